@@ -2,14 +2,16 @@
 
     python scripts/train_residual.py                                     # on the log that comes with torchid
     python scripts/train_residual.py my.yaml estimator.friction=false    # another log; friction is left to the networks
+    python scripts/train_residual.py --device cuda                       # on a GPU
 
 The regularization weight of the networks is chosen by held-out blocks of the training logs, unless --weight is given.
-The logs under `test` are evaluated at the end only. Curves go to TensorBoard: `tensorboard --logdir runs/residual`.
+The logs under `test` are evaluated at the end only. Curves go to a new folder: `tensorboard --logdir runs/residual`.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -59,37 +61,33 @@ def main() -> int:
     parser.add_argument("--mode", choices=["joint", "parameters_first", "alternating"], default="joint")
     parser.add_argument("--epochs", type=int, default=100, help="passes over the training logs")
     parser.add_argument("--weight", type=float, help="of the networks' force in the loss; chosen if not given")
-    parser.add_argument("--curves", type=Path, default=Path("runs/residual"), help="folder for TensorBoard")
+    parser.add_argument("--curves", type=Path, default=Path("runs/residual"), help="new folder for TensorBoard")
+    parser.add_argument("--device", help="where to compute, by default what the file says: cpu, cuda, cuda:0, ...")
     options = parser.parse_args()
     return run_guarded("train_residual", lambda: compare(options))
 
 
 def compare(options: argparse.Namespace) -> None:
-    """Train twice on the same batches."""
-    config = load_config(options.file, options.overrides)
-    if not config.logs.test:
-        raise ConfigError(options.file, "logs.test", "none", "logs to evaluate the networks on")
+    """Train twice on the same batches, without and with the networks."""
+    if os.path.lexists(options.curves) and not (options.curves.is_dir() and not any(options.curves.iterdir())):
+        raise ConfigError("command line", "--curves", f"{options.curves} exists", "a new folder")
+    config = load_config(options.file, [*options.overrides, *([f"device={options.device}"] if options.device else [])])
     with about_file(options.file):
+        if not config.logs.test:
+            raise ConfigError.at_field("logs.test", "none", "logs to evaluate the networks on")
         experiment = set_up(config)
-    robot = experiment.robot
-    builder = torchid.RowBuilder(robot, experiment.contacts, experiment.sensors)
+    robot, builder = experiment.robot, experiment.builder(experiment.sensors)
     reader = LogReader(experiment)
     train, test = (reader.read(paths, experiment.sensors) for paths in (config.logs.train, config.logs.test))
     train = [replace(log, motion_noise=None) for log in train]  # a descent sees samples as they are
     problem = torchid.linear_problem(torchid.compress(train, builder), builder, robot, config.estimator.friction)
-    settings = Sgd(
-        ridge=config.estimator.numeric_ridge,
-        epochs=options.epochs,
-        residual=options.mode,
-        residual_lr=0.01,
-        residual_weight=options.weight,
-    )
+    ridge, chosen = config.estimator.numeric_ridge, {"residual": options.mode, "residual_weight": options.weight}
+    settings = Sgd(ridge=ridge, epochs=options.epochs, residual_lr=0.01, **chosen)
     torch.manual_seed(0)
-
     table = Table(title="rms of the projected residual, in standard deviations of the stated sensor noise")
     for name in ("", "training logs", "unseen logs", "share of rigid bodies", "share of networks"):
         table.add_column(name, justify="right" if name else "left")
-    for name, networks in (("rigid bodies alone", None), ("with networks", JointNetworks(robot.n))):
+    for name, networks in (("rigid bodies alone", None), ("with networks", JointNetworks(robot.n).to(config.device))):
         trainer = Trainer(settings, problem, MiniBatches(train, builder), residual=networks)
         with RunEvents(options.curves / name.replace(" ", "_"), robot.body_names, descent=True) as events:
             for _ in track(range(options.epochs), description=name):
@@ -107,11 +105,7 @@ def print_effect(effect: ResidualEffect | None, bodies: Sequence[str]) -> None:
     if effect is None:
         return
     if effect.choice is not None:
-        losses = ", ".join(
-            f"{x:.4g} with {w:g}" for w, x in zip(effect.choice.candidates, effect.choice.losses, strict=True)
-        )
-        print(f"residual weight {effect.weight:g}: held-out loss {effect.choice.alone:.4g} without networks, {losses}")
-        print(f"  (the largest within one standard error, {effect.choice.standard_error:.2g}, of the least)")
+        print(f"residual weight {effect.weight:g}, by blocks of the training logs")
     for name, share in effect.shares.items():
         print(f"{name.replace('_', ' ')}: the networks give {100.0 * share:.3g} %, rms {effect.rms[name]:.3g}")
     print(f"rigid bodies can explain {100.0 * effect.rigid_share:.3g} % of the networks' force")

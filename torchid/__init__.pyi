@@ -1,3 +1,25 @@
+from .api import (
+    analyze,
+    check,
+    evaluate,
+    identify,
+)
+from .commands.analyze import (
+    Analysis,
+)
+from .commands.check import (
+    CheckedLogs,
+)
+from .commands.evaluate import (
+    EvaluatedRun,
+)
+from .commands.named_results import (
+    BodyEstimate,
+    ParameterTable,
+)
+from .commands.results import (
+    Identification,
+)
 from .errors import (
     TorchidError,
     TorchidWarning,
@@ -55,9 +77,6 @@ from .identifiability.structure import (
 )
 from .log_checks import (
     Checked,
-)
-from .log_checks.check import (
-    check,
 )
 from .logs import (
     Columns,
@@ -117,6 +136,12 @@ from .sensing import (
 __version__: str
 
 __all__ = [
+    "Analysis",
+    "BodyEstimate",
+    "CheckedLogs",
+    "EvaluatedRun",
+    "Identification",
+    "ParameterTable",
     "RIDGES",
     "BaseParameters",
     "Calibration",
@@ -151,6 +176,7 @@ __all__ = [
     "TorchidWarning",
     "Trainer",
     "TriangularFactor",
+    "analyze",
     "assemble",
     "base_parameters",
     "bind_log",
@@ -165,9 +191,11 @@ __all__ = [
     "cross_validate",
     "estimate_extras",
     "estimate_noise",
+    "evaluate",
     "fit_robustly",
     "fold_compressed",
     "frozen_parameters",
+    "identify",
     "split_into_folds",
     "linear_problem",
     "load_robot",

@@ -31,7 +31,7 @@ from shared_work import (
 
 import torchid
 from torchid import ranks
-from torchid.commands.training import CHECKPOINT
+from torchid.commands.checkpoint import CHECKPOINT
 from torchid.parameters import Array
 from torchid.problem.linear import parameter_scale
 

@@ -21,6 +21,23 @@ def test_networks_find_the_friction_that_the_model_lacks(tmp_path: Path) -> None
     assert beside < 0.5 * alone
     assert {path.name for path in tmp_path.iterdir()} == {"rigid_bodies_alone", "with_networks"}
 
+    status, _, told = call("train_residual", DEMO, "--curves", str(tmp_path))
+    assert status == 2
+    assert told == f"train_residual: command line: --curves: {tmp_path} exists; accepted: a new folder\n"
+
+
+def test_the_script_computes_where_it_is_told(tmp_path: Path) -> None:
+    """The option counts, not the file; without a GPU it is refused before any work, with one it is used."""
+    arguments = (DEMO, "device=cuda:99", "--epochs", "1", "--weight", "1", "--curves")
+    status, _, told = call("train_residual", *arguments, str(tmp_path / "cpu"), "--device", "cpu")
+    assert (status, told) == (0, "")
+    status, _, told = call("train_residual", *arguments, str(tmp_path / "cuda"), "--device", "cuda")
+    if torch.cuda.is_available():
+        assert (status, told) == (0, "")
+    else:
+        assert status == 2
+        assert "device: 'cuda' is not available here; accepted: cpu, cuda, cuda:0, ..." in told
+
 
 def test_networks_start_at_no_force() -> None:
     q, v, a = (torch.randn(5, size, dtype=torch.float64) for size in (11, 10, 10))

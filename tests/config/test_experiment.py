@@ -255,7 +255,7 @@ def test_an_unknown_key_is_refused_by_its_place_and_the_nearest_that_exists(
 @pytest.mark.parametrize(
     ("settings", "place", "found"),
     [
-        (changed(robot="robot.urdf"), "robot", "'robot.urdf'"),
+        (changed(robot=["robot.urdf"]), "robot", "['robot.urdf']"),
         (changed(robot=None), "robot", "None"),
         (changed(robot={"urdf": "r", "fixed_base": "perhaps"}), "robot.fixed_base", "'perhaps'"),
         (changed(logs={"train": "a.npz"}), "logs.train", "a.npz"),

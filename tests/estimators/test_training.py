@@ -16,7 +16,7 @@ from synthetic import Array
 from torch import Tensor, nn
 
 from torchid import parameters
-from torchid.commands.training import load_checkpoint, save_checkpoint
+from torchid.commands.checkpoint import load_checkpoint, save_checkpoint
 from torchid.errors import InputError
 from torchid.estimators import Epoch, LeastSquares, Sgd, SgdEstimate, Trainer
 from torchid.estimators.optimizers import optimizer_names

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from grown import Chance, tree
 
-from torchid.commands.training import save_checkpoint
+from torchid.commands.checkpoint import save_checkpoint
 
 INERTIAL = '<inertial><mass value="1"/><inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>'
 

@@ -16,7 +16,7 @@ from hostile import Tally, examined
 from repository import DEMO
 
 from torchid.cli import main
-from torchid.commands.training import load_checkpoint
+from torchid.commands.checkpoint import load_checkpoint
 from torchid.config import load_analysis, load_config, load_simulation
 from torchid.config.maps import load_columns, load_topics
 from torchid.errors import InputError, is_plain

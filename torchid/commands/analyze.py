@@ -20,7 +20,7 @@ from torchid.commands.folder import ANALYSIS, check_free, new_folder, write_json
 from torchid.commands.reading import LogReader, check_parts
 from torchid.commands.sensor_set_accuracy import accuracies
 from torchid.config import AnalyzeConfig, dump_config, inputs_of
-from torchid.errors import ConfigError, SensorError, UnknownNameError, during, warn
+from torchid.errors import ConfigError, SensorError, UnknownNameError, during, join_names, warn
 from torchid.fitting.experiment import Scene, set_up_scene, with_noise
 from torchid.identifiability.base_parameters import BaseParameters, base_parameters
 from torchid.parameters import WRENCH_COMPONENTS
@@ -40,6 +40,7 @@ from torchid.report.analysis import (
 )
 from torchid.report.figures import save_figure, tree_figure
 from torchid.report.tables import progress_bars
+from torchid.reprs import short_repr
 from torchid.sensing import Contact, SensorSet
 from torchid.sensing.sensors import NORMAL_FORCE
 from torchid.sensor_planning.demands import Candidate, candidates, count_channels, sensor_set
@@ -64,10 +65,19 @@ class ScenarioAnalysis:
     proposed: tuple[BaseObservability, ...] | None
     base: BaseParameters
 
+    __repr__ = short_repr
+
+    def _headline(self) -> str:
+        plan = self.plan
+        proof = "no cheaper set exists" if plan.proven else "not proven to be the cheapest"
+        names = join_names([one.name for one in plan.chosen])
+        what = f"{len(plan.chosen)} sensors at a cost of {plan.cost:g} ({proof}): {names}"
+        return f"{self.name}, {len(self.states)} contact states, {what}"
+
 
 @dataclass(frozen=True)
 class Analysis:
-    """Results by scenario, and the accuracy of sensor sets on logs.
+    """Results by scenario, the accuracy of sensor sets on logs, and the folder that they were written to, if any.
 
     Of processes that share the work, the first alone has the scenarios: to look for sensors is the work of one.
     """
@@ -75,7 +85,26 @@ class Analysis:
     scene: Scene
     scenarios: tuple[ScenarioAnalysis, ...]
     accuracies: dict[str, SetAccuracy]
-    output: Path
+    output: Path | None
+
+    __repr__ = short_repr
+
+    def _headline(self) -> str:
+        sets = f"; accuracy of {join_names(list(self.accuracies))}" if self.accuracies else ""
+        chosen = [f"{one.name}: {len(one.plan.chosen)} sensors, cost {one.plan.cost:g}" for one in self.scenarios]
+        return f"{self.scene.robot.path.name}; {'; '.join(chosen)}{sets}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """What `analysis.json` has."""
+        names, scenarios = self.scene.robot.body_names, {}
+        for scenario in self.scenarios:
+            proposed = scenario.proposed
+            scenarios[scenario.name] = sensor_plan_document(scenario.plan) | {
+                "proposed": None if proposed is None else observability_document(proposed),
+                "base_parameters": base_parameters_document(scenario.base, names),
+            }
+        accuracies = {name: accuracy.as_dict() for name, accuracy in self.accuracies.items()}
+        return {"scenarios": scenarios, "accuracy": accuracies or None}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,18 +158,16 @@ class AnalysisRequest:
 
 
 def analyze(config: AnalyzeConfig) -> Analysis:
-    """Plan and check sensors as an experiment file says under `analysis`, and write a folder with the results.
+    """Plan and check sensors as an experiment file says under `analysis`, and write a folder if there is an output.
 
     Raises:
         InputError: whatever does not fit; nothing has been written then.
     """
-    output = analysis_folder(config.output)
-    if not config.output.name:
-        found = f"'{config.output}', no name for a folder"
-        raise ConfigError.at_field("output", found, "a path to a new folder")
     if config.logs is not None:
         config.logs.require_samples("analyze")
-    ranks.from_first(partial(check_free, output, config.overwrite, ANALYSIS, inputs_of(config)), "output")
+    output = None if config.output is None else analysis_folder(config.output)
+    if output is not None:
+        ranks.from_first(partial(check_free, output, config.overwrite, ANALYSIS, inputs_of(config)), "output")
     scene = set_up_scene(config)
     request = AnalysisRequest.of(scene)
     with progress_bars() as bars:
@@ -161,13 +188,20 @@ def analyze(config: AnalyzeConfig) -> Analysis:
         sets = ranks.from_first(plan, "sensor sets")
         compared = accuracies(scene, sets, train, test, bars) if train else {}
         analysis = Analysis(scene, tuple(results), compared, output)
-        bars.add_task("writing", total=None)
-        ranks.from_first(partial(write_analysis, analysis), "analysis folder")
+        if output is not None:
+            bars.add_task("writing", total=None)
+            ranks.from_first(partial(write_analysis, analysis, output, config.overwrite), "analysis folder")
     return analysis
 
 
 def analysis_folder(output: Path) -> Path:
-    """Where an analysis goes: beside the run of the same experiment file."""
+    """Where an analysis goes: beside the run of the same experiment file.
+
+    Raises:
+        ConfigError: the output has no name.
+    """
+    if not output.name:
+        raise ConfigError.at_field("output", f"'{output}', no name for a folder", "a path to a new folder")
     return output.parent / f"{output.name}.analysis"
 
 
@@ -288,26 +322,19 @@ def is_planned(plan: SensorPlan, sensors: SensorSet, contacts: Sequence[Contact]
     return same and not planned_along_normals(plan, contacts)
 
 
-def write_analysis(analysis: Analysis) -> None:
-    """Write the folder."""
+def write_analysis(analysis: Analysis, output: Path, overwrite: bool = False) -> None:
+    """Write the folder; one that stands there may be replaced with `overwrite`."""
     scene, names = analysis.scene, analysis.scene.robot.body_names
-    document: dict[str, Any] = {"scenarios": {}, "accuracy": None}
     texts, figures = [], {}
     for scenario in analysis.scenarios:
-        plan, proposed = scenario.plan, scenario.proposed
-        document["scenarios"][scenario.name] = sensor_plan_document(plan) | {
-            "proposed": None if proposed is None else observability_document(proposed),
-            "base_parameters": base_parameters_document(scenario.base, names),
-        }
-        which = "planned" if proposed is None else "proposed"
+        which = "planned" if scenario.proposed is None else "proposed"
         texts.append(base_parameters_text(f"{scenario.name}, {which} sensors", scenario.base, names))
         figures[f"sensors-{scenario.name}"] = _picture(scene, scenario)
     if analysis.accuracies:
-        document["accuracy"] = {name: accuracy.as_dict() for name, accuracy in analysis.accuracies.items()}
         figures["accuracy"] = accuracy_figure(analysis.accuracies)
-    with during("writing", analysis.output), new_folder(analysis.output, scene.config.overwrite, ANALYSIS) as folder:
+    with during("writing", output), new_folder(output, overwrite, ANALYSIS) as folder:
         (folder / "config.yaml").write_text(dump_config(scene.config))
-        write_json(folder / "analysis.json", document)
+        write_json(folder / "analysis.json", analysis.to_dict())
         (folder / "base_parameters.txt").write_text("\n\n".join(texts))
         for name, figure in figures.items():
             save_figure(figure, folder / f"{name}.png")

@@ -33,12 +33,12 @@ def open_reader(scene: Scene) -> LogReader:
 
 
 def open_cache(scene: Scene) -> Cache | None:
-    """The cache beside the output of an experiment; None without one, or where processes have no common folder.
+    """The cache beside the output of an experiment; None without any, or where processes have no common folder.
 
     All processes that share the work call this together.
     """
     size, output = scene.config.preprocessing.cache_gb, scene.config.output
-    if not size:
+    if not size or output is None:
         return None
     cache = Cache(output.absolute().parent / FOLDER, size)
     if ranks.world_size() > 1 and not _is_common(cache.folder):

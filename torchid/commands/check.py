@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from torchid.config.logs import LogsConfig
 from torchid.config.maps import load_columns, load_topics
 from torchid.config.preprocessing import PreprocessingConfig
 from torchid.config.sensors import ContactConfig
-from torchid.errors import ConfigError, LogError, about_file
+from torchid.errors import ConfigError, LogError, about_file, current_file, format_count
 from torchid.fitting.contacts import resolve_contacts
 from torchid.fitting.experiment import set_up_scene
 from torchid.log_checks import Checked
@@ -33,9 +34,29 @@ from torchid.robot import CollisionShapes, load_robot
 
 EXPERIMENTS = (".yaml", ".yml")
 FIGURES = (".png", ".pdf", ".svg")
+_FEW_LOGS = 8
 _WRENCH = (slice(0, 3), slice(3, 6))
 MOST_CHECKED = 100_000
 """Samples of a log that are checked at once for the reason of a bad fit."""
+
+
+class CheckedLogs(list[Checked]):
+    """Logs with the results of their checks."""
+
+    @property
+    def usable(self) -> bool:
+        """Whether enough of every log may be fitted."""
+        return all(log.usable for log in self)
+
+    def to_dict(self) -> dict[str, Any]:
+        """What `torchid check --json` writes."""
+        return log_check_document(self)
+
+    def __repr__(self) -> str:
+        usable = sum(log.usable for log in self)
+        lines = [repr(log).splitlines()[0] for log in self]
+        more = [f"... and {len(self) - _FEW_LOGS} more"] if len(self) > _FEW_LOGS else []
+        return "\n".join([f"{format_count(len(self), 'log')} checked, {usable} usable", *lines[:_FEW_LOGS], *more])
 
 
 def check_files(
@@ -67,16 +88,18 @@ def check_files(
     return [check_log(path, urdf, base_link, fixed_base, topics, columns)]
 
 
-def check_experiment(path: str | Path, overrides: Sequence[str] = ()) -> list[Checked]:
-    """Check all logs of an experiment file against its robot and contacts.
+def check_experiment(
+    path: str | Path | None, overrides: Sequence[str] = (), sections: Mapping[str, object] | None = None
+) -> list[Checked]:
+    """Check all logs of an experiment, see `load_config`, against its robot and contacts.
 
     Raises:
         InputError: whatever in the file does not fit the robot, or a log that cannot be read.
     """
-    config = load_analysis(path, overrides)
-    if config.logs is None:
-        raise ConfigError(path, "logs", "missing", "logs to check")
-    with about_file(path):
+    config = load_analysis(path, overrides, sections)
+    with about_file(path or current_file()):
+        if config.logs is None:
+            raise ConfigError.at_field("logs", "missing", "logs to check")
         config.logs.require_samples("check")
         scene = set_up_scene(config)
     files = [*config.logs.train, *config.logs.validation, *config.logs.test]

@@ -3,36 +3,95 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
+from rich.progress import Progress
+
 from torchid import ranks
+from torchid.commands.compared_forces import compare_forces, noise_of_readings
 from torchid.commands.folder import EVALUATION, RUN, check_free, new_folder, refuse_link, write_json
 from torchid.commands.reading import LogReader
-from torchid.commands.results import draw_forces, noise_of_readings
+from torchid.commands.results import Identification, draw_forces
 from torchid.config import load_config
 from torchid.errors import ConfigError, about_file, during, warn
 from torchid.fitting.calibration import Calibration, Comparison
 from torchid.fitting.cross_validation import Scorer
-from torchid.fitting.experiment import Experiment, set_up
+from torchid.fitting.experiment import Experiment, require_device, set_up
 from torchid.guards import MAX_JSON, MAX_YAML, read_bytes
 from torchid.logs.time_range import split_range
-from torchid.problem import Metrics, RowBuilder
+from torchid.parameters import Array
+from torchid.problem import Metrics
+from torchid.problem.metrics import DECISIVE_GROUPS, describe_errors
 from torchid.report.figures import error_figure, save_figure
+from torchid.report.forces import ForceSeries
 from torchid.report.parameter_files import read_parameters, read_shared_extras
 from torchid.report.tables import progress_bars
+from torchid.reprs import short_repr
+from torchid.robot import Robot
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class EvaluatedRun:
-    """Errors of the parameters of a run by the name of a log, and the folder that they were written to."""
+    """Errors of the parameters of a run on further logs.
+
+    Attributes:
+        metrics: errors of the nominal and of the identified parameters, by the name of a log.
+        excluded: condemned samples left out, by the name of a log.
+        forces: of the first samples of the first log, as measured and as predicted.
+        robot: whose they are.
+        output: the folder that they were written to, if any.
+    """
 
     metrics: dict[str, Comparison[Metrics]]
-    output: Path
+    excluded: dict[str, int]
+    forces: ForceSeries
+    robot: Robot
+    output: Path | None = None
+
+    __repr__ = short_repr
+
+    def _headline(self) -> str:
+        texts = [
+            f"{name}: {describe_errors(group, pair.identified.rms.get(group), pair.nominal.rms.get(group))}"
+            for name, pair in self.metrics.items()
+            for group in DECISIVE_GROUPS
+            if pair.identified.rms.get(group) is not None
+        ]
+        return f"identified against URDF; {'; '.join(texts)}"
+
+    def to_dict(self) -> dict[str, dict[str, object]]:
+        """What `metrics.json` has, by name of a log."""
+        document: dict[str, dict[str, object]] = {
+            name: {
+                "identified": pair.identified.as_dict(),
+                "nominal": pair.nominal.as_dict(),
+                "noise_floor": pair.identified.noise,
+            }
+            for name, pair in self.metrics.items()
+        }
+        for name, count in self.excluded.items():
+            document[name]["excluded_samples"] = count
+        return document
 
 
-def evaluate(run: str | Path, logs: Sequence[str | Path], device: str | None = None) -> EvaluatedRun:
+@dataclass(frozen=True, kw_only=True)
+class _Fitted:
+    """What a run has found, from its folder or from memory.
+
+    `states_noise`: whether its settings stated the noise of any sensor; they have the estimated one as well.
+    """
+
+    experiment: Experiment
+    calibrations: Comparison[Calibration]
+    states_noise: bool
+
+
+def evaluate(
+    run: str | Path, logs: Sequence[str | Path], device: str | None = None, write: bool = True
+) -> EvaluatedRun:
     """Evaluate nominal and identified parameters; of processes that share the work, the first writes.
 
     Results go to `RUN/evaluation/<name of the first log>` and replace an earlier evaluation of that name.
@@ -41,65 +100,122 @@ def evaluate(run: str | Path, logs: Sequence[str | Path], device: str | None = N
         run: folder that `identify` wrote.
         logs: log files, or parts of them (`walk.npz[30:]`), preprocessed as the run's own were.
         device: where to compute; None: where the run did.
+        write: whether results are written at all.
 
     Raises:
         InputError: the folder is no run, or a log does not fit its robot.
     """
     folder = Path(run)
-    output = _output(folder, logs)
-    config = load_config(folder / "config.yaml", [f"device={device}"] if device else [])
+    settings, found = folder / "config.yaml", folder / "parameters.json"
+    if not settings.is_file():
+        raise ConfigError(folder, "RUN", "no config.yaml in it", "a folder that torchid identify wrote")
+    output = _output(folder, logs) if write else None
+    config = load_config(settings, [f"device={device}"] if device else [])
     with progress_bars() as bars:
-        with about_file(folder / "config.yaml"):
+        with about_file(settings):
             experiment = set_up(config)
-        builder = experiment.builder(experiment.sensors)
-        evaluation = experiment.evaluation(noise_of_readings(config, _states_noise(folder / "metrics.json")))
-        compared = _calibrations(experiment, builder, folder / "parameters.json")
-        reading = bars.add_task("reading logs", total=len(logs))
-        reader = LogReader(experiment, folder)
-        samples = reader.read([Path(log) for log in logs], None, lambda _: bars.advance(reading))
-        evaluating = bars.add_task("evaluating", total=sum(map(len, samples)))
-        scorer = Scorer(evaluation, builder)
-        metrics = {}
-        for log in samples:
-            pair = scorer.score_logs([log], compared, lambda n: bars.advance(evaluating, n))
-            metrics[split_range(log.source).name] = pair
-            if not any(x is not None for x in pair.identified.rms.values()):
-                warn(f"{log.source}: neither joint torques nor contact wrenches to compare predictions with")
-        document = _document(metrics, reader.excluded)
+        shared = Comparison(read_shared_extras(found, "nominal_value"), read_shared_extras(found, "value"))
+        calibrations = _calibrations(experiment, read_parameters(found, experiment.robot), shared)
+        states = _states_noise(folder / "metrics.json")
+        fitted = _Fitted(experiment=experiment, calibrations=calibrations, states_noise=states)
+        evaluated = replace(_evaluate(fitted, logs, folder, bars), output=output)
+        if output is not None:
+            ranks.from_first(partial(_write, evaluated, output, settings), "evaluation folder")
+    return evaluated
 
-        def write() -> None:
-            with during("writing", output), new_folder(output, True, EVALUATION) as new:
-                (new / "config.yaml").write_bytes(read_bytes(folder / "config.yaml", MAX_YAML))
-                write_json(new / "metrics.json", document)
-                save_figure(draw_forces(evaluation, samples[0], compared), new / "forces.png")
-                save_figure(error_figure(metrics), new / "errors.png")
 
-        ranks.from_first(write, "evaluation folder")
-    return EvaluatedRun(metrics, output)
+def evaluate_identification(run: Identification, logs: Sequence[str | Path], device: str | None = None) -> EvaluatedRun:
+    """As `evaluate`, of a run that need not have been written; nothing is."""
+    experiment = run.experiment
+    if device is not None:
+        require_device(device)
+        experiment = replace(experiment, config=replace(experiment.config, device=device))
+    shared = [(one.extra.label, one) for one in run.extras if not one.log]
+    values = Comparison({x: one.nominal_value for x, one in shared}, {x: one.value for x, one in shared})
+    fitted = _Fitted(
+        experiment=experiment,
+        calibrations=_calibrations(experiment, run.phi, values),
+        states_noise=any(group.origin == "stated" for group in run.noise.groups),
+    )
+    with progress_bars() as bars:
+        return _evaluate(fitted, logs, None, bars)
+
+
+def _evaluate(fitted: _Fitted, logs: Sequence[str | Path], folder: Path | None, bars: Progress) -> EvaluatedRun:
+    """Errors of what a run has found; `folder`: on whose disk large logs are kept."""
+    experiment, compared = fitted.experiment, fitted.calibrations
+    _log_names(logs)
+    evaluation = experiment.evaluation(noise_of_readings(experiment.config, fitted.states_noise))
+    reading = bars.add_task("reading logs", total=len(logs))
+    reader = LogReader(experiment, folder)
+    samples = reader.read([Path(log) for log in logs], None, lambda _: bars.advance(reading))
+    evaluating = bars.add_task("evaluating", total=sum(map(len, samples)))
+    scorer = Scorer(evaluation, compared.identified.builder)
+    metrics = {}
+    for log in samples:
+        pair = scorer.score_logs([log], compared, lambda n: bars.advance(evaluating, n))
+        metrics[split_range(log.source).name] = pair
+        if not any(x is not None for x in pair.identified.rms.values()):
+            warn(f"{log.source}: neither joint torques nor contact wrenches to compare predictions with")
+    excluded = {split_range(path).name: count for path, count in reader.excluded.items()}
+    forces = ranks.from_first(partial(compare_forces, evaluation, samples[0], compared), "forces")
+    return EvaluatedRun(metrics=metrics, excluded=excluded, forces=forces, robot=experiment.robot)
+
+
+def _calibrations(experiment: Experiment, phi: Array, shared: Comparison[dict[str, float]]) -> Comparison[Calibration]:
+    """Nominal and identified parameters (L, 12), each with the extra parameters of all logs, by label."""
+    robot, builder = experiment.robot, experiment.builder(experiment.sensors)
+    nominal, identified = (
+        Calibration(
+            robot=robot,
+            builder=builder,
+            phi=of_bodies.flatten(),
+            values={("", label): value for label, value in values.items()},
+            loss=experiment.loss,
+        )
+        for of_bodies, values in zip((robot.nominal, phi), shared, strict=True)
+    )
+    return Comparison(nominal, identified)
+
+
+def _write(evaluated: EvaluatedRun, output: Path, config: Path) -> None:
+    """Write the folder, beside the settings of the run."""
+    with during("writing", output), new_folder(output, True, EVALUATION) as new:
+        (new / "config.yaml").write_bytes(read_bytes(config, MAX_YAML))
+        write_json(new / "metrics.json", evaluated.to_dict())
+        save_figure(draw_forces(evaluated.forces, evaluated.robot), new / "forces.png")
+        save_figure(error_figure(evaluated.metrics), new / "errors.png")
+
+
+def _log_names(logs: Sequence[str | Path]) -> list[str]:
+    """Names of the logs, without their folders.
+
+    Raises:
+        ConfigError: two have the same, or there is none.
+    """
+    names = [split_range(log).name for log in logs]
+    if not names:
+        raise ConfigError.at_field("logs", "none", "logs to evaluate")
+    again = [name for name in names if names.count(name) > 1]
+    if again:
+        raise ConfigError.at_field("logs", f"several logs named '{again[0]}'", "logs of different names")
+    return names
 
 
 def _output(run: Path, logs: Sequence[str | Path]) -> Path:
     """The folder of an evaluation of some logs.
 
     Raises:
-        ConfigError: the folder is no run, two logs have one name, a name that no folder can have, or something else stands where results go.
+        ConfigError: two logs have one name, it is of dots alone, or something else stands where results go.
     """
-    if not (run / "config.yaml").is_file():
-        raise ConfigError(run, "RUN", "no config.yaml in it", "a folder that torchid identify wrote")
-    parts = [split_range(log) for log in logs]
-    names = [part.name for part in parts]
-    again = [name for name in names if names.count(name) > 1]
-    if again:
-        raise ConfigError("command line", "--log", f"several logs named '{again[0]}'", "logs of different names")
-    if names[0] in (".", ".."):
-        raise ConfigError(
-            "command line", "--log", f"'{logs[0]}', whose name is of dots alone", "another name of the file"
-        )
-    output = run / RUN.inner_folder / names[0]
+    name = _log_names(logs)[0]
+    if name in (".", ".."):
+        raise ConfigError.at_field("logs", f"'{logs[0]}', whose name is of dots alone", "another name of the file")
+    output = run / RUN.inner_folder / name
 
     def check() -> None:
         refuse_link(output.parent)
-        check_free(output, True, EVALUATION, [file.path for part in parts for file in part.files])
+        check_free(output, True, EVALUATION, [file.path for log in logs for file in split_range(log).files])
 
     ranks.from_first(check, "output")
     return output
@@ -112,32 +228,3 @@ def _states_noise(path: Path) -> bool:
         return any(group["origin"] == "stated" for group in groups)
     except (OSError, ValueError, LookupError, TypeError):
         return False
-
-
-def _document(metrics: Mapping[str, Comparison[Metrics]], excluded: Mapping[str, int]) -> dict[str, dict[str, object]]:
-    """What `metrics.json` has, by name of a log."""
-    document: dict[str, dict[str, object]] = {
-        name: {
-            "identified": pair.identified.as_dict(),
-            "nominal": pair.nominal.as_dict(),
-            "noise_floor": pair.identified.noise,
-        }
-        for name, pair in metrics.items()
-    }
-    for path, count in excluded.items():
-        document[split_range(path).name]["excluded_samples"] = count
-    return document
-
-
-def _calibrations(experiment: Experiment, builder: RowBuilder, path: Path) -> Comparison[Calibration]:
-    """Parameters of a `parameters.json`, each with the extra parameters of all logs that suit them."""
-    robot, loss = experiment.robot, experiment.loss
-    phi = read_parameters(path, robot).flatten()
-    nominal, identified = (
-        {("", label): value for label, value in read_shared_extras(path, column).items()}
-        for column in ("nominal_value", "value")
-    )
-    return Comparison(
-        Calibration(robot=robot, builder=builder, phi=robot.nominal.flatten(), values=nominal, loss=loss),
-        Calibration(robot=robot, builder=builder, phi=phi, values=identified, loss=loss),
-    )

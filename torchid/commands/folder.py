@@ -61,21 +61,24 @@ def check_free(output: Path, overwrite: bool, kind: FolderKind = RUN, inputs: It
         require_replaceable(output, kind)
 
 
-def check_free_file(path: Path, field: str, overwrite: bool, inputs: Iterable[object]) -> None:
+def check_free_file(
+    path: Path, field: str, overwrite: bool, inputs: Iterable[object], option: str = "--overwrite"
+) -> None:
     """Make sure, before any work, that a file may be written.
 
     Args:
         path: of the file.
-        field: of the command line that names it.
+        field: of the command line, or argument, that names it.
         overwrite: whether a file there may be replaced.
         inputs: files and folders that the command reads.
+        option: what sets `overwrite`.
 
     Raises:
         ConfigError: it exists and may not be replaced, or there is no folder for it.
     """
     if os.path.lexists(path) and not (overwrite and os.path.isfile(path) and not os.path.islink(path)):
         found = "a link" if os.path.islink(path) else "exists"
-        raise ConfigError(path, field, found, "a new file, or --overwrite in place of a file")
+        raise ConfigError(path, field, found, f"a new file, or {option} in place of a file")
     if not os.path.isdir(path.parent):
         raise ConfigError(path, field, f"no folder {path.parent}", "a file in an existing folder")
     for other in inputs:

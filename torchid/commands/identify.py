@@ -1,4 +1,4 @@
-"""`torchid identify`: from an experiment to a run folder."""
+"""`torchid identify`: from an experiment to an identification, and to a run folder."""
 
 from __future__ import annotations
 
@@ -14,16 +14,18 @@ from torchid import ranks
 from torchid.commands.cached_factors import cached_parts, factors_key
 from torchid.commands.cached_reading import CachedReader, open_reader
 from torchid.commands.chosen_cutoff import with_cutoff
+from torchid.commands.chosen_ridge import with_ridge
 from torchid.commands.chosen_sign_width import with_sign_width
 from torchid.commands.clock import Clock
+from torchid.commands.compared_forces import compare_forces, noise_of_readings
 from torchid.commands.folder import RUN, check_free, claim_folder
 from torchid.commands.plausibility import require_not_worse, require_plausible
 from torchid.commands.reading import LogReader, check_parts
-from torchid.commands.results import Identification, noise_of_readings, write_run
+from torchid.commands.results import Identification, write_run
 from torchid.commands.training import Training, descent_settings, require_trainable, training_folder
 from torchid.config import ExperimentConfig, inputs_of
 from torchid.errors import NumericalWarning, format_count, warn_about_file
-from torchid.estimators import Conditions, Estimate, violations
+from torchid.estimators import Conditions, Estimate, Violation, violations
 from torchid.fitting.calibration import Calibration, Comparison, warn_of_confounded, warn_of_disagreement
 from torchid.fitting.cross_validation import CrossValidation, RidgeChoice, Scorer
 from torchid.fitting.experiment import Experiment, set_up, with_noise
@@ -48,7 +50,7 @@ from torchid.report.tables import progress_bars
 
 
 def identify(config: ExperimentConfig, resume: bool = False) -> Identification:
-    """Fit the parameters and write the run folder; of processes that share the work, the first writes.
+    """Fit the parameters and write the run folder, if there is an output; of several processes, the first writes.
 
     Args:
         config: the experiment.
@@ -59,18 +61,24 @@ def identify(config: ExperimentConfig, resume: bool = False) -> Identification:
         BaseLostError: the sensors cannot see the base.
         KeyboardInterrupt: a training was interrupted; the message says how it can go on.
     """
-    trains = config.estimator.name == "sgd"
-    resume = resume or (trains and ranks.is_restart())
+    trains, output = config.estimator.name == "sgd", config.output
+    resume = resume or (trains and output is not None and ranks.is_restart())
     with ExitStack() as stack:
 
         def claim() -> None:
-            if trains:
-                stack.enter_context(claim_folder(training_folder(config.output)))
+            if trains and output is not None:
+                stack.enter_context(claim_folder(training_folder(output)))
             require_trainable(config, resume)
-            check_free(config.output, config.overwrite, RUN, inputs_of(config))
+            if output is not None:
+                check_free(output, config.overwrite, RUN, inputs_of(config))
 
         ranks.from_first(claim, "output")
-        return _identify(config, resume)
+        bars = stack.enter_context(progress_bars())
+        run, training = _identify(config, resume, bars)
+        if output is not None:
+            bars.add_task("writing", total=None)
+            ranks.from_first(partial(write_run, run, output, config.overwrite, training), "run folder")
+    return run
 
 
 @dataclass
@@ -112,7 +120,7 @@ def _prepare(config: ExperimentConfig, clock: Clock, bars: Progress) -> _Prepare
             descent_settings(config)  # before any work
     data = (_data_of_factors if config.logs.compressed else _data_of_logs)(experiment, clock, bars)
     with clock("ridge"):
-        experiment, ridge = _with_ridge(data.experiment, data.parts, data.blocks, data.builder, conditions, bars)
+        experiment, ridge = with_ridge(data.experiment, data.parts, data.blocks, data.builder, conditions, bars)
     fitter = experiment.fitter(data.builder, conditions)
     return _Prepared(**vars(data) | {"experiment": experiment}, conditions=conditions, fitter=fitter, ridge=ridge)
 
@@ -183,81 +191,60 @@ def _solved(ready: _Prepared, evaluation: Evaluation, bars: Progress, resume: bo
     return _Solved(fit, robust, training, mass)
 
 
-def _identify(config: ExperimentConfig, resume: bool) -> Identification:
+def _identify(config: ExperimentConfig, resume: bool, bars: Progress) -> tuple[Identification, Training | None]:
+    """What the logs say, and how it was trained, if so."""
     clock = Clock()
-    with progress_bars() as bars:
-        ready = _prepare(config, clock, bars)
-        experiment, fitter, logs, blocks = ready.experiment, ready.fitter, ready.logs, ready.blocks
-        builder, stated = fitter.builder, bool(config.sensors.noise.forces)
-        evaluation = experiment.evaluation(noise_of_readings(experiment.config, stated))
-        with clock("solve"):
-            solved = _solved(ready, evaluation, bars, resume)
-            fit, ready.parts = solved.fit, []
-            estimate, problem = fit.estimate, fit.assembly.problem
-        with clock("identifiability"):
-            whole = merge_folds(_with_states(fit.parts, ready.factors), builder)
-            alone = _by_state(fitter, whole)
-            added = ranks.from_first(
-                lambda: _contributions(experiment, builder, whole, logs["train"], problem, bars), "contributions"
-            )
-        with clock("evaluate"):
-            fits = (fit, *fitter.fit_without_folds(fit.parts))
-            compared, *without_folds = (experiment.calibrations(one, builder) for one in fits)
-            scorer, of_blocks = Scorer(evaluation, builder), merge_states(fit.parts, builder)
-            scores = _scores(scorer, logs["test"], blocks, of_blocks, compared, without_folds, bars)
-        broken = violations(estimate.phi.reshape(-1, PER_BODY), problem.scale.reshape(-1, PER_BODY), ready.conditions)
-        run = Identification(
-            experiment=experiment,
-            estimate=estimate,
-            extras=fit.extras,
-            noise=ready.noise,
-            motion_noise=fit.assembly.noise,
-            misfit=misfit(estimate, ready.noise, fit.scatter),
-            robust=solved.robust,
-            states=ready.states,
-            by_state=alone,
-            contributions=added,
-            metrics=scores.metrics,
-            evaluated=scores.samples,
-            violations=broken,
-            seconds=clock.seconds,
-            samples=sum(map(len, blocks)),
-            factors=ready.factors,
-            excluded=ready.excluded,
-            mass=solved.mass,
-            validation=scores.validation,
-            ridge=ready.ridge,
-            cutoff=ready.cutoff,
-            sign_width=ready.sign_width,
-            reused=ready.reused,
+    ready = _prepare(config, clock, bars)
+    experiment, fitter, logs, blocks = ready.experiment, ready.fitter, ready.logs, ready.blocks
+    builder, stated = fitter.builder, bool(config.sensors.noise.forces)
+    evaluation = experiment.evaluation(noise_of_readings(experiment.config, stated))
+    with clock("solve"):
+        solved = _solved(ready, evaluation, bars, resume)
+        fit, ready.parts = solved.fit, []
+        estimate, problem = fit.estimate, fit.assembly.problem
+    with clock("identifiability"):
+        whole = merge_folds(_with_states(fit.parts, ready.factors), builder)
+        alone = _by_state(fitter, whole)
+        added = ranks.from_first(
+            lambda: _contributions(experiment, builder, whole, logs["train"], problem, bars), "contributions"
         )
-        plotted = next(iter([*logs["test"], *logs["train"]]), None)
-        logs.clear()  # checks of a log and figures need room, too
-        ready.blocks = blocks = []
-        require_not_worse(run.worse, experiment)
-        bars.add_task("writing", total=None)
-        ranks.from_first(partial(write_run, run, evaluation, plotted, compared, solved.training), "run folder")
-    return run
-
-
-def _with_ridge(
-    experiment: Experiment,
-    parts: Sequence[Part],
-    blocks: Sequence[Block],
-    builder: RowBuilder,
-    conditions: Conditions,
-    bars: Progress,
-) -> tuple[Experiment, RidgeChoice | None]:
-    """The experiment with a ridge that is a number, and how it was chosen, if it was."""
-    config = experiment.config
-    if not config.estimator.chooses_ridge:
-        return experiment, None
-    bar = bars.add_task("choosing the ridge", total=None)
-    fitter = experiment.fitter(builder, conditions)
-    choice = ranks.from_first(partial(experiment.choose_ridge, parts, blocks, fitter, conditions), "ridge")
-    bars.update(bar, total=1, completed=1)
-    chosen = replace(config, estimator=replace(config.estimator, ridge=choice.ridge))
-    return replace(experiment, config=chosen), choice
+    with clock("evaluate"):
+        fits = (fit, *fitter.fit_without_folds(fit.parts))
+        compared, *without_folds = (experiment.calibrations(one, builder) for one in fits)
+        scorer, of_blocks = Scorer(evaluation, builder), merge_states(fit.parts, builder)
+        scores = _scores(scorer, logs["test"], blocks, of_blocks, compared, without_folds, bars)
+        shown = [*logs["test"], *logs["train"]][:1]
+        forces = ranks.from_first(lambda: [compare_forces(evaluation, log, compared) for log in shown], "forces")
+    run = Identification(
+        experiment=experiment,
+        estimate=estimate,
+        extras=fit.extras,
+        noise=ready.noise,
+        motion_noise=fit.assembly.noise,
+        misfit=misfit(estimate, ready.noise, fit.scatter),
+        robust=solved.robust,
+        states=ready.states,
+        by_state=alone,
+        contributions=added,
+        metrics=scores.metrics,
+        evaluated=scores.samples,
+        violations=_violations(estimate, problem, ready.conditions),
+        seconds=clock.seconds,
+        samples=sum(map(len, blocks)),
+        factors=ready.factors,
+        excluded=ready.excluded,
+        mass=solved.mass,
+        validation=scores.validation,
+        ridge=ready.ridge,
+        cutoff=ready.cutoff,
+        sign_width=ready.sign_width,
+        forces=next(iter(forces), None),
+        reused=ready.reused,
+    )
+    logs.clear()  # checks of a log and figures need room, too
+    ready.blocks = blocks = []
+    require_not_worse(run.worse, experiment)
+    return run, solved.training
 
 
 def _read(reader: LogReader, experiment: Experiment, bars: Progress) -> dict[str, list[Samples]]:
@@ -358,6 +345,11 @@ def _contributions(
     out = contributions(parts, train, builder, problem, names, tolerance, lambda n: bars.advance(leaving_out, n))
     bars.update(leaving_out, total=1, completed=1)
     return out
+
+
+def _violations(estimate: Estimate, problem: LinearProblem, conditions: Conditions) -> list[Violation]:
+    phi, scale = (x.reshape(-1, PER_BODY) for x in (estimate.phi, problem.scale))
+    return violations(phi, scale, conditions)
 
 
 @dataclass

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from tempfile import gettempdir
 
 import numpy as np
 import torch
@@ -41,12 +42,12 @@ class LogReader:
 
     Attributes:
         scene: robot, contacts and settings.
-        folder: on whose disk logs are kept.
+        folder: on whose disk logs are kept, as long as they are used.
         excluded: how many samples of each log were left out because they are condemned, by path.
     """
 
     def __init__(self, scene: Scene, folder: Path | None = None) -> None:
-        """Nothing is read yet; without a `folder` it is the one that the output of the scene goes to.
+        """Nothing is read yet; without a `folder` it is the one that the output of the scene goes to, or a temporary.
 
         Raises:
             ConfigError: settings that leave the cutoff to the logs, and nobody has chosen it.
@@ -293,6 +294,8 @@ def memory_needed(path: Path, memory_gb: float, held: float = 0.0) -> float:
     return held + log_bytes(path, GIGABYTE * (memory_gb - held)) / GIGABYTE
 
 
-def _folder_beside(output: Path) -> Path:
-    """The folder that a run goes to, or the nearest above it that exists already."""
+def _folder_beside(output: Path | None) -> Path:
+    """The folder that a run goes to, or the nearest above it that exists already; that of the system without a run."""
+    if output is None:
+        return Path(gettempdir())
     return next((folder for folder in output.absolute().parents if folder.is_dir()), Path.cwd())

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import yaml
 
-from torchid.commands.folder import new_folder, write_json
+from torchid.commands.folder import RUN, check_free, check_free_file, new_folder, write_json
+from torchid.commands.named_results import BodyEstimate, ParameterTable, body_estimate, parameter_table, run_lines
 from torchid.commands.training import Training, body_eigenvalues
-from torchid.config import ExperimentConfig, dump_config
+from torchid.config import ExperimentConfig, dump_config, inputs_of
 from torchid.errors import during
 from torchid.estimators import ConstrainedEstimate, Estimate, SgdEstimate, Violation
-from torchid.fitting.calibration import Calibration, Comparison, list_confounded
+from torchid.fitting.calibration import Comparison, list_confounded
 from torchid.fitting.cross_validation import CrossValidation, RidgeChoice
 from torchid.fitting.experiment import Experiment
 from torchid.fitting.factor_files import FactorFile
@@ -26,12 +28,12 @@ from torchid.fitting.sign_width import SignWidthChoice
 from torchid.identifiability.base_parameters import StateReport
 from torchid.identifiability.confounding import ExtraEstimate, TotalMass
 from torchid.identifiability.contributions import Contributions
+from torchid.logs.containers import atomic_output
 from torchid.logs.cutoff import CutoffChoice
 from torchid.logs.time_range import log_title
 from torchid.parameters import PER_BODY, Array
-from torchid.problem import Evaluation, Metrics, Samples
+from torchid.problem import Metrics
 from torchid.problem.metrics import SETS, WHITENED, WorseThanNominal, describe_worse, worse_than_nominal
-from torchid.problem.predict import force_series, noise_series
 from torchid.problem.surplus import NoiseShares
 from torchid.report import identified_urdf, parameters_document
 from torchid.report.figures import (
@@ -46,19 +48,18 @@ from torchid.report.forces import ForceSeries, force_figure
 from torchid.report.ridge import ridge_figure
 from torchid.report.tables import table_text, verdict_counts_table
 from torchid.report.tensorboard import RunEvents
-from torchid.sensing import SensorNoise
+from torchid.robot import Robot
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_PLOTTED_SAMPLES = 3000
 HELD_OUT = "blocks left out of the fit"
 """Name of the training samples that cross-validation predicts, in messages."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Identification:
-    """A finished run.
+    """A finished run; `run["l_knee"]` is what it says of a body, by its name or that of its joint.
 
     Attributes:
         experiment: robot, contacts, sensors and settings, with the noise and the ridge that were used.
@@ -83,6 +84,7 @@ class Identification:
         ridge: how it was chosen, if it was.
         cutoff: likewise.
         sign_width: likewise.
+        forces: of the first samples of a log, as measured and as predicted; None where there are but factors.
         reused: what an earlier run has left in the cache, in words.
     """
 
@@ -108,7 +110,62 @@ class Identification:
     ridge: RidgeChoice | None
     cutoff: CutoffChoice | None
     sign_width: SignWidthChoice | None
+    forces: ForceSeries | None
     reused: Sequence[str] = ()
+
+    def __getitem__(self, name: str) -> BodyEstimate:
+        """Identified parameters of a body, by its name, or else by that of its joint or of any link of it.
+
+        Raises:
+            UnknownNameError: the robot has neither.
+        """
+        return body_estimate(self.experiment.robot, self.estimate, name)
+
+    def __iter__(self) -> Iterator[str]:
+        """Names of the bodies."""
+        return iter(self.experiment.robot.body_names)
+
+    def __len__(self) -> int:
+        """Number of bodies."""
+        return len(self.experiment.robot.bodies)
+
+    def __repr__(self) -> str:
+        return "\n".join(run_lines(self))
+
+    def table(self) -> ParameterTable:
+        """All parameters of all bodies, one per row; `pandas.DataFrame` takes it."""
+        return parameter_table(self.experiment.robot, self.estimate)
+
+    def to_dict(self) -> dict[str, Any]:
+        """What a run folder has in `parameters.json`, `metrics.json` and `config.yaml`."""
+        parameters = parameters_document(self.experiment.robot, self.estimate, self.by_state, self.extras)
+        config = yaml.safe_load(dump_config(self.experiment.config))
+        return {"parameters": parameters, "metrics": metrics_document(self), "config": config}
+
+    def to_urdf(self, path: str | Path, overwrite: bool = False) -> Path:
+        """Write the URDF with the identified parameters; meshes keep their paths, as `identified.urdf` of a run does.
+
+        Raises:
+            ConfigError: the file exists and `overwrite` is not set, or it is an input.
+
+        Warns:
+            TorchidWarning: bodies that cannot exist.
+        """
+        inputs = inputs_of(self.experiment.config)
+        check_free_file(path := Path(path), "path", overwrite, inputs, "overwrite=True")
+        with atomic_output(path) as new:
+            new.write_bytes(identified_urdf(self.experiment.robot, self.phi))
+        return path
+
+    def write(self, output: str | Path, overwrite: bool = False) -> Path:
+        """Write the run folder that `torchid identify` writes.
+
+        Raises:
+            ConfigError: the folder exists and may not be replaced.
+        """
+        check_free(path := Path(output).absolute(), overwrite, RUN, inputs_of(self.experiment.config))
+        write_run(self, path, overwrite)
+        return path
 
     def violations_by_name(self) -> list[dict[str, object]]:
         """Conditions that the identified parameters break, the body by its name."""
@@ -132,25 +189,22 @@ class Identification:
         return self.estimate.phi.reshape(-1, PER_BODY)
 
 
-def write_run(
-    run: Identification,
-    evaluation: Evaluation,
-    plotted: Samples | None,
-    compared: Comparison[Calibration],
-    training: Training | None,
-) -> None:
+def write_run(run: Identification, output: Path, overwrite: bool = False, training: Training | None = None) -> None:
     """Write the run folder.
 
     Args:
         run: what to write.
-        evaluation: for the predicted forces.
-        plotted: log of the figure of forces, as recorded; None: no such figure.
-        compared: parameters, with the extra parameters that suit them.
+        output: the folder.
+        overwrite: whether a run that stands there may be replaced.
         training: whose curves go into the folder, and whose checkpoint is then no longer needed.
+
+    Raises:
+        ConfigError: the folder exists and may not be replaced.
     """
-    config, robot = run.experiment.config, run.experiment.robot
+    config, robot = replace(run.experiment.config, output=output), run.experiment.robot
+    run = replace(run, experiment=replace(run.experiment, config=config))
     figures = {
-        **({} if plotted is None else {"forces": draw_forces(evaluation, plotted, compared)}),
+        **({} if run.forces is None else {"forces": draw_forces(run.forces, robot)}),
         "errors": error_figure(run.metrics),
         "parameters": parameter_figure(
             robot.body_names, robot.nominal, run.phi, run.estimate.standard_error.reshape(-1, PER_BODY)
@@ -162,7 +216,7 @@ def write_run(
         figures["extras"] = extra_figure(run.extras)
     if run.ridge is not None:
         figures["ridge"] = ridge_figure(run.ridge)
-    with during("writing", config.output), new_folder(config.output, config.overwrite) as folder:
+    with during("writing", output), new_folder(output, overwrite) as folder:
         (folder / "config.yaml").write_text(dump_config(config))
         write_json(folder / "parameters.json", parameters_document(robot, run.estimate, run.by_state, run.extras))
         write_json(folder / "metrics.json", metrics_document(run))
@@ -176,30 +230,8 @@ def write_run(
         training.remove_checkpoint()
 
 
-def noise_of_readings(config: ExperimentConfig, stated: bool) -> SensorNoise | None:
-    """The noise of readings as recorded, NaN where it is unknown; None where it is not `stated` of any sensor.
-
-    Noise that was estimated beside a stated one is in proportion to it. Without any, it comes from the residuals
-    themselves, which it could not judge.
-    """
-    return SensorNoise.of_known(config.sensors.noise.forces) if stated else None
-
-
-def draw_forces(evaluation: Evaluation, samples: Samples, compared: Comparison[Calibration]) -> Figure:
-    """The figure of forces of a log's first samples: nominal, identified, and measured as the latter calibrates it.
-
-    Each prediction is as far from what was measured as from readings that are calibrated for it.
-    """
-    measured, predicted = [], []
-    for one in compared:
-        (read,) = one.calibrate([samples])
-        part = read[:_PLOTTED_SAMPLES]
-        readings, (forces,) = force_series(evaluation.builder, part, one.parameters(evaluation)[None])
-        measured.append(readings)
-        predicted.append(forces)
-    robot, nominal = evaluation.robot, predicted[0] + np.nan_to_num(measured[1] - measured[0])  # NaN: not measured
-    noise = None if evaluation.noise is None else noise_series(evaluation.builder, part, evaluation.noise)
-    series = ForceSeries(log_title(samples.source), part.time.numpy(), measured[1], nominal, predicted[1], noise)
+def draw_forces(series: ForceSeries, robot: Robot) -> Figure:
+    """The figure of forces of a log's first samples."""
     return force_figure(series, robot.dof_names, robot.base_rows)
 
 

@@ -3,27 +3,23 @@
 from __future__ import annotations
 
 import glob
-import hashlib
-import io
 import os
 import shutil
 import socket
 import time
-import warnings
-import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
 from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import torch
 import yaml
 from rich.progress import Progress
 
 from torchid import parameters, ranks
+from torchid.commands.checkpoint import CHECKPOINT, load_checkpoint, refusing_damage, save_checkpoint
 from torchid.commands.folder import (
     EVENTS,
     TRAINING,
@@ -35,22 +31,16 @@ from torchid.commands.folder import (
 )
 from torchid.commands.manifest import Manifest, inspect_folder, read_manifest
 from torchid.config import ExperimentConfig, dump_config, inputs_of
-from torchid.config.reading import check_yaml
-from torchid.errors import ConfigError, InputError, SensorError, excerpt, warn
+from torchid.errors import ConfigError, InputError, SensorError, warn
 from torchid.estimators import Epoch, Sgd, SgdEstimate, Trainer
 from torchid.estimators.optimizers import OPTIMIZERS
 from torchid.fitting.experiment import Experiment
-from torchid.guards import MAX_STATE, check_regular
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, Metrics, MiniBatches, RowBuilder, Samples
 from torchid.problem.linear import parameter_scale
 from torchid.report.tensorboard import RunEvents
 from torchid.robot import Robot
 
-CHECKPOINT = "checkpoint.pt"
-
-_ACCEPTED = "a checkpoint that torchid wrote"
-_DIGEST = "digest"
 Evaluate = Callable[[Array], Mapping[str, Metrics]]
 _FREE_TO_CHANGE = ("output", "overwrite")
 _SAME = 1e-9  # relative: the logs of a checkpoint, up to rounding
@@ -67,12 +57,15 @@ def require_trainable(config: ExperimentConfig, resume: bool) -> None:
     Raises:
         ConfigError: nothing to go on with, or an unfinished training in the way.
     """
-    folder, output, inputs = training_folder(config.output), config.output, inputs_of(config)
-    if config.estimator.name != "sgd":
+    output, inputs = config.output, inputs_of(config)
+    if config.estimator.name != "sgd" or output is None:
         if resume:
-            found = f"{config.estimator.name}, which is done in one go"
-            raise ConfigError.at_field("--resume", found, "estimator.name: sgd, or no --resume")
+            sgd = config.estimator.name == "sgd"
+            found = "set, without an output" if sgd else f"{config.estimator.name}, which is done in one go"
+            accepted = "an output with an unfinished run" if sgd else "estimator.name: sgd, or no --resume"
+            raise ConfigError.at_field("--resume", found, accepted)
         return
+    folder = training_folder(output)
     refuse_link(folder)
     recover_leftovers(folder, TRAINING)
     waiting = (folder / CHECKPOINT).is_file()
@@ -89,7 +82,11 @@ def require_trainable(config: ExperimentConfig, resume: bool) -> None:
 
 
 class Training:
-    """The descent of one run, which leaves its state in a folder of its own until the run is done."""
+    """The descent of one run, which leaves its state in a folder of its own until the run is done.
+
+    Attributes:
+        folder: that folder; None where nothing is to be written.
+    """
 
     def __init__(self, experiment: Experiment) -> None:
         """Fix the settings.
@@ -99,7 +96,7 @@ class Training:
         """
         config = experiment.config
         self.config, self.robot = config, experiment.robot
-        self.folder = training_folder(config.output)
+        self.folder = None if config.output is None else training_folder(config.output)
         self.settings = descent_settings(config)
         self._text, self._saved = dump_config(config), 0
 
@@ -142,8 +139,7 @@ class Training:
             self._saved = trainer.epoch
         bar = bars.add_task("training", total=self.settings.epochs, completed=trainer.epoch)
         since = trainer.epoch + 1 if trainer.epoch else 0
-        curves = partial(RunEvents, self.folder, self.robot.body_names, True, since)
-        with self._interruptible(trainer), curves() if ranks.is_first() else nullcontext() as events:
+        with self._interruptible(trainer), self._curves(since) as events:
             if trainer.epoch == 0:
                 self._evaluate(0, trainer.phi(), evaluate, events)
                 self._save(trainer, events)
@@ -152,7 +148,7 @@ class Training:
 
     def copy_curves(self, folder: Path) -> None:
         """Copy the training's event files into the finished run's folder."""
-        contents = inspect_folder(self.folder, TRAINING)
+        contents = None if self.folder is None else inspect_folder(self.folder, TRAINING)
         for path in contents.own if contents else ():
             if fnmatchcase(path.name, EVENTS):
                 shutil.copy2(path, folder)
@@ -163,11 +159,19 @@ class Training:
         Warns:
             TorchidWarning: there is more in its folder than torchid wrote.
         """
+        if self.folder is None:
+            return
         if contents := inspect_folder(self.folder, TRAINING):
             contents.remove()
         if self.folder.exists():
             message = f"{self.folder}: stays: it holds what torchid did not write"
             warn(message)
+
+    def _curves(self, since: int) -> AbstractContextManager[RunEvents | None]:
+        """What the first process writes curves with, from an epoch on."""
+        if self.folder is None or not ranks.is_first():
+            return nullcontext()
+        return RunEvents(self.folder, self.robot.body_names, True, since)
 
     def _share(self) -> tuple[int, int]:
         """The part of every batch that this process takes; all take all of it where a line search asks for more."""
@@ -198,10 +202,12 @@ class Training:
 
     def _prepare(self, trainer: Trainer, resume: bool) -> dict[str, Any] | None:
         """Start a new folder, or take up what is in it: the state of the trainer there."""
+        if self.folder is None:
+            return None
         if resume and (self.folder / CHECKPOINT).is_file():
             state = load_checkpoint(self.folder)
             with refusing_damage(self.folder):
-                self._check(state, trainer)
+                self._check(state, trainer, self.folder / CHECKPOINT)
                 trainer.load_state_dict(state["trainer"])
             before = read_manifest(self.folder) or Manifest(TRAINING.name, self.folder.name, {})
             replace(before, growing=(*before.growing, *_growing())).write(self.folder)
@@ -213,14 +219,13 @@ class Training:
 
     def _save(self, trainer: Trainer, events: RunEvents | None) -> None:
         self._saved = trainer.epoch
-        if events is None:  # the first process saves
+        if events is None or self.folder is None:  # the first process saves
             return
         events.flush()  # first: a resumed run's curves start where the checkpoint is
         state = {"config": self._text, "logs": _fingerprint(trainer), "trainer": trainer.state_dict()}
         save_checkpoint(self.folder, state)
 
-    def _check(self, state: Mapping[str, Any], trainer: Trainer) -> None:
-        path = self.folder / CHECKPOINT
+    def _check(self, state: Mapping[str, Any], trainer: Trainer, path: Path) -> None:
         if set(state) != {"config", "logs", "trainer"}:
             raise InputError(path, "file", "not a checkpoint of a run", "one that torchid identify wrote")
         before, now = (yaml.safe_load(text) for text in (state["config"], self._text))
@@ -236,10 +241,12 @@ class Training:
         try:
             yield
         except KeyboardInterrupt as error:
-            stopped = f"interrupted in epoch {trainer.epoch}; --resume goes on after epoch {self._saved}"
+            stopped = f"interrupted in epoch {trainer.epoch}"
+            if self.folder is not None:
+                stopped = f"{stopped}; --resume goes on after epoch {self._saved}"
             raise KeyboardInterrupt(stopped) from error
         except InputError:  # it would diverge again; the curves stay, to be looked at
-            if ranks.is_first():
+            if ranks.is_first() and self.folder is not None:
                 (self.folder / CHECKPOINT).unlink(missing_ok=True)
             raise
 
@@ -284,116 +291,3 @@ def _differences(before: Any, now: Any, key: str = "") -> Iterator[tuple[str, An
             yield from _differences(before.get(name), now.get(name), f"{key}.{name}" if key else str(name))
     elif before != now:
         yield key, before, now
-
-
-def save_checkpoint(folder: Path, state: dict[str, Any]) -> None:
-    """Write a state of plain types and tensors, under a temporary name first, with a digest of its values.
-
-    Raises:
-        OSError: names the file, if the disk is full or cannot be written.
-    """
-    temporary, path, content = folder / f".{CHECKPOINT}", folder / CHECKPOINT, io.BytesIO()
-    torch.save(state | {_DIGEST: _digest(state)}, content)  # not to the file: torch hides why that cannot be written
-    try:
-        with temporary.open("wb") as file:
-            file.write(content.getbuffer())
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except OSError as error:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        raise OSError(error.errno, error.strerror, str(path)) from error
-
-
-def load_checkpoint(folder: Path) -> dict[str, Any]:
-    """The state that `save_checkpoint` wrote; no code in the file is run.
-
-    Raises:
-        InputError: the file is damaged, was changed by others than `save_checkpoint`, or is none of ours.
-    """
-    path = folder / CHECKPOINT
-    with refusing_damage(folder):
-        _check_archive(path)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of pickles that are not torch's, which it then refuses
-            state = torch.load(path, weights_only=True)
-        _check_values(state)
-    if not isinstance(state, dict):
-        raise InputError(path, "file", f"holds a {type(state).__name__}", _ACCEPTED)
-    if state.pop(_DIGEST, None) != _digest(state):
-        raise InputError(path, "file", "not the values that were written, by their digest", _ACCEPTED)
-    return state
-
-
-@contextmanager
-def refusing_damage(folder: Path) -> Iterator[None]:
-    """Turn whatever reading a checkpoint or taking up its state raises into one line that names the file.
-
-    Raises:
-        InputError: a checkpoint whose parts are not what they should be.
-    """
-    try:
-        yield
-    except InputError:
-        raise
-    except Exception as error:  # noqa: B902 - an unpickler, torch and its optimizers raise what they like
-        found = f"not readable ({excerpt(str(error) or type(error).__name__, 200)})"
-        raise InputError(folder / CHECKPOINT, "file", found, _ACCEPTED) from error
-
-
-def _digest(value: Any) -> str:
-    """Of all values in a state, with their types and their order."""
-    digest, left = hashlib.sha256(), [value]
-    while left:
-        value = left.pop()
-        digest.update(type(value).__name__.encode())
-        if isinstance(value, torch.Tensor):
-            digest.update(f"{value.dtype}{tuple(value.shape)}".encode())
-            digest.update(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes())
-        elif isinstance(value, dict):
-            digest.update(f"{len(value)}".encode())
-            left += [x for pair in value.items() for x in pair]
-        elif isinstance(value, (list, tuple)):
-            digest.update(f"{len(value)}".encode())
-            left += value
-        else:
-            digest.update(f"{value!r};".encode())
-    return digest.hexdigest()
-
-
-def _check_archive(path: Path) -> None:
-    """Compare what was written with its checksums, which `torch.load` does not look at; nothing may have to unfold."""
-    check_regular(path)
-    with zipfile.ZipFile(path) as file:
-        entries = file.infolist()
-        if len(entries) > MAX_STATE or any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
-            raise zipfile.BadZipFile("compressed, or of too many parts")
-        if any(entry.filename.endswith("constants.pkl") for entry in entries):
-            raise zipfile.BadZipFile("a programme of torch.jit")
-        damaged = file.testzip()
-    if damaged is not None:
-        raise zipfile.BadZipFile(f"damaged in {damaged}")
-
-
-def _check_values(state: object) -> None:
-    """Refuse tensors that are larger than what is stored of them, settings that would unfold, and endless nesting."""
-    left, count = [state], 0
-    while left:
-        value, count = left.pop(), count + 1
-        if count > MAX_STATE:
-            raise ValueError(f"more than {MAX_STATE} values")
-        if isinstance(value, dict):
-            left += [*value.keys(), *value.values()]
-        elif isinstance(value, (list, tuple)):
-            left += value
-        elif isinstance(value, torch.Tensor) and not _is_stored(value):
-            raise ValueError(f"a tensor of shape {tuple(value.shape)} that is not stored as such")
-    if isinstance(state, dict) and isinstance(state.get("config"), str):
-        check_yaml(state["config"])
-
-
-def _is_stored(tensor: torch.Tensor) -> bool:
-    """Whether every number of it is in the file."""
-    size = tensor.numel() * tensor.element_size()
-    return tensor.layout == torch.strided and not tensor.is_meta and size <= tensor.untyped_storage().nbytes()

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 from pydantic import BeforeValidator, FiniteFloat
 from pydantic.dataclasses import dataclass
 
 from torchid.config.analysis import AnalysisConfig
 from torchid.config.estimator import MASS_ACCEPTED, ROBUST_ACCEPTED, EstimatorConfig, validate_keys
+from torchid.config.keywords import plain_sections
 from torchid.config.logs import SETS, LogsConfig, entries_spelled_out, resolve_logs
 from torchid.config.maps import MAPS_ACCEPTED
 from torchid.config.preprocessing import PreprocessingConfig
@@ -78,11 +80,11 @@ class ActuatorsConfig:
 
 @dataclass(config=STRICT, frozen=True, kw_only=True)
 class _Common:
-    """The keys of identification and analysis alike."""
+    """The keys of identification and analysis alike; no `output`, as Python alone may say: nothing is written."""
 
     robot: RobotConfig
     sensors: Sensors = dataclasses.field(default_factory=SensorsConfig)
-    output: Path
+    output: Path | None
     contacts: list[ContactConfig] = dataclasses.field(default_factory=list)
     preprocessing: PreprocessingConfig = dataclasses.field(default_factory=PreprocessingConfig)
     actuators: ActuatorsConfig = dataclasses.field(default_factory=ActuatorsConfig)
@@ -107,11 +109,18 @@ class AnalyzeConfig(_Common):
     logs: LogsConfig | None = None
 
 
+C = TypeVar("C", ExperimentConfig, AnalyzeConfig)
+
+
 def _spelled_out(settings: Settings, overriding: Settings) -> Settings:
-    """Parts of logs by name, and sensors as a mapping.
+    """Parts of logs by name; robot, logs and sensors as mappings, where they are a URDF, training logs, a named set.
 
     An override of one key of sensors joins the others; a named set replaces sensors by name.
     """
+    if isinstance(robot := settings.get("robot"), str):
+        settings = settings | {"robot": {"urdf": robot}}
+    if isinstance(logs := settings.get("logs"), (str, list)):
+        settings = settings | {"logs": {"train": [logs] if isinstance(logs, str) else logs}}
     settings = entries_spelled_out(settings)
     if "sensors" not in settings:
         return settings
@@ -121,13 +130,15 @@ def _spelled_out(settings: Settings, overriding: Settings) -> Settings:
     return settings | {"sensors": spelled_out(sensors)}
 
 
+_LISTS = ("", *(f".{name}" for name in SETS))  # a list of logs alone is that to fit on
+_FILES = ("", ".file", ".files.*", ".files.*.file")
 _EXPERIMENT = FileKind(
     settings=ExperimentConfig,
     name="experiment",
     keys="robot, logs, sensors, output",
     list_example="contacts=[{frame: l_sole, type: flat}]",
-    paths=("robot.urdf", *(f"logs.{name}.*{of}" for name in SETS for of in ("", ".file", ".files.*", ".files.*.file"))),
-    urls=("logs.train.*",),
+    paths=("robot", "robot.urdf", "logs", *(f"logs{name}.*{of}" for name in _LISTS for of in _FILES)),
+    urls=("logs", "logs.*", "logs.train.*"),
     outputs=("output",),
     prepare=_spelled_out,
     accepted={
@@ -149,12 +160,15 @@ _EXPERIMENT = FileKind(
 _ANALYSIS = FileKind(**(vars(_EXPERIMENT) | {"settings": AnalyzeConfig, "keys": "robot, contacts, output"}))
 
 
-def load_config(path: str | Path, overrides: Sequence[str] = ()) -> ExperimentConfig:
-    """Read and check an experiment file.
+def load_config(
+    path: str | Path | None, overrides: Sequence[str] = (), sections: Mapping[str, object] | None = None
+) -> ExperimentConfig:
+    """Read and check an experiment file, or the same from Python.
 
     Args:
-        path: the YAML file; paths in it are relative to it, but `output` to the working directory.
+        path: the YAML file; paths in it are relative to it, but `output` to the working directory. None: there is none.
         overrides: `key.subkey=value`, the value in YAML; paths in them are relative to the working directory.
+        sections: values by key, which override likewise; or all, where there is no file.
 
     Raises:
         ConfigError: unreadable file, a value of the wrong kind, a missing key.
@@ -163,9 +177,8 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> ExperimentCo
     Warns:
         TorchidWarning: a log is both fitted and tested on.
     """
-    path = Path(path)
-    config = load(_EXPERIMENT, path, overrides)
-    with about_file(path):
+    config, about = _loaded(_EXPERIMENT, path, overrides, sections)
+    with about:
         validate_choice("sensors", config.sensors)
         validate_keys(config.estimator)
         _check_extras(config)
@@ -173,11 +186,12 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> ExperimentCo
         return dataclasses.replace(config, logs=_checked_logs(config, config.logs))
 
 
-def load_analysis(path: str | Path, overrides: Sequence[str] = ()) -> AnalyzeConfig:
+def load_analysis(
+    path: str | Path | None, overrides: Sequence[str] = (), sections: Mapping[str, object] | None = None
+) -> AnalyzeConfig:
     """Read an experiment file for `torchid analyze`: as `load_config`, but logs and sensors may be left out."""
-    path = Path(path)
-    config = load(_ANALYSIS, path, overrides)
-    with about_file(path):
+    config, about = _loaded(_ANALYSIS, path, overrides, sections)
+    with about:
         validate_choice("sensors", config.sensors, may_be_empty=True)
         validate_keys(config.estimator)
         _check_extras(config)
@@ -190,6 +204,19 @@ def load_analysis(path: str | Path, overrides: Sequence[str] = ()) -> AnalyzeCon
             found = "set, without logs to predict accuracy from"
             raise ConfigError.at_field("analysis.compare", found, "logs.train too")
     return config
+
+
+def _loaded(
+    kind: FileKind[C], path: str | Path | None, overrides: Sequence[str], sections: Mapping[str, object] | None
+) -> tuple[C, AbstractContextManager[None]]:
+    """Settings, and what errors found in them later are about: the file, or what they are about already."""
+    given = plain_sections(sections or {})
+    if path is None:
+        return load(kind, None, overrides, {"output": None} | given), nullcontext()
+    config, about = load(kind, Path(path), overrides, given), about_file(path)
+    if config.output is None and given.get("output", config) is not None:  # left empty in the file or by the shell
+        raise ConfigError(path, "output", "found None", "a path")
+    return config, about
 
 
 def inputs_of(config: ExperimentConfig | AnalyzeConfig) -> list[Path]:

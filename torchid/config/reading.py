@@ -6,6 +6,7 @@ import dataclasses
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from difflib import get_close_matches
 from fnmatch import fnmatch
 from pathlib import Path
@@ -75,7 +76,7 @@ def check_yaml(text: str) -> None:
         elif isinstance(event, yaml.CollectionEndEvent):
             count.end()
         elif isinstance(event, yaml.ScalarEvent):
-            _check_scalar(event.value)
+            check_text(event.value)
             count.add(1)
             if event.anchor is not None:
                 count.anchored[event.anchor] = 1
@@ -95,7 +96,12 @@ def _check_tag(event: yaml.Event) -> None:
             raise ValueError(f"'{excerpt(event.value)}', which is no !!{kind}")
 
 
-def _check_scalar(value: str) -> None:
+def check_text(value: str) -> None:
+    """Refuse a text that no setting can be: too long, with control characters, or with an interpolation.
+
+    Raises:
+        ValueError: what was found.
+    """
     if len(value) > MAX_TEXT:
         raise ValueError(f"a text of {len(value)} characters, more than {MAX_TEXT}")
     if not is_plain(value.replace("\n", "")):
@@ -159,12 +165,13 @@ class FileKind(Generic[T]):
         return otherwise
 
 
-def load(kind: FileKind[T], path: Path, overrides: Sequence[str] = ()) -> T:
-    """Read and check a settings file.
+def load(kind: FileKind[T], path: Path | None, overrides: Sequence[str] = (), sections: Settings | None = None) -> T:
+    """Read and check a settings file, or the same settings without a file.
 
     Args:
         kind: of the file.
         path: the YAML file; paths of inputs in it are relative to it, those of results to the working directory.
+        sections: plain values by key of the file, merged as overrides are, before them.
         overrides: `key.subkey=value`, the value in YAML, one after the other; paths in them are relative to the working
             directory. A mapping adds to what is there, unless it is empty: `key={}` clears it.
 
@@ -172,19 +179,25 @@ def load(kind: FileKind[T], path: Path, overrides: Sequence[str] = ()) -> T:
         ConfigError: unreadable file, a value of the wrong kind, a missing key.
         UnknownNameError: a key that does not exist; the message names the nearest that do.
     """
-    with during("reading", path):
-        return _load(kind, path, overrides)
+    with nullcontext() if path is None else during("reading", path):
+        return _load(kind, path, overrides, sections or {})
 
 
-def _load(kind: FileKind[T], path: Path, overrides: Sequence[str]) -> T:
-    in_file = _absolute(_read(kind, path), kind.paths, path.resolve().parent, kind.urls)
-    settings = kind.prepare(_absolute(in_file, kind.outputs, Path.cwd()), {})
+def _load(kind: FileKind[T], path: Path | None, overrides: Sequence[str], sections: Settings) -> T:
+    settings: Settings = {}
+    if path is not None:
+        in_file = _absolute(_read(kind, path), kind.paths, path.resolve().parent, kind.urls)
+        settings = kind.prepare(_absolute(in_file, kind.outputs, Path.cwd()), {})
+    for key, value in sections.items():
+        try:
+            settings = _merged(kind, settings, _from_here(kind, {key: value}))
+        except (OmegaConfBaseException, TypeError) as error:
+            raise ConfigError.at_field(key, f"found {_repr(value)}", f"what a YAML {kind.name} file takes") from error
     for text in overrides:
         with about_file("command line"):
-            given = _absolute(_parsed(text), (*kind.paths, *kind.outputs), Path.cwd(), kind.urls)
+            given = _from_here(kind, _parsed(text))
         try:
-            layers = _cleared(kind.prepare(settings, given), given), kind.prepare(given, {})
-            settings = _container(OmegaConf.merge(*layers))
+            settings = _merged(kind, settings, given)
         except (OmegaConfBaseException, TypeError) as error:
             accepted = f"key.subkey=value, a list as a whole: '{kind.list_example}'"
             raise ConfigError("command line", excerpt(text), "does not fit the file", accepted) from error
@@ -192,6 +205,17 @@ def _load(kind: FileKind[T], path: Path, overrides: Sequence[str]) -> T:
         return TypeAdapter(kind.settings).validate_python(settings)
     except ValidationError as error:
         raise _in_one_line(kind, error) from error
+
+
+def _from_here(kind: FileKind[T], given: Settings) -> Settings:
+    """Settings with their paths relative to the working directory."""
+    return _absolute(given, (*kind.paths, *kind.outputs), Path.cwd(), kind.urls)
+
+
+def _merged(kind: FileKind[T], settings: Settings, given: Settings) -> Settings:
+    prepared = kind.prepare(given, {})
+    out: Settings = _container(OmegaConf.merge(_cleared(kind.prepare(settings, given), prepared), prepared))
+    return out
 
 
 def dump(settings: object) -> str:

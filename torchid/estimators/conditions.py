@@ -9,6 +9,7 @@ import numpy as np
 
 from torchid import parameters
 from torchid.parameters import PER_BODY, Array
+from torchid.reprs import short_repr
 from torchid.settings import BelowOne, Positive, validate_settings
 
 EnclosureKind = Literal["box", "ellipsoid"]
@@ -29,6 +30,8 @@ class Enclosure:
     centre: Array
     axes: Array
     half: Array
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         """Check kind, centre, axes and size."""
@@ -51,6 +54,8 @@ class Mirror:
     body: int
     image: int
     reflection: Array
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         """Check that the reflection is orthogonal."""
@@ -89,6 +94,8 @@ class Conditions:
     lower: Array | None = None
     upper: Array | None = None
     names: tuple[str, ...] = ()
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         """Check the numbers; `bounds` checks those by body."""

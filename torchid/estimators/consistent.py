@@ -18,11 +18,12 @@ from torchid.estimators.least_squares import ConstrainedEstimate, Regularized, r
 from torchid.estimators.ridge_limit import RidgeLimit, ridge_limit
 from torchid.parameters import Array
 from torchid.problem import LinearProblem
+from torchid.reprs import short_repr
 
 Method = Literal["barrier", "certified"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ConsistentEstimate(ConstrainedEstimate):
     """An estimate that meets its conditions; with the entropic prior, `unconstrained` is None.
 
@@ -64,6 +65,8 @@ class Consistent(Regularized):
     conditions: Conditions = field(default_factory=Conditions)
     method: Method = "barrier"
     certify: bool = False
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         """Check the settings.

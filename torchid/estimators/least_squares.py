@@ -13,6 +13,7 @@ from torchid.errors import InputError
 from torchid.parameters import Array
 from torchid.problem import LinearProblem
 from torchid.problem.chunks import one_thread
+from torchid.reprs import short_repr
 from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, relative_tolerance
 from torchid.settings import NotNegative, Tolerance, validate_settings
 
@@ -60,6 +61,12 @@ class Estimate:
     oversampling: float
     block_error: Array | None = field(default=None, kw_only=True)
 
+    __repr__ = short_repr
+
+    def _headline(self) -> str:
+        counts = ", ".join(f"{count} {verdict}" for verdict, count in self.verdict_counts().items() if count)
+        return f"rank {self.rank} of {self.phi.size} parameters ({counts}), residual {self.residual_std:.3g} x noise"
+
     @property
     def standard_error(self) -> Array:
         """The larger of `noise_error` and `block_error`, (P,); NaN where the data do not determine the parameter."""
@@ -97,7 +104,7 @@ def residual_std(cost: float, rows: int, rank: int, oversampling: float) -> floa
     return float(np.sqrt(cost / max(rows - oversampling * rank, (rows - rank) / oversampling, 1.0)))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ConstrainedEstimate(Estimate):
     """An estimate under conditions, compared with the best one without.
 

@@ -17,6 +17,7 @@ from torchid.estimators.learnable import LearnableParameters
 from torchid.estimators.least_squares import Regularized
 from torchid.estimators.optimizers import try_out
 from torchid.problem import Batch, LinearProblem, MiniBatches
+from torchid.reprs import short_repr
 from torchid.settings import BelowOne, Count, NamedClass, NotNegative, Positive, validate_settings
 
 Consistency = Literal["log_cholesky", "penalties"]
@@ -107,6 +108,8 @@ class Sgd(TrainingSettings, Regularized):
     residual: ResidualMode = "joint"
     residual_lr: Positive | None = None
     residual_weight: NotNegative | None = None
+
+    __repr__ = short_repr
 
 
 def pseudo_inertias(scaled: Tensor) -> Tensor:

@@ -60,7 +60,7 @@ class Epoch:
     samples_per_second: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class SgdEstimate(ConstrainedEstimate):
     """The result of a descent; objective and distance are those of the parameters alone.
 
@@ -127,6 +127,9 @@ class Trainer:
         self.weight_choice: WeightChoice | None = None
         self.epoch, self.best_epoch, self.best_loss = 0, 0, float("inf")
         self._best = self._snapshot()
+
+    def __repr__(self) -> str:
+        return f"Trainer: epoch {self.epoch} of {self.settings.epochs}, {self.batches!r}"
 
     @property
     def finished(self) -> bool:

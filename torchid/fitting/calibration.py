@@ -23,6 +23,7 @@ from torchid.problem.compression import Part
 from torchid.problem.extras import Extra
 from torchid.problem.predict import calibrate_readings
 from torchid.problem.samples import require_forces
+from torchid.reprs import short_repr
 from torchid.robot import Robot
 
 T = TypeVar("T")
@@ -62,6 +63,8 @@ class Calibration:
     values: ExtraValues
     loss: RobustLoss | None = None
     _of_new_logs: dict[str, Array | float] = field(default_factory=dict, init=False)
+
+    __repr__ = short_repr
 
     @property
     def changes_readings(self) -> bool:

@@ -30,6 +30,7 @@ from torchid.problem import Evaluation, ExtraTerms, RowBuilder, Samples
 from torchid.problem.compressed_log import Block
 from torchid.problem.compression import Part
 from torchid.problem.sampled_rows import LogElsewhere
+from torchid.reprs import short_repr
 from torchid.robot import Robot, body_extents, load_robot, mirror_pairs
 from torchid.robot.tree import FT_FIELD
 from torchid.sensing import Contact, SensorNoise, SensorSet, chosen_sensors, named_sensors, with_ft_sensors
@@ -53,6 +54,8 @@ class Scene:
     robot: Robot
     contacts: tuple[Contact, ...]
     rolling: str = ""
+
+    __repr__ = short_repr
 
     @property
     def noise(self) -> SensorNoise:
@@ -168,7 +171,7 @@ class Scene:
             raise ConfigError.at_field("estimator.ridge", f"auto, but {error.found}", accepted) from error
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Experiment(Scene):
     """A scene with the sensors of its fit."""
 
@@ -191,17 +194,21 @@ def with_noise(scene: S, summary: NoiseSummary) -> S:
     return stated
 
 
+def require_device(device: str) -> None:
+    """Refuse a device that this machine has not."""
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise ConfigError.at_field("device", f"'{device}' is not available here", "cpu, cuda, cuda:0, ...") from error
+
+
 def set_up_scene(config: ExperimentConfig | AnalyzeConfig) -> Scene:
     """Load the robot of an experiment file and look its contacts up.
 
     Raises:
         InputError: whatever in the file does not fit the robot.
     """
-    try:
-        torch.empty(0, device=config.device)
-    except (RuntimeError, AssertionError) as error:
-        found = f"'{config.device}' is not available here"
-        raise ConfigError.at_field("device", found, "cpu, cuda, cuda:0, ...") from error
+    require_device(config.device)
     try:
         of = config.robot
         robot = load_robot(of.urdf, of.base_link, of.fixed_base, _ft_joints(config), of.weld)

@@ -26,6 +26,7 @@ from torchid.logs.remote import RemoteFile, is_url, local_copy
 from torchid.parameters import Array
 from torchid.problem.compressed_log import CompressedLog, piece_spans
 from torchid.problem.compression import FOLDS, block_spans
+from torchid.reprs import short_repr
 from torchid.settings import NotNegative, Number
 from torchid.staging import atomic_file
 
@@ -63,6 +64,8 @@ class FactorFile:
     excluded: int = 0
     states: list[StateReport] = field(default_factory=list)
     version: str = __version__
+
+    __repr__ = short_repr
 
 
 @dataclass(config=_STRICT, frozen=True)

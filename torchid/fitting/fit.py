@@ -19,6 +19,7 @@ from torchid.parameters import PER_BODY
 from torchid.problem import LinearProblem, RowBuilder, assemble
 from torchid.problem.compression import Part, merge_blocks_of_folds, merge_states
 from torchid.problem.elimination import Assembly
+from torchid.reprs import short_repr
 from torchid.robot import Robot
 from torchid.rounding import RANK_TOLERANCE
 
@@ -48,6 +49,8 @@ class LogProblem:
     parts: list[Part]
     assembly: Assembly
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True)
 class Fit:
@@ -61,6 +64,8 @@ class Fit:
     estimate: Estimate
     extras: list[ExtraEstimate]
     scatter: BlockScatter | None = None
+
+    __repr__ = short_repr
 
     def columns(self, builder: RowBuilder, log: str) -> Tensor:
         """Parameters in the builder's columns for the rows of a log, (width,)."""
@@ -95,6 +100,8 @@ class LogFitter:
     friction: bool = True
     frozen: np.ndarray | None = None
     masses: tuple[KnownMass, ...] = ()
+
+    __repr__ = short_repr
 
     @property
     def least_squares(self) -> LeastSquares:

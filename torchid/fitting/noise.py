@@ -15,6 +15,7 @@ from torchid.parameters import Array
 from torchid.problem import LinearProblem, Samples
 from torchid.problem.noise import GroupVariances, VarianceComponentEstimator
 from torchid.problem.sampled_rows import BASE_GROUPS, LogElsewhere, SampledRows, noise_of_groups, std_by_group
+from torchid.reprs import short_repr
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet
 
@@ -52,6 +53,8 @@ class NoiseSummary:
     groups: list[GroupNoise]
     suggested: dict[str, float | tuple[float, float, float]]
     passes: int
+
+    __repr__ = short_repr
 
 
 def estimate_noise(

@@ -12,6 +12,7 @@ from torchid.parameters import Array
 from torchid.problem import RowBuilder
 from torchid.problem.extras import measured_components
 from torchid.problem.sampled_rows import noise_of_sensors
+from torchid.reprs import short_repr
 from torchid.robot import Robot
 from torchid.robot.tree import BodyJoint
 from torchid.rounding import KINEMATIC_TOLERANCE
@@ -37,6 +38,8 @@ class RowModel:
     settings: dict[str, Value]
     noise: dict[str, float]
     geometry: dict[str, Array]
+
+    __repr__ = short_repr
 
     @classmethod
     def of(cls, robot: Robot, builder: RowBuilder, preprocessing: Mapping[str, float | None]) -> RowModel:

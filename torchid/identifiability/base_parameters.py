@@ -67,6 +67,10 @@ class BaseParameters(nn.Module):
         self.null_space = _null_space(kept, combination, free, scale)
         self.register_buffer("index", torch.from_numpy(kept), persistent=False)
 
+    def extra_repr(self) -> str:
+        """What `repr` says."""
+        return f"{self.rank} combinations of {int(self.free.sum())} free parameters of {len(self.free)}"
+
     def forward(self, K: Tensor) -> Tensor:
         """K_B, (..., P_B), of a regressor K, (..., P).
 

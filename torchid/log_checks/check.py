@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -41,6 +42,7 @@ from torchid.logs.timeline import DROPPED_SAMPLES, JITTER, REACH_PERIODS
 from torchid.problem import Samples
 from torchid.problem.standing import longest_standing
 from torchid.problem.welded_joints import without_welded_joints
+from torchid.reprs import short_repr
 from torchid.robot import Robot
 from torchid.sensing import Contact
 
@@ -67,6 +69,15 @@ class Checked:
     findings: tuple[Finding, ...]
     skipped: tuple[Skipped, ...]
     rolling: str = ""
+
+    __repr__ = short_repr
+
+    def _headline(self) -> str:
+        counts = Counter(finding.severity for finding in self.findings)
+        found = (
+            ", ".join(f"{counts[severity]} {severity}" for severity in SEVERITIES if counts[severity]) or "no finding"
+        )
+        return f"{log_title(self.log.source)}, {len(self.log)} samples, {self.verdict} ({found})"
 
     @cached_property
     def condemned(self) -> BoolArray:

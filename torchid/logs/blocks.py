@@ -27,11 +27,11 @@ from torchid.logs.log import (
     check_shape,
     check_time,
     field_shape,
-    parse_names,
     to_float64,
 )
 from torchid.logs.mapped_arrays import MappedArray
 from torchid.logs.mapped_fields import map_arrays
+from torchid.logs.names import parse_names
 from torchid.logs.read import build_log, check_fields_given
 from torchid.logs.spill import LazyArray, Spill
 from torchid.logs.tables import read_table, table_blocks, table_size

@@ -27,9 +27,9 @@ from torchid.logs.log import (
     check_shape,
     check_time,
     field_shape,
-    parse_names,
     to_float64,
 )
+from torchid.logs.names import parse_names
 from torchid.logs.tables import sample_table
 from torchid.logs.time_range import LogFile
 

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import LogError, UnknownNameError, about_file, excerpt, is_plain
-from torchid.guards import MAX_LETTERS
+from torchid.errors import LogError, UnknownNameError, about_file
 from torchid.parameters import WRENCH_COMPONENTS
+from torchid.reprs import short_repr
 
 if TYPE_CHECKING:
     from torchid.logs.signal_noise import SignalNoise
@@ -174,6 +174,12 @@ class Log:
     contact_unloaded: FloatArray | None = None
     noise_bandwidth_hz: float | None = None
     motion_noise: SignalNoise | None = None
+
+    __repr__ = short_repr
+
+    def _headline(self) -> str:
+        seconds = float(self.time[-1] - self.time[0]) if len(self) else 0.0
+        return f"{self.source}, {len(self)} samples in {seconds:.4g} s, in SI units"
 
     def __post_init__(self) -> None:
         """Check shapes and types."""
@@ -356,34 +362,6 @@ def normalize_normals(normals: FloatArray, active: BoolArray, labels: tuple[str,
         raise LogError.at_field(NORMALS, found, f"unit vectors, to {UNIT_TOLERANCE:g}")
     norm[np.abs(norm - 1.0) <= ROUNDING] = 1.0
     return np.where(known[..., None], normals / np.where(known, norm, 1.0)[..., None], np.nan)
-
-
-def parse_names(name: str, array: NDArray[Any]) -> tuple[str, ...]:
-    """The names in a one-dimensional array of strings or UTF-8 bytes, LogError on anything else or a duplicate."""
-    check_shape(name, array, SHAPES[name] or (1,), {})
-    if array.size and array.dtype.kind not in "US":
-        raise LogError.at_field(name, f"values of type {array.dtype}", "strings")
-    try:
-        names = tuple(item.decode() if isinstance(item, bytes) else str(item) for item in array.tolist())
-    except UnicodeDecodeError as error:
-        raise LogError.at_field(name, f"bytes that are no text ({error})", "UTF-8 strings") from error
-    seen: set[str] = set()
-    for i, item in enumerate(names):
-        if len(item) > MAX_LETTERS or not is_plain(item):
-            accepted = f"printable names of at most {MAX_LETTERS} characters"
-            raise LogError.at_field(name, f"'{excerpt(item)}' at {i}", accepted)
-        if not item or item in seen:
-            found = f"'{item}' again at {i}" if item else f"an empty name at {i}"
-            raise LogError.at_field(name, found, "names that are all different")
-        seen.add(item)
-    return names
-
-
-def parse_frame(name: str, array: NDArray[Any]) -> str:
-    """The one name in an array of strings or UTF-8 bytes of any shape, LogError on anything else."""
-    if array.size != 1:
-        raise LogError.at_field(name, f"{array.size} values", "one name")
-    return parse_names(name, array.reshape(1))[0]
 
 
 def parse_flags(name: str, array: NDArray[Any], labels: tuple[str, ...]) -> BoolArray:

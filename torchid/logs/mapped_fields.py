@@ -16,7 +16,8 @@ from torchid.logs.column_map import Columns, Part, check_columns, values_by_name
 from torchid.logs.column_matching import Matched, columns_of_file, match_columns
 from torchid.logs.columns import TEXT_COLUMN, TableLayout, is_column, parse_header
 from torchid.logs.force_plates import PlatePoses
-from torchid.logs.log import FORCE_NORMAL, NAME_FIELDS, POINTS, SHAPES, VARIANTS, WRENCHES, FloatArray, parse_names
+from torchid.logs.log import FORCE_NORMAL, NAME_FIELDS, POINTS, SHAPES, VARIANTS, WRENCHES, FloatArray
+from torchid.logs.names import parse_names
 from torchid.logs.units import unit_factor
 
 Take = Callable[[str], NDArray[Any]]

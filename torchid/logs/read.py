@@ -49,11 +49,10 @@ from torchid.logs.log import (
     normalize_normals,
     normalize_quaternions,
     parse_flags,
-    parse_frame,
-    parse_names,
     to_float64,
 )
 from torchid.logs.mapped_fields import map_arrays
+from torchid.logs.names import parse_frame, parse_names
 from torchid.logs.quaternion import make_sign_continuous, rotate_to_base, rotate_to_world
 from torchid.logs.ros_read import read_bag
 from torchid.logs.ros_topics import Topics

@@ -98,6 +98,9 @@ class MiniBatches:
         self._cache: dict[int, Batch] = {}
         self._memory_left = memory
 
+    def __repr__(self) -> str:
+        return f"MiniBatches: {self.samples} samples of {len(self._logs)} logs, {self.batch_size} a batch"
+
     def split_blocks(self, count: int) -> list[MiniBatches]:
         """Mini-batches of about `count` blocks of successive samples, each of one log, at least one of every log."""
         pieces: list[Samples] = []

@@ -20,6 +20,7 @@ from torchid.problem.compression import (
 )
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
+from torchid.reprs import short_repr
 
 Span = tuple[int, int]
 """First of some successive samples of a log, and the end."""
@@ -51,6 +52,11 @@ class CompressedLog:
     pieces: list[Part]
     by_state: list[Part]
     unloaded: dict[Span, list[Part]]
+
+    __repr__ = short_repr
+
+    def _headline(self) -> str:
+        return f"{self.rows} equations of {self.samples} samples, up to {self.blocks} blocks"
 
     def __len__(self) -> int:
         return self.samples

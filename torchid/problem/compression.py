@@ -20,6 +20,7 @@ from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.problem.surplus import Surplus, compress_surplus, corrected_triangle
 from torchid.problem.unloaded_offsets import unloaded_offset_equations
+from torchid.reprs import short_repr
 from torchid.robot import Robot
 
 FOLDS = 5
@@ -56,6 +57,8 @@ class Part:
     block: int = 0
     unloaded: bool = False
     gated: set[int] = field(default_factory=set)
+
+    __repr__ = short_repr
 
 
 def compress(

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from torchid.logs.column_map import fits
+from torchid.reprs import short_repr
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
 
@@ -45,6 +46,8 @@ class ExtraTerms:
     torque_offset: bool = False
     asymmetric_coulomb: bool = False
     sign_width: float | None = None
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchid import parameters
 from torchid.parameters import Array
+from torchid.reprs import short_repr
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,11 @@ class LinearProblem:
     scale: Array
     free: np.ndarray
     oversampling: float = 1.0
+
+    __repr__ = short_repr
+
+    def _headline(self) -> str:
+        return f"{self.rows} whitened equations for {self.A.shape[1]} parameters, {int(self.free.sum())} of them free"
 
     def __post_init__(self) -> None:
         """Check shapes, and that all numbers are finite."""
@@ -113,6 +119,11 @@ class TriangularFactor:
         surplus: what noise of the motion adds to X^T X on average, by the columns of the rows that have it,
             (len(support) + 1, len(support) + 1); an estimate, see `torchid.problem.surplus`.
     """
+
+    __repr__ = short_repr
+
+    def _headline(self) -> str:
+        return f"of {self.rows} whitened rows, {self.columns} columns and the right-hand side"
 
     def __init__(self, columns: int) -> None:
         """Start empty, for `columns` columns and one right-hand side."""

@@ -103,6 +103,9 @@ class RowBuilder(nn.Module):
         self.frames = self._layouts.frames
         self.width = self.columns.count + len(self.extras)
 
+    def __repr__(self) -> str:
+        return f"RowBuilder: {len(self.contacts)} contacts, {self.width} columns, {self.sensors!r}"
+
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> RowBuilder:
         self._layouts.clear()  # their tensors are not buffers of the module
         super()._apply(fn, recurse)

@@ -21,6 +21,7 @@ from torchid.problem.extras import recorded_components
 from torchid.problem.motion_noise import MotionNoise, bind_motion_noise
 from torchid.regressor import Motion
 from torchid.regressor.kinematics import GRAVITY_WORLD, rotation_matrix
+from torchid.reprs import short_repr
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
 from torchid.sensing.sensors import NORMAL_FORCE, NORMAL_INDEX
@@ -80,6 +81,11 @@ class Samples:
     block: int = 0
     has_force_normal: bool = False
     motion_noise: MotionNoise | None = None
+
+    __repr__ = short_repr
+
+    def _headline(self) -> str:
+        return f"{self.source}, {len(self)} samples in the robot's order, in SI units"
 
     def __len__(self) -> int:
         return len(self.time)

@@ -150,6 +150,10 @@ class KinematicTree(nn.Module):
         self._register("depth_first", position)
         self._register("parent_in_level", position[parent[by_depth]] - level_start)
 
+    def extra_repr(self) -> str:
+        """What `repr` says."""
+        return f"{len(self.node_of)} bodies, {self.n} joints, {self.n_rows} rows of K"
+
     def _register(self, name: str, value: np.ndarray) -> None:
         dtype = torch.int64 if value.dtype.kind == "i" else torch.float64
         self.register_buffer(name, torch.tensor(np.ascontiguousarray(value), dtype=dtype), persistent=False)

@@ -12,8 +12,9 @@ import numpy as np
 import torch
 
 from torchid import parameters
-from torchid.errors import MasslessBodyWarning, UnknownNameError, UrdfError, current_file, during, warn
+from torchid.errors import MasslessBodyWarning, UnknownNameError, UrdfError, current_file, during, join_names, warn
 from torchid.parameters import WRENCH_COMPONENTS, Array
+from torchid.reprs import short_repr
 from torchid.robot.tree import (
     BodyJoint,
     JointGeometry,
@@ -41,6 +42,8 @@ class Body:
     links: tuple[str, ...]
     massless: bool
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True)
 class Robot:
@@ -63,6 +66,15 @@ class Robot:
     welded: dict[str, float] = field(default_factory=dict)
     links_beyond_welds: dict[str, Array] = field(default_factory=dict, repr=False)
     kind_of_welded: dict[str, str] = field(default_factory=dict, repr=False)
+
+    __repr__ = short_repr
+
+    def _headline(self) -> str:
+        base = "fixed" if self.fixed_base else "floating"
+        mass = f"{self.nominal[:, 0].sum():.3f} kg"
+        joints = join_names(self.joint_names)
+        moved = f"{base} base {self.base_link}, {self.n} joints {joints}"
+        return f"{self.path.name}, {len(self.bodies)} bodies, {mass}, {moved}"
 
     @cached_property
     def joint_names(self) -> tuple[str, ...]:

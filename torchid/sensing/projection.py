@@ -93,6 +93,12 @@ class Projection(nn.Module):
             self.register_buffer("row_std", rows, persistent=False)
             self.register_buffer("wrench_std", wrench_std, persistent=False)
 
+    def extra_repr(self) -> str:
+        """What `repr` says."""
+        torque, wrench = self.get_buffer("torque_measured"), self.get_buffer("wrench_measured")
+        measured = f"{int(torque.sum())} of {len(torque)} torques, {int(wrench.sum())} of {len(wrench)} of contacts"
+        return f"measured: {measured}"
+
     def forward(self, J_C: Tensor, active: Tensor, K: Tensor, torque: Tensor, wrench: Tensor) -> list[ProjectedGroup]:
         """Project a batch.
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from torchid.errors import SensorError, UnknownNameError
 from torchid.parameters import WRENCH_COMPONENTS, Array
+from torchid.reprs import short_repr
 from torchid.robot import Robot
 
 _FORCES, _MOMENTS = (0, 1, 2), (3, 4, 5)
@@ -197,6 +198,12 @@ class SensorSet:
     torque: np.ndarray
     wrench: np.ndarray
     noise: SensorNoise = field(default_factory=SensorNoise)
+
+    __repr__ = short_repr
+
+    def _headline(self) -> str:
+        of_contacts = f"{int(self.wrench.sum())} components at contacts"
+        return f"{int(self.torque.sum())} joint torques and readings in limbs, {of_contacts}"
 
 
 def named_sensors(name: str, n: int, contacts: int, noise: SensorNoise | None = None, ft: int = 0) -> SensorSet:

@@ -35,7 +35,7 @@ from trainings import (
 import torchid
 from torchid import parameters
 from torchid.cli import main
-from torchid.commands.training import CHECKPOINT, load_checkpoint
+from torchid.commands.checkpoint import CHECKPOINT, load_checkpoint
 from torchid.config import load_config
 from torchid.estimators import Trainer
 from torchid.estimators.least_squares import VERDICTS

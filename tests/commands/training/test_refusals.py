@@ -29,7 +29,7 @@ from trainings import (
 
 import torchid
 from torchid.cli import main
-from torchid.commands.training import CHECKPOINT, load_checkpoint, save_checkpoint
+from torchid.commands.checkpoint import CHECKPOINT, load_checkpoint, save_checkpoint
 from torchid.config import load_config
 from torchid.errors import InputError
 

@@ -1,0 +1,32 @@
+"""The page about Python says what happens."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from textwrap import dedent
+from typing import Any
+
+import pytest
+from repository import ROOT
+
+
+@pytest.mark.filterwarnings("ignore:identified.urdf:torchid.errors.TorchidWarning")
+def test_the_page_about_python_runs_and_prints_what_it_shows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "torchid").symlink_to(ROOT / "torchid")
+    monkeypatch.chdir(tmp_path)
+    page = (ROOT / "docs" / "python.md").read_text()
+    said: dict[str, Any] = {}
+    printed = 0
+    for code, after in re.findall(r"```python\n(.*?)```\n(.*?)(?=```python|\Z)", page, re.DOTALL):
+        exec(code, said)
+        out = capsys.readouterr().out
+        shown = re.match(r"\n((?:    .*\n)+)", after)
+        assert out == (dedent(shown[1]) if shown else ""), code
+        printed += bool(shown)
+    assert printed == 2
+    assert said["knee"].name == "front_left_shank_link"
+    assert {path.name for path in tmp_path.iterdir()} == {"torchid", "identified.urdf", "runs"}
+    assert [path.name for path in (tmp_path / "runs").iterdir()] == ["from_python"]

@@ -1,0 +1,128 @@
+"""What a thing says of itself, in ten lines at most."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from repository import DEMO
+
+import torchid
+from torchid.config import load_config
+from torchid.fitting.experiment import set_up
+from torchid.reprs import LINES, short_repr
+
+FILE = DEMO / "quadruped.yaml"
+
+
+@pytest.fixture(scope="module")
+def things() -> Mapping[str, object]:
+    """One of each public building block, of the demo."""
+    log, robot = torchid.read_log(DEMO / "sway_train.npz"), torchid.load_robot(DEMO / "quadruped.urdf")
+    contacts = [torchid.Contact(name, "point") for name in log.contact_names]
+    noise = torchid.SensorNoise(joint_torque=0.1)
+    sensors = torchid.named_sensors("joints", robot.n, len(contacts), noise)
+    builder = torchid.RowBuilder(robot, contacts, sensors)
+    samples = replace(torchid.bind_log(torchid.preprocess(log, 8.0), robot, contacts), motion_noise=None)
+    factor = torchid.compress([samples], builder)
+    problem = torchid.linear_problem(factor, builder, robot)
+    fitter = torchid.LogFitter(robot=robot, builder=builder, estimator=torchid.LeastSquares())
+    parts = torchid.compress_parts([samples], builder)
+    fit = fitter.fit(parts)
+    batches = torchid.MiniBatches([samples], builder)
+    result = torchid.identify(FILE, output=None)
+    analysis = torchid.analyze(FILE, output=None)
+    checked = torchid.check(FILE)
+    return {
+        "log": log,
+        "filtered log": torchid.preprocess(log, 8.0),
+        "samples": samples,
+        "robot": robot,
+        "body": robot.bodies[3],
+        "contact": contacts[0],
+        "noise": noise,
+        "sensors": sensors,
+        "rows": builder,
+        "regressor": torchid.Regressor(robot),
+        "jacobian": torchid.FrameJacobian(robot, "trunk"),
+        "projection": torchid.Projection([True, False], [False]),
+        "factor": factor,
+        "part": parts[0],
+        "compressed log": torchid.compress_log(samples, builder),
+        "problem": problem,
+        "extra terms": torchid.ExtraTerms(),
+        "least squares": torchid.LeastSquares(ridge=1e-3),
+        "consistent": torchid.Consistent(conditions=torchid.Conditions()),
+        "conditions": torchid.Conditions(),
+        "sgd": torchid.Sgd(),
+        "log-Cholesky": torchid.LogCholeskyParameters(problem),
+        "batches": batches,
+        "trainer": torchid.Trainer(torchid.Sgd(epochs=3), problem, batches),
+        "estimate": fit.estimate,
+        "consistent estimate": torchid.Consistent(ridge=1e-3, conditions=torchid.Conditions()).solve(problem),
+        "fitter": fitter,
+        "fit": fit,
+        "calibration": torchid.calibrations(fit, robot, builder).identified,
+        "noise summary": torchid.estimate_noise([samples], fitter),
+        "base parameters": torchid.base_parameters(problem),
+        "loss": torchid.RobustLoss.named("huber", 1.345, 5),
+        "experiment": set_up(load_config(FILE)),
+        "identification": result,
+        "body estimate": result["trunk"],
+        "body values": result["trunk"].nominal,
+        "verdicts": result["trunk"].verdict,
+        "table": result.table(),
+        "evaluation": torchid.evaluate(result, DEMO / "sway_test.npz"),
+        "analysis": analysis,
+        "scenario": analysis.scenarios[0],
+        "checked logs": checked,
+        "checked log": checked[0],
+    }
+
+
+def test_no_repr_is_longer_than_ten_lines(things: Mapping[str, object]) -> None:
+    for name, thing in things.items():
+        lines = repr(thing).splitlines()
+        assert 1 <= len(lines) <= LINES, name
+        assert max(map(len, lines)) <= 200, name
+        assert " object at 0x" not in repr(thing), name
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("log", "sway_train.npz, 1300 samples in 12.99 s"),
+        ("log", "joint_torque (1300, 12)"),
+        ("robot", "Robot: quadruped.urdf, 13 bodies, 20.800 kg, floating base trunk, 12 joints front_left_hip, "),
+        ("sensors", "12 joint torques"),
+        ("rows", "RowBuilder: 4 contacts, 118 columns"),
+        ("regressor", "13 bodies, 12 joints, 18 rows of K"),
+        ("problem", "for 156 parameters, 154 of them free"),
+        ("estimate", "Estimate: rank 118 of 156 parameters (79 identified, "),
+        ("base parameters", "118 combinations of 154 free parameters"),
+        ("batches", "MiniBatches: 1250 samples of 1 log"),
+        ("trainer", "Trainer: epoch 0 of 3"),
+        ("identification", "Identification of quadruped.urdf, 13 bodies, 12 joints, by least_squares"),
+        ("identification", "data        1250 samples of 1 log"),
+        ("identification", "total mass  21.420 ± 0.06 kg (URDF: 20.800 kg)"),
+        ("identification", "written to  no folder"),
+        ("body estimate", "± 0.011 kg m, identified"),
+        ("evaluation", "sway_test: joint torque 0.0761 against 0.354 N m"),
+        ("analysis", "cost 12"),
+        ("checked logs", "2 logs checked, 2 usable"),
+    ],
+)
+def test_a_repr_says_what_the_thing_is(things: Mapping[str, object], name: str, said: str) -> None:
+    assert said in " ".join(repr(things[name]).split()) or said in repr(things[name])
+
+
+def test_what_says_nothing_is_left_out_and_what_is_long_is_cut() -> None:
+    field = torchid.Log(source="x", time=np.zeros(1), joint_names=("a",), joint_position=np.zeros((1, 1)))
+    assert "joint_torque" not in repr(field)
+    many = torchid.Conditions(names=tuple(f"body{number}" for number in range(1000)))
+    assert "and 996 more" in repr(many)
+    assert len(repr(many).splitlines()) <= 2
+    assert short_repr(torch.zeros(3)) == "Tensor()"
