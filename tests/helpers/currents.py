@@ -10,12 +10,14 @@ from typing import Any
 import numpy as np
 import yaml
 from motions import value
+from payloads import load_on
 from repository import DEMO
 from synthetic import Oracle, load, make_log
 from true_robots import true_parameters
 
 from torchid.logs import write_log
 from torchid.logs.column_map import fits
+from torchid.robot import Payload
 
 FEET = [f"{end}_{side}_foot" for end in ("front", "rear") for side in ("left", "right")]
 HIPS, KNEES = ["*_hip", "*_thigh"], ["*_knee"]
@@ -33,9 +35,13 @@ def quadruped_files(
     samples: int = 240,
     states: Sequence[Sequence[bool]] = STATES,
     noise: float = 0.0,
+    loads: Mapping[str, Payload] | None = None,
     **settings: Any,
 ) -> tuple[Path, float]:
-    """An experiment file beside exact logs of a robot that is off its URDF, read with scales by pattern; its mass."""
+    """An experiment file beside exact logs of a robot that is off its URDF, read with scales by pattern; its mass.
+
+    `loads`: what it carries in a log, and in those after it.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     robot, rng = load(DEMO / "quadruped.urdf", None, False), np.random.default_rng(8)
     oracle = Oracle.of(robot)
@@ -43,7 +49,10 @@ def quadruped_files(
     scale = np.ones(robot.n)
     for pattern, x in scales.items():
         scale[[fits(name, pattern) for name in robot.joint_names]] = x
+    mass = float(true_parameters(oracle, robot)[:, 0].sum())
     for name in ("a", "b", "new"):
+        if loads and name in loads:
+            load_on(oracle, loads[name])
         log = make_log(oracle, [(foot, 3) for foot in FEET], states, samples, rng, f"{name}.npz")
         write_log(
             replace(log, joint_torque=value(log.joint_torque) / scale, contact_wrench_local=None),
@@ -57,4 +66,4 @@ def quadruped_files(
         "output": str(folder / "run"),
     } | settings  # fmt: skip
     (folder / "quadruped.yaml").write_text(yaml.safe_dump(experiment))
-    return folder / "quadruped.yaml", float(true_parameters(oracle, robot)[:, 0].sum())
+    return folder / "quadruped.yaml", mass

@@ -18,6 +18,7 @@ from torchid.commands.shared_log import on_one_machine, read_together
 from torchid.errors import TorchidWarning, warn
 from torchid.fitting.experiment import Scene
 from torchid.fitting.noise import recorded_sensors
+from torchid.fitting.payloads import payload_of
 from torchid.logs.blocks import GIGABYTE, log_bytes
 from torchid.logs.containers import LogKind, existing_log_kind, log_files
 from torchid.logs.time_range import split_range
@@ -193,7 +194,9 @@ class CachedReader(LogReader):
         blocks = None if together is None else settings.memory_gb
         part = split_range(path)
         log = [content.checksum, part.kind, None if part.range is None else part.range.text]
-        return content_key([self._scene_content, log, blocks, masks])
+        added = payload_of(self.scene, path)
+        carried = [] if added is None else [added.tolist()]
+        return content_key([self._scene_content, log, blocks, masks, *carried])
 
     def _store(self, key: str, path: Path, read: ReadLog) -> bool:
         """Whether an entry is there now; none is written of a log that has changed since its key was made."""

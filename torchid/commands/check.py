@@ -21,6 +21,7 @@ from torchid.config.sensors import ContactConfig
 from torchid.errors import ConfigError, LogError, about_file, current_file, format_count
 from torchid.fitting.contacts import resolve_contacts
 from torchid.fitting.experiment import set_up_scene
+from torchid.fitting.payloads import scene_of_log
 from torchid.log_checks import Checked
 from torchid.log_checks.check import check
 from torchid.logs import Columns, Log, Topics, read_log, write_log
@@ -106,9 +107,9 @@ def check_experiment(
     checked = []
     with progress_bars() as bars:
         for file in bars.track(files, description="checking"):
-            settings = config.preprocessing
-            log, _ = settle_contacts(read_log_to_check(file, config.logs, settings), scene)
-            found = check(log, scene.robot, scene.contacts, settings.filter_hz, settings.derived)
+            settings, own = config.preprocessing, scene_of_log(scene, file)
+            log, _ = settle_contacts(read_log_to_check(file, config.logs, settings), own)
+            found = check(log, own.robot, scene.contacts, settings.filter_hz, settings.derived)
             checked.append(replace(found, rolling=scene.rolling))
     return checked
 

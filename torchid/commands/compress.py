@@ -6,7 +6,7 @@ import hashlib
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -169,6 +169,7 @@ def _compressed(
             float(log.time[-1] - log.time[0]),
             left_out,
             own,
+            payloads=[asdict(one) for one in experiment.config.logs.payloads_of(path)],
         )
 
 

@@ -22,6 +22,7 @@ from torchid.estimators import LeastSquares
 from torchid.fitting.experiment import Scene
 from torchid.fitting.fit import Fit
 from torchid.fitting.misfit import beyond_models
+from torchid.fitting.payloads import scene_of_log
 from torchid.identifiability.confounding import TotalMass, total_mass
 from torchid.log_checks import Finding
 from torchid.log_checks.check import check
@@ -210,10 +211,11 @@ def _findings(scene: Scene) -> Iterator[tuple[str, Finding]]:
     findings: list[tuple[str, Finding]] = []
     settings = scene.config.preprocessing
     for path in files.train:
+        own = scene_of_log(scene, path)
         with suppress(InputError):  # larger than memory: it is not checked
             for log, name in stretches_to_check(path, files, settings):
-                flagged, _ = settle_contacts(log, scene)
-                checked = check(flagged, scene.robot, scene.contacts, settings.filter_hz, settings.derived)
+                flagged, _ = settle_contacts(log, own)
+                checked = check(flagged, own.robot, scene.contacts, settings.filter_hz, settings.derived)
                 severe = (one for one in checked.findings if one.severity in SEVERITIES[:2])
                 findings += [(name, one) for one in severe if one.mask(len(checked.log)).mean() > _PART]
                 if any(one.condemns_all for _, one in findings):

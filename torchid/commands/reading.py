@@ -15,6 +15,7 @@ from torchid.commands.large_log import BLOCK_GB, LargeLog
 from torchid.config.logs import require_apart
 from torchid.errors import ConfigError, LogError, warn
 from torchid.fitting.experiment import Scene
+from torchid.fitting.payloads import payload_of, scene_of_log
 from torchid.log_checks import Checked, drop_condemned
 from torchid.log_checks.check import check
 from torchid.logs import Log, read_log
@@ -30,6 +31,7 @@ from torchid.problem.contact_slip import measure_slip
 from torchid.problem.standing import preprocess_standing
 from torchid.problem.welded_joints import without_welded_joints
 from torchid.problem.zeroing import zero_in_air
+from torchid.robot import Robot
 from torchid.sensing import SensorSet
 
 _WHOLE_GB = 4.0 * BLOCK_GB  # recorded arrays that are taken whole: no block is worth its neighbourhood
@@ -83,7 +85,8 @@ class LogReader:
             if on_read is not None:
                 on_read(path)
         names = ranks.as_first([log.source for log in logs], "names of the logs")  # they may lie elsewhere there
-        return [log if log.source == name else replace(log, source=name) for log, name in zip(logs, names, strict=True)]
+        added = [payload_of(self.scene, path) for path in paths]
+        return [replace(log, source=name, payload=x) for log, name, x in zip(logs, names, added, strict=True)]
 
     def _together(self, path: Path) -> float:
         """What a log takes in memory with those before it [GB]."""
@@ -108,8 +111,9 @@ class LogReader:
             bridge_gaps_s=bridge_gaps_s,
             needs_flags=settings.needs_flags,
         )
-        recorded, certain = settle_contacts(without_welded_joints(read, self.scene.robot), self.scene)
-        checked = self._checked(recorded)
+        own = scene_of_log(self.scene, path)
+        recorded, certain = settle_contacts(without_welded_joints(read, own.robot), own)
+        checked = self._checked(recorded, own.robot)
         clean = recorded if checked is None else checked.repaired
         rates, sign_width = (settings.filter_hz, settings.sample_rate_hz), self.scene.terms.sign_width
         if settings.base_motion is None:
@@ -227,12 +231,12 @@ class LogReader:
     def _stated(self) -> dict[str, float]:
         return self.scene.config.sensors.noise.motion
 
-    def _checked(self, log: Log) -> Checked | None:
+    def _checked(self, log: Log, robot: Robot) -> Checked | None:
         """What the checks of a log say, if condemned samples are to be left out."""
         settings = self.scene.config.preprocessing
         if not settings.exclude_condemned:
             return None
-        return check(log, self.scene.robot, self.scene.contacts, settings.filter_hz, settings.derived)
+        return check(log, robot, self.scene.contacts, settings.filter_hz, settings.derived)
 
 
 def settle_contacts(log: Log, scene: Scene) -> tuple[Log, BoolArray]:

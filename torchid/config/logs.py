@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
 from torchid.config.sensors import STRICT
@@ -18,6 +19,7 @@ from torchid.logs import Columns, Topics
 from torchid.logs.containers import FACTORS, READABLE, list_bag_files
 from torchid.logs.remote import RemoteFile, as_path, list_matching
 from torchid.logs.time_range import JOINED, JOINED_ACCEPTED, LogFile, LogPart, join_files, split_range
+from torchid.robot.payloads import INERTIA_ACCEPTED, Payload
 
 SETS = ("train", "test", "validation")
 """Keys of `logs` that list logs."""
@@ -25,9 +27,18 @@ SETS = ("train", "test", "validation")
 FOLDS = 5
 """Folds that a log is cut into where an entry names one and not their number."""
 
-_KEYS = ("file", "files", "from", "to", "fold", "without_fold", "of")
-_ENTRY = "the name of a log, or a mapping with file, or files, and from, to, fold or without_fold"
+_KEYS = ("file", "files", "from", "to", "fold", "without_fold", "of", "payload")
+_ENTRY = "the name of a log, or a mapping with file, or files, and from, to, fold, without_fold or payload"
 _FILES = "several files as one log, [motion.csv, {file: plates.csv, shift_s: 0.12}], the first with its stamps"
+
+PAYLOAD_ACCEPTED = "a mapping with link, mass [kg], center_of_mass [x, y, z in m] and inertia, or a list of several"
+_PAYLOAD: TypeAdapter[Payload] = TypeAdapter(Payload)
+_PAYLOAD_ACCEPTED = {
+    "link": "the name of a link of the URDF",
+    "mass": "a number greater than 0 [kg]",
+    "center_of_mass": "[x, y, z] in the link's frame [m]",
+    "inertia": INERTIA_ACCEPTED,
+}
 
 
 @dataclass(config=STRICT, frozen=True)
@@ -36,6 +47,7 @@ class LogsConfig:
 
     A name with `*` or `?` is a pattern for all files that match. A range behind a name takes a part of each log, as if
     it were a log of its own: `walk.npz[0:30]`, see `TimeRange`; mappings say the same in words (`entries_spelled_out`).
+    `payloads` are what the robot carried in a file, by its absolute path, whatever part of it is taken.
     `topics` describes the topics of bags, `columns` those of foreign tables and arrays. The logs to fit on may be
     factors of logs, from `torchid compress`, which may lie elsewhere: `s3://...`.
     """
@@ -45,6 +57,11 @@ class LogsConfig:
     validation: list[Path] = dataclasses.field(default_factory=list)
     topics: Topics | None = None
     columns: Columns | None = None
+    payloads: dict[str, Annotated[list[Payload], Field(min_length=1)]] = dataclasses.field(default_factory=dict)
+
+    def payloads_of(self, path: str | Path) -> Sequence[Payload]:
+        """What the robot carried in a log."""
+        return self.payloads.get(_recording(split_range(path)), ())
 
     @property
     def compressed(self) -> bool:
@@ -81,12 +98,50 @@ def entries_spelled_out(settings: dict[str, Any]) -> dict[str, Any]:
     logs = settings.get("logs")
     if not isinstance(logs, dict):
         return settings
-    spelled = {}
+    spelled: dict[str, Any] = {}
+    payloads: dict[str, Any] = {}
     for name, entries in logs.items():
         if name in SETS and isinstance(entries, list):
             numbered = enumerate(entries)
             spelled[name] = [x for number, entry in numbered for x in _names(f"logs.{name}.{number}", entry)]
+            for number, entry in enumerate(entries):
+                _add_payloads(payloads, f"logs.{name}.{number}", entry)
+    if payloads:
+        before = logs.get("payloads", {})
+        spelled["payloads"] = before | payloads if isinstance(before, dict) else before
     return settings | {"logs": logs | spelled}
+
+
+def _add_payloads(payloads: dict[str, Any], field: str, entry: object) -> None:
+    """Add the payloads of an entry, as settings, by the name of its log."""
+    if not isinstance(entry, Mapping) or "payload" not in entry:
+        return
+    field, given = f"{field}.payload", entry["payload"]
+    several = given if isinstance(given, list) else [given]
+    found = [_payload(field if given is not several else f"{field}.{k}", one) for k, one in enumerate(several)]
+    file = _file(field, entry)
+    if not found:
+        raise ConfigError.at_field(field, "an empty list", PAYLOAD_ACCEPTED)
+    if payloads.get(file, found) != found:
+        raise ConfigError.at_field(field, f"another than that of {file} elsewhere", "one payload in all of a recording")
+    payloads[file] = found
+
+
+def _payload(field: str, given: object) -> dict[str, Any]:
+    if not isinstance(given, Mapping):
+        raise ConfigError.at_field(field, f"found {excerpt(repr(given))}", PAYLOAD_ACCEPTED)
+    keys = [x.name for x in dataclasses.fields(Payload)]
+    for key in given:
+        if key not in keys:
+            raise UnknownNameError.at_field(field, str(key), keys)
+    try:
+        _PAYLOAD.validate_python(dict(given))
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = str(first["loc"][0])
+        found = "missing" if first["type"] == "missing" else f"found {excerpt(repr(given[key]))}"
+        raise ConfigError.at_field(f"{field}.{key}", found, _PAYLOAD_ACCEPTED[key]) from error
+    return dict(given)
 
 
 def _names(field: str, entry: object) -> Iterator[object]:
@@ -183,7 +238,31 @@ def resolve_logs(logs: LogsConfig) -> LogsConfig:
     files = {key: _matching(f"logs.{key}", getattr(logs, key)) for key in SETS}
     parts = {key: [_part(f"logs.{key}", path) for path in files[key]] for key in SETS}
     require_apart(parts, lambda one, other: one.shares_samples(other) is True)
-    return LogsConfig(**files, topics=logs.topics, columns=logs.columns)
+    return LogsConfig(**files, topics=logs.topics, columns=logs.columns, payloads=_resolved_payloads(logs))
+
+
+def _resolved_payloads(logs: LogsConfig) -> dict[str, list[Payload]]:
+    """Payloads by the absolute path of a recording, patterns resolved."""
+    out: dict[str, list[Payload]] = {}
+    for name, payloads in logs.payloads.items():
+        field = "logs.payloads"
+        if not Path(name).is_absolute():
+            found, accepted = f"{name}, a relative path", "payload: {...} in an entry of logs.train or logs.test"
+            raise ConfigError.at_field(field, found, accepted)
+        for path in _matching(field, [Path(name)]):
+            if path.suffix == FACTORS:
+                found = f"{path}, factors, which torchid compress has freed of a payload already"
+                raise ConfigError.at_field(field, found, "payloads of logs")
+            recording = _recording(_part(field, path))
+            if out.get(recording, payloads) != payloads:
+                raise ConfigError.at_field(field, f"two for {recording}", "one payload in all of a recording")
+            out[recording] = payloads
+    return out
+
+
+def _recording(part: LogPart) -> str:
+    """The file that stands for a recording: the first of several."""
+    return os.path.abspath(part.files[0].path)
 
 
 Parts = Mapping[str, Sequence[LogPart]]

@@ -31,7 +31,7 @@ from torchid.problem.compressed_log import Block
 from torchid.problem.compression import Part
 from torchid.problem.sampled_rows import LogElsewhere
 from torchid.reprs import short_repr
-from torchid.robot import Robot, body_extents, load_robot, mirror_pairs
+from torchid.robot import Robot, body_extents, load_robot, mirror_pairs, require_payloads
 from torchid.robot.tree import FT_FIELD
 from torchid.sensing import Contact, SensorNoise, SensorSet, chosen_sensors, named_sensors, with_ft_sensors
 
@@ -220,11 +220,11 @@ def set_up_scene(config: ExperimentConfig | AnalyzeConfig) -> Scene:
     if not robot.nv:
         raise ConfigError.at_field("robot", "a bolted base without a joint, which never moves", "a robot that can move")
     if config.logs is not None:
-        joints = [body.joint.name for body in robot.bodies if body.joint is not None]
-        joints += robot.welded
+        joints = [*(body.joint.name for body in robot.bodies if body.joint is not None), *robot.welded]
         require_joints(config.logs.topics, joints)
         if config.logs.columns is not None:
             require_names(config.logs.columns, {"joint": joints, "contact": robot.links})
+        require_payloads(robot, config.logs.payloads)
     contacts, rolling = resolve_contacts(config.contacts, robot)
     contacts = suited_to_preprocessing(read_along_normals(contacts, config.sensors), config)
     stated = [replace(c, radius=contact.radius) for c, contact in zip(config.contacts, contacts, strict=True)]

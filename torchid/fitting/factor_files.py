@@ -27,6 +27,7 @@ from torchid.parameters import Array
 from torchid.problem.compressed_log import CompressedLog, piece_spans
 from torchid.problem.compression import FOLDS, block_spans
 from torchid.reprs import short_repr
+from torchid.robot.payloads import Payload
 from torchid.settings import NotNegative, Number
 from torchid.staging import atomic_file
 
@@ -54,6 +55,7 @@ class FactorFile:
         excluded: condemned samples that were left out.
         states: contact states of the log.
         version: of torchid that compressed it.
+        payloads: what the robot carried, of which the rows are free; as settings.
     """
 
     log: CompressedLog
@@ -64,6 +66,7 @@ class FactorFile:
     excluded: int = 0
     states: list[StateReport] = field(default_factory=list)
     version: str = __version__
+    payloads: list[dict[str, Any]] = field(default_factory=list)
 
     __repr__ = short_repr
 
@@ -104,6 +107,7 @@ class _Description:
     unloaded: list[_Unloaded]
     supports: list[list[_Whole]]
     states: list[_State]
+    payloads: list[Payload] = field(default_factory=list)
 
 
 _DESCRIPTION: TypeAdapter[_Description] = TypeAdapter(_Description)
@@ -201,6 +205,8 @@ def _packed(factors: FactorFile) -> tuple[dict[str, object], Array]:
         "supports": packer.supports,
         "states": [asdict(state) for state in factors.states],
     }
+    if factors.payloads:  # a file of a robot without stays what it was
+        description["payloads"] = factors.payloads
     return description, packer.values
 
 
@@ -227,6 +233,7 @@ def _read(path: Path, container: Container) -> FactorFile:
         description.excluded,
         [StateReport(**vars(state)) for state in description.states],
         description.torchid,
+        [asdict(payload) for payload in description.payloads],
     )
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchid.parameters import Array
 from torchid.problem.chunks import chunks_by_state, one_thread
 from torchid.problem.contact_state import ContactState
-from torchid.problem.predict import predict_forces
+from torchid.problem.predict import predict_forces, with_payload_columns
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 
@@ -153,9 +153,10 @@ class MiniBatches:
         for log in self._logs:
             for start in range(0, len(log), _CHUNK):
                 samples = log[start : start + _CHUNK].to(self.builder.device)
+                own = with_payload_columns(self.builder, samples, columns)
                 yield (
                     samples.coordinates(),
-                    predict_forces(self.builder, self.builder.kinematics(samples), columns)[0].T,
+                    predict_forces(self.builder, self.builder.kinematics(samples), own)[0].T,
                 )
 
     def _generator(self, number: int) -> torch.Generator:

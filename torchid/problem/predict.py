@@ -102,6 +102,11 @@ def predict_forces(builder: RowBuilder, kinematics: ChunkKinematics, phi: Tensor
     return torch.cat([wrench.sum(2).transpose(0, 1), by_joint], 1) if tree.base_rows else by_joint
 
 
+def with_payload_columns(builder: RowBuilder, samples: Samples, phi: Tensor) -> Tensor:
+    """Parameters (M, columns) in the builder's columns of a robot with the payload of some samples."""
+    return phi if samples.payload is None else phi + builder.to_columns(samples.payload[None]).to(phi)
+
+
 def contact_forces(builder: RowBuilder, samples: Samples, state: ContactState, kinematics: ChunkKinematics) -> Tensor:
     """J_C^T lambda, (n_rows, B), over the active contacts; NaN in the rows that an unmeasured component reaches."""
     tree = builder.tree
@@ -157,12 +162,12 @@ def measured_and_predicted_forces(
 ) -> GeneralizedForces:
     """Measured and predicted forces of samples that share a contact state; `phi` is (M, width).
 
-    Sensors are taken as calibrated: of the extras only those of actuators enter.
+    Sensors are taken as calibrated: of the extras only those of actuators enter. A payload adds to each `phi`.
     """
     base_rows = builder.tree.base_rows
     torque = torch.nn.functional.pad(builder.recorded_torque(samples), (base_rows, 0))
     measured = torque + contact_forces(builder, samples, state, kinematics).T
-    predicted = predict_forces(builder, kinematics, phi).mT
+    predicted = predict_forces(builder, kinematics, with_payload_columns(builder, samples, phi)).mT
     for number, extra in enumerate(builder.extras, start=builder.columns.count):
         for dof in extra.dofs if extra.what in ACTUATORS else ():
             column = dof_extra_column(extra, dof, samples, builder.tree)

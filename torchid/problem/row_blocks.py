@@ -18,6 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from torchid import parameters
+from torchid.parameters import Array
 from torchid.regressor.columns import ColumnLayout
 from torchid.regressor.tree import KinematicTree
 
@@ -274,3 +275,20 @@ def multiply_wrenches(wrenches: Tensor, path_sums: Tensor, n_with_force: int, ou
         out.addcmul_(wrenches[k].unsqueeze(2), path_sums[k].unsqueeze(1))
     for k in (0, 1, 2):
         out[:, :n_with_force].addcmul_(wrenches[k, :, :n_with_force].unsqueeze(2), path_sums[k].unsqueeze(1))
+
+
+def subtract_payload(block: RowBlock, rows: Tensor, payload: Array | None, parameter_map: Array) -> None:
+    """Take what a payload needs off the right-hand side of rows: W^T f becomes W^T (f - K payload).
+
+    Readings keep their columns of scales and offsets: the payload is known as it is, whatever a sensor reads.
+
+    Args:
+        block: of the rows.
+        rows: (columns + 1, r, B), the right-hand side last.
+        payload: (12 L,), None for nothing.
+        parameter_map: (columns, 12 L), of all columns but those of extra parameters.
+    """
+    if payload is not None:
+        known = [*block.inertial, *block.friction]
+        added = torch.from_numpy(parameter_map[known] @ payload).to(rows)
+        rows[-1] -= torch.tensordot(added, rows[: len(known)], dims=1)

@@ -12,16 +12,11 @@ from torch import Tensor, nn
 from torchid.parameters import Array
 from torchid.problem.base_motion import levelled_base_axes
 from torchid.problem.chunk_dynamics import ChunkDynamics, ChunkKinematics, Workspace
-from torchid.problem.contact_state import (
-    Columns,
-    ContactState,
-    ContactStateLayout,
-    ContactStateLayouts,
-)
+from torchid.problem.contact_state import Columns, ContactState, ContactStateLayout, ContactStateLayouts
 from torchid.problem.extra_columns import dof_extra_column, extra_columns
 from torchid.problem.extras import ExtraTerms, list_extras
 from torchid.problem.recorded_wrenches import FramePoses
-from torchid.problem.row_blocks import RowBlock, multiply_wrenches, turn_rows
+from torchid.problem.row_blocks import RowBlock, multiply_wrenches, subtract_payload, turn_rows
 from torchid.problem.samples import Samples
 from torchid.problem.wrench_rows import wrenches_at_ground
 from torchid.regressor.columns import all_wrench_columns
@@ -277,6 +272,7 @@ class RowBuilder(nn.Module):
             rows = BlockRows.empty(block, 1, W, workspace)
             torch.mul(torque[:, joint], weight, out=rows.values[-1, 0])
             self._project(None, W, dynamics, rows, workspace)
+            subtract_payload(block, rows.values, samples.payload, self.columns.parameter_map)
             for number, column in enumerate(block.extras, start=len(block.inertial) + len(block.friction)):
                 extra = self.extras[column - self.columns.count]
                 torch.mul(dof_extra_column(extra, joint, samples, self.tree), weight, out=rows.values[number, 0])
@@ -311,6 +307,7 @@ class RowBuilder(nn.Module):
             rows = BlockRows.empty(block, own.shape[1], W, workspace)
             torch.sum(own * part.f[:, None], dim=0, out=rows.values[-1])
             self._project(own[:base] if base else None, own[base:], part.dynamics, rows, workspace)
+            subtract_payload(block, rows.values, part.samples.payload, self.columns.parameter_map)
             if block.extras:
                 rows.values[-1 - len(block.extras) : -1] = self._extra_columns(part, layout, block, own)
             yield rows

@@ -15,7 +15,7 @@ from torchid.errors import LogError, UnknownNameError, about_file, join_names
 from torchid.logs import Log
 from torchid.logs.log import FORCE_NORMAL, FloatArray, normalize_normals
 from torchid.logs.preprocess import unloaded_readings
-from torchid.parameters import WRENCH_COMPONENTS
+from torchid.parameters import WRENCH_COMPONENTS, Array
 from torchid.problem.base_motion import BaseMotion, base_motion, imu_pose, position_for_moments
 from torchid.problem.extras import recorded_components
 from torchid.problem.motion_noise import MotionNoise, bind_motion_noise
@@ -59,6 +59,7 @@ class Samples:
         block: number of the block in which they are compressed, see `compress_in_blocks`.
         has_force_normal: whether the log has forces along the ground's normal, which contacts may be read along.
         motion_noise: noise of the motion, None without any.
+        payload: (12 L,), what the robot carried beside its own parameters, see `payload_parameters`; None for nothing.
     """
 
     source: str
@@ -81,6 +82,7 @@ class Samples:
     block: int = 0
     has_force_normal: bool = False
     motion_noise: MotionNoise | None = None
+    payload: Array | None = None
 
     __repr__ = short_repr
 

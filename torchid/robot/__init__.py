@@ -1,5 +1,6 @@
 """From a URDF to a tree of bodies with nominal parameters."""
 
+from torchid.robot.payloads import Payload, payload_parameters, require_payloads, with_payload
 from torchid.robot.robot import Body, Robot, load_robot
 from torchid.robot.rolling import CollisionShapes, RollingShape
 from torchid.robot.shapes import Extent, body_extents
@@ -10,9 +11,13 @@ __all__ = [
     "CollisionShapes",
     "Extent",
     "MirrorPair",
+    "Payload",
     "Robot",
     "RollingShape",
     "body_extents",
     "load_robot",
     "mirror_pairs",
+    "payload_parameters",
+    "require_payloads",
+    "with_payload",
 ]
