@@ -32,7 +32,7 @@ def sections() -> dict[str, Any]:
     del settings["output"]
     settings["robot"] = DEMO / "quadruped.urdf"
     settings["logs"] = {"train": [DEMO / "sway_train.npz"], "test": (str(DEMO / "sway_test.npz"),)}
-    settings["estimator"]["ridge"] = np.float64(settings["estimator"]["ridge"])
+    settings["preprocessing"]["cutoff_hz"] = np.float64(settings["preprocessing"]["cutoff_hz"])
     return settings
 
 
