@@ -69,9 +69,7 @@ def _parser() -> argparse.ArgumentParser:
     identify = commands.add_parser("identify", help=_IDENTIFY, description=_IDENTIFY)
     identify.add_argument("file", help="experiment file (YAML)")
     identify.add_argument("overrides", nargs="*", default=[], help="key.subkey=value, for example estimator.ridge=0.01")
-    amount = identify.add_mutually_exclusive_group()
-    amount.add_argument("--verbose", "-v", action="store_true", help="print all tables, not the answer alone")
-    amount.add_argument("--quiet", "-q", action="store_true", help="print nothing but warnings and errors")
+    _add_amount(identify)
     identify.add_argument("--resume", action="store_true", help="continue an interrupted training (sgd)")
     identify.set_defaults(command=_identify)
     compress = commands.add_parser("compress", help=_COMPRESS, description=_COMPRESS)
@@ -85,6 +83,7 @@ def _parser() -> argparse.ArgumentParser:
         "--log", action="append", required=True, metavar="FILE", help="log to evaluate; may be repeated"
     )
     evaluate.add_argument("--device", help="device, by default that of the run: cpu, cuda, cuda:0, ...")
+    _add_amount(evaluate)
     evaluate.set_defaults(command=_evaluate)
     analyze = commands.add_parser("analyze", help=_ANALYZE, description=_ANALYZE)
     analyze.add_argument("file", help="experiment file (YAML); logs and sensors may be left out")
@@ -132,6 +131,12 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _add_amount(command: argparse.ArgumentParser) -> None:
+    amount = command.add_mutually_exclusive_group()
+    amount.add_argument("--verbose", "-v", action="store_true", help="print all tables, not the answer alone")
+    amount.add_argument("--quiet", "-q", action="store_true", help="print nothing but warnings and errors")
+
+
 @contextmanager
 def _importing() -> Iterator[None]:
     """Import what a command needs, uninterrupted; garbage is not looked for among a million objects that all stay."""
@@ -175,11 +180,11 @@ def _compress(options: argparse.Namespace) -> None:
 def _evaluate(options: argparse.Namespace) -> None:
     with _importing():
         from torchid.commands.evaluate import evaluate
-        from torchid.report.tables import error_tables, print_tables
+        from torchid.terminal.evaluation import print_all_errors, print_evaluation
 
     evaluated = evaluate(options.run, options.log, options.device)
-    print_tables(*error_tables(evaluated.metrics))
-    print(f"written to    {evaluated.output}")
+    if not options.quiet:
+        (print_all_errors if options.verbose else print_evaluation)(evaluated)
 
 
 def _analyze(options: argparse.Namespace) -> None:

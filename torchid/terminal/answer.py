@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from textwrap import shorten, wrap
 
 import numpy as np
@@ -17,26 +16,17 @@ from torchid.estimators.least_squares import COMBINED, FIXED, IDENTIFIED, PRIOR,
 from torchid.fitting.calibration import list_confounded
 from torchid.logs.time_range import log_title
 from torchid.parameters import PARAMETERS, PER_BODY, Array
-from torchid.problem import Metrics
-from torchid.problem.metrics import ADVICE, DECISIVE_GROUPS, ERROR_GROUPS, describe_worse
-from torchid.report.tables import noise_advice, table_text, terminal_width
+from torchid.problem.metrics import ADVICE, describe_worse
+from torchid.report.tables import noise_advice, terminal_width
 from torchid.robot import Robot
-from torchid.terminal.lines import LABEL
+from torchid.terminal.lines import LABEL, table_lines
+from torchid.terminal.verdict import Judged
 
 LINES = 20
 """At most so many."""
 
-_FEW_GROUPS = 2
 _MOST_ATTENTION, _ATTENTION_LINES = 2, 2
 _FEWEST_LINES = 4  # of the table of bodies: a heading, a body, how many others there are, what the marks mean
-#: By the least and the largest error of a group of rows, as shares of the URDF's.
-_VERDICTS = {
-    (0.5, 0.5): "Much better than the URDF",
-    (0.95, 0.95): "Better than the URDF",
-    (0.95, np.inf): "Better than the URDF in part",
-}
-_NO_BETTER = "No better than the URDF"
-_AT_THE_FLOOR = 1.3  # times the error that noise of the readings leaves
 _MASS, _CENTER = PARAMETERS.index("m"), slice(PARAMETERS.index("mcx"), PARAMETERS.index("mcz") + 1)
 _COULOMB, _VISCOUS = PARAMETERS.index("fc"), PARAMETERS.index("fv")
 _LEGEND = {COMBINED: "+ known only in sums with other bodies", PRIOR: "p mostly the URDF's", UNOBSERVABLE: ". unseen"}
@@ -56,7 +46,7 @@ def answer_lines(run: Identification, width: int) -> list[str]:
         width: of the terminal.
     """
     judged = _judged(run)
-    lines = [*wrap(_headline(run, judged), width), *_error_lines(judged, width), ""]
+    lines = [*wrap(_headline(run, judged), width), *judged.table(width), ""]
     lines += _labelled("total mass", f"{run.mass} (URDF: {run.mass.nominal:.3f} kg)", width)
     lines += _labelled("bodies", _bodies_text(run), width)
     attention = list(_attention(run))
@@ -69,64 +59,21 @@ def answer_lines(run: Identification, width: int) -> list[str]:
     return [*lines, *(["", *bodies] if bodies else []), *end]
 
 
-@dataclass(frozen=True)
-class _Judged:
-    """Errors of the URDF's and of the identified parameters, on motion of which `text` says where it is from."""
-
-    text: str
-    unseen: bool
-    nominal: Metrics
-    identified: Metrics
-
-    def errors(self, groups: Sequence[str] = DECISIVE_GROUPS) -> Iterator[tuple[str, float, float, float | None]]:
-        """Groups of rows with both errors, and what noise of the readings leaves."""
-        for group in groups:
-            before, after = self.nominal.rms.get(group), self.identified.rms.get(group)
-            if before is not None and after is not None:
-                yield group, before, after, self.identified.noise.get(group)
-
-
-def _judged(run: Identification) -> _Judged:
+def _judged(run: Identification) -> Judged:
     if "test" in run.metrics:
         names = [log_title(path) for path in run.experiment.config.logs.test]
         text = f"unseen motion ({shorten(', '.join(names), 40, placeholder=' ...')})"
-        return _Judged(text, True, run.metrics["test"].nominal, run.metrics["test"].identified)
+        return Judged(text, run.metrics["test"].nominal, run.metrics["test"].identified)
     if run.validation is not None:
         text = f"blocks of the training logs, each left out of the fit ({run.validation.folds})"
-        return _Judged(text, True, run.validation.nominal, run.validation.identified)
-    return _Judged("the training logs themselves", False, run.metrics["train"].nominal, run.metrics["train"].identified)
+        return Judged(text, run.validation.nominal, run.validation.identified)
+    return Judged("the training logs themselves", run.metrics["train"].nominal, run.metrics["train"].identified)
 
 
-def _headline(run: Identification, judged: _Judged) -> str:
+def _headline(run: Identification, judged: Judged) -> str:
     if run.worse:
         return f"WORSE THAN URDF: {describe_worse(run.worse)}"
-    ratios = [after / before if before else 1.0 for _, before, after, _ in judged.errors()]
-    if not ratios:
-        return f"Nothing to compare with the URDF on {judged.text}"
-    least, most = min(ratios), max(ratios)
-    shares = f"{_percent(least)} to {_percent(most)} %" if most > 1.1 * least else f"{_percent(most)} %"
-    verdict = next((text for limits, text in _VERDICTS.items() if least < limits[0] and most < limits[1]), _NO_BETTER)
-    known = [after / floor for _, _, after, floor in judged.errors() if floor]
-    floor = ", as near as the sensors' noise allows" if known and max(known) < _AT_THE_FLOOR else ""
-    if not run.misfit.explained:
-        floor = f", {'and' if verdict == _NO_BETTER else 'but'} the model does not explain these forces"
-    return f"{verdict} on {judged.text}: errors of {shares} of the URDF's{floor}"
-
-
-def _percent(share: float) -> str:
-    return f"{100.0 * share:.0f}" if share >= 0.1 else f"{100.0 * share:.2g}"
-
-
-def _error_lines(judged: _Judged, width: int) -> list[str]:
-    table = Table(box=None, pad_edge=False, padding=(0, 3, 0, 0))
-    table.add_column("rms error of", no_wrap=True)
-    for heading in ("URDF", "identified", "noise alone"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    few = len(list(judged.errors())) < _FEW_GROUPS  # no joint of its own, as all legs stand: their projection
-    for group, before, after, floor in judged.errors(tuple(ERROR_GROUPS) if few else DECISIVE_GROUPS):
-        cells = (f"{before:.4g}", f"{after:.4g}", "-" if floor is None else f"{floor:.4g}")
-        table.add_row(Text(ERROR_GROUPS[group]), *cells)
-    return _lines(table, width) if table.row_count else []
+    return judged.headline(explained=run.misfit.explained)
 
 
 def _bodies_text(run: Identification) -> str:
@@ -168,10 +115,6 @@ def _labelled(label: str, text: str, width: int) -> list[str]:
     return [f"{name:{LABEL}}{line}" for name, line in zip((label, *[""] * len(lines)), lines, strict=False)]
 
 
-def _lines(table: Table, width: int) -> list[str]:
-    return [line.rstrip() for line in table_text(table, width).splitlines()]
-
-
 # --------------------------------------------------------------------------------------------------------- the bodies
 
 
@@ -191,7 +134,7 @@ def _body_lines(robot: Robot, estimate: Estimate, room: int, width: int) -> list
             table.add_column(Text(heading), justify="right", no_wrap=True)
         for name, *cells in zip(names, *(cells for _, cells in columns), strict=True):
             table.add_row(Text(name), *(Text(cell) for cell in cells))
-        lines = _lines(table, 10 * width)
+        lines = table_lines(table, 10 * width)
         if max(map(len, lines)) <= width or len(columns) == 1:
             break
         columns.pop()

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import asdict
 from textwrap import fill
 
+from rich.table import Table
+
 from torchid.fitting.noise import NoiseSummary
-from torchid.report.tables import WIDTH, noise_advice, noise_table, print_tables
+from torchid.report.tables import WIDTH, noise_advice, noise_table, print_tables, table_text
 
 LABEL = 14
 """Columns of the words before what they are about."""
@@ -15,6 +17,11 @@ LABEL = 14
 def print_labelled(label: str, text: str) -> None:
     """Print what a word is about, broken into lines below each other."""
     print(fill(f"{label:{LABEL}}{text}", WIDTH, subsequent_indent=" " * LABEL))
+
+
+def table_lines(table: Table, width: int) -> list[str]:
+    """Lines of a table, not wider than so many columns."""
+    return [line.rstrip() for line in table_text(table, width).splitlines()]
 
 
 def print_rolling(rolling: str) -> None:

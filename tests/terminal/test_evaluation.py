@@ -1,0 +1,87 @@
+"""What `torchid evaluate` says on one screen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from repository import DEMO
+
+import torchid
+from torchid.cli import main
+from torchid.commands.evaluate import EvaluatedRun
+from torchid.problem import Metrics
+from torchid.terminal.answer import LINES
+from torchid.terminal.evaluation import MOST_LOGS, evaluation_lines
+
+LOG = str(DEMO / "sway_test.npz")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    output = tmp_path_factory.mktemp("evaluated") / "run"
+    assert main(["identify", "-q", str(DEMO / "quadruped.yaml"), f"output={output}", "preprocessing.cache_gb=0"]) == 0
+    return output
+
+
+@pytest.fixture(scope="module")
+def evaluated(run: Path) -> EvaluatedRun:
+    return torchid.evaluate(run, LOG)
+
+
+def with_torque_error(metrics: Metrics, error: float) -> Metrics:
+    return replace(metrics, rms=metrics.rms | {"joint_torque": error})
+
+
+def with_logs(evaluated: EvaluatedRun, errors: dict[str, float]) -> EvaluatedRun:
+    """The same with logs of other names and errors of joint torques."""
+    (pair,) = evaluated.metrics.values()
+    metrics = {
+        name: pair._replace(identified=with_torque_error(pair.identified, error)) for name, error in errors.items()
+    }
+    return replace(evaluated, metrics=metrics)
+
+
+def test_one_log_is_judged_in_a_sentence_with_its_errors(evaluated: EvaluatedRun) -> None:
+    said = evaluation_lines(evaluated, 80)
+    (pair,) = evaluated.metrics.values()
+    assert said[0].startswith("Much better than the URDF on sway_test: errors of ")
+    numbers = (pair.nominal.rms["base_force"], pair.identified.rms["base_force"], pair.identified.noise["base_force"])
+    (row,) = (line for line in said if line.startswith("base force [N]"))
+    assert row.split()[-3:] == [f"{x:.4g}" for x in numbers if x is not None]
+
+
+@pytest.mark.parametrize("width", [60, 80, 120])
+@pytest.mark.parametrize("count", [1, 2, 12])
+def test_any_number_of_logs_fits_on_a_screen(evaluated: EvaluatedRun, count: int, width: int) -> None:
+    lines = evaluation_lines(with_logs(evaluated, {f"trot_{k}": 0.05 + 0.01 * k for k in range(count)}), width)
+    assert len(lines) <= LINES
+    assert max(map(len, lines[:-1])) <= width
+    assert ("and 4 logs that are predicted better than these: --verbose" in lines) == (count > MOST_LOGS)
+
+
+def test_the_worst_log_comes_first_and_what_is_worse_than_the_urdf_is_said(evaluated: EvaluatedRun) -> None:
+    logs = with_logs(evaluated, {"good": 0.1, "bad": 5.0, "fair": 0.2})
+    said = " ".join(line.strip() for line in evaluation_lines(logs, 80))
+    assert said.startswith(
+        "WORSE THAN URDF: the identified parameters predict worse than the URDF's, on bad: joint torque 5"
+    )
+    assert said.index("on bad") < said.index("on fair") < said.index("on good")
+
+
+def test_samples_left_out_are_counted(evaluated: EvaluatedRun) -> None:
+    lines = evaluation_lines(replace(evaluated, excluded={"sway_test": 12}), 80)
+    assert "left out      12 samples that torchid check condemns" in lines
+    assert not any("left out" in line for line in evaluation_lines(evaluated, 80))
+
+
+def test_all_errors_are_printed_when_asked_for(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    printed = {}
+    for option in ("--quiet", "--verbose", None):
+        assert main(["evaluate", str(run), "--log", LOG, *([] if option is None else [option])]) == 0
+        printed[option] = capsys.readouterr().out
+    assert printed["--quiet"] == ""
+    assert "of its variation" in printed["--verbose"]
+    assert "of its variation" not in str(printed[None])
+    assert str(printed[None]).splitlines()[-1] == f"written to    {run / 'evaluation' / 'sway_test'}"

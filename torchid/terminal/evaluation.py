@@ -1,0 +1,54 @@
+"""What `torchid evaluate` prints: how much better than the URDF a run predicts other logs, or all errors."""
+
+from __future__ import annotations
+
+from textwrap import wrap
+
+from torchid.commands.evaluate import EvaluatedRun
+from torchid.problem.metrics import describe_worse, worse_than_nominal
+from torchid.report.tables import error_tables, print_tables, terminal_width
+from torchid.terminal.verdict import Judged
+
+MOST_LOGS = 8
+"""Logs of which a sentence is printed each: two lines at 80 columns, within a screen."""
+
+
+def print_evaluation(evaluated: EvaluatedRun) -> None:
+    """Print the answer for the terminal's width."""
+    print("\n".join(evaluation_lines(evaluated, terminal_width())))
+
+
+def evaluation_lines(evaluated: EvaluatedRun, width: int) -> list[str]:
+    """A sentence by log, the worst first, and of a single log the errors; lines of at most so many columns.
+
+    Args:
+        evaluated: of one log or several.
+        width: of the terminal.
+    """
+    judged = [Judged(name, pair.nominal, pair.identified) for name, pair in evaluated.metrics.items()]
+    judged.sort(key=_worst, reverse=True)
+    lines = [line for one in judged[:MOST_LOGS] for line in wrap(_sentence(one), width, subsequent_indent="  ")]
+    if len(judged) > MOST_LOGS:
+        lines.append(f"and {len(judged) - MOST_LOGS} logs that are predicted better than these: --verbose")
+    if len(judged) == 1:
+        lines += judged[0].table(width)
+    left_out = sum(evaluated.excluded.values())
+    if left_out:
+        lines.append(f"left out      {left_out} samples that torchid check condemns")
+    return [*lines, f"written to    {evaluated.output}"]
+
+
+def print_all_errors(evaluated: EvaluatedRun) -> None:
+    """Print the errors of all logs by group of rows."""
+    print_tables(*error_tables(evaluated.metrics))
+    print(f"written to    {evaluated.output}")
+
+
+def _sentence(one: Judged) -> str:
+    worse = worse_than_nominal({one.text: (one.nominal, one.identified)})
+    return f"WORSE THAN URDF: {describe_worse(worse)}" if worse else one.headline()
+
+
+def _worst(one: Judged) -> float:
+    """The largest error of a group as a share of the URDF's."""
+    return max((after / before if before else 1.0 for _, before, after, _ in one.errors()), default=0.0)

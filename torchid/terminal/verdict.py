@@ -1,0 +1,75 @@
+"""How much better than the URDF's some parameters predict forces, in a sentence and a small table."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from rich.table import Table
+from rich.text import Text
+
+from torchid.problem import Metrics
+from torchid.problem.metrics import DECISIVE_GROUPS, ERROR_GROUPS
+from torchid.terminal.lines import table_lines
+
+_FEW_GROUPS = 2
+#: By the least and the largest error of a group of rows, as shares of the URDF's.
+_VERDICTS = {
+    (0.5, 0.5): "Much better than the URDF",
+    (0.95, 0.95): "Better than the URDF",
+    (0.95, np.inf): "Better than the URDF in part",
+}
+_NO_BETTER = "No better than the URDF"
+_AT_THE_FLOOR = 1.3  # times the error that noise of the readings leaves
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Errors of the URDF's and of the identified parameters, on motion of which `text` says where it is from."""
+
+    text: str
+    nominal: Metrics
+    identified: Metrics
+
+    def errors(self, groups: Sequence[str] = DECISIVE_GROUPS) -> Iterator[tuple[str, float, float, float | None]]:
+        """Groups of rows with both errors, and what noise of the readings leaves."""
+        for group in groups:
+            before, after = self.nominal.rms.get(group), self.identified.rms.get(group)
+            if before is not None and after is not None:
+                yield group, before, after, self.identified.noise.get(group)
+
+    def headline(self, *, explained: bool = True) -> str:
+        """The verdict in a sentence.
+
+        Args:
+            explained: whether the model explains the forces that it was fitted to.
+        """
+        ratios = [after / before if before else 1.0 for _, before, after, _ in self.errors()]
+        if not ratios:
+            return f"Nothing to compare with the URDF on {self.text}"
+        least, most = min(ratios), max(ratios)
+        shares = f"{_percent(least)} to {_percent(most)} %" if most > 1.1 * least else f"{_percent(most)} %"
+        within = (text for limits, text in _VERDICTS.items() if least < limits[0] and most < limits[1])
+        verdict = next(within, _NO_BETTER)
+        known = [after / floor for _, _, after, floor in self.errors() if floor]
+        floor = ", as near as the sensors' noise allows" if known and max(known) < _AT_THE_FLOOR else ""
+        if not explained:
+            floor = f", {'and' if verdict == _NO_BETTER else 'but'} the model does not explain these forces"
+        return f"{verdict} on {self.text}: errors of {shares} of the URDF's{floor}"
+
+    def table(self, width: int) -> list[str]:
+        """Errors by group of rows, in lines that are not wider than so many columns; none without errors."""
+        table = Table(box=None, pad_edge=False, padding=(0, 3, 0, 0))
+        table.add_column("rms error of", no_wrap=True)
+        for heading in ("URDF", "identified", "noise alone"):
+            table.add_column(heading, justify="right", no_wrap=True)
+        few = len(list(self.errors())) < _FEW_GROUPS  # no joint of its own, as all legs stand: their projection
+        for group, before, after, floor in self.errors(tuple(ERROR_GROUPS) if few else DECISIVE_GROUPS):
+            cells = (f"{before:.4g}", f"{after:.4g}", "-" if floor is None else f"{floor:.4g}")
+            table.add_row(Text(ERROR_GROUPS[group]), *cells)
+        return table_lines(table, width) if table.row_count else []
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.0f}" if share >= 0.1 else f"{100.0 * share:.2g}"
