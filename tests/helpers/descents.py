@@ -49,7 +49,6 @@ class World:
 def demo() -> World:
     """The quadruped that comes with torchid, its joint torques measured, in batches of 128."""
     config = load_config(DEMO)
-    assert config.estimator.ridge == 0.001
     experiment = set_up(config)
     builder = RowBuilder(experiment.robot, experiment.contacts, experiment.sensors)
     return World.of(experiment.robot, builder, LogReader(experiment).read(config.logs.train, experiment.sensors), 128)
