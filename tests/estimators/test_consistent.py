@@ -78,7 +78,7 @@ def test_a_quadruped_takes_few_steps(prior: Prior) -> None:
     problem = replace(problem, A=100.0 * problem.A, b=100.0 * problem.b)
     conditions = Conditions(total_mass=float(problem.nominal[::12].sum()))
     estimate = Consistent(1e-4, prior, conditions, certify=True).solve(problem)
-    assert estimate.steps < 100
+    assert estimate.steps < 40
     assert estimate.certified_gap is not None
     assert estimate.certified_gap < 1e-6
     assert violations(estimate.phi.reshape(scale.shape), scale, conditions) == []

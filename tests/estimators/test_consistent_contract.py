@@ -186,7 +186,7 @@ def test_a_gap_is_as_small_as_was_asked_for_and_true(prior: Prior, tolerance: fl
 def test_a_solver_that_stops_short_says_so(method: Method, monkeypatch: pytest.MonkeyPatch) -> None:
     problem, _ = active_case(4)
     if method == "barrier":
-        monkeypatch.setattr("torchid.estimators.barrier._STAGES", 2)
+        monkeypatch.setattr("torchid.estimators.barrier._STEPS", 2)
     else:
         run = certified._run
         monkeypatch.setattr(certified, "_run", lambda program, _: run(program, 1e-2))
