@@ -180,8 +180,10 @@ def _demo(options: argparse.Namespace) -> None:
     if options.copy is not None:
         if options.overrides:
             raise ConfigError("command line", "--copy", f"beside {options.overrides[0]}", "--copy FOLDER alone")
-        for path in copy_examples(Path(options.copy)):
-            print(path)
+        folder = Path(options.copy)
+        for file, what in copy_examples(folder).items():
+            print(f"{file}\n    {what}")
+        print(f"written to    {folder}; in the folder above it: torchid identify {folder.name}/{EXPERIMENT.name}")
         return
     run = run_demo(options.overrides, options.output)
     if not options.quiet:

@@ -10,9 +10,12 @@ from pathlib import Path
 
 import pytest
 from refusals import refusal
-from repository import DEMO, ROOT
+from repository import CONFIGS, DEMO, ROOT
 
 from torchid.cli import main
+from torchid.config import inputs_of, load_analysis, load_config, load_simulation
+
+SETS = ("full", "contacts", "joints", "reduced", "analysis")
 
 
 def test_the_demo_runs_from_an_installed_package_that_cannot_be_written(tmp_path: Path) -> None:
@@ -45,15 +48,21 @@ def test_a_folder_that_is_there_is_replaced_only_on_request(tmp_path: Path, caps
     assert line.endswith("mine: output: not empty; accepted: a new folder, or overwrite=true")
 
 
-def test_copied_examples_are_those_that_ship_and_replace_nothing(
+def test_copied_examples_find_their_robots_and_logs_and_replace_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(["demo", "--copy", "examples"]) == 0
-    printed = capsys.readouterr().out.splitlines()
-    for file in DEMO.iterdir():
-        assert (tmp_path / "examples" / file.name).read_bytes() == file.read_bytes()
-        assert f"examples/{file.name}" in printed
-    assert not (tmp_path / "runs").exists(), "nothing is fitted"
+    printed = capsys.readouterr().out
+    for file in (*DEMO.iterdir(), *CONFIGS.glob("biped*")):
+        copy = Path("examples") / file.name
+        assert copy.read_bytes() == file.read_bytes()
+        assert (file.suffix != ".yaml") or f"{copy}\n    {file.read_text()[2:].splitlines()[0]}\n" in printed
+    assert not Path("runs").exists(), "nothing is fitted"
+    assert all(path.exists() for path in inputs_of(load_config("examples/quadruped.yaml")))
+    simulation = load_simulation("examples/biped_simulation.yaml")
+    assert simulation.robot.urdf.exists()
+    runs = [load_analysis(f"examples/biped_{name}.yaml", ["logs=null", "analysis.compare={}"]) for name in SETS]
+    assert {run.robot.urdf for run in runs} == {simulation.output / "nominal.urdf"}
     assert "--copy: exists" in refusal(["demo", "--copy", "examples"], tmp_path, capsys)
     assert "--copy FOLDER alone" in refusal(["demo", "--copy", "more", "estimator.ridge=1"], tmp_path, capsys)

@@ -13,8 +13,12 @@ from torchid.commands.results import Identification
 from torchid.config import load_config
 from torchid.errors import ConfigError, about_file
 
-EXPERIMENT = Path(__file__).parents[1] / "demo" / "quadruped.yaml"
+_PACKAGE = Path(__file__).parents[1]
+EXPERIMENT = _PACKAGE / "demo" / "quadruped.yaml"
 """The experiment file that the demo fits."""
+
+_EXAMPLES = ("demo/*", "examples/biped*")
+"""What ships; `examples` is a link to `configs` of the repository, of which some files fit recordings that do not."""
 
 
 def run_demo(overrides: Sequence[str] = (), output: str | None = None) -> Identification:
@@ -32,11 +36,11 @@ def run_demo(overrides: Sequence[str] = (), output: str | None = None) -> Identi
         return identify(config)
 
 
-def copy_examples(folder: Path) -> list[Path]:
-    """Copy the experiment files that ship with torchid, with their robots and logs, to a new folder.
+def copy_examples(folder: Path) -> dict[Path, str]:
+    """Copy the settings files that ship with torchid, with their robots and logs, to a new folder.
 
     Returns:
-        The files, sorted by name.
+        The settings files, sorted by name, and the first line of each, which says what it is.
 
     Raises:
         ConfigError: something of that name exists, or no folder can be made there.
@@ -44,7 +48,6 @@ def copy_examples(folder: Path) -> list[Path]:
     if os.path.lexists(folder):
         raise ConfigError(folder, "--copy", "exists", "a folder that does not exist yet")
     with new_folder(folder, kind=EXAMPLES) as copies:
-        for file in EXPERIMENT.parent.iterdir():
+        for file in (file for pattern in _EXAMPLES for file in _PACKAGE.glob(pattern)):
             shutil.copyfile(file, copies / file.name)
-        names = sorted(file.name for file in copies.iterdir())
-    return [folder / name for name in names]
+    return {file: file.read_text().partition("\n")[0].lstrip("# ") for file in sorted(folder.glob("*.yaml"))}
