@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 _IDENTIFY = "fit the parameters of an experiment file and write a run folder"
 _COMPRESS = "compress the training logs of an experiment file to small files of factors, which identify fits too"
 _EVALUATE = "predict the forces of further logs with the parameters of a run"
+_REPORT = "make report.html of a run anew, with what the checks of its logs find (needs the extra [report])"
 _ANALYZE = "analyze what sensors and motion determine, and plan the smallest sensor set"
 _INIT = "write an experiment file for a robot and a log, with a map of its columns or topics, and say what was guessed"
 _DEMO = "identify the demo's quadruped, or copy the examples that ship with torchid"
@@ -87,6 +88,9 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--device", help="device, by default that of the run: cpu, cuda, cuda:0, ...")
     _add_amount(evaluate)
     evaluate.set_defaults(command=_evaluate)
+    report = commands.add_parser("report", help=_REPORT, description=_REPORT)
+    report.add_argument("run", help="run folder")
+    report.set_defaults(command=_report)
     analyze = commands.add_parser("analyze", help=_ANALYZE, description=_ANALYZE)
     analyze.add_argument("file", help="experiment file (YAML); logs and sensors may be left out")
     analyze.add_argument(
@@ -214,6 +218,13 @@ def _evaluate(options: argparse.Namespace) -> None:
     evaluated = evaluate(options.run, options.log, options.device)
     if not options.quiet:
         (print_all_errors if options.verbose else print_evaluation)(evaluated)
+
+
+def _report(options: argparse.Namespace) -> None:
+    with _importing():
+        from torchid.commands.report import report
+
+    print(f"written to    {report(options.run)}")
 
 
 def _analyze(options: argparse.Namespace) -> None:

@@ -18,7 +18,8 @@ from torchid.config import inputs_of, load_analysis, load_config, load_simulatio
 WITHOUT_EXTRAS = """
 import sys
 
-sys.modules.update(dict.fromkeys(["h5py", "pyarrow", "rosbags", "mcap", "lz4", "zstandard", "clarabel", "mujoco"]))
+extras = ["h5py", "pyarrow", "rosbags", "mcap", "lz4", "zstandard", "plotly", "clarabel", "mujoco"]
+sys.modules.update(dict.fromkeys(extras))
 from torchid.cli import main
 
 sys.exit(main(["demo", "estimator.ridge=0.1"]))

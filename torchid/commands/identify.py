@@ -17,7 +17,7 @@ from torchid.commands.chosen_cutoff import with_cutoff
 from torchid.commands.chosen_ridge import with_ridge
 from torchid.commands.chosen_sign_width import with_sign_width
 from torchid.commands.clock import Clock
-from torchid.commands.compared_forces import compare_forces, noise_of_readings
+from torchid.commands.compared_forces import compare_forces, noise_of_readings, trace_forces
 from torchid.commands.folder import RUN, check_free, claim_folder
 from torchid.commands.plausibility import require_not_worse, require_plausible
 from torchid.commands.reading import LogReader, check_parts
@@ -215,6 +215,7 @@ def _identify(config: ExperimentConfig, resume: bool, bars: Progress) -> tuple[I
         scores = _scores(scorer, logs["test"], blocks, of_blocks, compared, without_folds, bars)
         shown = [*logs["test"], *logs["train"]][:1]
         forces = ranks.from_first(lambda: [compare_forces(evaluation, log, compared) for log in shown], "forces")
+        traces = ranks.from_first(lambda: [trace_forces(evaluation, log, compared) for log in shown], "traces")
     run = Identification(
         experiment=experiment,
         estimate=estimate,
@@ -239,6 +240,7 @@ def _identify(config: ExperimentConfig, resume: bool, bars: Progress) -> tuple[I
         cutoff=ready.cutoff,
         sign_width=ready.sign_width,
         forces=next(iter(forces), None),
+        traces=next(iter(traces), None),
         reused=ready.reused,
     )
     logs.clear()  # checks of a log and figures need room, too

@@ -13,6 +13,7 @@ import yaml
 
 from torchid.commands.folder import RUN, check_free, check_free_file, new_folder, write_json
 from torchid.commands.named_results import BodyEstimate, ParameterTable, body_estimate, parameter_table, run_lines
+from torchid.commands.report import DATA, report_document, write_page
 from torchid.commands.training import Training, body_eigenvalues
 from torchid.config import ExperimentConfig, dump_config, inputs_of
 from torchid.errors import during
@@ -48,6 +49,7 @@ from torchid.report.forces import ForceSeries, force_figure
 from torchid.report.ridge import ridge_figure
 from torchid.report.tables import table_text, verdict_counts_table
 from torchid.report.tensorboard import RunEvents
+from torchid.report.traces import LogForces
 from torchid.robot import Robot
 
 if TYPE_CHECKING:
@@ -85,6 +87,7 @@ class Identification:
         cutoff: likewise.
         sign_width: likewise.
         forces: of the first samples of a log, as measured and as predicted; None where there are but factors.
+        traces: of all of that log.
         reused: what an earlier run has left in the cache, in words.
     """
 
@@ -111,6 +114,7 @@ class Identification:
     cutoff: CutoffChoice | None
     sign_width: SignWidthChoice | None
     forces: ForceSeries | None
+    traces: LogForces | None
     reused: Sequence[str] = ()
 
     def __getitem__(self, name: str) -> BodyEstimate:
@@ -226,6 +230,8 @@ def write_run(run: Identification, output: Path, overwrite: bool = False, traini
         if training is not None:
             training.copy_curves(folder)
         _write_curves(run, folder, {name: folder / f"{name}.png" for name in figures})
+        write_json(folder / DATA, report_document(run))
+        write_page(folder, output)
     if training is not None:
         training.remove_checkpoint()
 

@@ -33,11 +33,13 @@ from torchid.sensing import Contact, SensorSet
 _INERTIAL = parameters.INERTIAL.stop
 ContactState = tuple[bool, ...]
 """Which contacts touch the ground."""
+IN_THE_AIR = "none"
+"""Name of the contact state without any."""
 
 
 def state_name(contacts: Sequence[Contact], state: ContactState) -> str:
     """Frames in contact, joined by "+"."""
-    return " + ".join(contact.frame for contact, active in zip(contacts, state, strict=True) if active) or "none"
+    return " + ".join(contact.frame for contact, active in zip(contacts, state, strict=True) if active) or IN_THE_AIR
 
 
 class Columns:

@@ -36,7 +36,7 @@ class ForceSeries:
 @matplotlib.rc_context(STYLE)
 def force_figure(series: ForceSeries, dof_names: Sequence[str], base_rows: int, max_rows: int = 6) -> Figure:
     """Forces over time, and beside them their errors: the largest base force and moment, then the largest others."""
-    rows = _largest_rows(series, base_rows, max_rows)
+    rows = largest_rows(series, base_rows, max_rows)
     figure = Figure(figsize=(12.0, 1.7 * max(len(rows), 1) + 0.8), layout="constrained")
     axes = figure.subplots(max(len(rows), 1), 2, sharex=True, squeeze=False, width_ratios=(3, 2))
     for (forces, errors), row in zip(axes, rows, strict=False):
@@ -44,11 +44,10 @@ def force_figure(series: ForceSeries, dof_names: Sequence[str], base_rows: int, 
         forces.plot(series.time, series.nominal[:, row], color=NOMINAL, linewidth=1.0, label="predicted, URDF")
         label = "predicted, identified"
         forces.plot(series.time, series.identified[:, row], color=IDENTIFIED, linewidth=1.0, label=label)
-        name = BASE_ROWS[row] if row < base_rows else dof_names[row - base_rows]
-        force = row < min(base_rows, 3) or name.endswith((".fx", ".fy", ".fz"))
+        name, unit = name_row(row, base_rows, dof_names)
         forces.set_title(name, loc="left", fontsize=9)
-        forces.set_ylabel(unit := "[N]" if force else "[N m]")
-        _draw_errors(errors, series, row, unit)
+        forces.set_ylabel(f"[{unit}]")
+        _draw_errors(errors, series, row, f"[{unit}]")
     if rows:
         handles, labels = (a + b for a, b in zip(*(x.get_legend_handles_labels() for x in axes[0]), strict=True))
         figure.legend(handles, labels, loc="outside lower center", ncols=4)
@@ -77,7 +76,13 @@ def _draw_errors(axis: Axes, series: ForceSeries, row: int, unit: str) -> None:
     axis.set_title(f"rms {rms:.3g}{text} {unit}", loc="left", fontsize=9)
 
 
-def _largest_rows(series: ForceSeries, base_rows: int, max_rows: int) -> list[int]:
+def name_row(row: int, base_rows: int, dof_names: Sequence[str]) -> tuple[str, str]:
+    """Name and unit of a row of the dynamics."""
+    name = BASE_ROWS[row] if row < base_rows else dof_names[row - base_rows]
+    return name, "N" if row < min(base_rows, 3) or name.endswith((".fx", ".fy", ".fz")) else "N m"
+
+
+def largest_rows(series: ForceSeries, base_rows: int, max_rows: int) -> list[int]:
     """Numbers of the rows to plot: by rms of the measured force."""
     size = np.sqrt(np.nanmean(np.square(np.nan_to_num(series.measured)), axis=0))
     size[~np.isfinite(series.measured).any(axis=0)] = -1.0

@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from textwrap import shorten, wrap
 
 import numpy as np
 from rich.table import Table
 from rich.text import Text
 
+from torchid.commands.answer import answer
 from torchid.commands.results import Identification
-from torchid.errors import join_names
 from torchid.estimators import Estimate
 from torchid.estimators.least_squares import COMBINED, FIXED, IDENTIFIED, PRIOR, UNOBSERVABLE
-from torchid.fitting.calibration import list_confounded
-from torchid.logs.time_range import log_title
 from torchid.parameters import PARAMETERS, PER_BODY, Array
-from torchid.problem.metrics import ADVICE, describe_worse
-from torchid.report.tables import noise_advice, terminal_width
+from torchid.report.tables import terminal_width
 from torchid.robot import Robot
-from torchid.terminal.lines import LABEL, table_lines
-from torchid.terminal.verdict import Judged
+from torchid.terminal.lines import LABEL, error_lines, table_lines
 
 LINES = 20
 """At most so many."""
@@ -45,67 +41,17 @@ def answer_lines(run: Identification, width: int) -> list[str]:
         run: a finished one.
         width: of the terminal.
     """
-    judged = _judged(run)
-    lines = [*wrap(_headline(run, judged), width), *judged.table(width), ""]
-    lines += _labelled("total mass", f"{run.mass} (URDF: {run.mass.nominal:.3f} kg)", width)
-    lines += _labelled("bodies", _bodies_text(run), width)
-    attention = list(_attention(run))
-    for one in attention[:_MOST_ATTENTION]:
+    said = answer(run)
+    lines = [*wrap(said.headline, width), *error_lines(said.errors, width), ""]
+    lines += _labelled("total mass", said.total_mass, width)
+    lines += _labelled("bodies", said.bodies, width)
+    for one in said.attention[:_MOST_ATTENTION]:
         lines += _labelled("attention", one, width)
-    if len(attention) > _MOST_ATTENTION:
-        lines += _labelled("", f"and {len(attention) - _MOST_ATTENTION} more: --verbose", width)
+    if len(said.attention) > _MOST_ATTENTION:
+        lines += _labelled("", f"and {len(said.attention) - _MOST_ATTENTION} more: --verbose", width)
     end = [f"{'written to':{LABEL}}{run.experiment.config.output}"]
     bodies = _body_lines(run.experiment.robot, run.estimate, LINES - len(lines) - len(end) - 1, width)
     return [*lines, *(["", *bodies] if bodies else []), *end]
-
-
-def _judged(run: Identification) -> Judged:
-    if "test" in run.metrics:
-        names = [log_title(path) for path in run.experiment.config.logs.test]
-        text = f"unseen motion ({shorten(', '.join(names), 40, placeholder=' ...')})"
-        return Judged(text, run.metrics["test"].nominal, run.metrics["test"].identified)
-    if run.validation is not None:
-        text = f"blocks of the training logs, each left out of the fit ({run.validation.folds})"
-        return Judged(text, run.validation.nominal, run.validation.identified)
-    return Judged("the training logs themselves", run.metrics["train"].nominal, run.metrics["train"].identified)
-
-
-def _headline(run: Identification, judged: Judged) -> str:
-    if run.worse:
-        return f"WORSE THAN URDF: {describe_worse(run.worse)}"
-    return judged.headline(explained=run.misfit.explained)
-
-
-def _bodies_text(run: Identification) -> str:
-    names, robot = [], run.experiment.robot
-    for one in run.violations:
-        if one.body is not None and robot.body_names[one.body] not in names:
-            names.append(robot.body_names[one.body])
-    count = len(robot.body_names)
-    if not run.violations:
-        mass = run.estimate.phi.reshape(-1, PER_BODY)[:, _MASS]
-        moving = slice(int(run.experiment.config.robot.fixed_base), None)
-        empty = [name for name, x in zip(robot.body_names[moving], mass[moving], strict=True) if not x]
-        if empty:
-            return f"all that have mass can exist; MuJoCo refuses those that move without: {join_names(empty)}"
-        return f"all {count} can exist, and simulators take them"
-    which = f"{len(names)} of {count}" if names else "all together"
-    advice = "; estimator.name=consistent finds the best that can" if type(run.estimate) is Estimate else ""
-    return f"{which} cannot exist, and simulators refuse them{advice}"
-
-
-def _attention(run: Identification) -> Iterator[str]:
-    """What the user should look at, the most urgent first."""
-    if run.worse:
-        yield ADVICE
-    if not run.misfit.explained:
-        yield f"friction, compliance or contacts that the model lacks, or a wrong sensor: {run.misfit}; torchid check"
-    if not run.mass.determined and not run.experiment.robot.fixed_base:
-        yield "these data do not determine the total mass; weigh the robot: estimator.total_mass"
-    for one in list_confounded(run.extras):
-        yield str(one)
-    if run.noise.suggested:
-        yield f"noise: {noise_advice(run.noise.suggested)}"
 
 
 def _labelled(label: str, text: str, width: int) -> list[str]:

@@ -5,9 +5,10 @@ from __future__ import annotations
 from textwrap import wrap
 
 from torchid.commands.evaluate import EvaluatedRun
+from torchid.commands.verdict import Judged
 from torchid.problem.metrics import describe_worse, worse_than_nominal
 from torchid.report.tables import error_tables, print_tables, terminal_width
-from torchid.terminal.verdict import Judged
+from torchid.terminal.lines import error_lines
 
 MOST_LOGS = 8
 """Logs of which a sentence is printed each: two lines at 80 columns, within a screen."""
@@ -31,7 +32,7 @@ def evaluation_lines(evaluated: EvaluatedRun, width: int) -> list[str]:
     if len(judged) > MOST_LOGS:
         lines.append(f"and {len(judged) - MOST_LOGS} logs that are predicted better than these: --verbose")
     if len(judged) == 1:
-        lines += judged[0].table(width)
+        lines += error_lines(judged[0].shown_errors(), width)
     left_out = sum(evaluated.excluded.values())
     if left_out:
         lines.append(f"left out      {left_out} samples that torchid check condemns")

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from textwrap import fill
 
 from rich.table import Table
+from rich.text import Text
 
 from torchid.fitting.noise import NoiseSummary
 from torchid.report.tables import WIDTH, noise_advice, noise_table, print_tables, table_text
@@ -22,6 +24,17 @@ def print_labelled(label: str, text: str) -> None:
 def table_lines(table: Table, width: int) -> list[str]:
     """Lines of a table, not wider than so many columns."""
     return [line.rstrip() for line in table_text(table, width).splitlines()]
+
+
+def error_lines(errors: Sequence[tuple[str, float, float, float | None]], width: int) -> list[str]:
+    """A small table of the errors of a `Judged`, not wider than so many columns; none without errors."""
+    table = Table(box=None, pad_edge=False, padding=(0, 3, 0, 0))
+    table.add_column("rms error of", no_wrap=True)
+    for heading in ("URDF", "identified", "noise alone"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for group, before, after, floor in errors:
+        table.add_row(Text(group), f"{before:.4g}", f"{after:.4g}", "-" if floor is None else f"{floor:.4g}")
+    return table_lines(table, width) if table.row_count else []
 
 
 def print_rolling(rolling: str) -> None:

@@ -1,4 +1,4 @@
-"""How much better than the URDF's some parameters predict forces, in a sentence and a small table."""
+"""How much better than the URDF's some parameters predict forces, in a sentence and a few errors."""
 
 from __future__ import annotations
 
@@ -6,12 +6,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from rich.table import Table
-from rich.text import Text
 
 from torchid.problem import Metrics
 from torchid.problem.metrics import DECISIVE_GROUPS, ERROR_GROUPS
-from torchid.terminal.lines import table_lines
 
 _FEW_GROUPS = 2
 #: By the least and the largest error of a group of rows, as shares of the URDF's.
@@ -58,17 +55,11 @@ class Judged:
             floor = f", {'and' if verdict == _NO_BETTER else 'but'} the model does not explain these forces"
         return f"{verdict} on {self.text}: errors of {shares} of the URDF's{floor}"
 
-    def table(self, width: int) -> list[str]:
-        """Errors by group of rows, in lines that are not wider than so many columns; none without errors."""
-        table = Table(box=None, pad_edge=False, padding=(0, 3, 0, 0))
-        table.add_column("rms error of", no_wrap=True)
-        for heading in ("URDF", "identified", "noise alone"):
-            table.add_column(heading, justify="right", no_wrap=True)
+    def shown_errors(self) -> list[tuple[str, float, float, float | None]]:
+        """Errors that a user should see, by the words for their group, with units."""
         few = len(list(self.errors())) < _FEW_GROUPS  # no joint of its own, as all legs stand: their projection
-        for group, before, after, floor in self.errors(tuple(ERROR_GROUPS) if few else DECISIVE_GROUPS):
-            cells = (f"{before:.4g}", f"{after:.4g}", "-" if floor is None else f"{floor:.4g}")
-            table.add_row(Text(ERROR_GROUPS[group]), *cells)
-        return table_lines(table, width) if table.row_count else []
+        errors = self.errors(tuple(ERROR_GROUPS) if few else DECISIVE_GROUPS)
+        return [(ERROR_GROUPS[group], before, after, floor) for group, before, after, floor in errors]
 
 
 def _percent(share: float) -> str:

@@ -1,0 +1,102 @@
+"""The answer of a run in words: did it work, what is the model, what needs attention."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from textwrap import shorten
+from typing import TYPE_CHECKING
+
+from torchid import parameters
+from torchid.commands.verdict import Judged
+from torchid.errors import join_names
+from torchid.estimators import Estimate
+from torchid.fitting.calibration import list_confounded
+from torchid.logs.time_range import log_title
+from torchid.parameters import PER_BODY
+from torchid.problem.metrics import ADVICE, describe_worse
+from torchid.report.tables import noise_advice
+
+if TYPE_CHECKING:
+    from torchid.commands.results import Identification
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a run says first.
+
+    Attributes:
+        headline: how much better than the URDF it predicts, and what.
+        errors: groups of rows with the rms errors of the URDF's and of the identified parameters, and what noise of the
+            readings leaves, None where it is not known.
+        total_mass: with its standard error, beside the URDF's.
+        bodies: whether all can exist.
+        attention: what the user should look at, the most urgent first.
+    """
+
+    headline: str
+    errors: list[tuple[str, float, float, float | None]]
+    total_mass: str
+    bodies: str
+    attention: list[str]
+
+
+def answer(run: Identification) -> Answer:
+    """The answer of a finished run."""
+    judged = _judge(run)
+    return Answer(
+        headline=_headline(run, judged),
+        errors=judged.shown_errors(),
+        total_mass=f"{run.mass} (URDF: {run.mass.nominal:.3f} kg)",
+        bodies=_bodies_text(run),
+        attention=list(_attention(run)),
+    )
+
+
+def _judge(run: Identification) -> Judged:
+    if "test" in run.metrics:
+        names = [log_title(path) for path in run.experiment.config.logs.test]
+        text = f"unseen motion ({shorten(', '.join(names), 40, placeholder=' ...')})"
+        return Judged(text, run.metrics["test"].nominal, run.metrics["test"].identified)
+    if run.validation is not None:
+        text = f"blocks of the training logs, each left out of the fit ({run.validation.folds})"
+        return Judged(text, run.validation.nominal, run.validation.identified)
+    return Judged("the training logs themselves", run.metrics["train"].nominal, run.metrics["train"].identified)
+
+
+def _headline(run: Identification, judged: Judged) -> str:
+    if run.worse:
+        return f"WORSE THAN URDF: {describe_worse(run.worse)}"
+    return judged.headline(explained=run.misfit.explained)
+
+
+def _bodies_text(run: Identification) -> str:
+    names, robot = [], run.experiment.robot
+    for one in run.violations:
+        if one.body is not None and robot.body_names[one.body] not in names:
+            names.append(robot.body_names[one.body])
+    count = len(robot.body_names)
+    if not run.violations:
+        mass = run.estimate.phi.reshape(-1, PER_BODY)[:, parameters.MASS]
+        moving = slice(int(run.experiment.config.robot.fixed_base), None)
+        empty = [name for name, x in zip(robot.body_names[moving], mass[moving], strict=True) if not x]
+        if empty:
+            return f"all that have mass can exist; MuJoCo refuses those that move without: {join_names(empty)}"
+        return f"all {count} can exist, and simulators take them"
+    which = f"{len(names)} of {count}" if names else "all together"
+    advice = "; estimator.name=consistent finds the best that can" if type(run.estimate) is Estimate else ""
+    return f"{which} cannot exist, and simulators refuse them{advice}"
+
+
+def _attention(run: Identification) -> Iterator[str]:
+    """What the user should look at, the most urgent first."""
+    if run.worse:
+        yield ADVICE
+    if not run.misfit.explained:
+        yield f"friction, compliance or contacts that the model lacks, or a wrong sensor: {run.misfit}; torchid check"
+    if not run.mass.determined and not run.experiment.robot.fixed_base:
+        yield "these data do not determine the total mass; weigh the robot: estimator.total_mass"
+    for one in list_confounded(run.extras):
+        yield str(one)
+    if run.noise.suggested:
+        yield f"noise: {noise_advice(run.noise.suggested)}"

@@ -1,0 +1,149 @@
+"""`torchid report`: the page of a run, from the files in its folder; and what a run leaves there for it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from torchid.commands.answer import answer
+from torchid.commands.check import check_experiment
+from torchid.commands.folder import RUN, refuse_link
+from torchid.commands.manifest import file_checksum, read_manifest
+from torchid.errors import ConfigError, InputError, during, excerpt, warn
+from torchid.guards import MAX_JSON, MAX_YAML, read_bytes
+from torchid.report.log_checks import log_check_document
+from torchid.report.page import RunFiles, page_text, require_page, versions
+from torchid.report.traces import traces_document
+from torchid.robot import Robot
+from torchid.staging import atomic_file
+
+if TYPE_CHECKING:
+    from torchid.commands.results import Identification
+
+PAGE, DATA = "report.html", "report.json"
+_JSON = ("parameters.json", "metrics.json", DATA)
+
+_WRITTEN = "a folder that this version of torchid identify wrote"
+
+
+def report_document(run: Identification) -> dict[str, Any]:
+    """What `report.json` holds: what the page of a run shows and no other file of its folder has."""
+    robot, forces = run.experiment.robot, run.traces
+    return {
+        "answer": asdict(answer(run)),
+        "robot": {"name": robot.path.name, "base": robot.base_link, "joints": robot.n},
+        "bodies": {"parents": [max(body.parent, 0) for body in robot.bodies], "poses": _zero_poses(robot)},
+        "forces": None if forces is None else traces_document(forces, robot.base_rows, robot.dof_names),
+        "versions": versions(),
+    }
+
+
+def _zero_poses(robot: Robot) -> list[list[list[float]]]:
+    """Poses of the bodies' link frames in the base's at zero joint positions."""
+    poses = robot.link_poses(torch.zeros(1, robot.n, dtype=torch.float64))
+    return [poses[name][0].tolist() for name in robot.body_names]
+
+
+def write_page(folder: Path, output: Path) -> None:
+    """Write the page of a run that is being written.
+
+    Args:
+        folder: with its files.
+        output: that the folder will be.
+
+    Warns:
+        TorchidWarning: the libraries of a page are not installed.
+    """
+    try:
+        require_page()
+    except InputError as error:
+        warn(f"no {PAGE} is written: {error.found}; {error.accepted}")
+        return
+    asked = f"torchid report {output} checks the logs and lists here what it finds."
+    (folder / PAGE).write_text(page_text(replace(_read(folder), name=output.name, not_checked=asked)))
+
+
+def report(run: str | Path) -> Path:
+    """Make the page of a finished run anew, with the findings of the checks of its logs; the path of the page.
+
+    Raises:
+        InputError: the folder is no run, its page has been edited, or the libraries of a page are not installed.
+    """
+    folder = Path(run)
+    require_page()
+    refuse_link(folder)
+    manifest = read_manifest(folder)
+    if manifest is None or manifest.kind != RUN.name:
+        raise ConfigError(folder, "RUN", "no run of torchid", _WRITTEN)
+    page, written = folder / PAGE, manifest.files.get(PAGE)
+    there = page.exists() or page.is_symlink()
+    if there and (page.is_symlink() or not page.is_file() or written is None or file_checksum(page) != written[1]):
+        raise ConfigError(folder, PAGE, "changed since torchid wrote it", f"a run without {PAGE}: move it elsewhere")
+    files = _with_findings(_read(folder), folder)
+    with during("writing", folder), atomic_file(page) as new:
+        new.write_text(_made(files, folder))
+    entry = {PAGE: (page.stat().st_size, file_checksum(page))}
+    replace(manifest, files=dict(sorted((manifest.files | entry).items()))).write(folder)
+    return page
+
+
+def _made(files: RunFiles, folder: Path) -> str:
+    """The page of files that somebody may have changed.
+
+    Raises:
+        InputError: they are not what a page needs.
+    """
+    try:
+        return page_text(files)
+    except InputError:
+        raise
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        found = f"not what a page needs ({excerpt(str(error))})"
+        raise InputError(folder, ", ".join(_JSON), found, _WRITTEN) from error
+
+
+def _read(folder: Path) -> RunFiles:
+    """The files of a run that its page shows.
+
+    Raises:
+        InputError: one is missing or cannot be read.
+    """
+    parameters, metrics, data = (_document(folder, name) for name in _JSON)
+    return RunFiles(
+        name=folder.resolve().name,
+        config=_text(folder, "config.yaml", MAX_YAML),
+        parameters=parameters,
+        metrics=metrics,
+        report=data,
+    )
+
+
+def _document(folder: Path, name: str) -> dict[str, Any]:
+    text = _text(folder, name, MAX_JSON)
+    try:
+        document = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(folder, name, f"not readable as JSON ({excerpt(str(error))})", _WRITTEN) from error
+    return document if isinstance(document, dict) else {}
+
+
+def _text(folder: Path, name: str, most: int) -> str:
+    if not (folder / name).exists():
+        raise InputError(folder, name, "missing", _WRITTEN)
+    try:
+        return read_bytes(folder / name, most).decode()
+    except (OSError, ValueError) as error:
+        raise InputError(folder, name, f"not readable ({excerpt(str(error))})", _WRITTEN) from error
+
+
+def _with_findings(files: RunFiles, folder: Path) -> RunFiles:
+    """With what the checks of the logs find, or why they cannot be made."""
+    try:
+        checked = check_experiment(folder / "config.yaml")
+    except InputError as error:
+        return replace(files, not_checked=f"The logs could not be checked: {error}")
+    return replace(files, findings=log_check_document(checked)["logs"])
