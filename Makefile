@@ -13,7 +13,7 @@ TESTS ?= tests
 .PHONY: demo test test-fast coverage clean
 
 demo: .venv/ready
-	.venv/bin/torchid identify torchid/demo/quadruped.yaml output=runs/quadruped overwrite=true
+	.venv/bin/torchid demo overwrite=true
 
 test: .venv/ready-for-tests
 	.venv/bin/ruff check torchid scripts tests

@@ -1,8 +1,8 @@
-"""Write the demo biped's URDF, which ships with the package, from its description: `python scripts/make_biped.py`."""
+"""Write the URDF of the biped in `configs/` from its description: `python scripts/make_biped.py`."""
 
 from pathlib import Path
 
 from paper.biped import biped_urdf
 
 if __name__ == "__main__":
-    (Path(__file__).resolve().parents[1] / "torchid" / "demo" / "biped.urdf").write_bytes(biped_urdf())
+    (Path(__file__).resolve().parents[1] / "configs" / "biped.urdf").write_bytes(biped_urdf())

@@ -7,12 +7,13 @@ import gc
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict
+from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING
 
 from torchid import __version__
 from torchid.boundary import plain_streams, run_guarded, run_in_ranks
-from torchid.errors import during
+from torchid.errors import ConfigError, during
 from torchid.ranks import is_launched_first, share_work
 from torchid.staging import interrupts_deferred
 
@@ -25,6 +26,7 @@ _EVALUATE = "predict the forces of further logs with the parameters of a run"
 _REPORT = "make report.html of a run anew, with what the checks of its logs find (needs the extra [report])"
 _ANALYZE = "analyze what sensors and motion determine, and plan the smallest sensor set"
 _INIT = "write an experiment file for a robot and a log, with a map of its columns or topics, and say what was guessed"
+_DEMO = "identify the demo's quadruped, or copy the examples that ship with torchid"
 _CONVERT = "write a log of any type as .npz, .h5, .csv or .parquet"
 _CHECK = "check logs for errors before a fit"
 _SIMULATE = "simulate a robot and write the logs of its sensors (needs the extra [sim])"
@@ -129,6 +131,13 @@ def _parser() -> argparse.ArgumentParser:
     )
     init.add_argument("--output", default="experiment.yaml", metavar="FILE", help="file to write, a new one")
     init.set_defaults(command=_init)
+    demo = commands.add_parser("demo", help=_DEMO, description=_DEMO)
+    demo.add_argument("overrides", nargs="*", default=[], help="key.subkey=value, as of identify")
+    what = demo.add_mutually_exclusive_group()
+    what.add_argument("--output", metavar="FOLDER", help="run folder to write (default: runs/quadruped)")
+    what.add_argument("--copy", metavar="FOLDER", help="fit nothing; copy the examples to a new folder, to edit them")
+    _add_amount(demo)
+    demo.set_defaults(command=_demo)
     for name, command in commands.choices.items():
         command.add_argument("--debug", action="store_true", help="show the traceback of an unexpected error")
         command.set_defaults(name=name)
@@ -164,6 +173,26 @@ def _identify(options: argparse.Namespace) -> None:
     run = identify(load_config(options.file, options.overrides), options.resume)
     if not options.quiet:
         (print_details if options.verbose else print_answer)(run)
+
+
+def _demo(options: argparse.Namespace) -> None:
+    with _importing():
+        from torchid.commands.demo import EXPERIMENT, copy_examples, run_demo
+        from torchid.terminal.answer import print_answer
+        from torchid.terminal.details import print_details
+
+    if options.copy is not None:
+        if options.overrides:
+            raise ConfigError("command line", "--copy", f"beside {options.overrides[0]}", "--copy FOLDER alone")
+        folder = Path(options.copy)
+        for file, what in copy_examples(folder).items():
+            print(f"{file}\n    {what}")
+        print(f"written to    {folder}; in the folder above it: torchid identify {folder.name}/{EXPERIMENT.name}")
+        return
+    run = run_demo(options.overrides, options.output)
+    if not options.quiet:
+        (print_details if options.verbose else print_answer)(run)
+        print(f"experiment    {EXPERIMENT}; to edit a copy: torchid demo --copy FOLDER")
 
 
 def _compress(options: argparse.Namespace) -> None:

@@ -1,4 +1,4 @@
-"""The description of the demo biped: the lower half of a Sarcos-size humanoid, 16 joints, 66 kg.
+"""The description of the biped in `configs/`: the lower half of a Sarcos-size humanoid, 16 joints, 66 kg.
 
 `scripts/make_biped.py` writes the URDF of the package from it; MuJoCo's model is made from that URDF.
 """

@@ -1,4 +1,4 @@
-"""The page about Python says what happens."""
+"""The page about Python says what happens, and links between pages lead somewhere."""
 
 from __future__ import annotations
 
@@ -30,3 +30,27 @@ def test_the_page_about_python_runs_and_prints_what_it_shows(
     assert said["knee"].name == "front_left_shank_link"
     assert {path.name for path in tmp_path.iterdir()} == {"torchid", "identified.urdf", "runs"}
     assert [path.name for path in (tmp_path / "runs").iterdir()] == ["from_python"]
+
+
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").glob("*.md")]
+
+
+def anchors(page: Path) -> set[str]:
+    """What links to headings of a page are called, as GitHub makes them."""
+    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+    headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_between_pages_lead_somewhere(page: Path) -> None:
+    links = re.findall(r"\]\(([^)\s]+)\)", page.read_text())
+    for link in (link for link in links if not link.startswith("http")):
+        file, _, anchor = link.partition("#")
+        target = (page.parent / file) if file else page
+        assert target.exists(), link
+        assert not anchor or anchor in anchors(target), link
+
+
+def test_the_readme_stays_short() -> None:
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 120

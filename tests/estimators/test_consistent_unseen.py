@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from repository import DEMO
+from repository import CONFIGS, DEMO
 from synthetic import G1, SOLO12, Array, Oracle, load, make_log, random_states
 from true_robots import stepping, true_parameters
 
@@ -45,7 +45,7 @@ KINDS = {
     "quadruped": Kind(
         DEMO / "quadruped.urdf", tuple(f"{a}_{b}_foot" for a in ("front", "rear") for b in ("left", "right")), "point"
     ),
-    "biped": Kind(DEMO / "biped.urdf", ("l_sole", "r_sole"), "flat"),
+    "biped": Kind(CONFIGS / "biped.urdf", ("l_sole", "r_sole"), "flat"),
     "Solo12": Kind(SOLO12, ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT"), "point"),
     "G1": Kind(G1, ("left_ankle_roll_link", "right_ankle_roll_link"), "flat"),
 }

@@ -14,7 +14,7 @@ import yaml
 from experiments import LEAST
 from refusals import assert_wrong_value, refused
 from refusals import refusal as command_refusal
-from repository import DEMO
+from repository import CONFIGS, DEMO
 from synthetic import G1, SOLO12, Oracle, load, make_log
 from urdfs import INERTIAL, ball, inertial, joint, link, table, write
 
@@ -31,7 +31,7 @@ from torchid.problem.linear import parameter_scale
 from torchid.robot import Robot, body_extents
 from torchid.sensing import Contact, named_sensors
 
-BIPED = DEMO / "biped.urdf"
+BIPED = CONFIGS / "biped.urdf"
 
 
 def settings_of(folder: Path, **keys: Any) -> EstimatorConfig:

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from functools import cache
-from pathlib import Path
 
 import pytest
+from repository import CONFIGS
 from synthetic import G1, load
 
-import torchid
 from torchid.robot import Robot
 from torchid.sensing import Contact
 
-BIPED = Path(torchid.__file__).parent / "demo/biped.urdf"
-
+BIPED = CONFIGS / "biped.urdf"
 
 BOTH, LEFT, RIGHT, FLIGHT = (True, True), (True, False), (False, True), (False, False)
 

@@ -42,7 +42,7 @@ def write_experiments(folder: Path) -> dict[str, Path]:
         "quadruped": (demo / "quadruped.urdf", False, [(foot, 3) for foot in feet], walks, [2500], "joints"),
         "arm": (PANDA, True, [], [[]], [10800], "joints"),
         "biped": (
-            demo / "biped.urdf",
+            ROOT / "configs" / "biped.urdf",
             False,
             [("l_sole", 6), ("r_sole", 6)],
             [[True, True], [True, False], [False, True]],

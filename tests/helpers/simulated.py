@@ -24,7 +24,7 @@ from torchid.problem.predict import force_series
 from torchid.simulation import Stability
 
 SHIPPED = CONFIGS / "biped_simulation.yaml"
-BIPED = DEMO / "biped.urdf"
+BIPED = CONFIGS / "biped.urdf"
 QUADRUPED = DEMO / "quadruped.urdf"
 SOLES = ("l_sole", "r_sole")
 SQUATS = ("squat_0.5hz", "squat_1.0hz", "squat_1.5hz", "squat_2.0hz", "squat_2.5hz", "squat_3.0hz", "squat_3.5hz")

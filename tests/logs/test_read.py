@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from raw_logs import log_refusal, write_arrays
+from raw_logs import log_refusal, without_package, write_arrays
 from scipy.spatial.transform import Rotation
 
 from torchid.errors import InputError, LogError, UnknownNameError
@@ -272,6 +272,17 @@ def test_pickled_objects_are_refused(tmp_path: Path) -> None:
     with h5py.File(write_arrays(tmp_path / "x.h5", changed(time=None)), "a") as file:
         file.create_dataset("time", (N,), dtype=ragged)
     assert "time: values of type object" in log_refusal(tmp_path / "x.h5")
+
+
+def test_without_h5py_the_message_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_arrays(tmp_path / "x.h5", changed())
+    log = read_log(path)
+    without_package("h5py", monkeypatch)
+    line = "HDF5, but h5py is not installed; accepted: a .npz file, or pip install '.[hdf5]' in the clone of torchid"
+    assert log_refusal(path) == f"{path}: file: {line}"
+    with pytest.raises(LogError, match="h5py is not installed"):
+        write_log(log, tmp_path / "y.h5")
+    assert not (tmp_path / "y.h5").exists()
 
 
 def test_hdf5_groups_empty_datasets_and_dangling_links_are_refused(tmp_path: Path) -> None:

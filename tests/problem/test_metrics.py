@@ -67,3 +67,30 @@ def test_errors_by_group_are_those_of_the_series(tmp_path: Path, fixed_base: boo
         about_mean = rms(measured[:, :3] - measured[:, :3].mean(axis=0))
         assert found.base_force_of_variation == pytest.approx(rms(off[:, :3]) / about_mean, rel=1e-12)
     assert list(found.by_joint_rms.values()) == pytest.approx([rms(x) for x in off[:, joints].T], rel=1e-12)
+
+
+def test_joint_torques_are_said_to_be_of_limbs_in_the_air_only_where_no_others_count(tmp_path: Path) -> None:
+    """Without wrenches a limb that touches is left out of the series of which the errors are."""
+    robot, rng = load(machine(tmp_path), None, False, SENSORS), np.random.default_rng(0)
+    oracle = Oracle.of(robot)
+    contacts = [(contact.frame, contact.components) for contact in CONTACTS]
+    log = make_log(oracle, contacts, STATES, 24, rng)
+    evaluation, phi = Evaluation(robot, CONTACTS), 1.1 * robot.nominal.reshape(1, -1)
+    labels = {}
+    for name, wrench in (("all", log.contact_wrench_local), ("none", None)):
+        samples = bind_log(replace(log, contact_wrench_local=wrench), robot, CONTACTS)
+        (found,) = evaluation.metrics([samples], phi)
+        measured, (predicted,) = force_series(evaluation.builder, samples, phi)
+        off = (predicted - measured)[:, robot.base_rows : robot.nv]
+        known = [rms(x[np.isfinite(x)]) for x in off.T if np.isfinite(x).any()]
+        assert found.rms["joint_torque"] == pytest.approx(np.mean(known), rel=1e-12)
+        labels[name] = found.label("joint_torque")
+        assert found.label("base_force") == "base force [N]"
+    flying = replace(log, contact_wrench_local=None, contact_active=np.zeros((24, len(CONTACTS)), dtype=bool))
+    (in_flight,) = evaluation.metrics([bind_log(flying, robot, CONTACTS)], phi)
+    labels["flight"] = in_flight.label("joint_torque")
+    assert labels == {
+        "all": "joint torque [N m]",
+        "none": "joint torque, limbs in the air [N m]",
+        "flight": "joint torque [N m]",
+    }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from repository import DEMO
+from repository import CONFIGS
 
 import torchid
 from torchid import parameters
@@ -20,7 +20,7 @@ STEPPING = ((True, True), (True, False), (False, True))
 
 def foot_verdicts(sensors: str, states: tuple[tuple[bool, ...], ...]) -> np.ndarray:
     """Verdicts on the bodies of both soles, (2, 12)."""
-    robot = torchid.load_robot(DEMO / "biped.urdf")
+    robot = torchid.load_robot(CONFIGS / "biped.urdf")
     builder = RowBuilder(robot, SOLES, named_sensors(sensors, robot.n, 2))
     logs = structural_samples(robot, SOLES, states)
     estimate = torchid.LeastSquares(1e-6).solve(linear_problem(compress(logs, builder), builder, robot))

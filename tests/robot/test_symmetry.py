@@ -10,7 +10,7 @@ import pytest
 import torch
 from physical import of_points
 from refusals import refused
-from repository import DEMO
+from repository import CONFIGS, DEMO
 from scipy.spatial.transform import Rotation
 from synthetic import ANYMAL, G1, ROBOTS, ROMEO, SOLO8, SOLO12, TALOS, TALOS_FULL, Array, load
 from urdfs import joint, link, table, words, write
@@ -44,7 +44,7 @@ def names(robot: Robot, *tokens: str, **options: object) -> set[tuple[str, str]]
     "Go1": (GO1, "L_", "R_", 6, 0.015),
     "Romeo": (ROMEO, "L", "R", 23, None),  # one elbow's inertia is another
     "PR2": (PR2, "l_", "r_", 13, None),
-    "biped": (DEMO / "biped.urdf", "l_", "r_", 7, 1e-12),
+    "biped": (CONFIGS / "biped.urdf", "l_", "r_", 7, 1e-12),
     "quadruped": (DEMO / "quadruped.urdf", "left", "right", 6, 1e-12),
 })  # fmt: skip
 def test_the_limbs_of_real_robots_are_mirror_images_and_so_is_their_matter(case: tuple) -> None:
@@ -64,8 +64,8 @@ def test_the_limbs_of_real_robots_are_mirror_images_and_so_is_their_matter(case:
 
 def test_pairs_are_named_as_people_mean_them() -> None:
     assert ("LF_HIP", "RF_HIP") in names(load(ANYMAL), "L", "R")
-    assert ("l_foot", "r_foot") in names(load(DEMO / "biped.urdf"), "l_", "r_")
-    assert names(load(DEMO / "biped.urdf"), "l_", "r_") == names(load(DEMO / "biped.urdf"), "r_", "l_")
+    assert ("l_foot", "r_foot") in names(load(CONFIGS / "biped.urdf"), "l_", "r_")
+    assert names(load(CONFIGS / "biped.urdf"), "l_", "r_") == names(load(CONFIGS / "biped.urdf"), "r_", "l_")
     fingers = [pair for pair in names(load(PR2), "l_", "r_") if "r_gripper_l_finger_link" in pair]
     assert fingers == [("r_gripper_l_finger_link", "l_gripper_r_finger_link")], "not grippel_"
 

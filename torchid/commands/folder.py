@@ -21,6 +21,7 @@ SIMULATION = FolderKind("a simulation")
 ANALYSIS = FolderKind("an analysis")
 STUDY = FolderKind("a study")
 COMPRESSED = FolderKind("compressed logs")
+EXAMPLES = FolderKind("examples")
 
 _LONGEST_NAME = 200  # bytes; file systems take 255, and the temporary folder's name is longer
 _TAKEN = (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR)  # by another run

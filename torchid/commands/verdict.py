@@ -59,7 +59,7 @@ class Judged:
         """Errors that a user should see, by the words for their group, with units."""
         few = len(list(self.errors())) < _FEW_GROUPS  # no joint of its own, as all legs stand: their projection
         errors = self.errors(tuple(ERROR_GROUPS) if few else DECISIVE_GROUPS)
-        return [(ERROR_GROUPS[group], before, after, floor) for group, before, after, floor in errors]
+        return [(self.identified.label(group), before, after, floor) for group, before, after, floor in errors]
 
 
 def _percent(share: float) -> str:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import LogError
+from torchid.errors import LogError, how_to_install
 from torchid.guards import CHUNK_BYTES, MAX_CHUNKS, MAX_SMALL, check_fields, check_names
 from torchid.logs.spill import LazyArray
 
@@ -113,7 +113,8 @@ def import_h5py(path: Path) -> Any:
     try:
         import h5py
     except ImportError as error:
-        raise LogError(path, "file", "HDF5, but h5py is not installed", "a .npz file, or an installed h5py") from error
+        accepted = f"a .npz file, or {how_to_install('hdf5')}"
+        raise LogError(path, "file", "HDF5, but h5py is not installed", accepted) from error
     return h5py
 
 

@@ -173,7 +173,7 @@ def _pyarrow(path: Path) -> Any:
         import pyarrow
     except ImportError as error:
         found = f"a {path.suffix.lower()} file, but pyarrow is not installed"
-        raise LogError(path, "file", found, f"a .npz or .h5 file, or {how_to_install('tables')}") from error
+        raise LogError(path, "file", found, f"a .npz file, or {how_to_install('tables')}") from error
     return pyarrow
 
 

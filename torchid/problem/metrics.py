@@ -34,6 +34,8 @@ ROW_GROUPS = {
 ERROR_GROUPS = ROW_GROUPS | {WHITENED: "whitened [x noise]"}
 """Those, and the whitened projected residual of a fit's rows, which every sensor set has."""
 
+IN_AIR = "limbs in the air"  # whose joint torques alone count where no contact force was measured
+
 LIMB_GROUPS = {"ft_force": "force in limbs [N]", "ft_moment": "moment in limbs [N m]"}
 """Groups of readings of force/torque sensors in limbs."""
 
@@ -68,7 +70,8 @@ class Metrics:
     mostly weight. `limb_rms` and `limb_relative` by `LIMB_GROUPS`, empty for a robot without sensors in limbs.
     `by_axis_rms` and `by_axis_relative` of forces and moments by group and axis: of the base link, or of a sensor's
     frame, all sensors in limbs together. `noise`, by group, is the rms that the stated noise of the readings leaves
-    after the filter, which no model predicts; None where it is not known.
+    after the filter, which no model predicts; None where it is not known. `limbs_in_air`: joint torques are those of
+    limbs in the air alone, as no contact force was measured.
     """
 
     rms: dict[str, float | None]
@@ -81,6 +84,12 @@ class Metrics:
     by_axis_rms: dict[str, dict[str, float | None]] = field(default_factory=dict)
     by_axis_relative: dict[str, dict[str, float | None]] = field(default_factory=dict)
     noise: dict[str, float | None] = field(default_factory=dict)
+    limbs_in_air: bool = False
+
+    def label(self, group: str) -> str:
+        """Name and unit of a group of `ERROR_GROUPS`, and what it is limited to."""
+        limit = f", {IN_AIR} [" if self.limbs_in_air and group == "joint_torque" else " ["
+        return ERROR_GROUPS[group].replace(" [", limit)
 
     def as_dict(self) -> dict[str, object]:
         """As `metrics.json` has it."""
@@ -130,14 +139,15 @@ class Evaluation:
         self, logs: Sequence[Samples], phi: Array, progress: ProgressCallback | None = None
     ) -> list[ForceSums]:
         """Sums of squares of the measured forces, then of the errors of each row of `phi`."""
-        builder = self.builder
-        columns = builder.to_columns(phi)
+        builder, base = self.builder, self.robot.base_rows
+        columns, joints = builder.to_columns(phi), slice(base, base + self.robot.n)
 
         def sum_chunks(chunks: Iterator[tuple[Samples, ContactState]]) -> list[ForceSums]:
             sums = [ForceSums(self.robot.n_rows) for _ in range(len(phi) + 1)]
             for samples, state in chunks:
                 kinematics = builder.kinematics(samples)
                 forces = measured_and_predicted_forces(builder, samples, state, columns, kinematics)
+                sums[0].add_contact_forces(forces.measured[:, joints], forces.torque[:, joints])
                 for total, predicted in zip(sums, (torch.zeros_like(forces.torque), *forces.predicted), strict=True):
                     total.rows.add(predicted - forces.measured)
                 vectors = torch.cat([forces.torque[None], forces.predicted - forces.torque])
@@ -182,6 +192,7 @@ class Evaluation:
             {group: dict(zip("xyz", map(finite_or_none, x), strict=True)) for group, x in axes.items()},
             {group: dict(zip("xyz", map(_ratio, x, axis_size[group]), strict=True)) for group, x in axes.items()},
             {} if self.noise is None else measured.noise_rms(base, n),
+            bool(measured.contact_forces[0] and not measured.contact_forces[1]),
         )
 
 
@@ -260,13 +271,15 @@ class ForceSums:
     """Sums of squares of generalized forces or their errors: of rows, and inside the contacts' null space.
 
     `whitened`: of the rows of a fit, V_x^T f of its sensors in units of their noise. `noise` of rows: what the noise of
-    readings adds to the measured forces; `whitened_noise`: to the rows of a fit.
+    readings adds to the measured forces; `whitened_noise`: to the rows of a fit. `contact_forces`: whether one
+    that was not measured enters joint rows, which do not count, and whether a measured one enters rows that do.
     """
 
     def __init__(self, n_rows: int) -> None:
         """Start empty."""
         self.rows, self.projected, self.whitened = SumsOfSquares(n_rows), SumsOfSquares(1), SumsOfSquares(1)
         self.noise, self.whitened_noise = SumsOfSquares(n_rows), SumsOfSquares(1)
+        self.contact_forces = np.zeros(2, dtype=bool)
 
     @classmethod
     def total(cls, parts: Sequence[ForceSums]) -> ForceSums:
@@ -278,7 +291,13 @@ class ForceSums:
             out.whitened.merge(part.whitened)
             out.noise.merge(part.noise)
             out.whitened_noise.merge(part.whitened_noise)
+            out.contact_forces |= part.contact_forces
         return out
+
+    def add_contact_forces(self, measured: torch.Tensor, torque: torch.Tensor) -> None:
+        """Note those in measured joint rows J_C^T lambda + tau, (B, n), NaN where one is not known."""
+        lost, known = measured.isnan() & torque.isfinite(), measured.isfinite() & (measured != torque)
+        self.contact_forces |= [bool(lost.any()), bool(known.any())]
 
     def noise_rms(self, base_rows: int, n: int) -> dict[str, float | None]:
         """Rms of the noise by group of rows, as `rms`; None where it is not known."""

@@ -25,7 +25,7 @@ from torchid.identifiability.contributions import Contribution, Contributions, P
 from torchid.logs.time_range import log_title
 from torchid.parameters import PARAMETERS, PER_BODY
 from torchid.problem import Metrics
-from torchid.problem.metrics import ERROR_GROUPS
+from torchid.problem.metrics import ERROR_GROUPS, IN_AIR
 
 WIDTH = 100
 """Columns of what is printed, at most."""
@@ -87,6 +87,9 @@ def _error_table(columns: Mapping[str, Comparison[Metrics]]) -> Table:
     for group, label in ERROR_GROUPS.items():
         errors = [_error_cell(m, group) for pair in columns.values() for m in pair]
         table.add_row(Text(label), *errors)
+        if group == "joint_torque" and any(pair.identified.limbs_in_air for pair in columns.values()):
+            limited = ("only" if pair.identified.limbs_in_air else "" for pair in columns.values())
+            table.add_row(f"  {IN_AIR}", *(cell for text in limited for cell in ("", text)))
         if group == "base_force":
             shares = [m.base_force_of_variation for pair in columns.values() for m in pair]
             table.add_row("  of its variation", *("-" if x is None else f"({100 * x:.3g} %)" for x in shares))
