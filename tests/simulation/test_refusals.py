@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import yaml
 from refusals import files_in, refusal
-from simulated import BIPED, SHIPPED, SOLES, STOOD
+from simulated import BIPED, QUADRUPED, SHIPPED, SOLES, STOOD
 
 from torchid.cli import main
 from torchid.commands.folder import SIMULATION, new_folder
@@ -244,7 +244,7 @@ def test_an_identification_does_not_replace_a_simulation(folder: Path, capsys: p
     output = folder / "out"
     with new_folder(output, kind=SIMULATION) as new:
         (new / "nominal.urdf").write_text("x")
-    demo = BIPED.parent / "quadruped.yaml"
+    demo = QUADRUPED.parent / "quadruped.yaml"
     assert main(["identify", str(demo), f"output={output}", "overwrite=true"]) == 2
     assert "holds a simulation; accepted: a new folder, or a run to overwrite" in capsys.readouterr().err
     assert len(list(output.iterdir())) == 2
