@@ -23,7 +23,7 @@ from torchid.commands.manifest import MANIFEST
 from torchid.errors import ConfigError, LogError
 from torchid.logs import read_log, write_log
 
-WHOLE = {"config.yaml", "parameters.json", "metrics.json", "identified.urdf", "hparams", "forces.png", "errors.png"}
+WHOLE = {"config.yaml", "parameters.json", "metrics.json", "identified.urdf", "forces.png", "errors.png"}
 NOBODY = 65534
 
 

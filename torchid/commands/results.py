@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import yaml
 
+from torchid.commands.events import write_events
 from torchid.commands.folder import RUN, check_free, check_free_file, new_folder, write_json
 from torchid.commands.named_results import BodyEstimate, ParameterTable, body_estimate, parameter_table, run_lines
 from torchid.commands.report import DATA, report_document, write_page
 from torchid.commands.training import Training, body_eigenvalues
-from torchid.config import ExperimentConfig, dump_config, inputs_of
+from torchid.config import dump_config, inputs_of
 from torchid.errors import during
-from torchid.estimators import ConstrainedEstimate, Estimate, SgdEstimate, Violation
+from torchid.estimators import ConstrainedEstimate, Estimate, Violation
 from torchid.fitting.calibration import Comparison, list_confounded
 from torchid.fitting.cross_validation import CrossValidation, RidgeChoice
 from torchid.fitting.experiment import Experiment
@@ -34,7 +35,7 @@ from torchid.logs.cutoff import CutoffChoice
 from torchid.logs.time_range import log_title
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Metrics
-from torchid.problem.metrics import SETS, WHITENED, WorseThanNominal, describe_worse, worse_than_nominal
+from torchid.problem.metrics import SETS, WorseThanNominal, describe_worse, worse_than_nominal
 from torchid.problem.surplus import NoiseShares
 from torchid.report import identified_urdf, parameters_document
 from torchid.report.figures import (
@@ -47,8 +48,6 @@ from torchid.report.figures import (
 )
 from torchid.report.forces import ForceSeries, force_figure
 from torchid.report.ridge import ridge_figure
-from torchid.report.tables import table_text, verdict_counts_table
-from torchid.report.tensorboard import RunEvents
 from torchid.report.traces import LogForces
 from torchid.robot import Robot
 
@@ -229,7 +228,7 @@ def write_run(run: Identification, output: Path, overwrite: bool = False, traini
             save_figure(figure, folder / f"{name}.png")
         if training is not None:
             training.copy_curves(folder)
-        _write_curves(run, folder, {name: folder / f"{name}.png" for name in figures})
+        write_events(run, folder, {name: folder / f"{name}.png" for name in figures})
         write_json(folder / DATA, report_document(run))
         write_page(folder, output)
     if training is not None:
@@ -342,60 +341,3 @@ def _solution_document(estimate: Estimate) -> dict[str, object] | None:
         return None
     names = ("objective", "unconstrained", "distance", "gap", "certified_gap", "steps", "epochs", "best_epoch")
     return {name: getattr(estimate, name) for name in names if hasattr(estimate, name)}
-
-
-def _write_curves(run: Identification, folder: Path, figures: Mapping[str, Path]) -> None:
-    estimate, robot, config = run.estimate, run.experiment.robot, run.experiment.config
-    epochs = estimate.epochs if isinstance(estimate, SgdEstimate) else None
-    last = 1 if epochs is None else epochs
-    with RunEvents(folder, robot.body_names, epochs is not None) as events:
-        if epochs is None:
-            for step, phi in enumerate((robot.nominal.flatten(), estimate.phi)):
-                events.write_errors(step, {name: pair[step] for name, pair in run.metrics.items()})
-                events.write_eigenvalues(step, body_eigenvalues(robot, phi))
-            events.write_solution(estimate, None if run.factors else run.samples / run.seconds["compress"])
-        else:  # what was not worked out by epoch
-            for step, which in ((0, 0), (epochs, 1)):
-                events.write_errors(step, {name: pair[which] for name, pair in run.metrics.items()}, (WHITENED,))
-        if run.validation is not None:
-            events.write_errors(0, {"left_out": run.validation.nominal})
-            events.write_errors(last, {"left_out": run.validation.identified})
-        if run.ridge is not None:
-            events.write_ridges(run.ridge)
-        events.write_verdict(last, describe_worse(run.worse) or "nowhere worse than the URDF's parameters")
-        events.write_fit(last, estimate)
-        events.write_identifiability(
-            last, estimate, run.contributions.total, table_text(verdict_counts_table(run.by_state, estimate))
-        )
-        final = {
-            f"{name}_{group}": value
-            for name in reversed(SETS)  # test logs first: TensorBoard shows the first few
-            if name in run.metrics
-            for group, value in run.metrics[name].identified.relative.items()
-            if value is not None
-        }
-        price = estimate.relative_increase if isinstance(estimate, ConstrainedEstimate) else 0.0
-        final |= {"rank": float(estimate.rank)} | ({} if price is None else {"objective_above_least": price})
-        events.write_summary(dump_config(config), _hyperparameters(config), final, figures, last)
-
-
-def _hyperparameters(config: ExperimentConfig) -> dict[str, str | float | bool]:
-    """The same keys for every estimator: TensorBoard compares runs by the keys of the first that it finds."""
-    estimator, training = config.estimator, config.estimator.training
-    descent = estimator.name == "sgd"
-    return {
-        "sensors": config.sensors.set or "by name",
-        "estimator": estimator.name,
-        "ridge": estimator.numeric_ridge,
-        "friction": estimator.friction,
-        "cutoff_hz": config.preprocessing.filter_hz or 0.0,
-        "margin": 0.0 if estimator.name == "least_squares" else estimator.margin,
-        "prior": estimator.prior,
-        "consistency": estimator.consistency if descent else estimator.name,
-        "optimizer": training.optimizer["name"] if descent else "none",
-        "lr": float(training.optimizer.get("lr", 0.0)) if descent else 0.0,
-        "schedule": (training.schedule or {}).get("name", "none") if descent else "none",
-        "batch_size": training.batch_size if descent else 0,
-        "epochs": training.epochs if descent else 0,
-        "seed": training.seed if descent else 0,
-    }

@@ -11,6 +11,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 from tensorboard.compat.proto.summary_pb2 import Summary
 from torch.utils.tensorboard import SummaryWriter
+from torch.utils.tensorboard.summary import hparams
 
 from torchid.estimators import ConstrainedEstimate, Epoch, Estimate
 from torchid.fitting.cross_validation import RidgeChoice
@@ -19,6 +20,7 @@ from torchid.problem import Metrics
 from torchid.problem.metrics import ERROR_GROUPS, SETS
 
 _RGBA = 4  # colour space in Summary.Image
+_URDF = "_URDF"  # ends the names of charts of the URDF's parameters
 _CHARTED = (*SETS, "left_out")
 _TERMS = ("total", "data", "prior", "eigenvalue", "log_det", "mass", "friction", "residual")
 
@@ -26,7 +28,8 @@ _TERMS = ("total", "data", "prior", "eigenvalue", "log_det", "mass", "friction",
 class RunEvents:
     """Event files of one run: charts by step, train and test logs on one chart, figures and settings.
 
-    Steps of a descent are its epochs; a batch fit has step 0, the URDF's parameters, and step 1, the identified.
+    Steps of a descent are its epochs, after step 0, the URDF's parameters. A batch fit has step 1 alone, and the URDF's
+    parameters have charts of their own: TensorBoard would smooth a curve of two points into one that shows neither.
     """
 
     def __init__(self, folder: Path, bodies: Sequence[str], descent: bool, since: int | None = None) -> None:
@@ -38,16 +41,19 @@ class RunEvents:
             descent: whether steps are epochs.
             since: first step of earlier event files in the folder that is overwritten.
         """
-        self._writer = SummaryWriter(str(folder), purge_step=since)
+        self._writer, self._descent = SummaryWriter(str(folder), purge_step=since), descent
+        kinds = ("",) if descent else ("", _URDF)
         groups = {
-            group: ["Multiline", [f"relative_error_{name}/{group}" for name in _CHARTED]] for group in ERROR_GROUPS
+            group: ["Multiline", [f"relative_error_{name}{kind}/{group}" for name in _CHARTED for kind in kinds]]
+            for group in ERROR_GROUPS
         }
         loss = {
             "train and held out": ["Multiline", ["loss/data", "loss_held_out/data"]],
             "terms": ["Multiline", [f"loss/{term}" for term in _TERMS]],
         }
         least = {"smallest eigenvalue": ["Multiline", [f"eigenvalue/{re.escape(name)}$" for name in bodies]]}
-        layout = {"errors, share of measured (step 0: URDF)": groups, "bodies (step 0: URDF)": least}
+        which = " (step 0: URDF)" if descent else ""
+        layout = {f"errors, share of measured{which}": groups, f"bodies{which}": least}
         self._writer.add_custom_scalars(layout | ({"loss by epoch": loss} if descent else {}))
 
     def __enter__(self) -> RunEvents:
@@ -60,14 +66,26 @@ class RunEvents:
         """Write buffered events."""
         self._writer.flush()
 
-    def write_errors(self, step: int, sets: Mapping[str, Metrics], groups: Sequence[str] = tuple(ERROR_GROUPS)) -> None:
-        """Errors by group of rows of one parameter vector on sets of logs."""
+    def write_errors(
+        self,
+        step: int,
+        sets: Mapping[str, Metrics],
+        groups: Sequence[str] = tuple(ERROR_GROUPS),
+        *,
+        nominal: bool = False,
+    ) -> None:
+        """Errors by group of rows of one parameter vector, `nominal` or identified, on sets of logs."""
+        kind = self._kind(nominal)
         for name, metrics in sets.items():
             for group in groups:
                 if metrics.relative.get(group) is not None:
-                    self._writer.add_scalar(f"relative_error_{name}/{group}", metrics.relative[group], step)
+                    self._writer.add_scalar(f"relative_error_{name}{kind}/{group}", metrics.relative[group], step)
                 if metrics.rms.get(group) is not None:
-                    self._writer.add_scalar(f"rms_error_{name}/{group}", metrics.rms[group], step)
+                    self._writer.add_scalar(f"rms_error_{name}{kind}/{group}", metrics.rms[group], step)
+
+    def _kind(self, nominal: bool) -> str:
+        """What the name of a chart ends with: the URDF's parameters are the first step of a descent."""
+        return _URDF if nominal and not self._descent else ""
 
     def write_ridges(self, choice: RidgeChoice) -> None:
         """Errors on held-out folds by ridge: in these charts, steps are the decades of ridges, -3 for 0.001."""
@@ -81,10 +99,10 @@ class RunEvents:
         """Whether the identified parameters predict held-out blocks and test logs better than the URDF's."""
         self._writer.add_text("verdict", text, step)
 
-    def write_eigenvalues(self, step: int, least: Mapping[str, float]) -> None:
+    def write_eigenvalues(self, step: int, least: Mapping[str, float], *, nominal: bool = False) -> None:
         """Smallest eigenvalue of the scaled pseudo-inertia by body; negative: no such body exists."""
         for body, value in least.items():
-            self._writer.add_scalar(f"eigenvalue/{body}", value, step)
+            self._writer.add_scalar(f"eigenvalue{self._kind(nominal)}/{body}", value, step)
 
     def write_epoch(self, epoch: Epoch) -> None:
         """Losses and rates of an epoch of a descent."""
@@ -108,7 +126,7 @@ class RunEvents:
             samples_per_second: of the stream through the logs, None without one.
         """
         rows = max(estimate.rows, 1)
-        self._writer.add_scalar("loss/data", estimate.nominal_cost / rows, 0)
+        self._writer.add_scalar(f"loss{_URDF}/data", estimate.nominal_cost / rows, 1)
         self._writer.add_scalar("loss/data", estimate.cost / rows, 1)
         if samples_per_second is not None:
             self._writer.add_scalar("descent/samples_per_second", samples_per_second, 1)
@@ -167,7 +185,10 @@ class RunEvents:
             image = Summary.Image(encoded_image_string=png, width=width, height=height, colorspace=_RGBA)
             self._writer.file_writer.add_summary(Summary(value=[Summary.Value(tag=tag, image=image)]), step)
         named = {f"final/{name}": value for name, value in final.items()}
-        self._writer.add_hparams(dict(hyperparameters), named, run_name="hparams")
+        for summary in hparams(dict(hyperparameters), named):  # add_hparams would write a run of its own
+            self._writer.file_writer.add_summary(summary)
+        for tag, value in named.items():
+            self._writer.add_scalar(tag, value, step)
 
 
 def _preformatted(text: str) -> str:
