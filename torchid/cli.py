@@ -37,7 +37,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _main(arguments: Sequence[str] | None) -> int:
     with plain_streams():  # argparse repeats unknown arguments in its errors
         options = _options(arguments)
-    return run_guarded("torchid", lambda: _command(options), options.debug)
+    folds = not getattr(options, "verbose", True)
+    return run_guarded("torchid", lambda: _command(options), options.debug, folds)
 
 
 def _command(options: argparse.Namespace) -> int | None:
