@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from torchid import __version__
 from torchid.boundary import plain_streams, run_guarded, run_in_ranks
@@ -25,6 +26,7 @@ _DEMO = "identify the demo's quadruped, or copy the examples that ship with torc
 _CONVERT = "write a log of any type as .npz, .h5, .csv or .parquet"
 _CHECK = "check logs for errors before a fit"
 _SIMULATE = "simulate a robot and write the logs of its sensors (needs the extra [sim])"
+_SHELLS = ("bash", "zsh")
 _SHARED = ("identify", "compress", "evaluate", "analyze")
 """By the processes that torchrun has started; the first runs all others."""
 
@@ -64,6 +66,12 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="torchid", description="Identify a robot's inertia and friction from logs.")
     parser.add_argument("--version", action="version", version=f"torchid {__version__}")
+    parser.add_argument(
+        "--print-completion",
+        action=_PrintCompletion,
+        choices=_SHELLS,
+        help="print a script that completes commands, options and files in this shell",
+    )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     identify = commands.add_parser("identify", help=_IDENTIFY, description=_IDENTIFY)
     identify.add_argument("file", help="experiment file (YAML)")
@@ -141,6 +149,21 @@ def _parser() -> argparse.ArgumentParser:
         command.add_argument("--debug", action="store_true", help="show the traceback of an unexpected error")
         command.set_defaults(name=name)
     return parser
+
+
+class _PrintCompletion(argparse.Action):
+    """Prints a completion script for a shell, and ends."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *values: Any) -> None:
+        """Whatever takes a value is completed by names of files, but for names in a robot, devices and settings."""
+        import shtab
+
+        (commands,) = (action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
+        for command in commands.choices.values():
+            for action in command._actions:
+                if action.dest not in ("overrides", "base_link", "device") and action.nargs != 0:
+                    action.complete = shtab.DIRECTORY if action.metavar == "FOLDER" else shtab.FILE
+        parser.exit(run_guarded("torchid", lambda: print(shtab.complete(parser, values[1]))))
 
 
 def _add_amount(command: argparse.ArgumentParser) -> None:
