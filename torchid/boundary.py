@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import logging
 import os
+import re
 import sys
 import traceback
 import warnings
@@ -19,6 +20,7 @@ from torchid.errors import (
     TorchidError,
     TorchidWarning,
     activity_of,
+    format_count,
     one_line,
 )
 from torchid.staging import list_written, reset_written, termination_as_interrupt
@@ -29,7 +31,9 @@ _MACHINE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, 
 _NUMERICAL = (RuntimeWarning,)
 
 
-def run_guarded(program: str, command: Callable[[], int | None], debug: bool = False) -> int:
+def run_guarded(
+    program: str, command: Callable[[], int | None], debug: bool = False, fold_warnings: bool = False
+) -> int:
     """Run a command; every failure is reported in one line.
 
     Control characters in all output are escaped. Numerical warnings of libraries are printed as one line, as they may
@@ -39,6 +43,8 @@ def run_guarded(program: str, command: Callable[[], int | None], debug: bool = F
         program: its name.
         command: what to run; returns an exit status, None for 0.
         debug: whether to show tracebacks and all warnings.
+        fold_warnings: whether a terminal gets the first of alike warnings alone, and at last how many there were; a
+            file or pipe gets all.
 
     Returns:
         The exit status: the command's own or 0 on success, 2 on bad input, 1 on anything else, silently if the
@@ -46,7 +52,7 @@ def run_guarded(program: str, command: Callable[[], int | None], debug: bool = F
     """
     with plain_streams(), warnings.catch_warnings(), _libraries_silent(debug):
         warnings.simplefilter("always", TorchidWarning)
-        warnings.showwarning = _Warnings(program, debug)
+        warnings.showwarning = shown = _Warnings(program, debug, fold_warnings and sys.stderr.isatty())
         try:
             reset_written()
             with termination_as_interrupt():
@@ -65,6 +71,8 @@ def run_guarded(program: str, command: Callable[[], int | None], debug: bool = F
             status, line = _describe_failure(error)
             _print_line(program, line)
             return status
+        finally:
+            shown.count_folded()
 
 
 def run_in_ranks(program: str, run: Callable[[], int]) -> int:
@@ -118,19 +126,36 @@ def _describe_failure(error: Exception) -> tuple[int, str]:
 
 
 class _Warnings:
-    """Prints warnings as lines; repeated warnings of libraries once."""
+    """Prints warnings as lines; repeated warnings of libraries once, and alike ones of torchid if `fold`."""
 
-    def __init__(self, program: str, debug: bool) -> None:
-        self._program, self._debug, self._printed = program, debug, set[str]()
+    def __init__(self, program: str, debug: bool, fold: bool) -> None:
+        self._program, self._debug, self._fold = program, debug, fold
+        self._printed, self._folded = set[str](), 0
 
     def __call__(self, message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
-        text = f"{category.__name__}: {message}"
-        if not issubclass(category, TorchidWarning):
-            if not (self._debug or issubclass(category, _NUMERICAL)) or text in self._printed:
+        text = kind = f"{category.__name__}: {message}"
+        if issubclass(category, TorchidWarning):
+            kind = _without_names(text)
+            if self._fold and kind in self._printed:
+                self._folded += 1
                 return
-            self._printed.add(text)
+        else:
+            if not (self._debug or issubclass(category, _NUMERICAL)) or kind in self._printed:
+                return
             text = f"NumericalWarning: a library met a number that it cannot handle ({message})"
+        self._printed.add(kind)
         _print_line(self._program, text)
+
+    def count_folded(self) -> None:
+        """Print how many warnings have not been printed, if any."""
+        if self._folded:
+            _print_line(self._program, f"and {format_count(self._folded, 'warning')} like these: --verbose")
+
+
+def _without_names(text: str) -> str:
+    """What is alike in warnings of many logs: without the name that comes first, quoted ones and numbers."""
+    category, _, message = text.partition(": ")
+    return category + re.sub(r"'[^']*'|\d[\d.]*(e[-+]?\d+)?", "#", message.partition(": ")[2] or message)
 
 
 def _print_line(program: str, text: str) -> None:

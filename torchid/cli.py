@@ -8,17 +8,13 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict
 from pathlib import Path
-from textwrap import fill
-from typing import TYPE_CHECKING
+from typing import Any
 
 from torchid import __version__
 from torchid.boundary import plain_streams, run_guarded, run_in_ranks
 from torchid.errors import ConfigError, during
 from torchid.ranks import is_launched_first, share_work
 from torchid.staging import interrupts_deferred
-
-if TYPE_CHECKING:
-    from torchid.commands.analyze import ScenarioAnalysis
 
 _IDENTIFY = "fit the parameters of an experiment file and write a run folder"
 _COMPRESS = "compress the training logs of an experiment file to small files of factors, which identify fits too"
@@ -30,6 +26,7 @@ _DEMO = "identify the demo's quadruped, or copy the examples that ship with torc
 _CONVERT = "write a log of any type as .npz, .h5, .csv or .parquet"
 _CHECK = "check logs for errors before a fit"
 _SIMULATE = "simulate a robot and write the logs of its sensors (needs the extra [sim])"
+_SHELLS = ("bash", "zsh")
 _SHARED = ("identify", "compress", "evaluate", "analyze")
 """By the processes that torchrun has started; the first runs all others."""
 
@@ -42,7 +39,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _main(arguments: Sequence[str] | None) -> int:
     with plain_streams():  # argparse repeats unknown arguments in its errors
         options = _options(arguments)
-    return run_guarded("torchid", lambda: _command(options), options.debug)
+    folds = not getattr(options, "verbose", True)
+    return run_guarded("torchid", lambda: _command(options), options.debug, folds)
 
 
 def _command(options: argparse.Namespace) -> int | None:
@@ -68,6 +66,12 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="torchid", description="Identify a robot's inertia and friction from logs.")
     parser.add_argument("--version", action="version", version=f"torchid {__version__}")
+    parser.add_argument(
+        "--print-completion",
+        action=_PrintCompletion,
+        choices=_SHELLS,
+        help="print a script that completes commands, options and files in this shell",
+    )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     identify = commands.add_parser("identify", help=_IDENTIFY, description=_IDENTIFY)
     identify.add_argument("file", help="experiment file (YAML)")
@@ -96,12 +100,14 @@ def _parser() -> argparse.ArgumentParser:
     analyze.add_argument(
         "overrides", nargs="*", default=[], help="key.subkey=value, for example analysis.candidates.contacts=axis"
     )
+    _add_amount(analyze)
     analyze.set_defaults(command=_analyze)
     simulate = commands.add_parser("simulate", help=_SIMULATE, description=_SIMULATE)
     simulate.add_argument("file", help="simulation file (YAML)")
     simulate.add_argument(
         "overrides", nargs="*", default=[], help="key.subkey=value, for example sensors.bias.enabled=true"
     )
+    _add_amount(simulate)
     simulate.set_defaults(command=_simulate)
     check = commands.add_parser("check", help=_CHECK, description=_CHECK)
     check.add_argument("file", help="experiment file (YAML), whose logs are checked against its robot, or a log")
@@ -114,6 +120,7 @@ def _parser() -> argparse.ArgumentParser:
     check.add_argument("--json", metavar="FILE", help="write all findings to a .json file")
     check.add_argument("--figure", metavar="FILE", help="write an overview of all channels (.png, .pdf or .svg)")
     check.add_argument("--overwrite", action="store_true", help="replace these two files if they exist")
+    _add_amount(check)
     check.set_defaults(command=_check)
     convert = commands.add_parser("convert", help=_CONVERT, description=_CONVERT)
     convert.add_argument("source", metavar="IN", help="log: .npz, .h5, .csv, .parquet, or a bag of ROS messages")
@@ -142,6 +149,21 @@ def _parser() -> argparse.ArgumentParser:
         command.add_argument("--debug", action="store_true", help="show the traceback of an unexpected error")
         command.set_defaults(name=name)
     return parser
+
+
+class _PrintCompletion(argparse.Action):
+    """Prints a completion script for a shell, and ends."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *values: Any) -> None:
+        """Whatever takes a value is completed by names of files, but for names in a robot, devices and settings."""
+        import shtab
+
+        (commands,) = (action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
+        for command in commands.choices.values():
+            for action in command._actions:
+                if action.dest not in ("overrides", "base_link", "device") and action.nargs != 0:
+                    action.complete = shtab.DIRECTORY if action.metavar == "FOLDER" else shtab.FILE
+        parser.exit(run_guarded("torchid", lambda: print(shtab.complete(parser, values[1]))))
 
 
 def _add_amount(command: argparse.ArgumentParser) -> None:
@@ -231,76 +253,25 @@ def _analyze(options: argparse.Namespace) -> None:
     with _importing():
         from torchid.commands.analyze import analyze
         from torchid.config import load_analysis
-        from torchid.report.analysis import accuracy_table, confounded_lines
-        from torchid.report.tables import print_tables
-        from torchid.terminal.lines import print_rolling
+        from torchid.terminal.analysis import print_analysis, print_analysis_tables
 
     analysis = analyze(load_analysis(options.file, options.overrides))
-    print_rolling(analysis.scene.rolling)
-    for scenario in analysis.scenarios:
-        _print_scenario(scenario)
-    if analysis.accuracies:
-        print_tables(accuracy_table(analysis.accuracies))
-        for line in confounded_lines(analysis.accuracies):
-            print(line)
-    print(f"written to    {analysis.output}")
-
-
-def _print_scenario(scenario: ScenarioAnalysis) -> None:
-    from torchid.report.analysis import (
-        branch_table,
-        describe_losses,
-        join_names,
-        observability_table,
-        removal_table,
-        sets_table,
-    )
-    from torchid.report.tables import print_tables
-    from torchid.terminal.lines import print_labelled
-
-    plan, base = scenario.plan, scenario.base
-    print(f"Scenario {scenario.name}")
-    print_tables(branch_table(plan), *([sets_table(plan.parts)] if plan.parts else []))
-    proof = "no cheaper set exists" if plan.proven else "whether a cheaper set exists is not proven"
-    print_labelled("chosen", join_names(plan.chosen))
-    print(f"cost          {plan.cost:g}; {proof}")
-    named = {"Chosen sensors": plan.observability}
-    if scenario.proposed is not None and scenario.proposed is not plan.observability:
-        named["Proposed sensors"] = scenario.proposed
-    for title, states in named.items():
-        if states:
-            print_tables(observability_table(title, states))
-        for line in describe_losses(states) if title != "Chosen sensors" or plan.parts else []:
-            print(fill(line, 100, subsequent_indent="  "))
-    if plan.removals:
-        print_tables(removal_table(plan))
-    structure = f"{base.rank} combinations of {int(base.free.sum())} parameters"
-    print(f"structure     {structure}; base_parameters.txt names them")
-    print()
+    if not options.quiet:
+        (print_analysis_tables if options.verbose else print_analysis)(analysis)
 
 
 def _check(options: argparse.Namespace) -> int:
     with _importing():
         from torchid.commands.check import check_files, check_outputs, write_check_outputs
-        from torchid.report.log_checks import finding_table, log_heading, skipped_checks_text
-        from torchid.report.tables import print_tables
-        from torchid.terminal.lines import print_labelled, print_rolling
+        from torchid.terminal.checks import print_all_findings, print_checks
 
     inputs = (options.file, options.urdf, options.topics, options.columns)
     check_outputs(options.json, options.figure, options.overwrite, inputs)
     robot = {"urdf": options.urdf, "base_link": options.base_link, "fixed_base": options.fixed_base}
     checked = check_files(options.file, options.overrides, **robot, topics=options.topics, columns=options.columns)
     write_check_outputs(checked, options.json, options.figure)
-    if checked:
-        print_rolling(checked[0].rolling)
-    for log in checked:
-        print(log_heading(log))
-        if log.findings:
-            print_tables(finding_table(log.findings))
-        if skipped := skipped_checks_text(log):
-            print_labelled("not checked", skipped)
-        print_labelled("verdict", log.verdict)
-        print()
+    if not options.quiet:
+        (print_all_findings if options.verbose else print_checks)(checked, (options.json, options.figure))
     return 0 if all(log.usable for log in checked) else 1
 
 
@@ -321,13 +292,11 @@ def _convert(options: argparse.Namespace) -> None:
 
 def _simulate(options: argparse.Namespace) -> None:
     with _importing():
-        from torchid.commands.simulate import simulate, simulated_balls
+        from torchid.commands.simulate import simulate
         from torchid.config import load_simulation
-        from torchid.report.tables import print_tables, stability_table
-        from torchid.terminal.lines import print_rolling
+        from torchid.terminal.simulation import print_all_motions, print_simulation
 
     config = load_simulation(options.file, options.overrides)
     stabilities = simulate(config)
-    print_rolling(simulated_balls(config))
-    print_tables(stability_table({name: asdict(stability) for name, stability in stabilities.items()}))
-    print(f"written to    {config.output}")
+    if not options.quiet:
+        (print_all_motions if options.verbose else print_simulation)(config, stabilities)

@@ -22,7 +22,7 @@ from torchid.config import load_analysis
 from torchid.errors import TorchidWarning
 from torchid.identifiability.information import ExpectedErrors
 from torchid.problem.metrics import ROW_GROUPS
-from torchid.report.analysis import SetAccuracy, accuracy_figure, describe_losses
+from torchid.report.analysis import SetAccuracy, accuracy_figure, describe_singular_postures
 from torchid.report.figures import tree_figure
 from torchid.sensor_planning.observability import BaseObservability, PostureSummary
 
@@ -263,7 +263,7 @@ def test_a_base_that_is_often_all_but_lost_is_warned_of() -> None:
         random, zero = PostureSummary(6, 0.1, low, low), PostureSummary(6, 0.1, 0.1, 0.1)
         return BaseObservability((True,), "sole", random, zero, None, None, ())
 
-    (line,) = describe_losses([checked(1e-3), checked(1e-8)])
+    (line,) = describe_singular_postures([checked(1e-3), checked(1e-8)])
     assert "in 1 of 2 contact states" in line
 
 

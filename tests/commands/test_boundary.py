@@ -210,3 +210,35 @@ def test_a_file_is_read_as_far_as_it_may_be(tmp_path: Path) -> None:
         read_bytes(tmp_path / "x", 99)
     with pytest.raises(OSError, match="a folder"):
         read_bytes(tmp_path, 99)
+
+
+class _Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def _warn_of_logs(told: list[str], monkeypatch: pytest.MonkeyPatch, *, terminal: bool, fold: bool) -> list[str]:
+    """Lines on standard error of a command that warns."""
+
+    def command() -> None:
+        for text in told:
+            warnings.warn(text, TorchidWarning, stacklevel=1)
+
+    screen = _Terminal() if terminal else io.StringIO()
+    monkeypatch.setattr(sys, "stderr", screen)
+    assert run_guarded("torchid", command, fold_warnings=fold) == 0
+    return screen.getvalue().splitlines()
+
+
+def test_a_terminal_gets_the_first_of_alike_warnings_and_their_number_and_a_file_all(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    logs = [f"walk_{k}.npz: {10 * k} of 1300 samples excluded: 'joint_{k}' has spikes" for k in range(9)]
+    told = [*logs, "walk_0.npz: time: a gap of 0.3 s", "identified.urdf: 2 bodies cannot exist", logs[0]]
+    for terminal, fold in ((False, True), (True, False)):
+        lines = _warn_of_logs(told, monkeypatch, terminal=terminal, fold=fold)
+        assert lines == [f"torchid: TorchidWarning: {text}" for text in told]
+    lines = _warn_of_logs(told, monkeypatch, terminal=True, fold=True)
+    first = [f"torchid: TorchidWarning: {text}" for text in (told[0], told[-3], told[-2])]
+    assert lines == [*first, "torchid: and 9 warnings like these: --verbose"]
+    assert _warn_of_logs(told[-3:-1], monkeypatch, terminal=True, fold=True) == first[1:]

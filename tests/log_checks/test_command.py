@@ -1,4 +1,4 @@
-"""`torchid check` from the command line: tables, exit statuses, files, refusals."""
+"""`torchid check` from the command line: answers, tables, exit statuses, files, refusals."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def folder(tmp_path: Path) -> Path:
 def test_the_logs_of_an_experiment_file_are_checked_one_by_one(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["check", str(folder / "quadruped.yaml")]) == 0
+    assert main(["check", "--verbose", str(folder / "quadruped.yaml")]) == 0
     printed = capsys.readouterr().out
     train, test = printed.split("sway_test.npz")
     assert "sway_train.npz: 400 samples, 3.99 s" in train
@@ -54,7 +54,7 @@ def test_frames_that_are_sent_again_are_one_row_of_the_table(folder: Path, capsy
     again = np.arange(400)
     again[150:156] = 149
     write_log(replace(log.select(again), time=log.time), folder / "sway_train.npz")
-    assert main(["check", str(folder / "sway_train.npz")]) == 0
+    assert main(["check", "--verbose", str(folder / "sway_train.npz")]) == 0
     printed = capsys.readouterr().out
     assert printed.count("condemned") == 1
     assert "likewise" in printed
@@ -75,7 +75,9 @@ def test_a_log_that_is_not_usable_ends_with_status_one(folder: Path, capsys: pyt
     log = read_log(folder / "sway_train.npz")
     write_log(replace(log, joint_position=np.degrees(log.joint_position)), folder / "sway_train.npz")
     assert main(["check", str(folder / "quadruped.yaml")]) == 1
-    assert "verdict       not usable: joint_position: unit" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert printed.startswith("0 of 2 logs are free of usual mistakes; 1 is not usable; 1 is usable")
+    assert "condemned     joint_position, unit in sway_train.npz: " in printed
 
 
 @pytest.mark.parametrize("samples", [1, 4])
@@ -85,7 +87,7 @@ def test_a_log_too_short_to_differentiate_is_not_usable(
     log, path = read_log(folder / "sway_train.npz"), str(folder / "sway_train.npz")
     write_log(log.select(np.arange(samples)), path)
     assert main(["check", path, "--urdf", str(folder / "quadruped.urdf")]) == 1
-    assert "verdict       not usable: time: too short" in capsys.readouterr().out
+    assert ": not usable: time: too short\n" in capsys.readouterr().out
 
 
 def test_one_sample_of_an_arm_with_its_velocity_and_acceleration_needs_no_derivative(folder: Path) -> None:
@@ -180,7 +182,7 @@ def test_a_recorded_arm_is_usable_and_its_stamps_are_seen_to_jitter(
     for name in ("run1", "run2"):
         given = [str(ARM / f"{name}.npz"), "--urdf", urdf, "--fixed-base", "--json", str(document), "--overwrite"]
         assert main(["check", *given]) == 0
-        assert "verdict       usable\n" in capsys.readouterr().out
+        assert ": usable; free of usual mistakes\n" in capsys.readouterr().out
         (log,) = json.loads(document.read_text())["logs"]
         assert [(finding["name"], finding["severity"]) for finding in log["findings"]] == [("jitter", "note")]
 
@@ -213,6 +215,6 @@ def test_the_shipped_demo_is_usable_without_reserve(capsys: pytest.CaptureFixtur
         shutil.copy(DEMO / name, tmp_path)
     assert main(["check", str(tmp_path / "quadruped.yaml")]) == 0
     printed = capsys.readouterr().out
-    assert printed.count("verdict       usable\n") == 2
+    assert printed.startswith("2 of 2 logs are free of usual mistakes\n")
     assert "condemned" not in printed
     assert "suspicious" not in printed

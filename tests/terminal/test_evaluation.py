@@ -12,8 +12,8 @@ import torchid
 from torchid.cli import main
 from torchid.commands.evaluate import EvaluatedRun
 from torchid.problem import Metrics
-from torchid.terminal.answer import LINES
 from torchid.terminal.evaluation import MOST_LOGS, evaluation_lines
+from torchid.terminal.lines import LINES
 
 LOG = str(DEMO / "sway_test.npz")
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from textwrap import shorten
 from typing import TYPE_CHECKING
 
 from torchid import parameters
@@ -56,7 +55,7 @@ def answer(run: Identification) -> Answer:
 def _judge(run: Identification) -> Judged:
     if "test" in run.metrics:
         names = [log_title(path) for path in run.experiment.config.logs.test]
-        text = f"unseen motion ({shorten(', '.join(names), 40, placeholder=' ...')})"
+        text = f"unseen motion ({join_names(names, 2)})"
         return Judged(text, run.metrics["test"].nominal, run.metrics["test"].identified)
     if run.validation is not None:
         text = f"blocks of the training logs, each left out of the fit ({run.validation.folds})"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from textwrap import fill, wrap
+from textwrap import wrap
 from typing import Any
 
 import matplotlib
@@ -14,6 +14,7 @@ from matplotlib.ticker import LogFormatter
 from rich.table import Table
 from rich.text import Text
 
+from torchid.errors import format_count
 from torchid.identifiability.base_parameters import BaseParameters, format_base_parameters, unobservable_parameters
 from torchid.identifiability.information import ExpectedErrors
 from torchid.problem import Metrics
@@ -175,44 +176,48 @@ def observability_table(title: str, states: Sequence[BaseObservability]) -> Tabl
 
 
 def describe_losses(states: Sequence[BaseObservability]) -> list[str]:
-    """Lost directions of the base with remedies, and postures at which a set is singular or nearly so."""
-    lines = []
+    """Lost directions of the base with remedies, a message for each that differs."""
+    messages = []
     by_loss: dict[tuple[object, ...], list[LostBase]] = {}
     for lost in (state.lost for state in states if state.lost is not None):
         by_loss.setdefault((lost.descriptions, lost.unmet_groups, lost.remedies), []).append(lost)
     for alike in by_loss.values():
-        lost, count = alike[0], f"{len(alike)} of {len(states)} contact states"
+        lost, count = alike[0], f"{len(alike)} of {format_count(len(states), 'contact state')}"
         lacking = [
-            f"{' + '.join(frames)} lacks {number} sensor{'s' * (number != 1)}" for frames, number in lost.unmet_groups
+            f"{' + '.join(frames)} lacks {format_count(number, 'sensor')}" for frames, number in lost.unmet_groups
         ]
+        remedies = join_names(lost.remedies[:_MAX_REMEDIES]) if lost.remedies else "no single candidate"
         whole = len(lost.descriptions) == _BASE_DIRECTIONS
         directions = "whole base" if whole else f"base's {' and '.join(lost.descriptions)}"
-        lines.append(f"{' and '.join(lacking)} in {count}; lost is the {directions}")
-        remedies = join_names(lost.remedies[:_MAX_REMEDIES]) if lost.remedies else "no single candidate"
-        lines.append(f"  any of these would help: {remedies}")
-    near = [
-        state
-        for state in states
-        if state.lost is None and state.recorded and state.recorded.least < _MIN_SINGULAR_VALUE
-    ]
+        cause = f"{' and '.join(lacking)} in {count}; any of these would help: {remedies}"
+        messages.append(f"{cause}; lost is the {directions}")
+    return messages
+
+
+def describe_singular_postures(states: Sequence[BaseObservability], beyond_logs: bool = True) -> list[str]:
+    """Postures at which a set that keeps the base loses it, or nearly so.
+
+    `beyond_logs`: whether postures count that the logs, if there are any, do not have.
+    """
+    messages, kept = [], [state for state in states if state.lost is None]
+    near = [state.recorded.least for state in kept if state.recorded and state.recorded.least < _MIN_SINGULAR_VALUE]
     if near:
-        least = min(state.recorded.least for state in near if state.recorded)
-        lines.append(
-            f"warning: at some postures of the logs the base is nearly lost (smallest singular value {least:.2g})"
-        )
-    rare = sum(state.lost is None and state.generic.low < BASE_RANK_TOLERANCE for state in states)
+        where = f"at some postures of the logs the base is nearly lost (smallest singular value {min(near):.2g})"
+        messages.append(f"{where}: use others, or more sensors")
+    kept = [state for state in kept if beyond_logs or state.recorded is None]
+    rare = sum(state.generic.low < BASE_RANK_TOLERANCE for state in kept)
     if rare:
-        where = f"{rare} of {len(states)} contact states"
-        lines.append(f"warning: in {where} the base is nearly lost at one random posture in twenty or more")
-    singular = [state for state in states if state.lost is None and state.zero.rank < state.generic.rank]
+        where = f"{rare} of {format_count(len(states), 'contact state')}"
+        messages.append(f"in {where} the base is nearly lost at one random posture in twenty or more")
+    singular = [state for state in kept if state.zero.rank < state.generic.rank]
     if singular:
         dependent = dict.fromkeys(names for state in singular for names in state.dependent)
         cause = "; ".join(" = ".join(names) for names in dependent)
-        lines.append(
-            "warning: the base is lost where all joints are at zero, and nearly lost close to it"
+        messages.append(
+            "the base is lost where all joints are at zero, and nearly lost close to it: move elsewhere"
             + (f"; sensors with dependent readings there: {cause}" if cause else "")
         )
-    return lines
+    return messages
 
 
 def removal_table(plan: SensorPlan) -> Table:
@@ -284,10 +289,13 @@ def accuracy_table(sets: Mapping[str, SetAccuracy]) -> Table:
     return table
 
 
-def confounded_lines(sets: Mapping[str, SetAccuracy]) -> list[str]:
-    """What each set does not separate, one paragraph a message."""
-    messages = [f"confounded    {name}: {message}" for name, found in sets.items() for message in found.confounded]
-    return [fill(message, 100, subsequent_indent=" " * 14) for message in messages]
+def confounded_messages(sets: Mapping[str, SetAccuracy]) -> list[str]:
+    """What some sets do not separate, with their names."""
+    names: dict[str, list[str]] = {}
+    for name, found in sets.items():
+        for message in found.confounded:
+            names.setdefault(message, []).append(name)
+    return [f"{', '.join(of)}: {message}" for message, of in names.items()]
 
 
 def _number(x: float | None) -> str:

@@ -130,7 +130,7 @@ def finding_table(findings: Sequence[Finding]) -> Table:
     table.add_column("samples", overflow="fold", max_width=12)
     table.add_column("found", overflow="fold", ratio=8)
     table.add_column("what to do", overflow="fold", ratio=5)
-    for finding, *others in _group_alike(findings):
+    for finding, *others in group_alike(findings):
         text = f"{finding.field}, {finding.name}: {finding.found}"
         if others:
             text += f"; likewise {join_names([other.field for other in others])}"
@@ -138,7 +138,7 @@ def finding_table(findings: Sequence[Finding]) -> Table:
     return table
 
 
-def _group_alike(findings: Sequence[Finding]) -> list[list[Finding]]:
+def group_alike(findings: Sequence[Finding]) -> list[list[Finding]]:
     """Findings in groups of the same kind and samples in several fields."""
     rows: dict[object, list[Finding]] = {}
     for finding in findings:

@@ -11,7 +11,7 @@ import numpy as np
 from lxml import etree
 
 from torchid import parameters
-from torchid.errors import InputError, during, warn
+from torchid.errors import InputError, during, join_names, warn
 from torchid.estimators import Estimate
 from torchid.guards import MAX_JSON, read_bytes
 from torchid.identifiability.confounding import ExtraEstimate
@@ -194,13 +194,13 @@ def _warn_if_inconsistent(robot: Robot, phi: Array) -> None:
     inconsistent = (phi[:, parameters.MASS] < 0.0) | (parameters.consistency_margin(phi) < parameters.POSSIBLE_MARGIN)
     bodies = [robot.bodies[number] for number in np.flatnonzero(phi.any(axis=1) & inconsistent)]
     if bodies:
-        names = ", ".join(body.name for body in bodies)
+        names = join_names([body.name for body in bodies])
         message = f"identified.urdf: no distribution of positive mass has the parameters of {names}"
         warn(f"{message}; simulators will refuse or misread them")
     negative = [robot.bodies[number] for number in np.flatnonzero((phi[:, parameters.FRICTION] < 0.0).any(axis=1))]
     joints = [body.joint.name for body in negative if body.joint is not None]
     if joints:
-        warn(f"identified.urdf: negative friction at {', '.join(joints)}; simulators and torchid refuse it")
+        warn(f"identified.urdf: negative friction at {join_names(joints)}; simulators and torchid refuse it")
 
 
 def _set_inertial(link: etree._Element, values: Array | None) -> None:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from textwrap import shorten, wrap
+from textwrap import shorten
 
 import numpy as np
-from rich.table import Table
-from rich.text import Text
 
 from torchid.commands.answer import answer
 from torchid.commands.results import Identification
@@ -16,12 +14,9 @@ from torchid.estimators.least_squares import COMBINED, FIXED, IDENTIFIED, PRIOR,
 from torchid.parameters import PARAMETERS, PER_BODY, Array
 from torchid.report.tables import terminal_width
 from torchid.robot import Robot
-from torchid.terminal.lines import LABEL, error_lines, table_lines
+from torchid.terminal.lines import CUT, LABEL, LINES, column_lines, error_lines, labelled, wrap_words
 
-LINES = 20
-"""At most so many."""
-
-_MOST_ATTENTION, _ATTENTION_LINES = 2, 2
+_MOST_ATTENTION, _TEXT_LINES = 2, 2
 _FEWEST_LINES = 4  # of the table of bodies: a heading, a body, how many others there are, what the marks mean
 _MASS, _CENTER = PARAMETERS.index("m"), slice(PARAMETERS.index("mcx"), PARAMETERS.index("mcz") + 1)
 _COULOMB, _VISCOUS = PARAMETERS.index("fc"), PARAMETERS.index("fv")
@@ -42,23 +37,16 @@ def answer_lines(run: Identification, width: int) -> list[str]:
         width: of the terminal.
     """
     said = answer(run)
-    lines = [*wrap(said.headline, width), *error_lines(said.errors, width), ""]
-    lines += _labelled("total mass", said.total_mass, width)
-    lines += _labelled("bodies", said.bodies, width)
+    lines = [*wrap_words(said.headline, width), *error_lines(said.errors, width), ""]
+    lines += labelled("total mass", said.total_mass, width, _TEXT_LINES)
+    lines += labelled("bodies", said.bodies, width, _TEXT_LINES)
     for one in said.attention[:_MOST_ATTENTION]:
-        lines += _labelled("attention", one, width)
+        lines += labelled("attention", one, width, _TEXT_LINES)
     if len(said.attention) > _MOST_ATTENTION:
-        lines += _labelled("", f"and {len(said.attention) - _MOST_ATTENTION} more: --verbose", width)
+        lines += labelled("", f"and {len(said.attention) - _MOST_ATTENTION} more: --verbose", width, _TEXT_LINES)
     end = [f"{'written to':{LABEL}}{run.experiment.config.output}"]
     bodies = _body_lines(run.experiment.robot, run.estimate, LINES - len(lines) - len(end) - 1, width)
     return [*lines, *(["", *bodies] if bodies else []), *end]
-
-
-def _labelled(label: str, text: str, width: int) -> list[str]:
-    lines = wrap(text, width - LABEL) or [""]
-    if len(lines) > _ATTENTION_LINES:
-        lines = [*lines[: _ATTENTION_LINES - 1], f"{lines[_ATTENTION_LINES - 1][: width - LABEL - 4]} ..."]
-    return [f"{name:{LABEL}}{line}" for name, line in zip((label, *[""] * len(lines)), lines, strict=False)]
 
 
 # --------------------------------------------------------------------------------------------------------- the bodies
@@ -71,24 +59,13 @@ def _body_lines(robot: Robot, estimate: Estimate, room: int, width: int) -> list
         return []
     most = room - 2  # heading, legend
     shown = sorted(_most_changed(robot, estimate, free)[: most if len(free) <= most else most - 1])
-    columns = [column for column in _columns(robot, estimate, shown) if any(cell.strip() for cell in column[1])]
-    names = [robot.body_names[k] for k in shown]
-    while True:
-        table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-        table.add_column("body", no_wrap=True)
-        for heading, _ in columns:
-            table.add_column(Text(heading), justify="right", no_wrap=True)
-        for name, *cells in zip(names, *(cells for _, cells in columns), strict=True):
-            table.add_row(Text(name), *(Text(cell) for cell in cells))
-        lines = table_lines(table, 10 * width)
-        if max(map(len, lines)) <= width or len(columns) == 1:
-            break
-        columns.pop()
+    names, columns = [robot.body_names[k] for k in shown], _columns(robot, estimate, shown)
+    lines = column_lines(("body", names), columns, width)
+    marks = {word for line in lines[1:] for word in line.split()[1:]}
     if len(free) > len(shown):
         lines.append(f"and {len(free) - len(shown)} bodies that changed less: parameters.json, --verbose")
-    marks = {mark for _, cells in columns for cell in cells for mark in (cell[-1:],)}
     legend = "; ".join(text for verdict, text in _LEGEND.items() if _MARKS[verdict] in marks)
-    return [*(line[:width] for line in lines), *([shorten(legend, width, placeholder=" ...")] if legend else [])]
+    return [*lines, *([shorten(legend, width, placeholder=CUT)] if legend else [])]
 
 
 def _most_changed(robot: Robot, estimate: Estimate, bodies: Sequence[int]) -> list[int]:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from textwrap import wrap
-
 from torchid.commands.evaluate import EvaluatedRun
 from torchid.commands.verdict import Judged
 from torchid.problem.metrics import describe_worse, worse_than_nominal
 from torchid.report.tables import error_tables, print_tables, terminal_width
-from torchid.terminal.lines import error_lines
+from torchid.terminal.lines import LABEL, error_lines, wrap_words
 
 MOST_LOGS = 8
 """Logs of which a sentence is printed each: two lines at 80 columns, within a screen."""
@@ -28,21 +26,21 @@ def evaluation_lines(evaluated: EvaluatedRun, width: int) -> list[str]:
     """
     judged = [Judged(name, pair.nominal, pair.identified) for name, pair in evaluated.metrics.items()]
     judged.sort(key=_worst, reverse=True)
-    lines = [line for one in judged[:MOST_LOGS] for line in wrap(_sentence(one), width, subsequent_indent="  ")]
+    lines = [line for one in judged[:MOST_LOGS] for line in wrap_words(_sentence(one), width, "  ")]
     if len(judged) > MOST_LOGS:
         lines.append(f"and {len(judged) - MOST_LOGS} logs that are predicted better than these: --verbose")
     if len(judged) == 1:
         lines += error_lines(judged[0].shown_errors(), width)
     left_out = sum(evaluated.excluded.values())
     if left_out:
-        lines.append(f"left out      {left_out} samples that torchid check condemns")
-    return [*lines, f"written to    {evaluated.output}"]
+        lines.append(f"{'left out':{LABEL}}{left_out} samples that torchid check condemns")
+    return [*lines, f"{'written to':{LABEL}}{evaluated.output}"]
 
 
 def print_all_errors(evaluated: EvaluatedRun) -> None:
     """Print the errors of all logs by group of rows."""
     print_tables(*error_tables(evaluated.metrics))
-    print(f"written to    {evaluated.output}")
+    print(f"{'written to':{LABEL}}{evaluated.output}")
 
 
 def _sentence(one: Judged) -> str:

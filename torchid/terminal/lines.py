@@ -1,24 +1,54 @@
-"""Lines with a label, and what several commands print."""
+"""Lines with a label, texts and tables within a screen, and what several commands print."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict
-from textwrap import fill
+from textwrap import wrap
 
 from rich.table import Table
 from rich.text import Text
 
+from torchid.errors import one_line
 from torchid.fitting.noise import NoiseSummary
 from torchid.report.tables import WIDTH, noise_advice, noise_table, print_tables, table_text
 
 LABEL = 14
 """Columns of the words before what they are about."""
+LINES = 20
+"""Of an answer, at most."""
+CUT = " ..."
+_ANY_WIDTH = 10_000
+
+
+def wrap_words(text: str, width: int, indent: str = "", most: int | None = None) -> list[str]:
+    """Lines of at most so many columns, but no word is broken: a longer name has a line of its own.
+
+    Args:
+        text: to be broken.
+        width: of the lines.
+        indent: of all lines but the first.
+        most: lines; the last of them ends in `CUT` if there are words beyond.
+    """
+    room = max(width, 1)
+    lines = wrap(text, room, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False) or [""]
+    if most is None or len(lines) <= most:
+        return lines
+    *before, last = lines[:most]
+    while " " in last.strip() and len(last) > width - len(CUT):
+        last = last[: last.rindex(" ")]
+    return [*before, last + CUT]
+
+
+def labelled(label: str, text: str, width: int, most: int | None = None) -> list[str]:
+    """What a word is about, in at most so many lines below each other; see `wrap_words`."""
+    lines = wrap_words(text, width - LABEL, most=most)
+    return [f"{name:{LABEL}}{line}" for name, line in zip((label, *[""] * len(lines)), lines, strict=False)]
 
 
 def print_labelled(label: str, text: str) -> None:
     """Print what a word is about, broken into lines below each other."""
-    print(fill(f"{label:{LABEL}}{text}", WIDTH, subsequent_indent=" " * LABEL))
+    print("\n".join(labelled(label, text, WIDTH)))
 
 
 def table_lines(table: Table, width: int) -> list[str]:
@@ -26,15 +56,38 @@ def table_lines(table: Table, width: int) -> list[str]:
     return [line.rstrip() for line in table_text(table, width).splitlines()]
 
 
+def column_lines(
+    names: tuple[str, Sequence[str]], columns: Sequence[tuple[str, Sequence[str]]], width: int
+) -> list[str]:
+    """Lines of a table without borders: whole names, the first column, and as many others as there is room for.
+
+    Args:
+        names: their heading and what the rows are of.
+        columns: heading and cells of each, the most important first; one without any text is left out.
+        width: of the lines; only names can be wider.
+    """
+    shown = [column for column in columns if any(cell.strip() for cell in column[1])]
+    while True:
+        table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+        table.add_column(Text(names[0]), no_wrap=True)
+        for heading, _ in shown:
+            table.add_column(Text(heading), justify="right", no_wrap=True)
+        for name, *cells in zip(names[1], *(cells for _, cells in shown), strict=True):
+            table.add_row(Text(one_line(name)), *(Text(cell) for cell in cells))
+        lines = table_lines(table, _ANY_WIDTH)
+        if len(shown) <= 1 or max(map(len, lines)) <= width:
+            return lines
+        shown.pop()
+
+
 def error_lines(errors: Sequence[tuple[str, float, float, float | None]], width: int) -> list[str]:
     """A small table of the errors of a `Judged`, not wider than so many columns; none without errors."""
-    table = Table(box=None, pad_edge=False, padding=(0, 3, 0, 0))
-    table.add_column("rms error of", no_wrap=True)
-    for heading in ("URDF", "identified", "noise alone"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    for group, before, after, floor in errors:
-        table.add_row(Text(group), f"{before:.4g}", f"{after:.4g}", "-" if floor is None else f"{floor:.4g}")
-    return table_lines(table, width) if table.row_count else []
+    columns = [
+        ("URDF", [f"{before:.4g}" for _, before, _, _ in errors]),
+        ("identified", [f"{after:.4g}" for _, _, after, _ in errors]),
+        ("noise alone", ["-" if floor is None else f"{floor:.4g}" for *_, floor in errors]),
+    ]
+    return column_lines(("rms error of", [group for group, *_ in errors]), columns, width) if errors else []
 
 
 def print_rolling(rolling: str) -> None:

@@ -1,0 +1,72 @@
+"""What `torchid simulate` says on one screen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from simulated import SHIPPED, shipped
+
+import torchid.commands.simulate
+from torchid.cli import main
+from torchid.config import SimulationConfig
+from torchid.simulation import Stability
+from torchid.terminal.lines import LINES
+from torchid.terminal.simulation import simulation_lines
+
+STANDS = Stability((0.622, 0.835), 0.001, 0.0002, 0.076, 0.0, 0.01, (0.0, 0.33))
+
+
+def motions(names: list[str]) -> tuple[SimulationConfig, dict[str, Stability]]:
+    """A simulation that has motions of such names, and how the robot stood: the later the worse."""
+    config = shipped(Path("runs/biped"))
+    found = [replace(config.motions[0], name=name, duration_s=10.0) for name in names]
+    stood = {name: replace(STANDS, zmp_margin=0.1 / (1 + k)) for k, name in enumerate(names)}
+    return replace(config, motions=found), stood
+
+
+@pytest.mark.parametrize("width", [60, 80, 120])
+@pytest.mark.parametrize("count", [1, 13, 50])
+def test_any_number_of_motions_fits_on_a_screen(count: int, width: int) -> None:
+    config, stood = motions([f"squat_{k}" for k in range(count)])
+    lines = simulation_lines(config, stood, width)
+    assert len(lines) <= LINES
+    assert lines[-1] == f"written to    {config.output}"
+    assert max(map(len, lines[:-1])) <= width
+    shown = [line.split()[0] for line in lines if line.startswith("squat_")]
+    assert shown == [f"squat_{k}" for k in range(count)[::-1]][: len(shown)], "the nearest to a bound first"
+    if len(shown) < count:
+        assert f"and {count - len(shown)} motions farther from the bounds: --verbose" in lines
+    assert len(shown) >= min(count, 11)
+
+
+def test_the_worst_of_all_motions_comes_first_in_words() -> None:
+    config, stood = motions(["squat", "sway"])
+    stood["squat"] = replace(stood["squat"], slip=0.0031, effort=0.62)
+    said = " ".join(" ".join(simulation_lines(config, stood, 80)).split())
+    assert said.startswith(
+        "The robot stands throughout 2 motions, 20 s: feet slip by at most 3.1 mm, "
+        "the zero-moment point stays 50 mm inside the support, torques reach 62 % of their limits"
+    )
+
+
+def test_names_are_never_broken() -> None:
+    name = "a-squat-of-a-name-that-is-longer-than-a-terminal-of-sixty-columns-is-wide"
+    for width in (60, 80, 120):
+        lines = simulation_lines(*motions([name, "short"]), width)
+        assert sum(line.split()[:1] == [name] for line in lines) == 1
+
+
+def test_quiet_prints_nothing_and_verbose_every_motion(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config, stood = motions([f"motion_{k}" for k in range(30)])
+    monkeypatch.setattr(torchid.commands.simulate, "simulate", lambda _: stood)
+    printed = {}
+    for option in ("--quiet", "--verbose", "-q"):
+        assert main(["simulate", str(SHIPPED), option]) == 0
+        printed[option] = capsys.readouterr().out
+    assert printed["--quiet"] == printed["-q"] == ""
+    assert all(name in printed["--verbose"] for name in stood)
+    assert printed["--verbose"].splitlines()[-1] == f"written to    {config.output}"

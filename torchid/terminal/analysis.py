@@ -1,0 +1,229 @@
+"""What `torchid analyze` prints: whether sensors suffice, what they determine and the smallest set, or all tables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from torchid.commands.analyze import Analysis, ScenarioAnalysis
+from torchid.errors import format_count
+from torchid.errors import join_names as join_texts
+from torchid.identifiability.base_parameters import unobservable_parameters
+from torchid.problem.metrics import ROW_GROUPS
+from torchid.report.analysis import (
+    SetAccuracy,
+    accuracy_table,
+    branch_table,
+    confounded_messages,
+    describe_losses,
+    describe_singular_postures,
+    join_names,
+    observability_table,
+    removal_table,
+    sets_table,
+)
+from torchid.report.tables import print_tables, terminal_width
+from torchid.sensor_planning.observability import BaseObservability
+from torchid.terminal.lines import LABEL, LINES, column_lines, labelled, print_labelled, print_rolling, wrap_words
+
+_MOST_ATTENTION, _TEXT_LINES = 2, 2
+_MOST_SCENARIOS = 4
+
+
+def print_analysis(analysis: Analysis) -> None:
+    """Print the answer for the terminal's width."""
+    print("\n".join(analysis_lines(analysis, terminal_width())))
+
+
+def analysis_lines(analysis: Analysis, width: int) -> list[str]:
+    """The answer, in lines of at most so many columns, but for names that are longer.
+
+    Args:
+        analysis: a finished one.
+        width: of the terminal.
+    """
+    scenarios = sorted(analysis.scenarios, key=lambda one: -_lost(one))
+    lines = [*wrap_words(_headline(scenarios), width), ""]
+    if len(scenarios) == 1:
+        lines += labelled("determined", _determined_text(scenarios[0]), width, _TEXT_LINES + 1)
+        lines += labelled("smallest set", _smallest_text(scenarios[0]), width, _TEXT_LINES)
+    else:
+        lines += _scenario_lines(scenarios, width)
+    if analysis.scene.rolling:
+        lines += labelled("rolling", analysis.scene.rolling, width, _TEXT_LINES)
+    attention = list(_attention(analysis, scenarios))
+    for one in attention[:_MOST_ATTENTION]:
+        lines += labelled("attention", one, width, _TEXT_LINES)
+    if len(attention) > _MOST_ATTENTION:
+        lines += labelled("", f"and {len(attention) - _MOST_ATTENTION} more: --verbose", width)
+    lines += _accuracy_lines(analysis.accuracies, LINES - len(lines) - 1, width)
+    return [*lines, f"{'written to':{LABEL}}{analysis.output}"]
+
+
+def print_analysis_tables(analysis: Analysis) -> None:
+    """Print all tables of all scenarios."""
+    print_rolling(analysis.scene.rolling)
+    for scenario in analysis.scenarios:
+        _print_scenario(scenario)
+    if analysis.accuracies:
+        print_tables(accuracy_table(analysis.accuracies))
+        for message in confounded_messages(analysis.accuracies):
+            print_labelled("confounded", message)
+    print(f"{'written to':{LABEL}}{analysis.output}")
+
+
+# --------------------------------------------------------------------------------------------------------- the answer
+
+
+def _judged_states(scenario: ScenarioAnalysis) -> Sequence[BaseObservability]:
+    """The base with the proposed sensors, or else with the planned ones if each sample is to determine it."""
+    if scenario.proposed is not None:
+        return scenario.proposed
+    return scenario.plan.observability if scenario.plan.problem.criterion == "per_sample" else ()
+
+
+def _lost(scenario: ScenarioAnalysis) -> int:
+    """Contact states in which the base is lost."""
+    return sum(state.lost is not None for state in _judged_states(scenario))
+
+
+def _headline(scenarios: Sequence[ScenarioAnalysis]) -> str:
+    """The verdict on the sensors, of scenarios of which the worst comes first."""
+    if not scenarios:  # a process that only helps
+        return ""
+    worst, several = scenarios[0], len(scenarios) > 1
+    if not _judged_states(worst):
+        return _stack_headline(worst)
+    if lost := _lost(worst):  # planned sensors never lose it
+        where = f"{lost} of {format_count(len(worst.states), 'contact state')}"
+        if several:
+            bad = f"{sum(_lost(one) > 0 for one in scenarios)} of {len(scenarios)} scenarios"
+            where = f"{bad}, first of all in {where} of {worst.name}"
+        return f"The sensors of the file do not suffice: the base is lost in {where}"
+    count, states = len(worst.plan.chosen), sum(len(one.states) for one in scenarios)
+    if worst.proposed is not None:
+        sensors = "The sensors of the file suffice"
+    elif several:
+        sensors = "The smallest sets suffice"
+    else:
+        sensors = f"{format_count(count, 'sensor')} suffice{'s' * (count == 1)}" if count else "No sensor is needed"
+    return (
+        f"{sensors}: the base is observable in {f'all {states} contact states' if states > 1 else 'the contact state'}"
+    )
+
+
+def _stack_headline(scenario: ScenarioAnalysis) -> str:
+    """What sensors determine that are judged by all samples together."""
+    plan, base = scenario.plan, scenario.base
+    if scenario.proposed is not None:  # of a bolted robot
+        found = f"{base.rank} combinations of {int(base.free.sum())} parameters"
+        return f"The sensors of the file determine at best {found}, all samples together"
+    sensors = f"{len(plan.chosen)} of {len(plan.problem.candidates)} sensors"
+    share = f"{plan.stack_rank} of the {plan.stack_full} inertial combinations that all would"
+    return f"{sensors} determine {share}, all samples together"
+
+
+def _determined_text(scenario: ScenarioAnalysis) -> str:
+    """How many parameters are known alone, in sums and not at all."""
+    base, names = scenario.base, scenario.plan.problem.robot.body_names
+    alone = int((np.count_nonzero(base.combination, axis=1) == 1).sum())
+    seen, free = int(base.combination.any(axis=0).sum()), int(base.free.sum())
+    sums = f"{seen - alone} only in {format_count(base.rank - alone, 'sum')}"
+    bodies = [line.partition(":")[0] for line in unobservable_parameters(base, names)]
+    unseen = f"{free - seen} not at all{f' (of {join_texts(bodies)})' if bodies else ''}"
+    return f"at best {alone} of {free} parameters alone, {sums}, {unseen}; base_parameters.txt"
+
+
+def _smallest_text(scenario: ScenarioAnalysis) -> str:
+    plan = scenario.plan
+    proof = "no cheaper set exists" if plan.proven else "not proven to be the cheapest"
+    own = bool(scenario.proposed) and scenario.proposed is plan.observability
+    names = "that of the file" if own else join_names(plan.chosen)
+    return f"{format_count(len(plan.chosen), 'sensor')}, cost {plan.cost:g}, {proof}: {names}"
+
+
+def _scenario_lines(scenarios: Sequence[ScenarioAnalysis], width: int) -> list[str]:
+    shown = scenarios[:_MOST_SCENARIOS]
+    states = [_judged_states(one) for one in shown]
+    columns = [
+        (
+            "base lost in",
+            [f"{_lost(one)} of {len(of)} states" if of else "" for one, of in zip(shown, states, strict=True)],
+        ),
+        ("combinations", [f"{one.base.rank} of {int(one.base.free.sum())}" for one in shown]),
+        ("smallest set", [format_count(len(one.plan.chosen), "sensor") for one in shown]),
+        ("cost", [f"{one.plan.cost:g}" for one in shown]),
+        ("proven", ["yes" if one.plan.proven else "no" for one in shown]),
+    ]
+    lines = column_lines(("scenario", [one.name for one in shown]), columns, width)
+    if len(scenarios) > len(shown):
+        lines.append(f"and {len(scenarios) - len(shown)} scenarios more: analysis.json, --verbose")
+    return lines
+
+
+def _attention(analysis: Analysis, scenarios: Sequence[ScenarioAnalysis]) -> Iterator[str]:
+    """What the user should look at, the most urgent first."""
+
+    def named(one: ScenarioAnalysis, messages: Sequence[str]) -> Iterator[str]:
+        return (f"{one.name}: {message}" if len(scenarios) > 1 else message for message in messages)
+
+    for one in scenarios:
+        yield from named(one, describe_losses(_judged_states(one)))
+    if analysis.scene.config.analysis.scenarios is None:
+        for one in scenarios:
+            found = analysis.accuracies.get("proposed" if one.proposed is not None else f"planned for {one.name}")
+            if found is not None and found.rank < one.base.rank:
+                what = f"the logs determine {found.rank} of {one.base.rank} combinations"
+                yield f"{what}: record motion that differs more, of all joints and of the base"
+    yield from confounded_messages(analysis.accuracies)
+    for one in scenarios:
+        yield from named(one, describe_singular_postures(_judged_states(one), beyond_logs=False))
+
+
+def _accuracy_lines(sets: Mapping[str, SetAccuracy], room: int, width: int) -> list[str]:
+    """A table of the errors of sensor sets, measured if that was done (of all or none), in so many lines."""
+    if not sets:
+        return []
+    most = room - 2 if len(sets) <= room - 2 else room - 3  # an empty line, a heading, how many others there are
+    if most < 1:
+        return labelled("compared", f"{format_count(len(sets), 'sensor set')}: analysis.json, --verbose", width)
+    shown = dict(list(sets.items())[:most])
+    measured = [found.measured.rms for found in shown.values() if found.measured is not None]
+    errors = measured or [found.expected.total for found in shown.values()]
+    columns = [
+        (label, ["" if (rms := of.get(group)) is None else f"{rms:.3g}" for of in errors])
+        for group, label in ROW_GROUPS.items()
+    ]
+    columns += [("rank", [str(found.rank) for found in shown.values()])]
+    lines = column_lines((f"rms error, {'measured' if measured else 'expected'}", list(shown)), columns, width)
+    if len(sets) > len(shown):
+        lines.append(f"and {len(sets) - len(shown)} sensor sets more: analysis.json, --verbose")
+    return ["", *lines]
+
+
+# --------------------------------------------------------------------------------------------------------- all tables
+
+
+def _print_scenario(scenario: ScenarioAnalysis) -> None:
+    plan, base = scenario.plan, scenario.base
+    print(f"Scenario {scenario.name}")
+    print_tables(branch_table(plan), *([sets_table(plan.parts)] if plan.parts else []))
+    proof = "no cheaper set exists" if plan.proven else "whether a cheaper set exists is not proven"
+    print_labelled("chosen", join_names(plan.chosen))
+    print_labelled("cost", f"{plan.cost:g}; {proof}")
+    named = {"Chosen sensors": plan.observability}
+    if scenario.proposed is not None and scenario.proposed is not plan.observability:
+        named["Proposed sensors"] = scenario.proposed
+    for title, states in named.items():
+        if states:
+            print_tables(observability_table(title, states))
+        if title != "Chosen sensors" or plan.parts:
+            for message in (*describe_losses(states), *describe_singular_postures(states)):
+                print_labelled("attention", message)
+    if plan.removals:
+        print_tables(removal_table(plan))
+    structure = f"{base.rank} combinations of {int(base.free.sum())} parameters"
+    print_labelled("structure", f"{structure}; base_parameters.txt names them")
+    print_labelled("determined", _determined_text(scenario))
+    print()
