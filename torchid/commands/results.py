@@ -43,10 +43,10 @@ from torchid.report.figures import (
     error_figure,
     extra_figure,
     identifiability_figure,
-    parameter_figure,
     save_figure,
 )
 from torchid.report.forces import ForceSeries, force_figure
+from torchid.report.parameter_figure import parameter_figure
 from torchid.report.ridge import ridge_figure
 from torchid.report.traces import LogForces
 from torchid.robot import Robot
@@ -209,9 +209,7 @@ def write_run(run: Identification, output: Path, overwrite: bool = False, traini
     figures = {
         **({} if run.forces is None else {"forces": draw_forces(run.forces, robot)}),
         "errors": error_figure(run.metrics),
-        "parameters": parameter_figure(
-            robot.body_names, robot.nominal, run.phi, run.estimate.standard_error.reshape(-1, PER_BODY)
-        ),
+        "parameters": parameter_figure(robot.body_names, robot.nominal, run.estimate),
         "identifiability": identifiability_figure(robot.body_names, run.estimate),
         "contributions": contribution_figure(_bits(run.contributions)),
     }

@@ -19,6 +19,7 @@ from torchid.identifiability.base_parameters import BaseParameters, format_base_
 from torchid.identifiability.information import ExpectedErrors
 from torchid.problem import Metrics
 from torchid.problem.metrics import ROW_GROUPS, group_name
+from torchid.report import palette
 from torchid.report.figures import STYLE
 from torchid.rounding import BASE_RANK_TOLERANCE
 from torchid.sensor_planning.demands import Candidate
@@ -32,7 +33,7 @@ _MAX_SETS, _MAX_REMEDIES, _BASE_DIRECTIONS = 5, 8, 6
 #: Smallest singular value of S_b V_x: below, the noise of the base's rows is a thousand times that of the sensors.
 _MIN_SINGULAR_VALUE = 1e-3
 #: Markers and colors of expected and measured errors.
-_MODEL, _EXPECTED, _MEASURED = ("o", "tab:blue"), ("s", "0.6"), ("D", "black")
+_MODEL, _EXPECTED, _MEASURED = ("o", palette.IDENTIFIED), ("s", palette.NOISE), ("D", palette.MEASURED)
 
 
 def sensor_plan_document(plan: SensorPlan) -> dict[str, Any]:

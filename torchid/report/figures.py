@@ -18,16 +18,16 @@ from matplotlib.lines import Line2D
 from matplotlib.text import Text
 from matplotlib.ticker import LogFormatter
 
-from torchid import parameters
 from torchid.errors import during, escape
 from torchid.estimators import Estimate
 from torchid.estimators.least_squares import FIXED
 from torchid.fitting.calibration import Comparison
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.logs.time_range import log_title
-from torchid.parameters import PARAMETERS, PER_BODY, WRENCH_COMPONENTS, Array
+from torchid.parameters import PARAMETERS, PER_BODY, WRENCH_COMPONENTS
 from torchid.problem import Metrics
 from torchid.problem.metrics import ERROR_GROUPS, group_name
+from torchid.report import palette
 from torchid.report.tables import MARKS, marks_legend
 from torchid.robot import Robot
 from torchid.robot.tree import BodyJoint
@@ -43,13 +43,11 @@ STYLE: dict[Any, Any] = {
     "axes.spines.right": False,
     "legend.frameon": False,
 }
-#: Colors of forces and parameters: measured, by the URDF, and identified.
-MEASURED, NOMINAL, IDENTIFIED = "black", "tab:orange", "tab:blue"
 #: Extra parameters: rows of a panel (`parameters.json` has all), longest error bar over the largest value, and vertical
 #: offsets for logs in one row.
 _MAX_PANEL_ROWS, _MAX_ERROR_RATIO, _LANES = 40, 4, 5
 #: Colors of sensors and links in the tree, and its column width, row height and legend width [inches].
-_TORQUE, _WRENCH, _LIMB, _PLAIN, _LOADED = "tab:blue", "tab:green", "tab:purple", "0.75", "0.3"
+_TORQUE, _WRENCH, _LIMB, _PLAIN, _LOADED = palette.IDENTIFIED, "#009e73", "#cc79a7", "0.75", "0.3"
 _COLUMN, _ROW, _LEGEND = 2.1, 0.3, 7.4
 
 Position = tuple[float, int]
@@ -82,7 +80,7 @@ def error_figure(sets: Mapping[str, Comparison[Metrics]]) -> Figure:
     for axis, (name, (nominal, identified)) in zip(axes, sets.items(), strict=True):
         groups = [group for group in ERROR_GROUPS if nominal.relative.get(group) is not None]
         index = np.arange(len(groups))
-        pairs = ((-0.2, nominal, NOMINAL, "URDF"), (0.2, identified, IDENTIFIED, "identified"))
+        pairs = ((-0.2, nominal, palette.NOMINAL, "URDF"), (0.2, identified, palette.IDENTIFIED, "identified"))
         for shift, metrics, color, label in pairs:
             heights = [100.0 * (metrics.relative.get(group) or 0.0) for group in groups]
             bars = axis.bar(index + shift, heights, 0.38, color=color, label=label)
@@ -94,37 +92,7 @@ def error_figure(sets: Mapping[str, Comparison[Metrics]]) -> Figure:
     return figure
 
 
-# ----------------------------------------------------------------------------------------------------------- parameters
-
-
-_QUANTITIES = {
-    "mass": lambda phi: phi[:, parameters.MASS],
-    "first moment, length": lambda phi: np.linalg.norm(phi[:, parameters.FIRST_MOMENT], axis=1),
-    "inertia about origin, trace": lambda phi: np.trace(parameters.inertia_matrix(phi), axis1=1, axis2=2),
-}
-
-
-@matplotlib.rc_context(STYLE)
-def parameter_figure(body_names: Sequence[str], nominal: Array, identified: Array, standard_error: Array) -> Figure:
-    """Mass, first moment and inertia of every body with mass, and standard errors of the masses."""
-    shown = np.flatnonzero(nominal[:, parameters.INERTIAL].any(axis=1))
-    nominal, identified, standard_error = nominal[shown], identified[shown], standard_error[shown]
-    index = np.arange(len(shown))
-    figure = Figure(figsize=(9.0, 0.24 * len(shown) + 1.4), layout="constrained")
-    axes = figure.subplots(1, 3, sharey=True)
-    mass = parameters.MASS
-    error = np.nan_to_num(standard_error[:, mass])
-    for axis, quantity, unit in zip(axes, _QUANTITIES, ("kg", "kg m", "kg m²"), strict=True):
-        before, after = (_QUANTITIES[quantity](phi) for phi in (nominal, identified))
-        axis.barh(index - 0.2, before, 0.38, color=NOMINAL, label="URDF")
-        axis.barh(index + 0.2, after, 0.38, color=IDENTIFIED, label="identified")
-        if unit == "kg":
-            axis.errorbar(after, index + 0.2, xerr=error, fmt="none", ecolor="black", elinewidth=0.8)
-        axis.set_xlabel(f"{quantity} [{unit}]")
-    axes[0].set_yticks(index, [body_names[int(body)] for body in shown], fontsize=7)
-    axes[0].set_ylim(len(shown) - 0.4, -0.6)
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
-    return figure
+# ----------------------------------------------------------------------------------------------------- identifiability
 
 
 @matplotlib.rc_context(STYLE | {"axes.grid": False})
@@ -145,7 +113,7 @@ def identifiability_figure(body_names: Sequence[str], estimate: Estimate) -> Fig
     left.set_title(marks_legend(), loc="left", fontsize=8)
     figure.colorbar(image, ax=left, label="share of the data", pad=0.01)
     values = estimate.singular_values
-    right.semilogy(np.arange(1, len(values) + 1), values, ".", color="tab:blue", markersize=4)
+    right.semilogy(np.arange(1, len(values) + 1), values, ".", color=palette.IDENTIFIED, markersize=4)
     right.yaxis.set_major_formatter(LogFormatter())  # the default writes formulas, which names forbid, see STYLE
     right.axvline(estimate.rank + 0.5, color="0.5", linewidth=0.8)
     right.set_title(f"singular values, rank {estimate.rank}", loc="left", fontsize=8)
@@ -164,7 +132,7 @@ def contribution_figure(groups: Mapping[str, Sequence[tuple[str, float]]], max_r
     axes = figure.subplots(len(shown), 1, squeeze=False, height_ratios=[count + 0.8 for count in counts])[:, 0]
     for axis, (group, pairs) in zip(axes, shown.items(), strict=True):
         names, bits = zip(*pairs, strict=True)
-        bars = axis.barh(range(len(pairs)), bits, 0.7, color=IDENTIFIED)
+        bars = axis.barh(range(len(pairs)), bits, 0.7, color=palette.IDENTIFIED)
         axis.bar_label(bars, fmt="%.3g", fontsize=8, padding=2)
         axis.set_yticks(range(len(pairs)), [fill(name, 60) for name in names], fontsize=7)
         axis.set_ylim(len(pairs) - 0.4, -0.6)
@@ -191,7 +159,7 @@ def extra_figure(extras: Sequence[ExtraEstimate]) -> Figure:
     figure = Figure(figsize=(9.0, max(height, 2.4)), layout="constrained")
     heights = [len(rows[unit]) + 1 for unit in units]
     axes = figure.subplots(len(units), 1, squeeze=False, gridspec_kw={"height_ratios": heights})
-    colors = {log: f"C{number}" for number, log in enumerate(logs)}
+    colors = {log: palette.CATEGORIES[::-1][number % len(palette.CATEGORIES)] for number, log in enumerate(logs)}
     for axis, unit in zip(axes[:, 0], units, strict=True):
         in_panel = [x for x in extras if x.extra.unit == unit and x.extra.label in rows[unit]]
         _draw_panel(axis, in_panel, rows[unit], colors)

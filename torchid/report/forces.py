@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 
 from torchid.parameters import Array
 from torchid.problem.metrics import BASE_ROWS
-from torchid.report.figures import IDENTIFIED, MEASURED, NOMINAL, STYLE
+from torchid.report.figures import STYLE
+from torchid.report.palette import IDENTIFIED, MEASURED, NOMINAL
 
 _NOISE = "0.8"
 _SHOWN = 1.6  # errors are shown up to so many times the largest of the identified ones, or of the noise

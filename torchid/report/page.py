@@ -19,7 +19,6 @@ from torchid.logs.time_range import log_title
 from torchid.parameters import PARAMETERS
 from torchid.problem.contact_state import IN_THE_AIR
 from torchid.report.page_figures import (
-    INTERVAL,
     contribution_bars,
     ellipsoid_scene,
     force_panels,
@@ -27,6 +26,7 @@ from torchid.report.page_figures import (
     spectrum_panels,
     state_color,
 )
+from torchid.report.parameter_figure import INTERVAL
 
 _TEMPLATE = "page.html"
 _DRAWN = ("m", "fc", "fv")

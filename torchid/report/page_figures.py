@@ -14,23 +14,17 @@ from torchid.errors import escape
 from torchid.estimators.least_squares import FIXED, IDENTIFIED
 from torchid.logs.time_range import log_title
 from torchid.parameters import INERTIAL, PARAMETERS
+from torchid.report import palette
 from torchid.report.ellipsoids import TRIANGLES, ellipsoid_points, equivalent_ellipsoid
+from torchid.report.parameter_figure import INTERVAL
 from torchid.report.traces import packed
 
 Figure = dict[str, Any]
 
-INTERVAL = 1.96
-"""Standard errors on either side of a 95 % interval."""
-
-STATE_COLORS = ("#56b4e9", "#f0e442", "#009e73", "#cc79a7", "#e69f00", "#8c8c8c", "#0072b2", "#d55e00")
-"""Of contact states, in the palette of Okabe and Ito, which the colour-blind tell apart; then again from the first."""
-
 _COMMONEST = "#ffffff"
-#: Of measured, the URDF's and identified forces and parameters, and of noise.
-_MEASURED, _NOMINAL, _FITTED, _NOISE = "#111111", "#d55e00", "#0072b2", "#8c8c8c"
 _GRID, _TEXT = "#e5e5e5", "#222222"
-_LINES = {"measured": ("measured", _MEASURED, 1.6), "nominal": ("URDF", _NOMINAL, 1.1)}
-_LINES |= {"identified": ("identified", _FITTED, 1.1)}
+_LINES = {"measured": ("measured", palette.MEASURED, 1.6), "nominal": ("URDF", palette.NOMINAL, 1.1)}
+_LINES |= {"identified": ("identified", palette.IDENTIFIED, 1.1)}
 #: Pixels of panels, of what is above and below all of them, between two rows and within one; of a bar, and its text.
 _FORCE, _ERROR, _SPECTRUM, _TOP, _BOTTOM, _BETWEEN, _WITHIN = 150, 90, 150, 40, 45, 40, 22
 _BAR, _LINE = 24, 15
@@ -83,8 +77,12 @@ def spectrum_panels(panels: Sequence[Mapping[str, Any]]) -> Figure | None:
                 values = spectrum[line]
                 data.append(_line(spectrum["frequency"], values, axis, label, color, width + 0.3, number == 0))
         if spectrum["noise"]:
-            floor = _line(spectrum["band"], [spectrum["noise"]] * 2, axis, "noise of the readings", _NOISE, 2, False)
-            data.append(floor | {"line": {"color": _NOISE, "width": 2, "dash": "dash"}, "showlegend": number == 0})
+            floor = _line(
+                spectrum["band"], [spectrum["noise"]] * 2, axis, "noise of the readings", palette.NOISE, 2, False
+            )
+            data.append(
+                floor | {"line": {"color": palette.NOISE, "width": 2, "dash": "dash"}, "showlegend": number == 0}
+            )
         layout[_key(axis)] |= {"type": "log", "dtick": 1, "exponentformat": "power"}
     layout["xaxis"] |= {"type": "log", "title": {"text": "frequency [Hz]"}}
     return {"data": data, "layout": layout}
@@ -104,10 +102,10 @@ def parameter_bars(bodies: Sequence[Mapping[str, Any]], parameter: str, unit: st
         bars.append(INTERVAL * error if known else None)
     nominal, identified = ([body[kind][parameter] for body in shown] for kind in ("nominal", "identified"))
     names = [_label(body["name"]) for body in shown]
-    fitted = _markers(identified, "identified", _FITTED, symbols) | {"hovertext": hover, "hoverinfo": "text"}
-    fitted["error_x"] = {"array": bars, "color": _FITTED, "thickness": 1.5, "width": 3}
+    fitted = _markers(identified, "identified", palette.IDENTIFIED, symbols) | {"hovertext": hover, "hoverinfo": "text"}
+    fitted["error_x"] = {"array": bars, "color": palette.IDENTIFIED, "thickness": 1.5, "width": 3}
     return {
-        "data": [_markers(nominal, "URDF", _NOMINAL, "diamond-open"), fitted],
+        "data": [_markers(nominal, "URDF", palette.NOMINAL, "diamond-open"), fitted],
         "layout": _list_layout(names, f"[{unit}]"),
     }
 
@@ -131,7 +129,7 @@ def contribution_bars(parts: Sequence[Mapping[str, Any]], of_logs: bool = False)
         "x": [part["bits"] for part in shown],
         "y": list(range(len(shown))),
         "width": 0.7,
-        "marker": {"color": _FITTED},
+        "marker": {"color": palette.IDENTIFIED},
         "texttemplate": "%{x:.3g}",
         "hovertext": [_text(name) for name in names],
         "hoverinfo": "text+x",
@@ -157,7 +155,7 @@ def ellipsoid_scene(
         The figure, None where nothing can be drawn, and the identified bodies with mass whose inertia is impossible.
     """
     frames = [np.array(pose, dtype=np.float64) for pose in poses]
-    kinds = {"nominal": ("URDF", _MEASURED, 0.25), "identified": ("identified", _FITTED, 0.4)}
+    kinds = {"nominal": ("URDF", palette.MEASURED, 0.25), "identified": ("identified", palette.IDENTIFIED, 0.4)}
     data, impossible, drawn = [], [], [frame[None, :3, 3] for frame in frames]
     for kind, (label, color, opacity) in kinds.items():
         points, names = [], []
@@ -283,7 +281,7 @@ def _band(axis: str, noise: float) -> Figure:
         "y0": -2.0 * noise,
         "y1": 2.0 * noise,
     }
-    return place | {"fillcolor": _NOISE, "opacity": 0.35, "line": {"width": 0}, "layer": "below"}
+    return place | {"fillcolor": palette.NOISE, "opacity": 0.35, "line": {"width": 0}, "layer": "below"}
 
 
 def _state_bands(states: Mapping[str, Any]) -> list[Figure]:
@@ -303,7 +301,9 @@ def state_color(states: Mapping[str, Any], number: int) -> str:
     spans = states["spans"]
     lasted = [sum(end - start for start, end, other in spans if other == k) for k in range(len(states["names"]))]
     longest = lasted.index(max(lasted))
-    return _COMMONEST if number == longest else STATE_COLORS[(number - (number > longest)) % len(STATE_COLORS)]
+    return (
+        _COMMONEST if number == longest else palette.CATEGORIES[(number - (number > longest)) % len(palette.CATEGORIES)]
+    )
 
 
 def _label(name: str) -> str:

@@ -8,9 +8,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
 
 from torchid.fitting.cross_validation import RidgeChoice
+from torchid.report import palette
 from torchid.report.figures import STYLE
 
-_CURVE, _CHOSEN, _LEAST = "tab:blue", "tab:red", "0.3"
+_CURVE, _CHOSEN, _LEAST = palette.IDENTIFIED, palette.NOMINAL, "0.3"
 _WIDE = 20.0  # ratio of errors from which on decades tell more than differences
 
 

@@ -1,0 +1,84 @@
+"""The figure of parameters: intervals are 95 % ones, and what cannot exist is marked."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from physical import random_bodies
+
+from torchid.estimators.least_squares import COMBINED, FIXED, IDENTIFIED
+from torchid.parameters import PARAMETERS
+from torchid.report.parameter_figure import parameter_figure
+
+COULOMB, VISCOUS = PARAMETERS.index("fc"), PARAMETERS.index("fv")
+NAMES = ["trunk", *(f"front_left_joint_number_{k}_link" for k in range(29))]
+
+
+def drawn(change: Any = lambda phi: None) -> tuple[Figure, np.ndarray, np.ndarray]:
+    """The figure, the identified parameters, their standard errors; masses in sums, the base without friction."""
+    rng = np.random.default_rng(0)
+    nominal = random_bodies(rng, len(NAMES))
+    phi = nominal.copy()
+    phi[:, [COULOMB, VISCOUS]] = rng.uniform(0.1, 0.5, (len(NAMES), 2))
+    change(phi)
+    verdict = np.full(phi.shape, COMBINED, dtype=object)
+    verdict[:, [COULOMB, VISCOUS]] = IDENTIFIED
+    verdict[0, [COULOMB, VISCOUS]] = FIXED
+    errors = rng.uniform(0.01, 0.1, phi.shape)
+    estimate: Any = SimpleNamespace(phi=phi.ravel(), standard_error=errors.ravel(), verdict=verdict.ravel())
+    return parameter_figure(NAMES, nominal, estimate), phi, errors
+
+
+def bars(figure: Figure, title: str) -> np.ndarray:
+    """Ends of the error bars of a panel, (n, 2)."""
+    (axis,) = (axis for axis in figure.axes if axis.get_xlabel().startswith(title))
+    lines = [x for x in axis.collections if isinstance(x, LineCollection)]
+    segments = np.concatenate([x.get_segments() for x in lines])
+    return np.array([segment[:, 0] for segment in segments if np.isfinite(segment).all()])
+
+
+def test_error_bars_are_95_percent_intervals_of_what_is_identified_alone() -> None:
+    figure, phi, errors = drawn()
+    assert len(bars(figure, "mass")) == 0
+    for title, k in (("Coulomb", COULOMB), ("viscous", VISCOUS)):
+        expected = phi[1:, k, None] + 1.96 * errors[1:, k, None] * [-1.0, 1.0]
+        np.testing.assert_allclose(bars(figure, title), expected, rtol=1e-12)
+
+
+def test_bodies_that_cannot_exist_and_negative_friction_have_a_cross() -> None:
+    def broken(phi: np.ndarray) -> None:
+        phi[3, 0] = -1.0
+        phi[5, 4:10] = 0.0  # mass beside the origin without inertia about it
+        phi[7, VISCOUS] = -0.1
+
+    whole, figure = drawn()[0], drawn(broken)[0]
+    labels = [text.get_text() for text in figure.axes[0].get_yticklabels()]
+    assert [k for k, label in enumerate(labels) if label.startswith("x ")] == [3, 5]
+    assert not any(text.get_text().startswith("x ") for text in whole.axes[0].get_yticklabels())
+    crosses = {
+        axis.get_xlabel().split(" ")[0]: [
+            x for line in axis.lines if line.get_marker() == "X" for x in line.get_xdata()
+        ]
+        for axis in figure.axes
+    }
+    assert crosses["mass"] == [-1.0]
+    assert crosses["viscous"] == [-0.1]
+    assert not crosses["Coulomb"]
+
+
+def test_names_of_thirty_bodies_do_not_touch() -> None:
+    figure = drawn()[0]
+    figure.set_canvas(FigureCanvasAgg(figure))
+    figure.canvas.draw()
+    boxes = [text.get_window_extent() for text in figure.axes[0].get_yticklabels()]
+    assert len(boxes) == len(NAMES)
+    for above, below in zip(boxes, boxes[1:], strict=False):
+        assert below.y1 <= above.y0
+    titles = [axis.xaxis.label.get_window_extent() for axis in figure.axes]
+    for left, right in zip(titles, titles[1:], strict=False):
+        assert left.x1 < right.x0
