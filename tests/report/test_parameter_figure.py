@@ -38,8 +38,8 @@ def bars(figure: Figure, title: str) -> np.ndarray:
     """Ends of the error bars of a panel, (n, 2)."""
     (axis,) = (axis for axis in figure.axes if axis.get_xlabel().startswith(title))
     lines = [x for x in axis.collections if isinstance(x, LineCollection)]
-    segments = np.concatenate([x.get_segments() for x in lines])
-    return np.array([segment[:, 0] for segment in segments if np.isfinite(segment).all()])
+    segments = [np.asarray(segment) for x in lines for segment in x.get_segments()]
+    return np.array([segment[:, 0] for segment in segments if segment.size and np.isfinite(segment).all()])
 
 
 def test_error_bars_are_95_percent_intervals_of_what_is_identified_alone() -> None:
