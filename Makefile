@@ -15,6 +15,9 @@ TESTS ?= tests
 demo: .venv/ready
 	.venv/bin/torchid demo overwrite=true
 
+# One worker by core, each with one thread: with as many threads as cores in each, they wait for one another.
+test test-fast coverage: export OMP_NUM_THREADS = 1
+
 test: .venv/ready-for-tests
 	.venv/bin/ruff check torchid scripts tests
 	.venv/bin/ruff format --check torchid scripts tests
