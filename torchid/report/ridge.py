@@ -20,7 +20,7 @@ def ridge_figure(choice: RidgeChoice) -> Figure:
     """Mean square of whitened residuals on held-out folds by ridge, on logarithmic axes.
 
     The band is a standard error of the difference from the least, fold by fold, on either side; ridges where it reaches
-    down to the least are shaded, and the largest of them is the chosen one. Ridges of 0 have no place on the axis.
+    down to the least are shaded: the data hardly tell them from the chosen one. Ridges of 0 have no place on the axis.
     """
     tried, mean, error = (np.array(x) for x in (choice.tried, choice.mean_square, choice.standard_error))
     least = float(mean.min())
