@@ -154,7 +154,7 @@ def nearest_consistent(
     problem = LinearProblem(nothing, np.zeros(0), 0.0, 1, phi.flatten(), scale.flatten(), free.flatten())
     reference = None if nominal is None else nominal.flatten()
     conic = build_conic_problem(problem, conditions, 1.0, prior, reference)
-    solution = _solve(conic, method)
+    solution = _solve(conic, method, 1e-12)  # parameters are as near as the root of the gap
     out = phi.copy()
     out[free] += scale[free] * (conic.deviations @ solution.x)
     return out
