@@ -10,7 +10,7 @@ SLOW := tests/logs/test_bags.py tests/logs/test_bag_messages.py tests/logs/test_
 	tests/problem/test_rows.py::test_fast_rows_are_the_plain_ones_whatever_is_measured_touches_and_however_frames_are_turned
 TESTS ?= tests
 
-.PHONY: demo test test-fast coverage clean
+.PHONY: demo test test-fast coverage site clean
 
 demo: .venv/ready
 	.venv/bin/torchid demo overwrite=true
@@ -30,6 +30,9 @@ test-fast: .venv/ready-for-tests
 
 coverage: .venv/ready-for-tests
 	.venv/bin/pytest -n auto --dist loadfile --cov=torchid $(TESTS)
+
+site: .venv/ready-for-tests
+	.venv/bin/mkdocs build
 
 clean:
 	rm -rf .venv .coverage

@@ -1,0 +1,164 @@
+"""Pages of the site that other files hold: README and the like, every key of the experiment file, every public name.
+
+A hook of MkDocs (`mkdocs.yml`): `mkdocs serve` shows the site, `mkdocs build` writes it to `site/`.
+"""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import inspect
+import re
+import typing
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
+from torchid.config import ExperimentConfig
+
+_ROOT = Path(__file__).resolve().parents[1]
+_PAGES = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
+_LINK = re.compile(r"(?<!!)\[([^\]]+)\]\(([^)\s#]+)(#[^)]*)?\)")
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the pages that are made here."""
+    made = {page: _relinked((_ROOT / name).read_text(), "") for name, page in _PAGES.items()}
+    made |= {"keys.md": keys_page(), "reference.md": reference_page()}
+    for name, text in made.items():
+        files.append(File.generated(config, name, content=text))
+    return files
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Let links to files that are no pages be text, and those to README and the like lead to their pages."""
+    return _relinked(markdown, "docs/")
+
+
+def _relinked(markdown: str, folder: str) -> str:
+    def replaced(match: re.Match[str]) -> str:
+        text, target, anchor = match.group(1), match.group(2), match.group(3) or ""
+        if re.match(r"[a-z]+:", target):
+            return match.group(0)
+        path = (_ROOT / folder / target).resolve()
+        if not path.is_relative_to(_ROOT):
+            return match.group(0)
+        name = path.relative_to(_ROOT).as_posix()
+        if name in _PAGES:
+            return f"[{text}]({_PAGES[name]}{anchor})"
+        if name.startswith("docs/"):
+            return f"[{text}]({name.removeprefix('docs/')}{anchor})"
+        return match.group(0) if (_ROOT / "docs" / target).exists() or "/" not in name else text
+
+    return re.sub(r"(!\[[^\]]*\]\()docs/", r"\1", _LINK.sub(replaced, markdown))
+
+
+# ------------------------------------------------------------------------------------------------------------ keys
+
+
+def keys_page() -> str:
+    """Every key of the experiment file, with what it accepts, its default and what it means."""
+    parts = [
+        "# Every key of the experiment file",
+        "Defaults are those of a file without the key; required keys have none.",
+    ]
+    first: dict[Any, str] = {}  # block of keys: where it is described
+    for prefix, block in _blocks(ExperimentConfig, ""):
+        first.setdefault(block, prefix.removesuffix("."))
+    for block, key in first.items():
+        parts += [
+            f"## {key or 'The file'} {{ #{_anchor(key)} }}",
+            inspect.cleandoc(_described(block)),
+            _table(block, first),
+        ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _blocks(block: Any, prefix: str, above: tuple[Any, ...] = ()) -> Iterator[tuple[str, Any]]:
+    """Blocks of keys by the key that holds them, each before those inside."""
+    yield prefix, block
+    hints = typing.get_type_hints(block)
+    for field in dataclasses.fields(block):
+        for inner in _inside(hints[field.name]):
+            if inner not in above:
+                yield from _blocks(inner, f"{prefix}{field.name}.", (*above, block))
+
+
+def _inside(hint: Any) -> list[Any]:
+    """Blocks of keys in a type."""
+    if dataclasses.is_dataclass(hint):
+        return [hint]
+    return [block for part in typing.get_args(hint) for block in _inside(part)]
+
+
+def _anchor(key: str) -> str:
+    return key.replace(".", "-") or "file"
+
+
+def _described(block: Any) -> str:
+    """The docstring of a block, its attributes as a list."""
+    text = inspect.getdoc(block) or ""
+    return re.sub(r"^    (\w+): ", r"- `\1`: ", text.replace("Attributes:\n", "\n"), flags=re.MULTILINE)
+
+
+def _table(block: Any, first: Mapping[Any, str]) -> str:
+    """Its keys."""
+    hints = typing.get_type_hints(block)
+    lines = ["| key | accepts | default |", "|---|---|---|"]
+    for field in dataclasses.fields(block):
+        lines.append(f"| `{field.name}` | {_accepted(hints[field.name], first)} | {_default(field)} |")
+    return "\n".join(lines)
+
+
+_PLAIN = {bool: "`true`, `false`", int: "integer", float: "number", str: "text", Path: "path", type(None): "`null`"}
+
+
+def _accepted(hint: Any, first: Mapping[Any, str]) -> str:
+    """A type in words."""
+    if hint in first:
+        return f"[block of keys](#{_anchor(first[hint])})"
+    origin, parts = typing.get_origin(hint), typing.get_args(hint)
+    if origin is typing.Literal:
+        return ", ".join(f"`{part}`" for part in parts)
+    names = [_accepted(part, first) for part in parts if part is not ...]
+    if origin is list:
+        return f"list: {names[0]}"
+    if origin is tuple:
+        return f"list of {len(names)}: {names[0]}"
+    if origin is dict:
+        return f"mapping: {names[1]}"
+    return " or ".join(dict.fromkeys(names)) if names else _PLAIN.get(hint, "anything")
+
+
+def _default(field: dataclasses.Field[Any]) -> str:
+    if field.default is not dataclasses.MISSING:
+        return f"`{_yaml(field.default)}`"
+    if field.default_factory is dataclasses.MISSING:
+        return "required"
+    made = field.default_factory()
+    return "" if dataclasses.is_dataclass(made) else f"`{made}`"
+
+
+def _yaml(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:g}"
+    return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+
+
+# ------------------------------------------------------------------------------------------------------- public names
+
+
+def reference_page() -> str:
+    """The public names of `torchid`, by the module that they are from."""
+    parts = [
+        "# Reference",
+        "The names that `import torchid` has. Arrays have the shapes and units that their descriptions give.",
+    ]
+    for node in ast.parse((_ROOT / "torchid" / "__init__.pyi").read_text()).body:
+        if isinstance(node, ast.ImportFrom) and node.module:
+            parts.append(f"## torchid.{node.module}")
+            parts += [f"::: torchid.{node.module}.{name.name}" for name in node.names]
+    return "\n\n".join(parts) + "\n"

@@ -1,0 +1,57 @@
+"""The site builds without a warning, with every key of the experiment file and every public name."""
+
+from __future__ import annotations
+
+import html
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import torchid
+
+ROOT = Path(torchid.__file__).resolve().parents[1]
+KEYS = ("estimator.ridge", "preprocessing.cutoff_hz", "logs.columns.joint_torque.pd", "sensors.noise.joint_torque")
+
+pytest.importorskip("material", reason="MkDocs is not installed")
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(folder)]
+    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1", "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "WARNING" not in done.stderr
+    return folder
+
+
+def text_of(page: Path) -> str:
+    return html.unescape(re.sub(r"<[^>]+>", " ", page.read_text()))
+
+
+def test_every_page_of_the_documentation_is_there(site: Path) -> None:
+    pages = {path.stem for path in (ROOT / "docs").glob("*.md")}
+    assert {path.parent.name for path in site.glob("*/index.html")} >= pages | {"keys", "reference", "contributing"}
+    assert "Two commands" in text_of(site / "index.html")
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_keys_have_what_they_accept_and_their_defaults(site: Path, key: str) -> None:
+    block, _, name = key.rpartition(".")
+    page = (site / "keys" / "index.html").read_text()
+    section = page[page.index(f'id="{block.replace(".", "-")}"') :]
+    row = re.search(rf"<tr>\s*<td><code>{name}</code></td>\s*<td>(.+?)</td>\s*<td>(.*?)</td>", section)
+    assert row is not None
+    default = re.sub(r"<[^>]+>", "", row.group(2))
+    assert default == {"ridge": "auto"}.get(name, "null")
+
+
+def test_public_names_are_described(site: Path) -> None:
+    text = text_of(site / "reference" / "index.html")
+    for name in ("identify", "LeastSquares", "Robot", "read_log", "RowBuilder"):
+        assert name in text
