@@ -29,7 +29,7 @@ def solve_barrier(problem: ConicProblem, tolerance: float = 1e-9) -> Solution:
 
     Newton's method on primal and dual together, with Mehrotra's predictor and corrector, in the null space of the
     equalities; blocks and multipliers are linearized as by Helmberg, Rendl, Vanderbei, Wolkowicz, "An interior-point
-    method for semidefinite programming", 1996. It needs a third of the steps of a path that is followed by the primal
+    method for semidefinite programming", 1996. It needs half of the steps of a path that is followed by the primal
     alone. Newton or Gauss-Newton steps in log-Cholesky coordinates need many more: their curvature excites the stiff
     directions of the data.
 
