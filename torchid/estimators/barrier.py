@@ -17,6 +17,7 @@ from torchid.problem.chunks import one_thread
 
 _STEPS = 200
 _LOOSE = 1e-6  # relative gap above which there is a warning
+_PATIENCE = 2  # steps in a row without a smaller gap: rounding makes small gaps uneven
 _SHARE = 0.98  # of the longest step that stays inside
 _SHORT = 0.2  # length of a corrected step below which a plain one is taken
 _SHORTEST = 1e-6  # least share of a step: below, rounding decides about feasibility
@@ -46,7 +47,7 @@ def solve_barrier(problem: ConicProblem, tolerance: float = 1e-9) -> Solution:
     x, steps = find_strictly_feasible(problem)
     path = _PrimalDual(problem)
     point = path.start(x)
-    best = Solution(x, problem.objective(x), np.inf, steps)
+    best, worse = Solution(x, problem.objective(x), np.inf, steps), 0
     for count in range(1, _STEPS + 1):
         after = path.step(point)
         if after is not None:
@@ -57,9 +58,11 @@ def solve_barrier(problem: ConicProblem, tolerance: float = 1e-9) -> Solution:
         if not last and path.complementarity(point) > _CENTRED * max(tolerance, _ACCURATE) * scale:
             continue  # the gap takes as long as a step
         gap = problem.gap(x, *path.multipliers(point))
-        if gap >= best.gap:
+        worse = worse + 1 if gap >= best.gap else 0
+        if worse > _PATIENCE:
             break  # rounding errors exceed the progress
-        best = Solution(x, objective, gap, steps)
+        if gap < best.gap:
+            best = Solution(x, objective, gap, steps)
         if last or gap <= tolerance * scale:
             break
     if not best.gap <= max(_LOOSE, tolerance) * max(best.objective, problem.floor):
@@ -142,8 +145,9 @@ class _PrimalDual:
         shrunk = (1.0 - min(1.0, self._longest(point, Z_root, affine))) ** 3 * kappa
         move = solve(shrunk, _symmetric(affine.blocks @ affine.Z), affine.slack * affine.y)
         length = min(1.0, _SHARE * self._longest(point, Z_root, move))
-        if length < _SHORT:  # far from the path, where the corrections mislead: back to it
-            move = solve(kappa, none, none)
+        if length < _SHORT:  # far from the path, where the corrections mislead: back to a point of it that is as far
+            promised = -float(self.problem.gradient(point.x.numpy()) @ affine.x.numpy())
+            move = solve(max(kappa, promised / max(self.problem.degree, 1)), none, none)
             length = min(1.0, _SHARE * self._longest(point, Z_root, move))
         while (factors := self._factors(point.x + length * move.x)) is None and length > _SHORTEST:
             length *= 0.5  # infeasible by rounding alone

@@ -199,8 +199,7 @@ class LeastSquares(Regularized):
         null_share = np.linalg.norm(np.eye(A.shape[1]) - pinv @ A, axis=1)  # of each parameter in the null space
         gain = pinv
         if self.ridge > 0.0:
-            stacked = np.vstack([A, np.sqrt(self.ridge * problem.rows) * np.eye(A.shape[1])])
-            gain = pinv @ (A @ _pseudo_inverse(stacked, 0.0)[0][:, : len(b)])  # no rounding in A's null space
+            gain = pinv @ (A @ _ridge_inverse(A, self.ridge * problem.rows))  # no rounding in A's null space
         phi = problem.nominal.copy()
         phi[free] += scale * (gain @ b)
         cost = problem.cost(phi)
@@ -233,3 +232,11 @@ def _pseudo_inverse(A: Array, tolerance: float) -> tuple[Array, Array, int]:
     rcond = relative_tolerance(tolerance, A.shape)
     solved = torch.linalg.lstsq(torch.from_numpy(np.ascontiguousarray(A)), identity, rcond=rcond, driver="gelss")
     return solved.solution.numpy(), solved.singular_values.numpy(), int(solved.rank)
+
+
+def _ridge_inverse(A: Array, weight: float) -> Array:
+    """The matrix, (P, R), that takes b to the minimizer of ||A x - b||^2 + weight ||x||^2."""
+    count, columns = A.shape
+    stacked = np.vstack([A, np.sqrt(weight) * np.eye(columns)])
+    target = torch.eye(len(stacked), count, dtype=torch.float64)
+    return torch.linalg.lstsq(torch.from_numpy(stacked), target, driver="gels").solution.numpy()

@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 from torch import Tensor
 
 from torchid.errors import InputError
-from torchid.estimators.conic_problem import ConicProblem
+from torchid.estimators.conic_problem import EQUAL_WITHIN, ConicProblem
 from torchid.estimators.damped import damped_inverse
 from torchid.parameters import Array
 from torchid.problem.chunks import one_thread
@@ -21,6 +21,7 @@ _STEPS, _STAGES = 200, 40
 _GOOD_SLACK = 1e-6  # of a starting point, at which phase I stops
 _LEAST_SLACK = 1e-9  # of a starting point that is accepted if phase I finds no better one
 _MOST_SLACK = 0.01  # bound of the slack in phase I
+_ROOM, _MOVES = 0.1, 3  # at rows of a starting point, and moves to get there
 _SHORTEST = 1e-6  # least share of a step: below, rounding decides about feasibility
 
 
@@ -39,6 +40,9 @@ def find_strictly_feasible(problem: ConicProblem, patience: int = _STEPS * _STAG
     worst = float(problem.slack(x).min(initial=np.inf))
     if worst > _GOOD_SLACK:
         return x, 0
+    inside = _with_room(problem, x)
+    if problem.slack(inside).min() > _GOOD_SLACK:
+        return inside, 0
     z, kappa, steps = np.append(x, 1.0 - worst), 1.0, 0
     while kappa * (problem.degree + 1) > 0.1 * _LEAST_SLACK and steps < patience:
         z, taken = _CentralPath(_phase_one(problem, kappa)).centre(z, kappa, patience - steps)
@@ -52,6 +56,21 @@ def find_strictly_feasible(problem: ConicProblem, patience: int = _STEPS * _STAG
     which = int(slack.argmin())
     name = problem.names[which // 4 if which < 4 * len(problem.F0) else which - 3 * len(problem.F0)]
     raise InputError("estimator", name, "excluded by the other conditions", "conditions that some robot can meet")
+
+
+def _with_room(problem: ConicProblem, x: Array) -> Array:
+    """Near x, a point that is well inside the linear conditions: nominal friction of 0 stands on the border of its own.
+
+    Each move, of least length, makes room at the rows that lack it, and may take some from others.
+    """
+    for _ in range(_MOVES):
+        slack = problem.G @ x - problem.h
+        tight = slack < _ROOM
+        if not tight.any():
+            break
+        rows = problem.G[tight] @ problem.null_space
+        x = x + problem.null_space @ np.linalg.lstsq(rows, _ROOM - slack[tight], rcond=EQUAL_WITHIN)[0]
+    return x
 
 
 def _phase_one(problem: ConicProblem, kappa: float) -> ConicProblem:
