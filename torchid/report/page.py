@@ -79,7 +79,7 @@ def require_page() -> None:
         InputError: they are not installed.
     """
     if not page_available():
-        raise InputError("torchid", "report", "plotly or jinja2 is not installed", how_to_install("report"))
+        raise InputError("", "report", "plotly or jinja2 is not installed", how_to_install("report"))
 
 
 def page_text(run: RunFiles) -> str:
@@ -151,7 +151,7 @@ def _library() -> str:
     """Plotly's library, compressed, in base64."""
     spec = find_spec("plotly")
     if spec is None or spec.origin is None:
-        raise InputError("torchid", "report", "plotly is not installed", how_to_install("report"))
+        raise InputError("", "report", "plotly is not installed", how_to_install("report"))
     code = (Path(spec.origin).parent / "package_data" / "plotly.min.js").read_bytes()
     return base64.b64encode(gzip.compress(code, mtime=0)).decode()
 

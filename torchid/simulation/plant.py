@@ -19,7 +19,7 @@ try:
     import mujoco
 except ImportError as error:
     found = "needs MuJoCo, which " + ("is not installed" if error.name == "mujoco" else f"does not load: {error}")
-    raise InputError("torchid", "simulate", found, how_to_install("sim")) from error
+    raise InputError("", "simulate", found, how_to_install("sim")) from error
 
 _RADIUS = 1e-4  # m, of contact points that the file gives: where they touch the floor is where they are
 _NARROWEST = 1e-3  # m, of a support polygon
