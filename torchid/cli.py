@@ -19,6 +19,7 @@ from torchid.staging import interrupts_deferred
 _IDENTIFY = "fit the parameters of an experiment file and write a run folder"
 _COMPRESS = "compress the training logs of an experiment file to small files of factors, which identify fits too"
 _EVALUATE = "predict the forces of further logs with the parameters of a run"
+_REPLAY = "drive the robot in MuJoCo with the torques of a log, and say how far it drifts (needs the extra [sim])"
 _REPORT = "make report.html of a run anew, with what the checks of its logs find (needs the extra [report])"
 _ANALYZE = "analyze what sensors and motion determine, and plan the smallest sensor set"
 _INIT = "write an experiment file for a robot and a log, with a map of its columns or topics, and say what was guessed"
@@ -92,6 +93,14 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--device", help="device, by default that of the run: cpu, cuda, cuda:0, ...")
     _add_amount(evaluate)
     evaluate.set_defaults(command=_evaluate)
+    replay = commands.add_parser("replay", help=_REPLAY, description=_REPLAY)
+    replay.add_argument("run", help="run folder")
+    replay.add_argument("--log", required=True, metavar="FILE", help="log whose joint torques drive the robot")
+    replay.add_argument("--window", type=float, default=0.5, metavar="S", help="seconds from each state (default: 0.5)")
+    replay.add_argument("--output", metavar="FOLDER", help="folder to write: a figure and all numbers")
+    replay.add_argument("--overwrite", action="store_true", help="replace an earlier replay in this folder")
+    _add_amount(replay)
+    replay.set_defaults(command=_replay)
     report = commands.add_parser("report", help=_REPORT, description=_REPORT)
     report.add_argument("run", help="run folder")
     report.set_defaults(command=_report)
@@ -240,6 +249,16 @@ def _evaluate(options: argparse.Namespace) -> None:
     evaluated = evaluate(options.run, options.log, options.device)
     if not options.quiet:
         (print_all_errors if options.verbose else print_evaluation)(evaluated)
+
+
+def _replay(options: argparse.Namespace) -> None:
+    with _importing():
+        from torchid.commands.replay import replay
+        from torchid.terminal.replay import print_replay
+
+    replayed = replay(options.run, options.log, options.window, options.output, options.overwrite)
+    if not options.quiet:
+        print_replay(replayed, options.verbose)
 
 
 def _report(options: argparse.Namespace) -> None:

@@ -32,6 +32,8 @@ from torchid.report.tables import progress_bars
 from torchid.reprs import short_repr
 from torchid.robot import Robot
 
+_SETTINGS = "config.yaml"
+
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluatedRun:
@@ -78,7 +80,7 @@ class EvaluatedRun:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Fitted:
+class FittedRun:
     """What a run has found, from its folder or from memory.
 
     `states_noise`: whether its settings stated the noise of any sensor; they have the estimated one as well.
@@ -106,22 +108,45 @@ def evaluate(
         InputError: the folder is no run, or a log does not fit its robot.
     """
     folder = Path(run)
-    settings, found = folder / "config.yaml", folder / "parameters.json"
-    if not settings.is_file():
-        raise ConfigError(folder, "RUN", "no config.yaml in it", "a folder that torchid identify wrote")
+    require_run(folder)
     output = _output(folder, logs) if write else None
-    config = load_config(settings, [f"device={device}"] if device else [])
     with progress_bars() as bars:
-        with about_file(settings):
-            experiment = set_up(config)
-        shared = Comparison(read_shared_extras(found, "nominal_value"), read_shared_extras(found, "value"))
-        calibrations = _calibrations(experiment, read_parameters(found, experiment.robot), shared)
-        states = _states_noise(folder / "metrics.json")
-        fitted = _Fitted(experiment=experiment, calibrations=calibrations, states_noise=states)
+        fitted = read_run(folder, device)
         evaluated = replace(_evaluate(fitted, logs, folder, bars), output=output)
         if output is not None:
-            ranks.from_first(partial(_write, evaluated, output, settings), "evaluation folder")
+            ranks.from_first(partial(_write, evaluated, output, folder / _SETTINGS), "evaluation folder")
     return evaluated
+
+
+def require_run(folder: Path) -> None:
+    """Make sure that a folder is that of a run.
+
+    Raises:
+        ConfigError: it has no settings.
+    """
+    if not (folder / _SETTINGS).is_file():
+        raise ConfigError(folder, "RUN", f"no {_SETTINGS} in it", "a folder that torchid identify wrote")
+
+
+def read_run(folder: Path, device: str | None = None) -> FittedRun:
+    """What a run has found, from its folder.
+
+    Args:
+        folder: that `identify` wrote.
+        device: where to compute; None: where the run did.
+
+    Raises:
+        InputError: it is no run, or does not fit its robot any more.
+    """
+    require_run(folder)
+    settings, found = folder / _SETTINGS, folder / "parameters.json"
+    config = load_config(settings, [f"device={device}"] if device else [])
+    with about_file(settings):
+        experiment = set_up(config)
+    shared = Comparison(read_shared_extras(found, "nominal_value"), read_shared_extras(found, "value"))
+    calibrations = _calibrations(experiment, read_parameters(found, experiment.robot), shared)
+    states = _states_noise(folder / "metrics.json")
+    return FittedRun(experiment=experiment, calibrations=calibrations, states_noise=states)
 
 
 def evaluate_identification(run: Identification, logs: Sequence[str | Path], device: str | None = None) -> EvaluatedRun:
@@ -132,7 +157,7 @@ def evaluate_identification(run: Identification, logs: Sequence[str | Path], dev
         experiment = replace(experiment, config=replace(experiment.config, device=device))
     shared = [(one.extra.label, one) for one in run.extras if not one.log]
     values = Comparison({x: one.nominal_value for x, one in shared}, {x: one.value for x, one in shared})
-    fitted = _Fitted(
+    fitted = FittedRun(
         experiment=experiment,
         calibrations=_calibrations(experiment, run.phi, values),
         states_noise=any(group.origin == "stated" for group in run.noise.groups),
@@ -141,7 +166,7 @@ def evaluate_identification(run: Identification, logs: Sequence[str | Path], dev
         return _evaluate(fitted, logs, None, bars)
 
 
-def _evaluate(fitted: _Fitted, logs: Sequence[str | Path], folder: Path | None, bars: Progress) -> EvaluatedRun:
+def _evaluate(fitted: FittedRun, logs: Sequence[str | Path], folder: Path | None, bars: Progress) -> EvaluatedRun:
     """Errors of what a run has found; `folder`: on whose disk large logs are kept."""
     experiment, compared = fitted.experiment, fitted.calibrations
     _log_names(logs)

@@ -20,6 +20,7 @@ TRAINING = FolderKind("a training", result=False)
 SIMULATION = FolderKind("a simulation")
 ANALYSIS = FolderKind("an analysis")
 STUDY = FolderKind("a study")
+REPLAY = FolderKind("a replay")
 COMPRESSED = FolderKind("compressed logs")
 EXAMPLES = FolderKind("examples")
 

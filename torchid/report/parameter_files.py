@@ -17,7 +17,7 @@ from torchid.guards import MAX_JSON, read_bytes
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.parameters import PARAMETERS, PER_BODY, UNITS, Array
 from torchid.robot import Robot
-from torchid.robot.urdf import parse_xml
+from torchid.robot.urdf import drop_repeated_origins, parse_xml
 
 _MAX_NUMBER = 1e100  # products and squares stay within the range of float64
 _ROUNDING = 1e-12  # of a body's mass: below it the link that gives it its name has none
@@ -166,6 +166,7 @@ def identified_urdf(robot: Robot, phi: Array) -> bytes:
         TorchidWarning: inconsistent bodies, or negative friction, which simulators (and `load_robot`) refuse.
     """
     tree = parse_xml(robot.path)
+    drop_repeated_origins(tree.getroot())
     links = {link.get("name"): link for link in tree.getroot().findall("link")}
     joints = {joint.get("name"): joint for joint in tree.getroot().findall("joint")}
     phi = _without_links_beyond_welds(robot, phi)

@@ -63,6 +63,13 @@ def parse_xml(path: Path) -> etree._ElementTree:
     return tree
 
 
+def drop_repeated_origins(root: etree._Element) -> None:
+    """Keep the first `<origin>` of every element, the one that counts; simulators refuse several."""
+    for element in root.iter(etree.Element):
+        for again in element.findall("origin")[1:]:
+            element.remove(again)
+
+
 def read_urdf(path: Path) -> tuple[list[Link], list[Joint]]:
     """Links and joints of a URDF, each element checked on its own; `build_tree` checks the tree.
 

@@ -12,7 +12,7 @@ from lxml import etree
 from torchid.config import FootConfig
 from torchid.errors import ConfigError, InputError, UnknownNameError, UrdfError, how_to_install
 from torchid.parameters import Array
-from torchid.robot.urdf import parse_xml
+from torchid.robot.urdf import drop_repeated_origins, parse_xml
 from torchid.sensing.sensors import NORMAL_FORCE
 
 try:
@@ -62,6 +62,11 @@ class Foot:
     def constrained(self) -> int:
         """Number of its six velocities that the floor constrains: three, or all six if it stands flat."""
         return 6 if form_polygon(np.array(self.points)) else 3
+
+
+def point_foot(frame: str, radius: float = 0.0) -> Foot:
+    """A foot that is one sphere about the origin of its frame, of a radius [m], or a point."""
+    return Foot(frame, ((0.0, 0.0, 0.0),), (max(radius, _RADIUS),))
 
 
 def find_feet(settings: list[FootConfig], urdf: Path) -> tuple[Foot, ...]:
@@ -168,18 +173,7 @@ class Plant:
         Raises:
             UrdfError: MuJoCo does not take it, or it has mimic joints.
         """
-        spec = _spec(urdf)
-        spec.option.timestep = 1.0 / physics_hz
-        spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-        spec.option.impratio = _SLIP_RATIO
-        spec.option.tolerance, spec.option.iterations = 1e-15, 100
-        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], friction=_FRICTION, solref=_SPRING)
-        for foot in feet:
-            _add_foot(spec, foot)
-        try:
-            self.model = spec.compile()
-        except ValueError as error:
-            raise UrdfError(urdf, "URDF", f"MuJoCo refuses it: {error}", "a robot that MuJoCo can simulate") from error
+        self.model = compile_model(urdf, feet, physics_hz)
         mujoco.set_mju_user_warning(lambda _: None)  # see `unstable`; MuJoCo would write a log file
         self.data = mujoco.MjData(self.model)
         model = self.model
@@ -188,15 +182,13 @@ class Plant:
         self.nv, self.n = model.nv, model.nv - 6
         self.joint_names = tuple(model.joint(i).name for i in range(1, model.njnt))
         self.mass = float(model.body_subtreemass[1])
-        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT  # a stop's force would be in no sensor
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP  # it integrates another acceleration than qacc
-        model.dof_solref[:], model.dof_solimp[:, :2] = _STICTION, (0.99, 0.999)
         self.limits = np.where(model.jnt_limited[1:, None], model.jnt_range[1:], [-np.inf, np.inf])
         limited = model.jnt_actfrclimited[1:].astype(bool)
         self.efforts = np.where(limited, model.jnt_actfrcrange[1:, 1], np.inf)
         self.weight = -self.mass * model.opt.gravity  # force that holds the robot up (3,) [N]
         self.foot_frames = tuple(foot.frame for foot in feet)
-        self._sensors = [model.site(_sensor(foot)).id for foot in feet]
+        self._sensors = [model.site(foot_site(foot)).id for foot in feet]
         self._middles = [model.site(_middle(foot)).id for foot in feet]
         self._bodies = [int(model.site_bodyid[site]) for site in self._middles]
         self._M = np.zeros((self.nv, self.nv))
@@ -292,8 +284,33 @@ class Plant:
         return FootMotion(data.site_xpos[site], rotation, J @ data.qvel, J, J_dot @ data.qvel)
 
 
+def compile_model(urdf: Path, feet: Sequence[Foot], physics_hz: float, floating: bool = True) -> mujoco.MjModel:
+    """MuJoCo's model of a URDF robot without shapes, on a soft floor that its feet alone touch, without joint stops.
+
+    Raises:
+        UrdfError: MuJoCo does not take it, or it has mimic joints.
+    """
+    spec = _spec(urdf)
+    if floating:
+        spec.worldbody.first_body().add_freejoint()
+    spec.option.timestep = 1.0 / physics_hz
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = _SLIP_RATIO
+    spec.option.tolerance, spec.option.iterations = 1e-15, 100
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], friction=_FRICTION, solref=_SPRING)
+    for foot in feet:
+        _add_foot(spec, foot)
+    try:
+        model = spec.compile()
+    except ValueError as error:
+        raise UrdfError(urdf, "URDF", f"MuJoCo refuses it: {error}", "a robot that MuJoCo can simulate") from error
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT  # a stop's force would be in no sensor
+    model.dof_solref[:], model.dof_solimp[:, :2] = _STICTION, (0.99, 0.999)
+    return model
+
+
 def _spec(urdf: Path) -> mujoco.MjSpec:
-    """The URDF without shapes, free to move."""
+    """The URDF without shapes, bolted to the world."""
     root = parse_xml(urdf).getroot()
     mimic = root.find("joint/mimic/..")
     if mimic is not None:
@@ -301,6 +318,7 @@ def _spec(urdf: Path) -> mujoco.MjSpec:
     for tag in _DISCARDED:
         for element in root.findall(tag):
             root.remove(element)
+    drop_repeated_origins(root)
     for link in root.findall("link"):
         for shape in [*link.findall("visual"), *link.findall("collision")]:
             link.remove(shape)
@@ -314,14 +332,13 @@ def _spec(urdf: Path) -> mujoco.MjSpec:
         raise UrdfError(urdf, "URDF", f"MuJoCo refuses it: {error}", "a robot that MuJoCo can simulate") from error
     spec.compiler.fusestatic = False
     spec.compiler.balanceinertia = False
-    spec.worldbody.first_body().add_freejoint()
     return spec
 
 
 def _add_foot(spec: mujoco.MjSpec, foot: Foot) -> None:
     """A massless plate welded to the link: all that touches the floor, and a six-axis sensor in the weld."""
-    plate = spec.body(foot.frame).add_body(name=_sensor(foot))
-    plate.add_site(name=_sensor(foot))
+    plate = spec.body(foot.frame).add_body(name=foot_site(foot))
+    plate.add_site(name=foot_site(foot))
     plate.add_site(name=_middle(foot), pos=foot.middle)
     for point, radius in zip(foot.points, foot.radii, strict=True):
         plate.add_geom(
@@ -333,10 +350,11 @@ def _add_foot(spec: mujoco.MjSpec, foot: Foot) -> None:
             solref=_SPRING,
         )
     for kind in (mujoco.mjtSensor.mjSENS_FORCE, mujoco.mjtSensor.mjSENS_TORQUE):
-        spec.add_sensor(type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=_sensor(foot))
+        spec.add_sensor(type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=foot_site(foot))
 
 
-def _sensor(foot: Foot) -> str:
+def foot_site(foot: Foot) -> str:
+    """Name of the site in a foot's frame."""
     return f"{foot.frame} sensor"
 
 

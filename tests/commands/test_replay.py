@@ -1,0 +1,98 @@
+"""`torchid replay`: the torques of a log on the robot in MuJoCo."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from demo import shortened_demo
+from refusals import refusal
+from repository import DEMO
+
+from torchid.cli import main
+from torchid.commands.folder import REPLAY
+from torchid.commands.manifest import read_manifest
+
+UNSEEN = str(DEMO / "sway_test.npz")
+pytestmark = pytest.mark.filterwarnings("ignore:identified.urdf")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of the demo."""
+    folder = tmp_path_factory.mktemp("run") / "run"
+    assert main(["identify", str(DEMO / "quadruped.yaml"), f"output={folder}", "estimator.ridge=0.001"]) == 0
+    return folder
+
+
+def test_the_identified_robot_stays_nearer_to_a_new_log_than_the_urdf(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "replay"
+    assert main(["replay", str(run), "--log", UNSEEN, "--window", "0.2", "--output", str(output)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    document = json.loads((output / "replay.json").read_text())
+    for name in ("joints [rad]", "base tilt [rad]"):
+        nominal, identified = (np.array(document["quartiles"][name][who]) for who in ("nominal", "identified"))
+        assert nominal.shape == (3, len(document["time_s"]))
+        assert (np.diff(nominal, axis=0) >= 0.0).all()
+        assert identified[1, -1] < 0.2 * nominal[1, -1]
+        assert any(f"{identified[1, -1]:.4g}" in line for line in lines)
+    assert lines[0].startswith("Drift after 0.2 s of the torques of sway_test alone")
+    assert len(lines) <= 20
+    assert max(map(len, lines)) <= 100
+    kind = read_manifest(output)
+    assert kind is not None
+    assert kind.kind == REPLAY.name
+    assert {file.name for file in output.iterdir()} == {"replay.json", "drift.png", "manifest.json"}
+    assert main(["replay", str(run), "--log", UNSEEN, "--window", "0.2", "--verbose"]) == 0
+    assert "rear_right_knee" in capsys.readouterr().out
+
+
+def test_a_replay_replaces_nothing_but_a_replay(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    again = ["replay", str(run), "--log", UNSEEN, "--output", str(run)]
+    assert "not empty" in refusal(again, run, capsys)
+    assert "a run" in refusal([*again, "--overwrite"], run, capsys)
+
+
+@pytest.mark.parametrize(
+    ("more", "found"),
+    [
+        (["--window", "0"], "--window: 0"),
+        (["--window", "nan"], "--window: nan"),
+        (["--window", "1e9"], "no 1e+09 s without a gap"),
+        (["--window", "1e-6"], "windows of 1e-06 s"),
+    ],
+)
+def test_windows_that_no_log_has_are_refused(
+    run: Path, more: list[str], found: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert found in refusal(["replay", str(run), "--log", UNSEEN, *more], tmp_path, capsys)
+
+
+def test_what_a_replay_lacks_is_named(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with np.load(UNSEEN) as arrays:
+        log = dict(arrays)
+    np.savez(tmp_path / "untorqued.npz", **{name: x for name, x in log.items() if name != "joint_torque"})
+    no_torque = ["replay", str(run), "--log", str(tmp_path / "untorqued.npz")]
+    assert "the torques of all joints" in refusal(no_torque, tmp_path, capsys)
+    assert "a folder that torchid identify wrote" in refusal(
+        ["replay", str(tmp_path), "--log", UNSEEN], tmp_path, capsys
+    )
+
+
+def test_a_run_with_welds_is_not_replayed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = shortened_demo(tmp_path / "demo", 400) / "quadruped.yaml"
+    for path in file.parent.glob("*.npz"):
+        with np.load(path) as arrays:
+            log = dict(arrays)
+        kept = log["joint_names"] != "rear_right_knee"
+        of_joints = {name: log[name][:, kept] for name in ("joint_position", "joint_torque")}
+        np.savez(path, **(log | of_joints | {"joint_names": log["joint_names"][kept]}))
+    weld = ["robot.weld={rear_right_knee: -1.4}", "sensors.on_base_lost=warn", f"output={tmp_path / 'run'}"]
+    assert main(["identify", str(file), *weld]) == 0
+    capsys.readouterr()
+    again = ["replay", str(tmp_path / "run"), "--log", str(file.parent / "sway_test.npz")]
+    assert "robot.weld: 1 joint held still" in refusal(again, tmp_path, capsys)

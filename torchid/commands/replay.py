@@ -1,0 +1,244 @@
+"""`torchid replay`: the torques of a log on the robot in MuJoCo, with the URDF's and with identified parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from torchid.commands.evaluate import FittedRun, read_run, require_run
+from torchid.commands.folder import REPLAY, check_free, new_folder, write_json
+from torchid.commands.reading import LogReader
+from torchid.config import FootConfig
+from torchid.errors import ConfigError, LogError, about_file, during, format_count
+from torchid.fitting.calibration import Calibration, Comparison
+from torchid.logs.time_range import split_range
+from torchid.parameters import Array
+from torchid.problem import Samples
+from torchid.report.drift_figure import drift_figure
+from torchid.report.figures import save_figure
+from torchid.report.tables import progress_bars
+from torchid.reprs import short_repr
+from torchid.robot import Robot
+from torchid.sensing import Contact
+from torchid.simulation.plant import Foot, find_feet, point_foot
+from torchid.simulation.replay import Drift, Model, ReplayedLog, replay_log
+
+_TIMES = 25  # at which the drift is compared, within a window
+_UNITS = {"revolute": "rad", "prismatic": "m"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replay:
+    """How far robots drift from a log that their joints' torques are taken from.
+
+    Attributes:
+        source: name of the log.
+        window: of the log that is replayed at a time [s].
+        windows: number of them.
+        drift: with the URDF, which has no armature and no offsets, and with what was identified.
+        joint_names: of the robot.
+        units: of the joints' positions, "rad" or "m".
+        output: the folder that it was written to, if any.
+    """
+
+    source: str
+    window: float
+    windows: int
+    drift: Comparison[Drift]
+    joint_names: tuple[str, ...]
+    units: tuple[str, ...]
+    output: Path | None = None
+
+    __repr__ = short_repr
+
+    def _headline(self) -> str:
+        texts = [f"{name} {before:.3g} and {after:.3g}" for name, (before, after) in self.at(self.window).items()]
+        return f"{self.source}, drift after {self.window:g} s, URDF against identified: {'; '.join(texts)}"
+
+    def quartiles(self) -> dict[str, Comparison[Array]]:
+        """Quartiles over windows of the drift, (3, T), by what drifts and its unit.
+
+        Of joints it is the root mean square over them. A robot that has fallen over is far off, but no farther matters.
+        """
+        out = {}
+        for unit in dict.fromkeys(self.units):
+            columns = np.flatnonzero(np.array(self.units) == unit)
+            out[f"joints [{unit}]"] = Comparison(*(_quartiles(one.of_joints(columns)) for one in self.drift))
+        tilts = [one.tilt for one in self.drift]
+        if tilts[0] is not None and tilts[1] is not None:
+            out["base tilt [rad]"] = Comparison(_quartiles(tilts[0]), _quartiles(tilts[1]))
+        return out
+
+    def at(self, time: float) -> dict[str, Comparison[float]]:
+        """Median drift at the compared time that is nearest to one since the beginning of a window [s]."""
+        k = int(np.abs(self.drift.nominal.time - time).argmin())
+        return {name: Comparison(*(float(x[1, k]) for x in pair)) for name, pair in self.quartiles().items()}
+
+    def by_joint(self) -> dict[str, Comparison[float]]:
+        """Median drift at the end of the windows, by joint."""
+        each = [_quartiles(np.abs(one.joints[:, -1]))[1].tolist() for one in self.drift]
+        return {name: Comparison(*pair) for name, *pair in zip(self.joint_names, *each, strict=True)}
+
+    def to_dict(self) -> dict[str, object]:
+        """What `replay.json` has."""
+        return {
+            "log": self.source,
+            "window_s": self.window,
+            "windows": self.windows,
+            "time_s": self.drift.nominal.time.tolist(),
+            "quartiles": {
+                name: {"nominal": pair.nominal.tolist(), "identified": pair.identified.tolist()}
+                for name, pair in self.quartiles().items()
+            },
+            "by_joint": {name: pair._asdict() for name, pair in self.by_joint().items()},
+        }
+
+
+def replay(
+    run: str | Path,
+    log: str | Path,
+    window: float = 0.5,
+    output: str | Path | None = None,
+    overwrite: bool = False,
+) -> Replay:
+    """Drive the robot in MuJoCo with the torques of a log, and see how far it drifts from the log.
+
+    The log is preprocessed as the run's own were. In each of its windows the robot begins in the log's state. A
+    floating base stands on a level floor with the run's contacts.
+
+    Args:
+        run: folder that `identify` wrote.
+        log: a log file, or a part of it (`walk.npz[30:]`).
+        window: length of the windows [s].
+        output: folder to write; None: nothing is.
+        overwrite: whether a replay that stands there may be replaced.
+
+    Raises:
+        InputError: the folder is no run, MuJoCo is not installed or does not take the robot, or the log has not what
+            a replay needs.
+    """
+    if not 0.0 < window < np.inf:
+        raise ConfigError("command line", "--window", f"{window:g}", "a length of time greater than 0 [s]")
+    folder, out = Path(run), None if output is None else Path(output)
+    require_run(folder)
+    if out is not None:
+        check_free(out, overwrite, REPLAY, [folder, *(file.path for file in split_range(log).files)])
+    with progress_bars() as bars:
+        fitted = read_run(folder)
+        with about_file(folder / "config.yaml"):
+            _require_simple(fitted)
+        reading = bars.add_task("reading the log", total=1)
+        (samples,) = LogReader(fitted.experiment, folder).read([Path(log)], None, lambda _: bars.advance(reading))
+        robot = fitted.experiment.robot
+        urdfs = Comparison(fitted.experiment.config.robot.urdf, folder / "identified.urdf")
+        feet = _feet(fitted.experiment.contacts, urdfs.nominal) if not robot.fixed_base else ()
+        calibration = fitted.calibrations.identified
+        logs = Comparison(*(_replayed(one) for one in (samples, *calibration.calibrate([samples]))))
+        models = Comparison(_model(urdfs.nominal, robot, None), _model(urdfs.identified, robot, calibration))
+        windows = logs.nominal.windows(window)
+        replaying = bars.add_task("replaying", total=2 * len(windows))
+        times = window * np.arange(1, _TIMES + 1) / _TIMES
+        nominal, identified = (
+            replay_log(model, of, feet, windows, times, lambda n: bars.advance(replaying, n))
+            for model, of in zip(models, logs, strict=True)
+        )
+    found = Replay(
+        source=split_range(log).name,
+        window=float(window),
+        windows=len(windows),
+        drift=Comparison(nominal, identified),
+        joint_names=robot.joint_names,
+        units=tuple(_UNITS[kind] for kind in _joint_kinds(robot)),
+        output=out,
+    )
+    if out is not None:
+        with during("writing", out), new_folder(out, overwrite, REPLAY) as new:
+            write_json(new / "replay.json", found.to_dict())
+            figure = drift_figure(
+                found.source, found.drift.nominal.time, found.quartiles(), found.by_joint(), found.units
+            )
+            save_figure(figure, new / "drift.png")
+    return found
+
+
+def _require_simple(fitted: FittedRun) -> None:
+    """Make sure that MuJoCo can move the robot as the run understands it.
+
+    Raises:
+        ConfigError: it cannot.
+    """
+    config, robot = fitted.experiment.config.robot, fitted.experiment.robot
+    held = format_count(len(robot.welded), "joint")
+    if config.weld:
+        raise ConfigError.at_field("robot.weld", f"{held} held still", "a replay without welds")
+    root = next(name for name, (body, pose) in robot.links.items() if body == 0 and np.array_equal(pose, np.eye(4)))
+    if not robot.fixed_base and robot.base_link != root:
+        raise ConfigError.at_field("robot.base_link", f"'{robot.base_link}'", f"the URDF's root, '{root}', to replay")
+
+
+def _quartiles(drift: Array) -> Array:
+    """Over windows, of what is off in each of them, (W, ...); infinitely, where a simulation has diverged."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.quantile(np.nan_to_num(drift, nan=np.inf), (0.25, 0.5, 0.75), axis=0, method="nearest"))
+
+
+def _joint_kinds(robot: Robot) -> list[str]:
+    """Of the independent joints: revolute or prismatic."""
+    moving = {body.joint.name: body.joint.kind for body in robot.bodies if body.joint is not None}
+    return [moving[name] for name in robot.joint_names]
+
+
+def _model(urdf: Path, robot: Robot, calibration: Calibration | None) -> Model:
+    """The robot of a URDF with identified armatures and offsets of torque, if there are any.
+
+    Coulomb friction that differs by direction is symmetric friction and an offset, as far as the joint moves.
+    """
+    values = {
+        "armature": np.zeros(robot.n),
+        "torque_offset": np.zeros(robot.n),
+        "asymmetric_coulomb": np.zeros(robot.n),
+    }
+    for extra in calibration.builder.extras if calibration is not None else ():
+        if extra.what in values and calibration is not None:
+            values[extra.what][list(extra.dofs)] = calibration.values[("", extra.label)]
+    offset = values["torque_offset"] + values["asymmetric_coulomb"]
+    return Model(urdf, robot.joint_names, values["armature"], offset)
+
+
+def _replayed(samples: Samples) -> ReplayedLog:
+    """What is replayed of a log.
+
+    Raises:
+        LogError: it has no joint torques, or a floating base whose orientation was not recorded.
+    """
+    base = samples.base
+    if samples.torque is None or not np.isfinite(samples.torque.numpy()).all():
+        raise LogError(samples.source, "joint_torque", "not of every joint", "a log with the torques of all joints")
+    floating = base.angular_velocity is not None
+    if floating and base.quat_xyzw is None:
+        raise LogError(samples.source, "base", "no orientation", "base_quat_wxyz or base_quat_xyzw, to replay it")
+    return ReplayedLog(
+        source=samples.source,
+        time=samples.time.numpy(),
+        position=samples.joint_position.numpy(),
+        velocity=samples.joint_velocity.numpy(),
+        torque=samples.torque.numpy(),
+        quat_xyzw=None if base.quat_xyzw is None else base.quat_xyzw.numpy(),
+        angular_velocity=None if base.angular_velocity is None else base.angular_velocity.numpy(),
+        active=samples.active.numpy(),
+    )
+
+
+def _feet(contacts: Sequence[Contact], urdf: Path) -> tuple[Foot, ...]:
+    """Contacts of a run as they touch a floor: spheres of their radius, or of the URDF's collision shapes.
+
+    Raises:
+        InputError: a flat contact without collision spheres.
+    """
+    return tuple(
+        point_foot(x.frame, x.radius) if x.kind == "point" else find_feet([FootConfig(frame=x.frame)], urdf)[0]
+        for x in contacts
+    )

@@ -1,0 +1,232 @@
+"""A log's joint torques on a simulated robot, in windows that each begin at the log's state, and how far it drifts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from mujoco import rollout
+from scipy.spatial.transform import Rotation, Slerp
+
+from torchid.errors import InputError, LogError
+from torchid.parameters import Array
+from torchid.regressor.kinematics import GRAVITY_WORLD
+from torchid.simulation.plant import Foot, compile_model, foot_site
+
+_PHYSICS_HZ = 1000.0
+_LONGEST_GAP = 2.5  # median sampling intervals, within a window
+_FEWEST, _MOST_WINDOWS = 2, 500
+
+
+@dataclass(frozen=True)
+class ReplayedLog:
+    """What is replayed of a log of N samples.
+
+    Attributes:
+        source: its name.
+        time: (N,) [s].
+        position, velocity: (N, n), of the joints [rad or m, rad/s or m/s].
+        torque: (N, n), of the joints [N m or N].
+        quat_xyzw: (N, 4), base to world; None of a bolted base that stands upright.
+        angular_velocity: (N, 3), of the base in its own axes [rad/s]; None of a bolted one.
+        active: (N, F) bool, which feet stand on the floor.
+    """
+
+    source: str
+    time: Array
+    position: Array
+    velocity: Array
+    torque: Array
+    quat_xyzw: Array | None
+    angular_velocity: Array | None
+    active: np.ndarray
+
+    def windows(self, length: float) -> Array:
+        """Where windows begin and end, (W, 2) int, one after the other, evenly chosen if they are too many.
+
+        Args:
+            length: of each [s].
+
+        Raises:
+            LogError: the log has none without a gap, in which a floating base stands at the beginning, or they would be
+                shorter than two samples.
+        """
+        interval = float(np.median(np.diff(self.time)))
+        if length < _FEWEST * interval:
+            accepted = f"at least {_FEWEST * interval:.3g} s, {_FEWEST} sampling intervals"
+            raise LogError(self.source, "time", f"windows of {length:g} s", accepted)
+        gaps = np.cumsum(np.diff(self.time, prepend=self.time[0]) > _LONGEST_GAP * interval)
+        stands = np.full(len(self.time), self.angular_velocity is None) | self.active.any(axis=1)
+        found, begin = list[tuple[int, int]](), 0
+        while begin < len(self.time) - 1:
+            end = int(np.searchsorted(self.time, self.time[begin] + length - 0.5 * interval))
+            if end >= len(self.time):
+                break
+            if gaps[end] != gaps[begin]:
+                begin = int(np.searchsorted(gaps, gaps[begin] + 1))
+            elif stands[begin]:
+                found.append((begin, end))
+                begin = end
+            else:
+                begin += 1
+        if not found:
+            accepted = "a shorter window, or a longer log" + ("" if stands.all() else " of a robot that stands")
+            raise LogError(self.source, "time", f"no {length:g} s without a gap", accepted)
+        chosen = np.linspace(0, len(found) - 1, min(len(found), _MOST_WINDOWS)).round().astype(int)
+        return np.array(found)[chosen]
+
+
+@dataclass(frozen=True)
+class Model:
+    """A robot as it is simulated: a URDF and what a URDF cannot say of its n joints.
+
+    Attributes:
+        urdf: with inertia, damping and friction.
+        joints: names of the n joints.
+        armature: (n,), reflected rotor inertia [kg m^2 or kg].
+        offset: (n,), subtracted from the joints' torques [N m or N].
+    """
+
+    urdf: Path
+    joints: tuple[str, ...]
+    armature: Array
+    offset: Array
+
+
+@dataclass(frozen=True)
+class Drift:
+    """How far a simulated robot is from the log, after T times in W windows.
+
+    Attributes:
+        time: (T,) since the beginning of a window [s].
+        joints: (W, T, n), position of the joints less that of the log [rad or m].
+        tilt: (W, T), angle between the base's orientations [rad]; None of a bolted base.
+    """
+
+    time: Array
+    joints: Array
+    tilt: Array | None
+
+    def of_joints(self, columns: np.ndarray | slice = slice(None)) -> Array:
+        """Root mean square over some joints, (W, T)."""
+        return np.asarray(np.sqrt(np.mean(np.square(self.joints[..., columns]), axis=2)))
+
+
+def replay_log(
+    model: Model,
+    log: ReplayedLog,
+    feet: Sequence[Foot],
+    windows: Array,
+    times: Array,
+    progress: Callable[[int], None] | None = None,
+) -> Drift:
+    """Drive a robot with a log's torques, linear between samples, from the log's state at the beginning of each window.
+
+    A floating base begins where the lowest of its standing feet touches a level floor, with the velocity that leaves
+    them still.
+
+    Args:
+        model: the robot.
+        log: the log.
+        feet: what stands on the floor, in the order of `log.active`; not used for a bolted base.
+        windows: (W, 2) int, from `ReplayedLog.windows`.
+        times: (T,) since the beginning of a window at which the drift is wanted [s], ascending.
+        progress: called with the number of windows done.
+
+    Raises:
+        UrdfError: MuJoCo does not take the robot.
+        InputError: an armature is negative.
+    """
+    robot = _Simulated(model, feet, log)
+    steps = np.arange(round(times[-1] * _PHYSICS_HZ)) / _PHYSICS_HZ
+    joints, tilts = [], []
+    for begin, _ in windows:
+        starts = float(log.time[begin])
+        torque = _interpolated(starts + steps + 0.5 / _PHYSICS_HZ, log.time, log.torque) - model.offset
+        position, quaternion = robot.run(begin, torque)
+        since = np.append(0.0, steps + 1.0 / _PHYSICS_HZ)
+        measured = _interpolated(starts + times, log.time, log.position)
+        joints.append(_interpolated(times, since, position) - measured)
+        if quaternion is not None and log.quat_xyzw is not None:
+            own = Slerp(since, Rotation.from_quat(quaternion, scalar_first=True))(np.minimum(times, since[-1]))
+            tilts.append((own.inv() * _orientation(log, starts + times)).magnitude())
+        if progress is not None:
+            progress(1)
+    return Drift(times, np.array(joints), np.array(tilts) if tilts else None)
+
+
+class _Simulated:
+    """A robot in MuJoCo, put into states of a log."""
+
+    def __init__(self, model: Model, feet: Sequence[Foot], log: ReplayedLog) -> None:
+        for name, value in zip(model.joints, model.armature, strict=True):
+            if value < 0.0:
+                found = f"{value:.3g} kg m^2, which MuJoCo would not take"
+                raise InputError(model.urdf.parent, f"armature of {name}", found, "estimator.name=consistent")
+        self.log, self.floating = log, log.angular_velocity is not None
+        self.feet = feet if self.floating else ()
+        self.model = compile_model(model.urdf, self.feet, _PHYSICS_HZ, self.floating)
+        self.model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
+        self.model.opt.gravity = GRAVITY_WORLD
+        if not self.floating and log.quat_xyzw is not None:
+            self.model.opt.gravity = Rotation.from_quat(log.quat_xyzw[0]).inv().apply(GRAVITY_WORLD)
+        self.data = mujoco.MjData(self.model)
+        joints = [self.model.joint(name) for name in model.joints]
+        self.at, self.rate = (np.array([int(getattr(x, key)[0]) for x in joints]) for key in ("qposadr", "dofadr"))
+        self.model.dof_armature[self.rate] += model.armature
+
+    def run(self, begin: int, torque: Array) -> tuple[Array, Array | None]:
+        """Positions of the joints (S + 1, n) and the base's quaternion w x y z, (S + 1, 4), from a sample on.
+
+        Args:
+            begin: index of the sample.
+            torque: (S, n), of the joints at every step.
+        """
+        model, data = self.model, self.data
+        self._place(begin)
+        force = np.zeros((1, len(torque), model.nv))
+        force[0][:, self.rate] = torque
+        kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
+        state = np.zeros(mujoco.mj_stateSize(model, kind))
+        mujoco.mj_getState(model, data, state, kind)
+        spec = int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
+        states, _ = rollout.rollout(model, data, state[None], force, control_spec=spec)
+        position = np.vstack([state, states[0]])[:, 1 : 1 + model.nq]  # after the time
+        return position[:, self.at], position[:, 3:7] if self.floating else None
+
+    def _place(self, begin: int) -> None:
+        """Put the robot into the state of a sample."""
+        model, data, log = self.model, self.data, self.log
+        mujoco.mj_resetData(model, data)
+        data.qpos[self.at], data.qvel[self.rate] = log.position[begin], log.velocity[begin]
+        if log.angular_velocity is not None and log.quat_xyzw is not None:
+            data.qpos[3:7] = log.quat_xyzw[begin][[3, 0, 1, 2]]
+            data.qvel[3:6] = log.angular_velocity[begin]
+            mujoco.mj_fwdPosition(model, data)
+            standing = [foot for foot, on in zip(self.feet, log.active[begin], strict=True) if on]
+            low, still = zip(*(self._contact(foot) for foot in standing), strict=True)
+            data.qpos[2], data.qvel[:3] = -min(low), -np.mean(still, axis=0)
+
+    def _contact(self, foot: Foot) -> tuple[float, Array]:
+        """Height of a foot's lowest point [m], and the velocity (3,) of the material there [m/s]."""
+        site = self.model.site(foot_site(foot)).id
+        rotation, origin = self.data.site_xmat[site].reshape(3, 3), self.data.site_xpos[site]
+        points = origin + np.array(foot.points) @ rotation.T
+        lowest = int(np.argmin(points[:, 2] - foot.radii))
+        J = np.zeros((3, self.model.nv))
+        below = points[lowest] - [0.0, 0.0, foot.radii[lowest]]
+        mujoco.mj_jac(self.model, self.data, J, None, below, int(self.model.site_bodyid[site]))
+        return float(below[2]), J @ self.data.qvel
+
+
+def _orientation(log: ReplayedLog, times: Array) -> Rotation:
+    """Of the base at some times."""
+    return Slerp(log.time, Rotation.from_quat(log.quat_xyzw))(np.minimum(times, log.time[-1]))
+
+
+def _interpolated(times: Array, at: Array, values: Array) -> Array:
+    """Columns of values, (N, k), linear between their times, (T, k)."""
+    return np.stack([np.interp(times, at, column) for column in values.T], axis=1)
