@@ -167,6 +167,21 @@ def test_a_result_certifies_itself(seed: int, ridge: float) -> None:
 # ------------------------------------------------------------------------------------------------------------ refusals
 
 
+def test_what_solves_share_changes_no_bit_and_belongs_to_its_rank_tolerance() -> None:
+    problem = random_problem(np.random.default_rng(5), 60, 7, 9, noise=0.1)
+    for tolerance in (1e-10, 0.3):
+        for ridge in (0.0, 1e-3, 1.0):
+            estimator = LeastSquares(ridge, rank_tolerance=tolerance)
+            again, fresh = estimator.solve(problem), estimator.solve(replace(problem))
+            for name in ("phi", "noise_error", "data_share", "singular_values", "rank"):
+                np.testing.assert_array_equal(getattr(again, name), getattr(fresh, name))
+    ranks = [LeastSquares(rank_tolerance=tolerance).solve(problem).rank for tolerance in (1e-10, 0.3)]
+    assert ranks[0] == 7
+    assert ranks[1] < 7
+    changed = replace(problem, A=2.0 * problem.A, b=2.0 * problem.b)
+    np.testing.assert_allclose(LeastSquares().solve(changed).phi, LeastSquares().solve(problem).phi, rtol=1e-10)
+
+
 def test_shapes_that_do_not_belong_together_are_refused() -> None:
     good = problem_of(np.ones((3, 2)), np.ones(3))
     for change in ({"b": np.ones(2)}, {"nominal": np.ones(3)}, {"scale": np.ones(1)}, {"free": np.ones(3, bool)}):

@@ -195,7 +195,9 @@ class LeastSquares(Regularized):
         free, scale = problem.free, problem.scale[problem.free]
         A = problem.A[:, free] * scale
         b = problem.b - problem.A @ problem.nominal
-        pinv, values, rank = _pseudo_inverse(A, self.rank_tolerance)
+        pinv, values, rank = problem.shared(
+            ("pseudo-inverse", self.rank_tolerance), lambda: _pseudo_inverse(A, self.rank_tolerance)
+        )
         null_share = np.linalg.norm(np.eye(A.shape[1]) - pinv @ A, axis=1)  # of each parameter in the null space
         gain = pinv
         if self.ridge > 0.0:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch
@@ -13,6 +13,8 @@ from torch import Tensor
 from torchid import parameters
 from torchid.parameters import Array
 from torchid.reprs import short_repr
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,7 @@ class LinearProblem:
     scale: Array
     free: np.ndarray
     oversampling: float = 1.0
+    _shared: dict[Hashable, object] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     __repr__ = short_repr
 
@@ -75,6 +78,17 @@ class LinearProblem:
         """Sum of squared whitened residuals over all rows at parameters `phi`, (P,)."""
         misfit = self.A @ phi - self.b
         return float(misfit @ misfit + self.residual)
+
+    def shared(self, key: Hashable, compute: Callable[[], T]) -> T:
+        """What solves of the same problem with other settings have in common, computed once.
+
+        Args:
+            key: names what is computed and every setting it depends on.
+            compute: called if nothing is stored under the key.
+        """
+        if key not in self._shared:
+            self._shared[key] = compute()
+        return cast(T, self._shared[key])
 
     def fraction(self, share: float) -> LinearProblem:
         """The problem scaled to a share of its rows: that share of its information."""
