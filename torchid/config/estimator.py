@@ -103,7 +103,7 @@ Settings = TypeVar("Settings", LeastSquares, Consistent, Sgd)
 class _FitConfig:
     """What is fitted and how, whatever the estimator.
 
-    `ridge`: auto, the largest that predicts left-out blocks of the training logs as well as the best; `friction: false`
+    `ridge`: auto, the one that predicts left-out blocks of the training logs best; `friction: false`
     leaves friction at the URDF's values, `frozen` bodies keep all of theirs; `robust` weighs outliers down in a batch
     fit. `total_mass` and `masses` of bodies by name are known, as from a scale.
     """
