@@ -38,7 +38,13 @@ ALL: dict[str, Any] = {
         "scales": {"ft_force": "log", "joint_torque": [["hip", "*_hip"], ["knee"]]},
         "on_base_lost": "warn",
     },
-    "actuators": {"armature": True, "torque_offset": False, "asymmetric_coulomb": True, "sign_width": 0.01},
+    "actuators": {
+        "armature": True,
+        "torque_offset": False,
+        "asymmetric_coulomb": True,
+        "stiffness": False,
+        "sign_width": 0.01,
+    },
     "estimator": {"name": "least_squares", "ridge": 1e-5, "rank_tolerance": 1e-7, "friction": False},
     "analysis": {
         "scenarios": {"stand": [["l_sole", "r_sole"]], "step": [["l_sole"], ["r_sole"], []]},

@@ -40,6 +40,7 @@ TERMS = ExtraTerms(
     armature=True,
     torque_offset=True,
     asymmetric_coulomb=True,
+    stiffness=True,
     sign_width=0.05,
 )
 Chunks = Sequence[tuple[Samples, ContactState]]

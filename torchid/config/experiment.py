@@ -68,13 +68,14 @@ class ActuatorsConfig:
     """Unknown terms of the actuators, of every joint whose torque is measured.
 
     `armature`: reflected rotor inertia; `torque_offset`; `asymmetric_coulomb`: Coulomb friction that differs by
-    direction; `sign_width` [rad/s or m/s]: Coulomb friction goes with tanh(velocity / width) instead of the sign; auto,
-    with the width that leaves least of the training logs.
+    direction; `stiffness` of springs, or of cables that act as such; `sign_width` [rad/s or m/s]: Coulomb friction goes
+    with tanh(velocity / width) instead of the sign; auto, with the width that leaves least of the training logs.
     """
 
     armature: bool = False
     torque_offset: bool = False
     asymmetric_coulomb: bool = False
+    stiffness: bool = False
     sign_width: PositiveOrAuto = None
 
 
