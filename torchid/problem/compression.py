@@ -16,6 +16,7 @@ from torchid.problem.chunk_dynamics import Workspace
 from torchid.problem.chunks import ProgressCallback, chunks_by_state, map_chunks, one_thread, worker_count
 from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import LinearProblem, TriangularFactor, parameter_scale
+from torchid.problem.row_compressor import RowCompressor
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.problem.surplus import Surplus, compress_surplus, corrected_triangle
@@ -158,7 +159,7 @@ def _compress_chunks(
     Without `loaded`, those of readings in the air alone.
     """
     parts: dict[_Key, Part] = {}
-    workspace = Workspace()
+    workspace, compressor = Workspace(), RowCompressor()
 
     def part(samples: Samples, state: ContactState, unloaded: bool) -> Part:
         key = _key(samples, state, unloaded) if by_log else _key(None, state)
@@ -173,13 +174,14 @@ def _compress_chunks(
                 if weight_rows is not None:
                     rows = stacked[len(support) + 1 :]
                     rows.copy_(weight_rows(samples, support, rows))
-                own.factor.add_in_place(support, stacked, samples.oversampling)
+                compressor.add(own.factor, support, stacked, samples.oversampling)
         for channel in unloaded_offset_equations(builder, samples):
             in_the_air = part(samples, state, True)
             if channel.gated:
                 in_the_air.gated.add(channel.offset)
             else:
                 in_the_air.factor.add(*channel.row(builder), samples.oversampling)
+    compressor.finish()
     return list(parts.values())
 
 
