@@ -134,9 +134,9 @@ class Tally:
 class Repetitions:
     """Fits of one motion with new noise each time."""
 
-    def __init__(self, robot: str, situation: Situation, seconds: float) -> None:
-        """Simulate it once."""
-        self.situation = situation
+    def __init__(self, robot: str, situation: Situation, seconds: float, seed: int = 17) -> None:
+        """Simulate it once; the seed is that of the noise."""
+        self.situation, self.seed = situation, seed
         self.true, self.exact = truth(robot, situation, seconds)
         self.contacts = self.true.legged.contacts(rolling=False)
         self.noise = Noise().times(situation.motion, 1.0)
@@ -161,7 +161,7 @@ class Repetitions:
         for number in range(count):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", TorchidWarning)
-                self._add(tally, self._fit(self._samples(np.random.default_rng([number, 17]))))
+                self._add(tally, self._fit(self._samples(np.random.default_rng([number, self.seed]))))
             done()
         return tally
 

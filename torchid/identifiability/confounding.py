@@ -243,7 +243,11 @@ def combination_standard_error(
     along = covariance.scale_sensitivity(weights[None])
     if np.linalg.norm(along @ covariance.null_space) > UNOBSERVABLE_SHARE * np.linalg.norm(along):
         return float("inf")
-    return float(np.sqrt(problem.oversampling) * estimate.residual_std * np.linalg.norm(along @ covariance.root))
+    noise = np.sqrt(problem.oversampling) * estimate.residual_std * np.linalg.norm(along @ covariance.root)
+    if problem.held is None:
+        return float(noise)
+    by_rows = covariance.root.T @ (problem.A[:, problem.free] * covariance.scale).T @ problem.held
+    return float(np.hypot(noise, np.linalg.norm(along @ covariance.root @ by_rows)))
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import LinearProblem, TriangularFactor, parameter_scale
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
-from torchid.problem.surplus import Surplus, compress_surplus, corrected_triangle
+from torchid.problem.surplus import ColumnPrior, Surplus, compress_surplus, corrected_triangle
 from torchid.problem.unloaded_offsets import unloaded_offset_equations
 from torchid.reprs import short_repr
 from torchid.robot import Robot
@@ -246,12 +246,26 @@ def linear_problem(factor: TriangularFactor, builder: RowBuilder, robot: Robot, 
     """
     if builder.extras:
         raise ValueError("builder: found extra terms; accepted: one without, or torchid.assemble")
-    R, _ = corrected_triangle(factor)
-    return problem_from_triangle(R, factor.rows, factor.oversampling, builder, robot, friction)
+    own = corrected_triangle(factor, column_prior(builder, robot, friction))
+    return problem_from_triangle(own.R, factor.rows, factor.oversampling, builder, robot, friction, held=own.held)
+
+
+def column_prior(builder: RowBuilder, robot: Robot, friction: bool = True) -> ColumnPrior:
+    """The nominal parameters in the builder's columns, and deviations by their scale of those that are free."""
+    columns, nominal = builder.columns.parameter_map, robot.nominal.flatten()
+    scale = np.where(free_parameters(robot, friction), parameter_scale(robot.nominal).flatten(), 0.0)
+    return ColumnPrior(columns @ nominal, columns * scale)
 
 
 def problem_from_triangle(
-    R: Array, rows: int, oversampling: float, builder: RowBuilder, robot: Robot, friction: bool = True
+    R: Array,
+    rows: int,
+    oversampling: float,
+    builder: RowBuilder,
+    robot: Robot,
+    friction: bool = True,
+    *,
+    held: Array | None = None,
 ) -> LinearProblem:
     """The problem in all 12 L parameters from a triangle in the regrouped columns, right-hand side last.
 
@@ -262,6 +276,7 @@ def problem_from_triangle(
         builder: of the rows.
         robot: the robot.
         friction: whether friction is free.
+        held: (columns, Q), as `CorrectedTriangle` has it.
     """
     count = builder.columns.count
     return LinearProblem(
@@ -273,6 +288,7 @@ def problem_from_triangle(
         scale=parameter_scale(robot.nominal).flatten(),
         free=free_parameters(robot, friction),
         oversampling=oversampling,
+        held=None if held is None else R[:count, :-1] @ held,
     )
 
 
