@@ -21,6 +21,7 @@ from torchid.fitting.fit import Fit, LogFitter
 from torchid.fitting.misfit import misfit
 from torchid.fitting.noise import estimate_noise
 from torchid.fitting.robust import RobustLoss, fit_robustly
+from torchid.fitting.unfitted_friction import unfitted_friction
 from torchid.identifiability.confounding import ParameterCovariance, total_mass
 from torchid.logs import Log
 from torchid.logs.preprocess import preprocess
@@ -200,7 +201,8 @@ class Repetitions:
         tally.mass.append((mass.value, mass.standard_error))
         tally.parameters.append(np.where(known, off <= NORMAL, np.nan))
         tally.residual.append(estimate.residual_std)
-        tally.misfit.append(not misfit(estimate, self.weights, fit.scatter).explained)
+        friction = unfitted_friction(fit.assembly.problem, self.true.robot)
+        tally.misfit.append(not misfit(estimate, self.weights, fit.scatter, friction).explained)
 
 
 def combination_errors(fit: Fit, combinations: Array) -> Array:
