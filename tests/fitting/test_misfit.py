@@ -13,7 +13,6 @@ from repository import DEMO
 from synthetic import UR5
 
 import torchid
-
 from torchid.cli import main
 from torchid.fitting.misfit import Misfit
 from torchid.fitting.noise import GroupNoise

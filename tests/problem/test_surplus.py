@@ -237,6 +237,19 @@ def test_combinations_that_are_mostly_noise_follow_the_data_as_far_as_these_go_a
     assert np.allclose(combinations @ corrected.held[:, -1], along, rtol=1e-9, atol=1e-9 * of_extra.max())
 
 
+def test_combinations_with_more_noise_than_information_keep_to_the_prior() -> None:
+    prior = ColumnPrior(np.array([3.0, -2.0]), np.eye(2))
+    for share in (1.5, 1000.0):
+        factor, combinations = factor_with((0.1, share), np.array([1.0, 1.0]))
+        gained = gram(factor)[:-1, -1]
+        factor.surplus[0, 1][:-1, -1] = factor.surplus[0, 1][-1, :-1] = torch.from_numpy(gained)  # forces tell nothing
+        corrected = corrected_triangle(factor, prior)
+        best = np.linalg.solve(corrected.R[:-1, :-1], corrected.R[:-1, -1])
+        assert combinations[1] @ best == pytest.approx(combinations[1] @ prior.nominal, rel=1e-9)
+        assert corrected.held is not None
+        assert np.allclose(combinations[1] @ corrected.held[:, :2], combinations[1], rtol=1e-9)
+
+
 @pytest.mark.parametrize("ridge", [0.0, 1e-6])
 def test_intervals_hold_what_data_that_are_mostly_noise_leave_to_the_prior(robot: Robot, ridge: float) -> None:
     bolted = torchid.load_robot(robot.path, fixed_base=True)

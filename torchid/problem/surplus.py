@@ -184,7 +184,8 @@ def corrected_triangle(factor: TriangularFactor, prior: ColumnPrior) -> Correcte
 
     Residuals remain those of the rows at the parameters that fit R best. With a share of noise s in the information on
     a combination, of which 1 - `LEAST_SIGNAL` is taken off at most, the combination follows its data by
-    (1 - s) / `LEAST_SIGNAL` and the prior by the rest, as with a ridge.
+    (1 - s) / `LEAST_SIGNAL` and the prior by the rest, as with a ridge. By chance s may exceed 1; the data then give
+    nothing of it.
 
     Args:
         factor: of some rows.
@@ -207,7 +208,7 @@ def corrected_triangle(factor: TriangularFactor, prior: ColumnPrior) -> Correcte
     left = np.clip(1.0 - shares, LEAST_SIGNAL, _MOST_SIGNAL)
     combinations = turn.T @ (values[kept, None] * Vh[kept] * size)
     target = turn.T @ (U[:, kept].T @ rhs - whitening.T @ surplus[:-1, -1])
-    remaining = np.where(shares > 1.0 - LEAST_SIGNAL, left - (1.0 - shares), 0.0)
+    remaining = np.where(shares > 1.0 - LEAST_SIGNAL, left - np.maximum(1.0 - shares, 0.0), 0.0)
     target += remaining * (combinations[:, : len(prior.nominal)] @ prior.nominal)
     best = whitening @ (turn @ (target / left))
     rest = U[:, other].T @ rhs
@@ -221,6 +222,6 @@ def corrected_triangle(factor: TriangularFactor, prior: ColumnPrior) -> Correcte
     noise, triangle = NoiseShares.of(shares), np.asarray(np.linalg.qr(np.concatenate(stacked), mode="r"))
     if not noise.lost:
         return CorrectedTriangle(triangle, noise)
-    held, count = np.minimum(remaining / left, 1.0)[:, None] * combinations, len(prior.nominal)
+    held, count = (remaining / left)[:, None] * combinations, len(prior.nominal)
     units = np.hstack([held[:, :count] @ prior.spread, held[:, count:] * best[count:]])
     return CorrectedTriangle(triangle, noise, whitening @ turn @ units)
