@@ -13,6 +13,7 @@ from synthetic import Array
 
 from torchid.estimators import LeastSquares
 from torchid.problem import LinearProblem, TriangularFactor
+from torchid.problem.linear import PRIOR_DEVIATION
 
 seeds = st.integers(0, 2**32 - 1)
 few = settings(max_examples=50, deadline=None, derandomize=True)
@@ -237,7 +238,7 @@ def test_what_rows_lack_is_no_share_of_the_data_and_part_of_the_standard_error(r
     held, more = 0.3 * (problem.A * problem.scale), rng.normal(size=(40, 2))
     held[:, 2] = problem.A[:, 2] * problem.scale[2]  # the third parameter is the prior's alone
     held[:, 3:] = 0.0
-    lacking = replace(problem, held=np.hstack([held, more]))
+    lacking = replace(problem, held=np.hstack([PRIOR_DEVIATION * held, more]))
     before, estimate = (LeastSquares(ridge).solve(x) for x in (problem, lacking))
     assert np.array_equal(estimate.phi, before.phi)
     shares = before.data_share * np.array([0.7, 0.7, 0.0, 1.0, 1.0, 1.0])

@@ -263,7 +263,7 @@ def test_intervals_hold_what_data_that_are_mostly_noise_leave_to_the_prior(robot
     rng, regressor = np.random.default_rng(7), torchid.Regressor(bolted)(*slow.coordinates())
     missed, scattered = [], []
     for noisy in draws(slow, 20):
-        phi = bolted.nominal.flatten() + scale * rng.normal(size=len(scale))
+        phi = bolted.nominal.flatten() + scale * rng.uniform(-1.0, 1.0, len(scale))
         torque = regressor @ torch.from_numpy(phi)
         torque = torque + 0.1 * torch.from_numpy(rng.normal(size=torque.shape))
         logs = split_into_folds([replace(noisy, torque=torque, motion_noise=noise)], builder)

@@ -15,7 +15,7 @@ from torchid.parameters import Array
 from torchid.problem.chunk_dynamics import Workspace
 from torchid.problem.chunks import ProgressCallback, chunks_by_state, map_chunks, one_thread, worker_count
 from torchid.problem.contact_state import ContactState
-from torchid.problem.linear import LinearProblem, TriangularFactor, parameter_scale
+from torchid.problem.linear import PRIOR_DEVIATION, LinearProblem, TriangularFactor, parameter_scale
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.problem.surplus import ColumnPrior, Surplus, compress_surplus, corrected_triangle
@@ -251,10 +251,10 @@ def linear_problem(factor: TriangularFactor, builder: RowBuilder, robot: Robot, 
 
 
 def column_prior(builder: RowBuilder, robot: Robot, friction: bool = True) -> ColumnPrior:
-    """The nominal parameters in the builder's columns, and deviations by their scale of those that are free."""
+    """The nominal parameters in the builder's columns, and deviations within their scale of those that are free."""
     columns, nominal = builder.columns.parameter_map, robot.nominal.flatten()
     scale = np.where(free_parameters(robot, friction), parameter_scale(robot.nominal).flatten(), 0.0)
-    return ColumnPrior(columns @ nominal, columns * scale)
+    return ColumnPrior(columns @ nominal, columns * (PRIOR_DEVIATION * scale))
 
 
 def problem_from_triangle(

@@ -31,8 +31,8 @@ class LinearProblem:
         oversampling: rows per independent row, at least 1: a low-pass filter leaves noise correlated, so that rows hold
             less information than their number suggests.
         held: (R, Q), None without any: what the right-hand side lacks, of rows that are mostly noise of the motion, for
-            independent deviations of unit size from the nominal parameters. The first P are those of the parameters by
-            their scale: A (phi - nominal) - held @ deviations is what to expect of b - A nominal.
+            independent deviations of unit variance from the nominal parameters. The first P are of the parameters, by
+            `PRIOR_DEVIATION` of their scale: A (phi - nominal) - held @ deviations is what to expect of b - A nominal.
     """
 
     A: Array
@@ -106,12 +106,19 @@ class LinearProblem:
     @property
     def held_parameters(self) -> Array | None:
         """The part of `held` by deviations of the free parameters, (R, P'), in units of their scale."""
-        return None if self.held is None else self.held[:, : len(self.free)][:, self.free]
+        return None if self.held is None else self.held[:, : len(self.free)][:, self.free] / PRIOR_DEVIATION
 
     def prediction_distance(self, phi: Array, other: Array) -> float:
         """Rms difference of the projected whitened forces that two parameter vectors, (P,), predict."""
         difference = self.A @ (phi - other)
         return float(np.sqrt(difference @ difference / max(self.rows, 1)))
+
+
+PRIOR_DEVIATION = 3.0**-0.5
+"""Standard deviation, by its scale, of a parameter that is known to be within its scale of the nominal one.
+
+A mass is then between nothing and twice the nominal one.
+"""
 
 
 def parameter_scale(nominal: Array) -> Array:

@@ -154,7 +154,7 @@ class ColumnPrior:
 
     Attributes:
         nominal: (count,).
-        spread: (count, P), deviations from them for each of P independent ones of unit size.
+        spread: (count, P), deviations from them for each of P independent ones of unit variance.
     """
 
     nominal: Array
