@@ -21,6 +21,7 @@ from torchid.fitting.fit import Fit, LogFitter
 from torchid.fitting.misfit import misfit
 from torchid.fitting.noise import estimate_noise
 from torchid.fitting.robust import RobustLoss, fit_robustly
+from torchid.fitting.unfitted_friction import unfitted_friction
 from torchid.identifiability.confounding import ParameterCovariance, total_mass
 from torchid.logs import Log
 from torchid.logs.preprocess import preprocess
@@ -134,9 +135,9 @@ class Tally:
 class Repetitions:
     """Fits of one motion with new noise each time."""
 
-    def __init__(self, robot: str, situation: Situation, seconds: float) -> None:
-        """Simulate it once."""
-        self.situation = situation
+    def __init__(self, robot: str, situation: Situation, seconds: float, seed: int = 17) -> None:
+        """Simulate it once; the seed is that of the noise."""
+        self.situation, self.seed = situation, seed
         self.true, self.exact = truth(robot, situation, seconds)
         self.contacts = self.true.legged.contacts(rolling=False)
         self.noise = Noise().times(situation.motion, 1.0)
@@ -161,7 +162,7 @@ class Repetitions:
         for number in range(count):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", TorchidWarning)
-                self._add(tally, self._fit(self._samples(np.random.default_rng([number, 17]))))
+                self._add(tally, self._fit(self._samples(np.random.default_rng([number, self.seed]))))
             done()
         return tally
 
@@ -200,7 +201,8 @@ class Repetitions:
         tally.mass.append((mass.value, mass.standard_error))
         tally.parameters.append(np.where(known, off <= NORMAL, np.nan))
         tally.residual.append(estimate.residual_std)
-        tally.misfit.append(not misfit(estimate, self.weights, fit.scatter).explained)
+        friction = unfitted_friction(fit.assembly.problem, self.true.robot)
+        tally.misfit.append(not misfit(estimate, self.weights, fit.scatter, friction).explained)
 
 
 def combination_errors(fit: Fit, combinations: Array) -> Array:

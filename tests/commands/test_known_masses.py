@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from torchid.config import load_config
 from torchid.errors import ConfoundedWarning
 from torchid.estimators import LeastSquares
 from torchid.fitting.known_masses import KnownMass, with_known_masses
-from torchid.identifiability.confounding import mass_weights
+from torchid.identifiability.confounding import combination_standard_error, mass_weights
 from torchid.parameters import PER_BODY
 from torchid.problem import LinearProblem
 
@@ -191,3 +192,14 @@ def test_exact_masses_hold_whatever_the_data_say_and_uncertain_ones_are_weighed(
     rows = np.vstack([A, 1.5 / 0.2 * total])
     expected = np.linalg.lstsq(rows[:, free], np.append(left, 7.5 * (7.0 - total[~free] @ nominal[~free])))[0]
     np.testing.assert_allclose(LeastSquares().solve(uncertain).phi[free], expected, rtol=1e-9)
+
+
+def test_a_known_mass_is_as_well_known_where_other_rows_are_mostly_noise_of_the_motion() -> None:
+    rng, count = np.random.default_rng(0), 3 * PER_BODY
+    A, b = rng.normal(size=(2 * count, count)), rng.normal(size=2 * count)
+    problem = LinearProblem(A, b, 0.0, 2 * count, np.ones(count), np.ones(count), np.ones(count, dtype=bool))
+    lacking, total = replace(problem, held=0.5 * A), mass_weights(3)
+    known = [with_known_masses(x, [KnownMass("a", total, 7.0)]) for x in (problem, lacking)]
+    errors = [combination_standard_error(x, LeastSquares().solve(x), total) for x in (problem, lacking, *known)]
+    assert errors[1] > 2.0 * errors[0]
+    assert errors[3] == pytest.approx(errors[2], rel=1e-9), "the row of the mass lacks nothing"

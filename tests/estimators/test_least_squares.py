@@ -13,6 +13,7 @@ from synthetic import Array
 
 from torchid.estimators import LeastSquares
 from torchid.problem import LinearProblem, TriangularFactor
+from torchid.problem.linear import PRIOR_DEVIATION
 
 seeds = st.integers(0, 2**32 - 1)
 few = settings(max_examples=50, deadline=None, derandomize=True)
@@ -225,3 +226,33 @@ def test_a_triangular_factor_keeps_all_that_least_squares_needs(seed: int) -> No
 def test_factors_of_different_problems_do_not_merge() -> None:
     with pytest.raises(ValueError, match="found a factor of 3 columns; accepted: 4 columns"):
         TriangularFactor(4).merge(TriangularFactor(3))
+
+
+# --------------------------------------------------------------------------------------------- rows that hold back data
+
+
+@pytest.mark.parametrize("ridge", [0.0, 0.1])
+def test_what_rows_lack_is_no_share_of_the_data_and_part_of_the_standard_error(ridge: float) -> None:
+    rng = np.random.default_rng(0)
+    problem = random_problem(rng, 40, 5, 6)
+    held, more = 0.3 * (problem.A * problem.scale), rng.normal(size=(40, 2))
+    held[:, 2] = problem.A[:, 2] * problem.scale[2]  # the third parameter is the prior's alone
+    held[:, 3:] = 0.0
+    lacking = replace(problem, held=np.hstack([PRIOR_DEVIATION * held, more]))
+    before, estimate = (LeastSquares(ridge).solve(x) for x in (problem, lacking))
+    assert np.array_equal(estimate.phi, before.phi)
+    shares = before.data_share * np.array([0.7, 0.7, 0.0, 1.0, 1.0, 1.0])
+    assert np.allclose(estimate.data_share, shares, atol=1e-9)
+    unit = np.eye(8)
+    moved = [LeastSquares(ridge).solve(replace(problem, b=problem.b - lacking.held @ z)).phi for z in unit]
+    expected = np.sqrt(before.noise_error**2 + np.square(np.array(moved) - before.phi).sum(0))
+    assert np.allclose(estimate.noise_error, expected, rtol=1e-9, equal_nan=True)
+    quarter = LeastSquares(ridge).solve(lacking.fraction(0.25))
+    assert np.allclose(quarter.data_share, estimate.data_share, rtol=1e-9), "of a part of the data likewise"
+
+
+def test_what_rows_lack_has_their_number_and_the_parameters() -> None:
+    problem = random_problem(np.random.default_rng(0), 9, 3, 3)
+    for shape in ((8, 3), (9, 2)):
+        with pytest.raises(ValueError, match=r"held: found shape .*; accepted: 9 rows, at least 3 columns"):
+            replace(problem, held=np.zeros(shape))

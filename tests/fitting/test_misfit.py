@@ -6,13 +6,21 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 from repository import DEMO
+from synthetic import UR5
 
+import torchid
 from torchid.cli import main
 from torchid.fitting.misfit import Misfit
 from torchid.fitting.noise import GroupNoise
+from torchid.fitting.unfitted_friction import UnfittedFriction, unfitted_friction
+from torchid.parameters import FRICTION
+from torchid.problem import bind_log
 
+UNITS = (("N m", "N m s/rad"), ("N", "N s/m"))
 UNPHYSICAL = "ignore::torchid.errors.TorchidWarning"
 
 
@@ -31,6 +39,52 @@ def test_a_model_explains_what_noise_would_leave_and_no_more() -> None:
     assert not alike.explained
     assert str(alike) == "neighbouring residuals agree 4 times as much as those of noise"
     assert replace(alike, lack_of_fit=None).explained
+    friction = UnfittedFriction(("knee", "slide"), np.array([[0.1, 0.02], [3.0, -1.0]]), UNITS, 40.0, 4)
+    unfitted = replace(good, friction=friction)
+    assert not unfitted.explained
+    assert str(unfitted) == (
+        "friction, which is not fitted, explains 40 times as much as it would of noise"
+        " (knee 0.1 N m and 0.02 N m s/rad, slide 3 N and -1 N s/m)"
+    )
+    assert replace(good, friction=replace(friction, ratio=1.9)).explained
+    assert replace(good, friction=replace(friction, ratio=4.5)).explained, "one in a thousand of noise, of so few"
+
+
+def noise_and_friction(level: float, count: int) -> list[UnfittedFriction]:
+    """Fits without friction of forces of an arm with so much of it, one in three readings independent."""
+    arm, rng = torchid.load_robot(UR5, fixed_base=True), np.random.default_rng(3)
+    builder = torchid.RowBuilder(arm, [], torchid.named_sensors("joints", arm.n, 0, torchid.SensorNoise(0.3, 1.0, 0.1)))
+    t = np.arange(400) / 100.0
+    phase, pace = rng.uniform(0.0, 6.0, arm.n), rng.uniform(3.0, 9.0, arm.n)
+    q, v, a = (0.5 * pace**k * np.sin(pace * t[:, None] + phase + k * np.pi / 2.0) for k in range(3))
+    log = torchid.Log(
+        "arm.npz", t, joint_names=arm.joint_names, joint_position=q, joint_velocity=v, joint_acceleration=a
+    )
+    phi = arm.nominal.copy()
+    phi[1:, FRICTION] = level * np.array([1.0, 0.5])
+    out = []
+    for _ in range(count):
+        exact = bind_log(replace(log, joint_torque=np.zeros_like(q)), arm, [])
+        torque = torchid.Regressor(arm)(*exact.coordinates()) @ torch.from_numpy(phi.flatten())
+        white = rng.normal(size=(len(t) + 2, arm.n))
+        smeared = 0.3 * (white[2:] + white[1:-1] + white[:-2]) / np.sqrt(3.0)
+        samples = replace(exact, torque=torque + torch.from_numpy(smeared), oversampling=3.0)
+        problem = torchid.linear_problem(torchid.compress([samples], builder), builder, arm, friction=False)
+        found = unfitted_friction(problem, arm)
+        assert found is not None
+        out.append(found)
+    return out
+
+
+def test_friction_that_is_not_fitted_shows_and_noise_does_not_look_like_it() -> None:
+    none = noise_and_friction(0.0, 100)
+    assert sum(one.significant for one in none) == 0
+    assert 0.7 < np.mean([one.ratio for one in none]) < 1.3, "of noise it explains as much as of noise"
+    for one in noise_and_friction(0.3, 10):
+        assert one.significant
+        assert one.combinations == 12
+        assert one.units[0] == ("N m", "N m s/rad")
+        assert np.allclose(one.values, [0.3, 0.15], atol=0.15)
 
 
 @pytest.mark.filterwarnings(UNPHYSICAL)
@@ -52,9 +106,12 @@ def test_friction_that_the_model_lacks_is_said_before_all_else(
     good, lacking = told["true"][0]["misfit"], told["false"][0]["misfit"]
     assert good["explained"]
     assert good["message"] == ""
+    assert good["unfitted_friction"] is None
     assert told["true"][0]["residual_std"] == pytest.approx(good["expected_residual_std"], rel=0.05)
     assert 0.7 < good["lack_of_fit"] < 1.3
     assert "NOT EXPLAINED" not in told["true"][1]
     assert not lacking["explained"]
     assert "most in joint_torque" in lacking["message"]
+    assert lacking["unfitted_friction"] > 100.0
+    assert "friction, which is not fitted, explains" in lacking["message"]
     assert told["false"][1].startswith("NOT EXPLAINED: the model does not explain these forces: residuals are 11 times")

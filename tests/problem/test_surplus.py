@@ -13,11 +13,20 @@ from arms import ARMS
 from torch import Tensor
 
 import torchid
-from torchid.problem import RowBuilder, Samples, TriangularFactor, assemble, compress, compress_parts
+from torchid.estimators import LeastSquares
+from torchid.fitting.fit import LogFitter
+from torchid.problem import ExtraTerms, RowBuilder, Samples, TriangularFactor, assemble, compress, compress_parts
 from torchid.problem.base_motion import BaseMotion
-from torchid.problem.compression import compress_in_blocks, merge_factors, split_into_folds
+from torchid.problem.compression import (
+    column_prior,
+    compress_in_blocks,
+    free_parameters,
+    merge_factors,
+    split_into_folds,
+)
+from torchid.problem.linear import parameter_scale
 from torchid.problem.motion_noise import MotionNoise
-from torchid.problem.surplus import LEAST_SIGNAL, NoiseShares, corrected_triangle
+from torchid.problem.surplus import LEAST_SIGNAL, ColumnPrior, NoiseShares, corrected_triangle
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, named_sensors
 
@@ -153,7 +162,9 @@ def test_long_logs_are_sampled(robot: Robot, builder: RowBuilder, monkeypatch: p
 
 def test_a_corrected_factor_is_that_of_the_rows_without_their_surplus(robot: Robot, builder: RowBuilder) -> None:
     factor = compress([motion(robot, 2000, 0.01)], builder)
-    R, noise = corrected_triangle(factor)
+    corrected_factor = corrected_triangle(factor, column_prior(builder, robot))
+    R, noise = corrected_factor.R, corrected_factor.noise
+    assert corrected_factor.held is None
     plain, surplus = gram(factor), factor.whole_surplus().numpy()
     assert 0.0 < noise.largest < 1.0 - LEAST_SIGNAL
     assert noise.lost == 0
@@ -169,10 +180,11 @@ def test_a_corrected_factor_is_that_of_the_rows_without_their_surplus(robot: Rob
 
 def test_no_more_is_taken_off_than_leaves_a_third(robot: Robot, builder: RowBuilder) -> None:
     factor = compress([motion(robot, 500, 1.0)], builder)
-    R, noise = corrected_triangle(factor)
+    corrected = corrected_triangle(factor, column_prior(builder, robot))
+    R, noise = corrected.R, corrected.noise
     assert 0 < noise.lost <= noise.combinations
     assert noise.largest > 1.0 - LEAST_SIGNAL
-    assert "remain too small" in str(noise)
+    assert "remain near the URDF's" in str(noise)
     plain = factor.triangle().numpy()[:, :-1]
     U, values, Vh = np.linalg.svd(plain, full_matrices=False)
     kept = values > 1e-9 * values[0]
@@ -180,14 +192,103 @@ def test_no_more_is_taken_off_than_leaves_a_third(robot: Robot, builder: RowBuil
     assert left.min() == pytest.approx(np.sqrt(LEAST_SIGNAL), rel=1e-6)
 
 
+SHARES = (-0.1, 0.2, 0.5, 0.7, 0.8, 0.9, 0.99)
+"""Of noise in the information on combinations of parameters; the last four are beyond what is taken off."""
+
+
+def factor_with(shares: tuple[float, ...], phi: np.ndarray) -> tuple[TriangularFactor, np.ndarray]:
+    """A factor with as much noise in combinations (k, k), whose normal equations without it have the solution phi."""
+    rng, count = np.random.default_rng(2), len(shares)
+    X, y = rng.normal(size=(200, count)) * 10.0 ** rng.uniform(-2.0, 2.0, count), rng.normal(size=200)
+    U, values, Vh = np.linalg.svd(X, full_matrices=False)
+    turn = np.linalg.qr(rng.normal(size=(count, count)))[0]
+    combinations = turn.T @ (values[:, None] * Vh)
+    surplus = np.zeros((count + 1, count + 1))
+    surplus[:-1, :-1] = combinations.T * shares @ combinations
+    surplus[:-1, -1] = surplus[-1, :-1] = X.T @ y - (X.T @ X - surplus[:-1, :-1]) @ phi
+    factor, support = TriangularFactor(count), tuple(range(count))
+    factor.add(support, torch.from_numpy(np.column_stack([X, y])))
+    factor.add_surplus({support: torch.from_numpy(surplus)})
+    return factor, combinations
+
+
+@pytest.mark.parametrize("lost", [0, 4])
+def test_combinations_that_are_mostly_noise_follow_the_data_as_far_as_these_go_and_the_prior_beyond(lost: int) -> None:
+    rng, shares = np.random.default_rng(5), SHARES[: len(SHARES) - 4 + lost]
+    count = len(shares)
+    prior = ColumnPrior(rng.normal(size=count - 1), rng.normal(size=(count - 1, count + 2)))  # and an extra column
+    deviations = rng.normal(size=count + 2)
+    phi, nominal = np.append(prior.nominal + prior.spread @ deviations, 0.0), np.append(prior.nominal, 0.0)
+    factor, combinations = factor_with(shares, phi)
+    corrected = corrected_triangle(factor, prior)
+    best = np.linalg.solve(corrected.R[:-1, :-1], corrected.R[:-1, -1])
+    follows = np.minimum((1.0 - np.array(shares)) / LEAST_SIGNAL, 1.0)
+    expected = follows * (combinations @ (phi - nominal))
+    assert np.allclose(combinations @ (best - nominal), expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
+    assert corrected.noise.lost == lost
+    if not lost:
+        assert corrected.held is None
+        return
+    assert corrected.held is not None
+    off = combinations @ (phi - corrected.held[:, : count + 2] @ deviations - best)
+    assert np.abs(off).max() < 1e-9 * np.abs(expected).max()
+    of_extra = np.abs(corrected.held[:, count + 2 :])
+    along = (1.0 - follows) * combinations[:, -1] * best[-1]
+    assert np.allclose(combinations @ corrected.held[:, -1], along, rtol=1e-9, atol=1e-9 * of_extra.max())
+
+
+def test_combinations_with_more_noise_than_information_keep_to_the_prior() -> None:
+    prior = ColumnPrior(np.array([3.0, -2.0]), np.eye(2))
+    for share in (1.5, 1000.0):
+        factor, combinations = factor_with((0.1, share), np.array([1.0, 1.0]))
+        gained = gram(factor)[:-1, -1]
+        factor.surplus[0, 1][:-1, -1] = factor.surplus[0, 1][-1, :-1] = torch.from_numpy(gained)  # forces tell nothing
+        corrected = corrected_triangle(factor, prior)
+        best = np.linalg.solve(corrected.R[:-1, :-1], corrected.R[:-1, -1])
+        assert combinations[1] @ best == pytest.approx(combinations[1] @ prior.nominal, rel=1e-9)
+        assert corrected.held is not None
+        assert np.allclose(combinations[1] @ corrected.held[:, :2], combinations[1], rtol=1e-9)
+
+
+@pytest.mark.parametrize("ridge", [0.0, 1e-6])
+def test_intervals_hold_what_data_that_are_mostly_noise_leave_to_the_prior(robot: Robot, ridge: float) -> None:
+    bolted = torchid.load_robot(robot.path, fixed_base=True)
+    terms, sensors = ExtraTerms(offsets={"joint_torque": "log"}), named_sensors("joints", 2, 0, SensorNoise(0.1, 1.0))
+    builder = RowBuilder(bolted, [], sensors, terms)
+    noise = replace(unit_noise(0.1), base=torch.zeros(12, 12, dtype=torch.float64), turns_force=False)
+    moving = replace(motion(bolted, 2000), base=BaseMotion(), active=torch.zeros(2000, 0, dtype=torch.bool))
+    slow = replace(moving, joint_acceleration=0.02 * moving.joint_acceleration, motion_noise=noise)
+    fitter = LogFitter(robot=bolted, builder=builder, estimator=LeastSquares(ridge), friction=False)
+    scale = parameter_scale(bolted.nominal).flatten() * free_parameters(bolted, friction=False)
+    rng, regressor = np.random.default_rng(7), torchid.Regressor(bolted)(*slow.coordinates())
+    missed, scattered = [], []
+    for noisy in draws(slow, 20):
+        phi = bolted.nominal.flatten() + scale * rng.uniform(-1.0, 1.0, len(scale))
+        torque = regressor @ torch.from_numpy(phi)
+        torque = torque + 0.1 * torch.from_numpy(rng.normal(size=torque.shape))
+        logs = split_into_folds([replace(noisy, torque=torque, motion_noise=noise)], builder)
+        fit = fitter.fit(compress_in_blocks(logs, builder))
+        assert fit.scatter is not None
+        known, off = fit.estimate.identifiable, np.abs(fit.estimate.phi - phi)
+        missed.append((off > 1.96 * fit.estimate.standard_error)[known])
+        scattered.append((off > 1.96 * np.linalg.norm(fit.scatter.deviations[: fit.scatter.blocks], axis=0))[known])
+    assert np.mean(missed, axis=0).max() <= 0.1
+    assert np.mean(scattered, axis=0).max() > 0.8, "the scatter alone misses one in most cases"
+
+
 def test_without_noise_nothing_changes(robot: Robot, builder: RowBuilder) -> None:
     factor = compress([replace(motion(robot, 300), motion_noise=None)], builder)
     assert not factor.surplus
-    R, noise = corrected_triangle(factor)
+    prior = column_prior(builder, robot)
+    corrected = corrected_triangle(factor, prior)
+    R, noise = corrected.R, corrected.noise
+    assert corrected.held is None
     assert np.allclose(R, factor.triangle().numpy(), rtol=1e-12)
     assert noise == NoiseShares()
     little = compress([motion(robot, 300, 1e-9)], builder)
-    assert np.allclose(corrected_triangle(little)[0], little.triangle().numpy(), rtol=1e-12), "far below all errors"
+    assert np.allclose(corrected_triangle(little, prior).R, little.triangle().numpy(), rtol=1e-12), (
+        "far below all errors"
+    )
 
 
 def test_scaled_merged_and_compact_factors_take_their_surplus_along(robot: Robot, builder: RowBuilder) -> None:

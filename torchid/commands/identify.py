@@ -34,6 +34,7 @@ from torchid.fitting.fleet import read_fleet
 from torchid.fitting.misfit import misfit
 from torchid.fitting.noise import NoiseSummary
 from torchid.fitting.robust import RobustSummary, fit_robustly
+from torchid.fitting.unfitted_friction import unfitted_friction
 from torchid.identifiability.base_parameters import StateReport, require_base, state_reports
 from torchid.identifiability.confounding import TotalMass
 from torchid.identifiability.contributions import Contributions, contributions
@@ -216,7 +217,7 @@ def _identify(config: ExperimentConfig, resume: bool, bars: Progress) -> tuple[I
         extras=fit.extras,
         noise=ready.noise,
         motion_noise=fit.assembly.noise,
-        misfit=misfit(estimate, ready.noise, fit.scatter),
+        misfit=misfit(estimate, ready.noise, fit.scatter, unfitted_friction(problem, experiment.robot)),
         robust=solved.robust,
         states=ready.states,
         by_state=alone,

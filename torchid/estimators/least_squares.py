@@ -186,8 +186,8 @@ class LeastSquares(Regularized):
         """Fit the free parameters.
 
         Standard errors, `noise_error`, propagate the sensor noise, scaled to the observed residual, through the
-        estimator, and count only as many rows as the filtered noise leaves independent; they do not contain the bias
-        of the prior. They are NaN where the data alone do not determine the parameter.
+        estimator, and count only as many rows as the filtered noise leaves independent. Of the prior's bias they
+        contain what `held` of the problem says. They are NaN where the data alone do not determine the parameter.
 
         Raises:
             InputError: a decomposition failed.
@@ -209,9 +209,12 @@ class LeastSquares(Regularized):
         observable, identifiable = np.zeros(len(phi), dtype=bool), np.zeros(len(phi), dtype=bool)
         observable[free], identifiable[free] = null_share**2 < 1.0 - _OBSERVABLE, null_share < UNOBSERVABLE_SHARE
         noise_error, data_share = np.full(len(phi), np.nan), np.full(len(phi), np.nan)
-        noise_error[free] = noise * scale * np.linalg.norm(gain, axis=1)
+        noise_error[free], by_data = noise * scale * np.linalg.norm(gain, axis=1), A
+        if problem.held is not None and problem.held_parameters is not None:
+            noise_error[free] = np.hypot(noise_error[free], scale * np.linalg.norm(gain @ problem.held, axis=1))
+            by_data = A - problem.held_parameters
         noise_error[~identifiable] = np.nan
-        data_share[free] = np.clip(np.einsum("pr,rp->p", gain, A), 0.0, 1.0)  # diagonal of gain @ A
+        data_share[free] = np.clip(np.einsum("pr,rp->p", gain, by_data), 0.0, 1.0)  # diagonal of gain @ A
         return Estimate(
             phi=phi,
             noise_error=noise_error,

@@ -131,7 +131,12 @@ def with_known_masses(
         more[:, free] = weights[:, None] * equations / scale
         rows = np.concatenate([rows, more])
         values = np.append(values, weights * missing + more @ problem.nominal)
-    return replace(problem, A=np.concatenate([A, rows]), b=np.append(b, values), rows=problem.rows + len(values))
+    held = problem.held
+    if held is not None:
+        held = np.concatenate([held, np.zeros((len(rows), held.shape[1]))])
+    return replace(
+        problem, A=np.concatenate([A, rows]), b=np.append(b, values), rows=problem.rows + len(values), held=held
+    )
 
 
 def _eliminated(problem: LinearProblem, masses: Sequence[KnownMass], noise: float) -> tuple[Array, Array, Array, Array]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from torchid.estimators import Estimate
 from torchid.fitting.noise import GroupNoise, NoiseSummary
+from torchid.fitting.unfitted_friction import UnfittedFriction
 from torchid.identifiability.block_scatter import BlockScatter
 from torchid.problem import LinearProblem
 
@@ -31,6 +32,7 @@ class Misfit:
         error_growth: median over the identified parameters of the standard error by the scatter between blocks over
             that by noise, None likewise.
         groups: of readings and base rows that exceed their noise most.
+        friction: that was not fitted, None where all of it was.
     """
 
     residual: float
@@ -38,12 +40,14 @@ class Misfit:
     lack_of_fit: float | None
     error_growth: float | None
     groups: tuple[GroupNoise, ...]
+    friction: UnfittedFriction | None = None
 
     @property
     def explained(self) -> bool:
         """Whether noise may be all that the model leaves."""
         much = self.expected is not None and self.residual > _MUCH * self.expected
-        return not much and (self.lack_of_fit is None or self.lack_of_fit <= _ALIKE)
+        alike = self.lack_of_fit is not None and self.lack_of_fit > _ALIKE
+        return not (much or alike or (self.friction is not None and self.friction.significant))
 
     def __str__(self) -> str:
         """In words, "" where the model explains the forces."""
@@ -54,6 +58,8 @@ class Misfit:
             reasons.append(f"residuals are {self.residual / self.expected:.2g} times what the stated noise leaves")
         if self.lack_of_fit is not None and self.lack_of_fit > _ALIKE:
             reasons.append(f"neighbouring residuals agree {self.lack_of_fit:.2g} times as much as those of noise")
+        if self.friction is not None and self.friction.significant:
+            reasons.append(str(self.friction))
         share = self.expected or 1.0
         shown = [
             f"{one.group} {one.residual:.2g} {one.unit} where {share * one.used:.2g} are expected"
@@ -64,13 +70,16 @@ class Misfit:
         return f"{' and '.join(reasons)}{where}"
 
 
-def misfit(estimate: Estimate, noise: NoiseSummary, scatter: BlockScatter | None) -> Misfit:
+def misfit(
+    estimate: Estimate, noise: NoiseSummary, scatter: BlockScatter | None, friction: UnfittedFriction | None
+) -> Misfit:
     """What a fit leaves of the forces.
 
     Args:
         estimate: of the training logs.
         noise: that rows were weighed with.
         scatter: of the estimate between blocks of these logs.
+        friction: that was not fitted.
     """
     share = float(1.0 / np.sqrt(estimate.oversampling))
     stated = any(one.origin == "stated" for one in noise.groups)
@@ -86,6 +95,7 @@ def misfit(estimate: Estimate, noise: NoiseSummary, scatter: BlockScatter | None
         lack_of_fit=None if scatter is None else scatter.lack_of_fit,
         error_growth=growth,
         groups=tuple(sorted(beyond, key=lambda one: -excess[one.group])),
+        friction=friction,
     )
 
 

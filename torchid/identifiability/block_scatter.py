@@ -40,7 +40,8 @@ class BlockScatter:
     Attributes:
         blocks: their number G.
         deviations: (G, 12 L), whose norm over the blocks is the standard error of the parameters; 1.96 times it is half
-            of a 95 % interval.
+            of a 95 % interval. Where rows are mostly noise of the motion, rows of what they lack follow (`held` of
+            `LinearProblem`): no scatter tells of that.
         without_ridge: (G, 12 L), the same of the estimate without regularization.
         extras: the same of the extra parameters, (G, M) for each elimination, without regularization.
         lack_of_fit: variance of the blocks' part of the residuals over what it is if residuals are independent noise: 1
@@ -98,12 +99,14 @@ def block_scatter(
     )
     expected = noise * (np.trace(of_rows, axis1=1, axis2=2) - (of_rows * shares).sum((1, 2))).sum()
     factor = np.sqrt((count - 1) / count) * stats.t.ppf(0.975, count - 1) / _NORMAL
-    without_ridge = factor * _left_out(scores, shares) @ basis.T
+    held = np.zeros((0, basis.shape[1])) if problem.held is None else problem.held.T @ problem.A @ basis
+    without_ridge = np.concatenate([factor * _left_out(scores, shares), held]) @ basis.T
     with_ridge = without_ridge
     if ridge > 0.0:
         values = covariance.values[: basis.shape[1]]
         shrunk = values / np.sqrt(values**2 + ridge * problem.rows)
-        with_ridge = factor * _left_out(scores * shrunk, shares * np.outer(shrunk, shrunk)) * shrunk @ basis.T
+        scattered = factor * _left_out(scores * shrunk, shares * np.outer(shrunk, shrunk))
+        with_ridge = np.concatenate([scattered, held * shrunk]) * shrunk @ basis.T
     return BlockScatter(
         blocks=count,
         deviations=with_ridge,
@@ -225,6 +228,7 @@ def _of_extras(gradients: dict[str, Array], bodies: Array, assembly: Assembly, f
     out: dict[str, Array] = {}
     for one in sorted(assembly.eliminations, key=lambda elimination: elimination.log):  # that of all logs comes first
         moved = np.hstack([bodies, out[""]]) if one.log and "" in out else bodies
-        direct = factor * gradients[_name(one.log)] @ one.inverse @ one.inverse.T
+        direct = np.zeros((len(moved), len(one.extras)))
+        direct[: len(gradients[_name(one.log)])] = factor * gradients[_name(one.log)] @ one.inverse @ one.inverse.T
         out[one.log] = direct - moved @ (one.inverse @ one.C[:, : moved.shape[1]]).T
     return tuple(out[one.log] for one in assembly.eliminations)

@@ -209,14 +209,14 @@ def total_mass(
         block_error: standard error by the scatter between blocks of the logs, which counts if it is the larger.
     """
     weights = mass_weights(len(estimate.phi) // parameters.PER_BODY)
-    error, if_known = (
+    error, by_rows, if_known = (
         combination_standard_error(problem, estimate, weights, rank_tolerance)
-        for problem in (assembly.problem, assembly.if_known)
+        for problem in (assembly.problem, replace(assembly.problem, held=None), assembly.if_known)
     )
     noise = float(np.sqrt(assembly.problem.oversampling) * estimate.residual_std)
     covariance = ParameterCovariance.of(assembly.problem, rank_tolerance, assembly.stated)
     along = covariance.scale_sensitivity(weights[None])[0]
-    by_data = noise * covariance.without_stated(error / noise, along) if assembly.stated and noise else error
+    by_data = noise * covariance.without_stated(by_rows / noise, along) if assembly.stated and noise else by_rows
     separable = not np.isfinite(if_known) or by_data <= INFLATION_LIMIT * if_known
     value, nominal = (float(weights @ phi) for phi in (estimate.phi, assembly.problem.nominal))
     if assembly.scaled_by is not None:
@@ -243,7 +243,11 @@ def combination_standard_error(
     along = covariance.scale_sensitivity(weights[None])
     if np.linalg.norm(along @ covariance.null_space) > UNOBSERVABLE_SHARE * np.linalg.norm(along):
         return float("inf")
-    return float(np.sqrt(problem.oversampling) * estimate.residual_std * np.linalg.norm(along @ covariance.root))
+    noise = np.sqrt(problem.oversampling) * estimate.residual_std * np.linalg.norm(along @ covariance.root)
+    if problem.held is None:
+        return float(noise)
+    by_rows = covariance.root.T @ (problem.A[:, problem.free] * covariance.scale).T @ problem.held
+    return float(np.hypot(noise, np.linalg.norm(along @ covariance.root @ by_rows)))
 
 
 @dataclass(frozen=True)

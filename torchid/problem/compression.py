@@ -15,11 +15,11 @@ from torchid.parameters import Array
 from torchid.problem.chunk_dynamics import Workspace
 from torchid.problem.chunks import ProgressCallback, chunks_by_state, map_chunks, one_thread, worker_count
 from torchid.problem.contact_state import ContactState
-from torchid.problem.linear import LinearProblem, TriangularFactor, parameter_scale
+from torchid.problem.linear import PRIOR_DEVIATION, LinearProblem, TriangularFactor, parameter_scale
 from torchid.problem.row_compressor import RowCompressor
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
-from torchid.problem.surplus import Surplus, compress_surplus, corrected_triangle
+from torchid.problem.surplus import ColumnPrior, Surplus, compress_surplus, corrected_triangle
 from torchid.problem.unloaded_offsets import unloaded_offset_equations
 from torchid.reprs import short_repr
 from torchid.robot import Robot
@@ -248,12 +248,26 @@ def linear_problem(factor: TriangularFactor, builder: RowBuilder, robot: Robot, 
     """
     if builder.extras:
         raise ValueError("builder: found extra terms; accepted: one without, or torchid.assemble")
-    R, _ = corrected_triangle(factor)
-    return problem_from_triangle(R, factor.rows, factor.oversampling, builder, robot, friction)
+    own = corrected_triangle(factor, column_prior(builder, robot, friction))
+    return problem_from_triangle(own.R, factor.rows, factor.oversampling, builder, robot, friction, held=own.held)
+
+
+def column_prior(builder: RowBuilder, robot: Robot, friction: bool = True) -> ColumnPrior:
+    """The nominal parameters in the builder's columns, and deviations within their scale of those that are free."""
+    columns, nominal = builder.columns.parameter_map, robot.nominal.flatten()
+    scale = np.where(free_parameters(robot, friction), parameter_scale(robot.nominal).flatten(), 0.0)
+    return ColumnPrior(columns @ nominal, columns * (PRIOR_DEVIATION * scale))
 
 
 def problem_from_triangle(
-    R: Array, rows: int, oversampling: float, builder: RowBuilder, robot: Robot, friction: bool = True
+    R: Array,
+    rows: int,
+    oversampling: float,
+    builder: RowBuilder,
+    robot: Robot,
+    friction: bool = True,
+    *,
+    held: Array | None = None,
 ) -> LinearProblem:
     """The problem in all 12 L parameters from a triangle in the regrouped columns, right-hand side last.
 
@@ -264,6 +278,7 @@ def problem_from_triangle(
         builder: of the rows.
         robot: the robot.
         friction: whether friction is free.
+        held: (columns, Q), as `CorrectedTriangle` has it.
     """
     count = builder.columns.count
     return LinearProblem(
@@ -275,6 +290,7 @@ def problem_from_triangle(
         scale=parameter_scale(robot.nominal).flatten(),
         free=free_parameters(robot, friction),
         oversampling=oversampling,
+        held=None if held is None else R[:count, :-1] @ held,
     )
 
 

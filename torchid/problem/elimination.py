@@ -9,7 +9,7 @@ import numpy as np
 
 from torchid.parameters import Array
 from torchid.problem.chunks import one_thread
-from torchid.problem.compression import Part, merge_factors, problem_from_triangle
+from torchid.problem.compression import Part, column_prior, merge_factors, problem_from_triangle
 from torchid.problem.extras import Extra
 from torchid.problem.linear import LinearProblem
 from torchid.problem.rows import RowBuilder
@@ -91,23 +91,29 @@ def assemble(parts: Sequence[Part], builder: RowBuilder, robot: Robot, friction:
     least-squares solution nor the noise of the rows.
     """
     everything = merge_factors((part.factor for part in parts), builder)
-    of_all_logs, noise = corrected_triangle(everything)
+    prior = column_prior(builder, robot, friction)
+    corrected = corrected_triangle(everything, prior)
+    of_all_logs, noise, held = corrected.R, corrected.noise, corrected.held
     forces = float(np.square(of_all_logs[:, -1]).sum())
     if not builder.extras:
-        problem = problem_from_triangle(of_all_logs, everything.rows, everything.oversampling, builder, robot, friction)
+        problem = problem_from_triangle(
+            of_all_logs, everything.rows, everything.oversampling, builder, robot, friction, held=held
+        )
         return Assembly(problem, (), problem, noise, forces)
     count = builder.columns.count
     per_log, of_all = ([n for n, extra in enumerate(builder.extras) if extra.per_log is own] for own in (True, False))
     eliminations, rows = [], of_all_logs
     if per_log:
-        extras, remaining = tuple(builder.extras[number] for number in per_log), []
+        extras, remaining, lacking = tuple(builder.extras[number] for number in per_log), [], []
         for source in dict.fromkeys(part.source for part in parts):
-            R, _ = corrected_triangle(merge_factors((p.factor for p in parts if p.source == source), builder))
-            rest = np.delete(R, [count + number for number in per_log], axis=1)
-            columns = R[:, [count + number for number in per_log]]
+            own = corrected_triangle(merge_factors((p.factor for p in parts if p.source == source), builder), prior)
+            rest = np.delete(own.R, [count + number for number in per_log], axis=1)
+            columns = own.R[:, [count + number for number in per_log]]
             elimination, rest = _eliminate(source, extras, columns, rest, builder, np.linalg.norm(columns, axis=0))
             eliminations.append(elimination)
             remaining.append(rest)
+            lacking.append((rest, None if own.held is None else np.delete(own.held, [count + n for n in per_log], 0)))
+        held = _held_together(lacking)
         rows = np.asarray(np.linalg.qr(np.concatenate(remaining), mode="r"))
     if of_all:
         extras = tuple(builder.extras[number] for number in of_all)
@@ -118,10 +124,23 @@ def assemble(parts: Sequence[Part], builder: RowBuilder, robot: Robot, friction:
         rows = np.asarray(np.linalg.qr(rows, mode="r"))
     spent = everything.oversampling * sum(elimination.inverse.shape[1] for elimination in eliminations)
     rows_left = max(everything.rows - round(spent), 1)
-    problem = problem_from_triangle(rows, rows_left, everything.oversampling, builder, robot, friction)
+    held = None if held is None else held[:count]
+    problem = problem_from_triangle(rows, rows_left, everything.oversampling, builder, robot, friction, held=held)
     known = np.asarray(np.linalg.qr(np.delete(of_all_logs, np.s_[count:-1], axis=1), mode="r"))
     if_known = problem_from_triangle(known, everything.rows, everything.oversampling, builder, robot, friction)
     return Assembly(problem, tuple(eliminations), if_known, noise, forces)
+
+
+def _held_together(logs: Sequence[tuple[Array, Array | None]]) -> Array | None:
+    """What the parameters that fit the rows of all logs best lack, (columns, Q), by rows and `held` of each."""
+    width = max((held.shape[1] for _, held in logs if held is not None), default=0)
+    if not width:
+        return None
+    rows = np.concatenate([rest[:, :-1] for rest, _ in logs])
+    lacking = [np.zeros((len(rest), width)) if held is None else rest[:, :-1] @ held for rest, held in logs]
+    size = np.linalg.norm(rows, axis=0)
+    scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
+    return np.asarray(scale[:, None] * (np.linalg.pinv(rows * scale, rcond=RANK_TOLERANCE) @ np.concatenate(lacking)))
 
 
 def _eliminate(

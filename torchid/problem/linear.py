@@ -30,6 +30,9 @@ class LinearProblem:
         free: (P,) bool, parameters to fit; the others stay nominal.
         oversampling: rows per independent row, at least 1: a low-pass filter leaves noise correlated, so that rows hold
             less information than their number suggests.
+        held: (R, Q), None without any: what the right-hand side lacks, of rows that are mostly noise of the motion, for
+            independent deviations of unit variance from the nominal parameters. The first P are of the parameters, by
+            `PRIOR_DEVIATION` of their scale: A (phi - nominal) - held @ deviations is what to expect of b - A nominal.
     """
 
     A: Array
@@ -40,6 +43,7 @@ class LinearProblem:
     scale: Array
     free: np.ndarray
     oversampling: float = 1.0
+    held: Array | None = field(default=None, kw_only=True)
     _shared: dict[Hashable, object] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     __repr__ = short_repr
@@ -55,6 +59,8 @@ class LinearProblem:
             raise ValueError(
                 f"b, nominal, scale, free: found shapes {shapes}; accepted: {rows} rows, {columns} columns"
             )
+        if self.held is not None and (len(self.held) != rows or self.held.shape[1] < columns):
+            raise ValueError(f"held: found shape {self.held.shape}; accepted: {rows} rows, at least {columns} columns")
         for name in ("A", "b", "residual", "nominal", "scale"):
             if not np.isfinite(getattr(self, name)).all():
                 raise ValueError(f"{name}: found a number that is not finite; accepted: finite numbers")
@@ -94,12 +100,25 @@ class LinearProblem:
         """The problem scaled to a share of its rows: that share of its information."""
         root = float(np.sqrt(share))
         rows = max(round(share * self.rows), 1)
-        return replace(self, A=root * self.A, b=root * self.b, residual=share * self.residual, rows=rows)
+        held = None if self.held is None else root * self.held
+        return replace(self, A=root * self.A, b=root * self.b, residual=share * self.residual, rows=rows, held=held)
+
+    @property
+    def held_parameters(self) -> Array | None:
+        """The part of `held` by deviations of the free parameters, (R, P'), in units of their scale."""
+        return None if self.held is None else self.held[:, : len(self.free)][:, self.free] / PRIOR_DEVIATION
 
     def prediction_distance(self, phi: Array, other: Array) -> float:
         """Rms difference of the projected whitened forces that two parameter vectors, (P,), predict."""
         difference = self.A @ (phi - other)
         return float(np.sqrt(difference @ difference / max(self.rows, 1)))
+
+
+PRIOR_DEVIATION = 3.0**-0.5
+"""Standard deviation, by its scale, of a parameter that is known to be within its scale of the nominal one.
+
+A mass is then between nothing and twice the nominal one.
+"""
 
 
 def parameter_scale(nominal: Array) -> Array:
