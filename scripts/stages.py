@@ -117,7 +117,10 @@ def measure_stages(builder: RowBuilder, samples: Samples, limits: Limits) -> Sta
 
         def bases() -> None:
             for state, known in kinematics:
-                exhaust(builder.null_space_bases(state, known))
+                layout = builder.layout(state)
+                if layout.contact_bodies:
+                    contact = builder.contact_rows(layout, known)
+                    exhaust(builder.whitened_bases(layout, contact, contact.of_measured(), known.rotation_world_base))
 
         def rows() -> None:
             for chunk, state in chunks:

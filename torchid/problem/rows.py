@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchid.parameters import Array
 from torchid.problem.base_motion import levelled_base_axes
 from torchid.problem.chunk_dynamics import ChunkDynamics, ChunkKinematics, Workspace
-from torchid.problem.contact_rows import contact_rows, whitened_bases
+from torchid.problem.contact_rows import ContactRows, contact_rows, whitened_bases
 from torchid.problem.contact_state import Columns, ContactState, ContactStateLayout, ContactStateLayouts
 from torchid.problem.extra_columns import dof_extra_column, extra_columns
 from torchid.problem.extras import ExtraTerms, list_extras
@@ -201,8 +201,18 @@ class RowBuilder(nn.Module):
     ) -> Iterator[tuple[Tensor | slice, Tensor]]:
         """Orthonormal V_x, (B', base rows + coupled joints, r), with the samples it belongs to, grouped by rank."""
         layout = self._layouts.layout(state, kinematics.recorded_normals)
-        rows = contact_rows(self.tree, layout, kinematics, self._layouts.frame_origin)
-        yield from null_space(rows.of_unmeasured(slice(None)))
+        yield from null_space(self.contact_rows(layout, kinematics).of_unmeasured(slice(None)))
+
+    def contact_rows(self, layout: ContactStateLayout, kinematics: ChunkKinematics) -> ContactRows:
+        """Rows of J_C, unmeasured and measured, of the bodies that are in contact."""
+        return contact_rows(self.tree, layout, kinematics, self._layouts.frame_origin)
+
+    def whitened_bases(
+        self, layout: ContactStateLayout, rows: ContactRows, measured: Tensor, rotation_world_base: Tensor | None
+    ) -> Iterator[tuple[Tensor | slice, Tensor]]:
+        """W, (base rows + coupled joints, r, B'), of contact rows with the samples it belongs to, grouped by rank."""
+        axes = self.noise_axes(rotation_world_base) if self.sensors.noise.base_axes_differ else None
+        return whitened_bases(layout, rows, measured, axes, self.tree.index(layout.blocks.order))
 
     def contact_jacobian(self, samples: Samples) -> Tensor:
         """Jacobians of all contacts along their frames' axes, active or not, (B, C, 6, n_rows).
@@ -285,15 +295,13 @@ class RowBuilder(nn.Module):
         """Samples of one rank, their W, (base rows + coupled joints, r, B'), and their rows, block by block."""
         if not (self.tree.base_rows or layout.coupled_joints):
             return
-        rows = contact_rows(self.tree, layout, dynamics, self._layouts.frame_origin)
+        rows = self.contact_rows(layout, dynamics)
         measured = rows.of_measured()
         torque = self.recorded_torque(samples)[:, self.tree.index(layout.coupled_joints)]
         f = nn.functional.pad(torque, (self.tree.base_rows, 0))
         if len(layout.wrench_std):
             f = f + (measured.permute(2, 1, 0) @ self._measured_wrench(samples, layout, dynamics)[..., None])[..., 0]
-        axes = self.noise_axes(dynamics.rotation_world_base) if self.sensors.noise.base_axes_differ else None
-        order = self.tree.index(layout.blocks.order)
-        for index, W in whitened_bases(layout, rows, measured, axes, order):
+        for index, W in self.whitened_bases(layout, rows, measured, dynamics.rotation_world_base):
             own = measured[..., index].permute(2, 0, 1)
             part = _Part(samples[index], f[index].T, own, dynamics.select(index))
             yield index, W, self._projected_blocks(W, part, layout, workspace)
