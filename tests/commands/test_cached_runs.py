@@ -210,7 +210,8 @@ def test_noise_sensors_extras_and_folds_change_the_name_of_factors(demo: Path, t
     values |= {"base_force": [1.0, 2.0, 3.0], "base_moment": [1.0, 2.0, 3.0], "ft_force": 0.3, "ft_moment": 0.3}
     assert values.keys() | STATED_FIELDS.keys() == {x.name for x in fields(NoiseConfig)}
     values = {name: x for name, x in values.items() if name not in STATED_FIELDS}  # change samples
-    terms = {"armature": True, "torque_offset": True, "asymmetric_coulomb": True, "sign_width": 0.01}
+    terms = {"armature": True, "torque_offset": True, "asymmetric_coulomb": True, "stiffness": True}
+    terms["sign_width"] = 0.01
     assert terms.keys() == {x.name for x in fields(ActuatorsConfig)}
     others = [f"sensors.noise.{name}={json.dumps(x)}" for name, x in values.items()]
     others += [f"actuators.{name}={json.dumps(x)}" for name, x in terms.items()]

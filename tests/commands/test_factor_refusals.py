@@ -43,6 +43,7 @@ REFUSED = {
     "extras": (["sensors.offsets=log"], "sensors.offsets: without offset of front_left_hip, by log"),
     "scales": (["sensors.scales=all"], "sensors.scales: without scale of front_left_hip, of all logs"),
     "actuators": (["actuators.armature=true"], "actuators: without armature of front_left_hip"),
+    "tilt": (["robot.base_tilt=[0.1, 0]"], "robot.base_tilt: none; accepted: 0.1, 0.0, as in the experiment file"),
     "sign": (["actuators.sign_width=0.1"], "actuators.sign_width: none; accepted: 0.1"),
     "contacts": (
         ["contacts=[{frame: front_left_foot, type: point}, {frame: front_right_foot, type: point}]"],

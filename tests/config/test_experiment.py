@@ -38,7 +38,13 @@ ALL: dict[str, Any] = {
         "scales": {"ft_force": "log", "joint_torque": [["hip", "*_hip"], ["knee"]]},
         "on_base_lost": "warn",
     },
-    "actuators": {"armature": True, "torque_offset": False, "asymmetric_coulomb": True, "sign_width": 0.01},
+    "actuators": {
+        "armature": True,
+        "torque_offset": False,
+        "asymmetric_coulomb": True,
+        "stiffness": False,
+        "sign_width": 0.01,
+    },
     "estimator": {"name": "least_squares", "ridge": 1e-5, "rank_tolerance": 1e-7, "friction": False},
     "analysis": {
         "scenarios": {"stand": [["l_sole", "r_sole"]], "step": [["l_sole"], ["r_sole"], []]},
@@ -303,6 +309,8 @@ def test_a_value_of_the_wrong_kind_is_refused_by_its_place(file: Path, settings:
             "actuators.sign_width=wide",
             "actuators.sign_width: found 'wide'; accepted: auto, null, or a number",
         ),
+        ("robot.base_tilt=[0.1]", "robot.base_tilt: found [0.1]; accepted: auto, null, or two angles [rad]"),
+        ("robot.base_tilt=level", "robot.base_tilt: found 'level'; accepted: auto, null, or two angles [rad]"),
         ("estimator.training.epochs=2.5", "estimator.training.epochs: found 2.5; accepted: a whole number"),
         ("overwrite=perhaps", "overwrite: found 'perhaps'; accepted: true or false"),
         (

@@ -26,7 +26,7 @@ from torchid.problem.contact_state import ContactState
 from torchid.problem.extras import CHANNELS
 from torchid.sensing import Contact, SensorSet, with_ft_sensors
 
-DECISION = "sensing/projection.py, _exists: _local_scalar_dense (a number)"
+DECISION = "sensing/projection.py, any_suspect: _local_scalar_dense (a number)"
 CHUNK = 32
 LEGS = tuple(Contact(f"{leg}_FOOT", "point") for leg in ("FL", "FR", "HL", "HR"))
 SOLES = tuple(Contact(f"{side}_ankle_roll_link", "flat") for side in ("left", "right"))
@@ -40,6 +40,7 @@ TERMS = ExtraTerms(
     armature=True,
     torque_offset=True,
     asymmetric_coulomb=True,
+    stiffness=True,
     sign_width=0.05,
 )
 Chunks = Sequence[tuple[Samples, ContactState]]

@@ -22,7 +22,7 @@ from torchid.identifiability.base_parameters import base_parameters
 from torchid.identifiability.structure import structural_problem
 from torchid.logs import Log
 from torchid.problem import ExtraTerms, bind_log
-from torchid.problem.extras import CHANNELS, list_extras
+from torchid.problem.extras import ACTUATORS, CHANNELS, list_extras
 from torchid.problem.predict import calibrate_readings
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
@@ -136,9 +136,9 @@ def test_a_contact_and_a_limb_sensor_of_one_name_have_unknowns_of_their_own() ->
     assert len(set(labels)) == len(labels) == robot.n + 6 * len(SENSORS) + 6
 
 
-@pytest.mark.parametrize("kinds", ["asymmetric_coulomb", "all"])
+@pytest.mark.parametrize("kinds", ["asymmetric_coulomb", "stiffness", "all"])
 def test_terms_of_actuators_are_found_with_friction_that_turns_over_smoothly(kinds: str) -> None:
-    every = ("armature", "torque_offset", "asymmetric_coulomb")
+    every = tuple(ACTUATORS)
     terms = ExtraTerms(sign_width=WIDTH, **dict.fromkeys(every if kinds == "all" else (kinds,), True))
     w = world()
     logs, true = with_actuators(w, terms)
@@ -149,7 +149,7 @@ def test_terms_of_actuators_are_found_with_friction_that_turns_over_smoothly(kin
     for key, expected in true.items():
         assert found.values[key] == pytest.approx(expected, rel=EXACT, abs=1e-9), key
     assert found.estimate.residual_std < 1e-9
-    without = replace(terms, armature=False, torque_offset=False, asymmetric_coulomb=False)
+    without = replace(terms, **dict.fromkeys(every, False))
     plain = fit(w.robot, CONTACTS, sensors_of(w.robot, "full"), without, [bind_log(x, w.robot, CONTACTS) for x in logs])
     assert plain.estimate.residual_std > 1e-3, "the terms must matter"
     sharp = fit(w.robot, CONTACTS, sensors_of(w.robot, "full"), replace(terms, sign_width=None),

@@ -35,8 +35,9 @@ def arm(folder: Path, mass: float = 0.8) -> Path:
     return path
 
 
-def model_of(urdf: Path, armature: float = 0.0, offset: float = 0.0) -> Model:
-    return Model(urdf, ("first", "second"), np.full(2, armature), np.array([offset, -0.5 * offset]))
+def model_of(urdf: Path, armature: float = 0.0, offset: float = 0.0, stiffness: float = 0.0) -> Model:
+    springs = np.array([stiffness, 0.5 * stiffness])
+    return Model(urdf, ("first", "second"), np.full(2, armature), np.array([offset, -0.5 * offset]), springs)
 
 
 def swinging(urdf: Path, armature: float = 0.0, tilt: Rotation | None = None) -> ReplayedLog:
@@ -76,6 +77,15 @@ def test_armature_and_offsets_are_those_of_the_log(tmp_path: Path) -> None:
     assert drift(model_of(true, armature=0.05, offset=-0.7), off) > 1e-2
 
 
+def test_springs_of_joints_pull_towards_position_zero(tmp_path: Path) -> None:
+    true = arm(tmp_path)
+    log = swinging(true)
+    held = replace(log, torque=log.torque + log.position * [3.0, 1.5])
+    assert drift(model_of(true, stiffness=3.0), held) < 2e-5
+    assert drift(model_of(true), held) > 1e-2
+    assert drift(model_of(true, stiffness=-3.0), replace(log, torque=log.torque - log.position * [3.0, 1.5])) < 2e-5
+
+
 def test_an_arm_on_a_turned_base_feels_gravity_as_the_log_says(tmp_path: Path) -> None:
     true, tilt = arm(tmp_path), Rotation.from_euler("xyz", [0.4, -0.8, 0.3])
     log = swinging(true, tilt=tilt)
@@ -104,7 +114,7 @@ def test_a_base_of_equal_feet_falls_straight_where_nothing_drives_the_legs() -> 
         angular_velocity=np.zeros((len(time), 3)),
         active=np.ones((len(time), 4), dtype=bool),
     )
-    model = Model(DEMO / "quadruped.urdf", joints, np.zeros(12), np.zeros(12))
+    model = Model(DEMO / "quadruped.urdf", joints, *np.zeros((3, 12)))
     found = replay_log(model, log, feet, log.windows(0.1), np.array([0.02, 0.1]))
     assert found.tilt is not None
     knees = found.joints[0, :, 2::3]

@@ -14,8 +14,7 @@ import numpy as np
 from rich.progress import Progress
 
 from torchid import ranks
-from torchid.commands.chosen_cutoff import with_cutoff
-from torchid.commands.chosen_sign_width import with_sign_width
+from torchid.commands.chosen_settings import with_chosen_settings
 from torchid.commands.folder import ANALYSIS, check_free, new_folder, write_json
 from torchid.commands.reading import LogReader, check_parts
 from torchid.commands.sensor_set_accuracy import accuracies
@@ -171,8 +170,7 @@ def analyze(config: AnalyzeConfig) -> Analysis:
     scene = set_up_scene(config)
     request = AnalysisRequest.of(scene)
     with progress_bars() as bars:
-        scene, _ = with_cutoff(scene, bars)
-        scene, _ = with_sign_width(scene, bars)
+        scene, _ = with_chosen_settings(scene, bars)
         request = replace(request, scene=scene)
         train, test = _read(request, bars)
         if train:

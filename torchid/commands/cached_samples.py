@@ -59,7 +59,7 @@ def content_of_scene(scene: Scene) -> dict[str, Any]:
     return {
         "format": _FORMAT,
         "urdf": [config.robot.urdf.name, file_checksum(config.robot.urdf)],
-        "robot": [robot.base_link, robot.fixed_base, list(robot.ft_names), robot.welded],
+        "robot": [robot.base_link, robot.fixed_base, list(robot.ft_names), robot.welded, robot.base_tilt],
         "contacts": [asdict(contact) for contact in scene.contacts],
         "unloaded": fits_contact_offsets(scene),
         "preprocessing": settings,

@@ -14,8 +14,7 @@ from pathlib import Path
 from rich.progress import Progress
 
 from torchid import ranks
-from torchid.commands.chosen_cutoff import with_cutoff
-from torchid.commands.chosen_sign_width import with_sign_width
+from torchid.commands.chosen_settings import with_chosen_settings
 from torchid.commands.folder import COMPRESSED, check_free, new_folder
 from torchid.commands.manifest import file_checksum
 from torchid.commands.reading import LogReader
@@ -89,8 +88,7 @@ def compress(config: ExperimentConfig, output: str | Path) -> Compression:
     share = ranks.own_share(ranks.as_first([_size(path) for path in config.logs.train], "sizes of the logs"))
     paths = config.logs.train[share]
     with progress_bars() as bars:
-        experiment, _ = with_cutoff(set_up(config), bars)
-        experiment, _ = with_sign_width(experiment, bars)
+        experiment, _ = with_chosen_settings(set_up(config), bars)
         builder = experiment.builder(experiment.sensors)
         with _told_by_first(), ranks.apart():
             logs, excluded = _read(experiment, paths, output, bars)

@@ -13,9 +13,8 @@ from rich.progress import Progress
 from torchid import ranks
 from torchid.commands.cached_factors import cached_parts, factors_key
 from torchid.commands.cached_reading import CachedReader, open_reader
-from torchid.commands.chosen_cutoff import with_cutoff
 from torchid.commands.chosen_ridge import with_ridge
-from torchid.commands.chosen_sign_width import with_sign_width
+from torchid.commands.chosen_settings import Choices, with_chosen_settings
 from torchid.commands.clock import Clock
 from torchid.commands.compared_forces import compare_forces, noise_of_readings, trace_forces
 from torchid.commands.folder import RUN, check_free, claim_folder
@@ -35,12 +34,10 @@ from torchid.fitting.fleet import read_fleet
 from torchid.fitting.misfit import misfit
 from torchid.fitting.noise import NoiseSummary
 from torchid.fitting.robust import RobustSummary, fit_robustly
-from torchid.fitting.sign_width import SignWidthChoice
 from torchid.fitting.unfitted_friction import unfitted_friction
 from torchid.identifiability.base_parameters import StateReport, require_base, state_reports
 from torchid.identifiability.confounding import TotalMass
 from torchid.identifiability.contributions import Contributions, contributions
-from torchid.logs.cutoff import CutoffChoice
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Evaluation, LinearProblem, Metrics, RowBuilder, Samples
 from torchid.problem.compressed_log import Block, fold_compressed, merge_blocks
@@ -86,8 +83,8 @@ def identify(config: ExperimentConfig, resume: bool = False) -> Identification:
 class _Data:
     """Training logs in folds, or factors of them, with the noise that they are weighed with, and compressed; test logs.
 
-    `experiment`: with that noise. `factors`: files that the training logs come from, none if they come from logs.
-    `reused`: what an earlier run has left in the cache, in words.
+    `experiment`: with that noise, and what the logs have chosen. `factors`: files that the training logs come from, if
+    they do. `reused`: what an earlier run has left in the cache, in words.
     """
 
     experiment: Experiment
@@ -100,8 +97,7 @@ class _Data:
     blocks: Sequence[Block]
     parts: list[Part]
     reused: list[str]
-    cutoff: CutoffChoice | None
-    sign_width: SignWidthChoice | None
+    choices: Choices
 
 
 @dataclass
@@ -128,10 +124,8 @@ def _prepare(config: ExperimentConfig, clock: Clock, bars: Progress) -> _Prepare
 
 def _data_of_logs(experiment: Experiment, clock: Clock, bars: Progress) -> _Data:
     """The logs of an experiment, read and compressed."""
-    with clock("cutoff"):
-        experiment, cutoff = with_cutoff(experiment, bars)
-    with clock("sign width"):
-        experiment, width = with_sign_width(experiment, bars)
+    with clock("settings"):
+        experiment, choices = with_chosen_settings(experiment, bars)
     with clock("read"):
         reader = open_reader(experiment)
         logs = _read(reader, experiment, bars)
@@ -145,7 +139,7 @@ def _data_of_logs(experiment: Experiment, clock: Clock, bars: Progress) -> _Data
         blocks = split_into_folds(logs["train"], builder)
         parts, there = _compressed(experiment, reader, builder, blocks, bars)
     reused = [*_reused(reader), *(["factors"] if there else [])]
-    return _Data(experiment, logs, [], reader.excluded, states, noise, builder, blocks, parts, reused, cutoff, width)
+    return _Data(experiment, logs, [], reader.excluded, states, noise, builder, blocks, parts, reused, choices)
 
 
 def _data_of_factors(experiment: Experiment, clock: Clock, bars: Progress) -> _Data:
@@ -161,7 +155,7 @@ def _data_of_factors(experiment: Experiment, clock: Clock, bars: Progress) -> _D
         blocks = fold_compressed([one.log for one in fleet.files], builder)
         parts = merge_blocks(blocks, builder)
     excluded = {one.log.source: one.excluded for one in fleet.files if one.excluded}
-    same = (fleet.states, fleet.noise, builder, blocks, parts, _reused(reader), None, None)
+    same = (fleet.states, fleet.noise, builder, blocks, parts, _reused(reader), Choices())
     return _Data(fleet.experiment, logs, fleet.files, excluded, *same)
 
 
@@ -238,8 +232,7 @@ def _identify(config: ExperimentConfig, resume: bool, bars: Progress) -> tuple[I
         mass=solved.mass,
         validation=scores.validation,
         ridge=ready.ridge,
-        cutoff=ready.cutoff,
-        sign_width=ready.sign_width,
+        choices=ready.choices,
         forces=next(iter(forces), None),
         traces=next(iter(traces), None),
         reused=ready.reused,

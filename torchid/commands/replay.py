@@ -17,6 +17,7 @@ from torchid.fitting.calibration import Calibration, Comparison
 from torchid.logs.time_range import split_range
 from torchid.parameters import Array
 from torchid.problem import Samples
+from torchid.problem.extras import ACTUATORS
 from torchid.report.drift_figure import drift_figure
 from torchid.report.figures import save_figure
 from torchid.report.tables import progress_bars
@@ -192,20 +193,16 @@ def _joint_kinds(robot: Robot) -> list[str]:
 
 
 def _model(urdf: Path, robot: Robot, calibration: Calibration | None) -> Model:
-    """The robot of a URDF with identified armatures and offsets of torque, if there are any.
+    """The robot of a URDF with identified armatures, springs and offsets of torque, if there are any.
 
     Coulomb friction that differs by direction is symmetric friction and an offset, as far as the joint moves.
     """
-    values = {
-        "armature": np.zeros(robot.n),
-        "torque_offset": np.zeros(robot.n),
-        "asymmetric_coulomb": np.zeros(robot.n),
-    }
+    values = {what: np.zeros(robot.n) for what in ACTUATORS}
     for extra in calibration.builder.extras if calibration is not None else ():
         if extra.what in values and calibration is not None:
             values[extra.what][list(extra.dofs)] = calibration.values[("", extra.label)]
     offset = values["torque_offset"] + values["asymmetric_coulomb"]
-    return Model(urdf, robot.joint_names, values["armature"], offset)
+    return Model(urdf, robot.joint_names, values["armature"], offset, values["stiffness"])
 
 
 def _replayed(samples: Samples) -> ReplayedLog:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import yaml
 
+from torchid.commands.chosen_settings import Choices
 from torchid.commands.events import write_events
 from torchid.commands.folder import RUN, check_free, check_free_file, new_folder, write_json
 from torchid.commands.named_results import BodyEstimate, ParameterTable, body_estimate, parameter_table, run_lines
@@ -26,12 +27,10 @@ from torchid.fitting.factor_files import FactorFile
 from torchid.fitting.misfit import Misfit
 from torchid.fitting.noise import NoiseSummary
 from torchid.fitting.robust import RobustSummary
-from torchid.fitting.sign_width import SignWidthChoice
 from torchid.identifiability.base_parameters import StateReport
 from torchid.identifiability.confounding import ExtraEstimate, TotalMass
 from torchid.identifiability.contributions import Contributions
 from torchid.logs.containers import atomic_output
-from torchid.logs.cutoff import CutoffChoice
 from torchid.logs.time_range import log_title
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Metrics
@@ -83,8 +82,7 @@ class Identification:
         mass: the total mass and how well it is known.
         validation: errors on held-out blocks, None where the samples are too few to leave some out.
         ridge: how it was chosen, if it was.
-        cutoff: likewise.
-        sign_width: likewise.
+        choices: how other settings were chosen, if they were.
         forces: of the first samples of a log, as measured and as predicted; None where there are but factors.
         traces: of all of that log.
         reused: what an earlier run has left in the cache, in words.
@@ -110,8 +108,7 @@ class Identification:
     mass: TotalMass
     validation: CrossValidation | None
     ridge: RidgeChoice | None
-    cutoff: CutoffChoice | None
-    sign_width: SignWidthChoice | None
+    choices: Choices
     forces: ForceSeries | None
     traces: LogForces | None
     reused: Sequence[str] = ()
@@ -273,8 +270,7 @@ def metrics_document(run: Identification) -> dict[str, object]:
         "solution": _solution_document(estimate),
         "cross_validation": _validation_document(run),
         "ridge_selection": None if run.ridge is None else asdict(run.ridge),
-        "cutoff_selection": None if run.cutoff is None else asdict(run.cutoff),
-        "sign_width_selection": None if run.sign_width is None else asdict(run.sign_width),
+        **{f"{name}_selection": x and asdict(x) for name, x in vars(run.choices).items()},
         "worse_than_nominal": [asdict(one) for one in run.worse],
         "verdict": describe_worse(run.worse),
         "contact_states": run.state_entries(),

@@ -6,9 +6,9 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, Literal, TypeVar
 
-from pydantic import BeforeValidator, FiniteFloat
+from pydantic import BeforeValidator, Field, FiniteFloat, PlainSerializer, PlainValidator, TypeAdapter
 from pydantic.dataclasses import dataclass
 
 from torchid.config.analysis import AnalysisConfig
@@ -29,6 +29,7 @@ from torchid.config.sensors import (
     Device,
     Sensors,
     SensorsConfig,
+    as_list,
     spelled_out,
     validate_choice,
 )
@@ -36,7 +37,7 @@ from torchid.errors import ConfigError, about_file
 from torchid.logs.column_map import check_columns
 from torchid.logs.containers import FACTORS
 from torchid.logs.ros_topics import check_topics
-from torchid.settings import PositiveOrAuto
+from torchid.settings import AUTO, Number, PositiveOrAuto
 
 
 def _at_zero(value: object) -> object:
@@ -50,17 +51,40 @@ WELDS_ACCEPTED = "a list of joints or patterns, or a mapping to positions [rad o
 Welds = Annotated[dict[str, FiniteFloat], BeforeValidator(_at_zero)]
 
 
+def _tilt(value: object) -> object:
+    """Two angles, auto or none."""
+    if value is None or value == AUTO:
+        return value
+    try:
+        x, y = _ANGLES.validate_python(value)
+    except ValueError as error:
+        raise ValueError("auto, null, or two angles [rad] about the base's x and y axes: [0.01, -0.02]") from error
+    return x, y
+
+
+_ANGLES: TypeAdapter[list[float]] = TypeAdapter(Annotated[list[Number], Field(min_length=2, max_length=2)])
+BaseTilt = Annotated[tuple[float, float] | Literal["auto"] | None, PlainValidator(_tilt), PlainSerializer(as_list)]
+
+
 @dataclass(config=STRICT, frozen=True)
 class RobotConfig:
     """The robot; `base_link` defaults to the URDF's root.
 
     `weld`: names or patterns of joints that are held still, at 0 or at the position [rad or m] that a mapping gives.
+    `base_tilt`: two angles [rad] about the base's x and y axes by which it is turned from the base that logs record, as
+    on a table that is not level; auto, those that leave least of the training logs; None for none.
     """
 
     urdf: Path
     base_link: str | None = None
     fixed_base: bool = False
     weld: Welds = dataclasses.field(default_factory=dict)
+    base_tilt: BaseTilt = None
+
+    @property
+    def tilt(self) -> tuple[float, float]:
+        """The angles, 0 where there are none, or they have not been chosen."""
+        return (0.0, 0.0) if self.base_tilt is None or isinstance(self.base_tilt, str) else self.base_tilt
 
 
 @dataclass(config=STRICT, frozen=True)
@@ -68,13 +92,14 @@ class ActuatorsConfig:
     """Unknown terms of the actuators, of every joint whose torque is measured.
 
     `armature`: reflected rotor inertia; `torque_offset`; `asymmetric_coulomb`: Coulomb friction that differs by
-    direction; `sign_width` [rad/s or m/s]: Coulomb friction goes with tanh(velocity / width) instead of the sign; auto,
-    with the width that leaves least of the training logs.
+    direction; `stiffness` of springs, or of cables that act as such; `sign_width` [rad/s or m/s]: Coulomb friction goes
+    with tanh(velocity / width) instead of the sign; auto, with the width that leaves least of the training logs.
     """
 
     armature: bool = False
     torque_offset: bool = False
     asymmetric_coulomb: bool = False
+    stiffness: bool = False
     sign_width: PositiveOrAuto = None
 
 
@@ -249,6 +274,9 @@ def _check_extras(config: _Common) -> None:
     if actuators.torque_offset and "joint_torque" in sensors.offsets:
         found = "set together with sensors.offsets.joint_torque, which is the same"
         raise ConfigError.at_field("actuators.torque_offset", found, "one of the two")
+    if config.robot.base_tilt is not None and config.preprocessing.base_motion is not None:
+        found = "set together with preprocessing.base_motion, which finds how the base itself is turned"
+        raise ConfigError.at_field("robot.base_tilt", found, "one of the two")
     twice = [kind for kind in ("contact_force", "contact_moment") if kind in sensors.offsets]
     if config.preprocessing.zero_in_air and twice:
         found = "set together with preprocessing.zero_in_air, which subtracts the same"
@@ -290,6 +318,7 @@ def _check_factors(config: _Common, logs: LogsConfig) -> None:
         ("estimator.robust", "set", config.estimator.robust is not None, "null"),
         ("preprocessing.cutoff_hz", "auto", config.preprocessing.cutoff_hz == "auto", "that which they were made with"),
         ("actuators.sign_width", "auto", config.actuators.sign_width == "auto", "the width that they were made with"),
+        ("robot.base_tilt", "auto", config.robot.base_tilt == "auto", "the tilt that they were made with"),
         (
             "preprocessing.exclude_condemned",
             "true",

@@ -50,7 +50,8 @@ def _per_axis(value: object) -> float | tuple[float, float, float]:
     return x, y, z
 
 
-def _plain(value: float | tuple[float, float, float]) -> float | list[float]:
+def as_list(value: object) -> object:
+    """A tuple as a list, as YAML has it."""
     return list(value) if isinstance(value, tuple) else value
 
 
@@ -67,7 +68,7 @@ def _normal(value: object) -> list[float] | None:
 
 _VECTOR: TypeAdapter[list[float]] = TypeAdapter(Annotated[list[Number], Field(min_length=3, max_length=3)])
 _POSITIVE: TypeAdapter[float] = TypeAdapter(Positive)
-PerAxis = Annotated[float | tuple[float, float, float], PlainValidator(_per_axis), PlainSerializer(_plain)]
+PerAxis = Annotated[float | tuple[float, float, float], PlainValidator(_per_axis), PlainSerializer(as_list)]
 
 
 @dataclass(config=STRICT, frozen=True)

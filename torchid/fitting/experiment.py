@@ -211,7 +211,7 @@ def set_up_scene(config: ExperimentConfig | AnalyzeConfig) -> Scene:
     require_device(config.device)
     try:
         of = config.robot
-        robot = load_robot(of.urdf, of.base_link, of.fixed_base, _ft_joints(config), of.weld)
+        robot = load_robot(of.urdf, of.base_link, of.fixed_base, _ft_joints(config), of.weld, of.tilt)
     except UnknownNameError as error:
         if error.field != FT_FIELD:
             raise

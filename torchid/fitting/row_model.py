@@ -72,6 +72,8 @@ class RowModel:
         }
         if robot.welded:  # a factor of a robot without stays what it was
             settings["robot.weld"] = [f"{name} at {position!r}" for name, position in robot.welded.items()]
+        if any(robot.base_tilt):
+            settings["robot.base_tilt"] = ", ".join(map(repr, robot.base_tilt))
         settings |= {f"preprocessing.{name}": value for name, value in preprocessing.items()}
         geometry = {
             "T_parent_joint": tree.T_parent_joint,

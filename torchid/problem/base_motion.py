@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -64,6 +64,22 @@ class BaseMotion:
         """The same motion with a function applied to every tensor."""
         return BaseMotion(**{name: function(x) for name, x in vars(self).items() if x is not None})
 
+    def tilted(self, tilt: Sequence[float] | Array, count: int) -> BaseMotion:
+        """The motion of a base that is turned in the recorded one by angles about x and y [rad], a rotation vector.
+
+        `count`: of the samples, of which nothing may be known. The noise of the motion is taken to be the same.
+        """
+        if not np.any(tilt):
+            return self
+        turn = Rotation.from_rotvec([*tilt, 0.0])
+        to_tilted = torch.from_numpy(turn.as_matrix())
+        recorded = np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)) if self.quat_xyzw is None else self.quat_xyzw.numpy()
+        vectors = ("specific_force", "angular_velocity", "angular_acceleration")
+        turned = {name: x @ to_tilted for name in vectors if (x := getattr(self, name)) is not None}
+        if self.quat_xyzw is not None or not turned:
+            turned["quat_xyzw"] = torch.from_numpy((Rotation.from_quat(recorded) * turn).as_quat())
+        return replace(self, **turned)
+
     @property
     def rotation(self) -> Tensor | None:
         """Rotation base to world, (N, 3, 3), if it is known."""
@@ -91,7 +107,7 @@ def levelled_base_axes(rotation_world_base: Tensor) -> Tensor:
 
 
 def base_motion(log: Log, robot: Robot) -> BaseMotion:
-    """Motion of the base in a preprocessed log; for a bolted base only its orientation.
+    """Motion of the robot's base in a preprocessed log; for a bolted base only its orientation.
 
     An IMU is preferred: the dynamics depend on just what it measures, without differentiation. The orientation is kept
     for wrenches along world axes.
@@ -100,6 +116,11 @@ def base_motion(log: Log, robot: Robot) -> BaseMotion:
         LogError: neither the base's motion nor IMU readings, or an IMU that is not on the base.
         UnknownNameError: an IMU frame that the robot does not have.
     """
+    return _recorded_base(log, robot).tilted(robot.base_tilt, len(log))
+
+
+def _recorded_base(log: Log, robot: Robot) -> BaseMotion:
+    """As `base_motion`, but of the base as it was recorded, which is that of the robot but for its tilt."""
     quat = None if log.base_quat_xyzw is None else torch.from_numpy(log.base_quat_xyzw)
     if robot.fixed_base:
         return BaseMotion(quat)

@@ -16,6 +16,7 @@ from torchid.problem.chunk_dynamics import Workspace
 from torchid.problem.chunks import ProgressCallback, chunks_by_state, map_chunks, one_thread, worker_count
 from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import PRIOR_DEVIATION, LinearProblem, TriangularFactor, parameter_scale
+from torchid.problem.row_compressor import RowCompressor
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.problem.surplus import ColumnPrior, Surplus, compress_surplus, corrected_triangle
@@ -158,7 +159,7 @@ def _compress_chunks(
     Without `loaded`, those of readings in the air alone.
     """
     parts: dict[_Key, Part] = {}
-    workspace = Workspace()
+    workspace, compressor = Workspace(), RowCompressor()
 
     def part(samples: Samples, state: ContactState, unloaded: bool) -> Part:
         key = _key(samples, state, unloaded) if by_log else _key(None, state)
@@ -173,13 +174,14 @@ def _compress_chunks(
                 if weight_rows is not None:
                     rows = stacked[len(support) + 1 :]
                     rows.copy_(weight_rows(samples, support, rows))
-                own.factor.add_in_place(support, stacked, samples.oversampling)
+                compressor.add(own.factor, support, stacked, samples.oversampling)
         for channel in unloaded_offset_equations(builder, samples):
             in_the_air = part(samples, state, True)
             if channel.gated:
                 in_the_air.gated.add(channel.offset)
             else:
                 in_the_air.factor.add(*channel.row(builder), samples.oversampling)
+    compressor.finish()
     return list(parts.values())
 
 
@@ -247,7 +249,7 @@ def linear_problem(factor: TriangularFactor, builder: RowBuilder, robot: Robot, 
     if builder.extras:
         raise ValueError("builder: found extra terms; accepted: one without, or torchid.assemble")
     own = corrected_triangle(factor, column_prior(builder, robot, friction))
-    return problem_from_triangle(own.R, factor.rows, factor.oversampling, builder, robot, friction, held=own.held)
+    return problem_from_triangle(own.R, factor.rows, factor.oversampling, builder, robot, friction, own.held)
 
 
 def column_prior(builder: RowBuilder, robot: Robot, friction: bool = True) -> ColumnPrior:
@@ -258,14 +260,7 @@ def column_prior(builder: RowBuilder, robot: Robot, friction: bool = True) -> Co
 
 
 def problem_from_triangle(
-    R: Array,
-    rows: int,
-    oversampling: float,
-    builder: RowBuilder,
-    robot: Robot,
-    friction: bool = True,
-    *,
-    held: Array | None = None,
+    R: Array, rows: int, oversampling: float, builder: RowBuilder, robot: Robot, friction: bool, held: Array | None
 ) -> LinearProblem:
     """The problem in all 12 L parameters from a triangle in the regrouped columns, right-hand side last.
 

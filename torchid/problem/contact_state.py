@@ -125,6 +125,16 @@ class ContactStateLayout:
     wrench_std: Tensor
     blocks: RowBlocks
 
+    @cached_property
+    def has_own_limbs(self) -> bool:
+        """Whether every contact of a floating base has as many unmeasured directions as joints that move it alone."""
+        joints = [joint for body in self.contact_bodies for joint in body.joints]
+        return (
+            len(self.row_std) > len(self.coupled_joints) > 0
+            and sorted(joints) == list(range(len(self.coupled_joints)))
+            and all(body.count == len(body.joints) for body in self.contact_bodies)
+        )
+
 
 class ContactStateLayouts:
     """Layouts of a robot's contact states, with its contacts and sensors."""

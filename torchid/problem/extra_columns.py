@@ -21,6 +21,8 @@ def dof_extra_column(extra: Extra, dof: int, samples: Samples, tree: KinematicTr
         return samples.time.new_full((len(samples),), torch.nan) if reading is None else -reading[:, dof]
     if extra.what == "armature":
         return samples.joint_acceleration[:, dof]
+    if extra.what == "stiffness":
+        return samples.joint_position[:, dof]
     if extra.what == "asymmetric_coulomb":
         return tree.coulomb_sign(samples.joint_velocity[:, dof]).abs()
     return torch.ones_like(samples.time)

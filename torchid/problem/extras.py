@@ -16,8 +16,13 @@ from torchid.sensing import Contact, SensorSet
 CHANNELS = ("joint_torque", "contact_force", "contact_moment", "ft_force", "ft_moment")
 """Kinds of sensor channels, as `SensorNoise` has them."""
 
-ACTUATORS = ("armature", "torque_offset", "asymmetric_coulomb")
-"""Extra parameters of joints rather than sensors."""
+ACTUATORS = {
+    "armature": ("kg m^2", 0.1),
+    "torque_offset": ("N m", 5.0),
+    "asymmetric_coulomb": ("N m", 1.0),
+    "stiffness": ("N m/rad", 1.0),
+}
+"""Extra parameters of joints rather than sensors: their unit, and the size of a plausible value in it."""
 
 ScaleGroups = Sequence[Sequence[str]]
 """Groups of sensors that share a scale of all logs: patterns of the names of joints or frames, as `fits` has them."""
@@ -36,7 +41,9 @@ class ExtraTerms:
     instead: all in a group have one scale, constant over all logs, and those in none have a scale of 1.
 
     Of every joint whose torque is measured: `armature` (reflected rotor inertia, times the joint's acceleration),
-    `torque_offset`, and `asymmetric_coulomb`, half the difference of Coulomb friction forwards and backwards.
+    `torque_offset`, `asymmetric_coulomb`, half the difference of Coulomb friction forwards and backwards, and
+    `stiffness` of a spring, or of cables and hoses that act as one, times the joint's position; where it is at rest
+    follows with an offset of the torque.
     `sign_width` [rad/s or m/s] replaces the sign of a velocity v in Coulomb friction by tanh(v / width).
     """
 
@@ -45,6 +52,7 @@ class ExtraTerms:
     armature: bool = False
     torque_offset: bool = False
     asymmetric_coulomb: bool = False
+    stiffness: bool = False
     sign_width: float | None = None
 
     __repr__ = short_repr
@@ -55,7 +63,7 @@ class Extra:
     """One extra parameter.
 
     Attributes:
-        what: "offset", "scale" (less 1), "armature", "torque_offset" or "asymmetric_coulomb".
+        what: "offset", "scale" (less 1), or one of `ACTUATORS`.
         name: of the joint or the sensor's frame, or the patterns of a group; `component`: of its wrench, "" of a joint
             torque, "force" or "moment" for a group of sensors.
         unit: of the unknown.
@@ -110,7 +118,7 @@ def list_extras(robot: Robot, contacts: Sequence[Contact], sensors: SensorSet, t
         if not isinstance(groups, str):
             extras += _group_scales(kind, groups, [channel for channel in channels if channel.kind == kind])
     measured = np.flatnonzero(sensors.torque[: robot.n]).tolist()
-    for what, unit, size in zip(ACTUATORS, ("kg m^2", "N m", "N m"), (0.1, 5.0, 1.0), strict=True):
+    for what, (unit, size) in ACTUATORS.items():
         if getattr(terms, what):
             extras += [Extra(what, robot.joint_names[dof], "", unit, size, False, (dof,)) for dof in measured]
     return tuple(extras)

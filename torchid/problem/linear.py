@@ -209,9 +209,8 @@ class TriangularFactor:
             rows: (M, len(support) + 1), right-hand side last.
             oversampling: rows per independent row, at least 1.
         """
-        self.rows += rows.shape[0]
-        self.independent_rows += rows.shape[0] / oversampling
-        self._absorb(support, rows)
+        self.count(rows.shape[0], oversampling)
+        self.absorb(support, rows)
 
     def add_in_place(self, support: tuple[int, ...], stacked: Tensor, oversampling: float = 1.0) -> None:
         """Add rows that have room above them, which are overwritten.
@@ -226,14 +225,13 @@ class TriangularFactor:
         if count < room:
             self.add(support, stacked[room:], oversampling)
             return
-        self.rows += count
-        self.independent_rows += count / oversampling
+        self.count(count, oversampling)
         kept = self._blocks.get(support)
         above = 0 if kept is None else len(kept)
         stacked[: room - above] = 0.0
         if kept is not None:
             stacked[room - above : room] = kept
-        self._blocks[support] = _triangularize(stacked)
+        self._blocks[support] = triangularize(stacked)
 
     def merge(self, other: TriangularFactor) -> None:
         """Add the rows of another factor.
@@ -246,7 +244,7 @@ class TriangularFactor:
         self.rows += other.rows
         self.independent_rows += other.independent_rows
         for support, block in other._blocks.items():
-            self._absorb(support, block)
+            self.absorb(support, block)
         self.add_surplus(other.surplus)
 
     def add_surplus(self, surplus: Mapping[tuple[int, ...], Tensor], weight: float = 1.0) -> None:
@@ -292,14 +290,20 @@ class TriangularFactor:
             total[at[:, None], at] += x.to("cpu", torch.float64)
         return total
 
+    def count(self, rows: int, oversampling: float = 1.0) -> None:
+        """Count rows that `absorb` is given something for."""
+        self.rows += rows
+        self.independent_rows += rows / oversampling
+
     @torch.no_grad()
-    def _absorb(self, support: tuple[int, ...], rows: Tensor) -> None:
+    def absorb(self, support: tuple[int, ...], rows: Tensor) -> None:
+        """Add rows (M, len(support) + 1), or a factor of them, without counting them."""
         kept = self._blocks.get(support)
         stacked = torch.cat([rows.T] if kept is None else [kept.T, rows.T], dim=1).T
-        self._blocks[support] = stacked if len(stacked) < stacked.shape[1] else _triangularize(stacked)
+        self._blocks[support] = stacked if len(stacked) < stacked.shape[1] else triangularize(stacked)
 
 
-def _triangularize(stacked: Tensor) -> Tensor:
+def triangularize(stacked: Tensor) -> Tensor:
     """R of the factorization of rows (M, columns), columns contiguous, which it overwrites."""
     # the same tensor twice: LAPACK then works in place
     torch.geqrf(stacked, out=(stacked, stacked.new_empty(stacked.shape[1])))

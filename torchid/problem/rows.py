@@ -12,13 +12,13 @@ from torch import Tensor, nn
 from torchid.parameters import Array
 from torchid.problem.base_motion import levelled_base_axes
 from torchid.problem.chunk_dynamics import ChunkDynamics, ChunkKinematics, Workspace
+from torchid.problem.contact_rows import contact_rows, whitened_bases
 from torchid.problem.contact_state import Columns, ContactState, ContactStateLayout, ContactStateLayouts
 from torchid.problem.extra_columns import dof_extra_column, extra_columns
 from torchid.problem.extras import ExtraTerms, list_extras
 from torchid.problem.recorded_wrenches import FramePoses
-from torchid.problem.row_blocks import RowBlock, multiply_wrenches, subtract_payload, turn_rows
+from torchid.problem.row_blocks import RowBlock, multiply_wrenches, subtract_payload
 from torchid.problem.samples import Samples
-from torchid.problem.wrench_rows import wrenches_at_ground
 from torchid.regressor.columns import all_wrench_columns
 from torchid.regressor.kinematics import body_states, joint_motion, joint_screw_axes
 from torchid.regressor.regressor import (
@@ -30,7 +30,7 @@ from torchid.regressor.regressor import (
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
-from torchid.sensing.projection import null_space, whitened_null_space
+from torchid.sensing.projection import null_space
 
 
 @dataclass(frozen=True)
@@ -201,7 +201,8 @@ class RowBuilder(nn.Module):
     ) -> Iterator[tuple[Tensor | slice, Tensor]]:
         """Orthonormal V_x, (B', base rows + coupled joints, r), with the samples it belongs to, grouped by rank."""
         layout = self._layouts.layout(state, kinematics.recorded_normals)
-        yield from null_space(self._contact_rows(layout, kinematics)[0])
+        rows = contact_rows(self.tree, layout, kinematics, self._layouts.frame_origin)
+        yield from null_space(rows.of_unmeasured(slice(None)))
 
     def contact_jacobian(self, samples: Samples) -> Tensor:
         """Jacobians of all contacts along their frames' axes, active or not, (B, C, 6, n_rows).
@@ -284,18 +285,17 @@ class RowBuilder(nn.Module):
         """Samples of one rank, their W, (base rows + coupled joints, r, B'), and their rows, block by block."""
         if not (self.tree.base_rows or layout.coupled_joints):
             return
-        unmeasured, measured = self._contact_rows(layout, dynamics)
+        rows = contact_rows(self.tree, layout, dynamics, self._layouts.frame_origin)
+        measured = rows.of_measured()
         torque = self.recorded_torque(samples)[:, self.tree.index(layout.coupled_joints)]
         f = nn.functional.pad(torque, (self.tree.base_rows, 0))
         if len(layout.wrench_std):
-            f = f + (measured.mT @ self._measured_wrench(samples, layout, dynamics)[..., None])[..., 0]
+            f = f + (measured.permute(2, 1, 0) @ self._measured_wrench(samples, layout, dynamics)[..., None])[..., 0]
         axes = self.noise_axes(dynamics.rotation_world_base) if self.sensors.noise.base_axes_differ else None
-        std, order = (layout.row_std, layout.wrench_std), self.tree.index(layout.blocks.order)
-        for index, basis in whitened_null_space(unmeasured, std[0], measured, std[1], axes, order):
-            W = basis.permute(1, 2, 0).contiguous()
-            if layout.blocks.are_turned:
-                turn_rows(W)
-            part = _Part(samples[index], f[index].T, measured[index], dynamics.select(index))
+        order = self.tree.index(layout.blocks.order)
+        for index, W in whitened_bases(layout, rows, measured, axes, order):
+            own = measured[..., index].permute(2, 0, 1)
+            part = _Part(samples[index], f[index].T, own, dynamics.select(index))
             yield index, W, self._projected_blocks(W, part, layout, workspace)
 
     def _projected_blocks(
@@ -365,27 +365,6 @@ class RowBuilder(nn.Module):
                 X[start:end].unflatten(0, (len(run.nodes), len(run.kept))),
             )
             start = end
-
-    def _contact_rows(self, layout: ContactStateLayout, kinematics: ChunkKinematics) -> tuple[Tensor, Tensor]:
-        """Rows of J_C, unmeasured and measured, in base and coupled joints, (B, k, base rows + coupled joints)."""
-        samples, base_rows = kinematics.screw_axes.shape[-1], self.tree.base_rows
-        sizes = [sum(body.count for body in layout.contact_bodies), len(layout.wrench_std)]
-        both = kinematics.screw_axes.new_zeros(sum(sizes), len(layout.row_std), samples)
-        starts = [0, sizes[0]]
-        for contact in layout.contact_bodies:
-            joints = [layout.coupled_joints[index] for index in contact.joints]
-            columns = [*range(base_rows), *(base_rows + index for index in contact.joints)]
-            counts = contact.count, len(contact.components)
-            for kind, parts in enumerate((contact.unmeasured, contact.measured)):
-                if parts:
-                    at_base = wrenches_at_ground(
-                        parts, counts[kind], kinematics, contact.body, self._layouts.frame_origin
-                    )
-                    rows = generalized_forces(self.tree, kinematics.screw_axes, contact.body, at_base, joints)
-                    target = both[starts[kind] : starts[kind] + counts[kind]]
-                    target.index_copy_(1, self.tree.index(columns), rows)
-                    starts[kind] += counts[kind]
-        return tuple(both.permute(2, 0, 1).split(sizes, dim=1))
 
     def _measured_wrench(self, samples: Samples, layout: ContactStateLayout, kinematics: ChunkKinematics) -> Tensor:
         """Measured wrench components along the frames' axes, (B, k_m)."""

@@ -130,8 +130,8 @@ def _surplus_of_chunks(
         noise, count, own = samples.motion_noise, len(samples), pieces[samples.source]
         if noise is None:
             continue
-        of_piece = torch.searchsorted(torch.stack([piece.time[0] for piece in own]).to(samples.time), samples.time,
-                                      right=True)  # fmt: skip
+        starts = torch.stack([piece.time[0] for piece in own]).to(samples.time)
+        of_piece = torch.searchsorted(starts, samples.time.contiguous(), right=True)
         ends = torch.bincount(of_piece - 1, minlength=len(own)).cumsum(0).tolist()
         spans = [(number, start, end) for number, (start, end) in enumerate(pairwise([0, *ends])) if end > start]
         side = torch.tensor([0.0, 1.0, -1.0]).to(samples.time).repeat_interleave(count)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from itertools import groupby
@@ -138,13 +138,18 @@ def wrench_columns(states: BodyStates, columns: tuple[int, ...], out: Tensor) ->
         inertia_moments = [
             moments_by_axes[parameters.INERTIA_AXES[column - parameters.INERTIA.start]] for column in inertia_columns
         ]
-        out[3:, :, n_with_force:] = _rotate_to_base(states.rotation, inertia_moments)
+        _rotate_to_base(states.rotation, inertia_moments, out[3:, :, n_with_force:])
 
 
-def _rotate_to_base(rotation: Tensor, vectors: list[list[Tensor]] | list[tuple[Tensor, Tensor, Tensor]]) -> Tensor:
-    """Rotate c vectors given by components (k, B) into base axes: (3, k, c, B)."""
-    components = torch.stack([torch.stack([vector[axis] for vector in vectors], dim=1) for axis in range(3)])
-    return rotate_vectors(rotation.unsqueeze(3), components)
+def _rotate_to_base(rotation: Tensor, vectors: Sequence[Sequence[Tensor]], out: Tensor | None = None) -> Tensor:
+    """Rotate c vectors given by components (k, B) into base axes: (3, k, c, B); straight to `out`, if there is one."""
+    components = torch.stack([vector[axis] for axis in range(3) for vector in vectors])
+    components = components.unflatten(0, (3, len(vectors))).transpose(1, 2)
+    if out is None:
+        return rotate_vectors(rotation.unsqueeze(3), components)
+    if torch.is_grad_enabled() and components.requires_grad:
+        return out.copy_(rotate_vectors(rotation.unsqueeze(3), components))
+    return rotate_vectors(rotation.unsqueeze(3), components, out)
 
 
 def body_wrenches(states: BodyStates, phi: Tensor) -> Tensor:

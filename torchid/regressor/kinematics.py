@@ -230,6 +230,6 @@ def cross_product(a: Tensor, b: Tensor) -> Tensor:
     return torch.stack(products)  # 1.6 times as fast as three differences: half as many temporaries
 
 
-def rotate_vectors(rotation: Tensor, x: Tensor) -> Tensor:
-    """Rotation (3, 3, ...) times vectors (3, ...)."""
-    return (rotation[:, 0] * x[0]).addcmul_(rotation[:, 1], x[1]).addcmul_(rotation[:, 2], x[2])
+def rotate_vectors(rotation: Tensor, x: Tensor, out: Tensor | None = None) -> Tensor:
+    """Rotation (3, 3, ...) times vectors (3, ...), to `out`, if given, which no gradient flows through."""
+    return torch.mul(rotation[:, 0], x[0], out=out).addcmul_(rotation[:, 1], x[1]).addcmul_(rotation[:, 2], x[2])

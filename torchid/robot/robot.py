@@ -53,7 +53,8 @@ class Robot:
     the body that carries a URDF link and the link's pose in that body's link frame, (4, 4) [m]. `welded[name]` is the
     position [rad or m] at which a joint of the URDF is held; `links_beyond_welds[name]`, (10,), are the URDF's inertial
     parameters, in its body's link frame, of a link that such a joint carries.
-    `kind_of_welded` has such joints' types.
+    `kind_of_welded` has such joints' types. `base_tilt`: rotation [rad] about the base link's x and y axes from the
+    base whose motion logs record to this one.
     """
 
     path: Path
@@ -66,6 +67,7 @@ class Robot:
     welded: dict[str, float] = field(default_factory=dict)
     links_beyond_welds: dict[str, Array] = field(default_factory=dict, repr=False)
     kind_of_welded: dict[str, str] = field(default_factory=dict, repr=False)
+    base_tilt: tuple[float, float] = (0.0, 0.0)
 
     __repr__ = short_repr
 
@@ -192,6 +194,7 @@ def load_robot(
     fixed_base: bool = False,
     ft_joints: Sequence[str] = (),
     weld: Mapping[str, float] | Sequence[str] = (),
+    base_tilt: tuple[float, float] = (0.0, 0.0),
 ) -> Robot:
     """Read a URDF into a `Robot`.
 
@@ -201,6 +204,8 @@ def load_robot(
         fixed_base: True if the base does not move.
         ft_joints: fixed joints with a force/torque sensor: the links beyond form a body of their own.
         weld: names or patterns of joints that are held, at 0 or at the position [rad or m] that a mapping gives.
+        base_tilt: rotation [rad] about the base link's x and y axes from the base whose motion logs record to this one:
+            of a table that is not level, or of an IMU that is mounted askew.
 
     Raises:
         UrdfError, UnknownNameError: see `read_urdf` and `build_tree`; also when no body has mass.
@@ -237,7 +242,8 @@ def load_robot(
         carried = {name: link_parameters(by_name[name], tree.links[name][1]) for name in beyond}
         kinds = {joint.name: joint.type for joint in joints if joint.name in welded}
         chain = build_chain(tree)
-        return Robot(path, tree.names[0], fixed_base, bodies, tree.links, nominal, chain, welded, carried, kinds)
+        held = welded, carried, kinds
+        return Robot(path, tree.names[0], fixed_base, bodies, tree.links, nominal, chain, *held, base_tilt)
 
 
 def _warn_of_massless_ends(path: Path, bodies: tuple[Body, ...]) -> None:

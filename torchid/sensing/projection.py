@@ -276,7 +276,7 @@ def _bases(A: Tensor, floor: float | Tensor) -> Iterator[tuple[Tensor | slice, T
             V = torch.ormqr(reflectors, tau, identity[:, k:].expand(samples, m, m - k))
         else:
             V = complement(reflectors, tau)
-        if not _exists(suspect):
+        if not any_suspect(suspect):
             yield slice(None), V
             return
         regular = torch.nonzero(~suspect)[:, 0]
@@ -305,7 +305,7 @@ def complement(reflectors: Tensor, tau: Tensor) -> Tensor:
     return nn.functional.pad(torch.eye(m - k, dtype=Y.dtype, device=Y.device), (0, 0, k, 0)) - Y @ T_last
 
 
-def _exists(suspect: Tensor) -> bool:
+def any_suspect(suspect: Tensor) -> bool:
     """Whether any sample needs its singular values: the one number of a chunk that the host waits for.
 
     The shapes of whatever comes after it depend on it. Only where there are such samples, the host waits for their

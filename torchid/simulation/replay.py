@@ -88,12 +88,14 @@ class Model:
         joints: names of the n joints.
         armature: (n,), reflected rotor inertia [kg m^2 or kg].
         offset: (n,), subtracted from the joints' torques [N m or N].
+        stiffness: (n,), of springs that are at rest at position 0 [N m/rad or N/m].
     """
 
     urdf: Path
     joints: tuple[str, ...]
     armature: Array
     offset: Array
+    stiffness: Array
 
 
 @dataclass(frozen=True)
@@ -177,6 +179,8 @@ class _Simulated:
         joints = [self.model.joint(name) for name in model.joints]
         self.at, self.rate = (np.array([int(getattr(x, key)[0]) for x in joints]) for key in ("qposadr", "dofadr"))
         self.model.dof_armature[self.rate] += model.armature
+        self.model.jnt_stiffness[[joint.id for joint in joints]] = model.stiffness
+        self.model.qpos_spring[self.at] = 0.0
 
     def run(self, begin: int, torque: Array) -> tuple[Array, Array | None]:
         """Positions of the joints (S + 1, n) and the base's quaternion w x y z, (S + 1, 4), from a sample on.

@@ -84,7 +84,7 @@ def _print_fit(run: Identification) -> None:
         print_labelled("motion noise", str(run.motion_noise))
     if run.validation is not None:
         _print_validation(run.validation)
-    for name, choice in (("cutoff", run.cutoff), ("ridge", run.ridge), ("sign width", run.sign_width)):
+    for name, choice in {**run.choices.by_name(), "ridge": run.ridge}.items():
         if choice is not None:
             print_labelled(name, str(choice))
     least, body = min((value, name) for name, value in body_eigenvalues(robot, estimate.phi).items())

@@ -1,0 +1,184 @@
+"""Gram matrices of combined columns stand for rows as well as Householder QR does, or are not used."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from synthetic import Array
+from torch import Tensor
+
+from torchid.problem import TriangularFactor
+from torchid.problem import row_compressor as module
+from torchid.problem.row_compressor import ColumnLevels, RowCompressor
+
+COLUMNS = 12
+PARAMETERS = np.linspace(-2.0, 3.0, COLUMNS)
+
+
+def well_conditioned(rng: np.random.Generator, rows: int) -> Array:
+    return rng.normal(size=(rows, COLUMNS)) * np.logspace(-4, 4, COLUMNS)
+
+
+def nearly_dependent(rng: np.random.Generator, rows: int) -> Array:
+    """Columns with condition 1e8, however they are scaled."""
+    basis = np.linalg.qr(np.random.default_rng(1).normal(size=(COLUMNS, COLUMNS))).Q
+    return rng.normal(size=(rows, COLUMNS)) * np.logspace(0, -8, COLUMNS) @ basis
+
+
+def dependent(rng: np.random.Generator, rows: int) -> Array:
+    """One column is a combination of two others, one is zero, one twice another."""
+    A = rng.normal(size=(rows, COLUMNS))
+    A[:, 3] = 0.3 * A[:, 7] - 2.0 * A[:, 1]
+    A[:, 5] = 0.0
+    A[:, 9] = 2.0 * A[:, 0]
+    return A
+
+
+KINDS = {"well conditioned": well_conditioned, "nearly dependent": nearly_dependent, "dependent": dependent}
+kinds = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
+
+
+def with_room(rows: Array) -> Tensor:
+    """Rows with room above them, for `RowCompressor.add`."""
+    stacked = torch.full((COLUMNS + 1, COLUMNS + 1 + len(rows)), torch.nan, dtype=torch.float64).T
+    stacked[COLUMNS + 1 :] = torch.from_numpy(rows)
+    return stacked
+
+
+def compressed(chunks: list[Array]) -> TriangularFactor:
+    """The factor of chunks of rows (M, COLUMNS + 1)."""
+    factor, compressor = TriangularFactor(COLUMNS), RowCompressor()
+    for rows in chunks:
+        compressor.add(factor, tuple(range(COLUMNS)), with_room(rows))
+    compressor.finish()
+    return factor
+
+
+def exact_rows(kind: Callable[[np.random.Generator, int], Array], chunks: int, noise: float = 0.0) -> list[Array]:
+    rng, out = np.random.default_rng(0), []
+    for _ in range(chunks):
+        A = kind(rng, 300)
+        out.append(np.column_stack([A, A @ PARAMETERS + noise * rng.normal(size=len(A))]))
+    return out
+
+
+def relative_difference(R: Array, rows: Array) -> float:
+    """The largest relative difference between ||R x|| and ||rows x||, of all x that rows do not map to rounding."""
+    U, values, Vh = np.linalg.svd(rows / (size := np.linalg.norm(rows, axis=0) + 1e-300), full_matrices=False)
+    known = values > 1e-12 * values[0]
+    unit = Vh[known].T / values[known]
+    return float(np.abs(np.linalg.svd((R / size) @ unit, compute_uv=False) - 1.0).max())
+
+
+@kinds
+@pytest.mark.parametrize("noise", [0.0, 1e-3])
+def test_the_factor_has_the_lengths_of_the_rows(
+    kind: Callable[[np.random.Generator, int], Array], noise: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chunks = exact_rows(kind, 4, noise)
+    by_qr = np.linalg.qr(np.vstack(chunks), mode="r")
+    monkeypatch.setattr(RowCompressor, "_factorize", None)  # all are summed
+    factor = compressed(chunks)
+    assert factor.rows == 1200
+    R = factor.triangle().numpy()
+    limit = 10.0 * relative_difference(by_qr, np.vstack(chunks)) + 1e-12
+    assert relative_difference(R, np.vstack(chunks)) < limit
+
+
+@kinds
+def test_exact_rows_give_the_parameters_back_as_qr_does(kind: Callable[[np.random.Generator, int], Array]) -> None:
+    chunks = exact_rows(kind, 4)
+    size = np.linalg.norm(np.vstack(chunks), axis=0)
+
+    def found(R: Array) -> tuple[Array, float]:
+        scaled = R / np.where(size > 0.0, size, 1.0)
+        x, *_ = np.linalg.lstsq(scaled[:, :-1], scaled[:, -1], rcond=1e-11)
+        return x, float(np.linalg.norm(scaled[:, :-1] @ x - scaled[:, -1]))
+
+    (x, left), (expected, left_by_qr) = (
+        found(compressed(chunks).triangle().numpy()),
+        found(np.linalg.qr(np.vstack(chunks), mode="r")),
+    )
+    assert left < 1e-14 + 10.0 * left_by_qr
+    exact = size[:-1] * PARAMETERS / size[-1]
+    if kind is dependent:
+        np.testing.assert_allclose(x, expected, atol=1e-13)
+    else:
+        assert np.abs(x - exact).max() < 1e-14 + 10.0 * np.abs(expected - exact).max()
+
+
+def test_a_plain_gram_matrix_would_lose_what_the_compressor_keeps() -> None:
+    """Else the test above says nothing."""
+    rows = np.vstack(exact_rows(nearly_dependent, 4))
+    scaled = rows / np.linalg.norm(rows, axis=0)
+    assert np.linalg.eigvalsh(scaled.T @ scaled).min() < 1e-15
+
+
+def test_rows_that_columns_were_not_combined_for_are_factorized_and_columns_combined_anew() -> None:
+    rng, factorized = np.random.default_rng(3), 0
+    still = rng.normal(size=(200, 3)) @ rng.normal(size=(3, COLUMNS + 1))  # as of a robot that holds a pose
+    chunks = [still + 1e-9 * rng.normal(size=still.shape), *exact_rows(nearly_dependent, 3, 1e-3)]
+    chunks[2] = 1e6 * chunks[2][:, ::-1]
+
+    class Counted(RowCompressor):
+        def _factorize(self, *args: object) -> None:
+            nonlocal factorized
+            factorized += 1
+            super()._factorize(*args)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(globals(), "RowCompressor", Counted)
+        factor = compressed(chunks)
+    rows = np.vstack(chunks)
+    assert 0 < factorized < len(chunks)
+    limit = 10.0 * relative_difference(np.linalg.qr(rows, mode="r"), rows) + 1e-12
+    assert relative_difference(factor.triangle().numpy(), rows) < limit
+
+
+def test_levels_make_rows_well_conditioned_and_can_be_undone() -> None:
+    rows = np.vstack(exact_rows(nearly_dependent, 1, 1e-3))
+    levels = ColumnLevels.of(np.linalg.qr(rows, mode="r"))
+    X = rows.T.copy()
+    levels.apply(X)
+    unit = X / np.linalg.norm(X, axis=1, keepdims=True)
+    assert np.linalg.eigvalsh(unit @ unit.T).min() > module._LEAST_EIGENVALUE
+    assert 0 < len(levels.lower) < COLUMNS
+    kept = np.setdiff1d(np.arange(COLUMNS + 1), levels.lower)
+    np.testing.assert_array_equal(X[kept], rows.T[kept])
+    R = levels.undo(np.linalg.qr(X.T, mode="r"))
+    assert relative_difference(R, rows) < 1e-7, "the least singular value is 1e-8"
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+@pytest.mark.parametrize("chunk", [0, 2])
+def test_numbers_that_are_not_finite_reach_the_factor(number: float, chunk: int) -> None:
+    chunks = exact_rows(well_conditioned, 4)
+    chunks[chunk][17, 4] = number
+    assert not compressed(chunks).triangle().isfinite().all()
+
+
+def test_factors_take_turns() -> None:
+    """Rows reach the factor that they are added to, whichever came before."""
+    chunks, compressor = exact_rows(well_conditioned, 4), RowCompressor()
+    factors = [TriangularFactor(COLUMNS), TriangularFactor(COLUMNS)]
+    for number, rows in enumerate(chunks):
+        compressor.add(factors[number % 2], tuple(range(COLUMNS)), with_room(rows), 2.0)
+    compressor.finish()
+    for number, factor in enumerate(factors):
+        rows = np.vstack(chunks[number::2])
+        assert (factor.rows, factor.independent_rows) == (600, 300.0)
+        assert relative_difference(factor.triangle().numpy(), rows) < 1e-12
+
+
+def test_a_factor_is_the_same_to_the_last_bit_whatever_was_compressed_before() -> None:
+    """Processes that share a log then find what one finds."""
+    alone, own = compressed(exact_rows(nearly_dependent, 2)), RowCompressor()
+    before, factor = TriangularFactor(COLUMNS), TriangularFactor(COLUMNS)
+    for target, kind in ((before, well_conditioned), (factor, nearly_dependent)):
+        for rows in exact_rows(kind, 2):
+            own.add(target, tuple(range(COLUMNS)), with_room(rows))
+    own.finish()
+    assert torch.equal(factor.triangle(), alone.triangle())

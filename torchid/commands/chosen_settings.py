@@ -1,0 +1,106 @@
+"""Settings that an experiment leaves to its training logs: the filter, the base's tilt, the sign of friction."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TypeVar
+
+from rich.progress import Progress
+
+from torchid import ranks
+from torchid.commands.check import recorded_stretches
+from torchid.commands.reading import LogReader
+from torchid.estimators import Conditions
+from torchid.fitting.base_tilt import TiltChoice, choose_base_tilt
+from torchid.fitting.experiment import Experiment, S, Scene
+from torchid.fitting.fit import LogFitter
+from torchid.fitting.noise import recorded_sensors
+from torchid.fitting.sign_width import SignWidthChoice, choose_sign_width
+from torchid.logs.cutoff import CutoffChoice, choose_cutoff
+from torchid.problem import Samples
+from torchid.settings import AUTO
+
+Choice = TypeVar("Choice")
+
+
+@dataclass(frozen=True)
+class Choices:
+    """How settings were chosen, in the order in which they are; None for what the experiment states."""
+
+    cutoff: CutoffChoice | None = None
+    base_tilt: TiltChoice | None = None
+    sign_width: SignWidthChoice | None = None
+
+    def by_name(self) -> dict[str, CutoffChoice | TiltChoice | SignWidthChoice | None]:
+        """The same by name, in words."""
+        return {name.replace("_", " "): choice for name, choice in vars(self).items()}
+
+
+def with_chosen_settings(scene: S, bars: Progress) -> tuple[S, Choices]:
+    """The scene with numbers, or none, where its settings leave them to the training logs, and how they were chosen.
+
+    Args:
+        scene: with logs to fit on; without sensors, all that were recorded count.
+        bars: shows that this goes on.
+
+    Raises:
+        InputError: logs that cannot be read, or lack what is needed.
+    """
+    if scene.config.logs is None:
+        return scene, Choices()
+    cutoff = tilt = width = None
+    if scene.config.preprocessing.cutoff_hz == AUTO:
+        cutoff = _chosen("cutoff", partial(_cutoff, scene), bars)
+        settings = replace(scene.config.preprocessing, cutoff_hz=cutoff.cutoff_hz)
+        scene = replace(scene, config=replace(scene.config, preprocessing=settings))
+    if scene.config.robot.base_tilt == AUTO:
+        tilt = _chosen("base tilt", partial(_base_tilt, scene), bars)
+        stated = replace(scene.config.robot, base_tilt=tilt.tilt)
+        robot = replace(scene.robot, base_tilt=tilt.tilt)
+        scene = replace(scene, robot=robot, config=replace(scene.config, robot=stated))
+    if scene.config.actuators.sign_width == AUTO:
+        width = _chosen("sign width", partial(choose_sign_width, partial(_logs_and_fitter, scene)), bars)
+        scene = _with_sign_width(scene, width.width)
+    return scene, Choices(cutoff, tilt, width)
+
+
+def _chosen(name: str, choose: Callable[[], Choice], bars: Progress) -> Choice:
+    """What the first process chooses."""
+    bar = bars.add_task(f"choosing the {name}", total=None)
+    choice = ranks.from_first(choose, name)
+    bars.update(bar, total=1, completed=1)
+    return choice
+
+
+def _cutoff(scene: Scene) -> CutoffChoice:
+    """By the middle of each training log."""
+    settings, files = scene.config.preprocessing, scene.config.logs
+    if files is None:
+        return CutoffChoice(None, by_noise=False)
+    logs = [next(recorded_stretches(path, files, settings))[0] for path in files.train]
+    stated, from_feet = scene.config.sensors.noise.motion, settings.base_motion is not None
+    return choose_cutoff(logs, stated, settings.sample_rate_hz, base_is_derived=from_feet)
+
+
+def _base_tilt(scene: Scene) -> TiltChoice:
+    return choose_base_tilt(*_logs_and_fitter(scene, scene.terms.sign_width))
+
+
+def _logs_and_fitter(scene: Scene, width: float | None) -> tuple[Sequence[Samples], LogFitter]:
+    """The training logs, and a fitter of their rows, with a width of friction's sign.
+
+    Logs are read anew for every width, since the filter comes after the friction.
+    """
+    scene = _with_sign_width(scene, width)
+    sensors = scene.sensors if isinstance(scene, Experiment) else None
+    logs = LogReader(scene).read(scene.config.logs.train if scene.config.logs else [], sensors)
+    if sensors is None:
+        sensors = recorded_sensors(scene.robot, scene.contacts, logs, scene.noise)
+    return logs, scene.fitter(scene.builder(sensors), Conditions(names=scene.robot.body_names))
+
+
+def _with_sign_width(scene: S, width: float | None) -> S:
+    config = scene.config
+    return replace(scene, config=replace(config, actuators=replace(config.actuators, sign_width=width)))

@@ -1,0 +1,137 @@
+"""Rows of the contact Jacobian at samples of a contact state, and bases of the null space of the unmeasured ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchid.problem.chunk_dynamics import ChunkKinematics
+from torchid.problem.contact_state import ContactStateLayout
+from torchid.problem.row_blocks import turn_rows
+from torchid.problem.wrench_rows import wrenches_at_ground
+from torchid.regressor.regressor import generalized_forces
+from torchid.regressor.tree import KinematicTree
+from torchid.sensing.limbs import limb_null_space
+from torchid.sensing.projection import any_suspect, whitened_null_space
+
+
+@dataclass(frozen=True)
+class ContactRows:
+    """Rows of J_C of the bodies in contact, each in the base rows and the joints that move its body.
+
+    Attributes:
+        unmeasured, measured: (k, base rows + own joints, B) of each body that has any.
+        unmeasured_columns, measured_columns: where these are among base rows and coupled joints, (columns,) int64 each.
+        width: number of base rows and coupled joints.
+        like: a tensor of the rows' type, (..., B).
+    """
+
+    unmeasured: Sequence[Tensor]
+    measured: Sequence[Tensor]
+    unmeasured_columns: Sequence[Tensor]
+    measured_columns: Sequence[Tensor]
+    width: int
+    like: Tensor
+
+    def of_unmeasured(self, index: Tensor | slice) -> Tensor:
+        """All unmeasured rows of some samples, (B', k, base rows + coupled joints)."""
+        parts = [part[..., index] for part in self.unmeasured]
+        return _together(parts, self.unmeasured_columns, self.width, self.like[..., index]).permute(2, 0, 1)
+
+    def of_measured(self) -> Tensor:
+        """All measured rows, (k, base rows + coupled joints, B)."""
+        return _together(self.measured, self.measured_columns, self.width, self.like)
+
+
+def _together(parts: Sequence[Tensor], columns: Sequence[Tensor], width: int, like: Tensor) -> Tensor:
+    rows, start = like.new_zeros(sum(map(len, parts)), width, like.shape[-1]), 0
+    for part, at in zip(parts, columns, strict=True):
+        rows[start : start + len(part)].index_copy_(1, at, part)
+        start += len(part)
+    return rows
+
+
+def contact_rows(
+    tree: KinematicTree, layout: ContactStateLayout, kinematics: ChunkKinematics, origin: Callable[[int], Tensor]
+) -> ContactRows:
+    """The rows at B samples.
+
+    Args:
+        tree: the robot's constants.
+        layout: of the samples' contact state.
+        kinematics: of the samples.
+        origin: of a contact frame in its node's joint frame, (3,) [m].
+    """
+    rows: tuple[list[Tensor], list[Tensor]] = ([], [])
+    columns: tuple[list[Tensor], list[Tensor]] = ([], [])
+    for contact in layout.contact_bodies:
+        joints = [layout.coupled_joints[index] for index in contact.joints]
+        own = tree.index([*range(tree.base_rows), *(tree.base_rows + index for index in contact.joints)])
+        counts = contact.count, len(contact.components)
+        for kind, parts in enumerate((contact.unmeasured, contact.measured)):
+            if parts:
+                at_base = wrenches_at_ground(parts, counts[kind], kinematics, contact.body, origin)
+                rows[kind].append(generalized_forces(tree, kinematics.screw_axes, contact.body, at_base, joints))
+                columns[kind].append(own)
+    return ContactRows(*rows, *columns, len(layout.row_std), kinematics.screw_axes)
+
+
+def whitened_bases(
+    layout: ContactStateLayout, rows: ContactRows, measured: Tensor, axes: Tensor | None, order: Tensor
+) -> Iterator[tuple[Tensor | slice, Tensor]]:
+    """Bases W of the null spaces of the unmeasured rows under which the projected noise is white, grouped by rank.
+
+    Args:
+        layout: of the samples' contact state.
+        rows: of the samples.
+        measured: (k, m, B), those that are measured.
+        axes: (B, 3, 3) or None, as of `whitened_null_space`.
+        order: (m,), as of `whitened_null_space`.
+
+    Yields:
+        (index of the samples, W): W is (m, r, B'), turned where the layout says so.
+    """
+    if not layout.has_own_limbs:
+        yield from _general_bases(layout, rows, slice(None), measured, axes, order)
+        return
+    joints = [columns[6:] - 6 for columns in rows.unmeasured_columns]
+    W, suspect = limb_null_space(rows.unmeasured, joints, layout.row_std, measured, layout.wrench_std, axes)
+    lost: list[tuple[Tensor, Tensor]] = []
+    if any_suspect(suspect):
+        doubtful = torch.nonzero(suspect)[:, 0]
+        some_axes = None if axes is None else axes[doubtful]
+        for index, basis in _general_bases(layout, rows, doubtful, measured[..., doubtful], some_axes, order):
+            if basis.shape[1] == W.shape[1]:
+                W[..., doubtful[index]] = basis
+            else:
+                lost.append((doubtful[index], basis))
+    if not lost:
+        yield slice(None), W
+        return
+    suspect.fill_(False)
+    for index, _ in lost:
+        suspect[index] = True
+    regular = torch.nonzero(~suspect)[:, 0]
+    if len(regular):
+        yield regular, W[..., regular]
+    yield from lost
+
+
+def _general_bases(
+    layout: ContactStateLayout,
+    rows: ContactRows,
+    index: Tensor | slice,
+    measured: Tensor,
+    axes: Tensor | None,
+    order: Tensor,
+) -> Iterator[tuple[Tensor | slice, Tensor]]:
+    """The same by decompositions of all rows together; `measured` and `axes` are those of the samples in question."""
+    A, J_m = rows.of_unmeasured(index), measured.permute(2, 0, 1)
+    for part, basis in whitened_null_space(A, layout.row_std, J_m, layout.wrench_std, axes, order):
+        W = basis.permute(1, 2, 0).contiguous()
+        if layout.blocks.are_turned:
+            turn_rows(W)
+        yield part, W
