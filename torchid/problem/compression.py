@@ -249,7 +249,7 @@ def linear_problem(factor: TriangularFactor, builder: RowBuilder, robot: Robot, 
     if builder.extras:
         raise ValueError("builder: found extra terms; accepted: one without, or torchid.assemble")
     own = corrected_triangle(factor, column_prior(builder, robot, friction))
-    return problem_from_triangle(own.R, factor.rows, factor.oversampling, builder, robot, friction, held=own.held)
+    return problem_from_triangle(own.R, factor.rows, factor.oversampling, builder, robot, friction, own.held)
 
 
 def column_prior(builder: RowBuilder, robot: Robot, friction: bool = True) -> ColumnPrior:
@@ -260,14 +260,7 @@ def column_prior(builder: RowBuilder, robot: Robot, friction: bool = True) -> Co
 
 
 def problem_from_triangle(
-    R: Array,
-    rows: int,
-    oversampling: float,
-    builder: RowBuilder,
-    robot: Robot,
-    friction: bool = True,
-    *,
-    held: Array | None = None,
+    R: Array, rows: int, oversampling: float, builder: RowBuilder, robot: Robot, friction: bool, held: Array | None
 ) -> LinearProblem:
     """The problem in all 12 L parameters from a triangle in the regrouped columns, right-hand side last.
 

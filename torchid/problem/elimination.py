@@ -97,7 +97,7 @@ def assemble(parts: Sequence[Part], builder: RowBuilder, robot: Robot, friction:
     forces = float(np.square(of_all_logs[:, -1]).sum())
     if not builder.extras:
         problem = problem_from_triangle(
-            of_all_logs, everything.rows, everything.oversampling, builder, robot, friction, held=held
+            of_all_logs, everything.rows, everything.oversampling, builder, robot, friction, held
         )
         return Assembly(problem, (), problem, noise, forces)
     count = builder.columns.count
@@ -125,9 +125,9 @@ def assemble(parts: Sequence[Part], builder: RowBuilder, robot: Robot, friction:
     spent = everything.oversampling * sum(elimination.inverse.shape[1] for elimination in eliminations)
     rows_left = max(everything.rows - round(spent), 1)
     held = None if held is None else held[:count]
-    problem = problem_from_triangle(rows, rows_left, everything.oversampling, builder, robot, friction, held=held)
+    problem = problem_from_triangle(rows, rows_left, everything.oversampling, builder, robot, friction, held)
     known = np.asarray(np.linalg.qr(np.delete(of_all_logs, np.s_[count:-1], axis=1), mode="r"))
-    if_known = problem_from_triangle(known, everything.rows, everything.oversampling, builder, robot, friction)
+    if_known = problem_from_triangle(known, everything.rows, everything.oversampling, builder, robot, friction, None)
     return Assembly(problem, tuple(eliminations), if_known, noise, forces)
 
 
