@@ -21,7 +21,7 @@ from torchid.errors import LogError, about_file
 from torchid.logs import Columns, Log
 from torchid.logs.blocks import GIGABYTE, LogBlocks, count_samples_from, open_log_blocks
 from torchid.logs.coverage import Coverage, warn_of_gaps
-from torchid.logs.log import CONTACT_READINGS, BoolArray, FloatArray
+from torchid.logs.log import CONTACT_READINGS, NORMALS, BoolArray, FloatArray
 from torchid.logs.preprocess import (
     away_from_changes,
     find_unloaded,
@@ -33,19 +33,32 @@ from torchid.logs.preprocess import (
 )
 from torchid.logs.rate_noise import warn_of_noisy_accelerations
 from torchid.logs.signal_noise import MOST_SAMPLES, SignalNoise, signal_noise
-from torchid.logs.spill import Filled, Spill
+from torchid.logs.spill import Filled, Spill, growing_array
 from torchid.logs.timeline import SPLINE_BLOCK, Timeline
 from torchid.problem import Samples, bind_log
 from torchid.problem.base_motion import BaseMotion
 from torchid.problem.chunks import one_thread
+from torchid.problem.contact_slip import away_from_own_changes, base_velocity, ground_speeds, judge_speeds, warn_of_slip
 from torchid.problem.samples import oversampling, require_forces
 from torchid.problem.welded_joints import distances_from_welds, warn_of_moving_welds
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
 
 _COPIES = 16  # a block takes so many times the memory of its recorded arrays: derivatives, splines, bound tensors
+_OF_MOTION = "joint_position", "joint_velocity", "joint_acceleration", "base_", "imu_", "contact_active", NORMALS
 BLOCK_GB = 0.01
 """Recorded arrays of a block in memory; smaller ones spend more on the neighbourhood that a filter needs."""
+
+
+def require_kept(kept: BoolArray, source: str | Path, checked_for_slip: bool) -> None:
+    """Refuse a log none of whose samples (N,) are kept away from changes of contact and, if checked, from slip."""
+    if kept.any():
+        return
+    found, accepted = "no sample away from changes of contact", "a smaller preprocessing.contact_margin_s"
+    if checked_for_slip:
+        found = f"{found} in which no contact slips"
+        accepted = "a larger preprocessing.max_slip, or a smaller contact_margin_s"
+    raise LogError(source, "contact_active", found, accepted)
 
 
 @dataclass(frozen=True)
@@ -136,7 +149,35 @@ class LargeLog:
         kept = None if contacts is None else self._away_from_changes(contacts, time)
         in_the_air = None if contacts is None or not with_unloaded else _in_the_air(contacts)
         noise = signal_noise(first, timeline, self.motion_noise)
-        return _Course(blocks, timeline, coverage, time, kept, in_the_air, noise)
+        course = _Course(blocks, timeline, coverage, time, kept, in_the_air, noise)
+        if settings.max_slip is None or contacts is None or not self.contacts:
+            return course
+        stands = self._standing_firmly(course, contacts)
+        kept = stands if kept is None else kept & stands
+        require_kept(kept, self.path, checked_for_slip=True)
+        return replace(course, kept=None if kept.all() else kept)
+
+    def _standing_firmly(self, course: _Course, contacts: Log) -> BoolArray:
+        """In which samples no contact slips, (N,), which takes a pass over the motion.
+
+        Warns:
+            TorchidWarning: as `warn_of_slip`.
+        """
+        settings, blocks, bare = self.settings, course.blocks, replace(course, in_the_air=None)
+        motion = tuple(name for name in blocks.fields if name.startswith(_OF_MOTION))
+        away = away_from_own_changes(contacts, course.time, self.contacts, settings.filter_hz)
+        speeds = growing_array(self.path, self.folder, len(course.time))
+        relative = not self.robot.fixed_base
+        for piece in self._pieces(blocks, len(course.time)):
+            block = _read_block(blocks, piece, course.timeline, None, motion)
+            log = self._moved(bare, block)
+            samples = bind_log(log, self.robot, self.contacts)
+            base = base_velocity(log, samples)
+            relative = relative and base is None
+            speeds.append(ground_speeds(samples, self.robot, self.contacts, base, away[piece]))
+        slip = judge_speeds(speeds.array(), self.contacts, settings.slip_limit, relative)
+        warn_of_slip(slip, blocks.source)
+        return np.asarray(~slip.slips.any(axis=1))
 
     def _check_welds(self, blocks: LogBlocks, first: Log) -> None:
         """Warn of joints that move though they are welded, which takes a pass over a log that has any."""
@@ -179,9 +220,13 @@ class LargeLog:
         margin = self.settings.contact_margin_s
         return None if margin is None else away_from_changes(contacts, time, margin)
 
+    def _moved(self, course: _Course, block: _Block) -> Log:
+        """A block of the preprocessed log."""
+        return block.log if block.timeline is None else move_to_timeline(block.log, block.timeline, course.coverage)
+
     def _bound(self, course: _Course, block: _Block) -> tuple[slice, Samples]:
         """The numbers of a block's samples, and these; errors count from the beginning."""
-        log = block.log if block.timeline is None else move_to_timeline(block.log, block.timeline, course.coverage)
+        log = self._moved(course, block)
         if block.timeline is not None and not block.piece.start:  # the first block stands for all
             warn_of_noisy_accelerations(block.log, log, block.timeline, course.noise)
         samples = bind_log(replace(log, motion_noise=course.noise), self.robot, self.contacts)
@@ -236,10 +281,16 @@ class _Block:
     timeline: Timeline | None
 
 
-def _read_block(blocks: LogBlocks, piece: slice, timeline: Timeline | None, in_the_air: BoolArray | None) -> _Block:
-    """What a part of the preprocessed log depends on."""
+def _read_block(
+    blocks: LogBlocks,
+    piece: slice,
+    timeline: Timeline | None,
+    in_the_air: BoolArray | None,
+    only: tuple[str, ...] | None = None,
+) -> _Block:
+    """What a part of the preprocessed log depends on; `only` as of `LogBlocks.read`."""
     samples, part = (piece, None) if timeline is None else timeline.part(piece.start, piece.stop)
-    log = blocks.read(samples)
+    log = blocks.read(samples, only)
     if in_the_air is not None:
         log = replace(log, contact_unloaded=unloaded_readings(log, in_the_air[samples]))
     return _Block(piece, log, part)
@@ -286,8 +337,7 @@ class _Stored:
             for name, x in vars(part).items():
                 if isinstance(x, Tensor):
                     if (name, of_base) not in self._spills:
-                        grows = Filled(total) if self._folder is None else Spill(self._source, self._folder)
-                        self._spills[name, of_base] = grows
+                        self._spills[name, of_base] = growing_array(self._source, self._folder, total)
                     self._spills[name, of_base].append(x.numpy())
         self._like = samples
 
