@@ -11,7 +11,8 @@ import numpy as np
 import torch
 
 from torchid import ranks
-from torchid.commands.large_log import BLOCK_GB, LargeLog, require_kept
+from torchid.commands.large_log import BLOCK_GB, LargeLog
+from torchid.commands.log_course import require_kept
 from torchid.config.logs import require_apart
 from torchid.errors import ConfigError, LogError
 from torchid.fitting.experiment import Scene
@@ -168,20 +169,24 @@ class LogReader:
             if settings.exclude_condemned:
                 key, accepted = "exclude_condemned", f"{accepted} that torchid check passes"
             else:
-                keys = "base_motion", "detect_contacts", "contact_threshold", "zero_in_air", "bridge_gaps_s"
+                keys = "contact_threshold", "zero_in_air", "bridge_gaps_s"
                 key = next(name for name in keys if getattr(settings, name) not in (None, False))
             raise LogError(path, f"preprocessing.{key}", found, accepted)
         return self._large_log(path, required, self.folder).samples(fits_contact_offsets(self.scene))
 
     def _takes_blocks(self, path: Path, gigabytes: float) -> bool:
-        """Whether a log with so much in arrays is read block by block even if there is memory for it."""
-        return gigabytes > _WHOLE_GB and not self._needs_whole_logs and not split_range(path).joins
+        """Whether a log with so much in arrays is read block by block even if there is memory for it.
+
+        Where fields are worked out of others, blocks take more passes over it.
+        """
+        whole = self._needs_whole_logs or self.scene.config.preprocessing.derived or split_range(path).joins
+        return gigabytes > _WHOLE_GB and not whole
 
     @property
     def _needs_whole_logs(self) -> bool:
         """Whether samples are left out or filled for what is known of a whole log alone."""
         settings = self.scene.config.preprocessing
-        of_all = settings.exclude_condemned or settings.zero_in_air or bool(settings.derived)
+        of_all = settings.exclude_condemned or settings.zero_in_air or settings.contact_threshold is not None
         return of_all or settings.bridge_gaps_s is not None
 
     def _large_log(self, path: Path, required: SensorSet | None, folder: Path | None) -> LargeLog:
@@ -198,6 +203,7 @@ class LogReader:
             motion_noise=self._stated,
             sign_width=scene.terms.sign_width,
             columns=None if scene.config.logs is None else scene.config.logs.columns,
+            loaded=scene_of_log(scene, path).robot,
         )
 
     @property

@@ -68,16 +68,33 @@ def with_detected_contacts(
         LogError: as `detect_contacts`; wrenches without the name of a contact.
     """
     active, certain = detect_contacts(log, robot, contacts, settings or DetectionConfig())
+    bare = log.contact_wrench is None and log.contact_force_normal is None and log.contact_normal_world is None
+    names, flags = name_flags(log.source, () if bare else log.contact_names, contacts, active)
+    return dataclasses.replace(log, contact_names=names, contact_active=flags), certain
+
+
+def name_flags(
+    source: str, names: tuple[str, ...], contacts: Sequence[Contact], active: BoolArray
+) -> tuple[tuple[str, ...], BoolArray]:
+    """Names of the contacts of a log and their flags (N, C'), of flags (N, C) of the experiment's contacts.
+
+    Args:
+        source: name of the log.
+        names: of contacts of which it has readings, () without any.
+        contacts: of the experiment.
+        active: their flags.
+
+    Raises:
+        LogError: readings without the name of a contact.
+    """
     frames = tuple(contact.frame for contact in contacts)
-    if log.contact_wrench is None and log.contact_force_normal is None and log.contact_normal_world is None:
-        return dataclasses.replace(log, contact_names=frames, contact_active=active), certain
-    if missing := [frame for frame in frames if frame not in log.contact_names]:
-        raise LogError(
-            log.source, "contact_names", f"contact '{missing[0]}' missing", "every contact of the experiment"
-        )
-    flags = np.zeros((len(log), len(log.contact_names)), dtype=bool)
-    flags[:, [log.contact_names.index(frame) for frame in frames]] = active
-    return dataclasses.replace(log, contact_active=flags), certain
+    if not names:
+        return frames, active
+    if missing := [frame for frame in frames if frame not in names]:
+        raise LogError(source, "contact_names", f"contact '{missing[0]}' missing", "every contact of the experiment")
+    flags = np.zeros((len(active), len(names)), dtype=bool)
+    flags[:, [names.index(frame) for frame in frames]] = active
+    return names, flags
 
 
 class Detection(NamedTuple):
