@@ -30,6 +30,7 @@ from synthetic import G1, ROBOTS
 from torchid.cli import main
 from torchid.commands.init import Initiated, init
 from torchid.config import load_config
+from torchid.errors import UnknownNameError
 from torchid.fitting.experiment import set_up
 from torchid.logs import Log, read_log
 from torchid.logs.joint_orders import HG, JOINT_ORDERS
@@ -158,6 +159,35 @@ def test_commands_other_joints_and_imus_of_limbs_are_left_out(tmp_path: Path) ->
     assert any(
         "2 topics not needed: /joint_command (sensor_msgs/msg/JointState), /a_chest/imu" in x for x in said.guessed
     )
+
+
+def test_joints_that_messages_spell_otherwise_are_named_and_those_that_they_lack_are_welded(tmp_path: Path) -> None:
+    """As a driver that has joints in capitals and a prefix, and no wrists."""
+    joints = list(load_robot(G1).joint_names)
+    held = [name for name in joints if "wrist" in name]
+    spelled = {f"g1/{name.removesuffix('_joint').upper()}": name for name in joints if name not in held}
+    for suffix in (".mcap", ".db3", ".bag"):
+        path = write_bag(tmp_path / f"x{suffix}", legged([*spelled, "gripper"], []))
+        said, topics, again = started(G1, path)
+        entry = topics["joint_states"]
+        assert entry["names"] == spelled
+        assert entry["joints"] == [name for name in joints if name not in held]
+        assert set(again.joint_names) == set(spelled.values())
+        assert load_config(path.with_suffix(".yaml")).robot.weld == dict.fromkeys(held, 0.0)
+        assert any(text.startswith("robot.weld: ") for text in said.guessed)
+        assert any("names of 23 joints, which the messages spell otherwise" in text for text in said.guessed)
+        assert not any("joint_position" in text for text in said.missing)
+    other = load_config(path.with_suffix(".yaml"), ["logs.topics.joint_states.names={a: left_kne_joint}"])
+    with pytest.raises(
+        UnknownNameError, match=r"joint_states\.names: unknown name 'left_kne_joint'; accepted: left_knee_joint"
+    ):
+        set_up(other)
+
+
+def test_states_of_a_few_joints_of_something_else_are_not_the_robots(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "x.mcap", legged(["other_left_knee", "other_right_knee"], []))
+    said = init(G1, path, tmp_path / "x.yaml")
+    assert any(text.startswith("joint_position: no topics that look like it") for text in said.missing)
 
 
 def test_wrenches_go_to_feet_by_the_limbs_in_names_and_frames(tmp_path: Path) -> None:

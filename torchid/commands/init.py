@@ -39,7 +39,7 @@ _FORCES = ("joint_torque", "contact_wrench_local", "contact_wrench_world", "cont
 _POSE = ("base_quat_wxyz", "base_quat_xyzw")
 _IMU = ("imu_specific_force", "imu_angular_velocity")
 _WHAT = {"columns": "names, units and orders of the file", "topics": "what the messages of the bag hold"}
-_WELDED = "joints that the log lacks, held still; one that moves needs columns"
+_WELDED = "joints that the log lacks, held still; one that moves needs readings"
 _OTHER_FILE = "; if another file has it: torchid init URDF 'FILE + FILE@SECONDS', docs/logs.md"
 _LINE = 118
 
