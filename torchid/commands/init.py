@@ -28,11 +28,13 @@ from torchid.logs.time_range import split_range
 from torchid.logs.topic_proposals import USED_TYPES, frame_of, propose_topics
 from torchid.regressor.kinematics import GRAVITY_WORLD
 from torchid.robot import CollisionShapes, Robot, load_robot
-from torchid.robot.urdf import position_limits
+from torchid.robot.urdf import fixed_joints, position_limits
 
 _FEET = (r"foot|feet", r"sole", r"ankle_roll|ankle_flexion", r"toe|ankle|paw|hoof")
 """Words in names of links that touch the ground, the surest first."""
 
+_SENSOR = r"(?<![a-z])(ft|force|torque|load_?cell)(?![a-z])"
+_MOST_SENSORS = 16  # in limbs that are looked at
 _ON_FEET = r"sensor|imu|camera|bumper|laser"
 _NAMED = r"foot|feet|sole"
 _FORCES = ("joint_torque", "contact_wrench_local", "contact_wrench_world", "contact_force_normal", "ft_wrench")
@@ -134,7 +136,25 @@ def _known(robot: Robot, contacts: Sequence[_Contact]) -> KnownRobot:
     """What the proposal of a map knows of the robot."""
     on_base, elsewhere = ([name for name, (body, _) in robot.links.items() if bool(body) == x] for x in (False, True))
     feet, weight = [contact.frame for contact in contacts], -GRAVITY_WORLD[2] * float(robot.nominal[:, 0].sum())
-    return KnownRobot(robot.joint_names, feet, robot.path.stem, weight, robot.base_link, on_base, elsewhere)
+    sensors = _limb_sensors(robot)
+    return KnownRobot(robot.joint_names, feet, robot.path.stem, weight, robot.base_link, on_base, elsewhere, sensors)
+
+
+def _limb_sensors(robot: Robot) -> dict[str, str]:
+    """Children of fixed joints in limbs whose names say that a force/torque sensor is there, by joint."""
+    found = fixed_joints(robot.path)
+    named = {joint: child for joint, child in found.items() if re.search(_SENSOR, f"{joint} {child}", re.IGNORECASE)}
+    in_limbs = {joint: child for joint, child in named.items() if child in robot.links and robot.links[child][0]}
+    return {joint: child for joint, child in list(in_limbs.items())[:_MOST_SENSORS] if _can_be_split(robot, joint)}
+
+
+def _can_be_split(robot: Robot, joint: str) -> bool:
+    """Whether both sides of a fixed joint have mass."""
+    try:
+        load_robot(robot.path, ft_joints=[joint])
+    except InputError:
+        return False
+    return True
 
 
 def _stated_contacts(sample: Any, robot: Robot) -> list[str]:
@@ -191,12 +211,13 @@ def _as_ignored(pattern: str) -> str:
     return re.sub(r"\{[^{}]*\}", "*", pattern)
 
 
-def _sensors(fields: set[str]) -> str:
-    """The set of sensors of a run."""
+def _sensors(fields: set[str], limbs: Sequence[str]) -> str | dict[str, object]:
+    """The set of sensors of a run, with those in limbs at fixed joints."""
     wrench = bool({"contact_wrench_local", "contact_wrench_world"} & fields)
-    if "joint_torque" in fields:
-        return "full" if wrench else "joints"
-    return "contacts"
+    named = ("full" if wrench else "joints") if "joint_torque" in fields else "contacts"
+    if not limbs:
+        return named
+    return ({"set": named} if wrench or named == "joints" else {}) | {"ft_sensors": list(limbs)}
 
 
 def _is_fixed(contacts: Sequence[_Contact], fields: set[str]) -> bool:
@@ -336,7 +357,7 @@ def _text(
             lines += [f"    {line}" for line in _entry(key, value)]
     lines += [f"# {' and '.join(from_feet)}: nobody recorded them"] if from_feet else []
     lines += _entry("preprocessing", {"cutoff_hz": "auto"} | from_feet)
-    lines += _entry("sensors", _sensors(fields))
+    lines += _entry("sensors", _sensors(fields, list(proposal.columns.get("ft_wrenches", ()))))
     lines += _entry("estimator", {"name": "consistent", "ridge": "auto"})
     lines += _entry("output", f"runs/{output.stem}")
     return "\n".join(lines) + "\n"

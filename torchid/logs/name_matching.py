@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 SUFFIXES = {"joint": ("", "_joint"), "contact": ("", "_foot", "_sole", "_contact", "_link", "_ankle_roll_link")}
 """What names of a URDF may have more than those of a recording."""
@@ -30,6 +30,7 @@ class KnownRobot:
         base_link: its base.
         on_base: links of its base.
         elsewhere: all others.
+        limb_sensors: children of the fixed joints in limbs that are called force or torque sensors, by joint.
     """
 
     joints: Sequence[str]
@@ -39,6 +40,7 @@ class KnownRobot:
     base_link: str
     on_base: Sequence[str]
     elsewhere: Sequence[str]
+    limb_sensors: Mapping[str, str] = field(default_factory=dict)
 
 
 def within(stem: str) -> re.Pattern[str]:

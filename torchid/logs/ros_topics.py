@@ -96,6 +96,7 @@ class LowStateTopic:
         robot: whose motors they are: go2, g1, ...; see `JOINT_ORDERS`.
         joints: in its place, joints by number of the motor, null for one that is to be left out.
         frame: of the IMU in the URDF; without it the IMU is not read.
+        orientation: whether the IMU's quaternion, as the robot estimates it, is the base's orientation.
         feet: contacts by number in `foot_force`, null for one to be left out; by default the robot's.
         above: [counts] a foot touches while its sensor reads more.
         forces: whether what the sensors read is the force along the ground's normal, in counts.
@@ -107,6 +108,7 @@ class LowStateTopic:
     robot: _Name | None = None
     joints: Annotated[list[_Name | None], Field(min_length=1)] | None = None
     frame: _Name | None = None
+    orientation: bool = True
     feet: Annotated[list[_Name | None], Field(min_length=1, max_length=4)] | None = None
     above: Number | None = None
     forces: bool = False

@@ -12,7 +12,7 @@ from torchid.logs.bag_samples import TopicSample
 from torchid.logs.column_proposals import is_desired
 from torchid.logs.joint_orders import JOINT_ORDERS, suitable_orders, usual_order
 from torchid.logs.map_proposals import MapProposal, threshold
-from torchid.logs.name_matching import KnownRobot, match_joints, match_names
+from torchid.logs.name_matching import KnownRobot, match_joints, match_names, spelled
 from torchid.logs.ros_low_state import LowState
 from torchid.logs.ros_messages import ContactFlag, Imu, JointStates, NormalForce, Odometry, Wrench
 
@@ -49,6 +49,7 @@ class _Proposer:
             self.out.columns = {"joint_states": "TOPIC", **self.out.columns}
             self.out.notes["joint_states"] = "nothing, as no topic has the robot's joints: name one in place of TOPIC"
         self._place_odometry()
+        self._place_limb_sensors()
         self._place_by_contact(Wrench, "contact_wrenches", frame_of, "contact_wrench_local")
         self._place_by_contact(NormalForce, "contact_force_normal", lambda _: "", "contact_force_normal")
         self._place_arrays()
@@ -183,7 +184,25 @@ class _Proposer:
             entry["twist"] = "none"
         self._add("odometry", name, entry, *fields)
 
-    # ------------------------------------------------------------------------------------------------------- contacts
+    # ----------------------------------------------------------------------------------------------- limbs, contacts
+
+    def _place_limb_sensors(self) -> None:
+        """Wrenches of the child link of a fixed joint that is called a sensor, or that name joint or link."""
+        entries: dict[str, Any] = {}
+        for name, topic in self._of(Wrench.types).items():
+            frame = frame_of(topic)
+            texts = {joint: (joint.removesuffix("_joint"), child) for joint, child in self.robot.limb_sensors.items()}
+            exact = [joint for joint, child in self.robot.limb_sensors.items() if child == frame]
+            named = [joint for joint in texts if any(spelled(x).search(f"{frame} {name}") for x in texts[joint])]
+            found = [joint for joint in exact or named if joint not in entries]
+            if frame in self.robot.feet or len(found) != 1:
+                continue
+            entries[found[0]] = {"topic": name, "frame": frame} if exact else name
+            self.used.add(name)
+        if entries:
+            self.out.columns["ft_wrenches"] = entries
+            self.out.notes["ft_wrenches"] = "by names; what the parent side exerts on the child side, else sign: -1"
+            self.out.fields.add("ft_wrench")
 
     def _place_by_contact(self, decoder: Any, key: str, frame_of: Callable[[TopicSample], str], field: str) -> None:
         """Topics of a type that names of contacts stand in, or in their frames."""
