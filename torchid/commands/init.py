@@ -20,7 +20,7 @@ from torchid.errors import ConfigError, InputError, LogError, about_file, excerp
 from torchid.logs import Columns, Topics, read_log
 from torchid.logs.bag_samples import read_bag_sample
 from torchid.logs.column_proposals import OF_PLATES, propose_field
-from torchid.logs.column_samples import read_sample, stated_names, texts_in
+from torchid.logs.column_samples import read_sample, stated_names, states_degrees, texts_in
 from torchid.logs.containers import LogKind, atomic_output, existing_log_kind
 from torchid.logs.map_proposals import MapProposal, propose_map
 from torchid.logs.name_matching import KnownRobot, within
@@ -107,7 +107,7 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> Initiated:
 
 def _of_columns(files: Sequence[Path], robot: Robot) -> tuple[list[_Contact], set[str], MapProposal]:
     """Contacts, fields and a map of a table or arrays, or of several that are one log."""
-    samples, size = [], 0.0
+    samples, in_degrees, size = [], set[str](), 0.0
     for file in files:
         size = memory_needed(file, PreprocessingConfig().memory_gb, size)
         if size > PreprocessingConfig().memory_gb:
@@ -115,9 +115,10 @@ def _of_columns(files: Sequence[Path], robot: Robot) -> tuple[list[_Contact], se
             raise LogError(file, "file", f"arrays of {size:.2g} GB", accepted)
         with about_file(file):
             samples.append(read_sample(file))
+            in_degrees |= set(samples[-1]) if states_degrees(file) else set()
     sample = {name: values for of_file in reversed(samples) for name, values in of_file.items()}
     contacts = _guess_contacts(robot, _stated_contacts(sample, robot), texts_in(sample))
-    proposal = propose_map(sample, _known(robot, contacts), samples if len(files) > 1 else ())
+    proposal = propose_map(sample, _known(robot, contacts), samples if len(files) > 1 else (), in_degrees)
     fields = _fields_of(sample, proposal)
     _add_imu_frame(robot, fields, proposal)
     return contacts, fields, proposal

@@ -34,7 +34,7 @@ from torchid.logs.mapped_fields import map_arrays
 from torchid.logs.names import parse_names
 from torchid.logs.read import build_log, check_fields_given
 from torchid.logs.spill import LazyArray, Spill
-from torchid.logs.tables import read_table, table_blocks, table_size
+from torchid.logs.tables import is_text_table, read_table, table_blocks, table_size
 from torchid.logs.time_range import split_range
 
 GIGABYTE = 1e9
@@ -44,7 +44,7 @@ _BYTES_PER_LETTER = 4  # of a table: a cell has at least two characters, a numbe
 
 
 def log_bytes(path: Path, limit: float) -> int:
-    """Bytes of a log's arrays: an upper bound for CSV files below a limit, 0 for bags, which are read whole.
+    """Bytes of a log's arrays: an upper bound for tables of text below a limit, 0 for bags, which are read whole.
 
     A part of a log counts as all of it, several files count together.
 
@@ -60,7 +60,7 @@ def log_bytes(path: Path, limit: float) -> int:
         path = split_range(path).file
         if kind is LogKind.TABLE:
             most = _BYTES_PER_LETTER * path.stat().st_size
-            return most if path.suffix.lower() == ".csv" and most <= limit else table_size(path)
+            return most if is_text_table(path) and most <= limit else table_size(path)
         with open_container(path, whole=False) as container:
             return sum(container.declared_bytes().values())
 
@@ -176,7 +176,7 @@ class LogBlocks:
 def open_log_blocks(
     path: Path, folder: Path | None, columns: Columns | None = None, needs_flags: bool = True
 ) -> Iterator[LogBlocks]:
-    """Open a log in one file (.h5, .npz, .csv or .parquet).
+    """Open a log in one file (.h5, .npz or a table).
 
     Arrays of .h5 and .npz files are read in place unless these are compressed; others are unpacked to temporary files
     in `folder`, or to memory without one. Of a part of a log no other samples are there.
