@@ -171,3 +171,17 @@ def test_what_large_logs_lack_is_said_in_one_line(
     file = written(tmp_path, change, **more)
     line = refusal(["identify", str(file), SMALL], tmp_path, capsys)
     assert message in line
+
+
+@pytest.mark.parametrize("name", ["joint_torque", "joint_position", "contact_active"])
+def test_fields_of_text_are_refused_whatever_follows_from_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    file = written(tmp_path, without_base, detect_contacts=True, base_motion="contacts")
+    write_log(without_base(walked()), tmp_path / "walk.npz")
+    with np.load(tmp_path / "walk.npz") as archive:
+        fields = dict(archive)
+    np.savez(tmp_path / "walk.npz", **(fields | {name: fields[name].astype("U5")}))
+    log = f"logs.train=['{tmp_path / 'walk.npz'}']"
+    settings = [] if name != "contact_active" else ["preprocessing.detect_contacts=false"]
+    assert f"walk.npz: {name}: " in refusal(["identify", str(file), SMALL, log, *settings], tmp_path, capsys)

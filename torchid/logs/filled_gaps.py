@@ -19,16 +19,16 @@ class GapsFilled:
     A channel of which more than a share is missing is NaN throughout.
     """
 
-    def __init__(self, array: LazyArray, most_missing: float, parts: Iterable[slice]) -> None:
-        """Find the gaps, which takes a pass over the array in successive parts that cover it."""
+    def __init__(self, array: LazyArray, most_missing: float, parts: Iterable[FloatArray]) -> None:
+        """Find the gaps, which takes a pass over the array in successive parts (M, k), all of it together."""
         self.shape, self.dtype = array.shape, np.dtype(np.float64)
         self._array = array
         channels = [_Gaps() for _ in range(array.shape[1])]
-        most = most_missing * array.shape[0]
-        for part in parts:
-            values = np.asarray(array[part], dtype=np.float64)
+        most, start = most_missing * array.shape[0], 0
+        for values in parts:
             for gaps, channel in zip(channels, values.T, strict=True):
-                gaps.add(part.start, channel, most)
+                gaps.add(start, channel, most)
+            start += len(values)
         self.broken = np.array([gaps.missing > most for gaps in channels])
         """Channels (k,) that are NaN throughout."""
 

@@ -86,7 +86,8 @@ def detect_in_blocks(
     """
     require_torque(blocks.source, "joint_torque" in blocks.fields)
     _require_level_or_measured(blocks, contacts)
-    torque = GapsFilled(blocks.fields["joint_torque"], MAX_GAPS, pieces(len(blocks)))
+    recorded = (blocks.read(piece, only=("joint_torque",)).joint_torque for piece in pieces(len(blocks)))
+    torque = GapsFilled(blocks.fields["joint_torque"], MAX_GAPS, (x for x in recorded if x is not None))
     filled = blocks.replaced({"joint_torque": torque})
     names = motion_fields(filled, "joint_torque")
     first = for_detection(filled.read(slice(0, SPLINE_BLOCK), names))
