@@ -132,7 +132,9 @@ def _parser() -> argparse.ArgumentParser:
     _add_amount(check)
     check.set_defaults(command=_check)
     convert = commands.add_parser("convert", help=_CONVERT, description=_CONVERT)
-    convert.add_argument("source", metavar="IN", help="log: .npz, .h5, .csv, .parquet, or a bag of ROS messages")
+    convert.add_argument(
+        "source", metavar="IN", help="log: .npz, .h5, .csv, .parquet, .mot, .sto, or a bag of ROS messages"
+    )
     convert.add_argument("target", metavar="OUT", help="file to write: .npz, .h5, .csv or .parquet")
     convert.add_argument("--topics", metavar="FILE", help="experiment file with logs.topics, the map of a bag's topics")
     convert.add_argument("--columns", metavar="FILE", help="experiment file with logs.columns, a map of columns")
@@ -143,7 +145,8 @@ def _parser() -> argparse.ArgumentParser:
     init.add_argument(
         "log",
         metavar="LOG",
-        help="table, arrays or bag: .csv, .parquet, .npz, .h5, .mcap, .db3, .bag; or several, 'FILE + FILE@SECONDS'",
+        help="table, arrays or bag: .csv, .parquet, .mot, .sto, .npz, .h5, .mcap, .db3, .bag; "
+        "or several, 'FILE + FILE@SECONDS'",
     )
     init.add_argument("--output", default="experiment.yaml", metavar="FILE", help="file to write, a new one")
     init.set_defaults(command=_init)

@@ -104,6 +104,26 @@ def test_a_converted_log_is_fitted_block_by_block_compressed_checked_and_judged(
     assert "point" not in capsys.readouterr().out
 
 
+def test_plates_that_drift_are_zeroed_by_what_they_read_without_a_foot(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An offset in a plate's own axes, which the map turns into the world's."""
+    write_motion(tmp_path / "motion.npz", walk(4.0))
+    fits = []
+    for name, offset in (("exact", 0.0), ("drifted", 1.0)):
+        plates_csv(tmp_path / f"{name}.csv", walk(4.0))
+        header, *rows = (tmp_path / f"{name}.csv").read_text().splitlines()
+        of = [0.0 if x == "time" else offset * (2.0 if "_F" in x else 300.0) * (-1) ** i
+              for i, x in enumerate(header.split(","))]  # fmt: skip
+        moved = [",".join(repr(float(x) + y) for x, y in zip(row.split(","), of, strict=True)) for row in rows]
+        (tmp_path / f"{name}.csv").write_text("\n".join([header, *moved]) + "\n")
+        text = PLATES_MAP.replace("above: 20", "above: 10")
+        file = experiment(tmp_path, f"motion.npz + {name}.csv", text, zero_in_air=bool(offset))
+        fits.append(identified(file)[0])
+        assert ("zero_in_air has subtracted" in capsys.readouterr().err) == bool(offset)
+    assert np.abs(fits[1] - fits[0]).max() < 1e-9 * np.abs(fits[0]).max()
+
+
 ARRAYS_MAP = """
 contact_order: [l_sole, r_sole]
 contact_wrench_world: {force: grf, moment: {column: free_moment, axes: [z]}}

@@ -25,17 +25,21 @@ from bags import (
 from dialects import with_velocity
 from low_states import FEET, GO2, START, low_states, moving, write_low_states
 from repository import DEMO
+from scipy.spatial.transform import Rotation
 from synthetic import G1, ROBOTS
 
 from torchid.cli import main
 from torchid.commands.init import Initiated, init
+from torchid.commands.reading import LogReader
 from torchid.config import load_config
+from torchid.errors import ConfigError, LogError, UnknownNameError
 from torchid.fitting.experiment import set_up
 from torchid.logs import Log, read_log
 from torchid.logs.joint_orders import HG, JOINT_ORDERS
 from torchid.robot import load_robot
 
 URDF = DEMO / "quadruped.urdf"
+TALOS = ROBOTS / "talos_data/robots/talos_reduced.urdf"
 GO2_URDF = ROBOTS / "go2_description/urdf/go2.urdf"
 COUNTS = np.random.default_rng(2).integers(10, 200, (40, 4))
 pytestmark = pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")  # of frames and of times of receipt
@@ -88,6 +92,28 @@ def test_a_go2s_state_needs_no_edit(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.contact_active, low_state["above"] < COUNTS)
     np.testing.assert_array_equal(again.joint_torque, log.joint_torque)
     assert said.missing == []
+
+
+def test_a_go2s_orientation_lets_its_feet_roll_and_turned_frames_are_refused(tmp_path: Path) -> None:
+    log = moving(GO2, 200)
+    turns = Rotation.from_rotvec(0.1 * np.sin(np.arange(200)[:, None] / 40.0 + np.arange(3))).as_quat()
+    balls = ", ".join(f"{{frame: {foot}, type: point, radius: 0.022}}" for foot in sorted(FEET))
+    overrides = ["preprocessing.cutoff_hz=20", "preprocessing.cache_gb=0", f"contacts=[{balls}]"]
+    read = []
+    for name, quats in (("set", np.roll(turns, 1, axis=1)), ("unset", None)):
+        path = tmp_path / f"{name}.mcap"
+        started(GO2_URDF, write_low_states(path, log, GO2, feet=np.tile(COUNTS, (5, 1)), turns=quats))
+        config = load_config(path.with_suffix(".yaml"), overrides)
+        read.append((config, LogReader(set_up(config))))
+    config, reader = read[0]
+    (samples,) = reader.read(config.logs.train, None)
+    assert samples.base.quat_xyzw is not None
+    with pytest.raises(LogError, match=r"base_quat_xyzw: missing, though FL_foot \(radius 0.022 m\) rolls"):
+        read[1][1].read(read[1][0].logs.train, None)
+    turned = ["logs.topics.low_state.frame=radar"]
+    with pytest.raises(ConfigError, match=r"low_state\.frame: 'radar', which is turned by 165 deg against base"):
+        set_up(load_config(tmp_path / "set.yaml", turned))
+    set_up(load_config(tmp_path / "set.yaml", [*turned, "logs.topics.low_state.orientation=false"]))
 
 
 @pytest.mark.parametrize(("robot", "feet"), [("g1", 2), ("a1", 4)])
@@ -160,6 +186,35 @@ def test_commands_other_joints_and_imus_of_limbs_are_left_out(tmp_path: Path) ->
     )
 
 
+def test_joints_that_messages_spell_otherwise_are_named_and_those_that_they_lack_are_welded(tmp_path: Path) -> None:
+    """As a driver that has joints in capitals and a prefix, and no wrists."""
+    joints = list(load_robot(G1).joint_names)
+    held = [name for name in joints if "wrist" in name]
+    spelled = {f"g1/{name.removesuffix('_joint').upper()}": name for name in joints if name not in held}
+    for suffix in (".mcap", ".db3", ".bag"):
+        path = write_bag(tmp_path / f"x{suffix}", legged([*spelled, "gripper"], []))
+        said, topics, again = started(G1, path)
+        entry = topics["joint_states"]
+        assert entry["names"] == spelled
+        assert entry["joints"] == [name for name in joints if name not in held]
+        assert set(again.joint_names) == set(spelled.values())
+        assert load_config(path.with_suffix(".yaml")).robot.weld == dict.fromkeys(held, 0.0)
+        assert any(text.startswith("robot.weld: ") for text in said.guessed)
+        assert any("names of 23 joints, which the messages spell otherwise" in text for text in said.guessed)
+        assert not any("joint_position" in text for text in said.missing)
+    other = load_config(path.with_suffix(".yaml"), ["logs.topics.joint_states.names={a: left_kne_joint}"])
+    with pytest.raises(
+        UnknownNameError, match=r"joint_states\.names: unknown name 'left_kne_joint'; accepted: left_knee_joint"
+    ):
+        set_up(other)
+
+
+def test_states_of_a_few_joints_of_something_else_are_not_the_robots(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "x.mcap", legged(["other_left_knee", "other_right_knee"], []))
+    said = init(G1, path, tmp_path / "x.yaml")
+    assert any(text.startswith("joint_position: no topics that look like it") for text in said.missing)
+
+
 def test_wrenches_go_to_feet_by_the_limbs_in_names_and_frames(tmp_path: Path) -> None:
     joints = list(load_robot(G1).joint_names)
     left = ("/ft/sensor_1", WRENCH, lambda i, stamp: wrench(stamp, [0, 0, 300 * (i % 2), 1, 0, 0], "left_foot_sensor"))
@@ -174,6 +229,25 @@ def test_wrenches_go_to_feet_by_the_limbs_in_names_and_frames(tmp_path: Path) ->
     wrenches = np.asarray(again.contact_wrench_local)
     np.testing.assert_array_equal(wrenches[0, :, 3], [1, 2])
     np.testing.assert_array_equal(np.asarray(again.contact_active)[:2], [[False, True], [True, True]])
+
+
+def test_wrenches_at_fixed_joints_are_sensors_in_limbs(tmp_path: Path) -> None:
+    """By the frame of the messages, or by the name of the joint or its link in the topic."""
+    joints = list(load_robot(TALOS).joint_names)
+    left = ("/left/wrench", WRENCH, lambda i, stamp: wrench(stamp, [0, 0, 1.0, i, 0, 0], "wrist_left_ft_link"))
+    right = ("/wrist_right_ft", WRENCH, lambda i, stamp: wrench(stamp, [0, 0, 2.0, i, 0, 0]))
+    sole = ("/left_sole_link", WRENCH, lambda i, stamp: wrench(stamp, [0, 0, 400.0 * (i % 2), 0, 0, 0]))
+    said, topics, again = started(TALOS, write_bag(tmp_path / "x.mcap", legged(joints, [left, right, sole])))
+    assert topics["ft_wrenches"] == {
+        "wrist_left_ft_joint": {"topic": "/left/wrench", "frame": "wrist_left_ft_link"},
+        "wrist_right_ft_joint": "/wrist_right_ft",
+    }
+    assert topics["contact_wrenches"] == {"left_sole_link": "/left_sole_link"}
+    assert again.ft_names == ("wrist_left_ft_joint", "wrist_right_ft_joint")
+    np.testing.assert_array_equal(np.asarray(again.ft_wrench)[:2, :, 2:4], [[[1, 0], [2, 0]], [[1, 1], [2, 1]]])
+    sensors = yaml.safe_load((tmp_path / "x.yaml").read_text())["sensors"]
+    assert sensors == {"set": "full", "ft_sensors": ["wrist_left_ft_joint", "wrist_right_ft_joint"]}
+    assert any(text.startswith("ft_wrenches: by names; what the parent side exerts") for text in said.guessed)
 
 
 def test_an_array_of_feet_and_flags_of_some(tmp_path: Path) -> None:

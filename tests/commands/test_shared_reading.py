@@ -88,6 +88,7 @@ def read(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Any]]:
     np.savez(demo / "nan.npz", **fields)
     long, nan = f"logs.train=[{demo}/long.npz, {demo}/sway_train.npz]", f"logs.train=[{demo}/nan.npz]"
     fewer = ["preprocessing.contact_margin_s=0.02", "preprocessing.sample_rate_hz=150"]
+    slip = "preprocessing.max_slip=4"
     runs = {
         "without": [three, out, "preprocessing.cache_gb=0"],
         "first": [three, out],
@@ -101,6 +102,8 @@ def read(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Any]]:
         "blocks again": ["in blocks", long, f"output={folder / 'blocks' / 'run'}"],
         "fewer, without": ["in blocks", long, *fewer, out, "preprocessing.cache_gb=0"],
         "fewer": ["in blocks", long, *fewer, f"output={folder / 'fewer' / 'run'}"],
+        "slipping, without": ["in blocks", long, slip, out, "preprocessing.cache_gb=0"],
+        "slipping": ["in blocks", long, slip, f"output={folder / 'slipping' / 'run'}"],
         "on the disk, without": [long, SMALL, out, "preprocessing.cache_gb=0"],
         "on the disk": ["in blocks", long, SMALL, f"output={folder / 'disk' / 'run'}"],
         "broken blocks, without": ["in blocks", nan, out, "preprocessing.cache_gb=0"],
@@ -165,12 +168,13 @@ def test_what_the_cache_has_no_room_for_is_read_by_all(read: dict[str, list[Any]
     assert len(set(sum((one["opened"] for one in read["little room"]), []))) == 3
 
 
-@pytest.mark.parametrize("name", ["blocks", "fewer", "on the disk"])
+@pytest.mark.parametrize("name", ["blocks", "fewer", "slipping", "on the disk"])
 def test_blocks_of_a_large_log_are_shared_and_its_samples_are_those_of_one_process(
     read: dict[str, list[Any]], name: str
 ) -> None:
     expected = read[f"{name}, without"][0]
     assert any("NaN in part of" in line for line in expected["said"])
+    assert any("samples dropped, in which" in line for line in expected["said"]) == (name == "slipping")
     for one in read[name]:
         assert (one["logs"], one["said"], one["error"]) == (expected["logs"], expected["said"], "")
         assert len(one["blocks"]) >= 1

@@ -14,7 +14,7 @@ from demo import DEMO
 from experiments import changed, load
 from legged.robots import GO2
 from motions import value
-from refusals import refusal, refused
+from refusals import refused
 from repository import SHARED
 from walking import MACHINES, recorded, truth
 
@@ -140,15 +140,6 @@ def test_a_log_that_would_be_read_in_blocks_is_taken_whole(written: Written, mon
     monkeypatch.setattr("torchid.commands.reading._WHOLE_GB", 0.0)
     (other,) = LogReader(scene).read(scene.config.logs.train, scene.sensors)
     np.testing.assert_array_equal(value(one.base.specific_force), value(other.base.specific_force))
-
-
-def test_a_log_larger_than_memory_is_refused(
-    written: Written, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    arguments = ["identify", str(written(base_motion="contacts", memory_gb=1e-4))]
-    line = refusal(arguments, tmp_path, capsys)
-    assert "preprocessing.base_motion: set for arrays of" in line
-    assert "a preprocessing.memory_gb above" in line
 
 
 def test_cached_samples_of_one_setting_are_not_those_of_the_other(written: Written, tmp_path: Path) -> None:

@@ -58,6 +58,7 @@ def low_states(
     ticks: NDArray[np.int64] | None = None,
     feet: NDArray[np.int64] | None = None,
     late: NDArray[np.int64] | None = None,
+    turns: NDArray[np.float64] | None = None,
     **fields: Any,
 ) -> Iterator[Entry]:
     """A message for each sample.
@@ -68,6 +69,7 @@ def low_states(
         kind: of the messages.
         ticks: (N,) [ms]; those of the log from a million on if not given.
         feet: (N, 4) readings of the foot sensors.
+        turns: (N, 4) quaternions of the IMU, wxyz; all of no rotation if not given.
         late: (N,) [ns] that messages come late.
         fields: other content of all messages.
     """
@@ -82,7 +84,8 @@ def low_states(
         motors = [
             {} if k is None else {"mode": 1, "ddq": 7.0} | {n: x[i, k] for n, x in parts.items()} for k in columns
         ]
-        imu = {"quaternion": np.array([1, 0, 0, 0], np.float32), "gyroscope": turn[i].astype(np.float32)}
+        quaternion = np.array([1, 0, 0, 0]) if turns is None else turns[i]
+        imu = {"quaternion": quaternion.astype(np.float32), "gyroscope": turn[i].astype(np.float32)}
         imu |= {"accelerometer": force[i].astype(np.float32)}
         content = {"motor_state": motors, "imu_state": imu, "tick": int(ticks[i]) % 2**32, **fields}
         if feet is not None:

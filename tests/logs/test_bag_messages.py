@@ -59,6 +59,35 @@ def test_messages_of_other_joints_are_left_out_if_the_joints_are_listed(tmp_path
     assert "x.mcap: logs.topics.joint_states.joints: unknown name 'nope'; accepted: x, b, a, g" in message
 
 
+def test_joints_get_the_names_that_the_map_gives_them(tmp_path: Path) -> None:
+    arms = [("/joint_states", s, JOINT_STATE, joint_state(s, "xba", position=[3, 2, 1])) for s in map(int, STAMPS)]
+
+    def read(**more: Any) -> Log:
+        return read_messages(tmp_path / "x.mcap", arms, joint_states={"topic": "/joint_states", **more})
+
+    log = read(names={"x": "l_knee", "b": "a", "a": "b"})
+    assert log.joint_names == ("l_knee", "a", "b")
+    np.testing.assert_array_equal(log.joint_position, [[3.0, 2.0, 1.0]] * 4)
+    chosen = read(names={"x": "l_knee"}, joints=["a", "l_knee"])
+    assert chosen.joint_names == ("a", "l_knee")
+    np.testing.assert_array_equal(chosen.joint_position, [[1.0, 3.0]] * 4)
+
+
+@pytest.mark.parametrize(
+    ("names", "found"),
+    [
+        ({"y": "l_knee"}, "logs.topics.joint_states.names: unknown name 'y'; accepted: x, b, a"),
+        ({"x": "a"}, "names a, b, a, ... that repeat"),
+        ({"x": "k", "b": "k"}, "logs.topics.joint_states.names: two names of 'k'; accepted: each joint of the URDF"),
+    ],
+)
+def test_names_that_no_message_has_or_that_joints_share_are_refused(
+    tmp_path: Path, names: dict[str, str], found: str
+) -> None:
+    arms = [("/joint_states", s, JOINT_STATE, joint_state(s, "xba", position=[3, 2, 1])) for s in map(int, STAMPS)]
+    assert found in refusal(tmp_path / "x.mcap", arms, joint_states={"topic": "/joint_states", "names": names})
+
+
 BAD_STATES: list[tuple[list[dict[str, Any]], str]] = [
     ([{"names": "aa", "position": [1, 2]}], "names a, a, ... that repeat"),
     ([{"names": "ab", "position": [1]}], "[1] values of 2 names"),

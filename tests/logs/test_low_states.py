@@ -15,7 +15,8 @@ from low_states import FEET, GO2, LEGS, START, TOPIC, low_states, moving, write_
 from motions import value
 from refusals import refused
 from rosbags import rosbag2
-from synthetic import G1, ROBOTS
+from scipy.spatial.transform import Rotation
+from synthetic import G1, ROBOTS, Array
 
 from torchid.errors import InputError, TorchidWarning
 from torchid.logs import Log, read_log
@@ -63,6 +64,28 @@ def test_numbers_come_back_bit_for_bit_whatever_the_order_of_the_joints(
 def test_the_imu_and_the_feet_are_read_where_the_map_says_so_alone(tmp_path: Path) -> None:
     again = of(tmp_path / "x.mcap", moving(GO2), options={"feet": np.full((40, 4), 60)})
     assert set(again.arrays()) == {"time", "joint_position", "joint_velocity", "joint_torque"}
+
+
+def test_the_quaternion_of_the_imu_is_the_bases_orientation_where_it_is_set(tmp_path: Path) -> None:
+    """A driver that does not set it, to all zeros or to no rotation, says nothing of the base."""
+    log, rng = moving(GO2), np.random.default_rng(5)
+    turns = Rotation.from_rotvec(np.cumsum(0.02 * rng.standard_normal((len(log), 3)), axis=0)).as_quat()
+    wxyz = np.roll(turns, 1, axis=1) * rng.choice([-1.0, 1.0], (len(log), 1))
+
+    def read_with(quats: Array, **key: Any) -> Log:
+        return of(tmp_path / "x.mcap", log, options={"turns": quats}, **{"frame": "imu"} | key)
+
+    again = read_with(wxyz)
+    turned = Rotation.from_quat(value(again.base_quat_xyzw)) * Rotation.from_quat(turns).inv()
+    assert turned.magnitude().max() < 1e-6, "float32"
+    assert (np.diff(value(again.base_quat_xyzw), axis=0) ** 2).sum(axis=1).max() < 0.1, "no flips"
+    assert read_with(wxyz, orientation=False).base_quat_xyzw is None
+    assert read_with(wxyz, frame=None).base_quat_xyzw is None
+    for constant in ([1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]):
+        assert read_with(np.tile(constant, (len(log), 1))).base_quat_xyzw is None
+    wxyz[7] = 0.0
+    message = refused(lambda: read_with(wxyz), f"{tmp_path / 'x.mcap'}: {TOPIC}: a quaternion of the IMU of norm 0")
+    assert message.endswith("accepted: unit quaternions, or logs.topics.low_state.orientation: false")
 
 
 def test_joints_may_be_listed_by_number_in_place_of_a_robot(tmp_path: Path) -> None:

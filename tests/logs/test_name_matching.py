@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from torchid.logs.column_proposals import propose_field
-from torchid.logs.name_matching import limbs, match_names, spelled
+from torchid.logs.name_matching import limbs, match_joints, match_names, spelled
 
 FEET = ("LF_FOOT", "RF_FOOT", "LH_FOOT", "RH_FOOT")
 
@@ -55,3 +55,23 @@ def test_fields_that_differ_in_what_they_are_of_are_not_alike() -> None:
     assert propose_field("imu/linear_acceleration") == "imu_specific_force"
     assert propose_field("imu_angular_velocty") == "imu_angular_velocity"
     assert propose_field("joint_torqe") == "joint_torque"
+
+
+@pytest.mark.parametrize(
+    ("joints", "texts", "expected"),
+    [
+        (["FL_hip_joint", "FR_hip_joint"], ["fr_hip", "fl_hip"], ["FR_hip_joint", "FL_hip_joint"]),
+        (["LF_HAA", "RF_HAA"], ["robot/lf_haa_joint", "robot/rf_haa_joint"], ["LF_HAA", "RF_HAA"]),
+        (["left_hip_pitch_joint", "left_hip_yaw_joint"], ["LeftHipYaw"], ["left_hip_yaw_joint"]),
+        (["l_knee", "r_knee"], ["left_knee", "right_knee"], ["l_knee", "r_knee"]),
+        (["panda_joint1", "panda_joint2"], ["joint2", "joint1"], ["panda_joint2", "panda_joint1"]),
+        (["l_knee", "l_knee_2"], ["l_knee"], ["l_knee"]),
+        (["arm_knee", "leg_knee"], ["knee"], []),
+        (["hip"], ["a_hip", "b_hip"], []),
+        (["l_hip"], ["r_hip", "l_ship", "hip", "joint"], []),
+    ],
+)
+def test_joints_are_told_by_their_words_and_limbs_and_doubtful_ones_by_none(
+    joints: list[str], texts: list[str], expected: list[str]
+) -> None:
+    assert match_joints(texts, joints) == dict(zip(texts, expected, strict=False))

@@ -255,7 +255,7 @@ def test_absent_and_foreign_files_are_named(tmp_path: Path) -> None:
     (tmp_path / "folder.npz").mkdir()
     assert "a folder" in log_refusal(tmp_path / "folder.npz")
     (tmp_path / "log.mat").write_text("time\n0\n")
-    accepted = ".npz, .h5, .hdf5, .csv, .parquet, .bag, .mcap, .db3"
+    accepted = ".npz, .h5, .hdf5, .csv, .parquet, .mot, .sto, .bag, .mcap, .db3"
     assert f"extension '.mat'; accepted: {accepted}" in log_refusal(tmp_path / "log.mat")
     for suffix in SUFFIXES:
         (tmp_path / f"text{suffix}").write_text("not a log")

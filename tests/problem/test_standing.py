@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,8 +20,10 @@ from walking import robot_of
 
 from torchid.errors import LogError, TorchidWarning, UnknownNameError
 from torchid.logs import Log, preprocess
+from torchid.logs.blocks import LogBlocks
 from torchid.logs.preprocess import DERIVATIVE_CHAINS
 from torchid.problem import bind_log
+from torchid.problem.derived_blocks import stand_in_blocks
 from torchid.problem.standing import StandingBase, preprocess_standing, stand_on_feet
 from torchid.sensing import Contact
 
@@ -50,6 +54,39 @@ def without(log: Log, foot: int, samples: slice = slice(None)) -> Log:
     active = value(log.contact_active).copy()
     active[samples, foot] = False
     return replace(log, contact_active=active)
+
+
+CASES = {
+    "points": stance("quadruped", LEVEL, 0.0, ((1, 50, 90),)),
+    "balls on a slope": stance("quadruped", ASKEW, 0.022, ((1, 50, 90), (2, 120, 140))),
+    "soles": stance("biped", AHEAD, 0.0, ((0, 40, 70),)),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("most", [1, 7, 64])
+def test_a_walk_that_is_read_in_parts_is_that_of_the_whole_log(tmp_path: Path, name: str, most: int) -> None:
+    """Wherever the parts end: in a stance, at a change of feet, or between samples without enough feet."""
+    case = CASES[name]
+    log = without(without(without(case.log, 0, slice(100, 110)), 1, slice(100, 110)), 2 % len(case.contacts()))
+    whole = found(case, log) if name != "points" else found(case, log := without(case.log, 0, slice(60, 70)))
+    names = {"joint_names": np.array(log.joint_names), "contact_names": np.array(log.contact_names)}
+    fields = {"joint_position": log.joint_position, "contact_active": value(log.contact_active)}
+    fields |= {"imu_angular_velocity": np.zeros((len(log), 3)), "base_quat_wxyz": np.ones((len(log), 4))}
+    blocks = LogBlocks(log.source, names | {"imu_frame": np.array("imu")}, log.time, fields)
+
+    def pieces(count: int) -> Iterator[slice]:
+        return (slice(start, min(start + most, count)) for start in range(0, count, most))
+
+    for folder in (None, tmp_path):
+        stood, stretches = stand_in_blocks(blocks, robot_of(case.machine), case.contacts(), pieces, folder)
+        assert (stretches.stretches, stretches.dropped) == (whole.stretches, whole.dropped)
+        assert stretches.uneven == pytest.approx(whole.uneven, abs=1e-9)
+        assert stood.fields.keys() == {"joint_position", "contact_active", "base_quat_xyzw", "base_position_world"}
+        assert "imu_frame" not in stood.names
+        for field in ("base_quat_xyzw", "base_position_world"):
+            expected = value(getattr(whole.log, field))
+            np.testing.assert_allclose(np.asarray(stood.fields[field][:]), expected, rtol=0.0, atol=1e-11)
 
 
 # ----------------------------------------------------------------------------------------------------------------- pose

@@ -47,6 +47,17 @@ def test_constant_offsets_come_off_exactly_and_are_named() -> None:
     np.testing.assert_allclose(found.contact_force_normal, value(log.contact_wrench_local)[..., 2], rtol=0, atol=1e-12)
 
 
+def test_a_plates_offset_comes_off_along_the_worlds_axes() -> None:
+    """It is constant about the world's origin, as the plate does not move, whatever a foot does."""
+    log = stepping(noise=0.1)
+    fields: dict[str, Any] = {"contact_wrench_local": None, "moments_about_world_origin": True}
+    drifted = replace(log, **fields, contact_wrench_world=value(log.contact_wrench_local) + OFFSET)
+    found, exact = zeroed(drifted), zeroed(log)
+    np.testing.assert_allclose(found.contact_wrench_world, value(exact.contact_wrench_local), rtol=0, atol=1e-12)
+    assert found.contact_wrench_local is None
+    assert found.moments_about_world_origin
+
+
 def test_the_mean_is_of_readings_away_from_contact_alone() -> None:
     log = stepping(noise=0.1)
     wrench, active = value(log.contact_wrench_local).copy(), value(log.contact_active)
@@ -89,5 +100,8 @@ def test_what_cannot_be_zeroed_is_refused() -> None:
     standing[:, 1] = True
     said("contact_wrench_local: 0 readings of r_foot in the air", contact_active=standing)
     said("contact_wrench_local: 0 readings of l_foot in the air", contact_active=np.ones_like(active))
-    said("contact_wrench_world: given with", contact_wrench_local=None, contact_wrench_world=wrench)
+    line = said("contact_wrench_world: given with", contact_wrench_local=None, contact_wrench_world=wrench)
+    assert "contact_wrench_point_world, or logs.columns.plates" in line
+    plate = {"contact_wrench_local": None, "contact_wrench_world": silent, "moments_about_world_origin": True}
+    said("contact_wrench_world: 0 readings of l_foot in the air", **plate)
     said("contact_wrench_local: missing", contact_wrench_local=None)

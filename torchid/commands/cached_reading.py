@@ -21,6 +21,7 @@ from torchid.fitting.noise import recorded_sensors
 from torchid.fitting.payloads import payload_of
 from torchid.logs.blocks import GIGABYTE, log_bytes
 from torchid.logs.containers import LogKind, existing_log_kind, log_files
+from torchid.logs.tables import is_text_table
 from torchid.logs.time_range import split_range
 from torchid.problem import Samples
 from torchid.problem.extras import recorded_components
@@ -122,8 +123,8 @@ class CachedReader(LogReader):
         room = self.scene.config.preprocessing.memory_gb - self._held
         content, part = self._content(path), split_range(path)
         file = part.file
-        is_csv = any(one.path.suffix.lower() == ".csv" for one in part.files)
-        bound = room if is_csv else 0.0  # for others, `log_bytes` does not depend on it
+        is_text = any(is_text_table(one.path) for one in part.files)
+        bound = room if is_text else 0.0  # for others, `log_bytes` does not depend on it
         size = None if content is None else self.cache.array_bytes(file, content.checksum, bound)
         if size is None:
             size = log_bytes(path, GIGABYTE * room)
@@ -189,7 +190,7 @@ class CachedReader(LogReader):
         if content is None:
             return None
         settings = self.scene.config.preprocessing
-        drops = settings.exclude_condemned or settings.margin_s is not None
+        drops = settings.exclude_condemned or settings.margin_s is not None or settings.max_slip is not None
         masks = None if required is None or not drops else [required.torque.tolist(), required.wrench.tolist()]
         blocks = None if together is None else settings.memory_gb
         part = split_range(path)

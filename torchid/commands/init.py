@@ -20,7 +20,7 @@ from torchid.errors import ConfigError, InputError, LogError, about_file, excerp
 from torchid.logs import Columns, Topics, read_log
 from torchid.logs.bag_samples import read_bag_sample
 from torchid.logs.column_proposals import OF_PLATES, propose_field
-from torchid.logs.column_samples import read_sample, stated_names, texts_in
+from torchid.logs.column_samples import read_sample, stated_names, states_degrees, texts_in
 from torchid.logs.containers import LogKind, atomic_output, existing_log_kind
 from torchid.logs.map_proposals import MapProposal, propose_map
 from torchid.logs.name_matching import KnownRobot, within
@@ -28,18 +28,20 @@ from torchid.logs.time_range import split_range
 from torchid.logs.topic_proposals import USED_TYPES, frame_of, propose_topics
 from torchid.regressor.kinematics import GRAVITY_WORLD
 from torchid.robot import CollisionShapes, Robot, load_robot
-from torchid.robot.urdf import position_limits
+from torchid.robot.urdf import fixed_joints, position_limits
 
 _FEET = (r"foot|feet", r"sole", r"ankle_roll|ankle_flexion", r"toe|ankle|paw|hoof")
 """Words in names of links that touch the ground, the surest first."""
 
+_SENSOR = r"(?<![a-z])(ft|force|torque|load_?cell)(?![a-z])"
+_MOST_SENSORS = 16  # in limbs that are looked at
 _ON_FEET = r"sensor|imu|camera|bumper|laser"
 _NAMED = r"foot|feet|sole"
 _FORCES = ("joint_torque", "contact_wrench_local", "contact_wrench_world", "contact_force_normal", "ft_wrench")
 _POSE = ("base_quat_wxyz", "base_quat_xyzw")
 _IMU = ("imu_specific_force", "imu_angular_velocity")
 _WHAT = {"columns": "names, units and orders of the file", "topics": "what the messages of the bag hold"}
-_WELDED = "joints that the log lacks, held still; one that moves needs columns"
+_WELDED = "joints that the log lacks, held still; one that moves needs readings"
 _OTHER_FILE = "; if another file has it: torchid init URDF 'FILE + FILE@SECONDS', docs/logs.md"
 _LINE = 118
 
@@ -105,7 +107,7 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> Initiated:
 
 def _of_columns(files: Sequence[Path], robot: Robot) -> tuple[list[_Contact], set[str], MapProposal]:
     """Contacts, fields and a map of a table or arrays, or of several that are one log."""
-    samples, size = [], 0.0
+    samples, in_degrees, size = [], set[str](), 0.0
     for file in files:
         size = memory_needed(file, PreprocessingConfig().memory_gb, size)
         if size > PreprocessingConfig().memory_gb:
@@ -113,9 +115,10 @@ def _of_columns(files: Sequence[Path], robot: Robot) -> tuple[list[_Contact], se
             raise LogError(file, "file", f"arrays of {size:.2g} GB", accepted)
         with about_file(file):
             samples.append(read_sample(file))
+            in_degrees |= set(samples[-1]) if states_degrees(file) else set()
     sample = {name: values for of_file in reversed(samples) for name, values in of_file.items()}
     contacts = _guess_contacts(robot, _stated_contacts(sample, robot), texts_in(sample))
-    proposal = propose_map(sample, _known(robot, contacts), samples if len(files) > 1 else ())
+    proposal = propose_map(sample, _known(robot, contacts), samples if len(files) > 1 else (), in_degrees)
     fields = _fields_of(sample, proposal)
     _add_imu_frame(robot, fields, proposal)
     return contacts, fields, proposal
@@ -134,7 +137,25 @@ def _known(robot: Robot, contacts: Sequence[_Contact]) -> KnownRobot:
     """What the proposal of a map knows of the robot."""
     on_base, elsewhere = ([name for name, (body, _) in robot.links.items() if bool(body) == x] for x in (False, True))
     feet, weight = [contact.frame for contact in contacts], -GRAVITY_WORLD[2] * float(robot.nominal[:, 0].sum())
-    return KnownRobot(robot.joint_names, feet, robot.path.stem, weight, robot.base_link, on_base, elsewhere)
+    sensors = _limb_sensors(robot)
+    return KnownRobot(robot.joint_names, feet, robot.path.stem, weight, robot.base_link, on_base, elsewhere, sensors)
+
+
+def _limb_sensors(robot: Robot) -> dict[str, str]:
+    """Children of fixed joints in limbs whose names say that a force/torque sensor is there, by joint."""
+    found = fixed_joints(robot.path)
+    named = {joint: child for joint, child in found.items() if re.search(_SENSOR, f"{joint} {child}", re.IGNORECASE)}
+    in_limbs = {joint: child for joint, child in named.items() if child in robot.links and robot.links[child][0]}
+    return {joint: child for joint, child in list(in_limbs.items())[:_MOST_SENSORS] if _can_be_split(robot, joint)}
+
+
+def _can_be_split(robot: Robot, joint: str) -> bool:
+    """Whether both sides of a fixed joint have mass."""
+    try:
+        load_robot(robot.path, ft_joints=[joint])
+    except InputError:
+        return False
+    return True
 
 
 def _stated_contacts(sample: Any, robot: Robot) -> list[str]:
@@ -191,12 +212,13 @@ def _as_ignored(pattern: str) -> str:
     return re.sub(r"\{[^{}]*\}", "*", pattern)
 
 
-def _sensors(fields: set[str]) -> str:
-    """The set of sensors of a run."""
+def _sensors(fields: set[str], limbs: Sequence[str]) -> str | dict[str, object]:
+    """The set of sensors of a run, with those in limbs at fixed joints."""
     wrench = bool({"contact_wrench_local", "contact_wrench_world"} & fields)
-    if "joint_torque" in fields:
-        return "full" if wrench else "joints"
-    return "contacts"
+    named = ("full" if wrench else "joints") if "joint_torque" in fields else "contacts"
+    if not limbs:
+        return named
+    return ({"set": named} if wrench or named == "joints" else {}) | {"ft_sensors": list(limbs)}
 
 
 def _is_fixed(contacts: Sequence[_Contact], fields: set[str]) -> bool:
@@ -336,7 +358,7 @@ def _text(
             lines += [f"    {line}" for line in _entry(key, value)]
     lines += [f"# {' and '.join(from_feet)}: nobody recorded them"] if from_feet else []
     lines += _entry("preprocessing", {"cutoff_hz": "auto"} | from_feet)
-    lines += _entry("sensors", _sensors(fields))
+    lines += _entry("sensors", _sensors(fields, list(proposal.columns.get("ft_wrenches", ()))))
     lines += _entry("estimator", {"name": "consistent", "ridge": "auto"})
     lines += _entry("output", f"runs/{output.stem}")
     return "\n".join(lines) + "\n"

@@ -16,29 +16,38 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchid.commands.log_course import Block, Course, Stretch, in_the_air, require_kept, row_numbers
 from torchid.config.preprocessing import PreprocessingConfig
 from torchid.errors import LogError, about_file
 from torchid.logs import Columns, Log
 from torchid.logs.blocks import GIGABYTE, LogBlocks, count_samples_from, open_log_blocks
 from torchid.logs.coverage import Coverage, warn_of_gaps
-from torchid.logs.log import CONTACT_READINGS, BoolArray, FloatArray
+from torchid.logs.log import CONTACT_READINGS, NORMALS, BoolArray
 from torchid.logs.preprocess import (
     away_from_changes,
-    find_unloaded,
+    away_from_stamps,
     gapless_fields,
     lacks_derivatives,
     make_timeline,
-    move_to_timeline,
-    unloaded_readings,
 )
 from torchid.logs.rate_noise import warn_of_noisy_accelerations
-from torchid.logs.signal_noise import MOST_SAMPLES, SignalNoise, signal_noise
-from torchid.logs.spill import Filled, Spill
+from torchid.logs.signal_noise import MOST_SAMPLES, signal_noise
+from torchid.logs.spill import Filled, Spill, growing_array
+from torchid.logs.stretches import count_samples, long_stretches
 from torchid.logs.timeline import SPLINE_BLOCK, Timeline
 from torchid.problem import Samples, bind_log
 from torchid.problem.base_motion import BaseMotion
 from torchid.problem.chunks import one_thread
-from torchid.problem.samples import oversampling, require_forces
+from torchid.problem.contact_slip import (
+    away_from_own_changes,
+    base_velocity,
+    ground_speeds,
+    judge_speeds,
+    warn_of_slip,
+)
+from torchid.problem.derived_blocks import detect_in_blocks, motion_fields, stand_in_blocks
+from torchid.problem.samples import require_forces
+from torchid.problem.standing import Stretches, warn_of_standing
 from torchid.problem.welded_joints import distances_from_welds, warn_of_moving_welds
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
@@ -46,6 +55,21 @@ from torchid.sensing import Contact, SensorSet
 _COPIES = 16  # a block takes so many times the memory of its recorded arrays: derivatives, splines, bound tensors
 BLOCK_GB = 0.01
 """Recorded arrays of a block in memory; smaller ones spend more on the neighbourhood that a filter needs."""
+
+
+@dataclass(frozen=True)
+class _Settled:
+    """A log with the contact flags and the motion of its base that the settings want.
+
+    Attributes:
+        blocks: the log.
+        certain: where its flags are, (N,); None everywhere.
+        standing: where the pose of its base is known; None throughout.
+    """
+
+    blocks: LogBlocks
+    certain: BoolArray | None = None
+    standing: Stretches | None = None
 
 
 @dataclass(frozen=True)
@@ -64,6 +88,7 @@ class LargeLog:
         motion_noise: of the recorded motion, as far as it is stated, as `preprocess` takes it.
         sign_width: as `preprocess` takes it.
         columns: as of `read_log`.
+        loaded: the robot with what it carried in the log, if it carried something.
     """
 
     path: Path
@@ -75,6 +100,7 @@ class LargeLog:
     motion_noise: Mapping[str, float] = field(default_factory=dict)
     sign_width: float | None = None
     columns: Columns | None = None
+    loaded: Robot | None = None
 
     def samples(self, with_unloaded: bool = True) -> Samples:
         """What reading, preprocessing and binding the log as a whole would give.
@@ -105,51 +131,127 @@ class LargeLog:
             with_unloaded: as in `samples`.
             own: which of the log's blocks, from the numbers of their samples; all by default.
         """
-        with about_file(self.path), open_log_blocks(self.path, self.folder, self.columns) as blocks:
-            course = self._course(blocks, with_unloaded)
-            pieces, kept = list(self._pieces(blocks, len(course.time))), course.kept
-            mine = pieces[own([piece.stop - piece.start for piece in pieces])]
-            start = mine[0].start if mine else 0
-            row = start if kept is None else int(kept[:start].sum())
-            total = len(course.time) if kept is None else int(kept.sum())
-            course.follow_signs(start)
+        needs_flags = self.settings.needs_flags
+        with about_file(self.path), open_log_blocks(self.path, self.folder, self.columns, needs_flags) as recorded:
+            self._check_welds(recorded)
+            course = self._course(self._settled(recorded), with_unloaded)
+            pieces, kept = list(course.pieces(self._step(recorded, len(course.time)))), course.kept
+            mine = pieces[own([piece.stop - piece.start for _, piece in pieces])]
+            row, total = row_numbers(kept, mine[0][1].start if mine else 0, len(course.time))
+            if mine:
+                mine[0][0].follow_signs(mine[0][1].start, max(SPLINE_BLOCK, int(BLOCK_GB * GIGABYTE / 32)))
             threads = 0 if self.folder is not None else torch.get_num_threads()  # on a disk because memory is short
-            read = (_read_block(blocks, piece, course.timeline, course.in_the_air) for piece in mine)
+            read = (stretch.read(piece) for stretch, piece in mine)
             with closing(_in_threads(partial(self._bound, course), read, threads)) as bound:
                 for piece, samples in bound:
-                    if course.in_the_air is None:
+                    if course.longest.in_the_air is None:
                         samples = replace(samples, unloaded=None)
                     if kept is not None:
                         samples = samples[torch.from_numpy(np.flatnonzero(kept[piece]))]
                     add(replace(samples, oversampling=course.oversampling, folder=self.folder), row, total)
                     row += len(samples)
 
-    def _course(self, blocks: LogBlocks, with_unloaded: bool) -> _Course:
-        """What of a log must be known before its blocks can be worked on, which takes a pass or two over it."""
-        first, settings = blocks.read(slice(0, min(len(blocks), MOST_SAMPLES))), self.settings
-        self._check_welds(blocks, first)
-        rates = settings.filter_hz, settings.sample_rate_hz
-        timeline = make_timeline(blocks.time, lacks_derivatives(first), *rates, self.sign_width)
-        coverage = {} if timeline is None else self._coverage(blocks, first, timeline)
-        time = blocks.time if timeline is None else blocks.time[0] + timeline.output_stamps
-        contacts = self._contacts(blocks, first)
-        kept = None if contacts is None else self._away_from_changes(contacts, time)
-        in_the_air = None if contacts is None or not with_unloaded else _in_the_air(contacts)
-        noise = signal_noise(first, timeline, self.motion_noise)
-        return _Course(blocks, timeline, coverage, time, kept, in_the_air, noise)
+    def _settled(self, recorded: LogBlocks) -> _Settled:
+        """The log with what is worked out of its other fields, each of which takes passes over it."""
+        settings, out = self.settings, _Settled(recorded)
+        rest = partial(self._pieces, recorded), self.folder
+        if settings.detect_contacts is not None and self.contacts:
+            robot = self.robot if self.loaded is None else self.loaded
+            out = _Settled(*detect_in_blocks(recorded, robot, self.contacts, settings.detect_contacts, *rest))
+        if settings.base_motion is None:
+            return out
+        blocks, standing = stand_in_blocks(out.blocks, self.robot, self.contacts, *rest)
+        return replace(out, blocks=blocks, standing=standing)
 
-    def _check_welds(self, blocks: LogBlocks, first: Log) -> None:
+    def _course(self, settled: _Settled, with_unloaded: bool) -> Course:
+        """What of a log must be known before its blocks can be worked on, which takes a pass or two over it."""
+        blocks, settings, standing = settled.blocks, self.settings, settled.standing
+        chosen = [slice(0, len(blocks))] if standing is None else standing.stretches
+        longest = max(chosen, key=lambda stretch: stretch.stop - stretch.start)
+        start = blocks if standing is None else blocks.part(longest)
+        first = start.read(slice(0, min(len(start), MOST_SAMPLES)))
+        rates = settings.filter_hz, settings.sample_rate_hz, self.sign_width
+        whole = make_timeline(blocks.time, lacks_derivatives(first), *rates)
+        coverage = {} if whole is None else self._coverage(blocks, first, whole)
+        contacts = self._contacts(blocks, first)
+        air = None if contacts is None or not with_unloaded else in_the_air(contacts)
+        if standing is None or whole is None:
+            stretches: tuple[Stretch, ...] = (Stretch(blocks, whole, 0, air),)
+        else:
+            stretches = self._stretches(blocks, standing, whole, air)
+        time = np.concatenate([stretch.time for stretch in stretches])
+        stated = self.motion_noise if standing is None else {}
+        course = Course(stretches, coverage, time)
+        course = replace(course, noise=signal_noise(first, course.longest.timeline, stated))
+        return course if contacts is None else replace(course, kept=self._kept(course, contacts, settled.certain))
+
+    def _stretches(
+        self, blocks: LogBlocks, standing: Stretches, whole: Timeline, air: BoolArray | None
+    ) -> tuple[Stretch, ...]:
+        """The stretches of a log with a pose that are long enough, each with its timeline; warns of the others."""
+        out, first, settings = list[Stretch](), 0, self.settings
+        usable = long_stretches(blocks.time, standing.stretches, whole)
+        for stretch in usable:
+            part = blocks.part(stretch)
+            timeline = make_timeline(part.time, True, settings.filter_hz, settings.sample_rate_hz, self.sign_width)
+            out.append(Stretch(part, timeline, first, None if air is None else air[stretch]))
+            first += len(out[-1].time)
+        too_short = count_samples(standing.stretches) - count_samples(usable)
+        warn_of_standing(blocks.source, len(blocks), standing, too_short)
+        return tuple(out)
+
+    def _kept(self, course: Course, contacts: Log, certain: BoolArray | None) -> BoolArray | None:
+        """Which samples are kept, None for all: away from changes of contact, with flags that are certain, no slip."""
+        settings, parts = self.settings, list[BoolArray]()
+        checked = settings.max_slip is not None and bool(self.contacts)
+        if checked:
+            parts.append(self._standing_firmly(course, contacts))
+        if settings.margin_s is not None:
+            away = away_from_changes(contacts, course.time, settings.margin_s)
+            parts += [] if away is None else [away]
+        if certain is not None and not certain.all():
+            parts.append(away_from_stamps(course.time, contacts.time[~certain], settings.margin_s or 0.0))
+        kept = np.all(parts, axis=0) if parts else np.ones(1, dtype=bool)
+        require_kept(kept, self.path, checked)
+        return None if kept.all() else kept
+
+    def _standing_firmly(self, course: Course, contacts: Log) -> BoolArray:
+        """In which samples no contact slips, (N,), which takes a pass over the motion.
+
+        Warns:
+            TorchidWarning: as `warn_of_slip`.
+        """
+        settings, blocks = self.settings, course.longest.blocks
+        motion = motion_fields(blocks, "contact_active", NORMALS)
+        away = away_from_own_changes(contacts, course.time, self.contacts, settings.filter_hz)
+        speeds = growing_array(self.path, self.folder, len(course.time))
+        known = settings.base_motion is None
+        for stretch, piece in course.pieces(self._step(blocks, len(course.time))):
+            log = stretch.read(piece, motion).preprocessed(course.coverage)
+            samples = bind_log(log, self.robot, self.contacts)
+            base = base_velocity(log, samples) if known else None
+            known = base is not None
+            speeds.append(ground_speeds(samples, self.robot, self.contacts, base, away[piece]))
+        slip = judge_speeds(speeds.array(), self.contacts, settings.slip_limit, not known and not self.robot.fixed_base)
+        warn_of_slip(slip, blocks.source)
+        return np.asarray(~slip.slips.any(axis=1))
+
+    def _check_welds(self, blocks: LogBlocks) -> None:
         """Warn of joints that move though they are welded, which takes a pass over a log that has any."""
+        first = blocks.read(slice(0, 1), only=("joint_position",))
         if self.robot.welded.keys().isdisjoint(first.joint_names):
             return
         logs = (blocks.read(piece, only=("joint_position",)) for piece in self._pieces(blocks, len(blocks)))
         warn_of_moving_welds(first, self.robot, np.max([distances_from_welds(log, self.robot) for log in logs], axis=0))
 
+    def _step(self, blocks: LogBlocks, count: int) -> int:
+        """How many samples of a log, or of so many that become of it, fit into memory."""
+        most = BLOCK_GB if self.folder is None else self.settings.memory_gb / _COPIES
+        return max(SPLINE_BLOCK, int(most * GIGABYTE / blocks.row_bytes * count / len(blocks)))
+
     def _pieces(self, blocks: LogBlocks, count: int) -> Iterator[slice]:
         """The samples of a log, or of what becomes of them, in parts that fit into memory."""
-        most = BLOCK_GB if self.folder is None else self.settings.memory_gb / _COPIES
-        rows = most * GIGABYTE / blocks.row_bytes * count / len(blocks)
-        step = max(SPLINE_BLOCK, int(rows))
+        step = self._step(blocks, count)
         return (slice(start, min(start + step, count)) for start in range(0, count, step))
 
     def _coverage(self, blocks: LogBlocks, first: Log, timeline: Timeline) -> dict[str, Coverage]:
@@ -174,17 +276,14 @@ class LargeLog:
         active = np.concatenate([x for x in flags if x is not None])
         return Log(blocks.source, blocks.time, (), nothing, contact_names=first.contact_names, contact_active=active)
 
-    def _away_from_changes(self, contacts: Log, time: FloatArray) -> BoolArray | None:
-        """Which samples are further than the margin from changes of contact, None for all."""
-        margin = self.settings.contact_margin_s
-        return None if margin is None else away_from_changes(contacts, time, margin)
-
-    def _bound(self, course: _Course, block: _Block) -> tuple[slice, Samples]:
+    def _bound(self, course: Course, block: Block) -> tuple[slice, Samples]:
         """The numbers of a block's samples, and these; errors count from the beginning."""
-        log = block.log if block.timeline is None else move_to_timeline(block.log, block.timeline, course.coverage)
-        if block.timeline is not None and not block.piece.start:  # the first block stands for all
+        log = block.preprocessed(course.coverage)
+        if block.timeline is not None and block.piece.start == course.longest.first:  # this block stands for all
             warn_of_noisy_accelerations(block.log, log, block.timeline, course.noise)
-        samples = bind_log(replace(log, motion_noise=course.noise), self.robot, self.contacts)
+        if self.settings.base_motion is None:
+            log = replace(log, motion_noise=course.noise)
+        samples = bind_log(log, self.robot, self.contacts)
         if self.required is not None:
             try:
                 require_forces(samples, self.robot, self.contacts, self.required)
@@ -193,60 +292,8 @@ class LargeLog:
         return block.piece, samples
 
 
-@dataclass(frozen=True)
-class _Course:
-    """What is known of a whole log before its blocks are worked on; `kept`: which samples, None for all."""
-
-    blocks: LogBlocks
-    timeline: Timeline | None
-    coverage: Mapping[str, Coverage]
-    time: FloatArray
-    kept: BoolArray | None
-    in_the_air: BoolArray | None
-    noise: SignalNoise
-
-    @property
-    def oversampling(self) -> float:
-        """Samples per independent sample of noise."""
-        return oversampling(self.time, None if self.timeline is None else self.timeline.bandwidth_hz)
-
-    def follow_signs(self, start: int) -> None:
-        """Read quaternions up to a sample of the preprocessed log, whose signs go on from those."""
-        names = tuple(name for name in ("base_quat_xyzw", "base_quat_wxyz") if name in self.blocks.fields)
-        end = start if self.timeline is None or not start else self.timeline.part(start, start + 1)[0].start
-        step = max(SPLINE_BLOCK, int(BLOCK_GB * GIGABYTE / 32))
-        for first in range(0, end, step) if names else ():
-            self.blocks.read(slice(first, min(first + step, end)), only=names)
-
-
-def _in_the_air(contacts: Log) -> BoolArray | None:
-    """Which contacts are in the air for sure in which samples of the log, None if none ever is."""
-    if contacts.contact_active is None:
-        return None
-    unloaded = find_unloaded(contacts.time, contacts.contact_active)
-    return unloaded if unloaded.any() else None
-
-
-@dataclass(frozen=True)
-class _Block:
-    """A part of the samples of a preprocessed log: their numbers, and what they are made of, as it was recorded."""
-
-    piece: slice
-    log: Log
-    timeline: Timeline | None
-
-
-def _read_block(blocks: LogBlocks, piece: slice, timeline: Timeline | None, in_the_air: BoolArray | None) -> _Block:
-    """What a part of the preprocessed log depends on."""
-    samples, part = (piece, None) if timeline is None else timeline.part(piece.start, piece.stop)
-    log = blocks.read(samples)
-    if in_the_air is not None:
-        log = replace(log, contact_unloaded=unloaded_readings(log, in_the_air[samples]))
-    return _Block(piece, log, part)
-
-
 def _in_threads(
-    bind: Callable[[_Block], tuple[slice, Samples]], blocks: Iterator[_Block], threads: int
+    bind: Callable[[Block], tuple[slice, Samples]], blocks: Iterator[Block], threads: int
 ) -> Generator[tuple[slice, Samples], None, None]:
     """What becomes of each block, in their order; they are read here, a few ahead of those that are worked on.
 
@@ -286,8 +333,7 @@ class _Stored:
             for name, x in vars(part).items():
                 if isinstance(x, Tensor):
                     if (name, of_base) not in self._spills:
-                        grows = Filled(total) if self._folder is None else Spill(self._source, self._folder)
-                        self._spills[name, of_base] = grows
+                        self._spills[name, of_base] = growing_array(self._source, self._folder, total)
                     self._spills[name, of_base].append(x.numpy())
         self._like = samples
 

@@ -12,8 +12,9 @@ import torch
 
 from torchid import ranks
 from torchid.commands.large_log import BLOCK_GB, LargeLog
+from torchid.commands.log_course import require_kept
 from torchid.config.logs import require_apart
-from torchid.errors import ConfigError, LogError, warn
+from torchid.errors import ConfigError, LogError
 from torchid.fitting.experiment import Scene
 from torchid.fitting.payloads import payload_of, scene_of_log
 from torchid.log_checks import Checked, drop_condemned
@@ -27,7 +28,7 @@ from torchid.logs.preprocess import away_from_changes, away_from_stamps, preproc
 from torchid.logs.time_range import LogPart, split_range
 from torchid.problem import Samples, bind_log
 from torchid.problem.contact_detection import with_detected_contacts
-from torchid.problem.contact_slip import measure_slip
+from torchid.problem.contact_slip import measure_slip, warn_of_slip
 from torchid.problem.standing import preprocess_standing
 from torchid.problem.welded_joints import without_welded_joints
 from torchid.problem.zeroing import zero_in_air
@@ -137,12 +138,7 @@ class LogReader:
             kept = away if kept is None else kept & away
         if kept is None or kept.all():
             return samples
-        if not kept.any():
-            found, accepted = "no sample away from changes of contact", "a smaller preprocessing.contact_margin_s"
-            if slip is not None:
-                found = f"{found} in which no contact slips"
-                accepted = "a larger preprocessing.max_slip, or a smaller contact_margin_s"
-            raise LogError(path, "contact_active", found, accepted)
+        require_kept(kept, path, slip is not None)
         return samples[torch.from_numpy(np.flatnonzero(kept))]
 
     def _slipping(self, log: Log, samples: Samples, recorded: Log) -> FloatArray | None:
@@ -154,25 +150,11 @@ class LogReader:
         settings, scene = self.scene.config.preprocessing, self.scene
         if settings.max_slip is None or not scene.contacts:
             return None
-        limit = None if settings.max_slip == "auto" else float(settings.max_slip)
-        slip = measure_slip(
-            log,
-            samples,
-            recorded,
-            scene.robot,
-            scene.contacts,
-            limit,
-            settings.filter_hz,
-            settings.base_motion is not None,
-        )
-        slipping = slip.slips.any(axis=1)
-        if not slip.checked:
-            needed = "needs the base's linear velocity or two contacts that stand"
-            warn(f"{log.source}: slip is not checked: it {needed}, away from changes of contact")
-        elif slipping.any():
-            count = f"{int(slipping.sum())} of {len(samples)} samples dropped, in which contacts slip"
-            warn(f"{log.source}: {count}: {slip}; null as preprocessing.max_slip keeps them")
-        return np.asarray(samples.time.numpy()[slipping])
+        derived = settings.base_motion is not None
+        rest = scene.robot, scene.contacts, settings.slip_limit, settings.filter_hz, derived
+        slip = measure_slip(log, samples, recorded, *rest)
+        warn_of_slip(slip, log.source)
+        return np.asarray(samples.time.numpy()[slip.slips.any(axis=1)])
 
     def _large(self, path: Path, required: SensorSet | None, together: float) -> Samples:
         """A log that does not, with those before it [GB]."""
@@ -187,29 +169,25 @@ class LogReader:
             if settings.exclude_condemned:
                 key, accepted = "exclude_condemned", f"{accepted} that torchid check passes"
             else:
-                keys = (
-                    "base_motion",
-                    "detect_contacts",
-                    "contact_threshold",
-                    "zero_in_air",
-                    "max_slip",
-                    "bridge_gaps_s",
-                )
+                keys = "contact_threshold", "zero_in_air", "bridge_gaps_s"
                 key = next(name for name in keys if getattr(settings, name) not in (None, False))
             raise LogError(path, f"preprocessing.{key}", found, accepted)
         return self._large_log(path, required, self.folder).samples(fits_contact_offsets(self.scene))
 
     def _takes_blocks(self, path: Path, gigabytes: float) -> bool:
-        """Whether a log with so much in arrays is read block by block even if there is memory for it."""
-        return gigabytes > _WHOLE_GB and not self._needs_whole_logs and not split_range(path).joins
+        """Whether a log with so much in arrays is read block by block even if there is memory for it.
+
+        Where fields are worked out of others, blocks take more passes over it.
+        """
+        whole = self._needs_whole_logs or self.scene.config.preprocessing.derived or split_range(path).joins
+        return gigabytes > _WHOLE_GB and not whole
 
     @property
     def _needs_whole_logs(self) -> bool:
         """Whether samples are left out or filled for what is known of a whole log alone."""
         settings = self.scene.config.preprocessing
-        of_whole = settings.max_slip, settings.bridge_gaps_s
-        of_all = settings.exclude_condemned or settings.zero_in_air or bool(settings.derived)
-        return of_all or of_whole != (None, None)
+        of_all = settings.exclude_condemned or settings.zero_in_air or settings.contact_threshold is not None
+        return of_all or settings.bridge_gaps_s is not None
 
     def _large_log(self, path: Path, required: SensorSet | None, folder: Path | None) -> LargeLog:
         """A log that is read block by block."""
@@ -225,6 +203,7 @@ class LogReader:
             motion_noise=self._stated,
             sign_width=scene.terms.sign_width,
             columns=None if scene.config.logs is None else scene.config.logs.columns,
+            loaded=scene_of_log(scene, path).robot,
         )
 
     @property

@@ -63,6 +63,11 @@ class PreprocessingConfig:
         return None if isinstance(self.cutoff_hz, str) else self.cutoff_hz
 
     @property
+    def slip_limit(self) -> float | None:
+        """The stated speed [m/s] above which a contact slips, None where it follows from the noise."""
+        return None if isinstance(self.max_slip, str) else self.max_slip
+
+    @property
     def margin_s(self) -> float | None:
         """Samples that are dropped before and after each change of contact [s], None for none."""
         margins = [self.contact_margin_s, None if self.detect_contacts is None else self.detect_contacts.margin_s]

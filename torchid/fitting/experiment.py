@@ -20,18 +20,17 @@ from torchid.fitting.contacts import read_along_normals, resolve_contacts, suite
 from torchid.fitting.cross_validation import RIDGES, RidgeChoice, choose_ridge
 from torchid.fitting.fit import Fit, LogFitter, frozen_parameters
 from torchid.fitting.known_masses import known_masses
+from torchid.fitting.log_maps import require_maps_of
 from torchid.fitting.noise import NoiseSummary, estimate_noise, recorded_sensors
 from torchid.fitting.robust import RobustLoss
 from torchid.fitting.terms import check_scale_groups, check_terms
-from torchid.logs.column_map import require_names
-from torchid.logs.ros_topics import require_joints
 from torchid.parameters import PARAMETERS, Array
 from torchid.problem import Evaluation, ExtraTerms, RowBuilder, Samples
 from torchid.problem.compressed_log import Block
 from torchid.problem.compression import Part
 from torchid.problem.sampled_rows import LogElsewhere
 from torchid.reprs import short_repr
-from torchid.robot import Robot, body_extents, load_robot, mirror_pairs, require_payloads
+from torchid.robot import Robot, body_extents, load_robot, mirror_pairs
 from torchid.robot.tree import FT_FIELD
 from torchid.sensing import Contact, SensorNoise, SensorSet, chosen_sensors, named_sensors, with_ft_sensors
 
@@ -220,11 +219,7 @@ def set_up_scene(config: ExperimentConfig | AnalyzeConfig) -> Scene:
     if not robot.nv:
         raise ConfigError.at_field("robot", "a bolted base without a joint, which never moves", "a robot that can move")
     if config.logs is not None:
-        joints = [*(body.joint.name for body in robot.bodies if body.joint is not None), *robot.welded]
-        require_joints(config.logs.topics, joints)
-        if config.logs.columns is not None:
-            require_names(config.logs.columns, {"joint": joints, "contact": robot.links})
-        require_payloads(robot, config.logs.payloads)
+        require_maps_of(robot, config.logs)
     contacts, rolling = resolve_contacts(config.contacts, robot)
     contacts = suited_to_preprocessing(read_along_normals(contacts, config.sensors), config)
     stated = [replace(c, radius=contact.radius) for c, contact in zip(config.contacts, contacts, strict=True)]

@@ -34,7 +34,7 @@ from torchid.logs.mapped_fields import map_arrays
 from torchid.logs.names import parse_names
 from torchid.logs.read import build_log, check_fields_given
 from torchid.logs.spill import LazyArray, Spill
-from torchid.logs.tables import read_table, table_blocks, table_size
+from torchid.logs.tables import is_text_table, read_table, table_blocks, table_size
 from torchid.logs.time_range import split_range
 
 GIGABYTE = 1e9
@@ -44,7 +44,7 @@ _BYTES_PER_LETTER = 4  # of a table: a cell has at least two characters, a numbe
 
 
 def log_bytes(path: Path, limit: float) -> int:
-    """Bytes of a log's arrays: an upper bound for CSV files below a limit, 0 for bags, which are read whole.
+    """Bytes of a log's arrays: an upper bound for tables of text below a limit, 0 for bags, which are read whole.
 
     A part of a log counts as all of it, several files count together.
 
@@ -60,7 +60,7 @@ def log_bytes(path: Path, limit: float) -> int:
         path = split_range(path).file
         if kind is LogKind.TABLE:
             most = _BYTES_PER_LETTER * path.stat().st_size
-            return most if path.suffix.lower() == ".csv" and most <= limit else table_size(path)
+            return most if is_text_table(path) and most <= limit else table_size(path)
         with open_container(path, whole=False) as container:
             return sum(container.declared_bytes().values())
 
@@ -125,6 +125,14 @@ class LogBlocks:
         fields = {name: _Rows(array, samples.start, samples.stop) for name, array in self.fields.items()}
         return LogBlocks(self.source, self.names, self.time[samples], fields)
 
+    def replaced(
+        self, fields: Mapping[str, LazyArray | None], names: Mapping[str, NDArray[Any]] | None = None
+    ) -> LogBlocks:
+        """The log with other fields, None for none, and other arrays of text."""
+        kept = {name: array for name, array in self.fields.items() if name not in fields}
+        changed = {name: array for name, array in fields.items() if array is not None}
+        return LogBlocks(self.source, {**self.names, **(names or {})}, self.time, kept | changed)
+
     def read(self, samples: slice, only: tuple[str, ...] | None = None, allow_gaps: bool = False) -> Log:
         """Some samples as a log, or only the fields `only` of them with positions of 0; `allow_gaps` as of `read_log`.
 
@@ -165,8 +173,10 @@ class LogBlocks:
 
 
 @contextmanager
-def open_log_blocks(path: Path, folder: Path | None, columns: Columns | None = None) -> Iterator[LogBlocks]:
-    """Open a log in one file (.h5, .npz, .csv or .parquet).
+def open_log_blocks(
+    path: Path, folder: Path | None, columns: Columns | None = None, needs_flags: bool = True
+) -> Iterator[LogBlocks]:
+    """Open a log in one file (.h5, .npz or a table).
 
     Arrays of .h5 and .npz files are read in place unless these are compressed; others are unpacked to temporary files
     in `folder`, or to memory without one. Of a part of a log no other samples are there.
@@ -175,6 +185,7 @@ def open_log_blocks(path: Path, folder: Path | None, columns: Columns | None = N
         path: of the log.
         folder: on whose disk there is room.
         columns: as of `read_log`.
+        needs_flags: likewise.
 
     Raises:
         LogError: the file is invalid.
@@ -184,10 +195,10 @@ def open_log_blocks(path: Path, folder: Path | None, columns: Columns | None = N
         with about_file(path):
             part = split_range(path)
             if existing_log_kind(part.file) is LogKind.TABLE:
-                names, fields = _open_table(part.file, folder, columns)
+                names, fields = _open_table(part.file, folder, columns, needs_flags)
             else:
                 container = stack.enter_context(open_container(part.file, whole=False))
-                names, fields = _open_arrays(container, folder, columns)
+                names, fields = _open_arrays(container, folder, columns, needs_flags)
             blocks = _check_blocks(str(path), names, fields)
             if part.range is not None:
                 blocks = blocks.part(part.range.select(blocks.time))
@@ -195,7 +206,7 @@ def open_log_blocks(path: Path, folder: Path | None, columns: Columns | None = N
 
 
 def _open_arrays(
-    container: Container, folder: Path | None, columns: Columns | None
+    container: Container, folder: Path | None, columns: Columns | None, needs_flags: bool
 ) -> tuple[dict[str, NDArray[Any]], dict[str, LazyArray]]:
     """Text and arrays of a container."""
 
@@ -209,7 +220,7 @@ def _open_arrays(
 
     given = list(container.declared_bytes())
     mapped = None if columns is None else map_arrays(columns, given, load)
-    check_fields_given(given if mapped is None else mapped.given)
+    check_fields_given(given if mapped is None else mapped.given, needs_flags)
     if mapped is None:
         text = [name for name in given if _is_text(name)]
         return {name: load(name) for name in text}, {name: lazy(name) for name in given if name not in text}
@@ -223,18 +234,18 @@ def _open_arrays(
 
 
 def _open_table(
-    path: Path, folder: Path | None, columns: Columns | None
+    path: Path, folder: Path | None, columns: Columns | None, needs_flags: bool
 ) -> tuple[dict[str, NDArray[Any]], dict[str, LazyArray]]:
     """Text and arrays of a table, which is read once."""
     names: dict[str, NDArray[Any]] = {}
     if folder is None:
         raw = read_table(path, columns)
-        check_fields_given(raw)
+        check_fields_given(raw, needs_flags)
         return {n: x for n, x in raw.items() if _is_text(n)}, {n: x for n, x in raw.items() if not _is_text(n)}
     spills: defaultdict[str, Spill] = defaultdict(partial(Spill, path, folder))
     for number, block in enumerate(table_blocks(path, columns)):
         if not number:
-            check_fields_given(block)
+            check_fields_given(block, needs_flags)
             continue
         for name, array in block.items():
             if not _is_text(name):

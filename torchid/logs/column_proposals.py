@@ -5,6 +5,9 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
 
 from torchid.errors import LogError, excerpt
 from torchid.logs.log import NAME_FIELDS, POINTS, SHAPES, VARIANTS, WRENCHES
@@ -12,6 +15,7 @@ from torchid.logs.units import quantities_with, split_unit
 
 _FIELDS = tuple(name for name in (*SHAPES, *VARIANTS) if name not in NAME_FIELDS)
 _LISTED, _LONGEST = 12, 60
+_SHARE = 0.2  # of the way from the lowest to the highest reading, a threshold of contact
 #: What force plates read; under which foot each lies, no name of a column says.
 OF_PLATES = (WRENCHES[1], POINTS)
 _BASE = r"\b(base|root|trunk|torso|pelvis|body|floating base)"
@@ -102,3 +106,10 @@ def unknown_columns(columns: Sequence[str]) -> LogError:
     """The error of columns or arrays that the log format does not know, all in one line."""
     accepted = "names of the log format, or logs.columns of an experiment file, which says what they hold"
     return LogError.at_field("columns", f"{len(columns)} unknown: {name_unknown(columns)}", accepted)
+
+
+def threshold(readings: Any) -> float:
+    """A reading above which a contact is probably active, by the range of all of its sensor, in two digits."""
+    values = np.asarray(readings, dtype=float)
+    low, high = np.percentile(values[np.isfinite(values)], (2, 98)) if np.isfinite(values).any() else (0.0, 0.0)
+    return float(f"{low + _SHARE * (high - low):.2g}")

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.logs.containers import LogKind, existing_log_kind, open_container, reader_errors_explained
-from torchid.logs.tables import sample_table
+from torchid.logs.table_headers import read_header
+from torchid.logs.tables import is_text_table, sample_table
 
 Columns = Mapping[str, NDArray[Any] | None]
 """Columns of a table or arrays with some of their rows, some of them names; None for what is neither."""
@@ -35,6 +36,11 @@ def read_sample(path: Path) -> Columns:
             is_list = array.ndim == 1 and len(array) <= _NAMES
             out[name] = array if array.dtype.kind in "fiub" or is_list else None
     return out
+
+
+def states_degrees(path: Path) -> bool:
+    """Whether a table says that its angles are in degrees; LogError where it cannot be read."""
+    return existing_log_kind(path) is LogKind.TABLE and is_text_table(path) and read_header(path).in_degrees
 
 
 def stated_names(sample: Columns, field: str) -> list[str]:

@@ -27,13 +27,17 @@ from torchid.staging import atomic_file
 
 #: Containers of named arrays.
 ARRAYS = (".npz", ".h5", ".hdf5")
-TABLES = (".csv", ".parquet")
+#: Tables of OpenSim, motions and storages: text with lines before the names of the columns.
+OPENSIM = (".mot", ".sto")
+#: Tables of text.
+TEXT_TABLES = (".csv", *OPENSIM)
+TABLES = (*TEXT_TABLES, ".parquet")
 #: Logs that torchid compress has made factors of.
 FACTORS = ".factor"
 #: Files of ROS 1 (.bag) and ROS 2; those of ROS 2 may also lie in a folder.
 BAGS = (".bag", ".mcap", ".db3")
-WRITABLE = (*ARRAYS, *TABLES)
-READABLE = (*WRITABLE, *BAGS)
+WRITABLE = (*ARRAYS, ".csv", ".parquet")
+READABLE = (*WRITABLE, *OPENSIM, *BAGS)
 
 
 class LogKind(Enum):

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from torchid.errors import excerpt
 from torchid.logs.column_families import Family, find_families
 from torchid.logs.column_map import PLACEHOLDER
-from torchid.logs.column_proposals import OF_PLATES, is_desired, propose_field
+from torchid.logs.column_proposals import OF_PLATES, is_desired, propose_field, threshold
 from torchid.logs.column_samples import Columns, stated_names
 from torchid.logs.columns import is_column
 from torchid.logs.joint_orders import JOINT_ORDERS, MOTORS, suitable_orders, usual_order
 from torchid.logs.log import SHAPES, VARIANTS
 from torchid.logs.name_matching import SUFFIXES, KnownRobot, match_names
-from torchid.logs.units import UNITS, quantities_of, quantities_with, unit_factor
+from torchid.logs.units import IN_DEGREES, UNITS, quantities_of, quantities_with, unit_factor
 
 _GAINS = re.compile(r"\b(kp|kd)\b", re.IGNORECASE)
 _FORCE = re.compile(r"force|(?<![a-z])f\{axis", re.IGNORECASE)
@@ -33,7 +33,6 @@ _LEVER = 1.0  # [m]: rms of no torque is as large as that of the robot's weight 
 _FAR = 60.0  # [m]: no base is recorded as far away
 _SORTED = 0.9  # of the steps of stamps, forwards
 _TOUCH = 0.05  # of the robot's weight, what a contact bears at least
-_SHARE = 0.2  # of the way from the lowest to the highest reading, a threshold of contact
 
 
 @dataclass
@@ -59,24 +58,33 @@ class MapProposal:
     partial: dict[str, list[str]] = field(default_factory=dict)
 
 
-def propose_map(sample: Columns, robot: KnownRobot, files: Sequence[Collection[str]] = ()) -> MapProposal:
+def propose_map(
+    sample: Columns, robot: KnownRobot, files: Sequence[Collection[str]] = (), in_degrees: Collection[str] = ()
+) -> MapProposal:
     """Sort foreign columns into fields of a log by what they are called and what is in them.
 
     Args:
         sample: from `read_sample`.
         robot: whose log it is.
         files: columns of each of several files that are one log, whose stamps may differ in name.
+        in_degrees: columns of files whose header says that angles are in degrees.
     """
     native = [name for name in sample if is_column(name) or name in (*SHAPES, *VARIANTS)]
     foreign = [name for name in sample if name not in native]
-    return _Proposer(sample, native, robot, files).propose(foreign)
+    return _Proposer(sample, native, robot, files, in_degrees).propose(foreign)
 
 
 class _Proposer:
     def __init__(
-        self, sample: Columns, native: Sequence[str], robot: KnownRobot, files: Sequence[Collection[str]]
+        self,
+        sample: Columns,
+        native: Sequence[str],
+        robot: KnownRobot,
+        files: Sequence[Collection[str]],
+        in_degrees: Collection[str],
     ) -> None:
         self.sample, self.native, self.robot, self.files = sample, native, robot, files
+        self.in_degrees = in_degrees
         self.joints, self.feet = robot.joints, robot.feet
         self.given = {name.partition(".")[0] for name in native}
         self.out = MapProposal()
@@ -298,6 +306,9 @@ class _Proposer:
 
     def _add_stated_unit(self, family: Family, entry: dict[str, Any], key: str, quantities: tuple[str, ...]) -> None:
         """The unit in the names of columns, for the field that they are; a note where it is none of that field."""
+        if not family.unit and quantities and quantities[0] in IN_DEGREES and family.columns[0] in self.in_degrees:
+            self.factors[key] = unit_factor(key, IN_DEGREES[quantities[0]], quantities)
+            self.out.notes[key] = f"{IN_DEGREES[quantities[0]]}, as the file's header says (inDegrees=yes)"
         if not family.unit or not quantities:
             return
         if not set(quantities) & set(quantities_with(family.unit)):
@@ -371,13 +382,6 @@ class _Proposer:
         flat = [np.asarray(x, dtype=float).reshape(len(x), -1) for x in found]
         values = np.concatenate(flat, axis=1) if flat and len({len(x) for x in flat}) == 1 else np.zeros((0, 1))
         return values if np.isfinite(values).any() else None
-
-
-def threshold(readings: Any) -> float:
-    """A reading above which a contact is probably active, by the range of all of its sensor, in two digits."""
-    values = np.asarray(readings, dtype=float)
-    low, high = np.percentile(values[np.isfinite(values)], (2, 98)) if np.isfinite(values).any() else (0.0, 0.0)
-    return float(f"{low + _SHARE * (high - low):.2g}")
 
 
 def _si(name: str) -> str:

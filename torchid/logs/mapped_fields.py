@@ -18,7 +18,7 @@ from torchid.logs.columns import TEXT_COLUMN, TableLayout, is_column, parse_head
 from torchid.logs.force_plates import PlatePoses
 from torchid.logs.log import FORCE_NORMAL, NAME_FIELDS, POINTS, SHAPES, VARIANTS, WRENCHES, FloatArray
 from torchid.logs.names import parse_names
-from torchid.logs.units import unit_factor
+from torchid.logs.units import IN_DEGREES, TRANSLATION, unit_factor
 
 Take = Callable[[str], NDArray[Any]]
 """The values (N, ...) of a column or an array."""
@@ -310,37 +310,53 @@ def _flagged(values: FloatArray, above: float | None) -> FloatArray:
     return values if above is None else np.where(np.isnan(values), np.nan, values > above)
 
 
-def _factors(part: Part, names: Sequence[str]) -> FloatArray | None:
-    """What the elements of a sample are multiplied by, (n,), (k,) or (n, k); None where that is 1."""
+def _factors(part: Part, names: Sequence[str], in_degrees: Callable[[str], bool]) -> FloatArray | None:
+    """What the elements of a sample are multiplied by, (n,), (k,) or (n, k); None where that is 1.
+
+    `in_degrees`: whether what has no unit and turns is in degrees, by name.
+    """
     entry, key = part.entry, f"{KEY}.{part.key}"
-    if not entry.unit and not entry.scale:
-        return None
     of_names, of_components = names if part.kind else ("",), part.components or ("",)
-    elements = [(".".join(filter(None, (name, axis))), axis) for name in of_names for axis in of_components]
-    labels = [label for label, _ in elements]
+    elements = [(name, ".".join(filter(None, (name, axis))), axis) for name in of_names for axis in of_components]
+    labels = [label for _, label, _ in elements]
     units = values_by_name(f"{key}.unit", entry.unit, labels)
     scales = values_by_name(f"{key}.scale", entry.scale, labels)
     out = np.ones(len(elements))
-    for index, (label, axis) in enumerate(elements):
-        if label in units:
-            out[index] = unit_factor(f"{key}.unit", units[label], part.quantities[axis])
+    for index, (name, label, axis) in enumerate(elements):
+        quantities = part.quantities[axis]
+        unit = units.get(label, IN_DEGREES.get(quantities[0], "") if quantities and in_degrees(name) else "")
+        if unit:
+            out[index] = unit_factor(f"{key}.unit", unit, quantities)
         out[index] *= scales.get(label, 1.0)
     shape = ([len(of_names)] if part.kind else []) + ([len(of_components)] if part.components else [])
     return None if (out == 1.0).all() else out.reshape(shape)
 
 
-def _values(matched: Mapping[str, Matched], names: Mapping[str, tuple[str, ...]]) -> dict[str, _Values]:
+def _turning(matched: Matched, in_degrees: bool) -> Callable[[str], bool]:
+    """Whether numbers of a name are in degrees that have no unit: all of such a file but those of translations."""
+    split = matched.by_name and not matched.by_component
+    moving = (
+        {name for name, column in zip(matched.names, matched.columns, strict=split) if TRANSLATION.search(column)}
+        if split
+        else set[str]()
+    )
+    return lambda name: in_degrees and name not in moving
+
+
+def _values(
+    matched: Mapping[str, Matched], names: Mapping[str, tuple[str, ...]], in_degrees: bool = False
+) -> dict[str, _Values]:
     out = {}
     for key, one in matched.items():
         common = names.get(one.part.names_field, ())
         order = [one.labels.index(name) for name in common]
         kept = None if order == list(range(len(one.labels))) else order
-        out[key] = _Values(one, kept, _factors(one.part, common))
+        out[key] = _Values(one, kept, _factors(one.part, common, _turning(one, in_degrees)))
     return out
 
 
-def map_table(columns: Columns, header: Sequence[str]) -> MappedFields | None:
-    """The fields of a table; None for one that needs no map.
+def map_table(columns: Columns, header: Sequence[str], in_degrees: bool = False) -> MappedFields | None:
+    """The fields of a table, in which what turns may be in degrees unless it has a unit; None where no map is needed.
 
     Raises:
         InputError: a map that does not fit the columns, or itself.
@@ -351,7 +367,7 @@ def map_table(columns: Columns, header: Sequence[str]) -> MappedFields | None:
     if matching is None:
         return None
     layout = parse_header(matching.others, matching.names)
-    values = _values(matching.matched, layout.names)
+    values = _values(matching.matched, layout.names, in_degrees)
     return MappedFields(layout.names, columns, layout.columns, values, layout).check()
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 SUFFIXES = {"joint": ("", "_joint"), "contact": ("", "_foot", "_sole", "_contact", "_link", "_ankle_roll_link")}
 """What names of a URDF may have more than those of a recording."""
 
+_MOST_TEXTS = 1000  # that are compared with all joints
 _WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
 _LIMBS = {
     "left": "l", "right": "r", "front": "f", "fore": "f", "rear": "b", "hind": "b", "back": "b", "l": "l", "r": "r",
@@ -29,6 +30,7 @@ class KnownRobot:
         base_link: its base.
         on_base: links of its base.
         elsewhere: all others.
+        limb_sensors: children of the fixed joints in limbs that are called force or torque sensors, by joint.
     """
 
     joints: Sequence[str]
@@ -38,6 +40,7 @@ class KnownRobot:
     base_link: str
     on_base: Sequence[str]
     elsewhere: Sequence[str]
+    limb_sensors: Mapping[str, str] = field(default_factory=dict)
 
 
 def within(stem: str) -> re.Pattern[str]:
@@ -54,6 +57,43 @@ def spelled(stem: str) -> re.Pattern[str]:
 def limbs(text: str) -> frozenset[str]:
     """Left or right (l, r) and front or back (f, b), as far as a name says it, in words or letters."""
     return frozenset("".join(_LIMBS.get(word.lower(), "") for word in _WORD.findall(text)))
+
+
+def match_joints(texts: Sequence[str], joints: Sequence[str]) -> dict[str, str]:
+    """Joints of a robot by texts that spell them, some in other capitals, with other prefixes, or without `_joint`.
+
+    A text and a joint are of the same limb, and the other words of one are in the other, one after the other. Of
+    several the nearest counts; where two are as near, none.
+    """
+    out = {text: text for text in texts if text in joints}
+    of_texts = {text: _words(text) for text in texts[:_MOST_TEXTS] if text not in out}
+    of_joints = {joint: _words(joint) for joint in joints if joint not in out}
+    apart = {
+        (text, joint): abs(len(words) - len(others))
+        for text, (limb, words) in of_texts.items()
+        for joint, (other, others) in of_joints.items()
+        if limb == other and (_contains(words, others) or _contains(others, words))
+    }
+    nearest: dict[tuple[int, str], list[int]] = {}
+    for pair, distance in apart.items():
+        for which, name in enumerate(pair):
+            nearest.setdefault((which, name), []).append(distance)
+    for pair, distance in apart.items():
+        rivals = [nearest[which, name] for which, name in enumerate(pair)]
+        if all(min(others) == distance and others.count(distance) == 1 for others in rivals):
+            out[pair[0]] = pair[1]
+    return out
+
+
+def _words(text: str) -> tuple[frozenset[str], tuple[str, ...]]:
+    """The limb that a name of a joint means, and its other words."""
+    words = [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", text)]
+    return limbs(text), tuple(word for word in words if word not in _LIMBS and word != "joint")
+
+
+def _contains(words: tuple[str, ...], others: tuple[str, ...]) -> bool:
+    """Whether words contain others, at least one, one after the other."""
+    return bool(others) and any(words[i : i + len(others)] == others for i in range(len(words)))
 
 
 def match_names(texts: Sequence[str], names: Sequence[str], kind: str) -> dict[str, str]:

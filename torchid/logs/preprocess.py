@@ -137,7 +137,7 @@ def move_to_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Covera
 def _fields_on_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Coverage]) -> dict[str, Any]:
     """Fields that change in the preprocessed log."""
     fields: dict[str, Any] = {
-        "time": log.time[timeline.kept] if timeline.keeps_stamps else timeline.origin + timeline.output_stamps,
+        "time": timeline.stamps_of(log.time),
     }
     fields |= _motion(log, timeline)
     for name in NAN_ALLOWED:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from torchid.errors import LogError, format_count
 from torchid.logs.joint_orders import GO, JOINT_ORDERS, MOTORS
+from torchid.logs.log import UNIT_TOLERANCE
 
 if TYPE_CHECKING:
     from torchid.logs.log import FloatArray
@@ -53,7 +54,7 @@ class LowState:
             raise LogError.at_field(f"{field}.{key}", f"set, though {kind} has no foot sensors", f"no {key}")
 
     def row(self, message: Any) -> FloatArray:
-        """Position, velocity and torque of every motor, specific force, angular velocity, and foot sensors.
+        """Position, velocity and torque of every motor, specific force, angular velocity, quaternion, foot sensors.
 
         Raises:
             LogError: ankles and waist by motor rather than by joint.
@@ -64,14 +65,14 @@ class LowState:
         motors, imu = message.motor_state, message.imu_state
         self._motors = len(motors)
         values = [*(x.q for x in motors), *(x.dq for x in motors), *(x.tau_est for x in motors)]
-        arrays = imu.accelerometer, imu.gyroscope, getattr(message, "foot_force", np.array([]))
+        arrays = imu.accelerometer, imu.gyroscope, imu.quaternion, getattr(message, "foot_force", np.array([]))
         return np.array([*values, *(x for array in arrays for x in array.tolist())], dtype=np.float64)
 
     def fields(self, rows: FloatArray) -> dict[str, FloatArray]:
-        """Fields (N, n) of the joints, (N, 3) of the IMU, and the raw readings of feet (N, 4), if there are any.
+        """Fields (N, n) of the joints, (N, 3) and (N, 4) of the IMU, and the raw readings of feet (N, 4), if any.
 
         Raises:
-            LogError: a joint whose motor is not there, or a motor that moves without a joint.
+            LogError: a joint whose motor is not there, a motor that moves without a joint, or quaternions of no length.
         """
         count = self._motors
         motors = rows[:, : 3 * count].reshape(len(rows), 3, count)
@@ -81,8 +82,9 @@ class LowState:
         if self._settings.frame is not None:
             out["imu_specific_force"] = rows[:, 3 * count : 3 * count + 3]
             out["imu_angular_velocity"] = rows[:, 3 * count + 3 : 3 * count + 6]
-        if rows.shape[1] > 3 * count + 6:
-            out["foot_force"] = rows[:, 3 * count + 6 :]
+            out |= self._orientation(rows[:, 3 * count + 6 : 3 * count + 10])
+        if rows.shape[1] > 3 * count + 10:
+            out["foot_force"] = rows[:, 3 * count + 10 :]
         return out
 
     def _check_motors(self, motors: FloatArray) -> None:
@@ -112,6 +114,21 @@ class LowState:
         ]
         listed = f"{KEY}.joints with a name or null for each of {format_count(len(alive), 'motor')}"
         return f"{KEY}.robot: {' or '.join(fitting)}" if fitting else f"{listed}, null for motor {number} where unused"
+
+    def _orientation(self, wxyz: FloatArray) -> dict[str, FloatArray]:
+        """The base's orientation; nothing where quaternions are always the same, as of a driver that does not set them.
+
+        They are in the order in which others' come (xyzw), so that an odometry takes their place.
+        """
+        if not self._settings.orientation or not np.any(wxyz != wxyz[0]):
+            return {}
+        with np.errstate(over="ignore", invalid="ignore"):
+            norm = np.linalg.norm(wxyz, axis=1)
+            bad = ~(np.abs(norm - 1.0) <= UNIT_TOLERANCE)
+        if bad.any():
+            found = f"a quaternion of the IMU of norm {norm[bad][0]:.4g}"
+            raise LogError.at_field(self._topic, found, f"unit quaternions, or {KEY}.orientation: false")
+        return {"base_quat_xyzw": np.roll(wxyz, -1, axis=1)}
 
     # ------------------------------------------------------------------------------------------------------- stamps
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any, Protocol
@@ -87,9 +87,9 @@ class JointStates:
 
     types: tuple[str, ...] = ("sensor_msgs/msg/JointState",)
 
-    def __init__(self, topic: str, joints: list[str] | None) -> None:
-        """Use the given joints, or those of the first message."""
-        self.names = tuple(joints or ())
+    def __init__(self, topic: str, joints: list[str] | None, called: Mapping[str, str]) -> None:
+        """Use the given joints, or those of the first message; names are those of the URDF by those of messages."""
+        self.names, self._called = tuple(joints or ()), called
         self._given, self._topic = joints is not None, topic
         self._parts: tuple[str, ...] = ()
         self._orders: dict[tuple[str, ...], list[int] | slice | None] = {}
@@ -99,6 +99,13 @@ class JointStates:
         """Joints of skipped messages."""
         left_out = (names for names, order in self._orders.items() if order is None)
         return tuple(dict.fromkeys(name for names in left_out for name in names))
+
+    def check_names(self) -> None:
+        """Refuse a name for a joint that no message has."""
+        met = tuple(dict.fromkeys(name for names in self._orders for name in names))
+        for name in self._called:
+            if name not in met:
+                raise UnknownNameError.at_field("logs.topics.joint_states.names", name, met)
 
     def row(self, message: Any) -> FloatArray | None:
         """Position, velocity and effort, as far as present, of every joint; None for messages of other joints."""
@@ -125,6 +132,7 @@ class JointStates:
         return np.concatenate([x[order] for x in values])
 
     def _order(self, names: tuple[str, ...]) -> list[int] | slice | None:
+        names = tuple(self._called.get(name, name) for name in names)
         if len(set(names)) != len(names):
             raise LogError.at_field(
                 self._topic, f"names {', '.join(names[:4])}, ... that repeat", "joints of different names"
@@ -324,7 +332,7 @@ class TopicMessages:
 
         Raises:
             LogError: there are no messages, or several with the same stamp and different content.
-            UnknownNameError: no message has the joints of `logs.topics.joint_states.joints`.
+            UnknownNameError: no message has the joints of `logs.topics.joint_states.joints`, or of `names`.
 
         Warns:
             TorchidWarning: duplicate messages.
@@ -334,6 +342,8 @@ class TopicMessages:
             raise UnknownNameError.at_field(index, name, self._decoder.other_joints)
         if not self._stamps:
             raise LogError.at_field(self.topic, "no messages", "at least one")
+        if isinstance(self._decoder, JointStates):
+            self._decoder.check_names()
         stamps: Stamps = np.array(self._stamps, dtype=np.int64)
         rows: FloatArray = np.array(self._values, dtype=np.float64).reshape(len(stamps), -1)
         received, stamped = np.array(self._received, dtype=np.int64), bool(stamps.any())

@@ -229,7 +229,7 @@ def _decoder(topic: AnyTopic) -> Decoder:
     if isinstance(topic, LowStateTopic):
         return LowState(topic)
     if isinstance(topic, JointTopic):
-        return JointStates(topic.topic, topic.joints)
+        return JointStates(topic.topic, topic.joints, topic.names)
     if isinstance(topic, ImuTopic):
         return Imu(topic.topic)
     if isinstance(topic, OdometryTopic):

@@ -20,10 +20,14 @@ _Force = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
 @dataclass(config=_STRICT, frozen=True)
 class JointTopic:
-    """`sensor_msgs/JointState`: `joints` are the joints to read, by default all of the first message."""
+    """`sensor_msgs/JointState`: `joints` are the joints to read, by default all of the first message.
+
+    `names` are the URDF's names of those that the messages call otherwise, by what they call them.
+    """
 
     topic: _Name
     joints: Annotated[list[_Name], Field(min_length=1)] | None = None
+    names: dict[_Name, _Name] = dataclasses.field(default_factory=dict)
 
 
 @dataclass(config=_STRICT, frozen=True)
@@ -92,6 +96,7 @@ class LowStateTopic:
         robot: whose motors they are: go2, g1, ...; see `JOINT_ORDERS`.
         joints: in its place, joints by number of the motor, null for one that is to be left out.
         frame: of the IMU in the URDF; without it the IMU is not read.
+        orientation: whether the IMU's quaternion, as the robot estimates it, is the base's orientation.
         feet: contacts by number in `foot_force`, null for one to be left out; by default the robot's.
         above: [counts] a foot touches while its sensor reads more.
         forces: whether what the sensors read is the force along the ground's normal, in counts.
@@ -103,6 +108,7 @@ class LowStateTopic:
     robot: _Name | None = None
     joints: Annotated[list[_Name | None], Field(min_length=1)] | None = None
     frame: _Name | None = None
+    orientation: bool = True
     feet: Annotated[list[_Name | None], Field(min_length=1, max_length=4)] | None = None
     above: Number | None = None
     forces: bool = False
@@ -205,8 +211,8 @@ def check_topics(topics: Topics, needs_flags: bool = True) -> None:
     """Check that a map of topics is complete; `needs_flags` as in `read_log`.
 
     Raises:
-        ConfigError: no joints or these twice, a contact without a flag, a threshold or `always`, a low state that
-            does not fit itself.
+        ConfigError: no joints or these twice, two names for one joint, a contact without a flag, a threshold or
+            `always`, a low state that does not fit itself.
         UnknownNameError: a robot that is not known by name; the rate topic is not one of the topics.
     """
     if (topics.joint_states is None) == (topics.low_state is None):
@@ -215,6 +221,10 @@ def check_topics(topics: Topics, needs_flags: bool = True) -> None:
         raise ConfigError.at_field("logs.topics", found, f"one of the two, {accepted}")
     if topics.low_state is not None:
         _check_low_state(topics, topics.low_state)
+    given = [] if topics.joint_states is None else list(topics.joint_states.names.values())
+    if again := [name for name in given if given.count(name) > 1]:
+        found = f"two names of '{excerpt(again[0])}'"
+        raise ConfigError.at_field("logs.topics.joint_states.names", found, "each joint of the URDF once")
     for name, contact in topics.contact_active.items():
         if (contact.topic is None) != contact.always:
             accepted = "a topic of std_msgs/Bool, or true for a contact that always touches"
@@ -274,7 +284,7 @@ def _check_low_state(topics: Topics, low_state: LowStateTopic) -> None:
 
 
 def require_joints(topics: Topics | None, joints: Collection[str]) -> None:
-    """Make sure that the motors of a low state are joints of a robot.
+    """Make sure that the motors of a low state, and what joints of messages are called, are joints of a robot.
 
     Args:
         topics: the map; None for logs without bags.
@@ -283,6 +293,9 @@ def require_joints(topics: Topics | None, joints: Collection[str]) -> None:
     Raises:
         InputError: one is not; the message names the robots that it could be.
     """
+    for joint in () if topics is None or topics.joint_states is None else topics.joint_states.names.values():
+        if joint not in joints:
+            raise UnknownNameError.at_field("logs.topics.joint_states.names", joint, joints)
     if topics is None or topics.low_state is None:
         return
     low_state, key = topics.low_state, "logs.topics.low_state"

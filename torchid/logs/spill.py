@@ -103,3 +103,8 @@ class Spill:
     def _failure(self, error: OSError) -> SpillError:
         accepted = "a folder with room for the log, or a preprocessing.memory_gb that takes it"
         return SpillError(self.source, f"temporary file in {self.folder}", f"cannot be written ({error})", accepted)
+
+
+def growing_array(source: object, folder: Path | None, rows: int) -> Filled | Spill:
+    """An array that so many rows will be added to: on the disk of a folder, or in memory without one."""
+    return Filled(rows) if folder is None else Spill(source, folder)

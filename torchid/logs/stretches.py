@@ -10,7 +10,7 @@ import numpy as np
 
 from torchid.errors import LogError, about_file
 from torchid.logs.coverage import measure_coverage, warn_of_gaps
-from torchid.logs.log import Log
+from torchid.logs.log import FloatArray, Log
 from torchid.logs.preprocess import (
     gapless_fields,
     lacks_derivatives,
@@ -52,12 +52,7 @@ def preprocess_stretches(
         whole = make_timeline(log.time, lacks_derivatives(log), cutoff_hz, sample_rate_hz, sign_width)
         if whole is None:
             return _joined([log.select(stretch) for stretch in stretches]), 0
-        usable = [stretch for stretch in stretches if _is_long_enough(log, stretch, whole)]
-        if not usable:
-            longest = max((log.time[x.stop - 1] - log.time[x.start] for x in stretches), default=0.0)
-            needed = f"more than {2.0 * DROPPED_PERIODS / cutoff_hz:.3g} s" if cutoff_hz else "more samples"
-            found = f"stretches of at most {longest:.3g} s without a gap"
-            raise LogError.at_field("time", found, f"{needed}, of which both ends are dropped, or a higher cutoff_hz")
+        usable = long_stretches(log.time, stretches, whole)
     coverage = {name: measure_coverage(log, name) for name in gapless_fields(log, whole)}
     for name, found_of in coverage.items():
         warn_of_gaps(log, name, found_of)
@@ -74,18 +69,41 @@ def preprocess_stretches(
         if stretch is longest_of:
             with about_file(log.source):
                 warn_of_noisy_accelerations(part, parts[-1], timeline, signal_noise(part, timeline))
-    return _joined(parts), sum(x.stop - x.start for x in stretches) - sum(x.stop - x.start for x in usable)
+    return _joined(parts), count_samples(stretches) - count_samples(usable)
 
 
-def _is_long_enough(log: Log, stretch: slice, whole: Timeline) -> bool:
+def long_stretches(time: FloatArray, stretches: Sequence[slice], whole: Timeline) -> list[slice]:
+    """The stretches that are long enough for the filter and for derivatives; LogError if none is.
+
+    Args:
+        time: stamps of the log as recorded (N,) [s].
+        stretches: of its samples.
+        whole: what its timeline would be without gaps.
+    """
+    usable = [stretch for stretch in stretches if _is_long_enough(time, stretch, whole)]
+    if not usable:
+        longest = max((time[x.stop - 1] - time[x.start] for x in stretches), default=0.0)
+        cutoff_hz = whole.cutoff_hz
+        needed = f"more than {2.0 * DROPPED_PERIODS / cutoff_hz:.3g} s" if cutoff_hz else "more samples"
+        found = f"stretches of at most {longest:.3g} s without a gap"
+        raise LogError.at_field("time", found, f"{needed}, of which both ends are dropped, or a higher cutoff_hz")
+    return usable
+
+
+def count_samples(stretches: Sequence[slice]) -> int:
+    """How many samples stretches have together."""
+    return sum(stretch.stop - stretch.start for stretch in stretches)
+
+
+def _is_long_enough(time: FloatArray, stretch: slice, whole: Timeline) -> bool:
     """Whether two samples or more of a stretch are left, and two of those that it is resampled to."""
     count = stretch.stop - stretch.start
     if count <= FEWEST_DIFFERENTIATED:
         return False
     if whole.low_pass is None or whole.cutoff_hz is None:
         return True
-    step = float(np.median(np.diff(log.time)))
-    left = log.time[stretch.stop - 1] - log.time[stretch.start] - 2.0 * DROPPED_PERIODS / whole.cutoff_hz
+    step = float(np.median(np.diff(time)))
+    left = time[stretch.stop - 1] - time[stretch.start] - 2.0 * DROPPED_PERIODS / whole.cutoff_hz
     rate = step if whole.output is None else max(step, float(np.median(np.diff(whole.output))))
     return bool(left > 2.0 * rate and count > 2 * whole.low_pass.padding)
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +15,12 @@ from torchid.errors import LogError, excerpt, how_to_install
 from torchid.guards import MAX_ARRAYS, MAX_SCHEMA, check_names, check_unpacked_size
 from torchid.logs.column_map import Columns
 from torchid.logs.columns import TEXT_COLUMN, TableLayout, check_header, column_names, parse_header
-from torchid.logs.containers import atomic_output, reader_errors_explained
+from torchid.logs.containers import TEXT_TABLES, atomic_output, reader_errors_explained
 from torchid.logs.log import NAME_FIELDS
 from torchid.logs.mapped_fields import MappedFields, map_table
+from torchid.logs.table_headers import BLOCK, read_header
+from torchid.logs.units import IN_DEGREES, quantities_of
 
-#: Bytes of a CSV file that are parsed at a time; no row may be longer.
-_BLOCK = 2**22
 #: Rows that are converted at a time.
 _ROWS = 2**16
 #: Rows from which a map is proposed.
@@ -34,9 +32,6 @@ _PARQUET = {
     "page_checksum_verification": True,
 }
 _BAD_CELL = re.compile(r"In CSV column #(\d+): (?:Row #(\d+): )?.*?invalid value '(.{0,40})", re.DOTALL)
-_SEPARATORS = (",", ";", "\t")
-#: A cell such as -1,5 or 1,5e-3 between semicolons or tabs.
-_DECIMAL_COMMA = re.compile(rb'(?:^|[;\t\n])[ "]*[+-]?\d*,\d+(?:[eE][+-]?\d+)?[ "]*(?=[;\t\r\n]|\Z)')
 _QUOTES = "'\n"
 _EMPTY = ["", " ", "  ", "nan", "NaN", "NAN"]
 _FLAGS = {"true": "1", "false": "0"}
@@ -72,7 +67,7 @@ def sample_table(path: Path) -> dict[str, NDArray[Any] | None]:
     """
     pa = _pyarrow(path)
     with _complete(path):
-        names, batch = (_sample_csv if path.suffix.lower() == ".csv" else _sample_parquet)(pa, path)
+        names, batch = (_sample_csv if is_text_table(path) else _sample_parquet)(pa, path)
         if batch is None or not batch.num_rows:
             raise LogError.at_field("time", "no samples", "at least one sample")
         columns = dict(zip(batch.schema.names, batch.columns, strict=True))
@@ -87,11 +82,12 @@ def _is_number(pa: Any, type_: Any) -> bool:
 def _sample_csv(pa: Any, path: Path) -> tuple[list[str], Any]:
     import pyarrow.csv
 
-    header = _header(path)
+    header = read_header(path)
     check_header(header.texts)
     if header.is_all:
         return header.texts, None
-    options = pyarrow.csv.ReadOptions(use_threads=False, block_size=_BLOCK, skip_rows=1, column_names=header.texts)
+    rows: dict[str, Any] = {"skip_rows": header.lines, "column_names": header.columns}
+    options = pyarrow.csv.ReadOptions(use_threads=False, block_size=BLOCK, **rows)
     marks = {"decimal_point": header.decimal_mark, "null_values": _EMPTY, "strings_can_be_null": True}
     with path.open("rb") as stream:
         parse = pyarrow.csv.ParseOptions(delimiter=header.separator)
@@ -124,11 +120,22 @@ def _complete(path: Path) -> AbstractContextManager[None]:
     return reader_errors_explained("file", f"a complete {path.suffix.lower()} file")
 
 
-def _layout(texts: list[str], columns: Columns | None) -> _Layout:
-    """Which columns a table's fields come from."""
+def is_text_table(path: Path) -> bool:
+    """Whether a table is of text."""
+    return path.suffix.lower() in TEXT_TABLES
+
+
+def _layout(texts: list[str], columns: Columns | None, in_degrees: bool = False) -> _Layout:
+    """Which columns a table's fields come from; LogError for angles in degrees without a map."""
     check_header(texts)
-    mapped = None if columns is None else map_table(columns, texts)
-    return parse_header(texts) if mapped is None else mapped
+    mapped = None if columns is None else map_table(columns, texts, in_degrees)
+    layout = parse_header(texts) if mapped is None else mapped
+    native = layout.columns if isinstance(layout, TableLayout) else layout.native
+    turning = [name for name in native if set(quantities_of(name)) & IN_DEGREES.keys()]
+    if in_degrees and turning:
+        found = f"yes, though {turning[0]} is a name of the log format, in rad"
+        raise LogError.at_field("inDegrees", found, "no, or names that logs.columns has entries for")
+    return layout
 
 
 def _fields(pa: Any, layout: _Layout, batches: list[Any]) -> dict[str, NDArray[Any]]:
@@ -179,15 +186,15 @@ def _pyarrow(path: Path) -> Any:
 
 def _batches(pa: Any, path: Path, columns: Columns | None, whole: bool = True) -> Iterator[tuple[_Layout, Any]]:
     """The layout of a table, first with None, then with each batch of rows."""
-    return (_read_csv if path.suffix.lower() == ".csv" else _read_parquet)(pa, path, columns, whole)
+    return (_read_csv if is_text_table(path) else _read_parquet)(pa, path, columns, whole)
 
 
 def _read_csv(pa: Any, path: Path, columns: Columns | None, whole: bool) -> Iterator[tuple[_Layout, Any]]:
     import pyarrow.csv
 
-    header = _header(path)
+    header = read_header(path)
     texts = header.texts
-    layout = _layout(texts, columns)
+    layout = _layout(texts, columns, header.in_degrees)
     yield layout, None
     if header.is_all:
         return
@@ -199,14 +206,16 @@ def _read_csv(pa: Any, path: Path, columns: Columns | None, whole: bool) -> Iter
             reader = pyarrow.csv.open_csv(
                 stream,
                 # one thread: else error messages have no row number
-                pyarrow.csv.ReadOptions(use_threads=False, block_size=_BLOCK, skip_rows=1, column_names=texts),
+                pyarrow.csv.ReadOptions(
+                    use_threads=False, block_size=BLOCK, skip_rows=header.lines, column_names=header.columns
+                ),
                 pyarrow.csv.ParseOptions(delimiter=header.separator),
                 pyarrow.csv.ConvertOptions(
                     column_types=types,
                     null_values=_EMPTY,
                     strings_can_be_null=True,
                     decimal_point=header.decimal_mark,
-                    include_columns=layout.sources if columns is not None else None,
+                    include_columns=layout.sources if columns is not None or header.unnamed else None,
                 ),
             )
             for batch in _bounded(path, reader, len(types), whole):
@@ -219,41 +228,6 @@ def _read_csv(pa: Any, path: Path, columns: Columns | None, whole: bool) -> Iter
             where = "" if row is None else f" in row {row}"
             text = f"'{excerpt(found.strip(_QUOTES))}'{where}"
             raise LogError(path, f"column '{texts[int(column)]}'", text, _NUMBERS) from error
-
-
-@dataclass(frozen=True)
-class _Header:
-    """Names of a CSV file's columns, what separates them, the decimal mark, and whether the file has no rows."""
-
-    texts: list[str]
-    separator: str
-    decimal_mark: str
-    is_all: bool
-
-
-def _header(path: Path) -> _Header:
-    """The first line of a CSV file; the decimal mark is that of the rows after it."""
-    with path.open("rb") as stream:
-        line = stream.readline(_BLOCK)
-        rows = stream.read(_BLOCK)
-    if not line.strip():
-        raise LogError(path, "header", "an empty line", "the names of the columns")
-    if len(line) == _BLOCK:
-        raise LogError(path, "header", f"a line of at least {_BLOCK} bytes", "the names of the columns")
-    text = line.decode("utf-8-sig").rstrip("\r\n")
-    names, failures = dict[str, list[str]](), list[csv.Error]()
-    for mark in _SEPARATORS:
-        try:
-            names[mark] = next(csv.reader([text], strict=True, delimiter=mark))
-        except csv.Error as error:  # behind a quoted name stands another mark
-            failures.append(error)
-    separator = max(names, key=lambda mark: len(names[mark]), default="")  # the first of equals
-    if not separator or (failures and len(names[separator]) == 1):
-        accepted = "names separated by commas, semicolons or tabs"
-        raise LogError(path, "header", f"no line of names ({failures[0]})", accepted) from failures[0]
-    texts = [text.strip() for text in names[separator]]
-    decimal_comma = separator != "," and _DECIMAL_COMMA.search(rows) is not None
-    return _Header(texts, separator, "," if decimal_comma else ".", not rows.strip())
 
 
 def _read_parquet(pa: Any, path: Path, columns: Columns | None, whole: bool) -> Iterator[tuple[_Layout, Any]]:
@@ -317,10 +291,10 @@ def table_size(path: Path) -> int:
     """
     _pyarrow(path)
     with _complete(path):
-        if path.suffix.lower() == ".csv":
-            columns = len(_header(path).texts)
+        if is_text_table(path):
+            columns = len(read_header(path).texts)
             with path.open("rb") as stream:
-                return 8 * columns * sum(piece.count(b"\n") for piece in iter(lambda: stream.read(_BLOCK), b""))
+                return 8 * columns * sum(piece.count(b"\n") for piece in iter(lambda: stream.read(BLOCK), b""))
         import pyarrow.parquet
 
         with pyarrow.parquet.ParquetFile(path, **_PARQUET) as file:

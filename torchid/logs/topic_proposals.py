@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from torchid.errors import format_count
 from torchid.logs.bag_samples import TopicSample
-from torchid.logs.column_proposals import is_desired
+from torchid.logs.column_proposals import is_desired, threshold
 from torchid.logs.joint_orders import JOINT_ORDERS, suitable_orders, usual_order
-from torchid.logs.map_proposals import MapProposal, threshold
-from torchid.logs.name_matching import KnownRobot, match_names
+from torchid.logs.map_proposals import MapProposal
+from torchid.logs.name_matching import KnownRobot, match_joints, match_names, spelled
 from torchid.logs.ros_low_state import LowState
 from torchid.logs.ros_messages import ContactFlag, Imu, JointStates, NormalForce, Odometry, Wrench
 
@@ -48,6 +49,7 @@ class _Proposer:
             self.out.columns = {"joint_states": "TOPIC", **self.out.columns}
             self.out.notes["joint_states"] = "nothing, as no topic has the robot's joints: name one in place of TOPIC"
         self._place_odometry()
+        self._place_limb_sensors()
         self._place_by_contact(Wrench, "contact_wrenches", frame_of, "contact_wrench_local")
         self._place_by_contact(NormalForce, "contact_force_normal", lambda _: "", "contact_force_normal")
         self._place_arrays()
@@ -73,24 +75,36 @@ class _Proposer:
     # --------------------------------------------------------------------------------------------------- joints, base
 
     def _place_joints(self) -> None:
-        """The joint states that have most of the robot's joints, then most of their efforts."""
-        joints, best = set(self.robot.joints), ("", -1.0, dict[str, bool]())
+        """The joint states that have most of the robot's joints, then most of their efforts; others are welded."""
+        joints, best = set(self.robot.joints), ("", -1.0, dict[str, bool](), dict[str, str]())
         for name, topic in self._of(JointStates.types).items():
-            named = set(topic.messages[0].name)
+            named = {joint: None for message in topic.messages[:50] for joint in message.name}
+            matched = match_joints(list(named), self.robot.joints)
             parts = {field: any(len(getattr(x, part)) for x in topic.messages[:1]) for part, field in _EFFORT.items()}
-            score = len(named & joints) + 0.1 * sum(parts.values())
-            if named & joints and score > best[1]:
-                best = (name, score, parts)
-        name, _, parts = best
+            score = len(matched) + 0.1 * sum(parts.values())
+            if (joints & named.keys() or self._has_most(matched)) and score > best[1]:
+                best = (name, score, parts, matched)
+        name, _, parts, matched = best
         if not name:
             return
-        named = {joint for message in self.topics[name].messages[:50] for joint in message.name}
+        named = {joint: None for message in self.topics[name].messages[:50] for joint in message.name}
         entry: dict[str, Any] = {"topic": name}
-        if named != joints:
-            entry["joints"] = [joint for joint in self.robot.joints if joint in named]
-            self.out.notes["joint_states"] = f"those of the robot among the {len(named)} joints of its messages"
-        complete = {"joint_position"} if joints <= named else set()
+        notes = list[str]()
+        if {*matched.values()} != joints or len(named) > len(matched):
+            entry["joints"] = [joint for joint in self.robot.joints if joint in matched.values()]
+            notes.append(f"those of the robot among the {len(named)} joints of its messages")
+        if called := {text: joint for text, joint in matched.items() if text != joint}:
+            entry["names"] = called
+            notes.append(f"names of {format_count(len(called), 'joint')}, which the messages spell otherwise")
+        if notes:
+            self.out.notes["joint_states"] = "; ".join(notes)
+        complete = {"joint_position"} if self._has_most(matched) else set()
+        self.out.lacking = [x for x in self.robot.joints if complete and x not in matched.values()]
         self._add("joint_states", name, entry, *complete, *(field for field, given in parts.items() if given))
+
+    def _has_most(self, matched: Mapping[str, str]) -> bool:
+        """Whether most of the robot's joints are matched."""
+        return 2 * len(matched) >= max(len(self.robot.joints), 1)
 
     def _place_low_state(self) -> None:
         """The state of a robot of Unitree, if the URDF has its joints."""
@@ -170,7 +184,25 @@ class _Proposer:
             entry["twist"] = "none"
         self._add("odometry", name, entry, *fields)
 
-    # ------------------------------------------------------------------------------------------------------- contacts
+    # ----------------------------------------------------------------------------------------------- limbs, contacts
+
+    def _place_limb_sensors(self) -> None:
+        """Wrenches of the child link of a fixed joint that is called a sensor, or that name joint or link."""
+        entries: dict[str, Any] = {}
+        for name, topic in self._of(Wrench.types).items():
+            frame = frame_of(topic)
+            texts = {joint: (joint.removesuffix("_joint"), child) for joint, child in self.robot.limb_sensors.items()}
+            exact = [joint for joint, child in self.robot.limb_sensors.items() if child == frame]
+            named = [joint for joint in texts if any(spelled(x).search(f"{frame} {name}") for x in texts[joint])]
+            found = [joint for joint in exact or named if joint not in entries]
+            if frame in self.robot.feet or len(found) != 1:
+                continue
+            entries[found[0]] = {"topic": name, "frame": frame} if exact else name
+            self.used.add(name)
+        if entries:
+            self.out.columns["ft_wrenches"] = entries
+            self.out.notes["ft_wrenches"] = "by names; what the parent side exerts on the child side, else sign: -1"
+            self.out.fields.add("ft_wrench")
 
     def _place_by_contact(self, decoder: Any, key: str, frame_of: Callable[[TopicSample], str], field: str) -> None:
         """Topics of a type that names of contacts stand in, or in their frames."""

@@ -49,6 +49,12 @@ _BRACKETS = re.compile(r"(.*?)\s*(?:\[([^\[\]{}]*)\]|\(([^(){}]*)\))\s*")
 _INSIDE = re.compile(r"\d+|[wxyzWXYZ]|[fm][xyz]")  # of brackets: a number or a component, no unit
 
 
+#: Units of numbers about an axis in a file whose angles are in degrees.
+IN_DEGREES = {"angle": "deg", "angular velocity": "deg/s", "angular acceleration": "deg/s2"}
+#: Columns of translations in OpenSim's tables, such as pelvis_tx and /jointset/ground_pelvis/pelvis_tx/value.
+TRANSLATION = re.compile(r"_t[xyz](?![A-Za-z0-9])")
+
+
 def quantities_of(field: str, component: str = "") -> tuple[str, ...]:
     """The quantities that a field of a log, or one of its components, may have; none for numbers without a unit.
 

@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
-import warnings
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
-from scipy.spatial.transform import Rotation
 
-from torchid.errors import InputError, LogError, TorchidWarning
-from torchid.logs import Log, preprocess
+from torchid.errors import LogError
+from torchid.logs import Log
 from torchid.logs.flags import hysteresis, samples_of, without_short
 from torchid.logs.log import BoolArray, FloatArray
-from torchid.problem.base_motion import BaseMotion, base_motion
-from torchid.problem.floor_pose import levelled
+from torchid.logs.spill import growing_array
+from torchid.problem.contact_slip import base_velocity, contact_velocities
+from torchid.problem.detection_motion import Prepared, prepare
 from torchid.problem.predict import force_series
 from torchid.problem.rows import RowBuilder
-from torchid.problem.samples import Samples, joint_order
-from torchid.problem.standing import stand_on_feet
+from torchid.problem.samples import Samples, concatenate
 from torchid.problem.still_contacts import keep_still
 from torchid.regressor import FrameJacobian
 from torchid.regressor.kinematics import GRAVITY_WORLD
@@ -31,9 +30,6 @@ from torchid.sensing import Contact, named_sensors
 from torchid.settings import NotNegative, Positive
 
 GRAVITY = -GRAVITY_WORLD[2]
-_RATE_SHARE = 0.2  # of the sample rate: highest cutoff
-_MAX_GAPS = 0.05  # share of a torque's samples that may be missing, and are interpolated
-_FEWEST_TORQUES = 3  # above a contact, one for each component of a force
 _DAMPING = 1e-3  # of actuators' terms, against the share that samples have of them
 _LARGEST = 1.0, 100.0, 100.0  # armature [kg m^2] and friction [N m, N m s/rad] that nothing determines
 _SIGN_WIDTH = 0.001  # rad/s, below which friction is not sure of its sign
@@ -72,16 +68,33 @@ def with_detected_contacts(
         LogError: as `detect_contacts`; wrenches without the name of a contact.
     """
     active, certain = detect_contacts(log, robot, contacts, settings or DetectionConfig())
+    bare = log.contact_wrench is None and log.contact_force_normal is None and log.contact_normal_world is None
+    names, flags = name_flags(log.source, () if bare else log.contact_names, contacts, active)
+    return dataclasses.replace(log, contact_names=names, contact_active=flags), certain
+
+
+def name_flags(
+    source: str, names: tuple[str, ...], contacts: Sequence[Contact], active: BoolArray
+) -> tuple[tuple[str, ...], BoolArray]:
+    """Names of the contacts of a log and their flags (N, C'), of flags (N, C) of the experiment's contacts.
+
+    Args:
+        source: name of the log.
+        names: of contacts of which it has readings, () without any.
+        contacts: of the experiment.
+        active: their flags.
+
+    Raises:
+        LogError: readings without the name of a contact.
+    """
     frames = tuple(contact.frame for contact in contacts)
-    if log.contact_wrench is None and log.contact_force_normal is None and log.contact_normal_world is None:
-        return dataclasses.replace(log, contact_names=frames, contact_active=active), certain
-    if missing := [frame for frame in frames if frame not in log.contact_names]:
-        raise LogError(
-            log.source, "contact_names", f"contact '{missing[0]}' missing", "every contact of the experiment"
-        )
-    flags = np.zeros((len(log), len(log.contact_names)), dtype=bool)
-    flags[:, [log.contact_names.index(frame) for frame in frames]] = active
-    return dataclasses.replace(log, contact_active=flags), certain
+    if not names:
+        return frames, active
+    if missing := [frame for frame in frames if frame not in names]:
+        raise LogError(source, "contact_names", f"contact '{missing[0]}' missing", "every contact of the experiment")
+    flags = np.zeros((len(active), len(names)), dtype=bool)
+    flags[:, [names.index(frame) for frame in frames]] = active
+    return names, flags
 
 
 class Detection(NamedTuple):
@@ -112,17 +125,48 @@ def detect_contacts(log: Log, robot: Robot, contacts: Sequence[Contact], setting
     """
     if not contacts:
         return Detection(np.zeros((len(log), 0), dtype=bool), np.ones(len(log), dtype=bool))
+    whole = prepare(log, robot, contacts, settings.cutoff_hz)
+    return detect_in_parts(lambda: [whole], whole.log.time, log.time, robot, contacts, settings)
+
+
+def detect_in_parts(
+    parts: Callable[[], Iterable[Prepared]],
+    time: FloatArray,
+    stamps: FloatArray,
+    robot: Robot,
+    contacts: Sequence[Contact],
+    settings: DetectionConfig,
+    folder: Path | None = None,
+) -> Detection:
+    """As `detect_contacts`, of a log that is prepared in successive parts.
+
+    Args:
+        parts: called for each of two passes.
+        time: (K,) [s] of all samples of the parts.
+        stamps: (N,) [s] of the log as recorded.
+        robot: the robot.
+        contacts: one or more.
+        settings: thresholds.
+        folder: with room for forces and velocities; None: in memory.
+    """
     weight = GRAVITY * float(robot.nominal[:, 0].sum())
-    known, samples, rotation = _prepared(log, robot, contacts, settings.cutoff_hz)
-    share = _normal_forces(samples, rotation, robot, contacts) / weight
-    shortest = samples_of(settings.shortest_s, known.time)
+    shares, velocities = (growing_array("contacts", folder, len(time)) for _ in range(2))
+    forces = _Forces.of(parts(), len(time), robot, contacts)
+    in_world = moves = False
+    for part in parts():
+        shares.append(forces.along_normal(part) / weight)
+        in_world, moves = (base := base_velocity(part.log, part.samples)) is not None, part.base_is_known
+        if moves:
+            velocities.append(contact_velocities(part.samples, robot, contacts, base))
+    share = shares.array()
+    shortest = samples_of(settings.shortest_s, time)
     loaded = np.stack([hysteresis(one, settings.touch, settings.lift) for one in share.T], axis=1)
-    if known.imu_frame or known.base_quat_xyzw is not None:
+    if moves:
         light = share > settings.light
-        loaded |= keep_still(known, samples, robot, contacts, loaded, light, 2 * shortest)
+        loaded |= keep_still(velocities.array(), in_world, loaded, light, 2 * shortest)
     flags = np.stack([without_short(one, shortest) for one in loaded.T], axis=1)
-    nearest = np.searchsorted(0.5 * (known.time[1:] + known.time[:-1]), log.time)
-    inside = (log.time >= known.time[0]) & (log.time <= known.time[-1])
+    nearest = np.searchsorted(0.5 * (time[1:] + time[:-1]), stamps)
+    inside = (stamps >= time[0]) & (stamps <= time[-1])
     doubtful = np.asarray((loaded & ~flags).any(axis=1))
     return Detection(flags[nearest], inside & ~doubtful[nearest])
 
@@ -151,53 +195,40 @@ def normal_forces(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz
     Raises:
         InputError: no torques, fewer than three of joints above a contact, joints that are missing, or as `preprocess`.
     """
-    known, samples, rotation = _prepared(log, robot, contacts, cutoff_hz)
-    return NormalForces(known.time, _normal_forces(samples, rotation, robot, contacts))
+    whole = prepare(log, robot, contacts, cutoff_hz)
+    forces = _Forces.of([whole], len(whole.log), robot, contacts)
+    return NormalForces(whole.log.time, forces.along_normal(whole))
 
 
-def _prepared(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: float) -> tuple[Log, Samples, FloatArray]:
-    """The preprocessed log, its samples, in which all contacts stand, and rotations (K, 3, 3) of the base."""
-    if log.joint_torque is None:
-        raise LogError(log.source, "joint_torque", "missing", "the field, from which preprocessing.detect_contacts is")
-    known = _preprocessed(log, cutoff_hz)
-    order = joint_order(known, robot)
-    position, velocity, acceleration, torque = (
-        torch.from_numpy(np.ascontiguousarray(getattr(known, f"joint_{name}")[:, order]))
-        for name in ("position", "velocity", "acceleration", "torque")
-    )
-    _require_torques(log, robot, contacts, np.isfinite(torque.numpy()).all(axis=0))
-    base, rotation = _base(known, robot, contacts)
-    in_limbs = torque.new_full((len(known), robot.n_dofs - robot.n), torch.nan)
-    samples = Samples(
-        log.source, torch.from_numpy(known.time), position, velocity, acceleration, base,
-        torch.cat([torque, in_limbs], dim=1), None, False, torch.ones(len(known), len(contacts), dtype=torch.bool),
-    )  # fmt: skip
-    return known, samples, rotation
+@dataclasses.dataclass(frozen=True)
+class _Forces:
+    """Forces along the ground's normal, with the armature and friction (m, 3) of the log's joints."""
 
+    balance: _Balance
+    actuators: FloatArray
 
-def _normal_forces(samples: Samples, rotation: FloatArray, robot: Robot, contacts: Sequence[Contact]) -> FloatArray:
-    """Forces (K, C) [N] along the ground's normal."""
-    measured = np.zeros((0, 0)) if samples.torque is None else samples.torque[:, : robot.n].numpy()
-    balance = _Balance.of(robot, contacts, measured)
-    chosen = [slice(start, start + _TOGETHER) for start in range(0, len(samples), _TOGETHER)]
-    every = slice(None, None, -(-len(samples) // _FITTED))
-    actuators = _fit_actuators([balance.equations(samples[every], rotation[every])])
-    parts = [balance.normal_forces(balance.equations(samples[x], rotation[x]), actuators) for x in chosen]
-    return np.concatenate(parts)
+    @classmethod
+    def of(cls, parts: Iterable[Prepared], count: int, robot: Robot, contacts: Sequence[Contact]) -> _Forces:
+        """Of the parts of a log of so many samples."""
+        every, start, power, chosen = -(-count // _FITTED), 0, np.zeros(robot.n), list[tuple[Samples, FloatArray]]()
+        for part in parts:
+            measured = np.full((len(part.log), robot.n), np.nan)
+            if part.samples.torque is not None:
+                measured = part.samples.torque[:, : robot.n].numpy()
+            power = power + np.square(measured).sum(axis=0)
+            some = slice(-start % every, None, every)
+            chosen.append((part.samples[some], part.rotation[some]))
+            start += len(part.log)
+        balance = _Balance.of(robot, contacts, np.sqrt(power / count))
+        samples = concatenate([samples for samples, _ in chosen])
+        rotation = np.concatenate([rotation for _, rotation in chosen])
+        return cls(balance, _fit_actuators([balance.equations(samples, rotation)]))
 
-
-def _require_torques(log: Log, robot: Robot, contacts: Sequence[Contact], measured: BoolArray) -> None:
-    """Refuse a log in which fewer than three joints above a contact have a torque, of which measured are (n,)."""
-    for contact in contacts:
-        above, body = set[str](), robot.links[contact.frame][0]
-        while (joint := robot.bodies[body].joint) is not None:
-            above.add(joint.name if joint.mimic is None else joint.mimic.master)
-            body = joint.parent
-        of_contact = [name for name, known in zip(robot.joint_names, measured, strict=True) if known and name in above]
-        if len(of_contact) < _FEWEST_TORQUES:
-            found = f"measured at {', '.join(of_contact) or 'no joint'} alone above {contact.frame}"
-            accepted = f"torques of {_FEWEST_TORQUES} joints or more above each contact, for detect_contacts"
-            raise LogError(log.source, "joint_torque", found, accepted)
+    def along_normal(self, part: Prepared) -> FloatArray:
+        """Forces (K, C) [N] of some samples."""
+        chosen = [slice(start, start + _TOGETHER) for start in range(0, len(part.log), _TOGETHER)]
+        equations = (self.balance.equations(part.samples[x], part.rotation[x]) for x in chosen)
+        return np.concatenate([self.balance.normal_forces(found, self.actuators) for found in equations])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -212,12 +243,12 @@ class _Balance:
     weight: float
 
     @classmethod
-    def of(cls, robot: Robot, contacts: Sequence[Contact], torque: FloatArray) -> _Balance:
-        """Of the joints whose torques (N, n) [N m] were measured throughout, and the base."""
-        measured = np.isfinite(torque).all(axis=0)
-        rows, torque = np.concatenate([np.ones(6, dtype=bool), measured]), torque[:, measured]
+    def of(cls, robot: Robot, contacts: Sequence[Contact], torque_rms: FloatArray) -> _Balance:
+        """Of the base, and the joints whose torques were measured throughout: those with an rms (n,) [N m]."""
+        measured = np.isfinite(torque_rms)
+        rows = np.concatenate([np.ones(6, dtype=bool), measured])
         weight = GRAVITY * float(robot.nominal[:, 0].sum())
-        of_joints = _JOINT_SHARE * float(np.sqrt(np.square(torque).mean(axis=0)).max(initial=0.0)) + 1e-6 * weight
+        of_joints = _JOINT_SHARE * float(torque_rms[measured].max(initial=0.0)) + 1e-6 * weight
         of_base = _BASE_SHARE * weight * np.array([1.0, 1.0, 1.0, _LEVER_M, _LEVER_M, _LEVER_M])
         error = np.concatenate([of_base, np.full(int(rows[6:].sum()), of_joints)])
         plain = [dataclasses.replace(contact, along_normal=False) for contact in contacts]
@@ -300,77 +331,3 @@ def _fit_actuators(parts: Sequence[_Equations]) -> FloatArray:
 def _free(contact: Contact) -> FloatArray:
     """Units of a contact's components over those of a force [1, 1/m]."""
     return np.array([1.0 if k < 3 else 1.0 / _LEVER_M for k in contact.components])
-
-
-# ------------------------------------------------------------------------------------------------- motion of the base
-
-
-def _preprocessed(log: Log, cutoff_hz: float) -> Log:
-    """The log without contacts, filtered and differentiated; gaps are interpolated."""
-    fields: dict[str, Any] = {name: None for name in vars(log) if name.startswith(("contact_", "ft_"))}
-    fields |= {"contact_names": (), "ft_names": ()}
-    filled = {
-        name: _filled(np.asarray(array, dtype=np.float64))
-        for name, array in log.arrays().items()
-        if name.startswith(("joint_", "base_", "imu_"))
-    }
-    torque = filled["joint_torque"]
-    broken = np.isnan(np.asarray(log.joint_torque)).mean(axis=0) > _MAX_GAPS
-    filled["joint_torque"] = np.where(broken, np.nan, torque)
-    rate = 1.0 / float(np.median(np.diff(log.time))) if len(log) > 1 else 1.0
-    with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore", TorchidWarning
-        )  # of noise and gaps, said where the log is read for its own sake
-        return preprocess(dataclasses.replace(log, **fields | filled), min(cutoff_hz, _RATE_SHARE * rate))
-
-
-def _base(log: Log, robot: Robot, contacts: Sequence[Contact]) -> tuple[BaseMotion, FloatArray]:
-    """Motion of the base, and its rotation (N, 3, 3) to a world with any heading."""
-    zero = np.zeros((len(log), 3))
-    if log.imu_frame:
-        motion = base_motion(log, robot)
-        if log.base_quat_xyzw is not None or motion.specific_force is None:
-            return motion, _rotation(np.asarray(log.base_quat_xyzw))
-        up = motion.specific_force.numpy()
-        rotation = levelled(up / np.maximum(np.linalg.norm(up, axis=1, keepdims=True), np.finfo(float).tiny))
-        quat = torch.from_numpy(Rotation.from_matrix(rotation).as_quat())
-        return dataclasses.replace(motion, quat_xyzw=quat), rotation
-    rates = log.base_angular_velocity_base, log.base_angular_acceleration_base
-    rotation = _if_all_stand(log, robot, contacts) if log.base_quat_xyzw is None else _rotation(log.base_quat_xyzw)
-    moved = log.base_linear_acceleration_world
-    force = np.einsum("nji,nj->ni", rotation, (zero if moved is None else moved) - np.array(GRAVITY_WORLD))
-    quat = Rotation.from_matrix(rotation).as_quat()
-    omega, alpha = (zero if rate is None else rate for rate in rates)
-    return BaseMotion(*map(torch.from_numpy, (quat, force, omega, alpha))), rotation
-
-
-def _rotation(quat: FloatArray) -> FloatArray:
-    return np.asarray(Rotation.from_quat(quat).as_matrix())
-
-
-def _if_all_stand(log: Log, robot: Robot, contacts: Sequence[Contact]) -> FloatArray:
-    """Rotations (N, 3, 3) of the base as if all feet stood, near enough for their load; else its z axis points up."""
-    frames = tuple(contact.frame for contact in contacts)
-    flags = np.ones((len(log), len(contacts)), dtype=bool)
-    bare = Log(log.source, log.time, log.joint_names, log.joint_position, contact_names=frames, contact_active=flags)
-    try:
-        quat = stand_on_feet(bare, robot, contacts).log.base_quat_xyzw
-    except InputError:
-        quat = None
-    return np.tile(np.eye(3), (len(log), 1, 1)) if quat is None else _rotation(_filled(quat))
-
-
-# ------------------------------------------------------------------------------------------------------------- signals
-
-
-def _filled(values: FloatArray) -> FloatArray:
-    """Channels (N, k) with NaN interpolated; one that is NaN throughout stays so."""
-    if not np.isnan(values).any():
-        return values
-    out, index = values.copy(), np.arange(len(values))
-    for column in out.T:
-        good = np.isfinite(column)
-        if good.any():
-            column[~good] = np.interp(index[~good], index[good], column[good])
-    return out

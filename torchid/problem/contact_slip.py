@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchid.errors import warn
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import near_contact_changes
@@ -59,11 +60,10 @@ class Slip:
 
     def __str__(self) -> str:
         """How many samples of which contacts slip, "" for none."""
-        counts, fastest = self.slips.sum(axis=0), np.nanmax(np.where(self.slips, self.speed, 0.0), axis=0, initial=0.0)
         named = [
-            f"{frame} in {count} samples (up to {most:.2g} m/s, more than {limit:.2g})"
-            for frame, count, most, limit in zip(self.frames, counts, fastest, self.limits, strict=True)
-            if count
+            f"{frame} in {own.sum()} samples (up to {speed[own].max():.2g} m/s, more than {limit:.2g})"
+            for frame, own, speed, limit in zip(self.frames, self.slips.T, self.speed.T, self.limits, strict=True)
+            if own.any()
         ]
         return ", ".join(named)
 
@@ -96,13 +96,32 @@ def measure_slip(
         base_is_derived: whether the base's motion follows from the contacts themselves.
     """
     known = None if base_is_derived else base_velocity(log, samples)
-    velocity = contact_velocities(samples, robot, contacts, known)
-    standing = _standing(samples, recorded, contacts, cutoff_hz)
-    velocity[~standing] = np.nan
-    relative = known is None and not robot.fixed_base
-    if relative:
+    away = away_from_own_changes(recorded, samples.time.cpu().numpy(), contacts, cutoff_hz)
+    speed = ground_speeds(samples, robot, contacts, known, away)
+    return judge_speeds(speed, contacts, limit, relative=known is None and not robot.fixed_base)
+
+
+def ground_speeds(
+    samples: Samples, robot: Robot, contacts: Sequence[Contact], base: Tensor | None, away: BoolArray
+) -> FloatArray:
+    """Speeds of the contacts on the ground, (N, C) [m/s], as `Slip` has them.
+
+    Args:
+        samples: of a log, or of a part of one.
+        robot: the robot.
+        contacts: of the samples.
+        base: velocity of the base's origin along its axes, (N, 3) [m/s]; None where it is not known.
+        away: which contacts are away from their own changes, (N, C), from `away_from_own_changes`.
+    """
+    velocity = contact_velocities(samples, robot, contacts, base)
+    velocity[~(samples.active.cpu().numpy() & away)] = np.nan
+    if base is None and not robot.fixed_base:
         velocity = _against_others(velocity)
-    speed = np.linalg.norm(velocity, axis=2)
+    return np.asarray(np.linalg.norm(velocity, axis=2))
+
+
+def judge_speeds(speed: FloatArray, contacts: Sequence[Contact], limit: float | None, relative: bool) -> Slip:
+    """Slip of all samples of a log, from their `ground_speeds` (N, C) [m/s]; `limit` as of `measure_slip`."""
     limits = np.full(len(contacts), np.inf if limit is None else limit)
     if limit is None:
         for contact in np.flatnonzero(np.isfinite(speed).any(axis=0)):
@@ -150,18 +169,31 @@ def contact_velocities(samples: Samples, robot: Robot, contacts: Sequence[Contac
     return out
 
 
-def _standing(samples: Samples, recorded: Log, contacts: Sequence[Contact], cutoff_hz: float | None) -> BoolArray:
-    """Which contacts stand and are away from their own changes, (N, C)."""
-    time, standing = samples.time.cpu().numpy(), samples.active.cpu().numpy().copy()
+def away_from_own_changes(
+    recorded: Log, time: FloatArray, contacts: Sequence[Contact], cutoff_hz: float | None
+) -> BoolArray:
+    """Which contacts are away from their own changes, as recorded, at stamps (N,) [s] of a preprocessed log, (N, C)."""
+    away = np.ones((len(time), len(contacts)), dtype=bool)
     margin = _STENCIL * float(np.median(np.diff(recorded.time))) + (0.0 if cutoff_hz is None else 1.0 / cutoff_hz)
     if recorded.contact_active is None:
-        return np.asarray(standing)
+        return away
     for index, contact in enumerate(contacts):
         if contact.frame in recorded.contact_names:
             own = recorded.contact_active[:, [recorded.contact_names.index(contact.frame)]]
             alone = dataclasses.replace(recorded, contact_active=np.repeat(own, len(recorded.contact_names), axis=1))
-            standing[:, index] &= ~near_contact_changes(alone, time, margin)
-    return np.asarray(standing)
+            away[:, index] = ~near_contact_changes(alone, time, margin)
+    return away
+
+
+def warn_of_slip(slip: Slip, source: str) -> None:
+    """Say in which samples of a log contacts slip, which are dropped, or that nothing says whether they do."""
+    slipping = slip.slips.any(axis=1)
+    if not slip.checked:
+        needed = "needs the base's linear velocity or two contacts that stand"
+        warn(f"{source}: slip is not checked: it {needed}, away from changes of contact")
+    elif slipping.any():
+        count = f"{int(slipping.sum())} of {len(slip.speed)} samples dropped, in which contacts slip"
+        warn(f"{source}: {count}: {slip}; null as preprocessing.max_slip keeps them")
 
 
 def _against_others(velocity: FloatArray) -> FloatArray:

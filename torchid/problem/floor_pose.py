@@ -36,12 +36,8 @@ class Foot:
     points: FloatArray
 
     @classmethod
-    def of(cls, contact: Contact, pose: FloatArray, active: BoolArray) -> Foot:
-        """A foot with poses (N, 4, 4) in the base.
-
-        Raises:
-            LogError: a flat foot without an axis along the floor's normal.
-        """
+    def of(cls, contact: Contact, pose: FloatArray, sole_axis: int = 2) -> Foot:
+        """A foot with poses (N, 4, 4) in the base; `sole_axis` of a flat one's frame is along the floor's normal."""
         rotation, origin = pose[:, :3, :3], pose[:, :3, 3]
         axes = np.eye(3)
         if contact.kind == "point":
@@ -49,16 +45,22 @@ class Foot:
         elif contact.kind == "line":
             local = np.outer([1.0, -1.0], axes["xyz".index(contact.line_axis)])
         else:
-            across = np.delete(axes, _sole_axis(contact, rotation[active], origin[active]), axis=0)
+            across = np.delete(axes, sole_axis, axis=0)
             local = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]]) @ across
         return cls(contact, rotation, origin[:, None] + (_HALF_FOOT_M * local) @ rotation.swapaxes(1, 2))
 
 
-def _sole_axis(contact: Contact, rotation: FloatArray, origin: FloatArray) -> int:
-    """The axis of a flat foot's frame that is nearest to the way from the foot up to the base while it stands."""
-    if not len(origin):
-        return 2
-    way = -np.einsum("nji,nj->ni", rotation, origin).mean(axis=0)
+def ways_up(pose: FloatArray) -> FloatArray:
+    """Ways (N, 3) [m] from a foot with poses (N, 4, 4) in the base up to the base's origin, along the foot's axes."""
+    return np.asarray(-np.einsum("nji,nj->ni", pose[:, :3, :3], pose[:, :3, 3]))
+
+
+def find_sole_axis(contact: Contact, way: FloatArray) -> int:
+    """The axis of a flat foot's frame that is nearest to the way (3,) from the foot up to the base while it stands.
+
+    Raises:
+        LogError: none is near.
+    """
     share = np.abs(way) / max(float(np.linalg.norm(way)), np.finfo(float).tiny)
     axis = int(share.argmax())
     if share[axis] < _ALONG:
@@ -114,6 +116,28 @@ def _fit_planes(points: FloatArray, radius: FloatArray) -> tuple[FloatArray, Flo
     return up, on_plane.mean(axis=1), values
 
 
+@dataclass(frozen=True)
+class Footing:
+    """Feet of N successive samples above their floor, in the base frame; `points`: of all feet, (N, P, 3) [m]."""
+
+    feet: Sequence[Foot]
+    points: FloatArray
+    floor: Floor
+
+    @classmethod
+    def of(cls, feet: Sequence[Foot], stands: BoolArray) -> Footing:
+        """Of feet of whose P points these stand, (N, P)."""
+        points = np.concatenate([foot.points for foot in feet], axis=1)
+        radius = np.concatenate([np.full(foot.points.shape[1], foot.contact.radius) for foot in feet])
+        return cls(feet, points, fit_floors(points, radius, stands))
+
+    def __getitem__(self, samples: slice) -> Footing:
+        """Some of the samples."""
+        feet = [Foot(foot.contact, foot.rotation[samples], foot.points[samples]) for foot in self.feet]
+        floor = Floor(self.floor.up[samples], self.floor.height[samples], self.floor.uneven[samples])
+        return Footing(feet, self.points[samples], floor)
+
+
 def split_at_lost_feet(stands: BoolArray, known: BoolArray) -> Iterator[list[slice]]:
     """Runs of samples on the same feet, grouped where two points or more stand on both sides of a change."""
     changes = (stands[1:] != stands[:-1]).any(axis=1) | (known[1:] != known[:-1])
@@ -133,16 +157,10 @@ def split_at_lost_feet(stands: BoolArray, known: BoolArray) -> Iterator[list[sli
 class Walk:
     """Heading and place of a base above feet that keep theirs, or roll, while they stand."""
 
-    def __init__(
-        self, feet: Sequence[Foot], points: FloatArray, stands: BoolArray, floor: Floor, normal: Sequence[float]
-    ) -> None:
-        """Stand on the feet with `points` (N, P, 3) [m] that stand when, (N, P), on a floor with a normal (3,)."""
-        self._feet, self._stands = feet, stands
-        self._normal = np.array(normal)
-        self._levelled = levelled(floor.up)  # (N, 3, 3), base to floor but for the heading
-        self._flat = np.einsum("nij,npj->npi", self._levelled, points)[..., :2]
-        self._height = floor.height
-        self._places = np.full((points.shape[1], 2), np.nan)  # where points stood at the end of the last stretch
+    def __init__(self, stands: BoolArray, normal: Sequence[float]) -> None:
+        """Stand on feet of whose P points these stand, (N, P), on a floor with a normal (3,)."""
+        self._stands, self._normal = stands, np.array(normal)
+        self._places = np.full((stands.shape[1], 2), np.nan)  # where points stood at the last sample so far
         self._last = 0  # first sample after it
 
     def begin(self, start: int) -> bool:
@@ -151,56 +169,57 @@ class Walk:
         self._places[~stayed] = np.nan
         return bool(np.isfinite(self._places).all(axis=1).sum() >= 2)
 
-    def along(self, runs: Sequence[slice]) -> tuple[FloatArray, FloatArray]:
-        """Rotations (M, 3, 3) to the world and positions (M, 3) [m] in it, along the runs of a stretch."""
-        samples = slice(runs[0].start, runs[-1].stop)
-        rolled = np.zeros_like(self._flat[samples])
-        rolling = [foot.contact.radius > 0.0 for foot in self._feet]
+    def along(self, runs: Sequence[slice], footing: Footing) -> tuple[FloatArray, FloatArray]:
+        """Rotations (M, 3, 3) to the world and positions (M, 3) [m] in it, along the runs of a stretch.
+
+        A stretch may be walked in parts, of which each begins with the last sample of the part before.
+
+        Args:
+            runs: of samples on the same feet, without a gap.
+            footing: of their M samples.
+        """
+        levelled_base = levelled(footing.floor.up)  # base to floor but for the heading
+        flat = np.einsum("nij,npj->npi", levelled_base, footing.points)[..., :2]
+        rolled = np.zeros_like(flat)
+        rolling = [foot.contact.radius > 0.0 for foot in footing.feet]
         for _ in range(_PASSES):
-            yaw, place, places = self._follow(runs, rolled)
-            rotation = _about_z(yaw) @ self._levelled[samples]
+            yaw, place, places = self._follow(runs, levelled_base, flat, rolled)
+            rotation = _about_z(yaw) @ levelled_base
             if not any(rolling):
                 break
-            before, rolled = rolled, self._rolled(rotation, samples)
+            before, rolled = rolled, _rolled(footing.feet, rotation)
             if np.abs(rolled - before).max() < _SETTLED_M:
                 break
-        self._places, self._last = places, samples.stop
+        self._places, self._last = places, runs[-1].stop
         to_world = _rotation_between(np.array(UP), self._normal)
-        position = np.concatenate([place, self._height[samples, None]], axis=1)
+        position = np.concatenate([place, footing.floor.height[:, None]], axis=1)
         return to_world @ rotation, position @ to_world.T
 
-    def _follow(self, runs: Sequence[slice], rolled: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _follow(
+        self, runs: Sequence[slice], levelled_base: FloatArray, flat: FloatArray, rolled: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Headings (M,) and places (M, 2) [m] of the base, and final ones (P, 2) of points that have rolled so far."""
         offset, anchor = runs[0].start, self._places - rolled[0]
         yaw, place = np.empty(len(rolled)), np.empty((len(rolled), 2))
         for run in runs:
             stands, own = self._stands[run.start], slice(run.start - offset, run.stop - offset)
-            flat = self._flat[run][:, stands]
+            standing = flat[own][:, stands]
             known = np.isfinite(anchor[stands]).all(axis=1)
             start = rolled[own.start][stands]
             if known.sum() >= 2:
-                turn, shift = _align(flat[:1, known], (anchor[stands] + start)[None, known])
+                turn, shift = _align(standing[:1, known], (anchor[stands] + start)[None, known])
             else:
-                turn, shift = np.array([self._first_yaw(run.start)]), np.zeros((1, 2))
+                turn, shift = np.array([self._first_yaw(levelled_base[own.start])]), np.zeros((1, 2))
                 known[:] = False
-            placed = (_about_z(turn)[:, :2, :2] @ flat[0].T)[0].T + shift - start
+            placed = (_about_z(turn)[:, :2, :2] @ standing[0].T)[0].T + shift - start
             anchor[stands] = np.where(known[:, None], anchor[stands], placed)
             anchor[~stands] = np.nan
-            yaw[own], place[own] = _align(flat, anchor[stands] + rolled[own][:, stands])
+            yaw[own], place[own] = _align(standing, anchor[stands] + rolled[own][:, stands])
         return yaw, place, anchor + rolled[-1]
 
-    def _rolled(self, rotation: FloatArray, samples: slice) -> FloatArray:
-        """How far points have rolled along the floor since a stretch began, (M, P, 2) [m]."""
-        out = []
-        for foot in self._feet:
-            turned = rotation @ foot.rotation[samples]
-            far = rolled_distance(turned, foot.contact.radius, np.array(UP), foot.contact.rolling_axis)
-            out.append(np.repeat(far[:, None, :2], foot.points.shape[1], axis=1))
-        return np.concatenate(out, axis=1)
-
-    def _first_yaw(self, sample: int) -> float:
+    def _first_yaw(self, levelled_base: FloatArray) -> float:
         """The heading at which the base's x axis has no part along the world's y axis, and looks along its x axis."""
-        forward = self._levelled[sample][:, 0]
+        forward = levelled_base[:, 0]
         sideways, ahead = _rotation_between(np.array(UP), self._normal)[1::-1]  # the world's y and x axis by the floor
         a = sideways[0] * forward[0] + sideways[1] * forward[1]
         b = sideways[1] * forward[0] - sideways[0] * forward[1]
@@ -208,6 +227,21 @@ class Walk:
         middle, half = np.arctan2(b, a), np.arccos(np.clip(-sideways[2] * forward[2] / size, -1.0, 1.0))
         both = [float(middle + half), float(middle - half)]
         return max(both, key=lambda yaw: float(ahead @ (_about_z(np.array([yaw]))[0] @ forward)))
+
+
+def _rolled(feet: Sequence[Foot], rotation: FloatArray) -> FloatArray:
+    """How far the points of feet have rolled along the floor since the first sample, (M, P, 2) [m].
+
+    Args:
+        feet: at M samples.
+        rotation: of the base to the floor, (M, 3, 3).
+    """
+    out = []
+    for foot in feet:
+        turned = rotation @ foot.rotation
+        far = rolled_distance(turned, foot.contact.radius, np.array(UP), foot.contact.rolling_axis)
+        out.append(np.repeat(far[:, None, :2], foot.points.shape[1], axis=1))
+    return np.concatenate(out, axis=1)
 
 
 def levelled(up: FloatArray) -> FloatArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +16,16 @@ from torchid.logs import Log
 from torchid.logs.log import NORMALS, BoolArray, FloatArray
 from torchid.logs.quaternion import make_sign_continuous
 from torchid.logs.stretches import preprocess_stretches
-from torchid.problem.floor_pose import FEWEST_POINTS, Foot, Walk, fit_floors, split_at_lost_feet
+from torchid.problem.floor_pose import (
+    FEWEST_POINTS,
+    Foot,
+    Footing,
+    Walk,
+    find_sole_axis,
+    points_of,
+    split_at_lost_feet,
+    ways_up,
+)
 from torchid.problem.samples import joint_order
 from torchid.robot import Robot
 from torchid.sensing import Contact
@@ -31,21 +40,30 @@ _HEADING_TOLERANCE = 0.02  # of a recorded normal's components against the state
 
 
 @dataclass(frozen=True)
-class StandingBase:
-    """A log with the pose of the base wherever enough feet stand.
+class Stretches:
+    """Where enough feet of a log stand to say how its base does.
 
     Attributes:
-        log: with `base_quat_xyzw` and `base_position_world`, NaN where they are not known, and no other motion of the
-            base.
         stretches: of successive samples with a pose; nothing may be differentiated across their ends.
         dropped: number of samples without a pose, by the reason.
         uneven: rms distance of the feet that stand from one floor [m].
     """
 
-    log: Log
     stretches: tuple[slice, ...]
     dropped: dict[str, int]
     uneven: float
+
+
+@dataclass(frozen=True)
+class StandingBase(Stretches):
+    """A log with the pose of the base wherever enough feet stand.
+
+    Attributes:
+        log: with `base_quat_xyzw` and `base_position_world`, NaN where they are not known, and no other motion of the
+            base.
+    """
+
+    log: Log
 
 
 def preprocess_standing(
@@ -74,16 +92,21 @@ def preprocess_standing(
     """
     standing = stand_on_feet(log, robot, contacts)
     out, too_short = preprocess_stretches(standing.log, standing.stretches, cutoff_hz, sample_rate_hz, sign_width)
+    warn_of_standing(log.source, len(log), standing, too_short)
+    return out
+
+
+def warn_of_standing(source: str, count: int, standing: Stretches, too_short: int) -> None:
+    """Say which of so many samples are left out, some in stretches that are too short, and whether feet are uneven."""
     dropped = standing.dropped | ({"stretches too short to differentiate": too_short} if too_short else {})
     if dropped:
-        reasons = ", ".join(f"{reason}: {count}" for reason, count in dropped.items())
-        what = f"{sum(dropped.values())} of {len(log)} samples left out, base motion unknown"
-        warn(f"{log.source}: base_motion contacts: {what} ({reasons})")
+        reasons = ", ".join(f"{reason}: {number}" for reason, number in dropped.items())
+        what = f"{sum(dropped.values())} of {count} samples left out, base motion unknown"
+        warn(f"{source}: base_motion contacts: {what} ({reasons})")
     if standing.uneven > _MAX_UNEVEN_M:
         what = f"feet that stand are {1e3 * standing.uneven:.2g} mm (rms) off one floor"
         advice = "check joint zeros, contact flags, contacts' frames and radii"
-        warn(f"{log.source}: base_motion contacts: {what}; {advice}")
-    return out
+        warn(f"{source}: base_motion contacts: {what}; {advice}")
 
 
 def longest_standing(log: Log, robot: Robot, contacts: Sequence[Contact]) -> Log:
@@ -112,60 +135,125 @@ def stand_on_feet(log: Log, robot: Robot, contacts: Sequence[Contact]) -> Standi
         LogError: joints or contacts that are missing, no sample with enough feet, a foot without an axis along the
             normal, or readings along axes of a world whose heading nobody knows.
     """
-    frames = [contact.frame for contact in contacts]
-    active = _flags(log, contacts)
-    _require_no_heading(log, contacts)
+    active = standing_flags(log.source, log.contact_names, log.contact_active, contacts)
+    normals = None if log.contact_active is None else log.contact_normal_world
+    require_no_heading(log.source, log.contact_wrench_world is not None)
+    require_floor_normals(log.source, log.contact_names, normals, active, contacts)
     with about_file(log.source):
-        poses = _poses(log, robot, frames)
-        feet = [Foot.of(contact, poses[contact.frame], active[:, i]) for i, contact in enumerate(contacts)]
-    points = np.concatenate([foot.points for foot in feet], axis=1)
-    radius = np.concatenate([np.full(foot.points.shape[1], foot.contact.radius) for foot in feet])
-    stands = np.repeat(active, [foot.points.shape[1] for foot in feet], axis=1)
-    floor = fit_floors(points, radius, stands)
-    known = np.isfinite(floor.height)
-    few = int((stands.sum(axis=1) < FEWEST_POINTS).sum())
-    dropped = {"too few feet stand": few, "feet in a line": int((~known).sum()) - few}
-    _require_some(log, active, known, few)
-    normal = contacts[0].normal
-    walk = Walk(feet, points, stands, floor, normal)
-    rotation, position = np.full((len(log), 3, 3), np.nan), np.full((len(log), 3), np.nan)
-    stretches: list[slice] = []
-    for runs in split_at_lost_feet(stands, known):
-        samples = slice(runs[0].start, runs[-1].stop)
-        if walk.begin(samples.start) or normal == UP or not stretches:
-            rotation[samples], position[samples] = walk.along(runs)
-            stretches.append(samples)
-        else:
-            lost = "heading on a floor that is not level"
-            dropped[lost] = dropped.get(lost, 0) + samples.stop - samples.start
-    quat = np.full((len(log), 4), np.nan)
-    for samples in stretches:
-        quat[samples] = make_sign_continuous(Rotation.from_matrix(rotation[samples]).as_quat())
+        poses = feet_poses(log, robot, contacts)
+        soles = [ways_up(poses[x.frame])[active[:, i]] for i, x in enumerate(contacts)]
+        axes = sole_axes(contacts, [way.mean(axis=0) if len(way) else None for way in soles])
+        feet = [Foot.of(x, poses[x.frame], axis) for x, axis in zip(contacts, axes, strict=True)]
+    whole = Footing.of(feet, points_that_stand(active, contacts))
+    quat, position = np.full((len(log), 4), np.nan), np.full((len(log), 3), np.nan)
+
+    def add(samples: slice, turned: FloatArray, placed: FloatArray) -> None:
+        quat[samples], position[samples] = turned, placed
+
+    found = stand_in_parts(log.source, contacts, active, whole.__getitem__, [slice(0, len(log))], add)
     fields: dict[str, Any] = {name: None for name in vars(log) if name.startswith(("base_", "imu_"))} | {
         "imu_frame": ""
     }
     fields |= {"base_quat_xyzw": quat, "base_position_world": position, NORMALS: None}
-    uneven = float(np.sqrt(np.nanmean(np.square(floor.uneven))))
+    return StandingBase(found.stretches, found.dropped, found.uneven, dataclasses.replace(log, **fields))
+
+
+def stand_in_parts(
+    source: str,
+    contacts: Sequence[Contact],
+    active: BoolArray,
+    footing: Callable[[slice], Footing],
+    parts: Sequence[slice],
+    add: Callable[[slice, FloatArray, FloatArray], None],
+) -> Stretches:
+    """As `stand_on_feet`, of a log whose feet are worked out part by part.
+
+    Args:
+        source: name of the log.
+        contacts: its feet, C of them.
+        active: which stand, (N, C).
+        footing: of successive samples.
+        parts: all samples; nothing but flags and heights above the floor is kept from one to the next.
+        add: called with successive samples, their quaternions (M, 4) and positions (M, 3) [m].
+    """
+    stands = points_that_stand(active, contacts)
+    known, uneven, counted = np.zeros(len(active), dtype=bool), 0.0, 0
+    for part in parts:
+        floor = footing(part).floor
+        known[part] = np.isfinite(floor.height)
+        uneven += float(np.square(floor.uneven[known[part]]).sum())
+        counted += int(known[part].sum())
+    few = int((stands.sum(axis=1) < FEWEST_POINTS).sum())
+    dropped = {"too few feet stand": few, "feet in a line": int((~known).sum()) - few}
+    _require_some(source, active, known, few)
+    normal = contacts[0].normal
+    walk = Walk(stands, normal)
+    stretches: list[slice] = []
+    for runs in split_at_lost_feet(stands, known):
+        samples = slice(runs[0].start, runs[-1].stop)
+        if walk.begin(samples.start) or normal == UP or not stretches:
+            _walk_along(walk, runs, footing, [part.start for part in parts], add)
+            stretches.append(samples)
+        else:
+            lost = "heading on a floor that is not level"
+            dropped[lost] = dropped.get(lost, 0) + samples.stop - samples.start
     named = {reason: count for reason, count in dropped.items() if count}
-    return StandingBase(dataclasses.replace(log, **fields), tuple(stretches), named, uneven)
+    return Stretches(tuple(stretches), named, float(np.sqrt(uneven / max(counted, 1))))
+
+
+def _walk_along(
+    walk: Walk,
+    runs: Sequence[slice],
+    footing: Callable[[slice], Footing],
+    starts: Sequence[int],
+    add: Callable[[slice, FloatArray, FloatArray], None],
+) -> None:
+    """Walk along a stretch, in parts that begin at some of the samples `starts`."""
+    first, last = runs[0].start, runs[-1].stop
+    borders = [first, *(start for start in starts if first < start < last), last]
+    before: FloatArray | None = None
+    for start, stop in zip(borders, borders[1:], strict=False):
+        begin = start if before is None else start - 1  # where the part before has ended
+        own = [slice(max(run.start, begin), min(run.stop, stop)) for run in runs if run.stop > begin < stop > run.start]
+        rotation, position = walk.along(own, footing(slice(begin, stop)))
+        quat = make_sign_continuous(Rotation.from_matrix(rotation).as_quat())
+        if before is not None and float(quat[0] @ before) < 0.0:
+            quat = -quat
+        before = quat[-1]
+        add(slice(start, stop), quat[start - begin :], position[start - begin :])
 
 
 # ------------------------------------------------------------------------------------------------- what a log must have
 
 
-def _flags(log: Log, contacts: Sequence[Contact]) -> BoolArray:
-    """Which contacts stand, (N, C)."""
-    if log.contact_active is None:
+def standing_flags(
+    source: str, names: Sequence[str], flags: BoolArray | None, contacts: Sequence[Contact]
+) -> BoolArray:
+    """Which contacts stand, (N, C), by the flags of a log whose contacts have these names; LogError without any."""
+    if flags is None:
         accepted = "(N, C) bool: which contact stands when; base_motion: contacts follows from it"
-        raise LogError(log.source, "contact_active", "missing", accepted)
+        raise LogError(source, "contact_active", "missing", accepted)
     for contact in contacts:
-        if contact.frame not in log.contact_names:
+        if contact.frame not in names:
             accepted = "every contact of the experiment"
-            raise LogError(log.source, "contact_names", f"contact '{contact.frame}' missing", accepted)
-    return log.contact_active[:, [log.contact_names.index(contact.frame) for contact in contacts]]
+            raise LogError(source, "contact_names", f"contact '{contact.frame}' missing", accepted)
+    return flags[:, [list(names).index(contact.frame) for contact in contacts]]
 
 
-def _require_some(log: Log, active: BoolArray, known: BoolArray, few: int) -> None:
+def points_that_stand(active: BoolArray, contacts: Sequence[Contact]) -> BoolArray:
+    """Which points of contacts stand that are active, (N, P)."""
+    return np.repeat(active, [points_of(contact) for contact in contacts], axis=1)
+
+
+def sole_axes(contacts: Sequence[Contact], ways: Sequence[FloatArray | None]) -> list[int]:
+    """Axes along the normals of flat feet, from the mean ways up (3,) while they stand; z where one never does."""
+    return [
+        2 if way is None or contact.kind != "flat" else find_sole_axis(contact, way)
+        for contact, way in zip(contacts, ways, strict=True)
+    ]
+
+
+def _require_some(source: str, active: BoolArray, known: BoolArray, few: int) -> None:
     """Refuse a log in whose samples nothing says how the base stands."""
     if known.any():
         return
@@ -177,26 +265,33 @@ def _require_some(log: Log, active: BoolArray, known: BoolArray, few: int) -> No
     else:
         found = "the feet that stand are in a line, about which the base may turn"
     accepted = f"{FEET} on the floor, or preprocessing.base_motion: null for a log with the base's motion"
-    raise LogError(log.source, "contact_active", f"{found}, though preprocessing.base_motion is contacts", accepted)
+    raise LogError(source, "contact_active", f"{found}, though preprocessing.base_motion is contacts", accepted)
 
 
-def _require_no_heading(log: Log, contacts: Sequence[Contact]) -> None:
-    """Refuse readings along axes of the world, or of the floor, that the feet do not know."""
-    if log.contact_wrench_world is not None:
+def require_no_heading(source: str, in_world: bool) -> None:
+    """Refuse readings along axes of the world, whose heading the feet do not know."""
+    if in_world:
         found = "given, but preprocessing.base_motion: contacts knows no heading in the world"
-        raise LogError(log.source, "contact_wrench_world", found, "contact_wrench_local, or a log without wrenches")
-    if log.contact_normal_world is not None and log.contact_active is not None:
-        columns = [log.contact_names.index(contact.frame) for contact in contacts]
-        other = np.abs(log.contact_normal_world[:, columns] - np.array([contact.normal for contact in contacts]))
-        if (log.contact_active[:, columns] & (other > _HEADING_TOLERANCE).any(axis=2)).any():
-            found = "other normals than that of the contacts, though preprocessing.base_motion is contacts"
-            raise LogError(log.source, NORMALS, found, "contacts[].normal of the one floor, or a log without the field")
+        raise LogError(source, "contact_wrench_world", found, "contact_wrench_local, or a log without wrenches")
 
 
-def _poses(log: Log, robot: Robot, frames: Sequence[str]) -> dict[str, FloatArray]:
-    """Poses (N, 4, 4) of frames in the base."""
+def require_floor_normals(
+    source: str, names: Sequence[str], normals: FloatArray | None, active: BoolArray, contacts: Sequence[Contact]
+) -> None:
+    """Refuse recorded normals (N, C', 3) of contacts of these names that are not that of the floor."""
+    if normals is None:
+        return
+    columns = [list(names).index(contact.frame) for contact in contacts]
+    other = np.abs(normals[:, columns] - np.array([contact.normal for contact in contacts]))
+    if (active & (other > _HEADING_TOLERANCE).any(axis=2)).any():
+        found = "other normals than that of the contacts, though preprocessing.base_motion is contacts"
+        raise LogError(source, NORMALS, found, "contacts[].normal of the one floor, or a log without the field")
+
+
+def feet_poses(log: Log, robot: Robot, contacts: Sequence[Contact]) -> dict[str, FloatArray]:
+    """Poses (N, 4, 4) of the contacts' frames in the base."""
     position, parts = log.joint_position[:, joint_order(log, robot)], []
     for start in range(0, len(log), _POSES_TOGETHER):
         poses = robot.link_poses(torch.from_numpy(position[start : start + _POSES_TOGETHER]))
-        parts.append({frame: poses[frame].numpy() for frame in frames})
-    return {frame: np.concatenate([part[frame] for part in parts]) for frame in frames}
+        parts.append({contact.frame: poses[contact.frame].numpy() for contact in contacts})
+    return {frame: np.concatenate([part[frame] for part in parts]) for frame in parts[0]}

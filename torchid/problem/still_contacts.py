@@ -2,50 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from torchid.logs import Log
 from torchid.logs.flags import runs
 from torchid.logs.log import BoolArray, FloatArray
-from torchid.problem.contact_slip import base_velocity, contact_velocities
-from torchid.problem.samples import Samples
-from torchid.robot import Robot
-from torchid.sensing import Contact
 
 LEAST_LIMIT = 0.01
 """Speed [m/s] below which a contact always counts as still: what soft ground and filters leave of a stance."""
 
+_TOGETHER = 1 << 16  # samples whose speeds are worked out at once
 _MEDIANS = 2.0  # of the speed of contacts that surely stand, which is noise
 
 
 def keep_still(
-    log: Log,
-    samples: Samples,
-    robot: Robot,
-    contacts: Sequence[Contact],
-    standing: BoolArray,
-    possible: BoolArray,
-    shortest: int,
+    velocity: FloatArray, in_world: bool, standing: BoolArray, possible: BoolArray, shortest: int
 ) -> BoolArray:
     """Which contacts that may stand move no faster than those that surely do, for some samples at least, (N, C).
 
-    Speeds are those in the world where the log has the velocity of its base, else those against the median of the
-    other contacts that surely stand.
-
     Args:
-        log: preprocessed.
-        samples: bound from it, one for one, with the angular velocity of the base.
-        robot: the robot.
-        contacts: of the samples.
+        velocity: of the contacts (N, C, 3) [m/s], from `contact_velocities`.
+        in_world: whether that is in the world, as the log has the velocity of its base; else speeds are those against
+            the median of the other contacts that surely stand.
         standing: those that surely stand, (N, C).
         possible: those that may stand, (N, C).
         shortest: samples in a row.
     """
-    known = base_velocity(log, samples)
-    velocity = contact_velocities(samples, robot, contacts, known)
-    speed = np.linalg.norm(velocity if known is not None else _against_standing(velocity, standing), axis=2)
+    speed = np.empty(standing.shape)
+    for start in range(0, len(speed), _TOGETHER):
+        part = slice(start, start + _TOGETHER)
+        seen = velocity[part] if in_world else _against_standing(velocity[part], standing[part])
+        speed[part] = np.linalg.norm(seen, axis=2)
     noise = speed[standing & np.isfinite(speed)]
     limit = max(LEAST_LIMIT, _MEDIANS * float(np.median(noise))) if len(noise) else LEAST_LIMIT
     with np.errstate(invalid="ignore"):

@@ -198,6 +198,16 @@ def _check_link(path: Path, link: etree._Element) -> None:
         raise UrdfError(path, field, f"no {', '.join(missing)}", "all six numbers of <inertia> [kg m^2]")
 
 
+def fixed_joints(path: Path) -> dict[str, str]:
+    """Children of the fixed joints of a URDF that has been read, by joint."""
+    found = parse_xml(path).getroot().findall("joint")
+    return {
+        joint.get("name", ""): child.get("link", "")
+        for joint in found
+        if joint.get("type") == "fixed" and (child := joint.find("child")) is not None
+    }
+
+
 def position_limits(path: Path) -> dict[str, tuple[float, float]]:
     """Lowest and highest position [rad or m] of the joints that have limits, by name.
 

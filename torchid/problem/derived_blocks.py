@@ -1,0 +1,213 @@
+"""Contact flags and the base's motion of a log that is read block by block, worked out of its other fields."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchid.errors import LogError
+from torchid.logs import Log
+from torchid.logs.blocks import LogBlocks
+from torchid.logs.coverage import Coverage
+from torchid.logs.filled_gaps import GapsFilled
+from torchid.logs.log import CONTACT_READINGS, NORMALS, WRENCHES, BoolArray, FloatArray
+from torchid.logs.names import parse_names
+from torchid.logs.preprocess import gapless_fields, lacks_derivatives, make_timeline, move_to_timeline
+from torchid.logs.spill import Filled, Spill, growing_array
+from torchid.logs.timeline import SPLINE_BLOCK
+from torchid.problem.contact_detection import Detection, DetectionConfig, detect_in_parts, name_flags
+from torchid.problem.detection_motion import (
+    MAX_GAPS,
+    Prepared,
+    bind_for_detection,
+    detection_cutoff_hz,
+    for_detection,
+    quiet,
+    require_torque,
+)
+from torchid.problem.floor_pose import Foot, Footing, ways_up
+from torchid.problem.standing import (
+    Stretches,
+    feet_poses,
+    points_that_stand,
+    require_floor_normals,
+    require_no_heading,
+    sole_axes,
+    stand_in_parts,
+    standing_flags,
+)
+from torchid.robot import Robot
+from torchid.sensing import Contact
+from torchid.sensing.sensors import UP
+
+Pieces = Callable[[int], Iterator[slice]]
+"""Successive parts of so many samples, each of which fits into memory."""
+
+OF_MOTION = ("joint_position", "joint_velocity", "joint_acceleration", "base_", "imu_")
+"""How names of fields of the motion begin."""
+
+
+def motion_fields(blocks: LogBlocks, *more: str) -> tuple[str, ...]:
+    """Names of the fields of a log that are its motion, and others that it has."""
+    return tuple(name for name in blocks.fields if name.startswith((*OF_MOTION, *more)))
+
+
+def contact_names(blocks: LogBlocks) -> tuple[str, ...]:
+    """Names of a log's contacts."""
+    return parse_names("contact_names", blocks.names["contact_names"]) if "contact_names" in blocks.names else ()
+
+
+# ---------------------------------------------------------------------------------------------------- detected contacts
+
+
+def detect_in_blocks(
+    blocks: LogBlocks,
+    robot: Robot,
+    contacts: Sequence[Contact],
+    settings: DetectionConfig,
+    pieces: Pieces,
+    folder: Path | None,
+) -> tuple[LogBlocks, BoolArray]:
+    """As `with_detected_contacts`; three passes over motion and torques, two of which filter them.
+
+    Args:
+        blocks: the log as recorded.
+        robot: the robot.
+        contacts: that may stand, one or more.
+        settings: thresholds.
+        pieces: in which it is read.
+        folder: with room for forces and velocities of the contacts; None: in memory.
+
+    Raises:
+        InputError: as `with_detected_contacts`; a tilted floor below a base whose tilt nobody measured.
+    """
+    require_torque(blocks.source, "joint_torque" in blocks.fields)
+    _require_level_or_measured(blocks, contacts)
+    recorded = (blocks.read(piece, only=("joint_torque",)).joint_torque for piece in pieces(len(blocks)))
+    torque = GapsFilled(blocks.fields["joint_torque"], MAX_GAPS, (x for x in recorded if x is not None))
+    filled = blocks.replaced({"joint_torque": torque})
+    names = motion_fields(filled, "joint_torque")
+    first = for_detection(filled.read(slice(0, SPLINE_BLOCK), names))
+    cutoff_hz = detection_cutoff_hz(settings.cutoff_hz, blocks.time)
+    with quiet():
+        timeline = make_timeline(blocks.time, lacks_derivatives(first), cutoff_hz, None)
+    if timeline is None:
+        raise ValueError("nothing is filtered")
+    coverage = {name: Coverage.empty(torque.shape[1:]) for name in gapless_fields(first, timeline)}
+    for one in coverage.values():
+        one.add(np.where(torque.broken, np.nan, 0.0)[None], None)
+
+    def parts() -> Iterator[Prepared]:
+        for piece in pieces(len(timeline.output_stamps)):
+            samples, part = timeline.part(piece.start, piece.stop)
+            with quiet():
+                known = move_to_timeline(for_detection(filled.read(samples, names)), part, coverage)
+            yield bind_for_detection(known, robot, contacts)
+
+    time = timeline.stamps_of(blocks.time)
+    return _with_flags(blocks, contacts, detect_in_parts(parts, time, blocks.time, robot, contacts, settings, folder))
+
+
+def _require_level_or_measured(blocks: LogBlocks, contacts: Sequence[Contact]) -> None:
+    """Refuse a tilted floor where nobody measured the base's tilt: its heading there follows from the whole log."""
+    measured = "imu_frame" in blocks.names or any(name.startswith("base_quat") for name in blocks.fields)
+    if not measured and any(contact.normal != UP for contact in contacts):
+        found = "missing, with detect_contacts on a tilted floor in a log that is not in memory at once"
+        accepted = "the base's orientation or an IMU, a larger preprocessing.memory_gb, or parts of the log"
+        raise LogError(blocks.source, "base_quat_xyzw", found, accepted)
+
+
+def _with_flags(blocks: LogBlocks, contacts: Sequence[Contact], found: Detection) -> tuple[LogBlocks, BoolArray]:
+    """The log with the flags that were found."""
+    has_readings = any(name in blocks.fields for name in (*CONTACT_READINGS, NORMALS))
+    given = contact_names(blocks) if has_readings else ()
+    names, flags = name_flags(blocks.source, given, contacts, found.active)
+    return blocks.replaced({"contact_active": flags}, {"contact_names": np.array(names, dtype=np.str_)}), found.certain
+
+
+# -------------------------------------------------------------------------------------------------------- standing base
+
+
+def stand_in_blocks(
+    blocks: LogBlocks, robot: Robot, contacts: Sequence[Contact], pieces: Pieces, folder: Path | None
+) -> tuple[LogBlocks, Stretches]:
+    """As `stand_on_feet`: the log with the pose of its base in the stretches where it is known; passes over the joints.
+
+    Args:
+        blocks: the log, with flags.
+        robot: the robot.
+        contacts: its feet.
+        pieces: in which it is read.
+        folder: with room for the poses; None: in memory.
+
+    Raises:
+        LogError: as `stand_on_feet`.
+    """
+    active = _active(blocks, contacts, pieces)
+    parts = list(pieces(len(blocks)))
+
+    def joints(samples: slice) -> Log:
+        return blocks.read(samples, only=("joint_position",))
+
+    axes = _sole_axes(joints, active, robot, contacts, parts)
+
+    def footing(samples: slice) -> Footing:
+        poses = feet_poses(joints(samples), robot, contacts)
+        feet = [Foot.of(x, poses[x.frame], axis) for x, axis in zip(contacts, axes, strict=True)]
+        return Footing.of(feet, points_that_stand(active[samples], contacts))
+
+    quats, positions = (growing_array(blocks.source, folder, len(blocks)) for _ in range(2))
+    length = 0
+
+    def add(samples: slice, quat: FloatArray, position: FloatArray) -> None:
+        nonlocal length
+        for grows, rows in ((quats, quat), (positions, position)):
+            _skip(grows, samples.start - length, rows.shape[1])
+            grows.append(rows)
+        length = samples.stop
+
+    found = stand_in_parts(blocks.source, contacts, active, footing, parts, add)
+    _skip(quats, len(blocks) - length, 4)
+    _skip(positions, len(blocks) - length, 3)
+    fields: dict[str, Any] = {name: None for name in (*motion_fields(blocks), NORMALS) if not name.startswith("joint_")}
+    names = {name: array for name, array in blocks.names.items() if name != "imu_frame"}
+    fields |= {"base_quat_xyzw": quats.array(), "base_position_world": positions.array()}
+    stood = blocks.replaced(fields)
+    return LogBlocks(stood.source, names, stood.time, stood.fields), found
+
+
+def _skip(grows: Filled | Spill, count: int, width: int) -> None:
+    """Add samples of which nothing is known."""
+    for start in range(0, count, SPLINE_BLOCK):
+        grows.append(np.full((min(SPLINE_BLOCK, count - start), width), np.nan))
+
+
+def _active(blocks: LogBlocks, contacts: Sequence[Contact], pieces: Pieces) -> BoolArray:
+    """Which contacts stand, (N, C), in a log whose readings need no heading of the base."""
+    require_no_heading(blocks.source, WRENCHES[1] in blocks.fields)
+    names, out = contact_names(blocks), []
+    for piece in pieces(len(blocks)):
+        log = blocks.read(piece, only=("contact_active", NORMALS))
+        active = standing_flags(blocks.source, names, log.contact_active, contacts)
+        require_floor_normals(blocks.source, names, log.contact_normal_world, active, contacts)
+        out.append(active)
+    return np.concatenate(out)
+
+
+def _sole_axes(
+    joints: Callable[[slice], Log], active: BoolArray, robot: Robot, contacts: Sequence[Contact], parts: Sequence[slice]
+) -> list[int]:
+    """Axes along the normals of flat feet, which takes a pass over the joints if there are any."""
+    sums: list[FloatArray | None] = [None] * len(contacts)
+    flat = [index for index, contact in enumerate(contacts) if contact.kind == "flat"]
+    for part in parts if flat else ():
+        poses = feet_poses(joints(part), robot, contacts)
+        for index in flat:
+            ways = ways_up(poses[contacts[index].frame])[active[part, index]]
+            if len(ways):
+                before = sums[index]
+                sums[index] = ways.sum(axis=0) if before is None else before + ways.sum(axis=0)
+    return sole_axes(contacts, sums)
