@@ -55,7 +55,8 @@ def test_a_projection_is_the_nearest_parameters_that_meet_the_conditions(prior: 
         nearest_consistent(phi, scale, conditions, prior=prior, nominal=reference, method=method) for method in METHODS
     )
     assert violations(near, scale, conditions) == []
-    assert violations(sure, scale, conditions, 1e-7) == []  # Clarabel's iterates end up to 1e-8 outside
+    outside = 1e-6 if prior == "entropic" else 1e-7  # Clarabel's iterates end up to 1e-8, with exponential cones 3e-7
+    assert violations(sure, scale, conditions, outside) == []
     nearest = distance(near)
     assert nearest == pytest.approx(distance(sure), rel=1e-6, abs=1e-9)
     np.testing.assert_allclose(near / scale, sure / scale, rtol=0.0, atol=1e-4)  # sqrt(gap)
