@@ -24,7 +24,7 @@ from torchid.fitting.experiment import Scene, set_up_scene, with_noise
 from torchid.identifiability.base_parameters import BaseParameters, base_parameters
 from torchid.parameters import WRENCH_COMPONENTS
 from torchid.problem import Samples
-from torchid.problem.chunks import chunks_by_state
+from torchid.problem.chunks import chunks_by_state, one_thread
 from torchid.problem.compression import free_parameters
 from torchid.problem.contact_state import ContactState
 from torchid.problem.extras import measured_components
@@ -156,6 +156,7 @@ class AnalysisRequest:
         )
 
 
+@one_thread()
 def analyze(config: AnalyzeConfig) -> Analysis:
     """Plan and check sensors as an experiment file says under `analysis`, and write a folder if there is an output.
 

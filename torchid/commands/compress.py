@@ -29,6 +29,7 @@ from torchid.logs.containers import FACTORS, log_files
 from torchid.logs.remote import is_url
 from torchid.logs.time_range import log_title, split_range
 from torchid.problem import Samples
+from torchid.problem.chunks import one_thread
 from torchid.problem.compressed_log import compress_log
 from torchid.problem.sampled_rows import LogElsewhere
 from torchid.report.tables import progress_bars
@@ -64,6 +65,7 @@ class Compression:
     rolling: str
 
 
+@one_thread()
 def compress(config: ExperimentConfig, output: str | Path) -> Compression:
     """Compress the training logs of an experiment and write a folder with a file for each, whole or not at all.
 

@@ -24,6 +24,7 @@ from torchid.guards import MAX_JSON, MAX_YAML, read_bytes
 from torchid.logs.time_range import split_range
 from torchid.parameters import Array
 from torchid.problem import Metrics
+from torchid.problem.chunks import one_thread
 from torchid.problem.metrics import DECISIVE_GROUPS, describe_errors
 from torchid.report.figures import error_figure, save_figure
 from torchid.report.forces import ForceSeries
@@ -91,6 +92,7 @@ class FittedRun:
     states_noise: bool
 
 
+@one_thread()
 def evaluate(
     run: str | Path, logs: Sequence[str | Path], device: str | None = None, write: bool = True
 ) -> EvaluatedRun:
@@ -149,6 +151,7 @@ def read_run(folder: Path, device: str | None = None) -> FittedRun:
     return FittedRun(experiment=experiment, calibrations=calibrations, states_noise=states)
 
 
+@one_thread()
 def evaluate_identification(run: Identification, logs: Sequence[str | Path], device: str | None = None) -> EvaluatedRun:
     """As `evaluate`, of a run that need not have been written; nothing is."""
     experiment = run.experiment

@@ -40,6 +40,7 @@ from torchid.identifiability.confounding import TotalMass
 from torchid.identifiability.contributions import Contributions, contributions
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Evaluation, LinearProblem, Metrics, RowBuilder, Samples
+from torchid.problem.chunks import one_thread
 from torchid.problem.compressed_log import Block, fold_compressed, merge_blocks
 from torchid.problem.compression import Part, compress_in_blocks, merge_folds, merge_states, split_into_folds
 from torchid.problem.contact_state import ContactState, state_name
@@ -47,6 +48,7 @@ from torchid.problem.metrics import SETS
 from torchid.report.tables import progress_bars
 
 
+@one_thread()
 def identify(config: ExperimentConfig, resume: bool = False) -> Identification:
     """Fit the parameters and write the run folder, if there is an output; of several processes, the first writes.
 

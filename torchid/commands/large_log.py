@@ -37,7 +37,7 @@ from torchid.logs.stretches import count_samples, long_stretches
 from torchid.logs.timeline import SPLINE_BLOCK, Timeline
 from torchid.problem import Samples, bind_log
 from torchid.problem.base_motion import BaseMotion
-from torchid.problem.chunks import one_thread
+from torchid.problem.chunks import one_thread, thread_count
 from torchid.problem.contact_slip import (
     away_from_own_changes,
     base_velocity,
@@ -140,7 +140,7 @@ class LargeLog:
             row, total = row_numbers(kept, mine[0][1].start if mine else 0, len(course.time))
             if mine:
                 mine[0][0].follow_signs(mine[0][1].start, max(SPLINE_BLOCK, int(BLOCK_GB * GIGABYTE / 32)))
-            threads = 0 if self.folder is not None else torch.get_num_threads()  # on a disk because memory is short
+            threads = 0 if self.folder is not None else thread_count()  # on a disk because memory is short
             read = (stretch.read(piece) for stretch, piece in mine)
             with closing(_in_threads(partial(self._bound, course), read, threads)) as bound:
                 for piece, samples in bound:

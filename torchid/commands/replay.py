@@ -17,6 +17,7 @@ from torchid.fitting.calibration import Calibration, Comparison
 from torchid.logs.time_range import split_range
 from torchid.parameters import Array
 from torchid.problem import Samples
+from torchid.problem.chunks import one_thread
 from torchid.problem.extras import ACTUATORS
 from torchid.report.drift_figure import drift_figure
 from torchid.report.figures import save_figure
@@ -98,6 +99,7 @@ class Replay:
         }
 
 
+@one_thread()
 def replay(
     run: str | Path,
     log: str | Path,

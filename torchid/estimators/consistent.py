@@ -18,6 +18,7 @@ from torchid.estimators.least_squares import ConstrainedEstimate, Regularized, r
 from torchid.estimators.ridge_limit import RidgeLimit, ridge_limit
 from torchid.parameters import Array
 from torchid.problem import LinearProblem
+from torchid.problem.chunks import one_thread
 from torchid.reprs import short_repr
 
 Method = Literal["barrier", "certified"]
@@ -81,6 +82,7 @@ class Consistent(Regularized):
             raise InputError("estimator", "certified", found, f"{how_to_install('certified')}, or barrier alone")
 
     @report_rounding("consistent")
+    @one_thread()
     def solve(self, problem: LinearProblem) -> ConsistentEstimate:
         """Fit the free parameters.
 

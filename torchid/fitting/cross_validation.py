@@ -61,6 +61,7 @@ class RidgeChoice:
         return f"{self.ridge:g}, chosen by cross-validation on blocks of the training logs"
 
 
+@one_thread()
 def cross_validate(
     logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms | None = None, loss: RobustLoss | None = None
 ) -> CrossValidation:
@@ -96,6 +97,7 @@ def cross_validate(
     return scores.cross_validation
 
 
+@one_thread()
 def choose_ridge(
     parts: Sequence[Part],
     blocks: Sequence[Block],

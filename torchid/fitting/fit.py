@@ -17,6 +17,7 @@ from torchid.identifiability.block_scatter import BlockScatter, block_scatter
 from torchid.identifiability.confounding import ExtraEstimate, estimate_extras, mass_weights
 from torchid.parameters import PER_BODY
 from torchid.problem import LinearProblem, RowBuilder, assemble
+from torchid.problem.chunks import one_thread
 from torchid.problem.compression import Part, merge_blocks_of_folds, merge_states
 from torchid.problem.elimination import Assembly
 from torchid.reprs import short_repr
@@ -108,6 +109,7 @@ class LogFitter:
         """Least squares with the estimator's ridge and rank tolerance, for what needs no conditions."""
         return LeastSquares(self.estimator.ridge, rank_tolerance=self.estimator.rank_tolerance)
 
+    @one_thread()
     def fit(self, parts: Sequence[Part], solve: Solve | None = None) -> Fit:
         """Build the problem of compressed logs and solve it.
 
@@ -165,6 +167,7 @@ class LogFitter:
         extras = estimate_extras(assembly, estimate, self.robot.body_names, self.estimator.rank_tolerance)
         return Fit(problem.parts, assembly, estimate, extras)
 
+    @one_thread()
     def fit_without_folds(self, parts: Sequence[Part]) -> list[Fit]:
         """For every fold, in order, the fit of all others; none where there is only one fold.
 

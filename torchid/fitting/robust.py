@@ -18,7 +18,7 @@ from torchid.estimators import ConstrainedEstimate
 from torchid.fitting.fit import Fit, LogFitter, Solve, with_block_errors
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples, compress_parts
-from torchid.problem.chunks import ProgressCallback
+from torchid.problem.chunks import ProgressCallback, one_thread
 from torchid.problem.compression import (
     Part,
     add_surplus,
@@ -104,6 +104,7 @@ class RobustFit:
     summary: RobustSummary
 
 
+@one_thread()
 def fit_robustly(
     logs: Sequence[Samples],
     fitter: LogFitter,

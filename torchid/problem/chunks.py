@@ -164,22 +164,37 @@ def chunk_size(device: torch.device) -> int:
 
 def worker_count(device: torch.device) -> int:
     """Default number of workers: on a CPU one per thread that torch would use, on a GPU one."""
-    return torch.get_num_threads() if device.type == "cpu" else 1
+    return thread_count() if device.type == "cpu" else 1
+
+
+def thread_count() -> int:
+    """Threads that torch would use for one operation, outside of `one_thread`."""
+    return torch.get_num_threads() if _outside is None else _outside
+
+
+_outside: int | None = None  # `thread_count` while a block runs with one thread
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
     """Run the block with one intra-op thread, of torch and of NumPy's linear algebra.
 
-    These arrays are too small to split: on a busy two-core machine two threads made evaluation eight times slower, and
-    a consistent estimate three times.
+    These arrays are too small to split: on a busy two-core machine two threads made evaluation eight times slower, a
+    consistent estimate three times, and the QR decomposition of 275 rows of 157 columns twenty times.
     """
-    before = torch.get_num_threads()
+    global _outside
+    before, outermost = torch.get_num_threads(), _outside is None
     torch.set_num_threads(1)
     try:
-        with _pools().limit(limits=1, user_api="blas"):
+        if outermost:
+            _outside = before
+            with _pools().limit(limits=1, user_api="blas"):
+                yield
+        else:
             yield
     finally:
+        if outermost:
+            _outside = None
         torch.set_num_threads(before)
 
 
