@@ -11,7 +11,6 @@ from torchid.config import ExperimentConfig, dump_config
 from torchid.estimators import ConstrainedEstimate, SgdEstimate
 from torchid.problem.metrics import SETS, WHITENED, describe_worse
 from torchid.report.tables import table_text, verdict_counts_table
-from torchid.report.tensorboard import RunEvents
 
 if TYPE_CHECKING:
     from torchid.commands.results import Identification
@@ -25,6 +24,8 @@ def write_events(run: Identification, folder: Path, figures: Mapping[str, Path])
         folder: of its files.
         figures: PNG files by name.
     """
+    from torchid.report.tensorboard import RunEvents  # takes 0.3 s, which runs that write nothing need not
+
     estimate, robot, config = run.estimate, run.experiment.robot, run.experiment.config
     epochs = estimate.epochs if isinstance(estimate, SgdEstimate) else None
     last = 1 if epochs is None else epochs

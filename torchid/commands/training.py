@@ -13,7 +13,7 @@ from dataclasses import replace
 from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
 from rich.progress import Progress
@@ -38,8 +38,10 @@ from torchid.fitting.experiment import Experiment
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, Metrics, MiniBatches, RowBuilder, Samples
 from torchid.problem.linear import parameter_scale
-from torchid.report.tensorboard import RunEvents
 from torchid.robot import Robot
+
+if TYPE_CHECKING:
+    from torchid.report.tensorboard import RunEvents
 
 Evaluate = Callable[[Array], Mapping[str, Metrics]]
 _FREE_TO_CHANGE = ("output", "overwrite")
@@ -171,6 +173,8 @@ class Training:
         """What the first process writes curves with, from an epoch on."""
         if self.folder is None or not ranks.is_first():
             return nullcontext()
+        from torchid.report.tensorboard import RunEvents  # as in `write_events`
+
         return RunEvents(self.folder, self.robot.body_names, True, since)
 
     def _share(self) -> tuple[int, int]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtri
 
 from torchid.estimators.least_squares import residual_std
 from torchid.parameters import FRICTION, INERTIAL, PER_BODY, Array
@@ -47,7 +47,7 @@ class UnfittedFriction:
         """
         if not self.combinations:
             return False
-        return self.ratio > max(_MUCH, float(stats.chi2.isf(_LEVEL, self.combinations)) / self.combinations)
+        return self.ratio > max(_MUCH, float(chdtri(self.combinations, _LEVEL)) / self.combinations)
 
     def __str__(self) -> str:
         """How much it explains, and of which joints most."""

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy.special import ndtri, stdtrit  # scipy.stats takes 0.2 s to import
 
 from torchid.estimators.least_squares import residual_std
 from torchid.identifiability.confounding import ParameterCovariance, mass_weights
@@ -23,7 +23,7 @@ MOST_BLOCKS = 100
 """Of more, neighbours count as one: the factors of a fleet's logs are more than memory has room for matrices."""
 
 _LEVERAGE = 0.95  # of the information that a block has on a combination, at most: it alone cannot say how it scatters
-_NORMAL = float(stats.norm.ppf(0.975))
+_NORMAL = float(ndtri(0.975))
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def block_scatter(
         problem.oversampling * residual_std(problem.cost(best), problem.rows, basis.shape[1], problem.oversampling) ** 2
     )
     expected = noise * (np.trace(of_rows, axis1=1, axis2=2) - (of_rows * shares).sum((1, 2))).sum()
-    factor = np.sqrt((count - 1) / count) * stats.t.ppf(0.975, count - 1) / _NORMAL
+    factor = np.sqrt((count - 1) / count) * stdtrit(count - 1, 0.975) / _NORMAL
     held = np.zeros((0, basis.shape[1])) if problem.held is None else problem.held.T @ problem.A @ basis
     without_ridge = np.concatenate([factor * _left_out(scores, shares), held]) @ basis.T
     with_ridge = without_ridge

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import welch
 
 from torchid.logs.log import FloatArray, Log
 from torchid.logs.preprocess import lacks_derivatives
@@ -98,6 +97,8 @@ def choose_cutoff(
 
 def _gain(log: Log, noise: SignalNoise, candidates: FloatArray, base_is_derived: bool) -> FloatArray:
     """By how much each cutoff (n,) [Hz] lowers the square error of accelerations, times the log's length."""
+    from scipy.signal import welch  # as in `LowPass`
+
     gain = np.zeros(len(candidates))
     rate = (len(log) - 1) / float(log.time[-1] - log.time[0])
     for values, std, order in _noisy_sources(log, noise, base_is_derived):

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.signal import welch
 
 from torchid.parameters import Array
 from torchid.report.forces import ForceSeries, largest_rows, name_row
@@ -144,6 +143,8 @@ def _spectrum(series: ForceSeries, row: int, time: Array, bandwidth: float) -> d
     if count < _SHORTEST or not bandwidth > 0.0:
         return None
     rate = (count - 1) / (time[stretch.stop - 1] - time[stretch.start])
+    from scipy.signal import welch  # takes 0.1 s, which commands that draw nothing need not
+
     segment = int(np.clip(count // 4, _SHORTEST, _LONGEST))
     frequency, density = welch(errors[:, stretch], rate, nperseg=segment)
     shown = (frequency > 0.0) & (frequency <= _BEYOND * bandwidth)
