@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import mmap
 import secrets
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +26,12 @@ from torchid.logs.containers import LogKind, existing_log_kind, log_files
 from torchid.logs.tables import is_text_table
 from torchid.logs.time_range import split_range
 from torchid.problem import Samples
+from torchid.problem.chunks import ProgressCallback
 from torchid.problem.extras import recorded_components
 from torchid.sensing import SensorSet
+
+_DONTNEED = getattr(mmap, "MADV_DONTNEED", None)  # not on Windows
+_LET_GO = 8  # chunks after which pages that samples are mapped to leave the memory of the process
 
 
 def open_reader(scene: Scene) -> LogReader:
@@ -107,6 +113,23 @@ class CachedReader(LogReader):
         self._new = set[str]()  # keys that were not there when this run began
         self._contents: dict[Path, _Content] = {}
         self._scene_content = content_of_scene(scene)
+        self._mapped: list[mmap.mmap] = []
+
+    def progress(self, done: ProgressCallback) -> ProgressCallback:
+        """As `LogReader.progress`."""
+        calls = count(1)
+
+        def call(samples: int) -> None:
+            done(samples)
+            if next(calls) % _LET_GO == 0:
+                self.let_go()
+
+        return call
+
+    def let_go(self) -> None:
+        """As `LogReader.let_go`."""
+        for one in self._mapped if _DONTNEED is not None else ():
+            one.madvise(_DONTNEED)
 
     def read(
         self, paths: Sequence[Path], required: SensorSet | None, on_read: Callable[[Path], None] | None = None
@@ -211,6 +234,7 @@ class CachedReader(LogReader):
         entry = self.cache.load(key)
         if entry is None:
             return None
+        self._mapped += [x.base for x in entry.arrays.values() if isinstance(x.base, mmap.mmap)]
         try:
             found = samples_of_entry(entry, str(path), None if together is None else self.folder)
         except Exception as error:  # noqa: B902 - whatever another program has put there

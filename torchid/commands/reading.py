@@ -27,6 +27,7 @@ from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import away_from_changes, away_from_stamps, preprocess
 from torchid.logs.time_range import LogPart, split_range
 from torchid.problem import Samples, bind_log
+from torchid.problem.chunks import ProgressCallback
 from torchid.problem.contact_detection import with_detected_contacts
 from torchid.problem.contact_slip import measure_slip, warn_of_slip
 from torchid.problem.standing import preprocess_standing
@@ -88,6 +89,13 @@ class LogReader:
         names = ranks.as_first([log.source for log in logs], "names of the logs")  # they may lie elsewhere there
         added = [payload_of(self.scene, path) for path in paths]
         return [replace(log, source=name, payload=x) for log, name, x in zip(logs, names, added, strict=True)]
+
+    def progress(self, done: ProgressCallback) -> ProgressCallback:
+        """A callback of passes over the samples that calls `done`, and now and then `let_go`."""
+        return done
+
+    def let_go(self) -> None:
+        """Take pages of files that samples are mapped to out of memory; they come back where they are used."""
 
     def _together(self, path: Path) -> float:
         """What a log takes in memory with those before it [GB]."""
