@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 
 import pytest
@@ -43,6 +44,14 @@ def test_every_task_is_done_once_with_one_thread_each_and_without_gradients(work
     found = sorted(x for part in run_in_workers(range(7), run, workers) for x in part)
     assert found == [(task, 1, False) for task in range(7)]
     assert torch.get_num_threads() == before
+
+
+@pytest.mark.parametrize("tasks", [0, 1])
+def test_a_single_task_is_done_without_another_thread(tasks: int) -> None:
+    def run(own: object) -> tuple[int, list[int]]:
+        return threading.get_ident(), list(own)
+
+    assert run_in_workers(range(tasks), run, 4) == [(threading.get_ident(), list(range(tasks)))]
 
 
 def test_a_block_with_one_thread_has_one_in_linear_algebra_and_as_many_workers_as_before() -> None:

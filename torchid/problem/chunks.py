@@ -131,7 +131,7 @@ def subsample_states(logs: Sequence[Samples], count: int) -> Iterator[tuple[Samp
 
 
 def run_in_workers(tasks: Sequence[Task], run: Callable[[Iterator[Task]], Result], workers: int) -> list[Result]:
-    """Results of `run`, one per worker, each called without gradients on every n-th task.
+    """Results of `run`, one per worker, each called without gradients on every n-th task; no worker is without one.
 
     A failure or an interrupt stops all workers at their next task.
     """
@@ -150,6 +150,7 @@ def run_in_workers(tasks: Sequence[Task], run: Callable[[Iterator[Task]], Result
             stop.set()
             raise
 
+    workers = min(workers, max(len(tasks), 1))  # to start a thread takes as long as a small chunk
     with one_thread():
         if workers == 1:
             return [work(0)]

@@ -107,7 +107,7 @@ def compress_parts(
     reduce = partial(_compress_chunks, builder, by_log=True, weight_rows=weight_rows)
     parts = _merge_parts(map_chunks(logs, builder, reduce, chunk, threads, progress))
     if weight_rows is None:
-        add_surplus(parts, surplus_by_part(logs, builder))
+        add_surplus(parts, surplus_by_part(logs, builder, progress))
     order = list(dict.fromkeys(samples.source for samples in logs))
     return sorted(parts, key=lambda part: order.index(part.source))
 
@@ -185,14 +185,17 @@ def _compress_chunks(
     return list(parts.values())
 
 
-def surplus_by_part(logs: Sequence[Samples], builder: RowBuilder) -> dict[_Key, Surplus]:
+def surplus_by_part(
+    logs: Sequence[Samples], builder: RowBuilder, progress: ProgressCallback | None = None
+) -> dict[_Key, Surplus]:
     """The surplus of each part of some logs, to `add_surplus`, from the noise of their motion.
 
     Args:
         logs: as `compress_parts` takes them.
         builder: of their rows.
+        progress: as in `compress_surplus`.
     """
-    return compress_surplus(logs, builder, _key)
+    return compress_surplus(logs, builder, _key, progress)
 
 
 def _key(samples: Samples | None, state: ContactState, unloaded: bool = False) -> _Key:

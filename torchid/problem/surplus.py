@@ -24,7 +24,7 @@ from torch import Tensor
 from torchid import ranks
 from torchid.parameters import Array
 from torchid.problem.chunk_dynamics import Workspace
-from torchid.problem.chunks import map_chunks, one_thread
+from torchid.problem.chunks import ProgressCallback, map_chunks, one_thread
 from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import TriangularFactor
 from torchid.problem.rows import RowBuilder
@@ -75,7 +75,10 @@ class NoiseShares:
 
 
 def compress_surplus(
-    pieces: Sequence[Samples], builder: RowBuilder, key: Callable[[Samples, ContactState], Key]
+    pieces: Sequence[Samples],
+    builder: RowBuilder,
+    key: Callable[[Samples, ContactState], Key],
+    progress: ProgressCallback | None = None,
 ) -> dict[Key, Surplus]:
     """The surplus of the rows of some logs by the noise of their motion; none of logs without noise.
 
@@ -83,13 +86,14 @@ def compress_surplus(
         pieces: of bound logs, in the order of their samples.
         builder: of the rows.
         key: which rows belong together.
+        progress: called with 0 where some of the samples of a piece have been taken.
     """
     step = ranks.as_first(max(1, sum(map(len, pieces)) // _SHAKEN), "samples with noise")
     by_log: dict[str, list[Samples]] = {}
     for piece in pieces:
         if piece.motion_noise is not None and len(piece):
             by_log.setdefault(piece.source, []).append(piece)
-    logs = [concatenate([_spread(piece, step) for piece in of_log]) for of_log in by_log.values()]
+    logs = [concatenate([_spread(piece, step, progress) for piece in of_log]) for of_log in by_log.values()]
     total: dict[Key, Surplus] = {}
     if not logs:
         return total
@@ -106,14 +110,17 @@ def _add(total: Surplus, surplus: Surplus, weight: float) -> None:
         total[support] = total[support] + weight * x if support in total else weight * x
 
 
-def _spread(piece: Samples, step: int) -> Samples:
+def _spread(piece: Samples, step: int, progress: ProgressCallback | None) -> Samples:
     """One in so many samples, drawn so that they are in phase with nothing."""
     if step == 1:
         return piece
     starts = np.arange(0, len(piece), step)
     width = np.minimum(step, len(piece) - starts)
     at = starts + (np.random.default_rng(0).uniform(size=len(starts)) * width).astype(int)
-    return piece[torch.from_numpy(at)]
+    taken = piece[torch.from_numpy(at)]
+    if progress is not None:
+        progress(0)
+    return taken
 
 
 _Place = tuple[str, int, ContactState]
