@@ -128,8 +128,9 @@ class CachedReader(LogReader):
 
     def let_go(self) -> None:
         """As `LogReader.let_go`."""
-        for one in self._mapped if _DONTNEED is not None else ():
-            one.madvise(_DONTNEED)
+        if _DONTNEED is not None:
+            for one in self._mapped:
+                one.madvise(_DONTNEED)
 
     def read(
         self, paths: Sequence[Path], required: SensorSet | None, on_read: Callable[[Path], None] | None = None
@@ -234,7 +235,8 @@ class CachedReader(LogReader):
         entry = self.cache.load(key)
         if entry is None:
             return None
-        self._mapped += [x.base for x in entry.arrays.values() if isinstance(x.base, mmap.mmap)]
+        maps: list[object] = [array.base for array in entry.arrays.values()]
+        self._mapped += [one for one in maps if isinstance(one, mmap.mmap)]
         try:
             found = samples_of_entry(entry, str(path), None if together is None else self.folder)
         except Exception as error:  # noqa: B902 - whatever another program has put there
