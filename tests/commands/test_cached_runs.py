@@ -13,16 +13,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 import yaml
 from demo import DEMO, shortened_demo
-from large import experiment, overrides, recorded, tensors
+from large import experiment, overrides, recorded
 from trainings import trust_new_files
 
 from torchid.cli import main
 from torchid.commands.cache import FOLDER, content_key
 from torchid.commands.cached_factors import factors_key
-from torchid.commands.cached_reading import CachedReader, open_cache, open_reader
+from torchid.commands.cached_reading import CachedReader, open_cache
 from torchid.commands.cached_samples import NOT_IN_SAMPLES, content_of_scene
 from torchid.commands.reading import LogReader
 from torchid.config import load_config
@@ -92,38 +91,6 @@ def test_a_run_from_the_cache_has_the_results_of_one_without_to_the_last_bit(
 
 
 @pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
-def test_a_pass_over_mapped_samples_lets_go_of_their_pages_and_finds_the_same_numbers_again(
-    demo: Path, tmp_path: Path
-) -> None:
-    config = load_config(demo, [f"output={tmp_path / 'run'}"])
-    scene, done = set_up(config), []
-    reader = open_reader(scene)
-    [log] = reader.read(config.logs.train, scene.sensors)
-    before = {name: x.clone() for name, x in tensors(log).items()}
-    assert mapped_kilobytes(tmp_path / FOLDER) > 0
-    progress = reader.progress(done.append)
-    for _ in range(7):
-        progress(3)
-    assert mapped_kilobytes(tmp_path / FOLDER) > 0
-    progress(3)
-    assert mapped_kilobytes(tmp_path / FOLDER) == 0
-    assert done == [3] * 8
-    for name, x in tensors(log).items():
-        assert torch.equal(x.nan_to_num(), before[name].nan_to_num()), name
-
-
-def mapped_kilobytes(folder: Path) -> int:
-    """What of files in a folder is in this process's memory [kB]."""
-    total, inside = 0, False
-    for line in Path("/proc/self/smaps").read_text().splitlines():
-        if line.startswith("Rss:") and inside:
-            total += int(line.split()[1])
-        elif not line.split()[0].endswith(":"):
-            inside = str(folder) in line
-    return total
-
-
-@pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
 def test_another_ridge_estimator_and_prior_read_and_compress_nothing(
     demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -175,6 +142,7 @@ def test_every_key_of_preprocessing_that_changes_samples_changes_their_name(demo
         "robot.fixed_base=true",
         "robot.base_link=front_left_hip_link",
         "robot.weld=[front_left_hip]",
+        "robot.base_tilt=[0.01, 0.0]",
         "contacts.0.type=flat",
         "contacts.0={type: line, line_axis: x}",
         "contacts.0={type: point, radius: 0.02}",
@@ -184,7 +152,7 @@ def test_every_key_of_preprocessing_that_changes_samples_changes_their_name(demo
     ],
 )
 def test_robot_contacts_and_topics_change_the_name_of_samples(demo: Path, tmp_path: Path, other: str) -> None:
-    assert {x.name for x in fields(RobotConfig)} == {"urdf", "base_link", "fixed_base", "weld"}
+    assert {x.name for x in fields(RobotConfig)} == {"urdf", "base_link", "fixed_base", "weld", "base_tilt"}
     assert {x.name for x in fields(ContactConfig)} == {"frame", "type", "line_axis", "radius", "normal"}
     document = yaml.safe_load(demo.read_text())
     key, _, value = other.partition("=")
