@@ -20,7 +20,7 @@ from torchid.parameters import Array
 from torchid.problem import Evaluation, RowBuilder, Samples, assemble, compress_parts
 from torchid.problem.compressed_log import Block, CompressedBlock
 from torchid.problem.compression import Part
-from torchid.problem.extras import Extra
+from torchid.problem.extras import ACTUATORS, Extra
 from torchid.problem.predict import calibrate_readings
 from torchid.problem.samples import require_forces
 from torchid.reprs import short_repr
@@ -222,6 +222,9 @@ def _advice(extras: Sequence[ExtraEstimate], by_mass: bool) -> str:
         return (
             "add motion, state a known mass (estimator.total_mass, estimator.masses), or leave a sensor out of scales"
         )
+    terms = [f"actuators.{kind}" for kind in ACTUATORS if kind in kinds]
+    if terms:
+        return f"add motion, or leave out {' and '.join(terms)}"
     return "add motion that unloads the sensor, state what is known, or zero the sensor before the log"
 
 
