@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +16,10 @@ from torchid.guards import MAX_ARRAYS, MAX_SCHEMA, check_names, check_unpacked_s
 from torchid.logs.column_map import Columns
 from torchid.logs.columns import TEXT_COLUMN, TableLayout, check_header, column_names, parse_header
 from torchid.logs.containers import atomic_output, reader_errors_explained
+from torchid.logs.csv_header import BLOCK, CsvHeader, read_header
 from torchid.logs.log import NAME_FIELDS
 from torchid.logs.mapped_fields import MappedFields, map_table
 
-#: Bytes of a CSV file that are parsed at a time; no row may be longer.
-_BLOCK = 2**22
 #: Rows that are converted at a time.
 _ROWS = 2**16
 #: Rows from which a map is proposed.
@@ -34,9 +31,7 @@ _PARQUET = {
     "page_checksum_verification": True,
 }
 _BAD_CELL = re.compile(r"In CSV column #(\d+): (?:Row #(\d+): )?.*?invalid value '(.{0,40})", re.DOTALL)
-_SEPARATORS = (",", ";", "\t")
-#: A cell such as -1,5 or 1,5e-3 between semicolons or tabs.
-_DECIMAL_COMMA = re.compile(rb'(?:^|[;\t\n])[ "]*[+-]?\d*,\d+(?:[eE][+-]?\d+)?[ "]*(?=[;\t\r\n]|\Z)')
+_PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 _QUOTES = "'\n"
 _EMPTY = ["", " ", "  ", "nan", "NaN", "NAN"]
 _FLAGS = {"true": "1", "false": "0"}
@@ -76,23 +71,50 @@ def sample_table(path: Path) -> dict[str, NDArray[Any] | None]:
         if batch is None or not batch.num_rows:
             raise LogError.at_field("time", "no samples", "at least one sample")
         columns = dict(zip(batch.schema.names, batch.columns, strict=True))
-        read = {name: x for name, x in columns.items() if _is_number(pa, x.type)}
-        return {name: np.asarray(read[name].to_numpy(False)) if name in read else None for name in names}
+        read = {name: x for name, x in columns.items() if _is_number(pa, x.type) or _is_stamp(pa, x.type)}
+        return {name: _numbers(pa, read[name]) if name in read else None for name in names}
 
 
 def _is_number(pa: Any, type_: Any) -> bool:
     return bool(pa.types.is_integer(type_) or pa.types.is_floating(type_) or pa.types.is_boolean(type_))
 
 
+def _is_stamp(pa: Any, type_: Any) -> bool:
+    return bool(pa.types.is_timestamp(type_) or pa.types.is_time(type_) or pa.types.is_duration(type_))
+
+
+def _numbers(pa: Any, values: Any) -> NDArray[Any]:
+    """Numbers (N,) of a column: of dates seconds since 1970, of times of day since midnight, NaN for empty cells."""
+    if not _is_stamp(pa, values.type):
+        return np.asarray(values.to_numpy(False))
+    whole = np.asarray(values.cast(pa.int32() if values.type.bit_width == 32 else pa.int64()).to_numpy(False))
+    return whole / _PER_SECOND[values.type.unit]
+
+
+def _stamp_types(pa: Any, header: CsvHeader) -> dict[str, Any]:
+    """Types of the columns of a CSV file that hold dates or times of day."""
+    dates = {name: pa.timestamp("ns", "UTC" if zone else None) for name, zone in header.dates.items()}
+    return dates | dict.fromkeys(header.times_of_day, pa.time64("ns"))
+
+
+def _csv_options(header: CsvHeader) -> Any:
+    import pyarrow.csv
+
+    # one thread: else error messages have no row number
+    rows = {"skip_rows": header.lines, "column_names": header.texts}
+    return pyarrow.csv.ReadOptions(use_threads=False, block_size=BLOCK, **rows)
+
+
 def _sample_csv(pa: Any, path: Path) -> tuple[list[str], Any]:
     import pyarrow.csv
 
-    header = _header(path)
+    header = read_header(path)
     check_header(header.texts)
     if header.is_all:
         return header.texts, None
-    options = pyarrow.csv.ReadOptions(use_threads=False, block_size=_BLOCK, skip_rows=1, column_names=header.texts)
+    options = _csv_options(header)
     marks = {"decimal_point": header.decimal_mark, "null_values": _EMPTY, "strings_can_be_null": True}
+    marks["column_types"] = _stamp_types(pa, header)
     with path.open("rb") as stream:
         parse = pyarrow.csv.ParseOptions(delimiter=header.separator)
         return header.texts, pyarrow.csv.open_csv(
@@ -107,7 +129,8 @@ def _sample_parquet(pa: Any, path: Path) -> tuple[list[str], Any]:
         leaves = {name: type_ for field in file.schema_arrow for name, type_ in _leaves(pa, field)}
         check_header(list(leaves))
         _check_size(path, file.metadata.num_rows, len(leaves), whole=False)
-        numbers = [name for name, type_ in leaves.items() if _is_number(pa, type_)]  # of lists nobody knows the size
+        plain = {name for name, type_ in leaves.items() if _is_number(pa, type_) or _is_stamp(pa, type_)}
+        numbers = [name for name in leaves if name in plain]  # of lists nobody knows the size
         batch = next(file.iter_batches(_SAMPLE, columns=numbers), None) if numbers else None
     return list(leaves), None if batch is None else _flat(pa, batch)
 
@@ -185,7 +208,7 @@ def _batches(pa: Any, path: Path, columns: Columns | None, whole: bool = True) -
 def _read_csv(pa: Any, path: Path, columns: Columns | None, whole: bool) -> Iterator[tuple[_Layout, Any]]:
     import pyarrow.csv
 
-    header = _header(path)
+    header = read_header(path)
     texts = header.texts
     layout = _layout(texts, columns)
     yield layout, None
@@ -194,12 +217,12 @@ def _read_csv(pa: Any, path: Path, columns: Columns | None, whole: bool) -> Iter
     words = pa.dictionary(pa.int32(), pa.string())
     may_be_text = {TEXT_COLUMN, *layout.flags}
     types = {text: words if text in may_be_text else pa.float64() for text in layout.sources}
+    types |= {text: type_ for text, type_ in _stamp_types(pa, header).items() if text in types}
     with path.open("rb") as stream:
         try:
             reader = pyarrow.csv.open_csv(
                 stream,
-                # one thread: else error messages have no row number
-                pyarrow.csv.ReadOptions(use_threads=False, block_size=_BLOCK, skip_rows=1, column_names=texts),
+                _csv_options(header),
                 pyarrow.csv.ParseOptions(delimiter=header.separator),
                 pyarrow.csv.ConvertOptions(
                     column_types=types,
@@ -221,41 +244,6 @@ def _read_csv(pa: Any, path: Path, columns: Columns | None, whole: bool) -> Iter
             raise LogError(path, f"column '{texts[int(column)]}'", text, _NUMBERS) from error
 
 
-@dataclass(frozen=True)
-class _Header:
-    """Names of a CSV file's columns, what separates them, the decimal mark, and whether the file has no rows."""
-
-    texts: list[str]
-    separator: str
-    decimal_mark: str
-    is_all: bool
-
-
-def _header(path: Path) -> _Header:
-    """The first line of a CSV file; the decimal mark is that of the rows after it."""
-    with path.open("rb") as stream:
-        line = stream.readline(_BLOCK)
-        rows = stream.read(_BLOCK)
-    if not line.strip():
-        raise LogError(path, "header", "an empty line", "the names of the columns")
-    if len(line) == _BLOCK:
-        raise LogError(path, "header", f"a line of at least {_BLOCK} bytes", "the names of the columns")
-    text = line.decode("utf-8-sig").rstrip("\r\n")
-    names, failures = dict[str, list[str]](), list[csv.Error]()
-    for mark in _SEPARATORS:
-        try:
-            names[mark] = next(csv.reader([text], strict=True, delimiter=mark))
-        except csv.Error as error:  # behind a quoted name stands another mark
-            failures.append(error)
-    separator = max(names, key=lambda mark: len(names[mark]), default="")  # the first of equals
-    if not separator or (failures and len(names[separator]) == 1):
-        accepted = "names separated by commas, semicolons or tabs"
-        raise LogError(path, "header", f"no line of names ({failures[0]})", accepted) from failures[0]
-    texts = [text.strip() for text in names[separator]]
-    decimal_comma = separator != "," and _DECIMAL_COMMA.search(rows) is not None
-    return _Header(texts, separator, "," if decimal_comma else ".", not rows.strip())
-
-
 def _read_parquet(pa: Any, path: Path, columns: Columns | None, whole: bool) -> Iterator[tuple[_Layout, Any]]:
     import pyarrow.parquet
 
@@ -269,6 +257,7 @@ def _read_parquet(pa: Any, path: Path, columns: Columns | None, whole: bool) -> 
         used = set(layout.sources)
         for name, type_ in (leaf for field in file.schema_arrow for leaf in _leaves(pa, field)):
             number = _is_number(pa, type_) and (name in layout.flags or not pa.types.is_boolean(type_))
+            number |= _is_stamp(pa, type_)
             if name in used and not (pa.types.is_dictionary(type_) if name == TEXT_COLUMN else number):
                 accepted = "text" if name == TEXT_COLUMN else "real numbers"
                 raise LogError(path, f"column '{name}'", f"values of type {type_}", accepted)
@@ -318,9 +307,9 @@ def table_size(path: Path) -> int:
     _pyarrow(path)
     with _complete(path):
         if path.suffix.lower() == ".csv":
-            columns = len(_header(path).texts)
+            columns = len(read_header(path).texts)
             with path.open("rb") as stream:
-                return 8 * columns * sum(piece.count(b"\n") for piece in iter(lambda: stream.read(_BLOCK), b""))
+                return 8 * columns * sum(piece.count(b"\n") for piece in iter(lambda: stream.read(BLOCK), b""))
         import pyarrow.parquet
 
         with pyarrow.parquet.ParquetFile(path, **_PARQUET) as file:
@@ -339,7 +328,7 @@ def _values(pa: Any, column: str, values: Any) -> NDArray[Any]:
     if not pa.types.is_dictionary(values.type):
         if pa.types.is_boolean(values.type) and values.null_count:
             values = values.cast(pa.float64())
-        return np.asarray(values.to_numpy())
+        return _numbers(pa, values.combine_chunks())
     values = values.unify_dictionaries()
     words = values.unique().to_pylist()
     if column == TEXT_COLUMN:

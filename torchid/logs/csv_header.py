@@ -1,0 +1,161 @@
+"""Where the rows of a CSV file begin, and what their columns are called."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from torchid.errors import LogError, excerpt
+from torchid.logs.units import quantities_with
+
+BLOCK = 2**22
+"""Bytes of a CSV file that are parsed at a time; no row may be longer."""
+
+_LINES = 64  # at most before the first row
+_SEPARATORS = (",", ";", "\t")
+_COMMENT = re.compile(r"^(#|%|//)\s*")
+_NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?|[+-]?(nan|inf)|true|false", re.IGNORECASE)
+_DATE = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d(:\d\d(\.\d{1,9})?)?(Z|[+-]\d\d:?\d\d)?")
+_TIME_OF_DAY = re.compile(r"\d\d:\d\d:\d\d(\.\d{1,9})?")
+_BRACKETS = re.compile(r"\[(.*)\]|\((.*)\)")
+#: A cell such as -1,5 or 1,5e-3 between semicolons, tabs or spaces.
+_DECIMAL_COMMA = re.compile(rb'(?:^|[;\t\n ])[ "]*[+-]?\d*,\d+(?:[eE][+-]?\d+)?[ "]*(?=[;\t\r\n ]|\Z)')
+
+
+@dataclass(frozen=True)
+class CsvHeader:
+    """The lines of a CSV file before its rows.
+
+    Attributes:
+        texts: names of the columns, with their units in brackets where these have a line of their own.
+        lines: how many there are before the first row, the names and remarks above them.
+        separator: between cells.
+        decimal_mark: . or ,
+        is_all: whether the file has no rows.
+        dates: columns whose first cell is a date with a time of day, and whether that states its zone.
+        times_of_day: columns whose first cell is hours, minutes and seconds.
+    """
+
+    texts: list[str]
+    lines: int
+    separator: str
+    decimal_mark: str
+    is_all: bool
+    dates: dict[str, bool]
+    times_of_day: tuple[str, ...]
+
+
+def read_header(path: Path) -> CsvHeader:
+    """The names of a CSV file's columns; the decimal mark is that of the rows.
+
+    Names are in the first line with as many cells as the first row that is mostly numbers. Lines above are remarks, a
+    line of units may follow. A column without a name is called `unnamed_0` by its place.
+
+    Raises:
+        LogError: no names, or a line that is too long.
+    """
+    with path.open("rb") as stream:
+        lines = [line for _ in range(_LINES) if (line := stream.readline(BLOCK))]
+        rest = stream.read(BLOCK)
+    texts = [line.decode("utf-8-sig" if not number else "utf-8", "replace") for number, line in enumerate(lines)]
+    texts = [text.rstrip("\r\n") for text in texts]
+    row = next((number for number, text in enumerate(texts) if _is_row(text)), len(texts))
+    named = _named(texts, row)
+    if not texts or not texts[named].strip():
+        raise LogError(path, "header", "an empty line", "the names of the columns")
+    if len(lines[named]) == BLOCK:
+        raise LogError(path, "header", f"a line of at least {BLOCK} bytes", "the names of the columns")
+    if named == row:
+        raise LogError(path, "header", f"numbers, '{excerpt(texts[row])}'", "the names of the columns")
+    lines[named].decode("utf-8-sig")  # else it is no text
+    first = next((number for number in range(named + 1, row) if not _COMMENT.match(texts[number])), min(row, named + 1))
+    title = _COMMENT.sub("", texts[named])
+    separator = _separator(path, title, "".join(texts[row : row + 1]))
+    cells = [cell.strip() for cell in _cells(title, separator)]
+    if row == first + 1 and _is_units(texts[first], separator, len(cells)):
+        units = _cells(_COMMENT.sub("", texts[first]), separator)
+        cells = [_with_unit(*pair) for pair in zip(cells, units, strict=True)]
+        first = row
+    sample = [cell.strip() for cell in _cells(texts[first], separator)] if first < len(texts) else []
+    cells += [""] * (len(sample) == len(cells) + 1 and not sample[-1])  # a separator at the end of each row
+    names = [name or f"unnamed_{number}" for number, name in enumerate(cells)]
+    rows = b"".join(lines[first:]) + rest
+    comma = separator != "," and _DECIMAL_COMMA.search(rows) is not None
+    dates = {name: match for name, cell in zip(names, sample, strict=False) if (match := _DATE.fullmatch(cell))}
+    of_day = tuple(name for name, cell in zip(names, sample, strict=False) if _TIME_OF_DAY.fullmatch(cell))
+    zones = {name: bool(match[3]) for name, match in dates.items()}
+    return CsvHeader(names, first, separator, "," if comma else ".", not rows.strip(), zones, of_day)
+
+
+def _named(texts: Sequence[str], row: int) -> int:
+    """The line with names above the first row: the first with as many cells, remarks last; without one, the first."""
+    if row == len(texts):
+        return next((number for number, text in enumerate(texts) if text.strip() and not _COMMENT.match(text)), 0)
+    mark = _most_used(texts[row])
+    count = len(_cells(texts[row].rstrip(mark), mark))
+    alike = [k for k in range(row) if len(_cells(_COMMENT.sub("", texts[k]).rstrip(mark), mark)) == count]
+    plain = [k for k in range(row) if texts[k].strip() and not _COMMENT.match(texts[k])]
+    return next((k for k in alike if k in plain), (alike or plain[-1:] or [row])[-1])
+
+
+def _is_row(text: str) -> bool:
+    """Whether most of the cells of a line are numbers or stamps, by the mark that separates most cells."""
+    if _COMMENT.match(text):
+        return False
+    cells = [cell for cell in _cells(text, _most_used(text)) if cell.strip()]
+    numbers = [cell for cell in cells if _NUMBER.fullmatch(cell.strip())]
+    return 2 * len(numbers) > len(cells) or (bool(numbers) and _DATE.fullmatch(cells[0].strip()) is not None)
+
+
+def _is_units(text: str, mark: str, count: int) -> bool:
+    """Whether a line between names and the first row has units alone, one for each name."""
+    cells = [cell.strip() for cell in _cells(_COMMENT.sub("", text), mark)]
+    units = [cell for cell in cells if cell.strip("-")]
+    return len(cells) == count and bool(units) and all(map(_is_unit, units))
+
+
+def _is_unit(cell: str) -> bool:
+    found = _BRACKETS.fullmatch(cell)
+    return bool(quantities_with((found[1] or found[2] or "") if found else cell)) or cell in ("[]", "[-]", "1", "[1]")
+
+
+def _with_unit(name: str, unit: str) -> str:
+    """A name and its unit as one text; the name alone where there is no unit of it."""
+    found = _BRACKETS.fullmatch(unit.strip())
+    unit = ((found[1] or found[2] or "") if found else unit).strip()
+    return f"{name} [{unit}]" if quantities_with(unit) else name
+
+
+def _most_used(text: str) -> str:
+    """The mark that separates most cells of a line, a space if no other does."""
+    counts = {mark: len(_cells(text, mark)) for mark in _SEPARATORS}
+    mark = max(counts, key=lambda mark: counts[mark])
+    return mark if counts[mark] > 1 else " "
+
+
+def _cells(text: str, mark: str) -> list[str]:
+    try:
+        return next(csv.reader([text], strict=True, delimiter=mark), [])
+    except csv.Error:
+        return [text]
+
+
+def _separator(path: Path, names: str, row: str) -> str:
+    """What separates names: the mark that gives most, the first of equals; a space if no other does."""
+    found, failures = dict[str, int](), list[csv.Error]()
+    for mark in _SEPARATORS:
+        try:
+            found[mark] = len(next(csv.reader([names], strict=True, delimiter=mark)))
+        except csv.Error as error:  # behind a quoted name stands another mark
+            failures.append(error)
+    separator = max(found, key=lambda mark: found[mark], default="")
+    if not separator or (failures and found[separator] == 1):
+        accepted = "names separated by commas, semicolons, tabs or spaces"
+        raise LogError(path, "header", f"no line of names ({failures[0]})", accepted) from failures[0]
+    words = len(_cells(names, " "))
+    if found[separator] > 1 or words == 1 or words != len(_cells(row, " ")):
+        return separator
+    return " "
