@@ -139,8 +139,13 @@ def table_blocks(path: Path, columns: Columns | None = None) -> Iterator[dict[st
     """As `read_table`, some rows at a time, after a block without rows."""
     pa = _pyarrow(path)
     with _complete(path):
+        rows = 0
         for layout, batch in _batches(pa, path, columns, whole=False):
-            yield _fields(pa, layout, [] if batch is None else [batch])
+            block = _fields(pa, layout, [] if batch is None else [batch])
+            if isinstance(layout, MappedFields) and layout.step is not None:
+                block["time"] = layout.stamps(rows, len(block["time"]))
+                rows += len(block["time"])
+            yield block
 
 
 def _complete(path: Path) -> AbstractContextManager[None]:
