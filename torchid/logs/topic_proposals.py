@@ -9,8 +9,9 @@ import numpy as np
 
 from torchid.logs.bag_samples import TopicSample
 from torchid.logs.column_proposals import is_desired
+from torchid.logs.force_proposals import threshold
 from torchid.logs.joint_orders import JOINT_ORDERS, suitable_orders, usual_order
-from torchid.logs.map_proposals import MapProposal, threshold
+from torchid.logs.map_proposals import MapProposal
 from torchid.logs.name_matching import KnownRobot, match_names
 from torchid.logs.ros_low_state import LowState
 from torchid.logs.ros_messages import ContactFlag, Imu, JointStates, NormalForce, Odometry, Wrench
