@@ -196,7 +196,7 @@ def _add_imu_frame(robot: Robot, fields: set[str], proposal: MapProposal) -> Non
     frame = min(named, key=len, default=robot.base_link)
     proposal.columns = {"imu_frame": frame, **proposal.columns}
     others = [name for name, (body, _) in robot.links.items() if body and "imu" in name.lower()]
-    moving = f"; {join_names(others)} move against it" if others else ""
+    moving = f"; not {join_names(others)}, beyond a joint" if others else ""
     why = "from its name" if named else f"the base link, as no link of it is called imu{moving}"
     proposal.notes["imu_frame"] = why
     fields.add("imu_frame")
