@@ -126,7 +126,15 @@ def test_a_usual_mistake_is_named_by_what_it_explains(mistake: Callable[[Log], L
     explained = only(checked, EXPLAINED)
     assert (explained.severity, explained.field) == (CONDEMNED, field)
     assert explained.found.startswith(text)
+    assert "another robot" not in explained.advice
     assert not checked.usable
+
+
+def test_a_unit_that_leaves_a_third_of_the_misfit_may_be_another_robot() -> None:
+    checked = of_demo(scaled(demo_log().select(slice(0, 600)), "joint_torque", 1.25 / 9.81))
+    explained = only(checked, EXPLAINED)
+    assert explained.found.startswith("in kgm")
+    assert explained.advice.endswith("; or is quadruped.urdf another robot's?")
 
 
 def test_positions_in_degrees_are_named_even_where_no_joint_turns_far() -> None:

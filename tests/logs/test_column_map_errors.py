@@ -16,9 +16,10 @@ from mapped import ORDER, POSITION, TIME, mapped
 from refusals import refused
 from repository import DEMO
 
-from torchid.errors import InputError, LogError
+from torchid.errors import ConfigError, InputError, LogError, UnknownNameError
 from torchid.logs import Columns, read_log
 from torchid.logs.blocks import open_log_blocks
+from torchid.logs.column_map import require_names
 
 BAD: list[tuple[str, dict[str, Any], str]] = [
     (
@@ -255,3 +256,11 @@ def test_columns_inside_of_others_count_and_lists_are_refused(tmp_path: Path) ->
     message = refused(lambda: read_log(tmp_path / "x.parquet", columns=columns), f"{tmp_path}", LogError)
     assert "column 'a.list': values of type list<" in message
     assert "2 unknown: 'a.q' (joint_position?), 'a.list'" in refused(lambda: read_log(tmp_path / "x.parquet"), "")
+
+
+def test_a_map_of_another_robot_says_so_and_a_misspelt_name_the_nearest() -> None:
+    columns = Columns(joint_order=["LF_HAA", "LF_HFE"])  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="none of LF_HAA, LF_HFE is a joint of the URDF; is it that of the robot"):
+        require_names(columns, {"joint": ["FL_hip", "FL_thigh"]})
+    with pytest.raises(UnknownNameError, match="unknown name 'FL_hpi'"):
+        require_names(Columns(joint_order=["FL_hpi", "FL_thigh"]), {"joint": ["FL_hip", "FL_thigh"]})  # type: ignore[arg-type]

@@ -14,6 +14,8 @@ from torchid.config import load_config
 from torchid.errors import InputError
 from torchid.logs import Columns, Log, read_log, write_log
 from torchid.logs.blocks import log_bytes, open_log_blocks
+from torchid.logs.map_proposals import propose_map
+from torchid.logs.name_matching import KnownRobot
 
 TIME = np.arange(60) / 100.0
 ANGLES = np.stack([30.0 * np.sin(3.0 * TIME), 20.0 * np.cos(2.0 * TIME)], axis=1)  # deg
@@ -56,6 +58,23 @@ def test_a_stated_unit_counts_before_the_header_and_radians_stay(tmp_path: Path)
     np.testing.assert_allclose(mixed.joint_position[:, 2], 1e-3 * SLIDE, rtol=1e-15)
     plain = read(written(tmp_path / "x.mot", degrees="no"))
     np.testing.assert_array_equal(plain.joint_position[:, :2], ANGLES)
+
+
+def test_a_turn_of_such_angles_is_360_deg(tmp_path: Path) -> None:
+    angles = ANGLES - 15.0
+    turned = np.column_stack([TIME, np.mod(angles, 360.0), SLIDE])
+    assert (np.abs(np.diff(turned[:, 1:3], axis=0)) > 300.0).any(axis=0).all()  # where a joint is straight
+    rows = "".join("\t".join(map(repr, row)) + "\n" for row in turned.tolist())
+    names = "time\thip_r\tknee_r\tpelvis_tx\n"
+    (tmp_path / "x.mot").write_text(HEADER.format(rows=len(TIME), degrees="yes") + names + rows)
+    log = read(tmp_path / "x.mot", turn_from={"hip": -180, "knee": -180})
+    np.testing.assert_allclose(log.joint_position[:, :2], np.radians(angles), atol=1e-13)
+    np.testing.assert_array_equal(log.joint_position[:, 2], SLIDE)
+    robot = KnownRobot(["hip", "knee"], [], "leg", 100.0, "base", [], [])
+    sample = {f"angle_{name}": turned[:, 1 + k] for k, name in enumerate(robot.joints)} | {"time": TIME}
+    proposal = propose_map(sample, robot, in_degrees=list(sample))
+    assert proposal.columns["joint_position"] == {"column": "angle_{joint}", "turn_from": -180.0}
+    assert "deg, as the file's header says (inDegrees=yes)" in proposal.notes["joint_position"]
 
 
 def test_blocks_and_ranges_are_those_of_the_whole_table(tmp_path: Path) -> None:

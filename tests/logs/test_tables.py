@@ -152,8 +152,8 @@ def test_text_where_a_number_belongs_is_named_with_its_row(tmp_path: Path) -> No
     assert "column 'joint_torque.knee': values of type string; accepted: real numbers" in log_refusal(path)
     path = save(tmp_path / "z.parquet", columns(joint_torque__knee=[[1.0], [2.0], [3.0]]))
     assert "values of type list" in log_refusal(path)
-    path = save(tmp_path / "z.parquet", columns(time=np.array([1, 2, 3], dtype="M8[ns]")))
-    assert "column 'time': values of type timestamp[ns]" in log_refusal(path)
+    path = save(tmp_path / "z.parquet", columns(time=np.array([1, 2, 3], dtype="M8[D]")))
+    assert "column 'time': values of type date32[day]" in log_refusal(path)
 
 
 @pytest.mark.parametrize("separator", [";", "\t"])
@@ -190,7 +190,6 @@ def test_rows_of_other_lengths_and_repeated_columns_are_refused(tmp_path: Path) 
         (whole.replace("time", '"time', 1), "header: no line of names"),
         (whole.replace("time", "t\xefme", 1).encode("latin-1"), "cannot be read (UnicodeDecodeError"),
         (whole.replace("imu.link", "imu.l\xefnk", 1).encode("latin-1"), "invalid UTF8"),
-        ("\n" + whole, "header: an empty line"),
         (whole.split("\n")[0], "time: no samples"),
         (whole.split("\n")[0] + "\n\n\n", "time: no samples"),
         ("", "header: an empty line"),

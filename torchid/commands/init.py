@@ -14,12 +14,13 @@ from typing import Any
 import yaml
 
 from torchid.commands.folder import check_free_file
+from torchid.commands.init_hints import BRIDGED_S, gaps_in_motion, hints, missing_columns
+from torchid.commands.init_sensors import limb_sensors, sensor_set
 from torchid.commands.reading import memory_needed
 from torchid.config.preprocessing import PreprocessingConfig
 from torchid.errors import ConfigError, InputError, LogError, about_file, excerpt, format_count, join_names
-from torchid.logs import Columns, Topics, read_log
+from torchid.logs import Columns, Log, Topics, read_log
 from torchid.logs.bag_samples import read_bag_sample
-from torchid.logs.column_proposals import OF_PLATES, propose_field
 from torchid.logs.column_samples import read_sample, stated_names, states_degrees, texts_in
 from torchid.logs.containers import LogKind, atomic_output, existing_log_kind
 from torchid.logs.map_proposals import MapProposal, propose_map
@@ -28,21 +29,20 @@ from torchid.logs.time_range import split_range
 from torchid.logs.topic_proposals import USED_TYPES, frame_of, propose_topics
 from torchid.regressor.kinematics import GRAVITY_WORLD
 from torchid.robot import CollisionShapes, Robot, load_robot
-from torchid.robot.urdf import fixed_joints, position_limits
+from torchid.robot.urdf import position_limits
 
 _FEET = (r"foot|feet", r"sole", r"ankle_roll|ankle_flexion", r"toe|ankle|paw|hoof")
 """Words in names of links that touch the ground, the surest first."""
 
-_SENSOR = r"(?<![a-z])(ft|force|torque|load_?cell)(?![a-z])"
-_MOST_SENSORS = 16  # in limbs that are looked at
 _ON_FEET = r"sensor|imu|camera|bumper|laser"
+_IN_LIMBS = r"(?<![a-z])ft(?![a-z])"
 _NAMED = r"foot|feet|sole"
 _FORCES = ("joint_torque", "contact_wrench_local", "contact_wrench_world", "contact_force_normal", "ft_wrench")
 _POSE = ("base_quat_wxyz", "base_quat_xyzw")
 _IMU = ("imu_specific_force", "imu_angular_velocity")
+_RATE = "base_angular_velocity_base"
 _WHAT = {"columns": "names, units and orders of the file", "topics": "what the messages of the bag hold"}
 _WELDED = "joints that the log lacks, held still; one that moves needs readings"
-_OTHER_FILE = "; if another file has it: torchid init URDF 'FILE + FILE@SECONDS', docs/logs.md"
 _LINE = 118
 
 
@@ -97,9 +97,13 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> Initiated:
     robot = load_robot(urdf)
     contacts, fields, proposal = _of_bag(part.file, robot) if is_bag else _of_columns(files, robot)
     out = Initiated(target)
-    text = _text(robot, urdf, path, target, contacts, fields, proposal)
+    _state_flags(contacts, fields, proposal)
+    read = _try(path, proposal)
+    gaps = _gaps(read)
+    text = _text(robot, urdf, path, target, contacts, fields, proposal, gaps)
     _describe(out, robot, contacts, fields, proposal)
-    _try(out, path, proposal)
+    _describe_log(out, read)
+    out.guessed += [f"preprocessing.{key}: {value}, {why}" for key, (value, why) in gaps.items()]
     with atomic_output(target) as new:
         new.write_text(text, encoding="utf-8")
     return out
@@ -137,25 +141,8 @@ def _known(robot: Robot, contacts: Sequence[_Contact]) -> KnownRobot:
     """What the proposal of a map knows of the robot."""
     on_base, elsewhere = ([name for name, (body, _) in robot.links.items() if bool(body) == x] for x in (False, True))
     feet, weight = [contact.frame for contact in contacts], -GRAVITY_WORLD[2] * float(robot.nominal[:, 0].sum())
-    sensors = _limb_sensors(robot)
+    sensors = limb_sensors(robot)
     return KnownRobot(robot.joint_names, feet, robot.path.stem, weight, robot.base_link, on_base, elsewhere, sensors)
-
-
-def _limb_sensors(robot: Robot) -> dict[str, str]:
-    """Children of fixed joints in limbs whose names say that a force/torque sensor is there, by joint."""
-    found = fixed_joints(robot.path)
-    named = {joint: child for joint, child in found.items() if re.search(_SENSOR, f"{joint} {child}", re.IGNORECASE)}
-    in_limbs = {joint: child for joint, child in named.items() if child in robot.links and robot.links[child][0]}
-    return {joint: child for joint, child in list(in_limbs.items())[:_MOST_SENSORS] if _can_be_split(robot, joint)}
-
-
-def _can_be_split(robot: Robot, joint: str) -> bool:
-    """Whether both sides of a fixed joint have mass."""
-    try:
-        load_robot(robot.path, ft_joints=[joint])
-    except InputError:
-        return False
-    return True
 
 
 def _stated_contacts(sample: Any, robot: Robot) -> list[str]:
@@ -172,7 +159,8 @@ def _guess_contacts(robot: Robot, stated: Sequence[str], texts: Sequence[str]) -
     """
     shapes = CollisionShapes(robot)
     inner = {body.parent for body in robot.bodies}
-    named = [name for name in robot.links if any(within(name.lower()).search(text.lower()) for text in texts)]
+    texts = [text.lower() for text in texts if not re.search(_IN_LIMBS, text, re.IGNORECASE)]
+    named = [name for name in robot.links if any(within(name.lower()).search(text) for text in texts)]
     frames = list(stated)
     for words, links in ((_NAMED, named), *((words, list(robot.links)) for words in _FEET)) if not frames else ():
         by_body: dict[int, list[str]] = {}
@@ -180,7 +168,10 @@ def _guess_contacts(robot: Robot, stated: Sequence[str], texts: Sequence[str]) -
             body, is_foot = robot.links[name][0], re.search(words, name, re.IGNORECASE)
             if body and body not in inner and is_foot and not re.search(_ON_FEET, name, re.IGNORECASE):
                 by_body.setdefault(body, []).append(name)
-        frames = [min(names, key=lambda name: (shapes.about(name) is None, len(name))) for names in by_body.values()]
+        frames = [
+            min(names, key=lambda name: (shapes.about(name) is None, "sole" not in name.lower(), len(name)))
+            for names in by_body.values()
+        ]
         if len(frames) > 1:
             break
         frames = []
@@ -196,6 +187,9 @@ def _fields_of(sample: Any, proposal: MapProposal) -> set[str]:
 def _add_imu_frame(robot: Robot, fields: set[str], proposal: MapProposal) -> None:
     if not set(_IMU) & fields or "imu_frame" in fields:
         return
+    if _IMU[0] in fields and _IMU[1] not in fields and (rate := proposal.columns.pop(_RATE, None)):
+        proposal.columns[_IMU[1]] = rate
+        fields ^= {_RATE, _IMU[1]}
     if not set(_IMU) <= fields:  # one alone is of no use
         for name in set(_IMU) & set(proposal.columns):
             proposal.columns.setdefault("ignore", []).append(_as_ignored(proposal.columns.pop(name)["column"]))
@@ -204,21 +198,15 @@ def _add_imu_frame(robot: Robot, fields: set[str], proposal: MapProposal) -> Non
     named = [name for name, (body, _) in robot.links.items() if body == 0 and "imu" in name.lower()]
     frame = min(named, key=len, default=robot.base_link)
     proposal.columns = {"imu_frame": frame, **proposal.columns}
-    proposal.notes["imu_frame"] = "from its name" if named else "the base link, as no link of it is called imu"
+    others = [name for name, (body, _) in robot.links.items() if body and "imu" in name.lower()]
+    moving = f"; not {join_names(others)}, beyond a joint" if others else ""
+    why = "from its name" if named else f"the base link, as no link of it is called imu{moving}"
+    proposal.notes["imu_frame"] = why
     fields.add("imu_frame")
 
 
 def _as_ignored(pattern: str) -> str:
     return re.sub(r"\{[^{}]*\}", "*", pattern)
-
-
-def _sensors(fields: set[str], limbs: Sequence[str]) -> str | dict[str, object]:
-    """The set of sensors of a run, with those in limbs at fixed joints."""
-    wrench = bool({"contact_wrench_local", "contact_wrench_world"} & fields)
-    named = ("full" if wrench else "joints") if "joint_torque" in fields else "contacts"
-    if not limbs:
-        return named
-    return ({"set": named} if wrench or named == "joints" else {}) | {"ft_sensors": list(limbs)}
 
 
 def _is_fixed(contacts: Sequence[_Contact], fields: set[str]) -> bool:
@@ -241,11 +229,13 @@ def _from_feet(contacts: Sequence[_Contact], fields: set[str]) -> dict[str, obje
     return out
 
 
-def _describe_plates(out: Initiated, proposal: MapProposal) -> None:
-    """What of force plates no file says."""
-    if plates := [name for name in proposal.left_out if propose_field(name) in OF_PLATES]:
-        unknown = "without which foot stands on which and where each lies (docs/logs.md, Force plates)"
-        out.missing.append(f"contact_wrench_world: {join_names(plates)} may be readings of force plates, {unknown}")
+def _state_flags(contacts: Sequence[_Contact], fields: set[str], proposal: MapProposal) -> None:
+    """Let every foot touch throughout, where neither the log nor torques say which does."""
+    if contacts and "contact_active" not in fields and "detect_contacts" not in _from_feet(contacts, fields):
+        always = [contact.frame for contact in contacts]
+        is_map = proposal.key == "columns"
+        proposal.columns["contact_active"] = {"always": always} if is_map else dict.fromkeys(always, True)
+        proposal.notes["contact_active"] = "every foot touches throughout, as nothing recorded says otherwise"
 
 
 def _describe(
@@ -263,10 +253,10 @@ def _describe(
         out.guessed.append(f"robot.weld: {_WELDED}: {join_names(proposal.lacking)}")
     if proposal.left_out:
         out.guessed.append(f"{format_count(len(proposal.left_out), what)} not needed: {join_names(proposal.left_out)}")
-    out.missing += _missing_columns(robot, fields, proposal)
+    out.missing += missing_columns(len(robot.joint_names), fields, proposal.partial, what)
     if not set(_FORCES) & fields:
         out.missing.append("forces: neither joint torques nor contact wrenches")
-    _describe_plates(out, proposal)
+    out.missing += hints(proposal.left_out, fields, robot.joint_names, what)
     from_feet = _from_feet(contacts, fields)
     if contacts and "contact_active" not in fields:
         instead = "detected from joint torques" if "detect_contacts" in from_feet else "set to touch throughout"
@@ -274,20 +264,6 @@ def _describe(
     if _lacks_base_motion(contacts, fields):
         instead = "; taken from the feet that stand" if "base_motion" in from_feet else ""
         out.missing.append(f"motion of the base: neither its pose nor an IMU{instead}")
-
-
-def _missing_columns(robot: Robot, fields: set[str], proposal: MapProposal) -> list[str]:
-    """What stamps and fields of joints lack, in words."""
-    what = proposal.key.removesuffix("s")
-    partial = {name: joints for name, joints in proposal.partial.items() if name not in fields}
-    out = [
-        f"{name}: no {what} of numbers of {join_names(joints)}, but of all others" for name, joints in partial.items()
-    ]
-    for name in ("time", "joint_position"):
-        if name not in fields | partial.keys():
-            of_joints = f", of most of {len(robot.joint_names)} joints" * (name != "time")
-            out.append(f"{name}: no {what}s that look like it{of_joints}{_OTHER_FILE * (what == 'column')}")
-    return out
 
 
 def _describe_found(
@@ -305,16 +281,37 @@ def _describe_found(
         out.found.append(f"{proposal.key} of {', '.join(known)}")
 
 
-def _try(out: Initiated, path: Path, proposal: MapProposal) -> None:
-    """Read the log with the map, and say why that fails if it does."""
+def _try(path: Path, proposal: MapProposal) -> Log | InputError:
+    """The log as it is read with the map, or why it is not."""
     try:
         maps = {"columns": Columns, "topics": Topics}[proposal.key]
         given = {proposal.key: maps(**proposal.columns)} if proposal.columns else {}
-        log = read_log(path, allow_gaps=True, **given)
+        return read_log(path, allow_gaps=True, **given)
     except InputError as error:
-        out.missing.append(f"the log is not read with this file yet: {error.field}: {error.found}")
+        return error
+
+
+def _describe_log(out: Initiated, read: Log | InputError) -> None:
+    """What there is of the log, or why it is not read."""
+    if isinstance(read, InputError):
+        out.missing.append(f"the log is not read with this file yet: {read.field}: {read.found}")
         return
-    out.found.append(f"{len(log)} samples over {log.time[-1] - log.time[0]:.4g} s: {', '.join(log.arrays())}")
+    has = [name for name, array in read.arrays().items() if array.size]
+    out.found.append(f"{len(read)} samples over {read.time[-1] - read.time[0]:.4g} s: {', '.join(has)}")
+
+
+def _gaps(read: Log | InputError) -> dict[str, tuple[object, str]]:
+    """The keys of preprocessing that a log with gaps in its motion needs, with the reason."""
+    longest, at_end, name = (0.0, False, "") if isinstance(read, InputError) else gaps_in_motion(read)
+    out: dict[str, tuple[object, str]] = {}
+    if 0.0 < longest <= BRIDGED_S:
+        out["bridge_gaps_s"] = (BRIDGED_S, f"as gaps of {name} take up to {longest:.2g} s")
+    if longest > BRIDGED_S or at_end:
+        reason = (
+            f"as gaps of {name} take up to {longest:.2g} s" if longest > BRIDGED_S else f"as {name} has one at an end"
+        )
+        out["exclude_condemned"] = (True, reason)
+    return out
 
 
 # ------------------------------------------------------------------------------------------------------- the file
@@ -328,13 +325,10 @@ def _text(
     contacts: Sequence[_Contact],
     fields: set[str],
     proposal: MapProposal,
+    gaps: dict[str, tuple[object, str]],
 ) -> str:
     """The experiment file, with comments."""
-    from_feet, is_map = _from_feet(contacts, fields), proposal.key == "columns"
-    if contacts and "contact_active" not in fields and "detect_contacts" not in from_feet:
-        always = [contact.frame for contact in contacts]
-        proposal.columns["contact_active"] = {"always": always} if is_map else dict.fromkeys(always, True)
-        proposal.notes["contact_active"] = "every foot touches throughout, as nothing recorded says otherwise"
+    from_feet = _from_feet(contacts, fields)
     own: dict[str, object] = {"urdf": _relative(Path(urdf), output)} | (
         {"fixed_base": True} if _is_fixed(contacts, fields) else {}
     )
@@ -357,8 +351,10 @@ def _text(
             lines += [f"    # guessed: {note}"] if note else []
             lines += [f"    {line}" for line in _entry(key, value)]
     lines += [f"# {' and '.join(from_feet)}: nobody recorded them"] if from_feet else []
-    lines += _entry("preprocessing", {"cutoff_hz": "auto"} | from_feet)
-    lines += _entry("sensors", _sensors(fields, list(proposal.columns.get("ft_wrenches", ()))))
+    lines += [f"# {key}: {why}" for key, (_, why) in gaps.items()]
+    stated = {key: value for key, (value, _) in gaps.items()}
+    lines += _entry("preprocessing", {"cutoff_hz": "auto"} | from_feet | stated)
+    lines += _entry("sensors", sensor_set(fields, list(proposal.columns.get("ft_wrenches", ()))))
     lines += _entry("estimator", {"name": "consistent", "ridge": "auto"})
     lines += _entry("output", f"runs/{output.stem}")
     return "\n".join(lines) + "\n"

@@ -34,6 +34,9 @@ MAX_UNEXPLAINED_RATIO = 1.0
 #: Share of the misfit that a corrected mistake may leave. Misfits above 1, that of zero forces, count as 1: forces that
 #: are far too large fit better after any reduction.
 MAX_RESIDUAL_SHARE = 0.5
+#: Misfit that a corrected mistake leaves, above which it may be another robot that the forces are of: 0.05 to 0.1 is a
+#: URDF that is 20 % off, 0.33 was a robot of four times the weight whose torques were taken for kg m.
+MAX_CLEAR_MISFIT = 0.2
 #: Factors of single torques in another unit, and the tolerance of such a factor (see `model.MAX_GAIN_RATIO`).
 TORQUE_UNIT_FACTORS = {1e-3: "in mN m", 1e3: "in kN m"}
 _UNIT_TOLERANCE_RATIO = 3.0
@@ -97,7 +100,8 @@ def check_forces_against_urdf(
         return
     if fit.misfit > MAX_MISFIT and (scale is None or scale.recorded > MAX_UNEXPLAINED_RATIO):
         text = f"measured forces differ from the URDF's by {_percent(fit.misfit)}, and no usual mistake explains it"
-        advice = "check units, frames, the order of joints and contacts, friction, the URDF's base link and masses"
+        advice = "check units, frames, the order of joints and contacts, friction, the URDF's base link and masses,"
+        advice += " and whether the URDF is that of this robot"
         yield Finding("forces", SUSPICIOUS, "all", text, advice)
         return
     torques = [] if fit.torque is None else list(_torque_findings(robot, fit.torque))
@@ -125,7 +129,8 @@ def _best_mistake(
     if best is None:
         return None
     text = f"measured forces differ from the URDF's by {_percent(fit.misfit)}, by {_percent(least)} once corrected"
-    return Finding("unit, sign or frame", CONDEMNED, best.field, f"{best.description}: {text}", best.advice)
+    advice = best.advice + f"; or is {robot.path.name} another robot's?" * (least > MAX_CLEAR_MISFIT)
+    return Finding("unit, sign or frame", CONDEMNED, best.field, f"{best.description}: {text}", advice)
 
 
 def _may_explain(field: str, fit: ModelFit) -> bool:

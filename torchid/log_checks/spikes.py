@@ -175,7 +175,8 @@ def _position_steps(field: str, steps: _Jumps, samples: int) -> Iterator[Finding
     for kind, jumps in kinds.items():
         if kind == "wrapped":
             spans = tuple(_span(name, jump, 2.0 * np.pi * _turns(jump)) for name, jump in jumps)
-            advice = "unwrap the angle"
+            advice = f"logs.columns.{field}.turn_from, where its turn begins, such as -180 of deg; or unwrap it"
+            advice = advice if field == "joint_position" else "unwrap the angle"
             yield _finding("wrapped angle", CONDEMNED, field, jumps, advice, spans)
         elif kind == "displacement":
             spans = tuple(_span(name, jump, jump.size) for name, jump in jumps)

@@ -72,6 +72,7 @@ def _weight_findings(carried: float, when: str, field: str, robot: Robot | None)
         return
     if abs(ratio - 1.0) > MAX_MASS_ERROR:
         advice = "check for an unmeasured contact, a payload, an offset or gain of a sensor"
+        advice += ", and whether the URDF is that of this robot" * (not 0.5 < ratio < 2.0)
         yield Finding("weight", SUSPICIOUS, field, text, advice)
     elif abs(ratio - 1.0) > MIN_NOTED_MASS_ERROR:
         advice = "none if the URDF may have this error; an offset of a sensor has the same effect"

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import LogError, about_file
+from torchid.logs.array_parts import lazy_part
 from torchid.logs.column_map import Columns
 from torchid.logs.containers import Container, LogKind, existing_log_kind, open_container, reader_errors_explained
 from torchid.logs.log import (
@@ -225,7 +226,7 @@ def _open_arrays(
         text = [name for name in given if _is_text(name)]
         return {name: load(name) for name in text}, {name: lazy(name) for name in given if name not in text}
     sources = dict.fromkeys(source for name in mapped.fields for source in mapped.sources_of(name))
-    arrays = {source: lazy(source) for source in sources}
+    arrays = {source: lazy_part(source, given, lazy) for source in sources}
     fields: dict[str, LazyArray] = {}
     for name in mapped.fields:
         with reader_errors_explained(name, _ACCEPTED):

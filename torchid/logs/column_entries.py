@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from pydantic import BeforeValidator, ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from torchid.settings import Number
+from torchid.settings import Number, Positive
 
 KEY = "logs.columns"
 STRICT = ConfigDict(extra="forbid")
@@ -60,6 +60,23 @@ class ColumnEntry:
 
 
 Entry = Annotated[ColumnEntry, BeforeValidator(_column)]
+
+
+@dataclass(config=STRICT, frozen=True, kw_only=True)
+class TimeEntry(ColumnEntry):
+    """Stamps as a column; `step`: in its place, how much later each sample is than the one before, in the unit."""
+
+    step: Positive | None = None
+
+
+@dataclass(config=STRICT, frozen=True, kw_only=True)
+class AngleEntry(ColumnEntry):
+    """Positions of joints; `turn_from`: where the turn begins that angles are counted in, in their unit.
+
+    Of an encoder that jumps from 359 to 0 deg, -180 makes 359 deg -1 deg.
+    """
+
+    turn_from: Annotated[dict[str, Number], BeforeValidator(_for_all)] = dataclasses.field(default_factory=dict)
 
 
 @dataclass(config=STRICT, frozen=True, kw_only=True)
@@ -135,6 +152,8 @@ class Plate:
     rpy_deg: _Three = (0.0, 0.0, 0.0)
 
 
+Stamps = Annotated[TimeEntry, BeforeValidator(_column)]
+Angle = Annotated[AngleEntry, BeforeValidator(_column)]
 Torque = Annotated[TorqueEntry, BeforeValidator(_column)]
 Flags = Annotated[FlagEntry, BeforeValidator(_column)]
 Wrench = Annotated[WrenchEntry, BeforeValidator(_column)]

@@ -8,12 +8,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from torchid.logs.column_map import PLACEHOLDER
-from torchid.logs.name_matching import SUFFIXES, KnownRobot, spelled, within
+from torchid.logs.name_matching import SUFFIXES, KnownRobot, joints_by_place, spelled, within
 from torchid.logs.units import split_unit
 
 _NUMBER = re.compile(r"\d+")
 _AXIS = re.compile(
-    r"(?<=[._\-/\[ ])([wxyz])(?=$|[\]])|(?<=[a-zFM_.\-/\[ ])([WXYZ])(?=$|[\]])|(?<=[a-zFM])([wxyz])$",
+    r"(?<=[._\-/\[ ])([wxyz])(?=$|[\]])|(?<=[a-zFM_.\-/\[ ])([WXYZ])(?=$|[\]])|(?<=[a-zFM])([wxyz])$"
+    r"|(?<=[a-z])([XYZ])(?=[/_.])",
 )
 _BEHIND = re.compile(r"[_./ \[-]*\{[^{}]*\}\]?$")  # a unit: the axis in `acc_g.{axis}`
 
@@ -29,6 +30,7 @@ class Family:
         numbers: in the names; none where there are none.
         axes: likewise.
         by_name: by name of the URDF, its column, where the file spells names in another way; a pattern does not do.
+        by_place: whether names are those of limbs with a number of the joint in each.
     """
 
     pattern: str
@@ -37,11 +39,17 @@ class Family:
     numbers: tuple[int, ...]
     axes: tuple[str, ...]
     by_name: Mapping[str, str] = field(default_factory=dict)
+    by_place: bool = False
 
     @property
     def words(self) -> str:
         """All that is neither a name nor a number nor an axis."""
         return PLACEHOLDER.sub(" ", self.pattern)
+
+    @property
+    def as_ignored(self) -> str:
+        """A pattern of `ignore` that its columns fit."""
+        return PLACEHOLDER.sub("*", self.pattern)
 
     @property
     def unit(self) -> str:
@@ -64,6 +72,7 @@ class _Stems:
         suffix: that the URDF's names have more.
         find: the place of a name in a column.
         exact: whether the file spells names as the URDF does.
+        by_place: whether it has limbs with a number of the joint in each.
     """
 
     kind: str
@@ -71,6 +80,7 @@ class _Stems:
     suffix: str = ""
     find: Callable[[str], re.Pattern[str]] = within
     exact: bool = True
+    by_place: bool = False
 
 
 def find_families(columns: Sequence[str], robot: KnownRobot) -> tuple[list[Family], dict[str, str]]:
@@ -81,6 +91,8 @@ def find_families(columns: Sequence[str], robot: KnownRobot) -> tuple[list[Famil
         robot: whose joints and contacts they may name.
     """
     joints = _stems("joint", columns, robot.joints, _Stems("joint"))
+    if 2 * len(joints.names) <= len(robot.joints) and (places := joints_by_place(columns, robot.joints)):
+        joints = _Stems("joint", places, exact=False, by_place=True)
     kinds = (joints, _stems("contact", columns, robot.feet, joints))
     with_axes = [_pattern(column, kinds) for column in columns]
     axes = defaultdict[str, set[str]](set)
@@ -108,8 +120,19 @@ def _families(pattern: str, members: Sequence[tuple[str, str, str, str]], kinds:
     other = kind is not None and not kind.exact
     if not whole or (len(members) == 1 and PLACEHOLDER.search(pattern)) or (other and any(axes)):
         return [Family(column, [column], ("",), (), ("",)) for column in texts]
+    by_place = kind is not None and kind.by_place
     by_name = {kind.names[name]: column for column, name, *_ in members} if kind is not None and other else {}
-    return [Family(pattern, texts, tuple(names), tuple(int(x) for x in numbers if x), tuple(axes), by_name)]
+    return [
+        Family(
+            pattern,
+            texts,
+            tuple(names),
+            tuple(int(x) for x in numbers if x),
+            tuple(axes),
+            by_name,
+            by_place,
+        )
+    ]
 
 
 def _stems(kind: str, columns: Sequence[str], names: Sequence[str], others: _Stems) -> _Stems:

@@ -12,10 +12,11 @@ from typing import Annotated, TypeVar
 from pydantic import BeforeValidator
 from pydantic.dataclasses import dataclass
 
-from torchid.errors import ConfigError, UnknownNameError, excerpt
+from torchid.errors import ConfigError, UnknownNameError, excerpt, join_names
 from torchid.logs.column_entries import (
     KEY,
     STRICT,
+    Angle,
     ColumnEntry,
     Entry,
     FlagEntry,
@@ -25,6 +26,7 @@ from torchid.logs.column_entries import (
     Names,
     PdLaw,
     Plate,
+    Stamps,
     Torque,
     TorqueEntry,
     Vector,
@@ -61,9 +63,9 @@ class Columns:
         ignore: columns that are not needed; * and ? stand for others.
     """
 
-    time: Entry | None = None
+    time: Stamps | None = None
     other_times: list[Entry] = dataclasses.field(default_factory=list)
-    joint_position: Entry | None = None
+    joint_position: Angle | None = None
     joint_velocity: Entry | None = None
     joint_acceleration: Entry | None = None
     joint_torque: Torque | None = None
@@ -257,6 +259,7 @@ def _check_given(field: str, entry: ColumnEntry) -> None:
         "pd": getattr(entry, "pd", None),
         "always": getattr(entry, "always", None),
         "force": getattr(entry, "force", None),
+        "step": getattr(entry, "step", None),
     }
     given = [name for name, value in ways.items() if value]
     own = [name for name in ways if hasattr(entry, name)]
@@ -267,7 +270,8 @@ def _check_given(field: str, entry: ColumnEntry) -> None:
         found = f"{' and '.join(given)} together" if given else "nothing that says where it is"
         raise ConfigError.at_field(f"{KEY}.{field}", found, f"one of {', '.join(own)}")
     if given[0] not in ("column", "columns"):
-        _check_unscaled(field, entry, [x for x in ("unit", "scale", "order") if getattr(entry, x)], given[0])
+        unsaid = ("scale", "order") if given[0] == "step" else ("unit", "scale", "order")
+        _check_unscaled(field, entry, [x for x in unsaid if getattr(entry, x)], given[0])
     if isinstance(entry, WrenchEntry) and entry.moment is not None and entry.force is None:
         raise ConfigError.at_field(f"{KEY}.{field}", "moment without force", "force, with or without moment")
     if isinstance(entry, TorqueEntry) and entry.pd is not None:
@@ -352,6 +356,10 @@ def require_names(columns: Columns, known: Mapping[str, Collection[str]]) -> Non
     if columns.contact_active is not None:
         stated.append(("contact", "contact_active.always", columns.contact_active.always))
     for kind, key, names in stated:
-        for name in names:
-            if kind in known and name is not None and name not in known[kind]:
-                raise UnknownNameError.at_field(f"{KEY}.{key}", name, known[kind])
+        given = [name for name in names if name is not None]
+        unknown = [name for name in given if kind in known and name not in known[kind]]
+        if len(unknown) > 1 and unknown == given:
+            found = f"none of {join_names(given)} is a {kind} of the URDF; is it that of the robot that was recorded?"
+            raise ConfigError.at_field(f"{KEY}.{key}", found, f"names of the URDF: {join_names(list(known[kind]))}")
+        if unknown:
+            raise UnknownNameError.at_field(f"{KEY}.{key}", unknown[0], known[kind])

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from torchid.errors import ConfigError, LogError, excerpt, join_names
-from torchid.logs.column_entries import KEY
+from torchid.logs.column_entries import KEY, TimeEntry
 from torchid.logs.column_map import AXES, PLACEHOLDER, Columns, Part, fits, letters_of, list_parts
 from torchid.logs.column_proposals import name_unknown
 from torchid.logs.columns import KINDS
@@ -276,7 +276,7 @@ def columns_of_file(columns: Columns, given: Sequence[str]) -> Columns:
     others = [entry for entry in columns.other_times if entry.column in given]
     if not others or (columns.time is not None and columns.time.column in given):
         return columns
-    return replace(columns, time=others[0])
+    return replace(columns, time=TimeEntry(**vars(others[0])))
 
 
 def columns_by_file(columns: Columns, given: Sequence[Sequence[str]], files: Sequence[str]) -> list[Columns | None]:

@@ -18,25 +18,29 @@ _LISTED, _LONGEST = 12, 60
 _SHARE = 0.2  # of the way from the lowest to the highest reading, a threshold of contact
 #: What force plates read; under which foot each lies, no name of a column says.
 OF_PLATES = (WRENCHES[1], POINTS)
-_BASE = r"\b(base|root|trunk|torso|pelvis|body|floating base)"
+#: The base, as recordings call it.
+OF_BASE = r"\b(base|root|trunk|torso|pelvis|body|floating base|mocap|odom|odometry)"
+_STAMPS = r"(time|timestamps?|stamps?|tstamps?)"
 #: Words that recordings have for a field, by what the name of a column contains; the first that fits counts.
 _WORDS = (
+    ("time", rf"\b{_STAMPS}$"),  # of positions/timestamps
     (POINTS, r"\b(cop[xyz]?|ground force p[xyz])\b"),
     (WRENCHES[1], r"\b(ground (force|torque|moment)s?|force ?plates?|fp)\b"),
-    ("base_position_world", rf"{_BASE} (pos|position|xyz)\b"),
-    ("base_linear_velocity_world", rf"{_BASE} (lin vel|linear vel|linear velocity|vel|velocity)\b"),
-    ("base_angular_velocity_base", rf"{_BASE} (ang vel|angular velocity|omega)\b"),
-    ("joint_acceleration", r"\b(ddq|qdd|qacc|joint acc|joint acceleration)\b"),
+    ("base_position_world", rf"{OF_BASE} (pos|position|xyz)\b"),
+    ("base_linear_velocity_world", rf"{OF_BASE} (lin vel|linear vel|linear velocity|vel|velocity)\b"),
+    ("base_angular_velocity_base", rf"{OF_BASE} (ang vel|angular velocity|omega)\b"),
+    ("base_quat_wxyz", rf"{OF_BASE} (q|rot|rotation)\b"),
+    ("joint_acceleration", r"\b(ddqj?|qdd|thdd|qacc|joint acc|joint acceleration)\b"),
     ("imu_angular_velocity", r"\b(gyro\w*|omega|ang vel|angular velocity)\b"),
     ("imu_specific_force", r"\b(acc|accel\w*|linear acceleration|specific force)\b"),
     ("base_quat_wxyz", r"\b(quat\w*|orientation)\b"),
     ("contact_wrench_local", r"\b(wrench|wrenches)\b"),
-    ("contact_force_normal", r"\b(foot forces?|feet forces?|grf)\b"),
+    ("contact_force_normal", r"\b(foot forces?|feet forces?|contact forces?|grf|fsr)\b"),
     ("contact_active", r"\b(contacts?|touch|touches|stance)\b"),
-    ("joint_torque", r"\b(taus?|torques?|efforts?|trq)\b"),
-    ("joint_velocity", r"\b(dqs?|qd|qvel|vel|vels|velocity|velocities|speeds?|rates?)\b"),
-    ("joint_position", r"\b(qs?|qpos|pos|positions?|angles?)\b"),
-    ("time", r"\b(t|ts|time|timestamps?|stamps?|ticks?|clock|sec|secs|seconds)\b"),
+    ("joint_torque", r"\b(taus?|torques?|efforts?|trq|load|qfrc)\b"),
+    ("joint_velocity", r"\b(dqs?|dqj|qd|qdot|thd|v|qvel|vel|vels|velocity|velocities|speeds?|rates?)\b"),
+    ("joint_position", r"\b(qs?|qj|th|theta|qpos|pos|positions?|angles?)\b"),
+    ("time", rf"\b(t|ts|{_STAMPS}|ticks?|clock|sec|secs|seconds)\b"),
 )
 #: Fields that a unit alone tells: of `LF_HAA [deg]`, `LF_HAA [deg/s]`.
 _BY_QUANTITY = {
@@ -63,7 +67,8 @@ def propose_field(column: str, desired: bool = False) -> str:
     column, unit = split_unit(column)
     words = " ".join(_words(column))
     close = difflib.get_close_matches(column.partition(".")[0], _FIELDS, n=1, cutoff=0.8)
-    if close and not _contradicts(words, " ".join(_words(close[0]))):
+    of_base = bool(close) and "imu" in words.split() and not close[0].startswith("imu")
+    if close and not of_base and not _contradicts(words, " ".join(_words(close[0]))):
         return close[0]
     if not desired and _DESIRED.search(words):
         return ""

@@ -7,7 +7,9 @@ unitree_ros. H1-2 is not here: public sources disagree about its hips (yaw, pitc
 
 from __future__ import annotations
 
-from collections.abc import Collection
+import re
+from collections import defaultdict
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 from torchid.errors import ConfigError
@@ -102,12 +104,24 @@ def usual_order(kind: str, robot: KnownRobot, count: int) -> tuple[list[str] | s
     names = robot.joints if kind == "joint" else robot.feet
     for name in suitable_orders(robot.joints, robot.name) if kind == "joint" else ():
         order = JOINT_ORDERS[name]
-        if set(order.names) == set(names) and count >= len(order.joints):
+        is_whole = set(order.names) == set(names) or count < len(names)
+        if is_whole and count >= len(order.joints):
             return name, f"that of {name}, whose joints the URDF has"
+    if kind == "joint" and count < len(names):
+        return numbered_joints(names, count), "names that differ in a number"
     is_alike = any("thigh" in joint or "calf" in joint for joint in robot.joints)
     if names and is_alike and all(name.partition("_")[0] in _LEGS for name in names):
         return sorted(names, key=lambda name: _LEGS.index(name.partition("_")[0])), "as Unitree numbers legs"
     return list(names), "as in the URDF"
+
+
+def numbered_joints(joints: Sequence[str], count: int) -> list[str]:
+    """Joints whose names differ in a number alone, if that are so many; all but those of hands likewise; else none."""
+    alike = defaultdict[str, list[str]](list)
+    for name in joints:
+        alike[re.sub(r"\d+", "#", name)].append(name)
+    without = [name for name in joints if not re.search(r"finger|gripper|hand|thumb", name, re.IGNORECASE)]
+    return next((names for names in (*alike.values(), without) if len(names) == count), [])
 
 
 def require_joints_of(field: str, robot: str, joints: Collection[str]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
@@ -12,25 +13,24 @@ from numpy.typing import NDArray
 
 from torchid.errors import excerpt
 from torchid.logs.column_families import Family, find_families
-from torchid.logs.column_map import PLACEHOLDER
-from torchid.logs.column_proposals import OF_PLATES, is_desired, propose_field, threshold
+from torchid.logs.column_proposals import OF_BASE, OF_PLATES, is_desired, propose_field
 from torchid.logs.column_samples import Columns, stated_names
 from torchid.logs.columns import is_column
-from torchid.logs.joint_orders import JOINT_ORDERS, MOTORS, suitable_orders, usual_order
-from torchid.logs.log import SHAPES, VARIANTS
+from torchid.logs.force_proposals import point_along_z, threshold
+from torchid.logs.joint_orders import JOINT_ORDERS, MOTORS, numbered_joints, suitable_orders, usual_order
+from torchid.logs.log import SHAPES, VARIANTS, WRENCHES
 from torchid.logs.name_matching import SUFFIXES, KnownRobot, match_names
-from torchid.logs.units import IN_DEGREES, UNITS, quantities_of, quantities_with, unit_factor
+from torchid.logs.part_proposals import split_arrays
+from torchid.logs.unit_proposals import UnitProposer, step_of_stamps
+from torchid.logs.units import IN_DEGREES, quantities_of, quantities_with, unit_factor
 
 _GAINS = re.compile(r"\b(kp|kd)\b", re.IGNORECASE)
 _FORCE = re.compile(r"force|(?<![a-z])f\{axis", re.IGNORECASE)
 _MOMENT = re.compile(r"moment|torque|(?<![a-z])[mt]\{axis", re.IGNORECASE)
 _SIDEWAYS = re.compile(r"(?<![a-z])(f[xy]|m[xyz])(?![a-z])", re.IGNORECASE)  # components that tell of no contact
+_DRIVE = re.compile(r"joint|motor|current|temp|limit|volt", re.IGNORECASE)  # of a limb, but of no foot
 _FOOT = re.compile(r"foot|feet", re.IGNORECASE)
 _LAW = {"joint_position": "position", "joint_velocity": "velocity", "joint_torque": "feed_forward"}
-_STEP = (2e-4, 0.2)  # [s]: of recordings
-_TURNED = 7.0  # [rad]: no joint's position is as large throughout
-_LEVER = 1.0  # [m]: rms of no torque is as large as that of the robot's weight with it
-_FAR = 60.0  # [m]: no base is recorded as far away
 _SORTED = 0.9  # of the steps of stamps, forwards
 _TOUCH = 0.05  # of the robot's weight, what a contact bears at least
 
@@ -69,61 +69,108 @@ def propose_map(
         files: columns of each of several files that are one log, whose stamps may differ in name.
         in_degrees: columns of files whose header says that angles are in degrees.
     """
-    native = [name for name in sample if is_column(name) or name in (*SHAPES, *VARIANTS)]
-    foreign = [name for name in sample if name not in native]
-    return _Proposer(sample, native, robot, files, in_degrees).propose(foreign)
+    return _Proposer(sample, robot, files, in_degrees).propose()
 
 
 class _Proposer:
     def __init__(
-        self,
-        sample: Columns,
-        native: Sequence[str],
-        robot: KnownRobot,
-        files: Sequence[Collection[str]],
-        in_degrees: Collection[str],
+        self, sample: Columns, robot: KnownRobot, files: Sequence[Collection[str]], in_degrees: Collection[str]
     ) -> None:
-        self.sample, self.native, self.robot, self.files = sample, native, robot, files
-        self.in_degrees = in_degrees
+        self.sample, self.robot, self.files, self.in_degrees = sample, robot, files, in_degrees
         self.joints, self.feet = robot.joints, robot.feet
-        self.given = {name.partition(".")[0] for name in native}
+        self.native = {name for name in sample if is_column(name) or name in (*SHAPES, *VARIANTS)}
+        self.given = {name.partition(".")[0] for name in self.native}
         self.out = MapProposal()
         stated = stated_names(sample, "joint_names")
         self.names_stated = bool(stated) and set(stated) <= set(self.joints)
         self.named_joints = set(stated) if self.names_stated else set[str]()
-        self.joint_suffix = ""
-        self.factors: dict[str, float] = {}  # of units that columns state, by key
+        self.joint_suffix, self.factors = "", dict[str, float]()  # factors of units that columns state, by key
 
-    def propose(self, foreign: Sequence[str]) -> MapProposal:
+    def propose(self) -> MapProposal:
+        foreign = [name for name in self.sample if name not in self.native]
         numeric = [name for name in foreign if self._is_numeric(name)]
         families, more = find_families(numeric, self.robot)
         self.out.columns |= {f"{kind}_name": pattern for kind, pattern in more.items()}
         self.joint_suffix = more.get("joint", "").removeprefix("{joint}")
         self.named_joints = self.named_joints or self._all_named(families)
         self.out.lacking = [name for name in self.joints if self.named_joints and name not in self.named_joints]
-        used: list[Family] = [one for one in families if self._place(one)]
+        split = self._place_parts(numeric)
+        families = [one for one in families if one.columns[0] not in split]
+        stamps = [one for one in families if self._field(one) == "time"]
+        used = [one for one in families if one not in stamps and self._place(one)]
+        used += [one for one in self._stamps_first(stamps) if self._place(one)]
+        if "time" in self.out.columns:
+            self.out.columns = {"time": self.out.columns["time"], **self.out.columns}
+        elif "time" not in self.given and (found := step_of_stamps(self.sample)):
+            self.out.columns = {"time": {"step": found[1]}, **self.out.columns}
+            self.out.notes["time"] = f"steps of '{found[0]}' [s], as nothing has stamps"
         if "joint_torque" not in {*self.given, *self.out.columns}:
             used += self._place_law([one for one in families if one not in used])
-        if set(wrench := self.out.columns.get("contact_wrench_local", {})) == {"moment"}:  # of no use without forces
-            used = [one for one in used if not one.entry.items() <= wrench["moment"].items()]
-            del self.out.columns["contact_wrench_local"]
-        if "contact_wrench_local" in self.out.columns and "contact_active" not in {*self.given, *self.out.columns}:
-            self.out.columns["contact_active"] = {"above": float(f"{_TOUCH * self.robot.weight:.2g}")}
-            self.out.notes["contact_active"] = f"above {_TOUCH:.0%} of the URDF's weight [N], by the wrenches"
-        taken = {column for one in used for column in one.columns}
+        used = self._settle_contacts(used)
+        taken = {column for one in used for column in one.columns} | split
         self.out.left_out = [name for name in foreign if name not in taken]
-        ignored = {_anything(one.pattern) for one in families if one not in used}
-        ignored |= {name for name in foreign if not self._is_numeric(name)}
-        ignored |= {_anything(one.pattern) for one in used if len(one.numbers) > len(self.joints)}
+        ignored = {one.as_ignored for one in families if one not in used or len(one.numbers) > len(self.joints)}
+        ignored |= {name for name in foreign if name not in numeric}
         if ignored:
             self.out.columns["ignore"] = sorted(ignored)
         with np.errstate(all="ignore"):  # of numbers that no unit explains
-            self._add_units()
+            units = UnitProposer(self.sample, self.out.columns, self.out.notes, self.factors)
+            units.propose(self.robot.weight, not self.files)
         return self.out
+
+    def _settle_contacts(self, used: list[Family]) -> list[Family]:
+        """The families in use without moments of contacts that have no force; flags by forces where none are."""
+        for name in [name for name in WRENCHES if set(self.out.columns.get(name, {})) == {"moment"}]:
+            moment = self.out.columns.pop(name)["moment"]
+            used = [one for one in used if not one.entry.items() <= moment.items()]
+        if set(WRENCHES) & set(self.out.columns) and "contact_active" not in {*self.given, *self.out.columns}:
+            self.out.columns["contact_active"] = {"above": float(f"{_TOUCH * self.robot.weight:.2g}")}
+            self.out.notes["contact_active"] = f"above {_TOUCH:.0%} of the URDF's weight [N], by the wrenches"
+        return used
+
+    def _note(self, key: str, text: str) -> None:
+        self.out.notes[key] = "; ".join(filter(None, (text, self.out.notes.get(key))))
 
     def _is_numeric(self, name: str) -> bool:
         values = self.sample[name]
         return values is not None and values.dtype.kind in "fiub"
+
+    def _place_parts(self, numeric: Sequence[str]) -> set[str]:
+        """Arrays of which parts have become entries."""
+        if {"base_position_world", "base_quat_wxyz", "base_quat_xyzw"} & self.given:
+            return set()
+        counts = {len(numbered_joints(self.joints, count)) for count in range(len(self.joints))} - {0}
+        measured = [name for name in numeric if not is_desired(name)]
+        every = split_arrays(self.sample, measured, {*counts, len(self.joints)})
+        parts = [part for part in every if part[2] not in self.given]
+        for part in parts:
+            self._place_part(*part)
+        return {name for name, *_ in parts}
+
+    def _place_part(self, name: str, columns: str, field: str) -> None:
+        """Make some columns of an array an entry."""
+        (start, _, stop), text = columns.strip("[]").partition(":"), f"{name}{columns}"
+        part = np.asarray(self.sample[name])[:, int(start) : int(stop) if stop else None]
+        self.sample = {**self.sample, text: part}
+        family = Family(text, [text], ("",), (), ("",))
+        if field == "base_quat_wxyz":
+            field = self._quaternion(family)
+        if field.startswith("joint_") and "joint_order" not in self.out.columns and len(part.T) == len(self.joints):
+            self.out.columns["joint_order"] = list(self.joints)
+            self.out.notes["joint_order"] = "as in the URDF, as of libraries for dynamics"
+        self._add_order(family, field)
+        self.out.columns[field] = {"column": text}
+        self._note(field, f"columns {start} to {stop or 'the last'} of '{name}'")
+
+    def _stamps_first(self, families: Sequence[Family]) -> list[Family]:
+        """Families of stamps, those that increase first, of these those beside the positions of joints."""
+        entry = self.out.columns.get("joint_position", {})
+        beside = next(iter(entry.get("columns", {}).values()), "") or entry.get("column", "joint_position")
+
+        def rank(family: Family) -> tuple[bool, int]:
+            return not self._increases(family.columns[0]), -len(os.path.commonprefix([family.columns[0], beside]))
+
+        return sorted(families, key=rank)
 
     # ----------------------------------------------------------------------------------------------------- fields
 
@@ -132,11 +179,13 @@ class _Proposer:
         if is_desired(family.words) or _GAINS.search(family.words.replace("_", " ")):
             return False
         name = self._field(family)
-        if name == "contact_wrench_local" and len(family.axes) == 3:
+        if name == "contact_wrench_local" and (len(family.axes) == 3 or self._shape(family)[1:] == (3,)):
             return self._place_force(family)
         if name == "time" and name in self.out.columns:
             return self._place_other_time(family)
-        if not name or name in self.given or name in self.out.columns or not self._fits(family, name):
+        known = {*self.given, *self.out.columns}
+        again = name == "base_quat_wxyz" and "base_quat_xyzw" in known
+        if not name or name in known or again or not self._fits(family, name):
             return False
         entry: dict[str, Any] = family.entry
         if (first := min(family.numbers, default=0)) > 0:
@@ -144,11 +193,13 @@ class _Proposer:
         if name == "base_quat_wxyz":
             name = self._quaternion(family)
             if "imu" in family.words.lower():
-                self.out.notes[name] = "of the IMU, taken to be that of the base link; " + self.out.notes.get(name, "")
+                self._note(name, "of the IMU, taken to be that of the base link")
         if name == "contact_active":
             self._add_threshold(family, entry)
         self._add_order(family, name)
         self._add_stated_unit(family, entry, name, quantities_of(name))
+        if family.by_place:
+            self._note(name, "joints by their limb and number, counted from the base outwards")
         self.out.columns[name] = entry
         return True
 
@@ -180,13 +231,16 @@ class _Proposer:
         name, axes = propose_field(family.words), len(family.axes) == 3
         if not name and "time" in quantities_with(family.unit) and self._increases(family.columns[0]):
             return "time"
+        if not name and axes and re.fullmatch(OF_BASE, family.words.strip(" _./").lower()):
+            return "base_position_world"
         of_foot = "{contact}" in family.pattern or _FOOT.search(family.words) is not None
         of_force = name == "contact_force_normal" or _FORCE.search(family.pattern) or _MOMENT.search(family.pattern)
-        if axes and of_foot and of_force:
+        shape = self._shape(family)
+        if of_force and ((axes and of_foot) or (len(family.columns) == 1 and shape == (len(self.feet), 3))):
             return "contact_wrench_local"
         if of_foot and (_SIDEWAYS.search(family.words) or quantities_with(family.unit)[:1] == ("torque",)):
             return ""
-        if name == "contact_force_normal" or (not name and of_foot):
+        if name == "contact_force_normal" or (not name and of_foot and not _DRIVE.search(family.words)):
             return "contact_active"  # as a threshold: what it is in newtons nobody knows
         return "base_position_world" if name == "joint_position" and axes and not any(family.names) else name
 
@@ -196,12 +250,18 @@ class _Proposer:
             values is not None and values.ndim == 1 and len(values) > 2 and bool((np.diff(values) > 0).mean() > _SORTED)
         )
 
+    def _shape(self, family: Family) -> tuple[int, ...]:
+        """What a column or array of a family has of each sample."""
+        first = self.sample[family.columns[0]]
+        inner = () if first is None else first.shape[1:]
+        return inner[1:] if len(inner) > 1 and inner[0] == 1 else inner
+
     def _fits(self, family: Family, name: str) -> bool:
         """Whether a family has as many columns as a field."""
         first = self.sample[family.columns[0]]
         if first is None or not first.ndim or name in OF_PLATES:
             return False
-        inner = int(np.prod(first.shape[1:]))
+        inner = int(np.prod(self._shape(family)))
         count = max(inner, len(family.columns)) if inner == 1 or len(family.columns) == 1 else 0
         if name == "time":
             return count == 1
@@ -210,7 +270,7 @@ class _Proposer:
         if name.startswith("joint_"):
             return self._fits_joints(family, name, count)
         if name.startswith("contact_wrench"):
-            return count == 6 * len(self.feet)
+            return count == 6 * len(self.feet) > 0
         if name.startswith("contact_"):
             return count == len(self.feet) > 0 and not any(family.axes)
         axes = "".join(sorted(family.axes)).lower()
@@ -226,29 +286,49 @@ class _Proposer:
                 self.out.partial[field] = [x for x in self.joints if x in self.named_joints - named]
         else:
             whole = count in (len(self.joints), *slots, *([len(self.named_joints)] if self.names_stated else []))
-        enough = count >= len(self.joints) if family.numbers else whole
+            whole |= not self.names_stated and len(numbered_joints(self.joints, count)) == count > 2
+        enough = whole or (count >= len(self.joints) and bool(family.numbers))
         return enough and len(self.joints) > 0 and not any(family.axes)
 
     def _place_force(self, family: Family) -> bool:
         """Whether a family is the forces or the moments of contacts."""
-        wrench = self.out.columns.setdefault("contact_wrench_local", {})
-        part = "moment" if _MOMENT.search(family.pattern) else "force"
-        complete = "".join(sorted(family.axes)).lower() == "xyz" and len(family.columns) == 3 * len(self.feet)
-        if part in wrench or not complete or "contact_wrench_local" in self.given:
-            if not wrench:
-                del self.out.columns["contact_wrench_local"]
+        has_axes = "".join(sorted(family.axes)).lower() == "xyz" and len(family.columns) == 3 * len(self.feet)
+        if not has_axes and self._shape(family) != (len(self.feet), 3):
             return False
-        wrench[part] = family.entry
-        quantity = "torque" if part == "moment" else "force"
-        self._add_stated_unit(family, wrench[part], f"contact_wrench_local.{part}", (quantity,))
-        self.out.notes["contact_wrench_local"] = "taken to act on the robot, along the axes of the contact frames"
-        self._add_order(family, "contact_wrench_local")
+        is_moment = bool(_MOMENT.search(family.pattern))
+        (field, why), part = self._frame_of_forces(family, is_moment), "moment" if is_moment else "force"
+        if part in (wrench := self.out.columns.get(field, {})) or set(WRENCHES) & self.given:
+            return False
+        self.out.columns[field] = wrench | {part: family.entry}
+        wrench = self.out.columns[field]
+        self._add_stated_unit(family, wrench[part], f"{field}.{part}", ("torque" if is_moment else "force",))
+        if why:
+            self.out.notes[field] = f"taken to act on the robot, along the axes of {why}"
+        self._add_order(family, field)
         return True
+
+    def _frame_of_forces(self, family: Family, is_moment: bool) -> tuple[str, str]:
+        """The field of a family of forces, and why: in the world, forces of several small feet point up."""
+        known = [field for field in WRENCHES if field in self.out.columns]
+        if is_moment or known:
+            return (known or WRENCHES)[0], "" if known else "the contact frames"
+        in_order = not family.axes or family.axes[0] in "xX"
+        values = self._together(family)
+        if len(self.feet) > 2 and in_order and values.ndim > 1 and point_along_z(values):
+            return WRENCHES[1], "the world, as almost all of them points along z"
+        return WRENCHES[0], "the contact frames"
+
+    def _together(self, family: Family) -> NDArray[Any]:
+        """Numbers (N, columns) of a family, or its array; all in one row where columns have not as many each."""
+        values = [x for column in family.columns if (x := self.sample[column]) is not None]
+        if len(values) == 1:
+            return np.asarray(values[0])
+        alike = len({x.shape for x in values}) == 1
+        return np.stack(values, axis=-1) if alike else np.concatenate([np.ravel(x) for x in values])
 
     def _place_law(self, families: Sequence[Family]) -> list[Family]:
         """Families of a PD law, if there are gains."""
-        law: dict[str, Any] = {}
-        used = []
+        law, used = dict[str, Any](), list[Family]()
         for family in families:
             words = family.words.replace("_", " ").lower()
             gain, what = _GAINS.search(words), propose_field(family.words, desired=True)
@@ -275,10 +355,10 @@ class _Proposer:
         return f"base_quat_{order}"
 
     def _add_threshold(self, family: Family, entry: dict[str, Any]) -> None:
-        values = np.concatenate([np.ravel(x) for c in family.columns if (x := self.sample[c]) is not None])
+        values = self._together(family)
         if not np.isin(values, (0, 1)).all():
             entry["above"] = threshold(values)
-            self.out.notes["contact_active"] = "threshold, from the range of the readings"
+            self.out.notes["contact_active"] = "threshold, from the readings in the air and their range"
 
     def _add_order(self, family: Family, name: str) -> None:
         """An order of names by number, where columns have none."""
@@ -286,23 +366,13 @@ class _Proposer:
         key = f"{kind}_order"
         if not kind or any(family.names) or key in self.out.columns or (kind == "joint" and self.names_stated):
             return
-        first = self.sample[family.columns[0]]
-        numbers = len(family.numbers) or (1 if first is None else int(np.prod(first.shape[1:2])))
+        numbers = len(family.numbers) or int(np.prod(self._shape(family)[:1]))
         order, how = self._listed_order(kind, numbers) or usual_order(kind, self.robot, numbers)
         self.out.columns[key] = order
+        listed = JOINT_ORDERS[order].names if isinstance(order, str) else order
+        if kind == "joint" and not self.out.lacking:
+            self.out.lacking = [name for name in self.joints if name not in listed]
         self.out.notes[key] = f"{how}; compare it with the manual of the robot, and with what torchid check says"
-
-    def _listed_order(self, kind: str, count: int) -> tuple[list[str], str] | None:
-        """Names of joints or feet that some array of the file lists."""
-        known = self.joints if kind == "joint" else self.feet
-        for name in self.sample:
-            listed = [] if self._is_numeric(name) or self.sample[name] is None else stated_names(self.sample, name)
-            matched = match_names(listed, known, kind) if len(listed) == count == len(known) else {}
-            if len(matched) == len(known) > 0:
-                return [matched[text] for text in listed], f"as '{name}' of the file lists them"
-        return None
-
-    # ------------------------------------------------------------------------------------------------------ units
 
     def _add_stated_unit(self, family: Family, entry: dict[str, Any], key: str, quantities: tuple[str, ...]) -> None:
         """The unit in the names of columns, for the field that they are; a note where it is none of that field."""
@@ -319,82 +389,12 @@ class _Proposer:
         if self.factors[key] != 1.0:
             entry["unit"] = family.unit
 
-    def _add_units(self) -> None:
-        """Units other than SI that columns do not state, where the numbers say so."""
-        time = self._values("time")
-        if time is None or len(time) < 3:
-            return
-        step = float(np.median(np.diff(time[:, 0])))
-        unit = next((u for u in ("s", "ms", "us", "ns") if _STEP[0] <= step * UNITS["time"][u] <= _STEP[1]), "s")
-        self._set_unit("time", unit, f"from steps of {step:.3g}")
-        seconds = time[:, 0] * self.factors.get("time", UNITS["time"][unit])
-        position, velocity = self._values("joint_position"), self._values("joint_velocity")
-        factor, is_stated = self.factors.get("joint_position", 1.0), "joint_position" in self.factors
-        if position is not None and not is_stated and np.nanpercentile(np.abs(position), 98) > _TURNED:
-            self._set_unit("joint_position", "deg", f"from values up to {np.nanmax(np.abs(position)):.3g}")
-            factor = UNITS["angle"]["deg"]
-        if position is not None and velocity is not None and not self.files:  # whose stamps may differ
-            self._add_speed_unit(velocity, factor * position, seconds)
-        for name, is_it, unit, why in (
-            ("joint_torque", lambda x: _rms(x) > _LEVER * self.robot.weight, "N mm", "as they are too large for N m"),
-            ("base_position_world", lambda x: np.nanmax(np.abs(x)) > _FAR, "mm", "as it is too far away for m"),
-            ("imu_specific_force", lambda x: 0.7 < _length(x) < 1.4, "g", "as its length is about 1"),
-            ("imu_angular_velocity", lambda x: _rms(x) > 20.0, "deg/s", "as it is too fast for rad/s"),
-        ):
-            values = self._values(name)
-            if values is not None and is_it(values):
-                self._set_unit(name, unit, why)
-
-    def _add_speed_unit(
-        self, velocity: NDArray[np.float64], position: NDArray[np.float64], seconds: NDArray[np.float64]
-    ) -> None:
-        if position.shape != velocity.shape:
-            return
-        slope = np.gradient(position, seconds, axis=0)
-        ratio = float(np.sqrt(np.nanmean(velocity**2) / max(float(np.nanmean(slope**2)), 1e-12)))
-        units = {unit: 1.0 / UNITS["angular velocity"][unit] for unit in ("rad/s", "deg/s", "rpm", "rev/s")}
-        unit = min(units, key=lambda unit: abs(np.log(max(ratio, 1e-9) / units[unit])))
-        self._set_unit("joint_velocity", unit, f"as they are {ratio:.3g} times the slope of the positions")
-
-    def _set_unit(self, name: str, unit: str, why: str) -> None:
-        entry = self.out.columns.get(name)
-        if name in self.factors or unit == _si(name):
-            return
-        if isinstance(entry, dict) and {"column", "columns"} & set(entry):
-            entry["unit"] = unit
-            self.out.notes[name] = "; ".join(filter(None, (f"{unit}, {why}", self.out.notes.get(name))))
-
-    def _values(self, name: str) -> NDArray[np.float64] | None:
-        """Numbers (N, k) of an entry, in the order of its columns."""
-        entry = self.out.columns.get(name)
-        if not isinstance(entry, dict) or not {"column", "columns"} & set(entry):
-            return None
-        if "columns" in entry:
-            return self._flat([x for column in entry["columns"].values() if (x := self.sample[column]) is not None])
-        text = re.escape(entry["column"])
-        text = re.sub(r"\\{(joint|contact)\\}", ".+", text)
-        text = re.sub(r"\\{index(:\d+)?\\}", r"\\d+", re.sub(r"\\{(axis|AXIS)\\}", "[wxyzWXYZ]", text))
-        found = [x for column, x in self.sample.items() if x is not None and x.size and re.fullmatch(text, column)]
-        return self._flat(found)
-
-    def _flat(self, found: Sequence[NDArray[Any]]) -> NDArray[np.float64] | None:
-        """Numbers (N, k) of columns or arrays; None where they are none."""
-        flat = [np.asarray(x, dtype=float).reshape(len(x), -1) for x in found]
-        values = np.concatenate(flat, axis=1) if flat and len({len(x) for x in flat}) == 1 else np.zeros((0, 1))
-        return values if np.isfinite(values).any() else None
-
-
-def _si(name: str) -> str:
-    return {"time": "s", "joint_velocity": "rad/s"}.get(name, "")
-
-
-def _rms(x: NDArray[np.float64]) -> float:
-    return float(np.sqrt(np.nanmean(x**2)))
-
-
-def _length(x: NDArray[np.float64]) -> float:
-    return float(np.nanmedian(np.linalg.norm(x, axis=1)))
-
-
-def _anything(pattern: str) -> str:
-    return PLACEHOLDER.sub("*", pattern)
+    def _listed_order(self, kind: str, count: int) -> tuple[list[str], str] | None:
+        """Names of joints or feet that some array of the file lists."""
+        known = self.joints if kind == "joint" else self.feet
+        for name in self.sample:
+            listed = [] if self._is_numeric(name) or self.sample[name] is None else stated_names(self.sample, name)
+            matched = match_names(listed, known, kind) if len(listed) == count == len(known) else {}
+            if len(matched) == len(known) > 0:
+                return [matched[text] for text in listed], f"as '{name}' of the file lists them"
+        return None

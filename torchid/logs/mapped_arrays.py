@@ -37,6 +37,9 @@ class MappedArray:
 
     def __getitem__(self, rows: slice) -> NDArray[Any]:
         """Some rows."""
+        if self._name == "time" and self._fields.step is not None and hasattr(self, "shape"):
+            start, stop, _ = rows.indices(self.shape[0])
+            return self._fields.stamps(start, stop - start)
         return self._fields.value(self._name, lambda source: self._read(source, rows))
 
     def _read(self, source: str, rows: slice) -> NDArray[Any]:

@@ -11,14 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import LogError
+from torchid.logs.array_parts import with_parts
 from torchid.logs.column_entries import KEY, ColumnEntry, Gains, PdLaw, VectorEntry
-from torchid.logs.column_map import Columns, Part, check_columns, values_by_name, values_of_all
+from torchid.logs.column_map import Columns, check_columns, list_parts, values_by_name, values_of_all
 from torchid.logs.column_matching import Matched, columns_of_file, match_columns
 from torchid.logs.columns import TEXT_COLUMN, TableLayout, is_column, parse_header
+from torchid.logs.entry_units import element_factors, joint_turns, names_in_degrees
 from torchid.logs.force_plates import PlatePoses
 from torchid.logs.log import FORCE_NORMAL, NAME_FIELDS, POINTS, SHAPES, VARIANTS, WRENCHES, FloatArray
 from torchid.logs.names import parse_names
-from torchid.logs.units import IN_DEGREES, TRANSLATION, unit_factor
+from torchid.logs.units import unit_factor
 
 Take = Callable[[str], NDArray[Any]]
 """The values (N, ...) of a column or an array."""
@@ -34,11 +36,14 @@ class _Values:
         of: the columns.
         order: which names of these, in the order of the log; None for all as they are.
         factors: of a sample's elements, units and signs; None for 1.
+        turns: in the unit of the columns where the turn of each joint begins that its angle is counted in, and how much
+            a turn is, each (n,); None for angles as they are.
     """
 
     of: Matched
     order: list[int] | None
     factors: FloatArray | None
+    turns: tuple[FloatArray, FloatArray] | None
 
     def read(self, take: Take) -> FloatArray:
         """The numbers (N, ...), or of gains that hold throughout (1, ...).
@@ -61,6 +66,9 @@ class _Values:
                 out = out.reshape(len(out), len(self.of.labels), len(self.of.part.components))
         if self.order is not None:
             out = out[:, self.order]
+        if self.turns is not None:
+            start, turn = self.turns
+            out = np.where(np.isfinite(start), start + np.mod(out - np.nan_to_num(start), turn), out)
         out = out if self.factors is None else np.asarray(out * self.factors)
         return _with_zeros(out, self.of.part.entry)
 
@@ -72,6 +80,8 @@ class _Values:
             array = array[None]  # the same at all samples
         if array.ndim == 1 and int(np.prod(shape)) == 1:
             array = array.reshape(-1, *shape)
+        if array.ndim == len(shape) + 2 and array.shape[1] == 1:  # one row of each sample, as of Matlab's tables
+            array = array[:, 0]
         if array.ndim == 0:
             raise LogError.at_field(f"'{column}'", "a single value", "a row for each sample")
         if array.shape[1:] != shape and (array.shape[2:] != shape[1:] or not self.of.has_all_names(array.shape[1:2])):
@@ -127,6 +137,19 @@ class MappedFields:
         of_numbers = self._threshold is not None or "contact_active" not in self.fields
         return () if of_numbers else self._own("contact_active")
 
+    @property
+    def step(self) -> float | None:
+        """Between stamps that no column has [s]."""
+        entry = self.columns.time
+        if entry is None or entry.step is None:
+            return None
+        units = values_by_name(f"{KEY}.time.unit", entry.unit, [""])
+        return float(entry.step) * unit_factor(f"{KEY}.time.unit", units.get("", "s"), ("time",))
+
+    def stamps(self, start: int, count: int) -> FloatArray:
+        """Stamps [s] of so many samples, of which some are before, by the step between them."""
+        return np.asarray(np.arange(start, start + count) * (self.step or 1.0))
+
     def sources_of(self, name: str) -> tuple[str, ...]:
         """The columns that a field comes from."""
         return (*self._own(name), *(x for other in self._needed(name) for x in self.sources_of(other)))
@@ -144,6 +167,8 @@ class MappedFields:
 
     def _needed(self, name: str) -> tuple[str, ...]:
         """Other fields that a field is computed from."""
+        if name == "time" and self.step is not None:
+            return ("joint_position",)
         if name == "joint_torque" and (law := self._law) is not None:
             return ("joint_position",) * (law.kp is not None) + ("joint_velocity",) * (law.kd is not None)
         if name == "contact_active" and name not in self.native and not self._own(name):
@@ -209,6 +234,8 @@ class MappedFields:
             return _flagged(out, self._threshold) if name == "contact_active" else out
         if name == "joint_torque":
             return self._torque(take)
+        if name == "time":
+            return self.stamps(0, [len(take(source)) for source in self.sources_of(name)][0])
         return self._active(take) if name == "contact_active" else self._wrench(name, take)
 
     def _torque(self, take: Take) -> FloatArray:
@@ -236,7 +263,8 @@ class MappedFields:
                 raise LogError.at_field(f"{KEY}.{name}", found, accepted)
             for other in self._needed(name):
                 if other not in self.fields:
-                    gain = {"joint_position": ".pd.kp", "joint_velocity": ".pd.kd"}.get(other, "")
+                    of_law = {"joint_position": ".pd.kp", "joint_velocity": ".pd.kd"} if name == "joint_torque" else {}
+                    gain = of_law.get(other, "")
                     raise LogError.at_field(f"{KEY}.{name}{gain}", f"given without {other}", f"{other} in the log too")
         if self.columns.imu_frame is not None and TEXT_COLUMN in self.native:
             found, accepted = f"beside '{TEXT_COLUMN}' of the file", f"one of the two, the other in {KEY}.ignore"
@@ -310,39 +338,6 @@ def _flagged(values: FloatArray, above: float | None) -> FloatArray:
     return values if above is None else np.where(np.isnan(values), np.nan, values > above)
 
 
-def _factors(part: Part, names: Sequence[str], in_degrees: Callable[[str], bool]) -> FloatArray | None:
-    """What the elements of a sample are multiplied by, (n,), (k,) or (n, k); None where that is 1.
-
-    `in_degrees`: whether what has no unit and turns is in degrees, by name.
-    """
-    entry, key = part.entry, f"{KEY}.{part.key}"
-    of_names, of_components = names if part.kind else ("",), part.components or ("",)
-    elements = [(name, ".".join(filter(None, (name, axis))), axis) for name in of_names for axis in of_components]
-    labels = [label for _, label, _ in elements]
-    units = values_by_name(f"{key}.unit", entry.unit, labels)
-    scales = values_by_name(f"{key}.scale", entry.scale, labels)
-    out = np.ones(len(elements))
-    for index, (name, label, axis) in enumerate(elements):
-        quantities = part.quantities[axis]
-        unit = units.get(label, IN_DEGREES.get(quantities[0], "") if quantities and in_degrees(name) else "")
-        if unit:
-            out[index] = unit_factor(f"{key}.unit", unit, quantities)
-        out[index] *= scales.get(label, 1.0)
-    shape = ([len(of_names)] if part.kind else []) + ([len(of_components)] if part.components else [])
-    return None if (out == 1.0).all() else out.reshape(shape)
-
-
-def _turning(matched: Matched, in_degrees: bool) -> Callable[[str], bool]:
-    """Whether numbers of a name are in degrees that have no unit: all of such a file but those of translations."""
-    split = matched.by_name and not matched.by_component
-    moving = (
-        {name for name, column in zip(matched.names, matched.columns, strict=split) if TRANSLATION.search(column)}
-        if split
-        else set[str]()
-    )
-    return lambda name: in_degrees and name not in moving
-
-
 def _values(
     matched: Mapping[str, Matched], names: Mapping[str, tuple[str, ...]], in_degrees: bool = False
 ) -> dict[str, _Values]:
@@ -351,7 +346,9 @@ def _values(
         common = names.get(one.part.names_field, ())
         order = [one.labels.index(name) for name in common]
         kept = None if order == list(range(len(one.labels))) else order
-        out[key] = _Values(one, kept, _factors(one.part, common, _turning(one, in_degrees)))
+        turning = names_in_degrees(one) if in_degrees else set[str]()
+        factors, turns = element_factors(one.part, common, turning), joint_turns(one.part, common, turning)
+        out[key] = _Values(one, kept, factors, turns)
     return out
 
 
@@ -384,6 +381,10 @@ def map_arrays(columns: Columns, given: Sequence[str], load: Take) -> MappedFiel
     """
     check_columns(columns)
     columns = columns_of_file(columns, given)
+    texts = (
+        text for part in list_parts(columns).values() for text in (part.entry.column, *part.entry.columns.values())
+    )
+    given = with_parts(given, (text for text in texts if text))
     named = {name: parse_names(name, load(name)) for name in NAME_FIELDS if name in given}
     matching = match_columns(columns, given, lambda name: name in SHAPES or name in VARIANTS, named)
     if matching is None:

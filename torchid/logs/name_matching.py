@@ -11,6 +11,7 @@ SUFFIXES = {"joint": ("", "_joint"), "contact": ("", "_foot", "_sole", "_contact
 
 _MOST_TEXTS = 1000  # that are compared with all joints
 _WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
+_PLACE = re.compile(r"(?<![A-Za-z0-9])(?i:[FRHL][FRHL])[_.]?[0-9](?![A-Za-z0-9])")
 _LIMBS = {
     "left": "l", "right": "r", "front": "f", "fore": "f", "rear": "b", "hind": "b", "back": "b", "l": "l", "r": "r",
     "fl": "fl", "lf": "fl", "fr": "fr", "rf": "fr", "rl": "bl", "hl": "bl", "lh": "bl", "bl": "bl", "lb": "bl",
@@ -94,6 +95,19 @@ def _words(text: str) -> tuple[frozenset[str], tuple[str, ...]]:
 def _contains(words: tuple[str, ...], others: tuple[str, ...]) -> bool:
     """Whether words contain others, at least one, one after the other."""
     return bool(others) and any(words[i : i + len(others)] == others for i in range(len(words)))
+
+
+def joints_by_place(columns: Sequence[str], joints: Sequence[str]) -> dict[str, str]:
+    """Joints by texts like `FR_0` in columns, the first joint of the front right limb; none if not all joints are."""
+    found = dict.fromkeys(match[0] for column in columns if (match := _PLACE.search(column)))
+    limbs_of = {text: limbs(text) for text in found}
+    out = dict[str, str]()
+    for limb in set(limbs_of.values()):
+        texts = sorted((text for text, of in limbs_of.items() if of == limb), key=lambda text: int(text[-1]))
+        names = [name for name in joints if limbs(name) == limb]
+        if len(texts) == len(names):
+            out |= dict(zip(texts, names, strict=True))
+    return out if len(out) == len(joints) else {}
 
 
 def match_names(texts: Sequence[str], names: Sequence[str], kind: str) -> dict[str, str]:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import LogError, about_file, current_file, during
+from torchid.logs.array_parts import load_part
 from torchid.logs.column_map import Columns
 from torchid.logs.column_proposals import is_foreign, unknown_columns
 from torchid.logs.containers import (
@@ -158,10 +159,13 @@ def _read_arrays(
             with reader_errors_explained(name, "a plain array of numbers, truth values or text"):
                 return container.load(name)
 
+        def take(name: str) -> NDArray[Any]:
+            return load_part(name, names, load)
+
         names = list(container.declared_bytes())
         mapped = None if columns is None else map_arrays(columns, names, load)
         check(names if mapped is None else mapped.given)
-        return {name: load(name) for name in names} if mapped is None else mapped.read(load)
+        return {name: load(name) for name in names} if mapped is None else mapped.read(take)
 
 
 def _check_known(names: Collection[str]) -> None:

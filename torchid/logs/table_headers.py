@@ -1,89 +1,110 @@
-"""What stands before the rows of a table of text: names of columns, separators, and OpenSim's lines before these."""
+"""Where the rows of a table of text begin, CSV or OpenSim's, and what their columns are called."""
 
 from __future__ import annotations
 
 import csv
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
 from torchid.errors import LogError, excerpt
 from torchid.logs.containers import OPENSIM
+from torchid.logs.units import quantities_with
 
 BLOCK = 2**22
 """Bytes of a table of text that are parsed at a time; no row may be longer."""
 
+_LINES = 64  # at most before the first row
 _SEPARATORS = (",", ";", "\t")
-#: A cell such as -1,5 or 1,5e-3 between semicolons or tabs.
-_DECIMAL_COMMA = re.compile(rb'(?:^|[;\t\n])[ "]*[+-]?\d*,\d+(?:[eE][+-]?\d+)?[ "]*(?=[;\t\r\n]|\Z)')
-_END = "endheader"
-_MOST_LINES = 1000  # before OpenSim's names of columns
+_COMMENT = re.compile(r"^(#|%|//)\s*")
+_NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?|[+-]?(nan|inf)|true|false", re.IGNORECASE)
+_DATE = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d(:\d\d(\.\d{1,9})?)?(Z|[+-]\d\d:?\d\d)?")
+_TIME_OF_DAY = re.compile(r"\d\d:\d\d:\d\d(\.\d{1,9})?")
+_END, _MOST_LINES = "endheader", 1000  # before OpenSim's names of columns
 _DEGREES = re.compile(r"\s*inDegrees\s*=\s*(\S*)\s*", re.IGNORECASE)
+_BRACKETS = re.compile(r"\[(.*)\]|\((.*)\)")
+#: A cell such as -1,5 or 1,5e-3 between semicolons, tabs or spaces.
+_DECIMAL_COMMA = re.compile(rb'(?:^|[;\t\n ])[ "]*[+-]?\d*,\d+(?:[eE][+-]?\d+)?[ "]*(?=[;\t\r\n ]|\Z)')
 
 
 @dataclass(frozen=True)
-class Header:
-    """What a table of text has before its rows.
+class TextHeader:
+    """The lines of a table of text before its rows.
 
     Attributes:
-        texts: names of its columns.
-        separator: of cells.
-        decimal_mark: of numbers.
-        is_all: whether there are no rows.
-        lines: up to the names of the columns, with these.
-        unnamed: whether each row ends with one more, empty cell.
+        texts: names of the columns, with their units in brackets where these have a line of their own.
+        lines: how many there are before the first row, the names and remarks above them.
+        separator: between cells.
+        decimal_mark: . or ,
+        is_all: whether the file has no rows.
+        dates: columns whose first cell is a date with a time of day, and whether that states its zone.
+        times_of_day: columns whose first cell is hours, minutes and seconds.
+        is_open: whether rows end with a separator, so that the last column is empty.
         in_degrees: whether angles are in degrees.
     """
 
     texts: list[str]
+    lines: int
     separator: str
     decimal_mark: str
     is_all: bool
-    lines: int = 1
-    unnamed: bool = False
-    in_degrees: bool = False
+    dates: dict[str, bool]
+    times_of_day: tuple[str, ...]
+    is_open: bool
+    in_degrees: bool
 
     @property
-    def columns(self) -> list[str]:
-        """Names of all columns, of an empty one at the end too."""
-        return [*self.texts, *[""] * self.unnamed]
+    def named(self) -> list[str]:
+        """The columns, but for an empty one behind the last separator."""
+        return self.texts[: len(self.texts) - self.is_open]
 
 
-def read_header(path: Path) -> Header:
-    """The header of a .csv, .mot or .sto file; the decimal mark is that of the rows after it.
+def read_header(path: Path) -> TextHeader:
+    """The names of the columns of a .csv, .mot or .sto file; the decimal mark is that of the rows.
+
+    Names are in the first line with as many cells as the first row that is mostly numbers. Lines above are remarks, a
+    line of units may follow. A column without a name is called `unnamed_0` by its place. In OpenSim's tables all
+    that is below the line `endheader`.
 
     Raises:
-        LogError: there are no names of columns.
+        LogError: no names, or a line that is too long.
     """
+    is_opensim = path.suffix.lower() in OPENSIM
     with path.open("rb") as stream:
-        lines, in_degrees = (1, False) if path.suffix.lower() not in OPENSIM else _skip_to_names(path, stream)
-        line = stream.readline(BLOCK)
-        rows = stream.read(BLOCK)
-    if not line.strip():
-        raise LogError(path, "header", "an empty line", "the names of the columns")
-    if len(line) == BLOCK:
-        raise LogError(path, "header", f"a line of at least {BLOCK} bytes", "the names of the columns")
-    text = line.decode("utf-8-sig").rstrip("\r\n")
-    if path.suffix.lower() in OPENSIM:
-        return _opensim(path, text, rows, lines, in_degrees)
-    names, failures = dict[str, list[str]](), list[csv.Error]()
-    for mark in _SEPARATORS:
-        try:
-            names[mark] = next(csv.reader([text], strict=True, delimiter=mark))
-        except csv.Error as error:  # behind a quoted name stands another mark
-            failures.append(error)
-    separator = max(names, key=lambda mark: len(names[mark]), default="")  # the first of equals
-    if not separator or (failures and len(names[separator]) == 1):
-        accepted = "names separated by commas, semicolons or tabs"
-        raise LogError(path, "header", f"no line of names ({failures[0]})", accepted) from failures[0]
-    texts = [text.strip() for text in names[separator]]
-    decimal_comma = separator != "," and _DECIMAL_COMMA.search(rows) is not None
-    return Header(texts, separator, "," if decimal_comma else ".", not rows.strip())
+        above, in_degrees = _opensim_lines(path, stream) if is_opensim else (0, False)
+        lines = [line for _ in range(_LINES) if (line := stream.readline(BLOCK))]
+        rest = stream.read(BLOCK)
+    texts = [line.decode("utf-8-sig" if not number else "utf-8", "replace") for number, line in enumerate(lines)]
+    texts = [text.rstrip("\r\n") for text in texts]
+    row = next((number for number, text in enumerate(texts) if _is_row(text)), len(texts))
+    named = _named(texts, row)
+    _require_names(path, lines, named, row)
+    first = next((number for number in range(named + 1, row) if not _COMMENT.match(texts[number])), min(row, named + 1))
+    title = _COMMENT.sub("", texts[named])
+    separator = _separator(path, title, "".join(texts[row : row + 1]), is_opensim)
+    cells = [cell.strip() for cell in _cells(title, separator)]
+    if row == first + 1 and _is_units(texts[first], separator, len(cells)):
+        units = _cells(_COMMENT.sub("", texts[first]), separator)
+        cells = [_with_unit(*pair) for pair in zip(cells, units, strict=True)]
+        first = row
+    sample = [cell.strip() for cell in _cells(texts[first], separator)] if first < len(texts) else []
+    cells += [""] * (len(sample) == len(cells) + 1 and not sample[-1])  # a separator at the end of each row
+    cells = cells[: len(cells) - (len(sample) == len(cells) - 1 and not cells[-1])]  # or at that of the names alone
+    names = [name or f"unnamed_{number}" for number, name in enumerate(cells)]
+    rows = b"".join(lines[first:]) + rest
+    comma = separator != "," and _DECIMAL_COMMA.search(rows) is not None
+    dates = {name: match for name, cell in zip(names, sample, strict=False) if (match := _DATE.fullmatch(cell))}
+    of_day = tuple(name for name, cell in zip(names, sample, strict=False) if _TIME_OF_DAY.fullmatch(cell))
+    zones = {name: bool(match[3]) for name, match in dates.items()}
+    is_open = len(sample) == len(cells) > 1 and not sample[-1] and not cells[-1]
+    mark, is_all = "," if comma else ".", not rows.strip()
+    return TextHeader(names, above + first, separator, mark, is_all, zones, of_day, is_open, in_degrees)
 
 
-def _skip_to_names(path: Path, stream: BinaryIO) -> tuple[int, bool]:
-    """Read up to the names of the columns: how many lines there are with these, and whether angles are in degrees."""
+def _opensim_lines(path: Path, stream: BinaryIO) -> tuple[int, bool]:
+    """Read up to the line that ends OpenSim's own: how many they are, and whether angles are in degrees."""
     in_degrees = False
     for number in range(1, _MOST_LINES):
         line = stream.readline(BLOCK)
@@ -93,17 +114,94 @@ def _skip_to_names(path: Path, stream: BinaryIO) -> tuple[int, bool]:
                 raise LogError(path, "inDegrees", f"'{excerpt(found[1])}'", "yes or no")
             in_degrees = found[1].lower() == "yes"
         if text.lower() == _END:
-            return number + 1, in_degrees
+            return number, in_degrees
         if not line:
             break
     raise LogError(path, "header", f"no line {_END}", f"OpenSim's lines up to {_END}, then the names of the columns")
 
 
-def _opensim(path: Path, text: str, rows: bytes, lines: int, in_degrees: bool) -> Header:
-    """The header of an OpenSim table, whose cells tabs separate; its rows may end with another one."""
-    texts = [name.strip() for name in text.rstrip().split("\t")]
-    if len(texts) == 1 and len(text.split()) > 1:
-        raise LogError(path, "header", f"names between spaces: {excerpt(text)}", "names separated by tabs")
-    first = rows.lstrip(b"\r\n").partition(b"\n")[0].rstrip(b"\r").split(b"\t")
-    unnamed = len(first) == len(texts) + 1 and not first[-1].strip()
-    return Header(texts, "\t", ".", not rows.strip(), lines, unnamed, in_degrees)
+def _require_names(path: Path, lines: Sequence[bytes], named: int, row: int) -> None:
+    """LogError where the line with names, by its number and that of the first row, has none."""
+    if not lines or not lines[named].decode("utf-8-sig").strip():
+        raise LogError(path, "header", "an empty line", "the names of the columns")
+    if len(lines[named]) == BLOCK:
+        raise LogError(path, "header", f"a line of at least {BLOCK} bytes", "the names of the columns")
+    if named == row:
+        numbers = lines[row].decode("utf-8-sig").rstrip("\r\n")
+        raise LogError(path, "header", f"numbers, '{excerpt(numbers)}'", "the names of the columns")
+
+
+def _named(texts: Sequence[str], row: int) -> int:
+    """The line with names above the first row: the first with as many cells, remarks last; without one, the first."""
+    if row == len(texts):
+        return next((number for number, text in enumerate(texts) if text.strip() and not _COMMENT.match(text)), 0)
+    mark = _most_used(texts[row])
+    count = len(_cells(texts[row].rstrip(mark), mark))
+    alike = [k for k in range(row) if len(_cells(_COMMENT.sub("", texts[k]).rstrip(mark), mark)) == count]
+    plain = [k for k in range(row) if texts[k].strip() and not _COMMENT.match(texts[k])]
+    return next((k for k in alike if k in plain), (alike or plain[-1:] or [row])[-1])
+
+
+def _is_row(text: str) -> bool:
+    """Whether most of the cells of a line are numbers or stamps, by the mark that separates most cells."""
+    if _COMMENT.match(text):
+        return False
+    cells = [cell for cell in _cells(text, _most_used(text)) if cell.strip()]
+    numbers = [cell for cell in cells if _NUMBER.fullmatch(cell.strip())]
+    return 2 * len(numbers) > len(cells) or (bool(numbers) and _DATE.fullmatch(cells[0].strip()) is not None)
+
+
+def _is_units(text: str, mark: str, count: int) -> bool:
+    """Whether a line between names and the first row has units alone, one for each name."""
+    cells = [cell.strip() for cell in _cells(_COMMENT.sub("", text), mark)]
+    units = [cell for cell in cells if cell.strip("-")]
+    return len(cells) == count and bool(units) and all(map(_is_unit, units))
+
+
+def _is_unit(cell: str) -> bool:
+    found = _BRACKETS.fullmatch(cell)
+    return bool(quantities_with((found[1] or found[2] or "") if found else cell)) or cell in ("[]", "[-]", "1", "[1]")
+
+
+def _with_unit(name: str, unit: str) -> str:
+    """A name and its unit as one text; the name alone where there is no unit of it."""
+    found = _BRACKETS.fullmatch(unit.strip())
+    unit = ((found[1] or found[2] or "") if found else unit).strip()
+    return f"{name} [{unit}]" if quantities_with(unit) else name
+
+
+def _most_used(text: str) -> str:
+    """The mark that separates most cells of a line, a space if no other does."""
+    counts = {mark: len(_cells(text, mark)) for mark in _SEPARATORS}
+    mark = max(counts, key=lambda mark: counts[mark])
+    return mark if counts[mark] > 1 else " "
+
+
+def _cells(text: str, mark: str) -> list[str]:
+    try:
+        return next(csv.reader([text], strict=True, delimiter=mark), [])
+    except csv.Error:
+        return [text]
+
+
+def _separator(path: Path, names: str, row: str, is_opensim: bool) -> str:
+    """What separates names: the mark that gives most, the first of equals; a space if no other does, not in OpenSim's.
+
+    There columns between spaces have several of these.
+    """
+    found, failures = dict[str, int](), list[csv.Error]()
+    for mark in _SEPARATORS:
+        try:
+            found[mark] = len(next(csv.reader([names], strict=True, delimiter=mark)))
+        except csv.Error as error:  # behind a quoted name stands another mark
+            failures.append(error)
+    separator = max(found, key=lambda mark: found[mark], default="")
+    if not separator or (failures and found[separator] == 1):
+        accepted = "names separated by commas, semicolons, tabs or spaces"
+        raise LogError(path, "header", f"no line of names ({failures[0]})", accepted) from failures[0]
+    words = len(_cells(names, " "))
+    if is_opensim and found[separator] == 1 and len(names.split()) > 1:
+        raise LogError(path, "header", f"names between spaces: {excerpt(names)}", "names separated by tabs")
+    if found[separator] > 1 or words == 1 or words != len(_cells(row, " ")):
+        return separator
+    return " "

@@ -18,7 +18,7 @@ from torchid.logs.columns import TEXT_COLUMN, TableLayout, check_header, column_
 from torchid.logs.containers import TEXT_TABLES, atomic_output, reader_errors_explained
 from torchid.logs.log import NAME_FIELDS
 from torchid.logs.mapped_fields import MappedFields, map_table
-from torchid.logs.table_headers import BLOCK, read_header
+from torchid.logs.table_headers import BLOCK, TextHeader, read_header
 from torchid.logs.units import IN_DEGREES, quantities_of
 
 #: Rows that are converted at a time.
@@ -32,6 +32,7 @@ _PARQUET = {
     "page_checksum_verification": True,
 }
 _BAD_CELL = re.compile(r"In CSV column #(\d+): (?:Row #(\d+): )?.*?invalid value '(.{0,40})", re.DOTALL)
+_PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 _QUOTES = "'\n"
 _EMPTY = ["", " ", "  ", "nan", "NaN", "NAN"]
 _FLAGS = {"true": "1", "false": "0"}
@@ -71,12 +72,38 @@ def sample_table(path: Path) -> dict[str, NDArray[Any] | None]:
         if batch is None or not batch.num_rows:
             raise LogError.at_field("time", "no samples", "at least one sample")
         columns = dict(zip(batch.schema.names, batch.columns, strict=True))
-        read = {name: x for name, x in columns.items() if _is_number(pa, x.type)}
-        return {name: np.asarray(read[name].to_numpy(False)) if name in read else None for name in names}
+        read = {name: x for name, x in columns.items() if _is_number(pa, x.type) or _is_stamp(pa, x.type)}
+        return {name: _numbers(pa, read[name]) if name in read else None for name in names}
 
 
 def _is_number(pa: Any, type_: Any) -> bool:
     return bool(pa.types.is_integer(type_) or pa.types.is_floating(type_) or pa.types.is_boolean(type_))
+
+
+def _is_stamp(pa: Any, type_: Any) -> bool:
+    return bool(pa.types.is_timestamp(type_) or pa.types.is_time(type_) or pa.types.is_duration(type_))
+
+
+def _numbers(pa: Any, values: Any) -> NDArray[Any]:
+    """Numbers (N,) of a column: of dates seconds since 1970, of times of day since midnight, NaN for empty cells."""
+    if not _is_stamp(pa, values.type):
+        return np.asarray(values.to_numpy(False))
+    whole = np.asarray(values.cast(pa.int32() if values.type.bit_width == 32 else pa.int64()).to_numpy(False))
+    return whole / _PER_SECOND[values.type.unit]
+
+
+def _stamp_types(pa: Any, header: TextHeader) -> dict[str, Any]:
+    """Types of the columns of a table of text that hold dates or times of day."""
+    dates = {name: pa.timestamp("ns", "UTC" if zone else None) for name, zone in header.dates.items()}
+    return dates | dict.fromkeys(header.times_of_day, pa.time64("ns"))
+
+
+def _csv_options(header: TextHeader) -> Any:
+    import pyarrow.csv
+
+    # one thread: else error messages have no row number
+    rows = {"skip_rows": header.lines, "column_names": header.texts}
+    return pyarrow.csv.ReadOptions(use_threads=False, block_size=BLOCK, **rows)
 
 
 def _sample_csv(pa: Any, path: Path) -> tuple[list[str], Any]:
@@ -86,14 +113,12 @@ def _sample_csv(pa: Any, path: Path) -> tuple[list[str], Any]:
     check_header(header.texts)
     if header.is_all:
         return header.texts, None
-    rows: dict[str, Any] = {"skip_rows": header.lines, "column_names": header.columns}
-    options = pyarrow.csv.ReadOptions(use_threads=False, block_size=BLOCK, **rows)
+    options = _csv_options(header)
     marks = {"decimal_point": header.decimal_mark, "null_values": _EMPTY, "strings_can_be_null": True}
+    convert = pyarrow.csv.ConvertOptions(column_types=_stamp_types(pa, header), **marks)
     with path.open("rb") as stream:
         parse = pyarrow.csv.ParseOptions(delimiter=header.separator)
-        return header.texts, pyarrow.csv.open_csv(
-            stream, options, parse, pyarrow.csv.ConvertOptions(**marks)
-        ).read_next_batch()
+        return header.texts, pyarrow.csv.open_csv(stream, options, parse, convert).read_next_batch()
 
 
 def _sample_parquet(pa: Any, path: Path) -> tuple[list[str], Any]:
@@ -103,7 +128,8 @@ def _sample_parquet(pa: Any, path: Path) -> tuple[list[str], Any]:
         leaves = {name: type_ for field in file.schema_arrow for name, type_ in _leaves(pa, field)}
         check_header(list(leaves))
         _check_size(path, file.metadata.num_rows, len(leaves), whole=False)
-        numbers = [name for name, type_ in leaves.items() if _is_number(pa, type_)]  # of lists nobody knows the size
+        plain = {name for name, type_ in leaves.items() if _is_number(pa, type_) or _is_stamp(pa, type_)}
+        numbers = [name for name in leaves if name in plain]  # of lists nobody knows the size
         batch = next(file.iter_batches(_SAMPLE, columns=numbers), None) if numbers else None
     return list(leaves), None if batch is None else _flat(pa, batch)
 
@@ -112,8 +138,13 @@ def table_blocks(path: Path, columns: Columns | None = None) -> Iterator[dict[st
     """As `read_table`, some rows at a time, after a block without rows."""
     pa = _pyarrow(path)
     with _complete(path):
+        rows = 0
         for layout, batch in _batches(pa, path, columns, whole=False):
-            yield _fields(pa, layout, [] if batch is None else [batch])
+            block = _fields(pa, layout, [] if batch is None else [batch])
+            if isinstance(layout, MappedFields) and layout.step is not None:
+                block["time"] = layout.stamps(rows, len(block["time"]))
+                rows += len(block["time"])
+            yield block
 
 
 def _complete(path: Path) -> AbstractContextManager[None]:
@@ -193,29 +224,26 @@ def _read_csv(pa: Any, path: Path, columns: Columns | None, whole: bool) -> Iter
     import pyarrow.csv
 
     header = read_header(path)
-    texts = header.texts
-    layout = _layout(texts, columns, header.in_degrees)
+    layout = _layout(header.named, columns, header.in_degrees)
     yield layout, None
     if header.is_all:
         return
     words = pa.dictionary(pa.int32(), pa.string())
     may_be_text = {TEXT_COLUMN, *layout.flags}
     types = {text: words if text in may_be_text else pa.float64() for text in layout.sources}
+    types |= {text: type_ for text, type_ in _stamp_types(pa, header).items() if text in types}
     with path.open("rb") as stream:
         try:
             reader = pyarrow.csv.open_csv(
                 stream,
-                # one thread: else error messages have no row number
-                pyarrow.csv.ReadOptions(
-                    use_threads=False, block_size=BLOCK, skip_rows=header.lines, column_names=header.columns
-                ),
+                _csv_options(header),
                 pyarrow.csv.ParseOptions(delimiter=header.separator),
                 pyarrow.csv.ConvertOptions(
                     column_types=types,
                     null_values=_EMPTY,
                     strings_can_be_null=True,
                     decimal_point=header.decimal_mark,
-                    include_columns=layout.sources if columns is not None or header.unnamed else None,
+                    include_columns=layout.sources if columns is not None or header.is_open else None,
                 ),
             )
             for batch in _bounded(path, reader, len(types), whole):
@@ -227,7 +255,7 @@ def _read_csv(pa: Any, path: Path, columns: Columns | None, whole: bool) -> Iter
             column, row, found = bad.groups()
             where = "" if row is None else f" in row {row}"
             text = f"'{excerpt(found.strip(_QUOTES))}'{where}"
-            raise LogError(path, f"column '{texts[int(column)]}'", text, _NUMBERS) from error
+            raise LogError(path, f"column '{header.texts[int(column)]}'", text, _NUMBERS) from error
 
 
 def _read_parquet(pa: Any, path: Path, columns: Columns | None, whole: bool) -> Iterator[tuple[_Layout, Any]]:
@@ -243,6 +271,7 @@ def _read_parquet(pa: Any, path: Path, columns: Columns | None, whole: bool) -> 
         used = set(layout.sources)
         for name, type_ in (leaf for field in file.schema_arrow for leaf in _leaves(pa, field)):
             number = _is_number(pa, type_) and (name in layout.flags or not pa.types.is_boolean(type_))
+            number |= _is_stamp(pa, type_)
             if name in used and not (pa.types.is_dictionary(type_) if name == TEXT_COLUMN else number):
                 accepted = "text" if name == TEXT_COLUMN else "real numbers"
                 raise LogError(path, f"column '{name}'", f"values of type {type_}", accepted)
@@ -313,7 +342,7 @@ def _values(pa: Any, column: str, values: Any) -> NDArray[Any]:
     if not pa.types.is_dictionary(values.type):
         if pa.types.is_boolean(values.type) and values.null_count:
             values = values.cast(pa.float64())
-        return np.asarray(values.to_numpy())
+        return _numbers(pa, values.combine_chunks())
     values = values.unify_dictionaries()
     words = values.unique().to_pylist()
     if column == TEXT_COLUMN:

@@ -9,7 +9,8 @@ import numpy as np
 
 from torchid.errors import format_count
 from torchid.logs.bag_samples import TopicSample
-from torchid.logs.column_proposals import is_desired, threshold
+from torchid.logs.column_proposals import is_desired
+from torchid.logs.force_proposals import threshold
 from torchid.logs.joint_orders import JOINT_ORDERS, suitable_orders, usual_order
 from torchid.logs.map_proposals import MapProposal
 from torchid.logs.name_matching import KnownRobot, match_joints, match_names, spelled

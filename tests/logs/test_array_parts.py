@@ -1,0 +1,118 @@
+"""Arrays of simulators, several fields side by side: a map takes some of their columns."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from raw_logs import log_refusal
+
+from torchid.errors import InputError, LogError
+from torchid.logs import Columns, read_log
+from torchid.logs.blocks import open_log_blocks
+
+RNG = np.random.default_rng(0)
+TIME = 0.01 * np.arange(50)
+QUAT = np.array([1.0, 0.1, -0.2, 0.05]) / np.linalg.norm([1.0, 0.1, -0.2, 0.05])
+QPOS = np.hstack([RNG.normal(size=(50, 3)), np.tile(QUAT, (50, 1)), RNG.normal(size=(50, 2))])
+MAP = {
+    "joint_order": ["hip", "knee"],
+    "joint_position": {"column": "qpos[7:]"},
+    "base_position_world": {"column": "qpos[0:3]"},
+    "base_quat_wxyz": {"column": "qpos[3:7]"},
+    "joint_torque": {"column": "tau"},
+}
+
+
+def saved(path: Path) -> Path:
+    arrays = {"time": TIME, "qpos": QPOS, "tau": QPOS[:, -2:]}
+    if path.suffix == ".npz":
+        np.savez(path, **arrays)
+    else:
+        with h5py.File(path, "w") as file:
+            for name, x in arrays.items():
+                file[name] = x
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".h5"])
+def test_parts_of_an_array_are_fields_whole_and_in_blocks(tmp_path: Path, suffix: str) -> None:
+    path, columns = saved(tmp_path / f"x{suffix}"), Columns(**MAP)  # type: ignore[arg-type]
+    log = read_log(path, columns=columns)
+    np.testing.assert_array_equal(log.joint_position, QPOS[:, 7:])
+    np.testing.assert_array_equal(log.base_position_world, QPOS[:, :3])
+    np.testing.assert_allclose(log.base_quat_xyzw, QPOS[:, [4, 5, 6, 3]], atol=1e-15)
+    with open_log_blocks(path, None, columns) as blocks:
+        some = blocks.read(slice(20, 30))
+    np.testing.assert_array_equal(some.joint_position, QPOS[20:30, 7:])
+    np.testing.assert_array_equal(some.base_position_world, QPOS[20:30, :3])
+
+
+@pytest.mark.parametrize("text", ["qpos[7:12]", "qpos[9:]", "qpos[4:4]", "time[0:2]"])
+def test_columns_that_an_array_has_not_are_refused(tmp_path: Path, text: str) -> None:
+    columns = Columns(**{**MAP, "joint_position": {"column": text}, "time": {"column": "time"}})  # type: ignore[arg-type]
+    with pytest.raises(LogError, match="columns that it has, counted from 0"):
+        read_log(saved(tmp_path / "x.npz"), columns=columns)
+
+
+def test_an_array_without_an_entry_stays_unknown(tmp_path: Path) -> None:
+    assert "qpos" in log_refusal(saved(tmp_path / "x.npz"))
+
+
+def test_one_row_of_each_sample_in_an_array_counts_as_the_sample(tmp_path: Path) -> None:
+    np.savez(tmp_path / "x.npz", time=TIME, data=QPOS[:, None, -2:])
+    columns = Columns(joint_order=["hip", "knee"], joint_position={"column": "data"})  # type: ignore[arg-type]
+    np.testing.assert_array_equal(read_log(tmp_path / "x.npz", columns=columns).joint_position, QPOS[:, -2:])
+
+
+@pytest.mark.parametrize(("unit", "turn"), [("deg", 360.0), ("rad", 2.0 * np.pi), ("rev", 1.0)])
+def test_angles_that_jump_by_a_turn_are_counted_from_where_a_turn_begins(
+    tmp_path: Path, unit: str, turn: float
+) -> None:
+    angle = np.stack([0.1 * np.sin(TIME * 20.0), 0.05 + 0.2 * np.cos(TIME * 20.0)], axis=1)  # in turns
+    np.savez(tmp_path / "x.npz", time=TIME, q=np.mod(angle, 1.0) * turn)
+    entry = {"column": "q", "unit": unit, "turn_from": -0.5 * turn}
+    columns = Columns(joint_order=["hip", "knee"], joint_position=entry)  # type: ignore[arg-type]
+    log = read_log(tmp_path / "x.npz", columns=columns)
+    np.testing.assert_allclose(log.joint_position, 2.0 * np.pi * angle, atol=1e-12)
+    entry["turn_from"] = {"hip": -0.5 * turn}
+    columns = Columns(joint_order=["hip", "knee"], joint_position=entry)  # type: ignore[arg-type]
+    log = read_log(tmp_path / "x.npz", columns=columns)
+    np.testing.assert_allclose(log.joint_position[:, 0], 2.0 * np.pi * angle[:, 0], atol=1e-12)
+    np.testing.assert_allclose(log.joint_position[:, 1], 2.0 * np.pi * np.mod(angle[:, 1], 1.0), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["x.npz", "x.h5", "x.csv"])
+def test_a_log_without_stamps_has_those_of_its_step(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    if name == "x.csv":
+        path.write_text("q_0,q_1\n" + "".join(f"{a},{b}\n" for a, b in QPOS[:, -2:].tolist()))
+        entry = "q_{index}"
+    else:
+        saved(path)
+        entry = "qpos[7:]"
+    stated = {"joint_order": ["hip", "knee"], "joint_position": {"column": entry}, "ignore": ["*"]}
+    columns = Columns(time={"step": 5, "unit": "ms"}, **stated)  # type: ignore[arg-type]
+    if name != "x.csv":
+        columns = Columns(time={"step": 5, "unit": "ms"}, **(stated | {"ignore": ["time", "tau"]}))  # type: ignore[arg-type]
+    log = read_log(path, columns=columns)
+    np.testing.assert_array_equal(log.time, 0.005 * np.arange(50))
+    with open_log_blocks(path, tmp_path, columns) as blocks:
+        np.testing.assert_array_equal(blocks.time, log.time)
+        np.testing.assert_array_equal(blocks.read(slice(20, 30)).time, log.time[20:30])
+
+
+def test_a_step_needs_positions_and_no_column_beside_it(tmp_path: Path) -> None:
+    for given, found in (
+        (
+            {"time": {"step": 0.01}, "joint_torque": {"column": "tau"}, "ignore": ["qpos", "time"]},
+            "time: given without joint_position",
+        ),
+        ({**MAP, "time": {"step": 0.01, "column": "time"}, "ignore": ["time"]}, "column and step together"),
+        ({**MAP, "time": {"step": 0.01, "scale": 2}, "ignore": ["time"]}, "scale beside step"),
+    ):
+        columns = Columns(joint_order=["hip", "knee"], **{k: x for k, x in given.items() if k != "joint_order"})  # type: ignore[arg-type]
+        with pytest.raises(InputError, match=found):
+            read_log(saved(tmp_path / "x.npz"), columns=columns)

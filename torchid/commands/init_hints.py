@@ -1,0 +1,97 @@
+"""What columns that no field of a log takes may be, and what a log lacks, in lines for whoever reads `torchid init`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Mapping, Sequence
+
+import numpy as np
+
+from torchid.errors import excerpt, format_count, join_names
+from torchid.logs import Log
+from torchid.logs.column_proposals import OF_PLATES, is_desired, propose_field
+from torchid.logs.log import WRENCHES
+
+_OTHER_FILE = "; if another file has it: torchid init URDF 'FILE + FILE@SECONDS', docs/logs.md"
+_CURRENT = re.compile(r"current(?!.*limit)|(?<![a-z])amps?(?![a-z])|(?<![a-z])iq(?![a-z])", re.IGNORECASE)
+_LIMB_SENSOR = re.compile(r"(?<![a-z])(ft|loadcell|load_cell)(?![a-z]).*[xyz]$|(?<![a-z])fts?(?![a-z])", re.IGNORECASE)
+_EULER = re.compile(r"(?<![a-z])(roll|pitch|yaw|rpy|euler)(?![a-z])", re.IGNORECASE)
+_STEP = re.compile(r"(dt|time_?step|sample_?rate|fps|rate_?hz|freq\w*)", re.IGNORECASE)
+_MOTION = ("joint_position", "base_quat_xyzw", "base_position_world", *("imu_specific_force", "imu_angular_velocity"))
+BRIDGED_S = 0.05
+"""Gaps that `init` has bridged [s]."""
+
+
+def missing_columns(joints: int, fields: Collection[str], partial: Mapping[str, Sequence[str]], what: str) -> list[str]:
+    """What stamps and fields of joints lack, in words.
+
+    Args:
+        joints: how many the robot has.
+        fields: of the log.
+        partial: by field, joints that have columns of other fields alone.
+        what: column or topic.
+    """
+    partial = {name: of for name, of in partial.items() if name not in fields}
+    out = [f"{name}: no {what} of numbers of {join_names(of)}, but of all others" for name, of in partial.items()]
+    for name in ("time", "joint_position"):
+        if name not in {*fields, *partial}:
+            of_joints = f", of most of {joints} joints" * (name != "time")
+            out.append(f"{name}: no {what}s that look like it{of_joints}{_OTHER_FILE * (what == 'column')}")
+    return out
+
+
+def hints(left_out: Sequence[str], fields: Collection[str], joints: Sequence[str], what: str) -> list[str]:
+    """What columns or topics that are left out may hold of the fields that are missing.
+
+    Args:
+        left_out: their names.
+        fields: of the log.
+        joints: of the robot.
+        what: column or topic.
+    """
+    out = []
+    measured = [name for name in left_out if not is_desired(name)]
+    if plates := [name for name in left_out if propose_field(name) in OF_PLATES]:
+        unknown = "without which foot stands on which and where each lies (docs/logs.md, Force plates)"
+        out.append(f"contact_wrench_world: {join_names(plates)} may be readings of force plates, {unknown}")
+    positions = [name for name in measured if propose_field(name) == "joint_position"]
+    if "joint_position" not in fields and len(positions) > 2:
+        names = f"those of this URDF are {join_names(joints)}"
+        out.append(
+            f"joint_position: {format_count(len(positions), what)} like '{excerpt(positions[0])}' may be of other"
+            f" joints; {names}: is it the URDF of the robot that was recorded?"
+        )
+    if "joint_torque" not in fields and (currents := [name for name in measured if _CURRENT.search(name)]):
+        how = "scale: N m of the joint per A, its torque constant times the gear ratio, by joint"
+        out.append(f"joint_torque: {_like(currents)} may be currents of motors; give them as joint_torque with {how}")
+    if not {"ft_wrench", *WRENCHES} & set(fields) and (sensors := [x for x in measured if _LIMB_SENSOR.search(x)]):
+        where = "contact_wrench_local of the foot's frame, or ft_wrench of a fixed joint in the limb"
+        out.append(f"forces at the feet: {_like(sensors)} may be force/torque sensors: {where} (docs/sensors.md)")
+    if "time" not in fields and (steps := [name for name in left_out if _STEP.fullmatch(name)]):
+        out.append(f"time: '{steps[0]}' may be the step or the rate of the stamps, which have to be in the file")
+    if not {"base_quat_wxyz", "base_quat_xyzw"} & set(fields) and (angles := [x for x in measured if _EULER.search(x)]):
+        out.append(f"base_quat: {_like(angles)} may be angles of the base; it is read as a quaternion, four columns")
+    return out
+
+
+def _like(names: Sequence[str]) -> str:
+    return f"'{excerpt(names[0])}'" + (f" and {len(names) - 1} more" if len(names) > 1 else "")
+
+
+def gaps_in_motion(log: Log) -> tuple[float, bool, str]:
+    """Gaps in the motion of a log: how long the longest takes, whether some are at an end, and a field with one.
+
+    The length [s] is that from the value before to that after; gaps at an end do not count for it. Channels that are
+    NaN throughout are none.
+    """
+    longest, at_end, found = 0.0, False, ""
+    for name in _MOTION:
+        values = getattr(log, name)
+        for missing in () if values is None else np.isnan(values).reshape(len(log), -1).T:
+            known = np.flatnonzero(~missing)
+            if not missing.any() or len(known) < 2:
+                continue
+            at_end |= bool(missing[0] or missing[-1])
+            longest = max(longest, *np.diff(log.time[known])[np.diff(known) > 1].tolist(), 0.0)
+            found = found or name
+    return longest, at_end, found
