@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from demo import DEMO, shortened_demo
+from demo import shortened_demo
 from large import experiment, overrides, recorded
 from trainings import trust_new_files
 
@@ -395,8 +395,3 @@ def test_where_nothing_can_be_written_a_run_goes_on_without_and_says_so_once(
     assert results(tmp_path / "run") == results(tmp_path / "without")
     if reason != "a file in its place":
         assert not [path for path in (tmp_path / FOLDER).glob("*") if path.is_dir()]
-
-
-def test_cache_gb_is_checked_like_any_key(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["identify", str(DEMO / "quadruped.yaml"), "preprocessing.cache_gb=-1"]) == 2
-    assert "preprocessing.cache_gb: found -1; accepted: greater than or equal to 0" in capsys.readouterr().err
