@@ -11,9 +11,8 @@ from misread import world
 from motions import value
 from recordings import GRAVITY, with_imu
 from scipy.spatial.transform import Rotation
-from synthetic import G1, PANDA, Oracle, load, make_log
-from welded import CONTACTS as MACHINE_CONTACTS
-from welded import SENSORS, STATES
+from synthetic import PANDA, Oracle, load, make_log
+from welded import CONTACTS, SENSORS, STATES
 
 from torchid.estimators import LeastSquares
 from torchid.fitting.base_tilt import LARGEST, choose_base_tilt
@@ -21,23 +20,19 @@ from torchid.fitting.fit import LogFitter
 from torchid.logs import Log
 from torchid.problem import RowBuilder, bind_log
 from torchid.robot import Robot
-from torchid.sensing import Contact, named_sensors
+from torchid.sensing import named_sensors
 
 TILT = (0.03, -0.05)
 TURN = Rotation.from_rotvec([*TILT, 0.0])
-FEET = ("left_ankle_roll_link", "right_ankle_roll_link")
-CONTACTS = tuple(Contact(frame, "flat") for frame in FEET)
 VECTORS = ("specific_force", "angular_velocity", "angular_acceleration")
 
 
 @cache
-def humanoid() -> tuple[Robot, Oracle, Log]:
-    """One that differs from its URDF, and an exact log of it."""
-    robot, rng = load(G1), np.random.default_rng(0)
-    oracle = Oracle.of(robot)
-    oracle.perturb(rng, 0.2)
-    states = [[True, True], [True, False], [False, True]]
-    return robot, oracle, make_log(oracle, [(frame, 6) for frame in FEET], states, 150, rng)
+def skew_machine() -> tuple[Robot, Oracle, Log]:
+    """A small one that differs from its URDF, and an exact log of it."""
+    w, rng = world(), np.random.default_rng(2)
+    contacts = [(contact.frame, len(contact.components)) for contact in CONTACTS]
+    return w.robot, w.oracle, make_log(w.oracle, contacts, STATES, 120, rng)
 
 
 def recorded_askew(log: Log) -> Log:
@@ -49,7 +44,7 @@ def recorded_askew(log: Log) -> Log:
 
 
 def test_the_true_base_moves_as_a_log_says_that_records_it() -> None:
-    robot, _, log = humanoid()
+    robot, _, log = skew_machine()
     true, found = bind_log(log, robot, CONTACTS), bind_log(recorded_askew(log), tilted(robot), CONTACTS)
     for name in VECTORS:
         x, expected = value(getattr(found.base, name)).numpy(), value(getattr(true.base, name)).numpy()
@@ -63,7 +58,7 @@ def tilted(robot: Robot) -> Robot:
 
 
 def test_an_imu_that_is_mounted_askew_reads_the_motion_of_the_true_base() -> None:
-    robot, oracle, log = humanoid()
+    robot, oracle, log = skew_machine()
     read = with_imu(oracle, log, robot.base_link)
     true = bind_log(read, robot, CONTACTS)
     names = ("imu_specific_force", "imu_angular_velocity", "imu_angular_acceleration")
@@ -83,35 +78,27 @@ def test_a_bolted_arm_stands_on_a_table_as_it_is_turned() -> None:
     np.testing.assert_allclose(felt, TURN.inv().apply(GRAVITY), rtol=0.0, atol=1e-14)
 
 
-@cache
-def skew_machine() -> tuple[Robot, Log]:
-    """A small one that differs from its URDF, and an exact log of it."""
-    w, rng = world(), np.random.default_rng(2)
-    contacts = [(contact.frame, len(contact.components)) for contact in MACHINE_CONTACTS]
-    return w.robot, make_log(w.oracle, contacts, STATES, 120, rng)
-
-
 def fitter_of(robot: Robot, sensors: str) -> LogFitter:
-    chosen = named_sensors(sensors, robot.n, len(MACHINE_CONTACTS), ft=len(SENSORS))
-    builder = RowBuilder(robot, MACHINE_CONTACTS, chosen)
+    chosen = named_sensors(sensors, robot.n, len(CONTACTS), ft=len(SENSORS))
+    builder = RowBuilder(robot, CONTACTS, chosen)
     return LogFitter(robot=robot, builder=builder, estimator=LeastSquares())
 
 
 @pytest.mark.parametrize("sensors", ["full", "joints"])
 def test_the_tilt_is_found_and_the_true_robot_leaves_nothing(sensors: str) -> None:
-    robot, log = skew_machine()
-    choice = choose_base_tilt([bind_log(recorded_askew(log), robot, MACHINE_CONTACTS)], fitter_of(robot, sensors))
+    robot, _, log = skew_machine()
+    choice = choose_base_tilt([bind_log(recorded_askew(log), robot, CONTACTS)], fitter_of(robot, sensors))
     np.testing.assert_allclose(choice.tilt, TILT, rtol=0.0, atol=1e-4)
     assert choice.residual < 1e-2 * choice.level_residual
-    level = choose_base_tilt([bind_log(log, robot, MACHINE_CONTACTS)], fitter_of(robot, sensors))
+    level = choose_base_tilt([bind_log(log, robot, CONTACTS)], fitter_of(robot, sensors))
     np.testing.assert_allclose(level.tilt, 0.0, rtol=0.0, atol=1e-4)
 
 
 def test_the_base_of_another_frame_is_no_tilt() -> None:
     """A quarter of a turn about x: the search ends at its bound, and says so."""
-    robot, log = skew_machine()
+    robot, _, log = skew_machine()
     quat = (Rotation.from_quat(value(log.base_quat_xyzw)) * Rotation.from_euler("x", 90, degrees=True)).as_quat()
-    samples = bind_log(replace(log, base_quat_xyzw=quat), robot, MACHINE_CONTACTS)
+    samples = bind_log(replace(log, base_quat_xyzw=quat), robot, CONTACTS)
     with pytest.warns(match="is the base's orientation that of another frame"):
         choice = choose_base_tilt([samples], fitter_of(robot, "full"))
     assert max(np.abs(choice.tilt)) == LARGEST
