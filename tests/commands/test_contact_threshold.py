@@ -105,11 +105,6 @@ def test_wrong_flags_are_replaced_and_not_condemned(tmp_path: Path) -> None:
     np.testing.assert_array_equal(samples_of(file).active, right.active)
 
 
-def test_a_log_larger_than_memory_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    line = refusal(["identify", str(experiment(tmp_path, contact_threshold=1, memory_gb=1e-4))], tmp_path, capsys)
-    assert f"{KEY}: set for arrays of" in line
-
-
 def test_settings_that_contradict_each_other_are_refused(tmp_path: Path) -> None:
     def said(**preprocessing: Any) -> Callable[[], object]:
         return lambda: set_up(load_config(experiment(tmp_path, **preprocessing)))
@@ -165,5 +160,3 @@ def test_offsets_have_one_remedy(tmp_path: Path, capsys: pytest.CaptureFixture[s
     file = experiment(tmp_path, change=lambda log: log, zero_in_air=True)
     line = refusal(["identify", str(file), "sensors.offsets={contact_moment: log}"], tmp_path, capsys)
     assert "sensors.offsets.contact_moment: set together with preprocessing.zero_in_air" in line
-    line = refusal(["identify", str(file), "preprocessing.memory_gb=1e-4"], tmp_path, capsys)
-    assert "preprocessing.zero_in_air: set for arrays of" in line

@@ -77,6 +77,52 @@ def unflagged(log: Log) -> Log:
     return replace(log, **NO_FLAGS, joint_torque=torque)
 
 
+def read_in_the_air(log: Log) -> Log:
+    """Feet have sensors with offsets, which read in the air too; one force was never read, nor was a foot's flag."""
+    rng = np.random.default_rng(3)
+    active = without_base(log).contact_active
+    loaded = 30.0 * value(active)[..., None] * rng.uniform(0.5, 1.0, (len(log), 4, 6))
+    wrench = loaded + rng.normal(size=(4, 6)) + 0.2 * rng.normal(size=loaded.shape)
+    wrench[:, 1, 0], wrench[:, :, 3:] = np.nan, 0.0
+    return replace(log, contact_active=active, contact_wrench_local=wrench)
+
+
+def flagless(log: Log) -> Log:
+    return replace(read_in_the_air(log), contact_active=None)
+
+
+def by_scalars(log: Log) -> Log:
+    """Scalar sensors at three feet, a flag alone at the fourth."""
+    log = read_in_the_air(log)
+    force = np.linalg.norm(np.nan_to_num(value(log.contact_wrench_local)[..., :3]), axis=2)
+    force[:, 2] = np.nan
+    return replace(log, contact_wrench_local=None, contact_force_normal=force)
+
+
+def on_plates(log: Log) -> Log:
+    """Moments about points that move over plates, unknown where nothing touches."""
+    log = read_in_the_air(log)
+    wrench = np.nan_to_num(value(log.contact_wrench_local))
+    return replace(log, contact_wrench_local=None, contact_wrench_world=wrench, moments_about_world_origin=True)
+
+
+def with_gaps(log: Log) -> Log:
+    """Gaps of many lengths in every kind of field, some across the ends of blocks, some too long."""
+    log, rng = read_in_the_air(log), np.random.default_rng(4)
+    quat = value(log.base_quat_xyzw) * rng.choice([-1.0, 1.0], (len(log), 1))
+    torque, wrench = value(log.joint_torque).copy(), value(log.contact_wrench_local).copy()
+    for array in (quat, position := log.joint_position.copy(), torque, wrench[..., :3]):
+        for start in (*rng.integers(10, len(log) - 40, 12), 4_094, 8_190):
+            array[(slice(start, start + rng.integers(1, 8)), *map(rng.integers, array.shape[1:]))] = np.nan
+    torque[3_000:3_050, 2] = np.nan  # stays
+    return replace(log, base_quat_xyzw=quat, joint_position=position, joint_torque=torque, contact_wrench_local=wrench)
+
+
+def gaps_alone(log: Log) -> Log:
+    return replace(with_gaps(log), contact_active=None)
+
+
+FORCE: dict[str, Any] = {"contact_threshold": {"above": 10.0, "below": 6.0, "shortest_s": 0.05}}
 SETTINGS: dict[str, tuple[Callable[[Log], Log], float, dict[str, Any]]] = {
     "base": (without_base, 0.0, {"base_motion": "contacts"}),
     "base on balls": (without_base, 0.02, {"base_motion": "contacts", "contact_margin_s": 0.01}),
@@ -84,6 +130,20 @@ SETTINGS: dict[str, tuple[Callable[[Log], Log], float, dict[str, Any]]] = {
     "base, unfiltered": (without_base, 0.0, {"base_motion": "contacts", "cutoff_hz": None}),
     "base, slip": (without_base, 0.0, {"base_motion": "contacts", "max_slip": 0.05}),
     "flags": (unflagged, 0.0, {"detect_contacts": True}),
+    "flags by force": (flagless, 0.0, FORCE),
+    "flags by scalars, slip": (by_scalars, 0.0, FORCE | {"max_slip": 0.05}),
+    "flags by force, base": (flagless, 0.0, FORCE | {"base_motion": "contacts"}),
+    "zeros": (read_in_the_air, 0.0, {"zero_in_air": True}),
+    "zeros of scalars": (by_scalars, 0.0, {"zero_in_air": True}),
+    "zeros of plates": (on_plates, 0.0, {"zero_in_air": True}),
+    "zeros, then flags": (flagless, 0.0, {"zero_in_air": True, **FORCE}),
+    "gaps": (with_gaps, 0.0, {"bridge_gaps_s": 0.1}),
+    "gaps, flags": (with_gaps, 0.0, {"bridge_gaps_s": 0.1, "detect_contacts": True}),
+    "gaps, zeros, flags by force": (
+        lambda log: replace(with_gaps(log), contact_active=None),
+        0.0,
+        {"bridge_gaps_s": 0.1, "zero_in_air": True, **FORCE},
+    ),
     "flags without the base": (bare, 0.0, {"detect_contacts": {"margin_s": 0.05}, "base_motion": "contacts"}),
 }
 
@@ -149,6 +209,13 @@ REFUSED: dict[str, tuple[Callable[[Log], Log], dict[str, Any], str]] = {
     "world": (in_world, {"base_motion": "contacts"}, "contact_wrench_world: given, but preprocessing.base_motion"),
     "no flags": (bare, {"base_motion": "contacts"}, "contact_active: missing; accepted"),
     "a gap": (with_a_gap, {"base_motion": "contacts"}, "joint_position: nan at sample 9000"),
+    "no force": (bare, {"contact_threshold": 5.0}, "contact_wrench: missing; accepted"),
+    "no reading": (bare, {"zero_in_air": True}, "contact_wrench_local: missing; accepted"),
+    "no foot in the air": (
+        lambda log: replace(read_in_the_air(log), contact_active=np.ones_like(value(log.contact_active))),
+        {"zero_in_air": True},
+        "contact_wrench_local: 0 readings of front_left_foot in the air",
+    ),
     "no torques": (without_torques, {"detect_contacts": True}, "joint_torque: missing"),
     "a knee": (without_a_knee, {"detect_contacts": True}, "joint_torque: measured at front_left_hip, front_left_thigh"),
     "tilted": (

@@ -176,13 +176,12 @@ def stretches_to_check(path: Path, logs: LogsConfig, settings: PreprocessingConf
 
 def recorded_stretches(path: Path, logs: LogsConfig, settings: PreprocessingConfig) -> Iterator[tuple[Log, str]]:
     """As `stretches_to_check`, of a log of any size."""
-    whole = settings.bridge_gaps_s is not None or not settings.needs_flags
-    if whole or existing_log_kind(path) in (LogKind.BAG, LogKind.JOINED):
+    if settings.bridge_gaps_s is not None or existing_log_kind(path) in (LogKind.BAG, LogKind.JOINED):
         log = _read_with_gaps(path, logs, settings)
         for stretch in _stretches(len(log)):
             yield log.select(stretch), _stretch_name(path, stretch, len(log))
         return
-    with open_log_blocks(path, None, logs.columns) as blocks:
+    with open_log_blocks(path, None, logs.columns, settings.needs_flags) as blocks:
         for stretch in _stretches(len(blocks)):
             yield blocks.read(stretch, allow_gaps=True), _stretch_name(path, stretch, len(blocks))
 

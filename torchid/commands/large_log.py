@@ -21,6 +21,7 @@ from torchid.config.preprocessing import PreprocessingConfig
 from torchid.errors import LogError, about_file
 from torchid.logs import Columns, Log
 from torchid.logs.blocks import GIGABYTE, LogBlocks, count_samples_from, open_log_blocks
+from torchid.logs.bridged_blocks import bridge_in_blocks
 from torchid.logs.coverage import Coverage, warn_of_gaps
 from torchid.logs.log import CONTACT_READINGS, NORMALS, BoolArray
 from torchid.logs.preprocess import (
@@ -38,6 +39,7 @@ from torchid.logs.timeline import SPLINE_BLOCK, Timeline
 from torchid.problem import Samples, bind_log
 from torchid.problem.base_motion import BaseMotion
 from torchid.problem.chunks import one_thread, thread_count
+from torchid.problem.contact_blocks import contacts_alone, flag_by_force_in_blocks, zero_in_blocks
 from torchid.problem.contact_slip import (
     away_from_own_changes,
     base_velocity,
@@ -132,7 +134,10 @@ class LargeLog:
             own: which of the log's blocks, from the numbers of their samples; all by default.
         """
         needs_flags = self.settings.needs_flags
-        with about_file(self.path), open_log_blocks(self.path, self.folder, self.columns, needs_flags) as recorded:
+        with about_file(self.path), open_log_blocks(self.path, self.folder, self.columns, needs_flags) as opened:
+            recorded = opened.about_world_origin()
+            parts = self._pieces(recorded, len(recorded))
+            recorded = bridge_in_blocks(recorded, self.settings.bridge_gaps_s, parts)
             self._check_welds(recorded)
             course = self._course(self._settled(recorded), with_unloaded)
             pieces, kept = list(course.pieces(self._step(recorded, len(course.time)))), course.kept
@@ -153,15 +158,26 @@ class LargeLog:
 
     def _settled(self, recorded: LogBlocks) -> _Settled:
         """The log with what is worked out of its other fields, each of which takes passes over it."""
-        settings, out = self.settings, _Settled(recorded)
-        rest = partial(self._pieces, recorded), self.folder
-        if settings.detect_contacts is not None and self.contacts:
-            robot = self.robot if self.loaded is None else self.loaded
-            out = _Settled(*detect_in_blocks(recorded, robot, self.contacts, settings.detect_contacts, *rest))
+        settings = self.settings
+        out = self._flagged(recorded)
+        if settings.zero_in_air:
+            zeroed = zero_in_blocks(out.blocks, self.contacts, partial(self._pieces, recorded))
+            out = replace(out, blocks=zeroed) if settings.contact_threshold is None else self._flagged(zeroed)
         if settings.base_motion is None:
             return out
+        rest = partial(self._pieces, recorded), self.folder
         blocks, standing = stand_in_blocks(out.blocks, self.robot, self.contacts, *rest)
         return replace(out, blocks=blocks, standing=standing)
+
+    def _flagged(self, blocks: LogBlocks) -> _Settled:
+        """The log with flags as recorded, from joint torques or from forces."""
+        settings, rest = self.settings, (partial(self._pieces, blocks), self.folder)
+        if settings.detect_contacts is not None and self.contacts:
+            robot = self.robot if self.loaded is None else self.loaded
+            return _Settled(*detect_in_blocks(blocks, robot, self.contacts, settings.detect_contacts, *rest))
+        if settings.contact_threshold is not None:
+            return _Settled(*flag_by_force_in_blocks(blocks, settings.contact_threshold, *rest))
+        return _Settled(blocks)
 
     def _course(self, settled: _Settled, with_unloaded: bool) -> Course:
         """What of a log must be known before its blocks can be worked on, which takes a pass or two over it."""
@@ -173,7 +189,7 @@ class LargeLog:
         rates = settings.filter_hz, settings.sample_rate_hz, self.sign_width
         whole = make_timeline(blocks.time, lacks_derivatives(first), *rates)
         coverage = {} if whole is None else self._coverage(blocks, first, whole)
-        contacts = self._contacts(blocks, first)
+        contacts = None if first.contact_active is None else contacts_alone(blocks, partial(self._pieces, blocks))
         air = None if contacts is None or not with_unloaded else in_the_air(contacts)
         if standing is None or whole is None:
             stretches: tuple[Stretch, ...] = (Stretch(blocks, whole, 0, air),)
@@ -264,17 +280,6 @@ class LargeLog:
         for name, coverage in coverages.items():
             warn_of_gaps(first, name, coverage)
         return coverages
-
-    def _contacts(self, blocks: LogBlocks, first: Log) -> Log | None:
-        """The log with nothing but the contacts' flags, which takes a pass over it; None if there are none."""
-        if first.contact_active is None:
-            return None
-        flags = [
-            blocks.read(piece, only=("contact_active",)).contact_active for piece in self._pieces(blocks, len(blocks))
-        ]
-        nothing = np.empty((len(blocks), 0))
-        active = np.concatenate([x for x in flags if x is not None])
-        return Log(blocks.source, blocks.time, (), nothing, contact_names=first.contact_names, contact_active=active)
 
     def _bound(self, course: Course, block: Block) -> tuple[slice, Samples]:
         """The numbers of a block's samples, and these; errors count from the beginning."""

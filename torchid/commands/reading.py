@@ -171,15 +171,10 @@ class LogReader:
         if split_range(path).joins:
             found = f"several files with arrays of {together:.2g} GB, which are not in memory at once"
             raise LogError(path, "file", found, f"{needed}, or the one file that torchid convert makes of them")
-        if self._needs_whole_logs:
+        if settings.exclude_condemned:
             found = f"set for arrays of {together:.2g} GB, which are not in memory at once"
-            accepted = f"{needed}, or parts of the logs"
-            if settings.exclude_condemned:
-                key, accepted = "exclude_condemned", f"{accepted} that torchid check passes"
-            else:
-                keys = "contact_threshold", "zero_in_air", "bridge_gaps_s"
-                key = next(name for name in keys if getattr(settings, name) not in (None, False))
-            raise LogError(path, f"preprocessing.{key}", found, accepted)
+            accepted = f"{needed}, or parts of the logs that torchid check passes"
+            raise LogError(path, "preprocessing.exclude_condemned", found, accepted)
         return self._large_log(path, required, self.folder).samples(fits_contact_offsets(self.scene))
 
     def _takes_blocks(self, path: Path, gigabytes: float) -> bool:
@@ -187,15 +182,10 @@ class LogReader:
 
         Where fields are worked out of others, blocks take more passes over it.
         """
-        whole = self._needs_whole_logs or self.scene.config.preprocessing.derived or split_range(path).joins
-        return gigabytes > _WHOLE_GB and not whole
-
-    @property
-    def _needs_whole_logs(self) -> bool:
-        """Whether samples are left out or filled for what is known of a whole log alone."""
         settings = self.scene.config.preprocessing
-        of_all = settings.exclude_condemned or settings.zero_in_air or settings.contact_threshold is not None
-        return of_all or settings.bridge_gaps_s is not None
+        filled = settings.bridge_gaps_s is not None or settings.zero_in_air
+        whole = settings.exclude_condemned or settings.derived or filled or split_range(path).joins
+        return gigabytes > _WHOLE_GB and not whole
 
     def _large_log(self, path: Path, required: SensorSet | None, folder: Path | None) -> LargeLog:
         """A log that is read block by block."""

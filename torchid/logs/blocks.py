@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -17,8 +17,11 @@ from numpy.typing import NDArray
 from torchid.errors import LogError, about_file
 from torchid.logs.array_parts import lazy_part
 from torchid.logs.column_map import Columns
+from torchid.logs.computed import Computed
 from torchid.logs.containers import Container, LogKind, existing_log_kind, open_container, reader_errors_explained
+from torchid.logs.force_plates import about_world_origin
 from torchid.logs.log import (
+    FLAGS,
     NAME_FIELDS,
     POINTS,
     SHAPES,
@@ -143,7 +146,10 @@ class LogBlocks:
             LogError: an invalid value; the message counts samples from the start of the log.
         """
         with about_file(self.source):
-            raw = self._raw(samples, only)
+            raw: dict[str, Any] = dict(self.names)
+            if only is not None:
+                raw["joint_position"] = np.zeros((len(self.time[samples]), len(self.names["joint_names"])))
+            raw |= self.raw(samples, self._wanted(only))
             try:
                 log = build_log(raw, allow_gaps)
             except LogError as error:
@@ -152,16 +158,36 @@ class LogBlocks:
             self._continue_signs(log.base_quat_xyzw, samples)
         return log
 
-    def _raw(self, samples: slice, only: tuple[str, ...] | None) -> dict[str, Any]:
-        """Fields of some samples as they are in the file."""
-        raw: dict[str, Any] = dict(self.names) | {"time": self.time[samples]}
-        if only is not None:
-            raw["joint_position"] = np.zeros((len(raw["time"]), len(self.names["joint_names"])))
-        for name, array in self.fields.items():
-            if only is None or name in only or (name == POINTS and WRENCHES[1] in only):
-                with reader_errors_explained(name, _ACCEPTED):
-                    raw[name] = np.asarray(array[samples])
+    def _wanted(self, only: tuple[str, ...] | None) -> tuple[str, ...]:
+        """Names of the fields that are there of those to be read."""
+        with_points = only is not None and WRENCHES[1] in only
+        return tuple(name for name in self.fields if only is None or name in only or (name == POINTS and with_points))
+
+    def raw(self, samples: slice, names: Iterable[str]) -> dict[str, NDArray[Any]]:
+        """Stamps and fields of some samples as they are in the file."""
+        raw: dict[str, NDArray[Any]] = {"time": self.time[samples]}
+        for name in names:
+            with reader_errors_explained(name, _ACCEPTED):
+                raw[name] = np.asarray(self.fields[name][samples])
         return raw
+
+    def about_world_origin(self) -> LogBlocks:
+        """The log with moments about the world's origin, where it has the points of these, see `about_world_origin`."""
+        if POINTS not in self.fields or WRENCHES[1] not in self.fields:
+            return self
+        names = [name for name in (WRENCHES[1], POINTS, FLAGS) if name in self.fields]
+        wrench, points = self.fields[WRENCHES[1]], self.fields[POINTS]
+
+        def moved(rows: slice) -> NDArray[Any]:
+            try:
+                return about_world_origin(self.raw(rows, names))[WRENCHES[1]]
+            except LogError as error:
+                raise count_samples_from(rows.start, error) from error
+
+        origin = Computed(
+            points.shape, np.dtype(float), lambda rows: np.zeros((rows.stop - rows.start, *points.shape[1:]))
+        )
+        return self.replaced({WRENCHES[1]: Computed(wrench.shape, np.dtype(float), moved), POINTS: origin})
 
     def _continue_signs(self, quat: FloatArray, samples: slice) -> None:
         """Flip quaternions (M, 4) where their sign is not that of the samples before."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
 
 import numpy as np
 from pydantic import ConfigDict
@@ -28,7 +29,7 @@ class ContactThreshold:
 
 
 def with_flags_by_force(log: Log, settings: ContactThreshold) -> tuple[Log, BoolArray]:
-    """The log with flags by `contact_forces` in the place of what it has, and where they are certain.
+    """The log with flags by what its contacts carry in the place of what it has, and where they are certain.
 
     A contact without a force keeps its recorded flag. Samples (N,) of stances that are too short to count are not
     certain.
@@ -37,7 +38,26 @@ def with_flags_by_force(log: Log, settings: ContactThreshold) -> tuple[Log, Bool
         LogError: no force, or no flag either, of a contact; a force that is NaN in some samples; no normal of the
             ground where a contact stands.
     """
-    force = contact_forces(log)
+    measured = MeasuredForces.of(log.source, [log])
+    active, certain = flags_by_force(log, measured, measured.sizes(log), settings)
+    normals = log.contact_normal_world
+    if normals is not None:
+        with about_file(log.source):
+            normals = normalize_normals(normals, active, log.contact_names)
+    return dataclasses.replace(log, contact_active=active, contact_normal_world=normals), certain
+
+
+def flags_by_force(
+    log: Log, measured: MeasuredForces, force: FloatArray, settings: ContactThreshold
+) -> tuple[BoolArray, BoolArray]:
+    """Flags (N, C) of contacts that carry forces (N, C) [N], and where they (N,) are certain, as `with_flags_by_force`.
+
+    Args:
+        log: with stamps, names of contacts and recorded flags, if there are any; nothing else is looked at.
+        measured: what the forces are of.
+        force: the `sizes` of all its samples.
+        settings: thresholds.
+    """
     active = np.zeros(force.shape, dtype=bool) if log.contact_active is None else log.contact_active.copy()
     certain = np.ones(len(log), dtype=bool)
     below = settings.above if settings.below is None else settings.below
@@ -51,45 +71,69 @@ def with_flags_by_force(log: Log, settings: ContactThreshold) -> tuple[Log, Bool
             accepted = f"forces to compare with {KEY}, or gaps that preprocessing.bridge_gaps_s bridges"
             if missing.all():
                 found, accepted = f"no force of {name}", f"forces to compare with {KEY}, or contact_active"
-            raise LogError(log.source, _force_field(log, column), found, accepted)
+            raise LogError(log.source, measured.field(column), found, accepted)
         loaded = hysteresis(force[:, column], settings.above, below)
         active[:, column] = without_short(loaded, shortest)
         certain &= active[:, column] | ~loaded
-    normals = log.contact_normal_world
-    if normals is not None:
-        with about_file(log.source):
-            normals = normalize_normals(normals, active, log.contact_names)
-    return dataclasses.replace(log, contact_active=active, contact_normal_world=normals), certain
+    return active, certain
 
 
-def contact_forces(log: Log) -> FloatArray:
-    """What contacts carry, (N, C) [N]: `contact_force_normal`, or the size of a wrench's force where there is none.
+@dataclasses.dataclass(frozen=True)
+class MeasuredForces:
+    """Which readings say what contacts carry: `contact_force_normal`, or else the size of a wrench's force.
 
-    The size needs no orientation of foot, base or ground. A component that is NaN throughout counts as 0, a contact of
-    which all are has NaN.
+    The size needs no orientation of foot, base or ground.
 
-    Raises:
-        LogError: the log has neither.
+    Attributes:
+        normal: contacts (C,) whose force along the normal has a value in some sample.
+        components: likewise those (C, 3) of wrenches' forces.
+        wrench_field: name of the field of wrenches, None if there are none.
     """
-    scalar, wrench = log.contact_force_normal, log.contact_wrench
-    if not log.contact_names or (scalar is None and wrench is None):
-        accepted = f"contact_wrench_local or {FORCE_NORMAL}, to compare with {KEY}"
-        raise LogError(log.source, "contact_wrench", "missing", accepted)
-    force = np.full((len(log), len(log.contact_names)), np.nan)
-    if wrench is not None:
-        parts, measured = wrench[:, :, :3], ~np.isnan(wrench[:, :, :3]).all(axis=0)
-        sizes = np.linalg.norm(np.where(measured, parts, 0.0), axis=2)
-        force = np.where(np.any(measured, axis=1), sizes, np.nan)
-    if scalar is not None:
-        force = np.where(np.isnan(scalar).all(axis=0), force, scalar)
-    return np.asarray(force)
 
+    normal: BoolArray
+    components: BoolArray
+    wrench_field: str | None
 
-def _force_field(log: Log, column: int) -> str:
-    """The field of which `contact_forces` are for a contact."""
-    scalar = log.contact_force_normal
-    is_scalar = scalar is not None and (log.contact_wrench is None or not np.isnan(scalar[:, column]).all())
-    return FORCE_NORMAL if is_scalar else log.contact_wrench_field
+    @classmethod
+    def of(cls, source: str, parts: Iterable[Log]) -> MeasuredForces:
+        """Those of a log, from all of its samples.
+
+        Raises:
+            LogError: the log has neither.
+        """
+        found: MeasuredForces | None = None
+        for log in parts:
+            scalar, wrench = log.contact_force_normal, log.contact_wrench
+            if not log.contact_names or (scalar is None and wrench is None):
+                accepted = f"contact_wrench_local or {FORCE_NORMAL}, to compare with {KEY}"
+                raise LogError(source, "contact_wrench", "missing", accepted)
+            if found is None:
+                count, field = len(log.contact_names), None if wrench is None else log.contact_wrench_field
+                found = cls(np.zeros(count, dtype=bool), np.zeros((count, 3), dtype=bool), field)
+            if scalar is not None:
+                found.normal[:] |= ~np.isnan(scalar).all(axis=0)
+            if wrench is not None:
+                found.components[:] |= ~np.isnan(wrench[:, :, :3]).all(axis=0)
+        if found is None:
+            raise ValueError("no samples")
+        return found
+
+    def sizes(self, log: Log) -> FloatArray:
+        """What contacts carry in some samples of the log, (N, C) [N].
+
+        A component that is NaN throughout the log counts as 0, a contact of which all are has NaN.
+        """
+        force = np.full((len(log), len(log.contact_names)), np.nan)
+        if log.contact_wrench is not None:
+            sizes = np.linalg.norm(np.where(self.components, log.contact_wrench[:, :, :3], 0.0), axis=2)
+            force = np.where(self.components.any(axis=1), sizes, np.nan)
+        if log.contact_force_normal is not None:
+            force = np.where(self.normal, log.contact_force_normal, force)
+        return np.asarray(force)
+
+    def field(self, column: int) -> str:
+        """The field that a contact's force is of."""
+        return FORCE_NORMAL if self.wrench_field is None or self.normal[column] else self.wrench_field
 
 
 def samples_of(seconds: float, time: FloatArray) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -51,13 +51,29 @@ def bridge_gaps(raw: Mapping[str, NDArray[Any]], longest_s: float | None) -> dic
     Warns:
         TorchidWarning: how many samples were filled.
     """
-    out = dict(raw)
+    out, filled = fill_short_gaps(raw, longest_s)
+    if filled and longest_s is not None:
+        count = int(np.any(list(filled.values()), axis=0).sum())
+        warn_of_filled(filled, count, len(raw["time"]), longest_s)
+    return out
+
+
+def warn_of_filled(names: Iterable[str], count: int, samples: int, longest_s: float) -> None:
+    """Warn that gaps of some fields were filled in so many of all samples."""
+    what = f"gaps of at most {longest_s:g} s bridged in {count} of {samples} samples"
+    warn_about_file(f"{', '.join(names)}: {what}")
+
+
+def fill_short_gaps(
+    raw: Mapping[str, NDArray[Any]], longest_s: float | None
+) -> tuple[dict[str, NDArray[Any]], dict[str, BoolArray]]:
+    """The fields as `bridge_gaps` has them, and in which samples (N,) of which something was filled."""
+    out, filled = dict(raw), dict[str, BoolArray]()
     if longest_s is None:
-        return out
+        return out, filled
     check_shape("time", raw["time"], SHAPES["time"], {})
     time = to_float64("time", raw["time"])
     check_time(time)
-    filled = dict[str, BoolArray]()
     for name in sorted(_with_gaps(raw), key=lambda name: name != FLAGS):  # readings depend on flags
         missing = _missing(name, raw[name])
         usable = _touching(out, missing.shape) if name in CONTACT_READINGS else None
@@ -65,11 +81,7 @@ def bridge_gaps(raw: Mapping[str, NDArray[Any]], longest_s: float | None) -> dic
         if short.any():
             out[name] = _held(raw[name], short) if name == FLAGS else _filled(time, name, raw[name], short)
             filled[name] = np.asarray(short.reshape(len(time), -1).any(axis=1))
-    if filled:
-        count = int(np.any(list(filled.values()), axis=0).sum())
-        what = f"gaps of at most {longest_s:g} s bridged in {count} of {len(time)} samples"
-        warn_about_file(f"{', '.join(filled)}: {what}")
-    return out
+    return out, filled
 
 
 def refuse_gaps(name: str, values: FloatArray, time: FloatArray, labels: tuple[str, ...] = ()) -> None:

@@ -78,8 +78,13 @@ def unloaded_offset_equations(builder: RowBuilder, samples: Samples) -> Iterator
 
 def is_masked(y: Tensor) -> bool:
     """Whether readings (M,) in the air are masked or clamped, not measured: many are exactly 0, and few of one sign."""
-    above, below = ((y > 0.0).double().mean(), (y < 0.0).double().mean())
-    return bool(1.0 - above - below > _MASKED_SHARE and min(above, below) < _ONE_SIDED)
+    return are_masked(len(y), int((y > 0.0).sum()), int((y < 0.0).sum()))
+
+
+def are_masked(count: int, above: int, below: int) -> bool:
+    """The same of so many readings, of which some are above and below 0."""
+    zero = count - above - below
+    return zero > _MASKED_SHARE * count and min(above, below) < _ONE_SIDED * count
 
 
 def _robust_mean(y: Tensor, noise: float, oversampling: float) -> tuple[float, float]:
