@@ -55,7 +55,7 @@ def solve_barrier(problem: ConicProblem, tolerance: float = 1e-9) -> Solution:
         x = point.x.numpy()
         objective, last = problem.objective(x), after is None or count == _STEPS
         scale = max(objective, problem.floor)
-        if not last and path.complementarity(point) > _CENTRED * max(tolerance, _ACCURATE) * scale:
+        if not last and point.complementarity > _CENTRED * max(tolerance, _ACCURATE) * scale:
             continue  # the gap takes as long as a step
         gap = problem.gap(x, *path.multipliers(point))
         worse = worse + 1 if gap >= best.gap else 0
@@ -81,6 +81,7 @@ class _Point:
         slack: (M,), of the rows.
         Z: (K, 4, 4), multipliers of the blocks, C^T Z_k C.
         y: (M,), multipliers of the rows.
+        complementarity: how far the multipliers are from those of a minimizer: the gap where the gradient is balanced.
     """
 
     x: Tensor
@@ -88,6 +89,7 @@ class _Point:
     slack: Tensor
     Z: Tensor
     y: Tensor
+    complementarity: float
 
 
 @dataclass(frozen=True)
@@ -118,16 +120,16 @@ class _PrimalDual:
         factors = self._factors(torch.from_numpy(x.copy()))
         if factors is None:
             raise np.linalg.LinAlgError("by rounding, the starting point is not strictly feasible")
-        root, slack = factors
         kappa = max(self.problem.objective(x), self.problem.floor) / max(self.problem.degree, 1)
-        whitening = torch.linalg.solve_triangular(root, self.eye, upper=False)
         Z = (self.weights + kappa)[:, None, None] * self.eye
-        return _Point(torch.from_numpy(x.copy()), whitening, slack, Z, kappa / slack)
+        return self._point(torch.from_numpy(x.copy()), factors, Z, kappa / factors[1])
 
-    def complementarity(self, point: _Point) -> float:
-        """How far the multipliers are from those of a minimizer: the gap where the gradient is balanced."""
-        off = point.Z - self.weights[:, None, None] * self.eye
-        return float(torch.linalg.eigvalsh(off).abs().sum() + point.slack @ point.y)
+    def _point(self, x: Tensor, factors: tuple[Tensor, Tensor], Z: Tensor, y: Tensor) -> _Point:
+        """The point x, (n,), of these `_factors`, with its multipliers."""
+        root, slack = factors
+        whitening = torch.linalg.solve_triangular(root, self.eye, upper=False)
+        off = torch.linalg.eigvalsh(Z - self.weights[:, None, None] * self.eye)
+        return _Point(x, whitening, slack, Z, y, float(off.abs().sum() + slack @ y))
 
     def multipliers(self, point: _Point) -> tuple[np.ndarray, np.ndarray]:
         """Of the blocks, (K, 4, 4), and of the rows, (M,)."""
@@ -141,7 +143,7 @@ class _PrimalDual:
         solve = self._newton(point)
         none = torch.zeros(())
         affine = solve(0.0, none, none)
-        kappa = self.complementarity(point) / max(self.problem.degree, 1)
+        kappa = point.complementarity / max(self.problem.degree, 1)
         shrunk = (1.0 - min(1.0, self._longest(point, Z_root, affine))) ** 3 * kappa
         move = solve(shrunk, _symmetric(affine.blocks @ affine.Z), affine.slack * affine.y)
         length = min(1.0, _SHARE * self._longest(point, Z_root, move))
@@ -153,15 +155,9 @@ class _PrimalDual:
             length *= 0.5  # infeasible by rounding alone
         if factors is None:
             return None
-        root, slack = factors
-        change = point.whitening @ root
-        return _Point(
-            x=point.x + length * move.x,
-            whitening=torch.linalg.solve_triangular(root, self.eye, upper=False),
-            slack=slack,
-            Z=_symmetric(change.mT @ (point.Z + length * move.Z) @ change),
-            y=point.y + length * move.y,
-        )
+        change = point.whitening @ factors[0]
+        Z = _symmetric(change.mT @ (point.Z + length * move.Z) @ change)
+        return self._point(point.x + length * move.x, factors, Z, point.y + length * move.y)
 
     def _newton(self, point: _Point) -> Callable[[float, Tensor, Tensor], _Direction]:
         """Direction towards the point of the path at a barrier weight, with corrections of second order."""

@@ -143,12 +143,9 @@ class ConicProblem:
         multiplier_slopes = np.zeros_like(self.F)  # w F^-1 dF F^-1 of weighted blocks
         inverse = np.linalg.inv(blocks[weighted])[:, None]
         multiplier_slopes[weighted] = self.weights[weighted, None, None, None] * inverse @ self.F[weighted] @ inverse
-        hessian = self.hessian.copy()
-        pairs = (self.variables[:, :, None], self.variables[:, None, :])
-        np.add.at(hessian, pairs, np.einsum("kuij,kvij->kuv", multiplier_slopes, self.F))
         residual = self.gradient(x) - self.G.T @ y - self._gathered(Z)
         # A Newton step balances the part of it in directions in which quadratic and log-determinants are stiff enough.
-        values, vectors = np.linalg.eigh(self.null_space.T @ hessian @ self.null_space)
+        values, vectors = self._stiffness_modes(multiplier_slopes) if weighted.any() else self._quadratic_modes
         modes = vectors.T @ (self.null_space.T @ residual)
         balanced = np.abs(modes) <= 2.0 * SEARCH_RADIUS * values
         lengths = modes[balanced] / np.maximum(values[balanced], np.finfo(float).tiny)
@@ -163,6 +160,20 @@ class ConicProblem:
         if relative.min(initial=1.0) <= 0.0:
             return np.inf
         return float(gap + (weights * (relative - 1.0 - np.log(relative))).sum())
+
+    @cached_property
+    def _quadratic_modes(self) -> tuple[Array, Array]:
+        """Eigenvalues and eigenvectors of the quadratic in the null space of the equalities."""
+        values, vectors = np.linalg.eigh(self.null_space.T @ self.hessian @ self.null_space)
+        return values, vectors
+
+    def _stiffness_modes(self, multiplier_slopes: Array) -> tuple[Array, Array]:
+        """Those of quadratic and log-determinants, whose multipliers change by these slopes, (K, 10, 4, 4)."""
+        hessian = self.hessian.copy()
+        pairs = (self.variables[:, :, None], self.variables[:, None, :])
+        np.add.at(hessian, pairs, np.einsum("kuij,kvij->kuv", multiplier_slopes, self.F))
+        values, vectors = np.linalg.eigh(self.null_space.T @ hessian @ self.null_space)
+        return values, vectors
 
     def _gathered(self, Z: Array) -> Array:
         """Sum of <Z_k, dF_k/dx>, (n,)."""
