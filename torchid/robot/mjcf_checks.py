@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from torchid.errors import UrdfError, warn
+from torchid.guards import MAX_NUMBER
 from torchid.robot.mjcf_model import MjcfModel
 
 _GRAVITY = 9.81  # m/s^2
@@ -44,20 +45,30 @@ def _check_body(model: MjcfModel, body: Any) -> None:
     if body.plugin.active:
         model.refuse(body, "body", body.name, "a plugin, which may exert forces", "none")
     for joint in body.joints:
-        kind = joint.type.name.removeprefix("mjJNT_").lower()
-        if kind == "ball":
-            accepted = "joints of type hinge or slide: three hinges in place of a ball"
-            model.refuse(joint, "joint", joint.name, "type ball", accepted)
-        values = {name: np.atleast_1d(getattr(joint, name)) for name in ("damping", "stiffness")}
-        for name, value in values.items():
-            if value[1:].any():
-                model.refuse(joint, "joint", joint.name, f"{name} {_numbers(value)}", "one number")
-        if kind == "free":
-            for name in ("armature", "damping", "frictionloss", "stiffness"):
-                value = np.atleast_1d(getattr(joint, name))
-                if value.any():
-                    found = f"{name} {_numbers(value)} of a free joint"
-                    model.refuse(joint, "joint", joint.name, found, f"{name} 0, or <freejoint/>")
+        _check_joint(model, joint)
+        if joint.type.name == "mjJNT_FREE":
+            _check_free_joint(model, joint)
+
+
+def _check_joint(model: MjcfModel, joint: Any) -> None:
+    if joint.type.name == "mjJNT_BALL":
+        accepted = "joints of type hinge or slide: three hinges in place of a ball"
+        model.refuse(joint, "joint", joint.name, "type ball", accepted)
+    values = {name: np.atleast_1d(getattr(joint, name)) for name in ("damping", "stiffness")}
+    for name, value in values.items():
+        if value[1:].any():
+            model.refuse(joint, "joint", joint.name, f"{name} {_numbers(value)}", "one number")
+        if np.abs(value).max() > MAX_NUMBER:
+            accepted = f"at most {MAX_NUMBER:g}: no joint, if it cannot move"
+            model.refuse(joint, "joint", joint.name, f"{name} {_numbers(value)}", accepted)
+
+
+def _check_free_joint(model: MjcfModel, joint: Any) -> None:
+    for name in ("armature", "damping", "frictionloss", "stiffness"):
+        value = np.atleast_1d(getattr(joint, name))
+        if value.any():
+            found = f"{name} {_numbers(value)} of a free joint"
+            model.refuse(joint, "joint", joint.name, found, f"{name} 0, or <freejoint/>")
 
 
 def _check_transmissions(model: MjcfModel) -> None:

@@ -6,6 +6,7 @@ Imports MuJoCo, an extra, for all modules that need it.
 from __future__ import annotations
 
 import re
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -54,10 +55,13 @@ class MjcfModel:
             UrdfError: MuJoCo does not take it, or it has no joint.
         """
         self.path, self.text = path, MjcfText(path)
+        mujoco.set_mju_user_warning(lambda _: None)  # MuJoCo would write a log file where it runs
         try:
-            self.spec = mujoco.MjSpec.from_file(str(path))
-            meshes, dropped = self._drop_files()
-            self.model = self.spec.compile()
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # of MuJoCo, about elements that it will not have for ever
+                self.spec = mujoco.MjSpec.from_file(str(path))
+                meshes, dropped = self._drop_files()
+                self.model = self.spec.compile()
         except ValueError as error:
             text = excerpt(" ".join(str(error).split()), 300)
             raise UrdfError(path, "MJCF", f"MuJoCo refuses it: {text}", "a model that MuJoCo loads") from error

@@ -57,8 +57,7 @@ def is_bolted(path: Path) -> bool:
     """Whether a robot's file says that its base does not move: MJCF without a free joint; a URDF never says."""
     if not is_mjcf(path):
         return False
-    first = parse_xml(path).getroot().find("link")
-    return first is not None and first.get("name") == MJCF_WORLD
+    return parse_xml(path).getroot().find(f"link[@name='{MJCF_WORLD}']") is not None
 
 
 def drop_repeated_origins(root: etree._Element) -> None:
