@@ -20,6 +20,8 @@ _IDENTIFY = "fit the parameters of an experiment file and write a run folder"
 _COMPRESS = "compress the training logs of an experiment file to small files of factors, which identify fits too"
 _EVALUATE = "predict the forces of further logs with the parameters of a run"
 _REPLAY = "drive the robot in MuJoCo with the torques of a log, and say how far it drifts (needs the extra [sim])"
+_EXPORT = "write the identified parameters of a run for a simulator: MJCF, URDF, Isaac Lab's actuators, or JSON"
+_FORMATS = ("mjcf", "urdf", "isaaclab", "json")  # those of torchid.commands.export, which takes long to import
 _REPORT = "make report.html of a run anew, with what the checks of its logs find (needs the extra [report])"
 _ANALYZE = "analyze what sensors and motion determine, and plan the smallest sensor set"
 _INIT = "write an experiment file for a robot and a log, with a map of its columns or topics, and say what was guessed"
@@ -101,6 +103,12 @@ def _parser() -> argparse.ArgumentParser:
     replay.add_argument("--overwrite", action="store_true", help="replace an earlier replay in this folder")
     _add_amount(replay)
     replay.set_defaults(command=_replay)
+    export = commands.add_parser("export", help=_EXPORT, description=_EXPORT)
+    export.add_argument("run", help="run folder")
+    export.add_argument("--format", required=True, choices=_FORMATS, help="what to write")
+    export.add_argument("--output", metavar="FILE", help="file to write (default: standard output)")
+    export.add_argument("--overwrite", action="store_true", help="replace this file if it exists")
+    export.set_defaults(command=_export)
     report = commands.add_parser("report", help=_REPORT, description=_REPORT)
     report.add_argument("run", help="run folder")
     report.set_defaults(command=_report)
@@ -121,7 +129,9 @@ def _parser() -> argparse.ArgumentParser:
     check = commands.add_parser("check", help=_CHECK, description=_CHECK)
     check.add_argument("file", help="experiment file (YAML), whose logs are checked against its robot, or a log")
     check.add_argument("overrides", nargs="*", default=[], help="key.subkey=value, with an experiment file")
-    check.add_argument("--urdf", metavar="FILE", help="robot of a log; without it, checks against a robot are skipped")
+    check.add_argument(
+        "--urdf", metavar="FILE", help="robot of a log, URDF or MJCF; without it, checks against a robot are skipped"
+    )
     check.add_argument("--base-link", metavar="LINK", help="base of that robot, if it is not the URDF's root")
     check.add_argument("--fixed-base", action="store_true", help="the base of that robot is fixed")
     check.add_argument("--topics", metavar="FILE", help="experiment file with logs.topics, the map of a bag's topics")
@@ -141,7 +151,7 @@ def _parser() -> argparse.ArgumentParser:
     convert.add_argument("--overwrite", action="store_true", help="replace OUT if it exists")
     convert.set_defaults(command=_convert)
     init = commands.add_parser("init", help=_INIT, description=_INIT)
-    init.add_argument("urdf", metavar="URDF", help="the robot")
+    init.add_argument("urdf", metavar="ROBOT", help="the robot, a URDF or MJCF file")
     init.add_argument(
         "log",
         metavar="LOG",
@@ -262,6 +272,14 @@ def _replay(options: argparse.Namespace) -> None:
     replayed = replay(options.run, options.log, options.window, options.output, options.overwrite)
     if not options.quiet:
         print_replay(replayed, options.verbose)
+
+
+def _export(options: argparse.Namespace) -> None:
+    with _importing():
+        from torchid.commands.export import export
+
+    text = export(options.run, options.format, options.output, options.overwrite)
+    print(f"written to    {options.output}" if options.output else text, end="\n" if options.output else "")
 
 
 def _report(options: argparse.Namespace) -> None:

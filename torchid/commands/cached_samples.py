@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 from dataclasses import asdict, dataclass
@@ -10,18 +11,21 @@ from typing import Any
 
 import numpy as np
 import torch
+from lxml import etree
 from numpy.typing import NDArray
 from torch import Tensor
 
 from torchid.commands.cache import Entry, tensor_of
 from torchid.commands.manifest import file_checksum
 from torchid.commands.reading import fits_contact_offsets
+from torchid.config.experiment import RobotConfig
 from torchid.errors import TorchidWarning
 from torchid.fitting.experiment import Scene
 from torchid.logs.time_range import log_title
 from torchid.problem import Samples
 from torchid.problem.base_motion import BaseMotion
 from torchid.problem.motion_noise import MotionNoise
+from torchid.robot.urdf import parse_xml
 from torchid.sensing import SensorSet
 
 NOT_IN_SAMPLES = ("memory_gb", "cache_gb")
@@ -58,7 +62,7 @@ def content_of_scene(scene: Scene) -> dict[str, Any]:
     columns = None if config.logs is None or config.logs.columns is None else asdict(config.logs.columns)
     return {
         "format": _FORMAT,
-        "urdf": [config.robot.urdf.name, file_checksum(config.robot.urdf)],
+        "urdf": [config.robot.path.name, _robot_checksum(config.robot)],
         "robot": [robot.base_link, robot.fixed_base, list(robot.ft_names), robot.welded, robot.base_tilt],
         "contacts": [asdict(contact) for contact in scene.contacts],
         "unloaded": fits_contact_offsets(scene),
@@ -68,6 +72,13 @@ def content_of_scene(scene: Scene) -> dict[str, Any]:
         "topics": topics,
         "columns": json.dumps(columns),  # as text: the order of names in it is that of the log
     }
+
+
+def _robot_checksum(robot: RobotConfig) -> str:
+    """SHA-256 of a URDF; of MJCF that of what is read from it and the files that it includes."""
+    if robot.mjcf is None:
+        return file_checksum(robot.path)
+    return hashlib.sha256(etree.tostring(parse_xml(robot.path))).hexdigest()
 
 
 def named_tensors(samples: Samples) -> dict[str, Tensor]:

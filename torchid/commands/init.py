@@ -1,4 +1,4 @@
-"""`torchid init`: an experiment file from a URDF and a log, with what was guessed beside it."""
+"""`torchid init`: an experiment file from a URDF or MJCF and a log, with what was guessed beside it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ from torchid.logs.time_range import split_range
 from torchid.logs.topic_proposals import USED_TYPES, frame_of, propose_topics
 from torchid.regressor.kinematics import GRAVITY_WORLD
 from torchid.robot import CollisionShapes, Robot, load_robot
-from torchid.robot.urdf import position_limits
+from torchid.robot.urdf import is_bolted, position_limits
+from torchid.robot.xml_files import is_mjcf
 
 _FEET = (r"foot|feet", r"sole", r"ankle_roll|ankle_flexion", r"toe|ankle|paw|hoof")
 """Words in names of links that touch the ground, the surest first."""
@@ -78,7 +79,7 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> Initiated:
     """Write an experiment file for a robot and a log, complete or not at all.
 
     Args:
-        urdf: of the robot.
+        urdf: of the robot; or its MJCF file.
         log: a table or arrays, in the log format or not, several of these as one log, or a bag.
         output: the file; nothing that is there is replaced.
 
@@ -94,7 +95,7 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> Initiated:
     files = [file.path for file in part.files]
     check_free_file(target, "--output", False, [urdf, *files])
     is_bag = existing_log_kind(part.file) is LogKind.BAG
-    robot = load_robot(urdf)
+    robot = load_robot(urdf, fixed_base=is_bolted(Path(urdf)))
     contacts, fields, proposal = _of_bag(part.file, robot) if is_bag else _of_columns(files, robot)
     out = Initiated(target)
     _state_flags(contacts, fields, proposal)
@@ -247,7 +248,7 @@ def _describe(
     out.guessed += [f"{key}: {note}" for key, note in proposal.notes.items()]
     if contacts:
         out.guessed.append("contacts: from names of links; point where there is a ball or more than two of them")
-    if _is_fixed(contacts, fields):
+    if _is_fixed(contacts, fields) and not robot.fixed_base:
         out.guessed.append("robot.fixed_base: true, as there is neither a foot nor a motion of the base")
     if proposal.lacking:
         out.guessed.append(f"robot.weld: {_WELDED}: {join_names(proposal.lacking)}")
@@ -329,9 +330,8 @@ def _text(
 ) -> str:
     """The experiment file, with comments."""
     from_feet = _from_feet(contacts, fields)
-    own: dict[str, object] = {"urdf": _relative(Path(urdf), output)} | (
-        {"fixed_base": True} if _is_fixed(contacts, fields) else {}
-    )
+    own: dict[str, object] = {"mjcf" if is_mjcf(Path(urdf)) else "urdf": _relative(Path(urdf), output)}
+    own |= {"fixed_base": True} if robot.fixed_base or _is_fixed(contacts, fields) else {}
     own |= {"weld": weld} if (weld := _weld(robot, proposal)) else {}
     names = f"{excerpt(log.name)} and {excerpt(robot.path.name)}"
     lines = [f"# {names}, by torchid init; what is marked as guessed should be checked"]

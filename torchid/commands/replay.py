@@ -19,6 +19,7 @@ from torchid.parameters import Array
 from torchid.problem import Samples
 from torchid.problem.chunks import one_thread
 from torchid.problem.extras import ACTUATORS
+from torchid.report import identified_name
 from torchid.report.drift_figure import drift_figure
 from torchid.report.figures import save_figure
 from torchid.report.tables import progress_bars
@@ -40,7 +41,7 @@ class Replay:
         source: name of the log.
         window: of the log that is replayed at a time [s].
         windows: number of them.
-        drift: with the URDF, which has no armature and no offsets, and with what was identified.
+        drift: with the robot's file, which has no offsets and, a URDF, no armature, and with what was identified.
         joint_names: of the robot.
         units: of the joints' positions, "rad" or "m".
         output: the folder that it was written to, if any.
@@ -136,11 +137,11 @@ def replay(
         reading = bars.add_task("reading the log", total=1)
         (samples,) = LogReader(fitted.experiment, folder).read([Path(log)], None, lambda _: bars.advance(reading))
         robot = fitted.experiment.robot
-        urdfs = Comparison(fitted.experiment.config.robot.urdf, folder / "identified.urdf")
-        feet = _feet(fitted.experiment.contacts, urdfs.nominal) if not robot.fixed_base else ()
+        files = Comparison(robot.path, folder / identified_name(robot))
+        feet = _feet(fitted.experiment.contacts, files.nominal) if not robot.fixed_base else ()
         calibration = fitted.calibrations.identified
         logs = Comparison(*(_replayed(one) for one in (samples, *calibration.calibrate([samples]))))
-        models = Comparison(_model(urdfs.nominal, robot, None), _model(urdfs.identified, robot, calibration))
+        models = Comparison(_model(files.nominal, robot, None), _model(files.identified, robot, calibration))
         windows = logs.nominal.windows(window)
         replaying = bars.add_task("replaying", total=2 * len(windows))
         times = window * np.arange(1, _TIMES + 1) / _TIMES
@@ -195,15 +196,16 @@ def _joint_kinds(robot: Robot) -> list[str]:
 
 
 def _model(urdf: Path, robot: Robot, calibration: Calibration | None) -> Model:
-    """The robot of a URDF with identified armatures, springs and offsets of torque, if there are any.
+    """The robot of a file with identified armatures, springs and offsets of torque, or those of an MJCF file.
 
     Coulomb friction that differs by direction is symmetric friction and an offset, as far as the joint moves.
     """
     values = {what: np.zeros(robot.n) for what in ACTUATORS}
+    values |= {"armature": robot.armature.copy(), "stiffness": robot.stiffness.copy()}
     for extra in calibration.builder.extras if calibration is not None else ():
         if extra.what in values and calibration is not None:
             values[extra.what][list(extra.dofs)] = calibration.values[("", extra.label)]
-    offset = values["torque_offset"] + values["asymmetric_coulomb"]
+    offset = values["torque_offset"] + values["asymmetric_coulomb"] + robot.spring_torque
     return Model(urdf, robot.joint_names, values["armature"], offset, values["stiffness"])
 
 

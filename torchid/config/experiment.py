@@ -47,6 +47,9 @@ def _at_zero(value: object) -> object:
     return value
 
 
+MJCF_SUFFIXES = (".xml", ".mjcf")
+"""Of a robot's file that is MJCF, where nothing says what it is."""
+
 WELDS_ACCEPTED = "a list of joints or patterns, or a mapping to positions [rad or m]: {'*finger*': 0.3}"
 Welds = Annotated[dict[str, FiniteFloat], BeforeValidator(_at_zero)]
 
@@ -68,18 +71,25 @@ BaseTilt = Annotated[tuple[float, float] | Literal["auto"] | None, PlainValidato
 
 @dataclass(config=STRICT, frozen=True)
 class RobotConfig:
-    """The robot; `base_link` defaults to the URDF's root.
+    """The robot, `urdf` or `mjcf`; `base_link` defaults to the URDF's root.
 
+    `mjcf`: a MuJoCo model, read by MuJoCo (the extra [sim]); its tree of most degrees of freedom is the robot.
     `weld`: names or patterns of joints that are held still, at 0 or at the position [rad or m] that a mapping gives.
     `base_tilt`: two angles [rad] about the base's x and y axes by which it is turned from the base that logs record, as
     on a table that is not level; auto, those that leave least of the training logs; None for none.
     """
 
-    urdf: Path
+    urdf: Path | None = None
+    mjcf: Path | None = None
     base_link: str | None = None
     fixed_base: bool = False
     weld: Welds = dataclasses.field(default_factory=dict)
     base_tilt: BaseTilt = None
+
+    @property
+    def path(self) -> Path:
+        """The one of both files that is given."""
+        return self.urdf or self.mjcf or Path()
 
     @property
     def tilt(self) -> tuple[float, float]:
@@ -143,7 +153,8 @@ def _spelled_out(settings: Settings, overriding: Settings) -> Settings:
     An override of one key of sensors joins the others; a named set replaces sensors by name.
     """
     if isinstance(robot := settings.get("robot"), str):
-        settings = settings | {"robot": {"urdf": robot}}
+        key = "mjcf" if Path(robot).suffix.lower() in MJCF_SUFFIXES else "urdf"
+        settings = settings | {"robot": {key: robot}}
     if isinstance(logs := settings.get("logs"), (str, list)):
         settings = settings | {"logs": {"train": [logs] if isinstance(logs, str) else logs}}
     settings = entries_spelled_out(settings)
@@ -162,7 +173,7 @@ _EXPERIMENT = FileKind(
     name="experiment",
     keys="robot, logs, sensors, output",
     list_example="contacts=[{frame: l_sole, type: flat}]",
-    paths=("robot", "robot.urdf", "logs", *(f"logs{name}.*{of}" for name in _LISTS for of in _FILES)),
+    paths=("robot", "robot.urdf", "robot.mjcf", "logs", *(f"logs{name}.*{of}" for name in _LISTS for of in _FILES)),
     urls=("logs", "logs.*", "logs.train.*"),
     outputs=("output",),
     prepare=_spelled_out,
@@ -204,6 +215,7 @@ def load_config(
     """
     config, about = _loaded(_EXPERIMENT, path, overrides, sections)
     with about:
+        _check_robot(config.robot)
         validate_choice("sensors", config.sensors)
         validate_keys(config.estimator)
         _check_extras(config)
@@ -217,6 +229,7 @@ def load_analysis(
     """Read an experiment file for `torchid analyze`: as `load_config`, but logs and sensors may be left out."""
     config, about = _loaded(_ANALYSIS, path, overrides, sections)
     with about:
+        _check_robot(config.robot)
         validate_choice("sensors", config.sensors, may_be_empty=True)
         validate_keys(config.estimator)
         _check_extras(config)
@@ -245,9 +258,9 @@ def _loaded(
 
 
 def inputs_of(config: ExperimentConfig | AnalyzeConfig) -> list[Path]:
-    """URDF and logs; a bag may be a folder."""
+    """The robot's file and logs; a bag may be a folder."""
     logs = config.logs
-    return [config.robot.urdf, *(logs.files if logs else [])]
+    return [config.robot.path, *(logs.files if logs else [])]
 
 
 def dump_config(config: ExperimentConfig | AnalyzeConfig) -> str:
@@ -266,6 +279,13 @@ def _check_threshold(settings: PreprocessingConfig) -> None:
     if threshold.below is not None and threshold.below > threshold.above:
         found = f"{threshold.below:g}, more than above ({threshold.above:g})"
         raise ConfigError.at_field(f"{key}.below", found, "a force [N] up to that of above")
+
+
+def _check_robot(robot: RobotConfig) -> None:
+    """Refuse a robot of no file or of two."""
+    if (robot.urdf is None) == (robot.mjcf is None):
+        found = "missing" if robot.urdf is None else "set together with robot.mjcf"
+        raise ConfigError.at_field("robot.urdf", found, "a path to a URDF, or robot.mjcf: a path to a MuJoCo model")
 
 
 def _check_extras(config: _Common) -> None:

@@ -32,6 +32,7 @@ from torchid.problem.sampled_rows import LogElsewhere
 from torchid.reprs import short_repr
 from torchid.robot import Robot, body_extents, load_robot, mirror_pairs
 from torchid.robot.tree import FT_FIELD
+from torchid.robot.xml_files import is_mjcf
 from torchid.sensing import Contact, SensorNoise, SensorSet, chosen_sensors, named_sensors, with_ft_sensors
 
 _FRICTION = PARAMETERS[parameters.FRICTION]
@@ -210,7 +211,10 @@ def set_up_scene(config: ExperimentConfig | AnalyzeConfig) -> Scene:
     require_device(config.device)
     try:
         of = config.robot
-        robot = load_robot(of.urdf, of.base_link, of.fixed_base, _ft_joints(config), of.weld, of.tilt)
+        if is_mjcf(of.path) != (of.mjcf is not None):
+            key, other = ("robot.urdf", "mjcf") if of.mjcf is None else ("robot.mjcf", "urdf")
+            raise ConfigError.at_field(key, f"'{of.path}', no {key[6:].upper()}", f"robot: {{{other}: {of.path.name}}}")
+        robot = load_robot(of.path, of.base_link, of.fixed_base, _ft_joints(config), of.weld, of.tilt)
     except UnknownNameError as error:
         if error.field != FT_FIELD:
             raise

@@ -74,6 +74,9 @@ class RowModel:
             settings["robot.weld"] = [f"{name} at {position!r}" for name, position in robot.welded.items()]
         if any(robot.base_tilt):
             settings["robot.base_tilt"] = ", ".join(map(repr, robot.base_tilt))
+        for name in ("armature", "stiffness", "spring_torque"):
+            if (stated := getattr(robot, name)).any():  # of an MJCF robot, taken off the right-hand side
+                settings[f"robot.mjcf {name}"] = [repr(float(x)) for x in stated]
         settings |= {f"preprocessing.{name}": value for name, value in preprocessing.items()}
         geometry = {
             "T_parent_joint": tree.T_parent_joint,

@@ -162,12 +162,15 @@ def measured_and_predicted_forces(
 ) -> GeneralizedForces:
     """Measured and predicted forces of samples that share a contact state; `phi` is (M, width).
 
-    Sensors are taken as calibrated: of the extras only those of actuators enter. A payload adds to each `phi`.
+    Sensors are taken as calibrated: of the extras only those of actuators enter. A payload adds to each `phi`, known
+    armatures and springs to each prediction.
     """
     base_rows = builder.tree.base_rows
     torque = torch.nn.functional.pad(builder.recorded_torque(samples), (base_rows, 0))
     measured = torque + contact_forces(builder, samples, state, kinematics).T
     predicted = predict_forces(builder, kinematics, with_payload_columns(builder, samples, phi)).mT
+    if not builder.known_torques.none:
+        predicted[..., base_rows:] += builder.known_torques.of(samples)
     for number, extra in enumerate(builder.extras, start=builder.columns.count):
         for dof in extra.dofs if extra.what in ACTUATORS else ():
             column = dof_extra_column(extra, dof, samples, builder.tree)

@@ -16,6 +16,7 @@ from torchid.problem.contact_rows import ContactRows, contact_rows, whitened_bas
 from torchid.problem.contact_state import Columns, ContactState, ContactStateLayout, ContactStateLayouts
 from torchid.problem.extra_columns import dof_extra_column, extra_columns
 from torchid.problem.extras import ExtraTerms, list_extras
+from torchid.problem.known_torques import KnownTorques
 from torchid.problem.recorded_wrenches import FramePoses
 from torchid.problem.row_blocks import RowBlock, multiply_wrenches, subtract_payload
 from torchid.problem.samples import Samples
@@ -90,6 +91,7 @@ class RowBuilder(nn.Module):
         super().__init__()
         terms = terms or ExtraTerms()
         self.extras = list_extras(robot, contacts, sensors, terms)
+        self.known_torques = KnownTorques(robot, self.extras)
         self.tree = KinematicTree(robot, terms.sign_width)
         self.columns = Columns(self.tree)
         self.contacts = tuple(contacts)
@@ -272,11 +274,16 @@ class RowBuilder(nn.Module):
             return samples.time.new_full((len(samples), self.tree.n_dofs), torch.nan)
         return samples.torque
 
+    def _torque_of_bodies(self, samples: Samples) -> Tensor:
+        """Recorded torques and wrenches without what known armatures and springs need, (B, n + 6 F) [N m, N]."""
+        torque = self.recorded_torque(samples)
+        return torque if self.known_torques.none else torque - self.known_torques.of(samples)
+
     def _uncoupled_rows(
         self, samples: Samples, layout: ContactStateLayout, dynamics: ChunkDynamics, workspace: Workspace
     ) -> Iterator[tuple[int, BlockRows]]:
         """Uncoupled joints, and the row of each."""
-        torque = self.recorded_torque(samples)
+        torque = self._torque_of_bodies(samples)
         for joint, block in layout.uncoupled_joints.items():
             weight = 1.0 / self._layouts.dof_std[joint]
             W = torque.new_full((1, 1, len(samples)), weight)
@@ -297,7 +304,7 @@ class RowBuilder(nn.Module):
             return
         rows = self.contact_rows(layout, dynamics)
         measured = rows.of_measured()
-        torque = self.recorded_torque(samples)[:, self.tree.index(layout.coupled_joints)]
+        torque = self._torque_of_bodies(samples)[:, self.tree.index(layout.coupled_joints)]
         f = nn.functional.pad(torque, (self.tree.base_rows, 0))
         if len(layout.wrench_std):
             f = f + (measured.permute(2, 1, 0) @ self._measured_wrench(samples, layout, dynamics)[..., None])[..., 0]

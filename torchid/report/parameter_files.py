@@ -17,7 +17,9 @@ from torchid.guards import MAX_JSON, read_bytes
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.parameters import PARAMETERS, PER_BODY, UNITS, Array
 from torchid.robot import Robot
+from torchid.robot.plain_urdf import plain_urdf
 from torchid.robot.urdf import drop_repeated_origins, parse_xml
+from torchid.robot.xml_files import is_mjcf
 
 _MAX_NUMBER = 1e100  # products and squares stay within the range of float64
 _ROUNDING = 1e-12  # of a body's mass: below it the link that gives it its name has none
@@ -160,7 +162,8 @@ def identified_urdf(robot: Robot, phi: Array) -> bytes:
     """The URDF with parameters `phi`, (L, 12).
 
     The inertia of a body is that of the link with its name; links welded to it have none. Links beyond a joint that
-    the experiment welds keep the URDF's, and the rest of the body's is written. Mesh paths do not change.
+    the experiment welds keep the URDF's, and the rest of the body's is written. Mesh paths do not change. Of an MJCF
+    robot it is the URDF that says the same of bodies, joints and friction.
 
     Warns:
         TorchidWarning: inconsistent bodies, or negative friction, which simulators (and `load_robot`) refuse.
@@ -169,19 +172,21 @@ def identified_urdf(robot: Robot, phi: Array) -> bytes:
     drop_repeated_origins(tree.getroot())
     links = {link.get("name"): link for link in tree.getroot().findall("link")}
     joints = {joint.get("name"): joint for joint in tree.getroot().findall("joint")}
-    phi = _without_links_beyond_welds(robot, phi)
-    _warn_if_inconsistent(robot, phi)
+    phi = without_links_beyond_welds(robot, phi)
+    warn_if_inconsistent(robot, phi)
     for body, values in zip(robot.bodies, phi, strict=True):
         if body.joint is not None and body.joint.kind != "fixed":
             _set_friction(joints[body.joint.name], values)
         if not body.massless or values[parameters.INERTIAL].any():
             for name in (link for link in body.links if link not in robot.links_beyond_welds):
                 _set_inertial(links[name], values if name == body.name and values[parameters.MASS] else None)
+    if is_mjcf(robot.path):
+        plain_urdf(tree.getroot())
     etree.indent(tree)
     return etree.tostring(tree, xml_declaration=True, encoding="utf-8")
 
 
-def _without_links_beyond_welds(robot: Robot, phi: Array) -> Array:
+def without_links_beyond_welds(robot: Robot, phi: Array) -> Array:
     """Parameters (L, 12) of the bodies without what links beyond welded joints have in the URDF."""
     rest = phi.copy()
     for name, inertial in robot.links_beyond_welds.items():
@@ -191,17 +196,18 @@ def _without_links_beyond_welds(robot: Robot, phi: Array) -> Array:
     return rest
 
 
-def _warn_if_inconsistent(robot: Robot, phi: Array) -> None:
+def warn_if_inconsistent(robot: Robot, phi: Array, file: str = "identified.urdf") -> None:
+    """Warn of what simulators refuse in a file with parameters (L, 12)."""
     inconsistent = (phi[:, parameters.MASS] < 0.0) | (parameters.consistency_margin(phi) < parameters.POSSIBLE_MARGIN)
     bodies = [robot.bodies[number] for number in np.flatnonzero(phi.any(axis=1) & inconsistent)]
     if bodies:
         names = join_names([body.name for body in bodies])
-        message = f"identified.urdf: no distribution of positive mass has the parameters of {names}"
+        message = f"{file}: no distribution of positive mass has the parameters of {names}"
         warn(f"{message}; simulators will refuse or misread them")
     negative = [robot.bodies[number] for number in np.flatnonzero((phi[:, parameters.FRICTION] < 0.0).any(axis=1))]
     joints = [body.joint.name for body in negative if body.joint is not None]
     if joints:
-        warn(f"identified.urdf: negative friction at {join_names(joints)}; simulators and torchid refuse it")
+        warn(f"{file}: negative friction at {join_names(joints)}; simulators and torchid refuse it")
 
 
 def _set_inertial(link: etree._Element, values: Array | None) -> None:

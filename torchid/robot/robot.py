@@ -25,7 +25,7 @@ from torchid.robot.tree import (
     link_poses,
     nominal_parameters,
 )
-from torchid.robot.urdf import read_urdf
+from torchid.robot.urdf import is_bolted, read_urdf
 from torchid.robot.welds import links_beyond, weld_joints, weld_positions
 
 if TYPE_CHECKING:
@@ -53,6 +53,7 @@ class Robot:
     the body that carries a URDF link and the link's pose in that body's link frame, (4, 4) [m]. `welded[name]` is the
     position [rad or m] at which a joint of the URDF is held; `links_beyond_welds[name]`, (10,), are the URDF's inertial
     parameters, in its body's link frame, of a link that such a joint carries.
+    Of an MJCF robot, links and joints are those of `torchid.robot.mjcf.urdf_document`.
     `kind_of_welded` has such joints' types. `base_tilt`: rotation [rad] about the base link's x and y axes from the
     base whose motion logs record to this one.
     """
@@ -158,6 +159,28 @@ class Robot:
                 matrix[row, self.joint_names.index(joint.name)] = 1.0
         return matrix, constant
 
+    @cached_property
+    def armature(self) -> Array:
+        """Reflected rotor inertia of the independent joints and of those that mimic them, (n,) [kg m^2 or kg]."""
+        return (self.joint_map[0] ** 2).T @ np.array([joint.armature for joint in self._joints])
+
+    @cached_property
+    def stiffness(self) -> Array:
+        """Of the springs in the independent joints and in those that mimic them, (n,) [N m/rad or N/m]."""
+        return (self.joint_map[0] ** 2).T @ np.array([joint.stiffness for joint in self._joints])
+
+    @cached_property
+    def spring_torque(self) -> Array:
+        """Torque (n,) [N m or N] that holds the joints at position 0 against their springs."""
+        matrix, constant = self.joint_map
+        stiffness, rest = (np.array([getattr(x, name) for x in self._joints]) for name in ("stiffness", "rest"))
+        return matrix.T @ (stiffness * (constant - rest))
+
+    @property
+    def _joints(self) -> list[BodyJoint]:
+        """Joints of the L - 1 bodies after the base."""
+        return [body.joint for body in self.bodies if body.joint is not None]
+
     def link_poses(self, joint_position: torch.Tensor) -> dict[str, torch.Tensor]:
         """Pose of every URDF link in the base link's frame, from pytorch-kinematics.
 
@@ -196,10 +219,10 @@ def load_robot(
     weld: Mapping[str, float] | Sequence[str] = (),
     base_tilt: tuple[float, float] = (0.0, 0.0),
 ) -> Robot:
-    """Read a URDF into a `Robot`.
+    """Read a URDF or, by MuJoCo, an MJCF file into a `Robot`.
 
     Args:
-        path: the URDF file; meshes are never opened.
+        path: the file; meshes are not opened, but for those of an MJCF file that a body's inertia is made of.
         base_link: the link that becomes the floating (or bolted) base, by default the root of the URDF.
         fixed_base: True if the base does not move.
         ft_joints: fixed joints with a force/torque sensor: the links beyond form a body of their own.
@@ -208,8 +231,10 @@ def load_robot(
             of a table that is not level, or of an IMU that is mounted askew.
 
     Raises:
-        UrdfError, UnknownNameError: see `read_urdf` and `build_tree`; also when no body has mass.
+        UrdfError, UnknownNameError: see `read_urdf` and `build_tree`; also when no body has mass, or when the base of
+            an MJCF file has no free joint and is not said to be fixed.
         ConfigError: see `weld_positions`.
+        InputError: an MJCF file, and MuJoCo is not installed.
 
     Warns:
         MasslessBodyWarning: a body at the end of a limb has no inertia.
@@ -218,6 +243,9 @@ def load_robot(
     path = Path(path)
     with during("reading", path):
         links, joints = read_urdf(path)
+        if not fixed_base and is_bolted(path):
+            found = "none, so that the robot is bolted to the world"
+            raise UrdfError(path, "<freejoint>", found, "robot.fixed_base: true, or a free joint of the base's body")
     welded = weld_positions(path, joints, weld if isinstance(weld, Mapping) else dict.fromkeys(weld, 0.0))
     with during("reading", path):
         tree = build_tree(path, links, weld_joints(joints, welded), base_link, ft_joints)

@@ -16,13 +16,13 @@ from pytorch_kinematics.frame import Frame
 from pytorch_kinematics.frame import Joint as FrameJoint
 from pytorch_kinematics.frame import Link as FrameLink
 from scipy.spatial.transform import Rotation
-from yourdfpy.urdf import Inertial, Joint, Link
+from yourdfpy.urdf import Inertial, Link
 
 from torchid import parameters
 from torchid.errors import UnknownNameError, UnphysicalInertiaWarning, UrdfError, warn
 from torchid.guards import MAX_NUMBER
 from torchid.parameters import Array
-from torchid.robot.urdf import MOVING_TYPES
+from torchid.robot.urdf import MOVING_TYPES, TreeJoint
 
 FT_FIELD = "force/torque sensor at a fixed joint"
 
@@ -47,7 +47,9 @@ class BodyJoint:
 
     `T_parent_joint`, (4, 4), is the pose of the joint frame at position 0 in the parent body's link frame; the joint
     moves that frame about or along `axis`, (3,), a unit vector in it. `T_joint_link`, (4, 4), is the pose of the body's
-    link frame in the moved joint frame: the identity unless `base_link` reverses the joint. The axis of a weld is z, or
+    link frame in the moved joint frame: the identity unless `base_link` reverses the joint, or the body of an MJCF file
+    has its joint off its origin. Of such files come `armature` [kg m^2 or kg], and a spring of `stiffness` [N m/rad or
+    N/m] that is at rest at a position [rad or m]. The axis of a weld is z, or
     -z where the joint is reversed, so that the sensor reads the opposite wrench.
     """
 
@@ -60,6 +62,9 @@ class BodyJoint:
     mimic: Mimic | None
     damping: float
     friction: float
+    armature: float = 0.0
+    stiffness: float = 0.0
+    rest: float = 0.0
 
 
 @dataclass
@@ -72,7 +77,7 @@ class BodyTree:
 
 
 def build_tree(
-    path: Path, links: list[Link], joints: list[Joint], base_link: str | None, ft_joints: Sequence[str] = ()
+    path: Path, links: list[Link], joints: list[TreeJoint], base_link: str | None, ft_joints: Sequence[str] = ()
 ) -> BodyTree:
     """Depth-first tree of bodies from `base_link` (the URDF's root if None); `ft_joints` are not lumped.
 
@@ -89,14 +94,14 @@ def build_tree(
     _check_welds(path, names, joints, ft_joints)
     mimics = resolve_mimics(path, joints)
     locked = {name for name, mimic in mimics.items() if not mimic.master}
-    neighbours: dict[str, list[tuple[Joint, bool]]] = {name: [] for name in names}
-    for joint in joints:  # children before parents, each in the URDF's order
-        neighbours[joint.parent].append((joint, False))
-    for joint in joints:
-        neighbours[joint.child].append((joint, True))
+    neighbours: dict[str, list[tuple[TreeJoint, bool]]] = {name: [] for name in names}
+    for one in joints:  # children before parents, each in the URDF's order
+        neighbours[one.parent].append((one, False))
+    for one in joints:
+        neighbours[one.child].append((one, True))
 
     tree = BodyTree([], [], {})
-    stack: list[tuple[str, Joint | None, bool]] = [(base_link, None, False)]
+    stack: list[tuple[str, TreeJoint | None, bool]] = [(base_link, None, False)]
     while stack:
         name, joint, reverse = stack.pop()
         if joint is None:
@@ -116,7 +121,7 @@ def build_tree(
     return tree
 
 
-def _check_welds(path: Path, links: Sequence[str], joints: Sequence[Joint], ft_joints: Sequence[str]) -> None:
+def _check_welds(path: Path, links: Sequence[str], joints: Sequence[TreeJoint], ft_joints: Sequence[str]) -> None:
     kinds = {joint.name: joint.type for joint in joints}
     welds = [name for name, kind in kinds.items() if kind not in MOVING_TYPES]
     for name in ft_joints:
@@ -127,7 +132,7 @@ def _check_welds(path: Path, links: Sequence[str], joints: Sequence[Joint], ft_j
             raise UnknownNameError(path, FT_FIELD, name, welds, what and f"{what}, not a fixed joint")
 
 
-def _find_root(path: Path, links: list[Link], joints: list[Joint]) -> str:
+def _find_root(path: Path, links: list[Link], joints: list[TreeJoint]) -> str:
     parent: dict[str, str] = {}
     for joint in joints:
         if joint.child in parent:
@@ -153,7 +158,7 @@ def _find_root(path: Path, links: list[Link], joints: list[Joint]) -> str:
     return roots[0]
 
 
-def resolve_mimics(path: Path, joints: Sequence[Joint]) -> dict[str, Mimic]:
+def resolve_mimics(path: Path, joints: Sequence[TreeJoint]) -> dict[str, Mimic]:
     """Mimic relations of moving joints; a chain of them is composed into one relation to its independent joint."""
     by_name = {joint.name: joint for joint in joints}
     resolved = {}
@@ -191,16 +196,23 @@ def _start_body(tree: BodyTree, name: str, joint: BodyJoint | None) -> None:
     tree.joints.append(joint)
 
 
-def joint_origin(joint: Joint) -> Array:
+def joint_origin(joint: TreeJoint) -> Array:
     """Pose of a joint's frame in its parent link's, (4, 4) [m]."""
     return np.eye(4) if joint.origin is None else np.asarray(joint.origin, dtype=np.float64)
+
+
+def child_offset(joint: TreeJoint) -> Array:
+    """Pose of a joint's child link in the moved joint frame, (4, 4) [m]."""
+    T = np.eye(4)
+    T[:3, 3] = joint.child_offset
+    return T
 
 
 def _inverse(T: Array) -> Array:
     return np.asarray(np.linalg.inv(T), dtype=np.float64)
 
 
-def _body_joint(tree: BodyTree, joint: Joint, reverse: bool, mimic: Mimic | None) -> BodyJoint:
+def _body_joint(tree: BodyTree, joint: TreeJoint, reverse: bool, mimic: Mimic | None) -> BodyJoint:
     """The joint as seen from the base: if reversed, its frame is at the child link and its axis changes sign."""
     body, T_body_near = tree.links[joint.child if reverse else joint.parent]
     weld = joint.type not in MOVING_TYPES
@@ -210,23 +222,27 @@ def _body_joint(tree: BodyTree, joint: Joint, reverse: bool, mimic: Mimic | None
         kind="fixed" if weld else "prismatic" if joint.type == "prismatic" else "revolute",
         parent=body,
         axis=-axis if reverse else axis,
-        T_parent_joint=T_body_near if reverse else T_body_near @ joint_origin(joint),
-        T_joint_link=_inverse(joint_origin(joint)) if reverse else np.eye(4),
+        T_parent_joint=T_body_near @ (_inverse(child_offset(joint)) if reverse else joint_origin(joint)),
+        T_joint_link=_inverse(joint_origin(joint)) if reverse else child_offset(joint),
         mimic=mimic,
         damping=joint.dynamics.damping if joint.dynamics else 0.0,
         friction=joint.dynamics.friction if joint.dynamics else 0.0,
+        armature=joint.armature,
+        stiffness=joint.stiffness,
+        rest=joint.rest,
     )
 
 
-def _locked_pose(joint: Joint, reverse: bool, mimics: dict[str, Mimic]) -> Array:
+def _locked_pose(joint: TreeJoint, reverse: bool, mimics: dict[str, Mimic]) -> Array:
     """Pose of the next link in the previous one, seen from the base, across a joint that does not move."""
     T_parent_child = joint_origin(joint)
     if joint.name in mimics:
         T_parent_child = T_parent_child @ joint_motion(joint, mimics[joint.name].offset)
+    T_parent_child = T_parent_child @ child_offset(joint)
     return _inverse(T_parent_child) if reverse else T_parent_child
 
 
-def joint_motion(joint: Joint, position: float) -> Array:
+def joint_motion(joint: TreeJoint, position: float) -> Array:
     """Pose of the child link in a joint's frame at a position [rad or m], (4, 4)."""
     axis, T = joint.axis / np.linalg.norm(joint.axis), np.eye(4)
     if joint.type == "prismatic":

@@ -7,6 +7,7 @@ import math
 import os
 import re
 from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -23,10 +24,10 @@ from torchid.guards import (
     MAX_NUMBER,
     MAX_PARTS,
     MAX_UNFOLDED,
-    MAX_URDF,
     format_bytes,
     read_bytes,
 )
+from torchid.robot.xml_files import MJCF_WORLD, OWN, is_mjcf, read_xml
 
 MOVING_TYPES = ("revolute", "continuous", "prismatic")
 JOINT_TYPES = (*MOVING_TYPES, "fixed")
@@ -38,29 +39,25 @@ _DECIMAL = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|inf(inity)?|nan)", r
 
 
 def parse_xml(path: Path) -> etree._ElementTree:
-    """The URDF's XML tree; entities stay unresolved and nothing is fetched.
+    """The XML tree of a URDF, or the one that says the same as an MJCF file, see `torchid.robot.mjcf`.
 
     Raises:
-        UrdfError: the file is missing or is not well-formed XML with a `<robot>` root.
+        UrdfError: the file is missing, or is neither; or an MJCF robot is refused.
+        InputError: an MJCF file, and MuJoCo is not installed.
     """
-    try:  # read first: given a path, libxml2 would decompress files without bounds
-        content = read_bytes(path, MAX_URDF)
-    except FileNotFoundError as error:
-        raise UrdfError(path, "file", "no such file", "a readable URDF file") from error
-    except OSError as error:
-        raise UrdfError(path, "file", f"cannot be read ({error.strerror})", "a readable URDF file") from error
-    except ValueError as error:
-        accepted = f"a URDF of at most {format_bytes(MAX_URDF)}"
-        raise UrdfError(path, "file", f"cannot be read ({error})", accepted) from error
-    try:
-        tree = etree.parse(io.BytesIO(content), etree.XMLParser(resolve_entities=False, no_network=True))
-    except (etree.XMLSyntaxError, ValueError, LookupError) as error:
-        found = excerpt(getattr(error, "msg", None) or str(error), 200)
-        raise UrdfError(path, "XML", f"not well-formed: {found}", "a well-formed URDF") from error
-    root = tree.getroot()
-    if root.tag != "robot":
-        raise UrdfError(path, "XML root", f"<{excerpt(str(root.tag))}>", "<robot>")
-    return tree
+    tree = read_xml(path)
+    if tree.getroot().tag != "mujoco":
+        return tree
+    from torchid.robot.mjcf import urdf_document  # needs an extra
+
+    return urdf_document(path)
+
+
+def is_bolted(path: Path) -> bool:
+    """Whether a robot's file says that its base does not move: MJCF without a free joint; a URDF never says."""
+    if not is_mjcf(path):
+        return False
+    return parse_xml(path).getroot().find(f"link[@name='{MJCF_WORLD}']") is not None
 
 
 def drop_repeated_origins(root: etree._Element) -> None:
@@ -70,7 +67,36 @@ def drop_repeated_origins(root: etree._Element) -> None:
             element.remove(again)
 
 
-def read_urdf(path: Path) -> tuple[list[Link], list[Joint]]:
+@dataclass(eq=False)
+class TreeJoint(Joint):  # type: ignore[misc]
+    """A joint with what a URDF cannot say of it.
+
+    Attributes:
+        child_offset: origin of the child link's frame in the moved joint frame, (3,) [m].
+        armature: reflected rotor inertia [kg m^2 or kg].
+        stiffness: of a spring [N m/rad or N/m].
+        rest: position at which it exerts no force [rad or m].
+    """
+
+    child_offset: tuple[float, ...] = (0.0, 0.0, 0.0)
+    armature: float = 0.0
+    stiffness: float = 0.0
+    rest: float = 0.0
+
+
+def _tree_joint(joint: Joint, element: etree._Element) -> TreeJoint:
+    """A joint with the attributes of its element that yourdfpy does not read."""
+    if joint.dynamics is not None:  # left as text by yourdfpy
+        joint.dynamics.damping = float(joint.dynamics.damping or 0.0)
+        joint.dynamics.friction = float(joint.dynamics.friction or 0.0)
+    child, dynamics = element.find("child"), element.find("dynamics")
+    offset = "0 0 0" if child is None else child.get(f"{OWN}xyz", "0 0 0")
+    of = {} if dynamics is None else dynamics.attrib
+    own = {name: float(of.get(OWN + name, 0.0)) for name in ("armature", "stiffness", "rest")}
+    return TreeJoint(**vars(joint), child_offset=tuple(map(float, offset.split())), **own)
+
+
+def read_urdf(path: Path) -> tuple[list[Link], list[TreeJoint]]:
     """Links and joints of a URDF, each element checked on its own; `build_tree` checks the tree.
 
     Visual, collision, material and transmission tags are dropped before the parse: they carry no kinematics, and
@@ -92,10 +118,7 @@ def read_urdf(path: Path) -> tuple[list[Link], list[Joint]]:
         _check_link(path, element)
     try:
         model = yourdfpy.URDF.load(io.BytesIO(etree.tostring(root)), build_scene_graph=False, load_meshes=False).robot
-        for joint in model.joints:
-            if joint.dynamics is not None:  # left as text by yourdfpy
-                joint.dynamics.damping = float(joint.dynamics.damping or 0.0)
-                joint.dynamics.friction = float(joint.dynamics.friction or 0.0)
+        model.joints = [_tree_joint(*pair) for pair in zip(model.joints, root.findall("joint"), strict=True)]
     except ValueError as error:
         raise UrdfError(path, "XML", f"a number cannot be read: {error}", "decimal numbers") from error
     _check_values(path, model.links, model.joints)
@@ -259,7 +282,7 @@ def mesh_content(urdf: Path, filename: str) -> tuple[str, bytes]:
     Raises:
         MeshError: one line that names the file.
     """
-    path = _mesh_file(urdf, filename)
+    path = mesh_path(urdf, filename)
     kind = path.suffix.lower().removeprefix(".")
     if kind not in FORMATS:
         raise MeshError(f"{excerpt(filename)}: none of {', '.join(FORMATS)}")
@@ -276,11 +299,14 @@ def mesh_content(urdf: Path, filename: str) -> tuple[str, bytes]:
     return kind, content
 
 
-def _mesh_file(urdf: Path, filename: str) -> Path:
+def mesh_path(urdf: Path, filename: str) -> Path:
     """The mesh file that a URDF refers to: in its package or, as `package://NAME/...`, in one beside it.
 
     The package is the nearest folder above the URDF with a `package.xml`, or else the parent of the URDF's folder.
     Symbolic links in it are followed: workspaces use them.
+
+    Raises:
+        MeshError: there is none.
     """
     if not is_plain(filename):
         raise MeshError(f"{excerpt(filename)}: no name of a file")

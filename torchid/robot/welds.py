@@ -6,20 +6,20 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from yourdfpy.urdf import Joint
 
 from torchid.errors import ConfigError, UnknownNameError
 from torchid.robot.tree import joint_motion, joint_origin, resolve_mimics
-from torchid.robot.urdf import MOVING_TYPES, position_limits
+from torchid.robot.urdf import MOVING_TYPES, TreeJoint, position_limits
 
 WELD_FIELD = "robot.weld"
 
 _ROUNDING = 1e-6  # [rad or m] by which a position may exceed a limit: URDFs carry few digits
 
 
-def weld_positions(path: Path, joints: Sequence[Joint], weld: Mapping[str, float]) -> dict[str, float]:
+def weld_positions(path: Path, joints: Sequence[TreeJoint], weld: Mapping[str, float]) -> dict[str, float]:
     """Position [rad or m] of every joint that is welded, by name, in the URDF's order.
 
     Args:
@@ -61,7 +61,7 @@ def weld_positions(path: Path, joints: Sequence[Joint], weld: Mapping[str, float
 
 
 def _stated(
-    joints: Sequence[Joint], moving: Mapping[str, Joint], weld: Mapping[str, float]
+    joints: Sequence[TreeJoint], moving: Mapping[str, TreeJoint], weld: Mapping[str, float]
 ) -> dict[str, tuple[str, float]]:
     """Name or pattern and position by name of joint."""
     names, stated = [joint.name for joint in joints], dict[str, tuple[str, float]]()
@@ -89,20 +89,19 @@ def _first(names: Iterable[str], most: int = 6) -> str:
     return ", ".join(names[:most]) + (", ..." if len(names) > most else "")
 
 
-def weld_joints(joints: Sequence[Joint], positions: Mapping[str, float]) -> list[Joint]:
+def weld_joints(joints: Sequence[TreeJoint], positions: Mapping[str, float]) -> list[TreeJoint]:
     """The joints, those with a position fixed there."""
-    return [
-        replace(
-            joint, type="fixed", mimic=None, origin=joint_origin(joint) @ joint_motion(joint, positions[joint.name])
-        )
-        if joint.name in positions
-        else joint
-        for joint in joints
-    ]
+
+    def welded(joint: TreeJoint) -> TreeJoint:
+        origin = joint_origin(joint) @ joint_motion(joint, positions[joint.name])
+        changes: dict[str, Any] = {"type": "fixed", "mimic": None, "origin": origin}
+        return replace(joint, **changes)
+
+    return [welded(joint) if joint.name in positions else joint for joint in joints]
 
 
 def links_beyond(
-    joints: Sequence[Joint], welded: Iterable[str], body_of: Mapping[str, int], heads: Sequence[str]
+    joints: Sequence[TreeJoint], welded: Iterable[str], body_of: Mapping[str, int], heads: Sequence[str]
 ) -> list[str]:
     """Links that a welded joint separates from the link that gives their body its name.
 

@@ -1,4 +1,4 @@
-"""The simulated robot on its feet on the floor (the only module that imports MuJoCo)."""
+"""The simulated robot on its feet on the floor, in MuJoCo."""
 
 from __future__ import annotations
 
@@ -10,16 +10,13 @@ import numpy as np
 from lxml import etree
 
 from torchid.config import FootConfig
-from torchid.errors import ConfigError, InputError, UnknownNameError, UrdfError, how_to_install
+from torchid.errors import ConfigError, UnknownNameError, UrdfError
 from torchid.parameters import Array
+from torchid.robot.mjcf_model import mujoco
+from torchid.robot.plain_urdf import plain_urdf
 from torchid.robot.urdf import drop_repeated_origins, parse_xml
+from torchid.robot.xml_files import is_mjcf
 from torchid.sensing.sensors import NORMAL_FORCE
-
-try:
-    import mujoco
-except ImportError as error:
-    found = "needs MuJoCo, which " + ("is not installed" if error.name == "mujoco" else f"does not load: {error}")
-    raise InputError("", "simulate", found, how_to_install("sim")) from error
 
 _RADIUS = 1e-4  # m, of contact points that the file gives: where they touch the floor is where they are
 _NARROWEST = 1e-3  # m, of a support polygon
@@ -312,6 +309,8 @@ def compile_model(urdf: Path, feet: Sequence[Foot], physics_hz: float, floating:
 def _spec(urdf: Path) -> mujoco.MjSpec:
     """The URDF without shapes, bolted to the world."""
     root = parse_xml(urdf).getroot()
+    if is_mjcf(urdf):
+        plain_urdf(root)
     mimic = root.find("joint/mimic/..")
     if mimic is not None:
         raise UrdfError(urdf, f"joint '{mimic.get('name')}'", "a mimic joint", "independent joints, for a simulation")

@@ -1,0 +1,173 @@
+"""A run on an MJCF robot is that on its URDF, and `torchid export` writes for simulators what it has found."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+
+from demo import DEMO
+
+import torchid
+from torchid.cli import main
+from torchid.commands.export import FORMATS, export
+from torchid.commands.reading import LogReader
+from torchid.config import load_config
+from torchid.fitting.experiment import set_up
+from torchid.problem.chunks import chunks_by_state
+from torchid.problem.predict import force_series
+from torchid.report.mjcf_files import identified_mjcf
+from torchid.report.mjcf_of_urdf import mjcf_of_urdf
+from torchid.robot import load_robot
+
+pytestmark = pytest.mark.filterwarnings("ignore:identified:torchid.errors.TorchidWarning")
+
+LOG = DEMO / "sway_train.npz"
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Runs on the demo's quadruped as a URDF and as MJCF."""
+    folder = tmp_path_factory.mktemp("runs")
+    robot = load_robot(DEMO / "quadruped.urdf")
+    (folder / "quadruped.xml").write_bytes(mjcf_of_urdf(robot, robot.nominal, {}))
+    settings: dict[str, Any] = {"estimator": {"name": "consistent", "ridge": 1e-3}, "overwrite": True}
+    out = {}
+    for key, file in (("urdf", DEMO / "quadruped.urdf"), ("mjcf", folder / "quadruped.xml")):
+        out[key] = folder / key
+        own = settings | {"robot": {"urdf": None, key: file}, "output": out[key]}
+        torchid.identify(DEMO / "quadruped.yaml", **own)
+    return out
+
+
+def identified(run: Path) -> np.ndarray:
+    bodies = json.loads((run / "parameters.json").read_text())["bodies"]
+    return np.array([list(body["identified"].values()) for body in bodies])
+
+
+def test_a_run_on_mjcf_finds_what_it_finds_on_the_urdf(runs: dict[str, Path]) -> None:
+    one, other = (identified(runs[key]) for key in ("urdf", "mjcf"))
+    np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-7 * np.abs(one).max())
+    assert (runs["mjcf"] / "identified.xml").is_file()
+    assert not (runs["mjcf"] / "identified.urdf").exists()
+
+
+def test_the_written_mjcf_has_the_parameters_of_the_run(runs: dict[str, Path]) -> None:
+    robot = load_robot(runs["mjcf"] / "identified.xml")
+    np.testing.assert_allclose(robot.nominal, identified(runs["mjcf"]), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("key", ["urdf", "mjcf"])
+@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.filterwarnings("ignore:URDF. has no armature")
+def test_every_format_is_what_its_reader_reads(
+    form: str, key: str, runs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    robot, target = load_robot(DEMO / "quadruped.urdf"), tmp_path / f"out.{dict(mjcf='xml').get(form, form)}"
+    assert main(["export", str(runs[key]), "--format", form, "--output", str(target)]) == 0
+    assert "written to" in capsys.readouterr().out
+    text = target.read_text()
+    if form in ("mjcf", "urdf"):
+        read = load_robot(target)
+        found = {name: read.nominal[read.body_names.index(name), 0] for name in robot.body_names}
+        expected = dict(zip(robot.body_names, identified(runs[key])[:, 0], strict=True))
+        assert found == pytest.approx(expected, rel=1e-9)
+    elif form == "isaaclab":
+        given: dict[str, Any] = {}
+        code = text.replace("from isaaclab.actuators import ImplicitActuatorCfg", "ImplicitActuatorCfg = dict")
+        exec(code, given)
+        actuators = given["IDENTIFIED_ACTUATORS"]
+        for name in robot.joint_names:
+            assert [x for x in actuators["armature"] if re.fullmatch(x, name)] == [re.escape(name)]
+        assert set(actuators["friction"]) == set(actuators["joint_names_expr"])
+    else:
+        assert set(json.loads(text)["joints"]) == set(robot.joint_names)
+
+
+def test_no_file_is_replaced_unless_told_so(runs: dict[str, Path], tmp_path: Path) -> None:
+    target = tmp_path / "out.json"
+    target.write_text("mine")
+    with pytest.raises(torchid.TorchidError, match="exists; accepted: a new file, or --overwrite"):
+        export(runs["urdf"], "json", target)
+    export(runs["urdf"], "json", target, overwrite=True)
+    assert json.loads(target.read_text())["joints"]
+
+
+def test_a_key_of_the_other_kind_is_refused(runs: dict[str, Path], tmp_path: Path) -> None:
+    with pytest.raises(torchid.TorchidError, match=r"robot.urdf: .*no URDF; accepted: robot: \{mjcf: quadruped.xml\}"):
+        torchid.identify(
+            DEMO / "quadruped.yaml", robot={"urdf": runs["mjcf"].parent / "quadruped.xml"}, output=tmp_path / "out"
+        )
+
+
+def test_a_known_armature_is_taken_off_the_torques_and_a_fitted_one_is_all_of_it(
+    runs: dict[str, Path], tmp_path: Path
+) -> None:
+    bare = runs["mjcf"].parent / "quadruped.xml"
+    with_rotors = tmp_path / "rotors.xml"
+    with_rotors.write_text(bare.read_text().replace("<joint ", '<joint armature="0.05" stiffness="2" springref="0.1" '))
+    rows = {}
+    for name, file, fitted in (("all", bare, True), ("none", bare, False), ("known", with_rotors, False)):
+        actuators = {"armature": fitted, "stiffness": fitted, "torque_offset": fitted}
+        sections: dict[str, Any] = {"robot": {"urdf": None, "mjcf": file}, "actuators": actuators}
+        experiment = set_up(load_config(DEMO / "quadruped.yaml", (), sections | {"output": None}))
+        (samples,) = LogReader(experiment, None).read([LOG], None, lambda _: None)
+        builder, (state, index) = experiment.builder(experiment.sensors), next(iter(chunks_by_state(samples)))
+        rows[name] = builder.rows_by_sample(samples[index], state)[0].numpy()
+        series = force_series(
+            builder, samples, np.append(experiment.robot.nominal, np.zeros(len(builder.extras)))[None]
+        )
+        rows[f"predicted {name}"] = series[1][0]
+    size = rows["none"].shape[2] - 1
+    armature, offset, stiffness = (rows["all"][..., size:-1][..., k : k + 12].sum(-1) for k in (0, 12, 24))
+    expected = rows["none"][..., -1] - (0.05 * armature + 2.0 * stiffness - 0.2 * offset)
+    np.testing.assert_allclose(rows["known"][..., -1], expected, atol=1e-10 * np.abs(expected).max())
+    torque = 0.05 * samples.joint_acceleration + 2.0 * (samples.joint_position - 0.1)
+    difference = rows["predicted known"][:, 6:] - rows["predicted none"][:, 6:]
+    np.testing.assert_allclose(difference, torque.numpy(), atol=1e-10)
+
+
+def test_a_fitted_armature_does_not_depend_on_that_of_the_file_and_is_written(
+    runs: dict[str, Path], tmp_path: Path
+) -> None:
+    bare = runs["mjcf"].parent / "quadruped.xml"
+    other = tmp_path / "rotors.xml"
+    other.write_text(bare.read_text().replace("<joint ", '<joint armature="0.05" '))
+    found = []
+    for file in (bare, other):
+        found.append(
+            torchid.identify(
+                DEMO / "quadruped.yaml",
+                robot={"urdf": None, "mjcf": file},
+                output=None,
+                actuators={"armature": True},
+                estimator={"name": "least_squares", "ridge": 1e-3},
+            )
+        )
+    assert found[1].armature == pytest.approx(found[0].armature, abs=1e-10)
+    text = identified_mjcf(found[1].experiment.robot, found[1].experiment.robot.nominal, found[1].armature).decode()
+    written = dict(re.findall(r'<joint armature="([^"]*)" name="([^"]*)"', text))
+    assert {name: float(value) for value, name in written.items()} == found[1].armature
+
+
+def test_init_names_an_mjcf_robot_as_such(runs: dict[str, Path], tmp_path: Path) -> None:
+    file, log = runs["mjcf"].parent / "quadruped.xml", LOG
+    assert main(["init", str(file), str(log), "--output", str(tmp_path / "experiment.yaml")]) == 0
+    settings = yaml.safe_load((tmp_path / "experiment.yaml").read_text())
+    assert (tmp_path / settings["robot"]["mjcf"]).resolve() == file.resolve()
+
+
+def test_the_log_is_replayed_on_the_mjcf_robot_as_on_the_urdf(runs: dict[str, Path]) -> None:
+    from torchid.commands.replay import replay
+
+    log = LOG
+    drifts = [replay(runs[key], log, 0.1).drift for key in ("urdf", "mjcf")]
+    for one, other in zip(*drifts, strict=True):
+        np.testing.assert_allclose(one.joints, other.joints, atol=1e-4)

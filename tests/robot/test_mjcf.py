@@ -1,0 +1,180 @@
+"""MJCF robots mean the same to torchid as to MuJoCo, when read and when written; what is beyond a tree is refused."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+
+from survey_mjcf import States, difference, mujoco_forces, survey, torchid_forces
+
+from torchid.errors import InputError, TorchidWarning, UrdfError
+from torchid.report import identified_urdf
+from torchid.robot import Robot, load_robot
+from torchid.robot.mjcf import roll_pitch_yaw
+from torchid.robot.mjcf_model import MjcfModel
+
+FREE = """<mujoco><compiler angle="degree" autolimits="true"/>
+<default><joint armature="0.02" damping="0.3" frictionloss="0.1"/>
+ <default class="stiff"><joint stiffness="4" springref="20"/></default></default>
+<worldbody><body name="scenery"><geom size="1"/></body>
+ <body name="box" pos="2 0 0"><freejoint/><geom type="box" size=".1 .1 .1"/></body>
+ <body name="trunk" pos="0 0 1" euler="10 20 30"><freejoint name="root"/>
+  <inertial pos=".1 0 .02" mass="3" quat="1 2 3 4" diaginertia=".03 .04 .05"/>
+  <frame euler="0 30 40" pos="0.1 0 0"><body name="leg" pos="0 .1 0" euler="90 0 10">
+   <joint name="yaw" axis="0 1 1" pos=".05 .02 0" ref="15" range="-60 60"/>
+   <joint name="pitch" axis="1 0 0" pos="0 0 .3" class="stiff"/>
+   <joint name="stretch" type="slide" axis="0 0 1" ref=".1" damping="2"/>
+   <geom type="capsule" fromto="0 0 0 0 0 -.3" size=".03" mass="1.5"/>
+   <body name="weight" pos="0 0 -.1"><geom type="sphere" size=".05" mass=".4"/></body>
+   <body name="shank" pos="0 0 -.3" quat="0 1 0 0"><joint name="knee" pos="0 .01 0"/>
+    <geom name="ball" type="sphere" size=".02" pos="0 0 .3" mass=".2"/><site name="sole" pos="0 0 .3"/></body>
+  </body></frame></body></worldbody></mujoco>"""
+
+BOLTED = """<mujoco><compiler inertiafromgeom="true" settotalmass="7"/>
+<worldbody><body name="stand" euler="90 0 0"><geom size=".1"/>
+ <body name="arm" pos="0 0 .2"><joint name="shoulder" axis="0 1 0"/><geom type="box" size=".1 .02 .03" pos=".1 0 0"/>
+  <body name="left" pos=".2 .05 0"><joint name="left_finger" type="slide" axis="0 1 0" ref="0.01"/>
+   <geom size=".02" pos="0 .01 .1"/></body>
+  <body name="right" pos=".2 -.05 0"><joint name="right_finger" type="slide" axis="0 -1 0" armature=".1" damping="2"/>
+   <geom size=".02"/></body></body></body></worldbody>
+<equality><joint joint1="right_finger" joint2="left_finger" polycoef="0.02 0.5 0 0 0"/></equality></mujoco>"""
+
+
+def robot_of(text: str, folder: Path, fixed_base: bool = False) -> Robot:
+    path = folder / "robot.xml"
+    path.write_text(text)
+    return load_robot(path, fixed_base=fixed_base)
+
+
+@pytest.mark.parametrize(("text", "velocities"), [(FREE, 10), (BOLTED, 2)], ids=["free", "bolted"])
+def test_inverse_dynamics_are_those_of_mujoco_and_what_is_written_is_what_is_read(
+    text: str, velocities: int, tmp_path: Path
+) -> None:
+    (tmp_path / "robot.xml").write_text(text)
+    found = survey(tmp_path / "robot.xml", tmp_path)
+    assert found.robot is not None, found.refusal
+    assert found.robot.nv == velocities
+    assert found.inverse_dynamics < 1e-13
+    assert found.read_again < 1e-13
+    assert found.written < 1e-13
+
+
+def test_a_base_inside_the_tree_has_the_same_joint_torques(tmp_path: Path) -> None:
+    robot = robot_of(BOLTED, tmp_path, fixed_base=True)
+    free = robot_of(FREE, tmp_path)
+    rerooted = load_robot(tmp_path / "robot.xml", base_link="shank")
+    rest = States(np.array([[0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0.0]]), np.zeros((1, 10)), np.zeros((1, 10)))
+    weights = [torchid_forces(x, x.nominal, x.armature, rest)[0, :3] for x in (free, rerooted)]
+    np.testing.assert_allclose(*(np.linalg.norm(x) for x in weights), rtol=1e-13)
+    assert robot.nominal[:, 0].sum() == pytest.approx(7.0, rel=1e-12)
+
+
+def test_the_urdf_of_an_mjcf_robot_has_its_dynamics_but_for_armatures_and_springs(tmp_path: Path) -> None:
+    robot = robot_of(FREE, tmp_path)
+    (tmp_path / "plain.urdf").write_bytes(identified_urdf(robot, robot.nominal))
+    plain, states = load_robot(tmp_path / "plain.urdf"), States.random(robot)
+    assert plain.joint_names == robot.joint_names
+    assert not plain.armature.any()
+    one, other = (torchid_forces(plain, x.nominal, np.zeros(4), states) for x in (plain, plain))
+    assert difference(one, other) == 0.0
+    rigid = torchid_forces(robot, robot.nominal, np.zeros(robot.n), states)
+    rigid[:, 6:] -= robot.stiffness * states.q[:, 7:] + robot.spring_torque
+    assert difference(one, rigid) < 1e-13
+
+
+def test_sites_and_geoms_are_frames_and_names_are_those_of_the_file(tmp_path: Path) -> None:
+    robot = robot_of(FREE, tmp_path)
+    assert robot.joint_names == ("yaw", "pitch", "stretch", "knee")
+    assert robot.body_names == ("trunk", "leg/yaw", "leg/pitch", "leg", "shank")
+    for frame in ("sole", "ball"):
+        body, T = robot.link(frame)
+        assert robot.body_names[body] == "shank"
+        np.testing.assert_allclose(T[:3, 3], [0.0, -0.0, 0.3], atol=1e-15)
+
+
+def test_included_files_are_read_and_stand_in_what_is_written(tmp_path: Path) -> None:
+    (tmp_path / "part.xml").write_text(
+        '<mujoco><worldbody><body name="b"><joint name="j"/><geom size=".1"/></body></worldbody></mujoco>'
+    )
+    (tmp_path / "scene.xml").write_text('<mujoco><include file="part.xml"/></mujoco>')
+    (tmp_path / "out").mkdir()
+    found = survey(tmp_path / "scene.xml", tmp_path / "out")
+    assert found.written < 1e-13
+    assert "include" not in (tmp_path / "out" / "scene.xml").read_text()
+
+
+def test_a_missing_mesh_matters_only_where_it_gives_a_body_its_inertia(tmp_path: Path) -> None:
+    text = """<mujoco><asset><mesh name="m" file="none.stl"/></asset><worldbody><body name="b"><joint name="j"/>{}
+    <geom type="mesh" mesh="m"/></body></worldbody></mujoco>"""
+    inertial = '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
+    assert robot_of(text.format(inertial), tmp_path, True).nominal[1, 0] == 1.0
+    with pytest.raises(UrdfError, match=r"none\.stl"):
+        robot_of(text.format(""), tmp_path, True)
+
+
+BODY = '<mujoco>\n<worldbody>\n<body name="b"{}>{}<geom size=".1"/><site name="s"/></body></worldbody>{}</mujoco>'
+HINGE = '<joint name="j"{}/>'
+OTHER = '\n<equality>\n<connect body1="b" body2="world" anchor="0 0 0"/></equality>'
+TENDON = '<tendon>\n<fixed name="t" stiffness="3"><joint joint="j" coef="1"/></fixed></tendon>'
+REFUSED = {
+    "ball": (BODY.format("", '\n<joint name="j" type="ball"/>', ""), "<joint> 'j', line 4: type ball"),
+    "loop": (BODY.format("", HINGE.format(""), OTHER), "<connect>, line 5: an equality constraint"),
+    "tendon": (BODY.format("", HINGE.format(""), TENDON), "<fixed> 't', line 4: a tendon with stiffness"),
+    "gravcomp": (BODY.format(' gravcomp="1"', HINGE.format(""), ""), "<body> 'b', line 3: gravcomp 1"),
+    "locked": (BODY.format("", HINGE.format(' damping="1e11"'), ""), "<joint> 'j', line 3: damping 1e+11"),
+    "fluid": (BODY.format("", HINGE.format(""), '<option\n density="1000"/>'), "<option>, line 4: density 1000"),
+    "damped base": (
+        BODY.format("", '<joint type="free" damping="1"/>', ""),
+        "<joint>, line 3: damping 1 0 0 of a free",
+    ),
+    "no joint": (BODY.format("", "", ""), "<joint>: none"),
+    "polynomial": (BODY.format("", HINGE.format(' damping="1 2"'), ""), "<joint> 'j', line 3: damping 1 2 0"),
+    "unknown": (BODY.format("", "<jiont/>", ""), "MJCF: MuJoCo refuses it"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_is_no_tree_of_joints_is_refused_by_element_and_line(case: str, tmp_path: Path) -> None:
+    text, message = REFUSED[case]
+    with pytest.raises(UrdfError, match=re.escape(message)) as caught:
+        robot_of(text, tmp_path, fixed_base=case != "damped base")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_robot_without_a_free_joint_must_be_said_to_be_bolted(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="robot.fixed_base: true, or a free joint"):
+        robot_of(BOLTED, tmp_path)
+
+
+def test_another_planet_is_warned_of(tmp_path: Path) -> None:
+    text = BODY.format("", HINGE.format(""), '<option gravity="0 0 -1.6"/>')
+    with pytest.warns(TorchidWarning, match="gravity 0 0 -1.6; the Earth's"):
+        robot_of(text, tmp_path, True)
+
+
+@pytest.mark.parametrize("pitch", [0.3, 0.5 * np.pi, -0.5 * np.pi, 0.5 * np.pi - 1e-9])
+def test_angles_give_their_rotation_back_at_any_pitch(pitch: float) -> None:
+    from scipy.spatial.transform import Rotation
+
+    R = Rotation.from_euler("xyz", [0.7, pitch, -1.1]).as_matrix()
+    np.testing.assert_allclose(Rotation.from_euler("xyz", roll_pitch_yaw(R)).as_matrix(), R, atol=1e-15)
+
+
+def test_nothing_is_written_where_a_robot_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    robot_of(BOLTED, tmp_path, True)  # of whose settotalmass MuJoCo warns
+    assert [path.name for path in tmp_path.iterdir()] == ["robot.xml"]
+
+
+def test_a_limited_tendon_or_an_inactive_loop_changes_nothing(tmp_path: Path) -> None:
+    tendon = TENDON.replace('stiffness="3"', 'limited="true" range="0 1"')
+    loop = OTHER.replace("<connect", '<connect active="false"')
+    robot = robot_of(BODY.format("", HINGE.format(""), tendon + loop), tmp_path, True)
+    states = States.random(robot)
+    own = torchid_forces(robot, robot.nominal, robot.armature, states)
+    assert difference(own, mujoco_forces(MjcfModel(robot.path).model, robot, states)) < 1e-13

@@ -1,0 +1,96 @@
+"""`torchid export`: identified parameters of a run as a simulator reads them."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+
+from torchid.commands.evaluate import FittedRun, read_run
+from torchid.commands.folder import check_free_file
+from torchid.config import inputs_of
+from torchid.errors import ConfigError, InputError, TorchidWarning, during, join_names, warn
+from torchid.parameters import PER_BODY, Array
+from torchid.report import identified_robot, identified_urdf
+from torchid.report.joint_exports import isaaclab_text, joint_parameters, parameters_export
+from torchid.robot import Robot
+from torchid.robot.xml_files import is_mjcf
+from torchid.staging import atomic_file
+
+FORMATS = ("mjcf", "urdf", "isaaclab", "json")
+
+
+def export(run: str | Path, form: str, output: str | Path | None = None, overwrite: bool = False) -> str:
+    """Identified parameters of a run: a model of the robot, actuators of Isaac Lab, or a plain document.
+
+    Args:
+        run: folder that `identify` wrote.
+        form: one of `FORMATS`. "mjcf": the robot's own file, or one made of its URDF; "urdf" likewise; "isaaclab": a
+            Python module with an `ImplicitActuatorCfg`; "json": bodies and joints.
+        output: file to write; None: none is.
+        overwrite: whether a file there may be replaced.
+
+    Returns:
+        The text.
+
+    Raises:
+        InputError: the folder is no run, the file may not be written, or MuJoCo, which "mjcf" needs, is not installed
+            or does not take the robot.
+
+    Warns:
+        TorchidWarning: what the format cannot say, or what simulators will refuse.
+    """
+    folder, target = Path(run), None if output is None else Path(output)
+    if form not in FORMATS:
+        raise ConfigError("command line", "--format", f"'{form}'", ", ".join(FORMATS))
+    fitted = read_run(folder)
+    if target is not None:
+        check_free_file(target, "--output", overwrite, [folder, *inputs_of(fitted.experiment.config)])
+    robot, phi = fitted.experiment.robot, fitted.calibrations.identified.phi.reshape(-1, PER_BODY)
+    text = _text(form, robot, phi, _armature(fitted), folder)
+    if target is not None:
+        with during("writing", target), atomic_file(target) as new:
+            new.write_text(text, encoding="utf-8")
+    return text
+
+
+def _armature(fitted: FittedRun) -> dict[str, float]:
+    """Fitted armatures by joint."""
+    calibration = fitted.calibrations.identified
+    extras = [extra for extra in calibration.builder.extras if extra.what == "armature"]
+    return {extra.name: calibration.values[("", extra.label)] for extra in extras}
+
+
+def _text(form: str, robot: Robot, phi: Array, armature: Mapping[str, float], folder: Path) -> str:
+    joints = joint_parameters(robot, phi, armature)
+    if form == "isaaclab":
+        return isaaclab_text(joints, f"{folder.resolve().name} of {robot.path.name}")
+    if form == "json":
+        return json.dumps(parameters_export(robot, phi, joints), indent=1, allow_nan=False) + "\n"
+    if form == "mjcf":
+        return (_mjcf(robot, phi, armature)).decode()
+    lost = [joint.name for joint in joints if joint.armature]
+    if lost:
+        warn(f"URDF: has no armature, which {join_names(lost)} have: --format mjcf or isaaclab says it")
+    return identified_urdf(robot, phi).decode()
+
+
+def _mjcf(robot: Robot, phi: Array, armature: Mapping[str, float]) -> bytes:
+    """The robot's MJCF file, or a model made of its URDF, with meshes if MuJoCo takes them."""
+    if is_mjcf(robot.path):
+        return identified_robot(robot, phi, armature)
+    from torchid.report.mjcf_files import require_loadable
+    from torchid.report.mjcf_of_urdf import mjcf_of_urdf
+
+    text = mjcf_of_urdf(robot, phi, armature)
+    try:
+        require_loadable(text, robot.path)
+    except InputError as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", TorchidWarning)  # said already
+            bare = mjcf_of_urdf(robot, phi, armature, meshes=False)
+        require_loadable(bare, robot.path)
+        warn(f"{robot.path}: meshes are left out: {error.found}")
+        return bare
+    return text

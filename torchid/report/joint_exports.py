@@ -1,0 +1,114 @@
+"""Identified joints for simulators: an actuator configuration of Isaac Lab, and a plain document."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from torchid import parameters
+from torchid.parameters import Array
+from torchid.robot import Robot
+
+_UNITS = {"revolute": ("kg m^2", "N m", "N m s/rad"), "prismatic": ("kg", "N", "N s/m")}
+
+
+@dataclass(frozen=True)
+class JointParameters:
+    """What an actuator model needs of a joint.
+
+    Attributes:
+        name: of the joint.
+        kind: "revolute" or "prismatic".
+        armature: reflected rotor inertia [kg m^2 or kg].
+        coulomb: torque or force of dry friction, at any velocity [N m or N].
+        viscous: friction over velocity [N m s/rad or N s/m].
+    """
+
+    name: str
+    kind: str
+    armature: float
+    coulomb: float
+    viscous: float
+
+
+def joint_parameters(robot: Robot, phi: Array, armature: Mapping[str, float]) -> list[JointParameters]:
+    """Of all joints that move, also of those that mimic others.
+
+    Args:
+        robot: the robot.
+        phi: identified parameters, (L, 12).
+        armature: by joint [kg m^2 or kg], of those whose armature was fitted; others have that of the robot's file.
+    """
+    return [
+        JointParameters(
+            name=body.joint.name,
+            kind=body.joint.kind,
+            armature=float(armature.get(body.joint.name, body.joint.armature)),
+            coulomb=float(values[parameters.COULOMB]),
+            viscous=float(values[parameters.VISCOUS]),
+        )
+        for body, values in zip(robot.bodies, phi, strict=True)
+        if body.joint is not None and body.joint.kind != "fixed"
+    ]
+
+
+def isaaclab_text(joints: Sequence[JointParameters], source: str) -> str:
+    """Python text of an `ImplicitActuatorCfg` with all joints by name.
+
+    Args:
+        joints: from `joint_parameters`.
+        source: what they come from, for the first line.
+    """
+
+    def entries(value: Callable[[JointParameters], float]) -> str:
+        return "".join(f"        {_pattern(joint)}: {value(joint)!r},\n" for joint in joints)
+
+    def friction(joint: JointParameters) -> float:
+        return joint.coulomb
+
+    names = "".join(f"        {_pattern(joint)},\n" for joint in joints)
+    return (
+        f'"""Actuators identified by torchid: {_plain(source)}.\n\n'
+        "friction: Coulomb friction [N m or N]: an effort from Isaac Sim 5.0 on, a coefficient without unit before.\n"
+        "viscous_friction: [N m s/rad or N s/m], from Isaac Sim 5.0 on; before, leave it out and add its numbers to\n"
+        "damping. stiffness, damping: the gains of your controller; with 0 and 0 the joints take efforts.\n"
+        '"""\n\n'
+        "from isaaclab.actuators import ImplicitActuatorCfg\n\n"
+        "IDENTIFIED_ACTUATORS = ImplicitActuatorCfg(\n"
+        f"    joint_names_expr=[\n{names}    ],\n"
+        "    stiffness=0.0,\n"
+        "    damping=0.0,\n"
+        f"    armature={{\n{entries(lambda joint: joint.armature)}    }},\n"
+        f"    friction={{\n{entries(friction)}    }},\n"
+        f"    dynamic_friction={{\n{entries(friction)}    }},\n"
+        f"    viscous_friction={{\n{entries(lambda joint: joint.viscous)}    }},\n"
+        ")\n"
+    )
+
+
+def parameters_export(robot: Robot, phi: Array, joints: Sequence[JointParameters]) -> dict[str, Any]:
+    """Bodies by mass, centre of mass and inertia about it, in their link frames, and joints, with units."""
+    bodies = {}
+    for body, values in zip(robot.bodies, phi, strict=True):
+        if values[parameters.MASS]:
+            mass, com, inertia = parameters.mass_com_inertia(values)
+            bodies[body.name] = {"mass": mass, "center_of_mass": com.tolist(), "inertia": inertia.tolist()}
+    entries = {joint.name: asdict(joint) | {"units": list(_UNITS[joint.kind])} for joint in joints}
+    return {
+        "robot": robot.path.name,
+        "units": {"mass": "kg", "center_of_mass": "m", "inertia": "kg m^2"},
+        "frame": "each body's link frame; inertia about the centre of mass, along the link's axes",
+        "bodies": bodies,
+        "joints": {name: {k: x for k, x in entry.items() if k != "name"} for name, entry in entries.items()},
+    }
+
+
+def _pattern(joint: JointParameters) -> str:
+    """A joint's name as a regular expression that fits it alone, in Python."""
+    return repr(re.escape(joint.name))
+
+
+def _plain(text: str) -> str:
+    return text.replace("\\", "/").replace('"', "'")

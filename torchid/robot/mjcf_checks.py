@@ -1,0 +1,153 @@
+"""What an MJCF robot must not have: whatever exerts forces that the equations of a tree of joints do not have."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from torchid.errors import UrdfError, warn
+from torchid.guards import MAX_NUMBER
+from torchid.robot.mjcf_model import MjcfModel
+
+_GRAVITY = 9.81  # m/s^2
+_CLOSE = 0.02  # m/s^2: 9.8 and 9.81 are the same planet
+
+
+def check_model(model: MjcfModel) -> None:
+    """Refuse what makes forces on the robot's bodies beside gravity, joints' friction, armatures and springs.
+
+    Raises:
+        UrdfError: names the element and its line.
+
+    Warns:
+        TorchidWarning: the model's gravity is not the Earth's, which is used.
+    """
+    spec, members = model.spec, {model.bodies[i] for i in model.members}
+    for body in spec.bodies:
+        if body.id in model.members:
+            _check_body(model, body)
+    for flex in spec.flexes:
+        model.refuse(flex, "flex", flex.name, "a flexible body", "rigid bodies")
+    for equality in spec.equalities:
+        if equality.active and _touches(model, equality, members) and mimic_of(model, equality) is None:
+            kind = equality_kind(equality)
+            accepted = "a tree without loops" + (": joint1 = c0 + c1 joint2 alone" if kind == "joint" else "")
+            model.refuse(equality, kind, equality.name, "an equality constraint", accepted)
+    _check_transmissions(model)
+    _check_medium(model)
+
+
+def _check_body(model: MjcfModel, body: Any) -> None:
+    if body.gravcomp:
+        model.refuse(body, "body", body.name, f"gravcomp {body.gravcomp:g}", "gravcomp 0")
+    if body.plugin.active:
+        model.refuse(body, "body", body.name, "a plugin, which may exert forces", "none")
+    for joint in body.joints:
+        _check_joint(model, joint)
+        if joint.type.name == "mjJNT_FREE":
+            _check_free_joint(model, joint)
+
+
+def _check_joint(model: MjcfModel, joint: Any) -> None:
+    if joint.type.name == "mjJNT_BALL":
+        accepted = "joints of type hinge or slide: three hinges in place of a ball"
+        model.refuse(joint, "joint", joint.name, "type ball", accepted)
+    values = {name: np.atleast_1d(getattr(joint, name)) for name in ("damping", "stiffness")}
+    for name, value in values.items():
+        if value[1:].any():
+            model.refuse(joint, "joint", joint.name, f"{name} {_numbers(value)}", "one number")
+        if np.abs(value).max() > MAX_NUMBER:
+            accepted = f"at most {MAX_NUMBER:g}: no joint, if it cannot move"
+            model.refuse(joint, "joint", joint.name, f"{name} {_numbers(value)}", accepted)
+
+
+def _check_free_joint(model: MjcfModel, joint: Any) -> None:
+    for name in ("armature", "damping", "frictionloss", "stiffness"):
+        value = np.atleast_1d(getattr(joint, name))
+        if value.any():
+            found = f"{name} {_numbers(value)} of a free joint"
+            model.refuse(joint, "joint", joint.name, found, f"{name} 0, or <freejoint/>")
+
+
+def _check_transmissions(model: MjcfModel) -> None:
+    """Refuse tendons and actuators that exert forces or have inertia by themselves; limits are as those of joints."""
+    for tendon in model.spec.tendons:
+        for name in ("stiffness", "damping", "frictionloss", "armature"):
+            if np.any(getattr(tendon, name)):
+                tag = tendon_tag(tendon)
+                accepted = "tendons without stiffness, damping, frictionloss and armature"
+                model.refuse(tendon, tag, tendon.name, f"a tendon with {name}", accepted)
+    for actuator in model.spec.actuators:
+        for name in ("armature", "damping"):
+            if np.any(getattr(actuator, name)):
+                accepted = f"{name} of the joint, or none"
+                model.refuse(actuator, actuator_tag(model, actuator), actuator.name, f"{name} of an actuator", accepted)
+
+
+def _check_medium(model: MjcfModel) -> None:
+    option = model.model.opt
+    for name in ("density", "viscosity"):
+        if getattr(option, name):
+            element = next((x for x in model.text.root.iter("option") if x.get(name)), None)
+            line = "" if element is None else f", line {element.sourceline}"
+            raise UrdfError(model.path, f"<option>{line}", f"{name} {getattr(option, name):g}", f"{name} 0: no fluid")
+    if np.abs(option.gravity - [0.0, 0.0, -_GRAVITY]).max() > _CLOSE:
+        warn(f"{model.path}: gravity {_numbers(option.gravity)}; the Earth's along -z is used")
+
+
+def mimic_of(model: MjcfModel, equality: Any) -> tuple[str, str, float, float] | None:
+    """Follower, master, multiplier and offset [rad or m] of two joints that an equality couples linearly; else None.
+
+    MuJoCo's polynomial is of deviations from the joints' reference positions.
+    """
+    if equality_kind(equality) != "joint" or not (equality.active and equality.name1 and equality.name2):
+        return None
+    c0, c1, *rest = equality.data[:5]
+    if any(rest) or not c1:
+        return None
+    follower, master = (model.model.joint(name) for name in (equality.name1, equality.name2))
+    reference = [float(model.model.qpos0[int(joint.qposadr[0])]) for joint in (follower, master)]
+    return equality.name1, equality.name2, float(c1), float(c0 + reference[0] - c1 * reference[1])
+
+
+def _touches(model: MjcfModel, equality: Any, members: set[str]) -> bool:
+    """Whether an equality constraint is on a body or joint of the robot, or on what is neither."""
+    names = [name for name in (equality.name1, equality.name2) if name]
+    kind = equality.objtype.name.removeprefix("mjOBJ_").lower()
+    if equality_kind(equality) == "joint":
+        on = {model.bodies[int(model.model.jnt_bodyid[i])] for i, name in enumerate(model.joints) if name in names}
+    elif kind == "body":
+        on = set(names)
+    elif kind == "site":
+        on = {model.bodies[int(model.model.site(name).bodyid[0])] for name in names}
+    else:
+        return True
+    return bool(on & members)
+
+
+def equality_kind(equality: Any) -> str:
+    """Tag of an equality constraint."""
+    return str(equality.type.name).removeprefix("mjEQ_").lower()
+
+
+def tendon_tag(tendon: Any) -> str:
+    """Tag of a tendon."""
+    first = next(iter(tendon.path), None)
+    return "fixed" if first is not None and first.type.name == "mjWRAP_JOINT" else "spatial"
+
+
+def actuator_tag(model: MjcfModel, actuator: Any) -> str:
+    """Tag of an actuator, by its name."""
+    found = _actuators(model, actuator.name)
+    return next(found, "actuator")
+
+
+def _actuators(model: MjcfModel, name: str) -> Iterator[str]:
+    for section in model.text.root.iter("actuator"):
+        yield from (str(element.tag) for element in section if element.get("name", "") == name)
+
+
+def _numbers(values: Any) -> str:
+    return " ".join(f"{x:g}" for x in np.atleast_1d(values))
