@@ -1,0 +1,19 @@
+"""Models that MuJoCo makes of the URDFs of the package example-robot-data, against MuJoCo."""
+
+from __future__ import annotations
+
+import pytest
+from synthetic import ROBOTS
+
+pytest.importorskip("mujoco", reason="MuJoCo, extra [sim]")
+
+from survey_mjcf import survey_all
+
+
+@pytest.mark.skipif(not ROBOTS.is_dir(), reason="the package example-robot-data is not installed")
+def test_models_of_robots_have_the_dynamics_of_mujoco_as_they_are_read_and_written() -> None:
+    """Of all that MuJoCo saves: it refuses bodies without mass, and inertias that no body has."""
+    compared = [found for found in survey_all(sorted(ROBOTS.rglob("*.urdf"))) if found.robot is not None]
+    for found in compared:
+        assert max(found.inverse_dynamics, found.read_again, found.written) < 1e-12, found.name
+    assert len(compared) >= 40
