@@ -29,7 +29,8 @@ if TYPE_CHECKING:
     from torchid.sensing import Contact
 
 
-_OF_LOG = {"urdf", "base_link", "fixed_base"}
+_FILES = {"urdf", "mjcf"}
+_OF_LOG = _FILES | {"base_link", "fixed_base"}
 
 
 def identify(file: StrPath | None = None, /, *, resume: bool = False, **sections: Unpack[Sections]) -> Identification:
@@ -131,10 +132,10 @@ def check(what: Log | StrPath | None = None, *of_log: Any, **sections: Any) -> C
             raise UnknownNameError.at_field("key", min(other), ("robot",), "which goes with an experiment")
         robot = plain_sections(sections).get("robot", {})
         robot = {"urdf": robot} if isinstance(robot, str) else robot
-        if not isinstance(robot, Mapping) or not robot.keys() <= _OF_LOG or (robot and "urdf" not in robot):
-            accepted = "a URDF, or a mapping with urdf, and base_link or fixed_base"
+        if not isinstance(robot, Mapping) or not robot.keys() <= _OF_LOG or (robot and len(_FILES & robot.keys()) != 1):
+            accepted = "a URDF, or a mapping with urdf or mjcf, and base_link or fixed_base"
             raise ConfigError.at_field("robot", f"found {robot!r}", accepted)
-        return CheckedLogs([check_log(Path(what), **robot)])
+        return CheckedLogs([check_log(Path(what), **{"urdf" if key == "mjcf" else key: x for key, x in robot.items()})])
 
 
 @contextmanager

@@ -20,6 +20,7 @@ from torchid.cli import main
 from torchid.commands.export import FORMATS, export
 from torchid.commands.reading import LogReader
 from torchid.config import load_config
+from torchid.errors import ConfigError
 from torchid.fitting.experiment import set_up
 from torchid.problem.chunks import chunks_by_state
 from torchid.problem.predict import force_series
@@ -171,3 +172,13 @@ def test_the_log_is_replayed_on_the_mjcf_robot_as_on_the_urdf(runs: dict[str, Pa
     drifts = [replay(runs[key], log, 0.1).drift for key in ("urdf", "mjcf")]
     for one, other in zip(*drifts, strict=True):
         np.testing.assert_allclose(one.joints, other.joints, atol=1e-4)
+
+
+def test_a_log_is_checked_against_a_model_as_against_its_urdf(runs: dict[str, Path]) -> None:
+    file = runs["mjcf"].parent / "quadruped.xml"
+    (of_model,) = torchid.check(LOG, robot={"mjcf": file})
+    (of_urdf,) = torchid.check(LOG, robot=DEMO / "quadruped.urdf")
+    assert of_model.skipped == of_urdf.skipped
+    assert [one.name for one in of_model.findings] == [one.name for one in of_urdf.findings]
+    with pytest.raises(ConfigError, match="urdf or mjcf"):
+        torchid.check(LOG, robot={"mjcf": file, "urdf": DEMO / "quadruped.urdf"})
