@@ -40,6 +40,14 @@ def test_an_inertia_of_no_body_is_warned_of_by_link_and_kept_as_written(
     np.testing.assert_array_equal(robot.nominal[1, [4, 5]], [float(x) for x in numbers.groups()])
 
 
+def test_inertias_of_no_body_are_said_in_one_line(tmp_path: Path) -> None:
+    parts = [link("arm", inertial(ixx="0.3")), HINGE, link("tip", inertial(mass="0")), joint("wrist", "arm", "tip")]
+    _, caught = warned(write(tmp_path, BASE, *parts))
+    (message,) = [str(w.message) for w in caught]
+    assert "link 'arm': largest principal inertia 0.3 exceeds" in message
+    assert message.endswith("and the inertia of tip is no body's either; used as written")
+
+
 def test_a_thin_plate_or_a_point_mass_is_no_reason_to_warn(tmp_path: Path) -> None:
     plate = link("base", inertial(ixx="0.05", iyy="0.05", izz="0.1"))
     point = link("arm", inertial(ixx="0", iyy="0", izz="0"))

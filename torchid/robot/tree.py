@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from yourdfpy.urdf import Inertial, Link
 
 from torchid import parameters
-from torchid.errors import UnknownNameError, UnphysicalInertiaWarning, UrdfError, warn
+from torchid.errors import UnknownNameError, UnphysicalInertiaWarning, UrdfError, join_names, warn
 from torchid.guards import MAX_NUMBER
 from torchid.parameters import Array
 from torchid.robot.urdf import MOVING_TYPES, TreeJoint
@@ -256,18 +256,24 @@ def nominal_parameters(path: Path, tree: BodyTree, links: dict[str, Link]) -> Ar
     """Parameters (L, 12) of the bodies, each in its link frame.
 
     Warns:
-        UnphysicalInertiaWarning: a link's inertia belongs to no distribution of positive mass.
+        UnphysicalInertiaWarning: inertias of links that belong to no distribution of positive mass, in one line.
     """
     nominal = np.zeros((len(tree.names), parameters.PER_BODY))
+    unphysical = dict[str, str]()
     for name, (body, T_body_link) in tree.links.items():
         inertial = links[name].inertial
         if inertial is None:
             continue
-        _warn_if_unphysical(path, name, inertial)
+        if what := _unphysical(inertial):
+            unphysical[name] = what
         nominal[body, parameters.INERTIAL] += link_parameters(links[name], T_body_link)
     for body, joint in enumerate(tree.joints):
         if joint is not None:
             nominal[body, parameters.FRICTION] = joint.friction, joint.damping
+    for name, what in list(unphysical.items())[:1]:
+        others = join_names([other for other in unphysical if other != name])
+        what += f", and the inertia of {others} is no body's either" if others else ""
+        warn(f"{path}: link '{name}': {what}; used as written", UnphysicalInertiaWarning)
     return nominal
 
 
@@ -281,19 +287,18 @@ def link_parameters(link: Link, T_body_link: Array) -> Array:
     return parameters.change_of_frame(T_body_link @ T_link_com) @ at_com
 
 
-def _warn_if_unphysical(path: Path, link: str, inertial: Inertial) -> None:
+def _unphysical(inertial: Inertial) -> str:
+    """Why no distribution of positive mass has an inertia; "" if one has."""
     small, middle, large = np.linalg.eigvalsh(inertial.inertia)
     if large == small == inertial.mass == 0.0:
-        return
+        return ""
     if inertial.mass == 0.0:
-        what = "mass 0 kg with an inertia that is not 0"
-    elif small < -_ROUNDING * large - _POINT * inertial.mass:
-        what = f"principal inertias {small:.3g}, {middle:.3g}, {large:.3g} kg m^2 are not all positive"
-    elif large > (small + middle) * (1.0 + _TRIANGLE_TOLERANCE) + _POINT * inertial.mass:
-        what = f"largest principal inertia {large:.3g} exceeds the sum of the others, {small + middle:.3g} kg m^2"
-    else:
-        return
-    warn(f"{path}: link '{link}': {what}; used as written", UnphysicalInertiaWarning)
+        return "mass 0 kg with an inertia that is not 0"
+    if small < -_ROUNDING * large - _POINT * inertial.mass:
+        return f"principal inertias {small:.3g}, {middle:.3g}, {large:.3g} kg m^2 are not all positive"
+    if large > (small + middle) * (1.0 + _TRIANGLE_TOLERANCE) + _POINT * inertial.mass:
+        return f"largest principal inertia {large:.3g} exceeds the sum of the others, {small + middle:.3g} kg m^2"
+    return ""
 
 
 @dataclass(frozen=True)
