@@ -175,7 +175,6 @@ def saved_by_mujoco(urdf: Path, folder: Path) -> Path:
 def survey_all(paths: Sequence[Path]) -> list[Survey]:
     """Compare files; a URDF only if MuJoCo saves it."""
     out = []
-    mujoco.set_mju_user_warning(lambda _: None)
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore", TorchidWarning)
         (Path(folder) / "out").mkdir()

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from torchid import __version__
 from torchid.boundary import plain_streams, run_guarded, run_in_ranks
@@ -30,6 +30,7 @@ _CONVERT = "write a log of any type as .npz, .h5, .csv or .parquet"
 _CHECK = "check logs for errors before a fit"
 _SIMULATE = "simulate a robot and write the logs of its sensors (needs the extra [sim])"
 _SHELLS = ("bash", "zsh")
+_Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 _SHARED = ("identify", "compress", "evaluate", "analyze")
 """By the processes that torchrun has started; the first runs all others."""
 
@@ -76,6 +77,16 @@ def _parser() -> argparse.ArgumentParser:
         help="print a script that completes commands, options and files in this shell",
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    for add in (_add_fits, _add_uses_of_runs, _add_studies, _add_work_on_logs, _add_starts):
+        add(commands)
+    for name, command in commands.choices.items():
+        command.add_argument("--debug", action="store_true", help="show the traceback of an unexpected error")
+        command.set_defaults(name=name)
+    return parser
+
+
+def _add_fits(commands: _Commands) -> None:
+    """Commands that fit, or prepare a fit."""
     identify = commands.add_parser("identify", help=_IDENTIFY, description=_IDENTIFY)
     identify.add_argument("file", help="experiment file (YAML)")
     identify.add_argument("overrides", nargs="*", default=[], help="key.subkey=value, for example estimator.ridge=0.01")
@@ -87,6 +98,10 @@ def _parser() -> argparse.ArgumentParser:
     compress.add_argument("overrides", nargs="*", default=[], help="key.subkey=value, for example overwrite=true")
     compress.add_argument("--output", required=True, metavar="FOLDER", help="folder to write: a .factor file per log")
     compress.set_defaults(command=_compress)
+
+
+def _add_uses_of_runs(commands: _Commands) -> None:
+    """Commands that take the folder of a run."""
     evaluate = commands.add_parser("evaluate", help=_EVALUATE, description=_EVALUATE)
     evaluate.add_argument("run", help="run folder")
     evaluate.add_argument(
@@ -112,6 +127,10 @@ def _parser() -> argparse.ArgumentParser:
     report = commands.add_parser("report", help=_REPORT, description=_REPORT)
     report.add_argument("run", help="run folder")
     report.set_defaults(command=_report)
+
+
+def _add_studies(commands: _Commands) -> None:
+    """Commands that need no recorded log."""
     analyze = commands.add_parser("analyze", help=_ANALYZE, description=_ANALYZE)
     analyze.add_argument("file", help="experiment file (YAML); logs and sensors may be left out")
     analyze.add_argument(
@@ -126,6 +145,10 @@ def _parser() -> argparse.ArgumentParser:
     )
     _add_amount(simulate)
     simulate.set_defaults(command=_simulate)
+
+
+def _add_work_on_logs(commands: _Commands) -> None:
+    """Commands that take logs as they were recorded."""
     check = commands.add_parser("check", help=_CHECK, description=_CHECK)
     check.add_argument("file", help="experiment file (YAML), whose logs are checked against its robot, or a log")
     check.add_argument("overrides", nargs="*", default=[], help="key.subkey=value, with an experiment file")
@@ -150,6 +173,10 @@ def _parser() -> argparse.ArgumentParser:
     convert.add_argument("--columns", metavar="FILE", help="experiment file with logs.columns, a map of columns")
     convert.add_argument("--overwrite", action="store_true", help="replace OUT if it exists")
     convert.set_defaults(command=_convert)
+
+
+def _add_starts(commands: _Commands) -> None:
+    """Commands that one begins with."""
     init = commands.add_parser("init", help=_INIT, description=_INIT)
     init.add_argument("urdf", metavar="ROBOT", help="the robot, a URDF or MJCF file")
     init.add_argument(
@@ -167,10 +194,6 @@ def _parser() -> argparse.ArgumentParser:
     what.add_argument("--copy", metavar="FOLDER", help="fit nothing; copy the examples to a new folder, to edit them")
     _add_amount(demo)
     demo.set_defaults(command=_demo)
-    for name, command in commands.choices.items():
-        command.add_argument("--debug", action="store_true", help="show the traceback of an unexpected error")
-        command.set_defaults(name=name)
-    return parser
 
 
 class _PrintCompletion(argparse.Action):

@@ -108,12 +108,17 @@ def test_a_key_of_the_other_kind_is_refused(runs: dict[str, Path], tmp_path: Pat
         )
 
 
+def models(runs: dict[str, Path], folder: Path, of_joints: str) -> tuple[Path, Path]:
+    """The robot's model, and one whose joints have attributes more."""
+    bare, other = runs["mjcf"].parent / "quadruped.xml", folder / "rotors.xml"
+    other.write_text(bare.read_text().replace("<joint ", f"<joint {of_joints} "))
+    return bare, other
+
+
 def test_a_known_armature_is_taken_off_the_torques_and_a_fitted_one_is_all_of_it(
     runs: dict[str, Path], tmp_path: Path
 ) -> None:
-    bare = runs["mjcf"].parent / "quadruped.xml"
-    with_rotors = tmp_path / "rotors.xml"
-    with_rotors.write_text(bare.read_text().replace("<joint ", '<joint armature="0.05" stiffness="2" springref="0.1" '))
+    bare, with_rotors = models(runs, tmp_path, 'armature="0.05" stiffness="2" springref="0.1"')
     rows = {}
     for name, file, fitted in (("all", bare, True), ("none", bare, False), ("known", with_rotors, False)):
         actuators = {"armature": fitted, "stiffness": fitted, "torque_offset": fitted}
@@ -138,11 +143,8 @@ def test_a_known_armature_is_taken_off_the_torques_and_a_fitted_one_is_all_of_it
 def test_a_fitted_armature_does_not_depend_on_that_of_the_file_and_is_written(
     runs: dict[str, Path], tmp_path: Path
 ) -> None:
-    bare = runs["mjcf"].parent / "quadruped.xml"
-    other = tmp_path / "rotors.xml"
-    other.write_text(bare.read_text().replace("<joint ", '<joint armature="0.05" '))
     found = []
-    for file in (bare, other):
+    for file in models(runs, tmp_path, 'armature="0.05"'):
         found.append(
             torchid.identify(
                 DEMO / "quadruped.yaml",

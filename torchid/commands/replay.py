@@ -160,12 +160,15 @@ def replay(
     )
     if out is not None:
         with during("writing", out), new_folder(out, overwrite, REPLAY) as new:
-            write_json(new / "replay.json", found.to_dict())
-            figure = drift_figure(
-                found.source, found.drift.nominal.time, found.quartiles(), found.by_joint(), found.units
-            )
-            save_figure(figure, new / "drift.png")
+            _write(found, new)
     return found
+
+
+def _write(found: Replay, folder: Path) -> None:
+    """Write all numbers and the figure of a replay."""
+    write_json(folder / "replay.json", found.to_dict())
+    figure = drift_figure(found.source, found.drift.nominal.time, found.quartiles(), found.by_joint(), found.units)
+    save_figure(figure, folder / "drift.png")
 
 
 def _require_simple(fitted: FittedRun) -> None:

@@ -184,9 +184,7 @@ class LogBlocks:
             except LogError as error:
                 raise count_samples_from(rows.start, error) from error
 
-        origin = Computed(
-            points.shape, np.dtype(float), lambda rows: np.zeros((rows.stop - rows.start, *points.shape[1:]))
-        )
+        origin = np.broadcast_to(np.zeros(()), points.shape)
         return self.replaced({WRENCHES[1]: Computed(wrench.shape, np.dtype(float), moved), POINTS: origin})
 
     def _continue_signs(self, quat: FloatArray, samples: slice) -> None:

@@ -26,6 +26,8 @@ except ImportError as error:
     found = "need MuJoCo, which " + ("is not installed" if error.name == "mujoco" else f"does not load: {error}")
     raise InputError("", "simulation and MJCF", found, how_to_install("sim")) from error
 
+mujoco.set_mju_user_warning(lambda _: None)  # MuJoCo would write a log file where it runs
+
 __all__ = ["MeshShape", "MjcfModel", "complaint", "mujoco", "parse_model", "pose"]
 
 _PLACEHOLDER = 1e-3  # m, radius of the sphere that stands for a mesh which need not be read
@@ -55,7 +57,6 @@ class MjcfModel:
             UrdfError: MuJoCo does not take it, or it has no joint.
         """
         self.path, self.text = path, MjcfText(path)
-        mujoco.set_mju_user_warning(lambda _: None)  # MuJoCo would write a log file where it runs
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)  # of MuJoCo, about elements that it will not have for ever

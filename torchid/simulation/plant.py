@@ -171,7 +171,6 @@ class Plant:
             UrdfError: MuJoCo does not take it, or it has mimic joints.
         """
         self.model = compile_model(urdf, feet, physics_hz)
-        mujoco.set_mju_user_warning(lambda _: None)  # see `unstable`; MuJoCo would write a log file
         self.data = mujoco.MjData(self.model)
         model = self.model
         if friction is not None:
