@@ -24,6 +24,7 @@ from torchid.fitting.experiment import Scene
 from torchid.logs.time_range import log_title
 from torchid.problem import Samples
 from torchid.problem.base_motion import BaseMotion
+from torchid.problem.mapped_pages import MappedPages
 from torchid.problem.motion_noise import MotionNoise
 from torchid.robot.urdf import parse_xml
 from torchid.sensing import SensorSet
@@ -122,7 +123,10 @@ def samples_of_entry(entry: Entry, source: str, folder: Path | None) -> ReadLog:
         else:
             own[name] = tensor
     noise = _noise_of_document(document["motion_noise"])
-    samples = Samples(source, base=BaseMotion(**base), folder=folder, motion_noise=noise, **own, **document["samples"])
+    pages = MappedPages(entry.arrays.values())
+    samples = Samples(
+        source, base=BaseMotion(**base), folder=folder, motion_noise=noise, pages=pages, **own, **document["samples"]
+    )
     torque, wrench = (np.array(mask, dtype=bool) for mask in document["recorded"])
     recorded = SensorSet(torque, wrench.reshape(-1, 6))
     categories = {category.__name__: category for category in _said_again()}
