@@ -236,6 +236,7 @@ def test_angles_of_the_base_are_its_orientation(names: list[str], factor: float,
         columns |= {f"{what}_{k}": x[:, k] for k in range(12)}
     columns |= {name: factor * x for name, x in zip(names, RPY.T, strict=True)}
     columns |= {"cmd_roll": TIME, "cmd_pitch": TIME, "cmd_yaw": TIME, "roll_rate": TIME, "pitch_rate": TIME}
+    columns |= {"old_euler_x": TIME, "old_euler_y (deg)": TIME, "old_euler_z": TIME}
     _, log, _ = started(GO1, save_csv(tmp_path / "x.csv", columns))
     assert log.base_quat_xyzw is not None
     x, y, z = (Rotation.from_rotvec(np.outer(angle, axis)) for angle, axis in zip(RPY.T, np.eye(3), strict=True))

@@ -80,7 +80,9 @@ def _triples(names: Sequence[str]) -> list[list[str]]:
 
 
 def _in_turn(names: Sequence[str]) -> bool:
-    """Whether names differ in characters that follow one another."""
+    """Whether names of one length differ in characters that follow one another."""
+    if len({len(name) for name in names}) > 1:
+        return False
     changed = [[(a, b) for a, b in zip(*pair, strict=True) if a != b] for pair in pairwise(names)]
     return all(len(of) == 1 and ord(of[0][1]) == ord(of[0][0]) + 1 for of in changed)
 
@@ -99,4 +101,6 @@ def _angles(values: Mapping[str, NDArray[Any]], unit: str) -> Angles:
     elif (largest := float(np.nanmax([np.nanmax(np.abs(x), initial=0.0) for x in values.values()]))) > _LARGEST:
         entry["unit"] = "deg"
         note += f"; deg, from values up to {largest:.3g}"
+    else:
+        note += f"; rad, as none exceeds {_LARGEST}"
     return Angles(entry, columns, note)
