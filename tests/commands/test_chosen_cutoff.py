@@ -15,7 +15,7 @@ from torchid.config import load_config
 from torchid.errors import ConfigError
 from torchid.fitting.experiment import set_up
 
-AUTO = ["preprocessing={cutoff_hz: auto, cache_gb: 0}", "sensors.noise={joint_position: 1e-4}"]
+AUTO = ["preprocessing={cutoff_hz: auto, cache_gb: 0}", "sensors.noise={joint_position: 1e-4}", "estimator.ridge=0.01"]
 FILE = str(DEMO / "quadruped.yaml")
 
 
