@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
+from delays import DELAY, NOISE, STEP, arm, motion, recorded
 from motions import value
-from synthetic import ROBOTS, Array, Oracle, load
 
 from torchid.errors import LogError
 from torchid.estimators import Conditions, Consistent, LeastSquares
@@ -17,46 +16,7 @@ from torchid.fitting.fit import LogFitter
 from torchid.logs import Log, preprocess
 from torchid.logs.delay import with_delayed_torques
 from torchid.problem import ExtraTerms, RowBuilder, bind_log
-from torchid.robot import Robot
 from torchid.sensing import SensorNoise, named_sensors
-
-STEP, DELAY = 0.005, 0.0037  # [s]
-NOISE = 0.02  # [N m]
-
-
-@cache
-def arm() -> tuple[Robot, Oracle]:
-    """Two joints with friction, that differ from their URDF."""
-    robot = load(ROBOTS / "asr_twodof_description/urdf/TwoDofs.urdf", None, True)
-    oracle = Oracle.of(robot)
-    oracle.perturb(np.random.default_rng(3), 0.2)
-    oracle.friction[:] = 0.0, 0.3
-    return robot, oracle
-
-
-def motion(time: Array, sines: int = 6, size: float = 0.4) -> tuple[Array, Array, Array]:
-    """Positions, velocities, accelerations (N, 2), sums of sines up to 3 Hz [rad], a single one of both joints alike."""
-    rng = np.random.default_rng(0)
-    rate = 2.0 * np.pi * rng.uniform(0.3, 3.0, (sines, 1 if sines == 1 else 2))
-    phase = rng.uniform(0.0, 6.28, (sines, 2))
-
-    def of_order(k: int) -> Array:
-        return (size * rate**k * np.sin(time[:, None, None] * rate + phase + 0.5 * np.pi * k)).sum(1)
-
-    return of_order(0), of_order(1), of_order(2)
-
-
-def recorded(
-    delay: float = DELAY, noise: float = 0.0, seed: int = 0, seconds: float = 8.0, shape: tuple[int, float] = (6, 0.4)
-) -> Log:
-    """A log whose torques act so much later, with white noise."""
-    robot, oracle = arm()
-    time = STEP * np.arange(round(seconds / STEP))
-    torque = oracle.forces(*motion(time + delay, *shape))
-    torque += noise * np.random.default_rng(seed).normal(size=torque.shape)
-    fields = ("joint_position", "joint_velocity", "joint_acceleration")
-    moved = dict(zip(fields, motion(time, *shape), strict=True))
-    return Log(source="arm.npz", time=time, joint_names=robot.joint_names, joint_torque=torque, **moved)
 
 
 def chosen(

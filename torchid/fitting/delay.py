@@ -104,9 +104,9 @@ def choose_delay(logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms) 
         is_scaled = any(extra.what == "scale" for extra in fitter.builder.extras)
         if (best not in ends or best in (EARLIEST, LATEST)) and not (is_scaled and abs(best - before) > _SAME):
             break
-    if best in (EARLIEST, LATEST):
-        warn(f"actuators.delay: {best:g} s or beyond; are torques and positions stamped by the same clock?")
     term = near.term(near.fit_in_blocks(best))
+    if term.separable and best in (EARLIEST, LATEST):
+        warn(f"actuators.delay: {best:g} s or beyond; are torques and positions stamped by the same clock?")
     left, without = near.residual(best), near.residual(0.0)
     return _choice(best, term, left, without)
 
