@@ -91,8 +91,9 @@ def choose_delay(logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms) 
     Warns:
         TorchidWarning: the best delay is at an end of those that are tried.
     """
-    fitter = replace(fitter, estimator=replace(fitter.estimator, ridge=_RIDGE))  # type: ignore[type-var]
-    plain = replace(fitter, estimator=LeastSquares(_RIDGE, rank_tolerance=fitter.estimator.rank_tolerance))
+    ridge = max(fitter.estimator.ridge, _RIDGE)
+    fitter = replace(fitter, estimator=replace(fitter.estimator, ridge=ridge))  # type: ignore[type-var]
+    plain = replace(fitter, estimator=LeastSquares(ridge, rank_tolerance=fitter.estimator.rank_tolerance))
     wide = _Delays(_torques(logs, fitter, _FEW), plain, terms, (EARLIEST, LATEST), 0.0, _WIDE)
     tried = np.linspace(EARLIEST, LATEST, _TRIED)
     best = float(tried[int(np.argmin([wide.residual(delay) for delay in tried]))])
