@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 from delays import DELAY, NOISE, STEP, arm, motion, recorded
 from motions import value
+from repository import DEMO
 
+from torchid.config import load_config
 from torchid.errors import LogError
 from torchid.estimators import Conditions, Consistent, LeastSquares
 from torchid.fitting.delay import EARLIEST, LATEST, DelayChoice, choose_delay
+from torchid.fitting.experiment import set_up
 from torchid.fitting.fit import LogFitter
-from torchid.logs import Log, preprocess
+from torchid.logs import Log, preprocess, read_log
 from torchid.logs.delay import with_delayed_torques
 from torchid.problem import ExtraTerms, RowBuilder, bind_log
 from torchid.sensing import SensorNoise, named_sensors
@@ -111,3 +114,20 @@ def test_a_delay_reaches_across_no_break_of_a_log_and_knows_nothing_beside_what_
     assert known[:, 1].all()
     with pytest.raises(LogError, match="no longer than actuators.delay of 9 s"):
         with_delayed_torques(log, 9.0)
+
+
+@pytest.mark.parametrize("sensors", ["joints", "full"])
+def test_torques_of_a_quadruped_on_its_feet_are_found_to_be_as_late_as_they_are(sensors: str) -> None:
+    """The demo's noisy log has no delay; its torques are then taken from 4 ms later."""
+    scene = set_up(load_config(DEMO / "quadruped.yaml", [f"sensors.set={sensors}"]))
+    recorded_log, found = read_log(DEMO / "sway_train.npz"), []
+    for late in (0.0, 0.004):
+        log = preprocess(with_delayed_torques(recorded_log, -late), cutoff_hz=8.0)
+        samples = bind_log(log, scene.robot, scene.contacts)
+        fitter = scene.fitter(scene.builder(scene.sensors), scene.conditions())
+        found.append(choose_delay([samples], fitter, scene.terms))
+    none, delayed = found
+    assert none.delay == 0.0
+    assert delayed.interval[0] < 0.004 < delayed.interval[1]
+    assert delayed.delay - none.found == pytest.approx(0.004, abs=2e-5)
+    assert delayed.standard_error < 2e-4
