@@ -61,6 +61,16 @@ def test_a_run_finds_the_delay_of_a_pd_law_and_an_evaluation_predicts_with_it(
     assert json.loads((tmp_path / "without" / "metrics.json").read_text())["delay_selection"] is None
 
 
+def test_a_search_in_logs_without_a_filter_says_what_noise_does_to_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = commanded(tmp_path, preprocessing={})
+    assert main(["identify", str(file), "actuators.delay=auto"]) == 0
+    assert "actuators.delay: auto without a filter" in capsys.readouterr().err
+    assert main(["identify", str(file), "actuators.delay=auto", "preprocessing.cutoff_hz=40", "overwrite=true"]) == 0
+    assert "without a filter" not in capsys.readouterr().err
+
+
 def test_another_delay_is_other_samples_in_the_cache(tmp_path: Path) -> None:
     file, rms = commanded(tmp_path), {}
     for delay in (0.0, DELAY, 0.0):

@@ -12,6 +12,7 @@ from rich.progress import Progress
 from torchid import ranks
 from torchid.commands.check import recorded_stretches
 from torchid.commands.reading import LogReader
+from torchid.errors import warn_about_file
 from torchid.estimators import Conditions
 from torchid.fitting.base_tilt import TiltChoice, choose_base_tilt
 from torchid.fitting.delay import DelayChoice, choose_delay
@@ -24,6 +25,10 @@ from torchid.problem import Samples
 from torchid.settings import AUTO
 
 Choice = TypeVar("Choice")
+_UNFILTERED = (
+    "actuators.delay: auto without a filter: noise between samples is smaller than at them, which draws the delay to "
+    "half a step; accepted: a preprocessing.cutoff_hz, or auto"
+)
 
 
 @dataclass(frozen=True)
@@ -49,6 +54,9 @@ def with_chosen_settings(scene: S, bars: Progress) -> tuple[S, Choices]:
 
     Raises:
         InputError: logs that cannot be read, or lack what is needed.
+
+    Warns:
+        TorchidWarning: a delay is to be found in logs that are not filtered.
     """
     if scene.config.logs is None:
         return scene, Choices()
@@ -66,6 +74,8 @@ def with_chosen_settings(scene: S, bars: Progress) -> tuple[S, Choices]:
         width = _chosen("sign width", partial(choose_sign_width, partial(_logs_and_fitter, scene)), bars)
         scene = _with_sign_width(scene, width.width)
     if scene.config.actuators.delay == AUTO:
+        if cutoff is None and scene.config.preprocessing.cutoff_hz is None:
+            warn_about_file(_UNFILTERED)
         delay = _chosen("delay of torques", partial(_delay, scene), bars)
         scene = _with_actuators(scene, delay=delay.delay)
     return scene, Choices(cutoff, tilt, width, delay)
