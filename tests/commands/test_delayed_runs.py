@@ -17,11 +17,11 @@ from torchid.config import load_config
 KP = 20.0
 
 
-def commanded(folder: Path, **settings: object) -> Path:
+def commanded(folder: Path, shape: tuple[int, float] = (6, 0.4), **settings: object) -> Path:
     """An experiment of logs that have no torques but gains and desired positions."""
     robot, _ = arm()
     for name, seconds in (("train", 8.0), ("new", 4.0)):
-        log = recorded(seconds=seconds)
+        log = recorded(seconds=seconds, shape=shape)
         q, torque = value(log.joint_position), value(log.joint_torque)
         fields = {"time": log.time, "joint_names": list(robot.joint_names), "dof_pos": q, "target": q + torque / KP}
         np.savez(folder / f"{name}.npz", **fields)
@@ -69,6 +69,15 @@ def test_a_search_in_logs_without_a_filter_says_what_noise_does_to_it(
     assert "actuators.delay: auto without a filter" in capsys.readouterr().err
     assert main(["identify", str(file), "actuators.delay=auto", "preprocessing.cutoff_hz=40", "overwrite=true"]) == 0
     assert "without a filter" not in capsys.readouterr().err
+
+
+def test_a_run_on_a_motion_that_fits_any_delay_takes_none(tmp_path: Path) -> None:
+    """A sine of one rate and little size: armature, spring and damping make up for it."""
+    file = commanded(tmp_path, (1, 0.02), actuators={"armature": True, "stiffness": True, "delay": "auto"})
+    assert main(["identify", str(file)]) == 0
+    choice = json.loads((tmp_path / "run" / "metrics.json").read_text())["delay_selection"]
+    assert choice["delay"] == 0.0
+    assert choice["confounded_with"]
 
 
 def test_another_delay_is_other_samples_in_the_cache(tmp_path: Path) -> None:

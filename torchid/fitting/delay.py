@@ -42,28 +42,29 @@ class DelayChoice:
     Attributes:
         delay: [s]; 0 where the best cannot be told from none, or from other parameters.
         found: the best [s], which it is otherwise.
-        standard_error: of it [s]; infinite where the data do not determine it.
-        interval: of 95 % [s].
-        inflation: of its standard error by not knowing all other parameters.
+        standard_error: of it [s], and interval of 95 % [s]; None where the data do not determine it.
+        inflation: of its standard error by not knowing all other parameters, None likewise.
         confounded_with: names of other parameters that it cannot be told from, empty if it can be.
         residual, undelayed_residual: standard deviation of whitened residuals with the best and with none [1].
     """
 
     delay: float
     found: float
-    standard_error: float
-    interval: tuple[float, float]
-    inflation: float
+    standard_error: float | None
+    interval: tuple[float, float] | None
+    inflation: float | None
     confounded_with: tuple[str, ...]
     residual: float
     undelayed_residual: float
 
     def __str__(self) -> str:
         """The delay with its standard error, and what it is for."""
-        best = f"{1e3 * self.found:.3g} ± {1e3 * self.standard_error:.2g} ms"
-        left = f"residual {self.residual:.4g}, {self.undelayed_residual:.4g} without"
+        best, left = f"{1e3 * self.found:.3g}", f"residual {self.residual:.4g}, {self.undelayed_residual:.4g} without"
         if self.confounded_with:
-            return f"none: {best} is confounded with {', '.join(self.confounded_with)} ({left})"
+            return f"none: any, such as {best} ms, is confounded with {', '.join(self.confounded_with)} ({left})"
+        if self.standard_error is None or self.interval is None:
+            return f"none: the data do not determine it ({left})"
+        best = f"{best} ± {1e3 * self.standard_error:.2g} ms"
         if not self.delay:
             return f"none: {best} cannot be told from none ({left})"
         low, high = (1e3 * x for x in self.interval)
@@ -116,12 +117,13 @@ def _choice(best: float, term: ExtraEstimate, left: float, undelayed: float) -> 
     """The choice of the best delay, with the term of the last fit."""
     reach = _QUANTILE * term.standard_error
     confounded = () if term.separable else term.confounded_with or ("other parameters",)
+    known = bool(np.isfinite(reach))
     return DelayChoice(
         delay=0.0 if confounded or not abs(best) > reach else float(f"{best:.4g}"),
         found=best,
-        standard_error=term.standard_error,
-        interval=(best - reach, best + reach),
-        inflation=term.inflation,
+        standard_error=term.standard_error if known else None,
+        interval=(best - reach, best + reach) if known else None,
+        inflation=term.inflation if np.isfinite(term.inflation) else None,
         confounded_with=confounded,
         residual=left,
         undelayed_residual=undelayed,
