@@ -70,7 +70,8 @@ class Scene:
         scales = {str(channel): scope for channel, scope in sensors.scales.items()}
         actuators = vars(self.config.actuators)
         width = actuators["sign_width"]
-        return ExtraTerms(offsets, scales, **actuators | {"sign_width": None if width == "auto" else width})
+        known = {"sign_width": None if width == "auto" else width, "delay": False}  # logs are read with the delay
+        return ExtraTerms(offsets, scales, **actuators | known)
 
     @property
     def loss(self) -> RobustLoss | None:

@@ -63,6 +63,7 @@ class Samples:
         motion_noise: noise of the motion, None without any.
         pages: of files that the tensors are mapped to; None for those in memory.
         payload: (12 L,), what the robot carried beside its own parameters, see `payload_parameters`; None for nothing.
+        delayed_torque: (N, D, n), joint torques of D delays, in a search for the best; None otherwise.
     """
 
     source: str
@@ -87,6 +88,7 @@ class Samples:
     motion_noise: MotionNoise | None = None
     payload: Array | None = None
     pages: MappedPages | None = field(default=None, repr=False, compare=False)
+    delayed_torque: Tensor | None = None
 
     __repr__ = short_repr
 
@@ -404,9 +406,8 @@ def require_forces(samples: Samples, robot: Robot, contacts: Sequence[Contact], 
             if contacts[contact].along_normal:
                 raise _scalar_error(samples, contacts[contact].frame, sample, k)
             found = f"{WRENCH_COMPONENTS[k]} is not a finite number at sample {sample}, while in contact"
-            raise LogError(
-                samples.source, f"contact_wrench '{contacts[contact].frame}'", found, "a value: it is a sensor"
-            )
+            field = f"contact_wrench '{contacts[contact].frame}'"
+            raise LogError(samples.source, field, found, "a value: it is a sensor")
 
 
 def _scalar_error(samples: Samples, frame: str, sample: int, k: int) -> LogError:
