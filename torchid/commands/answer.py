@@ -6,14 +6,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from torchid import parameters
 from torchid.commands.verdict import Judged
 from torchid.errors import join_names
 from torchid.estimators import Estimate
 from torchid.fitting.calibration import list_confounded
 from torchid.logs.time_range import log_title
-from torchid.parameters import PER_BODY
 from torchid.problem.metrics import ADVICE, describe_worse
+from torchid.report.loadable_urdf import massless_ends
 from torchid.report.tables import noise_advice
 
 if TYPE_CHECKING:
@@ -76,11 +75,9 @@ def _bodies_text(run: Identification) -> str:
             names.append(robot.body_names[one.body])
     count = len(robot.body_names)
     if not run.violations:
-        mass = run.estimate.phi.reshape(-1, PER_BODY)[:, parameters.MASS]
-        moving = slice(int(run.experiment.config.robot.fixed_base), None)
-        empty = [name for name, x in zip(robot.body_names[moving], mass[moving], strict=True) if not x]
-        if empty:
-            return f"all that have mass can exist; MuJoCo refuses those that move without: {join_names(empty)}"
+        ends = massless_ends(robot, run.phi)
+        if ends:
+            return f"all that have mass can exist; MuJoCo refuses joints that move none: {join_names(ends)}"
         return f"all {count} can exist, and simulators take them"
     which = f"{len(names)} of {count}" if names else "all together"
     advice = "; estimator.name=consistent finds the best that can" if type(run.estimate) is Estimate else ""

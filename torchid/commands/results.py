@@ -143,7 +143,7 @@ class Identification:
         return {"parameters": parameters, "metrics": metrics_document(self), "config": config}
 
     def to_urdf(self, path: str | Path, overwrite: bool = False) -> Path:
-        """Write the URDF with the identified parameters; meshes keep their paths, as `identified.urdf` of a run does.
+        """Write the URDF with the identified parameters; meshes keep their names.
 
         Raises:
             ConfigError: the file exists and `overwrite` is not set, or it is an input.
