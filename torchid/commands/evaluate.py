@@ -26,7 +26,7 @@ from torchid.parameters import Array
 from torchid.problem import Metrics
 from torchid.problem.chunks import one_thread
 from torchid.problem.metrics import DECISIVE_GROUPS, describe_errors
-from torchid.report.figures import error_figure, save_figure
+from torchid.report.figures import error_figure, save_figures
 from torchid.report.forces import ForceSeries
 from torchid.report.parameter_files import read_parameters, read_shared_extras
 from torchid.report.tables import progress_bars
@@ -116,7 +116,8 @@ def evaluate(
         fitted = read_run(folder, device)
         evaluated = replace(_evaluate(fitted, logs, folder, bars), output=output)
         if output is not None:
-            ranks.from_first(partial(_write, evaluated, output, folder / _SETTINGS), "evaluation folder")
+            form = fitted.experiment.config.figures.format
+            ranks.from_first(partial(_write, evaluated, output, folder / _SETTINGS, form), "evaluation folder")
     return evaluated
 
 
@@ -206,13 +207,16 @@ def _calibrations(experiment: Experiment, phi: Array, shared: Comparison[dict[st
     return Comparison(nominal, identified)
 
 
-def _write(evaluated: EvaluatedRun, output: Path, config: Path) -> None:
-    """Write the folder, beside the settings of the run."""
+def _write(evaluated: EvaluatedRun, output: Path, config: Path, form: str) -> None:
+    """Write the folder, beside the settings of the run, with figures in a format."""
     with during("writing", output), new_folder(output, True, EVALUATION) as new:
         (new / "config.yaml").write_bytes(read_bytes(config, MAX_YAML))
         write_json(new / "metrics.json", evaluated.to_dict())
-        save_figure(draw_forces(evaluated.forces, evaluated.robot), new / "forces.png")
-        save_figure(error_figure(evaluated.metrics), new / "errors.png")
+        figures = {
+            "forces": draw_forces(evaluated.forces, evaluated.robot),
+            "errors": error_figure(evaluated.metrics),
+        }
+        save_figures(figures, new, form)
 
 
 def _log_names(logs: Sequence[str | Path]) -> list[str]:

@@ -16,13 +16,13 @@ if TYPE_CHECKING:
     from torchid.commands.results import Identification
 
 
-def write_events(run: Identification, folder: Path, figures: Mapping[str, Path]) -> None:
+def write_events(run: Identification, folder: Path, figures: Mapping[str, bytes]) -> None:
     """Write errors, losses, verdicts, settings and figures of a run; a descent has written its epochs before.
 
     Args:
         run: a finished one.
         folder: of its files.
-        figures: PNG files by name.
+        figures: PNG by name.
     """
     from torchid.report.tensorboard import RunEvents  # takes 0.3 s, which runs that write nothing need not
 

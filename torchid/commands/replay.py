@@ -21,7 +21,7 @@ from torchid.problem.chunks import one_thread
 from torchid.problem.extras import ACTUATORS
 from torchid.report import identified_name
 from torchid.report.drift_figure import drift_figure
-from torchid.report.figures import save_figure
+from torchid.report.figures import save_figures
 from torchid.report.tables import progress_bars
 from torchid.reprs import short_repr
 from torchid.robot import Robot
@@ -160,15 +160,15 @@ def replay(
     )
     if out is not None:
         with during("writing", out), new_folder(out, overwrite, REPLAY) as new:
-            _write(found, new)
+            _write(found, new, fitted.experiment.config.figures.format)
     return found
 
 
-def _write(found: Replay, folder: Path) -> None:
-    """Write all numbers and the figure of a replay."""
+def _write(found: Replay, folder: Path, form: str) -> None:
+    """Write all numbers and the figure of a replay, in a format."""
     write_json(folder / "replay.json", found.to_dict())
     figure = drift_figure(found.source, found.drift.nominal.time, found.quartiles(), found.by_joint(), found.units)
-    save_figure(figure, folder / "drift.png")
+    save_figures({"drift": figure}, folder, form)
 
 
 def _require_simple(fitted: FittedRun) -> None:

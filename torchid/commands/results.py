@@ -42,7 +42,8 @@ from torchid.report.figures import (
     error_figure,
     extra_figure,
     identifiability_figure,
-    save_figure,
+    png_of,
+    save_figures,
 )
 from torchid.report.forces import ForceSeries, force_figure
 from torchid.report.parameter_figure import parameter_figure
@@ -224,11 +225,10 @@ def write_run(run: Identification, output: Path, overwrite: bool = False, traini
         write_json(folder / "parameters.json", parameters_document(robot, run.estimate, run.by_state, run.extras))
         write_json(folder / "metrics.json", metrics_document(run))
         (folder / identified_name(robot)).write_bytes(identified_robot(robot, run.phi, run.armature))
-        for name, figure in figures.items():
-            save_figure(figure, folder / f"{name}.png")
+        files = save_figures(figures, folder, config.figures.format)
         if training is not None:
             training.copy_curves(folder)
-        write_events(run, folder, {name: folder / f"{name}.png" for name in figures})
+        write_events(run, folder, {name: png_of(figure, files[name]) for name, figure in figures.items()})
         write_json(folder / DATA, report_document(run))
         write_page(folder, output)
     if training is not None:

@@ -113,6 +113,13 @@ class ActuatorsConfig:
     sign_width: PositiveOrAuto = None
 
 
+@dataclass(config=STRICT, frozen=True)
+class FiguresConfig:
+    """How figures are written: `format`, of their files. TensorBoard and `report.html` have pictures of their own."""
+
+    format: Literal["png", "pdf", "svg"] = "png"
+
+
 @dataclass(config=STRICT, frozen=True, kw_only=True)
 class _Common:
     """The keys of identification and analysis alike; no `output`, as Python alone may say: nothing is written."""
@@ -125,6 +132,7 @@ class _Common:
     actuators: ActuatorsConfig = dataclasses.field(default_factory=ActuatorsConfig)
     estimator: EstimatorConfig = dataclasses.field(default_factory=EstimatorConfig)
     analysis: AnalysisConfig = dataclasses.field(default_factory=AnalysisConfig)
+    figures: FiguresConfig = dataclasses.field(default_factory=FiguresConfig)
     device: Device = "cpu"
     overwrite: bool = False
 

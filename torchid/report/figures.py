@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tempfile
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
@@ -42,7 +43,11 @@ STYLE: dict[Any, Any] = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "legend.frameon": False,
+    "pdf.fonttype": 42,  # letters that editors keep and journals accept
+    "svg.hashsalt": "torchid",  # the same figure is the same file
 }
+#: Dates in files, which then differ between runs that do not.
+_DATES = {"pdf": "CreationDate", "svg": "Date"}
 #: Extra parameters: rows of a panel (`parameters.json` has all), longest error bar over the largest value, and vertical
 #: offsets for logs in one row.
 _MAX_PANEL_ROWS, _MAX_ERROR_RATIO, _LANES = 40, 4, 5
@@ -63,10 +68,28 @@ def save_figure(figure: Figure, path: Path, kind: str | None = None) -> None:
         for text in figure.findobj(Text):
             text.set_text(escape(text.get_text(), "\n"))
         figure.set_dpi(130)
-        if (kind or path.suffix[1:]).lower() == "png":
+        form = (kind or path.suffix[1:]).lower()
+        if form == "png":
             FigureCanvasAgg(figure).print_png(path)  # `savefig` draws all of it twice, once for the layout
         else:
-            figure.savefig(path, format=kind)
+            figure.savefig(path, format=form, metadata={_DATES[form]: None})
+
+
+def save_figures(figures: Mapping[str, Figure], folder: Path, form: str) -> dict[str, Path]:
+    """Write figures by name, in the format of that extension; their files."""
+    files = {name: folder / f"{name}.{form}" for name in figures}
+    for name, path in files.items():
+        save_figure(figures[name], path)
+    return files
+
+
+def png_of(figure: Figure, file: Path) -> bytes:
+    """A figure as PNG: its file, where that is one, or drawn anew."""
+    if file.suffix == ".png":
+        return file.read_bytes()
+    with tempfile.TemporaryDirectory() as folder:
+        save_figure(figure, path := Path(folder) / "figure.png")
+        return path.read_bytes()
 
 
 # ---------------------------------------------------------------------------------------------------- errors

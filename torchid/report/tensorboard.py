@@ -166,7 +166,7 @@ class RunEvents:
         settings: str,
         hyperparameters: Mapping[str, str | float | bool],
         final: Mapping[str, float],
-        figures: Mapping[str, Path],
+        figures: Mapping[str, bytes],
         step: int,
     ) -> None:
         """Settings, final metrics and figures of a finished run.
@@ -175,12 +175,11 @@ class RunEvents:
             settings: resolved configuration, YAML.
             hyperparameters: for the HParams tab.
             final: metrics beside them.
-            figures: PNG files by tag, which are not drawn again.
+            figures: PNG by tag.
             step: of the figures.
         """
         self._writer.add_text("config", _preformatted(settings))
-        for tag, path in figures.items():
-            png = path.read_bytes()
+        for tag, png in figures.items():
             width, height = struct.unpack(">II", png[16:24])
             image = Summary.Image(encoded_image_string=png, width=width, height=height, colorspace=_RGBA)
             self._writer.file_writer.add_summary(Summary(value=[Summary.Value(tag=tag, image=image)]), step)
