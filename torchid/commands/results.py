@@ -37,10 +37,10 @@ from torchid.problem import Metrics
 from torchid.problem.metrics import SETS, WorseThanNominal, describe_worse, worse_than_nominal
 from torchid.problem.surplus import NoiseShares
 from torchid.report import identified_name, identified_robot, identified_urdf, parameters_document
+from torchid.report.extra_figure import extra_figure
 from torchid.report.figures import (
     contribution_figure,
     error_figure,
-    extra_figure,
     identifiability_figure,
     png_of,
     save_figures,
@@ -212,7 +212,7 @@ def write_run(run: Identification, output: Path, overwrite: bool = False, traini
     figures = {
         **({} if run.forces is None else {"forces": draw_forces(run.forces, robot)}),
         "errors": error_figure(run.metrics),
-        "parameters": parameter_figure(robot.body_names, robot.nominal, run.estimate),
+        "parameters": parameter_figure(robot.body_names, robot.nominal, run.estimate, _joint_kinds(robot)),
         "identifiability": identifiability_figure(robot.body_names, run.estimate),
         "contributions": contribution_figure(_bits(run.contributions)),
     }
@@ -235,9 +235,13 @@ def write_run(run: Identification, output: Path, overwrite: bool = False, traini
         training.remove_checkpoint()
 
 
+def _joint_kinds(robot: Robot) -> set[str]:
+    return {body.joint.kind for body in robot.bodies if body.joint is not None}
+
+
 def draw_forces(series: ForceSeries, robot: Robot) -> Figure:
     """The figure of forces of a log's first samples."""
-    return force_figure(series, robot.dof_names, robot.base_rows)
+    return force_figure(series, robot.dof_names, robot.base_rows, robot.sliding)
 
 
 def metrics_document(run: Identification) -> dict[str, object]:

@@ -99,6 +99,12 @@ class Robot:
         return (*self.joint_names, *(f"{name}.{k}" for name in self.ft_names for k in WRENCH_COMPONENTS))
 
     @property
+    def sliding(self) -> tuple[str, ...]:
+        """Names of the independent joints that slide: their torque is a force."""
+        joints = {body.joint.name: body.joint.kind for body in self.bodies if body.joint is not None}
+        return tuple(name for name in self.joint_names if joints[name] == "prismatic")
+
+    @property
     def n_dofs(self) -> int:
         """Number of `dof_names`: n joints and six components of each force/torque sensor in a limb, n + 6 F."""
         return len(self.dof_names)
