@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import re
+from functools import cache
 from pathlib import Path
 from textwrap import dedent
 from typing import Any
@@ -54,3 +56,39 @@ def test_links_between_pages_lead_somewhere(page: Path) -> None:
 
 def test_the_readme_stays_short() -> None:
     assert len((ROOT / "README.md").read_text().splitlines()) <= 120
+
+
+# --------------------------------------------------------------------------------------------------- troubleshooting
+
+
+def messages() -> list[str]:
+    """What the page on troubleshooting quotes."""
+    page = (ROOT / "docs" / "troubleshooting.md").read_text()
+    return re.findall(r"^\| `([^|]+)` \|", page, re.MULTILINE)
+
+
+@cache
+def said_by_the_code() -> list[str]:
+    """Every text in the package; "…" stands for what is filled in."""
+    texts = []
+    for file in (ROOT / "torchid").rglob("*.py"):
+        nodes = list(ast.walk(ast.parse(file.read_text())))
+        descriptions = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+        for node in (node for node in nodes if id(node) not in descriptions):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                texts.append(node.value)
+            elif isinstance(node, ast.JoinedStr):
+                parts = (x.value if isinstance(x, ast.Constant) else "…" for x in node.values)
+                texts.append("".join(map(str, parts)))
+    return texts
+
+
+@pytest.mark.parametrize("message", messages())
+def test_messages_that_are_explained_are_said(message: str) -> None:
+    pattern = ".*".join(re.escape(part) for part in message.split("…"))
+    assert any(re.search(pattern, text) for text in said_by_the_code()), "in no text of the package"
+
+
+def test_the_page_explains_what_users_meet_most() -> None:
+    assert len(messages()) >= 25
+    assert len(set(messages())) == len(messages())
