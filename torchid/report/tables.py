@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import os
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -48,7 +49,7 @@ def terminal_console(stderr: bool = False) -> Console:
 
 
 def print_tables(*tables: Table) -> None:
-    """Print to standard output, at most 100 columns wide; a file or pipe gets the full 100."""
+    """Print to standard output, as wide as `terminal_width` says."""
     console = terminal_console()
     console.width = terminal_width()
     for table in tables:
@@ -56,9 +57,9 @@ def print_tables(*tables: Table) -> None:
 
 
 def terminal_width() -> int:
-    """Columns to print in: those of the terminal, at most 100; a file or pipe gets the full 100."""
-    console = terminal_console()
-    return min(console.width, WIDTH) if console.is_terminal else WIDTH
+    """Columns to print in: those of the terminal, at most 100; a file or pipe gets 100, or as many as COLUMNS says."""
+    console, stated = terminal_console(), os.environ.get("COLUMNS", "").isdigit()
+    return min(console.width, WIDTH) if console.is_terminal or stated else WIDTH
 
 
 def table_text(table: Table, width: int = WIDTH) -> str:

@@ -11,7 +11,7 @@ from rich.text import Text
 
 from torchid.errors import one_line
 from torchid.fitting.noise import NoiseSummary
-from torchid.report.tables import WIDTH, noise_advice, noise_table, print_tables, table_text
+from torchid.report.tables import noise_advice, noise_table, print_tables, table_text, terminal_width
 
 LABEL = 14
 """Columns of the words before what they are about."""
@@ -48,7 +48,7 @@ def labelled(label: str, text: str, width: int, most: int | None = None) -> list
 
 def print_labelled(label: str, text: str) -> None:
     """Print what a word is about, broken into lines below each other."""
-    print("\n".join(labelled(label, text, WIDTH)))
+    print("\n".join(labelled(label, text, terminal_width())))
 
 
 def table_lines(table: Table, width: int) -> list[str]:
