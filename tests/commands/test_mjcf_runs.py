@@ -48,6 +48,24 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return out
 
 
+def test_what_an_mjcf_robot_is_compared_with_is_called_mjcf(
+    runs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In sentences, tables and the page, the same words as of a URDF otherwise."""
+    said = {}
+    for key, run in runs.items():
+        for words in (["evaluate", str(run)], ["evaluate", str(run), "--verbose"], ["replay", str(run)]):
+            assert main([*words, "--log", str(DEMO / "sway_test.npz")]) == 0
+        said[key] = re.sub(r"written to.*|[\d.]+(e[+-]\d+)?", "", capsys.readouterr().out).split()
+        answer = json.loads((run / "report.json").read_text())["answer"]
+        said[key] += [word for text in (answer["headline"], answer["total_mass"]) for word in text.split()[:5]]
+        said[key] += repr(torchid.evaluate(run, DEMO / "sway_test.npz")).split()[:6]
+    assert "URDF" in " ".join(said["urdf"])
+    assert "URDF" not in " ".join(said["mjcf"])
+    words = [re.sub("[^A-Za-z]", "", word.replace("URDF", "MJCF")) for word in said["urdf"]]
+    assert [re.sub("[^A-Za-z]", "", word) for word in said["mjcf"]] == words
+
+
 def identified(run: Path) -> np.ndarray:
     bodies = json.loads((run / "parameters.json").read_text())["bodies"]
     return np.array([list(body["identified"].values()) for body in bodies])

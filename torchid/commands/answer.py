@@ -45,26 +45,27 @@ def answer(run: Identification) -> Answer:
     return Answer(
         headline=_headline(run, judged),
         errors=judged.shown_errors(),
-        total_mass=f"{run.mass} (URDF: {run.mass.nominal:.3f} kg)",
+        total_mass=f"{run.mass} ({run.experiment.robot.format}: {run.mass.nominal:.3f} kg)",
         bodies=_bodies_text(run),
         attention=list(_attention(run)),
     )
 
 
 def _judge(run: Identification) -> Judged:
+    of = run.experiment.robot.format
     if "test" in run.metrics:
         names = [log_title(path) for path in run.experiment.config.logs.test]
         text = f"unseen motion ({join_names(names, 2)})"
-        return Judged(text, run.metrics["test"].nominal, run.metrics["test"].identified)
+        return Judged(text, run.metrics["test"].nominal, run.metrics["test"].identified, of)
     if run.validation is not None:
         text = f"blocks of the training logs, each left out of the fit ({run.validation.folds})"
-        return Judged(text, run.validation.nominal, run.validation.identified)
-    return Judged("the training logs themselves", run.metrics["train"].nominal, run.metrics["train"].identified)
+        return Judged(text, run.validation.nominal, run.validation.identified, of)
+    return Judged("the training logs themselves", run.metrics["train"].nominal, run.metrics["train"].identified, of)
 
 
 def _headline(run: Identification, judged: Judged) -> str:
     if run.worse:
-        return f"WORSE THAN URDF: {describe_worse(run.worse)}"
+        return f"WORSE THAN {judged.of}: {describe_worse(run.worse)}"
     return judged.headline(explained=run.misfit.explained)
 
 

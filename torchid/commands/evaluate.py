@@ -63,7 +63,7 @@ class EvaluatedRun:
             for group in DECISIVE_GROUPS
             if pair.identified.rms.get(group) is not None
         ]
-        return f"identified against URDF; {'; '.join(texts)}"
+        return f"identified against {self.robot.format}; {'; '.join(texts)}"
 
     def to_dict(self) -> dict[str, dict[str, object]]:
         """What `metrics.json` has, by name of a log."""
@@ -224,7 +224,7 @@ def _write(evaluated: EvaluatedRun, output: Path, config: Path, form: str, overw
         write_json(new / "metrics.json", evaluated.to_dict())
         figures = {
             "forces": draw_forces(evaluated.forces, evaluated.robot),
-            "errors": error_figure(evaluated.metrics),
+            "errors": error_figure(evaluated.metrics, evaluated.robot.format),
         }
         save_figures(figures, new, form)
 

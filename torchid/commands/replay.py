@@ -44,6 +44,7 @@ class Replay:
         drift: with the robot's file, which has no offsets and, a URDF, no armature, and with what was identified.
         joint_names: of the robot.
         units: of the joints' positions, "rad" or "m".
+        of: what the robot's file is, "URDF" or "MJCF".
         output: the folder that it was written to, if any.
     """
 
@@ -53,13 +54,14 @@ class Replay:
     drift: Comparison[Drift]
     joint_names: tuple[str, ...]
     units: tuple[str, ...]
+    of: str
     output: Path | None = None
 
     __repr__ = short_repr
 
     def _headline(self) -> str:
         texts = [f"{name} {before:.3g} and {after:.3g}" for name, (before, after) in self.at(self.window).items()]
-        return f"{self.source}, drift after {self.window:g} s, URDF against identified: {'; '.join(texts)}"
+        return f"{self.source}, drift after {self.window:g} s, {self.of} against identified: {'; '.join(texts)}"
 
     def quartiles(self) -> dict[str, Comparison[Array]]:
         """Quartiles over windows of the drift, (3, T), by what drifts and its unit.
@@ -156,6 +158,7 @@ def replay(
         drift=Comparison(nominal, identified),
         joint_names=robot.joint_names,
         units=tuple(_UNITS[kind] for kind in _joint_kinds(robot)),
+        of=robot.format,
         output=out,
     )
     if out is not None:
@@ -167,7 +170,9 @@ def replay(
 def _write(found: Replay, folder: Path, form: str) -> None:
     """Write all numbers and the figure of a replay, in a format."""
     write_json(folder / "replay.json", found.to_dict())
-    figure = drift_figure(found.source, found.drift.nominal.time, found.quartiles(), found.by_joint(), found.units)
+    figure = drift_figure(
+        found.source, found.drift.nominal.time, found.quartiles(), found.by_joint(), found.units, found.of
+    )
     save_figures({"drift": figure}, folder, form)
 
 

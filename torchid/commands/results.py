@@ -211,15 +211,17 @@ def write_run(run: Identification, output: Path, overwrite: bool = False, traini
     run = replace(run, experiment=replace(run.experiment, config=config))
     figures = {
         **({} if run.forces is None else {"forces": draw_forces(run.forces, robot)}),
-        "errors": error_figure(run.metrics),
-        "parameters": parameter_figure(robot.body_names, robot.nominal, run.estimate, _joint_kinds(robot)),
+        "errors": error_figure(run.metrics, robot.format),
+        "parameters": parameter_figure(
+            robot.body_names, robot.nominal, run.estimate, _joint_kinds(robot), robot.format
+        ),
         "identifiability": identifiability_figure(robot.body_names, run.estimate),
         "contributions": contribution_figure(_bits(run.contributions)),
     }
     if run.extras:
         figures["extras"] = extra_figure(run.extras)
     if run.ridge is not None:
-        figures["ridge"] = ridge_figure(run.ridge)
+        figures["ridge"] = ridge_figure(run.ridge, robot.format)
     with during("writing", output), new_folder(output, overwrite) as folder:
         (folder / "config.yaml").write_text(dump_config(config))
         write_json(folder / "parameters.json", parameters_document(robot, run.estimate, run.by_state, run.extras))
@@ -241,7 +243,7 @@ def _joint_kinds(robot: Robot) -> set[str]:
 
 def draw_forces(series: ForceSeries, robot: Robot) -> Figure:
     """The figure of forces of a log's first samples."""
-    return force_figure(series, robot.dof_names, robot.base_rows, robot.sliding)
+    return force_figure(series, robot.dof_names, robot.base_rows, robot.sliding, robot.format)
 
 
 def metrics_document(run: Identification) -> dict[str, object]:

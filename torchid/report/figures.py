@@ -108,14 +108,14 @@ def decade_formatter() -> FuncFormatter:
 
 
 @matplotlib.rc_context(STYLE)
-def error_figure(sets: Mapping[str, Comparison[Metrics]]) -> Figure:
-    """Relative error by group of rows, URDF against identified, one panel per set of logs."""
+def error_figure(sets: Mapping[str, Comparison[Metrics]], of: str = "URDF") -> Figure:
+    """Relative error by group of rows, nominal (`of` what) against identified, one panel per set of logs."""
     figure = Figure(figsize=(4.2 * len(sets) + 0.6, 3.2), layout="constrained")
     axes = figure.subplots(1, len(sets), sharey=True, squeeze=False)[0]
     for axis, (name, (nominal, identified)) in zip(axes, sets.items(), strict=True):
         groups = [group for group in ERROR_GROUPS if nominal.relative.get(group) is not None]
         index = np.arange(len(groups))
-        pairs = ((-0.2, nominal, palette.NOMINAL, "URDF"), (0.2, identified, palette.IDENTIFIED, "identified"))
+        pairs = ((-0.2, nominal, palette.NOMINAL, of), (0.2, identified, palette.IDENTIFIED, "identified"))
         for shift, metrics, color, label in pairs:
             heights = [100.0 * (metrics.relative.get(group) or 0.0) for group in groups]
             bars = axis.bar(index + shift, heights, 0.38, color=color, label=label)

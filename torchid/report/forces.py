@@ -16,6 +16,7 @@ from torchid.report.figures import STYLE
 from torchid.report.palette import IDENTIFIED, MEASURED, NOMINAL
 
 _NOISE = "0.8"
+_MOST_ROWS = 6
 _SHOWN = 1.6  # errors are shown up to so many times the largest of the identified ones, or of the noise
 
 
@@ -36,18 +37,18 @@ class ForceSeries:
 
 @matplotlib.rc_context(STYLE)
 def force_figure(
-    series: ForceSeries, dof_names: Sequence[str], base_rows: int, sliding: Collection[str] = (), max_rows: int = 6
+    series: ForceSeries, dof_names: Sequence[str], base_rows: int, sliding: Collection[str] = (), of: str = "URDF"
 ) -> Figure:
     """Forces over time, and beside them their errors: the largest base force and moment, then the largest others.
 
-    `dof_names`, `base_rows` and `sliding` are those of the robot.
+    `dof_names`, `base_rows` and `sliding` are those of the robot, `of` is what its nominal parameters are from.
     """
-    rows = largest_rows(series, base_rows, max_rows)
+    rows = largest_rows(series, base_rows, _MOST_ROWS)
     figure = Figure(figsize=(12.0, 1.7 * max(len(rows), 1) + 0.8), layout="constrained")
     axes = figure.subplots(max(len(rows), 1), 2, sharex=True, squeeze=False, width_ratios=(3, 2))
     for (forces, errors), row in zip(axes, rows, strict=False):
         forces.plot(series.time, series.measured[:, row], color=MEASURED, linewidth=1.6, label="measured")
-        forces.plot(series.time, series.nominal[:, row], color=NOMINAL, linewidth=1.0, label="predicted, URDF")
+        forces.plot(series.time, series.nominal[:, row], color=NOMINAL, linewidth=1.0, label=f"predicted, {of}")
         label = "predicted, identified"
         forces.plot(series.time, series.identified[:, row], color=IDENTIFIED, linewidth=1.0, label=label)
         name, unit = name_row(row, base_rows, dof_names, sliding)

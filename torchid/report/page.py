@@ -110,6 +110,7 @@ def page_text(run: RunFiles) -> str:
     return environment.get_template(_TEMPLATE).render(
         run=run,
         answer=run.report["answer"],
+        of=run.report["robot"].get("format", "URDF"),
         forces=forces,
         states=_named_states(forces),
         figures={name: figure for name, figure in _figures(run, scene).items() if figure is not None},

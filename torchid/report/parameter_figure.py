@@ -30,7 +30,11 @@ _DERIVED: dict[str, Callable[[Array], Array]] = {
 
 @matplotlib.rc_context(STYLE)
 def parameter_figure(
-    body_names: Sequence[str], nominal: Array, estimate: Estimate, kinds: Collection[str] = ("revolute", "prismatic")
+    body_names: Sequence[str],
+    nominal: Array,
+    estimate: Estimate,
+    kinds: Collection[str] = ("revolute", "prismatic"),
+    of: str = "URDF",
 ) -> Figure:
     """Mass, first moment, inertia and friction of every body with a free parameter.
 
@@ -42,6 +46,7 @@ def parameter_figure(
         nominal: (L, 12), the URDF's parameters.
         estimate: the fit.
         kinds: of the robot's joints, which friction has the unit of.
+        of: what the nominal parameters are from.
     """
     verdict = estimate.verdict.reshape(-1, PER_BODY)
     shown = np.flatnonzero((verdict != FIXED).any(axis=1))
@@ -68,7 +73,7 @@ def parameter_figure(
     first = axes[titles[0]]
     first.set_yticks(range(len(shown)), names, fontsize=7)
     first.set_ylim(len(shown) - 0.4, -0.6)
-    figure.legend(handles=_legend(first, bool(impossible.any())), loc="outside upper right", ncols=4)
+    figure.legend(handles=_legend(first, of, bool(impossible.any())), loc="outside upper right", ncols=4)
     return figure
 
 
@@ -92,10 +97,10 @@ def _draw(axis: Axes, before: Array, after: Array, known: np.ndarray, bars: Arra
     axis.plot(after[negative], rows[negative] + 0.16, "X", color=palette.MEASURED, markersize=6, zorder=3)
 
 
-def _legend(axis: Axes, impossible: bool) -> list[matplotlib.artist.Artist]:
+def _legend(axis: Axes, of: str, impossible: bool) -> list[matplotlib.artist.Artist]:
     """Handles with labels, drawn outside of what is seen."""
-    kinds = [("D", palette.NOMINAL, "none", "URDF"), ("o", palette.IDENTIFIED, palette.IDENTIFIED, "identified, 95 %")]
-    kinds.append(("o", palette.IDENTIFIED, "white", "known in sums, or the URDF's"))
+    kinds = [("D", palette.NOMINAL, "none", of), ("o", palette.IDENTIFIED, palette.IDENTIFIED, "identified, 95 %")]
+    kinds.append(("o", palette.IDENTIFIED, "white", f"known in sums, or the {of}'s"))
     if impossible:
         kinds.append(("X", palette.MEASURED, palette.MEASURED, "cannot exist"))
     return [

@@ -16,7 +16,7 @@ _WIDE = 5.0  # ratio of errors from which on decades tell more than differences
 
 
 @matplotlib.rc_context(STYLE)
-def ridge_figure(choice: RidgeChoice) -> Figure:
+def ridge_figure(choice: RidgeChoice, of: str = "URDF") -> Figure:
     """Mean square of whitened residuals on held-out folds by ridge, on logarithmic axes.
 
     The band is a standard error of the difference from the least, fold by fold, on either side; ridges where it reaches
@@ -55,7 +55,7 @@ def ridge_figure(choice: RidgeChoice) -> Figure:
         axes.yaxis.set_major_formatter(decade_formatter())
         axes.yaxis.set_minor_formatter(NullFormatter())
     axes.set_xlim(tried[shown].min() / 2.0, tried[shown].max() * 2.0)
-    axes.set_xlabel("ridge: weight of the URDF against the mean square of the rows [1]")
+    axes.set_xlabel(f"ridge: weight of the {of} against the mean square of the rows [1]")
     axes.set_ylabel("mean square of whitened residuals\non held-out folds [noise²]")
     figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=8)
     figure.suptitle("Ridge by cross-validation", x=0.01, ha="left")

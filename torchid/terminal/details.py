@@ -28,10 +28,10 @@ def print_details(run: Identification) -> None:
     """Print all tables, and the key figures one per line."""
     estimate, robot = run.estimate, run.experiment.robot
     if run.worse:
-        _print_worse(run.worse)
+        _print_worse(run.worse, robot.format)
     if not run.misfit.explained:
         _print_misfit(run.misfit)
-    print_tables(state_table([asdict(state) for state in run.states]), *error_tables(run.metrics))
+    print_tables(state_table([asdict(state) for state in run.states]), *error_tables(run.metrics, robot.format))
     if 0 < run.evaluated["train"] < run.samples:
         count = f"{run.evaluated['train']} of {run.samples} samples, evenly spaced"
         print_labelled("train", f"errors of forces of {count}")
@@ -59,9 +59,9 @@ def _print_wrapped(text: str, indent: str = "") -> None:
     print(indent + "\n".join(wrap_words(text, terminal_width() - len(indent), "  ")))
 
 
-def _print_worse(worse: list[WorseThanNominal]) -> None:
+def _print_worse(worse: list[WorseThanNominal], of: str) -> None:
     for line in (
-        f"WORSE THAN URDF: {describe_worse(worse)}",
+        f"WORSE THAN {of}: {describe_worse(worse)}",
         f"{ADVICE}; the results are written all the same, status 0",
     ):
         _print_wrapped(line)
@@ -98,7 +98,7 @@ def _print_fit(run: Identification) -> None:
         print_labelled("certified", f"objective within {estimate.certified_gap:.1g} of the other method's")
     if isinstance(estimate, SgdEstimate):
         print_labelled("training", f"{estimate.epochs} epochs, parameters of epoch {estimate.best_epoch}")
-    print_labelled("total mass", f"{run.mass} (URDF: {run.mass.nominal:.3f} kg)")
+    print_labelled("total mass", f"{run.mass} ({robot.format}: {run.mass.nominal:.3f} kg)")
     if run.robust is not None:
         kept = f"{100 * run.robust.mean_weight:.3g} % of the weight kept"
         print_labelled("robust", f"{run.robust.loss}, {kept}, {run.robust.passes} passes")

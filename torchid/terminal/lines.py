@@ -80,10 +80,13 @@ def column_lines(
         shown.pop()
 
 
-def error_lines(errors: Sequence[tuple[str, float, float, float | None]], width: int) -> list[str]:
-    """A small table of the errors of a `Judged`, not wider than so many columns; none without errors."""
+def error_lines(errors: Sequence[tuple[str, float, float, float | None]], width: int, of: str) -> list[str]:
+    """A small table of the errors of a `Judged`, not wider than so many columns; none without errors.
+
+    `of`: what the nominal parameters are those of.
+    """
     columns = [
-        ("URDF", [f"{before:.4g}" for _, before, _, _ in errors]),
+        (of, [f"{before:.4g}" for _, before, _, _ in errors]),
         ("identified", [f"{after:.4g}" for _, _, after, _ in errors]),
         ("noise alone", ["-" if floor is None else f"{floor:.4g}" for *_, floor in errors]),
     ]
