@@ -21,7 +21,7 @@ from torchid.config import load_analysis, load_simulation
 from torchid.logs import write_log
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
-ELSEWHERE = {"python.md", "README.md"}  # whose Python other tests run
+ELSEWHERE = {"python.md", "recipes.md", "README.md"}  # whose Python other tests run
 
 
 def blocks(language: str) -> list[Any]:

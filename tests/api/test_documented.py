@@ -13,13 +13,10 @@ import pytest
 from repository import ROOT
 
 
-@pytest.mark.filterwarnings("ignore:identified.urdf:torchid.errors.TorchidWarning")
-def test_the_page_about_python_runs_and_prints_what_it_shows(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "torchid").symlink_to(ROOT / "torchid")
-    monkeypatch.chdir(tmp_path)
-    page = (ROOT / "docs" / "python.md").read_text()
+def run_page(name: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> tuple[dict[str, Any], int]:
+    """Run a page's Python block by block in a folder with the demo; its names, and how many blocks print."""
+    (folder / "torchid").symlink_to(ROOT / "torchid")
+    page = (ROOT / "docs" / name).read_text()
     said: dict[str, Any] = {}
     printed = 0
     for code, after in re.findall(r"```python\n(.*?)```\n(.*?)(?=```python|\Z)", page, re.DOTALL):
@@ -28,10 +25,28 @@ def test_the_page_about_python_runs_and_prints_what_it_shows(
         shown = re.match(r"\n((?:    .*\n)+)", after)
         assert out == (dedent(shown[1]) if shown else ""), code
         printed += bool(shown)
+    return said, printed
+
+
+@pytest.mark.filterwarnings("ignore:identified.urdf:torchid.errors.TorchidWarning")
+def test_the_page_about_python_runs_and_prints_what_it_shows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    said, printed = run_page("python.md", tmp_path, capsys)
     assert printed == 2
     assert said["knee"].name == "front_left_shank_link"
     assert {path.name for path in tmp_path.iterdir()} == {"torchid", "identified.urdf", "runs"}
     assert [path.name for path in (tmp_path / "runs").iterdir()] == ["from_python"]
+
+
+@pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
+def test_the_recipes_print_what_they_show(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+    monkeypatch.chdir(tmp_path)
+    assert run_page("recipes.md", tmp_path, capsys)[1] == 6
 
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").glob("*.md")]
