@@ -259,9 +259,12 @@ def _demo(options: argparse.Namespace) -> None:
         print(f"written to    {folder}; in the folder above it: torchid identify {folder.name}/{EXPERIMENT.name}")
         return
     run = run_demo(options.overrides, options.output)
-    if not options.quiet:
-        (print_details if options.verbose else print_answer)(run)
-        print(f"experiment    {EXPERIMENT}; to edit a copy: torchid demo --copy FOLDER")
+    experiment = f"experiment    {EXPERIMENT}; to edit a copy: torchid demo --copy FOLDER"
+    if options.verbose:
+        print_details(run)
+        print(experiment)
+    elif not options.quiet:
+        print_answer(run, experiment)
 
 
 def _compress(options: argparse.Namespace) -> None:

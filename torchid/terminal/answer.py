@@ -24,17 +24,18 @@ _LEGEND = {COMBINED: "+ known only in sums with other bodies", PRIOR: "p mostly 
 _MARKS = {IDENTIFIED: " ", COMBINED: "+", PRIOR: "p", UNOBSERVABLE: ".", FIXED: "="}
 
 
-def print_answer(run: Identification) -> None:
-    """Print it for the terminal's width."""
-    print("\n".join(answer_lines(run, terminal_width())))
+def print_answer(run: Identification, *last: str) -> None:
+    """Print it for the terminal's width, with these lines at the end."""
+    print("\n".join(answer_lines(run, terminal_width(), last)))
 
 
-def answer_lines(run: Identification, width: int) -> list[str]:
+def answer_lines(run: Identification, width: int, last: Sequence[str] = ()) -> list[str]:
     """The answer, in lines that are not wider than so many columns.
 
     Args:
         run: a finished one.
         width: of the terminal.
+        last: lines at the end.
     """
     said = answer(run)
     lines = [*wrap_words(said.headline, width), *error_lines(said.errors, width, run.experiment.robot.format), ""]
@@ -44,7 +45,7 @@ def answer_lines(run: Identification, width: int) -> list[str]:
         lines += labelled("attention", one, width, _TEXT_LINES)
     if len(said.attention) > _MOST_ATTENTION:
         lines += labelled("", f"and {len(said.attention) - _MOST_ATTENTION} more: --verbose", width, _TEXT_LINES)
-    end = [f"{'written to':{LABEL}}{run.experiment.config.output}"]
+    end = [f"{'written to':{LABEL}}{run.experiment.config.output}", *last]
     bodies = _body_lines(run.experiment.robot, run.estimate, LINES - len(lines) - len(end) - 1, width)
     return [*lines, *(["", *bodies] if bodies else []), *end]
 
