@@ -72,7 +72,7 @@ def keys_page() -> str:
         parts += [
             f"## {key or 'The file'} {{ #{_anchor(key)} }}",
             inspect.cleandoc(_described(block)),
-            _table(block, first),
+            _table(block, key, first),
         ]
     return "\n\n".join(parts) + "\n"
 
@@ -104,13 +104,65 @@ def _described(block: Any) -> str:
     return re.sub(r"^    (\w+): ", r"- `\1`: ", text.replace("Attributes:\n", "\n"), flags=re.MULTILINE)
 
 
-def _table(block: Any, first: Mapping[Any, str]) -> str:
-    """Its keys."""
+def _table(block: Any, key: str, first: Mapping[Any, str]) -> str:
+    """The keys of a block at some key, with a column of units if any is a number."""
     hints = typing.get_type_hints(block)
-    lines = ["| key | accepts | default |", "|---|---|---|"]
-    for field in dataclasses.fields(block):
-        lines.append(f"| `{field.name}` | {_accepted(hints[field.name], first)} | {_default(field)} |")
-    return "\n".join(lines)
+    rows = [
+        (f"`{field.name}`", _accepted(hints[field.name], first), _default(field), _unit(f"{key}.{field.name}", hints))
+        for field in dataclasses.fields(block)
+    ]
+    width = 4 if any(row[3] for row in rows) else 3
+    lines = [("key", "accepts", "default", "unit"), ("---",) * 4, *rows]
+    return "\n".join(f"| {' | '.join(line[:width])} |" for line in lines)
+
+
+_SUFFIXES = {"_hz": "Hz", "_s": "s", "_seconds": "s", "_gb": "GB", "_deg": "deg"}
+_FRICTION = "N m or N; N m s/rad or N s/m"
+_UNITS = {
+    "robot.weld": "rad or m",
+    "robot.base_tilt": "rad",
+    "sensors.noise.joint_torque": "N m or N",
+    **dict.fromkeys((f"sensors.noise.{x}_force" for x in ("contact", "base", "ft")), "N"),
+    **dict.fromkeys((f"sensors.noise.{x}_moment" for x in ("contact", "base", "ft")), "N m"),
+    "sensors.noise.joint_position": "rad or m",
+    "sensors.noise.joint_velocity": "rad/s or m/s",
+    "sensors.noise.base_orientation": "rad",
+    "sensors.noise.angular_velocity": "rad/s",
+    "sensors.noise.specific_force": "m/s²",
+    "contacts.radius": "m",
+    "preprocessing.max_slip": "m/s",
+    **dict.fromkeys((f"preprocessing.detect_contacts.{x}" for x in ("touch", "lift", "light")), "robot's weight"),
+    **dict.fromkeys((f"preprocessing.contact_threshold.{x}" for x in ("above", "below")), "N"),
+    "actuators.sign_width": "rad/s or m/s",
+    "estimator.bounds": f"kg, kg m, kg m²; {_FRICTION}",
+    "estimator.robust.tuning": "standard deviations",
+    **dict.fromkeys((f"estimator.total_mass.{x}" for x in ("value", "std")), "kg"),
+    **dict.fromkeys((f"estimator.training.{x}" for x in ("epochs", "patience", "evaluate_every")), "epochs"),
+    "estimator.training.batch_size": "samples",
+    "analysis.costs": "cost of a channel",
+    "logs.topics.contact_force_threshold": "N",
+    "logs.topics.low_state.above": "counts",
+    "logs.columns.time.step": "that of `unit`",
+    "logs.columns.joint_position.turn_from": "that of `unit`",
+    "logs.columns.joint_torque.pd.kp.value": "N m/rad or N/m, N m s/rad or N s/m",
+    "logs.columns.contact_active.above": "that of `unit`",
+    "logs.columns.plates.position": "m",
+    "logs.payloads.mass": "kg",
+    "logs.payloads.center_of_mass": "m",
+    "logs.payloads.inertia": "kg m²",
+}
+"""Of keys with numbers by their path; those of `_SUFFIXES` say it themselves, all others are plain numbers."""
+
+
+def _unit(key: str, hints: Mapping[str, Any]) -> str:
+    """The unit of a key at a path; "1" for plain numbers and counts, nothing for what is no number."""
+    name = key.rpartition(".")[2]
+    known = _UNITS.get(key) or next((unit for end, unit in _SUFFIXES.items() if name.endswith(end)), "")
+    return known or ("1" if _has_numbers(hints[name]) else "")
+
+
+def _has_numbers(hint: Any) -> bool:
+    return hint in (int, float) or any(_has_numbers(part) for part in typing.get_args(hint))
 
 
 _PLAIN = {bool: "`true`, `false`", int: "integer", float: "number", str: "text", Path: "path", type(None): "`null`"}

@@ -107,6 +107,8 @@ def _add_uses_of_runs(commands: _Commands) -> None:
     evaluate.add_argument(
         "--log", action="append", required=True, metavar="FILE", help="log to evaluate; may be repeated"
     )
+    evaluate.add_argument("--output", metavar="FOLDER", help="folder to write (default: RUN/evaluation/LOG)")
+    evaluate.add_argument("--overwrite", action="store_true", help="replace an earlier evaluation in this folder")
     evaluate.add_argument("--device", help="device, by default that of the run: cpu, cuda, cuda:0, ...")
     _add_amount(evaluate)
     evaluate.set_defaults(command=_evaluate)
@@ -257,9 +259,12 @@ def _demo(options: argparse.Namespace) -> None:
         print(f"written to    {folder}; in the folder above it: torchid identify {folder.name}/{EXPERIMENT.name}")
         return
     run = run_demo(options.overrides, options.output)
-    if not options.quiet:
-        (print_details if options.verbose else print_answer)(run)
-        print(f"experiment    {EXPERIMENT}; to edit a copy: torchid demo --copy FOLDER")
+    experiment = f"experiment    {EXPERIMENT}; to edit a copy: torchid demo --copy FOLDER"
+    if options.verbose:
+        print_details(run)
+        print(experiment)
+    elif not options.quiet:
+        print_answer(run, experiment)
 
 
 def _compress(options: argparse.Namespace) -> None:
@@ -282,7 +287,7 @@ def _evaluate(options: argparse.Namespace) -> None:
         from torchid.commands.evaluate import evaluate
         from torchid.terminal.evaluation import print_all_errors, print_evaluation
 
-    evaluated = evaluate(options.run, options.log, options.device)
+    evaluated = evaluate(options.run, options.log, options.device, True, options.output, options.overwrite)
     if not options.quiet:
         (print_all_errors if options.verbose else print_evaluation)(evaluated)
 

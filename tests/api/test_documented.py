@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import re
+from functools import cache
 from pathlib import Path
 from textwrap import dedent
 from typing import Any
@@ -11,13 +13,10 @@ import pytest
 from repository import ROOT
 
 
-@pytest.mark.filterwarnings("ignore:identified.urdf:torchid.errors.TorchidWarning")
-def test_the_page_about_python_runs_and_prints_what_it_shows(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "torchid").symlink_to(ROOT / "torchid")
-    monkeypatch.chdir(tmp_path)
-    page = (ROOT / "docs" / "python.md").read_text()
+def run_page(name: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> tuple[dict[str, Any], int]:
+    """Run a page's Python block by block in a folder with the demo; its names, and how many blocks print."""
+    (folder / "torchid").symlink_to(ROOT / "torchid")
+    page = (ROOT / "docs" / name).read_text()
     said: dict[str, Any] = {}
     printed = 0
     for code, after in re.findall(r"```python\n(.*?)```\n(.*?)(?=```python|\Z)", page, re.DOTALL):
@@ -26,10 +25,28 @@ def test_the_page_about_python_runs_and_prints_what_it_shows(
         shown = re.match(r"\n((?:    .*\n)+)", after)
         assert out == (dedent(shown[1]) if shown else ""), code
         printed += bool(shown)
+    return said, printed
+
+
+@pytest.mark.filterwarnings("ignore:identified.urdf:torchid.errors.TorchidWarning")
+def test_the_page_about_python_runs_and_prints_what_it_shows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    said, printed = run_page("python.md", tmp_path, capsys)
     assert printed == 2
     assert said["knee"].name == "front_left_shank_link"
     assert {path.name for path in tmp_path.iterdir()} == {"torchid", "identified.urdf", "runs"}
     assert [path.name for path in (tmp_path / "runs").iterdir()] == ["from_python"]
+
+
+@pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
+def test_the_recipes_print_what_they_show(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+    monkeypatch.chdir(tmp_path)
+    assert run_page("recipes.md", tmp_path, capsys)[1] == 6
 
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").glob("*.md")]
@@ -54,3 +71,39 @@ def test_links_between_pages_lead_somewhere(page: Path) -> None:
 
 def test_the_readme_stays_short() -> None:
     assert len((ROOT / "README.md").read_text().splitlines()) <= 120
+
+
+# --------------------------------------------------------------------------------------------------- troubleshooting
+
+
+def messages() -> list[str]:
+    """What the page on troubleshooting quotes."""
+    page = (ROOT / "docs" / "troubleshooting.md").read_text()
+    return re.findall(r"^\| `([^|]+)` \|", page, re.MULTILINE)
+
+
+@cache
+def said_by_the_code() -> list[str]:
+    """Every text in the package; "…" stands for what is filled in."""
+    texts = []
+    for file in (ROOT / "torchid").rglob("*.py"):
+        nodes = list(ast.walk(ast.parse(file.read_text())))
+        descriptions = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+        for node in (node for node in nodes if id(node) not in descriptions):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                texts.append(node.value)
+            elif isinstance(node, ast.JoinedStr):
+                parts = (x.value if isinstance(x, ast.Constant) else "…" for x in node.values)
+                texts.append("".join(map(str, parts)))
+    return texts
+
+
+@pytest.mark.parametrize("message", messages())
+def test_messages_that_are_explained_are_said(message: str) -> None:
+    pattern = ".*".join(re.escape(part) for part in message.split("…"))
+    assert any(re.search(pattern, text) for text in said_by_the_code()), "in no text of the package"
+
+
+def test_the_page_explains_what_users_meet_most() -> None:
+    assert len(messages()) >= 25
+    assert len(set(messages())) == len(messages())

@@ -17,6 +17,7 @@ ROOT = Path(torchid.__file__).resolve().parents[1]
 KEYS = ("estimator.ridge", "preprocessing.cutoff_hz", "logs.columns.joint_torque.pd", "sensors.noise.joint_torque")
 
 pytest.importorskip("material", reason="MkDocs is not installed")
+site_pages = pytest.importorskip("site_pages")
 
 
 @pytest.fixture(scope="module")
@@ -49,6 +50,23 @@ def test_keys_have_what_they_accept_and_their_defaults(site: Path, key: str) -> 
     assert row is not None
     default = re.sub(r"<[^>]+>", "", row.group(2))
     assert default == {"ridge": "auto"}.get(name, "null")
+
+
+def test_every_number_of_the_file_has_a_unit() -> None:
+    """In the table, by the key's path; and no unit is that of a key that there is not."""
+    units = {}
+    for section in site_pages.keys_page().split("\n## ")[1:]:
+        key = section.split()[0]
+        for line in re.findall(r"^\| `(\w+)` \| (.*) \|$", section, re.MULTILINE):
+            cells = re.split(r"(?<!\\) \| ", line[1])
+            units[f"{key}.{line[0]}"] = (cells[0], cells[2].strip() if len(cells) > 2 else "")
+    assert site_pages._UNITS.keys() <= units.keys()
+    for key, (accepted, unit) in units.items():
+        assert bool(unit) is bool(re.search(r"number|integer", accepted)), f"{key}: {accepted}, {unit}"
+    assert units["preprocessing.cutoff_hz"][1] == "Hz"
+    assert units["estimator.total_mass.std"][1] == "kg"
+    assert units["sensors.noise.angular_velocity"][1] == "rad/s"
+    assert units["estimator.ridge"][1] == "1"
 
 
 def test_public_names_are_described(site: Path) -> None:

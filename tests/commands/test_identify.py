@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from loadable import assert_loads
 from repository import CONFIGS, DEMO, SHARED
 from run_folders import names_in
 from synthetic import Oracle, random_states
@@ -52,6 +53,10 @@ def test_a_run_folder_holds_what_it_promises(run: Path) -> None:
         "contributions",
     }
     assert names_in(run.parent) == [run.name], "temporary folders left behind"
+
+
+def test_simulators_take_the_robot_that_a_run_writes(run: Path) -> None:
+    assert_loads(run / "identified.urdf", json.loads((run / "metrics.json").read_text())["total_mass"])
 
 
 def test_resolved_config_reads_back_as_itself(run: Path) -> None:
@@ -314,6 +319,7 @@ def test_force_plates_alone_identify_a_person_who_then_squats_differently(tmp_pa
     assert metrics["test"]["base_force_rms_relative"] <= 0.02
     assert metrics["test_nominal"]["base_force_rms_relative"] == pytest.approx(0.048, abs=0.001)
     assert abs(metrics["total_mass"] - 60.03) <= 0.5
+    assert_loads(tmp_path / "run" / "identified.urdf", metrics["total_mass"])
     assert metrics["test"]["joint_torque_rms"] is None
     assert metrics["test"]["nullspace_rms"] is None
 
@@ -326,3 +332,5 @@ def test_a_bolted_arm_is_identified_from_its_joint_torques(tmp_path: Path) -> No
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert metrics["test"]["joint_torque_rms"] < 0.5 * metrics["test_nominal"]["joint_torque_rms"]
     assert metrics["test"]["base_force_rms"] is None
+    bodies = json.loads((tmp_path / "run" / "parameters.json").read_text())["bodies"]
+    assert_loads(tmp_path / "run" / "identified.urdf", sum(body["identified"]["m"] for body in bodies))

@@ -14,11 +14,13 @@ import yaml
 pytest.importorskip("mujoco", reason="MuJoCo is not installed")
 
 from demo import DEMO
+from pages import figures_of
 
 import torchid
 from torchid.cli import main
 from torchid.commands.export import FORMATS, export
 from torchid.commands.reading import LogReader
+from torchid.commands.report import report
 from torchid.config import load_config
 from torchid.errors import ConfigError
 from torchid.fitting.experiment import set_up
@@ -46,6 +48,37 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         own = settings | {"robot": {"urdf": None, key: file}, "output": out[key]}
         torchid.identify(DEMO / "quadruped.yaml", **own)
     return out
+
+
+@pytest.mark.parametrize(("key", "other"), [("mjcf", "URDF"), ("urdf", "MJCF")])
+def test_the_page_of_a_run_names_the_robot_s_file(runs: dict[str, Path], key: str, other: str) -> None:
+    """In its tables, lines and points, above what the checks of the logs say."""
+    pytest.importorskip("plotly", reason="the extra [report] is not installed")
+    pytest.importorskip("jinja2", reason="the extra [report] is not installed")
+    report(runs[key])
+    page = (runs[key] / "report.html").read_text()
+    answer = re.sub(r"<script.*?</script>", "", page.partition("Data quality")[0], flags=re.DOTALL)
+    named = json.dumps(figures_of(page)) + answer
+    assert f"{key.upper()}'s" in named
+    assert other not in named
+
+
+def test_what_an_mjcf_robot_is_compared_with_is_called_mjcf(
+    runs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In sentences, tables and the page, the same words as of a URDF otherwise."""
+    said = {}
+    for key, run in runs.items():
+        for words in (["evaluate", str(run)], ["evaluate", str(run), "--verbose"], ["replay", str(run)]):
+            assert main([*words, "--log", str(DEMO / "sway_test.npz")]) == 0
+        said[key] = re.sub(r"written to.*|[\d.]+(e[+-]\d+)?", "", capsys.readouterr().out).split()
+        answer = json.loads((run / "report.json").read_text())["answer"]
+        said[key] += [word for text in (answer["headline"], answer["total_mass"]) for word in text.split()[:5]]
+        said[key] += repr(torchid.evaluate(run, DEMO / "sway_test.npz")).split()[:6]
+    assert "URDF" in " ".join(said["urdf"])
+    assert "URDF" not in " ".join(said["mjcf"])
+    words = [re.sub("[^A-Za-z]", "", word.replace("URDF", "MJCF")) for word in said["urdf"]]
+    assert [re.sub("[^A-Za-z]", "", word) for word in said["mjcf"]] == words
 
 
 def identified(run: Path) -> np.ndarray:

@@ -73,3 +73,8 @@ def test_the_figure_has_errors_without_a_band_where_the_noise_is_unknown() -> No
         for errors in force_figure(series(noise), ["knee", "hip"], 0).axes[1::2]:
             assert not errors.collections
             assert errors.get_title(loc="left") == "rms 0.1 [N m]"
+
+
+def test_a_sliding_joint_s_torque_is_shown_as_a_force() -> None:
+    shown = force_figure(series(None), ["knee", "rail"], 0, ["rail"])
+    assert [axis.get_ylabel() for axis in shown.axes[::2]] == ["[N m]", "[N]"]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from demo import shortened_demo
 from matplotlib.image import imread
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from torchid.cli import main
 
@@ -25,3 +26,41 @@ def test_each_figure_of_a_run_and_of_an_evaluation_is_drawn(tmp_path: Path) -> N
         picture = imread(path)[..., :3]
         assert min(picture.shape[:2]) > 200
         assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 5, "lines, letters and their smooth edges"
+
+
+_BEGINS = {"pdf": b"%PDF-1.", "svg": b"<?xml"}
+
+
+@pytest.mark.usefixtures("figures")
+@pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
+@pytest.mark.parametrize("form", ["pdf", "svg"])
+def test_figures_for_print_are_the_same_files_each_time_and_tensorboard_keeps_its_pictures(
+    form: str, tmp_path: Path
+) -> None:
+    demo, run = shortened_demo(tmp_path / "demo", 300), tmp_path / "run"
+    log, experiment = demo / "sway_test.npz", str(demo / "quadruped.yaml")
+    given = [f"figures.format={form}", "estimator.name=consistent"]
+    assert main(["identify", experiment, f"output={run}", *given]) == 0
+    assert main(["evaluate", str(run), "--log", str(log)]) == 0
+    assert main(["replay", str(run), "--log", str(log), "--output", str(tmp_path / "replay")]) == 0
+    assert main(["analyze", experiment, f"output={tmp_path / 'other'}", *given]) == 0
+    written = list(tmp_path.rglob(f"*.{form}"))
+    assert {path.stem for path in written} == {*_RUN, "drift", "sensors-logs", "accuracy"}
+    assert len(written) == len(_RUN) + 5
+    for path in written:
+        assert path.read_bytes().startswith(_BEGINS[form])
+    assert not list(tmp_path.rglob("*.png"))
+    pictures = EventAccumulator(str(run), size_guidance={"images": 0}).Reload()
+    assert set(pictures.Tags()["images"]) == set(_RUN)
+    assert min(pictures.Images("forces")[0].height, pictures.Images("forces")[0].width) > 200
+    again = tmp_path / "again"
+    assert main(["identify", experiment, f"output={again}", *given]) == 0
+    assert (again / f"parameters.{form}").read_bytes() == (run / f"parameters.{form}").read_bytes()
+
+
+def test_a_format_that_is_none_is_refused_with_those_that_are(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    demo = shortened_demo(tmp_path / "demo", 50)
+    assert main(["identify", str(demo / "quadruped.yaml"), "figures.format=bmp"]) == 2
+    assert "figures.format: found 'bmp'" in capsys.readouterr().err

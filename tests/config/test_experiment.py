@@ -61,6 +61,7 @@ ALL: dict[str, Any] = {
         "prior_error": 0.1,
         "seed": 3,
     },
+    "figures": {"format": "svg"},
     "output": "runs/all",
     "device": "cuda:1",
     "overwrite": True,
@@ -98,7 +99,7 @@ def test_every_key_of_the_file_arrives(file: Path) -> None:
     (compared,) = config["analysis"]["compare"].values()
     assert compared.pop("set") is None
     assert compared.pop("ft_sensors") == []
-    for name in ("contacts", "preprocessing", "sensors", "actuators", "estimator", "analysis", "device", "overwrite"):
+    for name in ALL.keys() - {"robot", "logs", "output"}:
         expected = ALL[name]
         if name == "contacts":
             expected = [{"line_axis": "y", "radius": "auto", "normal": None} | contact for contact in expected]

@@ -17,7 +17,8 @@ from torchid.errors import ConfoundedWarning, about_file
 from torchid.fitting.calibration import warn_of_confounded
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.problem.extras import Extra
-from torchid.report.figures import STYLE, extra_figure, save_figure
+from torchid.report.extra_figure import extra_figure
+from torchid.report.figures import STYLE, save_figure
 from torchid.report.tables import extra_table
 
 
@@ -124,3 +125,15 @@ def test_a_png_is_what_savefig_draws_in_two_passes(tmp_path: Path) -> None:
     with matplotlib.rc_context(STYLE):
         extra_figure(of_logs(2, 3)).savefig(tmp_path / "drawn.png", dpi=130)
     assert (tmp_path / "saved.png").read_bytes() == (tmp_path / "drawn.png").read_bytes()
+
+
+def test_confounded_values_leave_room_for_those_that_are_known() -> None:
+    known = [replace(found("stiffness", f"j{k}", "", "N m/rad"), value=0.1 * k) for k in range(3)]
+    far = replace(found("stiffness", "far", "", "N m/rad"), value=-70.0, inflation=1e9, confounded_with=("m of trunk",))
+    (whole,), (cut,) = (extra_figure(extras).axes for extras in (known, [*known, far]))
+    assert not whole.texts
+    assert -1.0 < cut.get_xlim()[0] < -0.196
+    assert 0.396 < cut.get_xlim()[1] < 1.0
+    assert [text.get_text() for text in cut.texts] == ["◂ -70"]
+    assert cut.get_xlabel() == "stiffness [N m/rad]"
+    assert not cut.figure.legends, "all logs alone need no key"

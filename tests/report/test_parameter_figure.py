@@ -34,6 +34,19 @@ def drawn(change: Any = lambda phi: None) -> tuple[Figure, np.ndarray, np.ndarra
     return parameter_figure(NAMES, nominal, estimate), phi, errors
 
 
+def test_friction_has_the_unit_of_the_robot_s_joints() -> None:
+    nominal = random_bodies(np.random.default_rng(0), 1)
+    shape = np.full(nominal.size, IDENTIFIED, dtype=object)
+    estimate: Any = SimpleNamespace(phi=nominal.ravel(), standard_error=np.ones(nominal.size), verdict=shape)
+    for kinds, unit in (
+        ({"revolute", "fixed"}, "[N m]"),
+        ({"prismatic"}, "[N]"),
+        ({"prismatic", "revolute"}, "[N m or N]"),
+    ):
+        labels = [axis.get_xlabel() for axis in parameter_figure(["body"], nominal, estimate, kinds).axes]
+        assert f"Coulomb friction {unit}" in labels
+
+
 def bars(figure: Figure, title: str) -> np.ndarray:
     """Ends of the error bars of a panel, (n, 2)."""
     (axis,) = (axis for axis in figure.axes if axis.get_xlabel().startswith(title))

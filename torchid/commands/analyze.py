@@ -37,7 +37,7 @@ from torchid.report.analysis import (
     observability_document,
     sensor_plan_document,
 )
-from torchid.report.figures import save_figure, tree_figure
+from torchid.report.figures import save_figures, tree_figure
 from torchid.report.tables import progress_bars
 from torchid.reprs import short_repr
 from torchid.sensing import Contact, SensorSet
@@ -335,8 +335,7 @@ def write_analysis(analysis: Analysis, output: Path, overwrite: bool = False) ->
         (folder / "config.yaml").write_text(dump_config(scene.config))
         write_json(folder / "analysis.json", analysis.to_dict())
         (folder / "base_parameters.txt").write_text("\n\n".join(texts))
-        for name, figure in figures.items():
-            save_figure(figure, folder / f"{name}.png")
+        save_figures(figures, folder, scene.config.figures.format)
 
 
 def _picture(scene: Scene, scenario: ScenarioAnalysis) -> Figure:

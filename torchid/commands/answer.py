@@ -6,14 +6,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from torchid import parameters
 from torchid.commands.verdict import Judged
 from torchid.errors import join_names
 from torchid.estimators import Estimate
 from torchid.fitting.calibration import list_confounded
 from torchid.logs.time_range import log_title
-from torchid.parameters import PER_BODY
 from torchid.problem.metrics import ADVICE, describe_worse
+from torchid.report.loadable_urdf import massless_ends
 from torchid.report.tables import noise_advice
 
 if TYPE_CHECKING:
@@ -46,26 +45,27 @@ def answer(run: Identification) -> Answer:
     return Answer(
         headline=_headline(run, judged),
         errors=judged.shown_errors(),
-        total_mass=f"{run.mass} (URDF: {run.mass.nominal:.3f} kg)",
+        total_mass=f"{run.mass} ({run.experiment.robot.format}: {run.mass.nominal:.3f} kg)",
         bodies=_bodies_text(run),
         attention=list(_attention(run)),
     )
 
 
 def _judge(run: Identification) -> Judged:
+    of = run.experiment.robot.format
     if "test" in run.metrics:
         names = [log_title(path) for path in run.experiment.config.logs.test]
         text = f"unseen motion ({join_names(names, 2)})"
-        return Judged(text, run.metrics["test"].nominal, run.metrics["test"].identified)
+        return Judged(text, run.metrics["test"].nominal, run.metrics["test"].identified, of)
     if run.validation is not None:
         text = f"blocks of the training logs, each left out of the fit ({run.validation.folds})"
-        return Judged(text, run.validation.nominal, run.validation.identified)
-    return Judged("the training logs themselves", run.metrics["train"].nominal, run.metrics["train"].identified)
+        return Judged(text, run.validation.nominal, run.validation.identified, of)
+    return Judged("the training logs themselves", run.metrics["train"].nominal, run.metrics["train"].identified, of)
 
 
 def _headline(run: Identification, judged: Judged) -> str:
     if run.worse:
-        return f"WORSE THAN URDF: {describe_worse(run.worse)}"
+        return f"WORSE THAN {judged.of}: {describe_worse(run.worse)}"
     return judged.headline(explained=run.misfit.explained)
 
 
@@ -76,11 +76,9 @@ def _bodies_text(run: Identification) -> str:
             names.append(robot.body_names[one.body])
     count = len(robot.body_names)
     if all(one.term is not None for one in run.violations):
-        mass = run.estimate.phi.reshape(-1, PER_BODY)[:, parameters.MASS]
-        moving = slice(int(run.experiment.config.robot.fixed_base), None)
-        empty = [name for name, x in zip(robot.body_names[moving], mass[moving], strict=True) if not x]
-        if empty:
-            return f"all that have mass can exist; MuJoCo refuses those that move without: {join_names(empty)}"
+        ends = massless_ends(robot, run.phi)
+        if ends:
+            return f"all that have mass can exist; MuJoCo refuses joints that move none: {join_names(ends)}"
         return f"all {count} can exist, and simulators take them"
     which = f"{len(names)} of {count}" if names else "all together"
     advice = "; estimator.name=consistent finds the best that can" if type(run.estimate) is Estimate else ""

@@ -26,7 +26,7 @@ from torchid.parameters import Array
 from torchid.problem import Metrics
 from torchid.problem.chunks import one_thread
 from torchid.problem.metrics import DECISIVE_GROUPS, describe_errors
-from torchid.report.figures import error_figure, save_figure
+from torchid.report.figures import error_figure, save_figures
 from torchid.report.forces import ForceSeries
 from torchid.report.parameter_files import read_parameters, read_shared_extras
 from torchid.report.tables import progress_bars
@@ -63,7 +63,7 @@ class EvaluatedRun:
             for group in DECISIVE_GROUPS
             if pair.identified.rms.get(group) is not None
         ]
-        return f"identified against URDF; {'; '.join(texts)}"
+        return f"identified against {self.robot.format}; {'; '.join(texts)}"
 
     def to_dict(self) -> dict[str, dict[str, object]]:
         """What `metrics.json` has, by name of a log."""
@@ -94,29 +94,40 @@ class FittedRun:
 
 @one_thread()
 def evaluate(
-    run: str | Path, logs: Sequence[str | Path], device: str | None = None, write: bool = True
+    run: str | Path,
+    logs: Sequence[str | Path],
+    device: str | None = None,
+    write: bool = True,
+    output: str | Path | None = None,
+    overwrite: bool = False,
 ) -> EvaluatedRun:
     """Evaluate nominal and identified parameters; of processes that share the work, the first writes.
 
-    Results go to `RUN/evaluation/<name of the first log>` and replace an earlier evaluation of that name.
+    Results go to `RUN/evaluation/<name of the first log>` and replace an earlier evaluation of that name, or to
+    `output`.
 
     Args:
         run: folder that `identify` wrote.
         logs: log files, or parts of them (`walk.npz[30:]`), preprocessed as the run's own were.
         device: where to compute; None: where the run did.
         write: whether results are written at all.
+        output: folder to write.
+        overwrite: whether an evaluation that stands there may be replaced.
 
     Raises:
-        InputError: the folder is no run, or a log does not fit its robot.
+        InputError: the folder is no run, a log does not fit its robot, or `output` may not be replaced.
     """
     folder = Path(run)
     require_run(folder)
-    output = _output(folder, logs) if write else None
+    given, replaces = None if output is None else Path(output), output is None or overwrite
+    place = _output(folder, logs, given, replaces) if write else None
     with progress_bars() as bars:
         fitted = read_run(folder, device)
-        evaluated = replace(_evaluate(fitted, logs, folder, bars), output=output)
-        if output is not None:
-            ranks.from_first(partial(_write, evaluated, output, folder / _SETTINGS), "evaluation folder")
+        evaluated = replace(_evaluate(fitted, logs, folder, bars), output=place)
+        if place is not None:
+            form = fitted.experiment.config.figures.format
+            write_there = partial(_write, evaluated, place, folder / _SETTINGS, form, replaces)
+            ranks.from_first(write_there, "evaluation folder")
     return evaluated
 
 
@@ -206,13 +217,16 @@ def _calibrations(experiment: Experiment, phi: Array, shared: Comparison[dict[st
     return Comparison(nominal, identified)
 
 
-def _write(evaluated: EvaluatedRun, output: Path, config: Path) -> None:
-    """Write the folder, beside the settings of the run."""
-    with during("writing", output), new_folder(output, True, EVALUATION) as new:
+def _write(evaluated: EvaluatedRun, output: Path, config: Path, form: str, overwrite: bool) -> None:
+    """Write the folder, beside the settings of the run, with figures in a format."""
+    with during("writing", output), new_folder(output, overwrite, EVALUATION) as new:
         (new / "config.yaml").write_bytes(read_bytes(config, MAX_YAML))
         write_json(new / "metrics.json", evaluated.to_dict())
-        save_figure(draw_forces(evaluated.forces, evaluated.robot), new / "forces.png")
-        save_figure(error_figure(evaluated.metrics), new / "errors.png")
+        figures = {
+            "forces": draw_forces(evaluated.forces, evaluated.robot),
+            "errors": error_figure(evaluated.metrics, evaluated.robot.format),
+        }
+        save_figures(figures, new, form)
 
 
 def _log_names(logs: Sequence[str | Path]) -> list[str]:
@@ -230,20 +244,22 @@ def _log_names(logs: Sequence[str | Path]) -> list[str]:
     return names
 
 
-def _output(run: Path, logs: Sequence[str | Path]) -> Path:
-    """The folder of an evaluation of some logs.
+def _output(run: Path, logs: Sequence[str | Path], given: Path | None, overwrite: bool) -> Path:
+    """The folder of an evaluation of some logs, in that of the run if none is given.
 
     Raises:
         ConfigError: two logs have one name, it is of dots alone, or something else stands where results go.
     """
     name = _log_names(logs)[0]
-    if name in (".", ".."):
+    if given is None and name in (".", ".."):
         raise ConfigError.at_field("logs", f"'{logs[0]}', whose name is of dots alone", "another name of the file")
-    output = run / RUN.inner_folder / name
+    output = run / RUN.inner_folder / name if given is None else given
+    inputs = [file.path for log in logs for file in split_range(log).files]
 
     def check() -> None:
-        refuse_link(output.parent)
-        check_free(output, True, EVALUATION, [file.path for log in logs for file in split_range(log).files])
+        if given is None:
+            refuse_link(output.parent)
+        check_free(output, overwrite, EVALUATION, inputs if given is None else [run, *inputs])
 
     ranks.from_first(check, "output")
     return output

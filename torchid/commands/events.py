@@ -16,20 +16,19 @@ if TYPE_CHECKING:
     from torchid.commands.results import Identification
 
 
-def write_events(run: Identification, folder: Path, figures: Mapping[str, Path]) -> None:
+def write_events(run: Identification, folder: Path, figures: Mapping[str, bytes]) -> None:
     """Write errors, losses, verdicts, settings and figures of a run; a descent has written its epochs before.
 
     Args:
         run: a finished one.
         folder: of its files.
-        figures: PNG files by name.
+        figures: PNG by name.
     """
     from torchid.report.tensorboard import RunEvents  # takes 0.3 s, which runs that write nothing need not
 
     estimate, robot, config = run.estimate, run.experiment.robot, run.experiment.config
     epochs = estimate.epochs if isinstance(estimate, SgdEstimate) else None
     last = 1 if epochs is None else epochs
-    first = last if epochs is None else 0  # step of the URDF's parameters
     with RunEvents(folder, robot.body_names, epochs is not None) as events:
         if epochs is None:
             for nominal, phi in ((True, robot.nominal.flatten()), (False, estimate.phi)):
@@ -41,11 +40,12 @@ def write_events(run: Identification, folder: Path, figures: Mapping[str, Path])
                 events.write_eigenvalues(last, body_eigenvalues(robot, phi), nominal=nominal)
             events.write_solution(estimate, None if run.factors else run.samples / run.seconds["compress"])
         else:  # what was not worked out by epoch
-            for step, which in ((0, 0), (epochs, 1)):
-                events.write_errors(step, {name: pair[which] for name, pair in run.metrics.items()}, (WHITENED,))
+            for nominal, which in ((True, 0), (False, 1)):
+                found = {name: pair[which] for name, pair in run.metrics.items()}
+                events.write_errors(last, found, (WHITENED,), nominal=nominal, by_epoch=False)
         if run.validation is not None:
-            events.write_errors(first, {"left_out": run.validation.nominal}, nominal=True)
-            events.write_errors(last, {"left_out": run.validation.identified})
+            events.write_errors(last, {"left_out": run.validation.nominal}, nominal=True, by_epoch=False)
+            events.write_errors(last, {"left_out": run.validation.identified}, by_epoch=False)
         if run.ridge is not None:
             events.write_ridges(run.ridge)
         events.write_verdict(last, describe_worse(run.worse) or "nowhere worse than the URDF's parameters")
@@ -66,7 +66,10 @@ def write_events(run: Identification, folder: Path, figures: Mapping[str, Path])
 
 
 def _hyperparameters(config: ExperimentConfig) -> dict[str, str | float | bool]:
-    """The same keys for every estimator: TensorBoard compares runs by the keys of the first that it finds."""
+    """The same keys for every estimator: TensorBoard compares runs by the keys of the first that it finds.
+
+    It shows the first five by name at first: those of a descent, which most runs have not, come after them.
+    """
     estimator, training = config.estimator, config.estimator.training
     descent = estimator.name == "sgd"
     return {
@@ -78,10 +81,10 @@ def _hyperparameters(config: ExperimentConfig) -> dict[str, str | float | bool]:
         "margin": 0.0 if estimator.name == "least_squares" else estimator.margin,
         "prior": estimator.prior,
         "consistency": estimator.consistency if descent else estimator.name,
-        "optimizer": training.optimizer["name"] if descent else "none",
-        "lr": float(training.optimizer.get("lr", 0.0)) if descent else 0.0,
-        "schedule": (training.schedule or {}).get("name", "none") if descent else "none",
-        "batch_size": training.batch_size if descent else 0,
-        "epochs": training.epochs if descent else 0,
-        "seed": training.seed if descent else 0,
+        "training.optimizer": training.optimizer["name"] if descent else "none",
+        "training.lr": float(training.optimizer.get("lr", 0.0)) if descent else 0.0,
+        "training.schedule": (training.schedule or {}).get("name", "none") if descent else "none",
+        "training.batch_size": training.batch_size if descent else 0,
+        "training.epochs": training.epochs if descent else 0,
+        "training.seed": training.seed if descent else 0,
     }

@@ -149,7 +149,7 @@ class BodyEstimate(BodyValues):
 
     def __repr__(self) -> str:
         moved = f", moved by {self.joint}" if self.joint else ""
-        lines = [f"{self.name}{moved}: identified (URDF) ± standard error, verdict"]
+        lines = [f"{self.name}{moved}: identified (nominal) ± standard error, verdict"]
         for name, value, unit in self._lines():
             error = self.standard_error[name]
             known = f" ± {error:.2g}" if np.isfinite(error) else ""
@@ -190,14 +190,14 @@ def run_lines(run: Identification) -> list[str]:
     said = [("data", f"{format_count(run.samples, 'sample')} of {format_count(len(config.logs.train), 'log')}")]
     said += [("parameters", f"{estimate.phi.size}: {counts}")]
     if not robot.fixed_base:
-        said.append(("total mass", f"{run.mass} (URDF: {run.mass.nominal:.3f} kg)"))
+        said.append(("total mass", f"{run.mass} ({robot.format}: {run.mass.nominal:.3f} kg)"))
     sets = {name: (pair.identified, pair.nominal) for name, pair in run.metrics.items()}
     if run.validation is not None:
         sets["left out"] = (run.validation.identified, run.validation.nominal)
     for name, (identified, nominal) in sets.items():
         texts = (describe_errors(group, identified.rms.get(group), nominal.rms.get(group)) for group in DECISIVE_GROUPS)
         said.append((name, "; ".join(filter(None, texts))))
-    trouble = [*([f"WORSE THAN URDF: {describe_worse(run.worse)}"] if run.worse else []), str(run.misfit)]
+    trouble = [*([f"WORSE THAN {robot.format}: {describe_worse(run.worse)}"] if run.worse else []), str(run.misfit)]
     said += [("attention", "; ".join(filter(None, trouble)))] if any(trouble) else []
     said.append(("written to", str(config.output or "no folder: write(folder), to_urdf(file)")))
     of = f"{robot.path.name}, {len(run)} bodies, {format_count(robot.n, 'joint')}, by {config.estimator.name}"

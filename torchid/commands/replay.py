@@ -21,7 +21,7 @@ from torchid.problem.chunks import one_thread
 from torchid.problem.extras import ACTUATORS
 from torchid.report import identified_name
 from torchid.report.drift_figure import drift_figure
-from torchid.report.figures import save_figure
+from torchid.report.figures import save_figures
 from torchid.report.tables import progress_bars
 from torchid.reprs import short_repr
 from torchid.robot import Robot
@@ -44,6 +44,7 @@ class Replay:
         drift: with the robot's file, which has no offsets and, a URDF, no armature, and with what was identified.
         joint_names: of the robot.
         units: of the joints' positions, "rad" or "m".
+        of: what the robot's file is, "URDF" or "MJCF".
         output: the folder that it was written to, if any.
     """
 
@@ -53,13 +54,14 @@ class Replay:
     drift: Comparison[Drift]
     joint_names: tuple[str, ...]
     units: tuple[str, ...]
+    of: str
     output: Path | None = None
 
     __repr__ = short_repr
 
     def _headline(self) -> str:
         texts = [f"{name} {before:.3g} and {after:.3g}" for name, (before, after) in self.at(self.window).items()]
-        return f"{self.source}, drift after {self.window:g} s, URDF against identified: {'; '.join(texts)}"
+        return f"{self.source}, drift after {self.window:g} s, {self.of} against identified: {'; '.join(texts)}"
 
     def quartiles(self) -> dict[str, Comparison[Array]]:
         """Quartiles over windows of the drift, (3, T), by what drifts and its unit.
@@ -156,19 +158,22 @@ def replay(
         drift=Comparison(nominal, identified),
         joint_names=robot.joint_names,
         units=tuple(_UNITS[kind] for kind in _joint_kinds(robot)),
+        of=robot.format,
         output=out,
     )
     if out is not None:
         with during("writing", out), new_folder(out, overwrite, REPLAY) as new:
-            _write(found, new)
+            _write(found, new, fitted.experiment.config.figures.format)
     return found
 
 
-def _write(found: Replay, folder: Path) -> None:
-    """Write all numbers and the figure of a replay."""
+def _write(found: Replay, folder: Path, form: str) -> None:
+    """Write all numbers and the figure of a replay, in a format."""
     write_json(folder / "replay.json", found.to_dict())
-    figure = drift_figure(found.source, found.drift.nominal.time, found.quartiles(), found.by_joint(), found.units)
-    save_figure(figure, folder / "drift.png")
+    figure = drift_figure(
+        found.source, found.drift.nominal.time, found.quartiles(), found.by_joint(), found.units, found.of
+    )
+    save_figures({"drift": figure}, folder, form)
 
 
 def _require_simple(fitted: FittedRun) -> None:

@@ -35,9 +35,9 @@ def report_document(run: Identification) -> dict[str, Any]:
     robot, forces = run.experiment.robot, run.traces
     return {
         "answer": asdict(answer(run)),
-        "robot": {"name": robot.path.name, "base": robot.base_link, "joints": robot.n},
+        "robot": {"name": robot.path.name, "base": robot.base_link, "joints": robot.n, "format": robot.format},
         "bodies": {"parents": [max(body.parent, 0) for body in robot.bodies], "poses": _zero_poses(robot)},
-        "forces": None if forces is None else traces_document(forces, robot.base_rows, robot.dof_names),
+        "forces": None if forces is None else traces_document(forces, robot.base_rows, robot.dof_names, robot.sliding),
         "versions": versions(),
     }
 

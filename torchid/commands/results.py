@@ -37,12 +37,13 @@ from torchid.problem import Metrics
 from torchid.problem.metrics import SETS, WorseThanNominal, describe_worse, worse_than_nominal
 from torchid.problem.surplus import NoiseShares
 from torchid.report import identified_name, identified_robot, identified_urdf, parameters_document
+from torchid.report.extra_figure import extra_figure
 from torchid.report.figures import (
     contribution_figure,
     error_figure,
-    extra_figure,
     identifiability_figure,
-    save_figure,
+    png_of,
+    save_figures,
 )
 from torchid.report.forces import ForceSeries, force_figure
 from torchid.report.parameter_figure import parameter_figure
@@ -143,7 +144,7 @@ class Identification:
         return {"parameters": parameters, "metrics": metrics_document(self), "config": config}
 
     def to_urdf(self, path: str | Path, overwrite: bool = False) -> Path:
-        """Write the URDF with the identified parameters; meshes keep their paths, as `identified.urdf` of a run does.
+        """Write the URDF with the identified parameters; meshes keep their names.
 
         Raises:
             ConfigError: the file exists and `overwrite` is not set, or it is an input.
@@ -210,34 +211,39 @@ def write_run(run: Identification, output: Path, overwrite: bool = False, traini
     run = replace(run, experiment=replace(run.experiment, config=config))
     figures = {
         **({} if run.forces is None else {"forces": draw_forces(run.forces, robot)}),
-        "errors": error_figure(run.metrics),
-        "parameters": parameter_figure(robot.body_names, robot.nominal, run.estimate),
+        "errors": error_figure(run.metrics, robot.format),
+        "parameters": parameter_figure(
+            robot.body_names, robot.nominal, run.estimate, _joint_kinds(robot), robot.format
+        ),
         "identifiability": identifiability_figure(robot.body_names, run.estimate),
         "contributions": contribution_figure(_bits(run.contributions)),
     }
     if run.extras:
         figures["extras"] = extra_figure(run.extras)
     if run.ridge is not None:
-        figures["ridge"] = ridge_figure(run.ridge)
+        figures["ridge"] = ridge_figure(run.ridge, robot.format)
     with during("writing", output), new_folder(output, overwrite) as folder:
         (folder / "config.yaml").write_text(dump_config(config))
         write_json(folder / "parameters.json", parameters_document(robot, run.estimate, run.by_state, run.extras))
         write_json(folder / "metrics.json", metrics_document(run))
         (folder / identified_name(robot)).write_bytes(identified_robot(robot, run.phi, run.armature))
-        for name, figure in figures.items():
-            save_figure(figure, folder / f"{name}.png")
+        files = save_figures(figures, folder, config.figures.format)
         if training is not None:
             training.copy_curves(folder)
-        write_events(run, folder, {name: folder / f"{name}.png" for name in figures})
+        write_events(run, folder, {name: png_of(figure, files[name]) for name, figure in figures.items()})
         write_json(folder / DATA, report_document(run))
         write_page(folder, output)
     if training is not None:
         training.remove_checkpoint()
 
 
+def _joint_kinds(robot: Robot) -> set[str]:
+    return {body.joint.kind for body in robot.bodies if body.joint is not None}
+
+
 def draw_forces(series: ForceSeries, robot: Robot) -> Figure:
     """The figure of forces of a log's first samples."""
-    return force_figure(series, robot.dof_names, robot.base_rows)
+    return force_figure(series, robot.dof_names, robot.base_rows, robot.sliding, robot.format)
 
 
 def metrics_document(run: Identification) -> dict[str, object]:

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from torchid.report.tensorboard import RunEvents
 
 Evaluate = Callable[[Array], Mapping[str, Metrics]]
-_FREE_TO_CHANGE = ("output", "overwrite")
+_FREE_TO_CHANGE = ("output", "overwrite", "figures.format")
 _SAME = 1e-9  # relative: the logs of a checkpoint, up to rounding
 
 

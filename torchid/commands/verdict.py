@@ -11,23 +11,32 @@ from torchid.problem import Metrics
 from torchid.problem.metrics import DECISIVE_GROUPS, ERROR_GROUPS
 
 _FEW_GROUPS = 2
+_IN_PART = " in part"
 #: By the least and the largest error of a group of rows, as shares of the URDF's.
 _VERDICTS = {
-    (0.5, 0.5): "Much better than the URDF",
-    (0.95, 0.95): "Better than the URDF",
-    (0.95, np.inf): "Better than the URDF in part",
+    (0.5, 0.5): "Much better",
+    (0.95, 0.95): "Better",
+    (0.95, np.inf): f"Better{_IN_PART}",
 }
-_NO_BETTER = "No better than the URDF"
+_NO_BETTER = "No better"
 _AT_THE_FLOOR = 1.3  # times the error that noise of the readings leaves
 
 
 @dataclass(frozen=True)
 class Judged:
-    """Errors of the URDF's and of the identified parameters, on motion of which `text` says where it is from."""
+    """Errors of nominal and of identified parameters.
+
+    Attributes:
+        text: where the motion is from.
+        nominal: errors of the nominal parameters.
+        identified: likewise.
+        of: what the nominal parameters are those of, "URDF" or "MJCF".
+    """
 
     text: str
     nominal: Metrics
     identified: Metrics
+    of: str
 
     def errors(self, groups: Sequence[str] = DECISIVE_GROUPS) -> Iterator[tuple[str, float, float, float | None]]:
         """Groups of rows with both errors, and what noise of the readings leaves."""
@@ -44,7 +53,7 @@ class Judged:
         """
         ratios = [after / before if before else 1.0 for _, before, after, _ in self.errors()]
         if not ratios:
-            return f"Nothing to compare with the URDF on {self.text}"
+            return f"Nothing to compare with the {self.of} on {self.text}"
         least, most = min(ratios), max(ratios)
         shares = f"{_percent(least)} to {_percent(most)} %" if most > 1.1 * least else f"{_percent(most)} %"
         within = (text for limits, text in _VERDICTS.items() if least < limits[0] and most < limits[1])
@@ -53,7 +62,8 @@ class Judged:
         floor = ", as near as the sensors' noise allows" if known and max(known) < _AT_THE_FLOOR else ""
         if not explained:
             floor = f", {'and' if verdict == _NO_BETTER else 'but'} the model does not explain these forces"
-        return f"{verdict} on {self.text}: errors of {shares} of the URDF's{floor}"
+        words, part = verdict.removesuffix(_IN_PART), _IN_PART * verdict.endswith(_IN_PART)
+        return f"{words} than the {self.of}{part} on {self.text}: errors of {shares} of the {self.of}'s{floor}"
 
     def shown_errors(self) -> list[tuple[str, float, float, float | None]]:
         """Errors that a user should see, by the words for their group, with units."""

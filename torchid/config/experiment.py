@@ -120,6 +120,13 @@ class ActuatorsConfig:
         return 0.0 if self.delay is None or isinstance(self.delay, str) else self.delay
 
 
+@dataclass(config=STRICT, frozen=True)
+class FiguresConfig:
+    """How figures are written: `format`, of their files. TensorBoard and `report.html` have pictures of their own."""
+
+    format: Literal["png", "pdf", "svg"] = "png"
+
+
 @dataclass(config=STRICT, frozen=True, kw_only=True)
 class _Common:
     """The keys of identification and analysis alike; no `output`, as Python alone may say: nothing is written."""
@@ -132,6 +139,7 @@ class _Common:
     actuators: ActuatorsConfig = dataclasses.field(default_factory=ActuatorsConfig)
     estimator: EstimatorConfig = dataclasses.field(default_factory=EstimatorConfig)
     analysis: AnalysisConfig = dataclasses.field(default_factory=AnalysisConfig)
+    figures: FiguresConfig = dataclasses.field(default_factory=FiguresConfig)
     device: Device = "cpu"
     overwrite: bool = False
 

@@ -27,6 +27,7 @@ class Sections(TypedDict, total=False):
     actuators: Mapping[str, object]
     estimator: Mapping[str, object]
     analysis: Mapping[str, object]
+    figures: Mapping[str, object]
     device: str
     output: StrPath | None
     overwrite: bool

@@ -28,6 +28,7 @@ from torchid.sensor_planning.planner import PartPlan, SensorPlan
 
 #: Columns of text.
 _WIDTH = 100
+_LONGEST_NAME = 20  # of a sensor set that a table does not break
 #: Sets and remedies that are listed, and directions of the base.
 _MAX_SETS, _MAX_REMEDIES, _BASE_DIRECTIONS = 5, 8, 6
 #: Smallest singular value of S_b V_x: below, the noise of the base's rows is a thousand times that of the sensors.
@@ -271,7 +272,8 @@ def accuracy_table(sets: Mapping[str, SetAccuracy]) -> Table:
     """Expected and measured rms error by group of rows."""
     title = "Accuracy of sensor sets, rms error: expected of the model, with noise added, measured"
     table = Table(title=title, title_justify="left")
-    table.add_column("sensors", overflow="fold")
+    longest = max(map(len, sets), default=0)
+    table.add_column("sensors", overflow="fold", min_width=min(longest, _LONGEST_NAME))
     table.add_column("channels", justify="right")
     table.add_column("rank", justify="right")
     table.add_column("", no_wrap=True)

@@ -21,6 +21,7 @@ def drift_figure(
     quartiles: Mapping[str, Comparison[Array]],
     by_joint: Mapping[str, Comparison[float]],
     units: Sequence[str],
+    of: str,
 ) -> Figure:
     """Drift over the time since the beginning of a window, median and quartiles, and at its end by joint.
 
@@ -30,6 +31,7 @@ def drift_figure(
         quartiles: (3, T) each, over windows, by what drifts, with its unit.
         by_joint: at the end of the windows.
         units: of the joints, "rad" or "m".
+        of: what the robot's file is.
     """
     tall = max(0.22 * len(by_joint) + 1.4, 1.9 * len(quartiles) + 0.8)
     figure = Figure(figsize=(11.0, tall), layout="constrained")
@@ -38,7 +40,7 @@ def drift_figure(
     for row, (name, (nominal, identified)) in enumerate(quartiles.items()):
         axis = figure.add_subplot(grid[row, 0])
         for label, color, (low, middle, high) in (
-            ("URDF", palette.NOMINAL, nominal),
+            (of, palette.NOMINAL, nominal),
             ("identified", palette.IDENTIFIED, identified),
         ):
             axis.fill_between(since, np.append(0.0, low), np.append(0.0, high), color=color, alpha=0.2, linewidth=0.0)

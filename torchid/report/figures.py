@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tempfile
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
@@ -16,14 +17,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.text import Text
-from matplotlib.ticker import LogFormatter
+from matplotlib.ticker import FuncFormatter
 
 from torchid.errors import during, escape
 from torchid.estimators import Estimate
 from torchid.estimators.least_squares import FIXED
 from torchid.fitting.calibration import Comparison
-from torchid.identifiability.confounding import ExtraEstimate
-from torchid.logs.time_range import log_title
 from torchid.parameters import PARAMETERS, PER_BODY, WRENCH_COMPONENTS
 from torchid.problem import Metrics
 from torchid.problem.metrics import ERROR_GROUPS, group_name
@@ -42,10 +41,15 @@ STYLE: dict[Any, Any] = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "legend.frameon": False,
+    "pdf.fonttype": 42,  # letters that editors keep and journals accept
+    "svg.hashsalt": "torchid",  # the same figure is the same file
 }
-#: Extra parameters: rows of a panel (`parameters.json` has all), longest error bar over the largest value, and vertical
-#: offsets for logs in one row.
-_MAX_PANEL_ROWS, _MAX_ERROR_RATIO, _LANES = 40, 4, 5
+#: Up to which power of ten axes have plain numbers, and how far off a power rounding is.
+_PLAIN_DECADES, _ROUNDING = 3.0, 1e-9
+_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_FLOOR = "noise of the readings alone"
+#: Dates in files, without which the same run writes the same files.
+_DATES = {"pdf": "CreationDate", "svg": "Date"}
 #: Colors of sensors and links in the tree, and its column width, row height and legend width [inches].
 _TORQUE, _WRENCH, _LIMB, _PLAIN, _LOADED = palette.IDENTIFIED, "#009e73", "#cc79a7", "0.75", "0.3"
 _COLUMN, _ROW, _LEGEND = 2.1, 0.3, 7.4
@@ -63,33 +67,80 @@ def save_figure(figure: Figure, path: Path, kind: str | None = None) -> None:
         for text in figure.findobj(Text):
             text.set_text(escape(text.get_text(), "\n"))
         figure.set_dpi(130)
-        if (kind or path.suffix[1:]).lower() == "png":
+        form = (kind or path.suffix[1:]).lower()
+        if form == "png":
             FigureCanvasAgg(figure).print_png(path)  # `savefig` draws all of it twice, once for the layout
         else:
-            figure.savefig(path, format=kind)
+            figure.savefig(path, format=form, metadata={_DATES[form]: None})
+
+
+def save_figures(figures: Mapping[str, Figure], folder: Path, form: str) -> dict[str, Path]:
+    """Write figures by name, in the format of that extension; their files."""
+    files = {name: folder / f"{name}.{form}" for name in figures}
+    for name, path in files.items():
+        save_figure(figures[name], path)
+    return files
+
+
+def png_of(figure: Figure, file: Path) -> bytes:
+    """A figure as PNG: its file, where that is one, or drawn anew."""
+    if file.suffix == ".png":
+        return file.read_bytes()
+    with tempfile.TemporaryDirectory() as folder:
+        save_figure(figure, path := Path(folder) / "figure.png")
+        return path.read_bytes()
+
+
+def decade(value: float) -> str:
+    """A power of ten as axes show it; what matplotlib writes is a formula, which names forbid (`STYLE`)."""
+    exponent = math.log10(value)
+    if abs(exponent) <= _PLAIN_DECADES or abs(exponent - round(exponent)) > _ROUNDING:
+        return f"{value:g}"
+    return "10" + str(round(exponent)).translate(_SUPERSCRIPTS)
+
+
+def decade_formatter() -> FuncFormatter:
+    """Of the ticks of a logarithmic axis."""
+    return FuncFormatter(lambda value, _: decade(value))
 
 
 # ---------------------------------------------------------------------------------------------------- errors
 
 
 @matplotlib.rc_context(STYLE)
-def error_figure(sets: Mapping[str, Comparison[Metrics]]) -> Figure:
-    """Relative error by group of rows, URDF against identified, one panel per set of logs."""
+def error_figure(sets: Mapping[str, Comparison[Metrics]], of: str = "URDF") -> Figure:
+    """Relative error by group of rows, nominal (`of` what) against identified, one panel per set of logs."""
     figure = Figure(figsize=(4.2 * len(sets) + 0.6, 3.2), layout="constrained")
     axes = figure.subplots(1, len(sets), sharey=True, squeeze=False)[0]
     for axis, (name, (nominal, identified)) in zip(axes, sets.items(), strict=True):
         groups = [group for group in ERROR_GROUPS if nominal.relative.get(group) is not None]
         index = np.arange(len(groups))
-        pairs = ((-0.2, nominal, palette.NOMINAL, "URDF"), (0.2, identified, palette.IDENTIFIED, "identified"))
+        pairs = ((-0.2, nominal, palette.NOMINAL, of), (0.2, identified, palette.IDENTIFIED, "identified"))
         for shift, metrics, color, label in pairs:
             heights = [100.0 * (metrics.relative.get(group) or 0.0) for group in groups]
             bars = axis.bar(index + shift, heights, 0.38, color=color, label=label)
-            axis.bar_label(bars, fmt="%.3g", fontsize=8)
+            axis.bar_label(bars, fmt=_percent, fontsize=8)
+        _draw_noise(axis, identified, groups)
+        axis.margins(y=0.1)
         axis.set_xticks(index, [group_name(group).replace(" ", "\n") for group in groups])
         axis.set_title(name, loc="left")
     axes[0].set_ylabel("rms of error / rms of measured [%]")
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
+    by_label = {label: handle for axis in axes for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)}
+    labels = sorted(by_label, key=lambda label: label == _FLOOR)
+    figure.legend([by_label[label] for label in labels], labels, loc="outside upper right", ncols=3)
     return figure
+
+
+def _percent(value: float) -> str:
+    return f"{value:.2g}" if value < 99.5 else f"{value:.0f}"
+
+
+def _draw_noise(axis: Axes, metrics: Metrics, groups: Sequence[str]) -> None:
+    """A line across both bars of a group, at the error that noise of the readings leaves, where it is known."""
+    for place, group in enumerate(groups):
+        noise, rms, relative = (x.get(group) for x in (metrics.noise, metrics.rms, metrics.relative))
+        if noise and rms and relative:
+            axis.hlines(100.0 * noise * relative / rms, place - 0.4, place + 0.4, colors=palette.MEASURED, label=_FLOOR)
 
 
 # ----------------------------------------------------------------------------------------------------- identifiability
@@ -100,33 +151,42 @@ def identifiability_figure(body_names: Sequence[str], estimate: Estimate) -> Fig
     """Share of the data in every parameter, with the mark of its verdict, and the singular values of the problem."""
     verdicts = estimate.verdict.reshape(-1, PER_BODY)
     shown = np.flatnonzero((verdicts != FIXED).any(axis=1))
-    share = estimate.data_share.reshape(-1, PER_BODY)[shown]
+    free = np.flatnonzero((verdicts != FIXED).any(axis=0))
+    share = estimate.data_share.reshape(-1, PER_BODY)[np.ix_(shown, free)]
     figure = Figure(figsize=(11.0, 0.24 * len(shown) + 1.8), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=[1.9, 1.0])
     image = left.imshow(share, cmap="Blues", vmin=0.0, vmax=1.0, aspect="auto")
     for row, body in enumerate(shown):
-        for column, verdict in enumerate(verdicts[body]):
+        for column, verdict in enumerate(verdicts[body, free]):
             color = "white" if share[row, column] > 0.6 else "black"
             left.text(column, row, MARKS[verdict], ha="center", va="center", fontsize=8, color=color)
-    left.set_xticks(range(PER_BODY), PARAMETERS, fontsize=7)
+    left.set_xticks(range(len(free)), [PARAMETERS[int(k)] for k in free], fontsize=7)
     left.set_yticks(range(len(shown)), [body_names[int(body)] for body in shown], fontsize=7)
     left.set_title(marks_legend(), loc="left", fontsize=8)
     figure.colorbar(image, ax=left, label="share of the data", pad=0.01)
     values = estimate.singular_values
     right.semilogy(np.arange(1, len(values) + 1), values, ".", color=palette.IDENTIFIED, markersize=4)
-    right.yaxis.set_major_formatter(LogFormatter())  # the default writes formulas, which names forbid, see STYLE
+    right.yaxis.set_major_formatter(decade_formatter())
     right.axvline(estimate.rank + 0.5, color="0.5", linewidth=0.8)
     right.set_title(f"singular values, rank {estimate.rank}", loc="left", fontsize=8)
     right.set_xlabel("number")
-    right.set_ylabel("singular value [standard deviations per scale]")
+    right.set_ylabel("singular value [standard deviations per scale]", labelpad=12)
     right.grid(visible=True)
     return figure
 
 
 @matplotlib.rc_context(STYLE)
 def contribution_figure(groups: Mapping[str, Sequence[tuple[str, float]]], max_rows: int = 20) -> Figure:
-    """Bits lost without each log, contact state or sensor, by group: pairs of name and bits, the largest first."""
-    shown = {group: sorted(pairs, key=lambda pair: -pair[1])[:max_rows] for group, pairs in groups.items() if pairs}
+    """Bits lost without each log, contact state or sensor, by group: pairs of name and bits, the largest first.
+
+    Groups of one are left out if there are others.
+    """
+    several = {group: pairs for group, pairs in groups.items() if len(pairs) > 1}  # one alone has all that there is
+    shown = {
+        group: sorted(pairs, key=lambda pair: -pair[1])[:max_rows]
+        for group, pairs in (several or groups).items()
+        if pairs
+    }
     counts = [len(pairs) for pairs in shown.values()]
     figure = Figure(figsize=(9.0, 0.24 * sum(counts) + 0.6 * len(shown) + 0.6), layout="constrained")
     axes = figure.subplots(len(shown), 1, squeeze=False, height_ratios=[count + 0.8 for count in counts])[:, 0]
@@ -141,51 +201,6 @@ def contribution_figure(groups: Mapping[str, Sequence[tuple[str, float]]], max_r
         axis.set_title(group + (f", {hidden} more not shown" if hidden else ""), loc="left", fontsize=9)
     axes[-1].set_xlabel("information lost without it [bits]")
     return figure
-
-
-@matplotlib.rc_context(STYLE)
-def extra_figure(extras: Sequence[ExtraEstimate]) -> Figure:
-    """Extra parameters: a panel for each unit, a row for each, a point for each log with its 95 % interval.
-
-    Hollow points are confounded with other parameters.
-    """
-    units = list(dict.fromkeys(x.extra.unit for x in extras))
-    logs = list(dict.fromkeys(x.log for x in extras))
-    rows = {
-        unit: list(dict.fromkeys(x.extra.label for x in extras if x.extra.unit == unit))[:_MAX_PANEL_ROWS]
-        for unit in units
-    }
-    height = 1.2 + 0.24 * sum(map(len, rows.values())) + 0.6 * len(units)
-    figure = Figure(figsize=(9.0, max(height, 2.4)), layout="constrained")
-    heights = [len(rows[unit]) + 1 for unit in units]
-    axes = figure.subplots(len(units), 1, squeeze=False, gridspec_kw={"height_ratios": heights})
-    colors = {log: palette.CATEGORIES[::-1][number % len(palette.CATEGORIES)] for number, log in enumerate(logs)}
-    for axis, unit in zip(axes[:, 0], units, strict=True):
-        in_panel = [x for x in extras if x.extra.unit == unit and x.extra.label in rows[unit]]
-        _draw_panel(axis, in_panel, rows[unit], colors)
-        axis.set_xlabel(f"[{unit}]" if unit != "1" else "scale less 1 [1]")
-    axes[0, 0].set_title("95 % intervals; hollow: confounded with other parameters", loc="left", fontsize=8)
-    # made by hand: a log need not have a point in every panel, nor a filled one
-    keys = [Line2D([], [], marker="o", linestyle="", color=color) for color in colors.values()]
-    names = [log_title(log) or "all logs" for log in logs]
-    figure.legend(keys, names, loc="outside upper right", ncols=min(len(logs), 4))
-    return figure
-
-
-def _draw_panel(axis: Axes, extras: Sequence[ExtraEstimate], rows: Sequence[str], colors: Mapping[str, str]) -> None:
-    """Values with their intervals; the logs of a row have vertical offsets around its middle."""
-    longest = _MAX_ERROR_RATIO * max(abs(x.value) for x in extras) or 1.0
-    for number, log in enumerate(logs := [log for log in colors if any(x.log == log for x in extras)]):
-        points = [x for x in extras if x.log == log]
-        offset = 0.15 * (number % _LANES - (min(len(logs), _LANES) - 1) / 2)
-        values, index = [x.value for x in points], [rows.index(x.extra.label) + offset for x in points]
-        error = [min(1.96 * x.standard_error, longest) if math.isfinite(x.standard_error) else longest for x in points]
-        axis.errorbar(values, index, xerr=error, fmt="none", ecolor=colors[log], elinewidth=1.0)
-        faces = [colors[log] if x.separable else "white" for x in points]
-        axis.scatter(values, index, c=faces, edgecolors=colors[log], s=22, zorder=3)
-    axis.axvline(0.0, color="0.7", linewidth=0.8, zorder=0)
-    axis.set_yticks(range(len(rows)), rows, fontsize=8)
-    axis.set_ylim(len(rows) - 0.5, -0.5)
 
 
 # ------------------------------------------------------------------------------------- tree of a robot with its sensors

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import matplotlib
@@ -16,6 +16,7 @@ from torchid.report.figures import STYLE
 from torchid.report.palette import IDENTIFIED, MEASURED, NOMINAL
 
 _NOISE = "0.8"
+_MOST_ROWS = 6
 _SHOWN = 1.6  # errors are shown up to so many times the largest of the identified ones, or of the noise
 
 
@@ -35,17 +36,22 @@ class ForceSeries:
 
 
 @matplotlib.rc_context(STYLE)
-def force_figure(series: ForceSeries, dof_names: Sequence[str], base_rows: int, max_rows: int = 6) -> Figure:
-    """Forces over time, and beside them their errors: the largest base force and moment, then the largest others."""
-    rows = largest_rows(series, base_rows, max_rows)
+def force_figure(
+    series: ForceSeries, dof_names: Sequence[str], base_rows: int, sliding: Collection[str] = (), of: str = "URDF"
+) -> Figure:
+    """Forces over time, and beside them their errors: the largest base force and moment, then the largest others.
+
+    `dof_names`, `base_rows` and `sliding` are those of the robot, `of` is what its nominal parameters are from.
+    """
+    rows = largest_rows(series, base_rows, _MOST_ROWS)
     figure = Figure(figsize=(12.0, 1.7 * max(len(rows), 1) + 0.8), layout="constrained")
     axes = figure.subplots(max(len(rows), 1), 2, sharex=True, squeeze=False, width_ratios=(3, 2))
     for (forces, errors), row in zip(axes, rows, strict=False):
         forces.plot(series.time, series.measured[:, row], color=MEASURED, linewidth=1.6, label="measured")
-        forces.plot(series.time, series.nominal[:, row], color=NOMINAL, linewidth=1.0, label="predicted, URDF")
+        forces.plot(series.time, series.nominal[:, row], color=NOMINAL, linewidth=1.0, label=f"predicted, {of}")
         label = "predicted, identified"
         forces.plot(series.time, series.identified[:, row], color=IDENTIFIED, linewidth=1.0, label=label)
-        name, unit = name_row(row, base_rows, dof_names)
+        name, unit = name_row(row, base_rows, dof_names, sliding)
         forces.set_title(name, loc="left", fontsize=9)
         forces.set_ylabel(f"[{unit}]")
         _draw_errors(errors, series, row, f"[{unit}]")
@@ -77,10 +83,12 @@ def _draw_errors(axis: Axes, series: ForceSeries, row: int, unit: str) -> None:
     axis.set_title(f"rms {rms:.3g}{text} {unit}", loc="left", fontsize=9)
 
 
-def name_row(row: int, base_rows: int, dof_names: Sequence[str]) -> tuple[str, str]:
-    """Name and unit of a row of the dynamics."""
-    name = BASE_ROWS[row] if row < base_rows else dof_names[row - base_rows]
-    return name, "N" if row < min(base_rows, 3) or name.endswith((".fx", ".fy", ".fz")) else "N m"
+def name_row(row: int, base_rows: int, dof_names: Sequence[str], sliding: Collection[str]) -> tuple[str, str]:
+    """Name and unit of a row of the dynamics of a robot with such `sliding` joints."""
+    if row < base_rows:
+        return BASE_ROWS[row], "N" if row < min(base_rows, 3) else "N m"
+    name = dof_names[row - base_rows]
+    return name, "N" if name in sliding or name.endswith((".fx", ".fy", ".fz")) else "N m"
 
 
 def largest_rows(series: ForceSeries, base_rows: int, max_rows: int) -> list[int]:

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from torchid import parameters
 from torchid.errors import join_names, warn
 from torchid.parameters import Array
+from torchid.report.loadable_urdf import mass_bounds
 from torchid.report.mjcf_files import inertial_element, numbers_text
 from torchid.report.parameter_files import warn_if_inconsistent, without_links_beyond_welds
 from torchid.robot import Robot
@@ -54,7 +55,8 @@ class _Model:
         self._limits = position_limits(robot.path)
         mimics = resolve_mimics(robot.path, joints)
         self.root = etree.Element("mujoco", model=robot.path.stem)
-        etree.SubElement(self.root, "compiler", angle="radian", inertiafromgeom="false", autolimits="true")
+        rules = {"angle": "radian", "inertiafromgeom": "false", "autolimits": "true"} | mass_bounds(robot, phi)
+        etree.SubElement(self.root, "compiler", rules)
         self._assets = etree.SubElement(self.root, "asset")
         world = etree.SubElement(self.root, "worldbody")
         children = {joint.child for joint in joints}

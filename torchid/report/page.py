@@ -92,8 +92,9 @@ def page_text(run: RunFiles) -> str:
     require_page()
     import jinja2
 
+    of = run.report["robot"].get("format", "URDF")
     scene, impossible = ellipsoid_scene(
-        run.parameters["bodies"], run.report["bodies"]["poses"], run.report["bodies"]["parents"]
+        run.parameters["bodies"], run.report["bodies"]["poses"], run.report["bodies"]["parents"], of
     )
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
@@ -110,9 +111,10 @@ def page_text(run: RunFiles) -> str:
     return environment.get_template(_TEMPLATE).render(
         run=run,
         answer=run.report["answer"],
+        of=of,
         forces=forces,
         states=_named_states(forces),
-        figures={name: figure for name, figure in _figures(run, scene).items() if figure is not None},
+        figures={name: figure for name, figure in _figures(run, scene, of).items() if figure is not None},
         impossible=impossible,
         parameters=PARAMETERS,
         interval=INTERVAL,
@@ -120,18 +122,18 @@ def page_text(run: RunFiles) -> str:
     )
 
 
-def _figures(run: RunFiles, scene: Mapping[str, Any] | None) -> dict[str, Mapping[str, Any] | None]:
+def _figures(run: RunFiles, scene: Mapping[str, Any] | None, of: str) -> dict[str, Mapping[str, Any] | None]:
     """All figures by their place in the template, None for those that this run has not."""
     forces, metrics = run.report["forces"], run.metrics
     units = run.parameters["units"]
     out: dict[str, Mapping[str, Any] | None] = {}
     if forces is not None:
         for kind in ("recorded", "projected"):
-            out[kind] = force_panels(forces, kind) if forces[kind] else None
+            out[kind] = force_panels(forces, kind, of) if forces[kind] else None
         if forces["recorded"] and forces["states"]["names"] == [IN_THE_AIR]:
             out["projected"] = None  # the same once more
-        out["spectra"] = spectrum_panels(forces["projected"])
-    out |= {f"parameter_{name}": parameter_bars(run.parameters["bodies"], name, units[name]) for name in _DRAWN}
+        out["spectra"] = spectrum_panels(forces["projected"], of)
+    out |= {f"parameter_{name}": parameter_bars(run.parameters["bodies"], name, units[name], of) for name in _DRAWN}
     out["ellipsoids"] = scene
     added = metrics["identifiability"]
     out |= {"logs": contribution_bars(added["logs"], True), "sensors": contribution_bars(added["sensors"])}

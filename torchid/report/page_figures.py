@@ -23,8 +23,7 @@ Figure = dict[str, Any]
 
 _COMMONEST = "#ffffff"
 _GRID, _TEXT = "#e5e5e5", "#222222"
-_LINES = {"measured": ("measured", palette.MEASURED, 1.6), "nominal": ("URDF", palette.NOMINAL, 1.1)}
-_LINES |= {"identified": ("identified", palette.IDENTIFIED, 1.1)}
+_MEASURED, _NOMINAL, _IDENTIFIED = (palette.MEASURED, 1.6), (palette.NOMINAL, 1.1), (palette.IDENTIFIED, 1.1)
 #: Pixels of panels, of what is above and below all of them, between two rows and within one; of a bar, and its text.
 _FORCE, _ERROR, _SPECTRUM, _TOP, _BOTTOM, _BETWEEN, _WITHIN = 150, 90, 150, 40, 45, 40, 22
 _BAR, _LINE = 24, 15
@@ -33,12 +32,13 @@ _VIEW = np.array([1.3, -1.3, 0.6])  # where the eye is, for a scene as long as w
 _MOST_BARS, _LONGEST_LABEL, _MOST_LABEL_LINES = 20, 24, 4
 
 
-def force_panels(forces: Mapping[str, Any], kind: str) -> Figure:
+def force_panels(forces: Mapping[str, Any], kind: str, of: str) -> Figure:
     """Measured and predicted forces over the log, each with its errors below, and contact states behind all.
 
     Args:
         forces: from `traces_document`.
         kind: "recorded" or "projected".
+        of: what the nominal parameters are from, "URDF" or "MJCF".
     """
     panels = forces[kind]
     heights = [x for _ in panels for x in (_FORCE, _ERROR)]
@@ -47,13 +47,13 @@ def force_panels(forces: Mapping[str, Any], kind: str) -> Figure:
     for number, panel in enumerate(panels):
         upper, lower = axes[2 * number], axes[2 * number + 1]
         _title(layout, upper, f"{panel['name']} [{panel['unit']}]")
-        for line, (label, color, width) in _LINES.items():
+        for line, (label, color, width) in _lines(of).items():
             data.append(_line(forces["time"], panel["lines"][line], upper, label, color, width, number == 0))
-        for line, (label, color, _) in _LINES.items():
+        for line, (label, color, _) in _lines(of).items():
             if line != "measured":
                 values = panel["lines"][f"{line}_error"]
                 data.append(_line(forces["time"], values, lower, label, color, 0.9, False))
-        _title(layout, lower, _rms_text(panel), 10)
+        _title(layout, lower, _rms_text(panel, of), 10)
         layout[_key(lower)] |= _error_range(panel)
         if noise := panel["rms"].get("noise"):
             layout["shapes"].append(_band(lower, noise))
@@ -62,7 +62,7 @@ def force_panels(forces: Mapping[str, Any], kind: str) -> Figure:
     return {"data": data, "layout": layout}
 
 
-def spectrum_panels(panels: Sequence[Mapping[str, Any]]) -> Figure | None:
+def spectrum_panels(panels: Sequence[Mapping[str, Any]], of: str) -> Figure | None:
     """Amplitude densities of the errors, with that of the noise; None where no row has a spectrum."""
     shown = [panel for panel in panels if panel["spectrum"] is not None]
     if not shown:
@@ -72,7 +72,7 @@ def spectrum_panels(panels: Sequence[Mapping[str, Any]]) -> Figure | None:
     for number, (panel, axis) in enumerate(zip(shown, axes, strict=True)):
         spectrum = panel["spectrum"]
         _title(layout, axis, f"{panel['name']} [{panel['unit']}/√Hz]")
-        for line, (label, color, width) in _LINES.items():
+        for line, (label, color, width) in _lines(of).items():
             if line != "measured":
                 values = spectrum[line]
                 data.append(_line(spectrum["frequency"], values, axis, label, color, width + 0.3, number == 0))
@@ -88,8 +88,8 @@ def spectrum_panels(panels: Sequence[Mapping[str, Any]]) -> Figure | None:
     return {"data": data, "layout": layout}
 
 
-def parameter_bars(bodies: Sequence[Mapping[str, Any]], parameter: str, unit: str) -> Figure | None:
-    """One parameter of all bodies, the URDF's and the identified with its 95 % interval; None where none is fitted."""
+def parameter_bars(bodies: Sequence[Mapping[str, Any]], parameter: str, unit: str, of: str) -> Figure | None:
+    """One parameter of all bodies, nominal and identified with its 95 % interval; None where none is fitted."""
     shown = [body for body in bodies if body["verdict"][parameter] != FIXED]
     if not shown:
         return None
@@ -105,7 +105,7 @@ def parameter_bars(bodies: Sequence[Mapping[str, Any]], parameter: str, unit: st
     fitted = _markers(identified, "identified", palette.IDENTIFIED, symbols) | {"hovertext": hover, "hoverinfo": "text"}
     fitted["error_x"] = {"array": bars, "color": palette.IDENTIFIED, "thickness": 1.5, "width": 3}
     return {
-        "data": [_markers(nominal, "URDF", palette.NOMINAL, "diamond-open"), fitted],
+        "data": [_markers(nominal, of, palette.NOMINAL, "diamond-open"), fitted],
         "layout": _list_layout(names, f"[{unit}]"),
     }
 
@@ -142,7 +142,10 @@ def contribution_bars(parts: Sequence[Mapping[str, Any]], of_logs: bool = False)
 
 
 def ellipsoid_scene(
-    bodies: Sequence[Mapping[str, Any]], poses: Sequence[Sequence[Sequence[float]]], parents: Sequence[int]
+    bodies: Sequence[Mapping[str, Any]],
+    poses: Sequence[Sequence[Sequence[float]]],
+    parents: Sequence[int],
+    of: str,
 ) -> tuple[Figure | None, list[str]]:
     """Ellipsoids of the URDF's and of the identified inertia, with lines from each body's frame to its parent's.
 
@@ -150,12 +153,13 @@ def ellipsoid_scene(
         bodies: of `parameters.json`.
         poses: of the link frames in the base's, (4, 4) each [m].
         parents: number of each body's parent; the base's is its own.
+        of: what the nominal parameters are from.
 
     Returns:
         The figure, None where nothing can be drawn, and the identified bodies with mass whose inertia is impossible.
     """
     frames = [np.array(pose, dtype=np.float64) for pose in poses]
-    kinds = {"nominal": ("URDF", palette.MEASURED, 0.25), "identified": ("identified", palette.IDENTIFIED, 0.4)}
+    kinds = {"nominal": (of, palette.MEASURED, 0.25), "identified": ("identified", palette.IDENTIFIED, 0.4)}
     data, impossible, drawn = [], [], [frame[None, :3, 3] for frame in frames]
     for kind, (label, color, opacity) in kinds.items():
         points, names = [], []
@@ -250,15 +254,21 @@ def _title(layout: Figure, axis: str, text: str, size: int = 12) -> None:
     layout["annotations"].append({"text": _text(text)} | place | look)
 
 
+def _lines(of: str) -> dict[str, tuple[str, str, float]]:
+    """Label, color and width of lines."""
+    kinds = {"measured": ("measured", _MEASURED), "nominal": (of, _NOMINAL), "identified": ("identified", _IDENTIFIED)}
+    return {kind: (label, *look) for kind, (label, look) in kinds.items()}
+
+
 def _line(x: Any, y: Any, axis: str, name: str, color: str, width: float, shown: bool) -> Figure:
     """A line; those of one name go and come with the one that is in the legend."""
     line = {"type": "scatter", "mode": "lines", "x": x, "y": y, "yaxis": axis, "name": name, "legendgroup": name}
     return line | {"line": {"color": color, "width": width}, "showlegend": shown, "hoverinfo": "x+y+name"}
 
 
-def _rms_text(panel: Mapping[str, Any]) -> str:
+def _rms_text(panel: Mapping[str, Any], of: str) -> str:
     """The rms of both errors and of the noise."""
-    named = {"nominal_error": "URDF", "identified_error": "identified", "noise": "noise"}
+    named = {"nominal_error": of, "identified_error": "identified", "noise": "noise"}
     known = [f"{label} {panel['rms'][key]:.3g}" for key, label in named.items() if panel["rms"].get(key) is not None]
     return f"error, rms: {', '.join(known)}" if known else "error"
 

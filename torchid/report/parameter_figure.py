@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import matplotlib
 import numpy as np
@@ -20,7 +20,8 @@ INTERVAL = 1.96
 """Standard errors on either side of a 95 % interval."""
 
 _IMPOSSIBLE = "x "  # before the name of a body
-_SINGLE = {"m": "mass [kg]", "fc": "Coulomb friction [N m or N]", "fv": "viscous friction [N m s/rad or N s/m]"}
+_SINGLE = {"m": "mass [kg]", "fc": "Coulomb friction", "fv": "viscous friction"}
+_UNITS = {"revolute": {"fc": "N m", "fv": "N m s/rad"}, "prismatic": {"fc": "N", "fv": "N s/m"}}
 _DERIVED: dict[str, Callable[[Array], Array]] = {
     "first moment, length [kg m]": lambda phi: np.linalg.norm(phi[:, parameters.FIRST_MOMENT], axis=1),
     "inertia about origin, trace [kg m²]": lambda phi: np.trace(parameters.inertia_matrix(phi), axis1=1, axis2=2),
@@ -28,7 +29,13 @@ _DERIVED: dict[str, Callable[[Array], Array]] = {
 
 
 @matplotlib.rc_context(STYLE)
-def parameter_figure(body_names: Sequence[str], nominal: Array, estimate: Estimate) -> Figure:
+def parameter_figure(
+    body_names: Sequence[str],
+    nominal: Array,
+    estimate: Estimate,
+    kinds: Collection[str] = ("revolute", "prismatic"),
+    of: str = "URDF",
+) -> Figure:
     """Mass, first moment, inertia and friction of every body with a free parameter.
 
     Filled points are identified and have their 95 % intervals; hollow ones are known only in sums with others, or
@@ -38,13 +45,15 @@ def parameter_figure(body_names: Sequence[str], nominal: Array, estimate: Estima
         body_names: of all bodies.
         nominal: (L, 12), the URDF's parameters.
         estimate: the fit.
+        kinds: of the robot's joints, which friction has the unit of.
+        of: what the nominal parameters are from.
     """
     verdict = estimate.verdict.reshape(-1, PER_BODY)
     shown = np.flatnonzero((verdict != FIXED).any(axis=1))
     before, after, errors = (x.reshape(-1, PER_BODY)[shown] for x in (nominal, estimate.phi, estimate.standard_error))
     known = (verdict[shown] == IDENTIFIED) & np.isfinite(errors)
     single = [name for name in _SINGLE if (verdict[shown][:, PARAMETERS.index(name)] != FIXED).any()]
-    titles = [_SINGLE["m"], *_DERIVED, *(_SINGLE[name] for name in single if name != "m")]
+    titles = [_title("m", kinds), *_DERIVED, *(_title(name, kinds) for name in single if name != "m")]
     figure = Figure(figsize=(1.9 + 2.3 * len(titles), 0.24 * len(shown) + 1.7), layout="constrained")
     axes = dict(zip(titles, figure.subplots(1, len(titles), sharey=True, squeeze=False)[0], strict=True))
     for name in single:
@@ -52,7 +61,7 @@ def parameter_figure(body_names: Sequence[str], nominal: Array, estimate: Estima
         free = verdict[shown][:, k] != FIXED
         bars = np.where(known[:, k], INTERVAL * errors[:, k], np.nan)
         urdf, identified = (np.where(free, x[:, k], np.nan) for x in (before, after))
-        _draw(axes[_SINGLE[name]], urdf, identified, known[:, k], bars)
+        _draw(axes[_title(name, kinds)], urdf, identified, known[:, k], bars)
     for title, quantity in _DERIVED.items():
         _draw(axes[title], quantity(before), quantity(after), known[:, INERTIAL].all(axis=1), None)
     for title, axis in axes.items():
@@ -64,8 +73,13 @@ def parameter_figure(body_names: Sequence[str], nominal: Array, estimate: Estima
     first = axes[titles[0]]
     first.set_yticks(range(len(shown)), names, fontsize=7)
     first.set_ylim(len(shown) - 0.4, -0.6)
-    figure.legend(handles=_legend(first, bool(impossible.any())), loc="outside upper right", ncols=4)
+    figure.legend(handles=_legend(first, of, bool(impossible.any())), loc="outside upper right", ncols=4)
     return figure
+
+
+def _title(name: str, kinds: Collection[str]) -> str:
+    units = [by_name[name] for kind, by_name in _UNITS.items() if kind in kinds and name in by_name]
+    return f"{_SINGLE[name]} [{' or '.join(units)}]" if units else _SINGLE[name]
 
 
 def _draw(axis: Axes, before: Array, after: Array, known: np.ndarray, bars: Array | None) -> None:
@@ -83,10 +97,10 @@ def _draw(axis: Axes, before: Array, after: Array, known: np.ndarray, bars: Arra
     axis.plot(after[negative], rows[negative] + 0.16, "X", color=palette.MEASURED, markersize=6, zorder=3)
 
 
-def _legend(axis: Axes, impossible: bool) -> list[matplotlib.artist.Artist]:
+def _legend(axis: Axes, of: str, impossible: bool) -> list[matplotlib.artist.Artist]:
     """Handles with labels, drawn outside of what is seen."""
-    kinds = [("D", palette.NOMINAL, "none", "URDF"), ("o", palette.IDENTIFIED, palette.IDENTIFIED, "identified, 95 %")]
-    kinds.append(("o", palette.IDENTIFIED, "white", "known in sums, or the URDF's"))
+    kinds = [("D", palette.NOMINAL, "none", of), ("o", palette.IDENTIFIED, palette.IDENTIFIED, "identified, 95 %")]
+    kinds.append(("o", palette.IDENTIFIED, "white", f"known in sums, or the {of}'s"))
     if impossible:
         kinds.append(("X", palette.MEASURED, palette.MEASURED, "cannot exist"))
     return [

@@ -16,6 +16,7 @@ from torchid.estimators import Estimate
 from torchid.guards import MAX_JSON, read_bytes
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.parameters import PARAMETERS, PER_BODY, UNITS, Array
+from torchid.report.loadable_urdf import bound_massless_links, resolve_meshes
 from torchid.robot import Robot
 from torchid.robot.plain_urdf import plain_urdf
 from torchid.robot.urdf import drop_repeated_origins, parse_xml
@@ -159,15 +160,21 @@ def _check_number(path: Path, field: str, value: object) -> float:
     return float(value)
 
 
-def identified_urdf(robot: Robot, phi: Array) -> bytes:
+def identified_urdf(robot: Robot, phi: Array, full_mesh_paths: bool = False) -> bytes:
     """The URDF with parameters `phi`, (L, 12).
 
     The inertia of a body is that of the link with its name; links welded to it have none. Links beyond a joint that
-    the experiment welds keep the URDF's, and the rest of the body's is written. Mesh paths do not change. Of an MJCF
-    robot it is the URDF that says the same of bodies, joints and friction.
+    the experiment welds keep the URDF's, and the rest of the body's is written. Of an MJCF robot it is the URDF that
+    says the same of bodies, joints and friction.
+
+    Args:
+        robot: the robot.
+        phi: its parameters.
+        full_mesh_paths: whether meshes are named as `resolve_meshes` does, or as they were.
 
     Warns:
-        TorchidWarning: inconsistent bodies, or negative friction, which simulators (and `load_robot`) refuse.
+        TorchidWarning: inconsistent bodies, or negative friction, which simulators (and `load_robot`) refuse; meshes
+            that are not found.
     """
     tree = parse_xml(robot.path)
     drop_repeated_origins(tree.getroot())
@@ -181,8 +188,11 @@ def identified_urdf(robot: Robot, phi: Array) -> bytes:
         if not body.massless or values[parameters.INERTIAL].any():
             for name in (link for link in body.links if link not in robot.links_beyond_welds):
                 _set_inertial(links[name], values if name == body.name and values[parameters.MASS] else None)
+    bound_massless_links(tree.getroot(), robot, phi)
     if is_mjcf(robot.path):
         plain_urdf(tree.getroot())
+    elif full_mesh_paths:
+        resolve_meshes(tree.getroot(), robot.path, "identified.urdf")
     etree.indent(tree)
     return etree.tostring(tree, xml_declaration=True, encoding="utf-8")
 

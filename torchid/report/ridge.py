@@ -5,18 +5,18 @@ from __future__ import annotations
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogFormatter
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from torchid.fitting.cross_validation import RidgeChoice
 from torchid.report import palette
-from torchid.report.figures import STYLE
+from torchid.report.figures import STYLE, decade, decade_formatter
 
 _CURVE, _CHOSEN, _LEAST = palette.IDENTIFIED, palette.NOMINAL, "0.3"
-_WIDE = 20.0  # ratio of errors from which on decades tell more than differences
+_WIDE = 5.0  # ratio of errors from which on decades tell more than differences
 
 
 @matplotlib.rc_context(STYLE)
-def ridge_figure(choice: RidgeChoice) -> Figure:
+def ridge_figure(choice: RidgeChoice, of: str = "URDF") -> Figure:
     """Mean square of whitened residuals on held-out folds by ridge, on logarithmic axes.
 
     The band is a standard error of the difference from the least, fold by fold, on either side; ridges where it reaches
@@ -48,12 +48,14 @@ def ridge_figure(choice: RidgeChoice) -> Figure:
         (marker,) = axes.plot(choice.ridge, at, "D", color=_CHOSEN, markersize=8, markerfacecolor="none")
         handles.append(marker)
         labels.append(f"chosen: {choice.ridge:g}, {at:.4g}")
-    axes.set_xticks(tried[shown], [f"{ridge:g}" for ridge in tried[shown]])
+    axes.set_xticks(tried[shown], [decade(ridge) for ridge in tried[shown]])
     axes.minorticks_off()
     if axes.get_yscale() == "log":
-        axes.yaxis.set_major_formatter(LogFormatter())
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.yaxis.set_major_formatter(decade_formatter())
+        axes.yaxis.set_minor_formatter(NullFormatter())
     axes.set_xlim(tried[shown].min() / 2.0, tried[shown].max() * 2.0)
-    axes.set_xlabel("ridge: weight of the URDF against the mean square of the rows [1]")
+    axes.set_xlabel(f"ridge: weight of the {of} against the mean square of the rows [1]")
     axes.set_ylabel("mean square of whitened residuals\non held-out folds [noise²]")
     figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=8)
     figure.suptitle("Ridge by cross-validation", x=0.01, ha="left")

@@ -18,11 +18,13 @@ def identified_name(robot: Robot) -> str:
 def identified_robot(robot: Robot, phi: Array, armature: Mapping[str, float]) -> bytes:
     """The robot's file, URDF or MJCF, with parameters `phi`, (L, 12), and fitted armatures by joint [kg m^2 or kg].
 
+    Meshes that MuJoCo needs of a URDF are named by full paths.
+
     Warns:
         TorchidWarning: as `identified_urdf`.
     """
     if not is_mjcf(robot.path):
-        return identified_urdf(robot, phi)
+        return identified_urdf(robot, phi, full_mesh_paths=True)
     from torchid.report.mjcf_files import identified_mjcf  # needs an extra
 
     return identified_mjcf(robot, phi, armature)

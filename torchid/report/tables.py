@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import os
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -48,7 +49,7 @@ def terminal_console(stderr: bool = False) -> Console:
 
 
 def print_tables(*tables: Table) -> None:
-    """Print to standard output, at most 100 columns wide; a file or pipe gets the full 100."""
+    """Print to standard output, as wide as `terminal_width` says."""
     console = terminal_console()
     console.width = terminal_width()
     for table in tables:
@@ -56,9 +57,9 @@ def print_tables(*tables: Table) -> None:
 
 
 def terminal_width() -> int:
-    """Columns to print in: those of the terminal, at most 100; a file or pipe gets the full 100."""
-    console = terminal_console()
-    return min(console.width, WIDTH) if console.is_terminal else WIDTH
+    """Columns to print in: those of the terminal, at most 100; a file or pipe gets 100, or as many as COLUMNS says."""
+    console, stated = terminal_console(), os.environ.get("COLUMNS", "").isdigit()
+    return min(console.width, WIDTH) if console.is_terminal or stated else WIDTH
 
 
 def table_text(table: Table, width: int = WIDTH) -> str:
@@ -69,20 +70,20 @@ def table_text(table: Table, width: int = WIDTH) -> str:
     return captured.get()
 
 
-def error_tables(columns: Mapping[str, Comparison[Metrics]]) -> list[Table]:
-    """Errors of predicted forces, nominal against identified, two sets of logs to a table."""
+def error_tables(columns: Mapping[str, Comparison[Metrics]], of: str) -> list[Table]:
+    """Errors of predicted forces, nominal (`of` a URDF or MJCF) against identified, two sets of logs to a table."""
     sets = list(columns.items())
-    return [_error_table(dict(sets[i : i + 2])) for i in range(0, len(sets), 2)]
+    return [_error_table(dict(sets[i : i + 2]), of) for i in range(0, len(sets), 2)]
 
 
-def _error_table(columns: Mapping[str, Comparison[Metrics]]) -> Table:
+def _error_table(columns: Mapping[str, Comparison[Metrics]], of: str) -> Table:
     table = Table(
         title="Error of predicted forces: rms, and share of the rms of the measured; -: not measured",
         title_justify="left",
     )
     table.add_column("", no_wrap=True)
     for name in columns:
-        for parameter_set in ("URDF", "identified"):
+        for parameter_set in (of, "identified"):
             table.add_column(Text(f"{name}\n{parameter_set}"), justify="right", overflow="fold")
     for group, label in ERROR_GROUPS.items():
         errors = [_error_cell(m, group) for pair in columns.values() for m in pair]

@@ -28,8 +28,9 @@ _TERMS = ("total", "data", "prior", "eigenvalue", "log_det", "mass", "friction",
 class RunEvents:
     """Event files of one run: charts by step, train and test logs on one chart, figures and settings.
 
-    Steps of a descent are its epochs, after step 0, the URDF's parameters. A batch fit has step 1 alone, and the URDF's
-    parameters have charts of their own: TensorBoard would smooth a curve of two points into one that shows neither.
+    Steps of a descent are its epochs, after step 0, the URDF's parameters. A batch fit has step 1 alone. Of what is not
+    worked out by epoch, the URDF's parameters have charts of their own: TensorBoard would smooth a curve of two points
+    into one that shows neither.
     """
 
     def __init__(self, folder: Path, bodies: Sequence[str], descent: bool, since: int | None = None) -> None:
@@ -42,9 +43,8 @@ class RunEvents:
             since: first step of earlier event files in the folder that is overwritten.
         """
         self._writer, self._descent = SummaryWriter(str(folder), purge_step=since), descent
-        kinds = ("",) if descent else ("", _URDF)
-        groups = {
-            group: ["Multiline", [f"relative_error_{name}{kind}/{group}" for name in _CHARTED for kind in kinds]]
+        groups = {  # the same of all runs, which TensorBoard shows on one chart
+            group: ["Multiline", [f"relative_error_{name}{kind}/{group}" for name in _CHARTED for kind in ("", _URDF)]]
             for group in ERROR_GROUPS
         }
         loss = {
@@ -52,8 +52,7 @@ class RunEvents:
             "terms": ["Multiline", [f"loss/{term}" for term in _TERMS]],
         }
         least = {"smallest eigenvalue": ["Multiline", [f"eigenvalue/{re.escape(name)}$" for name in bodies]]}
-        which = " (step 0: URDF)" if descent else ""
-        layout = {f"errors, share of measured{which}": groups, f"bodies{which}": least}
+        layout = {"errors, share of measured": groups, "bodies": least}
         self._writer.add_custom_scalars(layout | ({"loss by epoch": loss} if descent else {}))
 
     def __enter__(self) -> RunEvents:
@@ -73,9 +72,13 @@ class RunEvents:
         groups: Sequence[str] = tuple(ERROR_GROUPS),
         *,
         nominal: bool = False,
+        by_epoch: bool = True,
     ) -> None:
-        """Errors by group of rows of one parameter vector, `nominal` or identified, on sets of logs."""
-        kind = self._kind(nominal)
+        """Errors by group of rows of one parameter vector, `nominal` or identified, on sets of logs.
+
+        `by_epoch`: whether a descent works them out on its way.
+        """
+        kind = _URDF if nominal and not by_epoch else self._kind(nominal)
         for name, metrics in sets.items():
             for group in groups:
                 if metrics.relative.get(group) is not None:
@@ -166,7 +169,7 @@ class RunEvents:
         settings: str,
         hyperparameters: Mapping[str, str | float | bool],
         final: Mapping[str, float],
-        figures: Mapping[str, Path],
+        figures: Mapping[str, bytes],
         step: int,
     ) -> None:
         """Settings, final metrics and figures of a finished run.
@@ -175,12 +178,11 @@ class RunEvents:
             settings: resolved configuration, YAML.
             hyperparameters: for the HParams tab.
             final: metrics beside them.
-            figures: PNG files by tag, which are not drawn again.
+            figures: PNG by tag.
             step: of the figures.
         """
         self._writer.add_text("config", _preformatted(settings))
-        for tag, path in figures.items():
-            png = path.read_bytes()
+        for tag, png in figures.items():
             width, height = struct.unpack(">II", png[16:24])
             image = Summary.Image(encoded_image_string=png, width=width, height=height, colorspace=_RGBA)
             self._writer.file_writer.add_summary(Summary(value=[Summary.Value(tag=tag, image=image)]), step)

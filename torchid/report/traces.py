@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,20 +41,23 @@ class LogForces:
     bandwidth: float
 
 
-def traces_document(forces: LogForces, base_rows: int, dof_names: Sequence[str]) -> dict[str, Any]:
+def traces_document(
+    forces: LogForces, base_rows: int, dof_names: Sequence[str], sliding: Collection[str] = ()
+) -> dict[str, Any]:
     """The largest rows, thinned to what a figure can show, for JSON; time is from the first sample [s].
 
     Args:
         forces: of a log.
         base_rows: of the robot.
         dof_names: likewise.
+        sliding: likewise.
     """
     time = forces.recorded.time - forces.recorded.time[0]
     thin = _Thinned(time)
     kinds = {"recorded": forces.recorded, "projected": forces.projected}
     panels = {
         kind: [
-            {"row": row} | dict(zip(("name", "unit"), name_row(row, base_rows, dof_names), strict=True))
+            {"row": row} | dict(zip(("name", "unit"), name_row(row, base_rows, dof_names, sliding), strict=True))
             | _panel(series, row, thin) | {"spectrum": _spectrum(series, row, time, forces.bandwidth)}
             for row in largest_rows(series, base_rows, _MOST_ROWS)
         ]

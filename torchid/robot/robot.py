@@ -27,6 +27,7 @@ from torchid.robot.tree import (
 )
 from torchid.robot.urdf import is_bolted, read_urdf
 from torchid.robot.welds import links_beyond, weld_joints, weld_positions
+from torchid.robot.xml_files import is_mjcf
 
 if TYPE_CHECKING:
     from pytorch_kinematics import Chain
@@ -97,6 +98,17 @@ class Robot:
         Such a sensor counts as six motionless degrees of freedom whose generalized force is measured.
         """
         return (*self.joint_names, *(f"{name}.{k}" for name in self.ft_names for k in WRENCH_COMPONENTS))
+
+    @cached_property
+    def format(self) -> str:
+        """What its file is, which nominal parameters are from: "URDF" or "MJCF"."""
+        return "MJCF" if is_mjcf(self.path) else "URDF"
+
+    @property
+    def sliding(self) -> tuple[str, ...]:
+        """Names of the independent joints that slide: their torque is a force."""
+        joints = {body.joint.name: body.joint.kind for body in self.bodies if body.joint is not None}
+        return tuple(name for name in self.joint_names if joints[name] == "prismatic")
 
     @property
     def n_dofs(self) -> int:

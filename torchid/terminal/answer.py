@@ -20,31 +20,32 @@ _MOST_ATTENTION, _TEXT_LINES = 2, 2
 _FEWEST_LINES = 4  # of the table of bodies: a heading, a body, how many others there are, what the marks mean
 _MASS, _CENTER = PARAMETERS.index("m"), slice(PARAMETERS.index("mcx"), PARAMETERS.index("mcz") + 1)
 _COULOMB, _VISCOUS = PARAMETERS.index("fc"), PARAMETERS.index("fv")
-_LEGEND = {COMBINED: "+ known only in sums with other bodies", PRIOR: "p mostly the URDF's", UNOBSERVABLE: ". unseen"}
+_LEGEND = {COMBINED: "+ known only in sums with other bodies", PRIOR: "p mostly the {of}'s", UNOBSERVABLE: ". unseen"}
 _MARKS = {IDENTIFIED: " ", COMBINED: "+", PRIOR: "p", UNOBSERVABLE: ".", FIXED: "="}
 
 
-def print_answer(run: Identification) -> None:
-    """Print it for the terminal's width."""
-    print("\n".join(answer_lines(run, terminal_width())))
+def print_answer(run: Identification, *last: str) -> None:
+    """Print it for the terminal's width, with these lines at the end."""
+    print("\n".join(answer_lines(run, terminal_width(), last)))
 
 
-def answer_lines(run: Identification, width: int) -> list[str]:
+def answer_lines(run: Identification, width: int, last: Sequence[str] = ()) -> list[str]:
     """The answer, in lines that are not wider than so many columns.
 
     Args:
         run: a finished one.
         width: of the terminal.
+        last: lines at the end.
     """
     said = answer(run)
-    lines = [*wrap_words(said.headline, width), *error_lines(said.errors, width), ""]
+    lines = [*wrap_words(said.headline, width), *error_lines(said.errors, width, run.experiment.robot.format), ""]
     lines += labelled("total mass", said.total_mass, width, _TEXT_LINES)
     lines += labelled("bodies", said.bodies, width, _TEXT_LINES)
     for one in said.attention[:_MOST_ATTENTION]:
         lines += labelled("attention", one, width, _TEXT_LINES)
     if len(said.attention) > _MOST_ATTENTION:
         lines += labelled("", f"and {len(said.attention) - _MOST_ATTENTION} more: --verbose", width, _TEXT_LINES)
-    end = [f"{'written to':{LABEL}}{run.experiment.config.output}"]
+    end = [f"{'written to':{LABEL}}{run.experiment.config.output}", *last]
     bodies = _body_lines(run.experiment.robot, run.estimate, LINES - len(lines) - len(end) - 1, width)
     return [*lines, *(["", *bodies] if bodies else []), *end]
 
@@ -64,7 +65,7 @@ def _body_lines(robot: Robot, estimate: Estimate, room: int, width: int) -> list
     marks = {word for line in lines[1:] for word in line.split()[1:]}
     if len(free) > len(shown):
         lines.append(f"and {len(free) - len(shown)} bodies that changed less: parameters.json, --verbose")
-    legend = "; ".join(text for verdict, text in _LEGEND.items() if _MARKS[verdict] in marks)
+    legend = "; ".join(text.format(of=robot.format) for verdict, text in _LEGEND.items() if _MARKS[verdict] in marks)
     return [*lines, *([shorten(legend, width, placeholder=CUT)] if legend else [])]
 
 
@@ -89,7 +90,7 @@ def _columns(robot: Robot, estimate: Estimate, bodies: Sequence[int]) -> list[tu
     moved = [_center_moved(nominal[k], phi[k], verdict[k]) for k in bodies]
     return [
         ("mass [kg]", cells(_MASS)),
-        ("URDF [kg]", [f"{nominal[k, _MASS]:.3f}" for k in bodies]),
+        (f"{robot.format} [kg]", [f"{nominal[k, _MASS]:.3f}" for k in bodies]),
         (f"Coulomb [{force}]", cells(_COULOMB)),
         ("centre moved [mm]", moved),
         ("viscous", cells(_VISCOUS)),

@@ -24,13 +24,14 @@ def evaluation_lines(evaluated: EvaluatedRun, width: int) -> list[str]:
         evaluated: of one log or several.
         width: of the terminal.
     """
-    judged = [Judged(name, pair.nominal, pair.identified) for name, pair in evaluated.metrics.items()]
+    of = evaluated.robot.format
+    judged = [Judged(name, pair.nominal, pair.identified, of) for name, pair in evaluated.metrics.items()]
     judged.sort(key=_worst, reverse=True)
     lines = [line for one in judged[:MOST_LOGS] for line in wrap_words(_sentence(one), width, "  ")]
     if len(judged) > MOST_LOGS:
         lines.append(f"and {len(judged) - MOST_LOGS} logs that are predicted better than these: --verbose")
     if len(judged) == 1:
-        lines += error_lines(judged[0].shown_errors(), width)
+        lines += error_lines(judged[0].shown_errors(), width, of)
     left_out = sum(evaluated.excluded.values())
     if left_out:
         lines.append(f"{'left out':{LABEL}}{left_out} samples that torchid check condemns")
@@ -39,13 +40,13 @@ def evaluation_lines(evaluated: EvaluatedRun, width: int) -> list[str]:
 
 def print_all_errors(evaluated: EvaluatedRun) -> None:
     """Print the errors of all logs by group of rows."""
-    print_tables(*error_tables(evaluated.metrics))
+    print_tables(*error_tables(evaluated.metrics, evaluated.robot.format))
     print(f"{'written to':{LABEL}}{evaluated.output}")
 
 
 def _sentence(one: Judged) -> str:
     worse = worse_than_nominal({one.text: (one.nominal, one.identified)})
-    return f"WORSE THAN URDF: {describe_worse(worse)}" if worse else one.headline()
+    return f"WORSE THAN {one.of}: {describe_worse(worse)}" if worse else one.headline()
 
 
 def _worst(one: Judged) -> float:

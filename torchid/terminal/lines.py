@@ -11,7 +11,7 @@ from rich.text import Text
 
 from torchid.errors import one_line
 from torchid.fitting.noise import NoiseSummary
-from torchid.report.tables import WIDTH, noise_advice, noise_table, print_tables, table_text
+from torchid.report.tables import noise_advice, noise_table, print_tables, table_text, terminal_width
 
 LABEL = 14
 """Columns of the words before what they are about."""
@@ -48,7 +48,7 @@ def labelled(label: str, text: str, width: int, most: int | None = None) -> list
 
 def print_labelled(label: str, text: str) -> None:
     """Print what a word is about, broken into lines below each other."""
-    print("\n".join(labelled(label, text, WIDTH)))
+    print("\n".join(labelled(label, text, terminal_width())))
 
 
 def table_lines(table: Table, width: int) -> list[str]:
@@ -80,10 +80,13 @@ def column_lines(
         shown.pop()
 
 
-def error_lines(errors: Sequence[tuple[str, float, float, float | None]], width: int) -> list[str]:
-    """A small table of the errors of a `Judged`, not wider than so many columns; none without errors."""
+def error_lines(errors: Sequence[tuple[str, float, float, float | None]], width: int, of: str) -> list[str]:
+    """A small table of the errors of a `Judged`, not wider than so many columns; none without errors.
+
+    `of`: what the nominal parameters are those of.
+    """
     columns = [
-        ("URDF", [f"{before:.4g}" for _, before, _, _ in errors]),
+        (of, [f"{before:.4g}" for _, before, _, _ in errors]),
         ("identified", [f"{after:.4g}" for _, _, after, _ in errors]),
         ("noise alone", ["-" if floor is None else f"{floor:.4g}" for *_, floor in errors]),
     ]

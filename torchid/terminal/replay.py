@@ -24,7 +24,7 @@ def replay_lines(replayed: Replay, width: int, verbose: bool = False) -> list[st
         verbose: with all joints.
     """
     lines = wrap_words(_sentence(replayed), width, "  ")
-    rows = [(name, who) for name in replayed.at(replayed.window) for who in ("URDF", "identified")]
+    rows = [(name, who) for name in replayed.at(replayed.window) for who in (replayed.of, "identified")]
     columns = [
         (f"{time:g} s", [f"{replayed.at(time)[name][who == 'identified']:.4g}" for name, who in rows])
         for time in (share * replayed.window for share in _SHARES)
@@ -32,7 +32,10 @@ def replay_lines(replayed: Replay, width: int, verbose: bool = False) -> list[st
     lines += column_lines(("median drift after", [f"{name}, {who}" for name, who in rows]), columns, width)
     joints = sorted(replayed.by_joint().items(), key=lambda x: -x[1].identified)
     few = joints if verbose else joints[:_MOST]
-    cells = [("URDF", [f"{x.nominal:.4g}" for _, x in few]), ("identified", [f"{x.identified:.4g}" for _, x in few])]
+    cells = [
+        (replayed.of, [f"{x.nominal:.4g}" for _, x in few]),
+        ("identified", [f"{x.identified:.4g}" for _, x in few]),
+    ]
     lines += ["", *column_lines((f"joint, after {replayed.window:g} s", [name for name, _ in few]), cells, width)]
     if len(few) < len(joints):
         lines.append(f"and {len(joints) - len(few)} joints that drift less: --verbose")
@@ -48,6 +51,6 @@ def _sentence(replayed: Replay) -> str:
         for name, (before, after) in replayed.at(replayed.window).items()
     ]
     worse = any(after > before for before, after in replayed.at(replayed.window).values())
-    head = "WORSE THAN URDF: drift" if worse else "Drift"
-    of = f"of the torques of {replayed.source} alone, as a share of the URDF's"
+    head = f"WORSE THAN {replayed.of}: drift" if worse else "Drift"
+    of = f"of the torques of {replayed.source} alone, as a share of the {replayed.of}'s"
     return f"{head} after {replayed.window:g} s {of}: {', '.join(shares)} ({replayed.windows} windows)"

@@ -86,7 +86,10 @@ def test_curves_say_everything_by_epoch_and_show_train_and_unseen_logs(run: Path
     evaluated = [f"{kind}_error_{name}/{group}" for kind in ("relative", "rms") for name in ("train", "test")
                  for group in ROW_GROUPS]  # fmt: skip
     # the log is too short to leave folds of it out
-    judged = [f"{kind}_error_{name}/{WHITENED}" for kind in ("relative", "rms") for name in ("train", "test")]
+    judged = [
+        f"{kind}_error_{name}{of}/{WHITENED}"
+        for kind in ("relative", "rms") for name in ("train", "test") for of in ("", "_URDF")
+    ]  # fmt: skip
     evaluated += [f"eigenvalue/{name}" for name in robot.body_names]
     once = ["fit/residual_std", "fit/rank", "fit/condition_number", "identifiability/bits"]
     once += ["identifiability/combinations", *(f"verdicts/{verdict}" for verdict in VERDICTS)]
@@ -94,7 +97,7 @@ def test_curves_say_everything_by_epoch_and_show_train_and_unseen_logs(run: Path
     assert set(events.Tags()["scalars"]) - final == {
         *(*by_epoch, *evaluated, *judged, *once, "identifiability/singular_value")
     }
-    for tags, expected in ((by_epoch, BY_EPOCH), (evaluated, EVALUATED), (judged, [0, EPOCHS]), (once, [EPOCHS])):
+    for tags, expected in ((by_epoch, BY_EPOCH), (evaluated, EVALUATED), (judged, [EPOCHS]), (once, [EPOCHS])):
         for tag in tags:
             assert steps(events, tag) == expected
     for tag in ("loss/data", "loss_held_out/data", "relative_error_test/nullspace", "closed_form/distance"):
@@ -109,6 +112,12 @@ def test_curves_say_everything_by_epoch_and_show_train_and_unseen_logs(run: Path
     assert b"checkpoint_seconds: 0" in text.tensor_proto.string_val[0]
 
 
+NAMES = {
+    "sensors", "estimator", "ridge", "friction", "cutoff_hz", "margin", "prior", "consistency",
+    *(f"training.{name}" for name in ("optimizer", "lr", "schedule", "batch_size", "epochs", "seed")),
+}  # fmt: skip
+
+
 def test_hyperparameters_stand_beside_the_final_errors(run: Path) -> None:
     events = events_in(run)
     tags = set(events.Tags()["scalars"])
@@ -117,8 +126,11 @@ def test_hyperparameters_stand_beside_the_final_errors(run: Path) -> None:
     (found,) = events.Scalars("final/test_nullspace")
     assert found.value == pytest.approx(metrics["test"]["nullspace_rms_relative"], rel=1e-6)
     (start,) = (summary for name, summary in events.summary_metadata.items() if name == "_hparams_/session_start_info")
-    for name in (b"optimizer", b"Adam", b"CosineAnnealingLR", b"batch_size", b"consistency", b"log_cholesky"):
-        assert name in start.plugin_data.content
+    content = start.plugin_data.content
+    for name in (b"training.optimizer", b"Adam", b"CosineAnnealingLR", b"training.batch_size", b"log_cholesky"):
+        assert name in content
+    names = sorted(name.decode() for name in set(re.findall(rb"[a-z_.]+", content)) if name.decode() in NAMES)
+    assert names[:5] == ["consistency", "cutoff_hz", "estimator", "friction", "margin"], "which TensorBoard shows"
 
 
 def test_custom_charts_show_training_and_unseen_logs_together(run: Path) -> None:
@@ -127,7 +139,8 @@ def test_custom_charts_show_training_and_unseen_logs_together(run: Path) -> None
     layout.ParseFromString(events.Tensors("custom_scalars__config__")[0].tensor_proto.string_val[0])
     charts = {chart.title: list(chart.multiline.tag) for category in layout.category for chart in category.chart}
     for group in ERROR_GROUPS:
-        assert charts[group] == [f"relative_error_{name}/{group}" for name in ("train", "test", "left_out")]
+        logs = ("train", "test", "left_out")
+        assert charts[group] == [f"relative_error_{name}{of}/{group}" for name in logs for of in ("", "_URDF")]
     assert charts["train and held out"] == ["loss/data", "loss_held_out/data"]
     tags = events.Tags()["scalars"]
     for title, patterns in charts.items():
