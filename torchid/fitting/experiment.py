@@ -90,7 +90,8 @@ class Scene:
         else:
             by_name = choice.joint_torques, choice.contact_wrenches
             sensors = chosen_sensors(robot.joint_names, contacts, *by_name, noise, ft)
-        return with_ft_sensors(sensors, robot, choice.ft_sensors)
+        measured = with_ft_sensors(sensors, robot, choice.ft_sensors)
+        return replace(measured, torque=measured.torque | robot.is_passive)  # known: 0
 
     def builder(self, sensors: SensorSet) -> RowBuilder:
         """Builder of the rows of some sensors, on the device of the settings."""
@@ -214,7 +215,9 @@ def set_up_scene(config: ExperimentConfig | AnalyzeConfig) -> Scene:
         if is_mjcf(of.path) != (of.mjcf is not None):
             key, other = ("robot.urdf", "mjcf") if of.mjcf is None else ("robot.mjcf", "urdf")
             raise ConfigError.at_field(key, f"'{of.path}', no {key[6:].upper()}", f"robot: {{{other}: {of.path.name}}}")
-        robot = load_robot(of.path, of.base_link, of.fixed_base, _ft_joints(config), of.weld, of.tilt)
+        loops = [loop.loop for loop in of.loops]
+        with_ft = _ft_joints(config)
+        robot = load_robot(of.path, of.base_link, of.fixed_base, with_ft, of.weld, of.tilt, loops, of.passive)
     except UnknownNameError as error:
         if error.field != FT_FIELD:
             raise

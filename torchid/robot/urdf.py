@@ -76,12 +76,14 @@ class TreeJoint(Joint):  # type: ignore[misc]
         armature: reflected rotor inertia [kg m^2 or kg].
         stiffness: of a spring [N m/rad or N/m].
         rest: position at which it exerts no force [rad or m].
+        passive: whether no motor drives it.
     """
 
     child_offset: tuple[float, ...] = (0.0, 0.0, 0.0)
     armature: float = 0.0
     stiffness: float = 0.0
     rest: float = 0.0
+    passive: bool = False
 
 
 def _tree_joint(joint: Joint, element: etree._Element) -> TreeJoint:
@@ -93,7 +95,8 @@ def _tree_joint(joint: Joint, element: etree._Element) -> TreeJoint:
     offset = "0 0 0" if child is None else child.get(f"{OWN}xyz", "0 0 0")
     of = {} if dynamics is None else dynamics.attrib
     own = {name: float(of.get(OWN + name, 0.0)) for name in ("armature", "stiffness", "rest")}
-    return TreeJoint(**vars(joint), child_offset=tuple(map(float, offset.split())), **own)
+    passive = f"{OWN}passive" in of
+    return TreeJoint(**vars(joint), child_offset=tuple(map(float, offset.split())), passive=passive, **own)
 
 
 def read_urdf(path: Path) -> tuple[list[Link], list[TreeJoint]]:

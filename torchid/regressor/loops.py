@@ -1,0 +1,211 @@
+"""Closed loops: how far their frames are apart, and the generalized forces of what they exert, batch-last."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from torchid.parameters import Array
+from torchid.regressor.kinematics import BodyStates, joint_frame_poses, joint_screw_axes
+from torchid.regressor.regressor import wrench_transform, wrenches_at_base
+from torchid.regressor.tree import KinematicTree
+from torchid.robot import Loop, Robot
+from torchid.rounding import KINEMATIC_TOLERANCE, is_significant
+
+_POSTURES = 16  # random ones, from which constant directions without work are told
+_LARGEST = 1.5  # rad or m, of their joint positions
+
+
+@dataclass(frozen=True)
+class LoopGeometry:
+    """Where a loop closes in a tree.
+
+    Attributes:
+        loop: its frames and type.
+        nodes: that carry both frames.
+        poses: of the frames, (4, 4) [m], in the nodes' joint frames.
+        moving: nodes whose joints move one of the two alone, with 1 where it is the first and -1 where the other.
+    """
+
+    loop: Loop
+    nodes: tuple[int, int]
+    poses: tuple[Array, Array]
+    moving: tuple[tuple[int, float], ...]
+
+    @classmethod
+    def of(cls, loop: Loop, robot: Robot, tree: KinematicTree) -> LoopGeometry:
+        """The geometry of a loop in a robot's tree."""
+        (one, T_one), (other, T_other) = (tree.frame(robot, frame) for frame in loop.frames)
+        paths = [set(tree.path(node)) for node in (one, other)]
+        apart = sorted(paths[0] ^ paths[1])
+        return cls(loop, (one, other), (T_one, T_other), tuple((x, 1.0 if x in paths[0] else -1.0) for x in apart))
+
+    @cached_property
+    def unit_wrenches(self) -> Array:
+        """Unit wrenches, (k, 6), that the first body takes, in its node's joint frame, along the frame's axes."""
+        return wrench_transform(self.poses[0]).T[list(self.loop.components)]
+
+    def joints(self, tree: KinematicTree) -> list[int]:
+        """Independent joints that move one frame relative to the other."""
+        map_ = tree.joint_map[[node for node, _ in self.moving], : tree.n]
+        return torch.nonzero((map_ != 0.0).any(0))[:, 0].tolist()
+
+    def forces(self, tree: KinematicTree, screw_axes: Tensor, wrenches: Tensor, joints: Sequence[int]) -> Tensor:
+        """Torques of wrenches on the first body and their opposite, at the same point, on the other; none on the base.
+
+        Args:
+            tree: the robot's constants.
+            screw_axes: from `joint_screw_axes`, (6, L, B).
+            wrenches: at the base origin, (6, k, B) [N, N m].
+            joints: independent joints to give columns for.
+
+        Returns:
+            (k, len(joints), B) [N m or N].
+        """
+        nodes, signs = zip(*self.moving, strict=True)
+        index, at = tree.index(nodes), tree.index(joints)
+        signed = tree.joint_map[index][:, at] * tree.joint_map.new_tensor(signs)[:, None]
+        screws = signed.T @ screw_axes[:, index]
+        return (wrenches[:, :, None] * screws[:, None]).sum(0)
+
+    def jacobian(self, tree: KinematicTree, states: BodyStates, joints: Sequence[int]) -> Tensor:
+        """Rows of the unit wrenches, (k, len(joints), B), in float64."""
+        at_base = wrenches_at_base(states, self.nodes[0], torch.from_numpy(self.unit_wrenches.copy()))
+        return self.forces(tree, joint_screw_axes(tree, states), at_base, joints)
+
+    def deviation(self, rotation: Tensor, position: Tensor) -> tuple[Tensor, Tensor]:
+        """Offset (3, B) [m] and rotation (3, 3, B) of the second frame from the first, along its axes.
+
+        Args:
+            rotation: of the joint frames, (3, 3, L, B).
+            position: of their origins, (3, L, B) [m].
+        """
+        (R, p), (R_other, p_other) = (
+            _frame(rotation, position, *at) for at in zip(self.nodes, self.poses, strict=True)
+        )
+        return ((p_other - p)[:, None] * R).sum(0), (R[:, :, None] * R_other[:, None]).sum(0)
+
+
+def _frame(rotation: Tensor, position: Tensor, node: int, pose: Array) -> tuple[Tensor, Tensor]:
+    """Rotation (3, 3, B) and position (3, B) of a frame on a node."""
+    T, R = rotation.new_tensor(pose), rotation[:, :, node]
+    origin = position[:, node] + (R * T[:3, 3, None]).sum(1)
+    return (R[:, :, None] * T[None, :3, :3, None]).sum(1), origin
+
+
+def rotation_angle(R: Tensor) -> Tensor:
+    """Angles (B,) [rad], from 0 to pi, of rotations (3, 3, B)."""
+    return torch.atan2(torch.linalg.vector_norm(_sines(R), dim=0), 0.5 * (R.diagonal().sum(-1) - 1.0))
+
+
+def _rotation_vector(R: Tensor) -> Tensor:
+    """Rotation vectors (3, B) [rad] of rotations (3, 3, B) by less than half a turn."""
+    sine = _sines(R)
+    size = torch.linalg.vector_norm(sine, dim=0)
+    tiny = torch.finfo(R.dtype).tiny
+    return sine * torch.where(size > 0.0, rotation_angle(R) / size.clamp_min(tiny), 1.0)
+
+
+def _sines(R: Tensor) -> Tensor:
+    return 0.5 * torch.stack([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+
+
+class LoopClosures:
+    """The loops of a robot at joint positions, in float64 on the CPU.
+
+    `geometries`: one for each loop. `joints`: independent joints that they depend on.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        """Look the loops up in the robot's tree."""
+        self.tree = KinematicTree(robot)
+        self.geometries = [LoopGeometry.of(loop, robot, self.tree) for loop in robot.loops]
+        self.joints = sorted({joint for loop in self.geometries for joint in loop.joints(self.tree)})
+
+    def gaps(self, joint_position: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Distance [m] and angle [rad] of each loop's frames, (B,) each, at joint positions (B, n).
+
+        The angle of a point is 0.
+        """
+        poses, out = self._poses(joint_position), []
+        for loop in self.geometries:
+            offset, turned = loop.deviation(*poses)
+            angle = rotation_angle(turned) if loop.loop.kind == "weld" else torch.zeros_like(offset[0])
+            out.append((torch.linalg.vector_norm(offset, dim=0), angle))
+        return out
+
+    def deviations(self, joint_position: Tensor) -> Tensor:
+        """Deviations of all loops that `jacobian` has rows for, (B, k) [m, rad], at joint positions (B, n)."""
+        poses, rows = self._poses(joint_position), []
+        for loop in self.geometries:
+            offset, turned = loop.deviation(*poses)
+            rows += [offset] if loop.loop.kind == "point" else [offset, _rotation_vector(turned)]
+        return torch.cat(rows).T
+
+    def jacobian(self, joint_position: Tensor) -> Tensor:
+        """Velocities of all loops' first frames relative to the second, by joint velocities, (B, k, n).
+
+        Along the first frame's axes; where the loops are closed, minus the derivative of the deviations.
+        """
+        rotation, position = self._poses(joint_position)
+        states = BodyStates(rotation, position, *([torch.zeros_like(position)] * 3))
+        rows = [loop.jacobian(self.tree, states, range(self.tree.n)) for loop in self.geometries]
+        return torch.cat(rows).permute(2, 0, 1)
+
+    def effective_wrenches(self, number: int, joints: Sequence[int]) -> Array:
+        """Unit wrenches of a loop on its first body, (k, 6), without those that never do work on some joints.
+
+        What a four-bar's pins exert across its plane moves nothing. Such directions are told by the loop's Jacobian at
+        random positions, closed or not: singular values below `KINEMATIC_TOLERANCE` of the largest. What is redundant
+        at single samples beyond these is left to the null space of each.
+
+        Args:
+            number: of the loop.
+            joints: independent joints that are measured.
+        """
+        loop, n = self.geometries[number], self.tree.n
+        generator = torch.Generator().manual_seed(0)
+        q = _LARGEST * (2.0 * torch.rand(_POSTURES, n, generator=generator, dtype=torch.float64) - 1.0)
+        rotation, position = self._poses(q)
+        states = BodyStates(rotation, position, *([torch.zeros_like(position)] * 3))
+        work = loop.jacobian(self.tree, states, joints).flatten(1).numpy()  # (k, joints x postures)
+        U, values, _ = np.linalg.svd(work, full_matrices=False)
+        kept: Array = U[:, is_significant(values, KINEMATIC_TOLERANCE)].T @ loop.unit_wrenches
+        return kept
+
+    def _poses(self, joint_position: Tensor) -> tuple[Tensor, Tensor]:
+        position = self.tree.joint_map[:, : self.tree.n] @ joint_position.T + self.tree.joint_constant
+        return joint_frame_poses(self.tree, position)
+
+
+class LoopJacobian(nn.Module):
+    """Jacobian of a robot's loops: `J(q) v` are the twists of their first frames relative to the second.
+
+    At the first frame's origin, along its axes: three rows of a point, six of a weld, loop by loop. What the loops
+    exert enters the dynamics as `J^T f`, as contacts do, and is not measured: rows for `torchid.Projection` after those
+    of J_C, which are always active. The base's columns are 0: forces inside of the robot do not move it.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        """Build the constants.
+
+        Args:
+            robot: with at least one loop.
+        """
+        super().__init__()
+        self.closures = LoopClosures(robot)
+
+    def forward(self, q: Tensor) -> Tensor:
+        """Jacobian at coordinates, (B, n + 7) or (B, n) for a fixed base (see `Regressor`).
+
+        Returns:
+            (B, k, n_rows).
+        """
+        tree = self.closures.tree
+        J = self.closures.jacobian(q[:, q.shape[1] - tree.n :])
+        return nn.functional.pad(J, (tree.base_rows, tree.n_dofs - tree.n))
