@@ -30,6 +30,7 @@ from torchid.log_checks.findings import (
 )
 from torchid.log_checks.forces import check_forces_against_urdf
 from torchid.log_checks.frozen import check_repeats, check_scalar_wrenches
+from torchid.log_checks.loops import check_loops
 from torchid.log_checks.motion import check_angle_unit, check_angular_velocity, check_derivatives
 from torchid.log_checks.slip import check_slip
 from torchid.log_checks.spikes import check_jumps
@@ -150,6 +151,7 @@ def check(
         results += check_angular_velocity(repaired, robot)
         results += check_accelerometer(repaired, robot)
     if _blocking_finding(results) is None:
+        results += check_loops(repaired, robot)
         results += check_standing_feet(repaired, robot, contacts, derived)
         results += check_slip(repaired, robot, contacts, cutoff_hz, derived)
     compared = repaired

@@ -180,7 +180,7 @@ class ContactStateLayouts:
         for contact, active in enumerate(state):
             if active:
                 touching.setdefault(self.frames[contact][0], []).append(contact)
-        moving = {joint for body in touching for joint in self.columns.joints_above(body)} | self._loops.joints
+        moving = {joint for body in touching for joint in self.columns.joints_above(body)} | self._loops.dofs
         measured = np.flatnonzero(self.sensors.torque).tolist()
         coupled = tuple(joint for joint in measured if joint in moving)
         bodies = tuple(

@@ -31,6 +31,12 @@ class LoopGap:
         """Whether the frames are farther apart than the loop accepts."""
         return self.rms > self.loop.max_gap or self.rms_angle > self.loop.max_angle
 
+    @property
+    def accepted(self) -> str:
+        """Up to which distance they count as together."""
+        bound = f"rms up to {1e3 * self.loop.max_gap:.3g} mm"
+        return bound if self.loop.kind != "weld" else f"{bound} and {np.degrees(self.loop.max_angle):.3g} deg"
+
     def __str__(self) -> str:
         text = f"rms {1e3 * self.rms:.3g} mm, at most {1e3 * self.largest:.3g} mm"
         if self.loop.kind != "weld":
@@ -67,9 +73,6 @@ def require_closed_loops(source: str, joint_position: torch.Tensor, robot: Robot
     """
     for number, gap in enumerate(loop_gaps(robot, joint_position)):
         if gap.is_open:
-            bound = f"rms up to {1e3 * gap.loop.max_gap:.3g} mm"
-            if gap.loop.kind == "weld":
-                bound += f" and {np.degrees(gap.loop.max_angle):.3g} deg"
-            accepted = f"{bound} (its max_gap, max_angle): frames that coincide, and zeros of encoders that agree"
+            accepted = f"{gap.accepted} (its max_gap, max_angle): frames that coincide, and encoders without an offset"
             found = f"{gap.loop.label} apart by {gap}"
             raise LogError(source, f"{LOOPS_FIELD}[{number}]", found, accepted)

@@ -36,12 +36,12 @@ class LoopRows:
 
 
 class LoopLayouts:
-    """The loops of a robot; `joints`: independent joints that some of them depends on."""
+    """The loops of a robot; `dofs`: degrees of freedom that some of them depends on."""
 
     def __init__(self, robot: Robot) -> None:
         """Look up where they close."""
         self._closures = LoopClosures(robot) if robot.loops else None
-        self.joints = frozenset() if self._closures is None else frozenset(self._closures.joints)
+        self.dofs = frozenset() if self._closures is None else frozenset(self._closures.dofs)
         self._wrenches: dict[tuple[int, tuple[int, ...]], Array] = {}
 
     def rows(self, coupled: Sequence[int], like: Tensor) -> Iterator[LoopRows]:
@@ -55,7 +55,7 @@ class LoopLayouts:
         if closures is None:
             return
         for number, loop in enumerate(closures.geometries):
-            own = set(loop.joints(closures.tree))
+            own = set(loop.dofs(closures.tree))
             joints = tuple(index for index, joint in enumerate(coupled) if joint in own)
             dofs = tuple(coupled[index] for index in joints)
             if (number, dofs) not in self._wrenches:

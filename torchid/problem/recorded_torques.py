@@ -16,8 +16,8 @@ _NO_TORQUE = 1e-9  # N m or N: what a simulator's log may have of a joint withou
 
 
 def recorded_torques(log: Log, robot: Robot, order: list[int]) -> Tensor | None:
-    """Joint torques and wrenches in limbs, (N, n + 6 F); None if neither was recorded."""
-    if log.joint_torque is None and not (robot.ft_names and log.ft_wrench is not None):
+    """Joint torques and wrenches in limbs, (N, n + 6 F); None if neither was recorded nor follows from the robot."""
+    if log.joint_torque is None and not (robot.ft_names and log.ft_wrench is not None) and not robot.passive:
         return None
     not_recorded = np.full((len(log), robot.n), np.nan)
     torque = not_recorded if log.joint_torque is None else columns_in_order(log.joint_torque, order)

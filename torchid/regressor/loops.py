@@ -19,6 +19,9 @@ from torchid.rounding import KINEMATIC_TOLERANCE, is_significant
 
 _POSTURES = 16  # random ones, from which constant directions without work are told
 _LARGEST = 1.5  # rad or m, of their joint positions
+_CLOSED = 1e-12  # m or rad: a gap that is rounding
+_MOST_STEPS, _LARGEST_STEP = 100, 0.3  # of Gauss-Newton, and of a joint in one of them [rad or m]
+_SINGULAR = 1e-6  # singular values of a loop's Jacobian below this share of the largest: no step along them
 
 
 @dataclass(frozen=True)
@@ -50,33 +53,34 @@ class LoopGeometry:
         """Unit wrenches, (k, 6), that the first body takes, in its node's joint frame, along the frame's axes."""
         return wrench_transform(self.poses[0]).T[list(self.loop.components)]
 
-    def joints(self, tree: KinematicTree) -> list[int]:
-        """Independent joints that move one frame relative to the other."""
-        map_ = tree.joint_map[[node for node, _ in self.moving], : tree.n]
-        return torch.nonzero((map_ != 0.0).any(0))[:, 0].tolist()
+    def dofs(self, tree: KinematicTree) -> list[int]:
+        """Degrees of freedom between both frames: joints, and those of force/torque sensors in limbs."""
+        moved = tree.joint_map[[node for node, _ in self.moving]]
+        out: list[int] = torch.nonzero((moved != 0.0).any(0))[:, 0].tolist()
+        return out
 
-    def forces(self, tree: KinematicTree, screw_axes: Tensor, wrenches: Tensor, joints: Sequence[int]) -> Tensor:
+    def forces(self, tree: KinematicTree, screw_axes: Tensor, wrenches: Tensor, dofs: Sequence[int]) -> Tensor:
         """Torques of wrenches on the first body and their opposite, at the same point, on the other; none on the base.
 
         Args:
             tree: the robot's constants.
             screw_axes: from `joint_screw_axes`, (6, L, B).
             wrenches: at the base origin, (6, k, B) [N, N m].
-            joints: independent joints to give columns for.
+            dofs: degrees of freedom to give columns for.
 
         Returns:
-            (k, len(joints), B) [N m or N].
+            (k, len(dofs), B) [N m or N].
         """
         nodes, signs = zip(*self.moving, strict=True)
-        index, at = tree.index(nodes), tree.index(joints)
+        index, at = tree.index(nodes), tree.index(dofs)
         signed = tree.joint_map[index][:, at] * tree.joint_map.new_tensor(signs)[:, None]
         screws = signed.T @ screw_axes[:, index]
         return (wrenches[:, :, None] * screws[:, None]).sum(0)
 
-    def jacobian(self, tree: KinematicTree, states: BodyStates, joints: Sequence[int]) -> Tensor:
-        """Rows of the unit wrenches, (k, len(joints), B), in float64."""
-        at_base = wrenches_at_base(states, self.nodes[0], torch.from_numpy(self.unit_wrenches.copy()))
-        return self.forces(tree, joint_screw_axes(tree, states), at_base, joints)
+    def jacobian(self, tree: KinematicTree, states: BodyStates, dofs: Sequence[int]) -> Tensor:
+        """Rows of the unit wrenches, (k, len(dofs), B)."""
+        at_base = wrenches_at_base(states, self.nodes[0], states.position.new_tensor(self.unit_wrenches))
+        return self.forces(tree, joint_screw_axes(tree, states), at_base, dofs)
 
     def deviation(self, rotation: Tensor, position: Tensor) -> tuple[Tensor, Tensor]:
         """Offset (3, B) [m] and rotation (3, 3, B) of the second frame from the first, along its axes.
@@ -118,14 +122,14 @@ def _sines(R: Tensor) -> Tensor:
 class LoopClosures:
     """The loops of a robot at joint positions, in float64 on the CPU.
 
-    `geometries`: one for each loop. `joints`: independent joints that they depend on.
+    `geometries`: one for each loop. `dofs`: degrees of freedom that they depend on.
     """
 
     def __init__(self, robot: Robot) -> None:
         """Look the loops up in the robot's tree."""
         self.tree = KinematicTree(robot)
         self.geometries = [LoopGeometry.of(loop, robot, self.tree) for loop in robot.loops]
-        self.joints = sorted({joint for loop in self.geometries for joint in loop.joints(self.tree)})
+        self.dofs = sorted({dof for loop in self.geometries for dof in loop.dofs(self.tree)})
 
     def gaps(self, joint_position: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Distance [m] and angle [rad] of each loop's frames, (B,) each, at joint positions (B, n).
@@ -148,17 +152,17 @@ class LoopClosures:
         return torch.cat(rows).T
 
     def jacobian(self, joint_position: Tensor) -> Tensor:
-        """Velocities of all loops' first frames relative to the second, by joint velocities, (B, k, n).
+        """Velocities of all loops' first frames relative to the second, by velocities, (B, k, n + 6 F).
 
         Along the first frame's axes; where the loops are closed, minus the derivative of the deviations.
         """
         rotation, position = self._poses(joint_position)
         states = BodyStates(rotation, position, *([torch.zeros_like(position)] * 3))
-        rows = [loop.jacobian(self.tree, states, range(self.tree.n)) for loop in self.geometries]
+        rows = [loop.jacobian(self.tree, states, range(self.tree.n_dofs)) for loop in self.geometries]
         return torch.cat(rows).permute(2, 0, 1)
 
-    def effective_wrenches(self, number: int, joints: Sequence[int]) -> Array:
-        """Unit wrenches of a loop on its first body, (k, 6), without those that never do work on some joints.
+    def effective_wrenches(self, number: int, dofs: Sequence[int]) -> Array:
+        """Unit wrenches of a loop on its first body, (k, 6), without those that never do work on measured joints.
 
         What a four-bar's pins exert across its plane moves nothing. Such directions are told by the loop's Jacobian at
         random positions, closed or not: singular values below `KINEMATIC_TOLERANCE` of the largest. What is redundant
@@ -166,17 +170,38 @@ class LoopClosures:
 
         Args:
             number: of the loop.
-            joints: independent joints that are measured.
+            dofs: degrees of freedom that are measured.
         """
         loop, n = self.geometries[number], self.tree.n
         generator = torch.Generator().manual_seed(0)
         q = _LARGEST * (2.0 * torch.rand(_POSTURES, n, generator=generator, dtype=torch.float64) - 1.0)
         rotation, position = self._poses(q)
         states = BodyStates(rotation, position, *([torch.zeros_like(position)] * 3))
-        work = loop.jacobian(self.tree, states, joints).flatten(1).numpy()  # (k, joints x postures)
+        work = loop.jacobian(self.tree, states, dofs).flatten(1).numpy()  # (k, dofs x postures)
         U, values, _ = np.linalg.svd(work, full_matrices=False)
         kept: Array = U[:, is_significant(values, KINEMATIC_TOLERANCE)].T @ loop.unit_wrenches
         return kept
+
+    def closed(self, joint_position: Tensor, free: Sequence[int] | None = None) -> tuple[Tensor, Tensor]:
+        """Joint positions near others at which the loops are closed, by Gauss-Newton steps of least norm.
+
+        Args:
+            joint_position: (B, n) [rad or m] to start from.
+            free: joints that move; None for all of them.
+
+        Returns:
+            Positions (B, n), and whether the loops are closed there, (B,) bool; others may be anywhere.
+        """
+        q, moving = joint_position.clone(), list(range(self.tree.n)) if free is None else list(free)
+        for _ in range(_MOST_STEPS):
+            gap = self.deviations(q)
+            if bool((gap.abs().amax(1) < _CLOSED).all()):
+                break
+            J = self.jacobian(q)[:, :, moving]
+            step = (torch.linalg.pinv(J, rtol=_SINGULAR) @ gap[..., None])[..., 0]
+            size = step.abs().amax(1, keepdim=True)
+            q[:, moving] += step * (_LARGEST_STEP / size.clamp_min(_LARGEST_STEP))
+        return q, self.deviations(q).abs().amax(1) < _CLOSED
 
     def _poses(self, joint_position: Tensor) -> tuple[Tensor, Tensor]:
         position = self.tree.joint_map[:, : self.tree.n] @ joint_position.T + self.tree.joint_constant
@@ -207,5 +232,4 @@ class LoopJacobian(nn.Module):
             (B, k, n_rows).
         """
         tree = self.closures.tree
-        J = self.closures.jacobian(q[:, q.shape[1] - tree.n :])
-        return nn.functional.pad(J, (tree.base_rows, tree.n_dofs - tree.n))
+        return nn.functional.pad(self.closures.jacobian(q[:, q.shape[1] - tree.n :]), (tree.base_rows, 0))
