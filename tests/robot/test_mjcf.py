@@ -123,7 +123,7 @@ OTHER = '\n<equality>\n<connect body1="b" body2="world" anchor="0 0 0"/></equali
 TENDON = '<tendon>\n<fixed name="t" stiffness="3"><joint joint="j" coef="1"/></fixed></tendon>'
 REFUSED = {
     "ball": (BODY.format("", '\n<joint name="j" type="ball"/>', ""), "<joint> 'j', line 4: type ball"),
-    "loop": (BODY.format("", HINGE.format(""), OTHER), "<connect>, line 5: an equality constraint"),
+    "loop": (BODY.format("", HINGE.format(""), OTHER), "<connect>, line 5: a constraint to what is not part of the robot"),
     "tendon": (BODY.format("", HINGE.format(""), TENDON), "<fixed> 't', line 4: a tendon with stiffness"),
     "gravcomp": (BODY.format(' gravcomp="1"', HINGE.format(""), ""), "<body> 'b', line 3: gravcomp 1"),
     "locked": (BODY.format("", HINGE.format(' damping="1e11"'), ""), "<joint> 'j', line 3: damping 1e+11"),
