@@ -26,8 +26,8 @@ from torchid.commands.cached_samples import NOT_IN_SAMPLES, content_of_scene
 from torchid.commands.reading import LogReader
 from torchid.config import load_config
 from torchid.config.experiment import ActuatorsConfig
-from torchid.config.robot import RobotConfig
 from torchid.config.preprocessing import PreprocessingConfig
+from torchid.config.robot import RobotConfig
 from torchid.config.sensors import ContactConfig, NoiseConfig
 from torchid.errors import TorchidWarning
 from torchid.fitting.experiment import set_up, with_noise

@@ -34,7 +34,9 @@ from torchid.sensing import Contact, SensorSet
 
 _ANGLE, _STROKE = 1.5, 0.3  # largest joint position [rad], [m]
 _ASSEMBLY = 0.3  # of random postures: from there the loops are closed for the first time
-_LEAST_SHARE = 0.01  # of a random posture's distance from the assembled one, at which the loops must close
+_PATH = 10  # steps from one posture to another
+_REGULAR = 0.1  # of the least singular value of a loop Jacobian where it is largest, what must be left of it elsewhere
+_LEAST_SHARE = 0.01  # of the way to a random posture, to which a path is cut short
 _SAMPLES_PER_COLUMN = 2  # per state: a sample gives at least one row, and some directions are rarely excited
 _WEIGHTLESS = (0.0, 0.0, 0.0)
 _AT_REST = 1e-10  # a projected velocity below this share of the drawn one is rounding and has no sign
@@ -186,26 +188,33 @@ def random_postures(robot: Robot, count: int, rng: np.random.Generator) -> Array
 def closed_postures(robot: Robot, postures: Array) -> Array:
     """Joint positions (N, n) at which the loops of a robot are closed, near given ones where there are any.
 
-    Those that find none start again nearer to the posture in which the robot was assembled.
+    All are reached from one posture, that nearest to joint positions of 0, on paths that keep the loops closed and away
+    from singular postures: beyond these a mechanism could have been assembled otherwise. Paths that fail are cut short.
 
     Raises:
         UrdfError: loops that close nowhere near joint positions of 0.
     """
-    closures = LoopClosures(robot)
+    closures, steps = LoopClosures(robot), torch.from_numpy(postures) / _PATH
     zero = torch.zeros(1, robot.n, dtype=torch.float64)
-    near_zero = torch.cat([zero, torch.from_numpy(_ASSEMBLY * postures)])
-    found, closed = closures.closed(near_zero)
+    found, closed = closures.closed(torch.cat([zero, _ASSEMBLY * torch.from_numpy(postures)]))
     if not closed.any():
         size = float(closures.deviations(zero).abs().max())
         text = f"loops that are open by {size:.3g} m or rad at joint positions of 0, and close nowhere near"
         raise UrdfError(robot.path, LOOPS_FIELD, text, "frames that the joints can bring together")
-    assembled = found[closed][:1]
-    out, left, share = assembled.repeat(len(postures), 1), torch.ones(len(postures), dtype=torch.bool), 1.0
-    while left.any() and share > _LEAST_SHARE:
-        tried, closed = closures.closed(assembled + share * torch.from_numpy(postures)[left])
-        at = torch.nonzero(left)[:, 0][closed]
-        out[at], left[at] = tried[closed], False
-        share /= 2.0
+    found = found[closed]
+    found = found[found.abs().amax(1).argsort()]
+    values = torch.linalg.svdvals(closures.jacobian(found))
+    rank = int((values > KINEMATIC_TOLERANCE * values[:, :1]).sum(1).max())
+    least = _REGULAR * float(values[:, rank - 1].max())
+    assembled = found[values[:, rank - 1] > least][:1]
+    out, left, share = assembled.repeat(len(postures), 1), torch.arange(len(postures)), 1.0
+    while len(left) and share > _LEAST_SHARE:
+        q, kept = assembled.repeat(len(left), 1), torch.ones(len(left), dtype=torch.bool)
+        for _ in range(_PATH):
+            q, closed = closures.closed(q + share * steps[left])
+            kept &= closed & (torch.linalg.svdvals(closures.jacobian(q))[:, rank - 1] > least)
+        out[left[kept]] = q[kept]
+        left, share = left[~kept], share / 2.0
     return np.asarray(out.numpy())
 
 

@@ -21,7 +21,7 @@ _POSTURES = 16  # random ones, from which constant directions without work are t
 _LARGEST = 1.5  # rad or m, of their joint positions
 _CLOSED = 1e-12  # m or rad: a gap that is rounding
 _MOST_STEPS, _LARGEST_STEP = 100, 0.3  # of Gauss-Newton, and of a joint in one of them [rad or m]
-_SINGULAR = 1e-6  # singular values of a loop's Jacobian below this share of the largest: no step along them
+_DAMPING = 1e-10  # of squares of a loop Jacobian's singular values, as a share of their sum
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,11 @@ class LoopClosures:
             if bool((gap.abs().amax(1) < _CLOSED).all()):
                 break
             J = self.jacobian(q)[:, :, moving]
-            step = (torch.linalg.pinv(J, rtol=_SINGULAR) @ gap[..., None])[..., 0]
+            gram = J @ J.mT  # singular where rows are redundant
+            damped = gram + _DAMPING * gram.diagonal(dim1=1, dim2=2).sum(1)[:, None, None] * torch.eye(
+                gram.shape[1], dtype=q.dtype
+            )
+            step = (J.mT @ torch.linalg.solve(damped, gap[..., None]))[..., 0]
             size = step.abs().amax(1, keepdim=True)
             q[:, moving] += step * (_LARGEST_STEP / size.clamp_min(_LARGEST_STEP))
         return q, self.deviations(q).abs().amax(1) < _CLOSED
