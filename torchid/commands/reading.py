@@ -30,6 +30,7 @@ from torchid.problem import Samples, bind_log
 from torchid.problem.chunks import ProgressCallback
 from torchid.problem.contact_detection import with_detected_contacts
 from torchid.problem.contact_slip import measure_slip, warn_of_slip
+from torchid.problem.loop_joints import with_loop_joints
 from torchid.problem.standing import preprocess_standing
 from torchid.problem.welded_joints import without_welded_joints
 from torchid.problem.zeroing import zero_in_air
@@ -121,7 +122,8 @@ class LogReader:
             needs_flags=settings.needs_flags,
         )
         own = scene_of_log(self.scene, path)
-        recorded, certain = settle_contacts(without_welded_joints(read, own.robot), own)
+        of_robot = with_loop_joints(without_welded_joints(read, own.robot), own.robot)
+        recorded, certain = settle_contacts(of_robot, own)
         checked = self._checked(recorded, own.robot)
         clean = recorded if checked is None else checked.repaired
         rates, sign_width = (settings.filter_hz, settings.sample_rate_hz), self.scene.terms.sign_width
@@ -185,7 +187,7 @@ class LogReader:
         settings = self.scene.config.preprocessing
         filled = settings.bridge_gaps_s is not None or settings.zero_in_air
         whole = settings.exclude_condemned or settings.derived or filled or split_range(path).joins
-        return gigabytes > _WHOLE_GB and not whole
+        return gigabytes > _WHOLE_GB and not whole and not self.scene.robot.loops
 
     def _large_log(self, path: Path, required: SensorSet | None, folder: Path | None) -> LargeLog:
         """A log that is read block by block."""

@@ -181,6 +181,9 @@ def _require_simple(fitted: FittedRun) -> None:
     held = format_count(len(robot.welded), "joint")
     if config.weld:
         raise ConfigError.at_field("robot.weld", f"{held} held still", "a replay without welds")
+    if robot.loops:
+        loops = format_count(len(robot.loops), "closed loop")
+        raise ConfigError.at_field("robot.loops", loops, "a replay of a robot without")
     root = next(name for name, (body, pose) in robot.links.items() if body == 0 and np.array_equal(pose, np.eye(4)))
     if not robot.fixed_base and robot.base_link != root:
         raise ConfigError.at_field("robot.base_link", f"'{robot.base_link}'", f"the URDF's root, '{root}', to replay")

@@ -18,9 +18,9 @@ from torchid.problem.contact_state import ContactState
 from torchid.regressor import FrameJacobian, motion_from_state
 from torchid.regressor.kinematics import (
     GRAVITY_WORLD,
-    BodyStates,
+    along_frame,
     body_states,
-    cross_product,
+    frame_acceleration,
     joint_motion,
     rotation_matrix,
 )
@@ -234,7 +234,7 @@ def _random_states(robot: Robot, count: int, rng: np.random.Generator) -> tuple[
 
 
 def _drift(robot: Robot, constrained: Sequence[Contact], q: Tensor, v: Tensor) -> Tensor:
-    """dJ_C/dt v, (B, k): accelerations of the constrained components at a = 0, along the contacts' axes."""
+    """dJ/dt v, (B, k): accelerations at a = 0 of the contacts' constrained components, along their axes, and of loops."""
     tree = KinematicTree(robot)
     motion = motion_from_state(q, v, torch.zeros_like(v), robot.n, robot.fixed_base, _WEIGHTLESS)
     states = body_states(tree, motion, joint_motion(tree, motion))
@@ -246,32 +246,9 @@ def _drift(robot: Robot, constrained: Sequence[Contact], q: Tensor, v: Tensor) -
             normal = (rotation_matrix(q[:, 3:7]).mT @ normal[..., None])[..., 0]
         pose = v.new_tensor(T_joint_frame)
         arms = contact_arms(states, node, pose[:3, :3], contact.radius, normal.T, contact.rolling_axis)
-        own = _acceleration(states, node, pose, arms)
-        rows.append(_along_frame(states, node, pose, own)[list(contact.components)])
-    for loop in LoopClosures(robot).geometries if robot.loops else ():
-        poses = [v.new_tensor(pose) for pose in loop.poses]
-        one, other = (_acceleration(states, *at) for at in zip(loop.nodes, poses, strict=True))
-        rows.append(_along_frame(states, loop.nodes[0], poses[0], one - other)[list(loop.loop.components)])
+        own = frame_acceleration(states, node, pose, arms)
+        rows.append(along_frame(states, node, pose, own)[list(contact.components)])
+    if robot.loops:
+        joints = (x[:, x.shape[1] - robot.n :] for x in (q, v))
+        rows.append(LoopClosures(robot).drift(*joints).T)
     return torch.cat(rows).T
-
-
-def _acceleration(states: BodyStates, body: int, T_joint_frame: Tensor, arms: Tensor | None = None) -> Tensor:
-    """Acceleration of a frame's origin and angular acceleration, in the base's axes, (3, 2, B), without gravity.
-
-    With arms, (3, 3, B), where it rolls: d/dt (v + omega x l), of the arm l whose direction the ground fixes. It is not
-    the acceleration of the material point, whose arm turns with the body.
-    """
-    arm = (states.rotation[:, :, body] * T_joint_frame[:3, 3, None]).sum(1)
-    omega, alpha = states.angular_velocity[:, body], states.angular_acceleration[:, body]
-    linear = (
-        states.specific_force[:, body] + cross_product(alpha, arm) + cross_product(omega, cross_product(omega, arm))
-    )
-    if arms is not None:
-        linear = linear + (arms * alpha[:, None]).sum(0)
-    return torch.stack([linear, alpha], dim=1)
-
-
-def _along_frame(states: BodyStates, body: int, T_joint_frame: Tensor, vectors: Tensor) -> Tensor:
-    """Two vectors in the base's axes, (3, 2, B), along those of a frame on a body, one after the other, (6, B)."""
-    in_joint_frame = (states.rotation[:, :, body][:, :, None] * vectors[:, None]).sum(0)
-    return torch.cat(list(T_joint_frame[:3, :3].T @ in_joint_frame.transpose(0, 1)))

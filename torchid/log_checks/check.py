@@ -30,7 +30,7 @@ from torchid.log_checks.findings import (
 )
 from torchid.log_checks.forces import check_forces_against_urdf
 from torchid.log_checks.frozen import check_repeats, check_scalar_wrenches
-from torchid.log_checks.loops import check_loops
+from torchid.log_checks.loops import check_loops, completed
 from torchid.log_checks.motion import check_angle_unit, check_angular_velocity, check_derivatives
 from torchid.log_checks.slip import check_slip
 from torchid.log_checks.spikes import check_jumps
@@ -126,7 +126,7 @@ def check(
             of a log that has got flags from its torques. base_: motion of the base will follow from the feet that
             stand; forces are compared with the URDF in the longest stretch in which enough of them do.
     """
-    log = without_welded_joints(log, robot)
+    log, unclosed = completed(without_welded_joints(log, robot), robot)
     contacts = [replace(contact, along_normal=False) for contact in contacts]  # wrenches are what is checked
     results: list[Finding | Skipped] = list(check_magnitudes(log))
     if (blocking := _blocking_finding(results)) is not None:
@@ -151,7 +151,7 @@ def check(
         results += check_angular_velocity(repaired, robot)
         results += check_accelerometer(repaired, robot)
     if _blocking_finding(results) is None:
-        results += check_loops(repaired, robot)
+        results += unclosed or check_loops(repaired, robot)
         results += check_standing_feet(repaired, robot, contacts, derived)
         results += check_slip(repaired, robot, contacts, cutoff_hz, derived)
     compared = repaired

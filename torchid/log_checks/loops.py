@@ -6,10 +6,21 @@ from collections.abc import Iterator
 
 import torch
 
+from torchid.errors import LogError
 from torchid.log_checks.findings import CONDEMNED, NOTE, Finding
 from torchid.logs import Log
 from torchid.problem.loop_gaps import loop_gaps
+from torchid.problem.loop_joints import with_loop_joints
 from torchid.robot import Robot
+
+
+def completed(log: Log, robot: Robot | None) -> tuple[Log, list[Finding]]:
+    """The log with joints of loops that follow from the others, see `with_loop_joints`; or the log, and why not."""
+    try:
+        return with_loop_joints(log, robot), []
+    except LogError as error:
+        finding = Finding("open loop", CONDEMNED, "joint_position", error.found, f"give {error.accepted}")
+        return log, [finding]
 
 
 def check_loops(log: Log, robot: Robot | None) -> Iterator[Finding]:

@@ -303,6 +303,8 @@ def joint_order(log: Log, robot: Robot) -> list[int]:
         found = f"{join_names(lacking, _LISTED)} of {robot.path.name} missing"
         listed = ", ".join(lacking) if len(lacking) <= _LISTED else f"{lacking[0]}, ..."
         accepted = f"every joint that moves, or robot.weld: [{listed}] for those that are held"
+        if robot.loops:
+            accepted += "; joints of loops follow from others in logs that fit into preprocessing.memory_gb"
         raise LogError(log.source, "joint_names", found, accepted)
     return [log.joint_names.index(name) for name in robot.joint_names]
 

@@ -11,7 +11,16 @@ import torch
 from torch import Tensor, nn
 
 from torchid.parameters import Array
-from torchid.regressor.kinematics import BodyStates, joint_frame_poses, joint_screw_axes
+from torchid.regressor.kinematics import (
+    BodyStates,
+    Motion,
+    along_frame,
+    body_states,
+    frame_acceleration,
+    joint_frame_poses,
+    joint_motion,
+    joint_screw_axes,
+)
 from torchid.regressor.regressor import wrench_transform, wrenches_at_base
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Loop, Robot
@@ -20,6 +29,7 @@ from torchid.rounding import KINEMATIC_TOLERANCE, is_significant
 _POSTURES = 16  # random ones, from which constant directions without work are told
 _LARGEST = 1.5  # rad or m, of their joint positions
 _CLOSED = 1e-12  # m or rad: a gap that is rounding
+_STANDS = 1e-10  # rad or m: after a smaller step, the next of Gauss-Newton is rounding
 _MOST_STEPS, _LARGEST_STEP = 100, 0.3  # of Gauss-Newton, and of a joint in one of them [rad or m]
 _DAMPING = 1e-10  # of squares of a loop Jacobian's singular values, as a share of their sum
 
@@ -206,6 +216,34 @@ class LoopClosures:
             size = step.abs().amax(1, keepdim=True)
             q[:, moving] += step * (_LARGEST_STEP / size.clamp_min(_LARGEST_STEP))
         return q, self.deviations(q).abs().amax(1) < _CLOSED
+
+    def fitted(self, joint_position: Tensor, free: Sequence[int]) -> Tensor:
+        """Positions (B, n) of which some joints move to where the loops are least open, by Gauss-Newton steps."""
+        q, moving = joint_position.clone(), list(free)
+        for _ in range(_MOST_STEPS):
+            J, gap = self.jacobian(q)[:, :, moving], self.deviations(q)
+            normal = J.mT @ J
+            damped = normal + _DAMPING * normal.diagonal(dim1=1, dim2=2).sum(1)[:, None, None] * torch.eye(
+                len(moving), dtype=q.dtype
+            )
+            step = torch.linalg.solve(damped, J.mT @ gap[..., None])[..., 0]
+            size = step.abs().amax(1, keepdim=True)
+            q[:, moving] += step * (_LARGEST_STEP / size.clamp_min(_LARGEST_STEP))
+            if bool((size < _STANDS).all()):
+                break
+        return q
+
+    def drift(self, joint_position: Tensor, joint_velocity: Tensor) -> Tensor:
+        """dJ/dt v of `jacobian`, (B, k), at positions of closed loops and velocities (B, n) that keep them closed."""
+        zero = torch.zeros_like(joint_position)
+        still = zero.new_zeros(len(zero), 3)
+        motion, rows = Motion(joint_position, joint_velocity, zero, still, still, still), []
+        states = body_states(self.tree, motion, joint_motion(self.tree, motion))
+        for loop in self.geometries:
+            poses = [zero.new_tensor(pose) for pose in loop.poses]
+            one, other = (frame_acceleration(states, *at) for at in zip(loop.nodes, poses, strict=True))
+            rows.append(along_frame(states, loop.nodes[0], poses[0], one - other)[list(loop.loop.components)])
+        return torch.cat(rows).T
 
     def _poses(self, joint_position: Tensor) -> tuple[Tensor, Tensor]:
         position = self.tree.joint_map[:, : self.tree.n] @ joint_position.T + self.tree.joint_constant
