@@ -119,10 +119,11 @@ class LoopWorld:
 
 
 @cache
-def loop_world(name: str, count: int = 300, seed: int = 0) -> LoopWorld:
+def loop_world(name: str, count: int = 300, seed: int = 0, rigid: bool = False) -> LoopWorld:
     """Random states on the constraints under random motor torques and, in stance, wrenches of the ground.
 
-    The robot is the same for all seeds.
+    MuJoCo's constraint forces are soft: accelerations open the loops. If rigid, these keep them closed instead. The
+    robot is the same for all seeds.
     """
     path = Path(mkdtemp()) / f"{name}.xml"
     path.write_text(MODELS[name])
@@ -131,7 +132,7 @@ def loop_world(name: str, count: int = 300, seed: int = 0) -> LoopWorld:
     moved = np.array([body.joint is not None for body in robot.bodies])
     true[moved, parameters.COULOMB] = np.random.default_rng(2).uniform(0.1, 0.5, moved.sum())
     model = mujoco.MjModel.from_xml_path(str(path))
-    return _record(path, robot, true, model, count, np.random.default_rng(seed))
+    return _record(path, robot, true, model, count, np.random.default_rng(seed), rigid)
 
 
 def closed_positions(robot: Robot, count: int, rng: np.random.Generator) -> Array:
@@ -143,7 +144,13 @@ def closed_positions(robot: Robot, count: int, rng: np.random.Generator) -> Arra
 
 
 def _record(
-    path: Path, robot: Robot, true: Array, model: mujoco.MjModel, count: int, rng: np.random.Generator
+    path: Path,
+    robot: Robot,
+    true: Array,
+    model: mujoco.MjModel,
+    count: int,
+    rng: np.random.Generator,
+    rigid: bool,
 ) -> LoopWorld:
     data, contacts = mujoco.MjData(model), FEET[path.stem]
     ids = [model.joint(name).id for name in robot.joint_names]
@@ -180,6 +187,11 @@ def _record(
         data.qfrc_applied[rate] -= coulomb * np.sign(data.qvel[rate])
         data.ctrl[:] = 5.0 * rng.normal(size=model.nu)
         mujoco.mj_forward(model, data)
+        if rigid:
+            v[k], a[k] = ([*x[:6], *x[rate]] for x in (data.qvel, _rigid_acceleration(robot, model, data, at, rate)))
+            torque[k] = data.qfrc_actuator[rate]
+            carried.append(np.inf)
+            continue
         mujoco.mj_inverse(model, data)  # with the constraint forces of this acceleration, to the last digits
         v[k], a[k] = ([*x[:6], *x[rate]] for x in (data.qvel, data.qacc))
         torque[k] = (data.qfrc_inverse - through)[rate] + coulomb * np.sign(data.qvel[rate])
@@ -206,3 +218,17 @@ def _record(
     nominal = parameters.perturb_parameters(true, 0.2, np.random.default_rng(1))
     nominal[:, parameters.FRICTION] *= 0.5
     return LoopWorld(path, replace(robot, nominal=nominal), true, log, np.array(loops), np.array(base))
+
+
+def _rigid_acceleration(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, at: Array, rate: Array) -> Array:
+    """Acceleration under MuJoCo's inertia and forces with constraint forces that keep the loops closed."""
+    closures = LoopClosures(robot)
+    q, v = (torch.from_numpy(x[None].copy()) for x in (data.qpos[at], data.qvel[rate]))
+    J = np.zeros((closures.jacobian(q).shape[1], model.nv))
+    J[:, rate] = closures.jacobian(q)[0].numpy()
+    forces = np.vstack([data.qfrc_smooth, J])
+    moved = np.zeros_like(forces)
+    mujoco.mj_solveM(model, data, moved, forces)
+    free, through = moved[0], moved[1:]
+    force = np.linalg.pinv(J @ through.T, rcond=1e-9) @ (-closures.drift(q, v)[0].numpy() - J @ free)
+    return np.asarray(free + through.T @ force)

@@ -17,7 +17,7 @@ from torchid.config.logs import SETS, LogsConfig, entries_spelled_out, resolve_l
 from torchid.config.maps import MAPS_ACCEPTED
 from torchid.config.preprocessing import PreprocessingConfig
 from torchid.config.reading import FileKind, Settings, dump, load
-from torchid.config.robot import FRAMES_ACCEPTED, LOOPS_ACCEPTED, MJCF_SUFFIXES, WELDS_ACCEPTED, RobotConfig
+from torchid.config.robot import LOOPS_ACCEPTED, MJCF_SUFFIXES, WELDS_ACCEPTED, RobotConfig
 from torchid.config.sensors import (
     CHOICE_ACCEPTED,
     COMPONENTS_ACCEPTED,
@@ -124,7 +124,6 @@ _EXPERIMENT = FileKind(
         "contacts.*.frame": "the name of a frame in the URDF",
         "robot.weld": WELDS_ACCEPTED,
         "robot.loops": LOOPS_ACCEPTED,
-        "robot.loops.*.frames": FRAMES_ACCEPTED,
         "sensors": CHOICE_ACCEPTED,
         **{f"{where}.contact_wrenches": WRENCHES_ACCEPTED for where in ("sensors", "analysis.compare.*")},
         **{f"{where}.contact_wrenches.*": COMPONENTS_ACCEPTED for where in ("sensors", "analysis.compare.*")},

@@ -43,8 +43,17 @@ _ANGLES: TypeAdapter[list[float]] = TypeAdapter(Annotated[list[Number], Field(mi
 BaseTilt = Annotated[tuple[float, float] | Literal["auto"] | None, PlainValidator(_tilt), PlainSerializer(as_list)]
 
 
-FRAMES_ACCEPTED = "two frames of the robot: [l_rod_end, l_ankle_pin]"
 LOOPS_ACCEPTED = "a list of mappings: [{frames: [l_rod_end, l_ankle_pin], type: point}]"
+
+
+def _frames(value: object) -> object:
+    """Two names."""
+    if isinstance(value, (list, tuple)) and len(value) == 2 and all(isinstance(name, str) and name for name in value):
+        return list(value)
+    raise ValueError("two frames of the robot: [l_rod_end, l_ankle_pin]")
+
+
+Frames = Annotated[list[str], PlainValidator(_frames)]
 
 
 @dataclass(config=STRICT, frozen=True)
@@ -55,7 +64,7 @@ class LoopConfig:
     [m] and `max_angle` [rad]: rms distance over a log up to which they count as together.
     """
 
-    frames: Annotated[list[str], Field(min_length=2, max_length=2)]
+    frames: Frames
     type: Literal["point", "weld"] = "point"
     max_gap: Positive = MAX_GAP
     max_angle: Positive = MAX_ANGLE

@@ -234,7 +234,7 @@ def _random_states(robot: Robot, count: int, rng: np.random.Generator) -> tuple[
 
 
 def _drift(robot: Robot, constrained: Sequence[Contact], q: Tensor, v: Tensor) -> Tensor:
-    """dJ/dt v, (B, k): accelerations at a = 0 of the contacts' constrained components, along their axes, and of loops."""
+    """dJ/dt v, (B, k): accelerations at a = 0 of contacts' constrained components, along their axes, and of loops."""
     tree = KinematicTree(robot)
     motion = motion_from_state(q, v, torch.zeros_like(v), robot.n, robot.fixed_base, _WEIGHTLESS)
     states = body_states(tree, motion, joint_motion(tree, motion))
