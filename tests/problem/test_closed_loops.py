@@ -17,12 +17,14 @@ from synthetic import Array
 from torchid import parameters
 from torchid.errors import LogError
 from torchid.estimators import Estimate, LeastSquares
+from torchid.identifiability.structure import standing_states
 from torchid.problem import Evaluation, RowBuilder, Samples, bind_log, compress, linear_problem
 from torchid.problem.chunks import chunks_by_state
 from torchid.problem.linear import parameter_scale
 from torchid.problem.predict import at_motors, force_series, null_space_part
-from torchid.regressor.loops import LoopJacobian
-from torchid.sensing import SensorSet, named_sensors
+from torchid.regressor import FrameJacobian, LoopJacobian, Regressor
+from torchid.regressor.loops import LoopClosures
+from torchid.sensing import Projection, SensorSet, named_sensors
 
 EXACT = 1e-8  # of the largest force or of a parameter's size; 1e-12 measured for most
 
@@ -149,6 +151,48 @@ def test_rows_are_as_many_as_motions_and_those_by_sample_are_those_of_the_fit(na
         assert set(used.tolist()) == {6 + w.robot.n - RANKS[name] - unmeasured}
         bound = (rows[..., :-1] @ builder.to_columns(w.true.flatten()[None])[0] - rows[..., -1]).abs().max()
         assert bound < 1e-11 * rows[..., -1].abs().max()
+
+
+@robots
+def test_the_public_modules_make_the_same_equations(name: str) -> None:
+    w = loop_world(name)
+    sensors, samples = sensors_of(w, "full"), samples_of(w)
+    builder, (q, v, a) = RowBuilder(w.robot, w.contacts, sensors), samples.coordinates()
+    torque, J_L = samples.torque, LoopJacobian(w.robot)(q)
+    assert torque is not None
+    assert samples.wrench is not None
+    J_C = torch.cat([FrameJacobian(w.robot, x.frame)(q)[:, list(x.components)] for x in w.contacts], dim=1)
+    masks, read = [], []
+    for index, contact in enumerate(w.contacts):
+        masks.append(samples.active[:, index, None].expand(-1, len(contact.components)))
+        read.append(samples.wrench[:, index, list(contact.components)])
+    always, nothing = J_L.new_ones(J_L.shape[:2], dtype=torch.bool), J_L.new_zeros(J_L.shape[:2])
+    measured = [True] * J_C.shape[1] + [False] * J_L.shape[1]
+    groups = Projection(sensors.torque, measured)(
+        torch.cat([J_C, J_L], dim=1),
+        torch.cat([*masks, always], dim=1),
+        Regressor(w.robot)(q, v, a),
+        torque - builder.known_torques.of(samples),
+        torch.cat([*read, nothing], dim=1),
+    )
+    for group in groups:
+        left = (group.K @ torch.from_numpy(w.true.flatten()) - group.f).abs().max()
+        assert left < 1e-11 * group.f.abs().max()
+        assert group.K.shape[1] == 6 + w.robot.n - RANKS[name]
+
+
+@robots
+def test_random_motion_keeps_the_loops_closed_to_second_order(name: str) -> None:
+    w = loop_world(name)
+    state = (True,) * len(w.contacts)
+    q, v, a = standing_states(w.robot, w.contacts, state, 40, np.random.default_rng(0))
+    closures, step = LoopClosures(w.robot), 1e-4
+    q, v, a = q[:, 7:], v[:, 6:], a[:, 6:]
+    before, at, after = (closures.deviations(q + s * v + 0.5 * s**2 * a) for s in (-step, 0.0, step))
+    assert at.abs().max() < 1e-12
+    assert ((after - before).abs().max() / (2.0 * step)) < 1e-6 * v.abs().max() ** 3
+    assert ((after - 2.0 * at + before).abs().max() / step**2) < 1e-5 * a.abs().max()
+    assert len(torch.unique(q.round(decimals=6), dim=0)) == 40
 
 
 def test_a_wrong_frame_is_refused_with_how_far_the_loop_is_open() -> None:

@@ -13,7 +13,7 @@ from torchid import parameters
 from torchid.config import AnalyzeConfig, ExperimentConfig
 from torchid.config.estimator import EstimatorConfig
 from torchid.config.sensors import ChoiceConfig
-from torchid.errors import ConfigError, LogError, UnknownNameError, warn_about_file
+from torchid.errors import ConfigError, LogError, UnknownNameError, format_count, warn_about_file
 from torchid.estimators import Conditions, Consistent, Enclosure, LeastSquares, Mirror
 from torchid.fitting.calibration import Calibration, Comparison, calibrations
 from torchid.fitting.contacts import read_along_normals, resolve_contacts, suited_to_preprocessing
@@ -227,6 +227,9 @@ def set_up_scene(config: ExperimentConfig | AnalyzeConfig) -> Scene:
         raise ConfigError.at_field("robot", "a bolted base without a joint, which never moves", "a robot that can move")
     if config.logs is not None:
         require_maps_of(robot, config.logs)
+    if robot.loops and config.preprocessing.detect_contacts is not None:
+        found = f"set, for a robot with {format_count(len(robot.loops), 'closed loop')}"
+        raise ConfigError.at_field("preprocessing.detect_contacts", found, "contact_threshold, or recorded flags")
     contacts, rolling = resolve_contacts(config.contacts, robot)
     contacts = suited_to_preprocessing(read_along_normals(contacts, config.sensors), config)
     stated = [replace(c, radius=contact.radius) for c, contact in zip(config.contacts, contacts, strict=True)]

@@ -130,7 +130,7 @@ def _sines(R: Tensor) -> Tensor:
 
 
 class LoopClosures:
-    """The loops of a robot at joint positions, in float64 on the CPU.
+    """The loops of a robot at joint positions.
 
     `geometries`: one for each loop. `dofs`: degrees of freedom that they depend on.
     """
@@ -168,8 +168,9 @@ class LoopClosures:
         """
         rotation, position = self._poses(joint_position)
         states = BodyStates(rotation, position, *([torch.zeros_like(position)] * 3))
-        rows = [loop.jacobian(self.tree, states, range(self.tree.n_dofs)) for loop in self.geometries]
-        return torch.cat(rows).permute(2, 0, 1)
+        none = position.new_zeros(0, self.tree.n_dofs, position.shape[-1])
+        rows = (loop.jacobian(self.tree, states, range(self.tree.n_dofs)) for loop in self.geometries)
+        return torch.cat([none, *rows]).permute(2, 0, 1)
 
     def effective_wrenches(self, number: int, dofs: Sequence[int]) -> Array:
         """Unit wrenches of a loop on its first body, (k, 6), without those that never do work on measured joints.
@@ -262,10 +263,11 @@ class LoopJacobian(nn.Module):
         """Build the constants.
 
         Args:
-            robot: with at least one loop.
+            robot: with its loops; without any, there are no rows.
         """
         super().__init__()
         self.closures = LoopClosures(robot)
+        self.tree = self.closures.tree
 
     def forward(self, q: Tensor) -> Tensor:
         """Jacobian at coordinates, (B, n + 7) or (B, n) for a fixed base (see `Regressor`).
@@ -273,5 +275,5 @@ class LoopJacobian(nn.Module):
         Returns:
             (B, k, n_rows).
         """
-        tree = self.closures.tree
+        tree = self.tree
         return nn.functional.pad(self.closures.jacobian(q[:, q.shape[1] - tree.n :]), (tree.base_rows, 0))
