@@ -17,7 +17,7 @@ from torchid.config.logs import SETS, LogsConfig, entries_spelled_out, resolve_l
 from torchid.config.maps import MAPS_ACCEPTED
 from torchid.config.preprocessing import PreprocessingConfig
 from torchid.config.reading import FileKind, Settings, dump, load
-from torchid.config.robot import LOOPS_ACCEPTED, MJCF_SUFFIXES, WELDS_ACCEPTED, RobotConfig
+from torchid.config.robot import LOOPS_ACCEPTED, MJCF_SUFFIXES, WELDS_ACCEPTED, RobotConfig, require_one_file
 from torchid.config.sensors import (
     CHOICE_ACCEPTED,
     COMPONENTS_ACCEPTED,
@@ -158,7 +158,7 @@ def load_config(
     """
     config, about = _loaded(_EXPERIMENT, path, overrides, sections)
     with about:
-        _check_robot(config.robot)
+        require_one_file(config.robot)
         validate_choice("sensors", config.sensors)
         validate_keys(config.estimator)
         _check_extras(config)
@@ -172,7 +172,7 @@ def load_analysis(
     """Read an experiment file for `torchid analyze`: as `load_config`, but logs and sensors may be left out."""
     config, about = _loaded(_ANALYSIS, path, overrides, sections)
     with about:
-        _check_robot(config.robot)
+        require_one_file(config.robot)
         validate_choice("sensors", config.sensors, may_be_empty=True)
         validate_keys(config.estimator)
         _check_extras(config)
@@ -222,13 +222,6 @@ def _check_threshold(settings: PreprocessingConfig) -> None:
     if threshold.below is not None and threshold.below > threshold.above:
         found = f"{threshold.below:g}, more than above ({threshold.above:g})"
         raise ConfigError.at_field(f"{key}.below", found, "a force [N] up to that of above")
-
-
-def _check_robot(robot: RobotConfig) -> None:
-    """Refuse a robot of no file or of two."""
-    if (robot.urdf is None) == (robot.mjcf is None):
-        found = "missing" if robot.urdf is None else "set together with robot.mjcf"
-        raise ConfigError.at_field("robot.urdf", found, "a path to a URDF, or robot.mjcf: a path to a MuJoCo model")
 
 
 def _check_extras(config: _Common) -> None:

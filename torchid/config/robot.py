@@ -10,7 +10,9 @@ from pydantic import BeforeValidator, Field, FiniteFloat, PlainSerializer, Plain
 from pydantic.dataclasses import dataclass
 
 from torchid.config.sensors import STRICT, as_list
+from torchid.errors import ConfigError
 from torchid.robot.loops import MAX_ANGLE, MAX_GAP, Loop
+from torchid.robot.xml_files import is_mjcf
 from torchid.settings import AUTO, Number, Positive
 
 
@@ -77,7 +79,44 @@ class LoopConfig:
 
 
 @dataclass(config=STRICT, frozen=True)
-class RobotConfig:
+class RobotFile:
+    """A robot's file, `urdf` or `mjcf`: one of both."""
+
+    urdf: Path | None = None
+    mjcf: Path | None = None
+
+    @property
+    def path(self) -> Path:
+        """The one of both files that is given."""
+        return self.urdf or self.mjcf or Path()
+
+
+def require_one_file(robot: RobotFile) -> None:
+    """Refuse a robot of no file or of two.
+
+    Raises:
+        ConfigError: names both keys.
+    """
+    if (robot.urdf is None) == (robot.mjcf is None):
+        found = "missing" if robot.urdf is None else "set together with robot.mjcf"
+        raise ConfigError.at_field("robot.urdf", found, "a path to a URDF, or robot.mjcf: a path to a MuJoCo model")
+
+
+def require_kind(robot: RobotFile) -> None:
+    """Refuse a file under the key of the other kind.
+
+    Raises:
+        ConfigError: names the key that it belongs under.
+        UrdfError: it cannot be read.
+    """
+    if is_mjcf(robot.path) != (robot.mjcf is not None):
+        key, other = ("robot.urdf", "mjcf") if robot.mjcf is None else ("robot.mjcf", "urdf")
+        accepted = f"robot: {{{other}: {robot.path.name}}}"
+        raise ConfigError.at_field(key, f"'{robot.path}', no {key[6:].upper()}", accepted)
+
+
+@dataclass(config=STRICT, frozen=True)
+class RobotConfig(RobotFile):
     """The robot, `urdf` or `mjcf`; `base_link` defaults to the URDF's root.
 
     `mjcf`: a MuJoCo model, read by MuJoCo (the extra [sim]); its tree of most degrees of freedom is the robot.
@@ -88,19 +127,12 @@ class RobotConfig:
     for those that no actuator of an MJCF file with loops drives.
     """
 
-    urdf: Path | None = None
-    mjcf: Path | None = None
     base_link: str | None = None
     fixed_base: bool = False
     weld: Welds = dataclasses.field(default_factory=dict)
     base_tilt: BaseTilt = None
     loops: list[LoopConfig] = dataclasses.field(default_factory=list)
     passive: list[str] | None = None
-
-    @property
-    def path(self) -> Path:
-        """The one of both files that is given."""
-        return self.urdf or self.mjcf or Path()
 
     @property
     def tilt(self) -> tuple[float, float]:

@@ -12,8 +12,9 @@ import torch
 from torchid import parameters
 from torchid.config import AnalyzeConfig, ExperimentConfig
 from torchid.config.estimator import EstimatorConfig
+from torchid.config.robot import require_kind
 from torchid.config.sensors import ChoiceConfig
-from torchid.errors import ConfigError, LogError, UnknownNameError, format_count, warn_about_file
+from torchid.errors import ConfigError, LogError, UnknownNameError, warn_about_file
 from torchid.estimators import Conditions, Consistent, Enclosure, LeastSquares, Mirror
 from torchid.fitting.calibration import Calibration, Comparison, calibrations
 from torchid.fitting.contacts import read_along_normals, resolve_contacts, suited_to_preprocessing
@@ -32,7 +33,6 @@ from torchid.problem.sampled_rows import LogElsewhere
 from torchid.reprs import short_repr
 from torchid.robot import Robot, body_extents, load_robot, mirror_pairs
 from torchid.robot.tree import FT_FIELD
-from torchid.robot.xml_files import is_mjcf
 from torchid.sensing import Contact, SensorNoise, SensorSet, chosen_sensors, named_sensors, with_ft_sensors
 
 _FRICTION = PARAMETERS[parameters.FRICTION]
@@ -212,9 +212,7 @@ def set_up_scene(config: ExperimentConfig | AnalyzeConfig) -> Scene:
     require_device(config.device)
     try:
         of = config.robot
-        if is_mjcf(of.path) != (of.mjcf is not None):
-            key, other = ("robot.urdf", "mjcf") if of.mjcf is None else ("robot.mjcf", "urdf")
-            raise ConfigError.at_field(key, f"'{of.path}', no {key[6:].upper()}", f"robot: {{{other}: {of.path.name}}}")
+        require_kind(of)
         loops = [loop.loop for loop in of.loops]
         with_ft = _ft_joints(config)
         robot = load_robot(of.path, of.base_link, of.fixed_base, with_ft, of.weld, of.tilt, loops, of.passive)
@@ -227,11 +225,8 @@ def set_up_scene(config: ExperimentConfig | AnalyzeConfig) -> Scene:
         raise ConfigError.at_field("robot", "a bolted base without a joint, which never moves", "a robot that can move")
     if config.logs is not None:
         require_maps_of(robot, config.logs)
-    if robot.loops and config.preprocessing.detect_contacts is not None:
-        found = f"set, for a robot with {format_count(len(robot.loops), 'closed loop')}"
-        raise ConfigError.at_field("preprocessing.detect_contacts", found, "contact_threshold, or recorded flags")
     contacts, rolling = resolve_contacts(config.contacts, robot)
-    contacts = suited_to_preprocessing(read_along_normals(contacts, config.sensors), config)
+    contacts = suited_to_preprocessing(read_along_normals(contacts, config.sensors), config, robot)
     stated = [replace(c, radius=contact.radius) for c, contact in zip(config.contacts, contacts, strict=True)]
     scene = Scene(config=replace(config, contacts=stated), robot=robot, contacts=contacts, rolling=rolling)
     check_scale_groups(scene.terms, robot, contacts)
