@@ -24,6 +24,7 @@ from torchid.errors import TorchidError
 from torchid.fitting.experiment import set_up
 from torchid.regressor.loops import LoopClosures
 from torchid.report import identified_urdf
+from torchid.report.mjcf_of_urdf import mjcf_of_urdf
 from torchid.robot import Loop, load_robot
 
 LEG = "four-bar leg"
@@ -83,6 +84,9 @@ def test_a_urdf_with_stated_loops_is_the_same_robot(tmp_path: Path) -> None:
     assert scene.robot.loops == (Loop((frames[0], frames[1]), "point", 0.001),)
     assert scene.robot.passive == w.robot.passive
     assert scene.sensors.torque.all()
+    (tmp_path / "again.xml").write_bytes(mjcf_of_urdf(scene.robot, scene.robot.nominal, {}))
+    (loop,) = load_robot(tmp_path / "again.xml").loops
+    assert loop.frames == (f"loop1 of {frames[0]}", f"loop1 of {frames[1]}")
     q = torch.from_numpy(w.log.joint_position)
     one, other = (LoopClosures(robot).jacobian(q) for robot in (scene.robot, w.robot))
     np.testing.assert_allclose(one, other, atol=1e-13)

@@ -15,7 +15,7 @@ import mujoco
 from survey_mjcf import States, difference, mujoco_forces, survey, torchid_forces
 
 from torchid.errors import InputError, TorchidWarning, UrdfError
-from torchid.report import identified_urdf
+from torchid.report import FittedJoints, identified_robot, identified_urdf
 from torchid.robot import Robot, load_robot
 from torchid.robot.mjcf import roll_pitch_yaw
 from torchid.robot.mjcf_model import MjcfModel
@@ -151,6 +151,33 @@ def test_what_is_no_tree_of_joints_is_refused_by_element_and_line(case: str, tmp
     with pytest.raises(UrdfError, match=re.escape(message)) as caught:
         robot_of(text, tmp_path, fixed_base=case != "damped base")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("angle", ["degree", "radian"])
+def test_fitted_springs_with_their_offsets_are_what_is_read_again(angle: str, tmp_path: Path) -> None:
+    robot = robot_of(FREE.replace('angle="degree"', f'angle="{angle}"'), tmp_path)
+    fitted = FittedJoints(
+        stiffness={"knee": 3.0, "stretch": 2.0}, torque_offset={"knee": 0.6, "pitch": 0.2, "yaw": 0.1}
+    )
+    with pytest.warns(TorchidWarning, match="MJCF cannot say what was fitted of yaw: an offset without a spring"):
+        text = identified_robot(robot, robot.nominal, fitted)
+    (tmp_path / "identified.xml").write_bytes(text)
+    again = load_robot(tmp_path / "identified.xml")
+    of = dict(zip(robot.joint_names, range(robot.n), strict=True))
+    expected, constant = robot.stiffness.copy(), robot.spring_torque.copy()
+    expected[[of["knee"], of["stretch"]]] = 3.0, 2.0
+    constant[[of["knee"], of["pitch"]]] += 0.6, 0.2
+    np.testing.assert_allclose(again.stiffness, expected, rtol=1e-14)
+    np.testing.assert_allclose(again.spring_torque, constant, rtol=0.0, atol=1e-13)
+
+
+def test_springs_that_push_or_move_several_joints_are_named(tmp_path: Path) -> None:
+    robot = robot_of(BOLTED, tmp_path, True)
+    fitted = FittedJoints(stiffness={"shoulder": -1.0, "left_finger": 2.0})
+    with pytest.warns(
+        TorchidWarning, match="shoulder, left_finger: an offset without a spring, or a spring that pushes"
+    ):
+        assert not fitted.springs(robot, "identified.xml")
 
 
 LOOPED = """<mujoco><worldbody><body name="b"><joint name="j"/><geom size=".1"/><site name="s" pos=".1 .2 .3"/></body>

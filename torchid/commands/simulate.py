@@ -21,7 +21,7 @@ from torchid.config.reading import dump
 from torchid.errors import about_file, current_file
 from torchid.logs import write_log
 from torchid.parameters import Array
-from torchid.report import identified_robot
+from torchid.report import FittedJoints, identified_robot
 from torchid.report.tables import progress_bars
 from torchid.robot import Robot, load_robot
 from torchid.simulation import LEAD_S, Stability, sensor_log, set_up_simulation
@@ -54,7 +54,7 @@ def simulate(config: SimulationConfig) -> dict[str, Stability]:
         stabilities = _in_processes(config, folder, lambda seconds: bars.update(bar, completed=seconds))
         (folder / "simulation.yaml").write_text(dump(config))
         write_json(folder / "stability.json", {name: asdict(stability) for name, stability in stabilities.items()})
-        nominal = identified_robot(robot, nominal_parameters(robot, config.nominal), {})
+        nominal = identified_robot(robot, nominal_parameters(robot, config.nominal), FittedJoints())
         (folder / nominal_name(config)).write_bytes(nominal)
     return stabilities
 
