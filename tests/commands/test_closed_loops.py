@@ -14,7 +14,8 @@ import yaml
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed")
 
-from closed_loops import LoopWorld, loop_world
+import mujoco
+from closed_loops import MODELS, LoopWorld, loop_world
 
 import torchid
 from torchid.cli import main
@@ -22,12 +23,44 @@ from torchid.commands.reading import LogReader
 from torchid.config import load_config
 from torchid.errors import TorchidError
 from torchid.fitting.experiment import set_up
+from torchid.logs import Log
+from torchid.parameters import FRICTION, perturb_parameters
 from torchid.regressor.loops import LoopClosures
 from torchid.report import identified_urdf
+from torchid.report.mjcf_files import identified_mjcf
 from torchid.report.mjcf_of_urdf import mjcf_of_urdf
-from torchid.robot import Loop, load_robot
+from torchid.robot import Loop, Robot, load_robot
 
 LEG = "four-bar leg"
+
+
+MOTORS = ("abduction", "hip", "crank")
+
+
+def swinging_leg(folder: Path) -> Robot:
+    """The leg, bolted, with friction that MuJoCo simulates and stiff loops."""
+    text = MODELS[LEG].replace("<freejoint/>", "").replace('<option jacobian="dense"/>', '<option timestep="0.001"/>')
+    joint = '<joint damping="0.1" frictionloss="0.05" armature="0.01"/><equality solref="0.004 1"/>'
+    text = text.replace('<joint damping="0.3" armature="0.01"/>', joint)
+    (folder / "true.xml").write_text(text)
+    return load_robot(folder / "true.xml", fixed_base=True)
+
+
+def swing(path: Path, seconds: float, seed: int) -> Log:
+    """What motors record of a leg that follows sines by a PD law, with noise: positions and torques at 500 Hz."""
+    model, rng = mujoco.MjModel.from_xml_path(str(path)), np.random.default_rng(seed)
+    model.dof_solref[:] = [0.004, 1.0]
+    data = mujoco.MjData(model)
+    at, rate = (np.array([getattr(model.joint(name), key)[0] for name in MOTORS]) for key in ("qposadr", "dofadr"))
+    hz, phase, size = (rng.uniform(low, high, (3, 3)) for low, high in ((0.2, 1.5), (0.0, 6.3), (0.05, 0.15)))
+    time, rows = 0.001 * np.arange(round(1000 * seconds)), []
+    for now in time:
+        goal = (size * np.sin(2.0 * np.pi * hz * now + phase)).sum(0) * min(1.0, now / 2.0)
+        data.ctrl[:] = 60.0 * (goal - data.qpos[at]) - 2.0 * data.qvel[rate]
+        rows.append([*data.qpos[at], *data.ctrl])
+        mujoco.mj_step(model, data)
+    recorded = np.array(rows)[::2] + np.repeat([1e-5, 0.05], 3) * rng.normal(size=(len(time[::2]), 6))
+    return Log(f"swing {seed}", time[::2], MOTORS, recorded[:, :3], joint_torque=recorded[:, 3:])
 
 
 def experiment(folder: Path, w: LoopWorld, **robot: Any) -> Path:
@@ -153,3 +186,26 @@ def test_analysis_offers_torques_of_motors_alone(tmp_path: Path) -> None:
     candidates = [one["name"] for one in found["scenarios"]["logs"]["candidates"]]
     assert candidates[:3] == ["abduction", "hip", "crank"]
     assert not set(w.robot.passive) & set(candidates)
+
+
+def test_noisy_positions_and_torques_of_motors_alone_identify_a_leg_that_mujoco_moves(tmp_path: Path) -> None:
+    robot = swinging_leg(tmp_path)
+    for name, seconds, seed in (("train", 12.0, 1), ("test", 6.0, 2)):
+        torchid.write_log(swing(tmp_path / "true.xml", seconds, seed), tmp_path / f"{name}.npz")
+    nominal = perturb_parameters(robot.nominal, 0.2, np.random.default_rng(3))
+    nominal[:, FRICTION] *= 0.5
+    (tmp_path / "leg.xml").write_bytes(identified_mjcf(robot, nominal, {}))
+    settings: dict[str, Any] = {
+        "robot": {"mjcf": str(tmp_path / "leg.xml"), "fixed_base": True},
+        "logs": {key: [str(tmp_path / f"{key}.npz")] for key in ("train", "test")},
+        "sensors": "joints",
+        "preprocessing": {"cutoff_hz": 15.0},
+        "estimator": {"name": "consistent", "ridge": 1e-3},
+        "output": None,
+    }
+    found = torchid.identify(**settings)
+    before, after = found.metrics["test"]
+    assert (after.rms["joint_torque"] or 1.0) < 0.15 * (before.rms["joint_torque"] or 0.0)
+    motors = [k for k, body in enumerate(robot.bodies) if body.joint is not None and body.joint.name in MOTORS]
+    friction = found.phi.reshape(-1, 12)[motors][:, FRICTION]
+    np.testing.assert_allclose(friction, np.tile([0.05, 0.1], (len(MOTORS), 1)), rtol=0.1)

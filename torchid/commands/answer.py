@@ -77,9 +77,10 @@ def _bodies_text(run: Identification) -> str:
     count = len(robot.body_names)
     if not run.violations:
         mass = run.estimate.phi.reshape(-1, PER_BODY)[:, parameters.MASS]
-        moving = slice(int(run.experiment.config.robot.fixed_base), None)
+        of = run.experiment.config.robot
+        moving = slice(int(of.fixed_base), None)
         empty = [name for name, x in zip(robot.body_names[moving], mass[moving], strict=True) if not x]
-        if empty:
+        if empty and of.mjcf is None:  # of MJCF they stand for all but the last of a body's joints
             return f"all that have mass can exist; MuJoCo refuses those that move without: {join_names(empty)}"
         return f"all {count} can exist, and simulators take them"
     which = f"{len(names)} of {count}" if names else "all together"
