@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from torchid.commands.evaluate import FittedRun, read_run, require_run
 from torchid.commands.folder import REPLAY, check_free, new_folder, write_json
 from torchid.commands.reading import LogReader
 from torchid.config import FootConfig
-from torchid.errors import ConfigError, LogError, about_file, during, format_count
+from torchid.errors import ConfigError, LogError, about_file, during, excerpt, format_count
 from torchid.fitting.calibration import Calibration, Comparison
 from torchid.logs.time_range import split_range
 from torchid.parameters import Array
@@ -25,6 +25,7 @@ from torchid.report.figures import save_figure
 from torchid.report.tables import progress_bars
 from torchid.reprs import short_repr
 from torchid.robot import Robot
+from torchid.robot.welds import matching_joints
 from torchid.sensing import Contact
 from torchid.simulation.plant import Foot, find_feet, point_foot
 from torchid.simulation.replay import Drift, Model, ReplayedLog, replay_log
@@ -44,6 +45,7 @@ class Replay:
         drift: with the robot's file, which has no offsets and, a URDF, no armature, and with what was identified.
         joint_names: of the robot.
         units: of the joints' positions, "rad" or "m".
+        gains: kp and kd of each joint, (2, n), 0 where the log's torques drive it alone.
         output: the folder that it was written to, if any.
     """
 
@@ -53,6 +55,7 @@ class Replay:
     drift: Comparison[Drift]
     joint_names: tuple[str, ...]
     units: tuple[str, ...]
+    gains: Array
     output: Path | None = None
 
     __repr__ = short_repr
@@ -91,6 +94,8 @@ class Replay:
             "log": self.source,
             "window_s": self.window,
             "windows": self.windows,
+            "kp": dict(zip(self.joint_names, self.gains[0].tolist(), strict=True)),
+            "kd": dict(zip(self.joint_names, self.gains[1].tolist(), strict=True)),
             "time_s": self.drift.nominal.time.tolist(),
             "quartiles": {
                 name: {"nominal": pair.nominal.tolist(), "identified": pair.identified.tolist()}
@@ -107,6 +112,8 @@ def replay(
     window: float = 0.5,
     output: str | Path | None = None,
     overwrite: bool = False,
+    kp: float | Mapping[str, float] = 0.0,
+    kd: float | Mapping[str, float] = 0.0,
 ) -> Replay:
     """Drive the robot in MuJoCo with the torques of a log, and see how far it drifts from the log.
 
@@ -119,6 +126,8 @@ def replay(
         window: length of the windows [s].
         output: folder to write; None: nothing is.
         overwrite: whether a replay that stands there may be replaced.
+        kp: gain of a PD law whose targets made the log's torques [N m/rad or N/m], of all joints or by name or pattern.
+        kd: its gain on the velocity [N m s/rad or N s/m], likewise.
 
     Raises:
         InputError: the folder is no run, MuJoCo is not installed or does not take the robot, or the log has not what
@@ -134,6 +143,7 @@ def replay(
         fitted = read_run(folder)
         with about_file(folder / "config.yaml"):
             _require_simple(fitted)
+        gains = np.stack([joint_gains(fitted.experiment.robot, *x) for x in (("--kp", kp), ("--kd", kd))])
         reading = bars.add_task("reading the log", total=1)
         (samples,) = LogReader(fitted.experiment, folder).read([Path(log)], None, lambda _: bars.advance(reading))
         robot = fitted.experiment.robot
@@ -146,7 +156,7 @@ def replay(
         replaying = bars.add_task("replaying", total=2 * len(windows))
         times = window * np.arange(1, _TIMES + 1) / _TIMES
         nominal, identified = (
-            replay_log(model, of, feet, windows, times, lambda n: bars.advance(replaying, n))
+            replay_log(model, of, feet, windows, times, lambda n: bars.advance(replaying, n), gains)
             for model, of in zip(models, logs, strict=True)
         )
     found = Replay(
@@ -156,12 +166,47 @@ def replay(
         drift=Comparison(nominal, identified),
         joint_names=robot.joint_names,
         units=tuple(_UNITS[kind] for kind in _joint_kinds(robot)),
+        gains=gains,
         output=out,
     )
     if out is not None:
         with during("writing", out), new_folder(out, overwrite, REPLAY) as new:
             _write(found, new)
     return found
+
+
+_GAIN = "a number of at least 0, or numbers by joint or pattern: 20 '*_calf=30'"
+
+
+def parse_gains(option: str, entries: Sequence[str]) -> dict[str, float]:
+    """Gains by joint or pattern, of words like 20 and *_calf=30.
+
+    Raises:
+        ConfigError: a word that is neither.
+    """
+    gains = {}
+    for entry in entries:
+        name, _, number = entry.rpartition("=")
+        try:
+            gains[name or "*"] = float(number)
+        except ValueError as error:
+            raise ConfigError("command line", option, f"'{excerpt(entry)}'", _GAIN) from error
+    return gains
+
+
+def joint_gains(robot: Robot, option: str, stated: float | Mapping[str, float]) -> Array:
+    """A gain of each joint, (n,), from one of all or by name or pattern; later patterns count, others have 0.
+
+    Raises:
+        UnknownNameError: a joint that does not exist.
+        ConfigError: a pattern that matches none, or a gain that is negative.
+    """
+    out, by_name = np.zeros(robot.n), stated if isinstance(stated, Mapping) else {"*": stated}
+    for key, gain in by_name.items():
+        if not 0.0 <= gain < np.inf:
+            raise ConfigError("command line", option, f"{gain:g}", _GAIN)
+        out[[robot.joint_names.index(name) for name in matching_joints(option, key, robot.joint_names)]] = gain
+    return out
 
 
 def _write(found: Replay, folder: Path) -> None:
