@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -159,7 +160,9 @@ def _record(
     coulomb = np.array([friction[name] for name in robot.joint_names])
     q, quat = closed_positions(robot, count, rng), Rotation.random(count, rng)
     active = rng.random((count, len(contacts))) < 0.6
-    wrench = np.zeros((count, len(contacts), 6))
+    possible = np.array([np.isin(range(6), contact.components) for contact in contacts])
+    wrench = np.where(active[..., None] & possible, [30.0, 30.0, 30.0, 3.0, 3.0, 3.0], 0.0)
+    wrench *= rng.normal(size=wrench.shape)
     (v, a), torque = np.zeros((2, count, 6 + robot.n)), np.zeros((count, robot.n))
     loops, base, carried = [], [], []
     for k in range(count):
@@ -175,14 +178,8 @@ def _record(
         data.qvel[:] = drawn - np.linalg.pinv(J, rcond=1e-9) @ (J @ drawn)
         data.qfrc_applied[:] = 0.0
         through = np.zeros(model.nv)
-        for c, contact in enumerate(contacts):
-            if active[k, c]:
-                size = 3 if contact.kind == "point" else 6
-                wrench[k, c, :size] = rng.normal(size=size) * [30.0, 30.0, 30.0, 3.0, 3.0, 3.0][:size]
-                site = model.site(contact.frame)
-                axes = data.site_xmat[site.id].reshape(3, 3)
-                force, moment = axes @ wrench[k, c, :3], axes @ wrench[k, c, 3:]
-                mujoco.mj_applyFT(model, data, force, moment, data.site_xpos[site.id], int(site.bodyid[0]), through)
+        for contact, read in zip(itertools.compress(contacts, active[k]), wrench[k][active[k]], strict=True):
+            _push(model, data, contact, read, through)
         data.qfrc_applied[:] = through
         data.qfrc_applied[rate] -= coulomb * np.sign(data.qvel[rate])
         data.ctrl[:] = 5.0 * rng.normal(size=model.nu)
@@ -199,9 +196,25 @@ def _record(
         carried.append(np.abs(data.qfrc_constraint[rate]).max())
     assert np.median(carried) > 1.0, "loops must carry forces"
     torque[:, robot.is_passive] = np.nan  # nobody measures what has no motor
-    log = Log(
+    log = _log(path, robot, (q, v, a), torque, quat, (active, wrench))
+    nominal = parameters.perturb_parameters(true, 0.2, np.random.default_rng(1))
+    nominal[:, parameters.FRICTION] *= 0.5
+    return LoopWorld(path, replace(robot, nominal=nominal), true, log, np.array(loops), np.array(base))
+
+
+def _log(
+    path: Path,
+    robot: Robot,
+    motion: tuple[Array, Array, Array],
+    torque: Array,
+    quat: Rotation,
+    contact: tuple[Array, Array],
+) -> Log:
+    """What a robot records, with motions q (N, n), v and a (N, 6 + n) in MuJoCo's axes of the base."""
+    (q, v, a), (active, wrench), contacts = motion, contact, FEET[path.stem]
+    return Log(
         f"{path.stem}.npz",
-        0.01 * np.arange(count),
+        0.01 * np.arange(len(q)),
         robot.joint_names,
         q,
         joint_velocity=v[:, 6:],
@@ -215,9 +228,14 @@ def _record(
         contact_active=active,
         contact_wrench_local=wrench,
     )
-    nominal = parameters.perturb_parameters(true, 0.2, np.random.default_rng(1))
-    nominal[:, parameters.FRICTION] *= 0.5
-    return LoopWorld(path, replace(robot, nominal=nominal), true, log, np.array(loops), np.array(base))
+
+
+def _push(model: mujoco.MjModel, data: mujoco.MjData, contact: Contact, wrench: Array, total: Array) -> None:
+    """Add the generalized forces (nv,) of a wrench (6,) on a contact, along its frame's axes."""
+    site = model.site(contact.frame)
+    axes = data.site_xmat[site.id].reshape(3, 3)
+    force, moment = axes @ wrench[:3], axes @ wrench[3:]
+    mujoco.mj_applyFT(model, data, force, moment, data.site_xpos[site.id], int(site.bodyid[0]), total)
 
 
 def _rigid_acceleration(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, at: Array, rate: Array) -> Array:

@@ -147,23 +147,17 @@ def replay(
         reading = bars.add_task("reading the log", total=1)
         (samples,) = LogReader(fitted.experiment, folder).read([Path(log)], None, lambda _: bars.advance(reading))
         robot = fitted.experiment.robot
-        files = Comparison(robot.path, folder / identified_name(robot))
-        feet = _feet(fitted.experiment.contacts, files.nominal) if not robot.fixed_base else ()
-        calibration = fitted.calibrations.identified
-        logs = Comparison(*(_replayed(one) for one in (samples, *calibration.calibrate([samples]))))
-        models = Comparison(_model(files.nominal, robot, None), _model(files.identified, robot, calibration))
+        feet = _feet(fitted.experiment.contacts, robot.path) if not robot.fixed_base else ()
+        logs, models = _replayed_pairs(fitted, samples, folder)
         windows = logs.nominal.windows(window)
         replaying = bars.add_task("replaying", total=2 * len(windows))
-        times = window * np.arange(1, _TIMES + 1) / _TIMES
-        nominal, identified = (
-            replay_log(model, of, feet, windows, times, lambda n: bars.advance(replaying, n), gains)
-            for model, of in zip(models, logs, strict=True)
-        )
+        rest = feet, windows, window * np.arange(1, _TIMES + 1) / _TIMES, lambda n: bars.advance(replaying, n), gains
+        drift = Comparison(*(replay_log(model, of, *rest) for model, of in zip(models, logs, strict=True)))
     found = Replay(
         source=split_range(log).name,
         window=float(window),
         windows=len(windows),
-        drift=Comparison(nominal, identified),
+        drift=drift,
         joint_names=robot.joint_names,
         units=tuple(_UNITS[kind] for kind in _joint_kinds(robot)),
         gains=gains,
@@ -173,6 +167,16 @@ def replay(
         with during("writing", out), new_folder(out, overwrite, REPLAY) as new:
             _write(found, new)
     return found
+
+
+def _replayed_pairs(
+    fitted: FittedRun, samples: Samples, folder: Path
+) -> tuple[Comparison[ReplayedLog], Comparison[Model]]:
+    """What drives the robot of its file and the identified one, and both."""
+    robot, calibration = fitted.experiment.robot, fitted.calibrations.identified
+    logs = Comparison(*(_replayed(one) for one in (samples, *calibration.calibrate([samples]))))
+    identified = _model(folder / identified_name(robot), robot, calibration)
+    return logs, Comparison(_model(robot.path, robot, None), identified)
 
 
 _GAIN = "a number of at least 0, or numbers by joint or pattern: 20 '*_calf=30'"

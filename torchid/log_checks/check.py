@@ -156,10 +156,8 @@ def check(
         results += check_slip(repaired, robot, contacts, cutoff_hz, derived)
     compared = repaired
     if "base_" in derived and robot is not None and _blocking_finding(results) is None:
-        try:
-            compared = longest_standing(repaired, robot, contacts)
-        except InputError as error:
-            results.append(Finding("does not fit", CONDEMNED, error.field, error.found, f"give {error.accepted}"))
+        compared, unfit = _longest_standing(repaired, robot, contacts)
+        results += unfit
     if _blocking_finding(results) is None:
         unbiased = subtract_contact_offsets(compared)
         results += check_forces_against_urdf(unbiased, robot, contacts, cutoff_hz, derived)
@@ -170,6 +168,14 @@ def check(
     else:
         results.append(_skip_dependent(blocking))
     return _collect(log, repaired, results)
+
+
+def _longest_standing(log: Log, robot: Robot, contacts: Sequence[Contact]) -> tuple[Log, list[Finding]]:
+    """The longest stretch in which enough feet stand; or the log, and why there is none."""
+    try:
+        return longest_standing(log, robot, contacts), []
+    except InputError as error:
+        return log, [Finding("does not fit", CONDEMNED, error.field, error.found, f"give {error.accepted}")]
 
 
 def _findings(results: Iterable[Finding | Skipped]) -> Iterator[Finding]:

@@ -27,6 +27,7 @@ from torchid.reprs import short_repr
 from torchid.robot.loops import Loop, loops_of_file, passive_joints, validate_loops
 from torchid.robot.tree import (
     BodyJoint,
+    BodyTree,
     JointGeometry,
     build_chain,
     build_tree,
@@ -277,16 +278,7 @@ def load_robot(
         massless = ~np.any(nominal[:, parameters.INERTIAL], axis=1)
         if massless.all():
             raise UrdfError(path, "<inertial>", "no link has mass", "at least one link with mass > 0")
-        bodies = tuple(
-            Body(
-                name,
-                parent=-1 if joint is None else joint.parent,
-                joint=joint,
-                links=tuple(link for link, (body, _) in tree.links.items() if body == index),
-                massless=bool(massless[index]),
-            )
-            for index, (name, joint) in enumerate(zip(tree.names, tree.joints, strict=True))
-        )
+        bodies = _bodies(tree, massless)
         _warn_of_massless_ends(path, bodies)
         body_of = {name: body for name, (body, _) in tree.links.items()}
         beyond = links_beyond(joints, welded, body_of, tree.names)
@@ -298,6 +290,20 @@ def load_robot(
     validate_loops([*loops, *closed], robot.links)
     motorless = passive_joints(joints, passive, robot.joint_names)
     return replace(robot, loops=(*loops, *closed), passive=motorless)
+
+
+def _bodies(tree: BodyTree, massless: np.ndarray) -> tuple[Body, ...]:
+    """The bodies of a tree; `massless`, (L,) bool."""
+    return tuple(
+        Body(
+            name,
+            parent=-1 if joint is None else joint.parent,
+            joint=joint,
+            links=tuple(link for link, (body, _) in tree.links.items() if body == index),
+            massless=bool(massless[index]),
+        )
+        for index, (name, joint) in enumerate(zip(tree.names, tree.joints, strict=True))
+    )
 
 
 def _warn_of_massless_ends(path: Path, bodies: tuple[Body, ...]) -> None:
