@@ -44,6 +44,8 @@ PositiveOrAuto = Annotated[
     float | Literal["auto"] | None, _number_or((AUTO, None), Positive, "auto, null, or a number greater than 0")
 ]
 """A positive number, one that the data choose, or none."""
+NumberOrAuto = Annotated[float | Literal["auto"] | None, _number_or((AUTO, None), Number, "auto, null, or a number")]
+"""A number, one that the data choose, or none."""
 NotNegative = Annotated[Number, Field(ge=0.0)]
 NotNegativeOrAuto = Annotated[
     float | Literal["auto"], _number_or((AUTO,), NotNegative, "auto, or a number of at least 0")

@@ -103,6 +103,45 @@ def test_a_run_through_files_finds_them_and_another_log_is_predicted_with_them(r
     assert min(errors_in(found["nominal"]).values()) > 1e-2
 
 
+def test_actuators_that_cannot_be_stand_on_their_bounds_and_are_named(
+    run: Run, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Something pushes a joint forwards, by more than dry friction resists: no friction does."""
+    overrides = []
+    for name in ("first", "second"):
+        with np.load(run.folder / f"{name}.npz") as log:
+            fields = dict(log)
+        joint = str(fields["joint_names"][0])
+        fields["joint_torque"][:, 0] -= 9.0 * np.abs(np.tanh(fields["joint_velocity"][:, 0] / WIDTH))
+        np.savez(run.folder / f"pushed_{name}.npz", **fields)
+        overrides.append(str(run.folder / f"pushed_{name}.npz"))
+    settings, output = [f"logs.train={json.dumps(overrides)}"], run.folder / "pushed"
+    assert main(["identify", str(run.file), *settings, f"output={output}"]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert f"negative, which nothing is: Coulomb friction of {joint} forwards; estimator.name=consistent" in shown
+    assert "all 9 can exist" in shown, "it is no body's fault"
+    (broken,) = json.loads((output / "metrics.json").read_text())["violations"]
+    assert (broken["term"], broken["unit"]) == (f"Coulomb friction of {joint} forwards", "N m")
+    assert broken["amount"] > 0.1
+
+    settings += ["estimator.name=consistent", "estimator.ridge=1e-6", "overwrite=true", f"output={output}"]
+    assert main(["identify", str(run.file), *settings, "--verbose"]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "|: at a physical bound" in shown
+    assert f"Coulomb friction of {joint} forwards" in shown
+    metrics, document = (json.loads((output / f"{name}.json").read_text()) for name in ("metrics", "parameters"))
+    assert metrics["violations"] == []
+    assert f"Coulomb friction of {joint} forwards" in metrics["solution"]["active"]
+    (found,) = [x for x in document["extras"] if (x["what"], x["name"]) == ("asymmetric_coulomb", joint)]
+    bodies = {body["name"]: body["identified"]["fc"] for body in document["bodies"]}
+    robot = load(run.folder / "machine.urdf", None, False, SENSORS)
+    resisting = sum(
+        abs(x) * bodies[body.name] for body, x in zip(robot.bodies[1:], robot.joint_map[0][:, 0], strict=True)
+    )
+    assert found["at_bound"]
+    assert -found["value"] == pytest.approx(resisting, abs=1e-4)
+
+
 def test_the_width_of_the_sign_is_found(run: Run) -> None:
     """Nobody knows it: everything else is fitted anew for each, and a run folder has the number."""
     output = run.folder / "auto"

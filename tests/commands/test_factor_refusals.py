@@ -45,6 +45,7 @@ REFUSED = {
     "actuators": (["actuators.armature=true"], "actuators: without armature of front_left_hip"),
     "tilt": (["robot.base_tilt=[0.1, 0]"], "robot.base_tilt: none; accepted: 0.1, 0.0, as in the experiment file"),
     "sign": (["actuators.sign_width=0.1"], "actuators.sign_width: none; accepted: 0.1"),
+    "delay": (["actuators.delay=0.003"], "actuators.delay: none; accepted: 0.003, as in the experiment file"),
     "contacts": (
         ["contacts=[{frame: front_left_foot, type: point}, {frame: front_right_foot, type: point}]"],
         "contacts: with rear_left_foot (point), rear_right_foot (point)",

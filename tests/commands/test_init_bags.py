@@ -18,6 +18,7 @@ from bags import (
     entries_of,
     imu,
     joint_state,
+    vector,
     wrench,
     write_bag,
     write_folder,
@@ -26,7 +27,7 @@ from dialects import with_velocity
 from low_states import FEET, GO2, START, low_states, moving, write_low_states
 from repository import DEMO
 from scipy.spatial.transform import Rotation
-from synthetic import G1, ROBOTS
+from synthetic import G1, ROBOTS, SOLO12
 
 from torchid.cli import main
 from torchid.commands.init import Initiated, init
@@ -169,6 +170,45 @@ def legged(names: list[str], more: list[tuple[str, str, Any]], samples: int = 20
         out.append(("/joint_states", stamp, JOINT_STATE, joint_state(stamp, names, **joints)))
         out += [(topic, stamp, kind, content(i, stamp)) for topic, kind, content in more]
     return out
+
+
+def test_the_orientation_of_an_imu_along_the_base_is_proposed_where_messages_have_it(tmp_path: Path) -> None:
+    joints = list(load_robot(G1).joint_names)
+
+    def started_with(name: str, turn: float, frame: str = "imu_in_pelvis") -> tuple[dict[str, Any], Log]:
+        def message(i: int, stamp: int) -> dict[str, Any]:
+            quat = [0.0, 0.0, np.sin(turn * i), np.cos(turn * i)]
+            return imu(stamp, [0, i, 9.8], [0, 0, 1], frame) | {"orientation": vector(quat, "xyzw")}
+
+        _, topics, again = started(G1, write_bag(tmp_path / name, legged(joints, [("/imu", IMU, message)])))
+        return topics["imu"], again
+
+    topic, log = started_with("turns.mcap", 0.01)
+    assert topic == {"topic": "/imu", "frame": "imu_in_pelvis", "orientation": True}
+    assert log.base_quat_xyzw is not None
+    assert "orientation" not in started_with("still.mcap", 0.0)[0], "of a driver that does not set it"
+
+
+def test_an_imu_turned_against_the_base_gives_it_no_orientation(tmp_path: Path) -> None:
+    joints, turned = list(load_robot(SOLO12).joint_names), tmp_path / "solo.urdf"
+    link = '<link name="imu"/><joint name="m" type="fixed"><parent link="base_link"/><child link="imu"/>'
+    turned.write_text(SOLO12.read_text().replace("</robot>", f'{link}<origin rpy="0 0 1.57"/></joint></robot>'))
+
+    def message(i: int, stamp: int) -> dict[str, Any]:
+        quat = [0.0, 0.0, np.sin(0.01 * i), np.cos(0.01 * i)]
+        return imu(stamp, [0, i, 9.8], [0, 0, 1], "imu") | {"orientation": vector(quat, "xyzw")}
+
+    _, topics, _ = started(turned, write_bag(tmp_path / "x.mcap", legged(joints, [("/imu", IMU, message)])))
+    assert topics["imu"] == {"topic": "/imu", "frame": "imu"}
+    settings = yaml.safe_load((tmp_path / "x.yaml").read_text())
+    settings["logs"]["topics"]["imu"]["orientation"] = True
+    (tmp_path / "y.yaml").write_text(yaml.safe_dump(settings))
+    with pytest.raises(ConfigError, match=r"imu\.frame: 'imu', which is turned by 90 deg against base_link"):
+        set_up(load_config(tmp_path / "y.yaml"))
+    del settings["logs"]["topics"]["imu"]["frame"]
+    (tmp_path / "y.yaml").write_text(yaml.safe_dump(settings))
+    with pytest.raises(ConfigError, match=r"logs\.topics\.imu\.frame: missing, with orientation: true"):
+        set_up(load_config(tmp_path / "y.yaml"))
 
 
 def test_commands_other_joints_and_imus_of_limbs_are_left_out(tmp_path: Path) -> None:

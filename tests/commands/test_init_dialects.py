@@ -9,6 +9,7 @@ import h5py
 import numpy as np
 import pytest
 from dialects import save_csv
+from scipy.spatial.transform import Rotation
 from synthetic import ANYMAL, PANDA, ROBOTS, SOLO12
 
 from torchid.commands.init import Initiated, init
@@ -215,6 +216,47 @@ def test_short_gaps_in_the_motion_are_bridged_and_long_ones_excluded(tmp_path: P
         assert any(text.startswith("preprocessing.") and "gaps of joint_position" in text for text in said.guessed)
 
 
+RPY = np.stack([0.2 * np.sin(TIME), 0.1 - 0.3 * TIME, 3.0 + 0.4 * TIME], axis=1)  # yaw passes half a turn
+
+
+@pytest.mark.parametrize(
+    ("names", "factor"),
+    [
+        (["roll", "pitch", "yaw"], 1.0),
+        (["imu_roll_deg", "imu_pitch_deg", "imu_yaw_deg"], 180.0 / np.pi),
+        (["base_rpy_0", "base_rpy_1", "base_rpy_2"], 1.0),
+        (["euler.x [deg]", "euler.y [deg]", "euler.z [deg]"], 180.0 / np.pi),
+        (["Attitude Roll", "Attitude Pitch", "Attitude Yaw"], 180.0 / np.pi),
+    ],
+)
+def test_angles_of_the_base_are_its_orientation(names: list[str], factor: float, tmp_path: Path) -> None:
+    q, dq, tau = motion(12)
+    columns: dict[str, Any] = {"t": TIME}
+    for what, x in (("q", q), ("dq", dq), ("tau", tau)):
+        columns |= {f"{what}_{k}": x[:, k] for k in range(12)}
+    columns |= {name: factor * x for name, x in zip(names, RPY.T, strict=True)}
+    columns |= {"cmd_roll": TIME, "cmd_pitch": TIME, "cmd_yaw": TIME, "roll_rate": TIME, "pitch_rate": TIME}
+    columns |= {"old_euler_x": TIME, "old_euler_y (deg)": TIME, "old_euler_z": TIME}
+    _, log, _ = started(GO1, save_csv(tmp_path / "x.csv", columns))
+    assert log.base_quat_xyzw is not None
+    x, y, z = (Rotation.from_rotvec(np.outer(angle, axis)) for angle, axis in zip(RPY.T, np.eye(3), strict=True))
+    off = (z * y * x).inv() * Rotation.from_quat(log.base_quat_xyzw)
+    np.testing.assert_allclose(off.magnitude(), 0.0, atol=1e-10)
+
+
+def test_angles_in_an_array_are_the_orientation_and_those_of_joints_are_not(tmp_path: Path) -> None:
+    q, dq, tau = motion(12)
+    arrays = {"t": TIME, "q": q, "dq": dq, "tau": tau}
+    np.savez(tmp_path / "x.npz", **arrays, imu_rpy=RPY, hip_roll=TIME, hip_pitch=TIME, hip_yaw=TIME)
+    _, log, given = started(GO1, tmp_path / "x.npz")
+    assert given["base_quat_wxyz"].rpy.column == "imu_rpy"
+    expected = Rotation.from_euler("ZYX", RPY[:, ::-1])
+    assert log.base_quat_xyzw is not None
+    np.testing.assert_allclose((expected.inv() * Rotation.from_quat(log.base_quat_xyzw)).magnitude(), 0.0, atol=1e-10)
+    np.savez(tmp_path / "y.npz", **arrays, hip_roll=TIME, hip_pitch=TIME, hip_yaw=TIME)
+    assert started(GO1, tmp_path / "y.npz")[1].base_quat_xyzw is None
+
+
 def test_what_columns_may_be_that_are_not_read_is_said(tmp_path: Path) -> None:
     q, dq, _ = motion(12)
     columns: dict[str, Any] = {"t": TIME, "dt": TIME}
@@ -222,12 +264,12 @@ def test_what_columns_may_be_that_are_not_read_is_said(tmp_path: Path) -> None:
     said = init(ANYMAL, save_csv(tmp_path / "other.csv", columns), tmp_path / "other.yaml")
     assert any("is it the URDF of the robot that was recorded?" in text for text in said.missing)
     columns = {f"q_{k}": q[:, k] for k in range(12)} | {f"current_{k}": dq[:, k] for k in range(12)}
-    columns |= {"roll_deg": TIME, "pitch_deg": TIME, "yaw_deg": TIME, "left_ft_x": TIME}
+    columns |= {"roll_deg": TIME, "pitch_deg": TIME, "left_ft_x": TIME}
     said = init(ANYMAL, save_csv(tmp_path / "lacks.csv", columns), tmp_path / "lacks.yaml")
     text = "\n".join(said.missing)
     for found in (
         "joint_torque: 'current_0' and 11 more may be currents of motors",
-        "base_quat: 'roll_deg' and 2 more may be angles of the base",
+        "base_quat: 'roll_deg' and 1 more may be angles of the base; give all three as base_quat_wxyz: {rpy: ...}",
         "forces at the feet: 'left_ft_x' may be force/torque sensors",
         "time: no columns that look like it",
     ):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 
 import pytest
@@ -46,3 +47,33 @@ def mapped_kilobytes(folder: Path) -> int:
         elif not line.split()[0].endswith(":"):
             inside = str(folder) in line
     return total
+
+
+@pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
+def test_samples_far_apart_are_taken_from_files_without_their_pages_staying_in_memory(tmp_path: Path) -> None:
+    demo = shortened_demo(tmp_path / "demo", 300) / "quadruped.yaml"
+    config = load_config(demo, [f"output={tmp_path / 'run'}"])
+    scene = set_up(config)
+    reader = open_reader(scene)
+    [log] = reader.read(config.logs.train, scene.sensors)
+    near, far = torch.arange(0, len(log), 2), torch.arange(0, len(log), 30)
+    expected = {name: x[far].nan_to_num() for name, x in tensors(log).items()}
+    assert log[near].pages is log.pages
+    reader.let_go()
+    for chosen in (log[far], log.every(30)):
+        assert mapped_kilobytes(tmp_path / FOLDER) == 0
+        assert chosen.pages is None
+        for name, x in tensors(chosen).items():
+            assert torch.equal(x.nan_to_num(), expected[name]), name
+
+
+@pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
+def test_mapped_samples_that_are_sent_to_another_process_are_in_its_memory(tmp_path: Path) -> None:
+    demo = shortened_demo(tmp_path / "demo", 300) / "quadruped.yaml"
+    config = load_config(demo, [f"output={tmp_path / 'run'}"])
+    scene = set_up(config)
+    [log] = open_reader(scene).read(config.logs.train, scene.sensors)
+    there = pickle.loads(pickle.dumps(log))  # noqa: S301 - what was just written
+    there.pages.let_go()
+    for name, x in tensors(there).items():
+        assert torch.equal(x.nan_to_num(), tensors(log)[name].nan_to_num()), name

@@ -44,6 +44,7 @@ ALL: dict[str, Any] = {
         "asymmetric_coulomb": True,
         "stiffness": False,
         "sign_width": 0.01,
+        "delay": -0.002,
     },
     "estimator": {"name": "least_squares", "ridge": 1e-5, "rank_tolerance": 1e-7, "friction": False},
     "analysis": {
@@ -309,6 +310,8 @@ def test_a_value_of_the_wrong_kind_is_refused_by_its_place(file: Path, settings:
             "actuators.sign_width=wide",
             "actuators.sign_width: found 'wide'; accepted: auto, null, or a number",
         ),
+        ("actuators.delay=short", "actuators.delay: found 'short'; accepted: auto, null, or a number"),
+        ("actuators.delay=true", "actuators.delay: found True; accepted: auto, null, or a number"),
         ("preprocessing.cache_gb=-1", "preprocessing.cache_gb: found -1; accepted: greater than or equal to 0"),
         ("robot.base_tilt=[0.1]", "robot.base_tilt: found [0.1]; accepted: auto, null, or two angles [rad]"),
         ("robot.base_tilt=level", "robot.base_tilt: found 'level'; accepted: auto, null, or two angles [rad]"),

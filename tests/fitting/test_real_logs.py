@@ -1,4 +1,4 @@
-"""Recorded logs with unknown offsets: an arm whose torque sensors have some, and a person whose plates are made to."""
+"""Recorded logs: an arm with offsets of torques, a person on plates with some, a quadruped with PD laws and delays."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from repository import CONFIGS, SHARED
+from synthetic import ROBOTS
 
 from torchid.cli import main
 from torchid.errors import ConfoundedWarning
@@ -75,3 +76,39 @@ def test_a_person_whose_feet_never_leave_the_plates_is_told_that_offset_and_mass
     assert metrics["total_mass_told_from_offsets"] is False
     verdicts = {body["name"]: body["verdict"]["m"] for body in parameters["bodies"]}
     assert "identified" not in verdicts.values()
+
+
+GO2, LEGS = ROBOTS / "go2_description/urdf/go2.urdf", ("FL", "FR", "RL", "RR")
+
+
+@pytest.mark.parametrize(("cutoff", "most"), [(10.0, 0.182), (20.0, 0.200)])
+def test_a_quadruped_in_the_air_is_predicted_with_actuators_that_can_exist(
+    tmp_path: Path, cutoff: float, most: float
+) -> None:
+    """Rms over all joints of the second half [N m], fitted on the first: 0.178 and 0.195 measured.
+
+    Models that were identified in GPU simulators miss 0.206 and 0.227 at 10 Hz, 0.23 and 0.24 at 20 Hz; least squares
+    of all bodies 0.200 and 0.225.
+    """
+    overrides = f"robot.urdf={GO2}", f"preprocessing.cutoff_hz={cutoff}"
+    metrics, parameters = identified(tmp_path / "go2", "go2_in_air.yaml", *overrides)
+    assert metrics["test"]["nullspace_rms"] <= most
+    assert metrics["violations"] == []
+    choice = metrics["delay_selection"]
+    assert 0.005 < choice["interval"][0] < choice["interval"][1] < 0.02, "12.7 and 14.5 ms found"
+    armature = {x["name"]: x["value"] for x in parameters["extras"] if x["what"] == "armature"}
+    assert len(armature) == 12
+    assert 0.0 <= min(armature.values()) < max(armature.values()) < 0.045  # 0.001 to 0.043 by others
+    legs = np.array([[armature[f"{leg}_{joint}_joint"] for joint in ("hip", "thigh", "calf")] for leg in LEGS])
+    assert (np.diff(np.median(legs, axis=0)) > 0.005).all(), "calves are geared down most"
+    assert np.ptp(legs, axis=0).max() < 0.015, "the four legs are alike"
+
+
+def test_the_ridge_for_the_quadruped_in_the_air_is_the_largest_within_a_standard_error_of_the_best(
+    tmp_path: Path,
+) -> None:
+    metrics, _ = identified(tmp_path / "go2", "go2_in_air.yaml", f"robot.urdf={GO2}", "estimator.ridge=auto")
+    choice = metrics["ridge_selection"]
+    error, spread = np.array(choice["mean_square"]), np.array(choice["standard_error"])
+    within = np.flatnonzero(error - error.min() <= spread)
+    assert choice["tried"][within[-1]] == 0.01

@@ -167,6 +167,36 @@ def test_an_imu_at_rest_reads_g_upwards_in_its_own_frame(tmp_path: Path) -> None
         assert f"/imu: no {part}" in refusal(tmp_path / "x.mcap", unknown, imu="/imu")
 
 
+def test_the_orientation_of_an_imu_is_the_bases_where_it_is_wanted(tmp_path: Path) -> None:
+    quats = Rotation.from_rotvec(np.outer([0.1, 0.2, 0.3, 0.4], [0.6, 0.0, 0.8])).as_quat()
+
+    def entries(turns: Any = quats, **content: Any) -> list[Entry]:
+        said = [imu(int(s), [0, 0, 9.81], [0, 0, 0], "imu_link") | content for s in STAMPS]
+        said = [x | {"orientation": vector(turn, "xyzw")} for x, turn in zip(said, turns, strict=True)]
+        return joints_at(STAMPS) + [("/imu", int(s), IMU, x) for s, x in zip(STAMPS, said, strict=True)]
+
+    wanted = {"imu": {"topic": "/imu", "frame": "imu_link", "orientation": True}}
+    np.testing.assert_allclose(read_messages(tmp_path / "x.bag", entries(), **wanted).base_quat_xyzw, quats, atol=1e-15)
+    assert read_messages(tmp_path / "x.bag", entries(), imu="/imu").base_quat_xyzw is None
+    other = Rotation.from_rotvec([0.0, 0.0, 1.0]).as_quat()
+    with_odometry = entries() + [("/odom", int(s), ODOMETRY, odometry(int(s), [0, 0, 0], other)) for s in STAMPS]
+    pose = {"topic": "/odom", "twist": "none", "frame": "base"}
+    both = read_messages(tmp_path / "y.mcap", with_odometry, **wanted, odometry=pose)
+    np.testing.assert_allclose(both.base_quat_xyzw, np.tile(other, (4, 1)), atol=1e-15)
+    unknown = entries(orientation_covariance=np.array([-1.0] + [0.0] * 8))
+    for bad, found in (
+        (unknown, "/imu: no orientation (the first of its covariances is -1)"),
+        (
+            entries(np.zeros((4, 4))),
+            "/imu: one orientation throughout, [0.0, 0.0, 0.0, 0.0], as of a driver without any",
+        ),
+        (entries(quats * [[1.0], [1.0], [2.0], [1.0]]), "/imu: a quaternion of the IMU of norm 2"),
+    ):
+        message = refusal(tmp_path / "z.mcap", bad, **wanted)
+        assert found in message
+        assert "logs.topics.imu.orientation: false" in message
+
+
 def test_wrenches_are_the_environments_and_the_parents_action_unless_a_sign_says_otherwise(tmp_path: Path) -> None:
     values = np.arange(1.0, 7.0)
     entries = joints_at(STAMPS) + [("/w", s, WRENCH, wrench(s, values, "sole")) for s in map(int, STAMPS)]

@@ -21,6 +21,8 @@ from torchid.logs import Columns, read_log
 from torchid.logs.blocks import open_log_blocks
 from torchid.logs.column_map import require_names
 
+QUAT = POSITION + "base_quat_wxyz: "
+
 BAD: list[tuple[str, dict[str, Any], str]] = [
     (
         'joint_position: "p_{index}"',
@@ -62,6 +64,21 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
         POSITION + 'base_quat_wxyz: {column: "k_{axis}", unit: deg}',
         {},
         "accepted: no unit, as this is a number without",
+    ),
+    (
+        QUAT + "{rpy: {columns: {roll: q_0}}}",
+        {},
+        "rpy.columns: components roll; accepted: each of",
+    ),
+    (
+        QUAT + "{rpy: {column: q_0, unit: rpm}}",
+        {},
+        "rpy.unit: 'rpm', a unit of angular velocity; acc",
+    ),
+    (
+        QUAT + "{column: q_0, rpy: q_1}",
+        {},
+        "base_quat_wxyz: column and rpy together; accepted: one",
     ),
     (
         'joint_position: {column: "q_{axis}", order: [a]}',

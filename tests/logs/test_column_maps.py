@@ -15,6 +15,7 @@ import yaml
 from dialects import save_csv
 from mapped import ORDER, POSITION, TIME, mapped
 from repository import ROOT, SHARED
+from scipy.spatial.transform import Rotation
 
 from torchid.errors import ConfigError, LogError
 from torchid.logs import Columns, Log, read_log
@@ -146,6 +147,27 @@ def test_the_maps_of_the_documentation_are_maps_of_at_most_15_lines() -> None:
     for block in blocks:
         assert len(block.splitlines()) <= 15
         check_columns(Columns(**yaml.safe_load(block)["logs"]["columns"]))
+
+
+def test_angles_of_the_base_give_its_quaternion_and_none_where_one_is_missing(tmp_path: Path) -> None:
+    angles = {"r": [10.0, -20.0, 30.0], "p": [40.0, 50.0, -60.0], "y": [170.0, 190.0, -200.0]}
+    text = ": {rpy: {columns: {roll: r, pitch: p, yaw: y}, unit: deg, scale: {pitch: -1}}}"
+    x, y, z = (
+        Rotation.from_rotvec(np.outer(sign * np.radians(of), axis))
+        for of, axis, sign in zip(angles.values(), np.eye(3), (1.0, -1.0, 1.0), strict=True)
+    )
+    for order in ("xyzw", "wxyz"):
+        log = mapped(tmp_path, f"{POSITION}base_quat_{order}{text}", **angles)
+        assert log.base_quat_xyzw is not None
+        off = (z * y * x).inv() * Rotation.from_quat(log.base_quat_xyzw)
+        np.testing.assert_allclose(off.magnitude(), 0.0, atol=1e-14)
+    arrays = {"q": np.zeros((3, 2)), "e": np.array([[0.1, 0.2, 0.3], [0.1, np.nan, 0.3], [0.1, 0.2, 0.4]])}
+    path = tmp_path / "gap.npz"
+    np.savez(path, time=np.array(TIME), **arrays)
+    columns = Columns(**yaml.safe_load(ORDER + "joint_position: q\nbase_quat_wxyz: {rpy: e}"))
+    gap = read_log(path, columns=columns, allow_gaps=True).base_quat_xyzw
+    assert gap is not None
+    np.testing.assert_array_equal(np.isnan(gap).all(axis=1), [False, True, False])
 
 
 # ---------------------------------------------------------------------------------------------------- units and signs

@@ -75,7 +75,7 @@ def _bodies_text(run: Identification) -> str:
         if one.body is not None and robot.body_names[one.body] not in names:
             names.append(robot.body_names[one.body])
     count = len(robot.body_names)
-    if not run.violations:
+    if all(one.term is not None for one in run.violations):
         mass = run.estimate.phi.reshape(-1, PER_BODY)[:, parameters.MASS]
         of = run.experiment.config.robot
         moving = slice(int(of.fixed_base), None)
@@ -92,6 +92,10 @@ def _attention(run: Identification) -> Iterator[str]:
     """What the user should look at, the most urgent first."""
     if run.worse:
         yield ADVICE
+    impossible = [one.term for one in run.violations if one.term is not None]
+    if impossible:
+        advice = "estimator.name=consistent finds the best that can be"
+        yield f"negative, which nothing is: {join_names(impossible)}; {advice}"
     if not run.misfit.explained:
         yield f"friction, compliance or contacts that the model lacks, or a wrong sensor: {run.misfit}; torchid check"
     if not run.mass.determined and not run.experiment.robot.fixed_base:

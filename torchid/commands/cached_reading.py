@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import mmap
 import secrets
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -28,9 +27,9 @@ from torchid.logs.time_range import split_range
 from torchid.problem import Samples
 from torchid.problem.chunks import ProgressCallback
 from torchid.problem.extras import recorded_components
+from torchid.problem.mapped_pages import MappedPages
 from torchid.sensing import SensorSet
 
-_DONTNEED = getattr(mmap, "MADV_DONTNEED", None)  # not on Windows
 _LET_GO = 8  # chunks after which pages that samples are mapped to leave the memory of the process
 
 
@@ -113,7 +112,7 @@ class CachedReader(LogReader):
         self._new = set[str]()  # keys that were not there when this run began
         self._contents: dict[Path, _Content] = {}
         self._scene_content = content_of_scene(scene)
-        self._mapped: list[mmap.mmap] = []
+        self._mapped: list[MappedPages] = []
 
     def progress(self, done: ProgressCallback) -> ProgressCallback:
         """As `LogReader.progress`."""
@@ -128,9 +127,8 @@ class CachedReader(LogReader):
 
     def let_go(self) -> None:
         """As `LogReader.let_go`."""
-        if _DONTNEED is not None:
-            for one in self._mapped:
-                one.madvise(_DONTNEED)
+        for one in self._mapped:
+            one.let_go()
 
     def read(
         self, paths: Sequence[Path], required: SensorSet | None, on_read: Callable[[Path], None] | None = None
@@ -235,13 +233,13 @@ class CachedReader(LogReader):
         entry = self.cache.load(key)
         if entry is None:
             return None
-        maps: list[object] = [array.base for array in entry.arrays.values()]
-        self._mapped += [one for one in maps if isinstance(one, mmap.mmap)]
         try:
             found = samples_of_entry(entry, str(path), None if together is None else self.folder)
         except Exception as error:  # noqa: B902 - whatever another program has put there
             self.cache.drop(key, str(error))
             return None
+        if found.samples.pages is not None:
+            self._mapped.append(found.samples.pages)
         return found if required is None or self._has(found, required) else None
 
     def _has(self, found: ReadLog, required: SensorSet) -> bool:

@@ -24,6 +24,7 @@ from torchid.fitting.experiment import Scene
 from torchid.logs.time_range import log_title
 from torchid.problem import Samples
 from torchid.problem.base_motion import BaseMotion
+from torchid.problem.mapped_pages import MappedPages
 from torchid.problem.motion_noise import MotionNoise
 from torchid.robot import Robot
 from torchid.robot.urdf import parse_xml
@@ -71,6 +72,7 @@ def content_of_scene(scene: Scene) -> dict[str, Any]:
         "preprocessing": settings,
         "motion_noise": config.sensors.noise.motion,
         "sign_width": config.actuators.sign_width,
+        "delay": config.actuators.known_delay,
         "topics": topics,
         "columns": json.dumps(columns),  # as text: the order of names in it is that of the log
     }
@@ -131,7 +133,10 @@ def samples_of_entry(entry: Entry, source: str, folder: Path | None) -> ReadLog:
         else:
             own[name] = tensor
     noise = _noise_of_document(document["motion_noise"])
-    samples = Samples(source, base=BaseMotion(**base), folder=folder, motion_noise=noise, **own, **document["samples"])
+    pages = MappedPages(entry.arrays.values())
+    samples = Samples(
+        source, base=BaseMotion(**base), folder=folder, motion_noise=noise, pages=pages, **own, **document["samples"]
+    )
     torque, wrench = (np.array(mask, dtype=bool) for mask in document["recorded"])
     recorded = SensorSet(torque, wrench.reshape(-1, 6))
     categories = {category.__name__: category for category in _said_again()}

@@ -1,19 +1,21 @@
-"""Settings that an experiment leaves to its training logs: the filter, the base's tilt, the sign of friction."""
+"""Settings that an experiment leaves to its training logs: filter, base's tilt, friction's sign, torques' delay."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from rich.progress import Progress
 
 from torchid import ranks
 from torchid.commands.check import recorded_stretches
 from torchid.commands.reading import LogReader
+from torchid.errors import warn_about_file
 from torchid.estimators import Conditions
 from torchid.fitting.base_tilt import TiltChoice, choose_base_tilt
+from torchid.fitting.delay import DelayChoice, choose_delay
 from torchid.fitting.experiment import Experiment, S, Scene
 from torchid.fitting.fit import LogFitter
 from torchid.fitting.noise import recorded_sensors
@@ -23,6 +25,10 @@ from torchid.problem import Samples
 from torchid.settings import AUTO
 
 Choice = TypeVar("Choice")
+_UNFILTERED = (
+    "actuators.delay: auto without a filter: noise between samples is smaller than at them, which draws the delay to "
+    "half a step; accepted: a preprocessing.cutoff_hz, or auto"
+)
 
 
 @dataclass(frozen=True)
@@ -32,8 +38,9 @@ class Choices:
     cutoff: CutoffChoice | None = None
     base_tilt: TiltChoice | None = None
     sign_width: SignWidthChoice | None = None
+    delay: DelayChoice | None = None
 
-    def by_name(self) -> dict[str, CutoffChoice | TiltChoice | SignWidthChoice | None]:
+    def by_name(self) -> dict[str, CutoffChoice | TiltChoice | SignWidthChoice | DelayChoice | None]:
         """The same by name, in words."""
         return {name.replace("_", " "): choice for name, choice in vars(self).items()}
 
@@ -47,10 +54,13 @@ def with_chosen_settings(scene: S, bars: Progress) -> tuple[S, Choices]:
 
     Raises:
         InputError: logs that cannot be read, or lack what is needed.
+
+    Warns:
+        TorchidWarning: a delay is to be found in logs that are not filtered.
     """
     if scene.config.logs is None:
         return scene, Choices()
-    cutoff = tilt = width = None
+    cutoff = tilt = width = delay = None
     if scene.config.preprocessing.cutoff_hz == AUTO:
         cutoff = _chosen("cutoff", partial(_cutoff, scene), bars)
         settings = replace(scene.config.preprocessing, cutoff_hz=cutoff.cutoff_hz)
@@ -63,7 +73,12 @@ def with_chosen_settings(scene: S, bars: Progress) -> tuple[S, Choices]:
     if scene.config.actuators.sign_width == AUTO:
         width = _chosen("sign width", partial(choose_sign_width, partial(_logs_and_fitter, scene)), bars)
         scene = _with_sign_width(scene, width.width)
-    return scene, Choices(cutoff, tilt, width)
+    if scene.config.actuators.delay == AUTO:
+        if cutoff is None and scene.config.preprocessing.cutoff_hz is None:
+            warn_about_file(_UNFILTERED)
+        delay = _chosen("delay of torques", partial(_delay, scene), bars)
+        scene = _with_actuators(scene, delay=delay.delay)
+    return scene, Choices(cutoff, tilt, width, delay)
 
 
 def _chosen(name: str, choose: Callable[[], Choice], bars: Progress) -> Choice:
@@ -88,6 +103,10 @@ def _base_tilt(scene: Scene) -> TiltChoice:
     return choose_base_tilt(*_logs_and_fitter(scene, scene.terms.sign_width))
 
 
+def _delay(scene: Scene) -> DelayChoice:
+    return choose_delay(*_logs_and_fitter(scene, scene.terms.sign_width), scene.terms)
+
+
 def _logs_and_fitter(scene: Scene, width: float | None) -> tuple[Sequence[Samples], LogFitter]:
     """The training logs, and a fitter of their rows, with a width of friction's sign.
 
@@ -102,5 +121,9 @@ def _logs_and_fitter(scene: Scene, width: float | None) -> tuple[Sequence[Sample
 
 
 def _with_sign_width(scene: S, width: float | None) -> S:
+    return _with_actuators(scene, sign_width=width)
+
+
+def _with_actuators(scene: S, **stated: Any) -> S:
     config = scene.config
-    return replace(scene, config=replace(config, actuators=replace(config.actuators, sign_width=width)))
+    return replace(scene, config=replace(config, actuators=replace(config.actuators, **stated)))

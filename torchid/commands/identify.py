@@ -25,6 +25,7 @@ from torchid.commands.training import Training, descent_settings, require_traina
 from torchid.config import ExperimentConfig, inputs_of
 from torchid.errors import NumericalWarning, format_count, warn_about_file
 from torchid.estimators import Conditions, Estimate, Violation, violations
+from torchid.estimators.conditions import term_violations
 from torchid.fitting.calibration import Calibration, Comparison, warn_of_confounded, warn_of_disagreement
 from torchid.fitting.cross_validation import CrossValidation, RidgeChoice, Scorer
 from torchid.fitting.experiment import Experiment, set_up, with_noise
@@ -349,7 +350,7 @@ def _contributions(
 
 def _violations(estimate: Estimate, problem: LinearProblem, conditions: Conditions) -> list[Violation]:
     phi, scale = (x.reshape(-1, PER_BODY) for x in (estimate.phi, problem.scale))
-    return violations(phi, scale, conditions)
+    return [*violations(phi, scale, conditions), *term_violations(problem, estimate.phi, estimate.psi)]
 
 
 @dataclass

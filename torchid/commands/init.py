@@ -19,6 +19,7 @@ from torchid.commands.init_sensors import limb_sensors, sensor_set
 from torchid.commands.reading import memory_needed
 from torchid.config.preprocessing import PreprocessingConfig
 from torchid.errors import ConfigError, InputError, LogError, about_file, excerpt, format_count, join_names
+from torchid.fitting.log_maps import is_along_base
 from torchid.logs import Columns, Log, Topics, read_log
 from torchid.logs.bag_samples import read_bag_sample
 from torchid.logs.column_samples import read_sample, stated_names, states_degrees, texts_in
@@ -143,7 +144,8 @@ def _known(robot: Robot, contacts: Sequence[_Contact]) -> KnownRobot:
     on_base, elsewhere = ([name for name, (body, _) in robot.links.items() if bool(body) == x] for x in (False, True))
     feet, weight = [contact.frame for contact in contacts], -GRAVITY_WORLD[2] * float(robot.nominal[:, 0].sum())
     sensors = limb_sensors(robot)
-    return KnownRobot(robot.joint_names, feet, robot.path.stem, weight, robot.base_link, on_base, elsewhere, sensors)
+    known = robot.joint_names, feet, robot.path.stem, weight, robot.base_link, on_base, elsewhere, sensors
+    return KnownRobot(*known, [link for link in on_base if is_along_base(robot, link)])
 
 
 def _stated_contacts(sample: Any, robot: Robot) -> list[str]:

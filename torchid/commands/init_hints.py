@@ -16,6 +16,7 @@ _OTHER_FILE = "; if another file has it: torchid init URDF 'FILE + FILE@SECONDS'
 _CURRENT = re.compile(r"current(?!.*limit)|(?<![a-z])amps?(?![a-z])|(?<![a-z])iq(?![a-z])", re.IGNORECASE)
 _LIMB_SENSOR = re.compile(r"(?<![a-z])(ft|loadcell|load_cell)(?![a-z]).*[xyz]$|(?<![a-z])fts?(?![a-z])", re.IGNORECASE)
 _EULER = re.compile(r"(?<![a-z])(roll|pitch|yaw|rpy|euler)(?![a-z])", re.IGNORECASE)
+_AS_ANGLES = "base_quat_wxyz: {rpy: ...}"
 _STEP = re.compile(r"(dt|time_?step|sample_?rate|fps|rate_?hz|freq\w*)", re.IGNORECASE)
 _MOTION = ("joint_position", "base_quat_xyzw", "base_position_world", *("imu_specific_force", "imu_angular_velocity"))
 BRIDGED_S = 0.05
@@ -70,7 +71,7 @@ def hints(left_out: Sequence[str], fields: Collection[str], joints: Sequence[str
     if "time" not in fields and (steps := [name for name in left_out if _STEP.fullmatch(name)]):
         out.append(f"time: '{steps[0]}' may be the step or the rate of the stamps, which have to be in the file")
     if not {"base_quat_wxyz", "base_quat_xyzw"} & set(fields) and (angles := [x for x in measured if _EULER.search(x)]):
-        out.append(f"base_quat: {_like(angles)} may be angles of the base; it is read as a quaternion, four columns")
+        out.append(f"base_quat: {_like(angles)} may be angles of the base; give all three as {_AS_ANGLES}")
     return out
 
 

@@ -48,6 +48,7 @@ from torchid.problem.contact_slip import (
     warn_of_slip,
 )
 from torchid.problem.derived_blocks import detect_in_blocks, motion_fields, stand_in_blocks
+from torchid.problem.mapped_pages import MappedPages
 from torchid.problem.samples import require_forces
 from torchid.problem.standing import Stretches, warn_of_standing
 from torchid.problem.welded_joints import distances_from_welds, warn_of_moving_welds
@@ -346,8 +347,10 @@ class _Stored:
         """All of them."""
         own: dict[str, Any] = {}
         base: dict[str, Tensor] = {}
-        for (name, of_base), spill in self._spills.items():
-            (base if of_base else own)[name] = torch.from_numpy(spill.array())
+        arrays = {key: spill.array() for key, spill in self._spills.items()}
+        for (name, of_base), array in arrays.items():
+            (base if of_base else own)[name] = torch.from_numpy(array)
         if self._like is None:
             raise ValueError("no samples")
-        return replace(self._like, base=BaseMotion(**base), **own)
+        pages = None if self._folder is None else MappedPages(arrays.values())
+        return replace(self._like, base=BaseMotion(**base), pages=pages, **own)

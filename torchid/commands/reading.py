@@ -22,6 +22,7 @@ from torchid.log_checks.check import check
 from torchid.logs import Log, read_log
 from torchid.logs.blocks import GIGABYTE, log_bytes
 from torchid.logs.containers import LogKind, existing_log_kind
+from torchid.logs.delay import with_delayed_torques
 from torchid.logs.flags import with_flags_by_force
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import away_from_changes, away_from_stamps, preprocess
@@ -122,8 +123,8 @@ class LogReader:
             needs_flags=settings.needs_flags,
         )
         own = scene_of_log(self.scene, path)
-        of_robot = with_loop_joints(without_welded_joints(read, own.robot), own.robot)
-        recorded, certain = settle_contacts(of_robot, own)
+        acting = with_delayed_torques(without_welded_joints(read, own.robot), self.scene.config.actuators.known_delay)
+        recorded, certain = settle_contacts(with_loop_joints(acting, own.robot), own)
         checked = self._checked(recorded, own.robot)
         clean = recorded if checked is None else checked.repaired
         rates, sign_width = (settings.filter_hz, settings.sample_rate_hz), self.scene.terms.sign_width
@@ -173,6 +174,9 @@ class LogReader:
         if split_range(path).joins:
             found = f"several files with arrays of {together:.2g} GB, which are not in memory at once"
             raise LogError(path, "file", found, f"{needed}, or the one file that torchid convert makes of them")
+        if self.scene.config.actuators.known_delay:
+            found = f"set for arrays of {together:.2g} GB, which are not in memory at once"
+            raise LogError(path, "actuators.delay", found, f"{needed}, or parts of the log")
         if settings.exclude_condemned:
             found = f"set for arrays of {together:.2g} GB, which are not in memory at once"
             accepted = f"{needed}, or parts of the logs that torchid check passes"
@@ -186,7 +190,8 @@ class LogReader:
         """
         settings = self.scene.config.preprocessing
         filled = settings.bridge_gaps_s is not None or settings.zero_in_air
-        whole = settings.exclude_condemned or settings.derived or filled or split_range(path).joins
+        delayed = bool(self.scene.config.actuators.known_delay)
+        whole = settings.exclude_condemned or settings.derived or filled or delayed or split_range(path).joins
         return gigabytes > _WHOLE_GB and not whole and not self.scene.robot.loops
 
     def _large_log(self, path: Path, required: SensorSet | None, folder: Path | None) -> LargeLog:

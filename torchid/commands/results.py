@@ -339,5 +339,15 @@ def _solution_document(estimate: Estimate) -> dict[str, object] | None:
     """What is known of the optimum, or of the descent."""
     if not isinstance(estimate, ConstrainedEstimate):
         return None
-    names = ("objective", "unconstrained", "distance", "gap", "certified_gap", "steps", "epochs", "best_epoch")
+    names = (
+        "objective",
+        "unconstrained",
+        "distance",
+        "gap",
+        "certified_gap",
+        "steps",
+        "active",
+        "epochs",
+        "best_epoch",
+    )
     return {name: getattr(estimate, name) for name in names if hasattr(estimate, name)}

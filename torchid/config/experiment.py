@@ -36,7 +36,7 @@ from torchid.errors import ConfigError, about_file
 from torchid.logs.column_map import check_columns
 from torchid.logs.containers import FACTORS
 from torchid.logs.ros_topics import check_topics
-from torchid.settings import PositiveOrAuto
+from torchid.settings import NumberOrAuto, PositiveOrAuto
 
 
 @dataclass(config=STRICT, frozen=True)
@@ -46,6 +46,7 @@ class ActuatorsConfig:
     `armature`: reflected rotor inertia; `torque_offset`; `asymmetric_coulomb`: Coulomb friction that differs by
     direction; `stiffness` of springs, or of cables that act as such; `sign_width` [rad/s or m/s]: Coulomb friction goes
     with tanh(velocity / width) instead of the sign; auto, with the width that leaves least of the training logs.
+    `delay` [s]: joint torques act so much later than recorded or commanded; auto, the delay that leaves least.
     """
 
     armature: bool = False
@@ -53,6 +54,12 @@ class ActuatorsConfig:
     asymmetric_coulomb: bool = False
     stiffness: bool = False
     sign_width: PositiveOrAuto = None
+    delay: NumberOrAuto = None
+
+    @property
+    def known_delay(self) -> float:
+        """The delay [s], 0 where there is none, or it has not been chosen."""
+        return 0.0 if self.delay is None or isinstance(self.delay, str) else self.delay
 
 
 @dataclass(config=STRICT, frozen=True, kw_only=True)
@@ -274,6 +281,7 @@ def _check_factors(config: _Common, logs: LogsConfig) -> None:
         ("estimator.robust", "set", config.estimator.robust is not None, "null"),
         ("preprocessing.cutoff_hz", "auto", config.preprocessing.cutoff_hz == "auto", "that which they were made with"),
         ("actuators.sign_width", "auto", config.actuators.sign_width == "auto", "the width that they were made with"),
+        ("actuators.delay", "auto", config.actuators.delay == "auto", "the delay that they were made with"),
         ("robot.base_tilt", "auto", config.robot.base_tilt == "auto", "the tilt that they were made with"),
         (
             "preprocessing.exclude_condemned",

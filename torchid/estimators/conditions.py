@@ -9,6 +9,7 @@ import numpy as np
 
 from torchid import parameters
 from torchid.parameters import PER_BODY, Array
+from torchid.problem import LinearProblem
 from torchid.reprs import short_repr
 from torchid.settings import BelowOne, Positive, validate_settings
 
@@ -141,12 +142,13 @@ def mirror_matrix(reflection: Array) -> Array:
 
 @dataclass(frozen=True)
 class Violation:
-    """A condition that a body violates, and by how much, in the unit given."""
+    """A condition that a body violates, or an actuator's term, and by how much, in the unit given."""
 
     body: int | None
     condition: str
     amount: float
     unit: str
+    term: str | None = None
 
 
 def validate_parameters(**arrays: Array) -> None:
@@ -187,6 +189,24 @@ def violations(phi: Array, scale: Array, conditions: Conditions, tolerance: floa
         if error > tolerance * conditions.total_mass:
             out.append(Violation(None, "total mass is another", error, "kg"))
     return out + _bound_violations(phi, scale, conditions, tolerance)
+
+
+def term_violations(problem: LinearProblem, phi: Array, psi: Array | None, tolerance: float = 1e-9) -> list[Violation]:
+    """Conditions on the terms of a problem that are violated by more than `tolerance` of their size.
+
+    Args:
+        problem: with the terms.
+        phi: (P,), parameters.
+        psi: (M,), terms; None for those that fit these parameters best.
+        tolerance: as above.
+    """
+    terms = problem.terms
+    if terms is None:
+        return []
+    psi = terms.best(phi) if psi is None else psi
+    values = [(one, one.value(phi, psi)) for one in terms.conditions]
+    below = [(one, value) for one, value in values if value < -tolerance * one.size]
+    return [Violation(None, "negative", -value, one.unit, one.name) for one, value in below]
 
 
 def _bound_violations(phi: Array, scale: Array, conditions: Conditions, tolerance: float) -> list[Violation]:

@@ -39,12 +39,13 @@ class _Block:
 class _Variables:
     """Indices in x of the free parameters, and the values of the fixed ones, all in units of their scale.
 
-    `deviations @ x` is the deviation of the free parameters from nominal, (n,).
+    `deviations @ x` is the deviation of the free parameters from nominal, followed by the problem's terms, (n,).
     """
 
     def __init__(self, problem: LinearProblem, conditions: Conditions) -> None:
         self.body_name = conditions.body_name
-        self.free, self.count = problem.free.reshape(-1, PER_BODY), int(problem.free.sum())
+        self.free, self.parameters = problem.free.reshape(-1, PER_BODY), int(problem.free.sum())
+        self.count = self.parameters + (0 if problem.terms is None else len(problem.terms.size))
         self.index = (np.cumsum(problem.free) - 1).reshape(-1, PER_BODY)
         self.scale = problem.scale.reshape(-1, PER_BODY)
         self.nominal = problem.nominal.reshape(-1, PER_BODY) / self.scale
@@ -97,8 +98,8 @@ def build_conic_problem(
     blocks += [_ellipsoid_block(x, enclosure) for enclosure in enclosures if enclosure.kind == "ellipsoid"]
     boxes = [_box_conditions(x, enclosure) for enclosure in enclosures if enclosure.kind == "box"]
     E, e = _equalities(x, conditions)
-    rows = remove_implied([*_bounds(x, conditions), *sum(boxes, [])], E, e)
-    weights, linear, metric = np.zeros(len(blocks)), np.zeros(x.count), np.eye(x.count)
+    rows = remove_implied([*_bounds(x, conditions), *_signs(x, problem), *sum(boxes, [])], E, e)
+    weights, linear, metric = np.zeros(len(blocks)), np.zeros(x.count), np.eye(x.parameters, x.count)
     if prior == "pullback":
         metric = _pullback_metric(x)
     elif prior == "entropic":
@@ -108,7 +109,8 @@ def build_conic_problem(
             linear[block.variables] = ridge * np.trace(block.F, axis1=1, axis2=2)
         blocks += relative
         weights = np.append(weights, np.full(len(relative), ridge))
-    root, target, unexplained = _compressed(problem, x.deviations, np.sqrt(ridge) * metric)
+    metric = np.vstack([metric, _prior_of_terms(x, problem)])
+    root, target, unexplained = _compressed(problem, x, np.sqrt(ridge) * metric)
     return ConicProblem(
         root=root,
         target=target,
@@ -128,11 +130,16 @@ def build_conic_problem(
     )
 
 
-def _compressed(problem: LinearProblem, deviations: Array, prior: Array) -> tuple[Array, Array, float]:
+def _compressed(problem: LinearProblem, x: _Variables, prior: Array) -> tuple[Array, Array, float]:
     """Data and quadratic prior as ||root x - target||^2 + constant, with no more rows than columns."""
-    free, rows = problem.free, max(problem.rows, 1)
-    A = (problem.A[:, free] * problem.scale[free]) @ deviations / np.sqrt(rows)
-    b = (problem.b - problem.A @ problem.nominal) / np.sqrt(rows)
+    free, rows, terms = problem.free, max(problem.rows, 1), problem.terms
+    A, b = problem.A[:, free] * problem.scale[free], problem.b - problem.A @ problem.nominal
+    if terms is not None:
+        A = np.block(
+            [[A, np.zeros((len(A), len(terms.size)))], [terms.C[:, free] * problem.scale[free], terms.D * terms.size]]
+        )
+        b = np.append(b, terms.z - terms.C @ problem.nominal)
+    A, b = A @ x.deviations / np.sqrt(rows), b / np.sqrt(rows)
     right = np.concatenate([b, np.zeros(len(prior))])
     triangle = np.asarray(np.linalg.qr(np.column_stack([np.concatenate([A, prior]), right]), mode="r"))
     count = A.shape[1]
@@ -197,6 +204,24 @@ def _bounds(x: _Variables, conditions: Conditions) -> list[LinearCondition]:
             name = f"{word} bound of {parameters.PARAMETERS[number]} of {x.body_name(body)}"
             out.append(LinearCondition(name, row, float(limit)))
     return out
+
+
+def _signs(x: _Variables, problem: LinearProblem) -> list[LinearCondition]:
+    """Conditions on the problem's terms."""
+    terms, out = problem.terms, list[LinearCondition]()
+    if terms is None:
+        return out
+    for one in terms.conditions_at(problem.free, problem.nominal):
+        row = np.concatenate([(one.parameters * problem.scale)[problem.free], one.terms * terms.size])
+        bound = -float(one.parameters @ problem.nominal)
+        out.append(LinearCondition(one.name, row @ x.deviations / one.size, bound / one.size))
+    return out
+
+
+def _prior_of_terms(x: _Variables, problem: LinearProblem) -> Array:
+    """Terms have no prior but in combinations that no row depends on, (k, n)."""
+    undetermined = np.zeros((0, 0)) if problem.terms is None else problem.terms.undetermined
+    return np.hstack([np.zeros((len(undetermined), x.parameters)), undetermined])
 
 
 def _coincide(x: _Variables, lower: Array, upper: Array) -> np.ndarray:

@@ -60,7 +60,8 @@ class ConicProblem:
         E, e: (Q, n), (Q,), rows of E orthonormal.
         names: (K,) and then (M,): of the conditions, for messages.
         floor: > 0, the objective that counts as 0: below, gaps are relative to this.
-        deviations: (n, n): `deviations @ x` is the deviation of the parameters from nominal, in units of their scale.
+        deviations: (n, n): `deviations @ x` is the deviation of the parameters from nominal, in units of their scale,
+            and then the terms of the problem in units of their size.
         start: (n,), a strictly feasible point; None where none is known.
     """
 
@@ -112,6 +113,12 @@ class ConicProblem:
     def slack(self, x: Array) -> Array:
         """Distance of x from the border of every condition: eigenvalues of F_k(x) (4 K,), then G x - h (M,)."""
         return np.concatenate([np.linalg.eigvalsh(self.blocks(x)).ravel(), self.G @ x - self.h])
+
+    def active(self, x: Array, tolerance: float) -> tuple[str, ...]:
+        """Names of the conditions from whose border x is no further than a tolerance; an entropic prior is none."""
+        blocks, rows = np.split(self.slack(x), [4 * len(self.F0)])
+        slack = np.append(np.where(self.weights > 0.0, np.inf, blocks.reshape(-1, 4).min(axis=1, initial=np.inf)), rows)
+        return tuple(dict.fromkeys(name for name, one in zip(self.names, slack, strict=True) if one <= tolerance))
 
     def gradient(self, x: Array) -> Array:
         """Gradient of the quadratic and the linear term, (n,)."""

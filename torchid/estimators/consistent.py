@@ -19,6 +19,7 @@ from torchid.estimators.ridge_limit import RidgeLimit, ridge_limit
 from torchid.parameters import Array
 from torchid.problem import LinearProblem
 from torchid.problem.chunks import one_thread
+from torchid.problem.eliminated_terms import AT_BOUND
 from torchid.reprs import short_repr
 
 Method = Literal["barrier", "certified"]
@@ -35,11 +36,13 @@ class ConsistentEstimate(ConstrainedEstimate):
             where data without noise make that next to 0, relative to 1e-8 of the mean square of the data or 1e-3 of the
             ridge, whichever is larger.
         steps: Newton steps, or iterations of the conic solver.
+        active: names of the conditions that hold with equality, to within `AT_BOUND` of their scale.
     """
 
     gap: float
     certified_gap: float | None
     steps: int
+    active: tuple[str, ...] = field(default=(), kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -106,10 +109,13 @@ class Consistent(Regularized):
             certified_gap = abs(other.objective - solution.objective) / compared
         if conic is not data:
             solution = limit.without_ridge(solution, data)
-        phi = problem.nominal.copy()
-        phi[problem.free] += problem.scale[problem.free] * (data.deviations @ solution.x)
+        phi, psi = problem.nominal.copy(), None
+        moved, terms = np.split(data.deviations @ solution.x, [int(problem.free.sum())])
+        phi[problem.free] += problem.scale[problem.free] * moved
+        if problem.terms is not None:
+            psi = problem.terms.size * terms
         return ConsistentEstimate(
-            **(vars(plain) | {"phi": phi, "cost": problem.cost(phi)}),
+            **(vars(plain) | {"phi": phi, "psi": psi, "cost": problem.cost(phi, psi)}),
             objective=solution.objective,
             unconstrained=data.unconstrained,
             distance=problem.prediction_distance(phi, plain.phi),
@@ -117,6 +123,7 @@ class Consistent(Regularized):
             gap=solution.gap,
             certified_gap=certified_gap,
             steps=solution.steps,
+            active=data.active(solution.x, AT_BOUND),
         )
 
 

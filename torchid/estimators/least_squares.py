@@ -45,6 +45,7 @@ class Estimate:
         oversampling: of the rows, as in `LinearProblem`.
         block_error: (P,), standard errors by the scatter between blocks of the logs, see `BlockScatter`; None where
             there are too few.
+        psi: (M,), values of the `terms` of the problem where conditions bound them, None where they are the best fit.
     """
 
     phi: Array
@@ -60,6 +61,7 @@ class Estimate:
     rows: int
     oversampling: float
     block_error: Array | None = field(default=None, kw_only=True)
+    psi: Array | None = field(default=None, kw_only=True)
 
     __repr__ = short_repr
 

@@ -217,7 +217,8 @@ class _EqualityProblem:
         step = basis @ (U[:, :rank].T @ (plain.target - plain.root @ start) / values[:rank])
         misfit = plain.objective(start + step)
         nothing = np.zeros((0, len(path.problem.nominal)))
-        without_data = replace(path.problem, A=nothing, b=np.zeros(0), residual=0.0, rows=1, held=None)
+        terms = None if path.problem.terms is None else path.problem.terms.without_rows()
+        without_data = replace(path.problem, A=nothing, b=np.zeros(0), residual=0.0, rows=1, held=None, terms=terms)
         alone = build_conic_problem(without_data, path.conditions, 1.0, path.prior)
         rows = basis.T @ alone.deviations
         size = np.linalg.norm(rows, axis=1)

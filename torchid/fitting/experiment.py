@@ -70,7 +70,8 @@ class Scene:
         scales = {str(channel): scope for channel, scope in sensors.scales.items()}
         actuators = vars(self.config.actuators)
         width = actuators["sign_width"]
-        return ExtraTerms(offsets, scales, **actuators | {"sign_width": None if width == "auto" else width})
+        known = {"sign_width": None if width == "auto" else width, "delay": False}  # logs are read with the delay
+        return ExtraTerms(offsets, scales, **actuators | known)
 
     @property
     def loss(self) -> RobustLoss | None:
@@ -213,9 +214,8 @@ def set_up_scene(config: ExperimentConfig | AnalyzeConfig) -> Scene:
     try:
         of = config.robot
         require_kind(of)
-        loops = [loop.loop for loop in of.loops]
-        with_ft = _ft_joints(config)
-        robot = load_robot(of.path, of.base_link, of.fixed_base, with_ft, of.weld, of.tilt, loops, of.passive)
+        loops, joints = [loop.loop for loop in of.loops], _ft_joints(config)
+        robot = load_robot(of.path, of.base_link, of.fixed_base, joints, of.weld, of.tilt, loops, of.passive)
     except UnknownNameError as error:
         if error.field != FT_FIELD:
             raise

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from torchid.errors import ConfigError, LogError, excerpt
@@ -32,7 +32,11 @@ _APART = (
 def row_model(experiment: Experiment, builder: RowBuilder) -> RowModel:
     """What the rows of an experiment are formed with."""
     settings = vars(experiment.config.preprocessing)
-    return RowModel.of(experiment.robot, builder, {name: x for name, x in settings.items() if name not in _APART})
+    model = RowModel.of(experiment.robot, builder, {name: x for name, x in settings.items() if name not in _APART})
+    delay = experiment.config.actuators.known_delay
+    if not delay:  # a factor without stays what it was
+        return model
+    return replace(model, settings=model.settings | {"actuators.delay": delay})
 
 
 @dataclass(frozen=True)

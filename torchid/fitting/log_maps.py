@@ -29,12 +29,23 @@ def require_maps_of(robot: Robot, logs: LogsConfig) -> None:
 
 def _require_base_axes(robot: Robot, topics: Topics | None) -> None:
     """Refuse an IMU whose quaternion is to be the base's orientation, though its frame is turned against the base."""
-    low_state = None if topics is None else topics.low_state
-    if low_state is None or not low_state.orientation or low_state.frame not in robot.links:
-        return
-    body, T_base_imu = robot.links[low_state.frame]
-    angle = float(np.arccos(np.clip(0.5 * (np.trace(T_base_imu[:3, :3]) - 1.0), -1.0, 1.0)))
-    if body == 0 and angle > _ALONG:
-        found = f"'{low_state.frame}', which is turned by {np.degrees(angle):.0f} deg against {robot.base_link}"
-        accepted = "a frame along the base's axes, or orientation: false, which leaves the IMU's quaternion out"
-        raise ConfigError.at_field("logs.topics.low_state.frame", found, accepted)
+    for key in ("low_state", "imu"):
+        topic = getattr(topics, key, None)
+        if topic is None or not topic.orientation:
+            continue
+        if topic.frame is None and key == "imu":
+            raise ConfigError.at_field("logs.topics.imu.frame", "missing, with orientation: true", "a link of the base")
+        if topic.frame in robot.links and robot.links[topic.frame][0] == 0 and not is_along_base(robot, topic.frame):
+            angle = np.degrees(_angle_to_base(robot, topic.frame))
+            found = f"'{topic.frame}', which is turned by {angle:.0f} deg against {robot.base_link}"
+            accepted = "a frame along the base's axes, or orientation: false, which leaves the IMU's quaternion out"
+            raise ConfigError.at_field(f"logs.topics.{key}.frame", found, accepted)
+
+
+def is_along_base(robot: Robot, link: str) -> bool:
+    """Whether a link of the base has the axes of the base link."""
+    return _angle_to_base(robot, link) <= _ALONG
+
+
+def _angle_to_base(robot: Robot, link: str) -> float:
+    return float(np.arccos(np.clip(0.5 * (np.trace(robot.links[link][1][:3, :3]) - 1.0), -1.0, 1.0)))

@@ -46,6 +46,7 @@ class ExtraEstimate:
         block_error: standard error by the scatter between blocks of the logs, see `BlockScatter`; 0 where there are too
             few.
         mass_separates: whether it is confounded with the total mass, so that stating this would separate it.
+        at_bound: whether a condition on it holds with equality: it would be beyond, but cannot be.
     """
 
     extra: Extra
@@ -57,6 +58,7 @@ class ExtraEstimate:
     confounded_with: tuple[str, ...]
     block_error: float = 0.0
     mass_separates: bool = False
+    at_bound: bool = False
 
     @property
     def standard_error(self) -> float:
@@ -83,16 +85,19 @@ def estimate_extras(
     """
     if not assembly.eliminations:
         return []
-    covariance, names = (
-        ParameterCovariance.of(assembly.problem, rank_tolerance, assembly.stated),
-        _names(assembly.problem.free, body_names),
-    )
+    covariance = ParameterCovariance.of(assembly.problem, rank_tolerance, assembly.stated)
+    names = _names(assembly.problem.free, body_names)
     noise = float(np.sqrt(assembly.problem.oversampling) * estimate.residual_std)
     shared = next((elimination for elimination in assembly.eliminations if not elimination.log), None)
-    values = zip(assembly.extras_at(estimate.phi), assembly.extras_at(assembly.problem.nominal), strict=True)
+    values = zip(
+        assembly.extras_at(estimate.phi, estimate.psi), assembly.extras_at(assembly.problem.nominal), strict=True
+    )
     out = []
     for elimination, pair in zip(assembly.eliminations, values, strict=True):
         out += _estimates(elimination, pair, noise, covariance, names, shared if elimination.log else None)
+    terms = assembly.problem.terms
+    bound = set() if terms is None else terms.at_bounds(estimate.phi, estimate.psi)
+    out = [replace(x, at_bound=not x.log and x.extra.label in bound) for x in out]
     if assembly.scaled_by is None:
         return out
     return [replace(x, noise_error=np.inf, inflation=np.inf, mass_separates=True) for x in out]
@@ -157,11 +162,7 @@ def disagreements(
                 if scale is not None:
                     expected, variance = expected / (1.0 + scale.value), variance + (read * scale.standard_error) ** 2
                 deviation = float(np.sqrt(variance))
-                out.append(
-                    Disagreement(
-                        extra=extra, log=source, in_the_air=read, in_contact=expected, standard_error=deviation
-                    )
-                )
+                out.append(Disagreement(extra, source, read, expected, deviation))
     sensors = builder.sensors.noise.wrench_std
     return sorted((x for x in out if x.exceeds_noise(sensors)), key=lambda x: -x.standard_errors)
 
@@ -335,11 +336,8 @@ def _estimates(
 ) -> list[ExtraEstimate]:
     """Estimates of one elimination at identified and nominal parameters; `shared`: that of the unknowns of all logs."""
     P = len(covariance.free)
-    sensitivity, own, unobservable = (
-        elimination.inverse @ elimination.C[:, :P],
-        [elimination.inverse],
-        [elimination.unobservable],
-    )
+    sensitivity = elimination.inverse @ elimination.C[:, :P]
+    own, unobservable = [elimination.inverse], [elimination.unobservable]
     if shared is not None:
         through = elimination.inverse @ elimination.C[:, P:]
         sensitivity = sensitivity - through @ shared.inverse @ shared.C[:, :P]

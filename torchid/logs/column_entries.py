@@ -80,6 +80,17 @@ class AngleEntry(ColumnEntry):
 
 
 @dataclass(config=STRICT, frozen=True, kw_only=True)
+class QuaternionEntry(ColumnEntry):
+    """The base's orientation as columns of a quaternion.
+
+    Attributes:
+        rpy: in its place, angles (roll, pitch, yaw) as a URDF has them: about the world's x, then y, then z.
+    """
+
+    rpy: Entry | None = None
+
+
+@dataclass(config=STRICT, frozen=True, kw_only=True)
 class Gains(ColumnEntry):
     """Gains [N m/rad, N m s/rad]: `value` by pattern of the joint or one for all, or columns, or an array (n,)."""
 
@@ -153,6 +164,7 @@ class Plate:
 
 
 Stamps = Annotated[TimeEntry, BeforeValidator(_column)]
+Quaternion = Annotated[QuaternionEntry, BeforeValidator(_column)]
 Angle = Annotated[AngleEntry, BeforeValidator(_column)]
 Torque = Annotated[TorqueEntry, BeforeValidator(_column)]
 Flags = Annotated[FlagEntry, BeforeValidator(_column)]

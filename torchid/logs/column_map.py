@@ -26,6 +26,8 @@ from torchid.logs.column_entries import (
     Names,
     PdLaw,
     Plate,
+    Quaternion,
+    QuaternionEntry,
     Stamps,
     Torque,
     TorqueEntry,
@@ -39,7 +41,7 @@ from torchid.logs.log import WRENCHES
 from torchid.logs.units import quantities_of, unit_factor
 
 _X = TypeVar("_X")
-_XYZ = ("x", "y", "z")
+_XYZ, _RPY = ("x", "y", "z"), ("roll", "pitch", "yaw")
 #: `{joint}`, `{index}`, `{index:02}`, `{axis}`, `{AXIS}`.
 PLACEHOLDER = re.compile(r"\{([^{}:]*)(?::(0\d))?\}")
 AXES = ("axis", "AXIS")
@@ -69,8 +71,8 @@ class Columns:
     joint_velocity: Entry | None = None
     joint_acceleration: Entry | None = None
     joint_torque: Torque | None = None
-    base_quat_xyzw: Entry | None = None
-    base_quat_wxyz: Entry | None = None
+    base_quat_xyzw: Quaternion | None = None
+    base_quat_wxyz: Quaternion | None = None
     base_position_world: Entry | None = None
     base_linear_velocity_world: Entry | None = None
     base_linear_velocity_base: Entry | None = None
@@ -194,6 +196,9 @@ def list_parts(columns: Columns) -> dict[str, Part]:
                     axes = tuple(getattr(inner, "axes", None) or _XYZ)
                     quantities = dict.fromkeys(axes, (quantity,))
                     parts[f"{field}.{name}"] = Part(f"{field}.{name}", inner, names_field(field), axes, quantities)
+        if isinstance(entry, QuaternionEntry) and entry.rpy is not None:
+            quantities = dict.fromkeys(_RPY, ("angle",))
+            parts[f"{field}.rpy"] = Part(f"{field}.rpy", entry.rpy, "", _RPY, quantities)
         if isinstance(entry, TorqueEntry) and entry.pd is not None:
             parts |= _pd_parts(entry.pd)
     return parts
@@ -260,6 +265,7 @@ def _check_given(field: str, entry: ColumnEntry) -> None:
         "always": getattr(entry, "always", None),
         "force": getattr(entry, "force", None),
         "step": getattr(entry, "step", None),
+        "rpy": getattr(entry, "rpy", None),
     }
     given = [name for name, value in ways.items() if value]
     own = [name for name in ways if hasattr(entry, name)]

@@ -5,9 +5,6 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Sequence
-from typing import Any
-
-import numpy as np
 
 from torchid.errors import LogError, excerpt
 from torchid.logs.log import NAME_FIELDS, POINTS, SHAPES, VARIANTS, WRENCHES
@@ -15,7 +12,6 @@ from torchid.logs.units import quantities_with, split_unit
 
 _FIELDS = tuple(name for name in (*SHAPES, *VARIANTS) if name not in NAME_FIELDS)
 _LISTED, _LONGEST = 12, 60
-_SHARE = 0.2  # of the way from the lowest to the highest reading, a threshold of contact
 #: What force plates read; under which foot each lies, no name of a column says.
 OF_PLATES = (WRENCHES[1], POINTS)
 #: The base, as recordings call it.
@@ -49,6 +45,7 @@ _BY_QUANTITY = {
 }  # fmt: skip
 _APART = (("linear", "angular"), ("position", "velocity", "acceleration", "torque"), ("world", "base", "local"))
 _DESIRED = re.compile(r"\b(des|desired|cmd|command|ref|target|goal|setpoint|ff)\b")
+_ANGLES = re.compile(r"\b(rpy|euler)\b")  # of the base, three: see `orientation_proposals`
 _SPLIT = re.compile(r"[^A-Za-z]+|(?<=[a-z])(?=[A-Z])")
 
 
@@ -70,7 +67,7 @@ def propose_field(column: str, desired: bool = False) -> str:
     of_base = bool(close) and "imu" in words.split() and not close[0].startswith("imu")
     if close and not of_base and not _contradicts(words, " ".join(_words(close[0]))):
         return close[0]
-    if not desired and _DESIRED.search(words):
+    if (not desired and _DESIRED.search(words)) or _ANGLES.search(words):
         return ""
     named = next((field for field, pattern in _WORDS if re.search(pattern, words)), "")
     return named or next((_BY_QUANTITY[x] for x in quantities_with(unit) if x in _BY_QUANTITY), "")
@@ -111,10 +108,3 @@ def unknown_columns(columns: Sequence[str]) -> LogError:
     """The error of columns or arrays that the log format does not know, all in one line."""
     accepted = "names of the log format, or logs.columns of an experiment file, which says what they hold"
     return LogError.at_field("columns", f"{len(columns)} unknown: {name_unknown(columns)}", accepted)
-
-
-def threshold(readings: Any) -> float:
-    """A reading above which a contact is probably active, by the range of all of its sensor, in two digits."""
-    values = np.asarray(readings, dtype=float)
-    low, high = np.percentile(values[np.isfinite(values)], (2, 98)) if np.isfinite(values).any() else (0.0, 0.0)
-    return float(f"{low + _SHARE * (high - low):.2g}")

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.logs.containers import LogKind, existing_log_kind, open_container, reader_errors_explained
+from torchid.logs.name_matching import KnownRobot, match_names
 from torchid.logs.table_headers import read_header
 from torchid.logs.tables import is_text_table, sample_table
 
@@ -54,3 +55,21 @@ def texts_in(sample: Columns) -> list[str]:
     """Names of columns and arrays, and all that lists of names in them have."""
     listed = [name for name, x in sample.items() if x is not None and x.dtype.kind not in "fiub"]
     return [*sample, *(text for name in listed for text in stated_names(sample, name))]
+
+
+def listed_order(sample: Columns, kind: str, robot: KnownRobot, count: int) -> tuple[list[str], str] | None:
+    """So many names of joints or feet that some array of a file lists, and which; None where none does.
+
+    Args:
+        sample: from `read_sample`.
+        kind: joint or contact.
+        robot: whose names they are.
+        count: how many.
+    """
+    known = robot.joints if kind == "joint" else robot.feet
+    for name, values in sample.items():
+        listed = [] if values is None or values.dtype.kind in "fiub" else stated_names(sample, name)
+        matched = match_names(listed, known, kind) if len(listed) == count == len(known) else {}
+        if len(matched) == len(known) > 0:
+            return [matched[text] for text in listed], f"as '{name}' of the file lists them"
+    return None

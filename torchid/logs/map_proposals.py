@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 from torchid.errors import excerpt
 from torchid.logs.column_families import Family, find_families
 from torchid.logs.column_proposals import OF_BASE, OF_PLATES, is_desired, propose_field
-from torchid.logs.column_samples import Columns, stated_names
+from torchid.logs.column_samples import Columns, listed_order, stated_names
 from torchid.logs.columns import is_column
 from torchid.logs.force_proposals import point_along_z, threshold
 from torchid.logs.joint_orders import JOINT_ORDERS, MOTORS, numbered_joints, suitable_orders, usual_order
 from torchid.logs.log import SHAPES, VARIANTS, WRENCHES
-from torchid.logs.name_matching import SUFFIXES, KnownRobot, match_names
+from torchid.logs.name_matching import SUFFIXES, KnownRobot
+from torchid.logs.orientation_proposals import find_angles, order_of_quaternion
 from torchid.logs.part_proposals import split_arrays
 from torchid.logs.unit_proposals import UnitProposer, step_of_stamps
 from torchid.logs.units import IN_DEGREES, quantities_of, quantities_with, unit_factor
@@ -108,7 +109,9 @@ class _Proposer:
             used += self._place_law([one for one in families if one not in used])
         used = self._settle_contacts(used)
         taken = {column for one in used for column in one.columns} | split
+        taken |= self._place_angles([name for name in numeric if name not in taken])
         self.out.left_out = [name for name in foreign if name not in taken]
+        families = [one for one in families if one in used or not set(one.columns) <= taken]
         ignored = {one.as_ignored for one in families if one not in used or len(one.numbers) > len(self.joints)}
         ignored |= {name for name in foreign if name not in numeric}
         if ignored:
@@ -345,14 +348,21 @@ class _Proposer:
         return used
 
     def _quaternion(self, family: Family) -> str:
-        """The order of a quaternion whose components have numbers: w is the largest of a base that stands upright."""
-        if any(family.axes):
-            return "base_quat_xyzw" if family.axes[0] in "xX" else "base_quat_wxyz"
-        values = [self.sample[column] for column in family.columns]
-        flat = np.concatenate([np.atleast_2d(x).T if x.ndim == 1 else x for x in values if x is not None], axis=1)
-        order = "xyzw" if np.nansum(np.abs(flat[:, 3])) > np.nansum(np.abs(flat[:, 0])) else "wxyz"
-        self.out.notes[f"base_quat_{order}"] = "order of components, with w as the largest"
+        """The field of a quaternion in the order that it has."""
+        order = None if not any(family.axes) else "xyzw" if family.axes[0] in "xX" else "wxyz"
+        if order is None:
+            order = order_of_quaternion([x for column in family.columns if (x := self.sample[column]) is not None])
+            self.out.notes[f"base_quat_{order}"] = "order of components, with w as the largest"
         return f"base_quat_{order}"
+
+    def _place_angles(self, columns: Sequence[str]) -> set[str]:
+        """Columns that are angles of the base, where nothing else says how it is turned."""
+        if any(name.startswith("base_quat") for name in (*self.given, *self.out.columns)):
+            return set()
+        if found := find_angles(self.sample, columns):
+            self.out.columns["base_quat_wxyz"] = {"rpy": found.entry}
+            self._note("base_quat_wxyz", found.note)
+        return set(found.columns if found else ())
 
     def _add_threshold(self, family: Family, entry: dict[str, Any]) -> None:
         values = self._together(family)
@@ -367,7 +377,7 @@ class _Proposer:
         if not kind or any(family.names) or key in self.out.columns or (kind == "joint" and self.names_stated):
             return
         numbers = len(family.numbers) or int(np.prod(self._shape(family)[:1]))
-        order, how = self._listed_order(kind, numbers) or usual_order(kind, self.robot, numbers)
+        order, how = listed_order(self.sample, kind, self.robot, numbers) or usual_order(kind, self.robot, numbers)
         self.out.columns[key] = order
         listed = JOINT_ORDERS[order].names if isinstance(order, str) else order
         if kind == "joint" and not self.out.lacking:
@@ -388,13 +398,3 @@ class _Proposer:
         self.factors[key] = unit_factor(key, family.unit, quantities)
         if self.factors[key] != 1.0:
             entry["unit"] = family.unit
-
-    def _listed_order(self, kind: str, count: int) -> tuple[list[str], str] | None:
-        """Names of joints or feet that some array of the file lists."""
-        known = self.joints if kind == "joint" else self.feet
-        for name in self.sample:
-            listed = [] if self._is_numeric(name) or self.sample[name] is None else stated_names(self.sample, name)
-            matched = match_names(listed, known, kind) if len(listed) == count == len(known) else {}
-            if len(matched) == len(known) > 0:
-                return [matched[text] for text in listed], f"as '{name}' of the file lists them"
-        return None

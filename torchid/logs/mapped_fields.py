@@ -20,6 +20,7 @@ from torchid.logs.entry_units import element_factors, joint_turns, names_in_degr
 from torchid.logs.force_plates import PlatePoses
 from torchid.logs.log import FORCE_NORMAL, NAME_FIELDS, POINTS, SHAPES, VARIANTS, WRENCHES, FloatArray
 from torchid.logs.names import parse_names
+from torchid.logs.quaternion import quaternion_of_rpy
 from torchid.logs.units import unit_factor
 
 Take = Callable[[str], NDArray[Any]]
@@ -236,6 +237,8 @@ class MappedFields:
             return self._torque(take)
         if name == "time":
             return self.stamps(0, [len(take(source)) for source in self.sources_of(name)][0])
+        if f"{name}.rpy" in self._values:
+            return quaternion_of_rpy(self._values[f"{name}.rpy"].read(take), name.removeprefix("base_quat_"))
         return self._active(take) if name == "contact_active" else self._wrench(name, take)
 
     def _torque(self, take: Take) -> FloatArray:

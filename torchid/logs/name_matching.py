@@ -29,7 +29,7 @@ class KnownRobot:
         name: what it may be called.
         weight: [N].
         base_link: its base.
-        on_base: links of its base.
+        on_base: links of its base; `along_base`: those with its axes.
         elsewhere: all others.
         limb_sensors: children of the fixed joints in limbs that are called force or torque sensors, by joint.
     """
@@ -42,6 +42,7 @@ class KnownRobot:
     on_base: Sequence[str]
     elsewhere: Sequence[str]
     limb_sensors: Mapping[str, str] = field(default_factory=dict)
+    along_base: Sequence[str] = ()
 
 
 def within(stem: str) -> re.Pattern[str]:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from torchid.logs.log import FloatArray
+from torchid.errors import LogError
+from torchid.logs.log import UNIT_TOLERANCE, FloatArray
 
 
 def make_sign_continuous(quat: FloatArray) -> FloatArray:
@@ -24,6 +26,39 @@ def make_sign_continuous(quat: FloatArray) -> FloatArray:
     sign = np.ones((len(quat), 1))
     sign[1:, 0] = np.where(np.cumsum(flips) % 2, -1.0, 1.0)
     return quat * sign
+
+
+def require_unit(topic: str, quat: FloatArray, key: str) -> FloatArray:
+    """The orientations (N, 4) of an IMU's messages.
+
+    Args:
+        topic: of the messages.
+        quat: in any order.
+        key: of the settings of the topic, whose `orientation` is true.
+
+    Raises:
+        LogError: one is no unit quaternion.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        norm = np.linalg.norm(quat, axis=1)
+        bad = ~(np.abs(norm - 1.0) <= UNIT_TOLERANCE)
+    if bad.any():
+        found = f"a quaternion of the IMU of norm {norm[bad][0]:.4g}"
+        raise LogError.at_field(topic, found, f"unit quaternions, or {key}.orientation: false")
+    return quat
+
+
+def quaternion_of_rpy(rpy: FloatArray, order: str) -> FloatArray:
+    """Quaternions (N, 4) of angles (N, 3) [rad] about the world's x, then y, then z; NaN where an angle is.
+
+    Args:
+        rpy: roll, pitch and yaw, as in a URDF.
+        order: of the components, xyzw or wxyz.
+    """
+    known = np.isfinite(rpy).all(axis=1)
+    quat = np.full((len(rpy), 4), np.nan)
+    quat[known] = Rotation.from_euler("xyz", rpy[known]).as_quat()
+    return quat if order == "xyzw" else np.roll(quat, 1, axis=1)
 
 
 def rotate_to_world(quat_xyzw: FloatArray, vector_base: FloatArray) -> FloatArray:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from torchid.errors import LogError, format_count
 from torchid.logs.joint_orders import GO, JOINT_ORDERS, MOTORS
-from torchid.logs.log import UNIT_TOLERANCE
+from torchid.logs.quaternion import require_unit
 
 if TYPE_CHECKING:
     from torchid.logs.log import FloatArray
@@ -122,13 +122,7 @@ class LowState:
         """
         if not self._settings.orientation or not np.any(wxyz != wxyz[0]):
             return {}
-        with np.errstate(over="ignore", invalid="ignore"):
-            norm = np.linalg.norm(wxyz, axis=1)
-            bad = ~(np.abs(norm - 1.0) <= UNIT_TOLERANCE)
-        if bad.any():
-            found = f"a quaternion of the IMU of norm {norm[bad][0]:.4g}"
-            raise LogError.at_field(self._topic, found, f"unit quaternions, or {KEY}.orientation: false")
-        return {"base_quat_xyzw": np.roll(wxyz, -1, axis=1)}
+        return {"base_quat_xyzw": np.roll(require_unit(self._topic, wxyz, KEY), -1, axis=1)}
 
     # ------------------------------------------------------------------------------------------------------- stamps
 

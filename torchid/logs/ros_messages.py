@@ -14,12 +14,14 @@ from numpy.typing import NDArray
 from torchid.errors import LogError, UnknownNameError, warn_about_file
 from torchid.guards import MAX_ARRAYS, check_names, require_plain_name
 from torchid.logs.log import FloatArray
+from torchid.logs.quaternion import require_unit
 from torchid.logs.ros_low_state import LowState
 from torchid.logs.unitree_messages import register
 
 if TYPE_CHECKING:
     from torchid.logs.ros_files import Channel
 
+_IMU = "logs.topics.imu"
 _ZSTD = b"\x28\xb5\x2f\xfd"
 _JOINT_FIELDS = {"position": "joint_position", "velocity": "joint_velocity", "effort": "joint_torque"}
 
@@ -156,27 +158,43 @@ class JointStates:
 
 
 class Imu:
-    """`sensor_msgs/Imu`: its linear acceleration is a specific force, which reads +g upwards at rest."""
+    """`sensor_msgs/Imu`: its linear acceleration is a specific force, which reads +g upwards at rest.
+
+    Its orientation, if it is wanted, is the base's; not of messages that are always the same, whose driver does not set
+    it.
+    """
 
     types: tuple[str, ...] = ("sensor_msgs/msg/Imu",)
 
-    def __init__(self, topic: str) -> None:
-        """For the messages of a topic."""
+    def __init__(self, topic: str, orientation: bool = False) -> None:
+        """For the messages of a topic, whose orientation may be wanted."""
         self.frame, self._topic = _Constant(topic, "header.frame_id"), topic
+        self._turning = ("orientation",) * orientation
 
     def row(self, message: Any) -> FloatArray:
-        """Specific force and angular velocity."""
+        """Specific force, angular velocity and orientation (xyzw)."""
         self.frame.check(message.header.frame_id)
-        for part in ("linear_acceleration", "angular_velocity"):
+        for part in ("linear_acceleration", "angular_velocity", *self._turning):
             if getattr(message, f"{part}_covariance")[0] == -1.0:
-                raise LogError.at_field(
-                    self._topic, f"no {part} (the first of its covariances is -1)", "an IMU with both"
-                )
-        return np.array([*_vector(message.linear_acceleration), *_vector(message.angular_velocity)])
+                accepted = "an IMU with both" if part != "orientation" else f"{_IMU}.orientation: false"
+                raise LogError.at_field(self._topic, f"no {part} (the first of its covariances is -1)", accepted)
+        turn = message.orientation
+        readings = *_vector(message.linear_acceleration), *_vector(message.angular_velocity)
+        return np.array([*readings, turn.x, turn.y, turn.z, turn.w])
 
     def fields(self, rows: FloatArray) -> dict[str, FloatArray]:
-        """Fields (N, 3)."""
-        return {"imu_specific_force": rows[:, :3], "imu_angular_velocity": rows[:, 3:]}
+        """Fields (N, 3), and the orientation (N, 4) if it is wanted.
+
+        Raises:
+            LogError: orientations that are wanted, but are none or always the same.
+        """
+        out = {"imu_specific_force": rows[:, :3], "imu_angular_velocity": rows[:, 3:6]}
+        if self._turning:
+            if len(rows) > 1 and not np.any(rows[:, 6:] != rows[0, 6:]):
+                found = f"one orientation throughout, {np.round(rows[0, 6:], 3).tolist()}, as of a driver without any"
+                raise LogError.at_field(self._topic, found, f"orientations, or {_IMU}.orientation: false")
+            out["base_quat_xyzw"] = require_unit(self._topic, rows[:, 6:], _IMU)
+        return out
 
 
 class Odometry:

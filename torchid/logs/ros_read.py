@@ -231,7 +231,7 @@ def _decoder(topic: AnyTopic) -> Decoder:
     if isinstance(topic, JointTopic):
         return JointStates(topic.topic, topic.joints, topic.names)
     if isinstance(topic, ImuTopic):
-        return Imu(topic.topic)
+        return Imu(topic.topic, topic.orientation)
     if isinstance(topic, OdometryTopic):
         return Odometry(topic.topic, topic.twist)
     if isinstance(topic, ForceTopic):
@@ -258,7 +258,7 @@ def _read(bag: _Bag, files: list[Path], progress: Callable[[float], None]) -> No
 def _motion(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries]) -> dict[str, NDArray[Any]]:
     """Joints, base and IMU."""
     out: dict[str, NDArray[Any]] = {}
-    for role in ("joint_states", "low_state", "odometry", "imu"):
+    for role in ("joint_states", "low_state", "imu", "odometry"):  # of two orientations the last counts
         if role in series:
             out |= clock.align(series[role])
         decoder = bag.decoders.get(role)

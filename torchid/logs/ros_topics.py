@@ -32,10 +32,17 @@ class JointTopic:
 
 @dataclass(config=_STRICT, frozen=True)
 class ImuTopic:
-    """`sensor_msgs/Imu`: `frame` is its frame in the URDF, by default the `header.frame_id` of the messages."""
+    """`sensor_msgs/Imu`.
+
+    Attributes:
+        topic: its name.
+        frame: where it is in the URDF, by default the `header.frame_id` of the messages.
+        orientation: whether its orientation is that of the base, along whose axes `frame`, stated, has to be.
+    """
 
     topic: _Name
     frame: _Name | None = None
+    orientation: bool = False
 
 
 @dataclass(config=_STRICT, frozen=True)

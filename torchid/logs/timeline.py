@@ -23,7 +23,7 @@ SPLINE_BLOCK = 4096
 SPLINE_OVERLAP = 128
 
 
-def _spline_degree(samples: int) -> int:
+def spline_degree(samples: int) -> int:
     """The spline's degree: 5, or 3 or 1 where fewer than 6 or 4 samples leave no choice."""
     return 5 if samples >= 6 else 3 if samples >= 4 else 1
 
@@ -50,7 +50,7 @@ def joint_spline_derivatives(
     flat = [values.reshape(len(time), -1) for values in fields]
     out = [[np.zeros((len(at), values.shape[1])) for _ in orders] for values in flat]
     ends = np.cumsum([values.shape[1] for values in flat])
-    degree = _spline_degree(len(time))
+    degree = spline_degree(len(time))
     for start in range(0, len(time) if any(values.size for values in flat) else 0, block):
         stop = start + block
         first = int(np.searchsorted(at, time[start])) if start else 0

@@ -12,6 +12,7 @@ from torchid.logs.bag_samples import TopicSample
 from torchid.logs.column_proposals import is_desired
 from torchid.logs.force_proposals import threshold
 from torchid.logs.joint_orders import JOINT_ORDERS, suitable_orders, usual_order
+from torchid.logs.log import UNIT_TOLERANCE
 from torchid.logs.map_proposals import MapProposal
 from torchid.logs.name_matching import KnownRobot, match_joints, match_names, spelled
 from torchid.logs.ros_low_state import LowState
@@ -50,6 +51,7 @@ class _Proposer:
             self.out.columns = {"joint_states": "TOPIC", **self.out.columns}
             self.out.notes["joint_states"] = "nothing, as no topic has the robot's joints: name one in place of TOPIC"
         self._place_odometry()
+        self._add_orientation()
         self._place_limb_sensors()
         self._place_by_contact(Wrench, "contact_wrenches", frame_of, "contact_wrench_local")
         self._place_by_contact(NormalForce, "contact_force_normal", lambda _: "", "contact_force_normal")
@@ -184,6 +186,20 @@ class _Proposer:
         if not twists.any():
             entry["twist"] = "none"
         self._add("odometry", name, entry, *fields)
+
+    def _add_orientation(self) -> None:
+        """That of the IMU, where nothing else says how the base is turned and messages do."""
+        entry = self.out.columns.get("imu", {})
+        if "base_quat_xyzw" in self.out.fields or entry.get("frame") not in self.robot.along_base:
+            return
+        messages = self.topics[entry["topic"]].messages
+        turns = np.array([[getattr(message.orientation, axis) for axis in "xyzw"] for message in messages])
+        known = all(message.orientation_covariance[0] != -1.0 for message in messages)
+        if known and np.any(turns != turns[0]) and np.allclose(np.linalg.norm(turns, axis=1), 1.0, atol=UNIT_TOLERANCE):
+            entry["orientation"] = True
+            self.out.fields.add("base_quat_xyzw")
+            what = "orientation: the IMU's, an estimate of its own, is that of the base"
+            self.out.notes["imu"] = "; ".join(filter(None, (self.out.notes.get("imu"), what)))
 
     # ----------------------------------------------------------------------------------------------- limbs, contacts
 

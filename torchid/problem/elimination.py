@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from torchid.parameters import Array
+from torchid import parameters
+from torchid.parameters import PER_BODY, Array
 from torchid.problem.chunks import one_thread
 from torchid.problem.compression import Part, column_prior, merge_factors, problem_from_triangle
+from torchid.problem.eliminated_terms import EliminatedTerms, SignCondition
 from torchid.problem.extras import Extra
 from torchid.problem.linear import LinearProblem
 from torchid.problem.rows import RowBuilder
 from torchid.problem.surplus import NoiseShares, corrected_triangle
 from torchid.robot import Robot
 from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, is_significant
+
+_NEVER_NEGATIVE = ("armature", "stiffness")
+_DIRECTIONS = {"forwards": 1.0, "backwards": -1.0}
 
 
 @dataclass(frozen=True)
@@ -27,6 +32,7 @@ class Elimination:
         extras: M unknowns.
         inverse: (M, r), of least norm; the noise of the r rows is white, of unit variance, and in no other row.
         C: (r, 12 L + S), columns of the bodies' parameters and, for those of one log, of the S unknowns of all logs.
+        D: (r, M), columns of the unknowns.
         z: (r,).
         std_if_known: (M,), standard deviation of each unknown if all else were known; infinite if no row depends on it.
         unobservable: (M, M), projector to combinations that no row depends on.
@@ -36,6 +42,7 @@ class Elimination:
     extras: tuple[Extra, ...]
     inverse: Array
     C: Array
+    D: Array
     z: Array
     std_if_known: Array
     unobservable: Array
@@ -69,11 +76,14 @@ class Assembly:
     scaled_by: float | None = None
     homogeneous: bool = False
 
-    def extras_at(self, phi: Array) -> list[Array]:
-        """Values of the eliminated unknowns, for each elimination, that fit the rows best at parameters (12 L,)."""
-        of_all = [x.inverse @ (x.z - x.C @ phi) for x in self.eliminations if not x.log]
-        remaining = np.concatenate([phi, *of_all])
-        return [x.inverse @ (x.z - x.C @ (remaining if x.log else phi)) for x in self.eliminations]
+    def extras_at(self, phi: Array, psi: Array | None = None) -> list[Array]:
+        """Values of the eliminated unknowns, for each elimination, that fit the rows best at parameters (12 L,).
+
+        `psi`: (M,), those of all logs, where an estimate bounds them.
+        """
+        shared = [x.inverse @ (x.z - x.C @ phi) if psi is None else psi for x in self.eliminations if not x.log]
+        remaining = np.concatenate([phi, *shared])
+        return [x.inverse @ (x.z - x.C @ remaining) if x.log else shared[0] for x in self.eliminations]
 
     def extras_sensitivity(self) -> list[Array]:
         """Change of the eliminated unknowns per unit of phi, (M, 12 L) for each elimination."""
@@ -126,9 +136,41 @@ def assemble(parts: Sequence[Part], builder: RowBuilder, robot: Robot, friction:
     rows_left = max(everything.rows - round(spent), 1)
     held = None if held is None else held[:count]
     problem = problem_from_triangle(rows, rows_left, everything.oversampling, builder, robot, friction, held)
+    if of_all:
+        problem = replace(problem, terms=_bounded_terms(eliminations[-1], robot))
     known = np.asarray(np.linalg.qr(np.delete(of_all_logs, np.s_[count:-1], axis=1), mode="r"))
     if_known = problem_from_triangle(known, everything.rows, everything.oversampling, builder, robot, friction, None)
     return Assembly(problem, tuple(eliminations), if_known, noise, forces)
+
+
+def _bounded_terms(of_all: Elimination, robot: Robot) -> EliminatedTerms | None:
+    """The unknowns of all logs, with the rows they have been eliminated by; None if no condition is on any.
+
+    Armatures and stiffnesses are never negative, nor is dry friction in either direction where the two differ.
+    """
+    conditions: list[SignCondition] = []
+    extras = of_all.extras
+    for number, extra in enumerate(extras):
+        unit = np.eye(len(extras))[number]
+        if extra.what in _NEVER_NEGATIVE:
+            conditions.append(SignCondition(extra.label, unit, np.zeros(robot.nominal.size), extra.size, extra.unit))
+        if extra.what == "asymmetric_coulomb" and extra.dof is not None:
+            friction = _dry_friction(robot, extra.dof)
+            conditions += [
+                SignCondition(f"Coulomb friction of {extra.name} {way}", sign * unit, friction, extra.size, extra.unit)
+                for way, sign in _DIRECTIONS.items()
+            ]
+    if not conditions:
+        return None
+    size, labels = np.array([extra.size for extra in extras]), tuple(extra.label for extra in extras)
+    return EliminatedTerms(of_all.C, of_all.D, of_all.z, size, labels, tuple(conditions))
+
+
+def _dry_friction(robot: Robot, dof: int) -> Array:
+    """Coulomb friction at an independent joint, those that mimic it included, as a row on all parameters, (12 L,)."""
+    row = np.zeros((len(robot.bodies), PER_BODY))
+    row[1:, parameters.COULOMB] = np.abs(robot.joint_map[0][:, dof])
+    return row.flatten()
 
 
 def _held_together(logs: Sequence[tuple[Array, Array | None]]) -> Array | None:
@@ -157,7 +199,8 @@ def _eliminate(
     C = np.hstack([top[:, :count] @ builder.columns.parameter_map, top[:, count:-1]])
     std_if_known = np.where(present, 1.0 / scale, np.inf)
     unobservable = np.eye(len(extras)) - V @ V.T
-    elimination = Elimination(log, extras, (V / values) / scale[:, None], C, top[:, -1], std_if_known, unobservable)
+    inverse, D = (V / values) / scale[:, None], values[:, None] * V.T * scale
+    elimination = Elimination(log, extras, inverse, C, D, top[:, -1], std_if_known, unobservable)
     return elimination, remaining
 
 

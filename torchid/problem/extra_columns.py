@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchid.problem.contact_state import ContactStateLayout
-from torchid.problem.extras import Extra
+from torchid.problem.extras import DELAYED, Extra
 from torchid.problem.recorded_wrenches import FramePoses
 from torchid.problem.samples import Samples
 from torchid.regressor.tree import KinematicTree
@@ -19,6 +19,8 @@ def dof_extra_column(extra: Extra, dof: int, samples: Samples, tree: KinematicTr
     if extra.what == "scale":
         reading = samples.torque
         return samples.time.new_full((len(samples),), torch.nan) if reading is None else -reading[:, dof]
+    if extra.what == DELAYED and samples.delayed_torque is not None:
+        return samples.delayed_torque[:, extra.number, dof]
     if extra.what == "armature":
         return samples.joint_acceleration[:, dof]
     if extra.what == "stiffness":

@@ -24,6 +24,10 @@ ACTUATORS = {
 }
 """Extra parameters of joints rather than sensors: their unit, and the size of a plausible value in it."""
 
+DELAY, DELAYED, _DELAY_SIZE = "delay", "torque of a delay", 0.005
+"""Extra parameters of a search for the delay of all joint torques, which no fit has: the delay, of a plausible size,
+and those whose columns are the torques of several delays, which that of any is worked out of."""
+
 ScaleGroups = Sequence[Sequence[str]]
 """Groups of sensors that share a scale of all logs: patterns of the names of joints or frames, as `fits` has them."""
 
@@ -45,6 +49,9 @@ class ExtraTerms:
     `stiffness` of a spring, or of cables and hoses that act as one, times the joint's position; where it is at rest
     follows with an offset of the torque.
     `sign_width` [rad/s or m/s] replaces the sign of a velocity v in Coulomb friction by tanh(v / width).
+
+    `delay` and `delays` are those of a search, see `torchid.fitting.delay`: how much later than recorded all joint
+    torques act, to first order, and the number of `delayed_torque` that samples have.
     """
 
     offsets: Mapping[str, str] = field(default_factory=dict)
@@ -54,6 +61,8 @@ class ExtraTerms:
     asymmetric_coulomb: bool = False
     stiffness: bool = False
     sign_width: float | None = None
+    delay: bool = False
+    delays: int = 0
 
     __repr__ = short_repr
 
@@ -67,7 +76,7 @@ class Extra:
     """One extra parameter.
 
     Attributes:
-        what: "offset", "scale" (less 1), or one of `ACTUATORS`.
+        what: "offset", "scale" (less 1), one of `ACTUATORS`, `DELAY` or `DELAYED`.
         name: of the joint or the sensor's frame, or the patterns of a group; `component`: of its wrench, "" of a joint
             torque, "force" or "moment" for a group of sensors.
         unit: of the unknown.
@@ -75,6 +84,7 @@ class Extra:
         per_log: whether every log has its own.
         dofs: indices in the robot's `dof_names`, more than one of a group, or
         contacts: index among the contacts, and component along the axes that the log has the wrench in.
+        number: of a delay.
     """
 
     what: str
@@ -85,6 +95,7 @@ class Extra:
     per_log: bool
     dofs: tuple[int, ...] = ()
     contacts: tuple[tuple[int, int], ...] = ()
+    number: int = 0
 
     @property
     def dof(self) -> int | None:
@@ -126,6 +137,9 @@ def list_extras(robot: Robot, contacts: Sequence[Contact], sensors: SensorSet, t
             without = robot.is_passive if what in _OF_MOTORS else np.zeros_like(robot.is_passive)
             measured = np.flatnonzero((sensors.torque & ~without)[: robot.n]).tolist()
             extras += [Extra(what, robot.joint_names[dof], "", unit, size, False, (dof,)) for dof in measured]
+    if terms.delay:
+        extras.append(Extra(DELAY, "joint torques", "", "s", _DELAY_SIZE, False, tuple(measured)))
+    extras += [Extra(DELAYED, str(k), "", "1", 1.0, False, tuple(measured), (), k) for k in range(terms.delays)]
     return tuple(extras)
 
 

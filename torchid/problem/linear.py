@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchid import parameters
 from torchid.parameters import Array
+from torchid.problem.eliminated_terms import EliminatedTerms
 from torchid.reprs import short_repr
 
 T = TypeVar("T")
@@ -33,6 +34,7 @@ class LinearProblem:
         held: (R, Q), None without any: what the right-hand side lacks, of rows that are mostly noise of the motion, for
             independent deviations of unit variance from the nominal parameters. The first P are of the parameters, by
             `PRIOR_DEVIATION` of their scale: A (phi - nominal) - held @ deviations is what to expect of b - A nominal.
+        terms: unknowns beside the parameters that physics bounds, None without any.
     """
 
     A: Array
@@ -44,6 +46,7 @@ class LinearProblem:
     free: np.ndarray
     oversampling: float = 1.0
     held: Array | None = field(default=None, kw_only=True)
+    terms: EliminatedTerms | None = field(default=None, kw_only=True)
     _shared: dict[Hashable, object] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     __repr__ = short_repr
@@ -80,10 +83,14 @@ class LinearProblem:
             raise ValueError("free: found a body of which part is free; accepted: inertial parameters body by body")
         return np.flatnonzero(inertial.all(axis=1))
 
-    def cost(self, phi: Array) -> float:
-        """Sum of squared whitened residuals over all rows at parameters `phi`, (P,)."""
+    def cost(self, phi: Array, psi: Array | None = None) -> float:
+        """Sum of squared whitened residuals over all rows at parameters `phi`, (P,).
+
+        `psi`: (M,), values of the `terms`; None for those that fit best.
+        """
         misfit = self.A @ phi - self.b
-        return float(misfit @ misfit + self.residual)
+        added = 0.0 if psi is None or self.terms is None else self.terms.misfit(phi, psi)
+        return float(misfit @ misfit + self.residual + added)
 
     def shared(self, key: Hashable, compute: Callable[[], T]) -> T:
         """What solves of the same problem with other settings have in common, computed once.
@@ -101,7 +108,9 @@ class LinearProblem:
         root = float(np.sqrt(share))
         rows = max(round(share * self.rows), 1)
         held = None if self.held is None else root * self.held
-        return replace(self, A=root * self.A, b=root * self.b, residual=share * self.residual, rows=rows, held=held)
+        terms = None if self.terms is None else self.terms.scaled(root)
+        out = replace(self, A=root * self.A, b=root * self.b, residual=share * self.residual, rows=rows)
+        return replace(out, held=held, terms=terms)
 
     @property
     def held_parameters(self) -> Array | None:

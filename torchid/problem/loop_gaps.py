@@ -13,6 +13,9 @@ from torchid.regressor.loops import LoopClosures
 from torchid.robot import Loop, Robot
 from torchid.robot.loops import LOOPS_FIELD
 
+FOLLOW = "; joints of loops follow from others in logs that fit into preprocessing.memory_gb"
+"""What helps where a log lacks joints of a robot with loops."""
+
 _CHUNK = 4096  # samples
 
 

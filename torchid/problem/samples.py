@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,8 @@ from torchid.logs.preprocess import unloaded_readings
 from torchid.parameters import WRENCH_COMPONENTS, Array
 from torchid.problem.base_motion import BaseMotion, base_motion, imu_pose, position_for_moments
 from torchid.problem.extras import recorded_components
-from torchid.problem.loop_gaps import require_closed_loops
+from torchid.problem.loop_gaps import FOLLOW, require_closed_loops
+from torchid.problem.mapped_pages import MappedPages
 from torchid.problem.motion_noise import MotionNoise, bind_motion_noise
 from torchid.problem.recorded_torques import columns_in_order, recorded_torques, require_limb_sensors
 from torchid.regressor import Motion
@@ -29,6 +30,7 @@ from torchid.sensing import Contact, SensorSet
 from torchid.sensing.sensors import NORMAL_FORCE, NORMAL_INDEX
 
 _LISTED = 6
+_FAR_APART = 8  # samples per chosen one, beyond which a page holds few of these
 _JOINT_FIELDS = ("joint_position", "joint_velocity", "joint_acceleration")
 
 
@@ -61,7 +63,9 @@ class Samples:
         block: number of the block in which they are compressed, see `compress_in_blocks`.
         has_force_normal: whether the log has forces along the ground's normal, which contacts may be read along.
         motion_noise: noise of the motion, None without any.
+        pages: of files that the tensors are mapped to; None for those in memory.
         payload: (12 L,), what the robot carried beside its own parameters, see `payload_parameters`; None for nothing.
+        delayed_torque: (N, D, n), joint torques of D delays, in a search for the best; None otherwise.
     """
 
     source: str
@@ -85,6 +89,8 @@ class Samples:
     has_force_normal: bool = False
     motion_noise: MotionNoise | None = None
     payload: Array | None = None
+    pages: MappedPages | None = field(default=None, repr=False, compare=False)
+    delayed_torque: Tensor | None = None
 
     __repr__ = short_repr
 
@@ -106,8 +112,17 @@ class Samples:
         return replace(self, base=self.base.map(change), **changed)
 
     def __getitem__(self, index: slice | Tensor) -> Samples:
-        """Some of the samples."""
-        return self._each(lambda x: x[index])
+        """Some of the samples; of mapped ones far apart, one tensor's pages are in memory at a time."""
+        pages = self.pages
+        if pages is None or not _is_far_apart(index):
+            return self._each(lambda x: x[index])
+
+        def chosen(x: Tensor) -> Tensor:
+            rows = x[index].clone() if isinstance(index, slice) else x[index]
+            pages.let_go()
+            return rows
+
+        return replace(self._each(chosen), pages=None)
 
     def every(self, step: int) -> Samples:
         """Every `step`-th sample from the first on; all of them, without a copy, for a step of 1."""
@@ -164,6 +179,15 @@ class Samples:
             torch.cat([zero, base.angular_velocity, v], dim=1),
             torch.cat([base.specific_force + g_base, base.angular_acceleration, a], dim=1),
         )
+
+
+def _is_far_apart(index: slice | Tensor) -> bool:
+    """Whether chosen samples, by their increasing numbers, are few of those between the first and the last."""
+    if isinstance(index, slice):
+        return (index.step or 1) >= _FAR_APART
+    if index.dtype == torch.bool or not len(index):
+        return False
+    return int(index[-1] - index[0]) >= _FAR_APART * len(index)
 
 
 def concatenate(pieces: Sequence[Samples]) -> Samples:
@@ -303,9 +327,7 @@ def joint_order(log: Log, robot: Robot) -> list[int]:
         found = f"{join_names(lacking, _LISTED)} of {robot.path.name} missing"
         listed = ", ".join(lacking) if len(lacking) <= _LISTED else f"{lacking[0]}, ..."
         accepted = f"every joint that moves, or robot.weld: [{listed}] for those that are held"
-        if robot.loops:
-            accepted += "; joints of loops follow from others in logs that fit into preprocessing.memory_gb"
-        raise LogError(log.source, "joint_names", found, accepted)
+        raise LogError(log.source, "joint_names", found, accepted + FOLLOW * bool(robot.loops))
     return [log.joint_names.index(name) for name in robot.joint_names]
 
 
@@ -362,9 +384,8 @@ def require_forces(samples: Samples, robot: Robot, contacts: Sequence[Contact], 
             if contacts[contact].along_normal:
                 raise _scalar_error(samples, contacts[contact].frame, sample, k)
             found = f"{WRENCH_COMPONENTS[k]} is not a finite number at sample {sample}, while in contact"
-            raise LogError(
-                samples.source, f"contact_wrench '{contacts[contact].frame}'", found, "a value: it is a sensor"
-            )
+            field = f"contact_wrench '{contacts[contact].frame}'"
+            raise LogError(samples.source, field, found, "a value: it is a sensor")
 
 
 def _scalar_error(samples: Samples, frame: str, sample: int, k: int) -> LogError:

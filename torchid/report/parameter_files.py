@@ -92,6 +92,7 @@ def _extra_entry(estimate: ExtraEstimate) -> dict[str, Any]:
         "inflation": _json_value(estimate.inflation),
         "told_apart": estimate.separable,
         "mixed_with": list(estimate.confounded_with),
+        "at_bound": estimate.at_bound,
         "label": extra.label,
     }
 

@@ -222,7 +222,7 @@ def violation_table(violations: Sequence[Mapping[str, Any]], max_rows: int = 12)
         table.add_column(heading, justify="right" if heading == "off by" else "left")
     for violation in violations[:max_rows]:
         amount = Text(f"{violation['amount']:.3g} {violation['unit']}")
-        table.add_row(Text(violation["body"] or "all"), Text(str(violation["condition"])), amount)
+        table.add_row(Text(violation["body"] or violation["term"] or "all"), Text(str(violation["condition"])), amount)
     return table
 
 
@@ -270,6 +270,7 @@ _MAX_COLUMNS, _MAX_ROWS = 4, 30
 def extra_table(extras: Sequence[ExtraEstimate]) -> Table:
     """Extra parameters with standard errors, a row for each, a column for each log; `parameters.json` has them all."""
     title = "Offsets, scales and actuators, with standard errors; ?: confounded with other parameters"
+    title += "; |: at a physical bound" if any(x.at_bound for x in extras) else ""
     table = Table(title=title, title_justify="left")
     logs = sorted(dict.fromkeys(x.log for x in extras), key=bool)  # terms common to all logs come first
     labels = list(dict.fromkeys(x.extra.label for x in extras))
@@ -291,7 +292,7 @@ def extra_table(extras: Sequence[ExtraEstimate]) -> Table:
 
 
 def _extra_cell(extra: ExtraEstimate) -> str:
-    mark = "" if extra.separable else " ?"
+    mark = ("" if extra.separable else " ?") + (" |" if extra.at_bound else "")
     if not math.isfinite(extra.standard_error):
         return f"{extra.value:.4g}{mark}"
     size = float(f"{extra.standard_error:.1e}")  # rounded first: 0.0998 becomes 0.10, with two decimals

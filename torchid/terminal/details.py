@@ -7,6 +7,7 @@ from textwrap import fill
 
 from torchid.commands.results import Identification
 from torchid.commands.training import body_eigenvalues
+from torchid.errors import join_names
 from torchid.estimators import ConsistentEstimate, ConstrainedEstimate, Estimate, SgdEstimate
 from torchid.fitting.cross_validation import CrossValidation
 from torchid.fitting.misfit import Misfit
@@ -23,6 +24,8 @@ from torchid.report.tables import (
     violation_table,
 )
 from torchid.terminal.lines import print_labelled, print_noise, print_rolling
+
+_NAMED = 6  # conditions
 
 
 def print_details(run: Identification) -> None:
@@ -87,12 +90,7 @@ def _print_fit(run: Identification) -> None:
     for name, choice in {**run.choices.by_name(), "ridge": run.ridge}.items():
         if choice is not None:
             print_labelled(name, str(choice))
-    least, body = min((value, name) for name, value in body_eigenvalues(robot, estimate.phi).items())
-    print(f"consistency   smallest eigenvalue of a scaled pseudo-inertia {least:.3g}, {body}")
-    if isinstance(estimate, ConstrainedEstimate) and estimate.relative_increase is not None:
-        print(f"objective     {100.0 * estimate.relative_increase:.3g} % above the least without conditions")
-    if isinstance(estimate, ConsistentEstimate) and estimate.certified_gap is not None:
-        print(f"certified     objective within {estimate.certified_gap:.1g} of the other method's")
+    _print_conditions(run)
     if isinstance(estimate, SgdEstimate):
         print(f"training      {estimate.epochs} epochs, parameters of epoch {estimate.best_epoch}")
     print(f"total mass    {run.mass} (URDF: {run.mass.nominal:.3f} kg)")
@@ -101,6 +99,19 @@ def _print_fit(run: Identification) -> None:
         print(f"robust        {run.robust.loss}, {kept}, {run.robust.passes} passes")
     if robot.massless:
         print_labelled("left out", f"massless: {', '.join(robot.massless)}")
+
+
+def _print_conditions(run: Identification) -> None:
+    """How the conditions of physical consistency are met, and what they cost."""
+    estimate, robot = run.estimate, run.experiment.robot
+    least, body = min((value, name) for name, value in body_eigenvalues(robot, estimate.phi).items())
+    print(f"consistency   smallest eigenvalue of a scaled pseudo-inertia {least:.3g}, {body}")
+    if isinstance(estimate, ConstrainedEstimate) and estimate.relative_increase is not None:
+        print(f"objective     {100.0 * estimate.relative_increase:.3g} % above the least without conditions")
+    if isinstance(estimate, ConsistentEstimate) and estimate.active:
+        print_labelled("at bounds", f"{len(estimate.active)}: {join_names(estimate.active, _NAMED)}")
+    if isinstance(estimate, ConsistentEstimate) and estimate.certified_gap is not None:
+        print(f"certified     objective within {estimate.certified_gap:.1g} of the other method's")
 
 
 def _print_validation(validation: CrossValidation) -> None:

@@ -1,0 +1,133 @@
+"""Torques that act later than the log says: the delay is found to a part of a step, with an interval that holds it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from delays import DELAY, NOISE, STEP, arm, motion, recorded
+from motions import value
+from repository import DEMO
+
+from torchid.config import load_config
+from torchid.errors import LogError
+from torchid.estimators import Conditions, Consistent, LeastSquares
+from torchid.fitting.delay import EARLIEST, LATEST, DelayChoice, choose_delay
+from torchid.fitting.experiment import set_up
+from torchid.fitting.fit import LogFitter
+from torchid.logs import Log, preprocess, read_log
+from torchid.logs.delay import with_delayed_torques
+from torchid.problem import ExtraTerms, RowBuilder, bind_log
+from torchid.sensing import SensorNoise, named_sensors
+
+
+def chosen(
+    *logs: Log, estimator: LeastSquares | Consistent | None = None, terms: ExtraTerms | None = None, std: float = NOISE
+) -> DelayChoice:
+    """What is found in logs of the arm."""
+    robot, terms = arm()[0], terms or ExtraTerms()
+    builder = RowBuilder(robot, (), named_sensors("joints", robot.n, 0, SensorNoise(joint_torque=std)), terms)
+    fitter = LogFitter(robot=robot, builder=builder, estimator=estimator or LeastSquares())
+    return choose_delay([bind_log(log, robot, ()) for log in logs], fitter, terms)
+
+
+@pytest.mark.parametrize("delay", [DELAY, -0.0042, 0.0231, 0.05])
+@pytest.mark.parametrize(
+    "estimator", [LeastSquares(), Consistent(conditions=Conditions())], ids=["plain", "consistent"]
+)
+def test_a_delay_of_a_part_of_a_step_is_found_to_a_microsecond(
+    delay: float, estimator: LeastSquares | Consistent
+) -> None:
+    found = chosen(recorded(delay), estimator=estimator)
+    assert found.found == pytest.approx(delay, abs=1e-6)
+    assert found.delay == pytest.approx(delay, abs=1e-6)
+    assert found.residual < 1e-2 * found.undelayed_residual
+    assert f"{1e3 * delay:.3g} ±" in str(found)
+
+
+def test_it_is_found_beside_armatures_springs_offsets_and_scales() -> None:
+    """A reading s y - o of a torque: scales go with the torques of the delay that is found."""
+    robot, _ = arm()
+    terms = ExtraTerms(
+        {"joint_torque": "log"}, {"joint_torque": [[robot.joint_names[1]]]}, armature=True, stiffness=True
+    )
+    log = recorded()
+    q, _, a = motion(log.time + DELAY)
+    torque = value(log.joint_torque) + 0.05 * a + 0.3 * q
+    torque = (torque + np.array([0.4, -0.2])) / np.array([1.0, 1.3])
+    found = chosen(replace(log, joint_torque=torque), terms=terms)
+    assert found.found == pytest.approx(DELAY, abs=2e-6)
+
+
+def test_intervals_of_95_percent_hold_the_delay_of_noisy_logs() -> None:
+    logs = [preprocess(recorded(noise=NOISE, seed=seed), cutoff_hz=30.0) for seed in range(40)]
+    found = [chosen(log, estimator=Consistent()) for log in logs]
+    held = sum(one.interval[0] <= DELAY <= one.interval[1] for one in found)
+    assert held >= 35  # of 40; 38 expected, fewer than 35 of every 21st draw
+    scatter = np.std([one.found for one in found])
+    assert 0.8 < np.median([one.standard_error for one in found]) / scatter < 1.4
+    assert np.mean([one.found for one in found]) == pytest.approx(DELAY, abs=0.4 * scatter)
+
+
+def test_no_delay_is_none_and_one_that_a_single_sine_cannot_tell_is_named() -> None:
+    """A sine of one rate fits any delay with some inertia and damping."""
+    none = chosen(preprocess(recorded(0.0, NOISE, seed=5), cutoff_hz=15.0))
+    assert none.delay == 0.0
+    assert abs(none.found) < 1e-3
+    assert "cannot be told from none" in str(none)
+    log = preprocess(recorded(DELAY, 1e-3, shape=(1, 0.02)), cutoff_hz=15.0)
+    single = chosen(log, terms=ExtraTerms(armature=True, stiffness=True), std=1e-3)
+    assert single.delay == 0.0
+    assert single.confounded_with
+    assert "confounded with" in str(single)
+
+
+def test_logs_that_are_too_short_for_the_delays_that_are_tried_are_refused() -> None:
+    with pytest.raises(LogError, match=f"none is longer than the {LATEST - EARLIEST:g} s"):
+        chosen(recorded(seconds=0.07))
+
+
+@pytest.mark.parametrize("delay", [DELAY, -DELAY, 0.011])
+def test_a_log_with_its_delay_has_the_torques_that_act_at_its_stamps(delay: float) -> None:
+    log = recorded(delay)
+    acting = with_delayed_torques(log, delay)
+    lost = int(np.ceil(abs(delay) / STEP))
+    np.testing.assert_array_equal(acting.time, log.time[lost:] if delay > 0.0 else log.time[:-lost])
+    expected = arm()[1].forces(*motion(acting.time))
+    np.testing.assert_allclose(acting.joint_torque[10:-10], expected[10:-10], rtol=0.0, atol=1e-6)
+    np.testing.assert_allclose(acting.joint_torque, expected, rtol=0.0, atol=1e-3)  # not-a-knot ends
+    assert with_delayed_torques(log, 0.0) is log
+
+
+def test_a_delay_reaches_across_no_break_of_a_log_and_knows_nothing_beside_what_was_not_recorded() -> None:
+    log = recorded()
+    broken = log.select(np.r_[0:600, 1000:1600])
+    acting = with_delayed_torques(broken, DELAY)
+    assert len(acting) == 1198, "the first sample of each part has no torque of before"
+    assert set(broken.time[[0, 600]]).isdisjoint(acting.time)
+    torque = value(log.joint_torque).copy()
+    torque[700, 0] = np.nan
+    lacking = with_delayed_torques(replace(log, joint_torque=torque), DELAY)
+    known = np.isfinite(lacking.joint_torque)
+    assert (~known).sum() == 2
+    assert known[:, 1].all()
+    with pytest.raises(LogError, match="no longer than actuators.delay of 9 s"):
+        with_delayed_torques(log, 9.0)
+
+
+@pytest.mark.parametrize("sensors", ["joints", "full"])
+def test_torques_of_a_quadruped_on_its_feet_are_found_to_be_as_late_as_they_are(sensors: str) -> None:
+    """The demo's noisy log has no delay; its torques are then taken from 4 ms later."""
+    scene = set_up(load_config(DEMO / "quadruped.yaml", [f"sensors.set={sensors}"]))
+    recorded_log, found = read_log(DEMO / "sway_train.npz"), []
+    for late in (0.0, 0.004):
+        log = preprocess(with_delayed_torques(recorded_log, -late), cutoff_hz=8.0)
+        samples = bind_log(log, scene.robot, scene.contacts)
+        fitter = scene.fitter(scene.builder(scene.sensors), scene.conditions())
+        found.append(choose_delay([samples], fitter, scene.terms))
+    none, delayed = found
+    assert none.delay == 0.0
+    assert delayed.interval[0] < 0.004 < delayed.interval[1]
+    assert delayed.delay - none.found == pytest.approx(0.004, abs=2e-5)
+    assert delayed.standard_error < 2e-4

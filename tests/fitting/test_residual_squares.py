@@ -1,0 +1,56 @@
+"""Squares of residuals of samples, and of the factors that these are compressed to."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from repository import DEMO
+
+from torchid.config import load_config
+from torchid.fitting.calibration import Calibration
+from torchid.fitting.experiment import set_up
+from torchid.fitting.residual_squares import residuals_of_samples, sum_residuals
+from torchid.logs import read_log
+from torchid.logs.preprocess import preprocess
+from torchid.problem import bind_log, compress_parts
+
+pytestmark = pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
+
+
+@pytest.mark.parametrize("sensors", ["joints", "contacts", "full"])
+@pytest.mark.parametrize("offsets", [False, True])
+def test_residuals_of_samples_are_those_of_their_factors(sensors: str, offsets: bool) -> None:
+    overrides = [f"sensors.set={sensors}"]
+    if offsets:
+        overrides += ["sensors.offsets=log"]
+    experiment = set_up(load_config(DEMO / "quadruped.yaml", overrides))
+    log = preprocess(read_log(DEMO / "sway_train.npz"), 8.0)
+    whole = bind_log(log, experiment.robot, experiment.contacts)
+    logs = [whole[:700], replace(whole[900:1500], source="other")]
+    builder, rng = experiment.builder(experiment.sensors), np.random.default_rng(0)
+    values = {("" if not x.per_log else one.source, x.label): rng.normal() for x in builder.extras for one in logs}
+    nominal = experiment.robot.nominal.flatten()
+    compared = [
+        Calibration(robot=experiment.robot, builder=builder, phi=scale * nominal, values=values) for scale in (1.0, 1.3)
+    ]
+    assert bool(builder.extras) == offsets
+    expected = sum_residuals(builder, logs, compress_parts(logs, builder), compared)
+    for found, one in zip(residuals_of_samples(builder, logs, compared), expected, strict=True):
+        assert found.rows == one.rows
+        assert found.noise == pytest.approx(one.noise, rel=1e-12)
+        assert found.measured == pytest.approx(one.measured, rel=1e-10)
+        assert found.error == pytest.approx(one.error, rel=1e-10)
+    assert expected[0].error != pytest.approx(expected[1].error, rel=1e-3)
+
+
+def test_a_log_without_samples_has_no_residuals() -> None:
+    experiment = set_up(load_config(DEMO / "quadruped.yaml"))
+    log = preprocess(read_log(DEMO / "sway_train.npz"), 8.0)
+    samples = bind_log(log, experiment.robot, experiment.contacts)[torch.zeros(0, dtype=torch.int64)]
+    builder = experiment.builder(experiment.sensors)
+    one = Calibration(robot=experiment.robot, builder=builder, phi=experiment.robot.nominal.flatten(), values={})
+    (found,) = residuals_of_samples(builder, [samples], [one])
+    assert (found.error, found.measured, found.rows) == (0.0, 0.0, 0)
