@@ -115,6 +115,7 @@ from .ranks import (
 )
 from .regressor import (
     FrameJacobian,
+    LoopJacobian,
     Motion,
     Regressor,
     motion_from_state,
@@ -160,6 +161,7 @@ __all__ = [
     "Log",
     "LogCholeskyParameters",
     "LogFitter",
+    "LoopJacobian",
     "MiniBatches",
     "Motion",
     "Projection",

@@ -116,6 +116,9 @@ def _add_uses_of_runs(commands: _Commands) -> None:
     replay.add_argument("run", help="run folder")
     replay.add_argument("--log", required=True, metavar="FILE", help="log whose joint torques drive the robot")
     replay.add_argument("--window", type=float, default=0.5, metavar="S", help="seconds from each state (default: 0.5)")
+    for option, what in (("--kp", "of positions"), ("--kd", "of velocities")):
+        text = f"gains {what} of the PD law that made the torques: 20, '*_calf=30' (default: 0)"
+        replay.add_argument(option, nargs="+", default=[], metavar="GAIN", help=text)
     replay.add_argument("--output", metavar="FOLDER", help="folder to write: a figure and all numbers")
     replay.add_argument("--overwrite", action="store_true", help="replace an earlier replay in this folder")
     _add_amount(replay)
@@ -294,10 +297,11 @@ def _evaluate(options: argparse.Namespace) -> None:
 
 def _replay(options: argparse.Namespace) -> None:
     with _importing():
-        from torchid.commands.replay import replay
+        from torchid.commands.replay import parse_gains, replay
         from torchid.terminal.replay import print_replay
 
-    replayed = replay(options.run, options.log, options.window, options.output, options.overwrite)
+    kp, kd = parse_gains("--kp", options.kp), parse_gains("--kd", options.kd)
+    replayed = replay(options.run, options.log, options.window, options.output, options.overwrite, kp, kd)
     if not options.quiet:
         print_replay(replayed, options.verbose)
 

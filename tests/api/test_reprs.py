@@ -48,6 +48,7 @@ def things() -> Mapping[str, object]:
         "rows": builder,
         "regressor": torchid.Regressor(robot),
         "jacobian": torchid.FrameJacobian(robot, "trunk"),
+        "loops": torchid.LoopJacobian(robot),
         "projection": torchid.Projection([True, False], [False]),
         "factor": factor,
         "part": parts[0],

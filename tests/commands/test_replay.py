@@ -51,6 +51,28 @@ def test_the_identified_robot_stays_nearer_to_a_new_log_than_the_urdf(
     assert "rear_right_knee" in capsys.readouterr().out
 
 
+def test_pd_targets_keep_both_nearer_to_the_log(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    ends = []
+    for name, gains in (("free", []), ("held", ["--kp", "20", "*_knee=40", "--kd", "0.5"])):
+        output = tmp_path / name
+        assert main(["replay", str(run), "--log", UNSEEN, "--window", "0.2", "--output", str(output), *gains]) == 0
+        document = json.loads((output / "replay.json").read_text())
+        ends.append([document["quartiles"]["joints [rad]"][who][1][-1] for who in ("nominal", "identified")])
+    assert "Drift after 0.2 s of the PD targets of sway_test alone" in capsys.readouterr().out
+    assert document["kp"]["rear_left_knee"] == 40.0
+    assert document["kp"]["rear_left_hip"] == 20.0
+    assert set(document["kd"].values()) == {0.5}
+    assert ends[1][0] < 0.8 * ends[0][0]
+    assert ends[1][1] < ends[1][0]
+    for wrong, message in (
+        ("stiff", "--kp: 'stiff'; accepted: a number"),
+        ("nee=3", "--kp: unknown name 'nee'"),
+        ("-1", "--kp: -1"),
+    ):
+        assert main(["replay", str(run), "--log", UNSEEN, f"--kp={wrong}"]) == 2
+        assert message in capsys.readouterr().err
+
+
 def test_a_replay_replaces_nothing_but_a_replay(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     again = ["replay", str(run), "--log", UNSEEN, "--output", str(run)]
     assert "not empty" in refusal(again, run, capsys)

@@ -7,13 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed")
 
+import mujoco
 from survey_mjcf import States, difference, mujoco_forces, survey, torchid_forces
 
 from torchid.errors import InputError, TorchidWarning, UrdfError
-from torchid.report import identified_urdf
+from torchid.report import FittedJoints, identified_robot, identified_urdf
 from torchid.robot import Robot, load_robot
 from torchid.robot.mjcf import roll_pitch_yaw
 from torchid.robot.mjcf_model import MjcfModel
@@ -119,11 +121,16 @@ def test_a_missing_mesh_matters_only_where_it_gives_a_body_its_inertia(tmp_path:
 
 BODY = '<mujoco>\n<worldbody>\n<body name="b"{}>{}<geom size=".1"/><site name="s"/></body></worldbody>{}</mujoco>'
 HINGE = '<joint name="j"{}/>'
-OTHER = '\n<equality>\n<connect body1="b" body2="world" anchor="0 0 0"/></equality>'
+OTHER = '<worldbody><body name="m" mocap="true"/></worldbody><equality>\n<weld body1="m" body2="b"/></equality>'
+POLYNOMIAL = '<equality>\n<joint joint1="j" polycoef="0 1 2 0 0"/></equality>'
 TENDON = '<tendon>\n<fixed name="t" stiffness="3"><joint joint="j" coef="1"/></fixed></tendon>'
 REFUSED = {
     "ball": (BODY.format("", '\n<joint name="j" type="ball"/>', ""), "<joint> 'j', line 4: type ball"),
-    "loop": (BODY.format("", HINGE.format(""), OTHER), "<connect>, line 5: an equality constraint"),
+    "mocap": (
+        BODY.format("", HINGE.format(""), OTHER),
+        "<weld>, line 4: a constraint to what is not part of the robot",
+    ),
+    "law": (BODY.format("", HINGE.format(""), POLYNOMIAL), "<joint>, line 4: an equality constraint"),
     "tendon": (BODY.format("", HINGE.format(""), TENDON), "<fixed> 't', line 4: a tendon with stiffness"),
     "gravcomp": (BODY.format(' gravcomp="1"', HINGE.format(""), ""), "<body> 'b', line 3: gravcomp 1"),
     "locked": (BODY.format("", HINGE.format(' damping="1e11"'), ""), "<joint> 'j', line 3: damping 1e+11"),
@@ -144,6 +151,89 @@ def test_what_is_no_tree_of_joints_is_refused_by_element_and_line(case: str, tmp
     with pytest.raises(UrdfError, match=re.escape(message)) as caught:
         robot_of(text, tmp_path, fixed_base=case != "damped base")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("angle", ["degree", "radian"])
+def test_fitted_springs_with_their_offsets_are_what_is_read_again(angle: str, tmp_path: Path) -> None:
+    robot = robot_of(FREE.replace('angle="degree"', f'angle="{angle}"'), tmp_path)
+    fitted = FittedJoints(
+        stiffness={"knee": 3.0, "stretch": 2.0}, torque_offset={"knee": 0.6, "pitch": 0.2, "yaw": 0.1}
+    )
+    with pytest.warns(TorchidWarning, match="MJCF cannot say what was fitted of yaw: an offset without a spring"):
+        text = identified_robot(robot, robot.nominal, fitted)
+    (tmp_path / "identified.xml").write_bytes(text)
+    again = load_robot(tmp_path / "identified.xml")
+    of = dict(zip(robot.joint_names, range(robot.n), strict=True))
+    expected, constant = robot.stiffness.copy(), robot.spring_torque.copy()
+    expected[[of["knee"], of["stretch"]]] = 3.0, 2.0
+    constant[[of["knee"], of["pitch"]]] += 0.6, 0.2
+    np.testing.assert_allclose(again.stiffness, expected, rtol=1e-14)
+    np.testing.assert_allclose(again.spring_torque, constant, rtol=0.0, atol=1e-13)
+
+
+def test_springs_that_push_or_move_several_joints_are_named(tmp_path: Path) -> None:
+    robot = robot_of(BOLTED, tmp_path, True)
+    fitted = FittedJoints(stiffness={"shoulder": -1.0, "left_finger": 2.0})
+    with pytest.warns(
+        TorchidWarning, match="shoulder, left_finger: an offset without a spring, or a spring that pushes"
+    ):
+        assert not fitted.springs(robot, "identified.xml")
+
+
+LOOPED = """<mujoco><worldbody><body name="b"><joint name="j"/><geom size=".1"/><site name="s" pos=".1 .2 .3"/></body>
+ <body name="c" pos=".3 0 0"><joint name="k"/><geom size=".1"/><site name="t" pos="-.2 .2 .3" euler="0 0 40"/></body>
+ </worldbody>
+ <equality>{}</equality><actuator>{}</actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("equality", "kind", "frames"),
+    [
+        ('<connect body1="b" body2="c" anchor=".1 .2 .3"/>', "point", ("loop1 of b", "loop1 of c")),
+        ('<connect name="pin" site1="s" site2="t"/>', "point", ("pin of b", "pin of c")),
+        ('<connect body1="c" anchor="0 .1 0"/>', "point", ("loop1 of c", "loop1 of world")),
+        ('<weld body1="b" body2="c"/>', "weld", ("loop1 of b", "loop1 of c")),
+        ('<weld body1="b" body2="c" anchor=".1 0 0" relpose=".4 0 0 1 0 0 0"/>', "weld", ("loop1 of b", "loop1 of c")),
+    ],
+)
+def test_loops_close_where_mujoco_closes_them(
+    equality: str, kind: str, frames: tuple[str, str], tmp_path: Path
+) -> None:
+    robot = robot_of(LOOPED.format(equality, ""), tmp_path, True)
+    [loop] = robot.loops
+    assert (loop.kind, loop.frames) == (kind, frames)
+    poses = robot.link_poses(torch.zeros(1, 2, dtype=torch.float64))
+    one, other = (poses[frame][0].numpy() for frame in frames)
+    np.testing.assert_allclose(one[:3, 3], other[:3, 3], atol=1e-15)
+    if kind == "weld":
+        np.testing.assert_allclose(one, other, atol=1e-15)
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "robot.xml"))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(data.efc_pos, 0.0, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("actuators", "passive"),
+    [
+        ('<motor joint="j"/>', ("k",)),
+        ('<position jointinparent="k"/>', ("j",)),
+        ('<motor site="s"/>', ()),
+        ("", ()),
+    ],
+)
+def test_joints_of_robots_with_loops_that_no_actuator_drives_have_no_motor(
+    actuators: str, passive: tuple[str, ...], tmp_path: Path
+) -> None:
+    closed = '<connect site1="s" site2="t"/>'
+    assert robot_of(LOOPED.format(closed, actuators), tmp_path, True).passive == passive
+    assert robot_of(LOOPED.format("", actuators), tmp_path, True).passive == (), "as before without loops"
+    assert load_robot(tmp_path / "robot.xml", fixed_base=True, passive=["j"]).passive == ("j",)
+
+
+def test_an_inactive_loop_is_none(tmp_path: Path) -> None:
+    text = LOOPED.format('<connect active="false" site1="s" site2="t"/>', "")
+    assert not robot_of(text, tmp_path, True).loops
 
 
 def test_a_robot_without_a_free_joint_must_be_said_to_be_bolted(tmp_path: Path) -> None:
@@ -173,7 +263,7 @@ def test_nothing_is_written_where_a_robot_is_read(tmp_path: Path, monkeypatch: p
 
 def test_a_limited_tendon_or_an_inactive_loop_changes_nothing(tmp_path: Path) -> None:
     tendon = TENDON.replace('stiffness="3"', 'limited="true" range="0 1"')
-    loop = OTHER.replace("<connect", '<connect active="false"')
+    loop = OTHER.replace("<weld", '<weld active="false"')
     robot = robot_of(BODY.format("", HINGE.format(""), tendon + loop), tmp_path, True)
     states = States.random(robot)
     own = torchid_forces(robot, robot.nominal, robot.armature, states)

@@ -77,6 +77,36 @@ def test_armature_and_offsets_are_those_of_the_log(tmp_path: Path) -> None:
     assert drift(model_of(true, armature=0.05, offset=-0.7), off) > 1e-2
 
 
+def test_pd_targets_hold_a_wrong_arm_near_its_log_as_that_law_would(tmp_path: Path) -> None:
+    true, heavy = arm(tmp_path), arm(tmp_path, mass=0.9)
+    log, gains = swinging(true), np.array([[40.0, 20.0], [2.0, 1.0]])
+
+    def end(model: Model, **driven: np.ndarray) -> np.ndarray:
+        return replay_log(model, log, (), log.windows(TIMES[-1]), TIMES, **driven).joints
+
+    assert np.abs(end(model_of(true), gains=gains)).max() < 2e-5
+    held, free = (np.abs(x).max() for x in (end(model_of(heavy), gains=gains), end(model_of(heavy))))
+    assert 1e-4 < held < 0.3 * free
+    np.testing.assert_array_equal(end(model_of(heavy)), end(model_of(heavy), gains=np.zeros((2, 2))))
+
+
+def test_targets_are_those_that_made_the_torques(tmp_path: Path) -> None:
+    """One joint alone, at rest: a constant torque error e under kp ends at e / kp."""
+    path = tmp_path / "wheel.urdf"
+    wheel = (
+        '<link name="a"><inertial><mass value="1"/><inertia ixx="0.02" iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/>'
+    )
+    path.write_text(
+        f'<robot name="wheel"><link name="base"/>{wheel}</inertial></link><joint name="first" type="continuous">'
+        '<parent link="base"/><child link="a"/><axis xyz="0 0 1"/></joint></robot>'
+    )
+    time, zero = 0.001 * np.arange(2001.0), np.zeros((2001, 1))
+    log = ReplayedLog("rest", time, zero, zero, zero, None, None, np.zeros((2001, 0), dtype=bool))
+    model = Model(path, ("first",), np.zeros(1), np.array([0.6]), np.zeros(1))
+    found = replay_log(model, log, (), np.array([[0, 2000]]), np.array([1.9]), gains=np.array([[3.0], [1.0]]))
+    np.testing.assert_allclose(found.joints, -0.2, atol=1e-3)
+
+
 def test_springs_of_joints_pull_towards_position_zero(tmp_path: Path) -> None:
     true = arm(tmp_path)
     log = swinging(true)

@@ -18,7 +18,7 @@ from torch import Tensor
 from torchid.commands.cache import Entry, tensor_of
 from torchid.commands.manifest import file_checksum
 from torchid.commands.reading import fits_contact_offsets
-from torchid.config.experiment import RobotConfig
+from torchid.config.robot import RobotConfig
 from torchid.errors import TorchidWarning
 from torchid.fitting.experiment import Scene
 from torchid.logs.time_range import log_title
@@ -26,6 +26,7 @@ from torchid.problem import Samples
 from torchid.problem.base_motion import BaseMotion
 from torchid.problem.mapped_pages import MappedPages
 from torchid.problem.motion_noise import MotionNoise
+from torchid.robot import Robot
 from torchid.robot.urdf import parse_xml
 from torchid.sensing import SensorSet
 
@@ -65,6 +66,7 @@ def content_of_scene(scene: Scene) -> dict[str, Any]:
         "format": _FORMAT,
         "urdf": [config.robot.path.name, _robot_checksum(config.robot)],
         "robot": [robot.base_link, robot.fixed_base, list(robot.ft_names), robot.welded, robot.base_tilt],
+        **_loops(robot),
         "contacts": [asdict(contact) for contact in scene.contacts],
         "unloaded": fits_contact_offsets(scene),
         "preprocessing": settings,
@@ -74,6 +76,13 @@ def content_of_scene(scene: Scene) -> dict[str, Any]:
         "topics": topics,
         "columns": json.dumps(columns),  # as text: the order of names in it is that of the log
     }
+
+
+def _loops(robot: Robot) -> dict[str, Any]:
+    """Loops and passive joints; nothing of a robot without, whose entries stay what they were."""
+    if not (robot.loops or robot.passive):
+        return {}
+    return {"loops": [asdict(loop) for loop in robot.loops], "passive": list(robot.passive)}
 
 
 def _robot_checksum(robot: RobotConfig) -> str:

@@ -12,7 +12,7 @@ from torchid.fitting.calibration import Calibration, Comparison
 from torchid.logs.time_range import log_title
 from torchid.problem import Evaluation, Samples
 from torchid.problem.contact_state import state_name
-from torchid.problem.predict import force_series, noise_series
+from torchid.problem.predict import at_motors, force_series, noise_series
 from torchid.problem.projected_forces import projected_forces
 from torchid.report.forces import ForceSeries
 from torchid.report.traces import LogForces
@@ -43,7 +43,8 @@ def compare_forces(
     for one in compared:
         (read,) = one.calibrate([samples])
         part = read[chosen]
-        readings, (forces,) = force_series(evaluation.builder, part, one.parameters(evaluation)[None])
+        series = force_series(evaluation.builder, part, one.parameters(evaluation)[None])
+        readings, forces = at_motors(evaluation.builder, part, np.stack([series[0], *series[1]]))
         measured.append(readings)
         predicted.append(forces)
     nominal = predicted[0] + np.nan_to_num(measured[1] - measured[0])  # NaN: not measured

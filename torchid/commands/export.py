@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Mapping
 from pathlib import Path
 
 from torchid.commands.evaluate import FittedRun, read_run
@@ -12,7 +11,8 @@ from torchid.commands.folder import check_free_file
 from torchid.config import inputs_of
 from torchid.errors import ConfigError, InputError, TorchidWarning, during, join_names, warn
 from torchid.parameters import PER_BODY, Array
-from torchid.report import identified_robot, identified_urdf
+from torchid.problem.extras import ACTUATORS
+from torchid.report import FittedJoints, identified_robot, identified_urdf
 from torchid.report.joint_exports import isaaclab_text, joint_parameters, parameters_export
 from torchid.robot import Robot
 from torchid.robot.xml_files import is_mjcf
@@ -48,48 +48,49 @@ def export(run: str | Path, form: str, output: str | Path | None = None, overwri
     if target is not None:
         check_free_file(target, "--output", overwrite, [folder, *inputs_of(fitted.experiment.config)])
     robot, phi = fitted.experiment.robot, fitted.calibrations.identified.phi.reshape(-1, PER_BODY)
-    text = _text(form, robot, phi, _armature(fitted), folder)
+    text = _text(form, robot, phi, _fitted_joints(fitted), folder)
     if target is not None:
         with during("writing", target), atomic_file(target) as new:
             new.write_text(text, encoding="utf-8")
     return text
 
 
-def _armature(fitted: FittedRun) -> dict[str, float]:
-    """Fitted armatures by joint."""
+def _fitted_joints(fitted: FittedRun) -> FittedJoints:
+    """What was fitted of joints."""
     calibration = fitted.calibrations.identified
-    extras = [extra for extra in calibration.builder.extras if extra.what == "armature"]
-    return {extra.name: calibration.values[("", extra.label)] for extra in extras}
+    of_joints = (extra for extra in calibration.builder.extras if extra.what in ACTUATORS)
+    return FittedJoints.of((extra, calibration.values[("", extra.label)]) for extra in of_joints)
 
 
-def _text(form: str, robot: Robot, phi: Array, armature: Mapping[str, float], folder: Path) -> str:
-    joints = joint_parameters(robot, phi, armature)
+def _text(form: str, robot: Robot, phi: Array, fitted: FittedJoints, folder: Path) -> str:
+    joints = joint_parameters(robot, phi, fitted.armature)
     if form == "isaaclab":
         return isaaclab_text(joints, f"{folder.resolve().name} of {robot.path.name}")
     if form == "json":
         return json.dumps(parameters_export(robot, phi, joints), indent=1, allow_nan=False) + "\n"
     if form == "mjcf":
-        return (_mjcf(robot, phi, armature)).decode()
+        return _mjcf(robot, phi, fitted).decode()
     lost = [joint.name for joint in joints if joint.armature]
     if lost:
         warn(f"URDF: has no armature, which {join_names(lost)} have: --format mjcf or isaaclab says it")
     return identified_urdf(robot, phi).decode()
 
 
-def _mjcf(robot: Robot, phi: Array, armature: Mapping[str, float]) -> bytes:
+def _mjcf(robot: Robot, phi: Array, fitted: FittedJoints) -> bytes:
     """The robot's MJCF file, or a model made of its URDF, with meshes if MuJoCo takes them."""
     if is_mjcf(robot.path):
-        return identified_robot(robot, phi, armature)
+        return identified_robot(robot, phi, fitted)
     from torchid.report.mjcf_files import require_loadable
     from torchid.report.mjcf_of_urdf import mjcf_of_urdf
 
-    text = mjcf_of_urdf(robot, phi, armature)
+    springs = fitted.springs(robot, "MJCF")
+    text = mjcf_of_urdf(robot, phi, fitted.armature, springs=springs)
     try:
         require_loadable(text, robot.path)
     except InputError as error:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", TorchidWarning)  # said already
-            bare = mjcf_of_urdf(robot, phi, armature, meshes=False)
+            bare = mjcf_of_urdf(robot, phi, fitted.armature, False, springs)
         require_loadable(bare, robot.path)
         warn(f"{robot.path}: meshes are left out: {error.found}")
         return bare

@@ -252,8 +252,8 @@ def _describe(
         out.guessed.append("contacts: from names of links; point where there is a ball or more than two of them")
     if _is_fixed(contacts, fields) and not robot.fixed_base:
         out.guessed.append("robot.fixed_base: true, as there is neither a foot nor a motion of the base")
-    if proposal.lacking:
-        out.guessed.append(f"robot.weld: {_WELDED}: {join_names(proposal.lacking)}")
+    if held := _held(robot, proposal):
+        out.guessed.append(f"robot.weld: {_WELDED}: {join_names(held)}")
     if proposal.left_out:
         out.guessed.append(f"{format_count(len(proposal.left_out), what)} not needed: {join_names(proposal.left_out)}")
     out.missing += missing_columns(len(robot.joint_names), fields, proposal.partial, what)
@@ -362,10 +362,15 @@ def _text(
     return "\n".join(lines) + "\n"
 
 
+def _held(robot: Robot, proposal: MapProposal) -> list[str]:
+    """Joints that a log lacks, but for those without a motor in loops, which follow from the others."""
+    return [name for name in proposal.lacking if name not in robot.passive]
+
+
 def _weld(robot: Robot, proposal: MapProposal) -> list[str] | dict[str, float]:
     """Joints that a log lacks, each at 0, or at the middle of its range if that is elsewhere."""
     limits = position_limits(robot.path)
-    ranges = {name: limits.get(name, (-math.inf, math.inf)) for name in proposal.lacking}
+    ranges = {name: limits.get(name, (-math.inf, math.inf)) for name in _held(robot, proposal)}
     at = {name: 0.0 if low <= 0.0 <= high else float(f"{(low + high) / 2:.4g}") for name, (low, high) in ranges.items()}
     return at if any(at.values()) else list(at)
 

@@ -31,6 +31,7 @@ from torchid.problem import Samples, bind_log
 from torchid.problem.chunks import ProgressCallback
 from torchid.problem.contact_detection import with_detected_contacts
 from torchid.problem.contact_slip import measure_slip, warn_of_slip
+from torchid.problem.loop_joints import with_loop_joints
 from torchid.problem.standing import preprocess_standing
 from torchid.problem.welded_joints import without_welded_joints
 from torchid.problem.zeroing import zero_in_air
@@ -123,7 +124,7 @@ class LogReader:
         )
         own = scene_of_log(self.scene, path)
         acting = with_delayed_torques(without_welded_joints(read, own.robot), self.scene.config.actuators.known_delay)
-        recorded, certain = settle_contacts(acting, own)
+        recorded, certain = settle_contacts(with_loop_joints(acting, own.robot), own)
         checked = self._checked(recorded, own.robot)
         clean = recorded if checked is None else checked.repaired
         rates, sign_width = (settings.filter_hz, settings.sample_rate_hz), self.scene.terms.sign_width
@@ -191,7 +192,7 @@ class LogReader:
         filled = settings.bridge_gaps_s is not None or settings.zero_in_air
         delayed = bool(self.scene.config.actuators.known_delay)
         whole = settings.exclude_condemned or settings.derived or filled or delayed or split_range(path).joins
-        return gigabytes > _WHOLE_GB and not whole
+        return gigabytes > _WHOLE_GB and not whole and not self.scene.robot.loops
 
     def _large_log(self, path: Path, required: SensorSet | None, folder: Path | None) -> LargeLog:
         """A log that is read block by block."""

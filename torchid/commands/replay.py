@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from torchid.commands.evaluate import FittedRun, read_run, require_run
 from torchid.commands.folder import REPLAY, check_free, new_folder, write_json
 from torchid.commands.reading import LogReader
 from torchid.config import FootConfig
-from torchid.errors import ConfigError, LogError, about_file, during, format_count
+from torchid.errors import ConfigError, LogError, about_file, during, excerpt, format_count
 from torchid.fitting.calibration import Calibration, Comparison
 from torchid.logs.time_range import split_range
 from torchid.parameters import Array
@@ -25,6 +25,7 @@ from torchid.report.figures import save_figures
 from torchid.report.tables import progress_bars
 from torchid.reprs import short_repr
 from torchid.robot import Robot
+from torchid.robot.welds import matching_joints
 from torchid.sensing import Contact
 from torchid.simulation.plant import Foot, find_feet, point_foot
 from torchid.simulation.replay import Drift, Model, ReplayedLog, replay_log
@@ -45,6 +46,7 @@ class Replay:
         joint_names: of the robot.
         units: of the joints' positions, "rad" or "m".
         of: what the robot's file is, "URDF" or "MJCF".
+        gains: kp and kd of each joint, (2, n), 0 where the log's torques drive it alone.
         output: the folder that it was written to, if any.
     """
 
@@ -55,6 +57,7 @@ class Replay:
     joint_names: tuple[str, ...]
     units: tuple[str, ...]
     of: str
+    gains: Array
     output: Path | None = None
 
     __repr__ = short_repr
@@ -93,6 +96,8 @@ class Replay:
             "log": self.source,
             "window_s": self.window,
             "windows": self.windows,
+            "kp": dict(zip(self.joint_names, self.gains[0].tolist(), strict=True)),
+            "kd": dict(zip(self.joint_names, self.gains[1].tolist(), strict=True)),
             "time_s": self.drift.nominal.time.tolist(),
             "quartiles": {
                 name: {"nominal": pair.nominal.tolist(), "identified": pair.identified.tolist()}
@@ -109,6 +114,8 @@ def replay(
     window: float = 0.5,
     output: str | Path | None = None,
     overwrite: bool = False,
+    kp: float | Mapping[str, float] = 0.0,
+    kd: float | Mapping[str, float] = 0.0,
 ) -> Replay:
     """Drive the robot in MuJoCo with the torques of a log, and see how far it drifts from the log.
 
@@ -121,6 +128,8 @@ def replay(
         window: length of the windows [s].
         output: folder to write; None: nothing is.
         overwrite: whether a replay that stands there may be replaced.
+        kp: gain of a PD law whose targets made the log's torques [N m/rad or N/m], of all joints or by name or pattern.
+        kd: its gain on the velocity [N m s/rad or N s/m], likewise.
 
     Raises:
         InputError: the folder is no run, MuJoCo is not installed or does not take the robot, or the log has not what
@@ -136,35 +145,75 @@ def replay(
         fitted = read_run(folder)
         with about_file(folder / "config.yaml"):
             _require_simple(fitted)
+        gains = np.stack([joint_gains(fitted.experiment.robot, *x) for x in (("--kp", kp), ("--kd", kd))])
         reading = bars.add_task("reading the log", total=1)
         (samples,) = LogReader(fitted.experiment, folder).read([Path(log)], None, lambda _: bars.advance(reading))
         robot = fitted.experiment.robot
-        files = Comparison(robot.path, folder / identified_name(robot))
-        feet = _feet(fitted.experiment.contacts, files.nominal) if not robot.fixed_base else ()
-        calibration = fitted.calibrations.identified
-        logs = Comparison(*(_replayed(one) for one in (samples, *calibration.calibrate([samples]))))
-        models = Comparison(_model(files.nominal, robot, None), _model(files.identified, robot, calibration))
+        feet = _feet(fitted.experiment.contacts, robot.path) if not robot.fixed_base else ()
+        logs, models = _replayed_pairs(fitted, samples, folder)
         windows = logs.nominal.windows(window)
         replaying = bars.add_task("replaying", total=2 * len(windows))
-        times = window * np.arange(1, _TIMES + 1) / _TIMES
-        nominal, identified = (
-            replay_log(model, of, feet, windows, times, lambda n: bars.advance(replaying, n))
-            for model, of in zip(models, logs, strict=True)
-        )
+        rest = feet, windows, window * np.arange(1, _TIMES + 1) / _TIMES, lambda n: bars.advance(replaying, n), gains
+        drift = Comparison(*(replay_log(model, of, *rest) for model, of in zip(models, logs, strict=True)))
     found = Replay(
         source=split_range(log).name,
         window=float(window),
         windows=len(windows),
-        drift=Comparison(nominal, identified),
+        drift=drift,
         joint_names=robot.joint_names,
         units=tuple(_UNITS[kind] for kind in _joint_kinds(robot)),
         of=robot.format,
+        gains=gains,
         output=out,
     )
     if out is not None:
         with during("writing", out), new_folder(out, overwrite, REPLAY) as new:
             _write(found, new, fitted.experiment.config.figures.format)
     return found
+
+
+def _replayed_pairs(
+    fitted: FittedRun, samples: Samples, folder: Path
+) -> tuple[Comparison[ReplayedLog], Comparison[Model]]:
+    """What drives the robot of its file and the identified one, and both."""
+    robot, calibration = fitted.experiment.robot, fitted.calibrations.identified
+    logs = Comparison(*(_replayed(one) for one in (samples, *calibration.calibrate([samples]))))
+    identified = _model(folder / identified_name(robot), robot, calibration)
+    return logs, Comparison(_model(robot.path, robot, None), identified)
+
+
+_GAIN = "a number of at least 0, or numbers by joint or pattern: 20 '*_calf=30'"
+
+
+def parse_gains(option: str, entries: Sequence[str]) -> dict[str, float]:
+    """Gains by joint or pattern, of words like 20 and *_calf=30.
+
+    Raises:
+        ConfigError: a word that is neither.
+    """
+    gains = {}
+    for entry in entries:
+        name, _, number = entry.rpartition("=")
+        try:
+            gains[name or "*"] = float(number)
+        except ValueError as error:
+            raise ConfigError("command line", option, f"'{excerpt(entry)}'", _GAIN) from error
+    return gains
+
+
+def joint_gains(robot: Robot, option: str, stated: float | Mapping[str, float]) -> Array:
+    """A gain of each joint, (n,), from one of all or by name or pattern; later patterns count, others have 0.
+
+    Raises:
+        UnknownNameError: a joint that does not exist.
+        ConfigError: a pattern that matches none, or a gain that is negative.
+    """
+    out, by_name = np.zeros(robot.n), stated if isinstance(stated, Mapping) else {"*": stated}
+    for key, gain in by_name.items():
+        if not 0.0 <= gain < np.inf:
+            raise ConfigError("command line", option, f"{gain:g}", _GAIN)
+        out[[robot.joint_names.index(name) for name in matching_joints(option, key, robot.joint_names)]] = gain
+    return out
 
 
 def _write(found: Replay, folder: Path, form: str) -> None:
@@ -186,6 +235,9 @@ def _require_simple(fitted: FittedRun) -> None:
     held = format_count(len(robot.welded), "joint")
     if config.weld:
         raise ConfigError.at_field("robot.weld", f"{held} held still", "a replay without welds")
+    if robot.loops:
+        loops = format_count(len(robot.loops), "closed loop")
+        raise ConfigError.at_field("robot.loops", loops, "a replay of a robot without")
     root = next(name for name, (body, pose) in robot.links.items() if body == 0 and np.array_equal(pose, np.eye(4)))
     if not robot.fixed_base and robot.base_link != root:
         raise ConfigError.at_field("robot.base_link", f"'{robot.base_link}'", f"the URDF's root, '{root}', to replay")

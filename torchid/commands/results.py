@@ -36,7 +36,7 @@ from torchid.parameters import PER_BODY, Array
 from torchid.problem import Metrics
 from torchid.problem.metrics import SETS, WorseThanNominal, describe_worse, worse_than_nominal
 from torchid.problem.surplus import NoiseShares
-from torchid.report import identified_name, identified_robot, identified_urdf, parameters_document
+from torchid.report import FittedJoints, identified_name, identified_robot, identified_urdf, parameters_document
 from torchid.report.extra_figure import extra_figure
 from torchid.report.figures import (
     contribution_figure,
@@ -185,9 +185,9 @@ class Identification:
         return [asdict(state) | contributions[state.name] for state in self.states]
 
     @property
-    def armature(self) -> dict[str, float]:
-        """Fitted armatures by joint [kg m^2 or kg]."""
-        return {x.extra.name: x.value for x in self.extras if x.extra.what == "armature"}
+    def fitted_joints(self) -> FittedJoints:
+        """What was fitted of joints beside friction."""
+        return FittedJoints.of((x.extra, x.value) for x in self.extras)
 
     @property
     def phi(self) -> Array:
@@ -226,7 +226,7 @@ def write_run(run: Identification, output: Path, overwrite: bool = False, traini
         (folder / "config.yaml").write_text(dump_config(config))
         write_json(folder / "parameters.json", parameters_document(robot, run.estimate, run.by_state, run.extras))
         write_json(folder / "metrics.json", metrics_document(run))
-        (folder / identified_name(robot)).write_bytes(identified_robot(robot, run.phi, run.armature))
+        (folder / identified_name(robot)).write_bytes(identified_robot(robot, run.phi, run.fitted_joints))
         files = save_figures(figures, folder, config.figures.format)
         if training is not None:
             training.copy_curves(folder)

@@ -21,7 +21,7 @@ from torchid.config.reading import dump
 from torchid.errors import about_file, current_file
 from torchid.logs import write_log
 from torchid.parameters import Array
-from torchid.report import identified_urdf
+from torchid.report import FittedJoints, identified_robot
 from torchid.report.tables import progress_bars
 from torchid.robot import Robot, load_robot
 from torchid.simulation import LEAD_S, Stability, sensor_log, set_up_simulation
@@ -42,8 +42,8 @@ def simulate(config: SimulationConfig) -> dict[str, Stability]:
     Raises:
         InputError: whatever does not fit, or a robot that does not keep standing; nothing has been written then.
     """
-    check_free(config.output, config.overwrite, SIMULATION, [config.robot.urdf])
-    robot = load_robot(config.robot.urdf)
+    check_free(config.output, config.overwrite, SIMULATION, [config.robot.path])
+    robot = load_robot(config.robot.path)
     simulation = set_up_simulation(config)
     for motion in config.motions:
         simulation.reference(motion)
@@ -54,13 +54,19 @@ def simulate(config: SimulationConfig) -> dict[str, Stability]:
         stabilities = _in_processes(config, folder, lambda seconds: bars.update(bar, completed=seconds))
         (folder / "simulation.yaml").write_text(dump(config))
         write_json(folder / "stability.json", {name: asdict(stability) for name, stability in stabilities.items()})
-        (folder / "nominal.urdf").write_bytes(identified_urdf(robot, nominal_parameters(robot, config.nominal)))
+        nominal = identified_robot(robot, nominal_parameters(robot, config.nominal), FittedJoints())
+        (folder / nominal_name(config)).write_bytes(nominal)
     return stabilities
+
+
+def nominal_name(config: SimulationConfig) -> str:
+    """Name of the file with the robot that an identification starts from."""
+    return "nominal.urdf" if config.robot.mjcf is None else "nominal.xml"
 
 
 def simulated_balls(config: SimulationConfig) -> str:
     """The feet that roll on one collision sphere of the URDF, with its radius, "" if none does."""
-    feet = find_feet(config.feet, config.robot.urdf)
+    feet = find_feet(config.feet, config.robot.path)
     rolling = [f"{foot.frame}: radius {foot.rolling_radius:g} m" for foot in feet if foot.rolling_radius]
     return ", ".join(rolling) + (" (collision spheres)" if rolling else "")
 

@@ -6,9 +6,8 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from typing import Literal, TypeVar
 
-from pydantic import BeforeValidator, Field, FiniteFloat, PlainSerializer, PlainValidator, TypeAdapter
 from pydantic.dataclasses import dataclass
 
 from torchid.config.analysis import AnalysisConfig
@@ -18,6 +17,7 @@ from torchid.config.logs import SETS, LogsConfig, entries_spelled_out, resolve_l
 from torchid.config.maps import MAPS_ACCEPTED
 from torchid.config.preprocessing import PreprocessingConfig
 from torchid.config.reading import FileKind, Settings, dump, load
+from torchid.config.robot import LOOPS_ACCEPTED, MJCF_SUFFIXES, WELDS_ACCEPTED, RobotConfig, require_one_file
 from torchid.config.sensors import (
     CHOICE_ACCEPTED,
     COMPONENTS_ACCEPTED,
@@ -29,7 +29,6 @@ from torchid.config.sensors import (
     Device,
     Sensors,
     SensorsConfig,
-    as_list,
     spelled_out,
     validate_choice,
 )
@@ -37,64 +36,7 @@ from torchid.errors import ConfigError, about_file
 from torchid.logs.column_map import check_columns
 from torchid.logs.containers import FACTORS
 from torchid.logs.ros_topics import check_topics
-from torchid.settings import AUTO, Number, NumberOrAuto, PositiveOrAuto
-
-
-def _at_zero(value: object) -> object:
-    """A list of names as a mapping to positions of 0."""
-    if isinstance(value, list) and value and all(isinstance(name, str) and name for name in value):
-        return dict.fromkeys(value, 0.0)
-    return value
-
-
-MJCF_SUFFIXES = (".xml", ".mjcf")
-"""Of a robot's file that is MJCF, where nothing says what it is."""
-
-WELDS_ACCEPTED = "a list of joints or patterns, or a mapping to positions [rad or m]: {'*finger*': 0.3}"
-Welds = Annotated[dict[str, FiniteFloat], BeforeValidator(_at_zero)]
-
-
-def _tilt(value: object) -> object:
-    """Two angles, auto or none."""
-    if value is None or value == AUTO:
-        return value
-    try:
-        x, y = _ANGLES.validate_python(value)
-    except ValueError as error:
-        raise ValueError("auto, null, or two angles [rad] about the base's x and y axes: [0.01, -0.02]") from error
-    return x, y
-
-
-_ANGLES: TypeAdapter[list[float]] = TypeAdapter(Annotated[list[Number], Field(min_length=2, max_length=2)])
-BaseTilt = Annotated[tuple[float, float] | Literal["auto"] | None, PlainValidator(_tilt), PlainSerializer(as_list)]
-
-
-@dataclass(config=STRICT, frozen=True)
-class RobotConfig:
-    """The robot, `urdf` or `mjcf`; `base_link` defaults to the URDF's root.
-
-    `mjcf`: a MuJoCo model, read by MuJoCo (the extra [sim]); its tree of most degrees of freedom is the robot.
-    `weld`: names or patterns of joints that are held still, at 0 or at the position [rad or m] that a mapping gives.
-    `base_tilt`: two angles [rad] about the base's x and y axes by which it is turned from the base that logs record, as
-    on a table that is not level; auto, those that leave least of the training logs; None for none.
-    """
-
-    urdf: Path | None = None
-    mjcf: Path | None = None
-    base_link: str | None = None
-    fixed_base: bool = False
-    weld: Welds = dataclasses.field(default_factory=dict)
-    base_tilt: BaseTilt = None
-
-    @property
-    def path(self) -> Path:
-        """The one of both files that is given."""
-        return self.urdf or self.mjcf or Path()
-
-    @property
-    def tilt(self) -> tuple[float, float]:
-        """The angles, 0 where there are none, or they have not been chosen."""
-        return (0.0, 0.0) if self.base_tilt is None or isinstance(self.base_tilt, str) else self.base_tilt
+from torchid.settings import NumberOrAuto, PositiveOrAuto
 
 
 @dataclass(config=STRICT, frozen=True)
@@ -196,6 +138,7 @@ _EXPERIMENT = FileKind(
         "contacts": "a list of mappings: [{frame: l_sole, type: flat}]",
         "contacts.*.frame": "the name of a frame in the URDF",
         "robot.weld": WELDS_ACCEPTED,
+        "robot.loops": LOOPS_ACCEPTED,
         "sensors": CHOICE_ACCEPTED,
         **{f"{where}.contact_wrenches": WRENCHES_ACCEPTED for where in ("sensors", "analysis.compare.*")},
         **{f"{where}.contact_wrenches.*": COMPONENTS_ACCEPTED for where in ("sensors", "analysis.compare.*")},
@@ -230,7 +173,7 @@ def load_config(
     """
     config, about = _loaded(_EXPERIMENT, path, overrides, sections)
     with about:
-        _check_robot(config.robot)
+        require_one_file(config.robot)
         validate_choice("sensors", config.sensors)
         validate_keys(config.estimator)
         _check_extras(config)
@@ -244,7 +187,7 @@ def load_analysis(
     """Read an experiment file for `torchid analyze`: as `load_config`, but logs and sensors may be left out."""
     config, about = _loaded(_ANALYSIS, path, overrides, sections)
     with about:
-        _check_robot(config.robot)
+        require_one_file(config.robot)
         validate_choice("sensors", config.sensors, may_be_empty=True)
         validate_keys(config.estimator)
         _check_extras(config)
@@ -294,13 +237,6 @@ def _check_threshold(settings: PreprocessingConfig) -> None:
     if threshold.below is not None and threshold.below > threshold.above:
         found = f"{threshold.below:g}, more than above ({threshold.above:g})"
         raise ConfigError.at_field(f"{key}.below", found, "a force [N] up to that of above")
-
-
-def _check_robot(robot: RobotConfig) -> None:
-    """Refuse a robot of no file or of two."""
-    if (robot.urdf is None) == (robot.mjcf is None):
-        found = "missing" if robot.urdf is None else "set together with robot.mjcf"
-        raise ConfigError.at_field("robot.urdf", found, "a path to a URDF, or robot.mjcf: a path to a MuJoCo model")
 
 
 def _check_extras(config: _Common) -> None:

@@ -11,18 +11,17 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from torchid.config.reading import FileKind, load
+from torchid.config.robot import RobotFile, require_one_file
 from torchid.config.sensors import STRICT, FileName
-from torchid.errors import ConfigError
+from torchid.errors import ConfigError, about_file
 from torchid.settings import BelowOne, NotNegative, Number, Positive, Seed
 
 Point = Annotated[list[Number], Field(min_length=3, max_length=3)]
 
 
 @dataclass(config=STRICT, frozen=True)
-class SimulatedRobotConfig:
-    """The true robot: its base is the URDF's root."""
-
-    urdf: Path
+class SimulatedRobotConfig(RobotFile):
+    """The true robot, `urdf` or `mjcf`: its base is the URDF's root, or the body with the free joint."""
 
 
 @dataclass(config=STRICT, frozen=True)
@@ -174,7 +173,7 @@ _FILE = FileKind(
     "simulation",
     "robot, feet, motions, output",
     "feet=[{frame: l_sole}, {frame: r_sole}]",
-    ("robot.urdf",),
+    ("robot.urdf", "robot.mjcf"),
     ("output",),
 )
 
@@ -192,6 +191,8 @@ def load_simulation(path: str | Path, overrides: Sequence[str] = ()) -> Simulati
     """
     path = Path(path)
     config = load(_FILE, path, overrides)
+    with about_file(path):
+        require_one_file(config.robot)
     ratio = config.physics_hz / config.control_hz
     if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-9:
         raise ConfigError(path, "control_hz", f"{config.control_hz:g}", f"{config.physics_hz:g} over a whole number")

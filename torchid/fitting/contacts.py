@@ -9,7 +9,7 @@ import numpy as np
 
 from torchid.config import AnalyzeConfig, ExperimentConfig
 from torchid.config.sensors import ChoiceConfig, ContactConfig
-from torchid.errors import ConfigError, SensorError
+from torchid.errors import ConfigError, SensorError, format_count
 from torchid.problem.floor_pose import FEWEST_POINTS, points_of
 from torchid.problem.standing import FEET
 from torchid.robot import CollisionShapes, Robot, RollingShape
@@ -55,13 +55,13 @@ def read_along_normals(contacts: Sequence[Contact], sensors: ChoiceConfig) -> tu
 
 
 def suited_to_preprocessing(
-    contacts: tuple[Contact, ...], config: ExperimentConfig | AnalyzeConfig
+    contacts: tuple[Contact, ...], config: ExperimentConfig | AnalyzeConfig, robot: Robot
 ) -> tuple[Contact, ...]:
     """The contacts, after making sure that flags and a base's motion can follow from them where settings want that.
 
     Raises:
-        ConfigError: a bolted base, feet that are too few even if all stand, normals of several floors, or thresholds
-            of detection that contradict each other.
+        ConfigError: a bolted base, closed loops, feet that are too few even if all stand, normals of several floors, or
+            thresholds of detection that contradict each other.
     """
     settings = config.preprocessing
     for key in ("detect_contacts", "base_motion"):
@@ -74,6 +74,9 @@ def suited_to_preprocessing(
     if settings.zero_in_air and not contacts:
         raise ConfigError.at_field("preprocessing.zero_in_air", "true, without contacts", "false, or contacts")
     if settings.detect_contacts is not None:
+        if robot.loops:
+            found = f"set, for a robot with {format_count(len(robot.loops), 'closed loop')}"
+            raise ConfigError.at_field("preprocessing.detect_contacts", found, "contact_threshold, or recorded flags")
         touch, lift = settings.detect_contacts.touch, settings.detect_contacts.lift
         if lift > touch:
             found, accepted = f"{lift:g}, above touch ({touch:g})", "a share of the weight up to that of touch"

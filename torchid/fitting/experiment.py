@@ -12,6 +12,7 @@ import torch
 from torchid import parameters
 from torchid.config import AnalyzeConfig, ExperimentConfig
 from torchid.config.estimator import EstimatorConfig
+from torchid.config.robot import require_kind
 from torchid.config.sensors import ChoiceConfig
 from torchid.errors import ConfigError, LogError, UnknownNameError, warn_about_file
 from torchid.estimators import Conditions, Consistent, Enclosure, LeastSquares, Mirror
@@ -32,7 +33,6 @@ from torchid.problem.sampled_rows import LogElsewhere
 from torchid.reprs import short_repr
 from torchid.robot import Robot, body_extents, load_robot, mirror_pairs
 from torchid.robot.tree import FT_FIELD
-from torchid.robot.xml_files import is_mjcf
 from torchid.sensing import Contact, SensorNoise, SensorSet, chosen_sensors, named_sensors, with_ft_sensors
 
 _FRICTION = PARAMETERS[parameters.FRICTION]
@@ -91,7 +91,8 @@ class Scene:
         else:
             by_name = choice.joint_torques, choice.contact_wrenches
             sensors = chosen_sensors(robot.joint_names, contacts, *by_name, noise, ft)
-        return with_ft_sensors(sensors, robot, choice.ft_sensors)
+        measured = with_ft_sensors(sensors, robot, choice.ft_sensors)
+        return replace(measured, torque=measured.torque | robot.is_passive)  # known: 0
 
     def builder(self, sensors: SensorSet) -> RowBuilder:
         """Builder of the rows of some sensors, on the device of the settings."""
@@ -212,10 +213,9 @@ def set_up_scene(config: ExperimentConfig | AnalyzeConfig) -> Scene:
     require_device(config.device)
     try:
         of = config.robot
-        if is_mjcf(of.path) != (of.mjcf is not None):
-            key, other = ("robot.urdf", "mjcf") if of.mjcf is None else ("robot.mjcf", "urdf")
-            raise ConfigError.at_field(key, f"'{of.path}', no {key[6:].upper()}", f"robot: {{{other}: {of.path.name}}}")
-        robot = load_robot(of.path, of.base_link, of.fixed_base, _ft_joints(config), of.weld, of.tilt)
+        require_kind(of)
+        loops, joints = [loop.loop for loop in of.loops], _ft_joints(config)
+        robot = load_robot(of.path, of.base_link, of.fixed_base, joints, of.weld, of.tilt, loops, of.passive)
     except UnknownNameError as error:
         if error.field != FT_FIELD:
             raise
@@ -226,7 +226,7 @@ def set_up_scene(config: ExperimentConfig | AnalyzeConfig) -> Scene:
     if config.logs is not None:
         require_maps_of(robot, config.logs)
     contacts, rolling = resolve_contacts(config.contacts, robot)
-    contacts = suited_to_preprocessing(read_along_normals(contacts, config.sensors), config)
+    contacts = suited_to_preprocessing(read_along_normals(contacts, config.sensors), config, robot)
     stated = [replace(c, radius=contact.radius) for c, contact in zip(config.contacts, contacts, strict=True)]
     scene = Scene(config=replace(config, contacts=stated), robot=robot, contacts=contacts, rolling=rolling)
     check_scale_groups(scene.terms, robot, contacts)

@@ -72,6 +72,10 @@ class RowModel:
         }
         if robot.welded:  # a factor of a robot without stays what it was
             settings["robot.weld"] = [f"{name} at {position!r}" for name, position in robot.welded.items()]
+        if robot.loops:
+            settings["robot.loops"] = [f"{loop.kind} of {loop.label}" for loop in robot.loops]
+        if robot.passive:
+            settings["robot.passive"] = list(robot.passive)
         if any(robot.base_tilt):
             settings["robot.base_tilt"] = ", ".join(map(repr, robot.base_tilt))
         for name in ("armature", "stiffness", "spring_torque"):
@@ -86,6 +90,9 @@ class RowModel:
             "contact_node": np.array([node for node, _ in builder.frames], dtype=float),
             "T_node_contact": np.array([pose for _, pose in builder.frames]).reshape(-1, 4, 4),
         }
+        if robot.loops:
+            poses = [tree.frame(robot, frame)[1] for loop in robot.loops for frame in loop.frames]
+            geometry["T_node_loop"] = np.array(poses)
         return cls(settings, noise_of_sensors(builder), geometry)
 
 

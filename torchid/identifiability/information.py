@@ -15,8 +15,8 @@ from torchid.problem import LinearProblem, RowBuilder, Samples
 from torchid.problem.chunks import ProgressCallback, chunks_by_state, one_thread, subsample_states
 from torchid.problem.contact_state import ContactState
 from torchid.problem.extras import measured_components
-from torchid.problem.metrics import ROW_GROUPS, ForceSums, finite_or_none, null_space_components
-from torchid.problem.predict import predict_forces
+from torchid.problem.metrics import ROW_GROUPS, ForceSums, finite_or_none
+from torchid.problem.predict import null_space_components, predict_forces
 from torchid.problem.unloaded_offsets import unloaded_offset_equations
 from torchid.rounding import KINEMATIC_TOLERANCE, RANK_TOLERANCE
 from torchid.sensing import SensorNoise
@@ -98,7 +98,7 @@ def sensor_information(
         done: called with the number of samples worked through.
     """
     n, base = builder.tree.n, builder.tree.base_rows
-    joints = np.flatnonzero(builder.sensors.torque[:n]).tolist()
+    joints = [x for x in np.flatnonzero(builder.sensors.torque[:n]).tolist() if x not in builder.motors.passive]
     in_limbs = builder.sensors.torque[n:].reshape(-1, 6)
     limbs = np.flatnonzero(in_limbs.any(axis=1)).tolist()
     components = measured_components(builder.contacts, builder.sensors)
@@ -275,7 +275,7 @@ def expected_errors(
             (model, predicted, predicted),
             (sensors, torch.cat([rows, through_contacts]), rows),
         ):
-            sums.rows.add(_root_sum_of_squares(errors), weight)
+            sums.rows.add(_root_sum_of_squares(builder.motors.of(builder.tree, kinematics, errors)), weight)
             for inside in null_space_components(builder, state, kinematics, without_contacts):
                 sums.projected.add(_root_sum_of_squares(inside).flatten()[:, None], weight)
     errors_rms = (sums.rms(base, builder.tree.n) for sums in (model, sensors))

@@ -9,6 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from torchid.errors import UrdfError
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, RowBuilder, Samples, compress, linear_problem
 from torchid.problem.base_motion import BaseMotion
@@ -17,19 +18,25 @@ from torchid.problem.contact_state import ContactState
 from torchid.regressor import FrameJacobian, motion_from_state
 from torchid.regressor.kinematics import (
     GRAVITY_WORLD,
-    BodyStates,
+    along_frame,
     body_states,
-    cross_product,
+    frame_acceleration,
     joint_motion,
     rotation_matrix,
 )
+from torchid.regressor.loops import LoopClosures, LoopJacobian
 from torchid.regressor.regressor import contact_arms
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
+from torchid.robot.loops import LOOPS_FIELD
 from torchid.rounding import KINEMATIC_TOLERANCE
 from torchid.sensing import Contact, SensorSet
 
 _ANGLE, _STROKE = 1.5, 0.3  # largest joint position [rad], [m]
+_ASSEMBLY = 0.3  # of random postures: from there the loops are closed for the first time
+_PATH = 10  # steps from one posture to another
+_REGULAR = 0.1  # of the least singular value of a loop Jacobian where it is largest, what must be left of it elsewhere
+_LEAST_SHARE = 0.01  # of the way to a random posture, to which a path is cut short
 _SAMPLES_PER_COLUMN = 2  # per state: a sample gives at least one row, and some directions are rarely excited
 _WEIGHTLESS = (0.0, 0.0, 0.0)
 _AT_REST = 1e-10  # a projected velocity below this share of the drawn one is rounding and has no sign
@@ -117,7 +124,11 @@ def standing_states(
 
     J_C has the rows of the components that active contacts can exert: a point contact fixes its frame's origin, a flat
     one the whole frame, a line contact all but the rotation about itself; with a radius, they roll. Twice as many
-    states are drawn, and those nearest to a singular J_C are dropped: accelerations are unbounded there.
+    states are drawn, and those nearest to a singular J_C are dropped: accelerations are unbounded there. Loops are
+    closed, and have rows too.
+
+    Raises:
+        UrdfError: loops that close nowhere.
     """
     q, v, a = _random_states(robot, 2 * count, rng)
     constrained = [contact for contact, active in zip(contacts, state, strict=True) if active]
@@ -127,8 +138,10 @@ def standing_states(
         ]
         for contact in constrained
     ]
+    if robot.loops:
+        rows.append(LoopJacobian(robot)(q)[..., : robot.nv])
     J = torch.cat([q.new_zeros(len(q), 0, robot.nv), *rows], dim=1)
-    if not constrained:
+    if not rows:
         return q[:count], v[:count], a[:count]
     values = torch.linalg.svdvals(J)
     regular = values > KINEMATIC_TOLERANCE * values[:, :1]
@@ -162,9 +175,47 @@ def resting_samples(joint_position: Array, state: ContactState) -> Samples:
 
 
 def random_postures(robot: Robot, count: int, rng: np.random.Generator) -> Array:
-    """Joint positions (count, n), uniform, up to 1.5 rad or 0.3 m either way."""
+    """Joint positions (count, n), uniform, up to 1.5 rad or 0.3 m either way; or near these, where loops are closed.
+
+    Raises:
+        UrdfError: as `closed_postures`.
+    """
     slides = (robot.joint_map[0] != 0.0).T @ robot.geometry.prismatic[1:]
-    return np.where(slides, _STROKE, _ANGLE) * rng.uniform(-1.0, 1.0, (count, robot.n))
+    drawn: Array = np.where(slides, _STROKE, _ANGLE) * rng.uniform(-1.0, 1.0, (count, robot.n))
+    return closed_postures(robot, drawn) if robot.loops else drawn
+
+
+def closed_postures(robot: Robot, postures: Array) -> Array:
+    """Joint positions (N, n) at which the loops of a robot are closed, near given ones where there are any.
+
+    All are reached from one posture, that nearest to joint positions of 0, on paths that keep the loops closed and away
+    from singular postures: beyond these a mechanism could have been assembled otherwise. Paths that fail are cut short.
+
+    Raises:
+        UrdfError: loops that close nowhere near joint positions of 0.
+    """
+    closures, steps = LoopClosures(robot), torch.from_numpy(postures) / _PATH
+    zero = torch.zeros(1, robot.n, dtype=torch.float64)
+    found, closed = closures.closed(torch.cat([zero, _ASSEMBLY * torch.from_numpy(postures)]))
+    if not closed.any():
+        size = float(closures.deviations(zero).abs().max())
+        text = f"loops that are open by {size:.3g} m or rad at joint positions of 0, and close nowhere near"
+        raise UrdfError(robot.path, LOOPS_FIELD, text, "frames that the joints can bring together")
+    found = found[closed]
+    found = found[found.abs().amax(1).argsort()]
+    values = torch.linalg.svdvals(closures.jacobian(found))
+    rank = int((values > KINEMATIC_TOLERANCE * values[:, :1]).sum(1).max())
+    least = _REGULAR * float(values[:, rank - 1].max())
+    assembled = found[values[:, rank - 1] > least][:1]
+    out, left, share = assembled.repeat(len(postures), 1), torch.arange(len(postures)), 1.0
+    while len(left) and share > _LEAST_SHARE:
+        q, kept = assembled.repeat(len(left), 1), torch.ones(len(left), dtype=torch.bool)
+        for _ in range(_PATH):
+            q, closed = closures.closed(q + share * steps[left])
+            kept &= closed & (torch.linalg.svdvals(closures.jacobian(q))[:, rank - 1] > least)
+        out[left[kept]] = q[kept]
+        left, share = left[~kept], share / 2.0
+    return np.asarray(out.numpy())
 
 
 def _in_null_space(x: Tensor, inverse: Tensor, J: Tensor) -> Tensor:
@@ -183,7 +234,7 @@ def _random_states(robot: Robot, count: int, rng: np.random.Generator) -> tuple[
 
 
 def _drift(robot: Robot, constrained: Sequence[Contact], q: Tensor, v: Tensor) -> Tensor:
-    """dJ_C/dt v, (B, k): accelerations of the constrained components at a = 0, along the contacts' axes."""
+    """dJ/dt v, (B, k): accelerations at a = 0 of contacts' constrained components, along their axes, and of loops."""
     tree = KinematicTree(robot)
     motion = motion_from_state(q, v, torch.zeros_like(v), robot.n, robot.fixed_base, _WEIGHTLESS)
     states = body_states(tree, motion, joint_motion(tree, motion))
@@ -195,21 +246,9 @@ def _drift(robot: Robot, constrained: Sequence[Contact], q: Tensor, v: Tensor) -
             normal = (rotation_matrix(q[:, 3:7]).mT @ normal[..., None])[..., 0]
         pose = v.new_tensor(T_joint_frame)
         arms = contact_arms(states, node, pose[:3, :3], contact.radius, normal.T, contact.rolling_axis)
-        rows.append(_acceleration(states, node, pose, arms)[list(contact.components)])
+        own = frame_acceleration(states, node, pose, arms)
+        rows.append(along_frame(states, node, pose, own)[list(contact.components)])
+    if robot.loops:
+        joints = (x[:, x.shape[1] - robot.n :] for x in (q, v))
+        rows.append(LoopClosures(robot).drift(*joints).T)
     return torch.cat(rows).T
-
-
-def _acceleration(states: BodyStates, body: int, T_joint_frame: Tensor, arms: Tensor) -> Tensor:
-    """Acceleration of a frame's origin, then angular acceleration, in the frame's axes, (6, B), without gravity.
-
-    With arms, (3, 3, B), where it rolls: d/dt (v + omega x l), of the arm l whose direction the ground fixes. It is not
-    the acceleration of the material point, whose arm turns with the body.
-    """
-    rotation = states.rotation[:, :, body]
-    arm = (rotation * T_joint_frame[:3, 3, None]).sum(1)
-    omega, alpha = states.angular_velocity[:, body], states.angular_acceleration[:, body]
-    linear = (
-        states.specific_force[:, body] + cross_product(alpha, arm) + cross_product(omega, cross_product(omega, arm))
-    ) + (arms * alpha[:, None]).sum(0)
-    in_joint_frame = (rotation[:, :, None] * torch.stack([linear, alpha], dim=1)[:, None]).sum(0)
-    return torch.cat(list(T_joint_frame[:3, :3].T @ in_joint_frame.transpose(0, 1)))

@@ -30,6 +30,7 @@ from torchid.log_checks.findings import (
 )
 from torchid.log_checks.forces import check_forces_against_urdf
 from torchid.log_checks.frozen import check_repeats, check_scalar_wrenches
+from torchid.log_checks.loops import check_loops, completed
 from torchid.log_checks.motion import check_angle_unit, check_angular_velocity, check_derivatives
 from torchid.log_checks.slip import check_slip
 from torchid.log_checks.spikes import check_jumps
@@ -125,7 +126,7 @@ def check(
             of a log that has got flags from its torques. base_: motion of the base will follow from the feet that
             stand; forces are compared with the URDF in the longest stretch in which enough of them do.
     """
-    log = without_welded_joints(log, robot)
+    log, unclosed = completed(without_welded_joints(log, robot), robot)
     contacts = [replace(contact, along_normal=False) for contact in contacts]  # wrenches are what is checked
     results: list[Finding | Skipped] = list(check_magnitudes(log))
     if (blocking := _blocking_finding(results)) is not None:
@@ -150,14 +151,13 @@ def check(
         results += check_angular_velocity(repaired, robot)
         results += check_accelerometer(repaired, robot)
     if _blocking_finding(results) is None:
+        results += unclosed or check_loops(repaired, robot)
         results += check_standing_feet(repaired, robot, contacts, derived)
         results += check_slip(repaired, robot, contacts, cutoff_hz, derived)
     compared = repaired
     if "base_" in derived and robot is not None and _blocking_finding(results) is None:
-        try:
-            compared = longest_standing(repaired, robot, contacts)
-        except InputError as error:
-            results.append(Finding("does not fit", CONDEMNED, error.field, error.found, f"give {error.accepted}"))
+        compared, unfit = _longest_standing(repaired, robot, contacts)
+        results += unfit
     if _blocking_finding(results) is None:
         unbiased = subtract_contact_offsets(compared)
         results += check_forces_against_urdf(unbiased, robot, contacts, cutoff_hz, derived)
@@ -168,6 +168,14 @@ def check(
     else:
         results.append(_skip_dependent(blocking))
     return _collect(log, repaired, results)
+
+
+def _longest_standing(log: Log, robot: Robot, contacts: Sequence[Contact]) -> tuple[Log, list[Finding]]:
+    """The longest stretch in which enough feet stand; or the log, and why there is none."""
+    try:
+        return longest_standing(log, robot, contacts), []
+    except InputError as error:
+        return log, [Finding("does not fit", CONDEMNED, error.field, error.found, f"give {error.accepted}")]
 
 
 def _findings(results: Iterable[Finding | Skipped]) -> Iterator[Finding]:

@@ -150,8 +150,8 @@ def fit_nominal_model(samples: Sequence[Samples], robot: Robot, contacts: Sequen
         torque = np.concatenate([part.torque[:, : robot.n].numpy() for part in samples if part.torque is not None])
         measured = np.isfinite(torque).all(axis=0) & (np.abs(torque) > MIN_TORQUE_NM).any(axis=0)
     sensors = named_sensors("joints", robot.n, len(contacts), ft=len(robot.ft_names))
-    sensors = dataclasses.replace(sensors, torque=np.append(measured, sensors.torque[robot.n :]))
-    builder = RowBuilder(robot, contacts, sensors)
+    known = np.append(measured, sensors.torque[robot.n :]) | robot.is_passive
+    builder = RowBuilder(robot, contacts, dataclasses.replace(sensors, torque=known))
     forces = [force_series(builder, part, robot.nominal.flatten()[None]) for part in samples]
     acting, required = np.concatenate([f[0] for f in forces]), np.concatenate([f[1][0] for f in forces])
     base = robot.base_rows
@@ -161,7 +161,7 @@ def fit_nominal_model(samples: Sequence[Samples], robot: Robot, contacts: Sequen
         fit = _fit_projected(builder, samples, required, torque, np.flatnonzero(measured))
         contact_part = acting[:, base : base + robot.n] - torque
         consistent = force is not None and force < _MAX_WRENCH_MISFIT and np.isfinite(contact_part).all()
-        if (consistent or not contacts) and not fit.determined.all():
+        if (consistent or not contacts) and not fit.determined.all() and not robot.loops:
             fit = _fit_single_rows(fit, required[:, base : base + robot.n] - contact_part, torque)
     return ModelFit(fit, force, moment)
 
@@ -180,7 +180,8 @@ def _fit_projected(
 ) -> TorqueFit:
     """Gains by least squares in the null space of the contacts, where contact forces vanish."""
     base = builder.tree.base_rows
-    rows = [*range(base), *(base + joints)]
+    passive = [row for row in builder.motors.passive if row not in joints]
+    rows = [*range(base), *(base + joints), *(base + row for row in passive)]
     vectors = np.zeros((1 + len(joints), *required.shape))
     vectors[0] = required
     for index, joint in enumerate(joints):

@@ -85,7 +85,7 @@ def _measured_sensors(samples: Sequence[Samples], robot: Robot, contacts: Sequen
     weight = -GRAVITY_WORLD[2] * float(robot.nominal[:, parameters.MASS].sum())
     moment = size or 0.1 * weight
     noise = SensorNoise(*(max(UNMODELLED_FORCE_SHARE * x, _TINY) for x in (moment, 0.5 * weight, moment)))
-    return SensorSet(torque, wrench, noise)
+    return SensorSet(torque | robot.is_passive, wrench, noise)
 
 
 def _missing_friction_scale(samples: Sequence[Samples], robot: Robot) -> FloatArray:
@@ -269,7 +269,7 @@ class TorqueGains:
 def fit_torque_gains(samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact]) -> TorqueGains | None:
     """Factors of single torques and the point of wrenches; None where neither was measured."""
     sensors = _measured_sensors(samples, robot, contacts)
-    joints = np.flatnonzero(sensors.torque[: robot.n])
+    joints = np.flatnonzero((sensors.torque & ~robot.is_passive)[: robot.n])
     if not len(joints) and not _has_moments(sensors.wrench):
         return None
     builder = RowBuilder(robot, contacts, sensors)

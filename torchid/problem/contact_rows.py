@@ -1,4 +1,4 @@
-"""Rows of the contact Jacobian at samples of a contact state, and bases of the null space of the unmeasured ones."""
+"""Rows of the Jacobian of contacts and loops at samples of a contact state, and null spaces of the unmeasured ones."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from torchid.sensing.projection import any_suspect, whitened_null_space
 
 @dataclass(frozen=True)
 class ContactRows:
-    """Rows of J_C of the bodies in contact, each in the base rows and the joints that move its body.
+    """Rows of J_C of the bodies in contact, each in the base rows and the joints that move its body, and of loops.
 
     Attributes:
-        unmeasured, measured: (k, base rows + own joints, B) of each body that has any.
+        unmeasured, measured: (k, base rows + own joints, B) of each body that has any, then of loops, without the base.
         unmeasured_columns, measured_columns: where these are among base rows and coupled joints, (columns,) int64 each.
         width: number of base rows and coupled joints.
         like: a tensor of the rows' type, (..., B).
@@ -76,6 +76,9 @@ def contact_rows(
                 at_base = wrenches_at_ground(parts, counts[kind], kinematics, contact.body, origin)
                 rows[kind].append(generalized_forces(tree, kinematics.screw_axes, contact.body, at_base, joints))
                 columns[kind].append(own)
+    for loop in layout.loops:
+        rows[0].append(loop.forces(tree, kinematics))
+        columns[0].append(tree.index(tree.base_rows + index for index in loop.joints))
     return ContactRows(*rows, *columns, len(layout.row_std), kinematics.screw_axes)
 
 

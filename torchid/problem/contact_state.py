@@ -13,6 +13,7 @@ from torch import Tensor
 from torchid import parameters
 from torchid.parameters import Array
 from torchid.problem.extras import Extra, measured_components
+from torchid.problem.loop_rows import LoopLayouts, LoopRows
 from torchid.problem.row_blocks import RowBlock, RowBlocks, row_block
 from torchid.problem.wrench_rows import Acting, WrenchRows
 from torchid.regressor.columns import reduced_layout, reduction_matrix
@@ -106,11 +107,12 @@ class ContactBody:
 class ContactStateLayout:
     """The bodies, joints and columns of a contact state's rows, which are the same for all its samples.
 
-    Measured joints between the base and a contact are coupled: the projection combines their rows with those of the
-    base. All others are uncoupled: each is an equation of its own.
+    Measured joints between the base and a contact, or in a closed loop, are coupled: the projection combines their rows
+    with those of the base. All others are uncoupled: each is an equation of its own.
 
     Attributes:
         contact_bodies: bodies in contact.
+        loops: what closed loops exert, which is never measured.
         coupled_joints: indices of independent joints.
         uncoupled_joints: indices of independent joints, with the block of each one's row.
         row_std: noise of the base rows and coupled joints [N, N m].
@@ -119,6 +121,7 @@ class ContactStateLayout:
     """
 
     contact_bodies: tuple[ContactBody, ...]
+    loops: tuple[LoopRows, ...]
     coupled_joints: tuple[int, ...]
     uncoupled_joints: Mapping[int, RowBlock]
     row_std: Tensor
@@ -131,6 +134,7 @@ class ContactStateLayout:
         joints = [joint for body in self.contact_bodies for joint in body.joints]
         return (
             len(self.row_std) > len(self.coupled_joints) > 0
+            and not self.loops
             and sorted(joints) == list(range(len(self.coupled_joints)))
             and all(body.count == len(body.joints) for body in self.contact_bodies)
         )
@@ -154,6 +158,7 @@ class ContactStateLayouts:
         self.sensors = sensors
         self.frames = [columns.tree.frame(robot, contact.frame) for contact in contacts]
         self._measured = measured_components(self.contacts, sensors)
+        self._loops = LoopLayouts(robot)
         self.dof_std = sensors.noise.dof_std(robot.n, robot.n_dofs)
         self.rolling = tuple(index for index, contact in enumerate(contacts) if contact.radius)
         self.along_normal = tuple(index for index, contact in enumerate(contacts) if contact.along_normal)
@@ -175,12 +180,13 @@ class ContactStateLayouts:
         for contact, active in enumerate(state):
             if active:
                 touching.setdefault(self.frames[contact][0], []).append(contact)
-        moving = {joint for body in touching for joint in self.columns.joints_above(body)}
+        moving = {joint for body in touching for joint in self.columns.joints_above(body)} | self._loops.dofs
         measured = np.flatnonzero(self.sensors.torque).tolist()
         coupled = tuple(joint for joint in measured if joint in moving)
         bodies = tuple(
             self._contact_body(body, members, coupled, recorded_normals) for body, members in touching.items()
         )
+        loops = tuple(self._loops.rows(coupled, self.columns.tree.joint_map))
         moved = sorted(
             (body, index, ratio)
             for index, joint in enumerate(coupled)
@@ -194,6 +200,7 @@ class ContactStateLayouts:
         noise, base_rows = self.sensors.noise, self.columns.tree.base_rows
         self._cache[key] = ContactStateLayout(
             bodies,
+            loops,
             coupled,
             {joint: self._uncoupled(joint) for joint in measured if joint not in moving},
             self._tensor(np.append(noise.base_std[:base_rows], self.dof_std[list(coupled)])),
@@ -204,7 +211,7 @@ class ContactStateLayouts:
                 moved,
                 [(self.columns.friction(body), self.columns.friction(body) + 1) for body, _, _ in moved],
                 [body.joints for body in bodies],
-                sum(body.count for body in bodies),
+                sum(body.count for body in bodies) + sum(len(loop.wrenches) for loop in loops),
                 [(column, *self._met(extra, coupled, bodies)) for column, extra in extras],
             ),
         )

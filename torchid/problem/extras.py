@@ -67,6 +67,10 @@ class ExtraTerms:
     __repr__ = short_repr
 
 
+_OF_MOTORS = ("torque_offset",)
+"""Those of `ACTUATORS` that joints without a motor have not."""
+
+
 @dataclass(frozen=True)
 class Extra:
     """One extra parameter.
@@ -128,9 +132,10 @@ def list_extras(robot: Robot, contacts: Sequence[Contact], sensors: SensorSet, t
     for kind, groups in terms.scales.items():
         if not isinstance(groups, str):
             extras += _group_scales(kind, groups, [channel for channel in channels if channel.kind == kind])
-    measured = np.flatnonzero(sensors.torque[: robot.n]).tolist()
     for what, (unit, size) in ACTUATORS.items():
         if getattr(terms, what):
+            without = robot.is_passive if what in _OF_MOTORS else np.zeros_like(robot.is_passive)
+            measured = np.flatnonzero((sensors.torque & ~without)[: robot.n]).tolist()
             extras += [Extra(what, robot.joint_names[dof], "", unit, size, False, (dof,)) for dof in measured]
     if terms.delay:
         extras.append(Extra(DELAY, "joint torques", "", "s", _DELAY_SIZE, False, tuple(measured)))
@@ -168,7 +173,7 @@ class Channel(NamedTuple):
 
 def _channels(robot: Robot, contacts: Sequence[Contact], sensors: SensorSet) -> Iterator[Channel]:
     """Every measured channel."""
-    for dof in np.flatnonzero(sensors.torque).tolist():
+    for dof in np.flatnonzero(sensors.torque & ~robot.is_passive).tolist():
         name, _, component = (
             robot.dof_names[dof].rpartition(".") if dof >= robot.n else (robot.joint_names[dof], "", "")
         )

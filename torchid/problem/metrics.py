@@ -14,7 +14,7 @@ from torchid.problem.chunk_dynamics import ChunkKinematics
 from torchid.problem.chunks import ProgressCallback, map_chunks
 from torchid.problem.contact_state import ContactState
 from torchid.problem.extras import ExtraTerms
-from torchid.problem.predict import measured_and_predicted_forces, reading_variance
+from torchid.problem.predict import measured_and_predicted_forces, null_space_components, reading_variance
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.robot import Robot
@@ -148,8 +148,9 @@ class Evaluation:
                 kinematics = builder.kinematics(samples)
                 forces = measured_and_predicted_forces(builder, samples, state, columns, kinematics)
                 sums[0].add_contact_forces(forces.measured[:, joints], forces.torque[:, joints])
-                for total, predicted in zip(sums, (torch.zeros_like(forces.torque), *forces.predicted), strict=True):
-                    total.rows.add(predicted - forces.measured)
+                errors = torch.cat([-forces.measured[None], forces.predicted - forces.measured])
+                for total, error in zip(sums, builder.motors.of(builder.tree, kinematics, errors), strict=True):
+                    total.rows.add(error)
                 vectors = torch.cat([forces.torque[None], forces.predicted - forces.torque])
                 if self.noise is not None:
                     sums[0].noise.merge(self._noise_sums(samples, state, kinematics, self.noise))
@@ -249,22 +250,6 @@ def describe_errors(group: str, identified: float | None, nominal: float | None)
 def group_name(group: str) -> str:
     """Name of a group of rows, without its unit."""
     return ERROR_GROUPS[group].split(" [")[0]
-
-
-def null_space_components(
-    builder: RowBuilder, state: ContactState, kinematics: ChunkKinematics, vectors: torch.Tensor
-) -> Iterator[torch.Tensor]:
-    """V_x^T of generalized forces (M, B, n_rows), V_x the contacts' null space, in groups of one rank, (M, B', r).
-
-    Joints away from contacts pass unchanged.
-    """
-    layout, base = builder.layout(state), builder.tree.base_rows
-    coupled = [*range(base), *(base + joint for joint in layout.coupled_joints)]
-    uncoupled = [base + joint for joint in layout.uncoupled_joints]
-    for index, V in builder.null_space_bases(state, kinematics):
-        forces = vectors[:, index]
-        inside = (V.mT @ forces[..., coupled].permute(1, 2, 0)).permute(2, 0, 1)
-        yield torch.cat([inside, forces[..., uncoupled]], dim=2)
 
 
 class ForceSums:

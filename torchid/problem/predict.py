@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -142,6 +142,7 @@ def reading_variance(
     tree = builder.tree
     total = samples.time.new_zeros(tree.n_rows, len(samples))
     std = noise.dof_std(tree.n, tree.n_dofs)
+    std[list(builder.motors.passive)] = np.nan
     torque = builder.recorded_torque(samples).T
     total[tree.base_rows :] = total.new_tensor(std**2)[:, None] + 0.0 * torque  # NaN where it was not recorded
     for contact, active in enumerate(state):
@@ -152,8 +153,10 @@ def reading_variance(
             joints = builder.columns.joints_above(body)
             rows = [*range(tree.base_rows), *(tree.base_rows + joint for joint in joints)]
             recorded = 0.0 * builder.recorded_wrench(samples, contact, kinematics)[:, possible].sum(1)
-            forces = generalized_forces(tree, kinematics.screw_axes, body, wrenches, joints)
-            total[rows] += forces.square().sum(0) + recorded
+            forces = total.new_zeros(len(possible), *total.shape)
+            forces[:, rows] = generalized_forces(tree, kinematics.screw_axes, body, wrenches, joints)
+            total += builder.motors.of(tree, kinematics, forces.mT).mT.square().sum(0)
+            total[rows] += recorded
     return total.T / samples.oversampling
 
 
@@ -217,4 +220,34 @@ def null_space_part(builder: RowBuilder, samples: Samples, forces: Array) -> Arr
                 at = np.ix_(np.arange(len(forces)), chosen, coupled)
                 inside = V @ (V.mT @ torch.from_numpy(forces[at]).to(V)[..., None])
                 out[at] = inside[..., 0].cpu().numpy()
+    return out
+
+
+def null_space_components(
+    builder: RowBuilder, state: ContactState, kinematics: ChunkKinematics, vectors: Tensor
+) -> Iterator[Tensor]:
+    """V_x^T of generalized forces (M, B, n_rows), V_x the contacts' null space, in groups of one rank, (M, B', r).
+
+    Joints away from contacts pass unchanged.
+    """
+    layout, base = builder.layout(state), builder.tree.base_rows
+    coupled = [*range(base), *(base + joint for joint in layout.coupled_joints)]
+    uncoupled = [base + joint for joint in layout.uncoupled_joints]
+    for index, V in builder.null_space_bases(state, kinematics):
+        forces = vectors[:, index]
+        inside = (V.mT @ forces[..., coupled].permute(1, 2, 0)).permute(2, 0, 1)
+        yield torch.cat([inside, forces[..., uncoupled]], dim=2)
+
+
+def at_motors(builder: RowBuilder, samples: Samples, forces: Array) -> Array:
+    """Generalized forces of a log in its order, (M, N, n_rows), as the motors of closed loops feel them."""
+    if builder.motors.none:
+        return forces
+    out = forces.copy()
+    with torch.no_grad(), one_thread():
+        for _, index in chunks_by_state(samples):
+            kinematics = builder.kinematics(samples[index].to(builder.device))
+            where = index if isinstance(index, slice) else index.numpy()
+            part = torch.from_numpy(forces[:, where]).to(kinematics.screw_axes)
+            out[:, where] = builder.motors.of(builder.tree, kinematics, part).cpu().numpy()
     return out

@@ -17,6 +17,7 @@ from torchid.problem.contact_state import Columns, ContactState, ContactStateLay
 from torchid.problem.extra_columns import dof_extra_column, extra_columns
 from torchid.problem.extras import ExtraTerms, list_extras
 from torchid.problem.known_torques import KnownTorques
+from torchid.problem.motor_forces import MotorForces
 from torchid.problem.recorded_wrenches import FramePoses
 from torchid.problem.row_blocks import RowBlock, multiply_wrenches, subtract_payload
 from torchid.problem.samples import Samples
@@ -92,6 +93,7 @@ class RowBuilder(nn.Module):
         terms = terms or ExtraTerms()
         self.extras = list_extras(robot, contacts, sensors, terms)
         self.known_torques = KnownTorques(robot, self.extras)
+        self.motors = MotorForces(robot)
         self.tree = KinematicTree(robot, terms.sign_width)
         self.columns = Columns(self.tree)
         self.contacts = tuple(contacts)

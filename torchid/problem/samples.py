@@ -18,8 +18,10 @@ from torchid.logs.preprocess import unloaded_readings
 from torchid.parameters import WRENCH_COMPONENTS, Array
 from torchid.problem.base_motion import BaseMotion, base_motion, imu_pose, position_for_moments
 from torchid.problem.extras import recorded_components
+from torchid.problem.loop_gaps import FOLLOW, require_closed_loops
 from torchid.problem.mapped_pages import MappedPages
 from torchid.problem.motion_noise import MotionNoise, bind_motion_noise
+from torchid.problem.recorded_torques import columns_in_order, recorded_torques, require_limb_sensors
 from torchid.regressor import Motion
 from torchid.regressor.kinematics import GRAVITY_WORLD, rotation_matrix
 from torchid.reprs import short_repr
@@ -215,6 +217,7 @@ def bind_log(log: Log, robot: Robot, contacts: Sequence[Contact], required: Sens
     """
     order = joint_order(log, robot)
     position, velocity, acceleration = (_joints(log, name, order) for name in _JOINT_FIELDS)
+    require_closed_loops(log.source, position, robot)
     base = replace(base_motion(log, robot), position=position_for_moments(log, robot, contacts))
     chosen, active = _contacts(log, robot, contacts)
     if log.contact_wrench_world is not None and contacts and base.quat_xyzw is None and not robot.fixed_base:
@@ -234,20 +237,20 @@ def bind_log(log: Log, robot: Robot, contacts: Sequence[Contact], required: Sens
         velocity,
         acceleration,
         base,
-        _torques(log, robot, order),
+        recorded_torques(log, robot, order),
         None if wrench is None else torch.from_numpy(wrench),
         log.contact_wrench_world is not None,
         torch.from_numpy(active),
         oversampling(log.time, log.noise_bandwidth_hz),
         normals,
-        None if log.contact_share is None else torch.from_numpy(_columns(log.contact_share, chosen)),
-        None if unloaded is None else torch.from_numpy(_unloaded(_columns(unloaded, chosen), contacts)),
-        None if log.joint_direction is None else torch.from_numpy(_columns(log.joint_direction, order)),
+        None if log.contact_share is None else torch.from_numpy(columns_in_order(log.contact_share, chosen)),
+        None if unloaded is None else torch.from_numpy(_unloaded(columns_in_order(unloaded, chosen), contacts)),
+        None if log.joint_direction is None else torch.from_numpy(columns_in_order(log.joint_direction, order)),
         has_force_normal=log.contact_force_normal is not None,
         motion_noise=bind_motion_noise(log, order, robot.fixed_base, imu),
     )
     if required is not None:
-        _require_limb_sensors(log, robot, required)
+        require_limb_sensors(log, robot, required)
         require_forces(samples, robot, contacts, required)
     return samples
 
@@ -270,7 +273,7 @@ def _contact_normals(
         return None
     with about_file(log.source):
         labels = tuple(contact.frame for contact in contacts)
-        return torch.from_numpy(normalize_normals(_columns(log.contact_normal_world, order), active, labels))
+        return torch.from_numpy(normalize_normals(columns_in_order(log.contact_normal_world, order), active, labels))
 
 
 def _wrenches(log: Log, contacts: Sequence[Contact], order: list[int]) -> FloatArray | None:
@@ -278,7 +281,7 @@ def _wrenches(log: Log, contacts: Sequence[Contact], order: list[int]) -> FloatA
     wrench, scalar = log.contact_wrench, log.contact_force_normal
     along = [contact.along_normal for contact in contacts]
     if not any(along) or wrench is None and scalar is None:
-        return None if wrench is None else _columns(wrench, order)
+        return None if wrench is None else columns_in_order(wrench, order)
     out = np.full((len(log), len(contacts), 6), np.nan) if wrench is None else wrench[:, order]
     out[:, along] = np.nan
     if scalar is not None:
@@ -310,36 +313,7 @@ def _joints(log: Log, name: str, order: list[int]) -> Tensor:
     values = getattr(log, name)
     if values is None:
         raise LogError(log.source, name, "missing", "the field, or a log passed through preprocess()")
-    return torch.from_numpy(_columns(values, order))
-
-
-def _torques(log: Log, robot: Robot, order: list[int]) -> Tensor | None:
-    """Joint torques and wrenches in limbs, (N, n + 6 F); None if neither was recorded."""
-    if log.joint_torque is None and not (robot.ft_names and log.ft_wrench is not None):
-        return None
-    not_recorded = np.full((len(log), robot.n), np.nan)
-    parts = [not_recorded if log.joint_torque is None else _columns(log.joint_torque, order)]
-    for name in robot.ft_names:
-        if log.ft_wrench is None or name not in log.ft_names:
-            parts.append(np.full((len(log), 6), np.nan))
-        else:
-            parts.append(log.ft_wrench[:, log.ft_names.index(name)])
-    return torch.from_numpy(parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1))
-
-
-def _require_limb_sensors(log: Log, robot: Robot, required: SensorSet) -> None:
-    """Refuse a log without the required force/torque sensors in limbs."""
-    needed = required.torque[robot.n :].reshape(-1, 6)
-    names = [name for name, axes in zip(robot.ft_names, needed, strict=True) if axes.any()]
-    if names and log.ft_wrench is None:
-        raise LogError(log.source, "ft_wrench", "missing", "the field, or sensors without ft_sensors")
-    if missing := [name for name in names if name not in log.ft_names]:
-        accepted = f"every name in sensors.ft_sensors; the log has {', '.join(log.ft_names)}"
-        raise LogError(log.source, "ft_names", f"{', '.join(missing)} missing", accepted)
-
-
-def _columns(x: np.ndarray, order: list[int]) -> np.ndarray:
-    return x if order == list(range(x.shape[1])) else x[:, order]
+    return torch.from_numpy(columns_in_order(values, order))
 
 
 def joint_order(log: Log, robot: Robot) -> list[int]:
@@ -353,7 +327,7 @@ def joint_order(log: Log, robot: Robot) -> list[int]:
         found = f"{join_names(lacking, _LISTED)} of {robot.path.name} missing"
         listed = ", ".join(lacking) if len(lacking) <= _LISTED else f"{lacking[0]}, ..."
         accepted = f"every joint that moves, or robot.weld: [{listed}] for those that are held"
-        raise LogError(log.source, "joint_names", found, accepted)
+        raise LogError(log.source, "joint_names", found, accepted + FOLLOW * bool(robot.loops))
     return [log.joint_names.index(name) for name in robot.joint_names]
 
 
@@ -372,7 +346,11 @@ def _contacts(log: Log, robot: Robot, contacts: Sequence[Contact]) -> tuple[list
     order = [log.contact_names.index(frame) for frame in frames]
     if frames and log.contact_active is None:
         raise LogError(log.source, "contact_active", "missing", "(N, C) bool: which contact touches the ground when")
-    active = np.zeros((len(log), 0), dtype=bool) if log.contact_active is None else _columns(log.contact_active, order)
+    active = (
+        np.zeros((len(log), 0), dtype=bool)
+        if log.contact_active is None
+        else columns_in_order(log.contact_active, order)
+    )
     return order, active
 
 

@@ -1,6 +1,7 @@
 """Batched kinematics and the regressor K(q, v, a)."""
 
 from torchid.regressor.kinematics import Motion, motion_from_state
+from torchid.regressor.loops import LoopJacobian
 from torchid.regressor.regressor import FrameJacobian, Regressor
 
-__all__ = ["FrameJacobian", "Motion", "Regressor", "motion_from_state"]
+__all__ = ["FrameJacobian", "LoopJacobian", "Motion", "Regressor", "motion_from_state"]

@@ -233,3 +233,25 @@ def cross_product(a: Tensor, b: Tensor) -> Tensor:
 def rotate_vectors(rotation: Tensor, x: Tensor, out: Tensor | None = None) -> Tensor:
     """Rotation (3, 3, ...) times vectors (3, ...), to `out`, if given, which no gradient flows through."""
     return torch.mul(rotation[:, 0], x[0], out=out).addcmul_(rotation[:, 1], x[1]).addcmul_(rotation[:, 2], x[2])
+
+
+def frame_acceleration(states: BodyStates, body: int, T_joint_frame: Tensor, arms: Tensor | None = None) -> Tensor:
+    """Acceleration of a frame's origin and angular acceleration, in the base's axes, (3, 2, B), without gravity.
+
+    With arms, (3, 3, B), where it rolls: d/dt (v + omega x l), of the arm l whose direction the ground fixes. It is not
+    the acceleration of the material point, whose arm turns with the body.
+    """
+    arm = (states.rotation[:, :, body] * T_joint_frame[:3, 3, None]).sum(1)
+    omega, alpha = states.angular_velocity[:, body], states.angular_acceleration[:, body]
+    linear = (
+        states.specific_force[:, body] + cross_product(alpha, arm) + cross_product(omega, cross_product(omega, arm))
+    )
+    if arms is not None:
+        linear = linear + (arms * alpha[:, None]).sum(0)
+    return torch.stack([linear, alpha], dim=1)
+
+
+def along_frame(states: BodyStates, body: int, T_joint_frame: Tensor, vectors: Tensor) -> Tensor:
+    """Two vectors in the base's axes, (3, 2, B), along those of a frame on a body, one after the other, (6, B)."""
+    in_joint_frame = (states.rotation[:, :, body][:, :, None] * vectors[:, None]).sum(0)
+    return torch.cat(list(T_joint_frame[:3, :3].T @ in_joint_frame.transpose(0, 1)))

@@ -1,6 +1,6 @@
 """What a run leaves behind: tables, figures, TensorBoard events, parameters and a file of the robot."""
 
 from torchid.report.parameter_files import identified_urdf, parameters_document
-from torchid.report.robot_files import identified_name, identified_robot
+from torchid.report.robot_files import FittedJoints, identified_name, identified_robot
 
-__all__ = ["identified_name", "identified_robot", "identified_urdf", "parameters_document"]
+__all__ = ["FittedJoints", "identified_name", "identified_robot", "identified_urdf", "parameters_document"]

@@ -21,8 +21,13 @@ _RULES = ("settotalmass", "boundmass", "boundinertia", "balanceinertia")
 """Attributes of `<compiler>` by which MuJoCo changes inertias that a file states."""
 
 
-def identified_mjcf(robot: Robot, phi: Array, armature: Mapping[str, float]) -> bytes:
-    """The MJCF file of a robot with parameters `phi`, (L, 12), and armatures of joints; all else is as it was.
+def identified_mjcf(
+    robot: Robot,
+    phi: Array,
+    armature: Mapping[str, float],
+    springs: Mapping[str, tuple[float, float]] | None = None,
+) -> bytes:
+    """The MJCF file of a robot with parameters `phi`, (L, 12), and what joints have; all else is as it was.
 
     Included files stand in it, and paths of meshes do not change. The inertia of a body is that of the body whose joint
     moves it; those welded to it have none. Where MuJoCo multiplies elements (`<replicate>`, `<attach>`), the file is
@@ -32,6 +37,7 @@ def identified_mjcf(robot: Robot, phi: Array, armature: Mapping[str, float]) -> 
         robot: of an MJCF file.
         phi: identified parameters.
         armature: by joint [kg m^2 or kg], of those whose armature was fitted.
+        springs: likewise, stiffness [N m/rad or N/m] and position at rest [rad or m].
 
     Warns:
         TorchidWarning: bodies or joints that MuJoCo will refuse.
@@ -54,6 +60,13 @@ def identified_mjcf(robot: Robot, phi: Array, armature: Mapping[str, float]) -> 
         if i not in written:
             _set_inertial(elements[i][0], model.inertial(i))
     _set_joints(robot, model, elements, rest, armature)
+    in_degrees = not model.text.multiplies and bool(model.spec.compiler.degree)
+    for name, (stiffness, at_rest) in (springs or {}).items():
+        joint = model.joints.index(name)
+        turns = in_degrees and not model.slides(joint)
+        element = _joint_element(model, elements, joint)
+        element.set("stiffness", repr(stiffness))
+        element.set("springref", repr(float(np.degrees(at_rest)) if turns else at_rest))
     etree.indent(root)
     return etree.tostring(root, encoding="utf-8", xml_declaration=True)
 
@@ -104,8 +117,7 @@ def _set_joints(
         if joint is None or joint.kind == "fixed":
             continue
         number = model.joints.index(joint.name)
-        of = int(model.model.jnt_bodyid[number])
-        element = elements[of][1][number - int(model.model.body_jntadr[of])]
+        element = _joint_element(model, elements, number)
         for name, index in (("frictionloss", parameters.COULOMB), ("damping", parameters.VISCOUS)):
             if values[index] != before[index] or (name == "damping" and model.has_spring_damper(number)):
                 element.set(name, repr(float(values[index])))
@@ -117,6 +129,14 @@ def _set_joints(
     negative = [name for name, value in armature.items() if value < follow.get(name, 0.0)]
     if negative:
         warn(f"{NAME}: negative armature at {join_names(negative)}; MuJoCo refuses it")
+
+
+def _joint_element(
+    model: MjcfModel, elements: Sequence[tuple[etree._Element, Sequence[etree._Element]]], number: int
+) -> etree._Element:
+    """The element of a joint, by its number."""
+    of = int(model.model.jnt_bodyid[number])
+    return elements[of][1][number - int(model.model.body_jntadr[of])]
 
 
 def _armature_of_mimics(robot: Robot) -> dict[str, float]:

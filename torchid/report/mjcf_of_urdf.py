@@ -22,7 +22,13 @@ from torchid.robot.urdf import MOVING_TYPES, MeshError, TreeJoint, mesh_path, pa
 _MESHES = (".stl", ".obj")  # that MuJoCo reads
 
 
-def mjcf_of_urdf(robot: Robot, phi: Array, armature: Mapping[str, float], meshes: bool = True) -> bytes:
+def mjcf_of_urdf(
+    robot: Robot,
+    phi: Array,
+    armature: Mapping[str, float],
+    meshes: bool = True,
+    springs: Mapping[str, tuple[float, float]] | None = None,
+) -> bytes:
     """A model of the robot for MuJoCo: bodies, joints, friction, armatures, primitive shapes and meshes by full paths.
 
     A floating base has a free joint; a mimic joint is an equality constraint.
@@ -32,11 +38,12 @@ def mjcf_of_urdf(robot: Robot, phi: Array, armature: Mapping[str, float], meshes
         phi: identified parameters, (L, 12).
         armature: by joint [kg m^2 or kg], of those whose armature was fitted.
         meshes: whether meshes are named, too.
+        springs: by joint, stiffness [N m/rad or N/m] and position at rest [rad or m], of those that were fitted.
 
     Warns:
         TorchidWarning: meshes that MuJoCo does not read, or bodies that it will refuse.
     """
-    model = _Model(robot, without_links_beyond_welds(robot, phi), armature, meshes)
+    model = _Model(robot, without_links_beyond_welds(robot, phi), armature, springs or {}, meshes)
     warn_if_inconsistent(robot, model.phi, "MJCF")
     if model.left_out:
         names = join_names(list(dict.fromkeys(model.left_out)))
@@ -45,9 +52,20 @@ def mjcf_of_urdf(robot: Robot, phi: Array, armature: Mapping[str, float], meshes
     return etree.tostring(model.root, encoding="utf-8", xml_declaration=True)
 
 
+def _body_name(link: str) -> str:
+    return link if link != "world" else "world link"  # MuJoCo has a world of its own
+
+
 class _Model:
-    def __init__(self, robot: Robot, phi: Array, armature: Mapping[str, float], meshes: bool) -> None:
-        self.robot, self.phi, self.armature, self.meshes = robot, phi, armature, meshes
+    def __init__(
+        self,
+        robot: Robot,
+        phi: Array,
+        armature: Mapping[str, float],
+        springs: Mapping[str, tuple[float, float]],
+        meshes: bool,
+    ) -> None:
+        self.robot, self.phi, self.armature, self.springs, self.meshes = robot, phi, armature, springs, meshes
         self.left_out: list[str] = []
         links, joints = read_urdf(robot.path)
         self._links, self._joints = {link.name: link for link in links}, joints
@@ -63,10 +81,10 @@ class _Model:
         (root,) = (name for name in self._links if name not in children)
         self._add_body(world, root, np.eye(4), None)
         self._add_mimics(mimics)
+        self._add_loops()
 
     def _add_body(self, parent: etree._Element, name: str, T: Array, joint: TreeJoint | None) -> None:
-        written = name if name != "world" else "world link"  # MuJoCo has a world of its own
-        body = etree.SubElement(parent, "body", name=written, pos=numbers_text(T[:3, 3]), quat=_quaternion(T))
+        body = etree.SubElement(parent, "body", name=_body_name(name), pos=numbers_text(T[:3, 3]), quat=_quaternion(T))
         if joint is None and not self.robot.fixed_base:
             etree.SubElement(body, "freejoint")
         values = self._inertial(name)
@@ -104,6 +122,9 @@ class _Model:
                 element.set(name, repr(float(friction[index])))
         if joint.name in self.armature:
             element.set("armature", repr(float(self.armature[joint.name])))
+        if joint.name in self.springs:
+            for key, value in zip(("stiffness", "springref"), self.springs[joint.name], strict=True):
+                element.set(key, repr(value))
 
     def _add_mimics(self, mimics: Mapping[str, Mimic]) -> None:
         free = {name: mimic for name, mimic in mimics.items() if mimic.master}
@@ -112,6 +133,18 @@ class _Model:
             if equality is not None:
                 polynomial = numbers_text([mimic.offset, mimic.multiplier, 0.0, 0.0, 0.0])
                 etree.SubElement(equality, "joint", joint1=name, joint2=mimic.master, polycoef=polynomial)
+
+    def _add_loops(self) -> None:
+        """Loops as `connect` and `weld` between sites in their frames."""
+        equality = etree.SubElement(self.root, "equality") if self.robot.loops else None
+        bodies = {body.get("name"): body for body in self.root.iter("body")}
+        for number, loop in enumerate(self.robot.loops, start=1):
+            sites = {f"site{end}": f"loop{number} {end}" for end in (1, 2)}
+            for name, frame in zip(sites.values(), loop.frames, strict=True):
+                etree.SubElement(bodies[_body_name(frame)], "site", name=name)
+            if equality is not None:
+                tag = "connect" if loop.kind == "point" else "weld"
+                etree.SubElement(equality, tag, sites, name=f"loop{number}")
 
     def _add_shape(self, body: etree._Element, shape: etree._Element, kind: str) -> None:
         origin, geometry = shape.find("origin"), shape.find("geometry")

@@ -2,12 +2,63 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 
+from torchid.errors import join_names, warn
 from torchid.parameters import Array
+from torchid.problem.extras import Extra
 from torchid.report.parameter_files import identified_urdf
 from torchid.robot import Robot
 from torchid.robot.xml_files import is_mjcf
+
+
+@dataclass(frozen=True)
+class FittedJoints:
+    """What a fit has found of joints beside friction, by joint.
+
+    Attributes:
+        armature: [kg m^2 or kg].
+        stiffness: of springs [N m/rad or N/m].
+        torque_offset: [N m or N].
+    """
+
+    armature: Mapping[str, float] = field(default_factory=dict)
+    stiffness: Mapping[str, float] = field(default_factory=dict)
+    torque_offset: Mapping[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, found: Iterable[tuple[Extra, float]]) -> FittedJoints:
+        """From extra parameters with their values."""
+        values: dict[str, dict[str, float]] = {name: {} for name in ("armature", "stiffness", "torque_offset")}
+        for extra, value in found:
+            if extra.what in values:
+                values[extra.what][extra.name] = value
+        return cls(**values)
+
+    def springs(self, robot: Robot, file: str) -> dict[str, tuple[float, float]]:
+        """Stiffness and position at rest [rad or m] of springs that say what was fitted, with offsets of their torque.
+
+        An offset o of a spring of stiffness k moves its rest by -o / k. Of joints without a spring no file can say it.
+
+        Warns:
+            TorchidWarning: offsets that are lost, and springs that MuJoCo does not take.
+        """
+        springs, lost = dict[str, tuple[float, float]](), []
+        masters = {body.joint.mimic.master for body in robot.bodies if body.joint is not None and body.joint.mimic}
+        for number, name in enumerate(robot.joint_names):
+            if name not in self.stiffness and name not in self.torque_offset:
+                continue
+            stiffness = self.stiffness.get(name, float(robot.stiffness[number]))
+            constant = float(robot.spring_torque[number]) + self.torque_offset.get(name, 0.0)
+            if stiffness > 0.0 and name not in masters:
+                springs[name] = stiffness, -constant / stiffness
+            elif stiffness or constant:
+                lost.append(name)
+        if lost:
+            warn(f"{file}: MJCF cannot say what was fitted of {join_names(lost)}: an offset without a spring, or a "
+                 "spring that pushes or moves several joints")  # fmt: skip
+        return springs
 
 
 def identified_name(robot: Robot) -> str:
@@ -15,8 +66,8 @@ def identified_name(robot: Robot) -> str:
     return "identified.xml" if is_mjcf(robot.path) else "identified.urdf"
 
 
-def identified_robot(robot: Robot, phi: Array, armature: Mapping[str, float]) -> bytes:
-    """The robot's file, URDF or MJCF, with parameters `phi`, (L, 12), and fitted armatures by joint [kg m^2 or kg].
+def identified_robot(robot: Robot, phi: Array, fitted: FittedJoints) -> bytes:
+    """The robot's file, URDF or MJCF, with parameters `phi`, (L, 12), and what was fitted of joints.
 
     Meshes that MuJoCo needs of a URDF are named by full paths.
 
@@ -27,4 +78,4 @@ def identified_robot(robot: Robot, phi: Array, armature: Mapping[str, float]) ->
         return identified_urdf(robot, phi, full_mesh_paths=True)
     from torchid.report.mjcf_files import identified_mjcf  # needs an extra
 
-    return identified_mjcf(robot, phi, armature)
+    return identified_mjcf(robot, phi, fitted.armature, fitted.springs(robot, identified_name(robot)))

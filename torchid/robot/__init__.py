@@ -1,5 +1,6 @@
 """From a URDF to a tree of bodies with nominal parameters."""
 
+from torchid.robot.loops import Loop
 from torchid.robot.payloads import Payload, payload_parameters, require_payloads, with_payload
 from torchid.robot.robot import Body, Robot, load_robot
 from torchid.robot.rolling import CollisionShapes, RollingShape
@@ -10,6 +11,7 @@ __all__ = [
     "Body",
     "CollisionShapes",
     "Extent",
+    "Loop",
     "MirrorPair",
     "Payload",
     "Robot",

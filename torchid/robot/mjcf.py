@@ -1,7 +1,7 @@
 """MJCF as a URDF document, from which everything else is read as from a URDF.
 
-What a URDF cannot say is in attributes of a namespace of their own, `xml_files.OWN`: the offset of a link from its
-joint, armatures and springs.
+What a URDF cannot say is in a namespace of its own, `xml_files.OWN`: the offset of a link from its joint, armatures,
+springs, closed loops and joints without a motor.
 """
 
 from __future__ import annotations
@@ -13,7 +13,16 @@ import numpy as np
 from lxml import etree
 
 from torchid.parameters import INERTIA_AXES, Array
-from torchid.robot.mjcf_checks import check_model, mimic_of
+from torchid.robot.mjcf_checks import (
+    LOOPS,
+    check_model,
+    driven_joints,
+    equality_kind,
+    is_loop,
+    loop_bodies,
+    loop_frames,
+    mimic_of,
+)
 from torchid.robot.mjcf_model import MjcfModel, pose
 from torchid.robot.xml_files import OWN
 
@@ -48,6 +57,7 @@ class _Document:
             self._add_body(body)
         for body in members if model.base else members[1:]:
             self._add_shapes(body)
+        self._add_loops()
 
     def _add_body(self, body: int) -> None:
         model, name = self.model, self.model.bodies[body]
@@ -141,6 +151,24 @@ class _Document:
                 element = etree.SubElement(link, "collision" if collides else "visual")
                 _add_origin(element, origin if geom.id not in model.meshes else origin @ self._mesh_frame(geom.id))
                 etree.SubElement(element, "geometry").append(shape)
+
+    def _add_loops(self) -> None:
+        """Loops, with links for their frames, and which joints no motor drives."""
+        model = self.model
+        loops = [x for x in model.spec.equalities if is_loop(model, x)]
+        for number, loop in enumerate(loops, start=1):
+            name, bodies = loop.name or f"loop{number}", loop_bodies(model, loop)
+            links = [
+                str(self._frame(body, f"{name} of {model.bodies[body]}", "loop", T).get("name"))
+                for body, T in zip(bodies, loop_frames(model, loop), strict=True)
+            ]
+            kind = LOOPS[equality_kind(loop)]
+            etree.SubElement(self.root, f"{OWN}loop", one=links[0], other=links[1], type=kind)
+        driven = driven_joints(model) if loops else None
+        for joint in self.root.findall("joint"):
+            dynamics = joint.find("dynamics")
+            if driven is not None and dynamics is not None and joint.get("name") not in driven:
+                dynamics.set(f"{OWN}passive", "true")
 
     def _frame(self, body: int, name: str, kind: str, T: Array) -> etree._Element:
         link = name

@@ -9,7 +9,11 @@ import numpy as np
 
 from torchid.errors import UrdfError, warn
 from torchid.guards import MAX_NUMBER
-from torchid.robot.mjcf_model import MjcfModel
+from torchid.parameters import Array
+from torchid.robot.mjcf_model import MjcfModel, mujoco, pose
+
+LOOPS = {"connect": "point", "weld": "weld"}
+"""Type of the loop that an equality constraint closes, by its tag."""
 
 _GRAVITY = 9.81  # m/s^2
 _CLOSE = 0.02  # m/s^2: 9.8 and 9.81 are the same planet
@@ -32,11 +36,20 @@ def check_model(model: MjcfModel) -> None:
         model.refuse(flex, "flex", flex.name, "a flexible body", "rigid bodies")
     for equality in spec.equalities:
         if equality.active and _touches(model, equality, members) and mimic_of(model, equality) is None:
-            kind = equality_kind(equality)
-            accepted = "a tree without loops" + (": joint1 = c0 + c1 joint2 alone" if kind == "joint" else "")
-            model.refuse(equality, kind, equality.name, "an equality constraint", accepted)
+            _check_equality(model, equality)
     _check_transmissions(model)
     _check_medium(model)
+
+
+def _check_equality(model: MjcfModel, equality: Any) -> None:
+    """Refuse all but a loop of the robot."""
+    kind = equality_kind(equality)
+    if kind not in LOOPS:
+        accepted = "joint1 = c0 + c1 joint2 alone" if kind == "joint" else "connect, weld, or a linear joint"
+        model.refuse(equality, kind, equality.name, "an equality constraint", accepted)
+    if not is_loop(model, equality):
+        found = "a constraint to what is not part of the robot"
+        model.refuse(equality, kind, equality.name, found, "two bodies of the robot")
 
 
 def _check_body(model: MjcfModel, body: Any) -> None:
@@ -125,6 +138,53 @@ def _touches(model: MjcfModel, equality: Any, members: set[str]) -> bool:
     else:
         return True
     return bool(on & members)
+
+
+def is_loop(model: MjcfModel, equality: Any) -> bool:
+    """Whether an equality constraint is active and keeps two bodies of the robot together."""
+    if not equality.active or equality_kind(equality) not in LOOPS:
+        return False
+    return {model.base, *model.members}.issuperset(loop_bodies(model, equality))
+
+
+def loop_bodies(model: MjcfModel, equality: Any) -> tuple[int, int]:
+    """Numbers of both bodies that a `connect` or `weld` keeps together."""
+    of, sites = model.model, equality.objtype.name == "mjOBJ_SITE"
+    one, other = int(of.eq_obj1id[equality.id]), int(of.eq_obj2id[equality.id])
+    return (int(of.site_bodyid[one]), int(of.site_bodyid[other])) if sites else (one, other)
+
+
+def loop_frames(model: MjcfModel, equality: Any) -> tuple[Array, Array]:
+    """Poses (4, 4) [m], in their bodies, of both frames that a `connect` or `weld` keeps together.
+
+    As `mj_instantiateEqual` has them: of bodies, the anchor of a connect in the first and in the second, and that of a
+    weld in the second and in the first, with the second body's orientation in the first.
+    """
+    of, data = model.model, model.model.eq_data[equality.id]
+    if equality.objtype.name == "mjOBJ_SITE":
+        sites = (int(x[equality.id]) for x in (of.eq_obj1id, of.eq_obj2id))
+        one, other = (pose(of.site_pos[site], of.site_quat[site]) for site in sites)
+        return one, other
+    level = np.array([1.0, 0.0, 0.0, 0.0])
+    if equality_kind(equality) == "connect":
+        return pose(data[:3], level), pose(data[3:6], level)
+    return pose(data[3:6], data[6:10]), pose(data[:3], level)
+
+
+def driven_joints(model: MjcfModel) -> set[str] | None:
+    """Names of the joints that actuators drive; None where some drive what is no joint, or there are none."""
+    of, driven, kinds = model.model, set[int](), mujoco.mjtTrn
+    for kind, (target, _) in zip(of.actuator_trntype, of.actuator_trnid, strict=True):
+        if int(kind) in map(int, (kinds.mjTRN_JOINT, kinds.mjTRN_JOINTINPARENT)):
+            driven.add(int(target))
+        elif int(kind) == int(kinds.mjTRN_TENDON):
+            first, count = int(of.tendon_adr[target]), int(of.tendon_num[target])
+            if (of.wrap_type[first : first + count] != int(mujoco.mjtWrap.mjWRAP_JOINT)).any():
+                return None
+            driven.update(map(int, of.wrap_objid[first : first + count]))
+        else:
+            return None
+    return {model.joints[joint] for joint in driven} or None
 
 
 def equality_kind(equality: Any) -> str:

@@ -9,7 +9,7 @@ from torchid.robot.xml_files import OWN
 
 
 def plain_urdf(root: etree._Element) -> None:
-    """Make a URDF of a document that may have attributes of torchid's own, whose armatures and springs it loses.
+    """Make a URDF of a document that may have attributes of torchid's own, whose armatures, springs and loops it loses.
 
     A joint about an anchor off its link's origin gets a link without mass, to which that one is welded.
     """
@@ -30,4 +30,6 @@ def plain_urdf(root: etree._Element) -> None:
         for dynamics in joint.findall("dynamics"):
             for key in [key for key in dynamics.attrib if str(key).startswith(OWN)]:
                 del dynamics.attrib[key]
+    for loop in root.findall(f"{OWN}loop"):
+        root.remove(loop)
     etree.cleanup_namespaces(root)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,11 +12,22 @@ import numpy as np
 import torch
 
 from torchid import parameters
-from torchid.errors import MasslessBodyWarning, UnknownNameError, UrdfError, current_file, during, join_names, warn
+from torchid.errors import (
+    MasslessBodyWarning,
+    UnknownNameError,
+    UrdfError,
+    current_file,
+    during,
+    format_count,
+    join_names,
+    warn,
+)
 from torchid.parameters import WRENCH_COMPONENTS, Array
 from torchid.reprs import short_repr
+from torchid.robot.loops import Loop, loops_of_file, passive_joints, validate_loops
 from torchid.robot.tree import (
     BodyJoint,
+    BodyTree,
     JointGeometry,
     build_chain,
     build_tree,
@@ -56,7 +67,8 @@ class Robot:
     parameters, in its body's link frame, of a link that such a joint carries.
     Of an MJCF robot, links and joints are those of `torchid.robot.mjcf.urdf_document`.
     `kind_of_welded` has such joints' types. `base_tilt`: rotation [rad] about the base link's x and y axes from the
-    base whose motion logs record to this one.
+    base whose motion logs record to this one. `loops`: pairs of frames that the tree's joints must keep together.
+    `passive`: joints without a motor, whose torque is zero and need not be in logs.
     """
 
     path: Path
@@ -70,6 +82,8 @@ class Robot:
     links_beyond_welds: dict[str, Array] = field(default_factory=dict, repr=False)
     kind_of_welded: dict[str, str] = field(default_factory=dict, repr=False)
     base_tilt: tuple[float, float] = (0.0, 0.0)
+    loops: tuple[Loop, ...] = ()
+    passive: tuple[str, ...] = ()
 
     __repr__ = short_repr
 
@@ -78,7 +92,8 @@ class Robot:
         mass = f"{self.nominal[:, 0].sum():.3f} kg"
         joints = join_names(self.joint_names)
         moved = f"{base} base {self.base_link}, {self.n} joints {joints}"
-        return f"{self.path.name}, {len(self.bodies)} bodies, {mass}, {moved}"
+        loops = f", {format_count(len(self.loops), 'closed loop')}" if self.loops else ""
+        return f"{self.path.name}, {len(self.bodies)} bodies, {mass}, {moved}{loops}"
 
     @cached_property
     def joint_names(self) -> tuple[str, ...]:
@@ -109,6 +124,11 @@ class Robot:
         """Names of the independent joints that slide: their torque is a force."""
         joints = {body.joint.name: body.joint.kind for body in self.bodies if body.joint is not None}
         return tuple(name for name in self.joint_names if joints[name] == "prismatic")
+
+    @cached_property
+    def is_passive(self) -> np.ndarray:
+        """Which of `dof_names` are joints without a motor, (n + 6 F,) bool."""
+        return np.isin(self.dof_names, self.passive)
 
     @property
     def n_dofs(self) -> int:
@@ -230,6 +250,8 @@ def load_robot(
     ft_joints: Sequence[str] = (),
     weld: Mapping[str, float] | Sequence[str] = (),
     base_tilt: tuple[float, float] = (0.0, 0.0),
+    loops: Sequence[Loop] = (),
+    passive: Sequence[str] | None = None,
 ) -> Robot:
     """Read a URDF or, by MuJoCo, an MJCF file into a `Robot`.
 
@@ -241,11 +263,13 @@ def load_robot(
         weld: names or patterns of joints that are held, at 0 or at the position [rad or m] that a mapping gives.
         base_tilt: rotation [rad] about the base link's x and y axes from the base whose motion logs record to this one:
             of a table that is not level, or of an IMU that is mounted askew.
+        loops: closed loops beside those that an MJCF file has.
+        passive: names or patterns of joints without a motor; None for those that an MJCF file with loops says are.
 
     Raises:
         UrdfError, UnknownNameError: see `read_urdf` and `build_tree`; also when no body has mass, or when the base of
             an MJCF file has no free joint and is not said to be fixed.
-        ConfigError: see `weld_positions`.
+        ConfigError: see `weld_positions`, `validate_loops` and `passive_joints`.
         InputError: an MJCF file, and MuJoCo is not installed.
 
     Warns:
@@ -266,24 +290,32 @@ def load_robot(
         massless = ~np.any(nominal[:, parameters.INERTIAL], axis=1)
         if massless.all():
             raise UrdfError(path, "<inertial>", "no link has mass", "at least one link with mass > 0")
-        bodies = tuple(
-            Body(
-                name,
-                parent=-1 if joint is None else joint.parent,
-                joint=joint,
-                links=tuple(link for link, (body, _) in tree.links.items() if body == index),
-                massless=bool(massless[index]),
-            )
-            for index, (name, joint) in enumerate(zip(tree.names, tree.joints, strict=True))
-        )
+        bodies = _bodies(tree, massless)
         _warn_of_massless_ends(path, bodies)
         body_of = {name: body for name, (body, _) in tree.links.items()}
         beyond = links_beyond(joints, welded, body_of, tree.names)
         carried = {name: link_parameters(by_name[name], tree.links[name][1]) for name in beyond}
         kinds = {joint.name: joint.type for joint in joints if joint.name in welded}
         chain = build_chain(tree)
-        held = welded, carried, kinds
-        return Robot(path, tree.names[0], fixed_base, bodies, tree.links, nominal, chain, *held, base_tilt)
+        held, closed = (welded, carried, kinds), loops_of_file(path)
+        robot = Robot(path, tree.names[0], fixed_base, bodies, tree.links, nominal, chain, *held, base_tilt)
+    validate_loops([*loops, *closed], robot.links)
+    motorless = passive_joints(joints, passive, robot.joint_names)
+    return replace(robot, loops=(*loops, *closed), passive=motorless)
+
+
+def _bodies(tree: BodyTree, massless: np.ndarray) -> tuple[Body, ...]:
+    """The bodies of a tree; `massless`, (L,) bool."""
+    return tuple(
+        Body(
+            name,
+            parent=-1 if joint is None else joint.parent,
+            joint=joint,
+            links=tuple(link for link, (body, _) in tree.links.items() if body == index),
+            massless=bool(massless[index]),
+        )
+        for index, (name, joint) in enumerate(zip(tree.names, tree.joints, strict=True))
+    )
 
 
 def _warn_of_massless_ends(path: Path, bodies: tuple[Body, ...]) -> None:

@@ -9,6 +9,7 @@ import re
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 import yourdfpy
@@ -74,14 +75,15 @@ class TreeJoint(Joint):  # type: ignore[misc]
     Attributes:
         child_offset: origin of the child link's frame in the moved joint frame, (3,) [m].
         armature: reflected rotor inertia [kg m^2 or kg].
-        stiffness: of a spring [N m/rad or N/m].
-        rest: position at which it exerts no force [rad or m].
+        stiffness, rest: of a spring [N m/rad or N/m], and the position at which it exerts no force [rad or m].
+        passive: whether no motor drives it.
     """
 
     child_offset: tuple[float, ...] = (0.0, 0.0, 0.0)
     armature: float = 0.0
     stiffness: float = 0.0
     rest: float = 0.0
+    passive: bool = False
 
 
 def _tree_joint(joint: Joint, element: etree._Element) -> TreeJoint:
@@ -90,10 +92,10 @@ def _tree_joint(joint: Joint, element: etree._Element) -> TreeJoint:
         joint.dynamics.damping = float(joint.dynamics.damping or 0.0)
         joint.dynamics.friction = float(joint.dynamics.friction or 0.0)
     child, dynamics = element.find("child"), element.find("dynamics")
-    offset = "0 0 0" if child is None else child.get(f"{OWN}xyz", "0 0 0")
-    of = {} if dynamics is None else dynamics.attrib
-    own = {name: float(of.get(OWN + name, 0.0)) for name in ("armature", "stiffness", "rest")}
-    return TreeJoint(**vars(joint), child_offset=tuple(map(float, offset.split())), **own)
+    offset, of = "0 0 0" if child is None else child.get(f"{OWN}xyz", "0 0 0"), getattr(dynamics, "attrib", {})
+    own: dict[str, Any] = {name: float(of.get(OWN + name, 0.0)) for name in ("armature", "stiffness", "rest")}
+    own |= {"child_offset": tuple(map(float, offset.split())), "passive": OWN + "passive" in of}
+    return TreeJoint(**vars(joint), **own)
 
 
 def read_urdf(path: Path) -> tuple[list[Link], list[TreeJoint]]:
@@ -223,10 +225,9 @@ def _check_link(path: Path, link: etree._Element) -> None:
 
 def fixed_joints(path: Path) -> dict[str, str]:
     """Children of the fixed joints of a URDF that has been read, by joint."""
-    found = parse_xml(path).getroot().findall("joint")
     return {
         joint.get("name", ""): child.get("link", "")
-        for joint in found
+        for joint in parse_xml(path).getroot().findall("joint")
         if joint.get("type") == "fixed" and (child := joint.find("child")) is not None
     }
 
@@ -257,7 +258,6 @@ def _check_values(path: Path, links: list[Link], joints: list[Joint]) -> None:
         if link.inertial is not None and link.inertial.mass < 0.0:
             field = f"link '{link.name}', <inertial>"
             raise UrdfError(path, field, f"mass {link.inertial.mass:g} kg", "mass > 0, or 0 for a massless link")
-
     for joint in joints:
         field = f"joint '{joint.name}'"
         if joint.dynamics is not None and min(joint.dynamics.damping, joint.dynamics.friction) < 0.0:

@@ -66,18 +66,34 @@ def _stated(
     """Name or pattern and position by name of joint."""
     names, stated = [joint.name for joint in joints], dict[str, tuple[str, float]]()
     for key, position in weld.items():
-        pattern = any(sign in key for sign in "*?")
-        matches = [name for name in moving if (fnmatchcase(name, key) if pattern else name == key)]
-        if not matches and pattern:
-            raise ConfigError.at_field(WELD_FIELD, f"'{key}' matches no joint that moves", f"among {_first(moving)}")
-        if not matches:
-            raise UnknownNameError.at_field(WELD_FIELD, key, moving, "a fixed joint" if key in names else "")
-        for name in matches:
+        for name in matching_joints(WELD_FIELD, key, moving, names):
             other, before = stated.setdefault(name, (key, position))
             if before != position:
                 found = f"{position:g} for joint '{name}', which '{other}' holds at {before:g}"
                 raise ConfigError.at_field(_field(key), found, "one position for a joint")
     return stated
+
+
+def matching_joints(field: str, key: str, moving: Iterable[str], names: Iterable[str] = ()) -> list[str]:
+    """Joints that a name or pattern stands for.
+
+    Args:
+        field: of the settings, for errors.
+        key: the name or pattern.
+        moving: joints to choose from.
+        names: of all joints.
+
+    Raises:
+        UnknownNameError: a name that is none of them.
+        ConfigError: a pattern that matches none.
+    """
+    pattern, moving = any(sign in key for sign in "*?"), list(moving)
+    matches = [name for name in moving if (fnmatchcase(name, key) if pattern else name == key)]
+    if not matches and pattern:
+        raise ConfigError.at_field(field, f"'{key}' matches no joint that moves", f"among {_first(moving)}")
+    if not matches:
+        raise UnknownNameError.at_field(field, key, moving, "a fixed joint" if key in names else "")
+    return matches
 
 
 def _field(key: str) -> str:

@@ -9,13 +9,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from torchid.errors import SensorError, UnknownNameError
-from torchid.identifiability.structure import random_postures, resting_samples
+from torchid.errors import SensorError, UnknownNameError, UrdfError
+from torchid.identifiability.structure import closed_postures, random_postures, resting_samples
 from torchid.parameters import Array
-from torchid.problem import RowBuilder
+from torchid.problem import RowBuilder, Samples
 from torchid.problem.contact_state import ContactState
 from torchid.problem.extras import measured_components
 from torchid.robot import Robot
+from torchid.robot.loops import LOOPS_FIELD
 from torchid.rounding import BASE_RANK_TOLERANCE
 from torchid.sensing import Contact, SensorNoise, SensorSet
 from torchid.sensing.sensors import NORMAL_FORCE, NORMAL_INDEX
@@ -82,7 +83,7 @@ def candidates(
     Args:
         robot: the robot.
         contacts: all contacts; a sensor measures the components that its contact can exert.
-        joint_torques: joints that can carry a torque sensor; None for all.
+        joint_torques: joints that can carry a torque sensor; None for all with a motor.
         per: "device", one force/torque sensor per contact, "axis", one candidate per component, or "none" at contacts.
             In limbs, too, a candidate per component with "axis".
         costs: by name of a candidate, or by kind and then per channel; 1 per channel by default.
@@ -96,10 +97,12 @@ def candidates(
     """
     if per not in PER:
         raise SensorError("sensors", "candidates.per", f"'{per}'", ", ".join(PER))
-    chosen = robot.joint_names if joint_torques is None else joint_torques
+    driven = [name for name in robot.joint_names if name not in robot.passive]  # the torque of others is known
+    chosen = driven if joint_torques is None else joint_torques
     for name in chosen:
-        if name not in robot.joint_names:
-            raise UnknownNameError("sensors", "candidates.joint_torques", name, robot.joint_names)
+        if name not in driven:
+            what = "a joint without a motor" if name in robot.passive else ""
+            raise UnknownNameError("sensors", "candidates.joint_torques", name, driven, what)
     offered = [
         Candidate(name, "joint_torque", 1.0, dofs=(j,)) for j, name in enumerate(robot.joint_names) if name in chosen
     ]
@@ -172,8 +175,8 @@ def read_along_normals(
 def sensor_set(
     robot: Robot, contacts: Sequence[Contact], chosen: Iterable[Candidate], noise: SensorNoise | None = None
 ) -> SensorSet:
-    """The sensor set that consists of some candidates."""
-    torque, wrench = np.zeros(robot.n_dofs, dtype=bool), np.zeros((len(contacts), 6), dtype=bool)
+    """The sensor set that consists of some candidates; torques of joints without a motor are known."""
+    torque, wrench = robot.is_passive.copy(), np.zeros((len(contacts), 6), dtype=bool)
     for candidate in chosen:
         torque[list(candidate.dofs)] = True
         if candidate.contact is not None:
@@ -266,19 +269,35 @@ def demands(
         states: contact states.
         candidates: sensors to choose from.
         seed: of the random posture, at which ranks are those of almost every posture.
-        joint_position: (n,), another posture instead [rad or m].
+        joint_position: (n,), another posture instead, or one near it with closed loops [rad or m].
+
+    Raises:
+        UrdfError: loops whose motors do not determine how they move.
     """
     if robot.fixed_base:
         return []
     if joint_position is None:
         joint_position = random_postures(robot, 1, np.random.default_rng(seed))[0]
+    elif robot.loops:
+        joint_position = closed_postures(robot, joint_position[None])[0]
     builder = RowBuilder(robot, contacts, sensor_set(robot, contacts, ()))
     linking = {*range(robot.n), *(dof for candidate in candidates for dof in candidate.dofs)}
-    J = builder.contact_jacobian(resting_samples(joint_position[None], (False,) * len(contacts)))[0].numpy()
-    above = [linking.intersection(builder.columns.joints_above(body)) for body, _ in builder.frames]
+    J = _jacobian(builder, resting_samples(joint_position[None], (False,) * len(contacts)), robot)
+    above = [linking & builder.motors.above(builder.columns.joints_above(body)) for body, _ in builder.frames]
     groups = dict.fromkeys(group for state in states for group in _groups(above, state))
     joints = {group: sorted(set().union(*(above[index] for index in group)) & set(range(robot.n))) for group in groups}
     return [_demand(group, tuple(joints[group]), contacts, J, candidates) for group in groups]
+
+
+def _jacobian(builder: RowBuilder, posture: Samples, robot: Robot) -> Array:
+    """Jacobians (C, 6, n_rows) of all contacts at a posture, by the motion of motors where there are loops."""
+    J = builder.contact_jacobian(posture).permute(1, 2, 0, 3)
+    by_motors = builder.motors.of(builder.tree, builder.kinematics(posture), J)[:, :, 0].numpy()
+    by_motors[..., [robot.base_rows + dof for dof in builder.motors.passive]] = 0.0
+    if np.isnan(by_motors).any():
+        found = "loops in which motors do not determine how the other joints move"
+        raise UrdfError(robot.path, LOOPS_FIELD, found, "as many motors as a loop has motions, to plan sensors")
+    return np.asarray(by_motors)
 
 
 def _groups(above: Sequence[AbstractSet[int]], state: ContactState) -> list[tuple[int, ...]]:

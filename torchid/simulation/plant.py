@@ -12,9 +12,10 @@ from lxml import etree
 from torchid.config import FootConfig
 from torchid.errors import ConfigError, UnknownNameError, UrdfError
 from torchid.parameters import Array
+from torchid.robot.loops import LOOPS_FIELD, loops_of_file
 from torchid.robot.mjcf_model import mujoco
 from torchid.robot.plain_urdf import plain_urdf
-from torchid.robot.urdf import drop_repeated_origins, parse_xml
+from torchid.robot.urdf import drop_repeated_origins, parse_xml, read_urdf
 from torchid.robot.xml_files import is_mjcf
 from torchid.sensing.sensors import NORMAL_FORCE
 
@@ -173,6 +174,7 @@ class Plant:
         self.model = compile_model(urdf, feet, physics_hz)
         self.data = mujoco.MjData(self.model)
         model = self.model
+        _add_armatures(model, urdf)
         if friction is not None:
             model.dof_frictionloss[6:], model.dof_damping[6:] = friction
         self.nv, self.n = model.nv, model.nv - 6
@@ -278,6 +280,20 @@ class Plant:
         mujoco.mj_jacDot(model, data, J_dot[:3], J_dot[3:], data.site_xpos[site], body)
         rotation = data.site_xmat[site].reshape(3, 3)
         return FootMotion(data.site_xpos[site], rotation, J @ data.qvel, J, J_dot @ data.qvel)
+
+
+def _add_armatures(model: mujoco.MjModel, path: Path) -> None:
+    """Give joints the armatures of an MJCF file, which `plain_urdf` loses; UrdfError of what else it loses."""
+    if not is_mjcf(path):
+        return
+    if loops_of_file(path):
+        raise UrdfError(path, LOOPS_FIELD, "closed loops", "a tree of joints, for a simulation")
+    for joint in read_urdf(path)[1]:
+        if joint.stiffness:
+            found = f"a spring of stiffness {joint.stiffness:g}"
+            raise UrdfError(path, f"joint '{joint.name}'", found, "joints without springs, for a simulation")
+        if joint.armature:
+            model.dof_armature[model.joint(joint.name).dofadr] = joint.armature
 
 
 def compile_model(urdf: Path, feet: Sequence[Foot], physics_hz: float, floating: bool = True) -> mujoco.MjModel:

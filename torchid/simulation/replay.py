@@ -124,8 +124,12 @@ def replay_log(
     windows: Array,
     times: Array,
     progress: Callable[[int], None] | None = None,
+    gains: Array | None = None,
 ) -> Drift:
     """Drive a robot with a log's torques, linear between samples, from the log's state at the beginning of each window.
+
+    With gains kp and kd the torques are those of a PD law with the targets that made those of the log: to a torque tau
+    at position q and velocity v of the log come kp (q - q_sim) + kd (v - v_sim) of the simulated robot.
 
     A floating base begins where the lowest of its standing feet touches a level floor, with the velocity that leaves
     them still.
@@ -137,17 +141,21 @@ def replay_log(
         windows: (W, 2) int, from `ReplayedLog.windows`.
         times: (T,) since the beginning of a window at which the drift is wanted [s], ascending.
         progress: called with the number of windows done.
+        gains: kp [N m/rad or N/m] and kd [N m s/rad or N s/m] of each joint, (2, n); None for 0.
 
     Raises:
         UrdfError: MuJoCo does not take the robot.
         InputError: an armature is negative.
     """
+    kp, kd = np.zeros((2, len(model.joints))) if gains is None else gains
     robot = _Simulated(model, feet, log)
+    robot.add_gains(kp, kd)
+    driving = log.torque + kp * log.position + kd * log.velocity
     steps = np.arange(round(times[-1] * _PHYSICS_HZ)) / _PHYSICS_HZ
     joints, tilts = [], []
     for begin, _ in windows:
         starts = float(log.time[begin])
-        torque = _interpolated(starts + steps + 0.5 / _PHYSICS_HZ, log.time, log.torque) - model.offset
+        torque = _interpolated(starts + steps + 0.5 / _PHYSICS_HZ, log.time, driving) - model.offset
         position, quaternion = robot.run(begin, torque)
         since = np.append(0.0, steps + 1.0 / _PHYSICS_HZ)
         measured = _interpolated(starts + times, log.time, log.position)
@@ -181,6 +189,11 @@ class _Simulated:
         self.model.dof_armature[self.rate] += model.armature
         self.model.jnt_stiffness[[joint.id for joint in joints]] = model.stiffness
         self.model.qpos_spring[self.at] = 0.0
+
+    def add_gains(self, kp: Array, kd: Array) -> None:
+        """Let joints be pulled to position 0 and velocity 0, (n,) each, as by springs and dampers."""
+        self.model.jnt_stiffness[self.model.dof_jntid[self.rate]] += kp
+        self.model.dof_damping[self.rate] += kd
 
     def run(self, begin: int, torque: Array) -> tuple[Array, Array | None]:
         """Positions of the joints (S + 1, n) and the base's quaternion w x y z, (S + 1, 4), from a sample on.

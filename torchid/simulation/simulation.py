@@ -11,6 +11,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from torchid.config import BoundsConfig, MotionConfig, SensorImperfectionsConfig, SimulationConfig
+from torchid.config.robot import require_kind
 from torchid.errors import InputError, LogError
 from torchid.logs import Log
 from torchid.logs.log import BoolArray
@@ -29,8 +30,9 @@ def set_up_simulation(config: SimulationConfig) -> Simulation:
     Raises:
         InputError: the URDF, the feet or the posture cannot be simulated.
     """
-    feet = find_feet(config.feet, config.robot.urdf)
-    plant = Plant(config.robot.urdf, feet, config.physics_hz, config.friction.levels)
+    require_kind(config.robot)
+    feet = find_feet(config.feet, config.robot.path)
+    plant = Plant(config.robot.path, feet, config.physics_hz, config.friction.levels)
     simulation = Simulation(config, plant, feet, find_stance(plant, feet, config.posture))
     simulation.require_support(np.ones(len(feet), dtype=bool), "feet")
     return simulation

@@ -89,7 +89,7 @@ def _print_fit(run: Identification) -> None:
     if run.motion_noise.combinations:
         print_labelled("motion noise", str(run.motion_noise))
     if run.validation is not None:
-        _print_validation(run.validation)
+        _print_validation(run.validation, run.experiment.robot.format)
     for name, choice in {**run.choices.by_name(), "ridge": run.ridge}.items():
         if choice is not None:
             print_labelled(name, str(choice))
@@ -117,8 +117,8 @@ def _print_conditions(run: Identification) -> None:
         print_labelled("certified", f"objective within {estimate.certified_gap:.1g} of the other method's")
 
 
-def _print_validation(validation: CrossValidation) -> None:
+def _print_validation(validation: CrossValidation, nominal_of: str) -> None:
     identified, nominal = validation.identified.rms, validation.nominal.rms
     texts = (describe_errors(group, identified.get(group), nominal.get(group)) for group in DECISIVE_GROUPS)
-    text = f"each of {validation.folds} blocks, against URDF: {'; '.join(filter(None, texts))}"
+    text = f"each of {validation.folds} blocks, against {nominal_of}: {'; '.join(filter(None, texts))}"
     print_labelled("held out", text)

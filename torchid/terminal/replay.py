@@ -52,5 +52,6 @@ def _sentence(replayed: Replay) -> str:
     ]
     worse = any(after > before for before, after in replayed.at(replayed.window).values())
     head = f"WORSE THAN {replayed.of}: drift" if worse else "Drift"
-    of = f"of the torques of {replayed.source} alone, as a share of the {replayed.of}'s"
+    driven = "PD targets" if replayed.gains.any() else "torques"
+    of = f"of the {driven} of {replayed.source} alone, as a share of the {replayed.of}'s"
     return f"{head} after {replayed.window:g} s {of}: {', '.join(shares)} ({replayed.windows} windows)"

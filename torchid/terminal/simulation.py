@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict
 
-from torchid.commands.simulate import simulated_balls
+from torchid.commands.simulate import nominal_name, simulated_balls
 from torchid.config import SimulationConfig
 from torchid.errors import format_count
 from torchid.report.tables import print_tables, stability_table, terminal_width
@@ -30,9 +30,9 @@ def simulation_lines(config: SimulationConfig, stabilities: Mapping[str, Stabili
     """
     lines = [*wrap_words(_headline(config, stabilities), width), ""]
     end = labelled("rolling", balls, width, _TEXT_LINES) if (balls := simulated_balls(config)) else []
-    end += labelled(
-        "to identify", "logs/ and nominal.urdf; the truth: exact/ and the simulated URDF", width, _TEXT_LINES
-    )
+    nominal, kind = nominal_name(config), "URDF" if config.robot.mjcf is None else "MJCF"
+    text = f"logs/ and {nominal}; the truth: exact/ and the simulated {kind}"
+    end += labelled("to identify", text, width, _TEXT_LINES)
     end.append(f"{'written to':{LABEL}}{config.output}")
     room = LINES - len(lines) - len(end)
     return [*lines, *_motion_lines(config, stabilities, room, width), *end]

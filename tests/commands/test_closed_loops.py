@@ -1,0 +1,211 @@
+"""Commands on robots with closed loops: from MJCF and from a URDF with `robot.loops`; wrong frames are refused."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+
+import mujoco
+from closed_loops import MODELS, LoopWorld, loop_world
+
+import torchid
+from torchid.cli import main
+from torchid.commands.reading import LogReader
+from torchid.config import load_config
+from torchid.errors import TorchidError
+from torchid.fitting.experiment import set_up
+from torchid.logs import Log
+from torchid.parameters import FRICTION, perturb_parameters
+from torchid.regressor.loops import LoopClosures
+from torchid.report import identified_urdf
+from torchid.report.mjcf_files import identified_mjcf
+from torchid.report.mjcf_of_urdf import mjcf_of_urdf
+from torchid.robot import Loop, Robot, load_robot
+
+LEG = "four-bar leg"
+
+
+MOTORS = ("abduction", "hip", "crank")
+
+
+def swinging_leg(folder: Path) -> Robot:
+    """The leg, bolted, with friction that MuJoCo simulates and stiff loops."""
+    text = MODELS[LEG].replace("<freejoint/>", "").replace('<option jacobian="dense"/>', '<option timestep="0.001"/>')
+    joint = '<joint damping="0.1" frictionloss="0.05" armature="0.01"/><equality solref="0.004 1"/>'
+    text = text.replace('<joint damping="0.3" armature="0.01"/>', joint)
+    (folder / "true.xml").write_text(text)
+    return load_robot(folder / "true.xml", fixed_base=True)
+
+
+def swing(path: Path, seconds: float, seed: int) -> Log:
+    """What motors record of a leg that follows sines by a PD law, with noise: positions and torques at 500 Hz."""
+    model, rng = mujoco.MjModel.from_xml_path(str(path)), np.random.default_rng(seed)
+    model.dof_solref[:] = [0.004, 1.0]
+    data = mujoco.MjData(model)
+    at, rate = (np.array([getattr(model.joint(name), key)[0] for name in MOTORS]) for key in ("qposadr", "dofadr"))
+    hz, phase, size = (rng.uniform(low, high, (3, 3)) for low, high in ((0.2, 1.5), (0.0, 6.3), (0.05, 0.15)))
+    time, rows = 0.001 * np.arange(round(1000 * seconds)), []
+    for now in time:
+        goal = (size * np.sin(2.0 * np.pi * hz * now + phase)).sum(0) * min(1.0, now / 2.0)
+        data.ctrl[:] = 60.0 * (goal - data.qpos[at]) - 2.0 * data.qvel[rate]
+        rows.append([*data.qpos[at], *data.ctrl])
+        mujoco.mj_step(model, data)
+    recorded = np.array(rows)[::2] + np.repeat([1e-5, 0.05], 3) * rng.normal(size=(len(time[::2]), 6))
+    return Log(f"swing {seed}", time[::2], MOTORS, recorded[:, :3], joint_torque=recorded[:, 3:])
+
+
+def experiment(folder: Path, w: LoopWorld, **robot: Any) -> Path:
+    """An experiment file with two logs of motors alone, as robots log them."""
+    motors = [k for k, name in enumerate(w.log.joint_names) if name not in w.robot.passive]
+    for name, seed in (("train", 0), ("test", 3)):
+        log = loop_world(LEG, 300, seed, True).log
+        arrays = {
+            key: getattr(log, f"joint_{key}")[:, motors] for key in ("position", "velocity", "acceleration", "torque")
+        }
+        named = {f"joint_{key}": array for key, array in arrays.items()}
+        joints = tuple(log.joint_names[k] for k in motors)
+        torchid.write_log(replace(log, joint_names=joints, **named), folder / f"{name}.npz")
+    settings = {
+        "robot": robot,
+        "contacts": [{"frame": contact.frame, "type": contact.kind} for contact in w.contacts],
+        "logs": {"train": ["train.npz"], "test": ["test.npz"]},
+        "sensors": "full",
+        "estimator": {"name": "least_squares", "ridge": 1e-12},
+        "output": str(folder / "run"),
+    }
+    (folder / "leg.yaml").write_text(yaml.safe_dump(settings))
+    return folder / "leg.yaml"
+
+
+def test_a_run_finds_the_motors_and_friction_of_joints_that_have_none(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    w = loop_world(LEG)
+    assert main(["identify", str(experiment(tmp_path, w, mjcf=str(w.path)))]) == 0
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())["test"]
+    by_joint = metrics["joint_torque_rms_by_joint"]
+    assert {name for name, x in by_joint.items() if x is None} == set(w.robot.passive)
+    assert metrics["nullspace_rms_relative"] < 1e-5
+    bodies = json.loads((tmp_path / "run" / "parameters.json").read_text())["bodies"]
+    found, true = np.array([body["identified"]["fc"] for body in bodies]), w.true[:, 10].copy()
+    knee, coupler = (w.robot.body_names.index(name) for name in ("shank", "coupler"))
+    for friction in (found, true):  # sides of a parallelogram turn together: only the sum can be told
+        friction[[knee, coupler]] = friction[knee] + friction[coupler], 0.0
+    np.testing.assert_allclose(found, true, atol=1e-8)
+    assert load_robot(tmp_path / "run" / "identified.xml").loops == w.robot.loops
+    capsys.readouterr()
+    assert main(["evaluate", str(tmp_path / "run"), "--log", str(tmp_path / "test.npz")]) == 0
+    assert main(["replay", str(tmp_path / "run"), "--log", str(tmp_path / "test.npz")]) == 2
+    assert "robot.loops: 1 closed loop; accepted: a replay of a robot without" in capsys.readouterr().err
+
+
+def test_a_urdf_with_stated_loops_is_the_same_robot(tmp_path: Path) -> None:
+    w = loop_world(LEG)
+    (tmp_path / "leg.urdf").write_bytes(identified_urdf(w.robot, w.robot.nominal))
+    frames, passive = list(w.robot.loops[0].frames), ["knee", "coup*"]
+    file = experiment(tmp_path, w, urdf="leg.urdf", loops=[{"frames": frames, "max_gap": 0.001}], passive=passive)
+    scene = set_up(load_config(file))
+    assert scene.robot.loops == (Loop((frames[0], frames[1]), "point", 0.001),)
+    assert scene.robot.passive == w.robot.passive
+    assert scene.sensors.torque.all()
+    (tmp_path / "again.xml").write_bytes(mjcf_of_urdf(scene.robot, scene.robot.nominal, {}))
+    (loop,) = load_robot(tmp_path / "again.xml").loops
+    assert loop.frames == (f"loop1 of {frames[0]}", f"loop1 of {frames[1]}")
+    q = torch.from_numpy(w.log.joint_position)
+    one, other = (LoopClosures(robot).jacobian(q) for robot in (scene.robot, w.robot))
+    np.testing.assert_allclose(one, other, atol=1e-13)
+    (samples,) = LogReader(scene).read(scene.config.logs.train, scene.sensors)
+    np.testing.assert_allclose(samples.joint_position, q, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("loops", "message"),
+    [
+        ([{"frames": ["knee"]}], "two frames of the robot"),
+        ([{"frames": ["shank", "pelvis"]}], "robot.loops[0].frames: unknown name 'pelvis'"),
+        ([{"frames": ["shank", "toe"]}], "robot.loops[0].frames: shank and toe, frames of one body"),
+        ([{"frames": ["shank", "crank"], "type": "hinge"}], "robot.loops.0.type: found 'hinge'; accepted: 'point'"),
+        ("knee", "a list of mappings: [{frames: [l_rod_end"),
+    ],
+)
+def test_loops_that_are_none_are_refused_in_one_line(loops: Any, message: str, tmp_path: Path) -> None:
+    w = loop_world(LEG)
+    file = experiment(tmp_path, w, mjcf=str(w.path), loops=loops)
+    with pytest.raises(TorchidError) as caught:
+        set_up(load_config(file))
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_joints_without_a_motor_are_named_or_matched(tmp_path: Path) -> None:
+    w = loop_world(LEG)
+    for passive, message in ((["knie"], "robot.passive: unknown name 'knie'"), (["z*"], "'z*' matches no joint")):
+        with pytest.raises(TorchidError, match=message.replace("*", r"\*")):
+            set_up(load_config(experiment(tmp_path, w, mjcf=str(w.path), passive=passive)))
+
+
+@pytest.mark.parametrize("command", ["identify", "check"])
+def test_a_wrong_frame_is_refused_with_how_far_the_loop_is_open(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    w = loop_world(LEG)
+    file = experiment(tmp_path, w, mjcf=str(w.path), loops=[{"frames": ["crank", "abduction_end"]}])
+    text = w.path.read_text().replace(
+        '<body name="crank">', '<site name="abduction_end" pos="0 0 .1"/><body name="crank">'
+    )
+    (tmp_path / "leg.xml").write_text(text)
+    code = main([command, str(file), f"robot.mjcf={tmp_path / 'leg.xml'}"])
+    out = " ".join("".join(capsys.readouterr()).split())
+    assert "crank and abduction_end" in out
+    assert "apart by rms 100 mm, at most 100 mm" in out
+    assert code == 2 if command == "identify" else "open loop" in out
+
+
+def test_check_says_how_open_loops_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    w = loop_world(LEG)
+    main(["check", str(experiment(tmp_path, w, mjcf=str(w.path))), "--verbose"])
+    out = " ".join(capsys.readouterr().out.split())
+    assert "closed loop" in out
+    for part in ("pin of coupler", "and pin of shank are together up to rms", "nothing: accepted is rms"):
+        assert part in out
+
+
+def test_analysis_offers_torques_of_motors_alone(tmp_path: Path) -> None:
+    w = loop_world(LEG)
+    assert main(["analyze", str(experiment(tmp_path, w, mjcf=str(w.path))), "sensors=joints"]) == 0
+    found = json.loads((tmp_path / "run.analysis" / "analysis.json").read_text())
+    candidates = [one["name"] for one in found["scenarios"]["logs"]["candidates"]]
+    assert candidates[:3] == ["abduction", "hip", "crank"]
+    assert not set(w.robot.passive) & set(candidates)
+
+
+def test_noisy_positions_and_torques_of_motors_alone_identify_a_leg_that_mujoco_moves(tmp_path: Path) -> None:
+    robot = swinging_leg(tmp_path)
+    for name, seconds, seed in (("train", 12.0, 1), ("test", 6.0, 2)):
+        torchid.write_log(swing(tmp_path / "true.xml", seconds, seed), tmp_path / f"{name}.npz")
+    nominal = perturb_parameters(robot.nominal, 0.2, np.random.default_rng(3))
+    nominal[:, FRICTION] *= 0.5
+    (tmp_path / "leg.xml").write_bytes(identified_mjcf(robot, nominal, {}))
+    settings: dict[str, Any] = {
+        "robot": {"mjcf": str(tmp_path / "leg.xml"), "fixed_base": True},
+        "logs": {key: [str(tmp_path / f"{key}.npz")] for key in ("train", "test")},
+        "sensors": "joints",
+        "preprocessing": {"cutoff_hz": 15.0},
+        "estimator": {"name": "consistent", "ridge": 1e-3},
+        "output": None,
+    }
+    found = torchid.identify(**settings)
+    before, after = found.metrics["test"]
+    assert (after.rms["joint_torque"] or 1.0) < 0.15 * (before.rms["joint_torque"] or 0.0)
+    motors = [k for k, body in enumerate(robot.bodies) if body.joint is not None and body.joint.name in MOTORS]
+    friction = found.phi.reshape(-1, 12)[motors][:, FRICTION]
+    np.testing.assert_allclose(friction, np.tile([0.05, 0.1], (len(MOTORS), 1)), rtol=0.1)

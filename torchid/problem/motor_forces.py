@@ -1,0 +1,103 @@
+"""Forces of a robot with closed loops as its motors feel them: what goes through the loops is eliminated."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.sparse.csgraph import connected_components
+from torch import Tensor
+
+from torchid.problem.chunk_dynamics import ChunkKinematics
+from torchid.regressor.loops import LoopClosures, LoopGeometry
+from torchid.regressor.tree import KinematicTree
+from torchid.robot import Robot
+
+_DETERMINED = 1e-6  # share of a Jacobian's size: a motor moves the passive joints if no more of its column is left
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Loops that share joints, with their degrees of freedom: those of passive joints, and others."""
+
+    loops: tuple[LoopGeometry, ...]
+    passive: tuple[int, ...]
+    driven: tuple[int, ...]
+
+
+class MotorForces:
+    """Rows of generalized forces as the motors of closed loops feel them.
+
+    With the loops' Jacobian J = [J_a, J_p] by motors and passive joints, a motor's motion moves the passive joints by
+    G = -J_p^+ J_a. Of generalized forces f, what goes through the loops drops out of f_a + G^T f_p: the principle of
+    virtual work. `none`: the robot has no loops, and rows stay as they are.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        """Group the loops of a robot."""
+        self.none = not robot.loops
+        self._base, self._groups = robot.base_rows, list[_Group]()
+        if self.none:
+            return
+        closures = LoopClosures(robot)
+        dofs = [set(loop.dofs(closures.tree)) for loop in closures.geometries]
+        linked = np.array([[bool(one & other) for other in dofs] for one in dofs])
+        _, label = connected_components(linked, directed=False)
+        for group in range(label.max() + 1):
+            members = np.flatnonzero(label == group).tolist()
+            own = sorted(set[int]().union(*(dofs[k] for k in members)))
+            passive = tuple(dof for dof in own if robot.is_passive[dof])
+            driven = tuple(dof for dof in own if not robot.is_passive[dof])
+            self._groups.append(_Group(tuple(closures.geometries[k] for k in members), passive, driven))
+
+    @property
+    def passive(self) -> tuple[int, ...]:
+        """Joints without a motor in loops."""
+        return tuple(dof for group in self._groups for dof in group.passive)
+
+    def above(self, dofs: Iterable[int]) -> set[int]:
+        """Degrees of freedom with those of all loops that some of them are in, but for passive joints in these."""
+        own, out = set(dofs), set(dofs)
+        for group in self._groups:
+            if own & {*group.passive, *group.driven}:
+                out = (out | set(group.driven)) - set(group.passive)
+        return out
+
+    def of(self, tree: KinematicTree, kinematics: ChunkKinematics, forces: Tensor) -> Tensor:
+        """Generalized forces (..., B, n_rows) with those of motors in loops; NaN at passive joints in them.
+
+        Also NaN where motors do not determine how the passive joints move.
+
+        Args:
+            tree: the robot's constants.
+            kinematics: of the samples.
+            forces: rows as in K.
+        """
+        if self.none:
+            return forces
+        out = forces.clone()
+        for group in self._groups:
+            motion, determined = _passive_motion(tree, kinematics, group)  # (B, p, a), (B, a)
+            driven, passive = (tree.index(self._base + k for k in x) for x in (group.driven, group.passive))
+            through = (forces[..., passive][..., None, :] @ motion)[..., 0, :]
+            out[..., driven] = torch.where(determined, forces[..., driven] + through, torch.nan)
+            out[..., passive] = torch.nan
+        return out
+
+
+def _passive_motion(tree: KinematicTree, kinematics: ChunkKinematics, group: _Group) -> tuple[Tensor, Tensor]:
+    """Motion of passive joints by that of motors, (B, p, a), and which motors (B, a) determine it."""
+    J_p, J_a = (
+        torch.cat([loop.jacobian(tree, kinematics.states, dofs) for loop in group.loops]).permute(2, 0, 1)
+        for dofs in (group.passive, group.driven)
+    )
+    values, p = torch.linalg.svdvals(J_p), len(group.passive)
+    size = torch.linalg.matrix_norm(torch.cat([J_p, J_a], dim=2))[:, None]
+    motion = -torch.linalg.pinv(J_p, rtol=_DETERMINED) @ J_a
+    left = torch.linalg.vector_norm(J_a + J_p @ motion, dim=1)
+    determined = left <= _DETERMINED * size
+    if values.shape[1] < p:  # more passive joints than constraints
+        return motion, torch.zeros_like(determined)
+    return motion, determined & (values[:, p - 1 : p] > _DETERMINED * size if p else determined)
