@@ -17,6 +17,7 @@ from torchid.identifiability.base_parameters import unobservable_parameters
 from torchid.identifiability.information import ExpectedErrors
 from torchid.problem.metrics import ROW_GROUPS
 from torchid.report.analysis import SetAccuracy
+from torchid.report.tables import terminal_width
 from torchid.terminal.analysis import analysis_lines
 from torchid.terminal.lines import LINES
 
@@ -178,7 +179,7 @@ def test_all_tables_are_printed_when_asked_for(
     ):
         assert title in str(printed["--verbose"])
         assert title not in str(printed[None])
-    assert str(printed[None]).splitlines() == analysis_lines(lame, 100)
+    assert str(printed[None]).splitlines() == analysis_lines(lame, terminal_width())
 
 
 def test_where_nothing_touches_no_sensor_is_needed(file: Path, tmp_path: Path) -> None:
