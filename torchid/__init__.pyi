@@ -56,6 +56,11 @@ from .fitting.fit import (
 from .fitting.noise import (
     estimate_noise,
 )
+from .fitting.posterior import (
+    FittedPosterior,
+    ParameterSamples,
+    PosteriorSampler,
+)
 from .fitting.robust import (
     RobustLoss,
     fit_robustly,
@@ -154,6 +159,7 @@ __all__ = [
     "Estimate",
     "ExtraTerms",
     "FactorFile",
+    "FittedPosterior",
     "FrameJacobian",
     "LeastSquares",
     "LinearProblem",
@@ -162,6 +168,8 @@ __all__ = [
     "LogFitter",
     "MiniBatches",
     "Motion",
+    "ParameterSamples",
+    "PosteriorSampler",
     "Projection",
     "Regressor",
     "Robot",
