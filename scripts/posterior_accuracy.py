@@ -50,8 +50,8 @@ _SAMPLES = 40_000
 class Synthetic:
     """Random motions of a robot unlike its URDF; `true`, (L, 12), are its parameters."""
 
-    def __init__(self, name: str, seed: int, error: float = 0.2, count: int = 200) -> None:
-        """So many samples of each contact state, of a robot whose parameters are off by up to `error`."""
+    def __init__(self, name: str, seed: int, error: float = 0.2, count: int = 200, rough: float = 0.5) -> None:
+        """So many samples of each contact state; parameters off by `error`, a share `rough` of joints with friction."""
         urdf, feet, kind = ROBOTS[name]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", TorchidWarning)
@@ -63,7 +63,7 @@ class Synthetic:
         self.problem = linear_problem(compress(samples, builder), builder, robot)
         rng = np.random.default_rng(seed)
         true = perturb_parameters(robot.nominal, error, rng)
-        true[:, FRICTION] = rng.choice([0.0, 1.0], (len(true), 1)) * rng.uniform(0.0, 0.3, (len(true), 2))
+        true[:, FRICTION] = (rng.uniform(size=(len(true), 1)) < rough) * rng.uniform(0.0, 0.3, (len(true), 2))
         self.true = np.where(self.problem.free.reshape(true.shape), true, robot.nominal)
         self.conditions = Conditions(names=robot.body_names)
 
@@ -114,7 +114,7 @@ def compare(name: str, options: argparse.Namespace) -> list[str]:
     found, chance = differences(draws, states), differences(states[:half], states[half:])
     texts = [f"{found[x][0]:.3f} ({found[x][1]:.3f}); {chance[x][0]:.3f}" for x in found]
     near = f"{int(sampler.near.sum())} of {len(sampler.near)}"
-    kind = f"{sampler.passes} {'in pairs' if sampler.in_pairs else 'whole'}"
+    kind = f"{sampler.passes} {sampler.moves}"
     return [name, f"{len(conic.linear)}", near, kind, *texts, f"{prepared:.2f} + {seconds:.2f}"]
 
 

@@ -21,8 +21,8 @@ def test_samples_of_an_arm_have_the_moments_of_long_chains() -> None:
 
 
 def coverage(robot: str, repetitions: int) -> float:
-    one = Synthetic(robot, 0)
-    return float(np.mean([covered(one, number, 0.2)[1].mean() for number in range(repetitions)]))
+    one = Synthetic(robot, 0, rough=1.0)
+    return float(np.mean([covered(one, number, 0.2).mean() for number in range(repetitions)]))
 
 
 def test_credible_intervals_hold_the_truth_where_the_data_speak() -> None:

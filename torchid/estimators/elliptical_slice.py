@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -20,9 +20,10 @@ _CHAINS, _BATCHES = 512, 2  # chains of a batch, which one thread works on, and 
 _TRIES = 24  # on an ellipse, after which a chain stays where it is; each halves the arc
 _INSIDE = 1e-12  # least pivot of a block and slack of a row, relative to the mean's: above what rounding can hide
 _ALIKE = 0.25  # correlation of a coordinate with what it was, in all chains, below which states count as new
-_MOST_WHOLE, _MOST = 8, 200  # passes after which whole moves, and all moves, count as too slow
+_MOST_WHOLE, _MOST_APART, _MOST = 5, 8, 200  # passes after which each kind of moves counts as too slow
 _BURN_IN = 4  # times as many passes as make states new, before the first is used
 _SHRINK, _SHRINKS = 0.8, 200  # of draws from the Gaussian that are outside, towards its mean
+_TAIL = 30.0  # standard deviations, from which on a normal tail is exponential, to a thousandth of its length
 _DIAGONAL = tuple(np.flatnonzero(UPPER[0] == UPPER[1]).tolist())
 
 
@@ -57,9 +58,10 @@ class EllipticalSlice(torch.nn.Module):
 
     An ellipse through the state and a draw from the Gaussian has that Gaussian's density all along, so that a point of
     it needs only to meet the conditions, and to be likely enough by what the density has beside the Gaussian
-    (`BarrierGaussian`): the arc is cut down until one does. Two bodies at a time move on their own, which few
-    conditions concern, and then all together; where conditions are far, all together are enough. How many such passes
-    make a state new is measured once, on a first set of chains.
+    (`BarrierGaussian`): the arc is cut down until one does. Where conditions are far, all variables together move so.
+    Else friction, which bounds of its own concern, is drawn exactly, one by one, and the rest moves while it is fixed;
+    and where bodies are near their conditions, two bodies at a time, which few of these concern. Which moves it takes,
+    and how many passes of them make a state new, is measured once, on a first set of chains.
 
     Source: Murray, Adams, MacKay, "Elliptical slice sampling", AISTATS 2010; with a Gaussian of one's own choice:
     Nishihara, Murray, Adams, "Parallel MCMC with generalized elliptical slice sampling", JMLR 2014.
@@ -72,6 +74,8 @@ class EllipticalSlice(torch.nn.Module):
     block_changes: Tensor
     row_changes: Tensor
     near: Tensor
+    alone: Tensor
+    precisions: Tensor
     weights: Tensor
     unit: Tensor
 
@@ -90,6 +94,8 @@ class EllipticalSlice(torch.nn.Module):
         """
         super().__init__()
         gaussian = barrier_gaussian(conic)
+        alone = _bounded_alone(conic, gaussian)
+        gaussian = replace(gaussian, root=_triangular_from(gaussian.root, alone))
         arrays = {
             "mean": gaussian.mean,
             "root": gaussian.root,
@@ -103,10 +109,13 @@ class EllipticalSlice(torch.nn.Module):
         }
         for name, array in arrays.items():
             self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(array)))
-        self._pairs = 0
+        self.register_buffer("alone", torch.from_numpy(alone))
+        self.register_buffer("precisions", torch.from_numpy(np.square(conic.root[:, alone]).sum(axis=0)))
+        self._groups = 0
+        self._add_group(gaussian, conic.E, np.setdiff1d(np.arange(len(gaussian.mean)), alone))
         for variables in _pairs(gaussian, owners):
             self._add_group(gaussian, conic.E, variables)
-        self.in_pairs, self.passes = False, 1
+        self.moves, self.passes = "whole", 1
         self._measure()
 
     def _add_group(self, gaussian: BarrierGaussian, E: Array, variables: np.ndarray) -> None:
@@ -121,8 +130,8 @@ class EllipticalSlice(torch.nn.Module):
         of_blocks = gaussian.blocks[blocks][:, :, variables].reshape(-1, len(variables))
         change = np.concatenate([of_blocks, gaussian.rows[rows][:, variables]]) @ spread
         for name, array in zip(_Group.__annotations__, (variables, spread, Q, change, blocks, rows), strict=True):
-            self.register_buffer(f"{name}_{self._pairs}", torch.from_numpy(np.ascontiguousarray(array)))
-        self._pairs += 1
+            self.register_buffer(f"{name}_{self._groups}", torch.from_numpy(np.ascontiguousarray(array)))
+        self._groups += 1
 
     def draw(self, count: int, generator: torch.Generator | None = None) -> Tensor:
         """Points x, (count, n), on the device of the module; they do not depend on the number of threads.
@@ -159,7 +168,8 @@ class EllipticalSlice(torch.nn.Module):
     def _measure(self) -> None:
         """Find out which moves it takes, and how many, until states are new."""
         generator = torch.Generator().manual_seed(0)
-        for self.in_pairs, most in ((False, _MOST_WHOLE), (True, _MOST)):
+        kinds = [("whole", _MOST_WHOLE), *([("apart", _MOST_APART)] if len(self.alone) else []), ("pairs", _MOST)]
+        for self.moves, most in kinds:
             state = self._start(_CHAINS, generator)
             for _ in range(2):
                 self._pass(state, generator)
@@ -187,18 +197,20 @@ class EllipticalSlice(torch.nn.Module):
         return self._at(torch.zeros_like(x))
 
     def _at(self, x: Tensor) -> _State:
-        return _State(x, self.root @ x if self.in_pairs else x, *self._changes(x))
+        return _State(x, self.root @ x if self.moves != "whole" else x, *self._changes(x))
 
     def _changes(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Of the entries of blocks, (K, 10, B), and of rows, (M, B), by x, (n, B)."""
         return self.block_changes @ x[self.block_variables], self.row_changes @ x
 
     def _pass(self, state: _State, generator: torch.Generator | None) -> None:
-        """One move of each pair of bodies, if it takes these, and one of all together."""
-        if self.in_pairs:
-            for number in range(self._pairs):
+        """One move of all variables, together, or one part after the other while the others rest."""
+        if self.moves != "whole":
+            for number in range(1) if self.moves == "apart" else range(1, self._groups):
                 self._move_group(state, self._group(number), generator)
-        self._move_all(state, generator)
+            self._move_alone(state, generator)
+        if self.moves != "apart":
+            self._move_all(state, generator)
 
     def _group(self, number: int) -> _Group:
         return _Group(*(getattr(self, f"{name}_{number}") for name in _Group.__annotations__))
@@ -219,6 +231,27 @@ class EllipticalSlice(torch.nn.Module):
         state.blocks[group.blocks] += changed[:cut].view(-1, 10, changed.shape[1])
         state.rows[group.rows] += changed[cut:]
 
+    def _move_alone(self, state: _State, generator: torch.Generator | None) -> None:
+        """Draw each variable that only bounds of its own concern from its exact distribution with all others fixed."""
+        near, whitened = self.near[len(state.blocks) :], state.whitened[: len(self.alone)]  # zero below
+        for number, variable in enumerate(self.alone.tolist()):
+            column, slopes, x = self.root[: len(whitened), variable], self.row_changes[:, variable], state.x[variable]
+            barrier = CURVATURE * (near * slopes.square()).sum()
+            precision = self.precisions[number]  # of the root less the barrier, which may be almost all of it
+            gradient = -(column @ whitened) + barrier * x - near @ slopes
+            deviation = precision.rsqrt()
+            centre = x + gradient / precision
+            ends = (_INSIDE - 1.0) / slopes  # where the slack of each bound ends
+            low = torch.where(slopes > 0.0, ends, -math.inf).amax()
+            high = torch.where(slopes < 0.0, ends, math.inf).amin()
+            uniform = torch.rand(len(x), dtype=x.dtype, device=x.device, generator=generator)
+            unit = _truncated_normal((low - centre) / deviation, (high - centre) / deviation, uniform)
+            step = torch.clamp(centre + deviation * unit, low, high) - x
+            x += step
+            whitened[: number + 1].addr_(column[: number + 1], step)
+            bounds = torch.nonzero(slopes)[:, 0]
+            state.rows[bounds] += slopes[bounds, None] * step
+
     def _move_all(self, state: _State, generator: torch.Generator | None) -> None:
         size = (self.directions.shape[1], state.x.shape[1])
         drawn = torch.randn(size, dtype=torch.float64, device=self.mean.device, generator=generator)
@@ -230,7 +263,7 @@ class EllipticalSlice(torch.nn.Module):
         cosine, sine = torch.cos(angle), torch.sin(angle)
         for old, new in ((state.x, x), (state.blocks, blocks), (state.rows, rows)):
             old.mul_(cosine).addcmul_(new, sine)
-        if self.in_pairs:
+        if self.moves != "whole":
             state.whitened = self.root @ state.x
 
     def _angle(
@@ -294,6 +327,33 @@ def _inside(blocks: Tensor, rows: Tensor) -> Tensor:
     last = j - i * i / h
     pivots = torch.minimum(torch.minimum(a, e), torch.minimum(h, last))  # NaN where one before is 0
     return (pivots > _INSIDE).all(0) & (rows > _INSIDE - 1.0).all(0)
+
+
+def _truncated_normal(low: Tensor, high: Tensor, uniform: Tensor) -> Tensor:
+    """Standard normal numbers between bounds, far into the tails, from uniform ones, (B,)."""
+    flipped = low + high < 0.0
+    near, far = torch.where(flipped, -high, low), torch.where(flipped, -low, high)  # the one nearer to 0 first
+    of_near, of_far = (0.5 * torch.erfc(x / math.sqrt(2.0)) for x in (near, far))  # torch's ndtr is 0 from 8.3 on
+    body = -torch.special.ndtri(of_far + uniform * (of_near - of_far))
+    tail = near - torch.log1p(-uniform * -torch.expm1(-near * (far - near))) / near
+    drawn = torch.where(near > _TAIL, tail, body)
+    return torch.where(flipped, -drawn, drawn)
+
+
+def _bounded_alone(conic: ConicProblem, gaussian: BarrierGaussian) -> np.ndarray:
+    """Variables that only rows of their own concern, one of which is near: friction, most often."""
+    of_rows, alone = conic.G != 0.0, np.ones(len(conic.linear), dtype=bool)
+    alone[conic.variables.ravel()] = False
+    alone &= ~conic.E.any(axis=0) & ~of_rows[of_rows.sum(axis=1) > 1].any(axis=0)
+    return np.flatnonzero(alone & of_rows[gaussian.near[len(conic.F0) :]].any(axis=0))
+
+
+def _triangular_from(root: Array, first: np.ndarray) -> Array:
+    """Another root of the same matrix, whose columns of some variables are zero below as many rows."""
+    order = np.concatenate([first, np.setdiff1d(np.arange(root.shape[1]), first)])
+    out = np.empty_like(root)
+    out[:, order] = np.linalg.qr(root[:, order], mode="r")
+    return out
 
 
 def _standardized(x: Tensor) -> Tensor:
