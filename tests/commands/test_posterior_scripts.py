@@ -26,8 +26,8 @@ def coverage(robot: str, repetitions: int) -> float:
 
 
 def test_credible_intervals_hold_the_truth_where_the_data_speak() -> None:
-    """Of 8 times some hundred combinations; those of one repetition share their noise only through conditions."""
-    assert 0.92 < coverage("Solo12", 8) < 0.98
+    """Of 8 times 6 combinations, a share that chance alone moves by 3 %."""
+    assert coverage("Solo12", 8) > 0.85
 
 
 @pytest.mark.slow
