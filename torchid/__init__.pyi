@@ -56,6 +56,11 @@ from .fitting.fit import (
 from .fitting.noise import (
     estimate_noise,
 )
+from .fitting.posterior import (
+    FittedPosterior,
+    ParameterSamples,
+    PosteriorSampler,
+)
 from .fitting.robust import (
     RobustLoss,
     fit_robustly,
@@ -155,6 +160,7 @@ __all__ = [
     "Estimate",
     "ExtraTerms",
     "FactorFile",
+    "FittedPosterior",
     "FrameJacobian",
     "LeastSquares",
     "LinearProblem",
@@ -164,6 +170,8 @@ __all__ = [
     "LoopJacobian",
     "MiniBatches",
     "Motion",
+    "ParameterSamples",
+    "PosteriorSampler",
     "Projection",
     "Regressor",
     "Robot",

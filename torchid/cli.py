@@ -22,6 +22,8 @@ _EVALUATE = "predict the forces of further logs with the parameters of a run"
 _REPLAY = "drive the robot in MuJoCo with the torques of a log, and say how far it drifts (needs the extra [sim])"
 _EXPORT = "write the identified parameters of a run for a simulator: MJCF, URDF, Isaac Lab's actuators, or JSON"
 _FORMATS = ("mjcf", "urdf", "isaaclab", "json")  # those of torchid.commands.export, which takes long to import
+_SAMPLE = "draw parameter sets from what the data of a run and a prior leave open, for domain randomization"
+_SAMPLE_FORMATS = ("npz", "urdf", "mjcf", "ranges")  # those of torchid.commands.sample
 _REPORT = "make report.html of a run anew, with what the checks of its logs find (needs the extra [report])"
 _ANALYZE = "analyze what sensors and motion determine, and plan the smallest sensor set"
 _INIT = "write an experiment file for a robot and a log, with a map of its columns or topics, and say what was guessed"
@@ -129,9 +131,25 @@ def _add_uses_of_runs(commands: _Commands) -> None:
     export.add_argument("--output", metavar="FILE", help="file to write (default: standard output)")
     export.add_argument("--overwrite", action="store_true", help="replace this file if it exists")
     export.set_defaults(command=_export)
+    _add_sample(commands)
     report = commands.add_parser("report", help=_REPORT, description=_REPORT)
     report.add_argument("run", help="run folder")
     report.set_defaults(command=_report)
+
+
+def _add_sample(commands: _Commands) -> None:
+    sample = commands.add_parser("sample", help=_SAMPLE, description=_SAMPLE)
+    sample.add_argument("run", help="run folder")
+    sample.add_argument("--count", type=int, metavar="N", help="number of sets (default: 10000, of robots' files 20)")
+    what = "arrays with names, a file of the robot for each set, or ranges and correlations (default: by --output)"
+    sample.add_argument("--format", choices=_SAMPLE_FORMATS, help=what)
+    sample.add_argument("--output", metavar="FILE", help="FILE.npz, FILE.json, or a folder for robots' files")
+    prior = "standard deviation of the robot file's parameters, as a share of each body (default: 0.2)"
+    sample.add_argument("--prior-error", type=float, default=0.2, metavar="SHARE", help=prior)
+    sample.add_argument("--seed", type=int, default=0, metavar="N", help="of the random numbers (default: 0)")
+    sample.add_argument("--overwrite", action="store_true", help="replace what stands there")
+    _add_amount(sample)
+    sample.set_defaults(command=_sample)
 
 
 def _add_studies(commands: _Commands) -> None:
@@ -304,6 +322,17 @@ def _replay(options: argparse.Namespace) -> None:
     replayed = replay(options.run, options.log, options.window, options.output, options.overwrite, kp, kd)
     if not options.quiet:
         print_replay(replayed, options.verbose)
+
+
+def _sample(options: argparse.Namespace) -> None:
+    with _importing():
+        from torchid.commands.sample import sample
+        from torchid.terminal.samples import print_samples
+
+    keys = ("run", "count", "format", "output", "prior_error", "seed", "overwrite")
+    drawn = sample(*(getattr(options, key) for key in keys))
+    if not options.quiet:
+        print_samples(drawn, options.verbose)
 
 
 def _export(options: argparse.Namespace) -> None:

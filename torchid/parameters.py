@@ -73,7 +73,8 @@ PSEUDO_BASIS = pseudo_inertia(np.eye(INERTIAL.stop))
 """Derivative of the pseudo-inertia with respect to the ten inertial parameters, (10, 4, 4); it is linear in them."""
 
 
-def _from_pseudo_inertia(pseudo: Array) -> Array:
+def from_pseudo_inertia(pseudo: Array) -> Array:
+    """Inverse of `pseudo_inertia`: ten inertial parameters, (..., 10)."""
     second_moment = pseudo[..., :3, :3]
     trace = np.trace(second_moment, axis1=-2, axis2=-1)[..., None, None]
     inertia = trace * np.eye(3) - second_moment
@@ -87,7 +88,7 @@ def change_of_frame(T_new_old: Array) -> Array:
     Args:
         T_new_old: pose of the old frame in the new one, (4, 4) [m].
     """
-    return _from_pseudo_inertia(T_new_old @ PSEUDO_BASIS @ T_new_old.T).T
+    return from_pseudo_inertia(T_new_old @ PSEUDO_BASIS @ T_new_old.T).T
 
 
 POSSIBLE_MARGIN = -1e-9

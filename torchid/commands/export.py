@@ -48,7 +48,7 @@ def export(run: str | Path, form: str, output: str | Path | None = None, overwri
     if target is not None:
         check_free_file(target, "--output", overwrite, [folder, *inputs_of(fitted.experiment.config)])
     robot, phi = fitted.experiment.robot, fitted.calibrations.identified.phi.reshape(-1, PER_BODY)
-    text = _text(form, robot, phi, _fitted_joints(fitted), folder)
+    text = robot_text(form, robot, phi, _fitted_joints(fitted), folder)
     if target is not None:
         with during("writing", target), atomic_file(target) as new:
             new.write_text(text, encoding="utf-8")
@@ -62,7 +62,15 @@ def _fitted_joints(fitted: FittedRun) -> FittedJoints:
     return FittedJoints.of((extra, calibration.values[("", extra.label)]) for extra in of_joints)
 
 
-def _text(form: str, robot: Robot, phi: Array, fitted: FittedJoints, folder: Path) -> str:
+def robot_text(form: str, robot: Robot, phi: Array, fitted: FittedJoints, folder: Path) -> str:
+    """The robot of a run with parameters phi, (L, 12), and what was fitted of joints, as text in one of `FORMATS`.
+
+    Raises:
+        InputError: as `export`.
+
+    Warns:
+        TorchidWarning: as `export`.
+    """
     joints = joint_parameters(robot, phi, fitted.armature)
     if form == "isaaclab":
         return isaaclab_text(joints, f"{folder.resolve().name} of {robot.path.name}")

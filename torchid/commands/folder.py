@@ -21,6 +21,7 @@ SIMULATION = FolderKind("a simulation")
 ANALYSIS = FolderKind("an analysis")
 STUDY = FolderKind("a study")
 REPLAY = FolderKind("a replay")
+SAMPLES = FolderKind("samples")
 COMPRESSED = FolderKind("compressed logs")
 EXAMPLES = FolderKind("examples")
 

@@ -34,6 +34,7 @@ from torchid.fitting.fit import Fit, LogFitter
 from torchid.fitting.fleet import read_fleet
 from torchid.fitting.misfit import misfit
 from torchid.fitting.noise import NoiseSummary
+from torchid.fitting.posterior import fitted_posterior
 from torchid.fitting.robust import RobustSummary, fit_robustly
 from torchid.fitting.unfitted_friction import unfitted_friction
 from torchid.identifiability.base_parameters import StateReport, require_base, state_reports
@@ -235,6 +236,7 @@ def _identify(config: ExperimentConfig, resume: bool, bars: Progress) -> tuple[I
         factors=ready.factors,
         excluded=ready.excluded,
         mass=solved.mass,
+        posterior=fitted_posterior(fit, experiment.robot, ready.conditions),
         validation=scores.validation,
         ridge=ready.ridge,
         choices=ready.choices,

@@ -26,6 +26,7 @@ from torchid.fitting.experiment import Experiment
 from torchid.fitting.factor_files import FactorFile
 from torchid.fitting.misfit import Misfit
 from torchid.fitting.noise import NoiseSummary
+from torchid.fitting.posterior import POSTERIOR, FittedPosterior, write_posterior
 from torchid.fitting.robust import RobustSummary
 from torchid.identifiability.base_parameters import StateReport
 from torchid.identifiability.confounding import ExtraEstimate, TotalMass
@@ -81,6 +82,7 @@ class Identification:
         factors: the training logs, where they came compressed.
         excluded: condemned samples left out, by log.
         mass: the total mass and how well it is known.
+        posterior: of the parameters, which `PosteriorSampler` draws from.
         validation: errors on held-out blocks, None where the samples are too few to leave some out.
         ridge: how it was chosen, if it was.
         choices: how other settings were chosen, if they were.
@@ -107,6 +109,7 @@ class Identification:
     factors: Sequence[FactorFile]
     excluded: Mapping[str, int]
     mass: TotalMass
+    posterior: FittedPosterior
     validation: CrossValidation | None
     ridge: RidgeChoice | None
     choices: Choices
@@ -226,6 +229,7 @@ def write_run(run: Identification, output: Path, overwrite: bool = False, traini
         (folder / "config.yaml").write_text(dump_config(config))
         write_json(folder / "parameters.json", parameters_document(robot, run.estimate, run.by_state, run.extras))
         write_json(folder / "metrics.json", metrics_document(run))
+        write_posterior(folder / POSTERIOR, run.posterior)
         (folder / identified_name(robot)).write_bytes(identified_robot(robot, run.phi, run.fitted_joints))
         files = save_figures(figures, folder, config.figures.format)
         if training is not None:

@@ -1,0 +1,146 @@
+"""Are samples of a posterior those of the posterior? Means and covariances against long chains of another kind.
+
+    python scripts/posterior_accuracy.py                       # UR5, Solo12 and G1
+    python scripts/posterior_accuracy.py --quick               # UR5 alone, shorter chains
+    python scripts/posterior_accuracy.py --prior-error 0.4 --robots Solo12
+
+A robot whose parameters are up to 20 % off its URDF, with friction in half of its joints, is seen in random motions in
+which a base that floats stands on one foot or more; joint torques have noise. Compared are 40 000 samples with
+hit-and-run chains (`long_chain.py`): the largest and the rms difference of means, in standard deviations, of standard
+deviations, as a share, and of correlations, over all parameters; and how much of each such difference chance explains
+(two halves of the long chains). Needs the package example-robot-data (extra `[oracle]`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import sysconfig
+import time
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from long_chain import LongChain
+from rich.console import Console
+from rich.table import Table
+
+from torchid.boundary import run_guarded
+from torchid.errors import TorchidWarning
+from torchid.estimators import Conditions
+from torchid.estimators.elliptical_slice import EllipticalSlice
+from torchid.estimators.posterior import Posterior, whitened_rows
+from torchid.identifiability.structure import structural_samples
+from torchid.parameters import FRICTION, Array, perturb_parameters
+from torchid.problem import RowBuilder, compress, linear_problem
+from torchid.problem.chunks import one_thread
+from torchid.robot import load_robot
+from torchid.sensing import Contact, named_sensors
+
+_FOLDER = Path(sysconfig.get_path("purelib")) / "cmeel.prefix/share/example-robot-data/robots"
+ROBOTS = {
+    "UR5": ("ur_description/urdf/ur5_robot.urdf", (), "flat"),
+    "Solo12": ("solo_description/robots/solo12.urdf", ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT"), "point"),
+    "G1": ("g1_description/urdf/g1_29dof_rev_1_0.urdf", ("left_ankle_roll_link", "right_ankle_roll_link"), "flat"),
+}
+_SAMPLES = 40_000
+
+
+class Synthetic:
+    """Random motions of a robot unlike its URDF; `true`, (L, 12), are its parameters."""
+
+    def __init__(self, name: str, seed: int, error: float = 0.2, count: int = 200, rough: float = 0.5) -> None:
+        """So many samples of each contact state; parameters off by `error`, a share `rough` of joints with friction."""
+        urdf, feet, kind = ROBOTS[name]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", TorchidWarning)
+            robot = load_robot(_FOLDER / urdf, fixed_base=not feet)
+        contacts = [Contact(foot, kind) for foot in feet]
+        all_but_one = [tuple(foot != other for other in feet) for foot in feet[:1] + feet[-1:]]
+        builder = RowBuilder(robot, contacts, named_sensors("joints" if feet else "full", robot.n, len(feet)))
+        samples = structural_samples(robot, contacts, [(True,) * len(feet), *all_but_one], count, seed)
+        self.problem = linear_problem(compress(samples, builder), builder, robot)
+        rng = np.random.default_rng(seed)
+        true = perturb_parameters(robot.nominal, error, rng)
+        true[:, FRICTION] = (rng.uniform(size=(len(true), 1)) < rough) * rng.uniform(0.0, 0.3, (len(true), 2))
+        self.true = np.where(self.problem.free.reshape(true.shape), true, robot.nominal)
+        self.conditions = Conditions(names=robot.body_names)
+
+    def posterior(self, repetition: int) -> Posterior:
+        """With rows of unit noise, which is new in each repetition."""
+        problem, noise = self.problem, np.random.default_rng([repetition, 1]).normal(size=len(self.problem.A))
+        noisy = replace(problem, b=problem.A @ self.true.flatten() + noise, residual=0.0)
+        A, b = whitened_rows(noisy, 1.0, None)
+        units, none = (problem.nominal, problem.scale, problem.free), np.zeros(0)
+        return Posterior(A, np.zeros((len(A), 0)), b, *units, self.conditions, none, none)
+
+
+def differences(one: Array, other: Array) -> dict[str, tuple[float, float]]:
+    """Largest and rms difference of means, standard deviations and correlations of draws (N, n)."""
+    deviation = other.std(axis=0)
+    parts = {
+        "mean": (one.mean(axis=0) - other.mean(axis=0)) / deviation,
+        "deviation": one.std(axis=0) / deviation - 1.0,
+        "correlation": np.corrcoef(one.T) - np.corrcoef(other.T),
+    }
+    return {name: (float(np.abs(x).max()), float(np.sqrt(np.mean(x**2)))) for name, x in parts.items()}
+
+
+@one_thread()
+def long_run(posterior: Posterior, prior_error: float, sweeps: int, chains: int) -> Array:
+    """States of hit-and-run chains, (N, n), after a fifth of the sweeps as burn-in; a sweep has a step a variable."""
+    conic, states = posterior.conic_problem(prior_error), []
+    chain, steps = LongChain(conic, posterior.owners(), chains, seed=1), len(conic.linear)
+    chain.run(sweeps // 5 * steps)
+    chain.run(sweeps * steps, lambda x: states.append(x.astype(np.float32)), every=steps)
+    return np.concatenate(states).astype(np.float64)
+
+
+def compare(name: str, options: argparse.Namespace) -> list[str]:
+    """One row of the table."""
+    posterior = Synthetic(name, options.seed).posterior(0)
+    conic = posterior.conic_problem(options.prior_error)
+    start = time.process_time()
+    sampler = EllipticalSlice(conic, posterior.owners())
+    prepared = time.process_time() - start
+    start = time.process_time()
+    sampler.draw(10_000, torch.Generator().manual_seed(1))
+    seconds = time.process_time() - start
+    draws = sampler.draw(_SAMPLES, torch.Generator().manual_seed(0)).numpy()
+    sweeps = options.sweeps // (10 if options.quick else 1)
+    states = long_run(posterior, options.prior_error, sweeps, options.chains)
+    half = len(states) // 2
+    found, chance = differences(draws, states), differences(states[:half], states[half:])
+    texts = [f"{found[x][0]:.3f} ({found[x][1]:.3f}); {chance[x][0]:.3f}" for x in found]
+    near = f"{int(sampler.near.sum())} of {len(sampler.near)}"
+    kind = f"{sampler.passes} {sampler.moves}"
+    return [name, f"{len(conic.linear)}", near, kind, *texts, f"{prepared:.2f} + {seconds:.2f}"]
+
+
+def run(options: argparse.Namespace) -> None:
+    """Compare and print."""
+    table = Table(title="samples against long chains: largest (rms) difference; largest between halves of the chains")
+    for name in ("robot", "n", "near", "passes", "mean / sd", "sd", "correlation", "CPU s: prepare + 10 000"):
+        table.add_column(name, no_wrap=True)
+    console = Console(width=150)
+    for name in ["UR5"] if options.quick else options.robots:
+        table.add_row(*compare(name, options))
+        console.print(table)
+
+
+def main() -> int:
+    """Read the arguments."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="UR5 alone, a tenth of the sweeps")
+    parser.add_argument("--robots", nargs="+", choices=list(ROBOTS), default=list(ROBOTS))
+    parser.add_argument("--prior-error", type=float, default=0.2)
+    parser.add_argument("--chains", type=int, default=200)
+    parser.add_argument("--sweeps", type=int, default=300, help="of the long chains")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    return run_guarded("posterior_accuracy", lambda: run(options))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,176 @@
+"""Samples of a posterior: inside every condition, as wide as the data and the prior say, as long chains find them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from long_chain import LongChain
+from physical import GOOD, SCALE, active_case, nothing_seen, random_case
+from synthetic import Array
+
+from torchid.estimators import Conditions, LeastSquares, violations
+from torchid.estimators.barrier_gaussian import barrier_gaussian
+from torchid.estimators.elliptical_slice import EllipticalSlice
+from torchid.estimators.posterior import Posterior, whitened_rows
+from torchid.problem import LinearProblem
+
+NONE = np.zeros(0)
+
+
+def posterior_of(problem: LinearProblem, conditions: Conditions, noise: float = 1.0) -> Posterior:
+    A, b = whitened_rows(problem, noise, None)
+    same = (problem.nominal, problem.scale, problem.free, conditions)
+    return Posterior(A, np.zeros((len(A), 0)), b, *same, NONE, NONE)
+
+
+def drawn(posterior: Posterior, count: int, prior_error: float = 0.2, seed: int = 0) -> tuple[Array, EllipticalSlice]:
+    """Samples of the parameters in units of their scale, (count, free), less the nominal ones."""
+    conic = posterior.conic_problem(prior_error)
+    sampler = EllipticalSlice(conic, posterior.owners())
+    x = sampler.draw(count, torch.Generator().manual_seed(seed)).numpy()
+    return x @ conic.deviations.T, sampler
+
+
+def parameters_of(posterior: Posterior, deviations: Array) -> Array:
+    """(count, L, 12)."""
+    phi = np.tile(posterior.nominal, (len(deviations), 1))
+    phi[:, posterior.free] += posterior.scale[posterior.free] * deviations[:, : posterior.free.sum()]
+    return phi.reshape(len(phi), -1, 12)
+
+
+@pytest.mark.parametrize("seed", range(25))
+def test_every_sample_meets_every_condition(seed: int) -> None:
+    case = random_case(np.random.default_rng(seed))
+    posterior = posterior_of(case.problem, case.conditions, noise=0.05)
+    deviations, _ = drawn(posterior, 200, prior_error=0.5)
+    for phi in parameters_of(posterior, deviations):
+        assert not violations(phi, case.scale, case.conditions, tolerance=1e-10)
+
+
+def test_what_the_data_do_not_see_is_as_wide_as_the_prior() -> None:
+    posterior = posterior_of(nothing_seen(GOOD), Conditions())
+    deviations, _ = drawn(posterior, 20_000, prior_error=0.1)
+    phi = parameters_of(posterior, deviations)[:, 0]
+    np.testing.assert_allclose(phi[:, 0].std(), 0.1 * GOOD[0, 0], rtol=0.03)
+    np.testing.assert_allclose(phi[:, :10].mean(axis=0), GOOD[0, :10], atol=0.02 * SCALE[0, 0])
+
+
+def test_without_conditions_nearby_samples_are_those_of_the_gaussian() -> None:
+    problem = replace(nothing_seen(GOOD), A=3.0 * np.eye(12) / SCALE, b=3.0 * GOOD[0] / SCALE[0])
+    posterior = posterior_of(problem, Conditions(lower=np.full((1, 12), -100.0), upper=np.full((1, 12), 100.0)), 0.02)
+    deviations, sampler = drawn(posterior, 20_000)
+    assert not sampler.near.any()
+    conic = posterior.conic_problem()
+    covariance = np.linalg.inv(conic.root.T @ conic.root)
+    expected = conic.deviations @ covariance @ conic.deviations.T
+    deviation = np.sqrt(np.diag(expected))
+    unit = np.outer(deviation, deviation)
+    np.testing.assert_allclose(np.cov(deviations.T) / unit, expected / unit, atol=0.04)
+
+
+@pytest.mark.parametrize("distance", [-1.0, 0.0, 3.0, 9.0, 29.0, 31.0, 1000.0])
+def test_friction_that_data_want_negative_is_a_truncated_normal(distance: float) -> None:
+    """Of a mean so many standard deviations below 0."""
+    problem = replace(nothing_seen(GOOD), A=np.eye(12)[10:11] * 100.0, b=np.array([-distance]))
+    posterior = posterior_of(problem, Conditions())
+    deviations, _ = drawn(posterior, 40_000)
+    friction = parameters_of(posterior, deviations)[:, 0, 10]
+    t = np.linspace(0.0, 0.12 / max(distance, 1.0), 100_001)
+    density = np.exp(-0.5 * (100.0 * t + distance) ** 2 + 0.5 * distance**2 - 0.5 * ((t - GOOD[0, 10]) / 0.2) ** 2)
+    mean = float(t @ density / density.sum())
+    deviation = np.sqrt(float((t - mean) ** 2 @ density / density.sum()))
+    assert friction.min() > 0.0
+    np.testing.assert_allclose(friction.mean(), mean, rtol=0.03)
+    np.testing.assert_allclose(friction.std(), deviation, rtol=0.03)
+
+
+def test_the_barrier_has_the_mean_of_an_exponential_tail() -> None:
+    problem = replace(nothing_seen(GOOD), A=np.eye(12)[10:11] * 1e4, b=np.array([-1e4]))
+    conic = posterior_of(problem, Conditions()).conic_problem(100.0)
+    found = barrier_gaussian(conic)
+    friction = int(np.flatnonzero(conic.deviations[10])[0])
+    rate = 1e4 * 1e4  # of exp(-|A fc - b|^2 / 2) at fc = 0
+    np.testing.assert_allclose(found.mean[friction] + GOOD[0, 10], 1.0 / rate, rtol=1e-3)
+    np.testing.assert_allclose(np.sqrt(found.covariance[friction, friction]), 2.0 / rate, rtol=1e-3)
+
+
+@pytest.mark.parametrize("prior_error", [0.2, 0.6])
+def test_mean_and_covariance_are_those_of_long_chains_where_bodies_are_cut_off(prior_error: float) -> None:
+    problem, _ = active_case(3)
+    posterior = posterior_of(problem, Conditions(1e-3), noise=0.1)
+    conic = posterior.conic_problem(prior_error)
+    sampler = EllipticalSlice(conic, posterior.owners())
+    assert sampler.near.any()
+    x = sampler.draw(40_000, torch.Generator().manual_seed(1)).numpy()
+    chain, states = LongChain(conic, posterior.owners(), 1000, seed=2), []
+    chain.run(2000)
+    chain.run(5000, lambda x: states.append(x.copy()), every=25)
+    reference = np.concatenate(states)
+    mean, deviation = reference.mean(axis=0), reference.std(axis=0)
+    np.testing.assert_allclose((x.mean(axis=0) - mean) / deviation, 0.0, atol=0.05)
+    np.testing.assert_allclose(x.std(axis=0) / deviation, 1.0, atol=0.05)
+    np.testing.assert_allclose(np.corrcoef(x.T), np.corrcoef(reference.T), atol=0.05)
+
+
+def test_the_seed_decides_every_bit_whatever_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, _ = active_case(3)
+    posterior = posterior_of(problem, Conditions())
+    _, sampler = drawn(posterior, 1)
+    one, other = (sampler.draw(1200, torch.Generator().manual_seed(5)) for _ in range(2))
+    monkeypatch.setattr("torchid.estimators.elliptical_slice.worker_count", lambda device: 1)
+    assert torch.equal(one, other)
+    assert torch.equal(one, sampler.draw(1200, torch.Generator().manual_seed(5)))
+    assert not torch.equal(one, sampler.draw(1200, torch.Generator().manual_seed(6)))
+
+
+def test_likelihood_of_a_full_problem_has_the_covariance_of_the_standard_errors() -> None:
+    rng = np.random.default_rng(1)
+    A = rng.normal(size=(40, 12)) / SCALE
+    problem = replace(nothing_seen(GOOD), A=A, b=A @ GOOD[0] + 0.3 * rng.normal(size=40), rows=40, oversampling=4.0)
+    estimate = LeastSquares().solve(problem)
+    noise = 2.0 * estimate.residual_std
+    rows, right = whitened_rows(problem, noise, None)
+    np.testing.assert_allclose(np.sqrt(np.diag(np.linalg.inv(rows.T @ rows))), estimate.noise_error, rtol=1e-9)
+    np.testing.assert_allclose(np.linalg.lstsq(rows, right)[0], estimate.phi, rtol=1e-8)
+
+
+def test_blocks_that_disagree_widen_the_posterior_along_what_they_disagree_on() -> None:
+    problem = replace(nothing_seen(GOOD), A=np.eye(12) * np.arange(1, 13) / SCALE, b=np.zeros(12), rows=12)
+    deviations = np.zeros((3, 12))
+    deviations[:, 0] = 5.0 * SCALE[0, 0] / np.sqrt(3.0)  # five times what noise of 1 leaves
+    rows, _ = whitened_rows(problem, 1.0, deviations)
+    covariance = np.linalg.inv(rows.T @ rows)
+    expected = SCALE[0] / np.arange(1, 13)
+    expected[0] *= 5.0
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), expected, rtol=1e-9)
+
+
+def test_an_extra_parameter_confounded_with_a_body_shares_its_spread() -> None:
+    """Armature + fv known to 0.001: what one has more the other has less, and neither is negative."""
+    row = np.zeros((1, 12))
+    row[0, 11] = 1000.0
+    same = nothing_seen(GOOD)
+    posterior = Posterior(
+        row, np.array([[1000.0]]), np.array([200.0]), same.nominal, same.scale, same.free, Conditions(),
+        np.array([0.1]), np.array([0.0]),
+    )  # fmt: skip
+    conic = posterior.conic_problem()
+    sampler = EllipticalSlice(conic, posterior.owners())
+    x = sampler.draw(10_000, torch.Generator().manual_seed(0)).numpy()
+    armature, viscous = 0.1 * x[:, -1], parameters_of(posterior, x @ conic.deviations.T)[:, 0, 11]
+    assert armature.min() > 0.0
+    assert viscous.min() > 0.0
+    np.testing.assert_allclose((armature + viscous).std(), 0.001, rtol=0.05)
+    assert np.corrcoef(armature, viscous)[0, 1] < -0.99
+
+
+def test_a_body_that_cannot_exist_in_the_urdf_has_samples_that_can() -> None:
+    impossible = GOOD.copy()
+    impossible[0, 4] = 10.0 * impossible[0, 4]  # breaks the triangle inequality
+    posterior = posterior_of(nothing_seen(impossible), Conditions())
+    deviations, _ = drawn(posterior, 100)
+    for phi in parameters_of(posterior, deviations):
+        assert not violations(phi, posterior.scale.reshape(-1, 12), Conditions(), tolerance=1e-10)

@@ -1,0 +1,378 @@
+"""Draws from a Gaussian that conditions cut off, by elliptical slice sampling of many chains at once in torch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchid.errors import NumericalWarning, warn
+from torchid.estimators.barrier_gaussian import CURVATURE, ENTRY_WEIGHTS, UPPER, BarrierGaussian, barrier_gaussian
+from torchid.estimators.conic_problem import ConicProblem
+from torchid.parameters import Array
+from torchid.problem.chunks import one_thread, run_in_workers, worker_count
+
+_CHAINS, _BATCHES = 512, 2  # chains of a batch, which one thread works on, and batches at most
+_TRIES = 24  # on an ellipse, after which a chain stays where it is; each halves the arc
+_INSIDE = 1e-12  # least pivot of a block and slack of a row, relative to the mean's: above what rounding can hide
+_ALIKE = 0.25  # correlation of a coordinate with what it was, in all chains, below which states count as new
+_MOST_WHOLE, _MOST_APART, _MOST = 5, 8, 200  # passes after which each kind of moves counts as too slow
+_BURN_IN = 4  # times as many passes as make states new, before the first is used
+_SHRINK, _SHRINKS = 0.8, 200  # of draws from the Gaussian that are outside, towards its mean
+_TAIL = 30.0  # standard deviations, from which on a normal tail is exponential, to a thousandth of its length
+_DIAGONAL = tuple(np.flatnonzero(UPPER[0] == UPPER[1]).tolist())
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Variables that move together: `spread @ y`, y of unit variance where all others are fixed.
+
+    `basis`: (n, d), orthonormal columns of the Gaussian's root; `change`: of the entries of the blocks, 10 for each of
+    them, and of the rows.
+    """
+
+    variables: Tensor
+    spread: Tensor
+    basis: Tensor
+    change: Tensor
+    blocks: Tensor
+    rows: Tensor
+
+
+@dataclass
+class _State:
+    """Points of B chains, all relative to the mean: x (n, B), root @ x, entries of blocks (K, 10, B), rows (M, B)."""
+
+    x: Tensor
+    whitened: Tensor
+    blocks: Tensor
+    rows: Tensor
+
+
+class EllipticalSlice(torch.nn.Module):
+    """Draws from exp(-objective / 2) of a conic problem, within its conditions.
+
+    An ellipse through the state and a draw from the Gaussian has that Gaussian's density all along, so that a point of
+    it needs only to meet the conditions, and to be likely enough by what the density has beside the Gaussian
+    (`BarrierGaussian`): the arc is cut down until one does. Where conditions are far, all variables together move so.
+    Else friction, which bounds of its own concern, is drawn exactly, one by one, and the rest moves while it is fixed;
+    and where bodies are near their conditions, two bodies at a time, which few of these concern. Which moves it takes,
+    and how many passes of them make a state new, is measured once, on a first set of chains.
+
+    Source: Murray, Adams, MacKay, "Elliptical slice sampling", AISTATS 2010; with a Gaussian of one's own choice:
+    Nishihara, Murray, Adams, "Parallel MCMC with generalized elliptical slice sampling", JMLR 2014.
+    """
+
+    mean: Tensor
+    root: Tensor
+    directions: Tensor
+    block_variables: Tensor
+    block_changes: Tensor
+    row_changes: Tensor
+    near: Tensor
+    alone: Tensor
+    precisions: Tensor
+    weights: Tensor
+    unit: Tensor
+
+    def __init__(self, conic: ConicProblem, owners: np.ndarray) -> None:
+        """Prepare.
+
+        Args:
+            conic: the problem, without log-determinants in its objective.
+            owners: (n,) int, to which body each variable belongs.
+
+        Raises:
+            InputError: the conditions exclude each other.
+
+        Warns:
+            NumericalWarning: states stay alike for too long, so that draws will be correlated.
+        """
+        super().__init__()
+        gaussian = barrier_gaussian(conic)
+        alone = _bounded_alone(conic, gaussian)
+        gaussian = replace(gaussian, root=_triangular_from(gaussian.root, alone))
+        arrays = {
+            "mean": gaussian.mean,
+            "root": gaussian.root,
+            "directions": gaussian.directions,
+            "block_variables": conic.variables,
+            "block_changes": np.take_along_axis(gaussian.blocks, conic.variables[:, None], axis=2),
+            "row_changes": gaussian.rows,
+            "near": gaussian.near.astype(np.float64),
+            "weights": ENTRY_WEIGHTS[:, None],
+            "unit": (UPPER[0] == UPPER[1]).astype(np.float64)[:, None],
+        }
+        for name, array in arrays.items():
+            self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(array)))
+        self.register_buffer("alone", torch.from_numpy(alone))
+        self.register_buffer("precisions", torch.from_numpy(np.square(conic.root[:, alone]).sum(axis=0)))
+        self._groups = 0
+        self._add_group(gaussian, conic.E, np.setdiff1d(np.arange(len(gaussian.mean)), alone))
+        for variables in _pairs(gaussian, owners):
+            self._add_group(gaussian, conic.E, variables)
+        self.moves, self.passes = "whole", 1
+        self._measure()
+
+    def _add_group(self, gaussian: BarrierGaussian, E: Array, variables: np.ndarray) -> None:
+        _, values, Vt = np.linalg.svd(E[:, variables])
+        basis = Vt[int((values > 1e-10).sum()) :].T  # of what equalities leave them
+        if not basis.shape[1]:
+            return
+        Q, R = np.linalg.qr(gaussian.root[:, variables] @ basis)
+        spread = basis @ np.linalg.inv(R)
+        blocks = np.flatnonzero(gaussian.blocks[:, :, variables].any(axis=(1, 2)))
+        rows = np.flatnonzero(gaussian.rows[:, variables].any(axis=1))
+        of_blocks = gaussian.blocks[blocks][:, :, variables].reshape(-1, len(variables))
+        change = np.concatenate([of_blocks, gaussian.rows[rows][:, variables]]) @ spread
+        for name, array in zip(_Group.__annotations__, (variables, spread, Q, change, blocks, rows), strict=True):
+            self.register_buffer(f"{name}_{self._groups}", torch.from_numpy(np.ascontiguousarray(array)))
+        self._groups += 1
+
+    def draw(self, count: int, generator: torch.Generator | None = None) -> Tensor:
+        """Points x, (count, n), on the device of the module; they do not depend on the number of threads.
+
+        Args:
+            count: number of them.
+            generator: of random numbers, on that device; None for torch's own.
+        """
+        device, batches = self.mean.device, max(1, min(_BATCHES, count // _CHAINS))
+        seeds = torch.randint(2**62, (batches,), generator=generator, device=device).tolist()
+        counts = [count * (k + 1) // batches - count * k // batches for k in range(batches)]
+        tasks = list(enumerate(zip(counts, seeds, strict=True)))
+        threads = worker_count(device)
+        done = run_in_workers(tasks, lambda part: [(number, self._batch(*of)) for number, of in part], threads)
+        drawn = dict(pair for pairs in done for pair in pairs)
+        return (self.mean[:, None] + torch.cat([drawn[k] for k in range(batches)], dim=1)).T.contiguous()
+
+    def _batch(self, count: int, seed: int) -> Tensor:
+        """Points relative to the mean, (n, count)."""
+        generator = torch.Generator(self.mean.device).manual_seed(seed)
+        chains = min(count, _CHAINS)
+        state = self._start(chains, generator)
+        for _ in range(_BURN_IN * self.passes):
+            self._pass(state, generator)
+        out = [state.x.clone()]
+        while len(out) * chains < count:
+            for _ in range(self.passes):
+                self._pass(state, generator)
+            out.append(state.x.clone())
+        return torch.cat(out, dim=1)[:, :count]
+
+    @one_thread()
+    @torch.no_grad()
+    def _measure(self) -> None:
+        """Find out which moves it takes, and how many, until states are new."""
+        generator = torch.Generator().manual_seed(0)
+        kinds = [("whole", _MOST_WHOLE), *([("apart", _MOST_APART)] if len(self.alone) else []), ("pairs", _MOST)]
+        for self.moves, most in kinds:
+            state = self._start(_CHAINS, generator)
+            for _ in range(2):
+                self._pass(state, generator)
+            first = _standardized(state.x)
+            for self.passes in range(1, most + 1):
+                self._pass(state, generator)
+                alike = float((first * _standardized(state.x)).mean(dim=1).max()) if len(state.x) else 0.0
+                if alike <= _ALIKE:
+                    return
+        message = f"estimator: after {_MOST} passes states of the sampler are still correlated by {alike:.2g}"
+        warn(f"{message}; samples are of too little variety", NumericalWarning)
+
+    def _start(self, chains: int, generator: torch.Generator | None) -> _State:
+        """Draws from the Gaussian, those outside of the conditions moved to the mean until they are inside."""
+        size = (self.directions.shape[1], chains)
+        x = self.directions @ torch.randn(size, dtype=torch.float64, device=self.mean.device, generator=generator)
+        state = self._at(x)
+        share = x.new_ones(chains)
+        for _ in range(_SHRINKS):
+            inside = _inside(state.blocks + self.unit, state.rows)
+            if bool(inside.all()):
+                return state
+            share = torch.where(inside, share, _SHRINK * share)
+            state = self._at(x * share)
+        return self._at(torch.zeros_like(x))
+
+    def _at(self, x: Tensor) -> _State:
+        return _State(x, self.root @ x if self.moves != "whole" else x, *self._changes(x))
+
+    def _changes(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Of the entries of blocks, (K, 10, B), and of rows, (M, B), by x, (n, B)."""
+        return self.block_changes @ x[self.block_variables], self.row_changes @ x
+
+    def _pass(self, state: _State, generator: torch.Generator | None) -> None:
+        """One move of all variables, together, or one part after the other while the others rest."""
+        if self.moves != "whole":
+            for number in range(1) if self.moves == "apart" else range(1, self._groups):
+                self._move_group(state, self._group(number), generator)
+            self._move_alone(state, generator)
+        if self.moves != "apart":
+            self._move_all(state, generator)
+
+    def _group(self, number: int) -> _Group:
+        return _Group(*(getattr(self, f"{name}_{number}") for name in _Group.__annotations__))
+
+    def _move_group(self, state: _State, group: _Group, generator: torch.Generator | None) -> None:
+        centre = -(group.basis.T @ state.whitened)  # of y, which is 0 at the state
+        drawn = torch.randn(centre.shape, dtype=torch.float64, device=centre.device, generator=generator)
+        blocks, rows = state.blocks[group.blocks], state.rows[group.rows]
+        near = self.near[: len(state.blocks)][group.blocks], self.near[len(state.blocks) :][group.rows]
+        cut = 10 * len(blocks)
+        now = torch.cat([blocks.flatten(0, 1), rows])
+        along, across = group.change @ centre, group.change @ drawn
+        angle = self._angle((now, along, across), cut, near, generator)
+        versed, sine = 1.0 - torch.cos(angle), torch.sin(angle)
+        y, changed = centre * versed + drawn * sine, along * versed + across * sine
+        state.x[group.variables] += group.spread @ y
+        state.whitened += group.basis @ y
+        state.blocks[group.blocks] += changed[:cut].view(-1, 10, changed.shape[1])
+        state.rows[group.rows] += changed[cut:]
+
+    def _move_alone(self, state: _State, generator: torch.Generator | None) -> None:
+        """Draw each variable that only bounds of its own concern from its exact distribution with all others fixed."""
+        near, whitened = self.near[len(state.blocks) :], state.whitened[: len(self.alone)]  # zero below
+        for number, variable in enumerate(self.alone.tolist()):
+            column, slopes, x = self.root[: len(whitened), variable], self.row_changes[:, variable], state.x[variable]
+            barrier = CURVATURE * (near * slopes.square()).sum()
+            precision = self.precisions[number]  # of the root less the barrier, which may be almost all of it
+            gradient = -(column @ whitened) + barrier * x - near @ slopes
+            deviation = precision.rsqrt()
+            centre = x + gradient / precision
+            ends = (_INSIDE - 1.0) / slopes  # where the slack of each bound ends
+            low = torch.where(slopes > 0.0, ends, -math.inf).amax()
+            high = torch.where(slopes < 0.0, ends, math.inf).amin()
+            uniform = torch.rand(len(x), dtype=x.dtype, device=x.device, generator=generator)
+            unit = _truncated_normal((low - centre) / deviation, (high - centre) / deviation, uniform)
+            step = torch.clamp(centre + deviation * unit, low, high) - x
+            x += step
+            whitened[: number + 1].addr_(column[: number + 1], step)
+            bounds = torch.nonzero(slopes)[:, 0]
+            state.rows[bounds] += slopes[bounds, None] * step
+
+    def _move_all(self, state: _State, generator: torch.Generator | None) -> None:
+        size = (self.directions.shape[1], state.x.shape[1])
+        drawn = torch.randn(size, dtype=torch.float64, device=self.mean.device, generator=generator)
+        x = self.directions @ drawn
+        blocks, rows = self._changes(x)
+        now, across = (torch.cat([b.flatten(0, 1), r]) for b, r in ((state.blocks, state.rows), (blocks, rows)))
+        near = self.near[: len(blocks)], self.near[len(blocks) :]
+        angle = self._angle((now, -now, across), 10 * len(blocks), near, generator)
+        cosine, sine = torch.cos(angle), torch.sin(angle)
+        for old, new in ((state.x, x), (state.blocks, blocks), (state.rows, rows)):
+            old.mul_(cosine).addcmul_(new, sine)
+        if self.moves != "whole":
+            state.whitened = self.root @ state.x
+
+    def _angle(
+        self,
+        ellipse: tuple[Tensor, Tensor, Tensor],
+        cut: int,
+        near: tuple[Tensor, Tensor],
+        generator: torch.Generator | None,
+    ) -> Tensor:
+        """Angles of the next states on ellipses, (B,), 0 where `_TRIES` have found none.
+
+        Args:
+            ellipse: entries of blocks and then rows, (10 K + M, B), at the state, by 1 - cos and by sin of the angle.
+            cut: 10 K.
+            near: which blocks and rows the Gaussian has barriers for.
+            generator: of random numbers.
+        """
+        now, along, across = ellipse
+        uniform = _uniform(now, generator)
+        level = self._excess(now, cut, near) + torch.log(uniform())
+        angle = 2.0 * math.pi * uniform()
+        least, most = angle - 2.0 * math.pi, angle
+        out, left = torch.zeros_like(angle), torch.arange(len(angle), device=angle.device)
+        for _ in range(_TRIES):
+            there = now + along * (1.0 - torch.cos(angle)) + across * torch.sin(angle)
+            fits = _inside(there[:cut].view(-1, 10, len(angle)) + self.unit, there[cut:])
+            fits &= self._excess(there, cut, near) >= level
+            out[left[fits]] = angle[fits]
+            rest = torch.nonzero(~fits)[:, 0]
+            if not len(rest):
+                break
+            left, level, angle, least, most = (x[rest] for x in (left, level, angle, least, most))
+            now, along, across = (x.index_select(1, rest) for x in (now, along, across))
+            least, most = torch.where(angle < 0.0, angle, least), torch.where(angle < 0.0, most, angle)
+            angle = least + (most - least) * _uniform(now, generator)()
+        return out
+
+    def _excess(self, entries: Tensor, cut: int, near: tuple[Tensor, Tensor]) -> Tensor:
+        """Logarithm of the density over that of the Gaussian, up to a constant, (B,).
+
+        With E = J^-1/2 F_k J^-1/2 - 1 of a block that has a barrier it is ||E||^2 / 2 - tr E, and likewise of a row.
+        """
+        blocks, rows = entries[:cut].view(-1, 10, entries.shape[1]), entries[cut:]
+        of_blocks = 0.5 * CURVATURE * (self.weights * blocks.square()).sum(1) - blocks[:, _DIAGONAL].sum(1)
+        return near[0] @ of_blocks + near[1] @ (0.5 * CURVATURE * rows.square() - rows)
+
+
+def _uniform(like: Tensor, generator: torch.Generator | None) -> Callable[[], Tensor]:
+    """Draws of uniform numbers, one for each column."""
+    return lambda: torch.rand(like.shape[1], dtype=like.dtype, device=like.device, generator=generator)
+
+
+def _inside(blocks: Tensor, rows: Tensor) -> Tensor:
+    """Where all blocks, (K, 10, B), are positive definite, and all rows, (M, B), above -1: (B,) bool."""
+    a, b, c, d, e, f, g, h, i, j = blocks.unbind(1)  # rows a b c d, e f g, h i, j of the upper triangle
+    first = 1.0 / a
+    e, f, g = e - b * b * first, f - b * c * first, g - b * d * first
+    h, i, j = h - c * c * first, i - c * d * first, j - d * d * first
+    second = 1.0 / e
+    h, i, j = h - f * f * second, i - f * g * second, j - g * g * second
+    last = j - i * i / h
+    pivots = torch.minimum(torch.minimum(a, e), torch.minimum(h, last))  # NaN where one before is 0
+    return (pivots > _INSIDE).all(0) & (rows > _INSIDE - 1.0).all(0)
+
+
+def _truncated_normal(low: Tensor, high: Tensor, uniform: Tensor) -> Tensor:
+    """Standard normal numbers between bounds, far into the tails, from uniform ones, (B,)."""
+    flipped = low + high < 0.0
+    near, far = torch.where(flipped, -high, low), torch.where(flipped, -low, high)  # the one nearer to 0 first
+    of_near, of_far = (0.5 * torch.erfc(x / math.sqrt(2.0)) for x in (near, far))  # torch's ndtr is 0 from 8.3 on
+    body = -torch.special.ndtri(of_far + uniform * (of_near - of_far))
+    tail = near - torch.log1p(-uniform * -torch.expm1(-near * (far - near))) / near
+    drawn = torch.where(near > _TAIL, tail, body)
+    return torch.where(flipped, -drawn, drawn)
+
+
+def _bounded_alone(conic: ConicProblem, gaussian: BarrierGaussian) -> np.ndarray:
+    """Variables that only rows of their own concern, one of which is near: friction, most often."""
+    of_rows, alone = conic.G != 0.0, np.ones(len(conic.linear), dtype=bool)
+    alone[conic.variables.ravel()] = False
+    alone &= ~conic.E.any(axis=0) & ~of_rows[of_rows.sum(axis=1) > 1].any(axis=0)
+    return np.flatnonzero(alone & of_rows[gaussian.near[len(conic.F0) :]].any(axis=0))
+
+
+def _triangular_from(root: Array, first: np.ndarray) -> Array:
+    """Another root of the same matrix, whose columns of some variables are zero below as many rows."""
+    order = np.concatenate([first, np.setdiff1d(np.arange(root.shape[1]), first)])
+    out = np.empty_like(root)
+    out[:, order] = np.linalg.qr(root[:, order], mode="r")
+    return out
+
+
+def _standardized(x: Tensor) -> Tensor:
+    """Coordinates (n, B) with mean 0 and variance 1 over the chains; those that do not move are 0."""
+    centred = x - x.mean(dim=1, keepdim=True)
+    deviation = centred.square().mean(dim=1, keepdim=True).sqrt()
+    return torch.where(deviation > 0.0, centred / deviation, 0.0)
+
+
+def _pairs(gaussian: BarrierGaussian, owners: np.ndarray) -> list[np.ndarray]:
+    """Variables of pairs of bodies that are most correlated: those of the tree that spans all bodies best."""
+    bodies = np.unique(owners)
+    deviation = np.linalg.norm(gaussian.directions, axis=1)
+    scaled = gaussian.directions / np.where(deviation > 0.0, deviation, 1.0)[:, None]
+    member = (owners[:, None] == bodies).astype(np.float64)
+    together = member.T @ np.square(scaled @ scaled.T) @ member
+    inside, outside, pairs = [0], list(range(1, len(bodies))), []
+    while outside:
+        row, column = np.unravel_index(int(together[np.ix_(inside, outside)].argmax()), (len(inside), len(outside)))
+        pairs.append((inside[row], outside[column]))
+        inside.append(outside.pop(int(column)))
+    return [np.flatnonzero(np.isin(owners, bodies[list(pair)])) for pair in pairs]

@@ -1,0 +1,135 @@
+"""What a fit and a prior leave open: the posterior of the parameters, a Gaussian within conditions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.linalg
+
+from torchid import parameters
+from torchid.estimators.conditions import Conditions
+from torchid.estimators.conic_formulation import build_conic_problem
+from torchid.estimators.conic_problem import ConicProblem
+from torchid.parameters import PER_BODY, Array
+from torchid.problem import LinearProblem
+from torchid.problem.chunks import one_thread
+from torchid.reprs import short_repr
+
+PRIOR_ERROR = 0.2
+"""Default standard deviation of the nominal parameters, as a share of each body; that of `analysis.prior_error`."""
+
+_LEAST_NOISE = 1e-8  # of rows without any, as a share of the rms of the right-hand side
+_THINNEST = 1e-4  # least eigenvalue of the scaled pseudo-inertias that the prior is relative to
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """exp(-||A phi + D psi - b||^2 / 2) times a prior, within conditions on phi, and psi at least `extra_lower`.
+
+    Attributes:
+        A: (R, 12 L), of the parameters phi; D: (R, S), of extra ones psi; b: (R,). Rows have noise of unit variance.
+        nominal, scale: (12 L,), where the prior is centred, and units of the parameters.
+        free: (12 L,) bool; the others stay nominal.
+        conditions: that parameters meet.
+        extra_size: (S,), standard deviation of the extra parameters by the prior, whose mean is 0.
+        extra_lower: (S,), least values of the extra parameters, minus infinity where there are none.
+    """
+
+    A: Array
+    D: Array
+    b: Array
+    nominal: Array
+    scale: Array
+    free: np.ndarray
+    conditions: Conditions
+    extra_size: Array
+    extra_lower: Array
+
+    __repr__ = short_repr
+
+    @one_thread()
+    def conic_problem(self, prior_error: float = PRIOR_ERROR) -> ConicProblem:
+        """The problem whose density exp(-objective / 2), within its conditions, is the posterior's.
+
+        Its variables are those of the free parameters (see `build_conic_problem`), and then the extra parameters in
+        units of their size. The prior is the pull-back one (Lee, Wensing, Park 2020): J_0^-1/2 (J - J_0) J_0^-1/2 of
+        each body's pseudo-inertia has entries of standard deviation `prior_error`, and friction one of that share of
+        1 N m and 1 N m s/rad.
+
+        Raises:
+            InputError: the conditions exclude each other.
+        """
+        problem = LinearProblem(
+            np.zeros((0, len(self.nominal))), np.zeros(0), 0.0, 1, self.nominal, self.scale, self.free
+        )
+        prior = build_conic_problem(problem, self.conditions, prior_error**-2, "pullback", self._metric())
+        return self._with_data(prior)
+
+    def owners(self) -> np.ndarray:
+        """The body that each variable of the conic problem belongs to, (n,) int; extra parameters are on their own."""
+        own = len(self.nominal) // PER_BODY + np.arange(len(self.extra_size))
+        return np.concatenate([np.flatnonzero(self.free) // PER_BODY, own])
+
+    def _with_data(self, prior: ConicProblem) -> ConicProblem:
+        """The problem of the prior alone with the data, and with the extra parameters as further variables."""
+        count, extras = int(self.free.sum()), len(self.extra_size)
+        by_free = (self.A[:, self.free] * self.scale[self.free]) @ prior.deviations
+        root = np.concatenate([by_free, prior.root, np.zeros((extras, count))])
+        of_extras = np.concatenate([self.D * self.extra_size, np.zeros((len(prior.root), extras)), np.eye(extras)])
+        target = np.concatenate([self.b - self.A @ self.nominal, prior.target, np.zeros(extras)])
+        triangle = np.asarray(np.linalg.qr(np.column_stack([root, of_extras, target]), mode="r"))
+        size, bounded = count + extras, np.isfinite(self.extra_lower)
+        return replace(
+            prior,
+            root=triangle[:size, :size],
+            target=triangle[:size, size],
+            linear=np.zeros(size),
+            constant=prior.constant + float(np.square(triangle[size:, size]).sum()),
+            G=scipy.linalg.block_diag(prior.G, np.eye(extras)[bounded]),
+            h=np.concatenate([prior.h, (self.extra_lower / np.maximum(self.extra_size, 1e-300))[bounded]]),
+            E=np.column_stack([prior.E, np.zeros((len(prior.E), extras))]),
+            names=(*prior.names, *["an extra parameter"] * int(bounded.sum())),
+            deviations=scipy.linalg.block_diag(prior.deviations, np.eye(extras)),
+        )
+
+    def _metric(self) -> Array:
+        """Parameters (12 L,) whose pseudo-inertias the prior is relative to: the nominal ones, none of them singular.
+
+        Bodies that cannot exist, or are thinner than the conditions allow, have their least eigenvalues raised.
+        """
+        scaled = (self.nominal / self.scale).reshape(-1, PER_BODY)
+        least = max(_THINNEST, 2.0 * self.conditions.margin)
+        values, vectors = np.linalg.eigh(parameters.pseudo_inertia(scaled))
+        thin = values[:, 0] < least
+        raised = (vectors * np.maximum(values, least)[:, None]) @ np.swapaxes(vectors, 1, 2)
+        scaled[thin, parameters.INERTIAL] = parameters.from_pseudo_inertia(raised[thin])
+        return scaled.flatten() * self.scale
+
+
+@one_thread()
+def whitened_rows(problem: LinearProblem, noise: float, block_deviations: Array | None) -> tuple[Array, Array]:
+    """Rows A, (R, 12 L), and b, (R,), with noise of unit variance, for the likelihood of a fit.
+
+    Args:
+        problem: that was fitted.
+        noise: standard deviation of its rows, correlation counted, as in the standard errors.
+        block_deviations: (G, 12 L), of the parameters by the scatter between blocks of the logs, without
+            regularization, whose outer products sum up to a covariance; None without blocks. It takes the noise's place
+            along the singular vectors of the rows along which it is the larger, as in the standard errors.
+    """
+    noise = max(noise, _LEAST_NOISE * float(np.linalg.norm(problem.b)) / max(problem.rows, 1) ** 0.5, 1e-300)
+    covariance = noise**2 * np.eye(len(problem.b))
+    if problem.held is not None:
+        covariance += problem.held @ problem.held.T
+    L = np.linalg.cholesky(covariance)
+    A = scipy.linalg.solve_triangular(L, problem.A, lower=True)
+    b = scipy.linalg.solve_triangular(L, problem.b, lower=True)
+    if block_deviations is None:
+        return A, b
+    scale = problem.scale[problem.free]
+    U, values, Vt = np.linalg.svd(A[:, problem.free] * scale, full_matrices=False)
+    along = (block_deviations[:, problem.free] / scale) @ Vt.T * values
+    growth = np.sqrt(np.maximum(np.square(along).sum(axis=0), 1.0))
+    U /= growth
+    return U.T @ A, U.T @ b

@@ -1,0 +1,345 @@
+"""The posterior of a fit: as a file of a run, and as a module that draws parameter sets from it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchid import parameters
+from torchid.errors import InputError, LogError, during
+from torchid.estimators import Conditions, Enclosure, Mirror
+from torchid.estimators.elliptical_slice import EllipticalSlice
+from torchid.estimators.posterior import PRIOR_ERROR, Posterior, whitened_rows
+from torchid.fitting.fit import Fit
+from torchid.logs.containers import open_container
+from torchid.parameters import PARAMETERS, PER_BODY, Array
+from torchid.problem.extras import ACTUATORS
+from torchid.reprs import short_repr
+from torchid.robot import Robot
+
+POSTERIOR = "posterior.npz"
+"""Name of the file in a run folder."""
+
+_FORMAT = 1
+_LARGEST = 1e100  # squares stay within the range of float64
+_TEXTS = ("body_names", "joint_names", "extra_names", "extra_units")
+_NUMBERS = ("A", "D", "b", "nominal", "scale", "free", "extra_size", "extra_lower")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FittedPosterior:
+    """The posterior of a fit, with names.
+
+    Attributes:
+        posterior: of the parameters, in the order of `body_names` and `torchid.parameters.PARAMETERS`.
+        body_names: of the L bodies.
+        joint_names: of the joints that move them, "" for the base.
+        extra_names: S labels of the extra parameters that all logs share: "armature of l_knee".
+        extra_units: of these.
+    """
+
+    posterior: Posterior
+    body_names: tuple[str, ...]
+    joint_names: tuple[str, ...]
+    extra_names: tuple[str, ...]
+    extra_units: tuple[str, ...]
+
+    __repr__ = short_repr
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the parameters, "l_knee.m" and so on, and then of the extra ones."""
+        return (*(f"{body}.{name}" for body in self.body_names for name in PARAMETERS), *self.extra_names)
+
+
+def fitted_posterior(fit: Fit, robot: Robot, conditions: Conditions) -> FittedPosterior:
+    """The posterior of a fit, with the noise that its standard errors are of.
+
+    Args:
+        fit: of a robot.
+        robot: for names.
+        conditions: that samples are to meet.
+    """
+    problem, estimate = fit.assembly.problem, fit.estimate
+    noise = math.sqrt(problem.oversampling) * estimate.residual_std
+    deviations = None if fit.scatter is None else fit.scatter.without_ridge[: fit.scatter.blocks]
+    A, b = whitened_rows(problem, noise, deviations)
+    D, extras = np.zeros((len(A), 0)), []
+    for one in fit.assembly.eliminations:
+        if one.log:
+            continue
+        extras = list(one.extras)
+        noise_of_rows = max(noise, 1e-8 * float(np.linalg.norm(one.z)) / max(len(one.z), 1) ** 0.5, 1e-300)
+        A = np.concatenate([A, one.C[:, : len(problem.nominal)] / noise_of_rows])
+        D = np.concatenate([np.zeros((len(D), len(extras))), np.linalg.pinv(one.inverse) / noise_of_rows])
+        b = np.concatenate([b, one.z / noise_of_rows])
+    joints = (body.joint for body in robot.bodies)
+    return FittedPosterior(
+        posterior=Posterior(
+            A=A,
+            D=D,
+            b=b,
+            nominal=problem.nominal,
+            scale=problem.scale,
+            free=problem.free,
+            conditions=conditions,
+            extra_size=np.array([extra.size for extra in extras]),
+            extra_lower=np.array([0.0 if extra.what == "armature" else -np.inf for extra in extras]),
+        ),
+        body_names=tuple(robot.body_names),
+        joint_names=tuple("" if joint is None else joint.name for joint in joints),
+        extra_names=tuple(extra.label for extra in extras),
+        extra_units=tuple(extra.unit for extra in extras),
+    )
+
+
+def posterior_arrays(fitted: FittedPosterior) -> dict[str, NDArray[Any]]:
+    """What the file of a posterior holds, by name."""
+    posterior, conditions = fitted.posterior, fitted.posterior.conditions
+    lower, upper = conditions.bounds(len(fitted.body_names))
+    enclosures, mirrors = conditions.enclosures, conditions.mirrors
+    return {
+        "format": np.array(_FORMAT),
+        **{name: np.asarray(getattr(posterior, name)) for name in _NUMBERS},
+        **{name: np.array(getattr(fitted, name), dtype=np.str_) for name in _TEXTS},
+        "margin": np.array(conditions.margin),
+        "total_mass": np.array(np.nan if conditions.total_mass is None else conditions.total_mass),
+        "lower": lower,
+        "upper": upper,
+        "enclosure_body": np.array([one.body for one in enclosures], dtype=np.int64),
+        "enclosure_kind": np.array([one.kind for one in enclosures], dtype=np.str_),
+        "enclosure_centre": np.array([one.centre for one in enclosures]).reshape(-1, 3),
+        "enclosure_axes": np.array([one.axes for one in enclosures]).reshape(-1, 3, 3),
+        "enclosure_half": np.array([one.half for one in enclosures]).reshape(-1, 3),
+        "mirror_bodies": np.array([(one.body, one.image) for one in mirrors], dtype=np.int64).reshape(-1, 2),
+        "mirror_reflection": np.array([one.reflection for one in mirrors]).reshape(-1, 3, 3),
+    }
+
+
+def write_posterior(path: Path, fitted: FittedPosterior) -> None:
+    """Write the file of a posterior into a folder that is being made."""
+    with path.open("xb") as stream:
+        named: dict[str, Any] = posterior_arrays(fitted)
+        np.savez_compressed(stream, **named)
+
+
+def read_posterior(path: Path) -> FittedPosterior:
+    """The posterior of a run, from its folder or from `posterior.npz` of it.
+
+    Raises:
+        InputError: there is none, or the file is damaged.
+    """
+    file = path / POSTERIOR if path.is_dir() else path
+    if path.is_dir() and not file.is_file():
+        accepted = "a run of this version: torchid identify writes it, overwrite=true replaces a run"
+        raise InputError(path, "RUN", f"no {POSTERIOR} in it", accepted)
+    try:
+        with during("reading", file), open_container(file) as container:
+            arrays = {name: container.load(name) for name in container.declared_bytes()}
+            return _posterior(arrays)
+    except LogError as error:
+        raise InputError(file, "file", error.found, f"{POSTERIOR} of a run folder") from error
+    except (KeyError, ValueError, TypeError) as error:
+        raise InputError(file, "file", f"no posterior ({error})", f"{POSTERIOR} of a run folder") from error
+
+
+def _posterior(arrays: Mapping[str, NDArray[Any]]) -> FittedPosterior:
+    """The posterior; ValueError or KeyError where the arrays are none of one."""
+    if arrays["format"].shape != () or int(arrays["format"]) != _FORMAT:
+        raise ValueError("of another version of torchid")
+    texts = {name: tuple(str(x) for x in arrays[name].reshape(-1)) for name in _TEXTS}
+    bodies, extras = len(texts["body_names"]), len(texts["extra_names"])
+    shapes = {"D": (-1, extras), "b": (-1,), "extra_size": (extras,), "extra_lower": (extras,), "A": (-1, 12 * bodies)}
+    numbers = {name: _numbers(arrays, name, shapes.get(name, (PER_BODY * bodies,))) for name in _NUMBERS}
+    if not (len(numbers["A"]) == len(numbers["D"]) == len(numbers["b"])):
+        raise ValueError("A, D and b have different numbers of rows")
+    if not ((numbers["scale"] > 0.0).all() and (numbers["extra_size"] > 0.0).all()):
+        raise ValueError("scale or extra_size is not positive")
+    total = float(arrays["total_mass"])
+    conditions = Conditions(
+        margin=float(arrays["margin"]),
+        total_mass=None if math.isnan(total) else total,
+        enclosures=tuple(
+            Enclosure(int(body), str(kind), centre, axes, half)  # type: ignore[arg-type]
+            for body, kind, centre, axes, half in zip(
+                *(arrays[f"enclosure_{name}"] for name in ("body", "kind", "centre", "axes", "half")), strict=True
+            )
+        ),
+        mirrors=tuple(
+            Mirror(int(pair[0]), int(pair[1]), reflection)
+            for pair, reflection in zip(arrays["mirror_bodies"], arrays["mirror_reflection"], strict=True)
+        ),
+        lower=_numbers(arrays, "lower", (bodies, PER_BODY)),
+        upper=_numbers(arrays, "upper", (bodies, PER_BODY)),
+        names=texts["body_names"],
+    )
+    conditions.validate_bodies(bodies)
+    conditions.bounds(bodies)
+    return FittedPosterior(posterior=Posterior(conditions=conditions, **numbers), **texts)
+
+
+def _numbers(arrays: Mapping[str, NDArray[Any]], name: str, shape: tuple[int, ...]) -> Array:
+    """An array of a shape, -1 for any length; ValueError for another one or numbers out of range."""
+    array = np.asarray(arrays[name])
+    fits = array.ndim == len(shape) and all(want in (-1, have) for want, have in zip(shape, array.shape, strict=True))
+    if not fits or array.dtype != (np.bool_ if name == "free" else np.float64):
+        raise ValueError(f"{name} is no array {shape} of numbers")
+    bounds = name in ("lower", "upper", "extra_lower")
+    if np.isnan(array).any() or not (bounds or (np.abs(array) <= _LARGEST).all()):
+        raise ValueError(f"{name} has a number that is not finite")
+    return array
+
+
+@dataclass(frozen=True)
+class ParameterSamples:
+    """N sets of parameters of one robot, each of a robot that can exist.
+
+    Attributes:
+        phi: (N, L, 12), in the order of `torchid.parameters.PARAMETERS`, inertia about the link's origin.
+        extras: (N, S), of the extra parameters that all logs share.
+        body_names: of the L bodies; `joint_names`: of the joints that move them, "" for the base.
+        extra_names: of the extra parameters, "armature of l_knee"; `extra_units`: of these.
+    """
+
+    phi: Tensor
+    extras: Tensor
+    body_names: tuple[str, ...]
+    joint_names: tuple[str, ...]
+    extra_names: tuple[str, ...]
+    extra_units: tuple[str, ...]
+
+    __repr__ = short_repr
+
+    def __len__(self) -> int:
+        """Number of sets."""
+        return len(self.phi)
+
+    @property
+    def mass(self) -> Tensor:
+        """(N, L) [kg]."""
+        return self.phi[..., parameters.MASS]
+
+    @property
+    def center_of_mass(self) -> Tensor:
+        """In the link frames, (N, L, 3) [m]; 0 for bodies without mass."""
+        mass = self.mass[..., None]
+        return torch.where(mass > 0.0, self.phi[..., parameters.FIRST_MOMENT] / torch.where(mass > 0.0, mass, 1.0), 0.0)
+
+    @property
+    def inertia(self) -> Tensor:
+        """About the centre of mass, along the axes of the link frame, (N, L, 3, 3) [kg m^2]."""
+        com = self.center_of_mass
+        about_origin = com.new_empty(*com.shape, 3)
+        numbers = self.phi[..., parameters.INERTIA].unbind(-1)
+        for value, (row, column) in zip(numbers, parameters.INERTIA_AXES, strict=True):
+            about_origin[..., row, column] = about_origin[..., column, row] = value
+        squared = com.square().sum(-1)[..., None, None] * torch.eye(3, dtype=com.dtype, device=com.device)
+        return about_origin - self.mass[..., None, None] * (squared - com[..., :, None] * com[..., None, :])
+
+    @property
+    def coulomb_friction(self) -> Tensor:
+        """Of the joints that move the bodies, (N, L) [N m or N]."""
+        return self.phi[..., parameters.COULOMB]
+
+    @property
+    def viscous_friction(self) -> Tensor:
+        """Of the joints that move the bodies, (N, L) [N m s/rad or N s/m]."""
+        return self.phi[..., parameters.VISCOUS]
+
+    def of_joints(self, what: str) -> dict[str, Tensor]:
+        """Actuator terms by joint, each (N,): "armature", "torque_offset", "asymmetric_coulomb" or "stiffness".
+
+        Raises:
+            ValueError: `what` is none of these.
+        """
+        if what not in ACTUATORS:
+            raise ValueError(f"what: found '{what}'; accepted: {', '.join(ACTUATORS)}")
+        start = f"{what.replace('_', ' ').replace('coulomb', 'Coulomb friction')} of "
+        return {
+            name.removeprefix(start): self.extras[:, number]
+            for number, name in enumerate(self.extra_names)
+            if name.startswith(start)
+        }
+
+
+class PosteriorSampler(torch.nn.Module):
+    """Draws parameter sets from the posterior of a run, on the device of the module.
+
+    Inside a training script::
+
+        sampler = torchid.PosteriorSampler("runs/g1").to("cuda")
+        samples = sampler.sample(4096, torch.Generator("cuda").manual_seed(0))
+        samples.mass, samples.center_of_mass, samples.inertia, samples.of_joints("armature")
+
+    Each set lies inside all conditions of the run: bodies that can exist, friction of at least 0, bounds. Where the
+    data determine parameters, samples differ as little as standard errors say; where they do not, as much as the prior
+    has it. Sampling itself is not differentiable; it is done in float64.
+
+    Args:
+        run: folder that `torchid identify` wrote, `posterior.npz` of one, or a `FittedPosterior`.
+        prior_error: standard deviation of the nominal parameters, as a share of each body.
+
+    Raises:
+        InputError: the folder is no run, or of an older version.
+    """
+
+    def __init__(self, run: str | Path | FittedPosterior, prior_error: float = PRIOR_ERROR) -> None:
+        """Read the posterior and prepare the sampler."""
+        super().__init__()
+        if not 0.0 < prior_error < math.inf:
+            raise InputError("sampler", "prior_error", f"{prior_error:g}", "a number above 0")
+        self.fitted = run if isinstance(run, FittedPosterior) else read_posterior(Path(run))
+        posterior = self.fitted.posterior
+        conic = posterior.conic_problem(prior_error)
+        self.draws = EllipticalSlice(conic, posterior.owners())
+        count = int(posterior.free.sum())
+        to_free = posterior.scale[posterior.free, None] * conic.deviations[:count, :count]
+        for name, array in (
+            ("nominal", posterior.nominal),
+            ("free", posterior.free),
+            ("to_free", to_free),
+            ("extra_size", posterior.extra_size),
+        ):
+            self.register_buffer(name, torch.from_numpy(np.array(array)))
+
+    nominal: Tensor
+    free: Tensor
+    to_free: Tensor
+    extra_size: Tensor
+
+    @torch.no_grad()
+    def sample(self, count: int, generator: torch.Generator | None = None) -> ParameterSamples:
+        """Parameter sets.
+
+        Args:
+            count: number N of them.
+            generator: of random numbers, on the module's device; None for torch's own.
+
+        Raises:
+            ValueError: a count below 1, or a module that was made one of less than float64.
+        """
+        if count < 1:
+            raise ValueError(f"count: found {count}; accepted: at least 1")
+        if self.nominal.dtype != torch.float64:
+            raise ValueError(f"module: found {self.nominal.dtype}; accepted: float64, and samples to another dtype")
+        x = self.draws.draw(count, generator)
+        phi = self.nominal.repeat(count, 1)
+        phi[:, self.free] += x[:, : len(self.to_free)] @ self.to_free.T
+        return ParameterSamples(
+            phi.view(count, -1, PER_BODY),
+            x[:, len(self.to_free) :] * self.extra_size,
+            self.fitted.body_names,
+            self.fitted.joint_names,
+            self.fitted.extra_names,
+            self.fitted.extra_units,
+        )
+
+    forward = sample
