@@ -6,7 +6,6 @@ import argparse
 import gc
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -292,15 +291,9 @@ def _compress(options: argparse.Namespace) -> None:
     with _importing():
         from torchid.commands.compress import compress
         from torchid.config import load_config
-        from torchid.report.tables import compression_table, print_tables, state_table
-        from torchid.terminal.lines import print_noise, print_rolling
+        from torchid.terminal.compression import print_compression
 
-    done = compress(load_config(options.file, options.overrides), options.output)
-    print_tables(state_table([asdict(state) for state in done.states]))
-    print_noise(done.noise)
-    print_tables(compression_table([asdict(file) for file in done.files]))
-    print_rolling(done.rolling)
-    print(f"written to    {done.output}")
+    print_compression(compress(load_config(options.file, options.overrides), options.output))
 
 
 def _evaluate(options: argparse.Namespace) -> None:
