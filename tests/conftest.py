@@ -25,6 +25,7 @@ def _elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Work in a folder of its own: results without an absolute path go to the working folder."""
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setenv("PYTHONPATH", str(Path(torchid.__file__).parents[1]), os.pathsep)  # of child processes
+        monkeypatch.delenv("COLUMNS", raising=False)  # of the terminal that tests are started from
         monkeypatch.chdir(tmp_path_factory.mktemp("work"))
         yield
 

@@ -103,6 +103,8 @@ def beside(folder: Path, page: str) -> dict[str, Any]:
     said["network"] = _Nothing(robot.nv)
     said["fitter"] = torchid.LogFitter(robot=robot, builder=builder, estimator=torchid.LeastSquares(0.01))
     said["paths"] = ["walk.factor"]
+    if page == "randomization.md":
+        torchid.identify(folder / "torchid" / "demo" / "quadruped.yaml", output=folder / "runs" / "g1")
     return said
 
 

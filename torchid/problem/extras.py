@@ -137,9 +137,10 @@ def list_extras(robot: Robot, contacts: Sequence[Contact], sensors: SensorSet, t
             without = robot.is_passive if what in _OF_MOTORS else np.zeros_like(robot.is_passive)
             measured = np.flatnonzero((sensors.torque & ~without)[: robot.n]).tolist()
             extras += [Extra(what, robot.joint_names[dof], "", unit, size, False, (dof,)) for dof in measured]
+    motors = tuple(np.flatnonzero((sensors.torque & ~robot.is_passive)[: robot.n]).tolist())
     if terms.delay:
-        extras.append(Extra(DELAY, "joint torques", "", "s", _DELAY_SIZE, False, tuple(measured)))
-    extras += [Extra(DELAYED, str(k), "", "1", 1.0, False, tuple(measured), (), k) for k in range(terms.delays)]
+        extras.append(Extra(DELAY, "joint torques", "", "s", _DELAY_SIZE, False, motors))
+    extras += [Extra(DELAYED, str(k), "", "1", 1.0, False, motors, (), k) for k in range(terms.delays)]
     return tuple(extras)
 
 

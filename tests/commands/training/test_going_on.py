@@ -46,7 +46,8 @@ from torchid.problem.metrics import ERROR_GROUPS, ROW_GROUPS, WHITENED
 def test_the_run_folder_is_that_of_any_run_and_nothing_is_left_beside_it(run: Path) -> None:
     names = {"events" if path.name.startswith("events") else path.name for path in run.iterdir()}
     figures = {"forces.png", "errors.png", "parameters.png", "identifiability.png", "contributions.png"}
-    results = {"config.yaml", "parameters.json", "metrics.json", "identified.urdf", "manifest.json", "report.json"}
+    results = {"config.yaml", "parameters.json", "metrics.json", "identified.urdf", "manifest.json"}
+    results |= {"report.json", "posterior.npz"}
     assert names == {"events", *results, *figures}
     assert names_in(run.parent) == [run.name]
     assert load_config(run / "config.yaml").estimator.training.epochs == EPOCHS
