@@ -132,8 +132,7 @@ def replay(
         kd: its gain on the velocity [N m s/rad or N s/m], likewise.
 
     Raises:
-        InputError: the folder is no run, MuJoCo is not installed or does not take the robot, or the log has not what
-            a replay needs.
+        InputError: the folder is no run, MuJoCo is not installed or refuses the robot, or the log lacks fields.
     """
     if not 0.0 < window < np.inf:
         raise ConfigError("command line", "--window", f"{window:g}", "a length of time greater than 0 [s]")
@@ -145,10 +144,10 @@ def replay(
         fitted = read_run(folder)
         with about_file(folder / "config.yaml"):
             _require_simple(fitted)
-        gains = np.stack([joint_gains(fitted.experiment.robot, *x) for x in (("--kp", kp), ("--kd", kd))])
+        robot = fitted.experiment.robot
+        gains = np.stack([joint_gains(robot, *x) for x in (("--kp", kp), ("--kd", kd))])
         reading = bars.add_task("reading the log", total=1)
         (samples,) = LogReader(fitted.experiment, folder).read([Path(log)], None, lambda _: bars.advance(reading))
-        robot = fitted.experiment.robot
         feet = _feet(fitted.experiment.contacts, robot.path) if not robot.fixed_base else ()
         logs, models = _replayed_pairs(fitted, samples, folder)
         windows = logs.nominal.windows(window)
