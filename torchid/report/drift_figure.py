@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from torchid.fitting.calibration import Comparison
 from torchid.parameters import Array
 from torchid.report import palette
-from torchid.report.figures import STYLE
+from torchid.report.figures import STYLE, decade_formatter
 
 
 @matplotlib.rc_context(STYLE)
@@ -25,6 +25,8 @@ def drift_figure(
 ) -> Figure:
     """Drift over the time since the beginning of a window, median and quartiles, and at its end by joint.
 
+    On logarithmic axes, as robots that spin and those that hardly drift are compared.
+
     Args:
         source: name of the log.
         time: (T,) [s].
@@ -35,7 +37,6 @@ def drift_figure(
     """
     tall = max(0.22 * len(by_joint) + 1.4, 1.9 * len(quartiles) + 0.8)
     figure = Figure(figsize=(11.0, tall), layout="constrained")
-    since = np.append(0.0, time)
     grid = figure.add_gridspec(len(quartiles), 2, width_ratios=(1.0, 1.1))
     for row, (name, (nominal, identified)) in enumerate(quartiles.items()):
         axis = figure.add_subplot(grid[row, 0])
@@ -43,22 +44,27 @@ def drift_figure(
             (of, palette.NOMINAL, nominal),
             ("identified", palette.IDENTIFIED, identified),
         ):
-            axis.fill_between(since, np.append(0.0, low), np.append(0.0, high), color=color, alpha=0.2, linewidth=0.0)
-            axis.plot(since, np.append(0.0, middle), color=color, label=label)
+            axis.fill_between(time, low, high, color=color, alpha=0.2, linewidth=0.0)
+            axis.plot(time, middle, color=color, label=label)
+        if min(nominal.min(), identified.min()) > 0.0:
+            axis.set_yscale("log")
+            axis.yaxis.set_major_formatter(decade_formatter())
         axis.set_ylabel(f"drift, {name}")
-        axis.set_ylim(bottom=0.0)
         axis.set_xlim(0.0, float(time[-1]))
     axis.set_xlabel("time since the beginning of a window [s]")
-    bars = figure.add_subplot(grid[:, 1])
+    joints = figure.add_subplot(grid[:, 1])
     rows = np.arange(len(by_joint))
-    for shift, color, values in (
-        (-0.2, palette.NOMINAL, [pair.nominal for pair in by_joint.values()]),
-        (0.2, palette.IDENTIFIED, [pair.identified for pair in by_joint.values()]),
-    ):
-        bars.barh(rows + shift, values, 0.38, color=color)
-    bars.set_yticks(rows, list(by_joint))
-    bars.invert_yaxis()
-    bars.set_xlabel(f"median drift after {time[-1]:g} s [{', '.join(dict.fromkeys(units))}]")
+    nominal, identified = (
+        np.array([getattr(pair, x) for pair in by_joint.values()]) for x in ("nominal", "identified")
+    )
+    for color, values in ((palette.NOMINAL, nominal), (palette.IDENTIFIED, identified)):
+        joints.plot(values, rows, "o", color=color)
+    if min(nominal.min(), identified.min()) > 0.0:
+        joints.set_xscale("log")
+        joints.xaxis.set_major_formatter(decade_formatter())
+    joints.set_yticks(rows, list(by_joint))
+    joints.invert_yaxis()
+    joints.set_xlabel(f"median drift after {time[-1]:g} s [{', '.join(dict.fromkeys(units))}]")
     figure.suptitle(
         f"Drift of a robot driven by the torques of {source}: median of windows, and quartiles", x=0.01, ha="left"
     )
