@@ -63,6 +63,30 @@ def test_a_sample_does_not_see_its_batch(urdf: Path) -> None:
         assert_close(jacobian(piece[0]).numpy(), J[part].numpy(), 1e-15)
 
 
+def test_compiled_and_exported_they_are_the_same(small: Robot) -> None:
+    state, more = (tensors(*random_states(np.random.default_rng(15), small.n, samples)) for samples in (3, 7))
+    K, J = Regressor(small), FrameJacobian(small, "c")
+    for module, inputs in ((K, state), (J, state[:1])):
+        whole_graph = torch.compile(module, backend="aot_eager", fullgraph=True)
+        assert_close(whole_graph(*inputs).numpy(), module(*inputs).numpy(), 1e-14)
+    batch = torch.export.Dim("batch")
+    exported = torch.export.export(K, tuple(state), dynamic_shapes=({0: batch},) * 3)
+    assert_close(exported.module()(*more).numpy(), K(*more).numpy(), 1e-15)
+
+
+@pytest.mark.filterwarnings("ignore:There is a performance drop:UserWarning")
+def test_samples_may_be_mapped_over(small: Robot) -> None:
+    state, K = tensors(*random_states(np.random.default_rng(15), small.n, 3)), Regressor(small)
+    mapped = torch.func.vmap(lambda *sample: K(*(x[None] for x in sample))[0])(*state)
+    assert_close(mapped.numpy(), K(*state).numpy(), 1e-15)
+
+
+def test_what_is_no_tensor_is_refused(small: Robot) -> None:
+    q, v, a = random_states(np.random.default_rng(15), small.n, 3)
+    with pytest.raises(TypeError, match="q, v, a: found ndarray; accepted: tensors"):
+        Regressor(small)(*tensors(q, v), a)  # type: ignore[arg-type]
+
+
 def test_a_motion_knows_all_that_the_regressor_needs(small: Robot) -> None:
     state = tensors(*random_states(np.random.default_rng(16), small.n, 3))
     K = Regressor(small)

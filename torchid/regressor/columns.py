@@ -94,16 +94,18 @@ def all_wrench_columns(states: BodyStates, layout: ColumnLayout, out: Tensor | N
         layout: which columns to compute.
         out: a buffer of the result's shape to write to, unchanged since an earlier call with the same layout, or zero.
     """
+    is_reused = out is not None
     if out is None:
         out = states.position.new_zeros(6, layout.count, states.position.shape[-1])
     for kept, bodies in layout.runs():
         if kept:
             columns = out[:, layout.starts[bodies.start] : layout.starts[bodies.stop]]
-            wrench_columns(states.slice_bodies(bodies.start, bodies.stop), kept, columns.unflatten(1, (-1, len(kept))))
+            own = states.slice_bodies(bodies.start, bodies.stop)
+            wrench_columns(own, kept, columns.unflatten(1, (-1, len(kept))), is_reused)
     return out
 
 
-def wrench_columns(states: BodyStates, columns: tuple[int, ...], out: Tensor) -> None:
+def wrench_columns(states: BodyStates, columns: tuple[int, ...], out: Tensor, is_reused: bool = False) -> None:
     """Write the wrenches of some inertial parameters of all given bodies.
 
     Args:
@@ -111,6 +113,8 @@ def wrench_columns(states: BodyStates, columns: tuple[int, ...], out: Tensor) ->
         columns: indices in the order of `torchid.parameters`, ascending, below 10.
         out: (6, k, len(columns), B), zero in the force rows of inertia columns; receives force [N], then moment about
             the base origin [N m], per unit of the parameter.
+        is_reused: whether `out` is a buffer that no gradient flows through; it is then written straight to, which
+            saves a copy, but which `torch.compile` and `torch.func.vmap` do not take.
 
     Source: the Newton-Euler equations of a body about its frame's origin, sorted by parameter.
     """
@@ -138,17 +142,17 @@ def wrench_columns(states: BodyStates, columns: tuple[int, ...], out: Tensor) ->
         inertia_moments = [
             moments_by_axes[parameters.INERTIA_AXES[column - parameters.INERTIA.start]] for column in inertia_columns
         ]
-        _rotate_to_base(states.rotation, inertia_moments, out[3:, :, n_with_force:])
+        moments = out[3:, :, n_with_force:]
+        if is_reused:
+            _rotate_to_base(states.rotation, inertia_moments, moments)
+        else:
+            moments.copy_(_rotate_to_base(states.rotation, inertia_moments))
 
 
 def _rotate_to_base(rotation: Tensor, vectors: Sequence[Sequence[Tensor]], out: Tensor | None = None) -> Tensor:
     """Rotate c vectors given by components (k, B) into base axes: (3, k, c, B); straight to `out`, if there is one."""
     components = torch.stack([vector[axis] for axis in range(3) for vector in vectors])
     components = components.unflatten(0, (3, len(vectors))).transpose(1, 2)
-    if out is None:
-        return rotate_vectors(rotation.unsqueeze(3), components)
-    if torch.is_grad_enabled() and components.requires_grad:
-        return out.copy_(rotate_vectors(rotation.unsqueeze(3), components))
     return rotate_vectors(rotation.unsqueeze(3), components, out)
 
 

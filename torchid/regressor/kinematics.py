@@ -69,8 +69,11 @@ def motion_from_state(
         gravity: (3,), in the world [m/s^2].
 
     Raises:
-        ValueError: wrong shapes of `q`, `v` or `a`.
+        TypeError: one of `q`, `v` and `a` is not a tensor.
+        ValueError: wrong shapes of these.
     """
+    if wrong := [type(x).__name__ for x in (q, v, a) if not isinstance(x, Tensor)]:
+        raise TypeError(f"q, v, a: found {wrong[0]}; accepted: tensors")
     width_q, width_v = (n, n) if fixed_base else (n + 7, n + 6)
     if q.ndim != 2 or q.shape[1] != width_q or v.shape != (q.shape[0], width_v) or a.shape != v.shape:
         shapes = ", ".join(str(tuple(x.shape)) for x in (q, v, a))
@@ -170,7 +173,7 @@ def body_states(tree: KinematicTree, motion: Motion, joints: JointMotion) -> Bod
 def link_states(tree: KinematicTree, states: BodyStates) -> BodyStates:
     """States of the bodies' link frames, from those of their joint frames."""
     rotation = torch.stack([rotate_vectors(states.rotation, tree.link_rotation[:, k]) for k in range(3)], dim=1)
-    if not tree.link_offset.any():
+    if not tree.has_link_offsets:
         return BodyStates(rotation, *list(vars(states).values())[1:])
     arm = rotate_vectors(states.rotation, tree.link_offset)
     omega, alpha = states.angular_velocity, states.angular_acceleration

@@ -32,9 +32,10 @@ from torchid.robot import Robot
 class Regressor(nn.Module):
     """K(q, v, a) with `K phi = S^T tau + J_C^T lambda` (Mistry et al. 2009, eq. 5).
 
-    Differentiable; `.to(device, dtype)` moves it. Columns: 12 per body, bodies in `robot.body_names`' order,
-    parameters in `torchid.parameters`' order. Rows: base force, base moment (base frame, about the base origin), then
-    `robot.dof_names`: joints, and the wrenches of force/torque sensors in limbs; a fixed base has no base rows.
+    Differentiable; moved by `.to(device, dtype)`; one graph to `torch.compile` and `torch.export`. Columns: 12 a body,
+    bodies in `robot.body_names`' order, parameters in `torchid.parameters`' order. Rows: base force, base moment (base
+    frame, about the base origin), then `robot.dof_names`: joints, and the wrenches of force/torque sensors in limbs; a
+    fixed base has no base rows.
 
     With `FrameJacobian` and `torchid.Projection`, the reference implementation of the equations of a fit. Fits use
     `torchid.RowBuilder`, which shares the functions of this package but never forms K, for speed
@@ -70,6 +71,7 @@ class Regressor(nn.Module):
             `.contiguous()` where layout matters.
 
         Raises:
+            TypeError: one that is not a tensor, or of another precision than the module.
             ValueError: wrong shapes.
         """
         return self.from_motion(motion_from_state(q, v, a, self.tree.n, not self.tree.base_rows, self.gravity))

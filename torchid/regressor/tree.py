@@ -85,7 +85,7 @@ class KinematicTree(nn.Module):
 
     `n_nodes`: one for each body, and five more for every force/torque sensor in a limb. `sign_width`: as in
     `Regressor`. `node_of`: node of each of the robot's bodies. `body_of`: body of each node; for a
-    massless node the body beyond the weld.
+    massless node the body beyond the weld. `has_link_offsets`: whether any `link_offset` is not 0.
     """
 
     pose: Tensor
@@ -122,6 +122,7 @@ class KinematicTree(nn.Module):
         self.T_parent_joint: Array = in_parent
         T_joint_link = np.stack([node.T_joint_link for node in nodes])
         self.T_joint_link: Array = np.asarray(np.linalg.inv(joint_frame) @ T_joint_link)
+        self.has_link_offsets = bool(self.T_joint_link[:, :3, 3].any())
 
         is_ancestor = np.eye(count)
         depth = np.zeros(count, dtype=int)
