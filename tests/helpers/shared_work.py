@@ -150,7 +150,7 @@ def differences(one: Any, other: Any, path: str = "") -> Iterator[tuple[str, flo
 def _main() -> None:
     import torch.distributed as dist  # noqa: TID251
     from matplotlib.figure import Figure
-    from run_figures import FIGURES
+    from run_figures import FIGURES, PAGE
 
     from torchid.commands import results
     from torchid.commands.identify import identify
@@ -158,8 +158,8 @@ def _main() -> None:
     from torchid.ranks import share_work
 
     warnings.simplefilter("ignore")
-    for figure in FIGURES:  # which take most of the time
-        setattr(results, figure, lambda *_: Figure(figsize=(1.0, 1.0)))
+    for figure in (*FIGURES, PAGE):  # which take most of the time
+        setattr(results, figure, lambda *_, **__: Figure(figsize=(1.0, 1.0)))
     if "RANK" in os.environ:
         dist.init_process_group("gloo")
     jobs = Path(sys.argv[1])

@@ -137,8 +137,12 @@ def bind_some_samples(
     return [part[torch.linspace(0, len(part) - 1, min(count // len(logs), len(part))).long()] for part in bound]
 
 
-def link_poses(log: Log, robot: Robot) -> dict[str, torch.Tensor]:
-    """Poses (N, 4, 4) in the base of the robot's links, by name, at the samples of a log of all its joints."""
+LinkPoses = dict[str, torch.Tensor]
+"""Poses (N, 4, 4) in the base of the robot's links, by name."""
+
+
+def link_poses(log: Log, robot: Robot) -> LinkPoses:
+    """Poses of the links at the samples of a log of all the robot's joints."""
     order = [log.joint_names.index(name) for name in robot.joint_names]
     return robot.link_poses(torch.from_numpy(log.joint_position[:, order]))
 
