@@ -11,10 +11,10 @@ from motions import value
 from walking import MACHINES, robot_of, truth
 
 from torchid.log_checks import NOTE
-from torchid.log_checks.contacts import measure_foot_slip
 from torchid.log_checks.mistakes import exchanged_names
 from torchid.log_checks.model import bind_some_samples, preprocess_pieces
 from torchid.log_checks.scales import fit_time_scale, fit_torque_gains, motion_cutoff_hz
+from torchid.log_checks.standing_feet import measure_foot_slip
 
 BY_NAME = {mistake.name: mistake for mistake in MISTAKES}
 #: Cells of the whole table that are not named, and why: see docs/checking.md.

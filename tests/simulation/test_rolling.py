@@ -21,8 +21,8 @@ from torchid.config.simulation import SimulatedRobotConfig, WaveConfig
 from torchid.estimators import LeastSquares
 from torchid.fitting.contacts import resolve_contacts
 from torchid.fitting.experiment import set_up
-from torchid.log_checks.contacts import check_standing_feet
 from torchid.log_checks.findings import Finding
+from torchid.log_checks.standing_feet import check_standing_feet
 from torchid.logs import Log, write_log
 from torchid.problem import RowBuilder, bind_log, compress, linear_problem
 from torchid.robot import Robot

@@ -16,7 +16,6 @@ from torchid.errors import InputError, LogError, warn
 from torchid.log_checks.contacts import (
     check_contact_flags,
     check_limb_sensors,
-    check_standing_feet,
     subtract_contact_offsets,
 )
 from torchid.log_checks.findings import (
@@ -35,6 +34,7 @@ from torchid.log_checks.motion import check_angle_unit, check_angular_velocity, 
 from torchid.log_checks.slip import check_slip
 from torchid.log_checks.spikes import check_jumps
 from torchid.log_checks.stamps import check_magnitudes, check_missing_values, check_time_stamps
+from torchid.log_checks.standing_feet import check_standing_feet
 from torchid.log_checks.weight import check_accelerometer, check_weight
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray

@@ -1,0 +1,167 @@
+"""Motion of feet that stand by their flags: what they show of orientation, joint positions, names and radii."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from torchid.errors import join_names
+from torchid.log_checks.findings import CONDEMNED, SUSPICIOUS, Finding, Skipped, find_spans, median_step
+from torchid.log_checks.mistakes import possible_mistakes, reversed_joints
+from torchid.log_checks.model import link_poses
+from torchid.logs import Log
+from torchid.logs.log import FloatArray
+from torchid.logs.quaternion import rotate_to_world
+from torchid.robot import Robot
+from torchid.robot.rolling import rolled_distance
+from torchid.sensing import Contact
+
+#: Motion of standing feet over that of the base above them. Soft soles and rolling feet have 0.05 to 0.2.
+MAX_SLIP_SHARE = 0.3
+#: The same where no mistake explains it. A person whose heels lift in squats has 0.4, an orientation that is wrong 0.9.
+MAX_UNEXPLAINED_SLIP_SHARE = 0.6
+#: Motion of standing feet from which on it is asked whether they roll on other radii, and the radius to begin with.
+MIN_ROLLING_SHARE, _TRIAL_RADIUS_M = 0.02, 0.01
+#: Share of this motion that a corrected mistake may leave.
+MAX_RESIDUAL_SHARE = 1.0 / 3.0
+#: Time at either end of a stance for heel and toe, and the shortest rest of a stance.
+_STANCE_END_S, _MIN_STANCE_S = 0.05, 0.15
+#: Samples that are compared, and the rms motion that the base must have [rad, or 0.3 m].
+_MAX_COMPARED_SAMPLES, _MIN_BASE_MOTION = 1500, 0.01
+_LENGTH_UNIT_M = 0.3
+_CORRECTED_FIELDS = (
+    *("joint_names", "joint_position", "base_quat_xyzw", "base_position_world"),
+    *("contact_names", "contact_active"),
+)
+_STANDING_FEET_CHECK = "feet that stand"
+
+
+def check_standing_feet(
+    log: Log, robot: Robot | None, contacts: Sequence[Contact], derived: tuple[str, ...] = ()
+) -> Iterator[Finding | Skipped]:
+    """Findings about feet that move while their flag is set, not to be blamed on fields that begin with `derived`."""
+    if robot is None or not contacts or robot.fixed_base:
+        return
+    log = log.select(slice(None, None, max(1, len(log) // _MAX_COMPARED_SAMPLES)))
+    slip = measure_foot_slip(log, robot, contacts)
+    if slip is None:
+        yield Skipped(_STANDING_FEET_CHECK, "no orientation of the base, or no stance above which the base moves")
+        return
+    yield from _radius_findings(log, robot, contacts, slip)
+    if slip < MAX_SLIP_SHARE:
+        return
+    best, least = None, MAX_RESIDUAL_SHARE * slip
+    for mistake in (*possible_mistakes(log), *reversed_joints(log)):
+        if mistake.field not in _CORRECTED_FIELDS or mistake.field.startswith(derived):
+            continue
+        trial = measure_foot_slip(mistake.correct(log), robot, contacts)
+        if trial is not None and trial < least:
+            best, least = mistake, trial
+    if best is not None:
+        share = f"{100 * slip:.3g} % as much as the base above them, {100 * least:.2g} % once corrected"
+        text = f"{best.description}: standing feet move {share}"
+        yield Finding("unit, sign or frame", CONDEMNED, best.field, text, best.advice)
+    elif slip > MAX_UNEXPLAINED_SLIP_SHARE:
+        yield _unexplained_motion(log, robot, contacts, slip)
+
+
+def _unexplained_motion(log: Log, robot: Robot, contacts: Sequence[Contact], slip: float) -> Finding:
+    """A finding about feet that move though they stand, which no usual mistake explains, with those that move most."""
+    alone = {c.frame: measure_foot_slip(log, robot, [c]) for c in contacts}
+    moving = sorted((name for name, own in alone.items() if own), key=lambda name: -(alone[name] or 0.0))
+    most = join_names([f"{name} {100 * (alone[name] or 0.0):.2g} %" for name in moving])
+    text = f"standing feet move {100 * slip:.3g} % as much as the base above them, and no usual mistake explains it"
+    advice = "check signs, scales and zeros of joint positions, the base's orientation and position, and the flags"
+    return Finding("standing feet", SUSPICIOUS, "all", f"{text}: {most}" if most else text, advice, tuple(moving))
+
+
+def _radius_findings(log: Log, robot: Robot, contacts: Sequence[Contact], slip: float) -> Iterator[Finding]:
+    """A finding about feet that roll on other radii than stated: the square of their slip is quadratic in these."""
+    points = [c for c in contacts if c.kind == "point" and c.frame in log.contact_names and c.frame in robot.links]
+    if slip < MIN_ROLLING_SHARE or not points:
+        return
+    usual = max(c.radius for c in points) or _TRIAL_RADIUS_M
+    unit = {c.frame: c.radius or usual for c in points}
+
+    def squared_slip(factor: float) -> float:
+        trial = [replace(c, radius=factor * unit[c.frame]) if c.frame in unit else c for c in contacts]
+        return (measure_foot_slip(log, robot, trial) or 0.0) ** 2
+
+    none, once, twice = map(squared_slip, (0.0, 1.0, 2.0))
+    curvature = 0.5 * (none + twice) - once
+    factor = 0.25 * (none - twice) / curvature + 1.0 if curvature > 0.0 else 0.0
+    least = float(np.sqrt(squared_slip(factor))) if factor > 0.0 else slip
+    if least < MAX_RESIDUAL_SHARE * slip:
+        found = ", ".join(f"{factor * radius:.3g}" for radius in sorted(set(unit.values())))
+        stated = ", ".join(f"{radius:.3g}" for radius in sorted({c.radius for c in points}))
+        text = f"standing feet move {100 * slip:.2g} % as much as the base above them if they roll on a radius of"
+        text += f" {stated} m, {100 * least:.2g} % on {found} m"
+        advice = f"contacts: [{{frame: {points[0].frame}, type: point, radius: {found}}}, ...], if the feet are balls"
+        yield Finding("radius", SUSPICIOUS, "contact_names", text, advice, tuple(c.frame for c in points))
+
+
+def measure_foot_slip(log: Log, robot: Robot, contacts: Sequence[Contact]) -> float | None:
+    """Motion of standing feet in the world over that in the base frame; None where the base hardly moves.
+
+    Flat feet must not turn, vectors between standing feet are constant, and so is the position of each foot where the
+    position of the base is known: of feet that roll, less what they have rolled.
+    """
+    feet = [c for c in contacts if c.frame in log.contact_names and c.frame in robot.links]
+    if log.base_quat_xyzw is None or log.contact_active is None or set(log.joint_names) != set(robot.joint_names):
+        return None
+    poses = link_poses(log, robot)
+    active = {c.frame: log.contact_active[:, log.contact_names.index(c.frame)] for c in feet}
+    rolled = {c.frame: _rolled(log, c, poses[c.frame].numpy()) for c in feet}
+    parts: list[tuple[float, float, int]] = []
+    for i, foot in enumerate(feet):
+        T = poses[foot.frame].numpy()
+        if foot.kind == "flat":
+            for axis in range(3):
+                parts += _stance_motion(log, T[:, :3, axis], active[foot.frame], 1.0)
+        if log.base_position_world is not None:
+            origin = log.base_position_world - rolled[foot.frame]
+            parts += _stance_motion(log, T[:, :3, 3], active[foot.frame], _LENGTH_UNIT_M, origin)
+        for second in feet[i + 1 :]:
+            between = T[:, :3, 3] - poses[second.frame].numpy()[:, :3, 3]
+            apart = rolled[second.frame] - rolled[foot.frame]
+            parts += _stance_motion(log, between, active[foot.frame] & active[second.frame], _LENGTH_UNIT_M, apart)
+    world, base, samples = np.array(parts).reshape(-1, 3).sum(axis=0) if parts else (0.0, 0.0, 0)
+    if not samples or base / samples < _MIN_BASE_MOTION**2:
+        return None
+    return float(np.sqrt(world / base))
+
+
+def _rolled(log: Log, contact: Contact, T_base_foot: FloatArray) -> FloatArray:
+    """How far a foot would have rolled along the ground since the log began, (N, 3) [m]; 0 for one that does not."""
+    quat = log.base_quat_xyzw
+    if not contact.radius or quat is None:
+        return np.zeros((len(log), 3))
+    normals: FloatArray = np.broadcast_to(contact.normal, (len(log), 3))
+    if log.contact_normal_world is not None:
+        recorded = log.contact_normal_world[:, log.contact_names.index(contact.frame)]
+        normals = np.where(np.isfinite(recorded), recorded, normals)
+    rotation = Rotation.from_quat(quat).as_matrix() @ T_base_foot[:, :3, :3]
+    return rolled_distance(rotation, contact.radius, normals, contact.rolling_axis)
+
+
+def _stance_motion(
+    log: Log, vector: FloatArray, active: np.ndarray, unit: float, origin: FloatArray | None = None
+) -> list[tuple[float, float, int]]:
+    """Sums of squared deviations of a vector (N, 3) within each stance, in world and base frame, and sample counts."""
+    quat = log.base_quat_xyzw
+    if quat is None:
+        return []
+    step = median_step(log)
+    ends, shortest = round(_STANCE_END_S / step), max(4, round(_MIN_STANCE_S / step))
+    sums = []
+    for span in find_spans(active):
+        stance = slice(span.first + ends, span.last + 1 - ends)
+        if stance.stop - stance.start < shortest:
+            continue
+        world = rotate_to_world(quat[stance], vector[stance]) + (0.0 if origin is None else origin[stance])
+        in_world, in_base = (float(np.square((x - x.mean(axis=0)) / unit).sum()) for x in (world, vector[stance]))
+        sums.append((in_world, in_base, stance.stop - stance.start))
+    return sums
