@@ -251,7 +251,8 @@ def _common_gain_findings(fit: TorqueGains | None) -> Iterator[Finding]:
         return
     gain, spread, blocks = fit.common
     off = max(gain, 1.0 / max(gain, _TINY)) > MIN_COMMON_GAIN_RATIO
-    if off and _is_certain(*map(np.atleast_1d, (gain - 1.0, spread)), blocks[:, None] - 1.0, MIN_COMMON_BLOCK_SHARE):
+    value, agreeing = np.array([gain - 1.0]), blocks[:, None] - 1.0
+    if off and _is_certain(value, np.array([spread]), agreeing, MIN_COMMON_BLOCK_SHARE).all():
         text = f"all torques: the factor that fits the URDF best is {gain:.3g} +- {spread:.2g}"
         advice = (
             "check units, gear ratios and torque constants, and whether the URDF's masses and contact forces are right"
