@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
@@ -10,13 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 from faults import CONTACTS, CUTOFF, changed, demo_log, demo_robot, found, of_demo, only, scaled
+from mistaken import case_of
 from motions import value
 from recordings import in_world
 from repository import SHARED
 from scipy.spatial.transform import Rotation
 from synthetic import PANDA, Oracle, load
+from walking import MACHINES, robot_of
 
-from torchid.log_checks import CONDEMNED, SUSPICIOUS, Checked
+from torchid.log_checks import CONDEMNED, NOTE, SUSPICIOUS, Checked, scales
 from torchid.log_checks.check import check
 from torchid.logs import Log, read_log
 from torchid.logs.preprocess import preprocess
@@ -73,6 +76,62 @@ def test_reversed_torques_of_a_standing_robot_are_seen_through_the_contacts_null
     log = rescaled(demo_log(), [1, 5], -1.0)
     log = log if measured else replace(log, contact_wrench_local=None)
     assert set(only(of_demo(log), "sign").channels) == {"front_left_thigh", "front_right_knee"}
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_torques_that_all_have_one_factor_contradict_the_contact_forces(factor: float) -> None:
+    case = case_of(MACHINES["quadruped"], "full")
+    wrong = replace(case.log, joint_torque=factor * value(case.log.joint_torque))
+    checked = check(wrong, robot_of(case.machine), case.machine.contacts, CUTOFF)
+    blamed = [one for one in checked.findings if one.severity != NOTE]
+    assert [(one.field, one.name) for one in blamed] == [("joint_torque", "scale")], blamed
+    stated = re.search("all torques: the factor that fits the URDF best is ([0-9.]+)", blamed[0].found)
+    assert float(value(stated)[1]) == pytest.approx(1.0 / factor, rel=0.2)
+
+
+def test_a_factor_that_is_far_from_minus_one_is_not_called_a_reversed_torque() -> None:
+    finding = only(of_arm(lambda log: rescaled(log, [3], -30.0)), "scale", "joint_torque")
+    assert finding.channels == ("panda_joint4",)
+    assert not found(of_arm(lambda log: rescaled(log, [3], -30.0)), "sign")
+
+
+def test_torques_that_dry_friction_may_hold_are_not_judged_in_a_robot_that_stands_still() -> None:
+    robot = load(PANDA, fixed_base=True)
+    rng, rest = np.random.default_rng(1), np.zeros((1, robot.n))
+    q = np.array([[0.2, 0.7, -0.3, -1.5, 0.2, 1.5, 0.1, 0.02]])
+    torque = Oracle.of(robot).forces(q, rest, rest)[0]
+    light = [0, 4, 6]
+    torque[light] = [-0.7, 0.9, -0.4]  # [N m], of friction: hardly any gravity is left for them
+    noise = rng.normal(size=(2, 800, robot.n))
+    held = Log(
+        "held.npz",
+        np.arange(800) / 200.0,
+        robot.joint_names,
+        q + 1e-5 * noise[0],
+        joint_torque=torque + 0.01 * noise[1],
+    )
+    assert not [one for one in check(held, robot, (), 5.0).findings if one.severity != NOTE]
+
+
+def test_torques_that_are_all_zero_say_nothing_of_time() -> None:
+    zero = of_arm(lambda log: replace(log, joint_torque=np.zeros_like(value(log.joint_torque))))
+    assert zero.usable
+    assert not found(zero, "unit", "time")
+
+
+def test_factors_that_one_block_of_time_makes_up_are_compared_within_blocks(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of a stretch of wrong readings, in which the joints of reference have factors of 0.02 and all others fit."""
+    robot, log = arm()
+    shape = (scales.BLOCKS, 5 + 3)
+    blocks = np.where(np.arange(8) < 5, 1.1, 0.0) * np.ones(shape)
+    blocks[0, :3] = 0.02
+    gains = scales.TorqueGains(
+        np.arange(5), np.array([0.02, 0.02, 0.02, 0.7, 0.75]), np.zeros(3), np.full(8, 0.05), blocks, None
+    )
+    monkeypatch.setattr("torchid.log_checks.forces.fit_torque_gains", lambda *_: gains)
+    assert not found(check(log, robot, (), 5.0), "scale")
 
 
 def test_a_joint_whose_torque_is_friction_alone_is_not_judged() -> None:

@@ -268,6 +268,18 @@ def test_a_torque_of_zero_throughout_is_suspicious_and_a_joint_that_never_moves_
     assert (still.severity, still.channels) == (NOTE, ("front_left_knee",))
 
 
+def test_forces_that_stay_at_one_value_while_joints_move_are_suspicious_also_beside_zeros() -> None:
+    def fill(torque: Any) -> None:
+        torque[:, 2], torque[:, 5] = 0.0, 3.3
+
+    zero, one = found(check(changed(demo_log(), "joint_torque", fill)), "constant", "joint_torque")
+    assert (zero.severity, zero.channels) == (SUSPICIOUS, ("front_left_knee",))
+    assert (one.severity, one.channels) == (SUSPICIOUS, (demo_log().joint_names[5],))
+    still = changed(demo_log(), "joint_position", lambda q: np.copyto(q, q[:1]))
+    torque = changed(still, "joint_torque", lambda t: np.copyto(t, t[:1]))
+    assert all(one.severity != SUSPICIOUS for one in found(check(torque), "constant", "joint_torque"))
+
+
 def test_holes_in_a_channel_are_condemned_and_a_channel_that_is_not_there_is_not() -> None:
     holes = check(changed(demo_log(), "joint_torque", put((slice(200, 210), 1), np.nan)))
     assert places(only(holes, "not measured")) == {(200, 209)}

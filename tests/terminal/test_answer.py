@@ -96,6 +96,22 @@ def test_bodies_that_cannot_exist_are_counted_with_what_to_do(consistent: Identi
     assert "cannot exist" not in text(consistent)
 
 
+def test_a_total_mass_that_contradicts_the_urdf_needs_attention(consistent: Identification) -> None:
+    assert "weigh the robot" not in text(consistent)
+    light = replace(consistent, mass=replace(consistent.mass, value=0.4 * consistent.mass.nominal))
+    assert "attention     the total mass is 0.4 times the URDF's: weigh the robot" in text(light, 400)
+    vague = replace(light, mass=replace(light.mass, standard_error=0.4 * consistent.mass.nominal))
+    assert "times the URDF's" not in text(vague)
+
+
+def test_residuals_that_cannot_contradict_the_model_are_said_to_show_nothing(consistent: Identification) -> None:
+    assert consistent.misfit.judged
+    short = replace(consistent, misfit=replace(consistent.misfit, expected=None, lack_of_fit=None))
+    said = text(short, 400)
+    assert "attention     whether the model explains these forces is not known" in said
+    assert "sensors.noise" in said
+
+
 def test_what_needs_attention_is_named_with_what_to_do(free: Identification) -> None:
     (line,) = [line for line in text(free, 400).splitlines() if line.startswith("attention     friction, ")]
     assert "most in joint_torque" in line

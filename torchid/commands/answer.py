@@ -10,6 +10,8 @@ from torchid.commands.verdict import Judged
 from torchid.errors import join_names
 from torchid.estimators import Estimate
 from torchid.fitting.calibration import list_confounded
+from torchid.identifiability.confounding import TotalMass
+from torchid.log_checks.weight import MAX_MASS_ERROR
 from torchid.logs.time_range import log_title
 from torchid.problem.metrics import ADVICE, describe_worse
 from torchid.report.loadable_urdf import massless_ends
@@ -17,6 +19,8 @@ from torchid.report.tables import noise_advice
 
 if TYPE_CHECKING:
     from torchid.commands.results import Identification
+
+_CLEAR_ERRORS = 4.0  # standard errors of a total mass from which on it is not the URDF's
 
 
 @dataclass(frozen=True)
@@ -95,9 +99,21 @@ def _attention(run: Identification) -> Iterator[str]:
         yield f"negative, which nothing is: {join_names(impossible)}; {advice}"
     if not run.misfit.explained:
         yield f"friction, compliance or contacts that the model lacks, or a wrong sensor: {run.misfit}; torchid check"
+    if run.experiment.config.estimator.total_mass is None and _contradicts_nominal(run.mass):
+        ratio = f"{run.mass.value / run.mass.nominal:.3g} times the {run.experiment.robot.format}'s"
+        yield f"the total mass is {ratio}: weigh the robot, or mend units and gains of forces: torchid check"
+    if not run.misfit.judged:
+        reason = "no noise is stated, and the logs are too short to tell it from errors of the model"
+        yield f"whether the model explains these forces is not known: {reason}; state sensors.noise, or record more"
     if not run.mass.determined and not run.experiment.robot.fixed_base:
         yield "these data do not determine the total mass; weigh the robot: estimator.total_mass"
     for one in list_confounded(run.extras):
         yield str(one)
     if run.noise.suggested:
         yield f"noise: {noise_advice(run.noise.suggested)}"
+
+
+def _contradicts_nominal(mass: TotalMass) -> bool:
+    """Whether the data determine another mass than the URDF's, beyond what its bodies may be off by together."""
+    clear = abs(mass.value - mass.nominal) > _CLEAR_ERRORS * mass.standard_error
+    return mass.determined and clear and abs(mass.value / mass.nominal - 1.0) > MAX_MASS_ERROR

@@ -43,6 +43,11 @@ class Misfit:
     friction: UnfittedFriction | None = None
 
     @property
+    def judged(self) -> bool:
+        """Whether residuals could have shown that the model is wrong: by stated noise, or from block to block."""
+        return self.expected is not None or self.lack_of_fit is not None
+
+    @property
     def explained(self) -> bool:
         """Whether noise may be all that the model leaves."""
         much = self.expected is not None and self.residual > _MUCH * self.expected

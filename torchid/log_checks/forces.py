@@ -19,7 +19,7 @@ from torchid.log_checks.model import (
     fit_nominal_model,
     preprocess_pieces,
 )
-from torchid.log_checks.scales import TimeScale, fit_time_scale, fit_torque_gains, motion_cutoff_hz
+from torchid.log_checks.scales import TimeScale, TorqueGains, fit_time_scale, fit_torque_gains, motion_cutoff_hz
 from torchid.logs import Log
 from torchid.logs.log import WRENCHES, BoolArray, FloatArray
 from torchid.problem import Samples
@@ -40,6 +40,9 @@ MAX_CLEAR_MISFIT = 0.2
 #: Factors of single torques in another unit, and the tolerance of such a factor (see `model.MAX_GAIN_RATIO`).
 TORQUE_UNIT_FACTORS = {1e-3: "in mN m", 1e3: "in kN m"}
 _UNIT_TOLERANCE_RATIO = 3.0
+#: How far the factor of a reversed torque may be from -1: others are no mistake of sign.
+_SIGN_TOLERANCE_RATIO = 3.0
+_TINY = 1e-9
 #: Factor of time that no error of inertias explains: its square is 2.25.
 MIN_TIME_FACTOR = 1.5
 #: Unexplained forces with the recorded time, or at rest, over those with the corrected time.
@@ -50,10 +53,14 @@ _TIME_UNIT_TOLERANCE = 0.1
 #: Gain of a torque relative to the other joints, and shift of a wrench's point, that are reported: errors of gears and
 #: calibrations are smaller.
 MIN_GAIN_RATIO, MIN_POINT_SHIFT_M = 1.15, 0.03
+#: The same of all torques alike: masses of a URDF may be off by a fifth.
+MIN_COMMON_GAIN_RATIO = 1.3
 #: Size of such a deviation in standard deviations, which include the errors of the URDF.
 MIN_STANDARD_DEVIATIONS = 4.0
 #: Share of a deviation that every block of time must show.
 MIN_BLOCK_SHARE = 0.5
+#: The same of a factor of all torques, for which a block alone has hardly more than the prior at 1.
+MIN_COMMON_BLOCK_SHARE = 0.3
 #: Gains with a smaller standard deviation are the reference for all others, if there are enough of them.
 _MAX_REFERENCE_SPREAD, _MIN_REFERENCE_JOINTS = 0.1, 3
 _FORCE_CHECK = "forces against the URDF"
@@ -99,6 +106,10 @@ def check_forces_against_urdf(
         yield explanation
         return
     if fit.misfit > MAX_MISFIT and (scale is None or scale.recorded > MAX_UNEXPLAINED_RATIO):
+        alike = list(_common_gain_findings(fit_torque_gains(samples, robot, contacts)))
+        yield from alike
+        if alike:
+            return
         text = f"measured forces differ from the URDF's by {_percent(fit.misfit)}, and no usual mistake explains it"
         advice = "check units, frames, the order of joints and contacts, friction, the URDF's base link and masses,"
         advice += " and whether the URDF is that of this robot"
@@ -154,7 +165,7 @@ def _torque_findings(robot: Robot, fit: TorqueFit) -> Iterator[Finding | Skipped
         text = f"{join_names(joints)}: {problem}factors that fit the URDF best: {gains}"
         return Finding(name, severity, "joint_torque", text, advice, joints)
 
-    is_reversed = fit.implausible & (fit.gain < 0.0)
+    is_reversed = fit.implausible & (fit.gain < -1.0 / _SIGN_TOLERANCE_RATIO) & (fit.gain > -_SIGN_TOLERANCE_RATIO)
     if is_reversed.any():
         yield finding("sign", CONDEMNED, is_reversed, "reversed; ", "reverse these torques")
     scaled = fit.implausible & ~is_reversed
@@ -210,8 +221,12 @@ def _gain_and_point_findings(
     m = len(fit.joints)
     spread = fit.spread[:m]
     known = spread < _MAX_REFERENCE_SPREAD
-    reference = float(np.median(fit.gain[known])) if known.sum() >= _MIN_REFERENCE_JOINTS else 1.0
-    relative, blocks = fit.gain / reference, fit.blocks[:, :m] / reference
+    reference, references = 1.0, np.ones((len(fit.blocks), 1))
+    if known.sum() >= _MIN_REFERENCE_JOINTS:
+        reference = float(np.median(fit.gain[known]))
+        references = np.median(fit.blocks[:, :m][:, known], axis=1, keepdims=True)
+    yield from _common_gain_findings(fit)
+    relative, blocks = fit.gain / reference, fit.blocks[:, :m] / references
     large = (relative > MIN_GAIN_RATIO) | (relative < 1.0 / MIN_GAIN_RATIO)
     off = large & _is_certain(relative - 1.0, spread / reference, blocks - 1.0)
     if off.any():
@@ -230,7 +245,22 @@ def _gain_and_point_findings(
         yield Finding("point", SUSPICIOUS, log.contact_wrench_field, text, advice)
 
 
-def _is_certain(value: FloatArray, spread: FloatArray, blocks: FloatArray) -> BoolArray:
+def _common_gain_findings(fit: TorqueGains | None) -> Iterator[Finding]:
+    """A finding about all torques times a common factor."""
+    if fit is None or fit.common is None:
+        return
+    gain, spread, blocks = fit.common
+    off = max(gain, 1.0 / max(gain, _TINY)) > MIN_COMMON_GAIN_RATIO
+    value, agreeing = np.array([gain - 1.0]), blocks[:, None] - 1.0
+    if off and _is_certain(value, np.array([spread]), agreeing, MIN_COMMON_BLOCK_SHARE).all():
+        text = f"all torques: the factor that fits the URDF best is {gain:.3g} +- {spread:.2g}"
+        advice = (
+            "check units, gear ratios and torque constants, and whether the URDF's masses and contact forces are right"
+        )
+        yield Finding("scale", SUSPICIOUS, "joint_torque", text, advice)
+
+
+def _is_certain(value: FloatArray, spread: FloatArray, blocks: FloatArray, share: float = MIN_BLOCK_SHARE) -> BoolArray:
     """Which values (k,) are not 0, by their standard deviations (k,) and their estimates by block (BLOCKS, k)."""
-    agree = (blocks * np.sign(value) > MIN_BLOCK_SHARE * np.abs(value)).all(axis=0)
+    agree = (blocks * np.sign(value) > share * np.abs(value)).all(axis=0)
     return np.asarray((np.abs(value) > MIN_STANDARD_DEVIATIONS * spread) & agree)

@@ -30,6 +30,8 @@ MIN_SAMPLES_AT_LIMIT = 5
 RATE_FIELDS = ("joint_velocity", "joint_acceleration")
 #: Fields in which a driver may set small readings to zero.
 DEAD_BAND_FIELDS = (*RATE_FIELDS, "joint_torque", "ft_wrench", *CONTACT_READINGS)
+#: Fields whose readings change with the loads of a robot that moves.
+FORCE_FIELDS = ("joint_torque", "ft_wrench", "imu_specific_force", *CONTACT_READINGS)
 #: Logarithm (base 10) of the probability of a run of repeats by chance: none in a million samples.
 MAX_LOG10_PROBABILITY = -8.0
 #: Steps on either side that a run is compared with.
@@ -100,7 +102,7 @@ def check_repeats(groups: Iterable[ChannelGroup]) -> Iterator[Finding]:
         steps = np.diff(group.values, axis=0)
         constant = (steps == 0.0).all(axis=0)
         if constant.any():
-            yield from _constant_findings(group, constant)
+            yield from _constant_findings(group, constant, _moves(positions))
         if constant.all():
             continue
         rests = _at_rest(group, steps, positions)
@@ -213,24 +215,26 @@ def _held_finding(group: ChannelGroup, held: list[tuple[str, float]]) -> Finding
     return Finding("held", SUSPICIOUS, group.field, text, advice, names)
 
 
-def _constant_findings(group: ChannelGroup, constant: BoolArray) -> Iterator[Finding]:
-    names = tuple(name for name, still in zip(group.names, constant, strict=True) if still)
-    zero = not group.values[0][constant].any()
-    if zero and group.field in WRENCHES:  # moments of a point contact
-        return
-    text = f"{join_names(names)}: {'0' if zero else 'one value'} throughout"
-    if zero and group.field == "joint_torque":
-        advice = "write NaN if they were not measured: zeros are fitted as measured torques"
-        yield Finding("constant", SUSPICIOUS, group.field, text, advice, names)
-    else:
-        yield Finding(
-            "constant",
-            NOTE,
-            group.field,
-            text,
-            "none if the robot does not move there: constant channels add no information",
-            names,
-        )
+def _moves(positions: ChannelGroup | None) -> bool:
+    """Whether any joint changes its position."""
+    return positions is not None and bool(np.ptp(positions.values, axis=0).any())
+
+
+def _constant_findings(group: ChannelGroup, constant: BoolArray, moves: bool) -> Iterator[Finding]:
+    """Findings about channels (c,) that never change, those that are 0 apart from those at another value."""
+    zero = constant & ~group.values[0].astype(bool)
+    is_force = group.field in FORCE_FIELDS
+    for still, value in ((zero, "0"), (constant & ~zero, "one value")):
+        names = tuple(name for name, here in zip(group.names, still, strict=True) if here)
+        if not names or (value == "0" and group.field in WRENCHES):  # moments of a point contact
+            continue
+        severity, advice = NOTE, "none if the robot does not move there: constant channels add no information"
+        if value == "0" and group.field == "joint_torque":
+            severity, advice = SUSPICIOUS, "write NaN if they were not measured: zeros are fitted as measured torques"
+        elif value != "0" and is_force and moves:
+            severity = SUSPICIOUS
+            advice = "write NaN if they were not measured: a sensor's readings change while joints move"
+        yield Finding("constant", severity, group.field, f"{join_names(names)}: {value} throughout", advice, names)
 
 
 def _mean_hold(values: FloatArray, repeated: BoolArray) -> float:

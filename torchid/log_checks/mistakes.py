@@ -111,14 +111,7 @@ def possible_mistakes(log: Log) -> Iterator[Mistake]:
         yield Mistake("joint_position", text, "convert to radians", lambda log: _degrees_to_radians(log, far))
     yield from _order_mistakes(log)
     if log.base_quat_xyzw is not None:
-        down, up = "in a world whose z axis points down", "turn positions, orientations and vectors so that z points up"
-        yield Mistake("base_quat_xyzw", down, up, _flip_world)
-        order, rename = "w first against w last is mixed up", "rename base_quat_wxyz and base_quat_xyzw"
-        yield Mistake("base_quat_xyzw", order, rename, _with_quaternions(lambda quat: np.roll(quat, -1, axis=1)))
-        yield Mistake("base_quat_xyzw", order, rename, _with_quaternions(lambda quat: np.roll(quat, 1, axis=1)))
-        yield Mistake(
-            "base_quat_xyzw", "rotates world to base", "give the inverse", _with_quaternions(inverse_rotation)
-        )
+        yield from _orientation_mistakes()
     if log.imu_specific_force is not None:
         reading = "reversed: gravity minus acceleration"
         yield Mistake(
@@ -133,6 +126,35 @@ def possible_mistakes(log: Log) -> Iterator[Mistake]:
     for field, other in (WRENCHES, WRENCHES[::-1]):
         if getattr(log, field) is not None:
             yield from _wrench_mistakes(field, other)
+
+
+def _orientation_mistakes() -> Iterator[Mistake]:
+    """Other worlds and orders than those of a quaternion xyzw from base to a world whose z axis points up."""
+    down, up = "in a world whose z axis points down", "turn positions, orientations and vectors so that z points up"
+    yield Mistake("base_quat_xyzw", down, up, _flip_world)
+    order, rename = "w first against w last is mixed up", "rename base_quat_wxyz and base_quat_xyzw"
+    yield Mistake("base_quat_xyzw", order, rename, _with_quaternions(lambda quat: np.roll(quat, -1, axis=1)))
+    yield Mistake("base_quat_xyzw", order, rename, _with_quaternions(lambda quat: np.roll(quat, 1, axis=1)))
+    yield Mistake("base_quat_xyzw", "rotates world to base", "give the inverse", _with_quaternions(inverse_rotation))
+    for axis, name in enumerate("xyz"):
+        mirrored, turn = f"in a left-handed world, whose {name} axis is reversed", "give a right-handed world's"
+        yield Mistake("base_quat_xyzw", mirrored, f"{turn} orientations and vectors", _mirror_world(axis))
+
+
+def reversed_joints(log: Log) -> Iterator[Mistake]:
+    """Joints whose position is reversed, one at a time: many logs to try."""
+    for joint, name in enumerate(log.joint_names):
+        advice = f"logs.columns.joint_position.scale: {{{name}: -1}}, and likewise velocity and torque"
+        yield Mistake("joint_position", f"{name} reversed", advice, _reverse_joint(joint))
+
+
+def _reverse_joint(joint: int) -> Callable[[Log], Log]:
+    def correct(log: Log) -> Log:
+        position = log.joint_position.copy()
+        position[:, joint] *= -1.0
+        return dataclasses.replace(_remove(_JOINT_RATES)(log), joint_position=position)
+
+    return correct
 
 
 def _order_mistakes(log: Log) -> Iterator[Mistake]:
@@ -178,6 +200,25 @@ def _flip_world(log: Log) -> Log:
         if (vectors := getattr(log, name)) is not None:
             fields[name] = vectors * (_HALF_TURN_SIGNS if vectors.shape[-1] == 3 else np.tile(_HALF_TURN_SIGNS, 2))
     return dataclasses.replace(log, **fields)
+
+
+def _mirror_world(axis: int) -> Callable[[Log], Log]:
+    """A log in a world, and along axes of the base, of which one is reversed: two components of the quaternion are."""
+    signs = np.ones(3)
+    signs[axis] = -1.0
+
+    def correct(log: Log) -> Log:
+        fields: dict[str, Any] = dict.fromkeys(_BASE_RATES)
+        if log.base_quat_xyzw is not None:
+            fields["base_quat_xyzw"] = log.base_quat_xyzw * np.append(-signs, 1.0)
+        for name in _WORLD_FIELDS[:-1]:
+            if (vectors := getattr(log, name)) is not None:
+                fields[name] = vectors * signs
+        if (wrench := log.contact_wrench_world) is not None:
+            fields["contact_wrench_world"] = wrench * np.append(signs, -signs)
+        return dataclasses.replace(log, **fields)
+
+    return correct
 
 
 def _change(fields: Callable[[Log], dict[str, Any]]) -> Callable[[Log], Log]:

@@ -35,6 +35,8 @@ MIN_ROW_SIGNAL_RATIO = 2.0
 MAX_GAIN_RATIO = 10.0
 #: Misfit of the base force above which contact wrenches do not decide on the sign of a torque.
 _MAX_WRENCH_MISFIT = 0.3
+#: Travel [rad or m] below which a joint stands still, and what dry friction may then carry of the largest load.
+MIN_MOTION, MAX_FRICTION_SHARE = 0.01, 0.2
 #: Torque below the resolution of any sensor.
 MIN_TORQUE_NM = 1e-9
 #: Smaller singular values, over the largest, are raised to this share: the data do not determine such combinations.
@@ -167,7 +169,15 @@ def fit_nominal_model(samples: Sequence[Samples], robot: Robot, contacts: Sequen
         consistent = force is not None and force < _MAX_WRENCH_MISFIT and np.isfinite(contact_part).all()
         if (consistent or not contacts) and not fit.determined.all() and not robot.loops:
             fit = _fit_single_rows(fit, required[:, base : base + robot.n] - contact_part, torque)
+        fit = dataclasses.replace(fit, determined=fit.determined & ~_held_by_friction(samples, torque)[fit.joints])
     return ModelFit(fit, force, moment)
+
+
+def _held_by_friction(samples: Sequence[Samples], torque: FloatArray) -> BoolArray:
+    """Which joints (n,) stand still under a load that dry friction may carry: their torque (N, n) may be anything."""
+    position = np.concatenate([part.joint_position.numpy() for part in samples])
+    load = np.sqrt(np.square(np.nan_to_num(torque)).mean(axis=0))
+    return np.asarray((np.ptp(position, axis=0) < MIN_MOTION) & (load < MAX_FRICTION_SHARE * load.max(initial=0.0)))
 
 
 def _misfit(measured: FloatArray, model: FloatArray) -> float | None:

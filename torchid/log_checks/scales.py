@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -152,6 +152,9 @@ _TIME_FACTORS = np.geomspace(1e-4, 1e4, 1601)
 _JOINT_TERM_SCALE = 3.0
 #: Prior standard deviations of a torque's factor about 1, and of the point of wrenches about the contact frame.
 _GAIN_PRIOR_STD, _POINT_PRIOR_STD_M = 0.5, 0.3
+#: Squared residual, in `UNMODELLED_FORCE_SHARE` of the forces, that a common factor of all torques may leave: noise of
+#: accelerations, which takes any factor for too large, leaves more.
+MAX_COMMON_RESIDUAL = 0.25
 
 
 @dataclass(frozen=True)
@@ -188,8 +191,8 @@ def motion_cutoff_hz(log: Log) -> float | None:
     )
 
 
-def fit_time_scale(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: float) -> TimeScale:
-    """The factor of time at which gravity and inertia explain the forces best.
+def fit_time_scale(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: float) -> TimeScale | None:
+    """The factor of time at which gravity and inertia explain the forces best; None where no force was measured.
 
     Velocities and accelerations scale with the inverse of time and its square, gravity is constant: three factors
     determine the predicted forces at all others.
@@ -203,7 +206,10 @@ def fit_time_scale(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_h
         return bind_some_samples(logs, robot, contacts, TIME_SCALE_SAMPLES)
 
     recorded, doubled, at_rest = samples_at(1.0), samples_at(2.0), samples_at(_REST_FACTOR)
-    builder = RowBuilder(robot, contacts, _measured_sensors(recorded, robot, contacts))
+    sensors = _measured_sensors(recorded, robot, contacts)
+    if not (sensors.torque[: robot.n] & ~robot.is_passive[: robot.n]).any() and not sensors.wrench.any():
+        return None  # no force was measured: any factor explains none
+    builder = RowBuilder(robot, contacts, sensors)
     parts = []
     columns = _prior_columns(builder, robot, recorded)
     phi = robot.nominal.flatten()[None]
@@ -257,6 +263,7 @@ class TorqueGains:
         point: (3,) [m] in the contact frames.
         spread: (m + 3,) standard deviations of both.
         blocks: (BLOCKS, m + 3), both by block of time.
+        common: factor of all torques alike, its standard deviation, and by block, (BLOCKS,); None without torques.
     """
 
     joints: np.ndarray
@@ -264,6 +271,7 @@ class TorqueGains:
     point: FloatArray
     spread: FloatArray
     blocks: FloatArray
+    common: tuple[float, float, FloatArray] | None
 
 
 def fit_torque_gains(samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact]) -> TorqueGains | None:
@@ -318,14 +326,30 @@ def _solve_gains(equations: _NormalEquations, joints: np.ndarray) -> TorqueGains
     prior_mean = np.append(np.ones(m), np.zeros(3))
     precision = np.append(np.full(m, _GAIN_PRIOR_STD), np.full(3, _POINT_PRIOR_STD_M)) ** -2.0
 
-    def solve(block: int | None) -> tuple[FloatArray, FloatArray, float]:
-        G = equations.unexplained(block)
-        H = G[1:, 1:] + np.diag(CORRELATED_SAMPLES * precision)
-        x = np.linalg.solve(H, G[1:, 0] + CORRELATED_SAMPLES * precision * prior_mean)
+    def solve(block: int | None, unknowns: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+        """Unknowns, of which the columns make gains and shifts, their variances, and the squared residual."""
+        map_ = np.zeros((len(unknowns) + 1, unknowns.shape[1] + 1))
+        map_[0, 0], map_[1:, 1:] = 1.0, unknowns
+        G = map_.T @ equations.unexplained(block) @ map_
+        H = G[1:, 1:] + CORRELATED_SAMPLES * unknowns.T @ np.diag(precision) @ unknowns
+        x = np.linalg.solve(H, G[1:, 0] + CORRELATED_SAMPLES * unknowns.T @ (precision * prior_mean))
         residual = G[0, 0] - 2.0 * G[0, 1:] @ x + x @ G[1:, 1:] @ x
         return np.asarray(x), np.asarray(np.diag(np.linalg.inv(H))), float(residual)
 
+    each = np.eye(m + 3)
+    x, spread, blocks = _with_blocks(lambda block: solve(block, each), equations.rows)
+    common = None
+    alike = np.column_stack([prior_mean, each[:, m:]])
+    if m and solve(None, alike)[2] < MAX_COMMON_RESIDUAL * equations.rows:
+        factor, certainty, by_block = _with_blocks(lambda block: solve(block, alike), equations.rows)
+        common = (float(factor[0]), float(certainty[0]), by_block[:, 0])
+    return TorqueGains(joints, x[:m], x[m:], spread, blocks, common)
+
+
+def _with_blocks(
+    solve: Callable[[int | None], tuple[FloatArray, FloatArray, float]], rows: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Unknowns (k,) of all samples, their standard deviations, and those of each block, (BLOCKS, k)."""
     x, variance, residual = solve(None)
-    size = max(1.0, residual / max(equations.rows, 1))
-    blocks = np.array([solve(block)[0] for block in range(BLOCKS)])
-    return TorqueGains(joints, x[:m], x[m:], np.sqrt(CORRELATED_SAMPLES * size * variance), blocks)
+    size = max(1.0, residual / max(rows, 1))
+    return x, np.sqrt(CORRELATED_SAMPLES * size * variance), np.array([solve(block)[0] for block in range(BLOCKS)])

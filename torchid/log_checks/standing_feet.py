@@ -1,4 +1,4 @@
-"""Feet that move in the world while their flag says that they stand."""
+"""Motion of feet that stand by their flags: what they show of orientation, joint positions, names and radii."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from torchid.errors import join_names
 from torchid.log_checks.findings import CONDEMNED, SUSPICIOUS, Finding, Skipped, find_spans, median_step
-from torchid.log_checks.mistakes import possible_mistakes
+from torchid.log_checks.mistakes import possible_mistakes, reversed_joints
 from torchid.log_checks.model import LinkPoses, link_poses
 from torchid.logs import Log
 from torchid.logs.log import FloatArray
@@ -20,6 +21,8 @@ from torchid.sensing import Contact
 
 #: Motion of standing feet over that of the base above them. Soft soles and rolling feet have 0.05 to 0.2.
 MAX_SLIP_SHARE = 0.3
+#: The same where no mistake explains it. A person whose heels lift in squats has 0.4, an orientation that is wrong 0.9.
+MAX_UNEXPLAINED_SLIP_SHARE = 0.6
 #: Motion of standing feet from which on it is asked whether they roll on other radii, and the radius to begin with.
 MIN_ROLLING_SHARE, _TRIAL_RADIUS_M = 0.02, 0.01
 #: Share of this motion that a corrected mistake may leave.
@@ -53,7 +56,7 @@ def check_standing_feet(
     if slip < MAX_SLIP_SHARE:
         return
     best, least = None, MAX_RESIDUAL_SHARE * slip
-    for mistake in possible_mistakes(log):
+    for mistake in (*possible_mistakes(log), *reversed_joints(log)):
         if mistake.field not in _CORRECTED_FIELDS or mistake.field.startswith(derived):
             continue
         corrected = mistake.correct(log)
@@ -65,6 +68,20 @@ def check_standing_feet(
         share = f"{100 * slip:.3g} % as much as the base above them, {100 * least:.2g} % once corrected"
         text = f"{best.description}: standing feet move {share}"
         yield Finding("unit, sign or frame", CONDEMNED, best.field, text, best.advice)
+    elif slip > MAX_UNEXPLAINED_SLIP_SHARE:
+        yield _unexplained_motion(log, robot, contacts, slip, poses)
+
+
+def _unexplained_motion(
+    log: Log, robot: Robot, contacts: Sequence[Contact], slip: float, poses: LinkPoses | None
+) -> Finding:
+    """A finding about feet that move though they stand, which no usual mistake explains, with those that move most."""
+    alone = {c.frame: measure_foot_slip(log, robot, [c], poses) for c in contacts}
+    moving = sorted((name for name, own in alone.items() if own), key=lambda name: -(alone[name] or 0.0))
+    most = join_names([f"{name} {100 * (alone[name] or 0.0):.2g} %" for name in moving])
+    text = f"standing feet move {100 * slip:.3g} % as much as the base above them, and no usual mistake explains it"
+    advice = "check signs, scales and zeros of joint positions, the base's orientation and position, and the flags"
+    return Finding("standing feet", SUSPICIOUS, "all", f"{text}: {most}" if most else text, advice, tuple(moving))
 
 
 def _radius_findings(
