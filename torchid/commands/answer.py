@@ -65,7 +65,7 @@ def _judge(run: Identification) -> Judged:
 
 def _headline(run: Identification, judged: Judged) -> str:
     if run.worse:
-        return f"WORSE THAN {judged.of}: {describe_worse(run.worse)}"
+        return f"WORSE THAN {judged.of}: {describe_worse(run.worse, judged.of)}"
     return judged.headline(explained=run.misfit.explained)
 
 
@@ -94,10 +94,10 @@ def _attention(run: Identification) -> Iterator[str]:
         advice = "estimator.name=consistent finds the best that can be"
         yield f"negative, which nothing is: {join_names(impossible)}; {advice}"
     if not run.misfit.explained:
-        yield f"friction, compliance or contacts that the model lacks, or a wrong sensor: {run.misfit}; torchid check"
+        yield f"friction, compliance or contacts that the model lacks, or a wrong sensor (torchid check): {run.misfit}"
     if not run.mass.determined and not run.experiment.robot.fixed_base:
         yield "these data do not determine the total mass; weigh the robot: estimator.total_mass"
     for one in list_confounded(run.extras):
-        yield str(one)
+        yield one.in_short
     if run.noise.suggested:
         yield f"noise: {noise_advice(run.noise.suggested)}"
