@@ -21,6 +21,7 @@ from torchid.config import ExperimentConfig
 
 _ROOT = Path(__file__).resolve().parents[1]
 _PAGES = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
+_FLOWCHART = re.compile(r"^```mermaid\nflowchart TD\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 _LINK = re.compile(r"(?<!!)\[([^\]]+)\]\(([^)\s#]+)(#[^)]*)?\)")
 
 
@@ -35,7 +36,22 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Let links to files that are no pages be text, and those to README and the like lead to their pages."""
-    return _relinked(markdown, "docs/")
+    return _FLOWCHART.sub(_in_words, _relinked(markdown, "docs/"))
+
+
+def _in_words(chart: re.Match[str]) -> str:
+    """A flowchart as lines of text: whoever draws it in a browser asks another site for the program that does."""
+    labels: dict[str, str] = {}
+    leads: dict[str, list[str]] = {}
+    for source, target in re.findall(r"^ +(.+?) --> (.+)$", chart.group(1), re.MULTILINE):
+        names = []
+        for node in (source, target):
+            name, label = re.findall(r"^(\w+)(?:\[[/\"]*(.*?)[/\"]*\])?$", node)[0]
+            labels[name] = label or labels.get(name, name)
+            names.append(name)
+        leads.setdefault(names[0], []).append(names[1])
+    lines = [f"{labels[name]}\n    → {', '.join(others)}" for name, others in leads.items()]
+    return "\n".join(["```text", *lines, "```"])
 
 
 def _relinked(markdown: str, folder: str) -> str:
@@ -51,7 +67,7 @@ def _relinked(markdown: str, folder: str) -> str:
             return f"[{text}]({_PAGES[name]}{anchor})"
         if name.startswith("docs/"):
             return f"[{text}]({name.removeprefix('docs/')}{anchor})"
-        return match.group(0) if (_ROOT / "docs" / target).exists() or "/" not in name else text
+        return text if "/" in name else match.group(0)
 
     return re.sub(r"(!\[[^\]]*\]\()docs/", r"\1", _LINK.sub(replaced, markdown))
 

@@ -24,6 +24,7 @@ from torch import Tensor, nn
 
 import torchid
 from torchid.boundary import run_guarded
+from torchid.commands.events import hyperparameters
 from torchid.commands.reading import LogReader
 from torchid.config import load_config
 from torchid.errors import ConfigError, about_file
@@ -89,11 +90,15 @@ def compare(options: argparse.Namespace) -> None:
         table.add_column(name, justify="right" if name else "left")
     for name, networks in (("rigid bodies alone", None), ("with networks", JointNetworks(robot.n).to(config.device))):
         trainer = Trainer(settings, problem, MiniBatches(train, builder), residual=networks)
-        with RunEvents(options.curves / name.replace(" ", "_"), robot.body_names, descent=True) as events:
+        with RunEvents(options.curves / name.replace(" ", "_")) as events:
+            events.write_layout([], [])
             for _ in track(range(options.epochs), description=name):
                 epoch = trainer.run_epoch()
-                events.write_epoch(epoch)
-        seen, unseen = (trainer.loss.mean_square(MiniBatches(logs, builder)) ** 0.5 for logs in (train, test))
+                events.write_epoch(epoch, trainer.loss.mean_square(MiniBatches(test, builder)))
+            seen, unseen = (trainer.loss.mean_square(MiniBatches(logs, builder)) ** 0.5 for logs in (train, test))
+            used = {**hyperparameters(config), "estimator": f"sgd, {name}", "training.epochs": options.epochs}
+            weight = {"training.residual_weight": trainer.loss.residual_weight or 0.0}
+            events.write_hyperparameters(used | weight, {"unseen_rms": unseen, "train_rms": seen}, options.epochs)
         shares = (f"{100.0 * epoch.shares.get(of, 0.0):.3g} %" for of in ("rigid_body", "residual"))
         table.add_row(name, f"{seen:.3f}", f"{unseen:.3f}", *shares)
     Console(width=100).print(table)

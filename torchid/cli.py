@@ -269,6 +269,7 @@ def _demo(options: argparse.Namespace) -> None:
         from torchid.commands.demo import EXPERIMENT, copy_examples, run_demo
         from torchid.terminal.answer import print_answer
         from torchid.terminal.details import print_details
+        from torchid.terminal.lines import print_labelled
 
     if options.copy is not None:
         if options.overrides:
@@ -279,12 +280,12 @@ def _demo(options: argparse.Namespace) -> None:
         print(f"written to    {folder}; in the folder above it: torchid identify {folder.name}/{EXPERIMENT.name}")
         return
     run = run_demo(options.overrides, options.output)
-    experiment = f"experiment    {EXPERIMENT}; to edit a copy: torchid demo --copy FOLDER"
+    shown = ("experiment", f"{EXPERIMENT}; to edit a copy: torchid demo --copy FOLDER")
     if options.verbose:
         print_details(run)
-        print(experiment)
+        print_labelled(*shown)
     elif not options.quiet:
-        print_answer(run, experiment)
+        print_answer(run, shown)
 
 
 def _compress(options: argparse.Namespace) -> None:

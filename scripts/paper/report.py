@@ -9,7 +9,6 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogFormatter
 from rich.table import Table
 
 from paper.fits import Series
@@ -18,7 +17,7 @@ from paper.settings import SHOWN
 from torchid.commands.folder import write_json
 from torchid.parameters import Array
 from torchid.problem.metrics import ROW_GROUPS, group_name
-from torchid.report.figures import STYLE, save_figure
+from torchid.report.figures import STYLE, label_decades, save_figure
 from torchid.report.tables import table_text
 from torchid.report.tensorboard import write_comparison
 
@@ -77,9 +76,8 @@ def bar_figure(title: str, groups: Sequence[Bars]) -> Figure:
         for x, y, top in zip(position, median, greatest, strict=True):
             axis.annotate(f"{y:.2g}", (x, top), (0, 2), textcoords="offset points", ha="center", fontsize=7)
         axis.set_yscale("log")
-        axis.yaxis.set_major_formatter(LogFormatter())  # the default writes formulas, which names forbid, see STYLE
-        axis.yaxis.set_minor_formatter(LogFormatter(labelOnlyBase=False))
         axis.margins(y=0.15)
+        label_decades(axis.yaxis)
         axis.set_xticks(position, list(group.heights), rotation=40, ha="right")
         axis.set_title(group.name, loc="left", fontsize=9)
     axes[0].set_ylabel("rms of error / rms of measured [%]")

@@ -90,7 +90,7 @@ def beside(folder: Path, page: str) -> dict[str, Any]:
     sensors = torchid.named_sensors("full", robot.n, 2, ft=len(welds))
     said["builder"] = builder = torchid.RowBuilder(robot, contacts, sensors)
     said["log"] = samples = torchid.bind_log(torchid.read_log(folder / "walk.npz"), robot, contacts)
-    said["train"], said["samples"] = [samples], samples
+    said["train"], said["samples"], said["logs"] = [samples], samples, [samples]
     said["problem"] = torchid.linear_problem(torchid.compress([samples], builder), builder, robot)
     said["problem_of_a_log"], said["nominal"] = said["problem"], robot.nominal.flatten()
     q, v, a = (torch.zeros(3, size, dtype=torch.float64) for size in (robot.n + 7, robot.n + 6, robot.n + 6))
@@ -127,9 +127,13 @@ def test_python_of_the_pages_runs(page: str, folder: Path, monkeypatch: pytest.M
     """Block after block, as a reader copies them."""
     monkeypatch.chdir(folder)
     monkeypatch.setattr(torchid, "Sgd", _two_epochs)
+    for name, text in {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "0", "RANK": "0", "WORLD_SIZE": "1"}.items():
+        monkeypatch.setenv(name, text)  # as torchrun sets them for one process
     said = beside(folder, page)
     for block in (x.values[1] for x in blocks("python") if x.values[0] == page):
         exec(compile(str(block), page, "exec"), said)
+    if torch.distributed.is_initialized():  # noqa: TID251
+        torch.distributed.destroy_process_group()  # noqa: TID251
 
 
 def _two_epochs(**settings: Any) -> Any:
@@ -137,6 +141,12 @@ def _two_epochs(**settings: Any) -> Any:
     from torchid.estimators import Sgd
 
     return Sgd(**settings | {"epochs": 2})
+
+
+def test_no_python_hides_in_a_block_that_no_test_runs() -> None:
+    for page in PAGES:
+        text = re.sub(r"^ *```.*?^ *```", "", page.read_text(), flags=re.S | re.M)
+        assert not re.findall(r"^    (?:import|from) \w+|^    .*\btorchid\.\w+\(", text, re.MULTILINE), page.name
 
 
 # ------------------------------------------------------------------------------------------------------------- shell

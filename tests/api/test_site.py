@@ -41,6 +41,30 @@ def test_every_page_of_the_documentation_is_there(site: Path) -> None:
     assert "Two commands" in text_of(site / "index.html")
 
 
+def test_no_page_asks_anybody_for_anything(site: Path) -> None:
+    for page in site.rglob("*.html"):
+        assert not re.findall(
+            r"<(?:script|link|img)[^>]*(?:src|href)=\"?(?:https?:)?//(?!localhost)[^>]*>", page.read_text()
+        )
+    chart = text_of(site / "architecture" / "index.html")
+    assert "logs: read, filter, differentiate, resample\n    → problem, log_checks" in chart
+    assert 'class="mermaid"' not in (site / "architecture" / "index.html").read_text()
+
+
+def test_links_lead_to_pages_and_sections_that_there_are(site: Path) -> None:
+    """Those within the site; strict MkDocs looks at pages alone, not at what the hook makes of them."""
+    pages = {page.parent: page.read_text() for page in site.rglob("index.html")}
+    sections = {folder: set(re.findall(r" id=\"?([^\" >]+)", text)) for folder, text in pages.items()}
+    for folder, text in pages.items():
+        for link in re.findall(r"<a [^>]*href=\"([^\"]+)\"", text):
+            place, _, section = html.unescape(link).partition("#")
+            if re.match(r"[a-z]+:", place):
+                continue
+            target = (folder / place).resolve()
+            assert target.exists(), f"{folder.name}: {link}"
+            assert not section or target.is_file() or section in sections[target], f"{folder.name}: {link}"
+
+
 @pytest.mark.parametrize("key", KEYS)
 def test_keys_have_what_they_accept_and_their_defaults(site: Path, key: str) -> None:
     block, _, name = key.rpartition(".")

@@ -157,7 +157,7 @@ def test_a_run_of_factors_says_what_it_can(fleet: Path, tmp_path: Path, capsys: 
     assert {one["origin"] for one in metrics["noise"]["groups"]} == {"stated"}
     events = EventAccumulator(str(output))
     events.Reload()
-    assert "descent/samples_per_second" not in events.Tags()["scalars"]
+    assert "training/samples_per_second" not in events.Tags()["scalars"]
     assert main(["evaluate", str(output), "--log", str(fleet / "sway_test.npz")]) == 0
 
 

@@ -155,17 +155,19 @@ def test_tensorboard_shows_train_and_test_before_and_after(run: Path) -> None:
     events = EventAccumulator(str(run), size_guidance={"images": 0})
     events.Reload()
     for name in ("train", "test"):
-        (urdf,), (identified,) = (events.Scalars(f"relative_error_{name}{kind}/base_force") for kind in ("_URDF", ""))
+        tags = (f"error_relative_{name}{kind}/base_force" for kind in ("_nominal", ""))
+        (urdf,), (identified,) = map(events.Scalars, tags)
         assert urdf.step == identified.step == 1  # points, which no smoothing changes
         assert identified.value < urdf.value
-    assert set(events.Tags()["images"]) == {
-        "forces",
-        "errors",
-        "parameters",
-        "identifiability",
-        "contributions",
-        "ridge",
-    }
+    figures = ("forces", "errors", "parameters", "identifiability", "contributions", "ridge")
+    assert set(events.Tags()["images"]) == {f"figure_{k}_{name}" for k, name in enumerate(figures, 1)}
+    assert min(events.Tags()["scalars"]).startswith("error_relative_"), "which TensorBoard shows first"
+    text = events.Tensors("answer/text_summary")[0].tensor_proto.string_val[0].decode()
+    assert "Much better than the URDF on unseen motion" in text
+    values = [events.Scalars(f"parameter{end}/total_mass")[0].value for end in ("_lower", "", "_upper")]
+    mass = json.loads((run / "metrics.json").read_text())
+    error = 1.96 * mass["total_mass_standard_error"]
+    assert values == pytest.approx([mass["total_mass"] + k * error for k in (-1, 0, 1)])
 
 
 def test_tensorboard_shows_what_is_identified_and_by_what(run: Path) -> None:

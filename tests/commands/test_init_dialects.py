@@ -262,7 +262,7 @@ def test_what_columns_may_be_that_are_not_read_is_said(tmp_path: Path) -> None:
     columns: dict[str, Any] = {"t": TIME, "dt": TIME}
     columns |= {f"leg_left_{k}_position": q[:, k] for k in range(6)}
     said = init(ANYMAL, save_csv(tmp_path / "other.csv", columns), tmp_path / "other.yaml")
-    assert any("is it the URDF of the robot that was recorded?" in text for text in said.missing)
+    assert any("is it the one that was recorded?" in text for text in said.missing)
     columns = {f"q_{k}": q[:, k] for k in range(12)} | {f"current_{k}": dq[:, k] for k in range(12)}
     columns |= {"roll_deg": TIME, "pitch_deg": TIME, "left_ft_x": TIME}
     said = init(ANYMAL, save_csv(tmp_path / "lacks.csv", columns), tmp_path / "lacks.yaml")

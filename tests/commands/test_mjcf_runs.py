@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -216,5 +217,30 @@ def test_a_log_is_checked_against_a_model_as_against_its_urdf(runs: dict[str, Pa
     (of_urdf,) = torchid.check(LOG, robot=DEMO / "quadruped.urdf")
     assert of_model.skipped == of_urdf.skipped
     assert [one.name for one in of_model.findings] == [one.name for one in of_urdf.findings]
+
+
+@pytest.mark.parametrize("factor", [0.7, 1.8, -1.0])
+def test_findings_against_a_model_are_those_against_its_urdf_and_name_the_model(
+    runs: dict[str, Path], factor: float
+) -> None:
+    """Of contact forces that are no weight of the robot, and of a torque that contradicts it."""
+    log = torchid.read_log(LOG)
+    assert log.joint_torque is not None
+    assert log.contact_wrench_local is not None
+    torque = log.joint_torque * np.where(np.arange(log.joint_torque.shape[1]) == 4, -1.0, 1.0)
+    log = replace(log, joint_torque=torque, contact_wrench_local=factor * log.contact_wrench_local)
+    entries = yaml.safe_load((DEMO / "quadruped.yaml").read_text())["contacts"]
+    contacts = [torchid.Contact(one["frame"], one["type"]) for one in entries]
+    files, said = {"urdf": DEMO / "quadruped.urdf", "mjcf": runs["mjcf"].parent / "quadruped.xml"}, {}
+    for key, file in files.items():
+        checked = torchid.check(log, load_robot(file), contacts)
+        said[key] = "; ".join(f"{one.found}; {one.advice}" for one in checked.findings)
+    assert "URDF" in said["urdf"]
+    assert "MJCF" in said["mjcf"]
+    assert re.sub(r"[\d.]+", "", said["mjcf"]) == re.sub(r"[\d.]+", "", said["urdf"]).replace("URDF", "MJCF")
+
+
+def test_a_log_is_checked_against_one_robot_alone(runs: dict[str, Path]) -> None:
+    file = runs["mjcf"].parent / "quadruped.xml"
     with pytest.raises(ConfigError, match="urdf or mjcf"):
         torchid.check(LOG, robot={"mjcf": file, "urdf": DEMO / "quadruped.urdf"})

@@ -5,8 +5,10 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import pytest
 import torch
 from script_calls import ROOT, call, script
+from trainings import events_in
 
 DEMO = str(ROOT / "torchid" / "demo" / "quadruped.yaml")
 
@@ -20,6 +22,14 @@ def test_networks_find_the_friction_that_the_model_lacks(tmp_path: Path) -> None
     alone, beside = (float(re.findall(r"\d+\.\d+", row)[1]) for row in rows)
     assert beside < 0.5 * alone
     assert {path.name for path in tmp_path.iterdir()} == {"rigid_bodies_alone", "with_networks"}
+    for row, run in zip(rows, ("rigid_bodies_alone", "with_networks"), strict=True):
+        events = events_in(tmp_path / run)
+        unseen = [event.value for event in events.Scalars("loss_unseen/data")]
+        assert len(unseen) == 25
+        (final,) = events.Scalars("final/unseen_rms")
+        assert final.value == pytest.approx(unseen[-1] ** 0.5, rel=1e-6)
+        assert f"{final.value:.3f}" in row
+        assert "_hparams_/session_start_info" in events.summary_metadata
 
     status, _, told = call("train_residual", DEMO, "--curves", str(tmp_path))
     assert status == 2

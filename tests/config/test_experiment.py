@@ -342,8 +342,8 @@ def test_a_value_of_the_wrong_kind_is_refused_by_its_place(file: Path, settings:
         ("contacts=[{frame: a, type: point, radius: [1, 2]}]", "contacts.0.radius: found [1, 2]; accepted: auto, or a"),
         ("contacts=[{frame: a, type: [point]}]", "contacts.0.type: found ['point']; accepted: 'point', 'line' or"),
         ("contacts=[{frame: a, type: line, line_axis: [x]}]", "contacts.0.line_axis: found ['x']; accepted: 'x', 'y'"),
-        ("contacts=[{frame: [a], type: line}]", "contacts.0.frame: found ['a']; accepted: the name of a frame in"),
-        ("contacts=[{type: line}]", "contacts.0.frame: missing; accepted: the name of a frame in the URDF"),
+        ("contacts=[{frame: [a], type: line}]", "contacts.0.frame: found ['a']; accepted: the name of a frame of"),
+        ("contacts=[{type: line}]", "contacts.0.frame: missing; accepted: the name of a frame of the robot"),
         ("contacts=[[a]]", "contacts.0: found ['a']; accepted: a mapping with frame, type, line_axis, radius, normal"),
         (
             "sensors={contact_wrenches: {a: fn}}",

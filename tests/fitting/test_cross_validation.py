@@ -196,7 +196,7 @@ def test_tensorboard_and_a_figure_have_the_error_of_every_ridge(run: Path) -> No
     for tag, values in (("mean_square", found["mean_square"]), ("standard_error", found["standard_error"])):
         curve = {one.step: one.value for one in events.Scalars(f"ridge/held_out_{tag}")}
         assert curve == pytest.approx(dict(zip(range(-7, 2), values, strict=True)), rel=1e-6)
-    assert "ridge" in events.Tags()["images"]
+    assert "figure_6_ridge" in events.Tags()["images"]
     assert (run / "ridge.png").is_file()
 
 
@@ -226,10 +226,10 @@ def test_evaluate_and_tensorboard_have_the_whitened_projected_residual(run: Path
     assert found["nominal"][WHITENED] == pytest.approx(metrics["test_nominal"][WHITENED])
     events = EventAccumulator(str(run))
     events.Reload()
-    scalars = [x for kind in ("_URDF", "") for x in events.Scalars(f"rms_error_left_out{kind}/{WHITENED}")]
+    scalars = [x for of in ("_nominal", "") for x in events.Scalars(f"error_rms_left_out{of}/{WHITENED}")]
     cross = json.loads((run / "metrics.json").read_text())["cross_validation"]
     assert [x.value for x in scalars] == pytest.approx([cross[x][WHITENED] for x in ("nominal", "identified")])
-    assert "verdict/text_summary" in events.Tags()["tensors"]
+    assert "answer/text_summary" in events.Tags()["tensors"]
 
 
 # ---------------------------------------------------------------------------------------------------------- the verdict
@@ -254,7 +254,7 @@ def metrics_of(rms: float, measured: float, group: str = "base_force") -> Metric
 def test_worse_is_clearly_larger_and_no_rounding(nominal: float, identified: float, worse: bool) -> None:
     found = worse_than_nominal({"test": (metrics_of(nominal, 100.0), metrics_of(identified, 100.0))})
     assert bool(found) is worse
-    assert (describe_worse(found) is None) is not worse
+    assert (describe_worse(found, "URDF") is None) is not worse
 
 
 def test_what_was_not_measured_is_not_judged() -> None:

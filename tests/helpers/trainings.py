@@ -75,5 +75,5 @@ def assert_as_uninterrupted(output: Path, run: Path) -> None:
     for tag in whole.Tags()["scalars"]:
         values = {event.step: event.value for event in whole.Scalars(tag)}
         assert steps(curves, tag) == steps(whole, tag)
-        if tag != "descent/samples_per_second":
+        if tag != "training/samples_per_second":
             assert all(event.value == values[event.step] for event in curves.Scalars(tag))

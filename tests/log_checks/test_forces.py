@@ -258,7 +258,7 @@ def test_a_log_of_another_robot_is_not_usable() -> None:
 
 def test_a_log_without_a_robot_says_what_was_not_checked() -> None:
     reasons = {skip.name: skip.reason for skip in check(arm()[1]).skipped}
-    assert "no robot" in reasons["forces against the URDF"]
+    assert "no robot" in reasons["forces against the model"]
 
 
 def test_a_long_log_is_compared_in_pieces() -> None:

@@ -78,7 +78,7 @@ def test_joints_get_the_names_that_the_map_gives_them(tmp_path: Path) -> None:
     [
         ({"y": "l_knee"}, "logs.topics.joint_states.names: unknown name 'y'; accepted: x, b, a"),
         ({"x": "a"}, "names a, b, a, ... that repeat"),
-        ({"x": "k", "b": "k"}, "logs.topics.joint_states.names: two names of 'k'; accepted: each joint of the URDF"),
+        ({"x": "k", "b": "k"}, "logs.topics.joint_states.names: two names of 'k'; accepted: each joint of the robot"),
     ],
 )
 def test_names_that_no_message_has_or_that_joints_share_are_refused(

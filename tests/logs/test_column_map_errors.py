@@ -277,7 +277,9 @@ def test_columns_inside_of_others_count_and_lists_are_refused(tmp_path: Path) ->
 
 def test_a_map_of_another_robot_says_so_and_a_misspelt_name_the_nearest() -> None:
     columns = Columns(joint_order=["LF_HAA", "LF_HFE"])  # type: ignore[arg-type]
-    with pytest.raises(ConfigError, match="none of LF_HAA, LF_HFE is a joint of the URDF; is it that of the robot"):
+    with pytest.raises(
+        ConfigError, match="none of LF_HAA, LF_HFE is a joint of the robot; is it the one that was recorded"
+    ):
         require_names(columns, {"joint": ["FL_hip", "FL_thigh"]})
     with pytest.raises(UnknownNameError, match="unknown name 'FL_hpi'"):
         require_names(Columns(joint_order=["FL_hpi", "FL_thigh"]), {"joint": ["FL_hip", "FL_thigh"]})  # type: ignore[arg-type]

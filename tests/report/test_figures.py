@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
 
 from torchid.estimators.least_squares import COMBINED, FIXED
 from torchid.fitting.calibration import Comparison
 from torchid.parameters import PER_BODY
 from torchid.problem import Metrics
-from torchid.report.figures import contribution_figure, decade, error_figure, identifiability_figure
+from torchid.report.figures import contribution_figure, decade, error_figure, identifiability_figure, label_decades
 
 
 def metrics(rms: float, noise: float | None) -> Metrics:
@@ -62,3 +63,15 @@ def test_parameters_that_nothing_fits_have_no_column() -> None:
 )
 def test_decades_are_read_as_they_are_spoken(value: float, text: str) -> None:
     assert decade(value) == text
+
+
+@pytest.mark.parametrize(("low", "high", "said"), [(0.02, 0.4, {"0.02", "0.1", "0.2"}), (1e-12, 3.0, {"10⁻⁸", "1"})])
+def test_logarithmic_axes_have_numbers_that_people_write(low: float, high: float, said: set[str]) -> None:
+    figure = Figure()
+    axes = figure.subplots()
+    axes.plot([0, 1], [low, high])
+    axes.set_yscale("log")
+    label_decades(axes.yaxis)
+    texts = {text.get_text() for text in axes.yaxis.get_ticklabels(which="both")}
+    assert texts >= said
+    assert not any("e" in text for text in texts)

@@ -51,6 +51,7 @@ def test_it_fits_on_a_screen_of_any_width(consistent: Identification, free: Iden
     for run in (consistent, free):
         lines = answer_lines(run, width)
         assert len(lines) <= LINES
+        assert not any(line.startswith("attention") and line.endswith("...") for line in lines)
         paths = [line for line in lines if "written to" in line or str(run.experiment.config.output.name) in line]
         assert max(len(line) for line in lines if line not in paths) <= width
 

@@ -30,7 +30,7 @@ WEIGHT = Finding("weight", NOTE, "contact_wrench_local", "contacts carry 21.36 k
 def checked(name: str, *findings: Finding) -> Checked:
     time = np.arange(20) * 0.01
     log = Log(f"{name}.npz", time, ("knee",), np.zeros((20, 1)))
-    return Checked(log, log, findings, (Skipped("forces against the URDF", "no robot (--urdf)"),))
+    return Checked(log, log, findings, (Skipped("forces against the model", "no robot (--urdf)"),))
 
 
 def text(logs: list[Checked], width: int = 100) -> str:
@@ -75,7 +75,7 @@ def test_one_log_is_named_with_its_verdict() -> None:
     assert text([checked("walk", WEIGHT)]).startswith("walk.npz: 20 samples, 0.19 s: usable; free of usual mistakes")
     assert text([checked("walk", SIGN)]).startswith("walk.npz: 20 samples, 0.19 s: usable suspicious ")
     assert text([checked("walk", DEGREES)]).startswith("walk.npz: 20 samples, 0.19 s: not usable: joint_position: unit")
-    assert "not checked 1 check: forces against the URDF (no robot (--urdf))" in text([checked("walk")])
+    assert "not checked 1 check: forces against the model (no robot (--urdf))" in text([checked("walk")])
 
 
 @pytest.mark.parametrize("width", [60, 100])

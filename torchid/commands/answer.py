@@ -69,7 +69,7 @@ def _judge(run: Identification) -> Judged:
 
 def _headline(run: Identification, judged: Judged) -> str:
     if run.worse:
-        return f"WORSE THAN {judged.of}: {describe_worse(run.worse)}"
+        return f"WORSE THAN {judged.of}: {describe_worse(run.worse, judged.of)}"
     return judged.headline(explained=run.misfit.explained)
 
 
@@ -98,7 +98,7 @@ def _attention(run: Identification) -> Iterator[str]:
         advice = "estimator.name=consistent finds the best that can be"
         yield f"negative, which nothing is: {join_names(impossible)}; {advice}"
     if not run.misfit.explained:
-        yield f"friction, compliance or contacts that the model lacks, or a wrong sensor: {run.misfit}; torchid check"
+        yield f"friction, compliance or contacts that the model lacks, or a wrong sensor (torchid check): {run.misfit}"
     if run.experiment.config.estimator.total_mass is None and _contradicts_nominal(run.mass):
         ratio = f"{run.mass.value / run.mass.nominal:.3g} times the {run.experiment.robot.format}'s"
         yield f"the total mass is {ratio}: weigh the robot, or mend units and gains of forces: torchid check"
@@ -108,12 +108,12 @@ def _attention(run: Identification) -> Iterator[str]:
     if not run.mass.determined and not run.experiment.robot.fixed_base:
         yield "these data do not determine the total mass; weigh the robot: estimator.total_mass"
     for one in list_confounded(run.extras):
-        yield str(one)
+        yield one.in_short
     if run.noise.suggested:
         yield f"noise: {noise_advice(run.noise.suggested)}"
 
 
 def _contradicts_nominal(mass: TotalMass) -> bool:
-    """Whether the data determine another mass than the URDF's, beyond what its bodies may be off by together."""
+    """Whether the data determine another mass than the model's, beyond what its bodies may be off by together."""
     clear = abs(mass.value - mass.nominal) > _CLEAR_ERRORS * mass.standard_error
     return mass.determined and clear and abs(mass.value / mass.nominal - 1.0) > MAX_MASS_ERROR

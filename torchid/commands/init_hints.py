@@ -12,7 +12,7 @@ from torchid.logs import Log
 from torchid.logs.column_proposals import OF_PLATES, is_desired, propose_field
 from torchid.logs.log import WRENCHES
 
-_OTHER_FILE = "; if another file has it: torchid init URDF 'FILE + FILE@SECONDS', docs/logs.md"
+_OTHER_FILE = "; if another file has it: torchid init ROBOT 'FILE + FILE@SECONDS', docs/logs.md"
 _CURRENT = re.compile(r"current(?!.*limit)|(?<![a-z])amps?(?![a-z])|(?<![a-z])iq(?![a-z])", re.IGNORECASE)
 _LIMB_SENSOR = re.compile(r"(?<![a-z])(ft|loadcell|load_cell)(?![a-z]).*[xyz]$|(?<![a-z])fts?(?![a-z])", re.IGNORECASE)
 _EULER = re.compile(r"(?<![a-z])(roll|pitch|yaw|rpy|euler)(?![a-z])", re.IGNORECASE)
@@ -57,10 +57,10 @@ def hints(left_out: Sequence[str], fields: Collection[str], joints: Sequence[str
         out.append(f"contact_wrench_world: {join_names(plates)} may be readings of force plates, {unknown}")
     positions = [name for name in measured if propose_field(name) == "joint_position"]
     if "joint_position" not in fields and len(positions) > 2:
-        names = f"those of this URDF are {join_names(joints)}"
+        names = f"those of this robot are {join_names(joints)}"
         out.append(
             f"joint_position: {format_count(len(positions), what)} like '{excerpt(positions[0])}' may be of other"
-            f" joints; {names}: is it the URDF of the robot that was recorded?"
+            f" joints; {names}: is it the one that was recorded?"
         )
     if "joint_torque" not in fields and (currents := [name for name in measured if _CURRENT.search(name)]):
         how = "scale: N m of the joint per A, its torque constant times the gear ratio, by joint"

@@ -197,7 +197,10 @@ def run_lines(run: Identification) -> list[str]:
     for name, (identified, nominal) in sets.items():
         texts = (describe_errors(group, identified.rms.get(group), nominal.rms.get(group)) for group in DECISIVE_GROUPS)
         said.append((name, "; ".join(filter(None, texts))))
-    trouble = [*([f"WORSE THAN {robot.format}: {describe_worse(run.worse)}"] if run.worse else []), str(run.misfit)]
+    trouble = [
+        *([f"WORSE THAN {robot.format}: {describe_worse(run.worse, robot.format)}"] if run.worse else []),
+        str(run.misfit),
+    ]
     said += [("attention", "; ".join(filter(None, trouble)))] if any(trouble) else []
     said.append(("written to", str(config.output or "no folder: write(folder), to_urdf(file)")))
     of = f"{robot.path.name}, {len(run)} bodies, {format_count(robot.n, 'joint')}, by {config.estimator.name}"

@@ -43,7 +43,7 @@ _GENERAL = ("forces", "weight")  # findings that say that something is off rathe
 _PART = 0.05  # share of a log's samples from which on a finding may be the reason
 _USUAL = (
     "torques or wrenches of the opposite sign, a world whose z axis points down, flags of other contacts, a quaternion "
-    "in another order, another unit, or masses in the URDF that are no masses"
+    "in another order, another unit, or masses in the {of} that are no masses"
 )
 
 
@@ -81,9 +81,9 @@ def require_plausible(fit: Fit, scene: Scene) -> TotalMass:
             "logs", f"{reason or unexplained}; torchid check finds in {checks}", finding.advice
         )
     if reason is not None:
-        raise ImplausibleFitError.at_field(
-            "logs", reason, f"data and URDF that fit each other; usual reasons: {_USUAL}"
-        )
+        of = scene.robot.format
+        accepted = f"data and {of} that fit each other; usual reasons: {_USUAL.format(of=of)}"
+        raise ImplausibleFitError.at_field("logs", reason, accepted)
     named = "" if finding is None else f"; torchid check finds in {log}: {finding.field}: {finding.found}"
     advice = "check units, frames, quaternion order and contact_active, or state the noise that there is"
     warn_about_file(f"{unexplained}{named}; {advice}", NumericalWarning)
@@ -116,7 +116,7 @@ def require_not_worse(worse: list[WorseThanNominal], scene: Scene) -> None:
     """
     if not worse:
         return
-    message, advice = describe_worse(worse), ADVICE
+    message, advice = describe_worse(worse, scene.robot.format), ADVICE
     log, finding = next(_findings(scene), (None, None))
     if finding is not None:
         message, advice = f"{message}; torchid check finds in {log}: {finding.field}: {finding.found}", finding.advice
@@ -138,10 +138,10 @@ def implausibility(problem: LinearProblem, phi: Array, mass: TotalMass, robot: R
     """
     gain = force_gain(problem)
     if mass.determined and is_implausible_factor(mass.value / mass.nominal):
-        known = f"{mass.value:.4g} ± {mass.standard_error:.2g} kg where the URDF weighs {mass.nominal:.4g} kg"
+        known = f"{mass.value:.4g} ± {mass.standard_error:.2g} kg where the {robot.format} weighs {mass.nominal:.4g} kg"
         return f"the fit's total mass is {known}{_sign_note(mass.value / mass.nominal)}"
     if gain is not None and is_implausible_factor(gain):
-        return f"the measured forces are {gain:.3g} times what the URDF's bodies need{_sign_note(gain)}"
+        return f"the measured forces are {gain:.3g} times what the {robot.format}'s bodies need{_sign_note(gain)}"
     return next(_beyond_bounds(phi.reshape(-1, PER_BODY), robot), None)
 
 
@@ -185,7 +185,7 @@ def _beyond_bounds(phi: Array, robot: Robot) -> Iterator[str]:
     beyond = ~(np.abs(phi) <= LARGEST_FACTOR * np.maximum(bound, np.abs(robot.nominal)))
     for body, parameter in np.argwhere(beyond):
         fitted = f"{robot.body_names[body]} has {PARAMETERS[parameter]} = {phi[body, parameter]:.3g}"
-        yield f"the fit's {fitted}, beyond {LARGEST_FACTOR:g} times the whole URDF's {bound[parameter]:.3g}"
+        yield f"the fit's {fitted}, beyond {LARGEST_FACTOR:g} times the whole {robot.format}'s {bound[parameter]:.3g}"
 
 
 def _reach(robot: Robot) -> float:

@@ -239,7 +239,8 @@ def _require_simple(fitted: FittedRun) -> None:
         raise ConfigError.at_field("robot.loops", loops, "a replay of a robot without")
     root = next(name for name, (body, pose) in robot.links.items() if body == 0 and np.array_equal(pose, np.eye(4)))
     if not robot.fixed_base and robot.base_link != root:
-        raise ConfigError.at_field("robot.base_link", f"'{robot.base_link}'", f"the URDF's root, '{root}', to replay")
+        accepted = f"the {robot.format}'s root, '{root}', to replay"
+        raise ConfigError.at_field("robot.base_link", f"'{robot.base_link}'", accepted)
 
 
 def _quartiles(drift: Array) -> Array:

@@ -287,7 +287,7 @@ def metrics_document(run: Identification) -> dict[str, object]:
         "ridge_selection": None if run.ridge is None else asdict(run.ridge),
         **{f"{name}_selection": x and asdict(x) for name, x in vars(run.choices).items()},
         "worse_than_nominal": [asdict(one) for one in run.worse],
-        "verdict": describe_worse(run.worse),
+        "verdict": describe_worse(run.worse, robot.format),
         "contact_states": run.state_entries(),
         "identifiability": _identifiability_document(run),
         "seconds": run.seconds,

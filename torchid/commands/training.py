@@ -15,6 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import yaml
 from rich.progress import Progress
 
@@ -32,10 +33,11 @@ from torchid.commands.folder import (
 from torchid.commands.manifest import Manifest, inspect_folder, read_manifest
 from torchid.config import ExperimentConfig, dump_config, inputs_of
 from torchid.errors import ConfigError, InputError, SensorError, warn
-from torchid.estimators import Epoch, Sgd, SgdEstimate, Trainer
+from torchid.estimators import Epoch, Estimate, Sgd, SgdEstimate, Trainer
+from torchid.estimators.least_squares import IDENTIFIED
 from torchid.estimators.optimizers import OPTIMIZERS
 from torchid.fitting.experiment import Experiment
-from torchid.parameters import Array
+from torchid.parameters import PARAMETERS, Array
 from torchid.problem import LinearProblem, Metrics, MiniBatches, RowBuilder, Samples
 from torchid.problem.linear import parameter_scale
 from torchid.robot import Robot
@@ -142,8 +144,11 @@ class Training:
         bar = bars.add_task("training", total=self.settings.epochs, completed=trainer.epoch)
         since = trainer.epoch + 1 if trainer.epoch else 0
         with self._interruptible(trainer), self._curves(since) as events:
+            if events is not None:
+                known = known_parameters(self.robot, trainer.closed_form, trainer.phi())
+                events.write_layout(self.robot.body_names, list(known))
             if trainer.epoch == 0:
-                self._evaluate(0, trainer.phi(), evaluate, events)
+                self._evaluate(trainer, evaluate, events)
                 self._save(trainer, events)
             self._train(trainer, evaluate, events, lambda text: bars.update(bar, advance=1, description=text))
         return trainer.estimate()
@@ -175,7 +180,7 @@ class Training:
             return nullcontext()
         from torchid.report.tensorboard import RunEvents  # as in `write_events`
 
-        return RunEvents(self.folder, self.robot.body_names, True, since)
+        return RunEvents(self.folder, since)
 
     def _share(self) -> tuple[int, int]:
         """The part of every batch that this process takes; all take all of it where a line search asks for more."""
@@ -192,17 +197,19 @@ class Training:
             if events is not None:
                 events.write_epoch(epoch)
             if epoch.number % training.evaluate_every == 0 or trainer.finished:
-                self._evaluate(epoch.number, trainer.phi(), evaluate, events)
+                self._evaluate(trainer, evaluate, events)
             if time.monotonic() - saved >= training.checkpoint_seconds or trainer.finished:
                 self._save(trainer, events)
                 saved = time.monotonic()
             progress(_described(epoch))
 
-    def _evaluate(self, step: int, phi: Array, evaluate: Evaluate, events: RunEvents | None) -> None:
+    def _evaluate(self, trainer: Trainer, evaluate: Evaluate, events: RunEvents | None) -> None:
+        step, phi = trainer.epoch, trainer.phi()
         errors = evaluate(phi)
         if events is not None:
-            events.write_errors(step, errors)
-            events.write_eigenvalues(step, body_eigenvalues(self.robot, phi))
+            events.write_errors(step, errors, by_epoch=True)
+            events.write_eigenvalues(step, body_eigenvalues(self.robot, phi), by_epoch=True)
+            events.write_parameters(step, known_parameters(self.robot, trainer.closed_form, phi), by_epoch=True)
 
     def _prepare(self, trainer: Trainer, resume: bool) -> dict[str, Any] | None:
         """Start a new folder, or take up what is in it: the state of the trainer there."""
@@ -273,6 +280,13 @@ def body_eigenvalues(robot: Robot, phi: Array) -> dict[str, float]:
     """Smallest eigenvalue of every body's scaled pseudo-inertia, by name, of parameters (12 L,)."""
     least = parameters.least_eigenvalues(phi, parameter_scale(robot.nominal).flatten())
     return {name: float(x) for name, x in zip(robot.body_names, least, strict=True) if x == x}
+
+
+def known_parameters(robot: Robot, estimate: Estimate, phi: Array) -> dict[str, tuple[float, float]]:
+    """Parameters (12 L,) that an estimate identifies one by one, with its standard errors, by `body.parameter`."""
+    names = [f"{body}.{parameter}" for body in robot.body_names for parameter in PARAMETERS]
+    known = (estimate.verdict == IDENTIFIED) & np.isfinite(estimate.standard_error)
+    return {names[k]: (float(phi[k]), float(estimate.standard_error[k])) for k in np.flatnonzero(known)}
 
 
 def _growing() -> tuple[str, ...]:

@@ -136,7 +136,7 @@ _EXPERIMENT = FileKind(
     prepare=_spelled_out,
     accepted={
         "contacts": "a list of mappings: [{frame: l_sole, type: flat}]",
-        "contacts.*.frame": "the name of a frame in the URDF",
+        "contacts.*.frame": "the name of a frame of the robot",
         "robot.weld": WELDS_ACCEPTED,
         "robot.loops": LOOPS_ACCEPTED,
         "sensors": CHOICE_ACCEPTED,

@@ -34,7 +34,7 @@ _FILES = "several files as one log, [motion.csv, {file: plates.csv, shift_s: 0.1
 PAYLOAD_ACCEPTED = "a mapping with link, mass [kg], center_of_mass [x, y, z in m] and inertia, or a list of several"
 _PAYLOAD: TypeAdapter[Payload] = TypeAdapter(Payload)
 _PAYLOAD_ACCEPTED = {
-    "link": "the name of a link of the URDF",
+    "link": "the name of a link of the robot",
     "mass": "a number greater than 0 [kg]",
     "center_of_mass": "[x, y, z] in the link's frame [m]",
     "inertia": INERTIA_ACCEPTED,

@@ -195,6 +195,11 @@ class Confounded:
         others = "the total mass" if self.confounded_with == (_TOTAL_MASS,) else _grouped(self.confounded_with)
         return f"{_grouped(self.extras)}: confounded with {others or 'each other'}; do not trust either; {self.advice}"
 
+    @property
+    def in_short(self) -> str:
+        """What to do, without what they are confounded with."""
+        return f"do not trust {_grouped(self.extras)}: {self.advice}"
+
 
 _TOTAL_MASS = "total mass"
 

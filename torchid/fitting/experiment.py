@@ -324,7 +324,7 @@ def _enclosures(settings: EstimatorConfig, robot: Robot) -> tuple[Enclosure, ...
     extents = body_extents(robot, settings.com_shapes, bodies)
     if not extents:
         found = f"{settings.com_inside}, but {robot.path.name} says of no body that is fitted what shape it has"
-        raise ConfigError.at_field("estimator.com_inside", found, "null, or a URDF with shapes")
+        raise ConfigError.at_field("estimator.com_inside", found, f"null, or a {robot.format} with shapes")
     out, outside = [], []
     for body, extent in extents.items():
         half = extent.half if settings.com_inside == "box" else extent.semi_axes
@@ -334,7 +334,9 @@ def _enclosures(settings: EstimatorConfig, robot: Robot) -> tuple[Enclosure, ...
         if (local.max() if settings.com_inside == "box" else np.linalg.norm(local)) > 1.0:
             outside.append(robot.body_names[body])
     if outside:
-        message = f"the URDF's own centre of mass is outside the {settings.com_inside} at {', '.join(outside)}"
+        message = (
+            f"the {robot.format}'s own centre of mass is outside the {settings.com_inside} at {', '.join(outside)}"
+        )
         advice = "are the shapes where the matter is? (estimator.com_shapes)"
         warn_about_file(f"estimator.com_inside: {message}; {advice}")
     return tuple(out)
@@ -386,7 +388,7 @@ def _check_fitted(settings: EstimatorConfig, robot: Robot, body: int, parameter:
     if friction and not settings.friction:
         raise ConfigError.at_field(field, "a bound on friction, which is not fitted", "friction: true")
     if not friction and robot.bodies[body].massless:
-        raise ConfigError.at_field(field, f"a bound, but {name} has no mass in the URDF", "a body that has")
+        raise ConfigError.at_field(field, f"a bound, but {name} has no mass in the {robot.format}", "a body that has")
 
 
 def _check_interval(parameter: str, low: float | None, high: float | None, field: str) -> None:

@@ -62,7 +62,7 @@ def known_masses(settings: EstimatorConfig, robot: Robot) -> tuple[KnownMass, ..
         if name in settings.frozen:
             raise ConfigError.at_field(field, "a mass of a body that is frozen", "one of the two")
         if robot.bodies[robot.body_names.index(name)].massless:
-            raise ConfigError.at_field(field, f"a mass, but {name} has none in the URDF", "a body that has")
+            raise ConfigError.at_field(field, f"a mass, but {name} has none in the {robot.format}", "a body that has")
         if "m" in (settings.bounds or {}).get(name, {}):
             raise ConfigError.at_field(field, f"a mass, beside estimator.bounds.{name}.m", "one of the two")
     out = [

@@ -237,7 +237,7 @@ def _limb_sensor_findings(name: str, measured: FloatArray, model: FloatArray, ro
     product = float((x * y).sum())
     correlated = abs(product) > _MIN_CORRELATION * np.linalg.norm(x) * np.linalg.norm(y)
     gain = product / float(np.square(x).sum()) if correlated else 1.0
-    text = f"{name}: in the air it reads {gain:.3g} times what hangs on it by the URDF ({weight:.3g} N)"
+    text = f"{name}: in the air it reads {gain:.3g} times what hangs on it by the {robot.format} ({weight:.3g} N)"
     if gain < 0.0:
         advice = "reverse it: the wrench that the parent side exerts on the child side"
         yield Finding("sign", CONDEMNED, "ft_wrench", text, advice, (name,))
@@ -252,7 +252,8 @@ def _limb_sensor_findings(name: str, measured: FloatArray, model: FloatArray, ro
     if not correlated:
         threshold += MAX_MASS_ERROR * weight
     if size > max(threshold, spread):
-        text = f"{name}: reads a steady {size:.3g} N in the air beside the {weight:.3g} N that hang on it by the URDF"
+        hanging = f"the {weight:.3g} N that hang on it by the {robot.format}"
+        text = f"{name}: reads a steady {size:.3g} N in the air beside {hanging}"
         ambiguity = "" if correlated else "; a load of that weight would look the same"
         advice = f"identify it, sensors.offsets: {{ft_force: log}}, or subtract it{ambiguity}"
         yield Finding("offset", NOTE, "ft_wrench", text, advice, (name,))

@@ -63,7 +63,7 @@ MIN_BLOCK_SHARE = 0.5
 MIN_COMMON_BLOCK_SHARE = 0.3
 #: Gains with a smaller standard deviation are the reference for all others, if there are enough of them.
 _MAX_REFERENCE_SPREAD, _MIN_REFERENCE_JOINTS = 0.1, 3
-_FORCE_CHECK = "forces against the URDF"
+_FORCE_CHECK = "forces against the model"
 
 
 def check_forces_against_urdf(
@@ -110,9 +110,9 @@ def check_forces_against_urdf(
         yield from alike
         if alike:
             return
-        text = f"measured forces differ from the URDF's by {_percent(fit.misfit)}, and no usual mistake explains it"
-        advice = "check units, frames, the order of joints and contacts, friction, the URDF's base link and masses,"
-        advice += " and whether the URDF is that of this robot"
+        text = f"{_difference(fit, robot)}, and no usual mistake explains it"
+        advice = f"check units, frames, the order of joints and contacts, friction, the {robot.format}'s base link and"
+        advice += f" masses, and whether the {robot.format} is that of this robot"
         yield Finding("forces", SUSPICIOUS, "all", text, advice)
         return
     torques = [] if fit.torque is None else list(_torque_findings(robot, fit.torque))
@@ -139,7 +139,7 @@ def _best_mistake(
             best, least = mistake, trial.misfit
     if best is None:
         return None
-    text = f"measured forces differ from the URDF's by {_percent(fit.misfit)}, by {_percent(least)} once corrected"
+    text = f"{_difference(fit, robot)}, by {_percent(least)} once corrected"
     advice = best.advice + f"; or is {robot.path.name} another robot's?" * (least > MAX_CLEAR_MISFIT)
     return Finding("unit, sign or frame", CONDEMNED, best.field, f"{best.description}: {text}", advice)
 
@@ -152,6 +152,10 @@ def _may_explain(field: str, fit: ModelFit) -> bool:
     return all(misfit is None or misfit > MAX_MISFIT for misfit in misfits.values())
 
 
+def _difference(fit: ModelFit, robot: Robot) -> str:
+    return f"measured forces differ from the {robot.format}'s by {_percent(fit.misfit)}"
+
+
 def _percent(share: float) -> str:
     return f"{100.0 * share:.3g} %" if share < 10.0 else f"{share:.3g} times their size"
 
@@ -162,7 +166,7 @@ def _torque_findings(robot: Robot, fit: TorqueFit) -> Iterator[Finding | Skipped
     def finding(name: str, severity: str, where: BoolArray, problem: str, advice: str) -> Finding:
         joints = tuple(robot.joint_names[joint] for joint in fit.joints[where])
         gains = join_names([f"{gain:.3g}" for gain in fit.gain[where]])
-        text = f"{join_names(joints)}: {problem}factors that fit the URDF best: {gains}"
+        text = f"{join_names(joints)}: {problem}factors that fit the {robot.format} best: {gains}"
         return Finding(name, severity, "joint_torque", text, advice, joints)
 
     is_reversed = fit.implausible & (fit.gain < -1.0 / _SIGN_TOLERANCE_RATIO) & (fit.gain > -_SIGN_TOLERANCE_RATIO)
@@ -232,13 +236,13 @@ def _gain_and_point_findings(
     if off.any():
         names = [robot.joint_names[joint] for joint in fit.joints[off]]
         gains = join_names([f"{gain:.3g} +- {std:.2g}" for gain, std in zip(relative[off], spread[off], strict=True)])
-        text = f"{join_names(names)}: factors that fit the URDF best, relative to the other joints: {gains}"
-        advice = "check gear ratios, torque constants and units, and the URDF's friction and inertias there"
+        text = f"{join_names(names)}: factors that fit the {robot.format} best, relative to the other joints: {gains}"
+        advice = f"check gear ratios, torque constants and units, and the {robot.format}'s friction and inertias there"
         yield Finding("scale", SUSPICIOUS, "joint_torque", text, advice, tuple(names))
     shifted = _is_certain(fit.point, fit.spread[m:], fit.blocks[:, m:]) & (np.abs(fit.point) > MIN_POINT_SHIFT_M)
     if shifted.any():
         point = ", ".join(f"{1e3 * x:.0f}" for x in fit.point)
-        text = f"forces and moments fit the URDF about a point that lies {point} mm from the contact frames' origins"
+        text = f"forces and moments fit the {robot.format} about a point {point} mm from the contact frames' origins"
         advice = "give moments about the contact frame's origin, or name the sensor's own frame as the contact"
         if log.moments_about_world_origin:
             advice = "check the points of the moments, where the plates lie, and the base's position in the same world"

@@ -61,21 +61,23 @@ def _weight_findings(carried: float, when: str, field: str, robot: Robot | None)
         return
     if robot is None:
         text = f"contacts carry {mass:.4g} kg {when}"
-        yield Finding("weight", NOTE, field, text, "compare with a scale, or give a URDF")
+        yield Finding("weight", NOTE, field, text, "compare with a scale, or give the robot")
         return
     nominal = float(robot.nominal[:, 0].sum())
     ratio = mass / nominal
-    text = f"contacts carry {mass:.4g} kg {when}, the URDF weighs {nominal:.4g} kg ({100 * (ratio - 1):+.2g} %)"
+    text = (
+        f"contacts carry {mass:.4g} kg {when}, the {robot.format} weighs {nominal:.4g} kg ({100 * (ratio - 1):+.2g} %)"
+    )
     if units := units_of_ratio(ratio, ("force",)):
         text = f"contacts carry {ratio:.3g} of the weight {when}: forces in {' or '.join(units)}?"
         yield Finding("unit", CONDEMNED, field, text, "convert forces to N and moments to N m")
         return
     if abs(ratio - 1.0) > MAX_MASS_ERROR:
         advice = "check for an unmeasured contact, a payload, an offset or gain of a sensor"
-        advice += ", and whether the URDF is that of this robot" * (not 0.5 < ratio < 2.0)
+        advice += f", and whether the {robot.format} is that of this robot" * (not 0.5 < ratio < 2.0)
         yield Finding("weight", SUSPICIOUS, field, text, advice)
     elif abs(ratio - 1.0) > MIN_NOTED_MASS_ERROR:
-        advice = "none if the URDF may have this error; an offset of a sensor has the same effect"
+        advice = f"none if the {robot.format} may have this error; an offset of a sensor has the same effect"
         yield Finding("weight", NOTE, field, text, advice)
 
 
@@ -176,7 +178,7 @@ def _tilt_findings(log: Log, robot: Robot | None, still: BoolArray, when: str) -
     name, text = "imu_specific_force", f"{angle:.3g} degrees from up {when}, by base_quat"
     if angle <= 90.0:
         if angle > _MAX_TILT_DEG:
-            advice = "check the IMU's frame in the URDF and the order of the quaternion"
+            advice = f"check the IMU's frame in the {robot.format} and the order of the quaternion"
             yield Finding("gravity", SUSPICIOUS, name, text, advice)
         return
     height = _height_above_feet(log.select(np.flatnonzero(still)), robot, in_base)

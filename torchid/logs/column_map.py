@@ -365,7 +365,7 @@ def require_names(columns: Columns, known: Mapping[str, Collection[str]]) -> Non
         given = [name for name in names if name is not None]
         unknown = [name for name in given if kind in known and name not in known[kind]]
         if len(unknown) > 1 and unknown == given:
-            found = f"none of {join_names(given)} is a {kind} of the URDF; is it that of the robot that was recorded?"
-            raise ConfigError.at_field(f"{KEY}.{key}", found, f"names of the URDF: {join_names(list(known[kind]))}")
+            found = f"none of {join_names(given)} is a {kind} of the robot; is it the one that was recorded?"
+            raise ConfigError.at_field(f"{KEY}.{key}", found, f"names of the robot: {join_names(list(known[kind]))}")
         if unknown:
             raise UnknownNameError.at_field(f"{KEY}.{key}", unknown[0], known[kind])

@@ -106,13 +106,13 @@ def usual_order(kind: str, robot: KnownRobot, count: int) -> tuple[list[str] | s
         order = JOINT_ORDERS[name]
         is_whole = set(order.names) == set(names) or count < len(names)
         if is_whole and count >= len(order.joints):
-            return name, f"that of {name}, whose joints the URDF has"
+            return name, f"that of {name}, whose joints the robot has"
     if kind == "joint" and count < len(names):
         return numbered_joints(names, count), "names that differ in a number"
     is_alike = any("thigh" in joint or "calf" in joint for joint in robot.joints)
     if names and is_alike and all(name.partition("_")[0] in _LEGS for name in names):
         return sorted(names, key=lambda name: _LEGS.index(name.partition("_")[0])), "as Unitree numbers legs"
-    return list(names), "as in the URDF"
+    return list(names), "as in the robot's file"
 
 
 def numbered_joints(joints: Sequence[str], count: int) -> list[str]:
@@ -137,7 +137,7 @@ def require_joints_of(field: str, robot: str, joints: Collection[str]) -> None:
     """
     absent = [name for name in JOINT_ORDERS[robot].names if name not in joints]
     if absent:
-        found = f"'{robot}', whose joint '{absent[0]}' the URDF has not"
+        found = f"'{robot}', whose joint '{absent[0]}' the robot has not"
         raise ConfigError.at_field(field, found, nearest_orders(joints))
 
 

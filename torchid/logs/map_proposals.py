@@ -128,7 +128,7 @@ class _Proposer:
             used = [one for one in used if not one.entry.items() <= moment.items()]
         if set(WRENCHES) & set(self.out.columns) and "contact_active" not in {*self.given, *self.out.columns}:
             self.out.columns["contact_active"] = {"above": float(f"{_TOUCH * self.robot.weight:.2g}")}
-            self.out.notes["contact_active"] = f"above {_TOUCH:.0%} of the URDF's weight [N], by the wrenches"
+            self.out.notes["contact_active"] = f"above {_TOUCH:.0%} of the robot's weight [N], by the wrenches"
         return used
 
     def _note(self, key: str, text: str) -> None:
@@ -160,7 +160,7 @@ class _Proposer:
             field = self._quaternion(family)
         if field.startswith("joint_") and "joint_order" not in self.out.columns and len(part.T) == len(self.joints):
             self.out.columns["joint_order"] = list(self.joints)
-            self.out.notes["joint_order"] = "as in the URDF, as of libraries for dynamics"
+            self.out.notes["joint_order"] = "as in the robot's file, as of libraries for dynamics"
         self._add_order(family, field)
         self.out.columns[field] = {"column": text}
         self._note(field, f"columns {start} to {stop or 'the last'} of '{name}'")

@@ -269,7 +269,7 @@ def _motion(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries]) -
         elif isinstance(decoder, Imu) and bag.topics.imu is not None:
             frame = bag.topics.imu.frame or decoder.frame.value.removeprefix("/")
             if not frame:
-                accepted = "logs.topics.imu.frame, the frame of the URDF it sits at"
+                accepted = "logs.topics.imu.frame, the robot's frame it sits at"
                 raise LogError.at_field(bag.topics.imu.topic, "no header.frame_id", accepted)
             out["imu_frame"] = np.array(frame)
     out.pop(_FEET, None)

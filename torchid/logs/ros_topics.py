@@ -231,7 +231,7 @@ def check_topics(topics: Topics, needs_flags: bool = True) -> None:
     given = [] if topics.joint_states is None else list(topics.joint_states.names.values())
     if again := [name for name in given if given.count(name) > 1]:
         found = f"two names of '{excerpt(again[0])}'"
-        raise ConfigError.at_field("logs.topics.joint_states.names", found, "each joint of the URDF once")
+        raise ConfigError.at_field("logs.topics.joint_states.names", found, "each joint of the robot once")
     for name, contact in topics.contact_active.items():
         if (contact.topic is None) != contact.always:
             accepted = "a topic of std_msgs/Bool, or true for a contact that always touches"

@@ -120,7 +120,7 @@ class _Proposer:
             entry: dict[str, Any] = {"topic": name, "robot": robot}
             same = [x for x in JOINT_ORDERS if JOINT_ORDERS[x] == JOINT_ORDERS[robot]]
             alike = f"; {', '.join(same)} have one order" if len(same) > 1 else ""
-            self.out.notes["low_state"] = f"{robot}, as the URDF has its joints{alike}"
+            self.out.notes["low_state"] = f"{robot}, as the robot's file has its joints{alike}"
             self._add("low_state", name, entry, "joint_position", "joint_velocity", "joint_torque")
             if "imu" not in self.out.columns:
                 entry["frame"] = self._imu_frame()

@@ -59,7 +59,7 @@ _CLEARLY = 1.05  # ratio of errors above which one is worse
 _MATTERS = 1e-3  # of the measured rms: smaller differences, as on data without noise, do not count
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Metrics:
     """Errors of one parameter vector on some logs; None where the logs cannot give a figure.
 
@@ -90,6 +90,15 @@ class Metrics:
         """Name and unit of a group of `ERROR_GROUPS`, and what it is limited to."""
         limit = f", {IN_AIR} [" if self.limbs_in_air and group == "joint_torque" else " ["
         return ERROR_GROUPS[group].replace(" [", limit)
+
+    def __repr__(self) -> str:
+        said = []
+        for group in ERROR_GROUPS:
+            rms, share = self.rms.get(group), self.relative.get(group)
+            if rms is not None:
+                name, _, unit = self.label(group).rstrip("]").partition(" [")
+                said.append(f"{name} {rms:.3g} {unit}" + ("" if share is None else f" ({100.0 * share:.2g} %)"))
+        return f"Metrics: {', '.join(said) or 'none'}"
 
     def as_dict(self) -> dict[str, object]:
         """As `metrics.json` has it."""
@@ -218,7 +227,7 @@ def worse_than_nominal(sets: Mapping[str, tuple[Metrics, Metrics]]) -> list[Wors
 
 @dataclass(frozen=True)
 class WorseThanNominal:
-    """A group of rows on a set of logs in which the URDF's parameters predict better, with both errors."""
+    """A group of rows on a set of logs in which the nominal parameters predict better, with both errors."""
 
     logs: str
     group: str
@@ -229,13 +238,16 @@ class WorseThanNominal:
         return describe_errors(self.group, self.identified, self.nominal) or self.group
 
 
-def describe_worse(groups: list[WorseThanNominal]) -> str | None:
-    """One line that lists the groups, None if there are none."""
+def describe_worse(groups: list[WorseThanNominal], of: str) -> str | None:
+    """One line that lists the groups, None if there are none.
+
+    `of`: what the nominal parameters are those of, as `Robot.format`.
+    """
     if not groups:
         return None
     by_logs = {group.logs: [str(other) for other in groups if other.logs == group.logs] for group in groups}
     texts_by_logs = "; ".join(f"on {logs}: {join_names(texts)}" for logs, texts in by_logs.items())
-    return f"the identified parameters predict worse than the URDF's, {texts_by_logs}"
+    return f"the identified parameters predict worse than the {of}'s, {texts_by_logs}"
 
 
 def describe_errors(group: str, identified: float | None, nominal: float | None) -> str | None:

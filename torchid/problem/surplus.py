@@ -70,7 +70,7 @@ class NoiseShares:
     def __str__(self) -> str:
         text = f"up to {100.0 * self.largest:.2g} % of the information on a combination was noise, taken off"
         if self.lost:
-            text += f" but for {self.lost} of {self.combinations}, which are mostly noise and remain near the URDF's"
+            text += f" but for {self.lost} of {self.combinations}, mostly noise, which remain near the nominal ones"
         return text
 
 

@@ -10,7 +10,6 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogFormatter
 from rich.table import Table
 from rich.text import Text
 
@@ -20,7 +19,7 @@ from torchid.identifiability.information import ExpectedErrors
 from torchid.problem import Metrics
 from torchid.problem.metrics import ROW_GROUPS, group_name
 from torchid.report import palette
-from torchid.report.figures import STYLE
+from torchid.report.figures import STYLE, label_decades
 from torchid.rounding import BASE_RANK_TOLERANCE
 from torchid.sensor_planning.demands import Candidate
 from torchid.sensor_planning.observability import BaseObservability, LostBase, PostureSummary
@@ -321,9 +320,8 @@ def accuracy_figure(sets: Mapping[str, SetAccuracy]) -> Figure:
             known = [np.nan if height is None else height for height in heights]
             axis.plot(index + shift, known, marker, color=color, markersize=7, label=name)
         axis.set_yscale("log")
-        axis.yaxis.set_major_formatter(LogFormatter())  # the default writes formulas, which names forbid, see STYLE
-        axis.yaxis.set_minor_formatter(LogFormatter(labelOnlyBase=False))
         axis.margins(x=0.3 / max(len(sets) - 1, 1), y=0.15)
+        label_decades(axis.yaxis)
         axis.set_xticks(index, list(sets), rotation=40, ha="right")
         axis.set_title(group_name(group), loc="left", fontsize=9)
         axis.set_ylabel(f"rms error {label[label.index('[') :]}")

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from torchid.fitting.calibration import Comparison
 from torchid.parameters import Array
 from torchid.report import palette
-from torchid.report.figures import STYLE, decade_formatter
+from torchid.report.figures import STYLE, label_decades
 
 
 @matplotlib.rc_context(STYLE)
@@ -48,7 +48,7 @@ def drift_figure(
             axis.plot(time, middle, color=color, label=label)
         if min(nominal.min(), identified.min()) > 0.0:
             axis.set_yscale("log")
-            axis.yaxis.set_major_formatter(decade_formatter())
+            label_decades(axis.yaxis)
         axis.set_ylabel(f"drift, {name}")
         axis.set_xlim(0.0, float(time[-1]))
     axis.set_xlabel("time since the beginning of a window [s]")
@@ -61,7 +61,7 @@ def drift_figure(
         joints.plot(values, rows, "o", color=color)
     if min(nominal.min(), identified.min()) > 0.0:
         joints.set_xscale("log")
-        joints.xaxis.set_major_formatter(decade_formatter())
+        label_decades(joints.xaxis)
     joints.set_yticks(rows, list(by_joint))
     joints.invert_yaxis()
     joints.set_xlabel(f"median drift after {time[-1]:g} s [{', '.join(dict.fromkeys(units))}]")

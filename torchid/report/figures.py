@@ -13,11 +13,12 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.text import Text
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from torchid.errors import during, escape
 from torchid.estimators import Estimate
@@ -46,6 +47,7 @@ STYLE: dict[Any, Any] = {
 }
 #: Up to which power of ten axes have plain numbers, and how far off a power rounding is.
 _PLAIN_DECADES, _ROUNDING = 3.0, 1e-9
+_FEW_DECADES = 1e3  # span of an axis on which 2 and 5 are labelled, too
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _FLOOR = "noise of the readings alone"
 #: Dates in files, without which the same run writes the same files.
@@ -102,6 +104,14 @@ def decade(value: float) -> str:
 def decade_formatter() -> FuncFormatter:
     """Of the ticks of a logarithmic axis."""
     return FuncFormatter(lambda value, _: decade(value))
+
+
+def label_decades(axis: Axis) -> None:
+    """Label 1, 2 and 5 of each power of ten of a logarithmic axis, however little of one it spans."""
+    low, high = sorted(axis.get_view_interval())
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < _FEW_DECADES * low else (1.0,)))
+    axis.set_major_formatter(decade_formatter())
+    axis.set_minor_formatter(NullFormatter())
 
 
 # ---------------------------------------------------------------------------------------------------- errors

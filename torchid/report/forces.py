@@ -17,6 +17,7 @@ from torchid.report.palette import IDENTIFIED, MEASURED, NOMINAL
 
 _NOISE = "0.8"
 _MOST_ROWS = 6
+_NEAR_0 = 0.1  # share of the time within which axes begin at 0
 _SHOWN = 1.6  # errors are shown up to so many times the largest of the identified ones, or of the noise
 
 
@@ -60,6 +61,8 @@ def force_figure(
         figure.legend(handles, labels, loc="outside lower center", ncols=4)
     for axis in axes[-1]:
         axis.set_xlabel("time [s]")
+    if len(series.time) and 0.0 <= series.time[0] < _NEAR_0 * series.time[-1]:
+        axes[0, 0].set_xlim(left=0.0)
     figure.suptitle(f"Generalized forces, {series.source}, and errors: predicted - measured", x=0.01, ha="left")
     return figure
 
@@ -80,7 +83,7 @@ def _draw_errors(axis: Axes, series: ForceSeries, row: int, unit: str) -> None:
     if largest > 0.0:
         axis.set_ylim(-_SHOWN * largest, _SHOWN * largest)
     rms = np.sqrt(np.nanmean(np.square(identified))) if np.isfinite(identified).any() else np.nan
-    axis.set_title(f"rms {rms:.3g}{text} {unit}", loc="left", fontsize=9)
+    axis.set_title(f"identified: rms {rms:.3g}{text} {unit}", loc="left", fontsize=9)
 
 
 def name_row(row: int, base_rows: int, dof_names: Sequence[str], sliding: Collection[str]) -> tuple[str, str]:

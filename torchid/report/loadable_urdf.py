@@ -14,6 +14,9 @@ from torchid.parameters import Array
 from torchid.robot import Robot
 from torchid.robot.urdf import MeshError, mesh_path
 
+MUJOCO_MESHES = (".stl", ".obj", ".msh")
+"""Extensions of the meshes that MuJoCo reads of a URDF."""
+
 SMALLEST = 1e-14
 """Mass [kg] and principal inertia [kg m^2] of moving links without any: MuJoCo refuses less than 1e-15 (mjMINVAL)."""
 
@@ -73,7 +76,7 @@ def resolve_meshes(root: etree._Element, urdf: Path, file: str) -> None:
     """Name meshes by full paths where MuJoCo, or whoever reads the file from another folder, would not find them.
 
     Those are meshes of collisions, and all with relative names. Visual meshes `package://` keep their names, as MuJoCo
-    skips them. Collisions with meshes that are not found become comments.
+    skips them. Collisions with meshes that are not found, or of a format that MuJoCo does not read, become comments.
 
     Args:
         root: of the URDF.
@@ -81,24 +84,33 @@ def resolve_meshes(root: etree._Element, urdf: Path, file: str) -> None:
         file: name of the written file, for the warning.
 
     Warns:
-        TorchidWarning: meshes of collisions that are not found.
+        TorchidWarning: meshes of collisions that are not found, or that MuJoCo does not read.
     """
-    missing = list[str]()
+    missing, foreign = list[str](), list[str]()
     for link in root.findall("link"):
         for shape in [*link.findall("visual"), *link.findall("collision")]:
             mesh = shape.find("geometry/mesh")
             name = "" if mesh is None else str(mesh.get("filename", ""))
-            if mesh is None or Path(name).is_absolute() or (shape.tag == "visual" and "://" in name):
+            if mesh is None or (shape.tag == "visual" and (Path(name).is_absolute() or "://" in name)):
+                continue
+            if shape.tag == "collision" and Path(name).suffix.lower() not in MUJOCO_MESHES:
+                foreign.append(name)
+                _comment_out(shape, "not of a format that MuJoCo reads")
+                continue
+            if Path(name).is_absolute():
                 continue
             path = _found(urdf, name)
             if path is not None:
                 mesh.set("filename", str(path.absolute()))
             elif shape.tag == "collision":
                 missing.append(name)
-                _comment_out(shape)
-    if missing:
-        names = join_names(list(dict.fromkeys(missing)))
-        warn(f"{file}: meshes of collisions that are not found, which MuJoCo would refuse, are comments: {names}")
+                _comment_out(shape, "not found")
+    reasons = {"that are not found": missing, f"that are none of {', '.join(MUJOCO_MESHES)}": foreign}
+    for reason, names in reasons.items():
+        if names:
+            listed = join_names(list(dict.fromkeys(names)))
+            text = f"{file}: meshes of collisions {reason}, which MuJoCo would refuse, are comments: {listed}"
+            warn(f"{text}; torchid export --format urdf keeps them")
 
 
 def _found(urdf: Path, name: str) -> Path | None:
@@ -121,10 +133,10 @@ def _ros_paths(name: str) -> list[Path]:
     return [*own, *(folder.joinpath(*parts) for folder in (*listed, *shared))]
 
 
-def _comment_out(element: etree._Element) -> None:
+def _comment_out(element: etree._Element, reason: str) -> None:
     tail, element.tail = element.tail, None
     text = etree.tostring(element, encoding="unicode").replace("--", "- -")
-    comment = etree.Comment(f" not found: {text} ")
+    comment = etree.Comment(f" {reason}: {text} ")
     comment.tail = tail
     parent = element.getparent()
     if parent is not None:

@@ -5,11 +5,10 @@ from __future__ import annotations
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter
 
 from torchid.fitting.cross_validation import RidgeChoice
 from torchid.report import palette
-from torchid.report.figures import STYLE, decade, decade_formatter
+from torchid.report.figures import STYLE, decade, label_decades
 
 _CURVE, _CHOSEN, _LEAST = palette.IDENTIFIED, palette.NOMINAL, "0.3"
 _WIDE = 5.0  # ratio of errors from which on decades tell more than differences
@@ -51,9 +50,7 @@ def ridge_figure(choice: RidgeChoice, of: str = "URDF") -> Figure:
     axes.set_xticks(tried[shown], [decade(ridge) for ridge in tried[shown]])
     axes.minorticks_off()
     if axes.get_yscale() == "log":
-        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axes.yaxis.set_major_formatter(decade_formatter())
-        axes.yaxis.set_minor_formatter(NullFormatter())
+        label_decades(axes.yaxis)
     axes.set_xlim(tried[shown].min() / 2.0, tried[shown].max() * 2.0)
     axes.set_xlabel(f"ridge: weight of the {of} against the mean square of the rows [1]")
     axes.set_ylabel("mean square of whitened residuals\non held-out folds [noise²]")

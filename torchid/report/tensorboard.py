@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -17,43 +17,61 @@ from torchid.estimators import ConstrainedEstimate, Epoch, Estimate
 from torchid.fitting.cross_validation import RidgeChoice
 from torchid.identifiability.information import InformationGain
 from torchid.problem import Metrics
-from torchid.problem.metrics import ERROR_GROUPS, SETS
+from torchid.problem.metrics import ERROR_GROUPS, ROW_GROUPS, SETS
+from torchid.report.parameter_figure import INTERVAL
 
 _RGBA = 4  # colour space in Summary.Image
-_URDF = "_URDF"  # ends the names of charts of the URDF's parameters
-_CHARTED = (*SETS, "left_out")
+_NOMINAL = "_nominal"  # ends the names of charts of the nominal parameters
+_BY_EPOCH = "training_"  # begins those of curves
+_CHARTED = ("test", "left_out", "train")
 _TERMS = ("total", "data", "prior", "eigenvalue", "log_det", "mass", "friction", "residual")
+_BOUNDS = ("_lower", "_upper")  # ends the names of charts of the ends of intervals
 
 
 class RunEvents:
-    """Event files of one run: charts by step, train and test logs on one chart, figures and settings.
+    """Event files of one run: results, curves of a descent, figures and settings.
 
-    Steps of a descent are its epochs, after step 0, the URDF's parameters. A batch fit has step 1 alone. Of what is not
-    worked out by epoch, the URDF's parameters have charts of their own: TensorBoard would smooth a curve of two points
-    into one that shows neither.
+    Results of all estimators are charts of one point for each run, at its last step: TensorBoard smooths a curve of few
+    points into one that shows none of them. A descent has curves beside them, whose names begin with "training", over
+    its epochs after step 0, the nominal parameters. Tags sort by what should be seen first: errors.
     """
 
-    def __init__(self, folder: Path, bodies: Sequence[str], descent: bool, since: int | None = None) -> None:
+    def __init__(self, folder: Path, since: int | None = None) -> None:
         """Open a new event file.
 
         Args:
             folder: where it goes.
-            bodies: names of the bodies.
-            descent: whether steps are epochs.
             since: first step of earlier event files in the folder that is overwritten.
         """
-        self._writer, self._descent = SummaryWriter(str(folder), purge_step=since), descent
-        groups = {  # the same of all runs, which TensorBoard shows on one chart
-            group: ["Multiline", [f"relative_error_{name}{kind}/{group}" for name in _CHARTED for kind in ("", _URDF)]]
-            for group in ERROR_GROUPS
-        }
-        loss = {
-            "train and held out": ["Multiline", ["loss/data", "loss_held_out/data"]],
-            "terms": ["Multiline", [f"loss/{term}" for term in _TERMS]],
-        }
-        least = {"smallest eigenvalue": ["Multiline", [f"eigenvalue/{re.escape(name)}$" for name in bodies]]}
-        layout = {"errors, share of measured": groups, "bodies": least}
-        self._writer.add_custom_scalars(layout | ({"loss by epoch": loss} if descent else {}))
+        self._writer = SummaryWriter(str(folder), purge_step=since)
+
+    def write_layout(self, bodies: Sequence[str], by_epoch: Sequence[str] | None = None) -> None:
+        """Say what *Custom scalars* shows, once for a run.
+
+        Args:
+            bodies: names of the bodies; none where losses are all that is written.
+            by_epoch: of a descent, names of the parameters whose intervals are drawn.
+        """
+        layout: dict[str, dict[str, list[str | list[str]]]] = {}
+        if bodies:
+            tags = [f"error_relative_{name}{kind}" for name in _CHARTED for kind in (_NOMINAL, "")]
+            layout["errors, share of measured"] = _charts(tags, ERROR_GROUPS)
+        if bodies and by_epoch is not None:
+            tags = [f"{_BY_EPOCH}error_relative_{name}" for name in SETS]
+            layout["errors by epoch, share of measured"] = _charts(tags, ROW_GROUPS)
+        if by_epoch is not None:
+            losses = [f"loss{of}/data$" for of in ("", "_held_out", "_unseen")]
+            terms = [f"loss/{term}" for term in _TERMS]
+            layout["loss by epoch"] = {"train, held out, unseen": ["Multiline", losses], "terms": ["Multiline", terms]}
+        if bodies:
+            least = [f"smallest_eigenvalue/{re.escape(name)}$" for name in bodies]
+            layout["bodies"] = {"smallest eigenvalue": ["Multiline", least]}
+        if by_epoch:
+            tag = f"{_BY_EPOCH}parameter"
+            layout["parameters by epoch, 95 % intervals"] = {
+                name: ["Margin", [f"{tag}{kind}/{name}" for kind in ("", *_BOUNDS)]] for name in by_epoch
+            }
+        self._writer.add_custom_scalars(layout)
 
     def __enter__(self) -> RunEvents:
         return self
@@ -66,29 +84,22 @@ class RunEvents:
         self._writer.flush()
 
     def write_errors(
-        self,
-        step: int,
-        sets: Mapping[str, Metrics],
-        groups: Sequence[str] = tuple(ERROR_GROUPS),
-        *,
-        nominal: bool = False,
-        by_epoch: bool = True,
+        self, step: int, sets: Mapping[str, Metrics], *, nominal: bool = False, by_epoch: bool = False
     ) -> None:
-        """Errors by group of rows of one parameter vector, `nominal` or identified, on sets of logs.
-
-        `by_epoch`: whether a descent works them out on its way.
-        """
-        kind = _URDF if nominal and not by_epoch else self._kind(nominal)
+        """Errors by group of rows of one parameter vector, `nominal` or not, on sets of logs."""
         for name, metrics in sets.items():
-            for group in groups:
-                if metrics.relative.get(group) is not None:
-                    self._writer.add_scalar(f"relative_error_{name}{kind}/{group}", metrics.relative[group], step)
-                if metrics.rms.get(group) is not None:
-                    self._writer.add_scalar(f"rms_error_{name}{kind}/{group}", metrics.rms[group], step)
+            for kind, values in (("relative", metrics.relative), ("rms", metrics.rms)):
+                chart = f"{_BY_EPOCH * by_epoch}error_{kind}_{name}{_NOMINAL * nominal}"
+                for group in ERROR_GROUPS:
+                    if values.get(group) is not None:
+                        self._writer.add_scalar(f"{chart}/{group}", values[group], step)
 
-    def _kind(self, nominal: bool) -> str:
-        """What the name of a chart ends with: the URDF's parameters are the first step of a descent."""
-        return _URDF if nominal and not self._descent else ""
+    def write_parameters(self, step: int, values: Mapping[str, tuple[float, float]], *, by_epoch: bool = False) -> None:
+        """Parameters and their standard errors by name, with the ends of their 95 % intervals."""
+        for name, (value, error) in values.items():
+            ends = (value, value - INTERVAL * error, value + INTERVAL * error)
+            for kind, end in zip(("", *_BOUNDS), ends, strict=True):
+                self._writer.add_scalar(f"{_BY_EPOCH * by_epoch}parameter{kind}/{name}", end, step)
 
     def write_ridges(self, choice: RidgeChoice) -> None:
         """Errors on held-out folds by ridge: in these charts, steps are the decades of ridges, -3 for 0.001."""
@@ -98,26 +109,36 @@ class RunEvents:
             self._writer.add_scalar("ridge/held_out_mean_square", mean, decade)
             self._writer.add_scalar("ridge/held_out_standard_error", error, decade)
 
-    def write_verdict(self, step: int, text: str) -> None:
-        """Whether the identified parameters predict held-out blocks and test logs better than the URDF's."""
-        self._writer.add_text("verdict", text, step)
+    def write_answer(self, step: int, lines: Sequence[str]) -> None:
+        """What the run says first, line by line."""
+        self._writer.add_text("answer", _preformatted("\n".join(lines)), step)
 
-    def write_eigenvalues(self, step: int, least: Mapping[str, float], *, nominal: bool = False) -> None:
+    def write_eigenvalues(
+        self, step: int, least: Mapping[str, float], *, nominal: bool = False, by_epoch: bool = False
+    ) -> None:
         """Smallest eigenvalue of the scaled pseudo-inertia by body; negative: no such body exists."""
         for body, value in least.items():
-            self._writer.add_scalar(f"eigenvalue{self._kind(nominal)}/{body}", value, step)
+            tag = f"{_BY_EPOCH * by_epoch}smallest_eigenvalue{_NOMINAL * nominal}/{body}"
+            self._writer.add_scalar(tag, value, step)
 
-    def write_epoch(self, epoch: Epoch) -> None:
-        """Losses and rates of an epoch of a descent."""
+    def write_epoch(self, epoch: Epoch, unseen: float | None = None) -> None:
+        """Losses and rates of an epoch of a descent.
+
+        Args:
+            epoch: of the descent.
+            unseen: mean squared whitened residual on logs that neither train nor decide, if it was worked out.
+        """
         scalars = {f"loss/{name}": value for name, value in epoch.losses.items()}
         if epoch.held_out is not None:
             scalars["loss_held_out/data"] = epoch.held_out
+        if unseen is not None:
+            scalars["loss_unseen/data"] = unseen
         scalars |= {f"share_of_force/{name}": value for name, value in epoch.shares.items()}
         if epoch.closed_form:  # 0 for a perfect fit of data without noise
-            scalars["closed_form/objective_above_least"] = epoch.objective / epoch.closed_form - 1.0
-        scalars["closed_form/distance"] = epoch.distance
-        scalars["descent/learning_rate"] = epoch.learning_rate
-        scalars["descent/samples_per_second"] = epoch.samples_per_second
+            scalars["optimum/objective_above_least"] = epoch.objective / epoch.closed_form - 1.0
+        scalars["optimum/distance"] = epoch.distance
+        scalars["training/learning_rate"] = epoch.learning_rate
+        scalars["training/samples_per_second"] = epoch.samples_per_second
         for tag, value in scalars.items():
             self._writer.add_scalar(tag, value, epoch.number)
 
@@ -129,15 +150,15 @@ class RunEvents:
             samples_per_second: of the stream through the logs, None without one.
         """
         rows = max(estimate.rows, 1)
-        self._writer.add_scalar(f"loss{_URDF}/data", estimate.nominal_cost / rows, 1)
+        self._writer.add_scalar(f"loss{_NOMINAL}/data", estimate.nominal_cost / rows, 1)
         self._writer.add_scalar("loss/data", estimate.cost / rows, 1)
         if samples_per_second is not None:
-            self._writer.add_scalar("descent/samples_per_second", samples_per_second, 1)
+            self._writer.add_scalar("training/samples_per_second", samples_per_second, 1)
         if isinstance(estimate, ConstrainedEstimate):
             self._writer.add_scalar("loss/prior", estimate.objective - estimate.cost / rows, 1)
-            self._writer.add_scalar("closed_form/distance", estimate.distance, 1)
+            self._writer.add_scalar("optimum/distance", estimate.distance, 1)
             if estimate.relative_increase is not None:
-                self._writer.add_scalar("closed_form/objective_above_least", estimate.relative_increase, 1)
+                self._writer.add_scalar("optimum/objective_above_least", estimate.relative_increase, 1)
 
     def write_fit(self, step: int, estimate: Estimate) -> None:
         """Statistics of the problem."""
@@ -164,33 +185,29 @@ class RunEvents:
         for index, value in enumerate(estimate.singular_values):
             self._writer.add_scalar("identifiability/singular_value", value, index)
 
-    def write_summary(
-        self,
-        settings: str,
-        hyperparameters: Mapping[str, str | float | bool],
-        final: Mapping[str, float],
-        figures: Mapping[str, bytes],
-        step: int,
-    ) -> None:
-        """Settings, final metrics and figures of a finished run.
-
-        Args:
-            settings: resolved configuration, YAML.
-            hyperparameters: for the HParams tab.
-            final: metrics beside them.
-            figures: PNG by tag.
-            step: of the figures.
-        """
+    def write_summary(self, settings: str, figures: Mapping[str, bytes], step: int) -> None:
+        """Settings, YAML, and figures of a finished run, PNG by name, in the order in which they are to be seen."""
         self._writer.add_text("config", _preformatted(settings))
-        for tag, png in figures.items():
+        for number, (name, png) in enumerate(figures.items(), 1):
             width, height = struct.unpack(">II", png[16:24])
             image = Summary.Image(encoded_image_string=png, width=width, height=height, colorspace=_RGBA)
-            self._writer.file_writer.add_summary(Summary(value=[Summary.Value(tag=tag, image=image)]), step)
+            value = Summary.Value(tag=f"figure_{number}_{name}", image=image)
+            self._writer.file_writer.add_summary(Summary(value=[value]), step)
+
+    def write_hyperparameters(
+        self, settings: Mapping[str, str | float | bool], final: Mapping[str, float], step: int
+    ) -> None:
+        """Settings and final metrics, a row for each run in the tab *HParams*; the same keys for all of them."""
         named = {f"final/{name}": value for name, value in final.items()}
-        for summary in hparams(dict(hyperparameters), named):  # add_hparams would write a run of its own
+        for summary in hparams(dict(settings), named):  # add_hparams would write a run of its own
             self._writer.file_writer.add_summary(summary)
         for tag, value in named.items():
             self._writer.add_scalar(tag, value, step)
+
+
+def _charts(tags: Sequence[str], groups: Iterable[str]) -> dict[str, list[str | list[str]]]:
+    """A chart of all of these for each group of rows."""
+    return {group: ["Multiline", [f"{tag}/{group}" for tag in tags]] for group in groups}
 
 
 def _preformatted(text: str) -> str:

@@ -68,7 +68,7 @@ def payload_parameters(robot: Robot, payloads: Sequence[Payload], recording: str
             found = f"{list(payload.inertia)}, which no body has"
             raise ConfigError.at_field(f"payload.inertia{of}", found, INERTIA_ACCEPTED)
         if robot.bodies[body].massless:
-            found = f"'{payload.link}', of a body without mass in the URDF"
+            found = f"'{payload.link}', of a body without mass in the {robot.format}"
             raise ConfigError.at_field(
                 f"payload.link{of}", found, "a link of a body with mass, or an <inertial> for it"
             )

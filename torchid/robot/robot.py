@@ -38,7 +38,7 @@ from torchid.robot.tree import (
 )
 from torchid.robot.urdf import is_bolted, read_urdf
 from torchid.robot.welds import links_beyond, weld_joints, weld_positions
-from torchid.robot.xml_files import is_mjcf
+from torchid.robot.xml_files import file_kind
 
 if TYPE_CHECKING:
     from pytorch_kinematics import Chain
@@ -117,7 +117,7 @@ class Robot:
     @cached_property
     def format(self) -> str:
         """What its file is, which nominal parameters are from: "URDF" or "MJCF"."""
-        return "MJCF" if is_mjcf(self.path) else "URDF"
+        return file_kind(self.path)
 
     @property
     def sliding(self) -> tuple[str, ...]:

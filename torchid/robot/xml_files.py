@@ -52,10 +52,19 @@ def read_xml(path: Path, root: str | None = None) -> etree._ElementTree:
     return tree
 
 
+def file_kind(path: Path) -> str:
+    """What a robot's file is: one of the values of `ROOTS`.
+
+    Raises:
+        UrdfError: as `read_xml`.
+    """
+    return ROOTS[str(read_xml(path).getroot().tag)]
+
+
 def is_mjcf(path: Path) -> bool:
     """Whether a robot's file is MJCF rather than a URDF.
 
     Raises:
         UrdfError: as `read_xml`.
     """
-    return str(read_xml(path).getroot().tag) == "mujoco"
+    return file_kind(path) == ROOTS["mujoco"]

@@ -16,7 +16,7 @@ from torchid.robot.loops import LOOPS_FIELD, loops_of_file
 from torchid.robot.mjcf_model import mujoco
 from torchid.robot.plain_urdf import plain_urdf
 from torchid.robot.urdf import drop_repeated_origins, parse_xml, read_urdf
-from torchid.robot.xml_files import is_mjcf
+from torchid.robot.xml_files import file_kind, is_mjcf
 from torchid.sensing.sensors import NORMAL_FORCE
 
 _RADIUS = 1e-4  # m, of contact points that the file gives: where they touch the floor is where they are
@@ -26,6 +26,7 @@ _DISCARDED = ("transmission", "gazebo", "material", "mujoco")
 _SPRING = (0.004, 1.0)  # time constant [s] and damping ratio of the floor; a softer one lets feet creep, by v^2
 _STICTION = (0.002, 1.0)  # the same of dry friction in a joint; MuJoCo's own lets joints creep at 0.1 rad/s
 _FRICTION = (1.0, 0.005, 0.0001)
+_SIMULATED = "a robot that MuJoCo can simulate"
 _SLIP_RATIO = 10.0  # friction's stiffness over the normal one's: soft friction creeps
 
 
@@ -315,7 +316,7 @@ def compile_model(urdf: Path, feet: Sequence[Foot], physics_hz: float, floating:
     try:
         model = spec.compile()
     except ValueError as error:
-        raise UrdfError(urdf, "URDF", f"MuJoCo refuses it: {error}", "a robot that MuJoCo can simulate") from error
+        raise UrdfError(urdf, file_kind(urdf), f"MuJoCo refuses it: {error}", _SIMULATED) from error
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT  # a stop's force would be in no sensor
     model.dof_solref[:], model.dof_solimp[:, :2] = _STICTION, (0.99, 0.999)
     return model
@@ -343,7 +344,7 @@ def _spec(urdf: Path) -> mujoco.MjSpec:
     try:
         spec = mujoco.MjSpec.from_string(etree.tostring(root, encoding="unicode"))
     except ValueError as error:
-        raise UrdfError(urdf, "URDF", f"MuJoCo refuses it: {error}", "a robot that MuJoCo can simulate") from error
+        raise UrdfError(urdf, file_kind(urdf), f"MuJoCo refuses it: {error}", _SIMULATED) from error
     spec.compiler.fusestatic = False
     spec.compiler.balanceinertia = False
     return spec

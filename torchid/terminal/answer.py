@@ -16,7 +16,7 @@ from torchid.report.tables import terminal_width
 from torchid.robot import Robot
 from torchid.terminal.lines import CUT, LABEL, LINES, column_lines, error_lines, labelled, wrap_words
 
-_MOST_ATTENTION, _TEXT_LINES = 2, 2
+_MOST_ATTENTION, _TEXT_LINES, _ATTENTION_LINES = 2, 2, 3
 _FEWEST_LINES = 4  # of the table of bodies: a heading, a body, how many others there are, what the marks mean
 _MASS, _CENTER = PARAMETERS.index("m"), slice(PARAMETERS.index("mcx"), PARAMETERS.index("mcz") + 1)
 _COULOMB, _VISCOUS = PARAMETERS.index("fc"), PARAMETERS.index("fv")
@@ -24,28 +24,29 @@ _LEGEND = {COMBINED: "+ known only in sums with other bodies", PRIOR: "p mostly 
 _MARKS = {IDENTIFIED: " ", COMBINED: "+", PRIOR: "p", UNOBSERVABLE: ".", FIXED: "="}
 
 
-def print_answer(run: Identification, *last: str) -> None:
-    """Print it for the terminal's width, with these lines at the end."""
+def print_answer(run: Identification, *last: tuple[str, str]) -> None:
+    """Print it for the terminal's width, with these words and what they are about at the end."""
     print("\n".join(answer_lines(run, terminal_width(), last)))
 
 
-def answer_lines(run: Identification, width: int, last: Sequence[str] = ()) -> list[str]:
+def answer_lines(run: Identification, width: int, last: Sequence[tuple[str, str]] = ()) -> list[str]:
     """The answer, in lines that are not wider than so many columns.
 
     Args:
         run: a finished one.
         width: of the terminal.
-        last: lines at the end.
+        last: words, and what they are about, at the end.
     """
     said = answer(run)
     lines = [*wrap_words(said.headline, width), *error_lines(said.errors, width, run.experiment.robot.format), ""]
     lines += labelled("total mass", said.total_mass, width, _TEXT_LINES)
     lines += labelled("bodies", said.bodies, width, _TEXT_LINES)
     for one in said.attention[:_MOST_ATTENTION]:
-        lines += labelled("attention", one, width, _TEXT_LINES)
+        lines += labelled("attention", one, width, _ATTENTION_LINES)
     if len(said.attention) > _MOST_ATTENTION:
         lines += labelled("", f"and {len(said.attention) - _MOST_ATTENTION} more: --verbose", width, _TEXT_LINES)
-    end = [f"{'written to':{LABEL}}{run.experiment.config.output}", *last]
+    end = [f"{'written to':{LABEL}}{run.experiment.config.output}"]
+    end += [line for one in last for line in labelled(*one, width, _TEXT_LINES)]
     bodies = _body_lines(run.experiment.robot, run.estimate, LINES - len(lines) - len(end) - 1, width)
     return [*lines, *(["", *bodies] if bodies else []), *end]
 
@@ -92,9 +93,14 @@ def _columns(robot: Robot, estimate: Estimate, bodies: Sequence[int]) -> list[tu
         ("mass [kg]", cells(_MASS)),
         (f"{robot.format} [kg]", [f"{nominal[k, _MASS]:.3f}" for k in bodies]),
         (f"Coulomb [{force}]", cells(_COULOMB)),
-        ("centre moved [mm]", moved),
-        ("viscous", cells(_VISCOUS)),
+        ("CoM moved [mm]", moved),
+        (f"viscous [{_per_speed(kinds)}]", cells(_VISCOUS)),
     ]
+
+
+def _per_speed(kinds: set[str]) -> str:
+    units = ["N m s/rad"] * bool(kinds - {"prismatic"}) + ["N s/m"] * ("prismatic" in kinds)
+    return ", ".join(units)
 
 
 def _cell(value: float, error: float, verdict: str) -> str:

@@ -64,7 +64,7 @@ def _print_wrapped(text: str, indent: str = "") -> None:
 
 def _print_worse(worse: list[WorseThanNominal], of: str) -> None:
     for line in (
-        f"WORSE THAN {of}: {describe_worse(worse)}",
+        f"WORSE THAN {of}: {describe_worse(worse, of)}",
         f"{ADVICE}; the results are written all the same, status 0",
     ):
         _print_wrapped(line)

@@ -46,7 +46,7 @@ def print_all_errors(evaluated: EvaluatedRun) -> None:
 
 def _sentence(one: Judged) -> str:
     worse = worse_than_nominal({one.text: (one.nominal, one.identified)})
-    return f"WORSE THAN {one.of}: {describe_worse(worse)}" if worse else one.headline()
+    return f"WORSE THAN {one.of}: {describe_worse(worse, one.of)}" if worse else one.headline()
 
 
 def _worst(one: Judged) -> float:

@@ -40,7 +40,7 @@ from torchid.config import load_config
 from torchid.estimators import Trainer
 from torchid.estimators.least_squares import VERDICTS
 from torchid.problem.linear import parameter_scale
-from torchid.problem.metrics import ERROR_GROUPS, ROW_GROUPS, WHITENED
+from torchid.problem.metrics import ERROR_GROUPS, ROW_GROUPS
 
 
 def test_the_run_folder_is_that_of_any_run_and_nothing_is_left_beside_it(run: Path) -> None:
@@ -65,7 +65,7 @@ def test_metrics_and_parameters_are_those_of_the_best_epoch(run: Path) -> None:
     best = min(held_out, key=lambda step: held_out[step])
     assert metrics["solution"]["epochs"] == EPOCHS
     assert metrics["solution"]["best_epoch"] == best
-    least = {event.step: event.value for event in events_in(run).Scalars("closed_form/objective_above_least")}
+    least = {event.step: event.value for event in events_in(run).Scalars("optimum/objective_above_least")}
     above = metrics["solution"]["objective"] / metrics["solution"]["unconstrained"] - 1.0
     assert above == pytest.approx(least[best], rel=1e-6)
     robot = torchid.load_robot(DEMO / "quadruped.urdf")
@@ -77,21 +77,32 @@ def test_metrics_and_parameters_are_those_of_the_best_epoch(run: Path) -> None:
     assert phi[1:, 10:].min() > 0.0
 
 
+INTERVALS = "parameters by epoch, 95 % intervals"
+
+
+def identified(run: Path) -> list[tuple[str, str]]:
+    """Bodies and parameters that are identified one by one."""
+    bodies = json.loads((run / "parameters.json").read_text())["bodies"]
+    return [(x["name"], name) for x in bodies for name, verdict in x["verdict"].items() if verdict == "identified"]
+
+
 def test_curves_say_everything_by_epoch_and_show_train_and_unseen_logs(run: Path) -> None:
     events, robot = events_in(run), torchid.load_robot(DEMO / "quadruped.urdf")
     by_epoch = [
         *("loss/total", "loss/data", "loss/prior", "loss_held_out/data", "share_of_force/rigid_body"),
-        *("closed_form/objective_above_least", "closed_form/distance"),
-        *("descent/learning_rate", "descent/samples_per_second"),
+        *("optimum/objective_above_least", "optimum/distance"),
+        *("training/learning_rate", "training/samples_per_second"),
     ]
-    evaluated = [f"{kind}_error_{name}/{group}" for kind in ("relative", "rms") for name in ("train", "test")
-                 for group in ROW_GROUPS]  # fmt: skip
+    charts = [f"error_{kind}_{name}" for kind in ("relative", "rms") for name in ("train", "test")]
+    evaluated = [f"training_{chart}/{group}" for chart in charts for group in ROW_GROUPS]
+    evaluated += [f"training_smallest_eigenvalue/{name}" for name in robot.body_names]
     # the log is too short to leave folds of it out
-    judged = [
-        f"{kind}_error_{name}{of}/{WHITENED}"
-        for kind in ("relative", "rms") for name in ("train", "test") for of in ("", "_URDF")
-    ]  # fmt: skip
-    evaluated += [f"eigenvalue/{name}" for name in robot.body_names]
+    judged = [f"{chart}{of}/{group}" for chart in charts for of in ("", "_nominal") for group in ERROR_GROUPS]
+    judged += [f"smallest_eigenvalue{of}/{name}" for of in ("", "_nominal") for name in robot.body_names]
+    known = [f"{body}.{name}" for body, name in identified(run)]
+    assert len(known) > 20
+    evaluated += [f"training_parameter{end}/{name}" for end in ("", "_lower", "_upper") for name in known]
+    judged += [f"parameter{end}/{name}" for end in ("", "_lower", "_upper") for name in known]
     once = ["fit/residual_std", "fit/rank", "fit/condition_number", "identifiability/bits"]
     once += ["identifiability/combinations", *(f"verdicts/{verdict}" for verdict in VERDICTS)]
     final = {tag for tag in events.Tags()["scalars"] if tag.startswith("final/")}
@@ -101,20 +112,22 @@ def test_curves_say_everything_by_epoch_and_show_train_and_unseen_logs(run: Path
     for tags, expected in ((by_epoch, BY_EPOCH), (evaluated, EVALUATED), (judged, [EPOCHS]), (once, [EPOCHS])):
         for tag in tags:
             assert steps(events, tag) == expected
-    for tag in ("loss/data", "loss_held_out/data", "relative_error_test/nullspace", "closed_form/distance"):
+    for tag in ("loss/data", "loss_held_out/data", "training_error_relative_test/nullspace", "optimum/distance"):
         values = [event.value for event in events.Scalars(tag)]
-        unseen = tag in ("loss_held_out/data", "relative_error_test/nullspace")  # little, after 240 samples
+        unseen = tag in ("loss_held_out/data", "training_error_relative_test/nullspace")  # little, after 240 samples
         assert values[-1] < (0.97 if unseen else 0.9) * values[0], tag
     total = [event.value for event in events.Scalars("loss/total")]
     parts = zip(*([event.value for event in events.Scalars(f"loss/{term}")] for term in ("data", "prior")), strict=True)
     assert total == pytest.approx([sum(pair) for pair in parts], rel=1e-6)
-    assert set(events.Tags()["images"]) == {"forces", "errors", "parameters", "identifiability", "contributions"}
+    figures = ("forces", "errors", "parameters", "identifiability", "contributions")
+    assert set(events.Tags()["images"]) == {f"figure_{k}_{name}" for k, name in enumerate(figures, 1)}
     (text,) = events.Tensors("config/text_summary")
     assert b"checkpoint_seconds: 0" in text.tensor_proto.string_val[0]
 
 
 NAMES = {
-    "sensors", "estimator", "ridge", "friction", "cutoff_hz", "margin", "prior", "consistency",
+    "sensors", "estimator", "ridge", "friction", "cutoff_hz",
+    *(f"settings.{name}" for name in ("margin", "prior", "consistency")),
     *(f"training.{name}" for name in ("optimizer", "lr", "schedule", "batch_size", "epochs", "seed")),
 }  # fmt: skip
 
@@ -131,18 +144,27 @@ def test_hyperparameters_stand_beside_the_final_errors(run: Path) -> None:
     for name in (b"training.optimizer", b"Adam", b"CosineAnnealingLR", b"training.batch_size", b"log_cholesky"):
         assert name in content
     names = sorted(name.decode() for name in set(re.findall(rb"[a-z_.]+", content)) if name.decode() in NAMES)
-    assert names[:5] == ["consistency", "cutoff_hz", "estimator", "friction", "margin"], "which TensorBoard shows"
+    assert names[:5] == ["cutoff_hz", "estimator", "friction", "ridge", "sensors"], "which TensorBoard shows"
 
 
 def test_custom_charts_show_training_and_unseen_logs_together(run: Path) -> None:
     events = events_in(run)
     layout = layout_pb2.Layout()
     layout.ParseFromString(events.Tensors("custom_scalars__config__")[0].tensor_proto.string_val[0])
-    charts = {chart.title: list(chart.multiline.tag) for category in layout.category for chart in category.chart}
+    found = {category.title: {x.title: x for x in category.chart} for category in layout.category}
     for group in ERROR_GROUPS:
-        logs = ("train", "test", "left_out")
-        assert charts[group] == [f"relative_error_{name}{of}/{group}" for name in logs for of in ("", "_URDF")]
-    assert charts["train and held out"] == ["loss/data", "loss_held_out/data"]
+        logs = [
+            f"error_relative_{name}{of}/{group}" for name in ("test", "left_out", "train") for of in ("_nominal", "")
+        ]
+        assert list(found["errors, share of measured"][group].multiline.tag) == logs
+    intervals = {name: chart.margin.series[0] for name, chart in found.pop(INTERVALS).items()}
+    for name, series in intervals.items():
+        value, low, high = (events.Scalars(tag) for tag in (series.value, series.lower, series.upper))
+        assert [x.step for x in value] == EVALUATED
+        assert all(a.value < x.value < b.value for a, x, b in zip(low, value, high, strict=True)), name
+    assert set(intervals) == {f"{body}.{parameter}" for body, parameter in identified(run)}
+    charts = {title: list(x.multiline.tag) for category in found.values() for title, x in category.items()}
+    assert charts["train, held out, unseen"] == ["loss/data$", "loss_held_out/data$", "loss_unseen/data$"]
     tags = events.Tags()["scalars"]
     for title, patterns in charts.items():
         shown = [tag for tag in tags if any(re.match(pattern, tag) for pattern in patterns)]

@@ -1,0 +1,145 @@
+"""Draw the figures of docs/concepts.md, all of the demo's quadruped.
+
+    python scripts/concept_figures.py                   # into docs
+    python scripts/concept_figures.py --folder figures
+
+The demo is identified as its experiment file says; the friction of its simulation is known (scripts/make_demo.py).
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+
+import torchid
+from torchid.boundary import run_guarded
+from torchid.commands import Identification
+from torchid.commands.reading import LogReader
+from torchid.identifiability.structure import structural_problem
+from torchid.parameters import PARAMETERS, PER_BODY, Array
+from torchid.problem.predict import force_series, null_space_part
+from torchid.report.figures import STYLE, identifiability_figure, save_figures
+from torchid.report.palette import IDENTIFIED, MEASURED, NOISE, NOMINAL
+from torchid.report.parameter_figure import INTERVAL
+
+ROOT = Path(__file__).resolve().parents[1]
+DEMO = ROOT / "torchid" / "demo" / "quadruped.yaml"
+TRUE_FRICTION = {"fc": 0.3, "fv": 0.05}  # of scripts/make_demo.py [N m, N m s/rad]
+STATES = {
+    "four feet": [(True, True, True, True)],
+    "two feet": [(True, False, False, True)],
+    "in the air": [(False, False, False, False)],
+    "all of these": [(True, True, True, True), (True, False, False, True), (False, False, False, False)],
+}
+SENSORS = {"contacts": NOMINAL, "joints": IDENTIFIED, "full": MEASURED}
+
+
+def main() -> int:
+    """Identify the demo and draw."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--folder", type=Path, default=ROOT / "docs")
+    options = parser.parse_args()
+    return run_guarded("concept_figures", lambda: draw(options.folder))
+
+
+def draw(folder: Path) -> None:
+    """Write the four figures."""
+    run = torchid.identify(DEMO, output=None)
+    robot = run.experiment.robot
+    with matplotlib.rc_context(STYLE):
+        figures = {
+            "concept_projection": projection_figure(*unmeasured_forces(run)),
+            "concept_observability": rank_figure(ranks(run)),
+            "concept_verdicts": identifiability_figure(robot.body_names, run.estimate),
+            "concept_intervals": interval_figure(run),
+        }
+    folder.mkdir(parents=True, exist_ok=True)
+    save_figures(figures, folder, "png")
+
+
+def unmeasured_forces(run: Identification) -> tuple[Array, Array, Array]:
+    """Time (N,) [s] of an unseen log, and K phi - S^T tau of two rows, (2, N), before and after projection."""
+    experiment = run.experiment
+    builder, config = experiment.builder(experiment.sensors), experiment.config
+    (log,) = LogReader(experiment).read(config.logs.test, experiment.sensors)
+    predicted = force_series(builder, log, run.phi.reshape(1, -1))[1]
+    assert log.torque is not None
+    torque = np.pad(log.torque.cpu().numpy(), ((0, 0), (builder.tree.base_rows, 0)))
+    left = predicted - torque
+    shown = [2, builder.tree.base_rows + experiment.robot.joint_names.index("front_left_knee")]
+    return log.time.cpu().numpy(), left[0][:, shown].T, null_space_part(builder, log, left)[0][:, shown].T
+
+
+def projection_figure(time: Array, before: Array, after: Array) -> Figure:
+    """What the equations of two rows lack, before and after the projection."""
+    figure = Figure(figsize=(9.0, 4.0), layout="constrained")
+    axes = figure.subplots(2, 2, sharex=True)
+    rows = ("base force z [N]", "front_left_knee [N m]")
+    for column, (what, values) in enumerate({"K φ - Sᵀ τ": before, "V Vᵀ (K φ - Sᵀ τ)": after}.items()):
+        for axis, name, series in zip(axes[:, column], rows, values, strict=True):
+            axis.plot(time, series, color=(NOMINAL, IDENTIFIED)[column], linewidth=1.0)
+            axis.set_title(f"{what}: rms {np.sqrt(np.mean(series**2)):.3g}", loc="left")
+            axis.set_ylabel(name)
+            axis.set_xlim(0.0, time[-1])
+    for axis in axes[-1]:
+        axis.set_xlabel("time [s]")
+    return figure
+
+
+def ranks(run: Identification) -> dict[str, dict[str, int]]:
+    """Number of combinations of parameters that motion in some contact states determines, by sensors."""
+    robot, contacts = run.experiment.robot, run.experiment.contacts
+    return {
+        name: {
+            of: int(
+                np.linalg.matrix_rank(
+                    structural_problem(robot, contacts, torchid.named_sensors(of, robot.n, len(contacts)), states).A
+                )
+            )
+            for of in SENSORS
+        }
+        for name, states in STATES.items()
+    }
+
+
+def rank_figure(found: dict[str, dict[str, int]]) -> Figure:
+    """Bars of ranks, by contact states and sensors."""
+    figure = Figure(figsize=(7.0, 3.4), layout="constrained")
+    axis = figure.subplots()
+    for number, (of, color) in enumerate(SENSORS.items()):
+        place = np.arange(len(found)) + 0.27 * (number - 1)
+        bars = axis.bar(place, [ranks[of] for ranks in found.values()], 0.25, color=color, label=f"sensors: {of}")
+        axis.bar_label(bars, fontsize=8)
+    axis.set_xticks(range(len(found)), list(found))
+    axis.set_ylabel("identifiable combinations [1]")
+    axis.grid(visible=False, axis="x")
+    figure.legend(loc="outside upper right", ncols=len(SENSORS))
+    return figure
+
+
+def interval_figure(run: Identification) -> Figure:
+    """Friction of every joint with its 95 % interval, beside the truth."""
+    robot, units = run.experiment.robot, {"fc": "Coulomb friction [N m]", "fv": "viscous friction [N m s/rad]"}
+    errors = run.estimate.standard_error.reshape(-1, PER_BODY)
+    figure = Figure(figsize=(9.0, 3.6), layout="constrained")
+    names = [body.joint.name for body in robot.bodies if body.joint is not None]
+    for axis, (name, true) in zip(figure.subplots(1, 2, sharey=True), TRUE_FRICTION.items(), strict=True):
+        k, place = PARAMETERS.index(name), range(len(names))
+        reach = INTERVAL * errors[1:, k]
+        axis.errorbar(run.phi[1:, k], place, xerr=reach, fmt="o", color=IDENTIFIED, capsize=2, label="identified, 95 %")
+        axis.axvline(true, color=MEASURED, linewidth=1.0, linestyle="--", label="truth of the simulation")
+        axis.axvline(0.0, color=NOISE, linewidth=0.8)
+        axis.set_yticks(place, names)
+        axis.set_xlabel(units[name])
+    axis.invert_yaxis()
+    handles, labels = axis.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper right", ncols=2)
+    return figure
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

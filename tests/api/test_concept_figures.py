@@ -1,0 +1,53 @@
+"""`scripts/concept_figures.py`: the figures of the page of concepts, and what that page says of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from repository import ROOT
+from script_calls import script
+
+import torchid
+from torchid.commands import Identification
+from torchid.parameters import COULOMB, PER_BODY, VISCOUS
+from torchid.report.parameter_figure import INTERVAL
+
+
+@pytest.fixture(scope="module")
+def run() -> Identification:
+    return torchid.identify(ROOT / "torchid" / "demo" / "quadruped.yaml", output=None)
+
+
+def test_the_projection_leaves_noise_of_forces_that_nobody_measured(run: Identification) -> None:
+    time, before, after = script("concept_figures").unmeasured_forces(run)
+    assert before.shape == after.shape == (2, len(time))
+    rms = np.sqrt(np.mean(np.square([before, after]), axis=2))
+    assert rms[0, 0] == pytest.approx(9.81 * run.mass.value, rel=0.05), "on the base: the weight"
+    assert (rms[1] < 0.01 * rms[0]).all()
+
+
+def test_ranks_are_those_of_the_page(run: Identification) -> None:
+    ranks = script("concept_figures").ranks(run)
+    friction = 2 * run.experiment.robot.n
+    for found in ranks.values():
+        assert found["full"] - found["contacts"] == friction
+    assert ranks["four feet"]["joints"] == ranks["all of these"]["joints"] - 4 == 114
+    assert ranks["all of these"]["joints"] == ranks["all of these"]["full"] == 118
+
+
+def test_as_many_intervals_hold_the_truth_as_the_page_says(run: Identification) -> None:
+    true = script("concept_figures").TRUE_FRICTION
+    errors, phi = run.estimate.standard_error.reshape(-1, PER_BODY)[1:], run.phi[1:]
+    off = [abs(phi[:, k] - true[name]) / errors[:, k] for name, k in (("fc", COULOMB), ("fv", VISCOUS))]
+    assert np.sum(np.less(off, INTERVAL)) == 23
+    assert "23 of the 24 intervals hold it" in " ".join((ROOT / "docs" / "concepts.md").read_text().split())
+
+
+def test_every_figure_of_the_page_is_there_and_is_drawn(tmp_path: Path) -> None:
+    script("concept_figures").draw(tmp_path)
+    drawn = {path.name for path in tmp_path.iterdir()}
+    assert len(drawn) == 4
+    page = (ROOT / "docs" / "concepts.md").read_text()
+    assert all(f"({name})" in page and (ROOT / "docs" / name).is_file() for name in drawn)
