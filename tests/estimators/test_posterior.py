@@ -97,7 +97,7 @@ def test_the_barrier_has_the_mean_of_an_exponential_tail() -> None:
     np.testing.assert_allclose(np.sqrt(found.covariance[friction, friction]), 2.0 / rate, rtol=1e-3)
 
 
-@pytest.mark.parametrize("prior_error", [0.2, 0.6])
+@pytest.mark.parametrize("prior_error", [pytest.param(0.2, marks=pytest.mark.slow), 0.6])
 def test_mean_and_covariance_are_those_of_long_chains_where_bodies_are_cut_off(prior_error: float) -> None:
     problem, _ = active_case(3)
     posterior = posterior_of(problem, Conditions(1e-3), noise=0.1)

@@ -70,7 +70,7 @@ def test_centre_and_inertia_of_samples_are_those_of_their_parameters(run: torchi
 
 def test_samples_are_as_wide_as_standard_errors_where_the_data_speak(run: torchid.Identification) -> None:
     estimate = run.estimate
-    samples = torchid.PosteriorSampler(run.posterior, prior_error=1.0).sample(2000, torch.Generator().manual_seed(0))
+    samples = torchid.PosteriorSampler(run.posterior).sample(2000, torch.Generator().manual_seed(0))
     viscous = np.arange(23, estimate.phi.size, 12)  # the prior has no say in them
     known = viscous[estimate.verdict[viscous] == "identified"]
     assert len(known) == 12
