@@ -51,6 +51,13 @@ NotNegativeOrAuto = Annotated[
     float | Literal["auto"], _number_or((AUTO,), NotNegative, "auto, or a number of at least 0")
 ]
 """A number that is not negative, or one that the data choose."""
+Ridge = Annotated[
+    float | Literal["auto", "one_standard_error"],
+    _number_or((AUTO, "one_standard_error"), NotNegative, "auto, one_standard_error, or a number of at least 0"),
+]
+"""A ridge, or how cross-validation chooses one."""
+RidgeRule = Literal["least", "one_standard_error"]
+"""Which ridge is chosen: that of the least error, or the largest whose error is within one standard error of it."""
 BelowOne = Annotated[Number, Field(ge=0.0, lt=1.0)]
 Tolerance = Annotated[Number, Field(gt=0.0, lt=1.0)]
 Count = Annotated[int, BeforeValidator(_not_bool), Field(ge=1)]

@@ -20,6 +20,7 @@ from closed_loops import MODELS, LoopWorld, loop_world
 import torchid
 from torchid.cli import main
 from torchid.commands.reading import LogReader
+from torchid.commands.replay import replay
 from torchid.config import load_config
 from torchid.errors import TorchidError
 from torchid.fitting.experiment import set_up
@@ -209,3 +210,7 @@ def test_noisy_positions_and_torques_of_motors_alone_identify_a_leg_that_mujoco_
     motors = [k for k, body in enumerate(robot.bodies) if body.joint is not None and body.joint.name in MOTORS]
     friction = found.phi.reshape(-1, 12)[motors][:, FRICTION]
     np.testing.assert_allclose(friction, np.tile([0.05, 0.1], (len(MOTORS), 1)), rtol=0.1)
+    found.write(tmp_path / "run")
+    drift = replay(tmp_path / "run", tmp_path / "test.npz", window=0.3).at(0.3)["joints [rad]"]
+    assert drift.identified < 0.3 * drift.nominal
+    assert drift.identified < 0.02

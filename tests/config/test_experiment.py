@@ -289,6 +289,7 @@ def test_an_unknown_key_is_refused_by_its_place_and_the_nearest_that_exists(
         (changed(estimator="least_squares"), "estimator", "'least_squares'"),
         (changed(estimator={"ridge": float("nan")}), "estimator.ridge", "nan"),
         (changed(estimator={"ridge": True}), "estimator.ridge", "True"),
+        (changed(estimator={"ridge": "one_se"}), "estimator.ridge", "auto, one_standard_error, or a number"),
         (changed(estimator={"rank_tolerance": 1.0}), "estimator.rank_tolerance", "1.0"),
         (changed(device=3), "device", "3"),
     ],

@@ -189,6 +189,21 @@ def test_the_chosen_ridge_predicts_held_out_blocks_best(run: Path) -> None:
     assert min(found["tried"]) < found["ridge"] < max(found["tried"]), "the grid holds the best"
 
 
+def test_one_standard_error_takes_the_largest_ridge_that_held_out_blocks_cannot_tell_from_the_best(
+    tmp_path: Path,
+) -> None:
+    larger = "sensors=full", "estimator={name: least_squares, ridge: one_standard_error}", f"output={tmp_path / 'run'}"
+    assert main(["identify", str(DEMO / "quadruped.yaml"), *larger]) == 0
+    found = json.loads((tmp_path / "run" / "metrics.json").read_text())["ridge_selection"]
+    error, spread = np.array(found["mean_square"]), np.array(found["standard_error"])
+    chosen, best = found["tried"].index(found["ridge"]), int(error.argmin())
+    assert error[chosen] - error[best] <= spread[chosen]
+    assert (error - error[best] > spread)[chosen + 1 :].all()
+    assert chosen > best, "of this log another one than the best"
+    assert found["rule"] == "one_standard_error"
+    assert yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())["estimator"]["ridge"] == found["ridge"]
+
+
 def test_tensorboard_and_a_figure_have_the_error_of_every_ridge(run: Path) -> None:
     found = json.loads((run / "metrics.json").read_text())["ridge_selection"]
     events = EventAccumulator(str(run))
@@ -202,7 +217,7 @@ def test_tensorboard_and_a_figure_have_the_error_of_every_ridge(run: Path) -> No
 
 def test_the_figure_marks_the_chosen_ridge_and_those_as_good_as_the_best() -> None:
     tried = (0.0, 0.001, 0.01, 0.1, 1.0)
-    choice = RidgeChoice(0.1, tried, (2.2, 2.0, 2.1, 2.3, 3.0), (0.1, 0.0, 0.2, 0.3, 0.4))
+    choice = RidgeChoice(0.1, tried, (2.2, 2.0, 2.1, 2.3, 3.0), (0.1, 0.0, 0.2, 0.3, 0.4), "one_standard_error")
     axes = ridge_figure(choice).axes[0]
     curve, least, chosen = axes.get_lines()
     np.testing.assert_array_equal(curve.get_xdata(), tried[1:])
@@ -214,6 +229,8 @@ def test_the_figure_marks_the_chosen_ridge_and_those_as_good_as_the_best() -> No
     assert 1e-4 < x.x0 < 1e-3
     assert 0.1 < x.x1 < 1.0
     assert axes.get_xscale() == "log"
+    (legend,) = axes.figure.legends
+    assert "chosen, the largest of these: 0.1, 2.3" in [text.get_text() for text in legend.get_texts()]
     assert "[" in axes.get_xlabel()
     assert "[" in axes.get_ylabel()
 

@@ -12,6 +12,7 @@ import torch
 pytest.importorskip("mujoco", reason="MuJoCo is not installed")
 
 import mujoco
+from lxml import etree
 from survey_mjcf import States, difference, mujoco_forces, survey, torchid_forces
 
 from torchid.errors import InputError, TorchidWarning, UrdfError
@@ -268,3 +269,27 @@ def test_a_limited_tendon_or_an_inactive_loop_changes_nothing(tmp_path: Path) ->
     states = States.random(robot)
     own = torchid_forces(robot, robot.nominal, robot.armature, states)
     assert difference(own, mujoco_forces(MjcfModel(robot.path).model, robot, states)) < 1e-13
+
+
+def test_what_mujoco_multiplies_is_written_with_what_was_identified_to_the_last_digit_and_the_rest_to_six(
+    tmp_path: Path,
+) -> None:
+    """`<replicate>` has no element for each of its legs: the file is MuJoCo's own, resolved."""
+    (tmp_path / "tool.xml").write_text(
+        '<mujoco model="tool"><worldbody><body name="probe"><joint name="twist" axis="0 0 1" damping="0.1"/>'
+        '<geom type="box" size=".01 .02 .03" mass=".3"/></body></worldbody></mujoco>'
+    )
+    leg = '<body name="leg" pos=".123456789 0 0"><joint name="hip" axis="0 1 0" armature="0.0123456789"/>'
+    leg += '<geom type="capsule" fromto="0 0 0 0 .01 -.3" size=".02" mass="1.5"/></body>'
+    text = f"""<mujoco><asset><model name="tool" file="tool.xml"/></asset><worldbody><body name="trunk"><freejoint/>
+     <geom type="box" size=".2 .1 .08" mass="6"/><replicate count="3" euler="0 0 2.0943951">{leg}</replicate>
+     <frame pos="0 0 .1"><attach model="tool" body="probe" prefix="tool_"/></frame></body></worldbody></mujoco>"""
+    robot = robot_of(text, tmp_path)
+    assert robot.joint_names == ("hip0", "hip1", "hip2", "tool_twist")
+    (tmp_path / "out").mkdir()
+    found = survey(tmp_path / "robot.xml", tmp_path / "out")
+    assert found.inverse_dynamics < 1e-13
+    written = tmp_path / "out" / "robot.xml"
+    assert not {"replicate", "attach"} & {str(element.tag) for element in etree.parse(written).iter()}
+    assert found.read_again < 1e-13, "identified: every digit"
+    assert 1e-9 < found.written < 1e-5, "where bodies are: six digits"

@@ -109,10 +109,6 @@ def test_a_simulation_that_makes_no_sense_is_refused_in_one_line(
 
 
 URDFS = {
-    "mimic joint": (
-        '<limit lower="-0.6" upper="1.2"', '<mimic joint="torso_roll"/><limit lower="-0.6" upper="1.2"',
-        ("biped.urdf: joint 'torso_pitch': a mimic joint; accepted: independent joints",),
-    ),
     "negative mass": ('<mass value="11"', '<mass value="-11"', ("pelvis", "-11 kg")),
     "spheres of no size": ('<sphere radius="0.01"', '<sphere radius="0"', ("'l_sole', <sphere>: radius 0",)),
     "planar joint": ('type="revolute"', 'type="planar"', ("torso_roll", "planar")),

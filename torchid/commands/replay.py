@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from torchid import parameters
 from torchid.commands.evaluate import FittedRun, read_run, require_run
 from torchid.commands.folder import REPLAY, check_free, new_folder, write_json
 from torchid.commands.reading import LogReader
 from torchid.config import FootConfig
-from torchid.errors import ConfigError, LogError, about_file, during, excerpt, format_count
+from torchid.errors import ConfigError, LogError, about_file, during, excerpt
 from torchid.fitting.calibration import Calibration, Comparison
 from torchid.logs.time_range import split_range
 from torchid.parameters import Array
@@ -25,10 +26,12 @@ from torchid.report.figures import save_figures
 from torchid.report.tables import progress_bars
 from torchid.reprs import short_repr
 from torchid.robot import Robot
+from torchid.robot.urdf import read_urdf
 from torchid.robot.welds import matching_joints
 from torchid.sensing import Contact
 from torchid.simulation.plant import Foot, find_feet, point_foot
 from torchid.simulation.replay import Drift, Model, ReplayedLog, replay_log
+from torchid.simulation.ties import Ties
 
 _TIMES = 25  # at which the drift is compared, within a window
 _UNITS = {"revolute": "rad", "prismatic": "m"}
@@ -230,13 +233,7 @@ def _require_simple(fitted: FittedRun) -> None:
     Raises:
         ConfigError: it cannot.
     """
-    config, robot = fitted.experiment.config.robot, fitted.experiment.robot
-    held = format_count(len(robot.welded), "joint")
-    if config.weld:
-        raise ConfigError.at_field("robot.weld", f"{held} held still", "a replay without welds")
-    if robot.loops:
-        loops = format_count(len(robot.loops), "closed loop")
-        raise ConfigError.at_field("robot.loops", loops, "a replay of a robot without")
+    robot = fitted.experiment.robot
     root = next(name for name, (body, pose) in robot.links.items() if body == 0 and np.array_equal(pose, np.eye(4)))
     if not robot.fixed_base and robot.base_link != root:
         accepted = f"the {robot.format}'s root, '{root}', to replay"
@@ -266,7 +263,20 @@ def _model(urdf: Path, robot: Robot, calibration: Calibration | None) -> Model:
         if extra.what in values and calibration is not None:
             values[extra.what][list(extra.dofs)] = calibration.values[("", extra.label)]
     offset = values["torque_offset"] + values["asymmetric_coulomb"] + robot.spring_torque
-    return Model(urdf, robot.joint_names, values["armature"], offset, values["stiffness"])
+    ties = Ties.of(urdf, read_urdf(urdf)[1], robot.loops, robot.welded)
+    if calibration is not None and robot.welded:
+        ties = replace(ties, inertials=_inertials_beyond_welds(robot, calibration.phi.reshape(robot.nominal.shape)))
+    return Model(urdf, robot.joint_names, values["armature"], offset, values["stiffness"], ties)
+
+
+def _inertials_beyond_welds(robot: Robot, phi: Array) -> dict[str, Array]:
+    """Inertial parameters (10,) of links that welds join to one body: all of it at the link that names the body.
+
+    What a run's file has of these links is the URDF's, and what is left: together a body that can exist.
+    """
+    numbers = {robot.links[link][0] for link in robot.links_beyond_welds}
+    out = {link: np.zeros(parameters.INERTIAL.stop) for k in numbers for link in robot.bodies[k].links}
+    return out | {robot.bodies[k].name: phi[k, parameters.INERTIAL] for k in numbers}
 
 
 def _replayed(samples: Samples) -> ReplayedLog:

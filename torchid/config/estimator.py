@@ -15,7 +15,7 @@ from torchid.estimators.conditions import EnclosureKind
 from torchid.estimators.conic_formulation import Prior
 from torchid.estimators.consistent import Method
 from torchid.estimators.sgd import Consistency
-from torchid.settings import AUTO, BelowOne, Count, NotNegative, NotNegativeOrAuto, Number, Positive, Seed, Tolerance
+from torchid.settings import AUTO, BelowOne, Count, NotNegative, Number, Positive, Ridge, RidgeRule, Seed, Tolerance
 
 ESTIMATORS: dict[str, type[LeastSquares | Consistent | Sgd]] = {
     "least_squares": LeastSquares,
@@ -103,13 +103,14 @@ Settings = TypeVar("Settings", LeastSquares, Consistent, Sgd)
 class _FitConfig:
     """What is fitted and how, whatever the estimator.
 
-    `ridge`: auto, the one that predicts left-out blocks of the training logs best; `friction: false`
-    leaves friction at the URDF's values, `frozen` bodies keep all of theirs; `robust` weighs outliers down in a batch
-    fit. `total_mass` and `masses` of bodies by name are known, as from a scale.
+    `ridge`: auto, the one that predicts left-out blocks of the training logs best, one_standard_error, the largest that
+    predicts them within one standard error of the best; `friction: false` leaves friction at the URDF's values,
+    `frozen` bodies keep all of theirs; `robust` weighs outliers down in a batch fit. `total_mass` and `masses` of
+    bodies by name are known, as from a scale.
     """
 
     name: Literal["least_squares", "consistent", "sgd"] = "consistent"
-    ridge: NotNegativeOrAuto = AUTO
+    ridge: Ridge = AUTO
     rank_tolerance: Tolerance = LeastSquares.rank_tolerance
     friction: bool = True
     frozen: list[str] = dataclasses.field(default_factory=list)
@@ -150,7 +151,12 @@ class EstimatorConfig(_ConditionsConfig, _FitConfig):
     @property
     def chooses_ridge(self) -> bool:
         """Whether the ridge is to be chosen by the data."""
-        return self.ridge == AUTO
+        return isinstance(self.ridge, str)
+
+    @property
+    def ridge_rule(self) -> RidgeRule:
+        """Which ridge the data choose, if they do."""
+        return "least" if self.ridge == AUTO else "one_standard_error"
 
     @property
     def numeric_ridge(self) -> float:

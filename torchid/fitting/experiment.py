@@ -153,7 +153,7 @@ class Scene:
     def choose_ridge(
         self, parts: Sequence[Part], blocks: Sequence[Block], fitter: LogFitter, conditions: Conditions
     ) -> RidgeChoice:
-        """The ridge that predicts held-out folds best, for the estimator of the settings.
+        """The ridge that predicts held-out folds best, or by one standard error, for the estimator of the settings.
 
         Args:
             parts: of the blocks, compressed.
@@ -167,10 +167,10 @@ class Scene:
         settings = self.config.estimator
         estimators = [batch_estimator(replace(settings, ridge=ridge), conditions) for ridge in RIDGES]
         try:
-            return choose_ridge(parts, blocks, fitter, estimators, self.loss)
+            return choose_ridge(parts, blocks, fitter, estimators, self.loss, rule=settings.ridge_rule)
         except LogError as error:
             accepted = "a number, 0.001 say, or longer logs"
-            raise ConfigError.at_field("estimator.ridge", f"auto, but {error.found}", accepted) from error
+            raise ConfigError.at_field("estimator.ridge", f"{settings.ridge}, but {error.found}", accepted) from error
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)

@@ -46,7 +46,8 @@ def ridge_figure(choice: RidgeChoice, of: str = "URDF") -> Figure:
         at = float(mean[list(choice.tried).index(choice.ridge)])
         (marker,) = axes.plot(choice.ridge, at, "D", color=_CHOSEN, markersize=8, markerfacecolor="none")
         handles.append(marker)
-        labels.append(f"chosen: {choice.ridge:g}, {at:.4g}")
+        what = "chosen" if choice.rule == "least" else "chosen, the largest of these"
+        labels.append(f"{what}: {choice.ridge:g}, {at:.4g}")
     axes.set_xticks(tried[shown], [decade(ridge) for ridge in tried[shown]])
     axes.minorticks_off()
     if axes.get_yscale() == "log":

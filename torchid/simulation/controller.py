@@ -13,10 +13,11 @@ from torchid.errors import InputError, UnknownNameError
 from torchid.logs.log import BoolArray
 from torchid.parameters import Array
 from torchid.simulation.plant import Foot, FootMotion, Plant
+from torchid.simulation.ties import rotation_error
 
 _STIFFNESS, _DAMPING = 100.0, 20.0  # 1/s^2, 1/s: errors decay within half a second, without overshoot
 _CREEP, _FOOT_DAMPING = 100.0, 20.0  # 1/s^2, 1/s, of a foot that stands: friction holds it, but lets it creep
-_STANDING, _CENTRE, _TURN, _SWING, _JOINT, _POSTURE = 100.0, 10.0, 10.0, 10.0, 3.0, 0.05  # weights of the tasks
+_TIED, _STANDING, _CENTRE, _TURN, _SWING, _JOINT, _POSTURE = 1000.0, 100.0, 10.0, 10.0, 10.0, 3.0, 0.05  # weights
 ALOFT = 1e-3  # a foot that carries a smaller share than this is off the floor
 _PREVIEW, _SMOOTH = 0.02, 0.05  # s, rad/s: friction is that of the velocity to come, and smooth where it turns
 _TRIES, _LEAST_POINTS = 3, 3
@@ -93,9 +94,10 @@ def _tasks(plant: Plant, feet: Sequence[Foot], targets: Array, rotations: Array)
         off.append(np.concatenate([target - now.position, rotation_error(now.rotation, R)])[: foot.constrained])
     level = np.zeros((3, plant.nv))
     level[:, 3:6] = np.eye(3)
-    A = np.vstack([*jacobians, plant.inertia[:2] / plant.mass, level])
+    tie, open_by, _ = plant.ties
+    A = np.vstack([*jacobians, tie, plant.inertia[:2] / plant.mass, level])
     above = (targets.mean(axis=0) - plant.com)[:2]
-    return A, np.concatenate([*off, above, rotation_error(plant.base_rotation, np.eye(3))])
+    return A, np.concatenate([*off, -open_by, above, rotation_error(plant.base_rotation, np.eye(3))])
 
 
 def _flattened(R: Array, foot: Foot) -> Array:
@@ -157,7 +159,17 @@ class Controller:
         needed = M @ acceleration + bias
         velocity = plant.velocity[6:] + _PREVIEW * acceleration[6:]
         lost = self._coulomb * np.tanh(velocity / _SMOOTH) + self._viscous * velocity
-        return (needed - self._contact_forces(needed[:6], goal.load, feet))[6:] + lost
+        joints = (needed - self._contact_forces(needed[:6], goal.load, feet))[6:] + lost
+        return joints if plant.has_motor.all() else self._of_motors(joints)
+
+    def _of_motors(self, needed: Array) -> Array:
+        """Torques (n,) that do what others would, (n,), where some joints have no motor: ties exert the rest."""
+        motors = np.flatnonzero(self._plant.has_motor)
+        J, _, _ = self._plant.ties
+        exerted = np.concatenate([np.eye(len(needed))[:, motors], J[:, 6:].T], axis=1)
+        out = np.zeros(len(needed))
+        out[motors] = np.linalg.lstsq(exerted, needed, rcond=_SINGULAR)[0][: len(motors)]
+        return out
 
     def _acceleration(self, goal: Goal, M: Array, bias: Array, feet: list[FootMotion]) -> Array:
         """The generalized acceleration (nv,) that meets all tasks best, by weighted least squares."""
@@ -190,6 +202,9 @@ class Controller:
                 weight, target = _SWING, _servo(off, rate, np.concatenate([a, np.zeros(3)]))
             rows = slice(self._feet[i].constrained)
             tasks.append((weight, foot.J[rows], (target - foot.bias)[rows]))
+
+        tie, off, bias_of_ties = plant.ties
+        tasks.append((_TIED, tie, _servo(-off, -tie @ velocity, -bias_of_ties)))
 
         joints = np.zeros((plant.n, nv))
         joints[:, 6:] = np.diag(np.where(goal.driven, _JOINT, _POSTURE))
@@ -231,12 +246,6 @@ class Controller:
                 break
             S = np.where(pulling, 0.0, S)
         return J.T @ force
-
-
-def rotation_error(start: Array, end: Array) -> Array:
-    """Error between two rotations (3, 3), (3,): axis in the outer frame times the sine of the angle."""
-    R = end @ start.T
-    return 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
 
 
 def _servo(error: Array, rate_error: Array, feedforward: Array) -> Array:

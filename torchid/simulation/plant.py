@@ -12,16 +12,17 @@ from lxml import etree
 from torchid.config import FootConfig
 from torchid.errors import ConfigError, UnknownNameError, UrdfError
 from torchid.parameters import Array
-from torchid.robot.loops import LOOPS_FIELD, loops_of_file
+from torchid.robot.loops import loops_of_file
 from torchid.robot.mjcf_model import mujoco
 from torchid.robot.plain_urdf import plain_urdf
-from torchid.robot.urdf import drop_repeated_origins, parse_xml, read_urdf
+from torchid.robot.urdf import TreeJoint, drop_repeated_origins, parse_xml, read_urdf
 from torchid.robot.xml_files import file_kind, is_mjcf
 from torchid.sensing.sensors import NORMAL_FORCE
+from torchid.simulation.ties import WORLD, Followers, Ties, loop_errors
 
 _RADIUS = 1e-4  # m, of contact points that the file gives: where they touch the floor is where they are
+_SMALLEST = 1e-14  # kg and kg m^2, of links without mass between the axes of a joint of several axes
 _NARROWEST = 1e-3  # m, of a support polygon
-_WORLD = "world link"
 _DISCARDED = ("transmission", "gazebo", "material", "mujoco")
 _SPRING = (0.004, 1.0)  # time constant [s] and damping ratio of the floor; a softer one lets feet creep, by v^2
 _STICTION = (0.002, 1.0)  # the same of dry friction in a joint; MuJoCo's own lets joints creep at 0.1 rad/s
@@ -170,12 +171,15 @@ class Plant:
             friction: Coulomb [N m] and viscous [N m s/rad] friction of every joint; None: the URDF's.
 
         Raises:
-            UrdfError: MuJoCo does not take it, or it has mimic joints.
+            UrdfError: MuJoCo does not take it, or it has springs.
         """
-        self.model = compile_model(urdf, feet, physics_hz)
+        joints = read_urdf(urdf)[1]
+        self._ties = Ties.of(urdf, joints, loops_of_file(urdf))
+        self.model = compile_model(urdf, feet, physics_hz, ties=self._ties)
         self.data = mujoco.MjData(self.model)
         model = self.model
-        _add_armatures(model, urdf)
+        if is_mjcf(urdf):
+            _add_armatures(model, urdf, joints)
         if friction is not None:
             model.dof_frictionloss[6:], model.dof_damping[6:] = friction
         self.nv, self.n = model.nv, model.nv - 6
@@ -191,6 +195,9 @@ class Plant:
         self._middles = [model.site(_middle(foot)).id for foot in feet]
         self._bodies = [int(model.site_bodyid[site]) for site in self._middles]
         self._M = np.zeros((self.nv, self.nv))
+        self._followers = Followers(model, self._ties.mimics)
+        passive = {joint.name for joint in joints if joint.passive} | self._ties.mimics.keys()
+        self.has_motor = np.array([name not in passive for name in self.joint_names])
 
     # ---------------------------------------------------------------------------------------------------- stepping
 
@@ -254,6 +261,14 @@ class Plant:
         return self.data.qfrc_bias
 
     @property
+    def ties(self) -> tuple[Array, Array, Array]:
+        """Joints that follow others, and closed loops: Jacobian (k, nv), errors (k,), bias accelerations (k,)."""
+        follow = self._followers.errors(self.model, self.data)
+        loops = loop_errors(self.model, self.data, self._ties.loops)
+        J, off, bias = (np.concatenate(pair) for pair in zip(follow, loops, strict=True))
+        return J, off, bias
+
+    @property
     def com(self) -> Array:
         """Centre of mass (3,) [m]."""
         return self.data.subtree_com[1]
@@ -283,13 +298,9 @@ class Plant:
         return FootMotion(data.site_xpos[site], rotation, J @ data.qvel, J, J_dot @ data.qvel)
 
 
-def _add_armatures(model: mujoco.MjModel, path: Path) -> None:
-    """Give joints the armatures of an MJCF file, which `plain_urdf` loses; UrdfError of what else it loses."""
-    if not is_mjcf(path):
-        return
-    if loops_of_file(path):
-        raise UrdfError(path, LOOPS_FIELD, "closed loops", "a tree of joints, for a simulation")
-    for joint in read_urdf(path)[1]:
+def _add_armatures(model: mujoco.MjModel, path: Path, joints: Sequence[TreeJoint]) -> None:
+    """Give joints the armatures of an MJCF file, which `plain_urdf` loses; UrdfError of springs, which it loses too."""
+    for joint in joints:
         if joint.stiffness:
             found = f"a spring of stiffness {joint.stiffness:g}"
             raise UrdfError(path, f"joint '{joint.name}'", found, "joints without springs, for a simulation")
@@ -297,13 +308,17 @@ def _add_armatures(model: mujoco.MjModel, path: Path) -> None:
             model.dof_armature[model.joint(joint.name).dofadr] = joint.armature
 
 
-def compile_model(urdf: Path, feet: Sequence[Foot], physics_hz: float, floating: bool = True) -> mujoco.MjModel:
+def compile_model(
+    urdf: Path, feet: Sequence[Foot], physics_hz: float, floating: bool = True, ties: Ties | None = None
+) -> mujoco.MjModel:
     """MuJoCo's model of a URDF robot without shapes, on a soft floor that its feet alone touch, without joint stops.
 
     Raises:
-        UrdfError: MuJoCo does not take it, or it has mimic joints.
+        UrdfError: MuJoCo does not take it.
     """
     spec = _spec(urdf)
+    if ties is not None:
+        ties.add_to(spec, physics_hz)
     if floating:
         spec.worldbody.first_body().add_freejoint()
     spec.option.timestep = 1.0 / physics_hz
@@ -327,27 +342,28 @@ def _spec(urdf: Path) -> mujoco.MjSpec:
     root = parse_xml(urdf).getroot()
     if is_mjcf(urdf):
         plain_urdf(root)
-    mimic = root.find("joint/mimic/..")
-    if mimic is not None:
-        raise UrdfError(urdf, f"joint '{mimic.get('name')}'", "a mimic joint", "independent joints, for a simulation")
-    for tag in _DISCARDED:
-        for element in root.findall(tag):
-            root.remove(element)
+    of_shapes = ("link/visual", "link/collision", "joint/mimic")  # `Ties` has the last
+    for element in [element for tag in (*_DISCARDED, *of_shapes) for element in root.findall(tag)]:
+        element.getparent().remove(element)
     drop_repeated_origins(root)
-    for link in root.findall("link"):
-        for shape in [*link.findall("visual"), *link.findall("collision")]:
-            link.remove(shape)
     for link in root.iterfind("link[@name='world']"):
-        link.set("name", _WORLD)  # MuJoCo has a world of its own, and would drop this link
+        link.set("name", WORLD)  # MuJoCo has a world of its own, and would drop this link
     for end in (*root.iterfind("joint/parent[@link='world']"), *root.iterfind("joint/child[@link='world']")):
-        end.set("link", _WORLD)
+        end.set("link", WORLD)
     try:
         spec = mujoco.MjSpec.from_string(etree.tostring(root, encoding="unicode"))
     except ValueError as error:
         raise UrdfError(urdf, file_kind(urdf), f"MuJoCo refuses it: {error}", _SIMULATED) from error
     spec.compiler.fusestatic = False
     spec.compiler.balanceinertia = False
+    if any(body.joints and not body.mass and _carries_mass(body) for body in spec.bodies):
+        spec.compiler.boundmass = spec.compiler.boundinertia = _SMALLEST
     return spec
+
+
+def _carries_mass(body: mujoco.MjsBody) -> bool:
+    """Whether a body has mass, or any that it moves."""
+    return bool(body.mass) or any(_carries_mass(child) for child in body.bodies)
 
 
 def _add_foot(spec: mujoco.MjSpec, foot: Foot) -> None:

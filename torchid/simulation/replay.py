@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import mujoco
@@ -15,6 +15,7 @@ from torchid.errors import InputError, LogError
 from torchid.parameters import Array
 from torchid.regressor.kinematics import GRAVITY_WORLD
 from torchid.simulation.plant import Foot, compile_model, foot_site
+from torchid.simulation.ties import Followers, Ties
 
 _PHYSICS_HZ = 1000.0
 _LONGEST_GAP = 2.5  # median sampling intervals, within a window
@@ -89,6 +90,7 @@ class Model:
         armature: (n,), reflected rotor inertia [kg m^2 or kg].
         offset: (n,), subtracted from the joints' torques [N m or N].
         stiffness: (n,), of springs that are at rest at position 0 [N m/rad or N/m].
+        ties: what keeps joints of the file from moving one by one.
     """
 
     urdf: Path
@@ -96,6 +98,7 @@ class Model:
     armature: Array
     offset: Array
     stiffness: Array
+    ties: Ties = field(default_factory=Ties)
 
 
 @dataclass(frozen=True)
@@ -178,7 +181,7 @@ class _Simulated:
                 raise InputError(model.urdf.parent, f"armature of {name}", found, "estimator.name=consistent")
         self.log, self.floating = log, log.angular_velocity is not None
         self.feet = feet if self.floating else ()
-        self.model = compile_model(model.urdf, self.feet, _PHYSICS_HZ, self.floating)
+        self.model = compile_model(model.urdf, self.feet, _PHYSICS_HZ, self.floating, model.ties)
         self.model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
         self.model.opt.gravity = GRAVITY_WORLD
         if not self.floating and log.quat_xyzw is not None:
@@ -189,6 +192,7 @@ class _Simulated:
         self.model.dof_armature[self.rate] += model.armature
         self.model.jnt_stiffness[[joint.id for joint in joints]] = model.stiffness
         self.model.qpos_spring[self.at] = 0.0
+        self.followers = Followers(self.model, model.ties.mimics)
 
     def add_gains(self, kp: Array, kd: Array) -> None:
         """Let joints be pulled to position 0 and velocity 0, (n,) each, as by springs and dampers."""
@@ -219,6 +223,7 @@ class _Simulated:
         model, data, log = self.model, self.data, self.log
         mujoco.mj_resetData(model, data)
         data.qpos[self.at], data.qvel[self.rate] = log.position[begin], log.velocity[begin]
+        self.followers.place(data)
         if log.angular_velocity is not None and log.quat_xyzw is not None:
             data.qpos[3:7] = log.quat_xyzw[begin][[3, 0, 1, 2]]
             data.qvel[3:6] = log.angular_velocity[begin]

@@ -1,0 +1,156 @@
+"""What ties joints of a simulated robot together: joints that are held, joints that follow others, closed loops."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from torchid import parameters
+from torchid.parameters import Array
+from torchid.robot.loops import Loop
+from torchid.robot.mjcf_model import mujoco
+from torchid.robot.tree import Mimic, resolve_mimics
+from torchid.robot.urdf import TreeJoint
+
+WORLD = "world link"
+"""Name of a link that is called as MuJoCo's own world."""
+
+_STIFFEST = 0.9999  # share of a violation's acceleration that MuJoCo's constraints take away at most
+
+
+@dataclass(frozen=True)
+class Ties:
+    """What keeps joints of a robot from moving one by one.
+
+    Attributes:
+        held: position of joints that do not move, by name [rad or m].
+        mimics: of joints that follow another one, by name.
+        loops: pairs of frames that coincide.
+        inertials: parameters (10,) in place of those that the file has, of links by name: what a held joint carries
+            can be known together with what carries it alone.
+    """
+
+    held: Mapping[str, float] = field(default_factory=dict)
+    mimics: Mapping[str, Mimic] = field(default_factory=dict)
+    loops: Sequence[Loop] = ()
+    inertials: Mapping[str, Array] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls,
+        path: Path,
+        joints: Sequence[TreeJoint],
+        loops: Sequence[Loop] = (),
+        held: Mapping[str, float] | None = None,
+    ) -> Ties:
+        """Those of a robot's file, with its joints, and of loops and held joints that a run has."""
+        held = held or {}
+        mimics = {name: one for name, one in resolve_mimics(path, joints).items() if one.master and name not in held}
+        return cls(held, mimics, loops)
+
+    def add_to(self, spec: mujoco.MjSpec, physics_hz: float) -> None:
+        """Tie a robot of a model with constraints as stiff as its steps allow; held joints are no joints any more."""
+        for link, values in self.inertials.items():
+            _set_inertial(spec.body(body_name(link)), values)
+        for name, position in self.held.items():
+            _hold(spec, spec.joint(name), position)
+        for name, mimic in self.mimics.items():
+            one = spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, name1=name, name2=mimic.master)
+            one.data[:5] = [mimic.offset, mimic.multiplier, 0.0, 0.0, 0.0]
+        for number, loop in enumerate(self.loops):
+            for frame, site in zip(loop.frames, _sites(number), strict=True):
+                spec.body(body_name(frame)).add_site(name=site)
+            kind = mujoco.mjtEq.mjEQ_CONNECT if loop.kind == "point" else mujoco.mjtEq.mjEQ_WELD
+            one, other = _sites(number)
+            spec.add_equality(type=kind, name1=one, name2=other, objtype=mujoco.mjtObj.mjOBJ_SITE)
+        for equality in spec.equalities:
+            equality.solref[:] = [2.0 / physics_hz, 1.0]
+            equality.solimp[:2] = _STIFFEST
+
+
+def body_name(link: str) -> str:
+    """Name of a link's body in MuJoCo."""
+    return WORLD if link == "world" else link
+
+
+def _sites(number: int) -> tuple[str, str]:
+    """Names of the sites of a loop, in its frames."""
+    return f"loop {number} one", f"loop {number} other"
+
+
+def _hold(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, position: float) -> None:
+    """Fix a joint of a URDF, whose anchor is its body's origin, at a position [rad or m]."""
+    body, axis = joint.parent, np.array(joint.axis) / np.linalg.norm(joint.axis)
+    start = Rotation.from_quat(np.array(body.quat), scalar_first=True)
+    if joint.type == mujoco.mjtJoint.mjJNT_SLIDE:
+        body.pos = np.array(body.pos) + start.apply(position * axis)
+    else:
+        body.quat = (start * Rotation.from_rotvec(position * axis)).as_quat(scalar_first=True)
+    spec.delete(joint)
+
+
+def _set_inertial(body: mujoco.MjsBody, values: Array) -> None:
+    """Replace the inertial parameters of a body with others, (10,)."""
+    body.mass, body.inertia, body.fullinertia[:] = 0.0, np.zeros(3), np.nan  # none of the last, for MuJoCo
+    if values[parameters.MASS]:
+        body.mass, com, inertia = parameters.mass_com_inertia(values)
+        body.ipos, body.fullinertia = com, inertia[(0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)]
+        body.iquat = [1.0, 0.0, 0.0, 0.0]
+
+
+class Followers:
+    """Joints of a compiled model that follow others."""
+
+    def __init__(self, model: mujoco.MjModel, mimics: Mapping[str, Mimic]) -> None:
+        """Look them up."""
+        joints = [(model.joint(name), model.joint(mimic.master)) for name, mimic in mimics.items()]
+        self.at, self.rate, self.master_at, self.master_rate = (
+            np.array([int(getattr(pair[k], key)[0]) for pair in joints], dtype=int)
+            for k in range(2)
+            for key in ("qposadr", "dofadr")
+        )
+        self.ratio = np.array([mimic.multiplier for mimic in mimics.values()])
+        self.offset = np.array([mimic.offset for mimic in mimics.values()])
+
+    def place(self, data: mujoco.MjData) -> None:
+        """Put them, and their velocities, where the others are."""
+        data.qpos[self.at] = self.ratio * data.qpos[self.master_at] + self.offset
+        data.qvel[self.rate] = self.ratio * data.qvel[self.master_rate]
+
+    def errors(self, model: mujoco.MjModel, data: mujoco.MjData) -> tuple[Array, Array, Array]:
+        """How far they are off: Jacobian (k, nv), errors (k,) [rad or m] and bias accelerations (k,), which are 0."""
+        J, rows = np.zeros((len(self.at), model.nv)), np.arange(len(self.at))
+        J[rows, self.rate] = 1.0
+        J[rows, self.master_rate] = -self.ratio
+        return J, data.qpos[self.at] - self.ratio * data.qpos[self.master_at] - self.offset, np.zeros(len(rows))
+
+
+def loop_errors(model: mujoco.MjModel, data: mujoco.MjData, loops: Sequence[Loop]) -> tuple[Array, Array, Array]:
+    """How far loops are open: Jacobian (k, nv), error (k,) [m, rad] and bias acceleration (k,) of what closes them."""
+    jacobians, errors, biases = [np.zeros((0, model.nv))], [np.zeros(0)], [np.zeros(0)]
+    for number, loop in enumerate(loops):
+        one, other = (_site_motion(model, data, name) for name in _sites(number))
+        rows = list(loop.components)
+        jacobians.append((one[2] - other[2])[rows])
+        errors.append(np.append(one[0] - other[0], rotation_error(other[1], one[1]))[rows])
+        biases.append((one[3] - other[3])[rows])
+    return np.concatenate(jacobians), np.concatenate(errors), np.concatenate(biases)
+
+
+def rotation_error(start: Array, end: Array) -> Array:
+    """Error between two rotations (3, 3), (3,): axis in the outer frame times the sine of the angle."""
+    R = end @ start.T
+    return 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+
+
+def _site_motion(model: mujoco.MjModel, data: mujoco.MjData, name: str) -> tuple[Array, Array, Array, Array]:
+    """Position (3,), rotation to world (3, 3), Jacobian (6, nv) and bias acceleration (6,) of a site."""
+    site = model.site(name).id
+    J, J_dot = np.zeros((6, model.nv)), np.zeros((6, model.nv))
+    mujoco.mj_jacSite(model, data, J[:3], J[3:], site)
+    mujoco.mj_jacDot(model, data, J_dot[:3], J_dot[3:], data.site_xpos[site], int(model.site_bodyid[site]))
+    return data.site_xpos[site].copy(), data.site_xmat[site].reshape(3, 3).copy(), J, J_dot @ data.qvel
