@@ -20,7 +20,7 @@ from torchid.commands.init import init
 from torchid.config import load_config
 from torchid.errors import InputError
 from torchid.fitting.experiment import set_up
-from torchid.logs import Log, read_log
+from torchid.logs import Log, read_log, write_log
 from torchid.robot import load_robot
 
 URDF = DEMO / "quadruped.urdf"
@@ -244,3 +244,35 @@ def test_recorded_arrays_of_a_go2_need_no_edit_to_be_read(tmp_path: Path) -> Non
         assert log.joint_torque is not None
         assert log.joint_velocity is not None
         assert {contact.frame for contact in config.contacts} == {f"{leg}_foot" for leg in LEGS}
+
+
+@pytest.mark.parametrize(
+    ("samples", "said", "test", "ridge"),
+    [
+        (20, "missing", False, 1e-3),
+        (60, "guessed", False, 1e-3),
+        (1000, None, True, "auto"),
+    ],
+)
+def test_a_part_is_held_back_only_where_a_filter_leaves_something_of_it(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    samples: int,
+    said: str | None,
+    test: bool,
+    ridge: object,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_log(read_log(DEMO / "sway_train.npz").select(slice(0, samples)), tmp_path / "log.npz")
+    assert (
+        main(["init", str(DEMO / "quadruped.urdf"), str(tmp_path / "log.npz"), "--output", str(tmp_path / "n.yaml")])
+        == 0
+    )
+    printed = " ".join(capsys.readouterr().out.split())
+    assert ("too short" in printed) is (said is not None)
+    assert said is None or f"{said} {'motion' if said == 'missing' else 'logs.test: none'}" in printed
+    written = yaml.safe_load((tmp_path / "n.yaml").read_text())
+    assert ("test" in written["logs"]) is test
+    assert written["estimator"]["ridge"] == ridge
+    assert main(["identify", str(tmp_path / "n.yaml")]) == (2 if said == "missing" else 0)

@@ -104,11 +104,11 @@ def test_a_log_without_stamps_has_those_of_its_step(tmp_path: Path, name: str) -
         np.testing.assert_array_equal(blocks.read(slice(20, 30)).time, log.time[20:30])
 
 
-def test_a_step_needs_positions_and_no_column_beside_it(tmp_path: Path) -> None:
+def test_a_step_has_no_column_beside_it_and_makes_up_no_positions(tmp_path: Path) -> None:
     for given, found in (
         (
             {"time": {"step": 0.01}, "joint_torque": {"column": "tau"}, "ignore": ["qpos", "time"]},
-            "time: given without joint_position",
+            "joint_position: missing",
         ),
         ({**MAP, "time": {"step": 0.01, "column": "time"}, "ignore": ["time"]}, "column and step together"),
         ({**MAP, "time": {"step": 0.01, "scale": 2}, "ignore": ["time"]}, "scale beside step"),

@@ -307,3 +307,31 @@ def test_a_file_takes_the_column_of_stamps_that_it_has(tmp_path: Path) -> None:
         parsed_map("other_times: [{column: t, unit: h}]")
     with pytest.raises(ConfigError, match="logs.columns.other_times: nothing that says where it is"):
         parsed_map("other_times: [{unit: s}]")
+
+
+@pytest.mark.parametrize("suffix", ["npz", "csv"])
+def test_files_without_stamps_have_those_of_one_step_each_from_its_first_sample(tmp_path: Path, suffix: str) -> None:
+    angle, force = np.arange(50.0), 100.0 + np.arange(47.0)
+    np.savez(tmp_path / "joints.npz", q=np.stack([angle, -angle], axis=1))
+    if suffix == "npz":
+        np.savez(tmp_path / "feet.npz", fz=force[:, None])
+    else:
+        save_csv(tmp_path / "feet.csv", {"fz": force})
+    text = """
+    time: {step: 5, unit: ms}
+    joint_order: [hip, knee]
+    joint_position: q
+    contact_order: [foot]
+    contact_force_normal: fz
+    contact_active: {above: 120}
+    """
+    text = text if suffix == "npz" else text.replace("normal: fz", "normal: {columns: {foot: fz}}")
+    for shift, first in (("", 0), ("@0.01s", 2)):
+        found = read_log(tmp_path / f"joints.npz + feet.{suffix}{shift}", columns=parsed_map(text))
+        np.testing.assert_allclose(found.time, 0.005 * np.arange(first, min(50, 47 + first)), atol=1e-12)
+        assert found.contact_force_normal is not None
+        np.testing.assert_array_equal(found.contact_force_normal[:, 0], force[: len(found)])
+        np.testing.assert_array_equal(found.joint_position[:, 0], angle[first : first + len(found)])
+    np.savez(tmp_path / "clock.npz", time=0.005 * np.arange(50), q=np.stack([angle, -angle], axis=1))
+    mixed = read_log(tmp_path / f"clock.npz + feet.{suffix}", columns=parsed_map(text))
+    np.testing.assert_array_equal(mixed.time, 0.005 * np.arange(47))

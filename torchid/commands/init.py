@@ -16,6 +16,7 @@ import yaml
 from torchid.commands.folder import check_free_file
 from torchid.commands.init_hints import BRIDGED_S, gaps_in_motion, hints, missing_columns
 from torchid.commands.init_sensors import limb_sensors, sensor_set
+from torchid.commands.init_split import Split, split_log
 from torchid.commands.reading import memory_needed
 from torchid.config.preprocessing import PreprocessingConfig
 from torchid.errors import ConfigError, InputError, LogError, about_file, excerpt, format_count, join_names
@@ -102,10 +103,13 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> Initiated:
     _state_flags(contacts, fields, proposal)
     read = _try(path, proposal)
     gaps = _gaps(read)
-    text = _text(robot, urdf, path, target, contacts, fields, proposal, gaps)
+    split = split_log(read, "base_motion" in _from_feet(contacts, fields))
+    text = _text(robot, urdf, path, target, contacts, fields, proposal, gaps, split)
     _describe(out, robot, contacts, fields, proposal)
     _describe_log(out, read)
     out.guessed += [f"preprocessing.{key}: {value}, {why}" for key, (value, why) in gaps.items()]
+    out.guessed += [split.guessed] * bool(split.guessed)
+    out.missing += [split.missing] * bool(split.missing)
     with atomic_output(target) as new:
         new.write_text(text, encoding="utf-8")
     return out
@@ -143,8 +147,7 @@ def _known(robot: Robot, contacts: Sequence[_Contact]) -> KnownRobot:
     """What the proposal of a map knows of the robot."""
     on_base, elsewhere = ([name for name, (body, _) in robot.links.items() if bool(body) == x] for x in (False, True))
     feet, weight = [contact.frame for contact in contacts], -GRAVITY_WORLD[2] * float(robot.nominal[:, 0].sum())
-    sensors = limb_sensors(robot)
-    known = robot.joint_names, feet, robot.path.stem, weight, robot.base_link, on_base, elsewhere, sensors
+    known = robot.joint_names, feet, robot.path.stem, weight, robot.base_link, on_base, elsewhere, limb_sensors(robot)
     return KnownRobot(*known, [link for link in on_base if is_along_base(robot, link)])
 
 
@@ -329,6 +332,7 @@ def _text(
     fields: set[str],
     proposal: MapProposal,
     gaps: dict[str, tuple[object, str]],
+    split: Split,
 ) -> str:
     """The experiment file, with comments."""
     from_feet = _from_feet(contacts, fields)
@@ -338,12 +342,12 @@ def _text(
     names = f"{excerpt(log.name)} and {excerpt(robot.path.name)}"
     lines = [f"# {names}, by torchid init; what is marked as guessed should be checked"]
     lines += _entry("robot", own)
-    lines += [f"  # guessed: weld: {_WELDED}"] if weld else []
+    lines += [f"  # guessed: weld: {_WELDED}"] * bool(weld)
     if contacts:
         lines.append("contacts:  # guessed: from names of links")
         lines += [f"  - {_flow({'frame': contact.frame, 'type': contact.type})}" for contact in contacts]
     name = _relative(log, output)
-    whole = split_range(log).range is not None
+    whole = split_range(log).range is not None or not split.has_test
     lines += ["logs:", f"  train: {_flow([name if whole else f'{name}[:80%]'])}"]
     lines += [] if whole else [f"  test: {_flow([f'{name}[80%:]'])}"]
     if proposal.columns:
@@ -357,7 +361,7 @@ def _text(
     stated = {key: value for key, (value, _) in gaps.items()}
     lines += _entry("preprocessing", {"cutoff_hz": "auto"} | from_feet | stated)
     lines += _entry("sensors", sensor_set(fields, list(proposal.columns.get("ft_wrenches", ()))))
-    lines += _entry("estimator", {"name": "consistent", "ridge": "auto"})
+    lines += _entry("estimator", {"name": "consistent", "ridge": split.ridge})
     lines += _entry("output", f"runs/{output.stem}")
     return "\n".join(lines) + "\n"
 

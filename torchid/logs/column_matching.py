@@ -306,7 +306,10 @@ def columns_by_file(columns: Columns, given: Sequence[Sequence[str]], files: Seq
 
 
 def _entries_in(columns: Columns, given: Sequence[str]) -> set[str]:
-    """Entries of a map of which a file has a column, and those without columns that belong to one of its fields."""
+    """Entries of a map of which a file has a column, and those without columns that belong to one of its fields.
+
+    Stamps by their step belong to every file without a column of stamps.
+    """
     patterns = [
         (part.key.partition(".")[0], letters_of(text), _regex(part, text))
         for part in list_parts(columns).values()
@@ -322,6 +325,8 @@ def _entries_in(columns: Columns, given: Sequence[str]) -> set[str]:
     has = {*out, *(text.partition(".")[0] for text in given)}
     without = {name: _beside(columns, name) for name in (*columns.fields, "imu_frame")}
     named = {field for field, *_ in patterns}
+    if columns.time is not None and columns.time.step is not None and "time" not in has:
+        out.add("time")
     return out | {name for name, beside in without.items() if name not in named and has & set(beside)}
 
 

@@ -169,12 +169,18 @@ class MappedFields:
     def _needed(self, name: str) -> tuple[str, ...]:
         """Other fields that a field is computed from."""
         if name == "time" and self.step is not None:
-            return ("joint_position",)
+            return self._counted
         if name == "joint_torque" and (law := self._law) is not None:
             return ("joint_position",) * (law.kp is not None) + ("joint_velocity",) * (law.kd is not None)
         if name == "contact_active" and name not in self.native and not self._own(name):
             return ("time",) if self._threshold is None else self._forces
         return ("time",) if name == POINTS and not self._own(name) else ()
+
+    @property
+    def _counted(self) -> tuple[str, ...]:
+        """The field whose samples have stamps by their step: the joints' positions, or any with columns of samples."""
+        sampled = [x for x in self.fields if x != "time" and self._own(x) and not self.constant_sources(x)]
+        return tuple(sampled[:1]) if "joint_position" not in sampled and sampled else ("joint_position",)
 
     @property
     def _forces(self) -> tuple[str, ...]:
@@ -254,12 +260,7 @@ class MappedFields:
         return np.asarray(sum(terms[1:], terms[0]))
 
     def check(self) -> MappedFields:
-        """The fields themselves.
-
-        Raises:
-            LogError: one is computed from others that are not there, or is there twice.
-            ConfigError: gains that are not those of all joints.
-        """
+        """The fields themselves; InputError for one that is there twice, or computed from others that are not there."""
         for name in self.columns.fields:
             if name in self.native:
                 found, accepted = f"beside '{self.native[name][0]}'", f"one of the two, the other in {KEY}.ignore"

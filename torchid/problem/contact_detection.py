@@ -16,28 +16,22 @@ from torchid.errors import LogError
 from torchid.logs import Log
 from torchid.logs.flags import hysteresis, samples_of, without_short
 from torchid.logs.log import BoolArray, FloatArray
+from torchid.logs.preprocess import find_unloaded
 from torchid.logs.spill import growing_array
 from torchid.problem.contact_slip import base_velocity, contact_velocities
-from torchid.problem.detection_motion import Prepared, prepare
-from torchid.problem.predict import force_series
-from torchid.problem.rows import RowBuilder
-from torchid.problem.samples import Samples, concatenate
+from torchid.problem.detection_forces import ForcesAlongNormals
+from torchid.problem.detection_model import fitted_parameters
+from torchid.problem.detection_motion import Prepared, detection_cutoff_hz, prepare
 from torchid.problem.still_contacts import keep_still
-from torchid.regressor import FrameJacobian
-from torchid.regressor.kinematics import GRAVITY_WORLD
 from torchid.robot import Robot
-from torchid.sensing import Contact, named_sensors
+from torchid.rounding import STD_PER_MAD
+from torchid.sensing import Contact
 from torchid.settings import NotNegative, Positive
 
-GRAVITY = -GRAVITY_WORLD[2]
-_DAMPING = 1e-3  # of actuators' terms, against the share that samples have of them
-_LARGEST = 1.0, 100.0, 100.0  # armature [kg m^2] and friction [N m, N m s/rad] that nothing determines
-_SIGN_WIDTH = 0.001  # rad/s, below which friction is not sure of its sign
-_FITTED = 4000  # samples, at least half of them, from which actuators' terms are worked out
-_TOGETHER = 2048  # samples whose forces are solved for at once
-_JOINT_SHARE, _BASE_SHARE = 0.1, 1.0  # errors of the URDF and of friction, of the largest torque's rms and the weight
-_LEVER_M = 0.3  # arm of the base's moments for a force of the size of its errors
-_FREE = 10.0  # standard deviation of a contact force that nothing determines, in weights
+_SUPPORTED = 0.25  # of the weight: what contact forces may leave of it in samples that parameters are fitted to
+_LEAST_FITTED = 100  # samples
+_DEVIATIONS = 3.0  # of what feet seem to carry in the air, to which thresholds go down
+_LOWEST = 0.01  # of the stated thresholds
 
 
 @dataclass(config=ConfigDict(extra="forbid"), frozen=True)
@@ -49,6 +43,10 @@ class DetectionConfig:
     keeps still, for twice `shortest_s` at least. Torques are low-pass filtered before (`cutoff_hz`, zero phase);
     stances and swings shorter than `shortest_s` [s] are none. Samples within `margin_s` [s] of a change are dropped, as
     are those within `preprocessing.contact_margin_s`.
+
+    With `refit`, where the base's acceleration is known, parameters are then fitted to each log with the contacts that
+    were found, and contacts detected again with these: by thresholds that are lower in the same ratio, three standard
+    deviations of what feet seem to carry in the air. Samples in which both thresholds differ are dropped.
     """
 
     touch: Positive = 0.02
@@ -57,6 +55,7 @@ class DetectionConfig:
     cutoff_hz: Positive = 20.0
     shortest_s: NotNegative = 0.04
     margin_s: NotNegative = 0.02
+    refit: bool = True
 
 
 def with_detected_contacts(
@@ -141,7 +140,7 @@ def detect_in_parts(
     """As `detect_contacts`, of a log that is prepared in successive parts.
 
     Args:
-        parts: called for each of two passes.
+        parts: called for each of two passes, or three with `refit`.
         time: (K,) [s] of all samples of the parts.
         stamps: (N,) [s] of the log as recorded.
         robot: the robot.
@@ -149,185 +148,76 @@ def detect_in_parts(
         settings: thresholds.
         folder: with room for forces and velocities; None: in memory.
     """
-    weight = GRAVITY * float(robot.nominal[:, 0].sum())
+    forces = ForcesAlongNormals.of(parts(), len(time), robot, contacts)
     shares, velocities = (growing_array("contacts", folder, len(time)) for _ in range(2))
-    forces = _Forces.of(parts(), len(time), robot, contacts)
-    in_world = moves = False
+    in_world = moves = accelerates = False
     for part in parts():
-        shares.append(forces.along_normal(part) / weight)
+        shares.append(forces.of_part(part) / forces.balance.weight)
         in_world, moves = (base := base_velocity(part.log, part.samples)) is not None, part.base_is_known
+        accelerates = moves and part.acceleration_is_known
         if moves:
             velocities.append(contact_velocities(part.samples, robot, contacts, base))
-    share = shares.array()
-    shortest = samples_of(settings.shortest_s, time)
-    loaded = np.stack([hysteresis(one, settings.touch, settings.lift) for one in share.T], axis=1)
-    if moves:
-        light = share > settings.light
-        loaded |= keep_still(velocities.array(), in_world, loaded, light, 2 * shortest)
-    flags = np.stack([without_short(one, shortest) for one in loaded.T], axis=1)
+    judged = _Judged(time, velocities.array() if moves else None, in_world, settings)
+    found = judged.by(shares.array())
+    if settings.refit and accelerates and (again := _fitted(forces, found, judged)) is not None:
+        shares = growing_array("contacts", folder, len(time))
+        for part in parts():
+            shares.append(again.of_part(part) / again.balance.weight)
+        found = judged.finer(shares.array(), find_unloaded(time, found.active, judged.smear_s))
     nearest = np.searchsorted(0.5 * (time[1:] + time[:-1]), stamps)
     inside = (stamps >= time[0]) & (stamps <= time[-1])
-    doubtful = np.asarray((loaded & ~flags).any(axis=1))
-    return Detection(flags[nearest], inside & ~doubtful[nearest])
+    return Detection(found.active[nearest], inside & found.certain[nearest])
 
 
 @dataclasses.dataclass(frozen=True)
-class NormalForces:
-    """Forces (K, C) [N] along the ground's normal at stamps (K,) [s]."""
+class _Judged:
+    """Contacts at stamps (K,) [s] with velocities (K, C, 3) [m/s], in the world or not, None where nobody knows."""
 
     time: FloatArray
-    force: FloatArray
+    velocity: FloatArray | None
+    in_world: bool
+    settings: DetectionConfig
+
+    @property
+    def smear_s(self) -> float:
+        """How far [s] from a change of contact its filtered force is seen."""
+        return 1.0 / detection_cutoff_hz(self.settings.cutoff_hz, self.time)
+
+    def by(self, share: FloatArray) -> Detection:
+        """Which contacts stand that carry shares (K, C) of the weight."""
+        settings, shortest = self.settings, samples_of(self.settings.shortest_s, self.time)
+        loaded = np.stack([hysteresis(one, settings.touch, settings.lift) for one in share.T], axis=1)
+        if self.velocity is not None:
+            loaded |= keep_still(self.velocity, self.in_world, loaded, share > settings.light, 2 * shortest)
+        flags = np.stack([without_short(one, shortest) for one in loaded.T], axis=1)
+        return Detection(flags, ~np.asarray((loaded & ~flags).any(axis=1)))
+
+    def finer(self, share: FloatArray, in_the_air: BoolArray) -> Detection:
+        """As `by`, with thresholds as low as the shares of contacts that are in the air (K, C) allow.
+
+        Certain is what the settings' own thresholds say too: they differ from before a foot touches until it carries
+        something, with an impact between.
+        """
+        found = self.by(share)
+        if in_the_air.sum() < _LEAST_FITTED:
+            return found
+        noise = STD_PER_MAD * float(np.median(np.abs(share[in_the_air])))
+        factor = float(np.clip(_DEVIATIONS * noise / self.settings.touch, _LOWEST, 1.0))
+        lower = {name: factor * getattr(self.settings, name) for name in ("touch", "lift", "light")}
+        finer = dataclasses.replace(self, settings=dataclasses.replace(self.settings, **lower)).by(share)
+        return Detection(finer.active, found.certain & (finer.active == found.active).all(axis=1))
 
 
-def normal_forces(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: float) -> NormalForces:
-    """Forces of the ground along its normal by the URDF's dynamics.
+def _fitted(forces: ForcesAlongNormals, found: Detection, judged: _Judged) -> ForcesAlongNormals | None:
+    """The forces of the robot with parameters that fit its torques with the contacts that were found; None without any.
 
-    Of all wrenches of all contacts, as if each could carry, those that balance measured joint torques, gravity and
-    inertia best, weighed least squares over the joints' and the base's rows. A base of which neither pose nor IMU was
-    recorded counts as still, and tilted as if all feet stood.
-
-    Args:
-        log: as recorded, with joint torques.
-        robot: the robot, whose base floats.
-        contacts: that may stand.
-        cutoff_hz: of the filter [Hz], lower where the log is slow.
-
-    Raises:
-        InputError: no torques, fewer than three of joints above a contact, joints that are missing, or as `preprocess`.
+    Of samples away from changes in which contacts carry the robot: a belly or a rope leaves a part of its weight.
     """
-    whole = prepare(log, robot, contacts, cutoff_hz)
-    forces = _Forces.of([whole], len(whole.log), robot, contacts)
-    return NormalForces(whole.log.time, forces.along_normal(whole))
-
-
-@dataclasses.dataclass(frozen=True)
-class _Forces:
-    """Forces along the ground's normal, with the armature and friction (m, 3) of the log's joints."""
-
-    balance: _Balance
-    actuators: FloatArray
-
-    @classmethod
-    def of(cls, parts: Iterable[Prepared], count: int, robot: Robot, contacts: Sequence[Contact]) -> _Forces:
-        """Of the parts of a log of so many samples."""
-        every, start, power, chosen = -(-count // _FITTED), 0, np.zeros(robot.n), list[tuple[Samples, FloatArray]]()
-        for part in parts:
-            measured = np.full((len(part.log), robot.n), np.nan)
-            if part.samples.torque is not None:
-                measured = part.samples.torque[:, : robot.n].numpy()
-            power = power + np.square(measured).sum(axis=0)
-            some = slice(-start % every, None, every)
-            chosen.append((part.samples[some], part.rotation[some]))
-            start += len(part.log)
-        balance = _Balance.of(robot, contacts, np.sqrt(power / count))
-        samples = concatenate([samples for samples, _ in chosen])
-        rotation = np.concatenate([rotation for _, rotation in chosen])
-        return cls(balance, _fit_actuators([balance.equations(samples, rotation)]))
-
-    def along_normal(self, part: Prepared) -> FloatArray:
-        """Forces (K, C) [N] of some samples."""
-        chosen = [slice(start, start + _TOGETHER) for start in range(0, len(part.log), _TOGETHER)]
-        equations = (self.balance.equations(part.samples[x], part.rotation[x]) for x in chosen)
-        return np.concatenate([self.balance.normal_forces(found, self.actuators) for found in equations])
-
-
-@dataclasses.dataclass(frozen=True)
-class _Balance:
-    """Of which rows, with which standard deviations (rows,) [N, N m], contact forces are worked out."""
-
-    robot: Robot
-    contacts: Sequence[Contact]
-    builder: RowBuilder
-    rows: BoolArray
-    error: FloatArray
-    weight: float
-
-    @classmethod
-    def of(cls, robot: Robot, contacts: Sequence[Contact], torque_rms: FloatArray) -> _Balance:
-        """Of the base, and the joints whose torques were measured throughout: those with an rms (n,) [N m]."""
-        measured = np.isfinite(torque_rms)
-        rows = np.concatenate([np.ones(6, dtype=bool), measured])
-        weight = GRAVITY * float(robot.nominal[:, 0].sum())
-        of_joints = _JOINT_SHARE * float(torque_rms[measured].max(initial=0.0)) + 1e-6 * weight
-        of_base = _BASE_SHARE * weight * np.array([1.0, 1.0, 1.0, _LEVER_M, _LEVER_M, _LEVER_M])
-        error = np.concatenate([of_base, np.full(int(rows[6:].sum()), of_joints)])
-        plain = [dataclasses.replace(contact, along_normal=False) for contact in contacts]
-        builder = RowBuilder(robot, plain, named_sensors("joints", robot.n, len(contacts), ft=len(robot.ft_names)))
-        return cls(robot, plain, builder, rows, error, weight)
-
-    def equations(self, samples: Samples, rotation: FloatArray) -> _Equations:
-        """Of some samples, with rotations (M, 3, 3) of the base to the world."""
-        n = 6 + self.robot.n
-        _, predicted = force_series(self.builder, samples, self.robot.nominal.flatten()[None])
-        q, _, _ = samples.coordinates()
-        poses = self.robot.link_poses(samples.joint_position)
-        missing = predicted[0, :, :n].copy()
-        missing[:, 6:] -= np.zeros(1) if samples.torque is None else samples.torque[:, : self.robot.n].numpy()
-        maps, normals = [], []
-        for contact in self.contacts:
-            normal = torch.tensor(contact.normal, dtype=torch.float64)
-            J = FrameJacobian(self.robot, contact.frame, contact.radius, contact.rolling_axis)(q, normal).numpy()
-            maps.append(J[:, list(contact.components), :n][:, :, self.rows])
-            to_frame = (rotation @ poses[contact.frame][:, :3, :3].numpy()).swapaxes(1, 2)
-            normals.append(to_frame @ np.array(contact.normal))
-        A = np.asarray(np.concatenate(maps, axis=1).swapaxes(1, 2) / self.error[:, None], dtype=np.float64)
-        free = np.concatenate([_free(contact) for contact in self.contacts]) / (_FREE * self.weight)
-        solver = np.linalg.solve(A.swapaxes(1, 2) @ A + np.diag(free**2), A.swapaxes(1, 2))
-        velocity, acceleration = samples.joint_velocity.numpy(), samples.joint_acceleration.numpy()
-        terms = np.stack([acceleration, np.tanh(velocity / _SIGN_WIDTH), velocity], axis=2)[:, self.rows[6:]]
-        return _Equations(
-            A,
-            missing[:, self.rows] / self.error,
-            np.asarray(solver, dtype=np.float64),
-            terms / self.error[6:, None],
-            normals,
-        )
-
-    def normal_forces(self, found: _Equations, actuators: FloatArray) -> FloatArray:
-        """Normal forces (M, C) [N], with armature and friction (m, 3) of the joints whose torque was measured."""
-        missing = found.missing.copy()
-        missing[:, 6:] += (found.terms * actuators).sum(axis=2)
-        solved = (found.solver @ missing[..., None])[..., 0]
-        ends = np.cumsum([len(contact.components) for contact in self.contacts])[:-1]
-        forces = [part[:, :3] for part in np.split(solved, ends, axis=1)]
-        return np.stack([(f * u).sum(axis=1) for f, u in zip(forces, found.normals, strict=True)], axis=1)
-
-
-@dataclasses.dataclass(frozen=True)
-class _Equations:
-    """Whitened balances of M samples.
-
-    Attributes:
-        maps: of the k components of contact forces to rows, (M, rows, k).
-        missing: what contact forces have to make up, (M, rows).
-        solver: of that to the components, (M, k, rows).
-        terms: acceleration, smoothed sign of the velocity and velocity by joint whose torque was measured, (M, m, 3).
-        normals: of the ground in the frame of each contact, (M, 3).
-    """
-
-    maps: FloatArray
-    missing: FloatArray
-    solver: FloatArray
-    terms: FloatArray
-    normals: list[FloatArray]
-
-
-def _fit_actuators(parts: Sequence[_Equations]) -> FloatArray:
-    """Armature, Coulomb and viscous friction (m, 3) by joint, from what no contact force can make up."""
-    joints = parts[0].terms.shape[1]
-    matrix, vector = np.zeros((joints, 3, joints, 3)), np.zeros((joints, 3))
-    for part in parts:
-        inside = part.maps @ part.solver
-        projector = (np.eye(inside.shape[1]) - inside)[:, 6:]
-        matrix += np.einsum("njk,nja,nkb->jakb", projector[:, :, 6:], part.terms, part.terms, optimize=True)
-        vector -= np.einsum("nj,nja->ja", (projector @ part.missing[..., None])[..., 0], part.terms)
-    flat = matrix.reshape(3 * joints, 3 * joints) + np.diag(np.tile(np.square(_LARGEST), joints) ** -1.0)
-    size = np.sqrt(np.diag(flat))
-    damped = flat / size / size[:, None] + _DAMPING * np.eye(len(flat))
-    found: FloatArray = (np.linalg.solve(damped, vector.reshape(-1) / size) / size).reshape(joints, 3)
-    return np.maximum(found, 0.0)
-
-
-def _free(contact: Contact) -> FloatArray:
-    """Units of a contact's components over those of a force [1, 1/m]."""
-    return np.array([1.0 if k < 3 else 1.0 / _LEVER_M for k in contact.components])
+    away = [find_unloaded(judged.time, active, judged.smear_s) for active in (found.active, ~found.active)]
+    sure = (found.certain & (away[0] | away[1]).all(axis=1))[forces.chosen]
+    kept = np.flatnonzero(sure & (forces.unexplained < _SUPPORTED * forces.balance.weight))
+    if len(kept) < _LEAST_FITTED:
+        return None
+    active = torch.from_numpy(found.active[forces.chosen[kept]])
+    samples = dataclasses.replace(forces.samples[torch.from_numpy(kept)], active=active)
+    return forces.with_parameters(fitted_parameters(samples, forces.balance.robot, forces.balance.contacts))

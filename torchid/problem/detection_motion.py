@@ -50,6 +50,11 @@ class Prepared:
         """Whether the base's motion was recorded."""
         return bool(self.log.imu_frame) or self.log.base_quat_xyzw is not None
 
+    @property
+    def acceleration_is_known(self) -> bool:
+        """Whether the base's linear acceleration was recorded, or follows from what was."""
+        return bool(self.log.imu_frame) or self.log.base_linear_acceleration_world is not None
+
 
 def prepare(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: float) -> Prepared:
     """A log as recorded, with joint torques, prepared for detection.

@@ -1,0 +1,61 @@
+"""What of a log `torchid init` has fitted, and what it holds back for a test, where there is enough for both."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torchid.errors import InputError
+from torchid.logs import Log
+from torchid.logs.cutoff import choose_cutoff
+from torchid.logs.timeline import DROPPED_PERIODS
+from torchid.problem.compression import LEAST_PER_FOLD
+
+_TESTED = 0.2  # of a log
+_FEWEST_FOLDS = 2
+_SURPLUS = 1.1  # of samples to choose the ridge by, as their number is known once they are filtered
+_LEAST_TEST = 1.5  # of what a filter spoils at both ends: a third of a test is left
+_RIDGE = 1e-3  # where nothing can be left out to choose it by
+
+
+@dataclass(frozen=True)
+class Split:
+    """How a log is used.
+
+    Attributes:
+        has_test: whether its last fifth is held back.
+        ridge: auto, where there are enough samples to leave some out.
+        guessed, missing: why not, and what a filter leaves nothing of, in words; "" where all is as usual.
+    """
+
+    has_test: bool = True
+    ridge: str | float = "auto"
+    guessed: str = ""
+    missing: str = ""
+
+
+def split_log(log: Log | InputError, base_is_derived: bool = False) -> Split:
+    """The split of a log, by the filter that `preprocessing.cutoff_hz: auto` chooses; as usual if it is not read.
+
+    Args:
+        log: as it is read, or why it is not.
+        base_is_derived: whether the motion of the base is worked out of that of the joints.
+    """
+    if isinstance(log, InputError) or len(log) < 2:
+        return Split()
+    try:
+        cutoff_hz = choose_cutoff([log], base_is_derived=base_is_derived).cutoff_hz
+    except InputError:  # which a fit will say
+        return Split()
+    length = float(log.time[-1] - log.time[0])
+    spoiled = 0.0 if cutoff_hz is None else 2.0 * DROPPED_PERIODS / cutoff_hz
+    independent_hz = (len(log) - 1) / length if cutoff_hz is None else 2.0 * cutoff_hz
+    folded = spoiled + _SURPLUS * _FEWEST_FOLDS * LEAST_PER_FOLD / independent_hz
+    if _TESTED * length >= _LEAST_TEST * spoiled and (1.0 - _TESTED) * length >= folded:
+        return Split()
+    filtered = "" if cutoff_hz is None else f" (the filter of {cutoff_hz:g} Hz spoils {spoiled:.2g} s)"
+    if length <= spoiled:
+        return Split(False, _RIDGE, missing=f"motion: {length:.2g} s are too short for a fit{filtered}")
+    guessed = f"logs.test: none, as {length:.2g} s are too short for a part to be held back{filtered}"
+    if length >= folded:
+        return Split(False, guessed=guessed)
+    return Split(False, _RIDGE, f"{guessed}, or to choose the ridge by ({_RIDGE:g})")
