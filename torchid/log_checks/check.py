@@ -143,7 +143,7 @@ def check(
     repaired = repair_log(log, _findings(results))
     if units := list(check_angle_unit(repaired, robot)):  # thresholds of position steps are in radians
         results = [x for x in results if not (isinstance(x, Finding) and x.name == "step" and x.whole)]
-    results += [*units, *([] if "contact_active" in derived else check_contact_flags(repaired))]
+    results += [*units, *([] if "contact_active" in derived else check_contact_flags(repaired, robot))]
     results += check_scalar_wrenches(repaired)
     repaired = repair_log(log, _findings(results))
     blocking = _blocking_finding(results)
