@@ -131,4 +131,5 @@ def _factor_finding(factor: float, text: str) -> Finding:
 def _least_squares(vectors: FloatArray, rates: FloatArray, inputs: FloatArray) -> FloatArray:
     """The matrix (3, k) that makes angular velocities of inputs (M, k) which fit d/dt r = r x (matrix inputs) best."""
     columns = np.stack([np.cross(vectors, axis)[..., None] * inputs[:, None] for axis in np.eye(3)], axis=2)
-    return np.linalg.lstsq(columns.reshape(3 * len(rates), -1), rates.reshape(-1), rcond=None)[0].reshape(3, -1)
+    solution = np.linalg.lstsq(columns.reshape(3 * len(rates), -1), rates.reshape(-1), rcond=None)[0]
+    return np.asarray(solution, np.float64).reshape(3, -1)
