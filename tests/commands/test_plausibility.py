@@ -34,6 +34,10 @@ def reversed_torques(log: dict[str, Any]) -> None:
     log["joint_torque"] = -log["joint_torque"]
 
 
+def silent_torques(log: dict[str, Any]) -> None:
+    log["joint_torque"] = np.zeros_like(log["joint_torque"])
+
+
 def reversed_wrenches(log: dict[str, Any]) -> None:
     log["contact_wrench_local"] = -log["contact_wrench_local"]
 
@@ -70,6 +74,7 @@ def changed(folder: Path, change: Callable[[dict[str, Any]], None]) -> list[str]
             ["sensors.set=joints"],
             ("total mass is -21.38", "opposite sign", "joint_torque: all reversed"),
         ),
+        (silent_torques, ["sensors.set=joints"], ("all measured forces are 0", "NaN where nobody measured")),
         (reversed_torques, ["estimator={name: least_squares, ridge: 0.001}"], ("total mass is -21.38", "all reversed")),
         (reversed_torques, ["sensors.set=full"], ("times the stated sensor noise", "joint_torque: all reversed")),
         (reversed_wrenches, ["sensors.set=contacts"], ("opposite sign", "contact_wrench_local: all reversed")),

@@ -233,6 +233,22 @@ def test_a_force_while_a_contact_is_inactive_is_condemned() -> None:
     assert value(check(log).repaired.contact_active)[640:690, 1].all()
 
 
+@pytest.mark.parametrize("flags", [np.zeros_like, np.logical_not], ids=["all off", "inverted"])
+def test_feet_that_carry_the_robot_while_no_flag_says_so_are_condemned(flags: Any) -> None:
+    log = replace(demo_log(), contact_active=flags(value(demo_log().contact_active)))
+    finding = only(of_demo(log), "force without contact")
+    assert (finding.severity, set(finding.channels)) == (CONDEMNED, set(log.contact_names))
+    assert not of_demo(log).usable
+
+
+def test_sensors_that_read_next_to_nothing_do_not_call_a_robot_in_the_air_standing() -> None:
+    wrench = value(demo_log().contact_wrench_local)
+    air = replace(
+        demo_log(), contact_active=np.zeros_like(value(demo_log().contact_active)), contact_wrench_local=0.02 * wrench
+    )
+    assert not found(of_demo(air), "force without contact")
+
+
 def test_a_contact_without_a_force_is_suspicious() -> None:
     finding = only(
         check(changed(demo_log(), "contact_wrench_local", lambda w: w[640:690, 1].fill(0.0))), "contact without force"

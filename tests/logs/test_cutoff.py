@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from dataclasses import replace
 
@@ -11,7 +12,7 @@ from motions import value
 from scipy.signal import butter, sosfilt
 from scipy.spatial.transform import Rotation
 
-from torchid.errors import TorchidWarning
+from torchid.errors import LogError, TorchidWarning
 from torchid.logs import Log
 from torchid.logs.cutoff import choose_cutoff
 from torchid.logs.log import FloatArray
@@ -117,6 +118,15 @@ def test_uneven_stamps_and_a_motionless_channel_make_no_difference() -> None:
     assert choose_cutoff([uneven], {"joint_position": 1e-3}).cutoff_hz == pytest.approx(
         choose_cutoff([noisy], {"joint_position": 1e-3}).cutoff_hz, rel=0.13
     )
+
+
+@pytest.mark.parametrize(("factor", "step"), [(1e3, "2 s"), (1e9, "2e+06 s")], ids=["ms", "ns"])
+def test_stamps_in_another_unit_are_refused_with_their_step(factor: float, step: str) -> None:
+    _, log = encoders(3.0, 1e-4)
+    with pytest.raises(
+        LogError, match=f"wander.npz: time: a median step of {re.escape(step)}; accepted: steps of at most 0.5 s"
+    ):
+        choose_cutoff([log, replace(log, source="wander.npz", time=factor * log.time)])
 
 
 def test_where_accelerations_were_recorded_nothing_is_filtered() -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from repository import DEMO
 
@@ -50,6 +52,21 @@ def test_one_log_is_judged_in_a_sentence_with_its_errors(evaluated: EvaluatedRun
     numbers = (pair.nominal.rms["base_force"], pair.identified.rms["base_force"], pair.identified.noise["base_force"])
     (row,) = (line for line in said if line.startswith("base force [N]"))
     assert row.split()[-3:] == [f"{x:.4g}" for x in numbers if x is not None]
+
+
+def test_a_log_that_is_predicted_far_worse_than_the_runs_own_needs_attention(run: Path, tmp_path: Path) -> None:
+    assert not any(line.startswith("attention") for line in evaluation_lines(torchid.evaluate(run, LOG), 400))
+    with np.load(LOG) as file:
+        log = dict(file)
+    log["joint_torque"] = -log["joint_torque"]
+    np.savez(tmp_path / "reversed.npz", **log)
+    said = evaluation_lines(torchid.evaluate(run, str(tmp_path / "reversed.npz")), 400)
+    (line,) = [line for line in said if line.startswith("attention")]
+    assert re.search(
+        "reversed: the error of the (joint torque|base force|base moment) is [0-9]+ times that on the run's own logs",
+        line,
+    ), line
+    assert "torchid check" in line
 
 
 @pytest.mark.parametrize("width", [60, 80, 120])

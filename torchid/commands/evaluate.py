@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -25,7 +25,7 @@ from torchid.logs.time_range import split_range
 from torchid.parameters import Array
 from torchid.problem import Metrics
 from torchid.problem.chunks import one_thread
-from torchid.problem.metrics import DECISIVE_GROUPS, describe_errors
+from torchid.problem.metrics import DECISIVE_GROUPS, WHITENED, describe_errors, group_name
 from torchid.report.figures import error_figure, save_figures
 from torchid.report.forces import ForceSeries
 from torchid.report.parameter_files import read_parameters, read_shared_extras
@@ -34,6 +34,8 @@ from torchid.reprs import short_repr
 from torchid.robot import Robot
 
 _SETTINGS = "config.yaml"
+FAR_OFF = 5.0
+"""Times the error on the run's own logs from which on a log is not one of the same robot, moving otherwise."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,6 +47,7 @@ class EvaluatedRun:
         excluded: condemned samples left out, by the name of a log.
         forces: of the first samples of the first log, as measured and as predicted.
         robot: whose they are.
+        usual: errors on the own logs of the run, by group of rows, the larger of train and test.
         output: the folder that they were written to, if any.
     """
 
@@ -52,9 +55,26 @@ class EvaluatedRun:
     excluded: dict[str, int]
     forces: ForceSeries
     robot: Robot
+    usual: Mapping[str, float] = field(default_factory=dict)
     output: Path | None = None
 
     __repr__ = short_repr
+
+    def far_off(self) -> str | None:
+        """The log that is predicted far worse than the run's own were, in words, None without one."""
+        ratios = {
+            (name, group): error / self.usual[group]
+            for name, pair in self.metrics.items()
+            for group in DECISIVE_GROUPS
+            if (error := pair.identified.rms.get(group)) is not None and self.usual.get(group, 0.0) > 0.0
+        }
+        far = {key: ratio for key, ratio in ratios.items() if ratio >= FAR_OFF}
+        if not far:
+            return None
+        name, group = worst = max(far, key=lambda key: (key[1] != WHITENED, far[key]))  # in N or N m, if it can be
+        what = "projected forces" if group == WHITENED else group_name(group)
+        text = f"{name}: the error of the {what} is {far[worst]:.0f} times that on the run's own logs"
+        return f"{text}: another robot, a payload, other friction or a mistake in this log; torchid check"
 
     def _headline(self) -> str:
         texts = [
@@ -85,11 +105,13 @@ class FittedRun:
     """What a run has found, from its folder or from memory.
 
     `states_noise`: whether its settings stated the noise of any sensor; they have the estimated one as well.
+    `usual`: errors on its own logs, as `EvaluatedRun` has them.
     """
 
     experiment: Experiment
     calibrations: Comparison[Calibration]
     states_noise: bool
+    usual: Mapping[str, float] = field(default_factory=dict)
 
 
 @one_thread()
@@ -158,8 +180,8 @@ def read_run(folder: Path, device: str | None = None) -> FittedRun:
         experiment = set_up(config)
     shared = Comparison(read_shared_extras(found, "nominal_value"), read_shared_extras(found, "value"))
     calibrations = _calibrations(experiment, read_parameters(found, experiment.robot), shared)
-    states = _states_noise(folder / "metrics.json")
-    return FittedRun(experiment=experiment, calibrations=calibrations, states_noise=states)
+    states, usual = _own_metrics(folder / "metrics.json")
+    return FittedRun(experiment=experiment, calibrations=calibrations, states_noise=states, usual=usual)
 
 
 @one_thread()
@@ -175,6 +197,7 @@ def evaluate_identification(run: Identification, logs: Sequence[str | Path], dev
         experiment=experiment,
         calibrations=_calibrations(experiment, run.phi, values),
         states_noise=any(group.origin == "stated" for group in run.noise.groups),
+        usual=_usual([pair.identified.as_dict() for pair in run.metrics.values()]),
     )
     with progress_bars() as bars:
         return _evaluate(fitted, logs, None, bars)
@@ -198,7 +221,7 @@ def _evaluate(fitted: FittedRun, logs: Sequence[str | Path], folder: Path | None
             warn(f"{log.source}: neither joint torques nor contact wrenches to compare predictions with")
     excluded = {split_range(path).name: count for path, count in reader.excluded.items()}
     forces = ranks.from_first(partial(compare_forces, evaluation, samples[0], compared), "forces")
-    return EvaluatedRun(metrics=metrics, excluded=excluded, forces=forces, robot=experiment.robot)
+    return EvaluatedRun(metrics=metrics, excluded=excluded, forces=forces, robot=experiment.robot, usual=fitted.usual)
 
 
 def _calibrations(experiment: Experiment, phi: Array, shared: Comparison[dict[str, float]]) -> Comparison[Calibration]:
@@ -265,10 +288,22 @@ def _output(run: Path, logs: Sequence[str | Path], given: Path | None, overwrite
     return output
 
 
-def _states_noise(path: Path) -> bool:
-    """Whether the settings of a run stated the noise of any sensor; its settings have the estimated one as well."""
+def _own_metrics(path: Path) -> tuple[bool, dict[str, float]]:
+    """Whether the settings of a run stated the noise of any sensor, as they have the estimated one too; its errors."""
     try:
-        groups = json.loads(read_bytes(path, MAX_JSON))["noise"]["groups"]
-        return any(group["origin"] == "stated" for group in groups)
-    except (OSError, ValueError, LookupError, TypeError):
-        return False
+        document = json.loads(read_bytes(path, MAX_JSON))
+        states = any(group["origin"] == "stated" for group in document["noise"]["groups"])
+        return states, _usual([document.get(name) or {} for name in ("train", "test")])
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+        return False, {}
+
+
+def _usual(documents: Sequence[Mapping[str, object]]) -> dict[str, float]:
+    """The larger error of each group of rows in documents of `Metrics`."""
+    usual: dict[str, float] = {}
+    for document in documents:
+        for group in DECISIVE_GROUPS:
+            error = document.get(group if group == WHITENED else f"{group}_rms")
+            if isinstance(error, float):
+                usual[group] = max(error, usual.get(group, 0.0))
+    return usual

@@ -55,8 +55,8 @@ def require_plausible(fit: Fit, scene: Scene) -> TotalMass:
 
     Raises:
         SensorError: no parameter is in reach of the sensors.
-        ImplausibleFitError: parameters that no robot has, forces that no parameters explain in a log that the checks
-            condemn, or scales that neither the data nor a known mass determines.
+        ImplausibleFitError: forces that are all 0, parameters that no robot has, forces that no parameters explain in a
+            log that the checks condemn, or scales that neither the data nor a known mass determines.
 
     Warns:
         NumericalWarning: forces that no parameters explain, for whatever reason.
@@ -64,6 +64,8 @@ def require_plausible(fit: Fit, scene: Scene) -> TotalMass:
     estimate = fit.estimate
     if not estimate.rank:
         raise SensorError.at_field("sensors", "no parameter is in reach of them", "other sensors, contacts or logs")
+    if not max(fit.assembly.problem.cost(np.zeros_like(estimate.phi)), fit.assembly.forces) > 0.0:
+        raise ImplausibleFitError.at_field("logs", "all measured forces are 0", "forces; NaN where nobody measured any")
     if fit.assembly.homogeneous:
         _require_scales(fit)
     block_error = 0.0 if fit.scatter is None else fit.scatter.mass_error

@@ -29,6 +29,7 @@ from torchid.log_checks.findings import (
 )
 from torchid.log_checks.forces import check_forces_against_urdf
 from torchid.log_checks.frozen import check_repeats, check_scalar_wrenches
+from torchid.log_checks.gyroscope import check_gyroscope
 from torchid.log_checks.loops import check_loops, completed
 from torchid.log_checks.motion import check_angle_unit, check_angular_velocity, check_derivatives
 from torchid.log_checks.slip import check_slip
@@ -142,7 +143,7 @@ def check(
     repaired = repair_log(log, _findings(results))
     if units := list(check_angle_unit(repaired, robot)):  # thresholds of position steps are in radians
         results = [x for x in results if not (isinstance(x, Finding) and x.name == "step" and x.whole)]
-    results += [*units, *([] if "contact_active" in derived else check_contact_flags(repaired))]
+    results += [*units, *([] if "contact_active" in derived else check_contact_flags(repaired, robot))]
     results += check_scalar_wrenches(repaired)
     repaired = repair_log(log, _findings(results))
     blocking = _blocking_finding(results)
@@ -154,6 +155,7 @@ def check(
         results += unclosed or check_loops(repaired, robot)
         results += check_standing_feet(repaired, robot, contacts, derived)
         results += check_slip(repaired, robot, contacts, cutoff_hz, derived)
+        results += [] if derived else check_gyroscope(repaired, robot, contacts, cutoff_hz)
     compared = repaired
     if "base_" in derived and robot is not None and _blocking_finding(results) is None:
         compared, unfit = _longest_standing(repaired, robot, contacts)

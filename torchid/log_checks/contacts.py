@@ -40,6 +40,8 @@ from torchid.sensing import Contact, named_sensors
 MAX_INACTIVE_WEIGHT_SHARE = 0.1
 #: Share of the weight that an active contact carries at least.
 MIN_ACTIVE_WEIGHT_SHARE = 0.005
+#: The same of all contacts together, from which on a robot stands though no flag says so.
+_MIN_STANDING_WEIGHT_SHARE = 0.5
 #: Time for which a contact may be active without a force: filters widen flags by as much.
 _MAX_UNLOADED_S = 0.1
 #: A reading in the air is an offset if it varies by at most this share, has enough samples, and is below this share of
@@ -59,8 +61,11 @@ class _Contact:
     force: FloatArray  # (N, 3) [N], NaN where not measured
 
 
-def check_contact_flags(log: Log) -> Iterator[Finding | Skipped]:
-    """Findings about contact flags and sensor offsets, relative to the total load: forces may be in any unit."""
+def check_contact_flags(log: Log, robot: Robot | None = None) -> Iterator[Finding | Skipped]:
+    """Findings about contact flags and sensor offsets, relative to the total load: forces may be in any unit.
+
+    Where no flag ever lets a contact carry, forces tell a robot that stands from one in the air by the URDF's weight.
+    """
     if not log.contact_names:
         return
     contacts = list(_contacts(log))
@@ -70,9 +75,9 @@ def check_contact_flags(log: Log) -> Iterator[Finding | Skipped]:
     judged = {contact.name for contact in contacts}
     for name in (name for name in log.contact_names if name not in judged):
         yield Skipped(_FLAG_CHECK, f"{name}: its force was not measured whenever it touches")
-    weight = _largest_load(contacts)
+    weight = _largest_load(contacts) or _load_without_flags(contacts, robot)
     if not weight > 0.0:
-        yield Skipped(_FLAG_CHECK, "all contact forces are zero")
+        yield Skipped(_FLAG_CHECK, "no contact carries anything while it touches")
         return
     for contact in contacts:
         offset = _offset(contact)
@@ -102,6 +107,15 @@ def _largest_load(contacts: list[_Contact]) -> float:
     sizes = [np.where(contact.active, np.linalg.norm(contact.force, axis=1), 0.0) for contact in contacts]
     total = np.sum(sizes, axis=0)
     return float(np.percentile(total, 90.0))
+
+
+def _load_without_flags(contacts: list[_Contact], robot: Robot | None) -> float:
+    """Median total contact force [N] whatever the flags say; 0 where it is far from carrying the robot."""
+    if robot is None:
+        return 0.0
+    total = np.sum([np.nan_to_num(np.linalg.norm(contact.force, axis=1)) for contact in contacts], axis=0)
+    load = float(np.median(total))
+    return load if load > _MIN_STANDING_WEIGHT_SHARE * GRAVITY * float(robot.nominal[:, 0].sum()) else 0.0
 
 
 def subtract_contact_offsets(log: Log) -> Log:

@@ -20,6 +20,7 @@ from torchid.log_checks.findings import (
     finite_median,
     neighbours_of,
 )
+from torchid.log_checks.model import MIN_MOTION
 from torchid.logs import Log
 from torchid.logs.log import CONTACT_READINGS, FORCE_NORMAL, WRENCHES, BoolArray, FloatArray
 from torchid.parameters import WRENCH_COMPONENTS
@@ -216,8 +217,8 @@ def _held_finding(group: ChannelGroup, held: list[tuple[str, float]]) -> Finding
 
 
 def _moves(positions: ChannelGroup | None) -> bool:
-    """Whether any joint changes its position."""
-    return positions is not None and bool(np.ptp(positions.values, axis=0).any())
+    """Whether any joint moves further than one that stands still."""
+    return positions is not None and bool((np.ptp(positions.values, axis=0) > MIN_MOTION).any())
 
 
 def _constant_findings(group: ChannelGroup, constant: BoolArray, moves: bool) -> Iterator[Finding]:

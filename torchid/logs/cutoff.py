@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from torchid.errors import LogError
 from torchid.logs.log import FloatArray, Log
 from torchid.logs.preprocess import lacks_derivatives
 from torchid.logs.quaternion import make_sign_continuous
@@ -14,6 +15,7 @@ from torchid.logs.signal_noise import SignalNoise, signal_noise
 from torchid.logs.timeline import spline_derivatives
 
 _LOWEST_HZ, _STEPS_PER_DECADE = 1.0, 40
+_LONGEST_STEP_S = 0.5  # median, as the checks of logs have it: longer ones are of another unit
 _SEGMENT_S = 8.0  # of the spectra: lines 1/8 Hz apart
 _USUAL_HZ = 10.0  # robots and people move below 5 Hz
 _RATE_SHARE = 0.2  # largest cutoff over the sample rate
@@ -79,11 +81,18 @@ def choose_cutoff(
         stated: standard deviations of noise in the motion, as `signal_noise` takes them.
         sample_rate_hz: that the logs are resampled to, None for their own.
         base_is_derived: whether the motion of the base is worked out of that of the joints.
+
+    Raises:
+        LogError: steps of time are too long for any motion of a robot.
     """
     derived = [log for log in logs if lacks_derivatives(log)]
     if not derived:
         return CutoffChoice(None, by_noise=False)
-    slowest = min(1.0 / float(np.median(np.diff(log.time))) for log in derived)
+    steps = [float(np.median(np.diff(log.time))) for log in derived]
+    if (step := max(steps)) > _LONGEST_STEP_S:
+        accepted = f"steps of at most {_LONGEST_STEP_S:g} s, or another unit in logs.columns.time"
+        raise LogError(derived[steps.index(step)].source, "time", f"a median step of {step:.3g} s", accepted)
+    slowest = 1.0 / step
     slowest = slowest if sample_rate_hz is None else min(slowest, sample_rate_hz)
     decades = np.log10(max(_RATE_SHARE * slowest / _LOWEST_HZ, 1.0))
     candidates = _LOWEST_HZ * np.logspace(0.0, decades, 1 + int(_STEPS_PER_DECADE * decades))

@@ -6,10 +6,12 @@ from torchid.commands.evaluate import EvaluatedRun
 from torchid.commands.verdict import Judged
 from torchid.problem.metrics import describe_worse, worse_than_nominal
 from torchid.report.tables import error_tables, print_tables, terminal_width
-from torchid.terminal.lines import LABEL, error_lines, wrap_words
+from torchid.terminal.lines import LABEL, error_lines, labelled, wrap_words
 
 MOST_LOGS = 8
 """Logs of which a sentence is printed each: two lines at 80 columns, within a screen."""
+
+_ATTENTION_LINES = 3
 
 
 def print_evaluation(evaluated: EvaluatedRun) -> None:
@@ -32,6 +34,8 @@ def evaluation_lines(evaluated: EvaluatedRun, width: int) -> list[str]:
         lines.append(f"and {len(judged) - MOST_LOGS} logs that are predicted better than these: --verbose")
     if len(judged) == 1:
         lines += error_lines(judged[0].shown_errors(), width, of)
+    if (far := evaluated.far_off()) is not None:
+        lines += labelled("attention", far, width, _ATTENTION_LINES)
     left_out = sum(evaluated.excluded.values())
     if left_out:
         lines.append(f"{'left out':{LABEL}}{left_out} samples that torchid check condemns")
