@@ -51,8 +51,9 @@ def test_figures_for_print_are_the_same_files_each_time_and_tensorboard_keeps_it
         assert path.read_bytes().startswith(_BEGINS[form])
     assert not list(tmp_path.rglob("*.png"))
     pictures = EventAccumulator(str(run), size_guidance={"images": 0}).Reload()
-    assert set(pictures.Tags()["images"]) == set(_RUN)
-    assert min(pictures.Images("forces")[0].height, pictures.Images("forces")[0].width) > 200
+    assert set(pictures.Tags()["images"]) == {f"figure_{number}_{name}" for number, name in enumerate(_RUN, 1)}
+    (forces,) = pictures.Images("figure_1_forces")
+    assert min(forces.height, forces.width) > 200
     again = tmp_path / "again"
     assert main(["identify", experiment, f"output={again}", *given]) == 0
     assert (again / f"parameters.{form}").read_bytes() == (run / f"parameters.{form}").read_bytes()

@@ -39,6 +39,8 @@ def test_a_model_explains_what_noise_would_leave_and_no_more() -> None:
     assert not alike.explained
     assert str(alike) == "neighbouring residuals agree 4 times as much as those of noise"
     assert replace(alike, lack_of_fit=None).explained
+    assert replace(alike, share=1e-7).explained, "what rounding leaves of exact signals"
+    assert not replace(alike, share=1e-5).explained
     friction = UnfittedFriction(("knee", "slide"), np.array([[0.1, 0.02], [3.0, -1.0]]), UNITS, 40.0, 4)
     unfitted = replace(good, friction=friction)
     assert not unfitted.explained

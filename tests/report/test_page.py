@@ -74,6 +74,21 @@ def test_every_axis_has_its_unit(page: str) -> None:
         assert all("[" in title for title in titles if not title.startswith("error"))
 
 
+def test_parameters_that_are_not_identified_have_no_interval(run: Path, page: str) -> None:
+    bodies = json.loads((run / "parameters.json").read_text())["bodies"]
+    drawn = 0
+    for name, figure in figures_of(page).items():
+        for trace in figure["data"][1:] if name.startswith("parameter_") else ():
+            known = [row for row, value in enumerate(trace["x"]) if value is not None]
+            assert known
+            assert ("error_x" in trace) is (trace["name"] == "identified, 95 %")
+            if "error_x" in trace:
+                of, drawn = name.removeprefix("parameter_"), drawn + len(known)
+                free = [x for x in bodies if x["verdict"][of] != "fixed"]
+                assert known == [row for row, x in enumerate(free) if x["verdict"][of] == "identified"]
+    assert drawn > 5
+
+
 def test_the_verdict_is_that_of_the_terminal(run: Path, page: str) -> None:
     said = json.loads((run / DATA).read_text())["answer"]
     assert said["headline"] in html.unescape(page)

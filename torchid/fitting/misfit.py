@@ -14,6 +14,7 @@ from torchid.problem import LinearProblem
 
 _MUCH = 1.5  # times the residual that noise leaves; stated noise is seldom known better
 _ALIKE = 2.0  # times the blocks' part of the residuals if these were noise, which alone gives 0.8 to 1.3
+_EXACT = 1e-6  # of what the nominal parameters leave: signals without noise, of which rounding is left
 _NAMED = 3
 
 _UNEXPLAINED = 5.0  # residual in units of the stated noise; recorded logs with honest noise figures stay below 2
@@ -33,6 +34,7 @@ class Misfit:
             that by noise, None likewise.
         groups: of readings and base rows that exceed their noise most.
         friction: that was not fitted, None where all of it was.
+        share: residual over that of the nominal parameters, None where these leave nothing.
     """
 
     residual: float
@@ -41,6 +43,13 @@ class Misfit:
     error_growth: float | None
     groups: tuple[GroupNoise, ...]
     friction: UnfittedFriction | None = None
+    share: float | None = None
+
+    @property
+    def alike(self) -> bool:
+        """Whether neighbouring residuals agree more than those of noise do, and are more than rounding."""
+        rounding = self.share is not None and self.share < _EXACT
+        return self.lack_of_fit is not None and self.lack_of_fit > _ALIKE and not rounding
 
     @property
     def judged(self) -> bool:
@@ -51,8 +60,7 @@ class Misfit:
     def explained(self) -> bool:
         """Whether noise may be all that the model leaves."""
         much = self.expected is not None and self.residual > _MUCH * self.expected
-        alike = self.lack_of_fit is not None and self.lack_of_fit > _ALIKE
-        return not (much or alike or (self.friction is not None and self.friction.significant))
+        return not (much or self.alike or (self.friction is not None and self.friction.significant))
 
     def __str__(self) -> str:
         """In words, "" where the model explains the forces."""
@@ -61,7 +69,7 @@ class Misfit:
         reasons = []
         if self.expected is not None and self.residual > _MUCH * self.expected:
             reasons.append(f"residuals are {self.residual / self.expected:.2g} times what the stated noise leaves")
-        if self.lack_of_fit is not None and self.lack_of_fit > _ALIKE:
+        if self.alike:
             reasons.append(f"neighbouring residuals agree {self.lack_of_fit:.2g} times as much as those of noise")
         if self.friction is not None and self.friction.significant:
             reasons.append(str(self.friction))
@@ -101,6 +109,7 @@ def misfit(
         error_growth=growth,
         groups=tuple(sorted(beyond, key=lambda one: -excess[one.group])),
         friction=friction,
+        share=float(np.sqrt(estimate.cost / estimate.nominal_cost)) if estimate.nominal_cost > 0.0 else None,
     )
 
 

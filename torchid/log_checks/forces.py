@@ -110,7 +110,10 @@ def check_forces_against_urdf(
         yield from alike
         if alike:
             return
-        text = f"{_difference(fit, robot)}, and no usual mistake explains it"
+        text = (
+            f"measured forces differ from the {robot.format}'s by {_percent(fit.misfit)}, "
+            "and no usual mistake explains it"
+        )
         advice = f"check units, frames, the order of joints and contacts, friction, the {robot.format}'s base link and"
         advice += f" masses, and whether the {robot.format} is that of this robot"
         yield Finding("forces", SUSPICIOUS, "all", text, advice)
@@ -139,7 +142,10 @@ def _best_mistake(
             best, least = mistake, trial.misfit
     if best is None:
         return None
-    text = f"{_difference(fit, robot)}, by {_percent(least)} once corrected"
+    text = (
+        f"measured forces differ from the {robot.format}'s by {_percent(fit.misfit)}, "
+        f"by {_percent(least)} once corrected"
+    )
     advice = best.advice + f"; or is {robot.path.name} another robot's?" * (least > MAX_CLEAR_MISFIT)
     return Finding("unit, sign or frame", CONDEMNED, best.field, f"{best.description}: {text}", advice)
 
@@ -150,10 +156,6 @@ def _may_explain(field: str, fit: ModelFit) -> bool:
     if field in misfits:
         return (misfits[field] or 0.0) > MAX_MISFIT
     return all(misfit is None or misfit > MAX_MISFIT for misfit in misfits.values())
-
-
-def _difference(fit: ModelFit, robot: Robot) -> str:
-    return f"measured forces differ from the {robot.format}'s by {_percent(fit.misfit)}"
 
 
 def _percent(share: float) -> str:

@@ -93,24 +93,24 @@ def parameter_bars(bodies: Sequence[Mapping[str, Any]], parameter: str, unit: st
     shown = [body for body in bodies if body["verdict"][parameter] != FIXED]
     if not shown:
         return None
-    hover, symbols, bars = [], [], []
+    hover, bars = [], []
     for body in shown:
         value, error, verdict = (body[key][parameter] for key in ("identified", "standard_error", "verdict"))
-        known = verdict == IDENTIFIED and error is not None
         hover.append(f"{_text(body['name'])}: {value:.5g} {unit}, {verdict}")
-        symbols.append("circle" if known else "circle-open")
-        bars.append(INTERVAL * error if known else None)
+        bars.append(INTERVAL * error if verdict == IDENTIFIED and error is not None else None)
     nominal, identified = ([body[kind][parameter] for body in shown] for kind in ("nominal", "identified"))
-    names = [_label(body["name"]) for body in shown]
-    fitted = _markers(identified, "identified", palette.IDENTIFIED, symbols) | {"hovertext": hover, "hoverinfo": "text"}
-    fitted["error_x"] = {"array": bars, "color": palette.IDENTIFIED, "thickness": 1.5, "width": 3}
-    return {
-        "data": [_markers(nominal, of, palette.NOMINAL, "diamond-open"), fitted],
-        "layout": _list_layout(names, f"[{unit}]"),
-    }
+    data = [_markers(nominal, of, palette.NOMINAL, "diamond-open")]
+    kinds = ((True, "identified, 95 %", "circle"), (False, f"known in sums, or mostly the {of}'s", "circle-open"))
+    for known, name, symbol in kinds:  # apart: Plotly draws the caps of intervals that there are none of
+        values = [x if (bar is not None) is known else None for x, bar in zip(identified, bars, strict=True)]
+        if any(x is not None for x in values):
+            points = _markers(values, name, palette.IDENTIFIED, symbol) | {"hovertext": hover, "hoverinfo": "text"}
+            interval = {"array": bars, "color": palette.IDENTIFIED, "thickness": 1.5, "width": 3}
+            data.append(points | ({"error_x": interval} if known else {}))
+    return {"data": data, "layout": _list_layout([_label(body["name"]) for body in shown], f"[{unit}]")}
 
 
-def _markers(values: Sequence[float], name: str, color: str, symbol: str | Sequence[str]) -> Figure:
+def _markers(values: Sequence[float | None], name: str, color: str, symbol: str) -> Figure:
     """A mark for each line of a list."""
     marker = {"symbol": symbol, "size": 9, "color": color, "line": {"width": 2}}
     rows = list(range(len(values)))

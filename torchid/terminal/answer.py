@@ -45,7 +45,8 @@ def answer_lines(run: Identification, width: int, last: Sequence[tuple[str, str]
         lines += labelled("attention", one, width, _ATTENTION_LINES)
     if len(said.attention) > _MOST_ATTENTION:
         lines += labelled("", f"and {len(said.attention) - _MOST_ATTENTION} more: --verbose", width, _TEXT_LINES)
-    end = [f"{'written to':{LABEL}}{run.experiment.config.output}"]
+    output = run.experiment.config.output
+    end = [] if output is None else [f"{'written to':{LABEL}}{output}"]
     end += [line for one in last for line in labelled(*one, width, _TEXT_LINES)]
     bodies = _body_lines(run.experiment.robot, run.estimate, LINES - len(lines) - len(end) - 1, width)
     return [*lines, *(["", *bodies] if bodies else []), *end]
