@@ -38,14 +38,17 @@ _SHARED = ("identify", "compress", "evaluate", "analyze")
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; 0 on success, 2 on bad input, 1 on anything else."""
-    return run_in_ranks("torchid", lambda: _main(arguments))
+    try:
+        return run_in_ranks("torchid", lambda: _main(arguments))
+    finally:
+        if arguments is not None:  # whoever calls this as a function goes on
+            gc.unfreeze()
 
 
 def _main(arguments: Sequence[str] | None) -> int:
     with plain_streams():  # argparse repeats unknown arguments in its errors
         options = _options(arguments)
-    folds = not getattr(options, "verbose", True)
-    return run_guarded("torchid", lambda: _command(options), options.debug, folds)
+    return run_guarded("torchid", lambda: _command(options), options.debug, not getattr(options, "verbose", True))
 
 
 def _command(options: argparse.Namespace) -> int | None:
@@ -248,6 +251,7 @@ def _importing() -> Iterator[None]:
         with interrupts_deferred():
             yield
     finally:
+        gc.freeze()  # later looks, and those when Python ends, are a sixth of the processor time of the demo
         if collects:
             gc.enable()
 

@@ -58,6 +58,10 @@ def test_noise_ridge_outliers_and_cross_validation_are_those_of_the_command(tmp_
     assert robust.summary.mean_weight == written["robust"]["mean_weight"]
     phi = [[body["identified"][name] for name in PARAMETERS] for body in bodies]
     np.testing.assert_array_equal(robust.fit.estimate.phi, np.ravel(phi))
+    compressed = {"first": regularized.fit(parts)}, {"first": regularized.fit(parts), "parts": parts}
+    for known in compressed:
+        again = torchid.fit_robustly(blocks, regularized, loss, **known)  # type: ignore[arg-type]
+        np.testing.assert_array_equal(again.fit.estimate.phi, robust.fit.estimate.phi)
 
 
 def test_cross_validation_predicts_blocks_that_a_fit_has_not_seen(tmp_path: Path) -> None:

@@ -246,7 +246,7 @@ def test_passes_over_some_samples_save_passes_over_all_and_change_nothing(
     _, expected, slow = bench.fits(kind, log[:2000], replace(log[2000:], source="other"))
     monkeypatch.setattr("torchid.fitting.robust._ROUGH_SAMPLES", 1000)
     _, fit, fast = bench.fits(kind, log[:2000], replace(log[2000:], source="other"))
-    assert fast.passes < slow.passes
+    assert fast.passes == 2 < slow.passes  # steps of least squares alone take 3 or 4
     assert fast.converged
     known = expected.estimate.verdict == "identified"
     moved = (fit.estimate.phi - expected.estimate.phi)[known] / expected.estimate.standard_error[known]

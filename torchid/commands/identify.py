@@ -185,7 +185,7 @@ def _solved(ready: _Prepared, evaluation: Evaluation, bars: Progress, resume: bo
         evaluate = partial(_identified_metrics, evaluation, logs)
         solve = partial(training.run, builder=fitter.builder, logs=logs, evaluate=evaluate, bars=bars, resume=resume)
     fit = fitter.fit(ready.parts, solve)
-    fit, robust = _robust(fit, experiment, fitter, [x for x in ready.blocks if isinstance(x, Samples)], bars)
+    fit, robust = _robust(fit, ready, bars)
     mass = require_plausible(fit, experiment)
     warn_of_confounded(fit.extras)
     warn_of_disagreement(fit, fitter)
@@ -295,19 +295,18 @@ def _compressed(
     return parts, there
 
 
-def _robust(
-    fit: Fit, experiment: Experiment, fitter: LogFitter, train: Sequence[Samples], bars: Progress
-) -> tuple[Fit, RobustSummary | None]:
+def _robust(fit: Fit, ready: _Prepared, bars: Progress) -> tuple[Fit, RobustSummary | None]:
     """The fit with outliers weighed down, if the settings say so; only batch estimators can.
 
     Warns:
         NumericalWarning: the passes were too few.
     """
-    loss = experiment.loss
+    loss, train = ready.experiment.loss, [x for x in ready.blocks if isinstance(x, Samples)]
     if loss is None:
         return fit, None
     bar = bars.add_task("weighing outliers down", total=loss.passes * sum(map(len, train)))
-    robust = fit_robustly(train, fitter, loss, first=fit, progress=lambda n: bars.advance(bar, n))
+    done = partial(bars.advance, bar)
+    robust = fit_robustly(train, ready.fitter, loss, first=fit, parts=ready.parts, progress=done)
     bars.update(bar, total=1, completed=1)
     if not robust.summary.converged:
         message = f"estimator.robust: not settled after {robust.summary.passes} passes; accepted: more passes"

@@ -6,6 +6,7 @@ import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,17 +17,22 @@ from torchid import ranks
 from torchid.errors import UnknownNameError
 from torchid.estimators import ConstrainedEstimate
 from torchid.fitting.fit import Fit, LogFitter, Solve, with_block_errors
+from torchid.identifiability.confounding import ExtraEstimate
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples, compress_parts
 from torchid.problem.chunks import ProgressCallback, one_thread
 from torchid.problem.compression import (
     Part,
+    PartKey,
+    RowWeighting,
     add_surplus,
     compress_in_blocks,
     cut_into_blocks,
     merge_factors,
     surplus_by_part,
 )
+from torchid.problem.samples import concatenate
+from torchid.problem.surplus import Surplus, surplus_of_share
 from torchid.rounding import MAD_PER_STD
 
 TUNING = {"huber": 1.345, "tukey": 4.685}
@@ -38,10 +44,12 @@ _CONVERGED = 0.03  # rms change of the predicted rows, in their standard errors
 _STEADY = 0.02  # relative change of the scale, whose histogram has bins of 1.2 %
 _EXACT = 1e-11  # of the predicted rows: less is rounding
 _TINY = float(np.finfo(float).tiny)
-_ROUGH_SAMPLES = 5000  # evenly spaced, that a fit of longer logs starts from: of 6 or 7 passes over all 3 or 4 are left
+_ROUGH_SAMPLES = 5000  # evenly spaced, at least, that a fit of longer logs starts from: 2 passes over all are left
+_ROUGH_STEP, _MOST_ROUGH = 8, 50_000  # one in so many, unless they are more than so many
 _LEAST_ROUGH = 200  # of them in each log, which may have unknowns of its own
 _WORTHWHILE = 4  # times as many samples, from which on that saves more than it costs
 _START = 3  # passes with Huber's loss before Tukey's
+_FARTHEST = 1.9  # steps of weighted least squares, a majorizer of the loss: any below 2 makes that smaller
 _SAME = 1e-3  # change of the extra parameters of one log
 
 
@@ -111,13 +119,15 @@ def fit_robustly(
     loss: RobustLoss,
     *,
     first: Fit | None = None,
+    parts: Sequence[Part] | None = None,
     solve: Solve | None = None,
     progress: ProgressCallback | None = None,
 ) -> RobustFit:
     """Iteratively re-weighted least squares, a pass over the logs each time, memory flat in their length.
 
-    Long logs begin with passes over every k-th sample. Standard errors are those of the loss, not of the last weighted
-    least squares::
+    A pass weighs the rows by their residuals at one point and fits them. It is the last if it finds what it started
+    from; otherwise the next starts where Newton's method would go, were outliers spread evenly. Long logs begin with
+    passes over every k-th sample. Standard errors are those of the loss, not of the last weighted least squares::
 
         robust = torchid.fit_robustly(logs, fitter, torchid.RobustLoss.named("huber"))
         robust.fit.estimate.phi, robust.summary.mean_weight
@@ -127,23 +137,32 @@ def fit_robustly(
         fitter: of their rows.
         loss: what residuals cost.
         first: the fit of all rows alike, if there is one already.
+        parts: the logs as `compress_in_blocks` compresses them, if they have been.
         solve: instead of the fitter's estimator.
         progress: called with the number of samples done.
 
     Source:
         Huber, "Robust Statistics", 1981, sections 7.6 (standard errors) and 7.8 (re-weighting).
     """
-    fit = fitter.fit(compress_in_blocks(logs, fitter.builder, progress=progress), solve) if first is None else first
-    scale, first_pass = fit.estimate.residual_std, 0
+    builder = fitter.builder
+    if first is None:
+        parts = compress_in_blocks(logs, builder, progress=progress) if parts is None else parts
+        first = fitter.fit(parts, solve)
+    if parts is None:
+        surplus = surplus_by_part(cut_into_blocks(logs, builder), builder)
+    else:
+        surplus = {part.key: part.factor.surplus for part in parts if part.factor.surplus}
+    start, first_pass = _Point(first, first.estimate.residual_std), 0
     step = min(sum(map(len, logs)) // _ROUGH_SAMPLES, min(map(len, logs)) // _LEAST_ROUGH)
+    step = min(step, max(_ROUGH_STEP, sum(map(len, logs)) // _MOST_ROUGH))
     if step >= _WORTHWHILE:
-        rough = _passes([log.every(step) for log in logs], fitter, loss, fit, scale, solve=solve)
-        fit, scale, first_pass = rough.fit, rough.scale, _START
-    found = _passes(logs, fitter, loss, fit, scale, first_pass, solve, progress)
+        start, first_pass = _passes(_some_rows(logs, surplus, step, fitter), loss, start, solve=solve).next, _START
+    every = _Rows(fitter, partial(compress_in_blocks, logs, builder, progress), surplus, {log.source for log in logs})
+    found = _passes(every, loss, start, first_pass, solve)
     summary = RobustSummary(
         loss=loss.kind,
         tuning=loss.tuning,
-        scale=found.scale,
+        scale=found.next.scale,
         mean_weight=found.reweighting.mean_weight,
         passes=found.done,
         converged=found.converged,
@@ -152,42 +171,72 @@ def fit_robustly(
 
 
 @dataclass(frozen=True)
-class _Passes:
-    """What some passes have come to."""
+class _Rows:
+    """Rows to pass over: what compresses them with weights, the surplus of the parts, and the logs that they are of."""
+
+    fitter: LogFitter
+    compress: Callable[[RowWeighting], list[Part]]
+    surplus: Mapping[PartKey, Surplus]
+    sources: set[str]
+
+
+def _some_rows(logs: Sequence[Samples], surplus: Mapping[PartKey, Surplus], step: int, fitter: LogFitter) -> _Rows:
+    """Those of every so many samples, in one part of each log and contact state."""
+    by_log: dict[str, list[Samples]] = {}
+    for log in logs:
+        by_log.setdefault(log.source, []).append(log.every(step))
+    some = [replace(concatenate(pieces), fold=0, block=0) for pieces in by_log.values()]
+    of_some = surplus_of_share(surplus, lambda key: (*key[:2], 0, 0, key[4]), 1.0 / step)
+    return _Rows(fitter, lambda weigh: compress_parts(some, fitter.builder, weight_rows=weigh), of_some, set(by_log))
+
+
+@dataclass(frozen=True)
+class _Point:
+    """Where rows are weighed: the parameters of a fit, and the scale of residuals."""
 
     fit: Fit
     scale: float
+
+    def beyond(self, fit: Fit, scale: float, stretch: float) -> _Point:
+        """Beyond a fit of the rows as they are weighed here, which falls short of the best by so much."""
+        step = min(stretch, _FARTHEST)
+        earlier = {(x.log, x.extra.label): x.value for x in self.fit.extras}
+
+        def further(x: ExtraEstimate) -> ExtraEstimate:
+            before = earlier.get((x.log, x.extra.label), x.value)
+            return replace(x, value=before + step * (x.value - before))
+
+        before = self.fit.estimate.phi
+        estimate = replace(fit.estimate, phi=before + step * (fit.estimate.phi - before))
+        return _Point(replace(fit, estimate=estimate, extras=list(map(further, fit.extras))), scale)
+
+
+@dataclass(frozen=True)
+class _Passes:
+    """What some passes have come to: the last fit, and where the next pass would weigh rows."""
+
+    fit: Fit
+    next: _Point
     reweighting: Reweighting
     done: int
     converged: bool
 
 
-def _passes(
-    logs: Sequence[Samples],
-    fitter: LogFitter,
-    loss: RobustLoss,
-    fit: Fit,
-    scale: float,
-    first_pass: int = 0,
-    solve: Solve | None = None,
-    progress: ProgressCallback | None = None,
-) -> _Passes:
-    """Passes over some logs from a fit and the scale of its residuals on, the first of them with the number given."""
-    builder, sources, converged, done = fitter.builder, {samples.source for samples in logs}, False, 0
-    surplus = surplus_by_part(cut_into_blocks(logs, builder), builder)
+def _passes(rows: _Rows, loss: RobustLoss, start: _Point, first_pass: int = 0, solve: Solve | None = None) -> _Passes:
+    """Passes over some rows, the first of them with the number given."""
+    converged, done, at, fitter = False, 0, start, rows.fitter
     while done < loss.passes and not converged:
         current = _loss_of_pass(loss, first_pass + done)
-        by_log = {source: fit.columns(builder, source) for source in sources}
-        reweighting = Reweighting(current, by_log, max(scale, _TINY))
-        before, done = fit, done + 1
-        parts = compress_in_blocks(logs, builder, progress=progress, weight_rows=reweighting)
+        by_log = {source: at.fit.columns(fitter.builder, source) for source in rows.sources}
+        reweighting = Reweighting(current, by_log, max(at.scale, _TINY))
+        parts, done = rows.compress(reweighting), done + 1
         reweighting.gather()
-        add_surplus(parts, surplus, reweighting.mean_weight)
-        fit = fitter.fit(parts, solve)
-        settled = current == loss and _settled(fit, before, scale, reweighting.median_scale)
+        add_surplus(parts, rows.surplus, reweighting.mean_weight)
+        fit, scale = fitter.fit(parts, solve), reweighting.median_scale
+        settled = current == loss and _settled(fit, at.fit, at.scale, scale)
         converged = ranks.as_first(settled, "convergence")
-        scale = reweighting.median_scale
-    return _Passes(fit, scale, reweighting, done, converged)
+        at = at.beyond(fit, scale, reweighting.stretch)
+    return _Passes(fit, at, reweighting, done, converged)
 
 
 def fit_extras_robustly(
@@ -243,7 +292,7 @@ class Reweighting:
 
     @torch.no_grad()
     def __call__(self, samples: Samples, support: tuple[int, ...], rows: Tensor) -> Tensor:
-        """The rows (M, len(support) + 1) times the square root of their weights."""
+        """Square roots of the weights of rows (M, len(support) + 1)."""
         theta = self._parameters[samples.source][list(support)].to(rows)
         u = (rows[:, :-1] @ theta - rows[:, -1]) / self.scale
         weight, slope = self.loss.weight(u), self.loss.slope(u)
@@ -253,7 +302,7 @@ class Reweighting:
         with self._lock:
             self._histogram += counts
             self._terms.append(sums)
-        return rows * weight.sqrt()[:, None]
+        return weight.sqrt()[:, None]
 
     def gather(self) -> None:
         """End the pass, where processes share the work: the statistics are those of all rows from now on."""

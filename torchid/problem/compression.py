@@ -37,9 +37,9 @@ _LEAST_PER_BLOCK = 10  # independent samples
 
 _MEMORY = 2**30  # [bytes] of factors
 RowWeighting = Callable[[Samples, tuple[int, ...], Tensor], Tensor]
-"""Weighted rows, from samples, columns and rows."""
+"""Square roots of the weights of rows, (M, 1), from samples, columns and rows (M, columns + 1)."""
 
-_Key = tuple[str, ContactState, int, int, bool]
+PartKey = tuple[str, ContactState, int, int, bool]  # source, state, fold, block, unloaded
 
 
 @dataclass
@@ -60,6 +60,11 @@ class Part:
     gated: set[int] = field(default_factory=set)
 
     __repr__ = short_repr
+
+    @property
+    def key(self) -> PartKey:
+        """Which rows it has."""
+        return self.source, self.state, self.fold, self.block, self.unloaded
 
 
 def compress(
@@ -158,7 +163,7 @@ def _compress_chunks(
 
     Without `loaded`, those of readings in the air alone.
     """
-    parts: dict[_Key, Part] = {}
+    parts: dict[PartKey, Part] = {}
     workspace, compressor = Workspace(), RowCompressor()
 
     def part(samples: Samples, state: ContactState, unloaded: bool) -> Part:
@@ -173,7 +178,7 @@ def _compress_chunks(
             for support, stacked in builder.stacked_rows(samples, state, workspace):
                 if weight_rows is not None:
                     rows = stacked[len(support) + 1 :]
-                    rows.copy_(weight_rows(samples, support, rows))
+                    rows *= weight_rows(samples, support, rows)
                 compressor.add(own.factor, support, stacked, samples.oversampling)
         for channel in unloaded_offset_equations(builder, samples):
             in_the_air = part(samples, state, True)
@@ -187,29 +192,25 @@ def _compress_chunks(
 
 def surplus_by_part(
     logs: Sequence[Samples], builder: RowBuilder, progress: ProgressCallback | None = None
-) -> dict[_Key, Surplus]:
+) -> dict[PartKey, Surplus]:
     """The surplus of each part of some logs, to `add_surplus`, from the noise of their motion.
 
-    Args:
-        logs: as `compress_parts` takes them.
-        builder: of their rows.
-        progress: as in `compress_surplus`.
+    Args: as `compress_surplus`.
     """
     return compress_surplus(logs, builder, _key, progress)
 
 
-def _key(samples: Samples | None, state: ContactState, unloaded: bool = False) -> _Key:
-    """Which rows a part has: those of a piece of a log in a contact state, or all of a state without samples."""
-    return (
-        ("", state, 0, 0, False) if samples is None else (samples.source, state, samples.fold, samples.block, unloaded)
-    )
+def _key(samples: Samples | None, state: ContactState, unloaded: bool = False) -> PartKey:
+    """Of the part of a piece of a log in a contact state, or of all of a state without samples."""
+    if samples is None:
+        return "", state, 0, 0, False
+    return samples.source, state, samples.fold, samples.block, unloaded
 
 
-def add_surplus(parts: Sequence[Part], surplus: Mapping[_Key, Surplus], weight: float = 1.0) -> None:
+def add_surplus(parts: Sequence[Part], surplus: Mapping[PartKey, Surplus], weight: float = 1.0) -> None:
     """Add its surplus to the factor of each part, times the mean weight of its rows."""
     for part in parts:
-        of_part = surplus.get((part.source, part.state, part.fold, part.block, part.unloaded), {})
-        part.factor.add_surplus(of_part, weight)
+        part.factor.add_surplus(surplus.get(part.key, {}), weight)
 
 
 def compress_unloaded(logs: Sequence[Samples], builder: RowBuilder) -> list[Part]:
@@ -221,9 +222,9 @@ def compress_unloaded(logs: Sequence[Samples], builder: RowBuilder) -> list[Part
 @one_thread()
 def _merge_parts(of_workers: Iterable[list[Part]]) -> list[Part]:
     """The parts of all workers, those of one log, contact state and fold merged."""
-    total: dict[_Key, Part] = {}
+    total: dict[PartKey, Part] = {}
     for part in chain.from_iterable(of_workers):
-        same = total.setdefault((part.source, part.state, part.fold, part.block, part.unloaded), part)
+        same = total.setdefault(part.key, part)
         if same is not part:
             same.samples += part.samples
             same.gated |= part.gated

@@ -46,6 +46,7 @@ _RESOLVED = 1e-5  # least singular value, of columns of unit size, along which a
 Support = tuple[int, ...]
 Surplus = dict[Support, Tensor]
 Key = TypeVar("Key", bound=Hashable)
+Other = TypeVar("Other", bound=Hashable)
 
 
 @dataclass(frozen=True)
@@ -108,6 +109,14 @@ def compress_surplus(
 def _add(total: Surplus, surplus: Surplus, weight: float) -> None:
     for support, x in surplus.items():
         total[support] = total[support] + weight * x if support in total else weight * x
+
+
+def surplus_of_share(surplus: Mapping[Key, Surplus], key: Callable[[Key], Other], share: float) -> dict[Other, Surplus]:
+    """About the surplus of an evenly spread share of the rows, by another key of theirs."""
+    total: dict[Other, Surplus] = {}
+    for one, of_one in surplus.items():
+        _add(total.setdefault(key(one), {}), of_one, share)
+    return total
 
 
 def _spread(piece: Samples, step: int, progress: ProgressCallback | None) -> Samples:
