@@ -334,11 +334,9 @@ def _enclosures(settings: EstimatorConfig, robot: Robot) -> tuple[Enclosure, ...
         if (local.max() if settings.com_inside == "box" else np.linalg.norm(local)) > 1.0:
             outside.append(robot.body_names[body])
     if outside:
-        message = (
-            f"the {robot.format}'s own centre of mass is outside the {settings.com_inside} at {', '.join(outside)}"
-        )
-        advice = "are the shapes where the matter is? (estimator.com_shapes)"
-        warn_about_file(f"estimator.com_inside: {message}; {advice}")
+        where = f"outside the {settings.com_inside} at {', '.join(outside)}"
+        message = f"estimator.com_inside: the {robot.format}'s own centre of mass is {where}"
+        warn_about_file(f"{message}; are the shapes where the matter is? (estimator.com_shapes)")
     return tuple(out)
 
 
