@@ -11,6 +11,7 @@ The logs under `test` are evaluated at the end only. Curves go to a new folder: 
 from __future__ import annotations
 
 import argparse
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import replace
@@ -24,6 +25,7 @@ from torch import Tensor, nn
 
 import torchid
 from torchid.boundary import run_guarded
+from torchid.commands.chosen_settings import with_chosen_settings
 from torchid.commands.events import hyperparameters
 from torchid.commands.reading import LogReader
 from torchid.config import load_config
@@ -31,6 +33,7 @@ from torchid.errors import ConfigError, about_file
 from torchid.estimators import ResidualEffect, Sgd, Trainer
 from torchid.fitting.experiment import set_up
 from torchid.problem import MiniBatches
+from torchid.report.tables import progress_bars
 from torchid.report.tensorboard import RunEvents
 
 DEMO = Path(torchid.__file__).parent / "demo" / "quadruped.yaml"
@@ -76,7 +79,9 @@ def compare(options: argparse.Namespace) -> None:
     with about_file(options.file):
         if not config.logs.test:
             raise ConfigError.at_field("logs.test", "none", "logs to evaluate the networks on")
-        experiment = set_up(config)
+        with progress_bars() as bars:
+            experiment, _ = with_chosen_settings(set_up(config), bars)
+    config = experiment.config
     robot, builder = experiment.robot, experiment.builder(experiment.sensors)
     reader = LogReader(experiment)
     train, test = (reader.read(paths, experiment.sensors) for paths in (config.logs.train, config.logs.test))
@@ -115,8 +120,13 @@ def print_effect(effect: ResidualEffect | None, bodies: Sequence[str]) -> None:
         print(f"{name.replace('_', ' ')}: the networks give {100.0 * share:.3g} %, rms {effect.rms[name]:.3g}")
     print(f"rigid bodies can explain {100.0 * effect.rigid_share:.3g} % of the networks' force")
     most = sorted(zip(effect.moved_scaled, effect.moved_errors, bodies, strict=True), reverse=True)[:3]
-    moved = (f"{body} ({scaled:.2g} of its size, {errors:.2g} standard errors)" for scaled, errors, body in most)
-    print(f"parameters moved most: {', '.join(moved)}")
+    print(f"parameters moved most: {', '.join(_moved(*one) for one in most)}")
+
+
+def _moved(scaled: float, errors: float, body: str) -> str:
+    """How far the networks move the parameters of a body; in standard errors where the data determine any."""
+    by_data = f", {errors:.2g} standard errors" if math.isfinite(errors) else ""
+    return f"{body} ({scaled:.2g} of its size{by_data})"
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ from torchid.logs.quaternion import angular_acceleration_base, angular_velocity_
 from torchid.logs.rate_noise import warn_of_noisy_accelerations
 from torchid.logs.signal_noise import signal_noise
 from torchid.logs.timeline import JITTER, Timeline, lay_out_timeline, nearest_known
+from torchid.logs.turns import require_no_turns
 
 #: Quantities of which each is the derivative of the one before. The first angular one would be the orientation.
 DERIVATIVE_CHAINS = (
@@ -129,7 +130,11 @@ def move_to_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Covera
         log: the log.
         timeline: stamps of it and of the result.
         coverage: of fields that must have no gap.
+
+    Raises:
+        LogError: a joint's position jumps by a whole turn, or is not finite.
     """
+    require_no_turns(log)
     with about_file(log.source):
         return replace(log, **_fields_on_timeline(log, timeline, coverage))
 
