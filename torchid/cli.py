@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import argparse
 import gc
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from torchid import __version__
-from torchid.boundary import plain_streams, run_guarded, run_in_ranks
+from torchid.boundary import importing, plain_streams, run_guarded, run_in_ranks
 from torchid.errors import ConfigError, during
 from torchid.ranks import is_launched_first, share_work
-from torchid.staging import interrupts_deferred
 
 _IDENTIFY = "fit the parameters of an experiment file and write a run folder"
 _COMPRESS = "compress the training logs of an experiment file to small files of factors, which identify fits too"
@@ -242,22 +241,8 @@ def _add_amount(command: argparse.ArgumentParser) -> None:
     amount.add_argument("--quiet", "-q", action="store_true", help="print nothing but warnings and errors")
 
 
-@contextmanager
-def _importing() -> Iterator[None]:
-    """Import what a command needs, uninterrupted; garbage is not looked for among a million objects that all stay."""
-    collects = gc.isenabled()
-    gc.disable()  # a seventh of the time of all imports
-    try:
-        with interrupts_deferred():
-            yield
-    finally:
-        gc.freeze()  # later looks, and those when Python ends, are a sixth of the processor time of the demo
-        if collects:
-            gc.enable()
-
-
 def _identify(options: argparse.Namespace) -> None:
-    with _importing():
+    with importing():
         from torchid.commands.identify import identify
         from torchid.config import load_config
         from torchid.terminal.answer import print_answer
@@ -269,7 +254,7 @@ def _identify(options: argparse.Namespace) -> None:
 
 
 def _demo(options: argparse.Namespace) -> None:
-    with _importing():
+    with importing():
         from torchid.commands.demo import EXPERIMENT, copy_examples, run_demo
         from torchid.terminal.answer import print_answer
         from torchid.terminal.details import print_details
@@ -293,7 +278,7 @@ def _demo(options: argparse.Namespace) -> None:
 
 
 def _compress(options: argparse.Namespace) -> None:
-    with _importing():
+    with importing():
         from torchid.commands.compress import compress
         from torchid.config import load_config
         from torchid.terminal.compression import print_compression
@@ -302,7 +287,7 @@ def _compress(options: argparse.Namespace) -> None:
 
 
 def _evaluate(options: argparse.Namespace) -> None:
-    with _importing():
+    with importing():
         from torchid.commands.evaluate import evaluate
         from torchid.terminal.evaluation import print_all_errors, print_evaluation
 
@@ -312,7 +297,7 @@ def _evaluate(options: argparse.Namespace) -> None:
 
 
 def _replay(options: argparse.Namespace) -> None:
-    with _importing():
+    with importing():
         from torchid.commands.replay import parse_gains, replay
         from torchid.terminal.replay import print_replay
 
@@ -323,7 +308,7 @@ def _replay(options: argparse.Namespace) -> None:
 
 
 def _sample(options: argparse.Namespace) -> None:
-    with _importing():
+    with importing():
         from torchid.commands.sample import sample
         from torchid.terminal.samples import print_samples
 
@@ -334,7 +319,7 @@ def _sample(options: argparse.Namespace) -> None:
 
 
 def _export(options: argparse.Namespace) -> None:
-    with _importing():
+    with importing():
         from torchid.commands.export import export
 
     text = export(options.run, options.format, options.output, options.overwrite)
@@ -342,14 +327,14 @@ def _export(options: argparse.Namespace) -> None:
 
 
 def _report(options: argparse.Namespace) -> None:
-    with _importing():
+    with importing():
         from torchid.commands.report import report
 
     print(f"written to    {report(options.run)}")
 
 
 def _analyze(options: argparse.Namespace) -> None:
-    with _importing():
+    with importing():
         from torchid.commands.analyze import analyze
         from torchid.config import load_analysis
         from torchid.terminal.analysis import print_analysis, print_analysis_tables
@@ -360,7 +345,7 @@ def _analyze(options: argparse.Namespace) -> None:
 
 
 def _check(options: argparse.Namespace) -> int:
-    with _importing():
+    with importing():
         from torchid.commands.check import check_files, check_outputs, write_check_outputs
         from torchid.terminal.checks import print_all_findings, print_checks
 
@@ -375,14 +360,14 @@ def _check(options: argparse.Namespace) -> int:
 
 
 def _init(options: argparse.Namespace) -> None:
-    with _importing():
+    with importing():
         from torchid.commands.init import init
 
     print(init(options.urdf, options.log, options.output))
 
 
 def _convert(options: argparse.Namespace) -> None:
-    with _importing():
+    with importing():
         from torchid.commands.check import convert
 
     log = convert(options.source, options.target, options.topics, options.overwrite, options.columns)
@@ -390,7 +375,7 @@ def _convert(options: argparse.Namespace) -> None:
 
 
 def _simulate(options: argparse.Namespace) -> None:
-    with _importing():
+    with importing():
         from torchid.commands.simulate import simulate
         from torchid.config import load_simulation
         from torchid.terminal.simulation import print_all_motions, print_simulation
