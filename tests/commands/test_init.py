@@ -276,3 +276,26 @@ def test_a_part_is_held_back_only_where_a_filter_leaves_something_of_it(
     assert ("test" in written["logs"]) is test
     assert written["estimator"]["ridge"] == ridge
     assert main(["identify", str(tmp_path / "n.yaml")]) == (2 if said == "missing" else 0)
+
+
+@pytest.mark.parametrize(
+    ("time", "position", "velocity", "torque"),
+    [
+        ("timestamp_ms", "/robot/{}/angle_deg", "/robot/{}/omega_rpm", "/robot/{}/moment_Nm"),
+        ("Zeit", "Winkel_{}", "Geschwindigkeit_{}", "Drehmoment_{}"),
+    ],
+    ids=["omega of joints", "German"],
+)
+def test_words_of_other_laboratories_are_known(
+    tmp_path: Path, time: str, position: str, velocity: str, torque: str
+) -> None:
+    log = with_velocity(recorded())
+    deg, rpm, ms = (180.0 / np.pi, 30.0 / np.pi, 1e3) if "ms" in time else (1.0, 1.0, 1.0)
+    columns: dict[str, Any] = {time: ms * log.time}
+    fields = {"joint_position": (position, deg), "joint_velocity": (velocity, rpm), "joint_torque": (torque, 1.0)}
+    for field, (pattern, factor) in fields.items():
+        columns |= {pattern.format(x): factor * getattr(log, field)[:, k] for k, x in enumerate(log.joint_names)}
+    init(URDF, save_csv(tmp_path / "x.csv", columns), tmp_path / "n.yaml")
+    found = read_log(tmp_path / "x.csv", columns=load_config(tmp_path / "n.yaml").logs.columns)
+    for field in fields:
+        np.testing.assert_allclose(getattr(found, field), getattr(log, field), atol=1e-9)

@@ -121,6 +121,11 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
         "contact_force_normal: given without contact_act",
     ),
     (POSITION + "imu_frame: imu", {}, "imu_frame: given without imu_specific_force"),
+    (
+        POSITION + "joint_velocity: 'v_{index}'",
+        {"v_1": TIME, "v_2": TIME},
+        "joint_velocity: 'v_0', no such column, with first_index: 0; accepted: first_index: 1, by the numbers",
+    ),
     (POSITION + "imu_specific_force: {columns: {x: q_0}}", {}, "columns: components x; accepted: each of x, y, z"),
     (
         POSITION,

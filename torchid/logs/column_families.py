@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from torchid.logs.column_map import PLACEHOLDER
+from torchid.logs.column_proposals import propose_field
 from torchid.logs.name_matching import SUFFIXES, KnownRobot, joints_by_place, spelled, within
 from torchid.logs.units import split_unit
 
@@ -40,6 +41,12 @@ class Family:
     axes: tuple[str, ...]
     by_name: Mapping[str, str] = field(default_factory=dict)
     by_place: bool = False
+
+    @property
+    def proposed(self) -> str:
+        """The field that its words say it is, "" without any; of joints an angular velocity is theirs."""
+        found = propose_field(self.words)
+        return "joint_velocity" if found == "imu_angular_velocity" and "{joint}" in self.pattern else found
 
     @property
     def words(self) -> str:

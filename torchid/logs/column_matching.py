@@ -130,10 +130,21 @@ class _Search:
         one = self._fixed_by_key.get(part.key) or self._named_by_columns(part)
         missing = [column for column in one.columns if column not in self._known]
         if missing:
+            self._require_numbers(part, missing[0])
             more = f" (nor {len(missing) - 1} more)" if len(missing) > 1 else ""
             unused = self._unused() or self._given
             raise UnknownFieldError.at_field(f"{KEY}.{part.key}", missing[0], unused, f"no such column{more}")
         return one
+
+    def _require_numbers(self, part: Part, missing: str) -> None:
+        """Refuse an entry whose columns are all there but numbered from another first one."""
+        first = 1 - min(part.entry.first_index, 1)
+        if "{index" not in (part.entry.column or "") or first == part.entry.first_index:
+            return
+        shifted = self._fixed(replace(part, entry=replace(part.entry, first_index=first)))
+        if shifted is not None and all(column in self._known for column in shifted.columns):
+            found = f"'{missing}', no such column, with first_index: {part.entry.first_index}"
+            raise LogError.at_field(f"{KEY}.{part.key}", found, f"first_index: {first}, by the numbers of the columns")
 
     def _unused(self) -> list[str]:
         taken = {column for one in self._fixed_by_key.values() for column in one.columns}

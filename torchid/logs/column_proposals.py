@@ -33,10 +33,13 @@ _WORDS = (
     ("contact_wrench_local", r"\b(wrench|wrenches)\b"),
     ("contact_force_normal", r"\b(foot forces?|feet forces?|contact forces?|grf|fsr)\b"),
     ("contact_active", r"\b(contacts?|touch|touches|stance)\b"),
-    ("joint_torque", r"\b(taus?|torques?|efforts?|trq|load|qfrc)\b"),
-    ("joint_velocity", r"\b(dqs?|dqj|qd|qdot|thd|v|qvel|vel|vels|velocity|velocities|speeds?|rates?)\b"),
-    ("joint_position", r"\b(qs?|qj|th|theta|qpos|pos|positions?|angles?)\b"),
-    ("time", rf"\b(t|ts|{_STAMPS}|ticks?|clock|sec|secs|seconds)\b"),
+    ("joint_torque", r"\b(taus?|torques?|efforts?|trq|load|qfrc|drehmoment)\b"),
+    (
+        "joint_velocity",
+        r"\b(dqs?|dqj|qd|qdot|thd|v|qvel|vels?|velocity|velocities|speeds?|rates?|geschwindigkeit)\b",
+    ),
+    ("joint_position", r"\b(qs?|qj|th|theta|qpos|pos|positions?|angles?|winkel)\b"),
+    ("time", rf"\b(t|ts|{_STAMPS}|ticks?|clock|sec|secs|seconds|zeit)\b"),
 )
 #: Fields that a unit alone tells: of `LF_HAA [deg]`, `LF_HAA [deg/s]`.
 _BY_QUANTITY = {
@@ -107,4 +110,5 @@ def is_foreign(column: str) -> bool:
 def unknown_columns(columns: Sequence[str]) -> LogError:
     """The error of columns or arrays that the log format does not know, all in one line."""
     accepted = "names of the log format, or logs.columns of an experiment file, which says what they hold"
+    accepted += "; torchid init writes one"
     return LogError.at_field("columns", f"{len(columns)} unknown: {name_unknown(columns)}", accepted)

@@ -231,7 +231,7 @@ class _Proposer:
 
     def _field(self, family: Family) -> str:
         """The field that a family probably is."""
-        name, axes = propose_field(family.words), len(family.axes) == 3
+        name, axes = family.proposed, len(family.axes) == 3
         if not name and "time" in quantities_with(family.unit) and self._increases(family.columns[0]):
             return "time"
         if not name and axes and re.fullmatch(OF_BASE, family.words.strip(" _./").lower()):

@@ -161,7 +161,8 @@ def read_bag(
         check_topics(topics, needs_flags)
     channels = list_channels(files)
     if topics is None:
-        raise LogError.at_field("logs.topics", f"missing; the bag has {_listed(channels)}", "what its topics hold")
+        accepted = "what its topics hold, of which torchid init writes a first map"
+        raise LogError.at_field("logs.topics", f"missing; the bag has {_listed(channels)}", accepted)
     bag = _Bag(topics, channels)
     _read(bag, files, progress or (lambda share: None))
     series = {role: rows.to_series() for role, rows in bag.rows.items()}

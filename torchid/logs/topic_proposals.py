@@ -49,7 +49,12 @@ class _Proposer:
         self._place_low_state()
         if not {"joint_states", "low_state"} & set(self.out.columns):
             self.out.columns = {"joint_states": "TOPIC", **self.out.columns}
-            self.out.notes["joint_states"] = "nothing, as no topic has the robot's joints: name one in place of TOPIC"
+            states = next(
+                (f"; {name} is a LowState, but of another robot than the URDF" for name in self._of(LowState.types)), ""
+            )
+            self.out.notes["joint_states"] = (
+                f"nothing, as no topic has the robot's joints{states}: name one in place of TOPIC"
+            )
         self._place_odometry()
         self._add_orientation()
         self._place_limb_sensors()
