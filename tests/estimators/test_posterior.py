@@ -148,6 +148,40 @@ def test_blocks_that_disagree_widen_the_posterior_along_what_they_disagree_on() 
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), expected, rtol=1e-9)
 
 
+def test_no_reported_combination_is_sharper_than_its_standard_error_between_blocks() -> None:
+    rng = np.random.default_rng(2)
+    A = rng.normal(size=(40, 12)) / SCALE
+    problem = replace(nothing_seen(GOOD), A=A, b=A @ GOOD[0] + rng.normal(size=40), rows=40)
+    deviations = 0.3 * SCALE * rng.normal(size=(1, 12)) + 0.03 * SCALE * rng.normal(size=(8, 12))
+    reported = np.vstack([np.eye(12), rng.normal(size=(3, 12)) / SCALE])
+    by_blocks = np.linalg.norm(deviations @ reported.T, axis=0)
+
+    def spread(*combinations: Array) -> Array:
+        rows, _ = whitened_rows(problem, 1.0, deviations, *combinations)
+        return np.sqrt(np.einsum("ki,ij,kj->k", reported, np.linalg.inv(rows.T @ rows), reported))
+
+    alone, together = spread(), spread(reported)
+    assert (alone < 0.8 * by_blocks).any(), "scatter along one direction is spread over many singular vectors"
+    assert (together > by_blocks * (1.0 - 1e-9)).all()
+    assert (together > alone * (1.0 - 1e-9)).all()
+    rows, right = whitened_rows(problem, 1.0, deviations, reported)
+    np.testing.assert_allclose(np.linalg.lstsq(rows, right)[0], np.linalg.lstsq(A, problem.b)[0], rtol=1e-8)
+
+
+def test_a_combination_that_scatters_widens_nothing_that_is_uncorrelated_with_it() -> None:
+    problem = replace(nothing_seen(GOOD), A=np.eye(12) * np.arange(1, 13) / SCALE, b=np.zeros(12), rows=12)
+    deviations = np.zeros((3, 12))
+    deviations[:, :2] = SCALE[0, :2] / np.arange(1, 3)  # both by as much as noise, each time together
+    both = np.zeros((1, 12))
+    both[0, :2] = np.arange(1, 3) / SCALE[0, :2]
+    rows, _ = whitened_rows(problem, 1.0, deviations / np.sqrt(3.0), both)
+    unit = np.diag(SCALE[0] / np.arange(1, 13))
+    covariance = np.linalg.inv(unit @ rows.T @ rows @ unit)
+    expected = np.eye(12)
+    expected[:2, :2] = [[1.5, 0.5], [0.5, 1.5]]  # the sum has variance 4, not 2, the difference 2 as before
+    np.testing.assert_allclose(covariance, expected, atol=1e-12)
+
+
 def test_an_extra_parameter_confounded_with_a_body_shares_its_spread() -> None:
     """Armature + fv known to 0.001: what one has more the other has less, and neither is negative."""
     row = np.zeros((1, 12))

@@ -15,6 +15,7 @@ from torchid.parameters import PER_BODY, Array
 from torchid.problem import LinearProblem
 from torchid.problem.chunks import one_thread
 from torchid.reprs import short_repr
+from torchid.rounding import RANK_TOLERANCE
 
 PRIOR_ERROR = 0.2
 """Default standard deviation of the nominal parameters, as a share of each body; that of `analysis.prior_error`."""
@@ -108,7 +109,9 @@ class Posterior:
 
 
 @one_thread()
-def whitened_rows(problem: LinearProblem, noise: float, block_deviations: Array | None) -> tuple[Array, Array]:
+def whitened_rows(
+    problem: LinearProblem, noise: float, block_deviations: Array | None, combinations: Array | None = None
+) -> tuple[Array, Array]:
     """Rows A, (R, 12 L), and b, (R,), with noise of unit variance, for the likelihood of a fit.
 
     Args:
@@ -117,6 +120,8 @@ def whitened_rows(problem: LinearProblem, noise: float, block_deviations: Array 
         block_deviations: (G, 12 L), of the parameters by the scatter between blocks of the logs, without
             regularization, whose outer products sum up to a covariance; None without blocks. It takes the noise's place
             along the singular vectors of the rows along which it is the larger, as in the standard errors.
+        combinations: (K, 12 L), of the parameters whose standard errors are reported: along each of them rows are no
+            sharper than the scatter says. None for none.
     """
     noise = max(noise, _LEAST_NOISE * float(np.linalg.norm(problem.b)) / max(problem.rows, 1) ** 0.5, 1e-300)
     covariance = noise**2 * np.eye(len(problem.b))
@@ -130,6 +135,23 @@ def whitened_rows(problem: LinearProblem, noise: float, block_deviations: Array 
     scale = problem.scale[problem.free]
     U, values, Vt = np.linalg.svd(A[:, problem.free] * scale, full_matrices=False)
     along = (block_deviations[:, problem.free] / scale) @ Vt.T * values
-    growth = np.sqrt(np.maximum(np.square(along).sum(axis=0), 1.0))
-    U /= growth
-    return U.T @ A, U.T @ b
+    spread = np.diag(np.maximum(np.square(along).sum(axis=0), 1.0))
+    determined = values > RANK_TOLERANCE * values.max(initial=0.0)
+    for weights in [] if combinations is None else combinations[:, problem.free] * scale:
+        t = np.where(determined, Vt @ weights, 0.0) / np.where(determined, values, 1.0)
+        _widen(spread, t, float(np.square(along @ t).sum()))
+    L = np.linalg.cholesky(spread)
+    A = scipy.linalg.solve_triangular(L, U.T @ A, lower=True)
+    return A, scipy.linalg.solve_triangular(L, U.T @ b, lower=True)
+
+
+def _widen(covariance: Array, weights: Array, least: float) -> None:
+    """Raise a covariance (n, n), in place, until the variance along weights (n,) is at least so much.
+
+    Of all Gaussians with that variance it becomes the nearest to the one before (least relative entropy): what is
+    uncorrelated with the combination stays as it is.
+    """
+    along = covariance @ weights
+    variance = float(weights @ along)
+    if least > variance > 0.0:
+        covariance += (least - variance) / variance**2 * np.outer(along, along)

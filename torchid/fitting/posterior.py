@@ -19,6 +19,7 @@ from torchid.estimators import Conditions, Enclosure, Mirror
 from torchid.estimators.elliptical_slice import EllipticalSlice
 from torchid.estimators.posterior import PRIOR_ERROR, Posterior, whitened_rows
 from torchid.fitting.fit import Fit
+from torchid.identifiability.confounding import mass_weights
 from torchid.logs.containers import open_container
 from torchid.parameters import PARAMETERS, PER_BODY, Array
 from torchid.problem.extras import ACTUATORS
@@ -71,7 +72,8 @@ def fitted_posterior(fit: Fit, robot: Robot, conditions: Conditions) -> FittedPo
     problem, estimate = fit.assembly.problem, fit.estimate
     noise = math.sqrt(problem.oversampling) * estimate.residual_std
     deviations = None if fit.scatter is None else fit.scatter.without_ridge[: fit.scatter.blocks]
-    A, b = whitened_rows(problem, noise, deviations)
+    reported = np.vstack([np.eye(len(problem.nominal)), mass_weights(len(robot.bodies))])
+    A, b = whitened_rows(problem, noise, deviations, reported)
     D, extras = np.zeros((len(A), 0)), []
     for one in fit.assembly.eliminations:
         if one.log:
