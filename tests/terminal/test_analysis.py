@@ -61,7 +61,8 @@ def with_logs(analysis: Analysis, rank: int, *confounded: str, sets: int = 1) ->
     """The same with the accuracy of sensor sets on logs that determine so many combinations."""
     rms = {group: 0.1234 for group in ROW_GROUPS}
     names = ["proposed", *(f"set {k}" for k in range(1, sets))]
-    accuracy = SetAccuracy(11, rank, ExpectedErrors(rms, rms), None, confounded)
+    advice = tuple(f"mend that {message}" for message in confounded)
+    accuracy = SetAccuracy(11, rank, ExpectedErrors(rms, rms), None, confounded, advice)
     scene = analysis.scene
     settings = replace(scene.config.analysis, scenarios=None)
     scene = replace(scene, config=replace(scene.config, analysis=settings))
@@ -135,7 +136,7 @@ def test_logs_that_determine_less_than_the_sensors_could_are_named(lame: Analysi
     assert "the logs determine" not in text(with_logs(lame, rank))
     assert "rms error, expected joint torque [N m] base force [N]" in text(with_logs(lame, rank))
     said = text(with_logs(lame, rank, "offset of a: confounded with b; do not trust either", "another", sets=2))
-    assert "attention proposed, set 1: offset of a: confounded with b; do not trust either" in said
+    assert "attention proposed, set 1: mend that offset of a: confounded with b; do not trust either" in said
     assert "and 2 more: --verbose" in said
 
 

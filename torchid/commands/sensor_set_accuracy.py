@@ -124,5 +124,6 @@ def _accuracy(
     phi = calibration.parameters(evaluation)
     measured = evaluation.metrics(calibration.calibrate(test), phi[None])[0] if test else None
     possible = measured_components(scene.contacts, sensors)
-    channels, confounded = int(sensors.torque.sum() + possible.sum()), tuple(map(str, list_confounded(fit.extras)))
-    return SetAccuracy(channels, estimate.rank, expected, measured, confounded)
+    channels, confounded = int(sensors.torque.sum() + possible.sum()), list_confounded(fit.extras)
+    words, advice = tuple(map(str, confounded)), tuple(one.in_short for one in confounded)
+    return SetAccuracy(channels, estimate.rank, expected, measured, words, advice)

@@ -197,8 +197,8 @@ class Confounded:
 
     @property
     def in_short(self) -> str:
-        """What to do, without what they are confounded with."""
-        return f"do not trust {_grouped(self.extras)}: {self.advice}"
+        """What to do, before what it is good for, without what they are confounded with."""
+        return f"{self.advice}; until then do not trust {_grouped(self.extras)}"
 
 
 _TOTAL_MASS = "total mass"

@@ -245,7 +245,7 @@ def _table(title: str, *headings: str) -> Table:
 class SetAccuracy:
     """Errors of a fit with one sensor set: expected, and measured on the test logs, if any.
 
-    `confounded`: what it is that the set does not separate, in words.
+    `confounded`: what it is that the set does not separate, in words; `advice`: for each, what not to trust and to do.
     """
 
     channels: int
@@ -253,6 +253,7 @@ class SetAccuracy:
     expected: ExpectedErrors
     measured: Metrics | None
     confounded: tuple[str, ...] = ()
+    advice: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, object]:
         """Rms by group of rows."""
@@ -291,11 +292,11 @@ def accuracy_table(sets: Mapping[str, SetAccuracy]) -> Table:
     return table
 
 
-def confounded_messages(sets: Mapping[str, SetAccuracy]) -> list[str]:
-    """What some sets do not separate, with their names."""
+def confounded_messages(sets: Mapping[str, SetAccuracy], in_short: bool = False) -> list[str]:
+    """What some sets do not separate, with their names; `in_short`: what to do about it alone."""
     names: dict[str, list[str]] = {}
     for name, found in sets.items():
-        for message in found.confounded:
+        for message in found.advice if in_short else found.confounded:
             names.setdefault(message, []).append(name)
     return [f"{', '.join(of)}: {message}" for message, of in names.items()]
 

@@ -176,7 +176,7 @@ def _attention(analysis: Analysis, scenarios: Sequence[ScenarioAnalysis]) -> Ite
             if found is not None and found.rank < one.base.rank:
                 what = f"the logs determine {found.rank} of {one.base.rank} combinations"
                 yield f"{what}: record motion that differs more, of all joints and of the base"
-    yield from confounded_messages(analysis.accuracies)
+    yield from confounded_messages(analysis.accuracies, in_short=True)
     for one in scenarios:
         yield from named(one, describe_singular_postures(_judged_states(one), beyond_logs=False))
 
