@@ -44,8 +44,10 @@ def test_the_demo_runs_without_extras_from_a_package_that_cannot_be_written(tmp_
             path.chmod(0o755 if path.is_dir() else 0o644)
     assert sorted(site.rglob("*")) == before
     assert run.stdout.startswith("Much better than the URDF on unseen motion (sway_test.npz)")
-    *_, written, experiment = lines = run.stdout.splitlines()
+    lines = run.stdout.splitlines()
     assert len(lines) <= 20, "a screen"
+    (start,) = (number for number, line in enumerate(lines) if line.startswith("written to"))
+    written, experiment = lines[start], " ".join(lines[start + 1 :])
     assert written.split() == ["written", "to", str(work / "runs" / "quadruped")]
     assert str(site / "torchid" / "demo" / "quadruped.yaml") in experiment
     assert (work / "runs" / "quadruped" / "identified.urdf").exists()

@@ -65,14 +65,14 @@ def test_the_figure_shows_errors_in_a_band_of_two_standard_deviations() -> None:
         nominal, identified = errors.get_lines()
         np.testing.assert_allclose(np.nanmax(np.asarray(nominal.get_ydata(), dtype=float)), 1.0)
         np.testing.assert_allclose(np.nanmax(np.asarray(identified.get_ydata(), dtype=float)), 0.1)
-        assert errors.get_title(loc="left") == "rms 0.1, noise alone 0.2 [N m]"
+        assert errors.get_title(loc="left") == "identified: rms 0.1, noise alone 0.2 [N m]"
 
 
 def test_the_figure_has_errors_without_a_band_where_the_noise_is_unknown() -> None:
     for noise in (None, np.full((50, 2), np.nan)):
         for errors in force_figure(series(noise), ["knee", "hip"], 0).axes[1::2]:
             assert not errors.collections
-            assert errors.get_title(loc="left") == "rms 0.1 [N m]"
+            assert errors.get_title(loc="left") == "identified: rms 0.1 [N m]"
 
 
 def test_a_sliding_joint_s_torque_is_shown_as_a_force() -> None:

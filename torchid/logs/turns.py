@@ -12,19 +12,20 @@ _LARGEST_STEP = 0.5  # [rad] of the motion on either side
 
 
 def require_no_turns(log: Log) -> None:
-    """Refuse joint positions [rad] that jump by whole turns from one sample to the next, between small steps.
+    """Refuse joint positions [rad] that jump by a turn from one sample to the next, between small steps.
 
     Raises:
         LogError: names the joints.
     """
     steps = np.diff(log.joint_position, axis=0)
-    turns = np.rint(steps / (2.0 * np.pi))
     with np.errstate(invalid="ignore"):
-        jumps = (turns != 0.0) & (np.abs(steps / (2.0 * np.pi) - turns) < _TOLERANCE_TURNS)
-    if not jumps.any():
-        return
-    small = np.pad(np.abs(steps) < _LARGEST_STEP, ((1, 1), (0, 0)), constant_values=True)
-    jumps &= small[:-2] & small[2:]
+        jumps = np.abs(np.abs(steps) / (2.0 * np.pi) - 1.0) < _TOLERANCE_TURNS
+        if not jumps.any():
+            return
+        is_small = np.abs(steps) < _LARGEST_STEP
+    around = np.pad(is_small, ((1, 1), (0, 0)), constant_values=True)
+    jumps &= around[:-2] & around[2:]
+    jumps &= (jumps | is_small).all(axis=1, keepdims=True)  # where others jump by other amounts, all is another unit's
     joints = np.flatnonzero(jumps.any(axis=0))
     if not len(joints):
         return
