@@ -6,6 +6,7 @@ import re
 from collections.abc import Collection, Sequence
 
 from torchid.errors import InputError
+from torchid.logs import Log
 from torchid.robot import Robot, load_robot
 from torchid.robot.urdf import fixed_joints
 
@@ -19,6 +20,13 @@ def limb_sensors(robot: Robot) -> dict[str, str]:
     named = {joint: child for joint, child in found.items() if re.search(_SENSOR, f"{joint} {child}", re.IGNORECASE)}
     in_limbs = {joint: child for joint, child in named.items() if child in robot.links and robot.links[child][0]}
     return {joint: child for joint, child in list(in_limbs.items())[:_MOST_SENSORS] if _can_be_split(robot, joint)}
+
+
+def read_sensors(robot: Robot, log: Log | InputError) -> list[str]:
+    """Sensors in limbs that a log has readings of, of those that the robot can be split at."""
+    names = () if isinstance(log, InputError) else log.ft_names
+    joints = fixed_joints(robot.path) if names else {}
+    return [name for name in names[:_MOST_SENSORS] if name in joints and _can_be_split(robot, name)]
 
 
 def _can_be_split(robot: Robot, joint: str) -> bool:
