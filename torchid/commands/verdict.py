@@ -41,7 +41,7 @@ class Judged:
     def errors(self, groups: Sequence[str] = DECISIVE_GROUPS) -> Iterator[tuple[str, float, float, float | None]]:
         """Groups of rows with both errors, and what noise of the readings leaves."""
         for group in groups:
-            before, after = self.nominal.rms.get(group), self.identified.rms.get(group)
+            before, after = self.nominal.rms_of(group), self.identified.rms_of(group)
             if before is not None and after is not None:
                 yield group, before, after, self.identified.noise.get(group)
 
