@@ -32,11 +32,10 @@ from torchid.fitting.experiment import Experiment, set_up, with_noise
 from torchid.fitting.factor_files import FactorFile
 from torchid.fitting.fit import Fit, LogFitter
 from torchid.fitting.fleet import read_fleet
-from torchid.fitting.misfit import misfit
+from torchid.fitting.misfit import misfit, unfitted_friction
 from torchid.fitting.noise import NoiseSummary
 from torchid.fitting.posterior import fitted_posterior
 from torchid.fitting.robust import RobustSummary, fit_robustly
-from torchid.fitting.unfitted_friction import unfitted_friction
 from torchid.identifiability.base_parameters import StateReport, require_base, state_reports
 from torchid.identifiability.confounding import TotalMass
 from torchid.identifiability.contributions import Contributions, contributions
