@@ -14,12 +14,11 @@ from torchid.commands.check import recorded_stretches
 from torchid.commands.reading import LogReader
 from torchid.errors import warn_about_file
 from torchid.estimators import Conditions
-from torchid.fitting.base_tilt import TiltChoice, choose_base_tilt
 from torchid.fitting.delay import DelayChoice, choose_delay
 from torchid.fitting.experiment import Experiment, S, Scene
 from torchid.fitting.fit import LogFitter
 from torchid.fitting.noise import recorded_sensors
-from torchid.fitting.sign_width import SignWidthChoice, choose_sign_width
+from torchid.fitting.separable import SignWidthChoice, TiltChoice, choose_base_tilt, choose_sign_width
 from torchid.logs.cutoff import CutoffChoice, choose_cutoff
 from torchid.problem import Samples
 from torchid.settings import AUTO
