@@ -245,8 +245,7 @@ def _identify(options: argparse.Namespace) -> None:
     with importing():
         from torchid.commands.identify import identify
         from torchid.config import load_config
-        from torchid.terminal.answer import print_answer
-        from torchid.terminal.details import print_details
+        from torchid.terminal.identification import print_answer, print_details
 
     run = identify(load_config(options.file, options.overrides), options.resume)
     if not options.quiet:
@@ -256,8 +255,7 @@ def _identify(options: argparse.Namespace) -> None:
 def _demo(options: argparse.Namespace) -> None:
     with importing():
         from torchid.commands.demo import EXPERIMENT, copy_examples, run_demo
-        from torchid.terminal.answer import print_answer
-        from torchid.terminal.details import print_details
+        from torchid.terminal.identification import print_answer, print_details
         from torchid.terminal.lines import print_labelled
 
     if options.copy is not None:
