@@ -297,7 +297,7 @@ def _evaluate(options: argparse.Namespace) -> None:
 def _replay(options: argparse.Namespace) -> None:
     with importing():
         from torchid.commands.replay import parse_gains, replay
-        from torchid.terminal.replay import print_replay
+        from torchid.terminal.simulators import print_replay
 
     kp, kd = parse_gains("--kp", options.kp), parse_gains("--kd", options.kd)
     replayed = replay(options.run, options.log, options.window, options.output, options.overwrite, kp, kd)
@@ -376,7 +376,7 @@ def _simulate(options: argparse.Namespace) -> None:
     with importing():
         from torchid.commands.simulate import simulate
         from torchid.config import load_simulation
-        from torchid.terminal.simulation import print_all_motions, print_simulation
+        from torchid.terminal.simulators import print_all_motions, print_simulation
 
     config = load_simulation(options.file, options.overrides)
     stabilities = simulate(config)
