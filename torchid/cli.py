@@ -287,7 +287,7 @@ def _compress(options: argparse.Namespace) -> None:
 def _evaluate(options: argparse.Namespace) -> None:
     with importing():
         from torchid.commands.evaluate import evaluate
-        from torchid.terminal.evaluation import print_all_errors, print_evaluation
+        from torchid.terminal.finished_runs import print_all_errors, print_evaluation
 
     evaluated = evaluate(options.run, options.log, options.device, True, options.output, options.overwrite)
     if not options.quiet:
@@ -308,7 +308,7 @@ def _replay(options: argparse.Namespace) -> None:
 def _sample(options: argparse.Namespace) -> None:
     with importing():
         from torchid.commands.sample import sample
-        from torchid.terminal.samples import print_samples
+        from torchid.terminal.finished_runs import print_samples
 
     keys = ("run", "count", "format", "output", "prior_error", "seed", "overwrite")
     drawn = sample(*(getattr(options, key) for key in keys))
