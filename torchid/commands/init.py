@@ -20,7 +20,7 @@ from torchid.commands.init_split import Split, split_log
 from torchid.commands.reading import memory_needed
 from torchid.config.preprocessing import PreprocessingConfig
 from torchid.errors import ConfigError, InputError, LogError, about_file, excerpt, format_count, join_names
-from torchid.fitting.log_maps import is_along_base
+from torchid.fitting.checked_settings import is_along_base
 from torchid.logs import Columns, Log, Topics, read_log
 from torchid.logs.bag_samples import read_bag_sample
 from torchid.logs.column_samples import read_sample, stated_names, states_degrees, texts_in
