@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from torchid.errors import LogError, about_file
 from torchid.logs.array_parts import lazy_part
 from torchid.logs.column_map import Columns
-from torchid.logs.computed import Computed
 from torchid.logs.containers import Container, LogKind, existing_log_kind, open_container, reader_errors_explained
 from torchid.logs.force_plates import about_world_origin
+from torchid.logs.lazy_arrays import Computed, MappedArray
 from torchid.logs.log import (
     FLAGS,
     NAME_FIELDS,
@@ -33,7 +33,6 @@ from torchid.logs.log import (
     field_shape,
     to_float64,
 )
-from torchid.logs.mapped_arrays import MappedArray
 from torchid.logs.mapped_fields import map_arrays
 from torchid.logs.names import parse_names
 from torchid.logs.read import build_log, check_fields_given

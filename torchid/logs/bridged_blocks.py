@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.logs.blocks import LogBlocks
-from torchid.logs.computed import Computed
 from torchid.logs.gaps import fill_short_gaps, warn_of_filled
+from torchid.logs.lazy_arrays import Computed
 from torchid.logs.log import CONTACT_READINGS, FLAGS
 
 _AROUND = 64

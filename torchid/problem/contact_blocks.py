@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from torchid.logs import Log
 from torchid.logs.blocks import LogBlocks
-from torchid.logs.computed import Computed
 from torchid.logs.flags import ContactThreshold, MeasuredForces, flags_by_force
+from torchid.logs.lazy_arrays import Computed
 from torchid.logs.log import CONTACT_READINGS, FLAGS, FORCE_NORMAL, WRENCHES, BoolArray, FloatArray
 from torchid.logs.preprocess import find_unloaded, unloaded_readings
 from torchid.logs.spill import growing_array

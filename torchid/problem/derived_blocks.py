@@ -12,7 +12,7 @@ from torchid.errors import LogError
 from torchid.logs import Log
 from torchid.logs.blocks import LogBlocks
 from torchid.logs.coverage import Coverage
-from torchid.logs.filled_gaps import GapsFilled
+from torchid.logs.lazy_arrays import GapsFilled
 from torchid.logs.log import CONTACT_READINGS, NORMALS, WRENCHES, BoolArray, FloatArray
 from torchid.logs.names import parse_names
 from torchid.logs.preprocess import gapless_fields, lacks_derivatives, make_timeline, move_to_timeline
