@@ -20,8 +20,7 @@ from torchid.commands.log_course import Block, Course, Stretch, in_the_air, requ
 from torchid.config.preprocessing import PreprocessingConfig
 from torchid.errors import LogError, about_file
 from torchid.logs import Columns, Log
-from torchid.logs.blocks import GIGABYTE, LogBlocks, count_samples_from, open_log_blocks
-from torchid.logs.bridged_blocks import bridge_in_blocks
+from torchid.logs.blocks import GIGABYTE, LogBlocks, bridge_in_blocks, count_samples_from, open_log_blocks
 from torchid.logs.coverage import Coverage, warn_of_gaps
 from torchid.logs.log import CONTACT_READINGS, NORMALS, BoolArray
 from torchid.logs.preprocess import (
