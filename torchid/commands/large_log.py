@@ -30,8 +30,7 @@ from torchid.logs.preprocess import (
     lacks_derivatives,
     make_timeline,
 )
-from torchid.logs.rate_noise import warn_of_noisy_accelerations
-from torchid.logs.signal_noise import MOST_SAMPLES, signal_noise
+from torchid.logs.signal_noise import MOST_SAMPLES, signal_noise, warn_of_noisy_accelerations
 from torchid.logs.spill import Filled, Spill, growing_array
 from torchid.logs.stretches import count_samples, long_stretches
 from torchid.logs.timeline import SPLINE_BLOCK, Timeline

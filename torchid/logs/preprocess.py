@@ -22,8 +22,7 @@ from torchid.logs.log import (
     column_labels,
 )
 from torchid.logs.quaternion import angular_acceleration_base, angular_velocity_base, make_sign_continuous
-from torchid.logs.rate_noise import warn_of_noisy_accelerations
-from torchid.logs.signal_noise import signal_noise
+from torchid.logs.signal_noise import signal_noise, warn_of_noisy_accelerations
 from torchid.logs.timeline import JITTER, Timeline, lay_out_timeline, nearest_known
 from torchid.logs.turns import require_no_turns
 
