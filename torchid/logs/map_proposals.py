@@ -20,8 +20,7 @@ from torchid.logs.force_proposals import point_along_z, threshold
 from torchid.logs.joint_orders import JOINT_ORDERS, MOTORS, numbered_joints, suitable_orders, usual_order
 from torchid.logs.log import SHAPES, VARIANTS, WRENCHES
 from torchid.logs.name_matching import SUFFIXES, KnownRobot
-from torchid.logs.orientation_proposals import find_angles, order_of_quaternion
-from torchid.logs.unit_proposals import UnitProposer, step_of_stamps
+from torchid.logs.number_proposals import UnitProposer, find_angles, order_of_quaternion, step_of_stamps
 from torchid.logs.units import IN_DEGREES, quantities_of, quantities_with, unit_factor
 
 _GAINS = re.compile(r"\b(kp|kd)\b", re.IGNORECASE)
