@@ -17,7 +17,7 @@ from torchid.problem.contact_state import Columns, ContactState, ContactStateLay
 from torchid.problem.extra_columns import dof_extra_column, extra_columns
 from torchid.problem.extras import ExtraTerms, list_extras
 from torchid.problem.known_torques import KnownTorques
-from torchid.problem.motor_forces import MotorForces
+from torchid.problem.loop_forces import MotorForces
 from torchid.problem.recorded_wrenches import FramePoses
 from torchid.problem.row_blocks import RowBlock, multiply_wrenches, subtract_payload
 from torchid.problem.samples import Samples
