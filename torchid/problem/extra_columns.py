@@ -9,8 +9,8 @@ from torch import Tensor
 
 from torchid.problem.contact_state import ContactStateLayout
 from torchid.problem.extras import DELAYED, Extra
-from torchid.problem.recorded_wrenches import FramePoses
 from torchid.problem.samples import Samples
+from torchid.problem.wrench_rows import FramePoses
 from torchid.regressor.tree import KinematicTree
 
 
