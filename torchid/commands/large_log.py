@@ -46,10 +46,10 @@ from torchid.problem.contact_slip import (
     warn_of_slip,
 )
 from torchid.problem.derived_blocks import detect_in_blocks, motion_fields, stand_in_blocks
+from torchid.problem.log_joints import distances_from_welds, warn_of_moving_welds
 from torchid.problem.mapped_pages import MappedPages
 from torchid.problem.samples import require_forces
 from torchid.problem.standing import Stretches, warn_of_standing
-from torchid.problem.welded_joints import distances_from_welds, warn_of_moving_welds
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
 

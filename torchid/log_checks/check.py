@@ -42,8 +42,8 @@ from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.time_range import log_title
 from torchid.logs.timeline import DROPPED_SAMPLES, JITTER, REACH_PERIODS
 from torchid.problem import Samples
+from torchid.problem.log_joints import without_welded_joints
 from torchid.problem.standing import longest_standing
-from torchid.problem.welded_joints import without_welded_joints
 from torchid.reprs import short_repr
 from torchid.robot import Robot
 from torchid.sensing import Contact
