@@ -29,10 +29,10 @@ from torchid.logs.preprocess import away_from_changes, away_from_stamps, preproc
 from torchid.logs.time_range import LogPart, split_range
 from torchid.problem import Samples, bind_log
 from torchid.problem.chunks import ProgressCallback
+from torchid.problem.closed_loops import with_loop_joints
 from torchid.problem.contact_detection import with_detected_contacts
 from torchid.problem.contact_slip import measure_slip, warn_of_slip
 from torchid.problem.log_joints import without_welded_joints
-from torchid.problem.loop_joints import with_loop_joints
 from torchid.problem.standing import preprocess_standing
 from torchid.problem.zeroing import zero_in_air
 from torchid.robot import Robot

@@ -9,8 +9,7 @@ import torch
 from torchid.errors import LogError
 from torchid.log_checks.findings import CONDEMNED, NOTE, Finding
 from torchid.logs import Log
-from torchid.problem.loop_gaps import loop_gaps
-from torchid.problem.loop_joints import with_loop_joints
+from torchid.problem.closed_loops import loop_gaps, with_loop_joints
 from torchid.robot import Robot
 
 

@@ -17,9 +17,9 @@ from torchid.logs.log import FORCE_NORMAL, FloatArray, normalize_normals
 from torchid.logs.preprocess import unloaded_readings
 from torchid.parameters import WRENCH_COMPONENTS, Array
 from torchid.problem.base_motion import BaseMotion, base_motion, imu_pose, position_for_moments
+from torchid.problem.closed_loops import FOLLOW, require_closed_loops
 from torchid.problem.extras import recorded_components
 from torchid.problem.log_joints import columns_in_order, recorded_torques, require_limb_sensors
-from torchid.problem.loop_gaps import FOLLOW, require_closed_loops
 from torchid.problem.mapped_pages import MappedPages
 from torchid.problem.motion_noise import MotionNoise, bind_motion_noise
 from torchid.regressor import Motion
