@@ -34,7 +34,7 @@ from torchid.problem.contact_detection import with_detected_contacts
 from torchid.problem.contact_slip import measure_slip, warn_of_slip
 from torchid.problem.log_joints import without_welded_joints
 from torchid.problem.standing import preprocess_standing
-from torchid.problem.zeroing import zero_in_air
+from torchid.problem.unloaded_sensors import zero_in_air
 from torchid.robot import Robot
 from torchid.sensing import SensorSet
 

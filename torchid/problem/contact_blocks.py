@@ -17,7 +17,7 @@ from torchid.logs.log import CONTACT_READINGS, FLAGS, FORCE_NORMAL, WRENCHES, Bo
 from torchid.logs.preprocess import find_unloaded, unloaded_readings
 from torchid.logs.spill import growing_array
 from torchid.problem.derived_blocks import Pieces, contact_names
-from torchid.problem.zeroing import offsets_in_the_air
+from torchid.problem.unloaded_sensors import offsets_in_the_air
 from torchid.sensing import Contact
 
 
