@@ -37,7 +37,6 @@ from torchid.logs.timeline import SPLINE_BLOCK, Timeline
 from torchid.problem import Samples, bind_log
 from torchid.problem.base_motion import BaseMotion
 from torchid.problem.chunks import one_thread, thread_count
-from torchid.problem.contact_blocks import contacts_alone, flag_by_force_in_blocks, zero_in_blocks
 from torchid.problem.contact_slip import (
     away_from_own_changes,
     base_velocity,
@@ -45,7 +44,14 @@ from torchid.problem.contact_slip import (
     judge_speeds,
     warn_of_slip,
 )
-from torchid.problem.derived_blocks import detect_in_blocks, motion_fields, stand_in_blocks
+from torchid.problem.derived_blocks import (
+    contacts_alone,
+    detect_in_blocks,
+    flag_by_force_in_blocks,
+    motion_fields,
+    stand_in_blocks,
+    zero_in_blocks,
+)
 from torchid.problem.log_joints import distances_from_welds, warn_of_moving_welds
 from torchid.problem.mapped_pages import MappedPages
 from torchid.problem.samples import require_forces
