@@ -32,10 +32,9 @@ from torchid.log_checks.frozen import check_repeats, check_scalar_wrenches
 from torchid.log_checks.gyroscope import check_gyroscope
 from torchid.log_checks.loops import check_loops, completed
 from torchid.log_checks.motion import check_angle_unit, check_angular_velocity, check_derivatives
-from torchid.log_checks.slip import check_slip
 from torchid.log_checks.spikes import check_jumps
 from torchid.log_checks.stamps import check_magnitudes, check_missing_values, check_time_stamps
-from torchid.log_checks.standing_feet import check_standing_feet
+from torchid.log_checks.standing_feet import check_slip, check_standing_feet
 from torchid.log_checks.weight import check_accelerometer, check_weight
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
