@@ -30,8 +30,13 @@ from torchid.log_checks.findings import (
 from torchid.log_checks.forces import check_forces_against_urdf
 from torchid.log_checks.frozen import check_repeats, check_scalar_wrenches
 from torchid.log_checks.gyroscope import check_gyroscope
-from torchid.log_checks.loops import check_loops, completed
-from torchid.log_checks.motion import check_angle_unit, check_angular_velocity, check_derivatives
+from torchid.log_checks.motion import (
+    check_angle_unit,
+    check_angular_velocity,
+    check_derivatives,
+    check_loops,
+    completed,
+)
 from torchid.log_checks.spikes import check_jumps
 from torchid.log_checks.stamps import check_magnitudes, check_missing_values, check_time_stamps
 from torchid.log_checks.standing_feet import check_slip, check_standing_feet
