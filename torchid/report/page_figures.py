@@ -16,7 +16,7 @@ from torchid.logs.time_range import log_title
 from torchid.parameters import INERTIAL, PARAMETERS
 from torchid.report import palette
 from torchid.report.ellipsoids import TRIANGLES, ellipsoid_points, equivalent_ellipsoid
-from torchid.report.parameter_figure import INTERVAL
+from torchid.report.parameter_figures import INTERVAL
 from torchid.report.traces import packed
 
 Figure = dict[str, Any]
