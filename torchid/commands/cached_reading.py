@@ -22,12 +22,12 @@ from torchid.fitting.noise import recorded_sensors
 from torchid.fitting.payloads import payload_of
 from torchid.logs.blocks import GIGABYTE, log_bytes
 from torchid.logs.containers import LogKind, existing_log_kind, log_files
+from torchid.logs.spill import MappedPages
 from torchid.logs.tables import is_text_table
 from torchid.logs.time_range import split_range
 from torchid.problem import Samples
 from torchid.problem.chunks import ProgressCallback
 from torchid.problem.extras import recorded_components
-from torchid.problem.mapped_pages import MappedPages
 from torchid.sensing import SensorSet
 
 _LET_GO = 8  # chunks after which pages that samples are mapped to leave the memory of the process

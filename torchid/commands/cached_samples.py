@@ -21,10 +21,10 @@ from torchid.commands.reading import fits_contact_offsets
 from torchid.config.robot import RobotConfig
 from torchid.errors import TorchidWarning
 from torchid.fitting.experiment import Scene
+from torchid.logs.spill import MappedPages
 from torchid.logs.time_range import log_title
 from torchid.problem import Samples
 from torchid.problem.base_motion import BaseMotion
-from torchid.problem.mapped_pages import MappedPages
 from torchid.problem.motion_noise import MotionNoise
 from torchid.robot import Robot
 from torchid.robot.urdf import parse_xml

@@ -31,7 +31,7 @@ from torchid.logs.preprocess import (
     make_timeline,
 )
 from torchid.logs.signal_noise import MOST_SAMPLES, signal_noise, warn_of_noisy_accelerations
-from torchid.logs.spill import Filled, Spill, growing_array
+from torchid.logs.spill import Filled, MappedPages, Spill, growing_array
 from torchid.logs.stretches import count_samples, long_stretches
 from torchid.logs.timeline import SPLINE_BLOCK, Timeline
 from torchid.problem import Samples, bind_log
@@ -53,7 +53,6 @@ from torchid.problem.derived_blocks import (
     zero_in_blocks,
 )
 from torchid.problem.log_joints import distances_from_welds, warn_of_moving_welds
-from torchid.problem.mapped_pages import MappedPages
 from torchid.problem.samples import require_forces
 from torchid.problem.standing import Stretches, warn_of_standing
 from torchid.robot import Robot
