@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from torchid.commands.answer import Judged
 from torchid.commands.evaluate import EvaluatedRun
 from torchid.commands.sample import DrawnSamples
-from torchid.commands.verdict import Judged
 from torchid.errors import format_count
 from torchid.parameters import COULOMB, MASS, PARAMETERS, PER_BODY, Array
 from torchid.problem.metrics import describe_worse, worse_than_nominal
