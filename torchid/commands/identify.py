@@ -13,8 +13,7 @@ from rich.progress import Progress
 from torchid import ranks
 from torchid.commands.cached_factors import cached_parts, factors_key
 from torchid.commands.cached_reading import CachedReader, open_reader
-from torchid.commands.chosen_ridge import with_ridge
-from torchid.commands.chosen_settings import Choices, with_chosen_settings
+from torchid.commands.chosen_settings import Choices, with_chosen_settings, with_ridge
 from torchid.commands.clock import Clock
 from torchid.commands.compared_forces import compare_forces, noise_of_readings, trace_forces
 from torchid.commands.folder import RUN, check_free, claim_folder
