@@ -13,7 +13,7 @@ from typing import Any
 
 from torchid import ranks
 from torchid.commands.cache import FOLDER, TOKEN, Cache, Files, content_key, file_states, missing_folders, remove_empty
-from torchid.commands.cached_samples import ReadLog, Said, content_of_scene, samples_entry, samples_of_entry
+from torchid.commands.cache_entries import ReadLog, Said, content_of_scene, samples_entry, samples_of_entry
 from torchid.commands.reading import LogReader, fits_contact_offsets
 from torchid.commands.shared_log import on_one_machine, read_together
 from torchid.errors import TorchidWarning, warn

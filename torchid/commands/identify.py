@@ -11,7 +11,7 @@ from functools import partial
 from rich.progress import Progress
 
 from torchid import ranks
-from torchid.commands.cached_factors import cached_parts, factors_key
+from torchid.commands.cache_entries import cached_parts, factors_key
 from torchid.commands.cached_reading import CachedReader, open_reader
 from torchid.commands.chosen_settings import Choices, with_chosen_settings, with_ridge
 from torchid.commands.clock import Clock
