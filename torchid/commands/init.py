@@ -15,8 +15,7 @@ import yaml
 
 from torchid.commands.folder import check_free_file
 from torchid.commands.init_hints import BRIDGED_S, gaps_in_motion, hints, missing_columns
-from torchid.commands.init_sensors import limb_sensors, sensor_set
-from torchid.commands.init_split import Split, split_log
+from torchid.commands.init_proposals import Split, limb_sensors, sensor_set, split_log
 from torchid.commands.reading import memory_needed
 from torchid.config.preprocessing import PreprocessingConfig
 from torchid.errors import ConfigError, InputError, LogError, about_file, excerpt, format_count, join_names
