@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from torchid.logs.column_map import PLACEHOLDER
 from torchid.logs.column_proposals import propose_field
-from torchid.logs.column_samples import Columns
+from torchid.logs.file_samples import Columns
 from torchid.logs.name_matching import SUFFIXES, KnownRobot, joints_by_place, spelled, within
 from torchid.logs.units import split_unit
 

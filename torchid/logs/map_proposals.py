@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from torchid.errors import excerpt
 from torchid.logs.column_groups import Family, find_families, split_arrays
 from torchid.logs.column_proposals import OF_BASE, OF_PLATES, is_desired, propose_field
-from torchid.logs.column_samples import Columns, listed_order, stated_names
 from torchid.logs.columns import is_column
+from torchid.logs.file_samples import Columns, listed_order, stated_names
 from torchid.logs.force_proposals import point_along_z, threshold
 from torchid.logs.joint_orders import JOINT_ORDERS, MOTORS, numbered_joints, suitable_orders, usual_order
 from torchid.logs.log import SHAPES, VARIANTS, WRENCHES

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.logs.column_proposals import is_desired
-from torchid.logs.column_samples import Columns
+from torchid.logs.file_samples import Columns
 from torchid.logs.units import UNITS, quantities_with, split_unit
 
 _STEP = (2e-4, 0.2)  # [s]: of recordings
