@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import LogError, about_file
-from torchid.logs.array_parts import lazy_part
+from torchid.logs.arrays import lazy_part, parse_names
 from torchid.logs.column_map import Columns
 from torchid.logs.containers import Container, LogKind, existing_log_kind, open_container, reader_errors_explained
 from torchid.logs.force_plates import about_world_origin
@@ -36,7 +36,6 @@ from torchid.logs.log import (
     to_float64,
 )
 from torchid.logs.mapped_fields import map_arrays
-from torchid.logs.names import parse_names
 from torchid.logs.read import build_log, check_fields_given
 from torchid.logs.spill import LazyArray, Spill
 from torchid.logs.tables import is_text_table, read_table, table_blocks, table_size
