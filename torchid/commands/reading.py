@@ -38,18 +38,6 @@ from torchid.problem.unloaded_sensors import zero_in_air
 from torchid.robot import Robot, payload_parameters, with_payload
 from torchid.sensing import SensorSet
 
-
-def payload_of(scene: Scene, path: str | Path) -> Array | None:
-    """What the robot carried in a log, (12 L,), as `Samples.payload` has it; None for nothing."""
-    payloads = () if scene.config.logs is None else scene.config.logs.payloads_of(path)
-    return payload_parameters(scene.robot, payloads) if payloads else None
-
-
-def scene_of_log(scene: S, path: str | Path) -> S:
-    """The scene with the nominal robot as it was in a log, for whatever compares recordings with it."""
-    return replace(scene, robot=with_payload(scene.robot, payload_of(scene, path)))
-
-
 _WHOLE_GB = 4.0 * BLOCK_GB  # recorded arrays that are taken whole: no block is worth its neighbourhood
 
 
@@ -299,3 +287,14 @@ def _folder_beside(output: Path | None) -> Path:
     if output is None:
         return Path(gettempdir())
     return next((folder for folder in output.absolute().parents if folder.is_dir()), Path.cwd())
+
+
+def payload_of(scene: Scene, path: str | Path) -> Array | None:
+    """What the robot carried in a log, (12 L,), as `Samples.payload` has it; None for nothing."""
+    payloads = () if scene.config.logs is None else scene.config.logs.payloads_of(path)
+    return payload_parameters(scene.robot, payloads) if payloads else None
+
+
+def scene_of_log(scene: S, path: str | Path) -> S:
+    """The scene with the nominal robot as it was in a log, for whatever compares recordings with it."""
+    return replace(scene, robot=with_payload(scene.robot, payload_of(scene, path)))
