@@ -77,8 +77,8 @@ class SensorInformation:
     def marginal(self, unknown: Sequence[int]) -> SensorInformation:
         """Information about the other columns, where some are unknown."""
         size = np.diag(self.total)[list(unknown)]
-        total = marginal_information(self.total, unknown, size)
-        lost = self.map(lambda H: total - marginal_information(self.total - H, unknown, size))
+        total = _marginal_information(self.total, unknown, size)
+        lost = self.map(lambda H: total - _marginal_information(self.total - H, unknown, size))
         return replace(lost, total=total)
 
 
@@ -161,7 +161,7 @@ def prior_directions(builder: RowBuilder, prior: Array) -> Array:
     return np.asarray(scipy.linalg.block_diag(rigid, np.diag([extra.size for extra in builder.extras])))
 
 
-def marginal_information(H: Array, unknown: Sequence[int], size: Array) -> Array:
+def _marginal_information(H: Array, unknown: Sequence[int], size: Array) -> Array:
     """Information about the other columns where some are unknown: the Schur complement, as `eliminate_columns` on rows.
 
     Args:
