@@ -21,9 +21,6 @@ from torchid.problem.unloaded_sensors import unloaded_offset_equations
 from torchid.rounding import KINEMATIC_TOLERANCE, RANK_TOLERANCE
 from torchid.sensing import SensorNoise
 
-DEPENDENT = 1e-9
-"""A direction that changes the whitened rows by less than this share of its size does so by rounding."""
-
 SAMPLES = 2000
 """Approximate number of samples whose rows represent those of all."""
 
