@@ -206,7 +206,7 @@ def rank_and_gap(values: Array, tolerance: float = RANK_TOLERANCE) -> RankGap:
     Values below rounding count as `eps` times the largest one in the gap, which is 4.5e15 at most.
 
     Args:
-        values: singular values, descending.
+        values: singular values (P,), descending.
         tolerance: a value below this share of the largest counts as zero.
 
     Warns:
