@@ -19,13 +19,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from legged.repetitions import SITUATIONS, Repetitions, Situation, summarize
-from legged.robots import ROBOTS
+from legged.robots import ROBOTS, require_available
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
 from torchid.boundary import run_guarded
-from torchid.errors import InputError, UnknownNameError
+from torchid.errors import UnknownNameError
 
 Result = dict[str, float | str]
 
@@ -80,10 +80,7 @@ def table(results: Sequence[Result]) -> Table:
 
 def run(options: argparse.Namespace) -> None:
     """Repeat, count, print."""
-    for name in options.robots:
-        if not ROBOTS[name].available:
-            found = f"{name}, whose URDF is not there ({ROBOTS[name].urdf})"
-            raise InputError("arguments", "--robots", found, "the package example-robot-data installed")
+    require_available(options.robots)
     known = {situation.name: situation for situation in SITUATIONS}
     for name in options.situations:
         if name not in known:

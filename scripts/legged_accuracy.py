@@ -23,12 +23,11 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from legged.accuracy import GROUPS, SENSORS, SIGNALS, Outcome, Simulated, cases, examine
-from legged.robots import ROBOTS
+from legged.robots import ROBOTS, require_available
 from rich.console import Console
 from rich.table import Table
 
 from torchid.boundary import run_guarded
-from torchid.errors import InputError
 
 
 def table(outcomes: Sequence[Outcome]) -> Table:
@@ -69,10 +68,7 @@ def table(outcomes: Sequence[Outcome]) -> Table:
 def run(options: argparse.Namespace) -> None:
     """Simulate, identify, print."""
     seconds = 8.0 if options.quick else options.seconds
-    for name in options.robots:
-        if not ROBOTS[name].available:
-            found = f"{name}, whose URDF is not there ({ROBOTS[name].urdf})"
-            raise InputError("arguments", "--robots", found, "the package example-robot-data installed")
+    require_available(options.robots)
     outcomes = []
     with tempfile.TemporaryDirectory() as folder:
         there: dict[tuple[str, bool], Simulated] = {}

@@ -19,9 +19,6 @@ COULOMB, VISCOUS = 10, 11
 INERTIA_AXES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """Row and column of each of the six inertia numbers in the inertia matrix."""
 
-PINOCCHIO_ORDER = (0, 1, 2, 3, 4, 5, 7, 6, 8, 9)
-"""`phi[list(PINOCCHIO_ORDER)]` are the ten inertial numbers in Pinocchio's order (Ixx, Ixy, Iyy, Ixz, Iyz, Izz)."""
-
 WRENCH_COMPONENTS = ("fx", "fy", "fz", "mx", "my", "mz")
 """Order of the components of a wrench: force [N], then moment [N m]."""
 

@@ -16,7 +16,7 @@ import yaml
 from legged.errors import ParameterErrors, parameter_errors
 from legged.gait import Reference
 from legged.recording import Noise, record
-from legged.robots import ROBOTS, Legged, TrueRobot, can_roll
+from legged.robots import ROBOTS, Legged, TrueRobot
 from legged.simulate import Exact, simulated
 from torchid.commands.identify import identify
 from torchid.commands.results import Identification
@@ -136,7 +136,7 @@ def experiment(case: Case, one: Simulated, contacts: list[dict[str, object]]) ->
 def contact_entries(case: Case, legged: Legged) -> list[dict[str, object]]:
     """`contacts` of the experiment file."""
     entries: list[dict[str, object]] = [{"frame": foot, "type": legged.kind} for foot in legged.feet]
-    if legged.kind == "point" and can_roll():
+    if legged.kind == "point":
         entries = [entry | {"radius": legged.radius if case.feet.assumed_rolling else 0.0} for entry in entries]
     return entries
 
@@ -175,7 +175,7 @@ def cases(robots: Sequence[str], signals: Sequence[str], sensors: Sequence[str])
     for robot in robots:
         feet: tuple[Feet, ...] = (FLAT,)
         if ROBOTS[robot].kind == "point":
-            feet = (POINT, BALL_AS_POINT, *((BALL,) if can_roll() else ()))
+            feet = (POINT, BALL_AS_POINT, BALL)
         for one in feet:
             for signal in signals:
                 yield from (Case(robot, one, signal, chosen) for chosen in sensors)

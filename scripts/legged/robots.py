@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import sysconfig
 import warnings
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from lxml import etree
 from scipy.spatial.transform import Rotation
 
 import torchid
-from torchid.errors import TorchidWarning
+from torchid.errors import InputError, TorchidWarning
 from torchid.parameters import FRICTION, INERTIAL, Array
 from torchid.robot import Robot, load_robot
 from torchid.sensing import Contact
@@ -84,21 +84,14 @@ class Legged:
         return len(self.feet) - len(lifted) >= (1 if self.kind == "flat" else 3)
 
     def contacts(self, rolling: bool = True) -> tuple[Contact, ...]:
-        """Contacts as torchid has them; `rolling`: with the spheres' radius, if contacts can have one."""
-        options: dict[str, Any] = {}
-        if self.kind == "point" and "radius" in {one.name for one in fields(Contact)}:
-            options["radius"] = self.radius if rolling else 0.0
-        return tuple(Contact(foot, self.kind, **options) for foot in self.feet)
+        """Contacts as torchid has them; `rolling`: with the spheres' radius, if they are points."""
+        radius = self.radius if rolling and self.kind == "point" else 0.0
+        return tuple(Contact(foot, self.kind, radius=radius) for foot in self.feet)
 
 
 def sphere_radius(legged: Legged) -> float:
     """Of the spheres that touch the ground in MuJoCo [m], which has no points."""
     return max(legged.radius, 1e-4)
-
-
-def can_roll() -> bool:
-    """Whether contacts can have a radius."""
-    return "radius" in {one.name for one in fields(Contact)}
 
 
 def _bent(pairs: Mapping[str, float], *limbs: str) -> dict[str, float]:
@@ -150,6 +143,18 @@ QUADRUPED = Legged(
     lifted=_TROT,
 )
 ROBOTS = {one.name: one for one in (GO2, G1, QUADRUPED)}
+
+
+def require_available(names: Iterable[str]) -> None:
+    """Make sure that the URDFs of some of `ROBOTS` are installed.
+
+    Raises:
+        InputError: one is not.
+    """
+    for name in names:
+        if not ROBOTS[name].available:
+            found = f"{name}, whose URDF is not there ({ROBOTS[name].urdf})"
+            raise InputError("arguments", "--robots", found, "the package example-robot-data installed")
 
 
 @cache

@@ -58,6 +58,7 @@ def series(noise: Array | None) -> ForceSeries:
 
 def test_the_figure_shows_errors_in_a_band_of_two_standard_deviations() -> None:
     figure = force_figure(series(np.full((50, 2), 0.2)), ["knee", "hip"], 0)
+    assert len(figure.axes) == 4
     for errors in figure.axes[1::2]:
         (band,) = errors.collections
         heights = band.get_paths()[0].vertices[:, 1]

@@ -158,6 +158,7 @@ def test_a_log_that_cannot_be_read_fails_as_without_a_cache(read: dict[str, list
 
 
 def test_processes_without_a_common_folder_read_all_logs(read: dict[str, list[Any]]) -> None:
+    assert len(read["apart"]) == 2
     for one in read["apart"]:
         assert not one["cache"]
         assert len(one["opened"]) == 3
@@ -194,6 +195,7 @@ def test_an_error_in_the_blocks_of_one_process_is_said_by_all_as_by_one(read: di
 
 def test_a_large_log_without_room_in_the_cache_is_read_by_all(read: dict[str, list[Any]]) -> None:
     expected = read["blocks, without"][0]
+    assert len(read["no room"]) == 2
     for one in read["no room"]:
         assert (one["logs"], one["said"]) == (expected["logs"], expected["said"])
         assert set(one["blocks"]) == set(expected["blocks"])

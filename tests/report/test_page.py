@@ -67,7 +67,10 @@ def test_it_is_one_file_of_less_than_5_megabytes_that_asks_nobody_for_more(page:
 
 
 def test_every_axis_has_its_unit(page: str) -> None:
-    for name, figure in figures_of(page).items():
+    figures = figures_of(page)
+    assert "ellipsoids" in figures
+    assert len(figures) > 5
+    for name, figure in figures.items():
         layout = figure["layout"]
         axes = [layout["scene"][f"{k}axis"] for k in "xyz"] if name == "ellipsoids" else [layout["xaxis"]]
         titles = [axis["title"]["text"] for axis in axes] + [note["text"] for note in layout["annotations"]]

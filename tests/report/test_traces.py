@@ -37,6 +37,7 @@ def unpacked(values: dict[str, str]) -> Array:
 @pytest.mark.parametrize("samples", [1500, 50_001])
 def test_a_peak_of_one_sample_is_seen_however_long_the_log_is(samples: int) -> None:
     document = traces_document(forces(samples, spike=1234), 0, ("hip", "knee"))
+    assert document["recorded"]
     for panel in document["recorded"]:
         values = unpacked(panel["lines"]["measured"])
         assert len(values) == len(unpacked(document["time"])) <= 2000
@@ -66,6 +67,7 @@ def test_contact_states_cover_the_log() -> None:
 def test_white_noise_lies_at_the_noise_floor_at_all_frequencies(step: int) -> None:
     """Of std s up to B hertz the amplitude density is s / sqrt(B); 20 averaged segments leave it 16 % of scatter."""
     document = traces_document(forces(10_000, step=step), 0, ("hip", "knee"))
+    assert document["projected"]
     for panel in document["projected"]:
         spectrum = panel["spectrum"]
         floor = STD / np.sqrt(0.5 * RATE / step)

@@ -126,8 +126,8 @@ def test_parameters_are_counted_that_are_known_alone_in_sums_and_not_at_all(lame
     assert hidden > 0
     (said,) = (line for line in analysis_lines(lame, 10_000) if line.startswith("determined "))
     assert f"at best {alone} of {base.free.sum()} parameters alone" in said
-    assert f"{base.free.sum() - alone - hidden} only in {base.rank - alone} sums, {hidden} not at all" in said
-    assert f"{hidden} not at all (of {unseen[0].split(':')[0]}" in said
+    assert f"{base.free.sum() - alone - hidden} only in {base.rank - alone} sums, {hidden} unobservable" in said
+    assert f"{hidden} unobservable (of {unseen[0].split(':')[0]}" in said
 
 
 def test_logs_that_determine_less_than_the_sensors_could_are_named(lame: Analysis) -> None:

@@ -165,7 +165,7 @@ def analyze(config: AnalyzeConfig) -> Analysis:
     """
     if config.logs is not None:
         config.logs.require_samples("analyze")
-    output = None if config.output is None else analysis_folder(config.output)
+    output = None if config.output is None else _analysis_folder(config.output)
     if output is not None:
         ranks.from_first(partial(check_free, output, config.overwrite, ANALYSIS, inputs_of(config)), "output")
     scene = set_up_scene(config)
@@ -189,11 +189,11 @@ def analyze(config: AnalyzeConfig) -> Analysis:
         analysis = Analysis(scene, tuple(results), compared, output)
         if output is not None:
             bars.add_task("writing", total=None)
-            ranks.from_first(partial(write_analysis, analysis, output, config.overwrite), "analysis folder")
+            ranks.from_first(partial(_write_analysis, analysis, output, config.overwrite), "analysis folder")
     return analysis
 
 
-def analysis_folder(output: Path) -> Path:
+def _analysis_folder(output: Path) -> Path:
     """Where an analysis goes: beside the run of the same experiment file.
 
     Raises:
@@ -274,7 +274,7 @@ def _analyze_scenario(
     proposed, at_best = None, problem.stack.problem(sensor_set(robot, contacts, plan.chosen))
     if request.proposed is not None:
         proposed = plan.observability
-        if not is_planned(plan, request.proposed, contacts):
+        if not _is_planned(plan, request.proposed, contacts):
             proposed = tuple(problem.assess(request.proposed, contacts))
         at_best = problem.stack.problem(request.proposed, contacts=contacts)
     base = base_parameters(replace(at_best, free=free))
@@ -291,10 +291,10 @@ def _sets_to_compare(
     for scenario in results:
         plan = scenario.plan
         planned = sensor_set(scene.robot, scene.contacts, plan.chosen, scene.noise)
-        known = any(is_planned(plan, other, scene.contacts) for other in sets.values())
+        known = any(_is_planned(plan, other, scene.contacts) for other in sets.values())
         if known or not recorded & set(scenario.states):
             continue
-        if scalar := planned_along_normals(plan, scene.contacts):
+        if scalar := _planned_along_normals(plan, scene.contacts):
             needed = f"sensors.contact_wrenches: {{{scalar[0]}: [{NORMAL_FORCE}]}}"
             bound = f"the file's sensors do not read {', '.join(scalar)} along the normal ({needed})"
             warn(f"{bound}; no accuracy of the sensors planned for {scenario.name}")
@@ -303,7 +303,7 @@ def _sets_to_compare(
     return sets
 
 
-def planned_along_normals(plan: SensorPlan, contacts: Sequence[Contact]) -> tuple[str, ...]:
+def _planned_along_normals(plan: SensorPlan, contacts: Sequence[Contact]) -> tuple[str, ...]:
     """Frames of contacts at which a plan has a scalar sensor alone, while others of the same frames read wrenches."""
     wrench = sensor_set(plan.problem.robot, contacts, plan.chosen).wrench
     return tuple(
@@ -313,15 +313,15 @@ def planned_along_normals(plan: SensorPlan, contacts: Sequence[Contact]) -> tupl
     )
 
 
-def is_planned(plan: SensorPlan, sensors: SensorSet, contacts: Sequence[Contact]) -> bool:
+def _is_planned(plan: SensorPlan, sensors: SensorSet, contacts: Sequence[Contact]) -> bool:
     """Whether a set, read along the axes of these contacts, is that of a plan; what none can exert does not count."""
     planned = sensor_set(plan.problem.robot, contacts, plan.chosen)
     wrench, other = (measured_components(contacts, one) for one in (planned, sensors))
     same = np.array_equal(planned.torque, sensors.torque) and np.array_equal(wrench, other)
-    return same and not planned_along_normals(plan, contacts)
+    return same and not _planned_along_normals(plan, contacts)
 
 
-def write_analysis(analysis: Analysis, output: Path, overwrite: bool = False) -> None:
+def _write_analysis(analysis: Analysis, output: Path, overwrite: bool = False) -> None:
     """Write the folder; one that stands there may be replaced with `overwrite`."""
     scene, names = analysis.scene, analysis.scene.robot.body_names
     texts, figures = [], {}

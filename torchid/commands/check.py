@@ -107,7 +107,7 @@ def check_experiment(
     with progress_bars() as bars:
         for file in bars.track(files, description="checking"):
             settings, own = config.preprocessing, scene_of_log(scene, file)
-            log, _ = settle_contacts(read_log_to_check(file, config.logs, settings), own)
+            log, _ = settle_contacts(_read_log_to_check(file, config.logs, settings), own)
             found = check(log, own.robot, scene.contacts, settings.filter_hz, settings.derived)
             checked.append(replace(found, rolling=scene.rolling))
     return checked
@@ -151,7 +151,7 @@ def check_log(
     return replace(check(log, robot, contacts), rolling=rolling)
 
 
-def read_log_to_check(path: Path, logs: LogsConfig, settings: PreprocessingConfig) -> Log:
+def _read_log_to_check(path: Path, logs: LogsConfig, settings: PreprocessingConfig) -> Log:
     """One of the logs of an experiment as it was read.
 
     Raises:
@@ -167,7 +167,7 @@ def stretches_to_check(path: Path, logs: LogsConfig, settings: PreprocessingConf
     Each has a name that says which.
 
     Raises:
-        LogError: as `read_log_to_check`.
+        LogError: as `_read_log_to_check`.
     """
     _require_memory(path, settings)
     yield from recorded_stretches(path, logs, settings)

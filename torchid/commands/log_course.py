@@ -113,7 +113,7 @@ class Course:
 
 
 def in_the_air(contacts: Log) -> BoolArray | None:
-    """Which contacts are in the air for sure in which samples of the log, None if none ever is."""
+    """Which contacts are in the air for sure in which samples of the log, (N, C), None if none ever is."""
     if contacts.contact_active is None:
         return None
     unloaded = find_unloaded(contacts.time, contacts.contact_active)
@@ -132,5 +132,5 @@ def require_kept(kept: BoolArray, source: str | Path, checked_for_slip: bool) ->
 
 
 def row_numbers(kept: BoolArray | None, start: int, count: int) -> tuple[int, int]:
-    """Which of the samples that are kept comes first from a number on, and how many there are of so many."""
+    """Which of the samples that are kept (N,) comes first from a number on, and how many there are of so many."""
     return (start, count) if kept is None else (int(kept[:start].sum()), int(np.count_nonzero(kept)))

@@ -148,7 +148,7 @@ def replay(
         with about_file(folder / "config.yaml"):
             _require_simple(fitted)
         robot = fitted.experiment.robot
-        gains = np.stack([joint_gains(robot, *x) for x in (("--kp", kp), ("--kd", kd))])
+        gains = np.stack([_joint_gains(robot, *x) for x in (("--kp", kp), ("--kd", kd))])
         reading = bars.add_task("reading the log", total=1)
         (samples,) = LogReader(fitted.experiment, folder).read([Path(log)], None, lambda _: bars.advance(reading))
         feet = _feet(fitted.experiment.contacts, robot.path) if not robot.fixed_base else ()
@@ -203,7 +203,7 @@ def parse_gains(option: str, entries: Sequence[str]) -> dict[str, float]:
     return gains
 
 
-def joint_gains(robot: Robot, option: str, stated: float | Mapping[str, float]) -> Array:
+def _joint_gains(robot: Robot, option: str, stated: float | Mapping[str, float]) -> Array:
     """A gain of each joint, (n,), from one of all or by name or pattern; later patterns count, others have 0.
 
     Raises:

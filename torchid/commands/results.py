@@ -143,7 +143,7 @@ class Identification:
         """What a run folder has in `parameters.json`, `metrics.json` and `config.yaml`."""
         parameters = parameters_document(self.experiment.robot, self.estimate, self.by_state, self.extras)
         config = yaml.safe_load(dump_config(self.experiment.config))
-        return {"parameters": parameters, "metrics": metrics_document(self), "config": config}
+        return {"parameters": parameters, "metrics": _metrics_document(self), "config": config}
 
     def to_urdf(self, path: str | Path, overwrite: bool = False) -> Path:
         """Write the URDF with the identified parameters; meshes keep their names.
@@ -227,7 +227,7 @@ def write_run(run: Identification, output: Path, overwrite: bool = False, traini
     with during("writing", output), new_folder(output, overwrite) as folder:
         (folder / "config.yaml").write_text(dump_config(config))
         write_json(folder / "parameters.json", parameters_document(robot, run.estimate, run.by_state, run.extras))
-        write_json(folder / "metrics.json", metrics_document(run))
+        write_json(folder / "metrics.json", _metrics_document(run))
         write_posterior(folder / POSTERIOR, run.posterior)
         (folder / identified_name(robot)).write_bytes(identified_robot(robot, run.phi, run.fitted_joints))
         files = save_figures(figures, folder, config.figures.format)
@@ -249,7 +249,7 @@ def draw_forces(series: ForceSeries, robot: Robot) -> Figure:
     return force_figure(series, robot.dof_names, robot.base_rows, robot.sliding, robot.format)
 
 
-def metrics_document(run: Identification) -> dict[str, object]:
+def _metrics_document(run: Identification) -> dict[str, object]:
     """What `metrics.json` holds: errors of the identified and of the nominal parameters."""
     estimate, robot = run.estimate, run.experiment.robot
     document: dict[str, object] = {}

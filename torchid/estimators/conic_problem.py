@@ -115,7 +115,7 @@ class ConicProblem:
         return np.concatenate([np.linalg.eigvalsh(self.blocks(x)).ravel(), self.G @ x - self.h])
 
     def active(self, x: Array, tolerance: float) -> tuple[str, ...]:
-        """Names of the conditions from whose border x is no further than a tolerance; an entropic prior is none."""
+        """Names of conditions from whose border x (n,) is no further than a tolerance; an entropic prior is none."""
         blocks, rows = np.split(self.slack(x), [4 * len(self.F0)])
         slack = np.append(np.where(self.weights > 0.0, np.inf, blocks.reshape(-1, 4).min(axis=1, initial=np.inf)), rows)
         return tuple(dict.fromkeys(name for name, one in zip(self.names, slack, strict=True) if one <= tolerance))
@@ -125,7 +125,7 @@ class ConicProblem:
         return 2.0 * self.root.T @ (self.root @ x - self.target) + self.linear
 
     def objective(self, x: Array) -> float:
-        """Objective at x; inf where a block with a weight is not positive definite."""
+        """Objective at x (n,); inf where a block with a weight is not positive definite."""
         misfit = self.root @ x - self.target
         value = misfit @ misfit + self.linear @ x + self.constant
         weighted = self.weights > 0.0
@@ -194,7 +194,10 @@ def reduce_equalities(rows: list[LinearCondition], count: int) -> tuple[Array, A
 
     Args:
         rows: the equalities.
-        count: of entries in x.
+        count: of entries in x, n.
+
+    Returns:
+        E, (rank, n), with orthonormal rows, and e, (rank,).
 
     Raises:
         InputError: they contradict each other, or parameters that are not free.

@@ -81,7 +81,7 @@ class FreeParameters(LearnableParameters):
         super().__init__(problem, int(problem.free.sum()))
 
     def constrained(self, u: Tensor) -> Tensor:
-        """Nominal parameters plus `u` in units of the scale."""
+        """Nominal parameters (P,) plus `u`, of the free ones (F,), in units of the scale."""
         return self.nominal.masked_scatter(self.free, self.nominal[self.free] + self.scale[self.free] * u)
 
 

@@ -39,7 +39,7 @@ def resolve_contacts(settings: Sequence[ContactConfig], robot: Robot) -> tuple[t
         source = f"contacts[{index}].radius"
         if given.radius == "auto" and contact.kind != "flat":
             shapes = shapes or CollisionShapes(robot)
-            shape = rolling_shape(shapes, contact)
+            shape = _rolling_shape(shapes, contact)
             if shape is not None:
                 contact = replace(contact, radius=shape.radius)
                 source = f"collision {shape.kind}" + (f" of {shape.link}" if shape.link != contact.frame else "")
@@ -98,7 +98,7 @@ def _require_floor(contacts: tuple[Contact, ...]) -> None:
             raise ConfigError.at_field(f"contacts[{index}].normal", found, accepted)
 
 
-def rolling_shape(shapes: CollisionShapes, contact: Contact) -> RollingShape | None:
+def _rolling_shape(shapes: CollisionShapes, contact: Contact) -> RollingShape | None:
     """The collision sphere of a point, or cylinder of a line, on which the URDF lets a contact roll; None without."""
     if contact.kind == "flat":
         return None

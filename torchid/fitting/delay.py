@@ -40,11 +40,11 @@ class DelayChoice:
     """A delay, and what fits with it and with none leave.
 
     Attributes:
-        delay: [s]; 0 where the best cannot be told from none, or from other parameters.
+        delay: [s]; 0 where the best does not differ significantly from none, or is confounded with other parameters.
         found: the best [s], which it is otherwise.
         standard_error: of it [s], and interval of 95 % [s]; None where the data do not determine it.
         inflation: of its standard error by not knowing all other parameters, None likewise.
-        confounded_with: names of other parameters that it cannot be told from, empty if it can be.
+        confounded_with: names of other parameters that it is confounded with, empty if with none.
         residual, undelayed_residual: standard deviation of whitened residuals with the best and with none [1].
     """
 
@@ -66,7 +66,7 @@ class DelayChoice:
             return f"none: the data do not determine it ({left})"
         best = f"{best} ± {1e3 * self.standard_error:.2g} ms"
         if not self.delay:
-            return f"none: {best} cannot be told from none ({left})"
+            return f"none: {best} does not differ significantly from none ({left})"
         low, high = (1e3 * x for x in self.interval)
         return f"{best} of joint torques (95 %: {low:.3g} to {high:.3g} ms), chosen by the residual: {left}"
 

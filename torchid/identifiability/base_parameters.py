@@ -122,17 +122,17 @@ def base_parameters(
         problem: with the rows.
         tolerance: a parameter whose column is below this share of the largest, in units of `problem.scale`, is not
             observable; a singular value of the scaled columns below this share of the largest counts as zero.
-        preference: (P,), > 0, for regrouping each parameter into others; by default `regrouping_preference`.
+        preference: (P,), > 0, for regrouping each parameter into others; by default `_regrouping_preference`.
 
     Warns:
         NumericalWarning: the rank is a matter of the tolerance.
     """
     free, count = np.flatnonzero(problem.free), len(problem.scale)
-    columns, units = normalized_columns(problem, tolerance)
+    columns, units = _normalized_columns(problem, tolerance)
     _, values, Vh = scipy.linalg.svd(columns, lapack_driver="gesvd")  # gesdd can fail on dozens of null directions
     rank_gap = rank_and_gap(values, tolerance)
     null_space = Vh[rank_gap.rank :].T
-    weight = (regrouping_preference(count) if preference is None else preference)[free]
+    weight = (_regrouping_preference(count) if preference is None else preference)[free]
     _, order = scipy.linalg.qr((null_space * weight[:, None]).T, mode="r", pivoting=True)
     null_dimension = len(free) - rank_gap.rank
     dropped, kept = order[:null_dimension], np.sort(order[null_dimension:])
@@ -145,7 +145,7 @@ def base_parameters(
     return BaseParameters(free[kept], combination, problem.free, problem.scale, values, rank_gap)
 
 
-def regrouping_preference(count: int) -> Array:
+def _regrouping_preference(count: int) -> Array:
     """Preference for regrouping each of `count` parameters into others, (count,), from 1 down to 0.01.
 
     As usual (Gautier, Khalil): bodies are regrouped into their parents; of a body the mass first, then first moments,
@@ -191,12 +191,12 @@ def structural_rank(problem: LinearProblem, tolerance: float = RANK_TOLERANCE) -
 
     Args:
         problem: with the rows.
-        tolerance: as in `normalized_columns` and `rank_and_gap`.
+        tolerance: as in `_normalized_columns` and `rank_and_gap`.
 
     Warns:
         NumericalWarning: the rank is a matter of the tolerance.
     """
-    columns, _ = normalized_columns(problem, tolerance)
+    columns, _ = _normalized_columns(problem, tolerance)
     return rank_and_gap(scipy.linalg.svd(columns, compute_uv=False, lapack_driver="gesvd"), tolerance)
 
 
@@ -206,7 +206,7 @@ def rank_and_gap(values: Array, tolerance: float = RANK_TOLERANCE) -> RankGap:
     Values below rounding count as `eps` times the largest one in the gap, which is 4.5e15 at most.
 
     Args:
-        values: singular values, descending.
+        values: singular values (P,), descending.
         tolerance: a value below this share of the largest counts as zero.
 
     Warns:
@@ -223,7 +223,7 @@ def rank_and_gap(values: Array, tolerance: float = RANK_TOLERANCE) -> RankGap:
     return RankGap(rank, gap)
 
 
-def normalized_columns(problem: LinearProblem, tolerance: float) -> tuple[Array, Array]:
+def _normalized_columns(problem: LinearProblem, tolerance: float) -> tuple[Array, Array]:
     """Free columns scaled to norm 1, (R, P_free), and their parameters' units, (P_free,).
 
     A column below the share `tolerance` of the largest, in units of `problem.scale`, is not observable, and set to 0.

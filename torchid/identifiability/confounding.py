@@ -292,7 +292,7 @@ class ParameterCovariance:
         )
 
     def variance_shares(self, sensitivity: Array, noise: float) -> Array:
-        """Part of the variance along sensitivities (P',) due to each parameter, as a share of the largest such part.
+        """Part (P',) of the variance along sensitivities (P',) due to each parameter, as a share of the largest.
 
         The prior bounds each deviation to about its scale: else the least certain parameter would dominate.
         """
@@ -316,7 +316,7 @@ class ParameterCovariance:
         return np.asarray(directions @ (directions.T @ sensitivity / (1.0 + (self.values / noise) ** 2)))
 
     def without_stated(self, deviation: float, sensitivity: Array) -> float:
-        """A standard deviation along sensitivities (P') less the part of what is known of the parameters."""
+        """A standard deviation along sensitivities (P',) less the part of what is known of the parameters."""
         if not self.by_stated.size:
             return deviation
         return float(np.sqrt(max(deviation**2 - float(np.square(sensitivity @ self.by_stated).sum()), 0.0)))

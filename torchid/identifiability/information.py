@@ -21,9 +21,6 @@ from torchid.problem.unloaded_sensors import unloaded_offset_equations
 from torchid.rounding import KINEMATIC_TOLERANCE, RANK_TOLERANCE
 from torchid.sensing import SensorNoise
 
-DEPENDENT = 1e-9
-"""A direction that changes the whitened rows by less than this share of its size does so by rounding."""
-
 SAMPLES = 2000
 """Approximate number of samples whose rows represent those of all."""
 
@@ -77,8 +74,8 @@ class SensorInformation:
     def marginal(self, unknown: Sequence[int]) -> SensorInformation:
         """Information about the other columns, where some are unknown."""
         size = np.diag(self.total)[list(unknown)]
-        total = marginal_information(self.total, unknown, size)
-        lost = self.map(lambda H: total - marginal_information(self.total - H, unknown, size))
+        total = _marginal_information(self.total, unknown, size)
+        lost = self.map(lambda H: total - _marginal_information(self.total - H, unknown, size))
         return replace(lost, total=total)
 
 
@@ -161,7 +158,7 @@ def prior_directions(builder: RowBuilder, prior: Array) -> Array:
     return np.asarray(scipy.linalg.block_diag(rigid, np.diag([extra.size for extra in builder.extras])))
 
 
-def marginal_information(H: Array, unknown: Sequence[int], size: Array) -> Array:
+def _marginal_information(H: Array, unknown: Sequence[int], size: Array) -> Array:
     """Information about the other columns where some are unknown: the Schur complement, as `eliminate_columns` on rows.
 
     Args:

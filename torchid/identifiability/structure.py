@@ -120,7 +120,7 @@ def standing_samples(
 def standing_states(
     robot: Robot, contacts: Sequence[Contact], state: ContactState, count: int, rng: np.random.Generator
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Coordinates q, v, a, as `Regressor` takes them, with `J_C v = 0` and `J_C a + dJ_C/dt v = 0`.
+    """Coordinates q (B, n + 7), v, a (B, nv), as `Regressor` takes them: `J_C v = 0`, `J_C a + dJ_C/dt v = 0`.
 
     J_C has the rows of the components that active contacts can exert: a point contact fixes its frame's origin, a flat
     one the whole frame, a line contact all but the rotation about itself; with a radius, they roll. Twice as many

@@ -270,21 +270,21 @@ def _check_given(field: str, entry: ColumnEntry) -> None:
     given = [name for name, value in ways.items() if value]
     own = [name for name in ways if hasattr(entry, name)]
     if isinstance(entry, FlagEntry) and entry.above is not None:
-        _check_unscaled(field, entry, [x for x in given if x == "always"], "above")
+        _check_unscaled(field, [x for x in given if x == "always"], "above")
         given = given or ["above"]
     if len(given) != 1:
         found = f"{' and '.join(given)} together" if given else "nothing that says where it is"
         raise ConfigError.at_field(f"{KEY}.{field}", found, f"one of {', '.join(own)}")
     if given[0] not in ("column", "columns"):
         unsaid = ("scale", "order") if given[0] == "step" else ("unit", "scale", "order")
-        _check_unscaled(field, entry, [x for x in unsaid if getattr(entry, x)], given[0])
+        _check_unscaled(field, [x for x in unsaid if getattr(entry, x)], given[0])
     if isinstance(entry, WrenchEntry) and entry.moment is not None and entry.force is None:
         raise ConfigError.at_field(f"{KEY}.{field}", "moment without force", "force, with or without moment")
     if isinstance(entry, TorqueEntry) and entry.pd is not None:
         _check_law(entry.pd)
 
 
-def _check_unscaled(field: str, entry: ColumnEntry, given: list[str], beside: str) -> None:
+def _check_unscaled(field: str, given: list[str], beside: str) -> None:
     if given:
         found = f"{given[0]} beside {beside}, which it says nothing about"
         raise ConfigError.at_field(f"{KEY}.{field}", found, f"{beside} without {given[0]}")

@@ -93,7 +93,7 @@ def parse_header(texts: Sequence[str], named: Mapping[str, tuple[str, ...]] | No
     unknown: dict[str, LogError] = {}
     for text in texts:
         try:
-            column = parse_column(text)
+            column = _parse_column(text)
         except LogError as error:
             unknown[text] = error
         else:
@@ -129,7 +129,7 @@ def check_header(texts: Sequence[str]) -> None:
 def is_column(text: str) -> bool:
     """Whether a column has a name of the log format."""
     try:
-        parse_column(text)
+        _parse_column(text)
     except LogError:
         return False
     return True
@@ -138,7 +138,7 @@ def is_column(text: str) -> bool:
 def _check_complete(field: str, expected: Sequence[str], given: Mapping[str, _Column]) -> None:
     missing = [text for text in expected if text not in given]
     if missing:
-        accepted = f"every column of {column_pattern(field)}; a cell may be empty where nothing was measured"
+        accepted = f"every column of {_column_pattern(field)}; a cell may be empty where nothing was measured"
         raise LogError.at_field(f"column '{missing[0]}'", f"missing, though there is '{next(iter(given))}'", accepted)
     extra = list(given.keys() - set(expected))
     if extra:
@@ -146,7 +146,7 @@ def _check_complete(field: str, expected: Sequence[str], given: Mapping[str, _Co
         raise LogError.at_field(f"column '{extra[0]}'", found, "the same names in all fields")
 
 
-def parse_column(text: str) -> _Column:
+def _parse_column(text: str) -> _Column:
     """The parts of a column's name: the field up to its first dot, a component after its last.
 
     Raises:
@@ -164,7 +164,7 @@ def parse_column(text: str) -> _Column:
         name, component = (rest, "") if of else ("", rest)
     column = _Column(field, name, component)
     if str(column) != text or bool(name) != bool(of) or (component not in components if components else component):
-        raise LogError.at_field(f"column '{text}'", "no such part of this field", column_pattern(field))
+        raise LogError.at_field(f"column '{text}'", "no such part of this field", _column_pattern(field))
     return column
 
 
@@ -188,7 +188,7 @@ def component_names(field: str) -> tuple[str, ...]:
     return ("x", "y", "z") if size == 3 else ()
 
 
-def column_pattern(field: str) -> str:
+def _column_pattern(field: str) -> str:
     """Pattern of a field's column names, such as `ft_wrench.<sensor>.{fx, fy, fz, mx, my, mz}`."""
     of, components = names_field(field), component_names(field)
     return str(_Column(field, f"<{KINDS[of]}>" if of else "", f"{{{', '.join(components)}}}" if components else ""))

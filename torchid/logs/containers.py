@@ -97,10 +97,16 @@ def log_files(path: Path) -> list[Path]:
 
 
 def _kind(path: Path, accepted: tuple[str, ...]) -> LogKind:
+    suffix = _suffix(path, accepted)
+    return LogKind.ARRAYS if suffix in ARRAYS else LogKind.TABLE if suffix in TABLES else LogKind.BAG
+
+
+def _suffix(path: Path, accepted: tuple[str, ...]) -> str:
+    """A file's extension in small letters, LogError unless it is one of these."""
     suffix = path.suffix.lower()
     if suffix not in accepted:
         raise LogError(path, "file", f"extension '{path.suffix}'", ", ".join(accepted))
-    return LogKind.ARRAYS if suffix in ARRAYS else LogKind.TABLE if suffix in TABLES else LogKind.BAG
+    return suffix
 
 
 # ------------------------------------------------------------------------------------------------- containers of arrays
@@ -137,13 +143,6 @@ def reader_errors_explained(field: str, accepted: str) -> Iterator[None]:
         raise LogError.at_field(field, f"cannot be read ({type(error).__name__}: {text})", accepted) from error
 
 
-def _suffix(path: Path) -> str:
-    suffix = path.suffix.lower()
-    if suffix not in ARRAYS:
-        raise LogError(path, "file", f"extension '{path.suffix}'", ", ".join(ARRAYS))
-    return suffix
-
-
 @contextlib.contextmanager
 def open_container(path: Path, whole: bool = True) -> Iterator[Container]:
     """Open a .npz, .h5 or .hdf5 file; LogError where it is missing, of another kind, damaged or too large.
@@ -152,7 +151,7 @@ def open_container(path: Path, whole: bool = True) -> Iterator[Container]:
         path: the file.
         whole: whether its arrays will be read whole, which limits their size to `MAX_ARRAYS`.
     """
-    suffix = _suffix(path)
+    suffix = _suffix(path, ARRAYS)
     if not path.is_file():
         found = "a folder" if path.is_dir() else "no such file"
         raise LogError(path, "file", found, f"an existing log ({', '.join(ARRAYS)})")
@@ -188,7 +187,7 @@ def atomic_output(path: Path) -> Iterator[Path]:
 
 def save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Write arrays to a .npz, .h5 or .hdf5 file, which appears complete or not at all."""
-    suffix = _suffix(path)
+    suffix = _suffix(path, ARRAYS)
     with atomic_output(path) as temporary:
         if suffix == ".npz":
             with temporary.open("xb") as stream:

@@ -16,15 +16,13 @@ from torchid.logs.log import (
     FLAGS,
     LARGEST,
     NORMALS,
-    SHAPES,
     BoolArray,
     FloatArray,
     Log,
-    check_shape,
-    check_time,
     describe_element,
     field_shape,
     is_quaternion,
+    parse_time,
     to_float64,
 )
 from torchid.logs.quaternion import make_sign_continuous
@@ -72,9 +70,7 @@ def fill_short_gaps(
     out, filled = dict(raw), dict[str, BoolArray]()
     if longest_s is None:
         return out, filled
-    check_shape("time", raw["time"], SHAPES["time"], {})
-    time = to_float64("time", raw["time"])
-    check_time(time)
+    time = parse_time(raw["time"])
     for name in sorted(_with_gaps(raw), key=lambda name: name != FLAGS):  # readings depend on flags
         missing = _missing(name, raw[name])
         usable = _touching(out, missing.shape) if name in CONTACT_READINGS else None

@@ -22,12 +22,11 @@ from torchid.logs.log import (
     NAME_FIELDS,
     NAN_ALLOWED,
     NORMALS,
-    SHAPES,
     FloatArray,
     check_finite,
     check_shape,
-    check_time,
     field_shape,
+    parse_time,
     to_float64,
 )
 from torchid.logs.tables import sample_table
@@ -90,9 +89,7 @@ def _stamped(raw: Fields, shift_s: float) -> Fields:
     """The fields of a file, those that have anything in them, with its stamps (K,) [s] in the clock of the log."""
     if "time" not in raw:
         raise LogError.at_field("time", "missing", "stamps in each of several files of a log")
-    check_shape("time", raw["time"], SHAPES["time"], {})
-    time = to_float64("time", raw["time"])
-    check_time(time)
+    time = parse_time(raw["time"])
     out = {name: x for name, x in raw.items() if name not in NAME_FIELDS}
     out |= {name: np.array(of, np.str_) for name in NAME_FIELDS if name in raw and (of := parse_names(name, raw[name]))}
     if "joint_names" not in out and 0 in out.get("joint_position", time).shape[1:]:

@@ -330,6 +330,14 @@ def check_time(time: FloatArray) -> None:
         raise LogError.at_field("time", found, "strictly increasing seconds")
 
 
+def parse_time(array: NDArray[Any]) -> FloatArray:
+    """The array of stamps (N,) [s] as float64, LogError unless it holds numbers that increase strictly."""
+    check_shape("time", array, SHAPES["time"], {})
+    time = to_float64("time", array)
+    check_time(time)
+    return time
+
+
 def normalize_quaternions(name: str, quat: FloatArray, allow_nan: bool = False) -> FloatArray:
     """The quaternions (N, 4) with a norm of exactly one, LogError at the first whose norm is not one.
 

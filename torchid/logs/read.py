@@ -43,13 +43,13 @@ from torchid.logs.log import (
     UnknownFieldError,
     check_finite,
     check_shape,
-    check_time,
     column_labels,
     field_shape,
     is_quaternion,
     normalize_normals,
     normalize_quaternions,
     parse_flags,
+    parse_time,
     to_float64,
 )
 from torchid.logs.mapped_fields import map_arrays
@@ -118,9 +118,7 @@ def build_log(raw: dict[str, NDArray[Any]], allow_gaps: bool = False) -> Log:
 
 def _cut(raw: dict[str, NDArray[Any]], range_: TimeRange) -> dict[str, NDArray[Any]]:
     """The fields of a file with the samples of a part alone; LogError where their numbers differ."""
-    check_shape("time", raw["time"], SHAPES["time"], {})
-    time = to_float64("time", raw["time"])
-    check_time(time)
+    time = parse_time(raw["time"])
     samples, out = range_.select(time), dict(raw)
     for name, array in raw.items():
         if field_shape(name)[:1] == ("N",):
@@ -198,10 +196,8 @@ def _check_combination(names: Collection[str], needs_flags: bool) -> None:
 def _check_values(raw: dict[str, NDArray[Any]], allow_gaps: bool) -> dict[str, Any]:
     """All fields of the file in their canonical types, with shapes and values checked."""
     names = {name: parse_names(name, raw[name]) if name in raw else () for name in NAME_FIELDS}
-    check_shape("time", raw["time"], SHAPES["time"], {})
-    sizes = {"N": len(raw["time"])} | {NAME_FIELDS[name]: len(labels) for name, labels in names.items()}
-    time = to_float64("time", raw["time"])
-    check_time(time)
+    time = parse_time(raw["time"])
+    sizes = {"N": len(time)} | {NAME_FIELDS[name]: len(labels) for name, labels in names.items()}
     fields: dict[str, Any] = {**names, "time": time}
     if "imu_frame" in raw:
         fields["imu_frame"] = parse_frame("imu_frame", raw["imu_frame"])

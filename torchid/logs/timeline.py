@@ -46,7 +46,10 @@ def spline_derivatives(
 def joint_spline_derivatives(
     time: FloatArray, fields: Sequence[FloatArray], at: FloatArray, orders: Sequence[int], block: int = SPLINE_BLOCK
 ) -> list[list[FloatArray]]:
-    """As `spline_derivatives` of each of some fields: one matrix is factorized for all."""
+    """As `spline_derivatives` of each of some fields (N, ...): one matrix is factorized for all.
+
+    Returns the derivatives (K, ...) of each field, by order, at the K stamps `at` [s].
+    """
     flat = [values.reshape(len(time), -1) for values in fields]
     out = [[np.zeros((len(at), values.shape[1])) for _ in orders] for values in flat]
     ends = np.cumsum([values.shape[1] for values in flat])
@@ -195,7 +198,7 @@ class Timeline:
         return self.evaluate_jointly([smoothed], orders)[0]
 
     def evaluate_jointly(self, smoothed: Sequence[FloatArray], orders: Sequence[int]) -> list[list[FloatArray]]:
-        """As `evaluate` of each of some fields."""
+        """As `evaluate` of each of some fields (M, ...) on the grid: their derivatives (K, ...) by order."""
         if self.output is None and orders[0] == 0:
             kept = [values[self.kept] for values in smoothed]
             if len(orders) == 1:

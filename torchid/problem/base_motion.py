@@ -52,7 +52,7 @@ class BaseMotion:
 
     @classmethod
     def from_coordinates(cls, q: Tensor, v: Tensor, a: Tensor, fixed_base: bool = False) -> BaseMotion:
-        """The base's motion in generalized coordinates as `Regressor` takes them; empty for a bolted base."""
+        """The base's motion in q (B, n + 7), v, a (B, n + 6), as `Regressor` takes them; empty for a bolted base."""
         if fixed_base:
             return cls()
         motion = motion_from_state(q, v, a, q.shape[1] - 7)

@@ -161,7 +161,7 @@ def contact_velocities(samples: Samples, robot: Robot, contacts: Sequence[Contac
         for contact, (body, _) in enumerate(builder.frames):
             units = builder.unit_wrenches(kinematics, contact, [0, 1, 2])
             joints = builder.columns.joints_above(body)
-            rows = [*range(tree.base_rows), *(tree.base_rows + joint for joint in joints)]
+            rows = builder.columns.rows_above(body)
             forces = generalized_forces(tree, kinematics.screw_axes, body, units, joints)  # (3, rows, B)
             along_frame = (forces * v.T[rows]).sum(1)
             velocity = (units[:3] * along_frame).sum(1)  # of a unit force the first three are the frame's axis

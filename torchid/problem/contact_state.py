@@ -72,6 +72,11 @@ class Columns:
         path = set(self.tree.path(body))
         return [j for j, row in enumerate(self.joint_rows) if any(moved in path for moved, _ in row.moved)]
 
+    def rows_above(self, body: int) -> list[int]:
+        """Rows of the dynamics that a wrench on a body enters: the base's and those of `joints_above`."""
+        base = self.tree.base_rows
+        return [*range(base), *(base + joint for joint in self.joints_above(body))]
+
     @cached_property
     def parameter_map(self) -> Array:
         """Matrix M, (count, 12 L), from parameters to these columns: `K = K_columns @ M`."""

@@ -57,7 +57,7 @@ def require_limb_sensors(log: Log, robot: Robot, required: SensorSet) -> None:
 
 
 def columns_in_order(x: np.ndarray, order: list[int]) -> np.ndarray:
-    """Some columns of an array, without a copy where they are all of them in order."""
+    """Columns (N, n) of an array (N, columns), without a copy where they are all of them in order."""
     return x if order == list(range(x.shape[1])) else x[:, order]
 
 
@@ -88,7 +88,7 @@ def distances_from_welds(log: Log, robot: Robot) -> FloatArray:
 
 
 def warn_of_moving_welds(log: Log, robot: Robot, distances: FloatArray) -> None:
-    """Warn, once, if joints of a log are not where they are welded, by `distances_from_welds`."""
+    """Warn, once, if joints of a log are not where they are welded, by distances (n,) [rad or m] from there."""
     far = []
     for name, distance in zip(log.joint_names, distances, strict=True):
         limit, unit = _TOLERANCE.get(robot.kind_of_welded.get(name, ""), _TOLERANCE_OF_OTHERS)

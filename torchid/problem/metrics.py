@@ -148,7 +148,7 @@ class Evaluation:
         self.builder = RowBuilder(robot, contacts, sensors, actuators).to(device)
 
     def metrics(self, logs: Sequence[Samples], phi: Array, progress: ProgressCallback | None = None) -> list[Metrics]:
-        """One `Metrics` per row of `phi`, as `RowBuilder.to_columns`, over all samples of the logs together.
+        """One `Metrics` per row of `phi` (M, 12 L), over all samples of the logs together.
 
         Without the whitened projected residual, which depends on sensors.
         """
@@ -158,7 +158,7 @@ class Evaluation:
     def force_sums(
         self, logs: Sequence[Samples], phi: Array, progress: ProgressCallback | None = None
     ) -> list[ForceSums]:
-        """Sums of squares of the measured forces, then of the errors of each row of `phi`."""
+        """Sums of squares of the measured forces, then of the errors of each row of `phi` (M, 12 L)."""
         builder, base = self.builder, self.robot.base_rows
         columns, joints = builder.to_columns(phi), slice(base, base + self.robot.n)
 

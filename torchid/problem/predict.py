@@ -119,7 +119,7 @@ def contact_forces(builder: RowBuilder, samples: Samples, state: ContactState, k
             at_base = builder.unit_wrenches(kinematics, contact, possible)
             wrench = (at_base * components).sum(1, keepdim=True)
             joints = builder.columns.joints_above(body)  # other rows must not become NaN by an unmeasured force
-            rows = [*range(tree.base_rows), *(tree.base_rows + joint for joint in joints)]
+            rows = builder.columns.rows_above(body)
             total[rows] += generalized_forces(tree, kinematics.screw_axes, body, wrench, joints)[0]
     return total
 
@@ -151,7 +151,7 @@ def reading_variance(
             possible = list(builder.contacts[contact].components)
             wrenches = builder.unit_wrenches(kinematics, contact, possible, noise.wrench_std)
             joints = builder.columns.joints_above(body)
-            rows = [*range(tree.base_rows), *(tree.base_rows + joint for joint in joints)]
+            rows = builder.columns.rows_above(body)
             recorded = 0.0 * builder.recorded_wrench(samples, contact, kinematics)[:, possible].sum(1)
             forces = total.new_zeros(len(possible), *total.shape)
             forces[:, rows] = generalized_forces(tree, kinematics.screw_axes, body, wrenches, joints)

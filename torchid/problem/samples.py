@@ -162,7 +162,7 @@ class Samples:
         return Motion(*joints, omega, alpha, force, self.direction)
 
     def coordinates(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Generalized coordinates q, v, a as `Regressor` takes them.
+        """Generalized coordinates q (N, n + 7), v and a (N, nv) as `Regressor` takes them.
 
         Base position and base linear velocity are 0: the dynamics do not depend on them, and logs need not have them.
         An orientation that was not measured is the identity: given the specific force, the dynamics do not depend on it

@@ -31,7 +31,7 @@ class SumsOfSquares:
         self.count += count
 
     def rms(self, rows: slice = slice(None)) -> Array:
-        """Rms row by row."""
+        """Rms row by row, (n_rows,) [N or N m]."""
         return root_mean(self.squares[rows], self.count[rows])
 
     def pooled(self, rows: slice) -> float:

@@ -78,19 +78,19 @@ def unloaded_offset_equations(builder: RowBuilder, samples: Samples) -> Iterator
         y = y[torch.isfinite(y)]
         if len(y) < LEAST_READINGS:
             continue
-        if is_masked(y):
+        if _is_masked(y):
             yield UnloadedOffsetEquation(number, None, gated=True)
         else:
             mean, deviation = _robust_mean(y, noise[axis], samples.oversampling)
             yield UnloadedOffsetEquation(number, scales.get(extra.contact), False, mean, deviation)
 
 
-def is_masked(y: Tensor) -> bool:
+def _is_masked(y: Tensor) -> bool:
     """Whether readings (M,) in the air are masked or clamped, not measured: many are exactly 0, and few of one sign."""
-    return are_masked(len(y), int((y > 0.0).sum()), int((y < 0.0).sum()))
+    return _are_masked(len(y), int((y > 0.0).sum()), int((y < 0.0).sum()))
 
 
-def are_masked(count: int, above: int, below: int) -> bool:
+def _are_masked(count: int, above: int, below: int) -> bool:
     """The same of so many readings, of which some are above and below 0."""
     zero = count - above - below
     return zero > _MASKED_SHARE * count and min(above, below) < _ONE_SIDED * count
@@ -166,7 +166,7 @@ def offsets_in_the_air(
             count, above, below = (int(x[column, component]) for x in (air.count, air.above, air.below))
             _require_readings(log, contact.frame, int(component), count)
             offsets[column, component] = air.total[column, component] / count
-            if are_masked(count, above, below) and contact.frame not in masked:
+            if _are_masked(count, above, below) and contact.frame not in masked:
                 masked.append(contact.frame)
     _say(log, offsets, masked)
     return offsets

@@ -112,7 +112,7 @@ def _frame(rotation: Tensor, position: Tensor, node: int, pose: Array) -> tuple[
     return (R[:, :, None] * T[None, :3, :3, None]).sum(1), origin
 
 
-def rotation_angle(R: Tensor) -> Tensor:
+def _rotation_angle(R: Tensor) -> Tensor:
     """Angles (B,) [rad], from 0 to pi, of rotations (3, 3, B)."""
     return torch.atan2(torch.linalg.vector_norm(_sines(R), dim=0), 0.5 * (R.diagonal().sum(-1) - 1.0))
 
@@ -122,7 +122,7 @@ def _rotation_vector(R: Tensor) -> Tensor:
     sine = _sines(R)
     size = torch.linalg.vector_norm(sine, dim=0)
     tiny = torch.finfo(R.dtype).tiny
-    return sine * torch.where(size > 0.0, rotation_angle(R) / size.clamp_min(tiny), 1.0)
+    return sine * torch.where(size > 0.0, _rotation_angle(R) / size.clamp_min(tiny), 1.0)
 
 
 def _sines(R: Tensor) -> Tensor:
@@ -149,7 +149,7 @@ class LoopClosures:
         poses, out = self._poses(joint_position), []
         for loop in self.geometries:
             offset, turned = loop.deviation(*poses)
-            angle = rotation_angle(turned) if loop.loop.kind == "weld" else torch.zeros_like(offset[0])
+            angle = _rotation_angle(turned) if loop.loop.kind == "weld" else torch.zeros_like(offset[0])
             out.append((torch.linalg.vector_norm(offset, dim=0), angle))
         return out
 

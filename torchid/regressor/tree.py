@@ -172,7 +172,7 @@ class KinematicTree(nn.Module):
         return self._indices[key]
 
     def coulomb_sign(self, velocity: Tensor) -> Tensor:
-        """Sign of velocities [rad/s or m/s] as Coulomb friction has it, smooth if a width is given."""
+        """Sign (...) of velocities (...) [rad/s or m/s] as Coulomb friction has it, smooth if a width is given."""
         return torch.sign(velocity) if self.sign_width is None else torch.tanh(velocity / self.sign_width)
 
     def frame(self, robot: Robot, link: str) -> tuple[int, Array]:

@@ -113,7 +113,7 @@ def base_parameters_document(base: BaseParameters, body_names: Sequence[str]) ->
         "parameters": int(base.free.sum()),
         "gap": base.gap if base.rank else None,
         "relations": format_base_parameters(base, body_names),
-        "unseen": unobservable_parameters(base, body_names),
+        "unobservable": unobservable_parameters(base, body_names),
     }
 
 
@@ -128,7 +128,7 @@ def base_parameters_text(title: str, base: BaseParameters, body_names: Sequence[
     return "\n".join(lines) + "\n"
 
 
-def join_names(chosen: Sequence[Candidate]) -> str:
+def candidate_names(chosen: Sequence[Candidate]) -> str:
     """Names of sensors, joined by commas."""
     return ", ".join(candidate.name for candidate in chosen) or "none"
 
@@ -156,7 +156,9 @@ def sets_table(parts: Sequence[PartPlan]) -> Table:
         for index, (bits, chosen) in enumerate(part.ranked[:_MAX_SETS]):
             first = index == 0
             count = "" if not first else "not counted" if part.sets is None else str(len(part.sets))
-            table.add_row(Text(", ".join(part.frames) if first else ""), count, f"{bits:.1f}", Text(join_names(chosen)))
+            table.add_row(
+                Text(", ".join(part.frames) if first else ""), count, f"{bits:.1f}", Text(candidate_names(chosen))
+            )
         if len(part.ranked) > _MAX_SETS:
             table.add_row("", "", "", f"({len(part.ranked) - _MAX_SETS} more in analysis.json)")
     return table
@@ -187,7 +189,7 @@ def describe_losses(states: Sequence[BaseObservability]) -> list[str]:
         lacking = [
             f"{' + '.join(frames)} lacks {format_count(number, 'sensor')}" for frames, number in lost.unmet_groups
         ]
-        remedies = join_names(lost.remedies[:_MAX_REMEDIES]) if lost.remedies else "no single candidate"
+        remedies = candidate_names(lost.remedies[:_MAX_REMEDIES]) if lost.remedies else "no single candidate"
         whole = len(lost.descriptions) == _BASE_DIRECTIONS
         directions = "whole base" if whole else f"base's {' and '.join(lost.descriptions)}"
         cause = f"{' and '.join(lacking)} in {count}; any of these would help: {remedies}"

@@ -101,7 +101,7 @@ def decade(value: float) -> str:
     return "10" + str(round(exponent)).translate(_SUPERSCRIPTS)
 
 
-def decade_formatter() -> FuncFormatter:
+def _decade_formatter() -> FuncFormatter:
     """Of the ticks of a logarithmic axis."""
     return FuncFormatter(lambda value, _: decade(value))
 
@@ -110,7 +110,7 @@ def label_decades(axis: Axis) -> None:
     """Label 1, 2 and 5 of each power of ten of a logarithmic axis, however little of one it spans."""
     low, high = sorted(axis.get_view_interval())
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < _FEW_DECADES * low else (1.0,)))
-    axis.set_major_formatter(decade_formatter())
+    axis.set_major_formatter(_decade_formatter())
     axis.set_minor_formatter(NullFormatter())
 
 
@@ -176,7 +176,7 @@ def identifiability_figure(body_names: Sequence[str], estimate: Estimate) -> Fig
     figure.colorbar(image, ax=left, label="share of the data", pad=0.01)
     values = estimate.singular_values
     right.semilogy(np.arange(1, len(values) + 1), values, ".", color=palette.IDENTIFIED, markersize=4)
-    right.yaxis.set_major_formatter(decade_formatter())
+    right.yaxis.set_major_formatter(_decade_formatter())
     right.axvline(estimate.rank + 0.5, color="0.5", linewidth=0.8)
     right.set_title(f"singular values, rank {estimate.rank}", loc="left", fontsize=8)
     right.set_xlabel("number")

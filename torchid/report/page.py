@@ -67,7 +67,7 @@ def versions() -> dict[str, str]:
     return out | {"system": platform.platform()}
 
 
-def page_available() -> bool:
+def _page_available() -> bool:
     """Whether the libraries of a page are installed."""
     return find_spec("plotly") is not None and find_spec("jinja2") is not None
 
@@ -78,7 +78,7 @@ def require_page() -> None:
     Raises:
         InputError: they are not installed.
     """
-    if not page_available():
+    if not _page_available():
         raise InputError("", "report", "plotly or jinja2 is not installed", how_to_install("report"))
 
 

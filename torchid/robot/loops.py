@@ -12,7 +12,6 @@ from torchid.robot.urdf import TreeJoint, parse_xml
 from torchid.robot.welds import matching_joints
 from torchid.robot.xml_files import OWN
 
-LOOP_TYPES = ("point", "weld")
 LOOPS_FIELD, PASSIVE_FIELD = "robot.loops", "robot.passive"
 MAX_GAP, MAX_ANGLE = 0.005, 0.05
 """Rms distance [m] and angle [rad] over a log up to which a loop counts as closed, unless it states its own."""

@@ -89,14 +89,16 @@ def _check_transmissions(model: MjcfModel) -> None:
     for tendon in model.spec.tendons:
         for name in ("stiffness", "damping", "frictionloss", "armature"):
             if np.any(getattr(tendon, name)):
-                tag = tendon_tag(tendon)
+                tag = _tendon_tag(tendon)
                 accepted = "tendons without stiffness, damping, frictionloss and armature"
                 model.refuse(tendon, tag, tendon.name, f"a tendon with {name}", accepted)
     for actuator in model.spec.actuators:
         for name in ("armature", "damping"):
             if np.any(getattr(actuator, name)):
                 accepted = f"{name} of the joint, or none"
-                model.refuse(actuator, actuator_tag(model, actuator), actuator.name, f"{name} of an actuator", accepted)
+                model.refuse(
+                    actuator, _actuator_tag(model, actuator), actuator.name, f"{name} of an actuator", accepted
+                )
 
 
 def _check_medium(model: MjcfModel) -> None:
@@ -192,13 +194,13 @@ def equality_kind(equality: Any) -> str:
     return str(equality.type.name).removeprefix("mjEQ_").lower()
 
 
-def tendon_tag(tendon: Any) -> str:
+def _tendon_tag(tendon: Any) -> str:
     """Tag of a tendon."""
     first = next(iter(tendon.path), None)
     return "fixed" if first is not None and first.type.name == "mjWRAP_JOINT" else "spatial"
 
 
-def actuator_tag(model: MjcfModel, actuator: Any) -> str:
+def _actuator_tag(model: MjcfModel, actuator: Any) -> str:
     """Tag of an actuator, by its name."""
     found = _actuators(model, actuator.name)
     return next(found, "actuator")

@@ -202,7 +202,7 @@ def joint_origin(joint: TreeJoint) -> Array:
     return np.eye(4) if joint.origin is None else np.asarray(joint.origin, dtype=np.float64)
 
 
-def child_offset(joint: TreeJoint) -> Array:
+def _child_offset(joint: TreeJoint) -> Array:
     """Pose of a joint's child link in the moved joint frame, (4, 4) [m]."""
     T = np.eye(4)
     T[:3, 3] = joint.child_offset
@@ -223,8 +223,8 @@ def _body_joint(tree: BodyTree, joint: TreeJoint, reverse: bool, mimic: Mimic | 
         kind="fixed" if weld else "prismatic" if joint.type == "prismatic" else "revolute",
         parent=body,
         axis=-axis if reverse else axis,
-        T_parent_joint=T_body_near @ (_inverse(child_offset(joint)) if reverse else joint_origin(joint)),
-        T_joint_link=_inverse(joint_origin(joint)) if reverse else child_offset(joint),
+        T_parent_joint=T_body_near @ (_inverse(_child_offset(joint)) if reverse else joint_origin(joint)),
+        T_joint_link=_inverse(joint_origin(joint)) if reverse else _child_offset(joint),
         mimic=mimic,
         damping=joint.dynamics.damping if joint.dynamics else 0.0,
         friction=joint.dynamics.friction if joint.dynamics else 0.0,
@@ -240,7 +240,7 @@ def _locked_pose(joint: TreeJoint, reverse: bool, mimics: dict[str, Mimic]) -> A
     T_parent_child = joint_origin(joint)
     if joint.name in mimics:
         T_parent_child = T_parent_child @ joint_motion(joint, mimics[joint.name].offset)
-    T_parent_child = T_parent_child @ child_offset(joint)
+    T_parent_child = T_parent_child @ _child_offset(joint)
     return _inverse(T_parent_child) if reverse else T_parent_child
 
 

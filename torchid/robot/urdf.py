@@ -289,7 +289,7 @@ def mesh_content(urdf: Path, filename: str) -> tuple[str, bytes]:
     try:
         content = read_bytes(path, MAX_MESH)
         if kind == "dae":
-            check_collada(content, MAX_UNFOLDED)
+            _check_collada(content, MAX_UNFOLDED)
     except (OSError, ValueError, etree.XMLSyntaxError, RecursionError) as error:
         raise MeshError(f"{excerpt(filename)}: {type(error).__name__}: {excerpt(str(error))}") from error
     if kind in _PART_KEYWORD and content.lower().count(_PART_KEYWORD[kind]) > MAX_PARTS:
@@ -351,7 +351,7 @@ def _paths_of_package_url(urdf: Path, package: Path, name: str) -> list[Path]:
     return [*(folder.joinpath(*parts) for folder in (*above, *beside)), *own]
 
 
-def check_collada(content: bytes, largest: int) -> None:
+def _check_collada(content: bytes, largest: int) -> None:
     """Refuse a document type, which may declare entities, and shapes that expand to more than `largest` bytes.
 
     Raises:

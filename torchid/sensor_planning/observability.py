@@ -146,7 +146,7 @@ def base_values(builder: RowBuilder, state: ContactState, postures: Array) -> to
     return values
 
 
-def dependent_sensors(generic: Demand, singular: Demand, chosen: Iterable[Candidate]) -> tuple[str, ...]:
+def _dependent_sensors(generic: Demand, singular: Demand, chosen: Iterable[Candidate]) -> tuple[str, ...]:
     """The smallest group of sensors that is independent at one posture but dependent at another, where they fail.
 
     Args:
@@ -222,7 +222,7 @@ class _StateDemands:
     def dependent(self) -> tuple[tuple[str, ...], ...]:
         """Sensors that are dependent at position zero only."""
         pairs = zip(self.generic, self.straight, strict=True)
-        return tuple(sensors for pair in pairs if (sensors := dependent_sensors(*pair, self.mounted)))
+        return tuple(sensors for pair in pairs if (sensors := _dependent_sensors(*pair, self.mounted)))
 
 
 def _assess_state(

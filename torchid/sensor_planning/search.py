@@ -59,9 +59,9 @@ def cheapest_set(
         seconds: time limit, after which the best known set is returned, unproven.
 
     Raises:
-        SensorError: as `usable_candidates`.
+        SensorError: as `_usable_candidates`.
     """
-    kept, usable = usable_candidates(demands, candidates, keep, exclude)
+    kept, usable = _usable_candidates(demands, candidates, keep, exclude)
     deadline = time.monotonic() + seconds
     solved = [_cheapest_part(part, kept, deadline) for part in demand_groups(demands, usable)]
     chosen = kept.union(*(result.chosen for result in solved))
@@ -97,9 +97,9 @@ def all_minimal_sets(
         The sets by size; None beyond the limit.
 
     Raises:
-        SensorError: as `usable_candidates`.
+        SensorError: as `_usable_candidates`.
     """
-    kept, usable = usable_candidates(demands, candidates, keep, exclude)
+    kept, usable = _usable_candidates(demands, candidates, keep, exclude)
     free = [c for c in usable if c not in kept]
     if len(free) > limit:
         return None
@@ -117,7 +117,7 @@ def all_minimal_sets(
     return [tuple(c for c in candidates if c in chosen) for chosen in minimal]
 
 
-def usable_candidates(
+def _usable_candidates(
     demands: Sequence[Demand], candidates: Sequence[Candidate], keep: Iterable[Candidate], exclude: Iterable[Candidate]
 ) -> tuple[frozenset[Candidate], tuple[Candidate, ...]]:
     """The kept candidates, and all that are not excluded after a check that these suffice.

@@ -84,7 +84,7 @@ class Simulation:
             InputError: the robot falls, slips, or its zero-moment point leaves the bounds.
         """
         recording = record(self, self.reference(config), progress)
-        stability = measure_stability(self, recording)
+        stability = _measure_stability(self, recording)
         stability.require_within(self.config.bounds, config.name)
         return recording, stability
 
@@ -142,7 +142,7 @@ def record(
     log = _exact_log(plant, motion.name, config.physics_hz, position, velocity, *pushed)
     along = np.array([foot.along_normal for foot in simulation.feet])
     if along.any():
-        up = np.einsum("nfi,nfi->nf", rotations[:, :, 2], require_field(log, "contact_wrench_local")[..., :3])
+        up = np.einsum("nfi,nfi->nf", rotations[:, :, 2], _require_field(log, "contact_wrench_local")[..., :3])
         log = replace(log, contact_force_normal=np.where(along, up, np.nan))
     return Recording(log, feet, rotations)
 
@@ -210,7 +210,7 @@ class Stability:
                 raise InputError.at_field(f"motions.{motion}", found, accepted)
 
 
-def measure_stability(simulation: Simulation, recording: Recording) -> Stability:
+def _measure_stability(simulation: Simulation, recording: Recording) -> Stability:
     """Measure how a robot stood; a foot stands from a vertical force of `sensors.contact_threshold` [N] on.
 
     Raises:
@@ -218,7 +218,7 @@ def measure_stability(simulation: Simulation, recording: Recording) -> Stability
     """
     log, load = recording.log, simulation.config.sensors.contact_threshold
     plant, stance, feet = simulation.plant, simulation.stance, simulation.feet
-    wrench = require_field(log, "contact_wrench_local")
+    wrench = _require_field(log, "contact_wrench_local")
     R = recording.rotations
     force, moment = ((R @ part[..., None])[..., 0] for part in (wrench[..., :3], wrench[..., 3:]))
     middles = recording.feet + np.einsum("nfij,fj->nfi", R, np.array([foot.middle for foot in feet]))
@@ -233,14 +233,14 @@ def measure_stability(simulation: Simulation, recording: Recording) -> Stability
             accepted = "a fraction of what a standing foot bears"
             raise InputError.at_field("sensors.contact_threshold", found, accepted)
     low, high = plant.limits.T
-    height = require_field(log, "base_position_world")[:, 2]
+    height = _require_field(log, "base_position_world")[:, 2]
     return Stability(
         (float(height.min()), float(height.max())),
         float(np.abs(height - stance.position[2]).max()),
         max(_slip(middles[:, i, :2], standing[:, i]) for i in range(len(feet))),
         _zmp_margin(recording.feet, force, moment, stance, feet),
         max(float((log.joint_position - high).max()), float((low - log.joint_position).max()), 0.0),
-        float(np.max(np.abs(require_field(log, "joint_torque")) / plant.efforts)),
+        float(np.max(np.abs(_require_field(log, "joint_torque")) / plant.efforts)),
         tuple(map(float, 1.0 - standing.mean(axis=0))),
     )
 
@@ -293,7 +293,7 @@ def sensor_log(truth: Log, sensors: SensorImperfectionsConfig, seed: int, name: 
         InputError: a delay of no sample, or of all.
     """
     name = name or truth.source
-    torque, wrench, along = require_field(truth, "joint_torque"), *_foot_readings(truth)
+    torque, wrench, along = _require_field(truth, "joint_torque"), *_foot_readings(truth)
     if sensors.delay.enabled:
         step = float(np.median(np.diff(truth.time)))
         late = round(sensors.delay.feet_s / step)
@@ -304,7 +304,7 @@ def sensor_log(truth: Log, sensors: SensorImperfectionsConfig, seed: int, name: 
     if sensors.bias.enabled:
         torque, wrench = _biased(torque, wrench, sensors, np.random.default_rng([seed, 0]))
     position, base, turn = (
-        require_field(truth, f) for f in ("joint_position", "base_position_world", "base_quat_xyzw")
+        _require_field(truth, f) for f in ("joint_position", "base_position_world", "base_quat_xyzw")
     )
     if sensors.noise.enabled:
         rng, noise = np.random.default_rng([seed, 1, zlib.crc32(name.encode())]), sensors.noise
@@ -338,7 +338,7 @@ def _foot_readings(truth: Log) -> tuple[Array, BoolArray]:
 
     As wrenches all feet get the noise, bias and gain that they have whatever some of them read.
     """
-    wrench, force = require_field(truth, "contact_wrench_local"), truth.contact_force_normal
+    wrench, force = _require_field(truth, "contact_wrench_local"), truth.contact_force_normal
     if force is None:
         return wrench, np.zeros(wrench.shape[1], dtype=bool)
     along: BoolArray = np.asarray(np.isfinite(force).any(axis=0))
@@ -366,7 +366,7 @@ def _loaded(wrench: Array, threshold: float) -> BoolArray:
     return np.einsum("nfi,fi->nf", force, direction) > threshold
 
 
-def require_field(log: Log, name: str) -> Array:
+def _require_field(log: Log, name: str) -> Array:
     """A field of an exact log, which must have it.
 
     Raises:

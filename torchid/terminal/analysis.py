@@ -7,18 +7,17 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from torchid.commands.analyze import Analysis, ScenarioAnalysis
-from torchid.errors import format_count
-from torchid.errors import join_names as join_texts
+from torchid.errors import format_count, join_names
 from torchid.identifiability.base_parameters import unobservable_parameters
 from torchid.problem.metrics import ROW_GROUPS
 from torchid.report.analysis import (
     SetAccuracy,
     accuracy_table,
     branch_table,
+    candidate_names,
     confounded_messages,
     describe_losses,
     describe_singular_postures,
-    join_names,
     observability_table,
     removal_table,
     sets_table,
@@ -125,21 +124,21 @@ def _stack_headline(scenario: ScenarioAnalysis) -> str:
 
 
 def _determined_text(scenario: ScenarioAnalysis) -> str:
-    """How many parameters are known alone, in sums and not at all."""
+    """How many parameters are known alone, how many in sums, and how many are unobservable."""
     base, names = scenario.base, scenario.plan.problem.robot.body_names
     alone = int((np.count_nonzero(base.combination, axis=1) == 1).sum())
     seen, free = int(base.combination.any(axis=0).sum()), int(base.free.sum())
     sums = f"{seen - alone} only in {format_count(base.rank - alone, 'sum')}"
     bodies = [line.partition(":")[0] for line in unobservable_parameters(base, names)]
-    unseen = f"{free - seen} not at all{f' (of {join_texts(bodies)})' if bodies else ''}"
-    return f"at best {alone} of {free} parameters alone, {sums}, {unseen}; base_parameters.txt"
+    unobservable = f"{free - seen} unobservable{f' (of {join_names(bodies)})' if bodies else ''}"
+    return f"at best {alone} of {free} parameters alone, {sums}, {unobservable}; base_parameters.txt"
 
 
 def _smallest_text(scenario: ScenarioAnalysis) -> str:
     plan = scenario.plan
     proof = "no cheaper set exists" if plan.proven else "not proven to be the cheapest"
     own = bool(scenario.proposed) and scenario.proposed is plan.observability
-    names = "that of the file" if own else join_names(plan.chosen)
+    names = "that of the file" if own else candidate_names(plan.chosen)
     return f"{format_count(len(plan.chosen), 'sensor')}, cost {plan.cost:g}, {proof}: {names}"
 
 
@@ -210,7 +209,7 @@ def _print_scenario(scenario: ScenarioAnalysis) -> None:
     print(f"Scenario {scenario.name}")
     print_tables(branch_table(plan), *([sets_table(plan.parts)] if plan.parts else []))
     proof = "no cheaper set exists" if plan.proven else "whether a cheaper set exists is not proven"
-    print_labelled("chosen", join_names(plan.chosen))
+    print_labelled("chosen", candidate_names(plan.chosen))
     print_labelled("cost", f"{plan.cost:g}; {proof}")
     named = {"Chosen sensors": plan.observability}
     if scenario.proposed is not None and scenario.proposed is not plan.observability:

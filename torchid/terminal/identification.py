@@ -47,7 +47,11 @@ _MOST_ATTENTION, _TEXT_LINES, _ATTENTION_LINES = 2, 2, 3
 _FEWEST_LINES = 4  # of the table of bodies: a heading, a body, how many others there are, what the marks mean
 _MASS, _CENTER = PARAMETERS.index("m"), slice(PARAMETERS.index("mcx"), PARAMETERS.index("mcz") + 1)
 _COULOMB, _VISCOUS = PARAMETERS.index("fc"), PARAMETERS.index("fv")
-_LEGEND = {COMBINED: "+ known only in sums with other bodies", PRIOR: "p mostly the {of}'s", UNOBSERVABLE: ". unseen"}
+_LEGEND = {
+    COMBINED: "+ known only in sums with other bodies",
+    PRIOR: "p mostly the {of}'s",
+    UNOBSERVABLE: ". unobservable",
+}
 _MARKS = {IDENTIFIED: " ", COMBINED: "+", PRIOR: "p", UNOBSERVABLE: ".", FIXED: "="}
 
 
