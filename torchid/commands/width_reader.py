@@ -16,7 +16,7 @@ from torchid.logs import Log
 from torchid.logs.log import FloatArray
 from torchid.logs.preprocess import directions, lacks_derivatives, make_timeline
 from torchid.problem import Samples
-from torchid.problem.recorded_torques import columns_in_order
+from torchid.problem.log_joints import columns_in_order
 from torchid.problem.samples import joint_order
 from torchid.sensing import SensorSet
 

@@ -26,7 +26,7 @@ from torchid.report.page_figures import (
     spectrum_panels,
     state_color,
 )
-from torchid.report.parameter_figure import INTERVAL
+from torchid.report.parameter_figures import INTERVAL
 
 _TEMPLATE = "page.html"
 _LEVEL = 5  # 1 % larger than with 9, in half of the time
