@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
-from torchid.errors import excerpt, format_count, join_names
+from torchid.errors import InputError, excerpt, format_count, join_names
 from torchid.logs import Log
 from torchid.logs.column_proposals import OF_PLATES, is_desired, propose_field
 from torchid.logs.log import WRENCHES
@@ -19,7 +19,7 @@ _EULER = re.compile(r"(?<![a-z])(roll|pitch|yaw|rpy|euler)(?![a-z])", re.IGNOREC
 _AS_ANGLES = "base_quat_wxyz: {rpy: ...}"
 _STEP = re.compile(r"(dt|time_?step|sample_?rate|fps|rate_?hz|freq\w*)", re.IGNORECASE)
 _MOTION = ("joint_position", "base_quat_xyzw", "base_position_world", *("imu_specific_force", "imu_angular_velocity"))
-BRIDGED_S = 0.05
+_BRIDGED_S = 0.05
 """Gaps that `init` has bridged [s]."""
 
 
@@ -79,7 +79,7 @@ def _like(names: Sequence[str]) -> str:
     return f"'{excerpt(names[0])}'" + (f" and {len(names) - 1} more" if len(names) > 1 else "")
 
 
-def gaps_in_motion(log: Log) -> tuple[float, bool, str]:
+def _gaps_in_motion(log: Log) -> tuple[float, bool, str]:
     """Gaps in the motion of a log: how long the longest takes, whether some are at an end, and a field with one.
 
     The length [s] is that from the value before to that after; gaps at an end do not count for it. Channels that are
@@ -96,3 +96,17 @@ def gaps_in_motion(log: Log) -> tuple[float, bool, str]:
             longest = max(longest, *np.diff(log.time[known])[np.diff(known) > 1].tolist(), 0.0)
             found = found or name
     return longest, at_end, found
+
+
+def keys_for_gaps(read: Log | InputError) -> dict[str, tuple[object, str]]:
+    """The keys of preprocessing that a log with gaps in its motion needs, with the reason."""
+    longest, at_end, name = (0.0, False, "") if isinstance(read, InputError) else _gaps_in_motion(read)
+    out: dict[str, tuple[object, str]] = {}
+    if 0.0 < longest <= _BRIDGED_S:
+        out["bridge_gaps_s"] = (_BRIDGED_S, f"as gaps of {name} take up to {longest:.2g} s")
+    if longest > _BRIDGED_S or at_end:
+        reason = (
+            f"as gaps of {name} take up to {longest:.2g} s" if longest > _BRIDGED_S else f"as {name} has one at an end"
+        )
+        out["exclude_condemned"] = (True, reason)
+    return out
