@@ -17,8 +17,8 @@ from matplotlib.figure import Figure
 
 import torchid
 from torchid.boundary import run_guarded
-from torchid.commands import Identification
 from torchid.commands.reading import LogReader
+from torchid.commands.results import Identification
 from torchid.identifiability.structure import structural_problem
 from torchid.parameters import PARAMETERS, PER_BODY, Array
 from torchid.problem.predict import force_series, null_space_part

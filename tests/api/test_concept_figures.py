@@ -10,7 +10,7 @@ from repository import ROOT
 from script_calls import script
 
 import torchid
-from torchid.commands import Identification
+from torchid.commands.results import Identification
 from torchid.parameters import COULOMB, PER_BODY, VISCOUS
 from torchid.report.parameter_figures import INTERVAL
 

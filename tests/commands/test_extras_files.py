@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import yaml
 from misread import WIDTH, World, with_actuators
 from motions import value
@@ -18,6 +19,7 @@ from welded import CONTACTS, SENSORS, STATES, machine
 
 from torchid.cli import main
 from torchid.commands.reading import LogReader
+from torchid.commands.width_reader import WidthReader
 from torchid.config import load_config
 from torchid.fitting.calibration import Calibration
 from torchid.fitting.experiment import set_up
@@ -227,3 +229,22 @@ def test_outliers_do_not_move_the_offsets_of_a_new_log_where_fits_are_robust(run
         errors[robust] = np.abs(value(read.torque)[:, : len(expected[0])].numpy() - expected).max()
     assert errors["null"] > 1.0
     assert errors["tukey"] < 1e-6, errors
+
+
+@pytest.mark.parametrize("settings", [
+    ["preprocessing.cutoff_hz=null"], ["preprocessing.contact_margin_s=0.05", "preprocessing.sample_rate_hz=150"],
+    ["preprocessing.base_motion=contacts"], ["preprocessing.memory_gb=1e-6"],
+])  # fmt: skip
+def test_logs_that_are_read_once_are_those_that_would_be_read_with_each_width(settings: list[str]) -> None:
+    scene = set_up(load_config(DEMO / "quadruped.yaml", [*settings, "actuators.sign_width=auto"]))
+    reader = WidthReader(scene)
+    for width in (0.1, 0.003, None, 0.1):
+        stated = load_config(DEMO / "quadruped.yaml", [*settings, f"actuators.sign_width={width or 'null'}"])
+        (expected,) = LogReader(set_up(stated)).read(stated.logs.train, scene.sensors)
+        (samples,) = reader.logs(width, scene.sensors)
+        for name, there in vars(expected).items():
+            found = getattr(samples, name)
+            if isinstance(there, torch.Tensor):
+                assert torch.equal(found.nan_to_num(), there.nan_to_num()), name
+            else:
+                assert name in ("base", "motion_noise", "folder", "pages") or found == there, name

@@ -17,7 +17,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import torchid
 from torchid.cli import main
-from torchid.commands import Identification
+from torchid.commands.results import Identification
 from torchid.config import load_config
 from torchid.fitting.factor_files import FactorFile, read_factors, write_factors
 from torchid.problem.metrics import ERROR_GROUPS, WHITENED

@@ -11,7 +11,8 @@ RARE = ("tensorboard", "scipy.stats", "scipy.signal", "pyarrow", "h5py")
 
 def test_commands_import_nothing_that_most_runs_do_without() -> None:
     code = (
-        "import sys; import torchid.cli, torchid.api, torchid.commands.identify, torchid.terminal.identification; "
+        "import sys; import torchid.cli, torchid.commands.identify, torchid.terminal.identification; "
+        "assert 'torchid.sensor_planning' not in sys.modules; import torchid.api; "
         f"print([name for name in {RARE} if name in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

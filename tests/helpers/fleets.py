@@ -13,9 +13,9 @@ from demo import shortened_demo
 from motions import value
 from walking import MACHINES, recorded, truth
 
-from torchid.commands import Identification
 from torchid.commands.compress import Compression, compress
 from torchid.commands.identify import identify
+from torchid.commands.results import Identification
 from torchid.config import load_config
 from torchid.logs import write_log
 

@@ -1,7 +1,4 @@
-"""Experiments of three robots for processes that share the work, and the commands that start these.
-
-As a script: runs experiments one after the other, as one process or as each of those that torchrun has started.
-"""
+"""Experiments of three robots for processes that share the work, and the commands that start these."""
 
 from __future__ import annotations
 
@@ -124,13 +121,32 @@ def finish(command: Sequence[str]) -> tuple[int, str, str]:
 
 
 def run_all(processes: int, folder: Path, runs: Sequence[tuple[str, Path, Sequence[str]]]) -> None:
-    """Run experiments by name, file and overrides in some processes; each writes the folder of its name."""
+    """Run experiments by name, file and overrides in this process or some forks, each into the folder of its name."""
     jobs = folder / "jobs.json"
     folder.mkdir(parents=True)
     jobs.write_text(json.dumps([[name, str(file), [*more]] for name, file, more in runs]))
-    before = (sys.executable,) if processes == 1 else (*TORCHRUN, str(processes))
-    status, _, complained = finish((*before, __file__, str(jobs)))
-    assert status == 0, complained
+    if processes == 1:
+        with one_thread():
+            _identify_all(jobs)
+        return
+    from torch.multiprocessing import start_processes
+
+    with one_thread(), warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of forks, here of a process whose threads are idle
+        start_processes(_identify_together, (processes, jobs), processes, start_method="fork")
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """As processes have that torchrun starts, where the tests have more."""
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def differences(one: Any, other: Any, path: str = "") -> Iterator[tuple[str, float]]:
@@ -147,32 +163,26 @@ def differences(one: Any, other: Any, path: str = "") -> Iterator[tuple[str, flo
         yield path, 0.0 if one == other else float("inf")
 
 
-def _main() -> None:
-    import torch.distributed as dist  # noqa: TID251
-    from matplotlib.figure import Figure
-    from run_figures import FIGURES, PAGE
-
-    from torchid.commands import results
+def _identify_all(jobs: Path) -> None:
     from torchid.commands.identify import identify
     from torchid.config import load_config
     from torchid.ranks import share_work
 
-    warnings.simplefilter("ignore")
-    for figure in (*FIGURES, PAGE):  # which take most of the time
-        setattr(results, figure, lambda *_, **__: Figure(figsize=(1.0, 1.0)))
-    if "RANK" in os.environ:
-        dist.init_process_group("gloo")
-    jobs = Path(sys.argv[1])
-    for name, file, more in json.loads(jobs.read_text()):
-        with share_work():
-            identify(load_config(file, [*more, f"output={jobs.parent / name}"]))
-    sys.stdout.flush()
-    os._exit(0)  # see torchid.ranks.leave_launched
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for name, file, more in json.loads(jobs.read_text()):
+            with share_work():
+                identify(load_config(file, [*more, f"output={jobs.parent / name}"]))
+
+
+def _identify_together(rank: int, processes: int, jobs: Path) -> None:
+    """One of some processes, forked with all that they import."""
+    import torch.distributed as dist  # noqa: TID251
+
+    meet = f"file://{jobs.with_name('rendezvous')}"
+    dist.init_process_group("gloo", init_method=meet, rank=rank, world_size=processes)
+    _identify_all(jobs)
 
 
 def lines_of_torchid(text: str) -> list[str]:
     return [line for line in text.splitlines() if line.startswith("torchid: ") and "Warning" not in line]
-
-
-if __name__ == "__main__":
-    _main()

@@ -14,8 +14,10 @@ from dataclasses import dataclass
 from typing import Any
 
 _SERVER = """
-import json, os, resource, signal, sys
-import torchid.commands.results, torchid.commands.evaluate, torchid.commands.analyze, torchid.commands.analyze, torchid.commands.check
+import gc, json, os, resource, signal, sys
+import h5py, jinja2, scipy.signal, torch._dynamo, torchid.commands.results, torchid.commands.evaluate, torchid.commands.analyze, torchid.commands.check
+import torchid.commands.compress, torchid.commands.identify, torchid.estimators.training, torchid.report.page, torchid.report.tensorboard
+import torchid.terminal.analysis, torchid.terminal.compression, torchid.terminal.finished_runs, torchid.terminal.identification
 from matplotlib.figure import Figure
 from torchid.cli import main
 names = ("draw_forces", "error_figure", "parameter_figure", "identifiability_figure", "contribution_figure", "tree_figure",
@@ -23,7 +25,9 @@ names = ("draw_forces", "error_figure", "parameter_figure", "identifiability_fig
 for module in (torchid.commands.results, torchid.commands.evaluate, torchid.commands.analyze):
     for name in names:
         if hasattr(module, name):
-            setattr(module, name, lambda *_, **__: Figure())
+            setattr(module, name, lambda *_, **__: Figure(figsize=(1.0, 1.0)))
+torchid.report.page._library()  # compressed once for all children
+gc.freeze()
 signal.signal(signal.SIGINT, signal.default_int_handler)
 said = {}
 "x".encode("cp437")  # which zipfile loads late, when another user may not read it

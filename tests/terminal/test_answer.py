@@ -11,8 +11,8 @@ import pytest
 from repository import DEMO
 
 from torchid.cli import main
-from torchid.commands import Identification
 from torchid.commands.identify import identify
+from torchid.commands.results import Identification
 from torchid.config import load_config
 from torchid.estimators.least_squares import COMBINED, IDENTIFIED
 from torchid.parameters import PER_BODY

@@ -11,7 +11,7 @@ from rich.progress import Progress
 
 from torchid import ranks
 from torchid.commands.check import recorded_stretches
-from torchid.commands.reading import LogReader
+from torchid.commands.width_reader import WidthReader
 from torchid.errors import warn_about_file
 from torchid.estimators import Conditions
 from torchid.fitting.cross_validation import RidgeChoice
@@ -72,13 +72,14 @@ def with_chosen_settings(scene: S, bars: Progress) -> tuple[S, Choices]:
         stated = replace(scene.config.robot, base_tilt=tilt.tilt)
         robot = replace(scene.robot, base_tilt=tilt.tilt)
         scene = replace(scene, robot=robot, config=replace(scene.config, robot=stated))
+    reader = WidthReader(scene)
     if scene.config.actuators.sign_width == AUTO:
-        width = _chosen("sign width", partial(choose_sign_width, partial(_logs_and_fitter, scene)), bars)
+        width = _chosen("sign width", partial(choose_sign_width, partial(_logs_and_fitter, scene, reader)), bars)
         scene = _with_sign_width(scene, width.width)
     if scene.config.actuators.delay == AUTO:
         if cutoff is None and scene.config.preprocessing.cutoff_hz is None:
             warn_about_file(_UNFILTERED)
-        delay = _chosen("delay of torques", partial(_delay, scene), bars)
+        delay = _chosen("delay of torques", partial(_delay, scene, reader), bars)
         scene = _with_actuators(scene, delay=delay.delay)
     return scene, Choices(cutoff, tilt, width, delay)
 
@@ -102,21 +103,18 @@ def _cutoff(scene: Scene) -> CutoffChoice:
 
 
 def _base_tilt(scene: Scene) -> TiltChoice:
-    return choose_base_tilt(*_logs_and_fitter(scene, scene.terms.sign_width))
+    return choose_base_tilt(*_logs_and_fitter(scene, WidthReader(scene), scene.terms.sign_width))
 
 
-def _delay(scene: Scene) -> DelayChoice:
-    return choose_delay(*_logs_and_fitter(scene, scene.terms.sign_width), scene.terms)
+def _delay(scene: Scene, reader: WidthReader) -> DelayChoice:
+    return choose_delay(*_logs_and_fitter(scene, reader, scene.terms.sign_width), scene.terms)
 
 
-def _logs_and_fitter(scene: Scene, width: float | None) -> tuple[Sequence[Samples], LogFitter]:
-    """The training logs, and a fitter of their rows, with a width of friction's sign.
-
-    Logs are read anew for every width, since the filter comes after the friction.
-    """
+def _logs_and_fitter(scene: Scene, reader: WidthReader, width: float | None) -> tuple[Sequence[Samples], LogFitter]:
+    """The training logs, and a fitter of their rows, with a width of friction's sign."""
     scene = _with_sign_width(scene, width)
     sensors = scene.sensors if isinstance(scene, Experiment) else None
-    logs = LogReader(scene).read(scene.config.logs.train if scene.config.logs else [], sensors)
+    logs = reader.logs(width, sensors)
     if sensors is None:
         sensors = recorded_sensors(scene.robot, scene.contacts, logs, scene.noise)
     return logs, scene.fitter(scene.builder(sensors), Conditions(names=scene.robot.body_names))

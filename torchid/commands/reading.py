@@ -127,11 +127,7 @@ class LogReader:
         recorded, certain = settle_contacts(with_loop_joints(acting, own.robot), own)
         checked = self._checked(recorded, own.robot)
         clean = recorded if checked is None else checked.repaired
-        rates, sign_width = (settings.filter_hz, settings.sample_rate_hz), self.scene.terms.sign_width
-        if settings.base_motion is None:
-            log = preprocess(clean, *rates, self._stated, sign_width)
-        else:
-            log = preprocess_standing(clean, self.scene.robot, self.scene.contacts, *rates, sign_width)
+        log = self._preprocessed(clean)
         samples = bind_log(log, self.scene.robot, self.scene.contacts, required)
         slip = self._slipping(log, samples, recorded)
         if not fits_contact_offsets(self.scene):
@@ -151,6 +147,14 @@ class LogReader:
             return samples
         require_kept(kept, path, slip is not None)
         return samples[torch.from_numpy(np.flatnonzero(kept))]
+
+    def _preprocessed(self, clean: Log) -> Log:
+        """A log as recorded, filtered, differentiated and resampled."""
+        settings = self.scene.config.preprocessing
+        rates, sign_width = (settings.filter_hz, settings.sample_rate_hz), self.scene.terms.sign_width
+        if settings.base_motion is None:
+            return preprocess(clean, *rates, self._stated, sign_width)
+        return preprocess_standing(clean, self.scene.robot, self.scene.contacts, *rates, sign_width)
 
     def _slipping(self, log: Log, samples: Samples, recorded: Log) -> FloatArray | None:
         """Stamps of samples in which a contact slips; None where all are kept.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from itertools import takewhile
 from typing import Any
@@ -226,6 +226,13 @@ def _direction(log: Log, smoothed: Mapping[str, FloatArray], timeline: Timeline)
         sign = _mean_sign(before, after) if width is None else _mean_tanh(before / width, after / width)
         out[:, column] = timeline.evaluate(timeline.low_pass(sign), (0,))[0]
     return out
+
+
+def directions(log: Log, timeline: Timeline) -> Callable[[float | None], FloatArray | None]:
+    """`joint_direction` of the preprocessed log by the width of the sign, as `preprocess` takes it."""
+    name = "joint_position" if log.joint_velocity is None else "joint_velocity"
+    smoothed = {name: timeline.smooth(getattr(log, name))}
+    return lambda width: _direction(log, smoothed, replace(timeline, sign_width=width))
 
 
 def _mean_sign(before: FloatArray, after: FloatArray) -> FloatArray:
