@@ -19,7 +19,7 @@ from torchid.problem.extras import ExtraTerms, list_extras
 from torchid.problem.known_torques import KnownTorques
 from torchid.problem.motor_forces import MotorForces
 from torchid.problem.recorded_wrenches import FramePoses
-from torchid.problem.row_blocks import RowBlock, multiply_wrenches, subtract_payload
+from torchid.problem.row_blocks import RowBlock, moved_rows, multiply_wrenches, subtract_payload
 from torchid.problem.samples import Samples
 from torchid.regressor.columns import all_wrench_columns
 from torchid.regressor.kinematics import body_states, joint_motion, joint_screw_axes
@@ -355,22 +355,22 @@ class RowBuilder(nn.Module):
         ever formed. Columns are contiguous, as the factorization needs them.
         """
         block, X = rows.block, rows.values
-        torques = [ratio * W_joints[joint] for _, joint, ratio, _ in block.moved]
-        for number, (torque, (node, _, _, _)) in enumerate(zip(torques, block.moved, strict=True)):
-            friction = X[len(block.inertial) + 2 * number :]
-            torch.mul(torque, dynamics.joints.direction[node], out=friction[0])
-            torch.mul(torque, dynamics.joints.velocity[node], out=friction[1])
+        torques = moved_rows(block, W_joints)
+        nodes = self.tree.index(node for node, *_ in block.moved)
+        friction = X[len(block.inertial) :][: 2 * len(nodes)].unflatten(0, (len(nodes), 2))
+        torch.mul(torques, dynamics.joints.direction[nodes, None], out=friction[:, 0])
+        torch.mul(torques, dynamics.joints.velocity[nodes, None], out=friction[:, 1])
 
-        sums = [] if W_base is None or block.base == "none" else [W_base]
-        path_sums = workspace.empty("path_sums", W_joints, 6, len(sums) + len(torques), *W_joints.shape[1:])
-        for number, base in enumerate(sums):
-            path_sums[:, number] = base
-        for number, (torque, (node, _, _, above)) in enumerate(zip(torques, block.moved, strict=True), len(sums)):
-            screw_axis = dynamics.screw_axes[:, node, None]
-            if above is None:
-                torch.mul(screw_axis, torque, out=path_sums[:, number])
+        of_base = int(W_base is not None and block.base != "none")
+        path_sums = workspace.empty("path_sums", W_joints, 6, of_base + len(nodes), *W_joints.shape[1:])
+        if W_base is not None and of_base:
+            path_sums[:, 0] = W_base
+        for step in block.path_steps:
+            screw_axes, own = dynamics.screw_axes[:, step.nodes, None], path_sums[:, step.sums]
+            if step.above is None:
+                torch.mul(screw_axes, torques[step.moved], out=own)
             else:
-                torch.addcmul(path_sums[:, above], screw_axis, torque, out=path_sums[:, number])
+                torch.addcmul(path_sums[:, step.above], screw_axes, torques[step.moved], out=own)
         start = 0
         for run in block.nodes:
             end = start + len(run.nodes) * len(run.kept)
