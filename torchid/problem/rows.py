@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from torchid.parameters import Array
 from torchid.problem.base_motion import levelled_base_axes
-from torchid.problem.chunk_dynamics import ChunkDynamics, ChunkKinematics, Workspace
+from torchid.problem.chunk_dynamics import ChunkDynamics, ChunkKinematics, Workspace, Workspaces
 from torchid.problem.contact_rows import ContactRows, contact_rows, whitened_bases
 from torchid.problem.contact_state import Columns, ContactState, ContactStateLayout, ContactStateLayouts
 from torchid.problem.extra_columns import dof_extra_column, extra_columns
@@ -75,7 +75,7 @@ class RowBuilder(nn.Module):
     `tests/problem/test_rows_two_ways.py` compares both; read the reference implementation first.
 
     `frames`: node of each contact, and the pose of the contact frame in the node's joint frame, (4, 4) [m]. `width`:
-    number of columns, those of the bodies' parameters and one for each of `extras`.
+    number of columns, those of the bodies' parameters and one for each of `extras`. `workspaces`: of passes over rows.
     """
 
     def __init__(
@@ -101,12 +101,14 @@ class RowBuilder(nn.Module):
         self._layouts = ContactStateLayouts(robot, self.columns, contacts, sensors, self.extras)
         self.frames = self._layouts.frames
         self.width = self.columns.count + len(self.extras)
+        self.workspaces = Workspaces()
 
     def __repr__(self) -> str:
         return f"RowBuilder: {len(self.contacts)} contacts, {self.width} columns, {self.sensors!r}"
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> RowBuilder:
         self._layouts.clear()  # their tensors are not buffers of the module
+        self.workspaces = Workspaces()
         super()._apply(fn, recurse)
         return self
 
