@@ -15,7 +15,7 @@ from torchid.estimators import Consistent, consistent
 from torchid.estimators.conic_formulation import build_conic_problem
 from torchid.estimators.conic_problem import ConicProblem
 from torchid.problem import RowBuilder, compress, linear_problem
-from torchid.problem.chunks import one_thread, run_in_workers, thread_count, worker_count
+from torchid.problem.chunks import chunks_by_state, one_thread, run_in_workers, thread_count, worker_count
 from torchid.sensing import Contact, named_sensors
 
 
@@ -52,6 +52,13 @@ def test_a_single_task_is_done_without_another_thread(tasks: int) -> None:
         return threading.get_ident(), list(own)
 
     assert run_in_workers(range(tasks), run, 4) == [(threading.get_ident(), list(range(tasks)))]
+
+
+def test_each_worker_gets_as_many_chunks_of_a_state_and_no_chunk_is_split_for_it() -> None:
+    samples, _ = random_samples(load(SOLO12), [Contact("FL_FOOT", "point")], 100, 0, states=1)
+    for chunk, expected in ((100, [100]), (60, [50, 50]), (40, [25] * 4)):
+        sizes = [len(samples[index]) for _, index in chunks_by_state(samples, chunk, workers=2)]
+        assert sizes == expected
 
 
 def test_a_block_with_one_thread_has_one_in_linear_algebra_and_as_many_workers_as_before() -> None:

@@ -26,6 +26,28 @@ class Workspace:
         return buffer[:size].view(shape)
 
 
+class Workspaces:
+    """Workspaces of workers that come and go: what one has given back, the next one takes.
+
+    The first touch of so much memory takes as long as a chunk or two.
+    """
+
+    def __init__(self) -> None:
+        """Start with none."""
+        self._idle: list[Workspace] = []
+
+    def take(self) -> Workspace:
+        """One that nobody else has until it is given back."""
+        try:
+            return self._idle.pop()  # no lock: one bytecode
+        except IndexError:
+            return Workspace()
+
+    def give_back(self, workspace: Workspace) -> None:
+        """Leave one to others; what was read from it is then no longer valid."""
+        self._idle.append(workspace)
+
+
 @dataclass(frozen=True)
 class ChunkKinematics:
     """Kinematics of B samples, from which predictions and contact Jacobians are computed.

@@ -26,10 +26,11 @@ Result = TypeVar("Result")
 ProgressCallback = Callable[[int], None]
 """Called with the number of samples, or of other steps, done since the last call."""
 
-CHUNK = 2048
-"""Samples per chunk: fewer lose to dispatch, more to memory traffic (measured on CPU)."""
+CHUNK = 4096
+"""Samples per chunk: fewer lose to dispatch, and to workers' waits for Python's lock; more to memory traffic."""
 
-_CHUNK_OF_GPU = 8 * CHUNK  # hides launches of some microseconds behind the work of each; not measured
+_LEAST, _EACH = 2048, 4  # samples per chunk where there are fewer chunks than so many for each worker
+_CHUNK_OF_GPU = 4 * CHUNK  # hides launches of some microseconds behind the work of each; not measured
 
 
 def map_chunks(
@@ -53,8 +54,11 @@ def map_chunks(
             intra-op thread torch would use, one if the builder is on a GPU.
         progress: called with the number of samples done since the last call.
     """
-    size = chunk or chunk_size(builder.device)
-    tasks = [(samples, state, index) for samples in logs for state, index in chunks_by_state(samples, size)]
+    workers = threads or worker_count(builder.device)
+    size, sharing = chunk or chunk_size(builder.device), ranks.as_first(workers, "workers")
+    if chunk is None and sharing > 1:
+        size = min(size, max(sum(map(len, logs)) // (_EACH * sharing), _LEAST))
+    tasks = [(samples, state, index) for samples in logs for state, index in chunks_by_state(samples, size, sharing)]
     for samples, state, _ in tasks:
         builder.layout(state, samples.contact_normal is not None)
     sizes = [_size(samples, index) for samples, _, index in tasks]
@@ -71,7 +75,7 @@ def map_chunks(
             if report is not None:
                 report(len(piece))
 
-    results = run_in_workers(tasks[share], lambda part: reduce(pieces(part)), threads or worker_count(builder.device))
+    results = run_in_workers(tasks[share], lambda part: reduce(pieces(part)), workers)
     if report is not None:
         report(0)
     return list(chain.from_iterable(ranks.gather(results, "chunks")))
@@ -99,19 +103,30 @@ def _size(samples: Samples, index: slice | torch.Tensor) -> int:
     return len(range(*index.indices(len(samples)))) if isinstance(index, slice) else len(index)
 
 
-def chunks_by_state(samples: Samples, chunk: int = CHUNK) -> Iterator[tuple[ContactState, slice | torch.Tensor]]:
-    """Chunks of samples that share a contact state, of about equal size: the state and an index into the samples."""
+def chunks_by_state(
+    samples: Samples, chunk: int = CHUNK, workers: int = 1
+) -> Iterator[tuple[ContactState, slice | torch.Tensor]]:
+    """Chunks of samples that share a contact state, of about equal size: the state and an index into the samples.
+
+    Args:
+        samples: of one log.
+        chunk: samples per chunk at most.
+        workers: that take turns with the chunks of a state, of which each gets as many, unless there is but one.
+    """
     active = samples.active.cpu().numpy()
     packed = np.packbits(active, axis=1) if active.shape[1] else np.zeros((len(active), 1), np.uint8)
     keys = packed.view(f"V{packed.shape[1]}")[:, 0]
     unique_keys, first = np.unique(keys, return_index=True)
     for key, sample in zip(unique_keys, first, strict=True):
+        count = -(-int(np.count_nonzero(keys == key)) // chunk)
+        if count > 1:
+            count = -(-count // workers) * workers
         if len(unique_keys) == 1:
-            ends = np.linspace(0, len(active), -(-len(active) // chunk) + 1).astype(int).tolist()
+            ends = np.linspace(0, len(active), count + 1).astype(int).tolist()
             pieces: Iterable[slice | torch.Tensor] = (slice(*pair) for pair in pairwise(ends))
         else:
             index = torch.from_numpy(np.flatnonzero(keys == key))
-            pieces = index.tensor_split(-(-len(index) // chunk))
+            pieces = index.tensor_split(count)
         for piece in pieces:
             yield tuple(active[sample].tolist()), piece
 

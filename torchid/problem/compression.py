@@ -12,7 +12,6 @@ from torch import Tensor
 
 from torchid import parameters, ranks
 from torchid.parameters import Array
-from torchid.problem.chunk_dynamics import Workspace
 from torchid.problem.chunks import ProgressCallback, chunks_by_state, map_chunks, one_thread, worker_count
 from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import PRIOR_DEVIATION, LinearProblem, TriangularFactor, parameter_scale
@@ -164,7 +163,7 @@ def _compress_chunks(
     Without `loaded`, those of readings in the air alone.
     """
     parts: dict[PartKey, Part] = {}
-    workspace, compressor = Workspace(), RowCompressor()
+    workspace, compressor = builder.workspaces.take(), RowCompressor()
 
     def part(samples: Samples, state: ContactState, unloaded: bool) -> Part:
         key = _key(samples, state, unloaded) if by_log else _key(None, state)
@@ -187,6 +186,7 @@ def _compress_chunks(
             else:
                 in_the_air.factor.add(*channel.row(builder), samples.oversampling)
     compressor.finish()
+    builder.workspaces.give_back(workspace)
     return list(parts.values())
 
 

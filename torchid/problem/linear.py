@@ -289,7 +289,7 @@ class TriangularFactor:
             wide = torch.zeros(block.shape[0], self.columns + 1, dtype=torch.float64)
             wide[:, [*support, self.columns]] = block.to("cpu", torch.float64)
             scattered.append(wide)
-        return torch.linalg.qr(torch.cat(scattered), mode="r").R
+        return triangularize(torch.cat([rows.T for rows in scattered], dim=1).T)
 
     def whole_surplus(self) -> Tensor:
         """The surplus of X^T X, (columns + 1, columns + 1), float64 on the CPU."""

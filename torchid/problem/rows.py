@@ -11,13 +11,13 @@ from torch import Tensor, nn
 
 from torchid.parameters import Array
 from torchid.problem.base_motion import levelled_base_axes
-from torchid.problem.chunk_dynamics import ChunkDynamics, ChunkKinematics, Workspace
+from torchid.problem.chunk_dynamics import ChunkDynamics, ChunkKinematics, Workspace, Workspaces
 from torchid.problem.contact_rows import ContactRows, contact_rows, whitened_bases
 from torchid.problem.contact_state import Columns, ContactState, ContactStateLayout, ContactStateLayouts
 from torchid.problem.extra_columns import KnownTorques, dof_extra_column, extra_columns
 from torchid.problem.extras import ExtraTerms, list_extras
 from torchid.problem.loop_forces import MotorForces
-from torchid.problem.row_blocks import RowBlock, multiply_wrenches, subtract_payload
+from torchid.problem.row_blocks import RowBlock, moved_rows, multiply_wrenches, subtract_payload
 from torchid.problem.samples import Samples
 from torchid.problem.wrench_rows import FramePoses
 from torchid.regressor.columns import all_wrench_columns
@@ -74,7 +74,7 @@ class RowBuilder(nn.Module):
     `tests/problem/test_rows_two_ways.py` compares both; read the reference implementation first.
 
     `frames`: node of each contact, and the pose of the contact frame in the node's joint frame, (4, 4) [m]. `width`:
-    number of columns, those of the bodies' parameters and one for each of `extras`.
+    number of columns, those of the bodies' parameters and one for each of `extras`. `workspaces`: of passes over rows.
     """
 
     def __init__(
@@ -100,12 +100,14 @@ class RowBuilder(nn.Module):
         self._layouts = ContactStateLayouts(robot, self.columns, contacts, sensors, self.extras)
         self.frames = self._layouts.frames
         self.width = self.columns.count + len(self.extras)
+        self.workspaces = Workspaces()
 
     def __repr__(self) -> str:
         return f"RowBuilder: {len(self.contacts)} contacts, {self.width} columns, {self.sensors!r}"
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> RowBuilder:
         self._layouts.clear()  # their tensors are not buffers of the module
+        self.workspaces = Workspaces()
         super()._apply(fn, recurse)
         return self
 
@@ -354,22 +356,22 @@ class RowBuilder(nn.Module):
         ever formed. Columns are contiguous, as the factorization needs them.
         """
         block, X = rows.block, rows.values
-        torques = [ratio * W_joints[joint] for _, joint, ratio, _ in block.moved]
-        for number, (torque, (node, _, _, _)) in enumerate(zip(torques, block.moved, strict=True)):
-            friction = X[len(block.inertial) + 2 * number :]
-            torch.mul(torque, dynamics.joints.direction[node], out=friction[0])
-            torch.mul(torque, dynamics.joints.velocity[node], out=friction[1])
+        torques = moved_rows(block, W_joints)
+        nodes = self.tree.index(node for node, *_ in block.moved)
+        friction = X[len(block.inertial) :][: 2 * len(nodes)].unflatten(0, (len(nodes), 2))
+        torch.mul(torques, dynamics.joints.direction[nodes, None], out=friction[:, 0])
+        torch.mul(torques, dynamics.joints.velocity[nodes, None], out=friction[:, 1])
 
-        sums = [] if W_base is None or block.base == "none" else [W_base]
-        path_sums = workspace.empty("path_sums", W_joints, 6, len(sums) + len(torques), *W_joints.shape[1:])
-        for number, base in enumerate(sums):
-            path_sums[:, number] = base
-        for number, (torque, (node, _, _, above)) in enumerate(zip(torques, block.moved, strict=True), len(sums)):
-            screw_axis = dynamics.screw_axes[:, node, None]
-            if above is None:
-                torch.mul(screw_axis, torque, out=path_sums[:, number])
+        of_base = int(W_base is not None and block.base != "none")
+        path_sums = workspace.empty("path_sums", W_joints, 6, of_base + len(nodes), *W_joints.shape[1:])
+        if W_base is not None and of_base:
+            path_sums[:, 0] = W_base
+        for step in block.path_steps:
+            screw_axes, own = dynamics.screw_axes[:, step.nodes, None], path_sums[:, step.sums]
+            if step.above is None:
+                torch.mul(screw_axes, torques[step.moved], out=own)
             else:
-                torch.addcmul(path_sums[:, above], screw_axis, torque, out=path_sums[:, number])
+                torch.addcmul(path_sums[:, step.above], screw_axes, torques[step.moved], out=own)
         start = 0
         for run in block.nodes:
             end = start + len(run.nodes) * len(run.kept)

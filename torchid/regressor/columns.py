@@ -16,10 +16,12 @@ from torchid.parameters import Array
 from torchid.regressor.kinematics import BodyStates, cross_product, rotate_vectors
 from torchid.regressor.tree import KinematicTree
 
+_Vector = Sequence[Tensor]
 ALL_INERTIAL = tuple(range(parameters.INERTIAL.stop))
 _REVOLUTE_KEPT = (1, 2, 4, 5, 6, 8, 9)  # mcx, mcy, Ixx, Ixy, Ixz, Iyz, Izz
 _PRISMATIC_KEPT = (0, 1, 2, 3)  # m, mcx, mcy, mcz
 _IXX, _IYY = 4, 7
+_TOGETHER = 2**15  # bodies times samples: what is worked out for them stays in a processor's second-level cache
 
 
 @dataclass(frozen=True)
@@ -98,10 +100,13 @@ def all_wrench_columns(states: BodyStates, layout: ColumnLayout, out: Tensor | N
     if out is None:
         out = states.position.new_zeros(6, layout.count, states.position.shape[-1])
     for kept, bodies in layout.runs():
-        if kept:
-            columns = out[:, layout.starts[bodies.start] : layout.starts[bodies.stop]]
-            own = states.slice_bodies(bodies.start, bodies.stop)
-            wrench_columns(own, kept, columns.unflatten(1, (-1, len(kept))), is_reused)
+        together = len(bodies)
+        if is_reused:
+            together = -(-together // -(-together * out.shape[-1] // _TOGETHER))
+        for start in range(bodies.start, bodies.stop, together) if kept else ():
+            end = min(start + together, bodies.stop)
+            columns = out[:, layout.starts[start] : layout.starts[end]].unflatten(1, (-1, len(kept)))
+            wrench_columns(states.slice_bodies(start, end), kept, columns, is_reused)
     return out
 
 
@@ -118,42 +123,21 @@ def wrench_columns(states: BodyStates, columns: tuple[int, ...], out: Tensor, is
 
     Source: the Newton-Euler equations of a body about its frame's origin, sorted by parameter.
     """
-    inverse = states.rotation.transpose(0, 1)
-    omega, alpha, force = (
-        rotate_vectors(inverse, x)
-        for x in (states.angular_velocity, states.angular_acceleration, states.specific_force)
-    )
-    inertia_columns = [column for column in columns if column >= parameters.INERTIA.start]
-    n_with_force = len(columns) - len(inertia_columns)
-    if n_with_force:
-        axes = [
-            column - parameters.FIRST_MOMENT.start for column in columns[:n_with_force] if column != parameters.MASS
-        ]
-        unit_forces, unit_moments = _first_moment_wrenches(omega, alpha, force)
-        forces = _rotate_to_base(states.rotation, [unit_forces[k] for k in axes])
-        moments = _rotate_to_base(states.rotation, [unit_moments[k] for k in axes])
-        if parameters.MASS in columns:
-            forces = torch.cat([states.specific_force[:, :, None], forces], 2)
-            moments = torch.nn.functional.pad(moments, (0, 0, 1, 0))
+    forces_of, moments_of = _unit_wrenches(states, columns)
+    n_with_force, rotation = len(forces_of), states.rotation.unsqueeze(3)
+    local = torch.stack([vector[axis] for axis in range(3) for vector in (*moments_of, *forces_of)])
+    local = local.unflatten(0, (3, -1)).transpose(1, 2)  # (3, k, vectors, B)
+    moments, forces, arm = local[:, :, : len(columns)], local[:, :, len(columns) :], states.position.unsqueeze(2)
+    if not is_reused:
+        forces = rotate_vectors(rotation, forces)
         out[:3, :, :n_with_force] = forces
-        out[3:, :, :n_with_force] = moments + cross_product(states.position[:, :, None], forces)
-    if inertia_columns:
-        moments_by_axes = _inertia_moments(omega, alpha)
-        inertia_moments = [
-            moments_by_axes[parameters.INERTIA_AXES[column - parameters.INERTIA.start]] for column in inertia_columns
-        ]
-        moments = out[3:, :, n_with_force:]
-        if is_reused:
-            _rotate_to_base(states.rotation, inertia_moments, moments)
-        else:
-            moments.copy_(_rotate_to_base(states.rotation, inertia_moments))
-
-
-def _rotate_to_base(rotation: Tensor, vectors: Sequence[Sequence[Tensor]], out: Tensor | None = None) -> Tensor:
-    """Rotate c vectors given by components (k, B) into base axes: (3, k, c, B); straight to `out`, if there is one."""
-    components = torch.stack([vector[axis] for axis in range(3) for vector in vectors])
-    components = components.unflatten(0, (3, len(vectors))).transpose(1, 2)
-    return rotate_vectors(rotation.unsqueeze(3), components, out)
+        out[3:] = rotate_vectors(rotation, moments)
+        out[3:, :, :n_with_force] += cross_product(arm, forces)
+        return
+    rotate_vectors(rotation, moments, out[3:])
+    (x, y, z), (fx, fy, fz) = arm.unbind(), rotate_vectors(rotation, forces, out[:3, :, :n_with_force]).unbind()
+    for row, (a, f), (b, g) in ((3, (y, fz), (z, fy)), (4, (z, fx), (x, fz)), (5, (x, fy), (y, fx))):
+        out[row, :, :n_with_force].addcmul_(a, f).addcmul_(b, g, value=-1)
 
 
 def body_wrenches(states: BodyStates, phi: Tensor) -> Tensor:
@@ -218,30 +202,48 @@ def _newton_euler_coefficients() -> Tensor:
     return torch.from_numpy(out)
 
 
-def _first_moment_wrenches(
-    omega: Tensor, alpha: Tensor, force: Tensor
-) -> tuple[list[list[Tensor]], list[list[Tensor]]]:
-    """Force ([alpha]x + [omega]x^2) e_k and moment e_k x specific force, for k = x, y, z, in the body frame."""
-    x, y, z = omega
-    ax, ay, az = alpha
-    xy, xz, yz, xx, yy, zz = x * y, x * z, y * z, x * x, y * y, z * z
-    forces = [[-yy - zz, az + xy, xz - ay], [xy - az, -xx - zz, yz + ax], [xz + ay, yz - ax, -xx - yy]]
-    zero = torch.zeros_like(x)
-    fx, fy, fz = force
-    moments = [[zero, -fz, fy], [fz, zero, -fx], [-fy, fx, zero]]
-    return forces, moments
+def _unit_wrenches(states: BodyStates, columns: Sequence[int]) -> tuple[list[_Vector], list[_Vector]]:
+    """Forces and moments, in each body's frame, of a unit of each of some inertial parameters; inertias have no force.
 
-
-def _inertia_moments(omega: Tensor, alpha: Tensor) -> dict[tuple[int, int], tuple[Tensor, Tensor, Tensor]]:
-    """Moment E alpha + omega x (E omega) per unit of each inertia entry, about and in the body frame, by its axes."""
-    x, y, z = omega
-    ax, ay, az = alpha
-    xy, xz, yz, xx, yy, zz = x * y, x * z, y * z, x * x, y * y, z * z
-    return {
-        (0, 0): (ax, xz, -xy),
-        (0, 1): (ay - xz, ax + yz, xx - yy),
-        (0, 2): (az + xy, zz - xx, ax - yz),
-        (1, 1): (-yz, ay, xy),
-        (1, 2): (yy - zz, az - xy, ay + xz),
-        (2, 2): (yz, -xz, az),
+    `m a + [alpha]x h + omega x (omega x h)` and `h x a + I alpha + omega x (I omega)`: all but a few entries are up to
+    sign what the products of angular velocities are, or the angular acceleration more or less than these.
+    """
+    inverse = states.rotation.transpose(0, 1)
+    omega, alpha, force = (
+        rotate_vectors(inverse, x)
+        for x in (states.angular_velocity, states.angular_acceleration, states.specific_force)
+    )
+    cyclic = torch.cat([omega, omega[:2]])
+    squares, products = cyclic * cyclic, cyclic[1:4] * cyclic[2:]  # ..., (yz, zx, xy)
+    yz, xz, xy = products.unbind()
+    less_yz, less_xz, less_xy = products.neg().unbind()
+    ax, ay, az = alpha.unbind()
+    plus_x, plus_y, plus_z = (alpha + products).unbind()
+    minus_x, minus_y, minus_z = (alpha - products).unbind()
+    differ_x, differ_y, differ_z = (squares[1:4] - squares[2:]).unbind()
+    forces: list[_Vector] = []
+    moments: list[_Vector] = []
+    if columns[0] < parameters.INERTIA.start:
+        reversed_x, reversed_y, reversed_z = (products - alpha).unbind()
+        inward_x, inward_y, inward_z = (squares[1:4] + squares[2:]).neg_().unbind()
+        fx, fy, fz = force.unbind()
+        less_fx, less_fy, less_fz = force.neg().unbind()
+        zero = torch.zeros_like(fx)
+        of_forces = [
+            ((fx, fy, fz), (zero, zero, zero)),
+            ((inward_x, plus_z, reversed_y), (zero, less_fz, fy)),
+            ((reversed_z, inward_y, plus_x), (fz, zero, less_fx)),
+            ((plus_y, reversed_x, inward_z), (less_fy, fx, zero)),
+        ]
+        chosen = [of_forces[column] for column in columns if column < parameters.INERTIA.start]
+        forces, moments = [x for x, _ in chosen], [x for _, x in chosen]
+    of_inertias = {
+        (0, 0): (ax, xz, less_xy),
+        (0, 1): (minus_y, plus_x, differ_z),
+        (0, 2): (plus_z, differ_y, minus_x),
+        (1, 1): (less_yz, ay, xy),
+        (1, 2): (differ_x, minus_z, plus_y),
+        (2, 2): (yz, less_xz, az),
     }
+    inertias = [column - parameters.INERTIA.start for column in columns if column >= parameters.INERTIA.start]
+    return forces, moments + [of_inertias[parameters.INERTIA_AXES[k]] for k in inertias]

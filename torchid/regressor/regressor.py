@@ -225,9 +225,11 @@ def generalized_forces(
     Returns:
         (k, base rows + len(joints), B).
     """
-    path = tree.index(tree.path(body))
-    screws = tree.joint_map[path][:, tree.index(joints)].T @ screw_axes[:, path]
-    torque = (wrenches[:, :, None] * screws[:, None]).sum(0)
+    path, ratios = tree.path_map(body, joints)
+    screws = screw_axes[:, path] if ratios is None else ratios @ screw_axes[:, path]
+    torque = wrenches[0, :, None] * screws[0]  # a product at a time: all six at once are six times the memory
+    for wrench, screw in zip(wrenches[1:].unsqueeze(2), screws[1:], strict=True):
+        torque.addcmul_(wrench, screw)
     return torch.cat([wrenches.transpose(0, 1), torque], dim=1) if tree.base_rows else torque
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -105,6 +105,7 @@ class KinematicTree(nn.Module):
         super().__init__()
         self.sign_width = sign_width
         self._indices: dict[tuple[int, ...], Tensor] = {}
+        self._path_maps: dict[tuple[int, ...], tuple[slice | Tensor, Tensor | None]] = {}
         nodes = tree_nodes(robot)
         self.node_of = [index for index, node in enumerate(nodes) if node.body is not None]
         self.body_of = np.searchsorted(self.node_of, np.arange(len(nodes))).tolist()
@@ -142,7 +143,8 @@ class KinematicTree(nn.Module):
         self._register("revolute", (moving & ~np.array(self.slides))[:, None])
         self._register("prismatic", np.array(self.slides)[:, None])
         self._register("ancestors", is_ancestor)
-        self._register("joint_map", np.stack([node.position_map for node in nodes]))
+        self._position_maps: list[list[float]] = [node.position_map.tolist() for node in nodes]
+        self._register("joint_map", np.array(self._position_maps))
         self._register("joint_constant", np.array([node.offset for node in nodes])[:, None])
         parent = np.maximum(self.parents, 0)
         level_start = np.repeat(np.cumsum([0, 0, *self.level_sizes[:-1]])[:-1], self.level_sizes)
@@ -161,6 +163,7 @@ class KinematicTree(nn.Module):
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> KinematicTree:
         self._indices.clear()
+        self._path_maps.clear()
         super()._apply(fn, recurse)
         return self
 
@@ -170,6 +173,24 @@ class KinematicTree(nn.Module):
         if key not in self._indices:
             self._indices[key] = torch.tensor(key, dtype=torch.int64, device=self.ancestors.device)
         return self._indices[key]
+
+    def path_map(self, body: int, joints: Sequence[int]) -> tuple[slice | Tensor, Tensor | None]:
+        """Nodes whose joints move a node, and the ratios of their motion to independent joints', made once.
+
+        Returns:
+            (nodes, ratios): an index, from the base outward, and (joints, nodes); None if they are one joint each.
+        """
+        key = (body, *joints)
+        if key not in self._path_maps:
+            path = self.path(body)
+            ratios = [[self._position_maps[node][joint] for node in path] for joint in joints]
+            one_each = [[float(node == other) for other in range(len(path))] for node in range(len(path))]
+            follow = bool(path) and path == list(range(path[0], body + 1))
+            self._path_maps[key] = (
+                slice(path[0], body + 1) if follow else self.index(path),
+                None if ratios == one_each else self.joint_map[self.index(path)][:, self.index(joints)].T,
+            )
+        return self._path_maps[key]
 
     def coulomb_sign(self, velocity: Tensor) -> Tensor:
         """Sign (...) of velocities (...) [rad/s or m/s] as Coulomb friction has it, smooth if a width is given."""
