@@ -29,8 +29,8 @@ from rich.table import Table
 from torchid.boundary import run_guarded
 from torchid.errors import TorchidWarning
 from torchid.estimators import Conditions
-from torchid.estimators.elliptical_slice import EllipticalSlice
 from torchid.estimators.posterior import Posterior, whitened_rows
+from torchid.estimators.truncated_gaussian import TruncatedGaussian
 from torchid.identifiability.structure import structural_samples
 from torchid.parameters import FRICTION, Array, perturb_parameters
 from torchid.problem import RowBuilder, compress, linear_problem
@@ -102,7 +102,7 @@ def compare(name: str, options: argparse.Namespace) -> list[str]:
     posterior = Synthetic(name, options.seed).posterior(0)
     conic = posterior.conic_problem(options.prior_error)
     start = time.process_time()
-    sampler = EllipticalSlice(conic, posterior.owners())
+    sampler = TruncatedGaussian(conic, posterior.owners())
     prepared = time.process_time() - start
     start = time.process_time()
     sampler.draw(10_000, torch.Generator().manual_seed(1))
@@ -113,8 +113,8 @@ def compare(name: str, options: argparse.Namespace) -> list[str]:
     half = len(states) // 2
     found, chance = differences(draws, states), differences(states[:half], states[half:])
     texts = [f"{found[x][0]:.3f} ({found[x][1]:.3f}); {chance[x][0]:.3f}" for x in found]
-    near = f"{int(sampler.near.sum())} of {len(sampler.near)}"
-    kind = f"{sampler.passes} {sampler.moves}"
+    near = f"{sampler.near} of {sampler.conditions}"
+    kind = "-" if sampler.chains is None else f"{sampler.chains.passes} {sampler.chains.moves}"
     return [name, f"{len(conic.linear)}", near, kind, *texts, f"{prepared:.2f} + {seconds:.2f}"]
 
 

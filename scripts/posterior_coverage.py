@@ -22,7 +22,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from torchid.boundary import run_guarded
-from torchid.estimators.elliptical_slice import EllipticalSlice
+from torchid.estimators.truncated_gaussian import TruncatedGaussian
 from torchid.parameters import Array
 
 _SAMPLES = 1000
@@ -33,7 +33,7 @@ def covered(one: Synthetic, repetition: int, prior_error: float) -> Array:
     """Whether the intervals of the combinations that the data determine hold the truth."""
     posterior = one.posterior(repetition)
     conic, free = posterior.conic_problem(prior_error), posterior.free
-    sampler = EllipticalSlice(conic, posterior.owners())
+    sampler = TruncatedGaussian(conic, posterior.owners())
     x = sampler.draw(_SAMPLES, torch.Generator().manual_seed(repetition)).numpy()
     true = ((one.true.flatten() - posterior.nominal) / posterior.scale)[free]
     rows = (posterior.A[:, free] * posterior.scale[free]) @ conic.deviations

@@ -68,6 +68,7 @@ def mujoco_forces(model: mujoco.MjModel, robot: Robot, states: States) -> Array:
     """
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     model.opt.gravity = [0.0, 0.0, -9.81]
+    model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)  # as torchid, which warns of it
     data, base, (matrix, constant), out = mujoco.MjData(model), robot.base_rows, robot.joint_map, []
     ids = [model.joint(body.joint.name).id for body in robot.bodies if body.joint is not None]
     at, rate = model.jnt_qposadr[ids], model.jnt_dofadr[ids]

@@ -8,13 +8,13 @@ import torch
 from posterior_accuracy import Synthetic, differences, long_run
 from posterior_coverage import covered
 
-from torchid.estimators.elliptical_slice import EllipticalSlice
+from torchid.estimators.truncated_gaussian import TruncatedGaussian
 
 
 @pytest.mark.slow
 def test_samples_of_an_arm_have_the_moments_of_long_chains() -> None:
     posterior = Synthetic("UR5", 0).posterior(0)
-    sampler = EllipticalSlice(posterior.conic_problem(0.2), posterior.owners())
+    sampler = TruncatedGaussian(posterior.conic_problem(0.2), posterior.owners())
     draws = sampler.draw(40_000, torch.Generator().manual_seed(0)).numpy()
     found = differences(draws, long_run(posterior, 0.2, 300, 200))
     assert {name: largest < 0.05 for name, (largest, _) in found.items()} == dict.fromkeys(found, True)

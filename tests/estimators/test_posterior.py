@@ -13,8 +13,8 @@ from synthetic import Array
 
 from torchid.estimators import Conditions, LeastSquares, violations
 from torchid.estimators.barrier_gaussian import barrier_gaussian
-from torchid.estimators.elliptical_slice import EllipticalSlice
 from torchid.estimators.posterior import Posterior, whitened_rows
+from torchid.estimators.truncated_gaussian import TruncatedGaussian
 from torchid.problem import LinearProblem
 
 NONE = np.zeros(0)
@@ -26,10 +26,10 @@ def posterior_of(problem: LinearProblem, conditions: Conditions, noise: float = 
     return Posterior(A, np.zeros((len(A), 0)), b, *same, NONE, NONE)
 
 
-def drawn(posterior: Posterior, count: int, prior_error: float = 0.2, seed: int = 0) -> tuple[Array, EllipticalSlice]:
+def drawn(posterior: Posterior, count: int, prior_error: float = 0.2, seed: int = 0) -> tuple[Array, TruncatedGaussian]:
     """Samples of the parameters in units of their scale, (count, free), less the nominal ones."""
     conic = posterior.conic_problem(prior_error)
-    sampler = EllipticalSlice(conic, posterior.owners())
+    sampler = TruncatedGaussian(conic, posterior.owners())
     x = sampler.draw(count, torch.Generator().manual_seed(seed)).numpy()
     return x @ conic.deviations.T, sampler
 
@@ -62,7 +62,7 @@ def test_without_conditions_nearby_samples_are_those_of_the_gaussian() -> None:
     problem = replace(nothing_seen(GOOD), A=3.0 * np.eye(12) / SCALE, b=3.0 * GOOD[0] / SCALE[0])
     posterior = posterior_of(problem, Conditions(lower=np.full((1, 12), -100.0), upper=np.full((1, 12), 100.0)), 0.02)
     deviations, sampler = drawn(posterior, 20_000)
-    assert not sampler.near.any()
+    assert not sampler.near
     conic = posterior.conic_problem()
     covariance = np.linalg.inv(conic.root.T @ conic.root)
     expected = conic.deviations @ covariance @ conic.deviations.T
@@ -102,8 +102,8 @@ def test_mean_and_covariance_are_those_of_long_chains_where_bodies_are_cut_off(p
     problem, _ = active_case(3)
     posterior = posterior_of(problem, Conditions(1e-3), noise=0.1)
     conic = posterior.conic_problem(prior_error)
-    sampler = EllipticalSlice(conic, posterior.owners())
-    assert sampler.near.any()
+    sampler = TruncatedGaussian(conic, posterior.owners())
+    assert sampler.near
     x = sampler.draw(40_000, torch.Generator().manual_seed(1)).numpy()
     chain, states = LongChain(conic, posterior.owners(), 1000, seed=2), []
     chain.run(2000)
@@ -120,7 +120,7 @@ def test_the_seed_decides_every_bit_whatever_the_number_of_threads(monkeypatch: 
     posterior = posterior_of(problem, Conditions())
     _, sampler = drawn(posterior, 1)
     one, other = (sampler.draw(1200, torch.Generator().manual_seed(5)) for _ in range(2))
-    monkeypatch.setattr("torchid.estimators.elliptical_slice.worker_count", lambda device: 1)
+    monkeypatch.setattr("torchid.estimators.truncated_gaussian.worker_count", lambda device: 1)
     assert torch.equal(one, other)
     assert torch.equal(one, sampler.draw(1200, torch.Generator().manual_seed(5)))
     assert not torch.equal(one, sampler.draw(1200, torch.Generator().manual_seed(6)))
@@ -192,13 +192,32 @@ def test_an_extra_parameter_confounded_with_a_body_shares_its_spread() -> None:
         np.array([0.1]), np.array([0.0]),
     )  # fmt: skip
     conic = posterior.conic_problem()
-    sampler = EllipticalSlice(conic, posterior.owners())
+    sampler = TruncatedGaussian(conic, posterior.owners())
     x = sampler.draw(10_000, torch.Generator().manual_seed(0)).numpy()
     armature, viscous = 0.1 * x[:, -1], parameters_of(posterior, x @ conic.deviations.T)[:, 0, 11]
     assert armature.min() > 0.0
     assert viscous.min() > 0.0
     np.testing.assert_allclose((armature + viscous).std(), 0.001, rtol=0.05)
     assert np.corrcoef(armature, viscous)[0, 1] < -0.99
+
+
+def test_what_no_condition_is_near_follows_what_a_bound_cuts_off() -> None:
+    """A mass and a friction of which the sum is known to 0.002, the friction truncated at 0: no chain has the mass."""
+    rows = np.zeros((2, 12))
+    rows[0, 10], rows[1, 10], rows[1, 0] = 20.0, 500.0, 500.0
+    problem = replace(nothing_seen(GOOD), A=rows, b=np.array([-1.0, 500.0 * (GOOD[0, 0] + 0.05)]))
+    posterior = posterior_of(problem, Conditions())
+    deviations, sampler = drawn(posterior, 40_000)
+    phi = parameters_of(posterior, deviations)[:, 0]
+    assert sampler.near == len(sampler.near_variables) == 2, "Coulomb and viscous friction"
+    mass, friction = phi[:, 0], phi[:, 10]
+    t = np.linspace(0.0, 0.4, 100_001)
+    of_sum = (t - 0.05) ** 2 / (0.002**2 + (0.2 * GOOD[0, 0]) ** 2)  # the mass integrated out
+    density = np.exp(-0.5 * (20.0 * t + 1.0) ** 2 - 0.5 * ((t - GOOD[0, 10]) / 0.2) ** 2 - 0.5 * of_sum)
+    mean = float(t @ density / density.sum())
+    np.testing.assert_allclose(friction.mean(), mean, rtol=0.03)
+    np.testing.assert_allclose((mass + friction).mean(), GOOD[0, 0] + 0.05, atol=1e-4)
+    np.testing.assert_allclose((mass + friction).std(), 0.002, rtol=0.03)
 
 
 def test_a_body_that_cannot_exist_in_the_urdf_has_samples_that_can() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from torchid.config.simulation import SimulatedRobotConfig, WaveConfig
 from torchid.logs import Log
 from torchid.problem import Evaluation, bind_log
 from torchid.problem.predict import force_series
+from torchid.robot import load_robot
 from torchid.simulation import Stability
 
 SHIPPED = CONFIGS / "biped_simulation.yaml"
@@ -92,9 +93,11 @@ STOOD = Stability((0.7, 0.8), 0.05, 0.001, 0.03, beyond_limits=0.0, effort=0.5, 
 """Of a robot that kept to all bounds."""
 
 
-def forces(log: Log, urdf: Path = BIPED, feet: Sequence[str] = SOLES) -> tuple[Array, Array]:
+def forces(
+    log: Log, urdf: Path = BIPED, feet: Sequence[str] = SOLES, held: Mapping[str, float] | None = None
+) -> tuple[Array, Array]:
     """Measured S^T tau + J_C^T lambda, and K phi of the true inertias without friction, (N, nv) each."""
-    robot = load(urdf)
+    robot = load(urdf) if held is None else load_robot(urdf, weld=held)
     contacts = [torchid.Contact(frame, "flat") for frame in feet]
     phi = robot.nominal.copy()
     phi[:, 10:] = 0.0

@@ -242,10 +242,13 @@ def test_a_robot_without_a_free_joint_must_be_said_to_be_bolted(tmp_path: Path) 
         robot_of(BOLTED, tmp_path)
 
 
-def test_another_planet_is_warned_of(tmp_path: Path) -> None:
-    text = BODY.format("", HINGE.format(""), '<option gravity="0 0 -1.6"/>')
-    with pytest.warns(TorchidWarning, match="gravity 0 0 -1.6; the Earth's"):
-        robot_of(text, tmp_path, True)
+@pytest.mark.parametrize(
+    ("option", "gravity"),
+    [('<option gravity="0 0 -1.6"/>', "0 0 -1.6"), ('<option><flag gravity="disable"/></option>', "0 0 0")],
+)
+def test_another_planet_is_warned_of(tmp_path: Path, option: str, gravity: str) -> None:
+    with pytest.warns(TorchidWarning, match=f"gravity {gravity}; the Earth's"):
+        robot_of(BODY.format("", HINGE.format(""), option), tmp_path, True)
 
 
 @pytest.mark.parametrize("pitch", [0.3, 0.5 * np.pi, -0.5 * np.pi, 0.5 * np.pi - 1e-9])

@@ -37,7 +37,7 @@ from torchid.config.simulation import WaveConfig
 from torchid.errors import InputError, UrdfError
 from torchid.logs import read_log
 from torchid.simulation import set_up_simulation
-from torchid.simulation.plant import find_feet
+from torchid.simulation.feet import find_feet
 
 THRESHOLD = 30.0  # N, from which on the shipped simulation counts a foot as standing
 
@@ -182,11 +182,14 @@ def test_a_point_foot_feels_no_moment_but_that_of_its_spheres_radius() -> None:
     assert (moment <= 0.0101 * force).all()  # 10 mm, and the floor gives way
 
 
-def test_a_robot_that_no_matter_could_be_made_of_is_refused() -> None:
-    """ANYmal's cameras and hatch break the triangle inequality of inertias, which torchid only warns of."""
+def test_a_robot_that_no_matter_could_be_made_of_is_refused(tmp_path: Path) -> None:
+    """ANYmal's cameras and hatch break the triangle inequality of inertias, the bodies they are part of do not."""
     feet = points_at(*(f"{leg}_FOOT" for leg in ("LF", "RF", "LH", "RH")))
-    with pytest.raises(UrdfError, match=r"anymal.urdf: .*inertia must satisfy A \+ B >= C") as raised:
-        set_up_simulation(robot_on(ANYMAL, feet, {}))
+    assert set_up_simulation(robot_on(ANYMAL, feet, {})).plant.mass > 40.0
+    urdf = tmp_path / "anymal.urdf"
+    urdf.write_text(re.sub(r'izz="[^"]*"', 'izz="90"', ANYMAL.read_text()))
+    with pytest.raises(UrdfError, match=r"anymal.urdf: link '\w+': .*an inertia that no body has") as raised:
+        set_up_simulation(robot_on(urdf, feet, {}))
     assert "\n" not in str(raised.value)
 
 

@@ -14,13 +14,16 @@ from motions import value
 from simulated import BIPED, SOLES, forces, only, robot_on, short
 
 from torchid.config import FootConfig, MotionConfig
+from torchid.config.robot import LoopConfig, TiedRobot
 from torchid.config.simulation import SimulatedRobotConfig, WaveConfig
+from torchid.errors import UnknownNameError
 from torchid.problem import RowBuilder, bind_log, compress, linear_problem
 from torchid.regressor.loops import LoopClosures
 from torchid.robot import load_robot
 from torchid.robot.urdf import read_urdf
 from torchid.sensing import Contact, named_sensors
 from torchid.simulation import set_up_simulation
+from torchid.simulation.plant import Plant
 from torchid.simulation.replay import Model, ReplayedLog, replay_log
 from torchid.simulation.ties import Ties
 
@@ -84,6 +87,14 @@ def test_a_held_joint_stays_where_it_is_held(tmp_path: Path, kind: str, position
     assert drift(urdf, Ties.of(urdf, joints, held={"second": 0.0}), log) > 1e-3
 
 
+def test_damping_that_is_faster_than_the_steps_does_not_make_a_joint_jump(tmp_path: Path) -> None:
+    urdf = arm(tmp_path)
+    log, held = swinging(urdf, (0.0, 0.0)), Ties.of(urdf, read_urdf(urdf)[1], held={"second": 0.0})
+    urdf.write_text(urdf.read_text().replace('damping="0.2"', 'damping="200"'))
+    assert drift(urdf, held, replace(log, torque=log.torque + 199.8 * log.velocity)) < 2e-4
+    assert drift(urdf, held, log) > 1e-2
+
+
 def test_a_biped_with_parallel_ankles_stands_on_its_motors_alone(tmp_path: Path) -> None:
     """Its exact log fulfils the equations of motion without the forces of its rods, which nobody measures."""
     path = tmp_path / "biped.xml"
@@ -127,4 +138,26 @@ def test_a_simulated_joint_that_mimics_another_obeys_the_equations_of_the_robot_
     np.testing.assert_allclose(log.joint_position[:, pitch], 0.5 * log.joint_position[:, roll], atol=1e-6)
     measured, predicted = forces(log, urdf, SOLES)
     assert measured.shape[1] == load_robot(urdf).nv
+    assert np.abs(predicted - measured).max() < 1e-5 * np.abs(measured).max()
+
+
+def test_a_simulated_robot_can_have_held_joints_loops_and_joints_without_motors(tmp_path: Path) -> None:
+    loop = LoopConfig(["base", "c"])  # type: ignore[arg-type]
+    urdf = arm(tmp_path)
+    urdf.write_text(urdf.read_text().replace('<link name="base"/>', LINK.format(name="base", mass=2.0)))
+    plant = Plant(urdf, (), 1000.0, stated=TiedRobot(weld={"second": 0.2}, loops=[loop], passive=["thi*"]))
+    assert plant.joint_names == ("first", "third")
+    np.testing.assert_array_equal(plant.has_motor, [True, False])
+    assert plant.ties[0].shape == (3, plant.nv)
+    with pytest.raises(UnknownNameError, match=r"robot\.weld"):
+        Plant(urdf, (), 1000.0, stated=TiedRobot(weld={"fourth": 0.0}))
+
+
+def test_the_log_of_a_robot_with_a_held_joint_is_that_of_the_robot_with_a_weld(tmp_path: Path) -> None:
+    held = {"torso_pitch": 0.1}
+    config = only(short(tmp_path / "out", "robot.weld={torso_pitch: 0.1}", "friction.enabled=false"), "squat_1.0hz")
+    motion = replace(config.motions[0], waves=[WaveConfig("com_z", 1.0, 0.03)])
+    log = set_up_simulation(config).run(motion)[0].log
+    assert "torso_pitch" not in log.joint_names
+    measured, predicted = forces(log, BIPED, SOLES, held)
     assert np.abs(predicted - measured).max() < 1e-5 * np.abs(measured).max()

@@ -29,7 +29,7 @@ from torchid.robot import Robot
 from torchid.robot.urdf import read_urdf
 from torchid.robot.welds import matching_joints
 from torchid.sensing import Contact
-from torchid.simulation.plant import Foot, find_feet, point_foot
+from torchid.simulation.feet import Foot, find_feet, point_foot
 from torchid.simulation.replay import Drift, Model, ReplayedLog, replay_log
 from torchid.simulation.ties import Ties
 

@@ -25,7 +25,7 @@ from torchid.report import FittedJoints, identified_robot
 from torchid.report.tables import progress_bars
 from torchid.robot import Robot, load_robot
 from torchid.simulation import LEAD_S, Stability, sensor_log, set_up_simulation
-from torchid.simulation.plant import find_feet
+from torchid.simulation.feet import find_feet
 
 _POLL_S = 0.2
 
@@ -43,7 +43,8 @@ def simulate(config: SimulationConfig) -> dict[str, Stability]:
         InputError: whatever does not fit, or a robot that does not keep standing; nothing has been written then.
     """
     check_free(config.output, config.overwrite, SIMULATION, [config.robot.path])
-    robot = load_robot(config.robot.path)
+    of = config.robot
+    robot = load_robot(of.path, weld=of.weld, loops=[loop.loop for loop in of.loops], passive=of.passive)
     simulation = set_up_simulation(config)
     for motion in config.motions:
         simulation.reference(motion)

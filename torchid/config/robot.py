@@ -116,23 +116,31 @@ def require_kind(robot: RobotFile) -> None:
 
 
 @dataclass(config=STRICT, frozen=True)
-class RobotConfig(RobotFile):
+class TiedRobot(RobotFile):
+    """A robot's file, and what its joints are tied by or lack that the file may not say.
+
+    `weld`: names or patterns of joints that are held still, at 0 or at the position [rad or m] that a mapping gives.
+    `loops`: closed loops beside those of an MJCF file. `passive`: names or patterns of joints without a motor, whose
+    torque is 0; None for those that no actuator of an MJCF file with loops drives.
+    """
+
+    weld: Welds = dataclasses.field(default_factory=dict)
+    loops: list[LoopConfig] = dataclasses.field(default_factory=list)
+    passive: list[str] | None = None
+
+
+@dataclass(config=STRICT, frozen=True)
+class RobotConfig(TiedRobot):
     """The robot, `urdf` or `mjcf`; `base_link` defaults to the URDF's root.
 
     `mjcf`: a MuJoCo model, read by MuJoCo (the extra [sim]); its tree of most degrees of freedom is the robot.
-    `weld`: names or patterns of joints that are held still, at 0 or at the position [rad or m] that a mapping gives.
     `base_tilt`: two angles [rad] about the base's x and y axes by which it is turned from the base that logs record, as
-    on a table that is not level; auto, those that leave least of the training logs; None for none. `loops`: closed
-    loops beside those of an MJCF file. `passive`: names or patterns of joints without a motor, whose torque is 0; None
-    for those that no actuator of an MJCF file with loops drives.
+    on a table that is not level; auto, those that leave least of the training logs; None for none.
     """
 
     base_link: str | None = None
     fixed_base: bool = False
-    weld: Welds = dataclasses.field(default_factory=dict)
     base_tilt: BaseTilt = None
-    loops: list[LoopConfig] = dataclasses.field(default_factory=list)
-    passive: list[str] | None = None
 
     @property
     def tilt(self) -> tuple[float, float]:

@@ -60,6 +60,20 @@ class BarrierGaussian:
         """(n, n)."""
         return self.directions @ self.directions.T
 
+    def marginal(self, variables: np.ndarray, blocks: np.ndarray, rows: np.ndarray) -> BarrierGaussian:
+        """The Gaussian of some variables, (m,) int, whatever the others are, some blocks, (K,), and rows, (M,) bool."""
+        rest = np.setdiff1d(np.arange(len(self.mean)), variables)
+        triangle = np.asarray(np.linalg.qr(self.root[:, [*rest, *variables]], mode="r"))
+        directions = np.asarray(np.linalg.qr(self.directions[variables].T, mode="r")).T
+        return BarrierGaussian(
+            mean=self.mean[variables],
+            root=triangle[len(rest) :, len(rest) :],
+            directions=directions,
+            blocks=self.blocks[blocks][:, :, variables],
+            rows=self.rows[rows][:, variables],
+            near=self.near[np.concatenate([blocks, rows])],
+        )
+
 
 @one_thread()
 def barrier_gaussian(conic: ConicProblem) -> BarrierGaussian:

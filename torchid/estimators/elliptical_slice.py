@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 
 from torchid.errors import NumericalWarning, warn
-from torchid.estimators.barrier_gaussian import CURVATURE, ENTRY_WEIGHTS, UPPER, BarrierGaussian, barrier_gaussian
+from torchid.estimators.barrier_gaussian import CURVATURE, ENTRY_WEIGHTS, UPPER, BarrierGaussian
 from torchid.estimators.conic_problem import ConicProblem
 from torchid.parameters import Array
-from torchid.problem.chunks import one_thread, run_in_workers, worker_count
+from torchid.problem.chunks import one_thread
 
-_CHAINS, _BATCHES = 512, 2  # chains of a batch, which one thread works on, and batches at most
+_CHAINS = 512  # that find out how many passes make a state new
 _TRIES = 24  # on an ellipse, after which a chain stays where it is; each halves the arc
 _INSIDE = 1e-12  # least pivot of a block and slack of a row, relative to the mean's: above what rounding can hide
 _ALIKE = 0.25  # correlation of a coordinate with what it was, in all chains, below which states count as new
@@ -41,6 +41,42 @@ class _Group:
     change: Tensor
     blocks: Tensor
     rows: Tensor
+
+
+@dataclass(frozen=True)
+class _Bounded:
+    """A variable that bounds alone concern.
+
+    `end`: a bound, relative to the mean; `other`: on the other side, None where there is none; `spread`: standard
+    deviation where all others are fixed, negative if `end` is an upper bound; `kept`, `pull`: then the centre is
+    `kept * x + pull`, less what the others make of it.
+    """
+
+    variable: int
+    end: float
+    other: float | None
+    spread: float
+    kept: float
+    pull: float
+
+    @classmethod
+    def of(cls, variable: int, gaussian: BarrierGaussian, precision: float) -> _Bounded:
+        """Of a Gaussian whose own precision, without barriers, is that where all others are fixed."""
+        slopes, near = gaussian.rows[:, variable], gaussian.near[len(gaussian.blocks) :]
+        low = float(max((_INSIDE - 1.0) / slopes[slopes > 0.0], default=-math.inf))
+        high = float(min((_INSIDE - 1.0) / slopes[slopes < 0.0], default=math.inf))
+        deviation, kept = precision**-0.5, 1.0 + CURVATURE * float(np.square(slopes[near]).sum()) / precision
+        pull = -float(slopes[near].sum()) / precision
+        if low == -math.inf:
+            return cls(variable, high, None, -deviation, kept, pull)
+        return cls(variable, low, high if high < math.inf else None, deviation, kept, pull)
+
+    def draw(self, centre: Tensor, uniform: Tensor) -> Tensor:
+        """From the normal distribution around a centre, cut off by the bounds, (B,)."""
+        low = (self.end - centre) / self.spread
+        high = None if self.other is None else (self.other - centre) / self.spread
+        drawn = torch.add(centre, _truncated_normal(low, high, uniform), alpha=self.spread)
+        return drawn.clamp(self.end, self.other) if self.spread > 0.0 else drawn.clamp(max=self.end)
 
 
 @dataclass
@@ -74,26 +110,23 @@ class EllipticalSlice(torch.nn.Module):
     block_changes: Tensor
     row_changes: Tensor
     near: Tensor
-    alone: Tensor
-    precisions: Tensor
+    alone_columns: Tensor
+    alone_weights: Tensor
     weights: Tensor
     unit: Tensor
 
-    def __init__(self, conic: ConicProblem, owners: np.ndarray) -> None:
+    def __init__(self, conic: ConicProblem, gaussian: BarrierGaussian, owners: np.ndarray) -> None:
         """Prepare.
 
         Args:
             conic: the problem, without log-determinants in its objective.
+            gaussian: that stands for it.
             owners: (n,) int, to which body each variable belongs.
-
-        Raises:
-            InputError: the conditions exclude each other.
 
         Warns:
             NumericalWarning: states stay alike for too long, so that draws will be correlated.
         """
         super().__init__()
-        gaussian = barrier_gaussian(conic)
         alone = _bounded_alone(conic, gaussian)
         gaussian = replace(gaussian, root=_triangular_from(gaussian.root, alone))
         arrays = {
@@ -109,8 +142,11 @@ class EllipticalSlice(torch.nn.Module):
         }
         for name, array in arrays.items():
             self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(array)))
-        self.register_buffer("alone", torch.from_numpy(alone))
-        self.register_buffer("precisions", torch.from_numpy(np.square(conic.root[:, alone]).sum(axis=0)))
+        precision = np.square(conic.root[:, alone]).sum(axis=0)
+        self.alone = [_Bounded.of(int(v), gaussian, float(p)) for v, p in zip(alone, precision, strict=True)]
+        by_alone = np.ascontiguousarray(gaussian.root[: len(alone), alone].T)
+        self.register_buffer("alone_columns", torch.from_numpy(by_alone))
+        self.register_buffer("alone_weights", torch.from_numpy(by_alone / precision[:, None]))
         self._groups = 0
         self._add_group(gaussian, conic.E, np.setdiff1d(np.arange(len(gaussian.mean)), alone))
         for variables in _pairs(gaussian, owners):
@@ -133,35 +169,15 @@ class EllipticalSlice(torch.nn.Module):
             self.register_buffer(f"{name}_{self._groups}", torch.from_numpy(np.ascontiguousarray(array)))
         self._groups += 1
 
-    def draw(self, count: int, generator: torch.Generator | None = None) -> Tensor:
-        """Points x, (count, n), on the device of the module; they do not depend on the number of threads.
-
-        Args:
-            count: number of them.
-            generator: of random numbers, on that device; None for torch's own.
-        """
-        device, batches = self.mean.device, max(1, min(_BATCHES, count // _CHAINS))
-        seeds = torch.randint(2**62, (batches,), generator=generator, device=device).tolist()
-        counts = [count * (k + 1) // batches - count * k // batches for k in range(batches)]
-        tasks = list(enumerate(zip(counts, seeds, strict=True)))
-        threads = worker_count(device)
-        done = run_in_workers(tasks, lambda part: [(number, self._batch(*of)) for number, of in part], threads)
-        drawn = dict(pair for pairs in done for pair in pairs)
-        return (self.mean[:, None] + torch.cat([drawn[k] for k in range(batches)], dim=1)).T.contiguous()
-
-    def _batch(self, count: int, seed: int) -> Tensor:
-        """Points relative to the mean, (n, count)."""
-        generator = torch.Generator(self.mean.device).manual_seed(seed)
-        chains = min(count, _CHAINS)
+    def states(self, chains: int, generator: torch.Generator) -> Iterator[Tensor]:
+        """Points x of so many chains, (n, chains), on the device of the module, again and again, new ones each time."""
         state = self._start(chains, generator)
         for _ in range(_BURN_IN * self.passes):
             self._pass(state, generator)
-        out = [state.x.clone()]
-        while len(out) * chains < count:
+        while True:
+            yield self.mean[:, None] + state.x
             for _ in range(self.passes):
                 self._pass(state, generator)
-            out.append(state.x.clone())
-        return torch.cat(out, dim=1)[:, :count]
 
     @one_thread()
     @torch.no_grad()
@@ -189,10 +205,10 @@ class EllipticalSlice(torch.nn.Module):
         state = self._at(x)
         share = x.new_ones(chains)
         for _ in range(_SHRINKS):
-            inside = _inside(state.blocks + self.unit, state.rows)
-            if bool(inside.all()):
+            fits = inside(state.blocks + self.unit, state.rows)
+            if bool(fits.all()):
                 return state
-            share = torch.where(inside, share, _SHRINK * share)
+            share = torch.where(fits, share, _SHRINK * share)
             state = self._at(x * share)
         return self._at(torch.zeros_like(x))
 
@@ -233,24 +249,17 @@ class EllipticalSlice(torch.nn.Module):
 
     def _move_alone(self, state: _State, generator: torch.Generator | None) -> None:
         """Draw each variable that only bounds of its own concern from its exact distribution with all others fixed."""
-        near, whitened = self.near[len(state.blocks) :], state.whitened[: len(self.alone)]  # zero below
-        for number, variable in enumerate(self.alone.tolist()):
-            column, slopes, x = self.root[: len(whitened), variable], self.row_changes[:, variable], state.x[variable]
-            barrier = CURVATURE * (near * slopes.square()).sum()
-            precision = self.precisions[number]  # of the root less the barrier, which may be almost all of it
-            gradient = -(column @ whitened) + barrier * x - near @ slopes
-            deviation = precision.rsqrt()
-            centre = x + gradient / precision
-            ends = (_INSIDE - 1.0) / slopes  # where the slack of each bound ends
-            low = torch.where(slopes > 0.0, ends, -math.inf).amax()
-            high = torch.where(slopes < 0.0, ends, math.inf).amin()
-            uniform = torch.rand(len(x), dtype=x.dtype, device=x.device, generator=generator)
-            unit = _truncated_normal((low - centre) / deviation, (high - centre) / deviation, uniform)
-            step = torch.clamp(centre + deviation * unit, low, high) - x
-            x += step
-            whitened[: number + 1].addr_(column[: number + 1], step)
-            bounds = torch.nonzero(slopes)[:, 0]
-            state.rows[bounds] += slopes[bounds, None] * step
+        size = (len(self.alone), state.x.shape[1])
+        uniform = 1.0 - torch.rand(size, dtype=state.x.dtype, device=state.x.device, generator=generator)  # never 0
+        for number, one in enumerate(self.alone):
+            x, above = state.x[one.variable], state.whitened[: number + 1]  # the columns are zero below
+            weights, column = self.alone_weights[number, : number + 1], self.alone_columns[number, : number + 1]
+            centre = torch.addmv(x, above.T, weights, beta=one.kept, alpha=-1.0).add_(one.pull)
+            drawn = one.draw(centre, uniform[number])
+            above.addr_(column, drawn - x)
+            x.copy_(drawn)
+        if self.alone:
+            state.rows = self.row_changes @ state.x
 
     def _move_all(self, state: _State, generator: torch.Generator | None) -> None:
         size = (self.directions.shape[1], state.x.shape[1])
@@ -289,7 +298,7 @@ class EllipticalSlice(torch.nn.Module):
         out, left = torch.zeros_like(angle), torch.arange(len(angle), device=angle.device)
         for _ in range(_TRIES):
             there = now + along * (1.0 - torch.cos(angle)) + across * torch.sin(angle)
-            fits = _inside(there[:cut].view(-1, 10, len(angle)) + self.unit, there[cut:])
+            fits = inside(there[:cut].view(-1, 10, len(angle)) + self.unit, there[cut:])
             fits &= self._excess(there, cut, near) >= level
             out[left[fits]] = angle[fits]
             rest = torch.nonzero(~fits)[:, 0]
@@ -316,7 +325,7 @@ def _uniform(like: Tensor, generator: torch.Generator | None) -> Callable[[], Te
     return lambda: torch.rand(like.shape[1], dtype=like.dtype, device=like.device, generator=generator)
 
 
-def _inside(blocks: Tensor, rows: Tensor) -> Tensor:
+def inside(blocks: Tensor, rows: Tensor) -> Tensor:
     """Where all blocks, (K, 10, B), are positive definite, and all rows, (M, B), above -1: (B,) bool."""
     a, b, c, d, e, f, g, h, i, j = blocks.unbind(1)  # rows a b c d, e f g, h i, j of the upper triangle
     first = 1.0 / a
@@ -329,15 +338,22 @@ def _inside(blocks: Tensor, rows: Tensor) -> Tensor:
     return (pivots > _INSIDE).all(0) & (rows > _INSIDE - 1.0).all(0)
 
 
-def _truncated_normal(low: Tensor, high: Tensor, uniform: Tensor) -> Tensor:
-    """Standard normal numbers between bounds, far into the tails, from uniform ones, (B,)."""
+def _truncated_normal(low: Tensor, high: Tensor | None, uniform: Tensor) -> Tensor:
+    """Standard normal numbers above `low`, below `high`, far into the tails, from uniform ones above 0, all (B,)."""
+    if high is None:
+        tail = low - torch.log(uniform) / low
+        return torch.where(low > _TAIL, tail, -torch.special.ndtri(uniform * _above(low)))
     flipped = low + high < 0.0
     near, far = torch.where(flipped, -high, low), torch.where(flipped, -low, high)  # the one nearer to 0 first
-    of_near, of_far = (0.5 * torch.erfc(x / math.sqrt(2.0)) for x in (near, far))  # torch's ndtr is 0 from 8.3 on
-    body = -torch.special.ndtri(of_far + uniform * (of_near - of_far))
+    body = -torch.special.ndtri(_above(far) + uniform * (_above(near) - _above(far)))
     tail = near - torch.log1p(-uniform * -torch.expm1(-near * (far - near))) / near
     drawn = torch.where(near > _TAIL, tail, body)
     return torch.where(flipped, -drawn, drawn)
+
+
+def _above(x: Tensor) -> Tensor:
+    """How often a standard normal number is larger; torch's own is 0 from 8.3 on."""
+    return 0.5 * torch.erfc(x / math.sqrt(2.0))
 
 
 def _bounded_alone(conic: ConicProblem, gaussian: BarrierGaussian) -> np.ndarray:

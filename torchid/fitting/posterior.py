@@ -16,8 +16,8 @@ from torch import Tensor
 from torchid import parameters
 from torchid.errors import InputError, LogError, during
 from torchid.estimators import Conditions, Enclosure, Mirror
-from torchid.estimators.elliptical_slice import EllipticalSlice
 from torchid.estimators.posterior import PRIOR_ERROR, Posterior, whitened_rows
+from torchid.estimators.truncated_gaussian import TruncatedGaussian
 from torchid.fitting.fit import Fit
 from torchid.identifiability.confounding import mass_weights
 from torchid.logs.containers import open_container
@@ -301,7 +301,7 @@ class PosteriorSampler(torch.nn.Module):
         self.fitted = run if isinstance(run, FittedPosterior) else read_posterior(Path(run))
         posterior = self.fitted.posterior
         conic = posterior.conic_problem(prior_error)
-        self.draws = EllipticalSlice(conic, posterior.owners())
+        self.draws = TruncatedGaussian(conic, posterior.owners())
         count = int(posterior.free.sum())
         to_free = posterior.scale[posterior.free, None] * conic.deviations[:count, :count]
         for name, array in (

@@ -108,8 +108,10 @@ def _check_medium(model: MjcfModel) -> None:
             element = next((x for x in model.text.root.iter("option") if x.get(name)), None)
             line = "" if element is None else f", line {element.sourceline}"
             raise UrdfError(model.path, f"<option>{line}", f"{name} {getattr(option, name):g}", f"{name} 0: no fluid")
-    if np.abs(option.gravity - [0.0, 0.0, -_GRAVITY]).max() > _CLOSE:
-        warn(f"{model.path}: gravity {_numbers(option.gravity)}; the Earth's along -z is used")
+    off = option.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY
+    gravity = np.zeros(3) if off else option.gravity
+    if np.abs(gravity - [0.0, 0.0, -_GRAVITY]).max() > _CLOSE:
+        warn(f"{model.path}: gravity {_numbers(gravity)}; the Earth's along -z is used")
 
 
 def mimic_of(model: MjcfModel, equality: Any) -> tuple[str, str, float, float] | None:

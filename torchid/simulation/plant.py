@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,119 +10,26 @@ from pathlib import Path
 import numpy as np
 from lxml import etree
 
-from torchid.config import FootConfig
-from torchid.errors import ConfigError, UnknownNameError, UrdfError
+from torchid import parameters
+from torchid.config.robot import TiedRobot
+from torchid.errors import UrdfError
 from torchid.parameters import Array
-from torchid.robot.loops import loops_of_file
+from torchid.robot.loops import loops_of_file, passive_joints
 from torchid.robot.mjcf_model import mujoco
+from torchid.robot.tree import joint_origin, link_parameters
 from torchid.robot.urdf import TreeJoint, drop_repeated_origins, parse_xml, read_urdf
+from torchid.robot.welds import weld_positions
 from torchid.robot.xml_files import file_kind, is_mjcf, plain_urdf
-from torchid.sensing.sensors import NORMAL_FORCE
-from torchid.simulation.ties import WORLD, Followers, Ties, loop_errors
+from torchid.simulation.feet import Foot
+from torchid.simulation.ties import WORLD, Followers, Ties, body_name, loop_errors, set_inertial
 
-_RADIUS = 1e-4  # m, of contact points that the file gives: where they touch the floor is where they are
 _SMALLEST = 1e-14  # kg and kg m^2, of links without mass between the axes of a joint of several axes
-_NARROWEST = 1e-3  # m, of a support polygon
 _DISCARDED = ("transmission", "gazebo", "material", "mujoco")
 _SPRING = (0.004, 1.0)  # time constant [s] and damping ratio of the floor; a softer one lets feet creep, by v^2
 _STICTION = (0.002, 1.0)  # the same of dry friction in a joint; MuJoCo's own lets joints creep at 0.1 rad/s
 _FRICTION = (1.0, 0.005, 0.0001)
 _SIMULATED = "a robot that MuJoCo can simulate"
 _SLIP_RATIO = 10.0  # friction's stiffness over the normal one's: soft friction creeps
-
-
-@dataclass(frozen=True)
-class Foot:
-    """A link that touches the floor with spheres about points, (k, 3) [m] in its frame, of radii (k,) [m].
-
-    `along_normal`: its sensor reads the force along the floor's normal alone.
-    """
-
-    frame: str
-    points: tuple[tuple[float, float, float], ...]
-    radii: tuple[float, ...]
-    along_normal: bool = False
-
-    @property
-    def middle(self) -> Array:
-        """Mean of the points (3,) [m], in the foot's frame."""
-        return np.mean(self.points, axis=0)
-
-    @property
-    def arms(self) -> Array:
-        """The points from their middle, (k, 3) [m]."""
-        return np.array(self.points) - self.middle
-
-    @property
-    def rolling_radius(self) -> float:
-        """Radius of a foot that is one sphere of the URDF [m], 0 of others: they stand on points."""
-        return self.radii[0] if len(self.radii) == 1 and self.radii[0] > _RADIUS else 0.0
-
-    @property
-    def constrained(self) -> int:
-        """Number of its six velocities that the floor constrains: three, or all six if it stands flat."""
-        return 6 if form_polygon(np.array(self.points)) else 3
-
-
-def point_foot(frame: str, radius: float = 0.0) -> Foot:
-    """A foot that is one sphere about the origin of its frame, of a radius [m], or a point."""
-    return Foot(frame, ((0.0, 0.0, 0.0),), (max(radius, _RADIUS),))
-
-
-def find_feet(settings: list[FootConfig], urdf: Path) -> tuple[Foot, ...]:
-    """The feet with their contact points, from the file or from the URDF's collision spheres.
-
-    Args:
-        settings: of the simulation file.
-        urdf: the robot.
-
-    Raises:
-        UnknownNameError: the URDF has no such link.
-        ConfigError: a foot is named twice, or has no contact points.
-        UrdfError: a collision sphere is not described by numbers.
-    """
-    root = parse_xml(urdf).getroot()
-    links = {link.get("name", ""): link for link in root.findall("link")}
-    frames = [foot.frame for foot in settings]
-    feet = []
-    for foot in settings:
-        if foot.frame not in links:
-            raise UnknownNameError.at_field("feet", foot.frame, links)
-        if frames.count(foot.frame) > 1:
-            raise ConfigError.at_field("feet", f"'{foot.frame}' named twice", "every foot once")
-        along_normal = foot.sensor == NORMAL_FORCE
-        if foot.points:
-            points = tuple((x, y, z) for x, y, z in foot.points)
-            feet.append(Foot(foot.frame, points, (_RADIUS,) * len(points), along_normal))
-            continue
-        shapes = links[foot.frame].findall("collision")
-        spheres = [sphere for shape in shapes if (sphere := _sphere(urdf, foot.frame, shape)) is not None]
-        if not spheres:
-            missing = f"no points, and {urdf.name} has no collision spheres at {foot.frame}"
-            raise ConfigError.at_field("feet", missing, "points: [[x, y, z], ...] in the frame of the foot")
-        points, radii = zip(*spheres, strict=True)
-        feet.append(Foot(foot.frame, points, radii, along_normal))
-    return tuple(feet)
-
-
-def _sphere(urdf: Path, frame: str, shape: object) -> tuple[tuple[float, float, float], float] | None:
-    """Centre and radius [m] of a collision shape in its link's frame, None unless it is a sphere."""
-    sphere, origin = shape.find("geometry/sphere"), shape.find("origin")  # type: ignore[attr-defined]
-    if sphere is None:
-        return None
-    try:
-        radius = float(sphere.get("radius", ""))
-        x, y, z = map(float, ("0 0 0" if origin is None else origin.get("xyz", "0 0 0")).split())
-    except ValueError as error:
-        raise UrdfError(urdf, f"link '{frame}', <sphere>", f"{error}", "numbers for radius and origin") from error
-    if not (np.isfinite([x, y, z, radius]).all() and radius > 0.0):
-        raise UrdfError(urdf, f"link '{frame}', <sphere>", f"radius {radius:g}", "finite numbers, radius > 0")
-    return (x, y, z), radius
-
-
-def form_polygon(points: Array) -> bool:
-    """Whether contact points, (k, 3) [m], form a polygon: do not all lie on a line."""
-    return len(points) > 2 and float(np.linalg.svd(points - points.mean(axis=0))[1][1]) > _NARROWEST
 
 
 @dataclass(frozen=True)
@@ -159,7 +67,12 @@ class Plant:
     """
 
     def __init__(
-        self, urdf: Path, feet: Sequence[Foot], physics_hz: float, friction: tuple[float, float] | None = None
+        self,
+        urdf: Path,
+        feet: Sequence[Foot],
+        physics_hz: float,
+        friction: tuple[float, float] | None = None,
+        stated: TiedRobot | None = None,
     ) -> None:
         """Compile the model.
 
@@ -168,12 +81,15 @@ class Plant:
             feet: what touches the floor.
             physics_hz: integration rate [Hz].
             friction: Coulomb [N m] and viscous [N m s/rad] friction of every joint; None: the URDF's.
+            stated: joints that are held or without a motor, and loops beside the file's.
 
         Raises:
             UrdfError: MuJoCo does not take it, or it has springs.
+            ConfigError: see `weld_positions` and `passive_joints`.
         """
-        joints = read_urdf(urdf)[1]
-        self._ties = Ties.of(urdf, joints, loops_of_file(urdf))
+        stated, joints = stated or TiedRobot(), read_urdf(urdf)[1]
+        loops = (*(loop.loop for loop in stated.loops), *loops_of_file(urdf))
+        self._ties = Ties.of(urdf, joints, loops, weld_positions(urdf, joints, stated.weld))
         self.model = compile_model(urdf, feet, physics_hz, ties=self._ties)
         self.data = mujoco.MjData(self.model)
         model = self.model
@@ -195,8 +111,9 @@ class Plant:
         self._bodies = [int(model.site_bodyid[site]) for site in self._middles]
         self._M = np.zeros((self.nv, self.nv))
         self._followers = Followers(model, self._ties.mimics)
-        passive = {joint.name for joint in joints if joint.passive} | self._ties.mimics.keys()
-        self.has_motor = np.array([name not in passive for name in self.joint_names])
+        moving = [name for name in self.joint_names if name not in self._ties.mimics]
+        driven = set(moving).difference(passive_joints(joints, stated.passive, moving))
+        self.has_motor = np.array([name in driven for name in self.joint_names])
 
     # ---------------------------------------------------------------------------------------------------- stepping
 
@@ -330,7 +247,7 @@ def compile_model(
     try:
         model = spec.compile()
     except ValueError as error:
-        raise UrdfError(urdf, file_kind(urdf), f"MuJoCo refuses it: {error}", _SIMULATED) from error
+        raise _refusal(urdf, spec, str(error)) from error
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT  # a stop's force would be in no sensor
     model.dof_solref[:], model.dof_solimp[:, :2] = _STICTION, (0.99, 0.999)
     return model
@@ -355,9 +272,42 @@ def _spec(urdf: Path) -> mujoco.MjSpec:
         raise UrdfError(urdf, file_kind(urdf), f"MuJoCo refuses it: {error}", _SIMULATED) from error
     spec.compiler.fusestatic = False
     spec.compiler.balanceinertia = False
+    for link, values in _lumped_inertials(urdf).items():
+        set_inertial(spec.body(body_name(link)), values)
     if any(body.joints and not body.mass and _carries_mass(body) for body in spec.bodies):
         spec.compiler.boundmass = spec.compiler.boundinertia = _SMALLEST
     return spec
+
+
+def _lumped_inertials(urdf: Path) -> dict[str, Array]:
+    """Parameters (10,) of every link with what is welded to it, 0 of what is welded to another.
+
+    MuJoCo checks links one by one: of a body that can exist, those of a camera or a foot often cannot.
+    """
+    links, joints = read_urdf(urdf)
+    fixed = {joint.child: joint for joint in joints if joint.type == "fixed"}
+    out = {link.name: np.zeros(parameters.INERTIAL.stop) for link in links}
+    for link in links:
+        carrier, T = link.name, np.eye(4)
+        while carrier in fixed:
+            carrier, T = fixed[carrier].parent, joint_origin(fixed[carrier]) @ T
+        out[carrier] += link_parameters(link, T)[parameters.INERTIAL]
+    return out
+
+
+def _refusal(urdf: Path, spec: mujoco.MjSpec, message: str) -> UrdfError:
+    """What is wrong with a model that MuJoCo does not take, of a link's inertia without MuJoCo's words."""
+    named = re.search(r"inertia.*Element name '([^']+)'", message, re.DOTALL)
+    body = spec.body(named[1]) if named else None
+    if named is None or body is None:
+        return UrdfError(urdf, file_kind(urdf), f"MuJoCo refuses it: {message}", _SIMULATED)
+    if "mjMINVAL" in message:
+        joint = body.joints[0].name if body.joints else ""
+        held = f", or robot.weld: {{{joint}: 0}}, which holds it still" if joint else ""
+        accepted = f"an <inertial> of the link{held}"
+        return UrdfError(urdf, f"link '{named[1]}'", "moves without mass or without inertia", accepted)
+    found = "with what is welded to it, an inertia that no body has"
+    return UrdfError(urdf, f"link '{named[1]}'", found, "principal moments A, B, C above 0, none above the others' sum")
 
 
 def _carries_mass(body: mujoco.MjsBody) -> bool:

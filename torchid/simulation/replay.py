@@ -14,10 +14,12 @@ from scipy.spatial.transform import Rotation, Slerp
 from torchid.errors import InputError, LogError
 from torchid.parameters import Array
 from torchid.regressor.kinematics import GRAVITY_WORLD
-from torchid.simulation.plant import Foot, compile_model, foot_site
+from torchid.simulation.feet import Foot
+from torchid.simulation.plant import compile_model, foot_site
 from torchid.simulation.ties import Followers, Ties
 
 _PHYSICS_HZ = 1000.0
+# Rates of decay by damping [1/s] from _PHYSICS_HZ on are for an implicit integrator: Runge and Kutta's would diverge.
 _LONGEST_GAP = 2.5  # median sampling intervals, within a window
 _FEWEST, _MOST_WINDOWS = 2, 500
 
@@ -182,7 +184,6 @@ class _Simulated:
         self.log, self.floating = log, log.angular_velocity is not None
         self.feet = feet if self.floating else ()
         self.model = compile_model(model.urdf, self.feet, _PHYSICS_HZ, self.floating, model.ties)
-        self.model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
         self.model.opt.gravity = GRAVITY_WORLD
         if not self.floating and log.quat_xyzw is not None:
             self.model.opt.gravity = Rotation.from_quat(log.quat_xyzw[0]).inv().apply(GRAVITY_WORLD)
@@ -198,6 +199,9 @@ class _Simulated:
         """Let joints be pulled to position 0 and velocity 0, (n,) each, as by springs and dampers."""
         self.model.jnt_stiffness[self.model.dof_jntid[self.rate]] += kp
         self.model.dof_damping[self.rate] += kd
+        fastest = float((self.model.dof_damping * self.model.dof_invweight0).max(initial=0.0))
+        kinds = mujoco.mjtIntegrator
+        self.model.opt.integrator = kinds.mjINT_RK4 if fastest < _PHYSICS_HZ else kinds.mjINT_IMPLICITFAST
 
     def run(self, begin: int, torque: Array) -> tuple[Array, Array | None]:
         """Positions of the joints (S + 1, n) and the base's quaternion w x y z, (S + 1, 4), from a sample on.

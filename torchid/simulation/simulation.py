@@ -19,7 +19,8 @@ from torchid.parameters import Array
 from torchid.robot.rolling import rolled_distance
 from torchid.sensing.sensors import NORMAL_INDEX
 from torchid.simulation.controller import Controller, ReferenceMotion, Stance, find_stance
-from torchid.simulation.plant import Foot, Plant, find_feet, form_polygon
+from torchid.simulation.feet import Foot, find_feet, form_polygon
+from torchid.simulation.plant import Plant
 
 _REPORT_S = 0.25  # simulated seconds between two checks of whether the robot stands
 
@@ -32,7 +33,7 @@ def set_up_simulation(config: SimulationConfig) -> Simulation:
     """
     require_kind(config.robot)
     feet = find_feet(config.feet, config.robot.path)
-    plant = Plant(config.robot.path, feet, config.physics_hz, config.friction.levels)
+    plant = Plant(config.robot.path, feet, config.physics_hz, config.friction.levels, config.robot)
     simulation = Simulation(config, plant, feet, find_stance(plant, feet, config.posture))
     simulation.require_support(np.ones(len(feet), dtype=bool), "feet")
     return simulation

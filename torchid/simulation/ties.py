@@ -55,7 +55,7 @@ class Ties:
     def add_to(self, spec: mujoco.MjSpec, physics_hz: float) -> None:
         """Tie a robot of a model with constraints as stiff as its steps allow; held joints are no joints any more."""
         for link, values in self.inertials.items():
-            _set_inertial(spec.body(_body_name(link)), values)
+            set_inertial(spec.body(body_name(link)), values)
         for name, position in self.held.items():
             _hold(spec, spec.joint(name), position)
         for name, mimic in self.mimics.items():
@@ -63,7 +63,7 @@ class Ties:
             one.data[:5] = [mimic.offset, mimic.multiplier, 0.0, 0.0, 0.0]
         for number, loop in enumerate(self.loops):
             for frame, site in zip(loop.frames, _sites(number), strict=True):
-                spec.body(_body_name(frame)).add_site(name=site)
+                spec.body(body_name(frame)).add_site(name=site)
             kind = mujoco.mjtEq.mjEQ_CONNECT if loop.kind == "point" else mujoco.mjtEq.mjEQ_WELD
             one, other = _sites(number)
             spec.add_equality(type=kind, name1=one, name2=other, objtype=mujoco.mjtObj.mjOBJ_SITE)
@@ -72,7 +72,7 @@ class Ties:
             equality.solimp[:2] = _STIFFEST
 
 
-def _body_name(link: str) -> str:
+def body_name(link: str) -> str:
     """Name of a link's body in MuJoCo."""
     return WORLD if link == "world" else link
 
@@ -93,7 +93,7 @@ def _hold(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, position: float) -> None:
     spec.delete(joint)
 
 
-def _set_inertial(body: mujoco.MjsBody, values: Array) -> None:
+def set_inertial(body: mujoco.MjsBody, values: Array) -> None:
     """Replace the inertial parameters of a body with others, (10,)."""
     body.mass, body.inertia, body.fullinertia[:] = 0.0, np.zeros(3), np.nan  # none of the last, for MuJoCo
     if values[parameters.MASS]:
