@@ -24,7 +24,7 @@ from torchid.parameters import PARAMETERS, PER_BODY, Array
 from torchid.problem.predict import force_series, null_space_part
 from torchid.report.figures import STYLE, identifiability_figure, save_figures
 from torchid.report.palette import IDENTIFIED, MEASURED, NOISE, NOMINAL
-from torchid.report.parameter_figure import INTERVAL
+from torchid.report.parameter_figures import INTERVAL
 
 ROOT = Path(__file__).resolve().parents[1]
 DEMO = ROOT / "torchid" / "demo" / "quadruped.yaml"

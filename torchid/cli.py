@@ -245,8 +245,7 @@ def _identify(options: argparse.Namespace) -> None:
     with importing():
         from torchid.commands.identify import identify
         from torchid.config import load_config
-        from torchid.terminal.answer import print_answer
-        from torchid.terminal.details import print_details
+        from torchid.terminal.identification import print_answer, print_details
 
     run = identify(load_config(options.file, options.overrides), options.resume)
     if not options.quiet:
@@ -256,8 +255,7 @@ def _identify(options: argparse.Namespace) -> None:
 def _demo(options: argparse.Namespace) -> None:
     with importing():
         from torchid.commands.demo import EXPERIMENT, copy_examples, run_demo
-        from torchid.terminal.answer import print_answer
-        from torchid.terminal.details import print_details
+        from torchid.terminal.identification import print_answer, print_details
         from torchid.terminal.lines import print_labelled
 
     if options.copy is not None:
@@ -289,7 +287,7 @@ def _compress(options: argparse.Namespace) -> None:
 def _evaluate(options: argparse.Namespace) -> None:
     with importing():
         from torchid.commands.evaluate import evaluate
-        from torchid.terminal.evaluation import print_all_errors, print_evaluation
+        from torchid.terminal.finished_runs import print_all_errors, print_evaluation
 
     evaluated = evaluate(options.run, options.log, options.device, True, options.output, options.overwrite)
     if not options.quiet:
@@ -299,7 +297,7 @@ def _evaluate(options: argparse.Namespace) -> None:
 def _replay(options: argparse.Namespace) -> None:
     with importing():
         from torchid.commands.replay import parse_gains, replay
-        from torchid.terminal.replay import print_replay
+        from torchid.terminal.simulators import print_replay
 
     kp, kd = parse_gains("--kp", options.kp), parse_gains("--kd", options.kd)
     replayed = replay(options.run, options.log, options.window, options.output, options.overwrite, kp, kd)
@@ -310,7 +308,7 @@ def _replay(options: argparse.Namespace) -> None:
 def _sample(options: argparse.Namespace) -> None:
     with importing():
         from torchid.commands.sample import sample
-        from torchid.terminal.samples import print_samples
+        from torchid.terminal.finished_runs import print_samples
 
     keys = ("run", "count", "format", "output", "prior_error", "seed", "overwrite")
     drawn = sample(*(getattr(options, key) for key in keys))
@@ -378,7 +376,7 @@ def _simulate(options: argparse.Namespace) -> None:
     with importing():
         from torchid.commands.simulate import simulate
         from torchid.config import load_simulation
-        from torchid.terminal.simulation import print_all_motions, print_simulation
+        from torchid.terminal.simulators import print_all_motions, print_simulation
 
     config = load_simulation(options.file, options.overrides)
     stabilities = simulate(config)

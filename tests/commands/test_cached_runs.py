@@ -20,9 +20,8 @@ from trainings import trust_new_files
 
 from torchid.cli import main
 from torchid.commands.cache import FOLDER, content_key
-from torchid.commands.cached_factors import factors_key
+from torchid.commands.cache_entries import NOT_IN_SAMPLES, content_of_scene, factors_key
 from torchid.commands.cached_reading import CachedReader, open_cache
-from torchid.commands.cached_samples import NOT_IN_SAMPLES, content_of_scene
 from torchid.commands.reading import LogReader
 from torchid.config import load_config
 from torchid.config.experiment import ActuatorsConfig

@@ -17,7 +17,7 @@ from trainings import trust_new_files
 
 from torchid.cli import main
 from torchid.commands.cache import content_key
-from torchid.commands.cached_samples import content_of_scene
+from torchid.commands.cache_entries import content_of_scene
 from torchid.commands.reading import LogReader
 from torchid.config import dump_config, load_config
 from torchid.fitting.experiment import set_up

@@ -11,7 +11,7 @@ RARE = ("tensorboard", "scipy.stats", "scipy.signal", "pyarrow", "h5py")
 
 def test_commands_import_nothing_that_most_runs_do_without() -> None:
     code = (
-        "import sys; import torchid.cli, torchid.api, torchid.commands.identify, torchid.terminal.answer; "
+        "import sys; import torchid.cli, torchid.api, torchid.commands.identify, torchid.terminal.identification; "
         f"print([name for name in {RARE} if name in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -14,9 +14,8 @@ from synthetic import UR5
 
 import torchid
 from torchid.cli import main
-from torchid.fitting.misfit import Misfit
+from torchid.fitting.misfit import Misfit, UnfittedFriction, unfitted_friction
 from torchid.fitting.noise import GroupNoise
-from torchid.fitting.unfitted_friction import UnfittedFriction, unfitted_friction
 from torchid.parameters import FRICTION
 from torchid.problem import bind_log
 

@@ -15,7 +15,7 @@ from rosbags.typesys import get_types_from_msg
 
 from torchid.logs import Log
 from torchid.logs.joint_orders import GO, MOTORS
-from torchid.logs.unitree_messages import register
+from torchid.logs.ros_low_state import register
 
 register(ROS2, get_types_from_msg)
 TOPIC = "/lowstate"

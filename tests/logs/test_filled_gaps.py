@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from torchid.logs.filled_gaps import GapsFilled
+from torchid.logs.lazy_arrays import GapsFilled
 
 
 @pytest.mark.parametrize("step", [1, 2, 5, 64])

@@ -15,8 +15,8 @@ from synthetic import PANDA, Oracle, load, make_log
 from welded import CONTACTS, SENSORS, STATES
 
 from torchid.estimators import LeastSquares
-from torchid.fitting.base_tilt import LARGEST, choose_base_tilt
 from torchid.fitting.fit import LogFitter
+from torchid.fitting.separable import LARGEST_TILT, choose_base_tilt
 from torchid.logs import Log
 from torchid.problem import RowBuilder, bind_log
 from torchid.robot import Robot
@@ -101,4 +101,4 @@ def test_the_base_of_another_frame_is_no_tilt() -> None:
     samples = bind_log(replace(log, base_quat_xyzw=quat), robot, CONTACTS)
     with pytest.warns(match="is the base's orientation that of another frame"):
         choice = choose_base_tilt([samples], fitter_of(robot, "full"))
-    assert max(np.abs(choice.tilt)) == LARGEST
+    assert max(np.abs(choice.tilt)) == LARGEST_TILT

@@ -27,7 +27,7 @@ from unknowns import fit
 from torchid.errors import LogError, SensorError, UnknownNameError
 from torchid.logs import Log, preprocess, read_log, write_log
 from torchid.problem import Evaluation, ExtraTerms, RowBuilder, bind_log, compress_parts
-from torchid.problem.unloaded_offsets import unloaded_offset_equations
+from torchid.problem.unloaded_sensors import unloaded_offset_equations
 from torchid.sensing import Contact, SensorSet, chosen_sensors, named_sensors
 
 ASKEW = (0.3, -0.2, 0.8)

@@ -12,8 +12,7 @@ from torchid.config import load_config
 from torchid.fitting.experiment import Experiment, set_up
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.chunks import chunks_by_state
-from torchid.problem.predict import force_series, null_space_part
-from torchid.problem.projected_forces import projected_forces
+from torchid.problem.predict import force_series, null_space_part, projected_forces
 
 
 @pytest.fixture(scope="module")

@@ -11,8 +11,8 @@ from random_samples import random_samples, sensor_set
 from synthetic import SOLO12, load
 from torch import Tensor
 
-from torchid.problem import RowBuilder, Samples, compress, upload
-from torchid.problem.chunks import CHUNK, chunk_size, map_chunks
+from torchid.problem import RowBuilder, Samples, compress
+from torchid.problem.chunks import CHUNK, _one_ahead, _SideStream, chunk_size, map_chunks, upload
 from torchid.problem.contact_state import ContactState
 from torchid.sensing import Contact
 
@@ -33,7 +33,7 @@ def chunks_of(samples: Samples, events: list[str] | None = None) -> Iterator[tup
 
 def test_on_a_cpu_chunks_are_handed_over_as_they_are(samples: Samples) -> None:
     events: list[str] = []
-    for chunk, number in upload.upload(chunks_of(samples, events), CPU):
+    for chunk, number in upload(chunks_of(samples, events), CPU):
         assert events[-1] == f"cut {number}", "cut ahead of the work"
         assert chunk.torque.data_ptr() == samples.torque[10 * number].data_ptr(), "copied"
         assert torch.equal(chunk.time, samples.time[10 * number : 10 * number + 10])
@@ -59,7 +59,7 @@ class Copies:
 
 def test_the_copy_of_the_next_chunk_starts_before_the_work_on_one_and_no_other(samples: Samples) -> None:
     events: list[str] = []
-    for chunk, number in upload._one_ahead(chunks_of(samples, events), Copies(events)):
+    for chunk, number in _one_ahead(chunks_of(samples, events), Copies(events)):
         assert torch.equal(chunk.time, samples.time[10 * number : 10 * number + 10])
         events.append(f"work {number}")
     expected = ["cut 0", "start 0"]
@@ -71,7 +71,7 @@ def test_the_copy_of_the_next_chunk_starts_before_the_work_on_one_and_no_other(s
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_few_chunks_arrive_too(samples: Samples, count: int) -> None:
     chunks = [(samples[number : number + 1], number) for number in range(count)]
-    assert [number for _, number in upload._one_ahead(iter(chunks), Copies([]))] == list(range(count))
+    assert [number for _, number in _one_ahead(iter(chunks), Copies([]))] == list(range(count))
 
 
 def test_copies_go_through_locked_memory_on_a_stream_that_the_work_waits_for(
@@ -118,7 +118,7 @@ def test_copies_go_through_locked_memory_on_a_stream_that_the_work_waits_for(
         (Tensor, "to", to),
     ):
         monkeypatch.setattr(place, name, value)
-    arrived = upload._SideStream(META).start(samples)
+    arrived = _SideStream(META).start(samples)
     tensors = 11  # time, joints, base, torque, wrench, active
     assert events == [*["lock"] * tensors, "beside", *["copy, go on"] * tensors, "copied", "back"]
     events.clear()
@@ -134,7 +134,7 @@ def test_a_log_is_the_same_whether_its_chunks_are_one_ahead_or_not(
     robot, contacts = load(SOLO12), [Contact("FL_FOOT", "point")]
     builder = RowBuilder(robot, contacts, sensor_set("full", robot, contacts))
     one = compress([samples], builder, 7, threads=1).triangle()
-    monkeypatch.setattr("torchid.problem.chunks.upload", lambda chunks, device: upload._one_ahead(chunks, Copies([])))
+    monkeypatch.setattr("torchid.problem.chunks.upload", lambda chunks, device: _one_ahead(chunks, Copies([])))
     assert torch.equal(compress([samples], builder, 7, threads=1).triangle(), one)
 
 

@@ -12,7 +12,7 @@ from refusals import refused
 
 from torchid.errors import LogError, TorchidWarning
 from torchid.logs import Log
-from torchid.problem.zeroing import zero_in_air
+from torchid.problem.unloaded_sensors import zero_in_air
 from torchid.sensing import Contact
 
 FEET = ("l_foot", "r_foot")

@@ -17,8 +17,8 @@ from torchid.errors import ConfoundedWarning, about_file
 from torchid.fitting.calibration import warn_of_confounded
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.problem.extras import Extra
-from torchid.report.extra_figure import extra_figure
 from torchid.report.figures import STYLE, save_figure
+from torchid.report.parameter_figures import extra_figure
 from torchid.report.tables import extra_table
 
 

@@ -18,7 +18,7 @@ from torchid.estimators.least_squares import COMBINED, IDENTIFIED
 from torchid.parameters import PER_BODY
 from torchid.problem import Metrics
 from torchid.problem.metrics import DECISIVE_GROUPS, WHITENED, WorseThanNominal
-from torchid.terminal.answer import answer_lines
+from torchid.terminal.identification import answer_lines
 from torchid.terminal.lines import LINES
 
 UNPHYSICAL = "ignore:identified.urdf:torchid.errors.TorchidWarning"

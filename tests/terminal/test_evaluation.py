@@ -14,7 +14,7 @@ import torchid
 from torchid.cli import main
 from torchid.commands.evaluate import EvaluatedRun
 from torchid.problem import Metrics
-from torchid.terminal.evaluation import MOST_LOGS, evaluation_lines
+from torchid.terminal.finished_runs import MOST_LOGS, evaluation_lines
 from torchid.terminal.lines import LINES
 
 LOG = str(DEMO / "sway_test.npz")

@@ -13,21 +13,20 @@ from typing import Any
 
 from torchid import ranks
 from torchid.commands.cache import FOLDER, TOKEN, Cache, Files, content_key, file_states, missing_folders, remove_empty
-from torchid.commands.cached_samples import ReadLog, Said, content_of_scene, samples_entry, samples_of_entry
-from torchid.commands.reading import LogReader, fits_contact_offsets
+from torchid.commands.cache_entries import ReadLog, Said, content_of_scene, samples_entry, samples_of_entry
+from torchid.commands.reading import LogReader, fits_contact_offsets, payload_of
 from torchid.commands.shared_log import on_one_machine, read_together
 from torchid.errors import TorchidWarning, warn
 from torchid.fitting.experiment import Scene
 from torchid.fitting.noise import recorded_sensors
-from torchid.fitting.payloads import payload_of
 from torchid.logs.blocks import GIGABYTE, log_bytes
 from torchid.logs.containers import LogKind, existing_log_kind, log_files
+from torchid.logs.spill import MappedPages
 from torchid.logs.tables import is_text_table
 from torchid.logs.time_range import split_range
 from torchid.problem import Samples
 from torchid.problem.chunks import ProgressCallback
 from torchid.problem.extras import recorded_components
-from torchid.problem.mapped_pages import MappedPages
 from torchid.sensing import SensorSet
 
 _LET_GO = 8  # chunks after which pages that samples are mapped to leave the memory of the process

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from torchid.commands.folder import check_free_file
-from torchid.commands.reading import memory_needed, settle_contacts
+from torchid.commands.reading import memory_needed, scene_of_log, settle_contacts
 from torchid.config import load_analysis
 from torchid.config.logs import LogsConfig
 from torchid.config.maps import load_columns, load_topics
@@ -21,7 +21,6 @@ from torchid.config.sensors import ContactConfig
 from torchid.errors import ConfigError, LogError, about_file, current_file, format_count
 from torchid.fitting.contacts import resolve_contacts
 from torchid.fitting.experiment import set_up_scene
-from torchid.fitting.payloads import scene_of_log
 from torchid.log_checks import Checked
 from torchid.log_checks.check import check
 from torchid.logs import Columns, Log, Topics, read_log, write_log

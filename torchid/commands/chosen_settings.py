@@ -1,4 +1,4 @@
-"""Settings that an experiment leaves to its training logs: filter, base's tilt, friction's sign, torques' delay."""
+"""Settings that an experiment leaves to its training logs: filter, base's tilt, friction's sign, delay, ridge."""
 
 from __future__ import annotations
 
@@ -14,14 +14,16 @@ from torchid.commands.check import recorded_stretches
 from torchid.commands.reading import LogReader
 from torchid.errors import warn_about_file
 from torchid.estimators import Conditions
-from torchid.fitting.base_tilt import TiltChoice, choose_base_tilt
+from torchid.fitting.cross_validation import RidgeChoice
 from torchid.fitting.delay import DelayChoice, choose_delay
 from torchid.fitting.experiment import Experiment, S, Scene
 from torchid.fitting.fit import LogFitter
 from torchid.fitting.noise import recorded_sensors
-from torchid.fitting.sign_width import SignWidthChoice, choose_sign_width
+from torchid.fitting.separable import SignWidthChoice, TiltChoice, choose_base_tilt, choose_sign_width
 from torchid.logs.cutoff import CutoffChoice, choose_cutoff
-from torchid.problem import Samples
+from torchid.problem import RowBuilder, Samples
+from torchid.problem.compressed_log import Block
+from torchid.problem.compression import Part
 from torchid.settings import AUTO
 
 Choice = TypeVar("Choice")
@@ -127,3 +129,23 @@ def _with_sign_width(scene: S, width: float | None) -> S:
 def _with_actuators(scene: S, **stated: Any) -> S:
     config = scene.config
     return replace(scene, config=replace(config, actuators=replace(config.actuators, **stated)))
+
+
+def with_ridge(
+    experiment: Experiment,
+    parts: Sequence[Part],
+    blocks: Sequence[Block],
+    builder: RowBuilder,
+    conditions: Conditions,
+    bars: Progress,
+) -> tuple[Experiment, RidgeChoice | None]:
+    """The experiment with a ridge that is a number, and how it was chosen, if it was."""
+    config = experiment.config
+    if not config.estimator.chooses_ridge:
+        return experiment, None
+    bar = bars.add_task("choosing the ridge", total=None)
+    fitter = experiment.fitter(builder, conditions)
+    choice = ranks.from_first(partial(experiment.choose_ridge, parts, blocks, fitter, conditions), "ridge")
+    bars.update(bar, total=1, completed=1)
+    chosen = replace(config, estimator=replace(config.estimator, ridge=choice.ridge))
+    return replace(experiment, config=chosen), choice

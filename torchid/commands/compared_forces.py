@@ -12,8 +12,7 @@ from torchid.fitting.calibration import Calibration, Comparison
 from torchid.logs.time_range import log_title
 from torchid.problem import Evaluation, Samples
 from torchid.problem.contact_state import state_name
-from torchid.problem.predict import at_motors, force_series, noise_series
-from torchid.problem.projected_forces import projected_forces
+from torchid.problem.predict import at_motors, force_series, noise_series, projected_forces
 from torchid.report.forces import ForceSeries
 from torchid.report.traces import LogForces
 from torchid.sensing import SensorNoise

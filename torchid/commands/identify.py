@@ -11,10 +11,9 @@ from functools import partial
 from rich.progress import Progress
 
 from torchid import ranks
-from torchid.commands.cached_factors import cached_parts, factors_key
+from torchid.commands.cache_entries import cached_parts, factors_key
 from torchid.commands.cached_reading import CachedReader, open_reader
-from torchid.commands.chosen_ridge import with_ridge
-from torchid.commands.chosen_settings import Choices, with_chosen_settings
+from torchid.commands.chosen_settings import Choices, with_chosen_settings, with_ridge
 from torchid.commands.clock import Clock
 from torchid.commands.compared_forces import compare_forces, noise_of_readings, trace_forces
 from torchid.commands.folder import RUN, check_free, claim_folder
@@ -32,11 +31,10 @@ from torchid.fitting.experiment import Experiment, set_up, with_noise
 from torchid.fitting.factor_files import FactorFile
 from torchid.fitting.fit import Fit, LogFitter
 from torchid.fitting.fleet import read_fleet
-from torchid.fitting.misfit import misfit
+from torchid.fitting.misfit import misfit, unfitted_friction
 from torchid.fitting.noise import NoiseSummary
 from torchid.fitting.posterior import fitted_posterior
 from torchid.fitting.robust import RobustSummary, fit_robustly
-from torchid.fitting.unfitted_friction import unfitted_friction
 from torchid.identifiability.base_parameters import StateReport, require_base, state_reports
 from torchid.identifiability.confounding import TotalMass
 from torchid.identifiability.contributions import Contributions, contributions

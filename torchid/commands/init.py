@@ -15,16 +15,14 @@ import yaml
 
 from torchid.commands.folder import check_free_file
 from torchid.commands.init_hints import BRIDGED_S, gaps_in_motion, hints, missing_columns
-from torchid.commands.init_sensors import limb_sensors, sensor_set
-from torchid.commands.init_split import Split, split_log
+from torchid.commands.init_proposals import Split, limb_sensors, sensor_set, split_log
 from torchid.commands.reading import memory_needed
 from torchid.config.preprocessing import PreprocessingConfig
 from torchid.errors import ConfigError, InputError, LogError, about_file, excerpt, format_count, join_names
-from torchid.fitting.log_maps import is_along_base
+from torchid.fitting.checked_settings import is_along_base
 from torchid.logs import Columns, Log, Topics, read_log
-from torchid.logs.bag_samples import read_bag_sample
-from torchid.logs.column_samples import read_sample, stated_names, states_degrees, texts_in
 from torchid.logs.containers import LogKind, atomic_output, existing_log_kind
+from torchid.logs.file_samples import read_bag_sample, read_sample, stated_names, states_degrees, texts_in
 from torchid.logs.map_proposals import MapProposal, propose_map
 from torchid.logs.name_matching import KnownRobot, within
 from torchid.logs.time_range import split_range

@@ -20,8 +20,7 @@ from torchid.commands.log_course import Block, Course, Stretch, in_the_air, requ
 from torchid.config.preprocessing import PreprocessingConfig
 from torchid.errors import LogError, about_file
 from torchid.logs import Columns, Log
-from torchid.logs.blocks import GIGABYTE, LogBlocks, count_samples_from, open_log_blocks
-from torchid.logs.bridged_blocks import bridge_in_blocks
+from torchid.logs.blocks import GIGABYTE, LogBlocks, bridge_in_blocks, count_samples_from, open_log_blocks
 from torchid.logs.coverage import Coverage, warn_of_gaps
 from torchid.logs.log import CONTACT_READINGS, NORMALS, BoolArray
 from torchid.logs.preprocess import (
@@ -31,15 +30,13 @@ from torchid.logs.preprocess import (
     lacks_derivatives,
     make_timeline,
 )
-from torchid.logs.rate_noise import warn_of_noisy_accelerations
-from torchid.logs.signal_noise import MOST_SAMPLES, signal_noise
-from torchid.logs.spill import Filled, Spill, growing_array
+from torchid.logs.signal_noise import MOST_SAMPLES, signal_noise, warn_of_noisy_accelerations
+from torchid.logs.spill import Filled, MappedPages, Spill, growing_array
 from torchid.logs.stretches import count_samples, long_stretches
 from torchid.logs.timeline import SPLINE_BLOCK, Timeline
 from torchid.problem import Samples, bind_log
 from torchid.problem.base_motion import BaseMotion
 from torchid.problem.chunks import one_thread, thread_count
-from torchid.problem.contact_blocks import contacts_alone, flag_by_force_in_blocks, zero_in_blocks
 from torchid.problem.contact_slip import (
     away_from_own_changes,
     base_velocity,
@@ -47,11 +44,17 @@ from torchid.problem.contact_slip import (
     judge_speeds,
     warn_of_slip,
 )
-from torchid.problem.derived_blocks import detect_in_blocks, motion_fields, stand_in_blocks
-from torchid.problem.mapped_pages import MappedPages
+from torchid.problem.derived_blocks import (
+    contacts_alone,
+    detect_in_blocks,
+    flag_by_force_in_blocks,
+    motion_fields,
+    stand_in_blocks,
+    zero_in_blocks,
+)
+from torchid.problem.log_joints import distances_from_welds, warn_of_moving_welds
 from torchid.problem.samples import require_forces
 from torchid.problem.standing import Stretches, warn_of_standing
-from torchid.problem.welded_joints import distances_from_welds, warn_of_moving_welds
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from torchid import parameters
 from torchid.commands.check import stretches_to_check
-from torchid.commands.reading import settle_contacts
+from torchid.commands.reading import scene_of_log, settle_contacts
 from torchid.errors import (
     ImplausibleFitError,
     InputError,
@@ -22,7 +22,6 @@ from torchid.estimators import LeastSquares
 from torchid.fitting.experiment import Scene
 from torchid.fitting.fit import Fit
 from torchid.fitting.misfit import beyond_models
-from torchid.fitting.payloads import scene_of_log
 from torchid.identifiability.confounding import TotalMass, total_mass
 from torchid.log_checks import Finding
 from torchid.log_checks.check import check

@@ -15,8 +15,7 @@ from torchid.commands.large_log import BLOCK_GB, LargeLog
 from torchid.commands.log_course import require_kept
 from torchid.config.logs import require_apart
 from torchid.errors import ConfigError, LogError
-from torchid.fitting.experiment import Scene
-from torchid.fitting.payloads import payload_of, scene_of_log
+from torchid.fitting.experiment import S, Scene
 from torchid.log_checks import Checked, drop_condemned
 from torchid.log_checks.check import check
 from torchid.logs import Log, read_log
@@ -27,15 +26,16 @@ from torchid.logs.flags import with_flags_by_force
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import away_from_changes, away_from_stamps, preprocess
 from torchid.logs.time_range import LogPart, split_range
+from torchid.parameters import Array
 from torchid.problem import Samples, bind_log
 from torchid.problem.chunks import ProgressCallback
+from torchid.problem.closed_loops import with_loop_joints
 from torchid.problem.contact_detection import with_detected_contacts
 from torchid.problem.contact_slip import measure_slip, warn_of_slip
-from torchid.problem.loop_joints import with_loop_joints
+from torchid.problem.log_joints import without_welded_joints
 from torchid.problem.standing import preprocess_standing
-from torchid.problem.welded_joints import without_welded_joints
-from torchid.problem.zeroing import zero_in_air
-from torchid.robot import Robot
+from torchid.problem.unloaded_sensors import zero_in_air
+from torchid.robot import Robot, payload_parameters, with_payload
 from torchid.sensing import SensorSet
 
 _WHOLE_GB = 4.0 * BLOCK_GB  # recorded arrays that are taken whole: no block is worth its neighbourhood
@@ -287,3 +287,14 @@ def _folder_beside(output: Path | None) -> Path:
     if output is None:
         return Path(gettempdir())
     return next((folder for folder in output.absolute().parents if folder.is_dir()), Path.cwd())
+
+
+def payload_of(scene: Scene, path: str | Path) -> Array | None:
+    """What the robot carried in a log, (12 L,), as `Samples.payload` has it; None for nothing."""
+    payloads = () if scene.config.logs is None else scene.config.logs.payloads_of(path)
+    return payload_parameters(scene.robot, payloads) if payloads else None
+
+
+def scene_of_log(scene: S, path: str | Path) -> S:
+    """The scene with the nominal robot as it was in a log, for whatever compares recordings with it."""
+    return replace(scene, robot=with_payload(scene.robot, payload_of(scene, path)))

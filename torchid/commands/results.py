@@ -38,7 +38,6 @@ from torchid.problem import Metrics
 from torchid.problem.metrics import SETS, WorseThanNominal, describe_worse, worse_than_nominal
 from torchid.problem.surplus import NoiseShares
 from torchid.report import FittedJoints, identified_name, identified_robot, identified_urdf, parameters_document
-from torchid.report.extra_figure import extra_figure
 from torchid.report.figures import (
     contribution_figure,
     error_figure,
@@ -47,7 +46,7 @@ from torchid.report.figures import (
     save_figures,
 )
 from torchid.report.forces import ForceSeries, force_figure
-from torchid.report.parameter_figure import parameter_figure
+from torchid.report.parameter_figures import extra_figure, parameter_figure
 from torchid.report.ridge import ridge_figure
 from torchid.report.traces import LogForces
 from torchid.robot import Robot

@@ -17,7 +17,7 @@ import numpy as np
 
 from torchid import ranks
 from torchid.commands.cache import Files, written_file
-from torchid.commands.cached_samples import ReadLog, Said, named_tensors, samples_entry
+from torchid.commands.cache_entries import ReadLog, Said, named_tensors, samples_entry
 from torchid.commands.large_log import LargeLog
 from torchid.commands.manifest import file_checksum
 from torchid.fitting.noise import recorded_sensors

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from torchid.errors import NumericalWarning, warn
 from torchid.estimators.conic_problem import ConicProblem, Solution
-from torchid.estimators.damped import damped_inverse
-from torchid.estimators.strict_feasibility import find_strictly_feasible
+from torchid.estimators.strict_feasibility import damped_inverse, find_strictly_feasible
 from torchid.problem.chunks import one_thread
 
 _STEPS = 200

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,6 @@ from torch import Tensor
 
 from torchid.errors import InputError
 from torchid.estimators.conic_problem import EQUAL_WITHIN, ConicProblem
-from torchid.estimators.damped import damped_inverse
 from torchid.parameters import Array
 from torchid.problem.chunks import one_thread
 
@@ -169,3 +169,15 @@ def _step_length(slope: float, curvature: float, rates: Array, kappa: float) -> 
 
     longest = min(10.0, 0.99 / max(-float(rates.min(initial=0.0)), 1e-9))
     return longest if slope_at(longest) <= 0.0 else float(brentq(slope_at, 0.0, longest, xtol=1e-3 * longest))
+
+
+def damped_inverse(A: Tensor) -> Callable[[Tensor], Tensor]:
+    """B -> A^-1 b for A positive semidefinite, (n, n), with the least damping that works (Levenberg)."""
+    scale = A.diagonal().abs().clamp_min(torch.finfo(A.dtype).tiny).rsqrt()
+    scaled = scale[:, None] * A * scale
+    damping = 0.0
+    while True:
+        root, failed = torch.linalg.cholesky_ex(scaled + damping * torch.eye(len(A), dtype=A.dtype))
+        if not failed:
+            return lambda b: scale * torch.cholesky_solve((scale * b)[:, None], root)[:, 0]
+        damping = max(1e-15, 10.0 * damping)

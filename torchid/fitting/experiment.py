@@ -17,14 +17,13 @@ from torchid.config.sensors import ChoiceConfig
 from torchid.errors import ConfigError, LogError, UnknownNameError, warn_about_file
 from torchid.estimators import Conditions, Consistent, Enclosure, LeastSquares, Mirror
 from torchid.fitting.calibration import Calibration, Comparison, calibrations
+from torchid.fitting.checked_settings import check_scale_groups, check_terms, require_maps_of
 from torchid.fitting.contacts import read_along_normals, resolve_contacts, suited_to_preprocessing
 from torchid.fitting.cross_validation import RIDGES, RidgeChoice, choose_ridge
 from torchid.fitting.fit import Fit, LogFitter, frozen_parameters
 from torchid.fitting.known_masses import known_masses
-from torchid.fitting.log_maps import require_maps_of
 from torchid.fitting.noise import NoiseSummary, estimate_noise, recorded_sensors
 from torchid.fitting.robust import RobustLoss
-from torchid.fitting.terms import check_scale_groups, check_terms
 from torchid.parameters import PARAMETERS, Array
 from torchid.problem import Evaluation, ExtraTerms, RowBuilder, Samples
 from torchid.problem.compressed_log import Block

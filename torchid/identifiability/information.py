@@ -17,7 +17,7 @@ from torchid.problem.contact_state import ContactState
 from torchid.problem.extras import measured_components
 from torchid.problem.metrics import ROW_GROUPS, ForceSums, finite_or_none
 from torchid.problem.predict import null_space_components, predict_forces
-from torchid.problem.unloaded_offsets import unloaded_offset_equations
+from torchid.problem.unloaded_sensors import unloaded_offset_equations
 from torchid.rounding import KINEMATIC_TOLERANCE, RANK_TOLERANCE
 from torchid.sensing import SensorNoise
 

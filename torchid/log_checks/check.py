@@ -30,20 +30,24 @@ from torchid.log_checks.findings import (
 from torchid.log_checks.forces import check_forces_against_urdf
 from torchid.log_checks.frozen import check_repeats, check_scalar_wrenches
 from torchid.log_checks.gyroscope import check_gyroscope
-from torchid.log_checks.loops import check_loops, completed
-from torchid.log_checks.motion import check_angle_unit, check_angular_velocity, check_derivatives
-from torchid.log_checks.slip import check_slip
+from torchid.log_checks.motion import (
+    check_angle_unit,
+    check_angular_velocity,
+    check_derivatives,
+    check_loops,
+    completed,
+)
 from torchid.log_checks.spikes import check_jumps
 from torchid.log_checks.stamps import check_magnitudes, check_missing_values, check_time_stamps
-from torchid.log_checks.standing_feet import check_standing_feet
+from torchid.log_checks.standing_feet import check_slip, check_standing_feet
 from torchid.log_checks.weight import check_accelerometer, check_weight
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.time_range import log_title
 from torchid.logs.timeline import DROPPED_SAMPLES, JITTER, REACH_PERIODS
 from torchid.problem import Samples
+from torchid.problem.log_joints import without_welded_joints
 from torchid.problem.standing import longest_standing
-from torchid.problem.welded_joints import without_welded_joints
 from torchid.reprs import short_repr
 from torchid.robot import Robot
 from torchid.sensing import Contact

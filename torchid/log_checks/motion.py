@@ -1,4 +1,4 @@
-"""Consistency of positions, velocities, accelerations and orientation: unit, sign, frame, order and delay."""
+"""Consistency of positions, velocities, accelerations, orientation and loops: unit, sign, frame, order and delay."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
-from torchid.errors import join_names
-from torchid.log_checks.findings import CONDEMNED, SUSPICIOUS, Finding, Skipped, channel_names
+from torchid.errors import LogError, join_names
+from torchid.log_checks.findings import CONDEMNED, NOTE, SUSPICIOUS, Finding, Skipped, channel_names
 from torchid.log_checks.units import UNIT_TOLERANCE, advise_units, describe_units, units_of_derivative_ratio
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
@@ -20,6 +21,7 @@ from torchid.logs.quaternion import (
     rotate_to_base,
     rotate_to_world,
 )
+from torchid.problem.closed_loops import loop_gaps, with_loop_joints
 from torchid.regressor.kinematics import GRAVITY_WORLD
 from torchid.robot import Robot
 from torchid.rounding import STD_PER_MAD
@@ -330,3 +332,27 @@ def _best_mistake(time: FloatArray, quat: FloatArray, omega: FloatArray, misfit:
         if trial is not None and trial.misfit < least:
             best, least = mistake, trial.misfit
     return best
+
+
+def completed(log: Log, robot: Robot | None) -> tuple[Log, list[Finding]]:
+    """The log with joints of loops that follow from the others, see `with_loop_joints`; or the log, and why not."""
+    try:
+        return with_loop_joints(log, robot), []
+    except LogError as error:
+        finding = Finding("open loop", CONDEMNED, "joint_position", error.found, f"give {error.accepted}")
+        return log, [finding]
+
+
+def check_loops(log: Log, robot: Robot | None) -> Iterator[Finding]:
+    """A finding for each loop, at the joint positions of the log; none where it lacks joints of the robot."""
+    if robot is None or not robot.loops or not set(robot.joint_names) <= set(log.joint_names):
+        return
+    order = [log.joint_names.index(name) for name in robot.joint_names]
+    for gap in loop_gaps(robot, torch.from_numpy(log.joint_position[:, order])):
+        if gap.is_open:
+            advice = f"look for other frames, zeros of encoders or signs; accepted is {gap.accepted}"
+            text = f"{gap.loop.label} are apart by {gap}"
+            yield Finding("open loop", CONDEMNED, "joint_position", text, advice, gap.loop.frames)
+        else:
+            text = f"{gap.loop.label} are together up to {gap}"
+            yield Finding("closed loop", NOTE, "joint_position", text, f"nothing: accepted is {gap.accepted}")

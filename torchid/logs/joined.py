@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from torchid.errors import LogError, about_file
 from torchid.logs.alignment import Series, stamp_slack
+from torchid.logs.arrays import parse_names
 from torchid.logs.column_map import Columns
 from torchid.logs.column_matching import columns_by_file
 from torchid.logs.columns import KINDS, names_field
@@ -29,7 +30,6 @@ from torchid.logs.log import (
     field_shape,
     to_float64,
 )
-from torchid.logs.names import parse_names
 from torchid.logs.tables import sample_table
 from torchid.logs.time_range import LogFile
 

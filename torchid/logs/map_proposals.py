@@ -12,17 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import excerpt
-from torchid.logs.column_families import Family, find_families
+from torchid.logs.column_groups import Family, find_families, split_arrays
 from torchid.logs.column_proposals import OF_BASE, OF_PLATES, is_desired, propose_field
-from torchid.logs.column_samples import Columns, listed_order, stated_names
 from torchid.logs.columns import is_column
+from torchid.logs.file_samples import Columns, listed_order, stated_names
 from torchid.logs.force_proposals import point_along_z, threshold
 from torchid.logs.joint_orders import JOINT_ORDERS, MOTORS, numbered_joints, suitable_orders, usual_order
 from torchid.logs.log import SHAPES, VARIANTS, WRENCHES
 from torchid.logs.name_matching import SUFFIXES, KnownRobot
-from torchid.logs.orientation_proposals import find_angles, order_of_quaternion
-from torchid.logs.part_proposals import split_arrays
-from torchid.logs.unit_proposals import UnitProposer, step_of_stamps
+from torchid.logs.number_proposals import UnitProposer, find_angles, order_of_quaternion, step_of_stamps
 from torchid.logs.units import IN_DEGREES, quantities_of, quantities_with, unit_factor
 
 _GAINS = re.compile(r"\b(kp|kd)\b", re.IGNORECASE)

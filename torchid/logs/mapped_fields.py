@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import LogError
-from torchid.logs.array_parts import with_parts
+from torchid.logs.arrays import parse_names, with_parts
 from torchid.logs.column_entries import KEY, ColumnEntry, Gains, PdLaw, VectorEntry
 from torchid.logs.column_map import Columns, check_columns, list_parts, values_by_name, values_of_all
 from torchid.logs.column_matching import Matched, columns_of_file, match_columns
@@ -19,7 +19,6 @@ from torchid.logs.columns import TEXT_COLUMN, TableLayout, is_column, parse_head
 from torchid.logs.entry_units import element_factors, joint_turns, names_in_degrees
 from torchid.logs.force_plates import PlatePoses
 from torchid.logs.log import FORCE_NORMAL, NAME_FIELDS, POINTS, SHAPES, VARIANTS, WRENCHES, FloatArray
-from torchid.logs.names import parse_names
 from torchid.logs.quaternion import quaternion_of_rpy
 from torchid.logs.units import unit_factor
 

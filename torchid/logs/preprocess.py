@@ -11,6 +11,7 @@ import numpy as np
 
 from torchid.errors import InputError, LogError, about_file
 from torchid.logs.coverage import Coverage, measure_coverage, warn_of_gaps
+from torchid.logs.gaps import require_no_turns
 from torchid.logs.log import (
     CONTACT_READINGS,
     NAN_ALLOWED,
@@ -22,10 +23,8 @@ from torchid.logs.log import (
     column_labels,
 )
 from torchid.logs.quaternion import angular_acceleration_base, angular_velocity_base, make_sign_continuous
-from torchid.logs.rate_noise import warn_of_noisy_accelerations
-from torchid.logs.signal_noise import signal_noise
+from torchid.logs.signal_noise import signal_noise, warn_of_noisy_accelerations
 from torchid.logs.timeline import JITTER, Timeline, lay_out_timeline, nearest_known
-from torchid.logs.turns import require_no_turns
 
 #: Quantities of which each is the derivative of the one before. The first angular one would be the orientation.
 DERIVATIVE_CHAINS = (

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import LogError, about_file, current_file, during
-from torchid.logs.array_parts import load_part
+from torchid.logs.arrays import load_part, parse_frame, parse_names
 from torchid.logs.column_map import Columns
 from torchid.logs.column_proposals import is_foreign, unknown_columns
 from torchid.logs.containers import (
@@ -53,7 +53,6 @@ from torchid.logs.log import (
     to_float64,
 )
 from torchid.logs.mapped_fields import map_arrays
-from torchid.logs.names import parse_frame, parse_names
 from torchid.logs.quaternion import make_sign_continuous, rotate_to_base, rotate_to_world
 from torchid.logs.ros_read import read_bag
 from torchid.logs.ros_topics import Topics

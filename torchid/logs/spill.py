@@ -1,9 +1,11 @@
-"""Arrays larger than memory, in anonymous temporary files that vanish with the process."""
+"""Arrays larger than memory: in anonymous temporary files that vanish with the process, or mapped to files."""
 
 from __future__ import annotations
 
+import mmap
 import tempfile
 import weakref
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -108,3 +110,25 @@ class Spill:
 def growing_array(source: object, folder: Path | None, rows: int) -> Filled | Spill:
     """An array that so many rows will be added to: on the disk of a folder, or in memory without one."""
     return Filled(rows) if folder is None else Spill(source, folder)
+
+
+_DONTNEED = getattr(mmap, "MADV_DONTNEED", None)  # not on Windows
+
+
+class MappedPages:
+    """The pages of some arrays that are mapped to files."""
+
+    def __init__(self, arrays: Iterable[NDArray[Any]]) -> None:
+        """Those of the arrays that are mapped, of all given ones."""
+        bases: list[object] = [array.base for array in arrays]
+        self._maps = [one for one in bases if isinstance(one, mmap.mmap)]
+
+    def let_go(self) -> None:
+        """Take them out of memory; they come back where they are used."""
+        if _DONTNEED is not None:
+            for one in self._maps:
+                one.madvise(_DONTNEED)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Tensors that another process gets are in its memory."""
+        return MappedPages, ((),)

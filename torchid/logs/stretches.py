@@ -18,8 +18,7 @@ from torchid.logs.preprocess import (
     move_to_timeline,
     unloaded_readings,
 )
-from torchid.logs.rate_noise import warn_of_noisy_accelerations
-from torchid.logs.signal_noise import signal_noise
+from torchid.logs.signal_noise import signal_noise, warn_of_noisy_accelerations
 from torchid.logs.timeline import DROPPED_PERIODS, FEWEST_DIFFERENTIATED, Timeline
 
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from torchid.errors import format_count
-from torchid.logs.bag_samples import TopicSample
 from torchid.logs.column_proposals import is_desired
+from torchid.logs.file_samples import TopicSample
 from torchid.logs.force_proposals import threshold
 from torchid.logs.joint_orders import JOINT_ORDERS, suitable_orders, usual_order
 from torchid.logs.log import UNIT_TOLERANCE

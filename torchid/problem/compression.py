@@ -20,7 +20,7 @@ from torchid.problem.row_compressor import RowCompressor
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.problem.surplus import ColumnPrior, Surplus, compress_surplus, corrected_triangle
-from torchid.problem.unloaded_offsets import unloaded_offset_equations
+from torchid.problem.unloaded_sensors import unloaded_offset_equations
 from torchid.reprs import short_repr
 from torchid.robot import Robot
 

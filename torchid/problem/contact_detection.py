@@ -12,20 +12,26 @@ import torch
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
+from torchid import ranks
 from torchid.errors import LogError
 from torchid.logs import Log
-from torchid.logs.flags import hysteresis, samples_of, without_short
+from torchid.logs.flags import hysteresis, runs, samples_of, without_short
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import find_unloaded
 from torchid.logs.spill import growing_array
+from torchid.parameters import FRICTION, PER_BODY
+from torchid.problem.compression import compress_parts
 from torchid.problem.contact_slip import base_velocity, contact_velocities
 from torchid.problem.detection_forces import ForcesAlongNormals
-from torchid.problem.detection_model import fitted_parameters
 from torchid.problem.detection_motion import Prepared, detection_cutoff_hz, prepare
-from torchid.problem.still_contacts import keep_still
+from torchid.problem.elimination import assemble
+from torchid.problem.extras import ExtraTerms
+from torchid.problem.linear import PRIOR_DEVIATION, LinearProblem
+from torchid.problem.rows import RowBuilder
+from torchid.problem.samples import Samples
 from torchid.robot import Robot
 from torchid.rounding import STD_PER_MAD
-from torchid.sensing import Contact
+from torchid.sensing import Contact, named_sensors
 from torchid.settings import NotNegative, Positive
 
 _SUPPORTED = 0.25  # of the weight: what contact forces may leave of it in samples that parameters are fitted to
@@ -221,3 +227,93 @@ def _fitted(forces: ForcesAlongNormals, found: Detection, judged: _Judged) -> Fo
     active = torch.from_numpy(found.active[forces.chosen[kept]])
     samples = dataclasses.replace(forces.samples[torch.from_numpy(kept)], active=active)
     return forces.with_parameters(fitted_parameters(samples, forces.balance.robot, forces.balance.contacts))
+
+
+LEAST_LIMIT = 0.01
+"""Speed [m/s] below which a contact always counts as still: what soft ground and filters leave of a stance."""
+
+_TOGETHER = 1 << 16  # samples whose speeds are worked out at once
+_MEDIANS = 2.0  # of the speed of contacts that surely stand, which is noise
+
+
+def keep_still(
+    velocity: FloatArray, in_world: bool, standing: BoolArray, possible: BoolArray, shortest: int
+) -> BoolArray:
+    """Which contacts that may stand move no faster than those that surely do, for some samples at least, (N, C).
+
+    Args:
+        velocity: of the contacts (N, C, 3) [m/s], from `contact_velocities`.
+        in_world: whether that is in the world, as the log has the velocity of its base; else speeds are those against
+            the median of the other contacts that surely stand.
+        standing: those that surely stand, (N, C).
+        possible: those that may stand, (N, C).
+        shortest: samples in a row.
+    """
+    speed = np.empty(standing.shape)
+    for start in range(0, len(speed), _TOGETHER):
+        part = slice(start, start + _TOGETHER)
+        seen = velocity[part] if in_world else _against_standing(velocity[part], standing[part])
+        speed[part] = np.linalg.norm(seen, axis=2)
+    noise = speed[standing & np.isfinite(speed)]
+    limit = max(LEAST_LIMIT, _MEDIANS * float(np.median(noise))) if len(noise) else LEAST_LIMIT
+    with np.errstate(invalid="ignore"):
+        still = (speed < limit) & possible
+    return np.stack([_lasting(one, shortest) for one in still.T], axis=1)
+
+
+def _lasting(flags: BoolArray, shortest: int) -> BoolArray:
+    """The flags (N,) without runs of fewer true ones."""
+    out = np.zeros_like(flags)
+    for start, stop in runs(flags):
+        out[start:stop] = stop - start >= shortest
+    return out
+
+
+def _against_standing(velocity: FloatArray, standing: BoolArray) -> FloatArray:
+    """Velocities (N, C, 3) against the median of the other contacts that stand; NaN where none does."""
+    out = np.full_like(velocity, np.nan)
+    for contact in range(velocity.shape[1]):
+        others = np.where(standing[:, :, None], velocity, np.nan)
+        others[:, contact] = np.nan
+        some = np.isfinite(others[:, :, 0]).any(axis=1)
+        out[some, contact] = velocity[some, contact] - np.nanmedian(others[some], axis=1)
+    return out
+
+
+_PASSES = 3  # over the variance of what the parameters leave, which settles at once
+
+
+def fitted_parameters(samples: Samples, robot: Robot, contacts: Sequence[Contact]) -> FloatArray:
+    """Parameters (L, 12) of a robot without friction, which was fitted with them, as armatures were.
+
+    Args:
+        samples: with joint torques and the contacts that stand; torques without a value count as not measured.
+        robot: for the prior.
+        contacts: none of which is measured.
+    """
+    sensors = named_sensors("joints", robot.n, len(contacts), ft=len(robot.ft_names))
+    if samples.torque is not None:
+        sensors = dataclasses.replace(sensors, torque=sensors.torque & samples.torque.isfinite().all(dim=0).numpy())
+    builder = RowBuilder(robot, contacts, sensors, ExtraTerms(armature=True))
+    with ranks.apart():  # each process has logs of its own
+        problem = assemble(compress_parts([samples], builder), builder, robot).problem
+    phi = most_probable(problem).reshape(-1, PER_BODY)
+    phi[:, FRICTION] = robot.nominal[:, FRICTION]
+    return phi
+
+
+def most_probable(problem: LinearProblem) -> FloatArray:
+    """Parameters (P,) that are most probable by data and nominal values, with the noise that the data themselves show.
+
+    The prior is that of `PRIOR_DEVIATION`; MacKay, Bayesian Interpolation, 1992, with the prior's width known.
+    """
+    unit = problem.scale[problem.free] * PRIOR_DEVIATION
+    A, b = problem.A[:, problem.free] * unit, problem.b - problem.A @ problem.nominal
+    information, x = A.T @ A, np.zeros(len(unit))
+    for _ in range(_PASSES):
+        left = A @ x - b
+        variance = problem.oversampling * (left @ left + problem.residual) / max(problem.rows, 1)
+        x = np.linalg.lstsq(information + variance * np.eye(len(unit)), A.T @ b, rcond=None)[0]
+    out = problem.nominal.copy()
+    out[problem.free] += unit * x
+    return out

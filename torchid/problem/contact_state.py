@@ -13,7 +13,7 @@ from torch import Tensor
 from torchid import parameters
 from torchid.parameters import Array
 from torchid.problem.extras import Extra, measured_components
-from torchid.problem.loop_rows import LoopLayouts, LoopRows
+from torchid.problem.loop_forces import LoopLayouts, LoopRows
 from torchid.problem.row_blocks import RowBlock, RowBlocks, row_block
 from torchid.problem.wrench_rows import Acting, WrenchRows
 from torchid.regressor.columns import reduced_layout, reduction_matrix

@@ -1,17 +1,20 @@
-"""Columns of extra parameters in the rows."""
+"""Columns of extra parameters in the rows, and torques of those that the robot's file states: armatures, springs."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchid.problem.contact_state import ContactStateLayout
 from torchid.problem.extras import DELAYED, Extra
-from torchid.problem.recorded_wrenches import FramePoses
 from torchid.problem.samples import Samples
+from torchid.problem.wrench_rows import FramePoses
 from torchid.regressor.tree import KinematicTree
+from torchid.robot import Robot
 
 
 def dof_extra_column(extra: Extra, dof: int, samples: Samples, tree: KinematicTree) -> Tensor:
@@ -76,3 +79,26 @@ def extra_columns(
                     along = reading if unit is None else unit[:, k] * reading
                     column = column + projected[components.index((contact, k))] * along
         yield column
+
+
+class KnownTorques:
+    """What armatures and springs of an MJCF robot need, `armature * acceleration + stiffness * position + constant`.
+
+    Armatures and stiffnesses that are among the extra parameters are not known: these stand for all of them.
+    """
+
+    def __init__(self, robot: Robot, extras: Sequence[Extra]) -> None:
+        """Of a robot, those that are not `extras`."""
+        fitted = {what: [dof for x in extras if x.what == what for dof in x.dofs] for what in ("armature", "stiffness")}
+        self._armature, self._stiffness = robot.armature.copy(), robot.stiffness.copy()
+        self._armature[fitted["armature"]] = self._stiffness[fitted["stiffness"]] = 0.0
+        self._constant, self._others = robot.spring_torque, robot.n_dofs - robot.n
+        self.none = not np.any([self._armature, self._stiffness, self._constant])
+
+    def of(self, samples: Samples) -> Tensor:
+        """Of some samples, (B, n + 6 F) [N m or N], 0 at force/torque sensors."""
+        armature, stiffness, constant = (
+            samples.time.new_tensor(x) for x in (self._armature, self._stiffness, self._constant)
+        )
+        known = armature * samples.joint_acceleration + stiffness * samples.joint_position + constant
+        return known if not self._others else pad(known, (0, self._others))

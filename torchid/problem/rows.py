@@ -14,13 +14,12 @@ from torchid.problem.base_motion import levelled_base_axes
 from torchid.problem.chunk_dynamics import ChunkDynamics, ChunkKinematics, Workspace
 from torchid.problem.contact_rows import ContactRows, contact_rows, whitened_bases
 from torchid.problem.contact_state import Columns, ContactState, ContactStateLayout, ContactStateLayouts
-from torchid.problem.extra_columns import dof_extra_column, extra_columns
+from torchid.problem.extra_columns import KnownTorques, dof_extra_column, extra_columns
 from torchid.problem.extras import ExtraTerms, list_extras
-from torchid.problem.known_torques import KnownTorques
-from torchid.problem.motor_forces import MotorForces
-from torchid.problem.recorded_wrenches import FramePoses
+from torchid.problem.loop_forces import MotorForces
 from torchid.problem.row_blocks import RowBlock, multiply_wrenches, subtract_payload
 from torchid.problem.samples import Samples
+from torchid.problem.wrench_rows import FramePoses
 from torchid.regressor.columns import all_wrench_columns
 from torchid.regressor.kinematics import body_states, joint_motion, joint_screw_axes
 from torchid.regressor.regressor import (

@@ -15,13 +15,13 @@ from torchid.errors import LogError, UnknownNameError, about_file, join_names
 from torchid.logs import Log
 from torchid.logs.log import FORCE_NORMAL, FloatArray, normalize_normals
 from torchid.logs.preprocess import unloaded_readings
+from torchid.logs.spill import MappedPages
 from torchid.parameters import WRENCH_COMPONENTS, Array
 from torchid.problem.base_motion import BaseMotion, base_motion, imu_pose, position_for_moments
+from torchid.problem.closed_loops import FOLLOW, require_closed_loops
 from torchid.problem.extras import recorded_components
-from torchid.problem.loop_gaps import FOLLOW, require_closed_loops
-from torchid.problem.mapped_pages import MappedPages
+from torchid.problem.log_joints import columns_in_order, recorded_torques, require_limb_sensors
 from torchid.problem.motion_noise import MotionNoise, bind_motion_noise
-from torchid.problem.recorded_torques import columns_in_order, recorded_torques, require_limb_sensors
 from torchid.regressor import Motion
 from torchid.regressor.kinematics import GRAVITY_WORLD, rotation_matrix
 from torchid.reprs import short_repr

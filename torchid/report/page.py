@@ -26,7 +26,7 @@ from torchid.report.page_figures import (
     spectrum_panels,
     state_color,
 )
-from torchid.report.parameter_figure import INTERVAL
+from torchid.report.parameter_figures import INTERVAL
 
 _TEMPLATE = "page.html"
 _DRAWN = ("m", "fc", "fv")

@@ -18,9 +18,8 @@ from torchid.identifiability.confounding import ExtraEstimate
 from torchid.parameters import PARAMETERS, PER_BODY, UNITS, Array
 from torchid.report.loadable_urdf import bound_massless_links, resolve_meshes
 from torchid.robot import Robot
-from torchid.robot.plain_urdf import plain_urdf
 from torchid.robot.urdf import drop_repeated_origins, parse_xml
-from torchid.robot.xml_files import is_mjcf
+from torchid.robot.xml_files import is_mjcf, plain_urdf
 
 _MAX_NUMBER = 1e100  # products and squares stay within the range of float64
 _ROUNDING = 1e-12  # of a body's mass: below it the link that gives it its name has none

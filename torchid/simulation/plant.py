@@ -14,9 +14,8 @@ from torchid.errors import ConfigError, UnknownNameError, UrdfError
 from torchid.parameters import Array
 from torchid.robot.loops import loops_of_file
 from torchid.robot.mjcf_model import mujoco
-from torchid.robot.plain_urdf import plain_urdf
 from torchid.robot.urdf import TreeJoint, drop_repeated_origins, parse_xml, read_urdf
-from torchid.robot.xml_files import file_kind, is_mjcf
+from torchid.robot.xml_files import file_kind, is_mjcf, plain_urdf
 from torchid.sensing.sensors import NORMAL_FORCE
 from torchid.simulation.ties import WORLD, Followers, Ties, loop_errors
 

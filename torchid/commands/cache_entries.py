@@ -1,11 +1,12 @@
-"""Samples of one log as entries of a cache: what they depend on, how they are stored, and what reading had said."""
+"""What a cache holds: samples of one log with what reading had said, and factors of training logs."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import re
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,18 +14,23 @@ import numpy as np
 import torch
 from lxml import etree
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 from torch import Tensor
 
-from torchid.commands.cache import Entry, tensor_of
+from torchid import ranks
+from torchid.commands.cache import Cache, Entry, content_key, tensor_of
 from torchid.commands.manifest import file_checksum
 from torchid.commands.reading import fits_contact_offsets
 from torchid.config.robot import RobotConfig
 from torchid.errors import TorchidWarning
-from torchid.fitting.experiment import Scene
+from torchid.fitting.experiment import Experiment, Scene
+from torchid.fitting.packed_parts import PackedPart, PartPacker, PartReader
+from torchid.logs.spill import MappedPages
 from torchid.logs.time_range import log_title
-from torchid.problem import Samples
+from torchid.problem import RowBuilder, Samples, TriangularFactor
 from torchid.problem.base_motion import BaseMotion
-from torchid.problem.mapped_pages import MappedPages
+from torchid.problem.chunks import worker_count
+from torchid.problem.compression import Part
 from torchid.problem.motion_noise import MotionNoise
 from torchid.robot import Robot
 from torchid.robot.urdf import parse_xml
@@ -36,7 +42,7 @@ NOT_IN_SAMPLES = ("memory_gb", "cache_gb")
 Said = tuple[type[Warning], str]
 """Class and text of a warning."""
 
-_FORMAT = 2  # of entries
+_SAMPLES_FORMAT = 2  # of entries
 _BASE = "base."  # before the names of tensors of the base's motion
 
 
@@ -63,7 +69,7 @@ def content_of_scene(scene: Scene) -> dict[str, Any]:
     topics = None if config.logs is None or config.logs.topics is None else asdict(config.logs.topics)
     columns = None if config.logs is None or config.logs.columns is None else asdict(config.logs.columns)
     return {
-        "format": _FORMAT,
+        "format": _SAMPLES_FORMAT,
         "urdf": [config.robot.path.name, _robot_checksum(config.robot)],
         "robot": [robot.base_link, robot.fixed_base, list(robot.ft_names), robot.welded, robot.base_tilt],
         **_loops(robot),
@@ -169,3 +175,95 @@ def _said_again() -> list[type[Warning]]:
     for category in out:
         out += category.__subclasses__() if category is not RuntimeWarning else []
     return out
+
+
+_FACTORS_FORMAT = 3  # of entries
+_PARTS = TypeAdapter(list[PackedPart])
+
+
+def factors_key(experiment: Experiment, builder: RowBuilder, samples: Sequence[str], blocks: Sequence[Samples]) -> str:
+    """The name of the factors of training logs: of whatever changes the last bit of one.
+
+    Args:
+        experiment: with the noise that rows are weighed with.
+        builder: of the rows.
+        samples: names of the samples of each log, see `CachedReader.keys`.
+        blocks: the logs in folds.
+    """
+    sensors, sources = experiment.sensors, list(dict.fromkeys(block.source for block in blocks))
+    return content_key(
+        {
+            "format": _FACTORS_FORMAT,
+            "samples": list(samples),
+            "sensors": [sensors.torque.tolist(), sensors.wrench.tolist()],
+            "noise": vars(sensors.noise),
+            "terms": vars(experiment.terms),
+            "blocks": [[sources.index(block.source), len(block), block.fold] for block in blocks],
+            "surplus": [block.motion_noise is not None for block in blocks],
+            "device": builder.device.type,
+            "shares": [worker_count(builder.device), ranks.world_size()],  # rows are added up by each
+        }
+    )
+
+
+def cached_parts(
+    cache: Cache, key: str, builder: RowBuilder, blocks: Sequence[Samples], compute: Callable[[], list[Part]]
+) -> tuple[list[Part], bool]:
+    """The parts of blocks of logs from a cache, or computed and stored; whether they were there.
+
+    All processes that share the work call this together.
+
+    Args:
+        cache: where they may be.
+        key: from `factors_key`.
+        builder: of the rows.
+        blocks: the logs in folds.
+        compute: compresses them.
+    """
+    sources = list(dict.fromkeys(block.source for block in blocks))
+    entry, found = cache.load(key), None
+    if entry is not None:
+        try:
+            found = _unpacked(entry, builder, sources)
+        except Exception as error:  # noqa: B902 - whatever another program has put there
+            cache.drop(key, str(error))
+    there = all(ranks.gather(found is not None, "factors in the cache"))
+    if there and found is not None:
+        return found, True
+    parts = compute()
+    if ranks.is_first():
+        cache.save(key, *_packed(parts, sources))
+    return parts, False
+
+
+def _packed(parts: Sequence[Part], sources: Sequence[str]) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """The document and the numbers of an entry."""
+    packer = PartPacker()
+    document = {
+        "parts": packer.pack(parts),
+        "of": [[sources.index(part.source), part.fold, part.block, part.unloaded] for part in parts],
+        "supports": packer.supports,
+    }
+    return document, {"values": packer.values}
+
+
+def _unpacked(entry: Entry, builder: RowBuilder, sources: Sequence[str]) -> list[Part]:
+    """What was stored, of logs of these names; any exception where that is something else."""
+    document, columns = entry.document, builder.width
+    reader = PartReader(
+        entry.arrays["values"], document["supports"], columns, len(builder.contacts), len(builder.extras)
+    )
+    parts = []
+    for packed, (source, fold, block, unloaded) in zip(
+        _PARTS.validate_python(document["parts"]), document["of"], strict=True
+    ):
+        part = reader.read(sources[source], packed, unloaded)
+        factor = part.factor
+        blocks, surplus = (
+            {support: x.to(builder.device) for support, x in by.items()} for by in (factor.blocks, factor.surplus)
+        )
+        moved = TriangularFactor.from_blocks(columns, factor.rows, factor.independent_rows, blocks, surplus)
+        parts.append(replace(part, factor=moved, fold=fold, block=block))
+    if reader.numbers_left:
+        raise ValueError("more numbers than are described")
+    return parts

@@ -1,16 +1,20 @@
-"""Columns of tables, or arrays, with some of their rows: what a map is proposed from."""
+"""Some of what a file holds, from which a map is proposed: rows of a table's columns, messages of a bag's topics."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.logs.containers import LogKind, existing_log_kind, open_container, reader_errors_explained
+from torchid.errors import TorchidError
+from torchid.logs.containers import LogKind, existing_log_kind, list_bag_files, open_container, reader_errors_explained
 from torchid.logs.name_matching import KnownRobot, match_names
+from torchid.logs.ros_messages import make_deserializer
+from torchid.logs.ros_read import list_channels, open_bag_file
 from torchid.logs.table_headers import read_header
 from torchid.logs.tables import is_text_table, sample_table
 
@@ -73,3 +77,53 @@ def listed_order(sample: Columns, kind: str, robot: KnownRobot, count: int) -> t
         if len(matched) == len(known) > 0:
             return [matched[text] for text in listed], f"as '{name}' of the file lists them"
     return None
+
+
+#: Messages of a topic that are looked at, spread over all of the bag.
+_MESSAGES = 500
+
+
+@dataclass
+class TopicSample:
+    """A topic, and some of its messages where their type is known.
+
+    Attributes:
+        type: of the messages.
+        messages: in the order of receipt.
+        count: how many there are.
+    """
+
+    type: str
+    messages: list[Any] = field(default_factory=list)
+    count: int = 0
+
+
+def read_bag_sample(path: Path, types: Collection[str]) -> dict[str, TopicSample]:
+    """Every topic of a bag, and messages of those that have one of some types.
+
+    Raises:
+        LogError: the bag is damaged.
+    """
+    files = list_bag_files(path)
+    channels = list_channels(files)
+    raw: dict[str, list[bytes]] = {name: [] for name, channel in channels.items() if channel.type in types}
+    counts, steps = dict.fromkeys(channels, 0), dict.fromkeys(channels, 1)
+    for file in files:
+        with open_bag_file(file) as opened:
+            for record in opened.records(raw.keys()):
+                name = record.topic
+                if counts[name] % steps[name] == 0:
+                    raw[name].append(record.data)
+                    if len(raw[name]) > 2 * _MESSAGES:
+                        raw[name], steps[name] = raw[name][::2], 2 * steps[name]
+                counts[name] += 1
+    out = {}
+    with open_bag_file(files[0]):  # whose errors are those of deserializing, too
+        for name, channel in channels.items():
+            try:
+                make = make_deserializer(name, channel)
+                messages = [make(data) for data in raw.get(name, [])]
+            except TorchidError:  # a serialization of others, which may be on a topic that nobody needs
+                messages = []
+            out[name] = TopicSample(channel.type, messages, counts[name])
+    return out

@@ -1,0 +1,248 @@
+"""What `torchid identify` prints: the answer on one screen, or all that a run says of its fit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from textwrap import shorten
+
+import numpy as np
+
+from torchid.commands.answer import answer
+from torchid.commands.results import Identification
+from torchid.commands.training import body_eigenvalues
+from torchid.errors import join_names
+from torchid.estimators import ConsistentEstimate, ConstrainedEstimate, Estimate, SgdEstimate
+from torchid.estimators.least_squares import COMBINED, FIXED, IDENTIFIED, PRIOR, UNOBSERVABLE
+from torchid.fitting.cross_validation import CrossValidation
+from torchid.fitting.misfit import Misfit
+from torchid.parameters import PARAMETERS, PER_BODY, Array
+from torchid.problem.metrics import ADVICE, DECISIVE_GROUPS, WorseThanNominal, describe_errors, describe_worse
+from torchid.report.tables import (
+    contribution_table,
+    error_tables,
+    extra_table,
+    print_tables,
+    state_table,
+    terminal_width,
+    verdict_counts_table,
+    verdict_table,
+    violation_table,
+)
+from torchid.robot import Robot
+from torchid.terminal.lines import (
+    CUT,
+    LABEL,
+    LINES,
+    column_lines,
+    error_lines,
+    labelled,
+    print_labelled,
+    print_noise,
+    print_rolling,
+    wrap_words,
+)
+
+_MOST_ATTENTION, _TEXT_LINES, _ATTENTION_LINES = 2, 2, 3
+_FEWEST_LINES = 4  # of the table of bodies: a heading, a body, how many others there are, what the marks mean
+_MASS, _CENTER = PARAMETERS.index("m"), slice(PARAMETERS.index("mcx"), PARAMETERS.index("mcz") + 1)
+_COULOMB, _VISCOUS = PARAMETERS.index("fc"), PARAMETERS.index("fv")
+_LEGEND = {COMBINED: "+ known only in sums with other bodies", PRIOR: "p mostly the {of}'s", UNOBSERVABLE: ". unseen"}
+_MARKS = {IDENTIFIED: " ", COMBINED: "+", PRIOR: "p", UNOBSERVABLE: ".", FIXED: "="}
+
+
+def print_answer(run: Identification, *last: tuple[str, str]) -> None:
+    """Print it for the terminal's width, with these words and what they are about at the end."""
+    print("\n".join(answer_lines(run, terminal_width(), last)))
+
+
+def answer_lines(run: Identification, width: int, last: Sequence[tuple[str, str]] = ()) -> list[str]:
+    """The answer, in lines that are not wider than so many columns.
+
+    Args:
+        run: a finished one.
+        width: of the terminal.
+        last: words, and what they are about, at the end.
+    """
+    said = answer(run)
+    lines = [*wrap_words(said.headline, width), *error_lines(said.errors, width, run.experiment.robot.format), ""]
+    lines += labelled("total mass", said.total_mass, width, _TEXT_LINES)
+    lines += labelled("bodies", said.bodies, width, _TEXT_LINES)
+    for one in said.attention[:_MOST_ATTENTION]:
+        lines += labelled("attention", one, width, _ATTENTION_LINES)
+    if len(said.attention) > _MOST_ATTENTION:
+        lines += labelled("", f"and {len(said.attention) - _MOST_ATTENTION} more: --verbose", width, _TEXT_LINES)
+    output = run.experiment.config.output
+    end = [] if output is None else [f"{'written to':{LABEL}}{output}"]
+    end += [line for one in last for line in labelled(*one, width, _TEXT_LINES)]
+    bodies = _body_lines(run.experiment.robot, run.estimate, LINES - len(lines) - len(end) - 1, width)
+    return [*lines, *(["", *bodies] if bodies else []), *end]
+
+
+# --------------------------------------------------------------------------------------------------------- the bodies
+
+
+def _body_lines(robot: Robot, estimate: Estimate, room: int, width: int) -> list[str]:
+    """A table of the bodies that changed most, with as many columns as fit, in so many lines."""
+    free = [k for k, row in enumerate(estimate.verdict.reshape(-1, PER_BODY)) if (row != FIXED).any()]
+    if room < _FEWEST_LINES:
+        return []
+    most = room - 2  # heading, legend
+    shown = sorted(_most_changed(robot, estimate, free)[: most if len(free) <= most else most - 1])
+    names, columns = [robot.body_names[k] for k in shown], _columns(robot, estimate, shown)
+    lines = column_lines(("body", names), columns, width)
+    marks = {word for line in lines[1:] for word in line.split()[1:]}
+    if len(free) > len(shown):
+        lines.append(f"and {len(free) - len(shown)} bodies that changed less: parameters.json, --verbose")
+    legend = "; ".join(text.format(of=robot.format) for verdict, text in _LEGEND.items() if _MARKS[verdict] in marks)
+    return [*lines, *([shorten(legend, width, placeholder=CUT)] if legend else [])]
+
+
+def _most_changed(robot: Robot, estimate: Estimate, bodies: Sequence[int]) -> list[int]:
+    """The bodies whose mass moved by the largest share of the robot's, or else friction by that of its own."""
+    phi, nominal = estimate.phi.reshape(-1, PER_BODY), robot.nominal
+    moved = np.abs(phi - nominal)
+    return sorted(bodies, key=lambda k: (-moved[k, _MASS], -moved[k, _COULOMB], k))
+
+
+def _columns(robot: Robot, estimate: Estimate, bodies: Sequence[int]) -> list[tuple[str, list[str]]]:
+    """Headings and cells, the most important first."""
+    phi, error = (x.reshape(-1, PER_BODY) for x in (estimate.phi, estimate.standard_error))
+    verdict, nominal = estimate.verdict.reshape(-1, PER_BODY), robot.nominal
+
+    def cells(parameter: int) -> list[str]:
+        return [_cell(*(x[k, parameter] for x in (phi, error, verdict))) for k in bodies]
+
+    joints = [robot.bodies[k].joint for k in bodies]
+    kinds = {joint.kind for joint in joints if joint is not None}
+    force = "N m" if "prismatic" not in kinds else "N m, N"
+    moved = [_center_moved(nominal[k], phi[k], verdict[k]) for k in bodies]
+    return [
+        ("mass [kg]", cells(_MASS)),
+        (f"{robot.format} [kg]", [f"{nominal[k, _MASS]:.3f}" for k in bodies]),
+        (f"Coulomb [{force}]", cells(_COULOMB)),
+        ("CoM moved [mm]", moved),
+        (f"viscous [{_per_speed(kinds)}]", cells(_VISCOUS)),
+    ]
+
+
+def _per_speed(kinds: set[str]) -> str:
+    units = ["N m s/rad"] * bool(kinds - {"prismatic"}) + ["N s/m"] * ("prismatic" in kinds)
+    return ", ".join(units)
+
+
+def _cell(value: float, error: float, verdict: str) -> str:
+    if verdict == FIXED:
+        return ""
+    known = verdict == IDENTIFIED and np.isfinite(error) and error > 0.0
+    digits = min(max(1 - int(np.floor(np.log10(error))), 0), 5) if known else 3
+    text = f"{value:.{digits}f} ± {error:.{digits}f}" if known else f"{value:.{digits}f}"
+    return f"{text} {_MARKS[verdict]}"
+
+
+def _center_moved(nominal: Array, phi: Array, verdict: np.ndarray) -> str:
+    """Distance between both centres of mass."""
+    if (verdict[_CENTER] == FIXED).all() or min(nominal[_MASS], phi[_MASS]) <= 0.0:
+        return ""
+    distance = np.linalg.norm(phi[_CENTER] / phi[_MASS] - nominal[_CENTER] / nominal[_MASS])
+    return f"{1e3 * distance:.0f} {_MARKS[COMBINED] if (verdict[_CENTER] == COMBINED).any() else ' '}"
+
+
+_NAMED = 6  # conditions
+
+
+def print_details(run: Identification) -> None:
+    """Print all tables, and the key figures one per line."""
+    estimate, robot = run.estimate, run.experiment.robot
+    if run.worse:
+        _print_worse(run.worse, robot.format)
+    if not run.misfit.explained:
+        _print_misfit(run.misfit)
+    print_tables(state_table([asdict(state) for state in run.states]), *error_tables(run.metrics, robot.format))
+    if 0 < run.evaluated["train"] < run.samples:
+        count = f"{run.evaluated['train']} of {run.samples} samples, evenly spaced"
+        print_labelled("train", f"errors of forces of {count}")
+    print_tables(
+        contribution_table(run.contributions),
+        verdict_table(robot.body_names, estimate.verdict),
+        verdict_counts_table(run.by_state, estimate),
+    )
+    print_noise(run.noise)
+    if run.extras:
+        print_tables(extra_table(run.extras))
+    if run.violations:
+        print_tables(violation_table(run.violations_by_name()))
+        if type(estimate) is Estimate:
+            print("estimator.name=consistent finds the best parameters that break none of them")
+    _print_fit(run)
+    timed = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in run.seconds.items())
+    print_labelled("time", f"{run.samples} samples: {timed}")
+    if run.reused:
+        print_labelled("from cache", ", ".join(run.reused))
+    print(f"written to    {run.experiment.config.output}")
+
+
+def _print_wrapped(text: str, indent: str = "") -> None:
+    print(indent + "\n".join(wrap_words(text, terminal_width() - len(indent), "  ")))
+
+
+def _print_worse(worse: list[WorseThanNominal], of: str) -> None:
+    for line in (
+        f"WORSE THAN {of}: {describe_worse(worse, of)}",
+        f"{ADVICE}; the results are written all the same, status 0",
+    ):
+        _print_wrapped(line)
+
+
+def _print_misfit(misfit: Misfit) -> None:
+    _print_wrapped(f"NOT EXPLAINED: the model does not explain these forces: {misfit}")
+    if misfit.error_growth is not None and misfit.error_growth > 1.0:
+        advice = "look for friction, compliance or contacts that the model lacks, and for wrong sensors (torchid check)"
+        growth = f"standard errors are {misfit.error_growth:.2g} times (median) what noise alone would make of them"
+        _print_wrapped(f"{growth}; {advice}", "  ")
+
+
+def _print_fit(run: Identification) -> None:
+    """Print the key figures, one per line."""
+    estimate, robot = run.estimate, run.experiment.robot
+    print_rolling(run.experiment.rolling)
+    print_labelled("parameters", f"{estimate.rank} independent combinations of {int(estimate.phi.size)} identified")
+    print_labelled("condition", f"{estimate.condition_number:.3g}")
+    rest = "" if run.misfit.expected is None else f"; {run.misfit.expected:.3g} are left by noise alone"
+    print_labelled("residual", f"{estimate.residual_std:.3g} standard deviations of that noise{rest}")
+    if run.motion_noise.combinations:
+        print_labelled("motion noise", str(run.motion_noise))
+    if run.validation is not None:
+        _print_validation(run.validation, run.experiment.robot.format)
+    for name, choice in {**run.choices.by_name(), "ridge": run.ridge}.items():
+        if choice is not None:
+            print_labelled(name, str(choice))
+    _print_conditions(run)
+    if isinstance(estimate, SgdEstimate):
+        print_labelled("training", f"{estimate.epochs} epochs, parameters of epoch {estimate.best_epoch}")
+    print_labelled("total mass", f"{run.mass} ({robot.format}: {run.mass.nominal:.3f} kg)")
+    if run.robust is not None:
+        kept = f"{100 * run.robust.mean_weight:.3g} % of the weight kept"
+        print_labelled("robust", f"{run.robust.loss}, {kept}, {run.robust.passes} passes")
+    if robot.massless:
+        print_labelled("left out", f"massless: {', '.join(robot.massless)}")
+
+
+def _print_conditions(run: Identification) -> None:
+    """How the conditions of physical consistency are met, and what they cost."""
+    estimate, robot = run.estimate, run.experiment.robot
+    least, body = min((value, name) for name, value in body_eigenvalues(robot, estimate.phi).items())
+    print_labelled("consistency", f"smallest eigenvalue of a scaled pseudo-inertia {least:.3g}, {body}")
+    if isinstance(estimate, ConstrainedEstimate) and estimate.relative_increase is not None:
+        print_labelled("objective", f"{100.0 * estimate.relative_increase:.3g} % above the least without conditions")
+    if isinstance(estimate, ConsistentEstimate) and estimate.active:
+        print_labelled("at bounds", f"{len(estimate.active)}: {join_names(estimate.active, _NAMED)}")
+    if isinstance(estimate, ConsistentEstimate) and estimate.certified_gap is not None:
+        print_labelled("certified", f"objective within {estimate.certified_gap:.1g} of the other method's")
+
+
+def _print_validation(validation: CrossValidation, nominal_of: str) -> None:
+    identified, nominal = validation.identified.rms, validation.nominal.rms
+    texts = (describe_errors(group, identified.get(group), nominal.get(group)) for group in DECISIVE_GROUPS)
+    text = f"each of {validation.folds} blocks, against {nominal_of}: {'; '.join(filter(None, texts))}"
+    print_labelled("held out", text)
