@@ -14,7 +14,7 @@ from typing import Any
 import yaml
 
 from torchid.commands.folder import check_free_file
-from torchid.commands.init_hints import BRIDGED_S, gaps_in_motion, hints, missing_columns
+from torchid.commands.init_hints import hints, keys_for_gaps, missing_columns
 from torchid.commands.init_proposals import Split, limb_sensors, sensor_set, split_log
 from torchid.commands.reading import memory_needed
 from torchid.config.preprocessing import PreprocessingConfig
@@ -44,6 +44,7 @@ _IMU = ("imu_specific_force", "imu_angular_velocity")
 _RATE = "base_angular_velocity_base"
 _WHAT = {"columns": "names, units and orders of the file", "topics": "what the messages of the bag hold"}
 _WELDED = "joints that the log lacks, held still; one that moves needs readings"
+_LIKE_TORQUES = "of these no name says what they are; uncomment one of torques [N m], or currents with scale: N m per A"
 _LINE = 118
 
 
@@ -100,7 +101,7 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> Initiated:
     out = Initiated(target)
     _state_flags(contacts, fields, proposal)
     read = _try(path, proposal)
-    gaps = _gaps(read)
+    gaps = keys_for_gaps(read)
     split = split_log(read, "base_motion" in _from_feet(contacts, fields))
     text = _text(robot, urdf, path, target, contacts, fields, proposal, gaps, split)
     _describe(out, robot, contacts, fields, proposal)
@@ -260,7 +261,7 @@ def _describe(
     out.missing += missing_columns(len(robot.joint_names), fields, proposal.partial, what)
     if not set(_FORCES) & fields:
         out.missing.append("forces: neither joint torques nor contact wrenches")
-    out.missing += hints(proposal.left_out, fields, robot.joint_names, what)
+    out.missing += hints(proposal.left_out, fields, robot.joint_names, what, proposal.like_torques)
     from_feet = _from_feet(contacts, fields)
     if contacts and "contact_active" not in fields:
         instead = "detected from joint torques" if "detect_contacts" in from_feet else "set to touch throughout"
@@ -304,20 +305,6 @@ def _describe_log(out: Initiated, read: Log | InputError) -> None:
     out.found.append(f"{len(read)} samples over {read.time[-1] - read.time[0]:.4g} s: {', '.join(has)}")
 
 
-def _gaps(read: Log | InputError) -> dict[str, tuple[object, str]]:
-    """The keys of preprocessing that a log with gaps in its motion needs, with the reason."""
-    longest, at_end, name = (0.0, False, "") if isinstance(read, InputError) else gaps_in_motion(read)
-    out: dict[str, tuple[object, str]] = {}
-    if 0.0 < longest <= BRIDGED_S:
-        out["bridge_gaps_s"] = (BRIDGED_S, f"as gaps of {name} take up to {longest:.2g} s")
-    if longest > BRIDGED_S or at_end:
-        reason = (
-            f"as gaps of {name} take up to {longest:.2g} s" if longest > BRIDGED_S else f"as {name} has one at an end"
-        )
-        out["exclude_condemned"] = (True, reason)
-    return out
-
-
 # ------------------------------------------------------------------------------------------------------- the file
 
 
@@ -354,6 +341,9 @@ def _text(
             note = proposal.notes.get(key, "")
             lines += [f"    # guessed: {note}"] if note else []
             lines += [f"    {line}" for line in _entry(key, value)]
+        lines += [f"    # {_LIKE_TORQUES}"] * bool(proposal.like_torques)
+        for family in proposal.like_torques:
+            lines += [f"    # {line}" for line in _entry("joint_torque", family.counted_entry)]
     lines += [f"# {' and '.join(from_feet)}: nobody recorded them"] if from_feet else []
     lines += [f"# {key}: {why}" for key, (_, why) in gaps.items()]
     stated = {key: value for key, (value, _) in gaps.items()}

@@ -7,8 +7,9 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
-from torchid.errors import excerpt, format_count, join_names
+from torchid.errors import InputError, excerpt, format_count, join_names
 from torchid.logs import Log
+from torchid.logs.column_groups import Family
 from torchid.logs.column_proposals import OF_PLATES, is_desired, propose_field
 from torchid.logs.log import WRENCHES
 
@@ -19,8 +20,7 @@ _EULER = re.compile(r"(?<![a-z])(roll|pitch|yaw|rpy|euler)(?![a-z])", re.IGNOREC
 _AS_ANGLES = "base_quat_wxyz: {rpy: ...}"
 _STEP = re.compile(r"(dt|time_?step|sample_?rate|fps|rate_?hz|freq\w*)", re.IGNORECASE)
 _MOTION = ("joint_position", "base_quat_xyzw", "base_position_world", *("imu_specific_force", "imu_angular_velocity"))
-BRIDGED_S = 0.05
-"""Gaps that `init` has bridged [s]."""
+_BRIDGED_S = 0.05  # gaps that are bridged
 
 
 def missing_columns(joints: int, fields: Collection[str], partial: Mapping[str, Sequence[str]], what: str) -> list[str]:
@@ -41,7 +41,9 @@ def missing_columns(joints: int, fields: Collection[str], partial: Mapping[str, 
     return out
 
 
-def hints(left_out: Sequence[str], fields: Collection[str], joints: Sequence[str], what: str) -> list[str]:
+def hints(
+    left_out: Sequence[str], fields: Collection[str], joints: Sequence[str], what: str, like_torques: Sequence[Family]
+) -> list[str]:
     """What columns or topics that are left out may hold of the fields that are missing.
 
     Args:
@@ -49,8 +51,12 @@ def hints(left_out: Sequence[str], fields: Collection[str], joints: Sequence[str
         fields: of the log.
         joints: of the robot.
         what: column or topic.
+        like_torques: columns of which there is one for each joint.
     """
     out = []
+    if like_torques:
+        each = join_names([_like(one.columns) for one in like_torques])
+        out.append(f"joint_torque: no {what} says that it is one; {each} have one of each joint: see the file")
     measured = [name for name in left_out if not is_desired(name)]
     if plates := [name for name in left_out if propose_field(name) in OF_PLATES]:
         unknown = "without which foot stands on which and where each lies (docs/logs.md, Force plates)"
@@ -79,7 +85,21 @@ def _like(names: Sequence[str]) -> str:
     return f"'{excerpt(names[0])}'" + (f" and {len(names) - 1} more" if len(names) > 1 else "")
 
 
-def gaps_in_motion(log: Log) -> tuple[float, bool, str]:
+def keys_for_gaps(log: Log | InputError) -> dict[str, tuple[object, str]]:
+    """The keys of preprocessing that a log with gaps in its motion needs, with the reason; none if it is not read."""
+    longest, at_end, name = (0.0, False, "") if isinstance(log, InputError) else _gaps_in_motion(log)
+    out: dict[str, tuple[object, str]] = {}
+    if 0.0 < longest <= _BRIDGED_S:
+        out["bridge_gaps_s"] = (_BRIDGED_S, f"as gaps of {name} take up to {longest:.2g} s")
+    if longest > _BRIDGED_S or at_end:
+        reason = (
+            f"as gaps of {name} take up to {longest:.2g} s" if longest > _BRIDGED_S else f"as {name} has one at an end"
+        )
+        out["exclude_condemned"] = (True, reason)
+    return out
+
+
+def _gaps_in_motion(log: Log) -> tuple[float, bool, str]:
     """Gaps in the motion of a log: how long the longest takes, whether some are at an end, and a field with one.
 
     The length [s] is that from the value before to that after; gaps at an end do not count for it. Channels that are

@@ -47,7 +47,8 @@ class KnownRobot:
 
 def within(stem: str) -> re.Pattern[str]:
     """A name as a part of another, between letters and numbers that are none of it."""
-    return re.compile(rf"(?<![A-Za-z0-9]){re.escape(stem)}(?![A-Za-z0-9])")
+    before = r"(?:(?<![A-Za-z0-9])|(?<=[a-z]))" if stem[:1].isupper() else r"(?<![A-Za-z0-9])"  # contactFlagLF_FOOT
+    return re.compile(rf"{before}{re.escape(stem)}(?![A-Za-z0-9])")
 
 
 def spelled(stem: str) -> re.Pattern[str]:
