@@ -132,6 +132,18 @@ def test_numbers_of_states_are_no_flags(tmp_path: Path) -> None:
     np.testing.assert_array_equal(value(found.contact_active), rising)
 
 
+def test_arrays_that_no_map_takes_are_named_with_what_to_do(tmp_path: Path) -> None:
+    log = recorded()
+    np.savez(tmp_path / "x.npz", t=log.time, q=log.joint_position.T, tau=value(log.joint_torque).T)
+    said = init(URDF, tmp_path / "x.npz", tmp_path / "x.yaml")
+    shape = f"' has shape (12, {len(log)}); if its columns are the samples, save it transposed, (N, 12)"
+    assert any(shape in line for line in said.guessed)
+    names = ["t", *(f"q_{name}" for name in log.joint_names)]
+    np.savez(tmp_path / "y.npz", data=np.column_stack([log.time, log.joint_position]), labels=np.array(names))
+    said = init(URDF, tmp_path / "y.npz", tmp_path / "y.yaml")
+    assert any("if 'labels' names its columns, save both as a table" in line for line in said.guessed)
+
+
 HEADERS = {
     "German": ("Zeit [s]", "Gelenkwinkel {} [°]", "Winkelgeschwindigkeit {} [°/s]", "Drehmoment {} [Nm]",
                "Beschleunigung {} [m/s²]", "Drehrate {} [°/s]"),

@@ -14,7 +14,7 @@ from typing import Any
 import yaml
 
 from torchid.commands.folder import check_free_file
-from torchid.commands.init_hints import hints, keys_for_gaps, missing_columns
+from torchid.commands.init_hints import hints, keys_for_gaps, missing_columns, notes_on_arrays
 from torchid.commands.init_proposals import Split, limb_sensors, sensor_set, split_log
 from torchid.commands.reading import memory_needed
 from torchid.config.preprocessing import PreprocessingConfig
@@ -129,6 +129,8 @@ def _of_columns(files: Sequence[Path], robot: Robot) -> tuple[list[_Contact], se
     contacts = _guess_contacts(robot, _stated_contacts(sample, robot), texts_in(sample))
     proposal = propose_map(sample, _known(robot, contacts), samples if len(files) > 1 else (), in_degrees)
     fields = _fields_of(sample, proposal)
+    if "joint_position" not in fields:
+        proposal.notes |= notes_on_arrays(sample, len(robot.joint_names))
     _add_imu_frame(robot, fields, proposal)
     return contacts, fields, proposal
 

@@ -11,6 +11,7 @@ from torchid.errors import InputError, excerpt, format_count, join_names
 from torchid.logs import Log
 from torchid.logs.column_groups import Family
 from torchid.logs.column_proposals import OF_PLATES, is_desired, propose_field
+from torchid.logs.file_samples import Columns
 from torchid.logs.log import WRENCHES
 
 _OTHER_FILE = "; if another file has it: torchid init ROBOT 'FILE + FILE@SECONDS', docs/logs.md"
@@ -78,6 +79,26 @@ def hints(
         out.append(f"time: '{steps[0]}' may be the step or the rate of the stamps, which have to be in the file")
     if not {"base_quat_wxyz", "base_quat_xyzw"} & set(fields) and (angles := [x for x in measured if _EULER.search(x)]):
         out.append(f"base_quat: {_like(angles)} may be angles of the base; give all three as {_AS_ANGLES}")
+    return out
+
+
+def notes_on_arrays(sample: Columns, joints: int) -> dict[str, str]:
+    """What arrays of a file without joint positions may be that no map takes as they are, by key.
+
+    Args:
+        sample: from `read_sample`.
+        joints: of the robot.
+    """
+    out: dict[str, str] = {}
+    for name, values in sample.items():
+        if values is None or values.ndim != 2 or values.dtype.kind not in "fiu":
+            continue
+        shape, width = f"'{excerpt(name)}' has shape {values.shape}", values.shape[1]
+        texts = (x for x, of in sample.items() if of is not None and of.dtype.kind not in "fiub" and of.shape == (width,))
+        if (listed := next(texts, None)) is not None:
+            out["columns"] = f"{shape}; if '{excerpt(listed)}' names its columns, save both as a table, CSV or Parquet"
+        elif len(values) == joints < width:
+            out["joint_position"] = f"{shape}; if its columns are the samples, save it transposed, (N, {joints})"
     return out
 
 
