@@ -94,7 +94,8 @@ def notes_on_arrays(sample: Columns, joints: int) -> dict[str, str]:
         if values is None or values.ndim != 2 or values.dtype.kind not in "fiu":
             continue
         shape, width = f"'{excerpt(name)}' has shape {values.shape}", values.shape[1]
-        texts = (x for x, of in sample.items() if of is not None and of.dtype.kind not in "fiub" and of.shape == (width,))
+        lists = {other: x for other, x in sample.items() if x is not None and x.dtype.kind not in "fiub"}
+        texts = (other for other, x in lists.items() if x.shape == (width,))
         if (listed := next(texts, None)) is not None:
             out["columns"] = f"{shape}; if '{excerpt(listed)}' names its columns, save both as a table, CSV or Parquet"
         elif len(values) == joints < width:
