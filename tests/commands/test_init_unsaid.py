@@ -144,6 +144,14 @@ def test_arrays_that_no_map_takes_are_named_with_what_to_do(tmp_path: Path) -> N
     assert any("if 'labels' names its columns, save both as a table" in line for line in said.guessed)
 
 
+def test_small_angles_by_which_a_base_would_lie_on_its_back_in_radians_are_degrees(tmp_path: Path) -> None:
+    log = recorded()
+    columns = {"t": log.time} | columns_of(log, ("q{}", "dq{}", "tau{}"))
+    roll = 5.0 * np.sin(log.time)
+    found, _, _ = initiated(save_csv(tmp_path / "x.csv", columns | {"Roll": roll, "Pitch": 0 * roll, "Yaw": 0 * roll}))
+    np.testing.assert_allclose(value(found.base_quat_xyzw)[:, 0], np.sin(0.5 * np.radians(roll)), atol=1e-12)
+
+
 HEADERS = {
     "German": ("Zeit [s]", "Gelenkwinkel {} [°]", "Winkelgeschwindigkeit {} [°/s]", "Drehmoment {} [Nm]",
                "Beschleunigung {} [m/s²]", "Drehrate {} [°/s]"),

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.logs.column_proposals import is_desired
-from torchid.logs.file_samples import Columns
+from torchid.logs.file_samples import Columns, side_by_side
 from torchid.logs.gaps import turn_jumps
 from torchid.logs.units import UNITS, quantities_with, split_unit
 
@@ -217,6 +217,7 @@ _OF_BASE = re.compile(
 )
 _SPLIT = re.compile(r"[^A-Za-z]+|(?<=[a-z])(?=[A-Z])")
 _LARGEST = 6.5  # [rad]: of no angle within a turn
+_UPRIGHT = 1.6  # [rad]: roll or pitch of a base that stands or hangs upright are less
 
 
 def order_of_quaternion(arrays: Sequence[NDArray[Any]]) -> str:
@@ -294,6 +295,9 @@ def _angles(values: Mapping[str, NDArray[Any]], unit: str) -> Angles:
     elif (largest := float(np.nanmax([np.nanmax(np.abs(x), initial=0.0) for x in values.values()]))) > _LARGEST:
         entry["unit"] = "deg"
         note += f"; deg, from values up to {largest:.3g}"
+    elif (tilt := float(np.nanmax(np.abs(side_by_side(values, columns)[:, :2]), initial=0.0))) > _UPRIGHT:
+        entry["unit"] = "deg"
+        note += f"; deg, as a base that is tilted by {tilt:.3g} rad would have fallen"
     else:
         note += f"; rad, as none exceeds {_LARGEST}"
     return Angles(entry, columns, note)
