@@ -14,6 +14,7 @@ from refusals import refusal
 from repository import DEMO, SHARED
 from synthetic import ANYMAL, G1, PANDA, ROBOTS, SOLO12
 from trainings import trust_new_files
+from welded import machine
 
 from torchid.cli import main
 from torchid.commands.init import init
@@ -299,3 +300,19 @@ def test_words_of_other_laboratories_are_known(
     found = read_log(tmp_path / "x.csv", columns=load_config(tmp_path / "n.yaml").logs.columns)
     for field in fields:
         np.testing.assert_allclose(getattr(found, field), getattr(log, field), atol=1e-9)
+
+
+def test_sensors_in_limbs_that_a_log_names_are_used_and_fields_keep_the_files_names(tmp_path: Path) -> None:
+    urdf, rng, count = machine(tmp_path), np.random.default_rng(0), 400
+    names = load_robot(urdf).joint_names
+    quat = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
+    np.savez(
+        tmp_path / "log.npz", time=np.arange(count) / 100.0, joint_names=names, base_quat_wxyz=quat,
+        joint_position=0.1 * rng.normal(size=(count, len(names))), ft_names=["ankle_ft", "no_such_joint"],
+        joint_torque=rng.normal(size=(count, len(names))), ft_wrench=rng.normal(size=(count, 2, 6)),
+    )  # fmt: skip
+    said = init(urdf, tmp_path / "log.npz", tmp_path / "new.yaml")
+    sensors = yaml.safe_load((tmp_path / "new.yaml").read_text())["sensors"]
+    assert sensors == {"set": "joints", "ft_sensors": ["ankle_ft"]}
+    assert "base_quat_wxyz" in str(said)
+    assert "xyzw" not in str(said)

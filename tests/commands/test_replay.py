@@ -14,7 +14,9 @@ from repository import DEMO
 from torchid.cli import main
 from torchid.commands.folder import REPLAY
 from torchid.commands.manifest import read_manifest
-from torchid.commands.replay import replay
+from torchid.commands.replay import _feet, replay
+from torchid.errors import ConfigError
+from torchid.sensing import Contact
 
 UNSEEN = str(DEMO / "sway_test.npz")
 pytestmark = pytest.mark.filterwarnings("ignore:identified.urdf")
@@ -126,3 +128,9 @@ def test_a_run_with_welds_is_replayed_with_the_joint_held(tmp_path: Path) -> Non
     ends = found.at(0.1)
     assert ends["joints [rad]"].identified < 0.05
     assert ends["base tilt [rad]"].identified < 0.05
+
+
+def test_a_flat_contact_without_spheres_is_refused_with_what_a_replay_can_stand_on() -> None:
+    urdf = DEMO / "quadruped.urdf"
+    with pytest.raises(ConfigError, match=r"contacts: trunk: flat, .*quadruped\.urdf.* point contacts"):
+        _feet([Contact("trunk", "flat")], urdf)

@@ -274,6 +274,15 @@ def test_worse_is_clearly_larger_and_no_rounding(nominal: float, identified: flo
     assert (describe_worse(found, "URDF") is None) is not worse
 
 
+def test_a_sensor_in_a_limb_that_the_urdf_predicts_better_counts() -> None:
+    nominal, identified = (
+        replace(metrics_of(1.0, 100.0), limb_rms={"ft_force": x}, limb_relative={"ft_force": x / 118.0})
+        for x in (9.0, 87.7)
+    )
+    (found,) = worse_than_nominal({"test logs": (nominal, identified)})
+    assert (found.group, str(found)) == ("ft_force", "force in limbs 87.7 against 9 N")
+
+
 def test_what_was_not_measured_is_not_judged() -> None:
     nothing = Metrics(dict.fromkeys(ROW_GROUPS), dict.fromkeys(ROW_GROUPS), {}, {}, None)
     assert worse_than_nominal({"test": (nothing, nothing)}) == []

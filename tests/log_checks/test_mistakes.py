@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from mistaken import MISTAKES, NAMED, SENSORS, Cell, case_of, cells, checked, judged
 from motions import value
 from walking import MACHINES, robot_of, truth
@@ -15,6 +16,7 @@ from torchid.log_checks.mistakes import exchanged_names
 from torchid.log_checks.model import bind_some_samples, preprocess_pieces
 from torchid.log_checks.scales import fit_time_scale, fit_torque_gains, motion_cutoff_hz
 from torchid.log_checks.standing_feet import measure_foot_slip
+from torchid.regressor import Regressor
 
 BY_NAME = {mistake.name: mistake for mistake in MISTAKES}
 #: Cells of the whole table that are not named, and why: see docs/checking.md.
@@ -68,6 +70,19 @@ def test_factors_of_torques_and_of_time_are_recovered() -> None:
     log = value(BY_NAME["one torque x 1.3"].make(case))
     factors = value(fit_torque_gains(bind_some_samples(preprocess_pieces(log, 10.0), robot, (), 240), robot, ()))
     assert factors.gain[1] / np.median(factors.gain) == pytest.approx(1.0 / 1.3, abs=3.0 * factors.spread[1])
+
+
+def test_a_tool_that_the_urdf_lacks_is_not_taken_for_another_unit_of_time() -> None:
+    machine = MACHINES["arm"]
+    case, robot, mass, height = case_of(machine, "contacts"), robot_of(machine), 6.0, 0.1
+    tool = np.zeros((len(robot.bodies), 12))
+    tool[robot.links["panda_hand"][0], [0, 3, 4, 7]] = mass * np.array([1.0, height, height**2, height**2])
+    motion = (torch.from_numpy(x) for x in (case.happened.q, case.happened.v, case.happened.a))
+    carried = (Regressor(robot)(*motion) @ torch.from_numpy(tool.flatten())).numpy()
+    log = replace(case.log, joint_torque=value(case.log.joint_torque) + carried)
+    scale = value(fit_time_scale(log, robot, (), value(motion_cutoff_hz(log))))
+    assert abs(np.log(scale.factor)) > np.log(1.5)  # less time makes up a part of what the tool needs
+    assert not [one for one in checked(case, log).findings if one.field == "time"]
 
 
 def test_feet_that_stand_do_not_move_and_tell_nothing_of_a_base_that_stands_still() -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,12 +14,13 @@ from faults import changed, demo_log, demo_robot, found, moving, of_demo, only, 
 from motions import angles, omega_base, position, slope, uniform, value, velocity
 from scipy.spatial.transform import Rotation
 
-from torchid.log_checks import CONDEMNED, NOTE, SUSPICIOUS, Checked
+from torchid.log_checks import CONDEMNED, NOTE, SUSPICIOUS, Checked, Finding
 from torchid.log_checks.check import check
-from torchid.log_checks.motion import compare_derivative
+from torchid.log_checks.motion import check_angle_unit, compare_derivative
 from torchid.log_checks.weight import check_weight
 from torchid.logs import Log, read_log, write_log
 from torchid.logs.quaternion import angular_velocity_base
+from torchid.robot import load_robot
 
 RATES = (
     "joint_velocity", "joint_acceleration", "base_linear_velocity_world", "base_linear_acceleration_world",
@@ -194,6 +197,21 @@ def test_a_joint_that_turns_more_than_twice_is_in_degrees_unless_it_can() -> Non
         assert not checked.usable
     one = changed(demo_log(), "joint_position", lambda q: q[:, 2].__iadd__(20.0))
     assert only(check(one), "unit").severity == SUSPICIOUS
+
+
+def test_a_continuous_joint_may_turn_more_than_twice_unless_most_joints_do(tmp_path: Path) -> None:
+    wheel = "rear_right_knee"
+    urdf = demo_robot().path.read_text()
+    path = tmp_path / "wheeled.urdf"
+    path.write_text(re.sub(f'(name="{wheel}" type=)"revolute"', r'\1"continuous"', urdf))
+    wheeled = load_robot(path)
+    spun = changed(demo_log(), "joint_position", lambda q: q[:, demo_log().joint_names.index(wheel)].__iadd__(20.0))
+    assert "degrees" in only(check(spun, demo_robot()), "unit", "joint_position").found
+    assert not list(check_angle_unit(spun, wheeled))
+    path.write_text(urdf.replace('type="revolute"', 'type="continuous"'))
+    (finding,) = check_angle_unit(scaled(demo_log(), "joint_position", 180.0 / np.pi), load_robot(path))
+    assert isinstance(finding, Finding)
+    assert finding.severity == SUSPICIOUS
 
 
 def test_a_slip_of_a_marker_in_degrees_is_no_step_in_radians() -> None:

@@ -64,3 +64,15 @@ def test_the_foot_that_moves_most_comes_first() -> None:
             position[:, joint] = position[:, joint].mean() + 5.0 * (position[:, joint] - position[:, joint].mean())
     (finding,) = findings(replace(log, joint_position=position))
     assert finding.channels[0] == "rear_left_foot"
+
+
+@pytest.mark.parametrize(("scale", "zero"), [(1.0, 0.3), (1.5, 0.0)], ids=["zero off by 0.3 rad", "scaled by 1.5"])
+def test_the_one_foot_whose_encoder_is_off_is_named(scale: float, zero: float) -> None:
+    log, joint = STANCE.measured, next(i for i, name in enumerate(ROBOT.joint_names) if "knee" in name)
+    position = log.joint_position.copy()
+    position[:, joint] = scale * position[:, joint] + zero
+    (finding,) = findings(replace(log, joint_position=position))
+    assert (finding.name, finding.severity, finding.field) == ("standing feet", SUSPICIOUS, "joint_position")
+    limb = ROBOT.joint_names[joint].removesuffix("_knee")
+    assert finding.channels == (f"{limb}_foot",)
+    assert finding.found.startswith(f"{limb}_foot moves though it stands")

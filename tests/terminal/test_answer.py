@@ -17,7 +17,7 @@ from torchid.config import load_config
 from torchid.estimators.least_squares import COMBINED, IDENTIFIED
 from torchid.parameters import PER_BODY
 from torchid.problem import Metrics
-from torchid.problem.metrics import DECISIVE_GROUPS, WHITENED, WorseThanNominal
+from torchid.problem.metrics import DECISIVE_GROUPS, LIMB_GROUPS, WHITENED, WorseThanNominal
 from torchid.terminal.identification import answer_lines
 from torchid.terminal.lines import LINES
 
@@ -60,7 +60,7 @@ def test_the_errors_on_unseen_motion_come_first_with_the_noise(consistent: Ident
     said = text(consistent)
     assert said.startswith("Much better than the URDF on unseen motion (sway_test.npz)")
     pair = consistent.metrics["test"]
-    for group in DECISIVE_GROUPS:
+    for group in (x for x in DECISIVE_GROUPS if x not in LIMB_GROUPS):  # this robot has none
         numbers = (pair.nominal.rms[group], pair.identified.rms[group], pair.identified.noise[group])
         assert all(x is not None for x in numbers)
         assert " ".join(f"{x:.4g}" for x in numbers) in " ".join(said.split())
@@ -111,6 +111,22 @@ def test_residuals_that_cannot_contradict_the_model_are_said_to_show_nothing(con
     said = text(short, 400)
     assert "attention     whether the model explains these forces is not known" in said
     assert "sensors.noise" in said
+
+
+def test_errors_of_a_sensor_in_a_limb_are_shown_and_need_attention_where_they_exceed_its_readings(
+    consistent: Identification,
+) -> None:
+    def with_limb(share: float) -> str:
+        pair, limb = consistent.metrics["test"], {"ft_force": 100.0 * share}
+        found = replace(pair.identified, limb_rms=limb, limb_relative={"ft_force": share})
+        nominal = replace(pair.nominal, limb_rms={"ft_force": 230.0})
+        one = pair._replace(identified=found, nominal=nominal)
+        return text(replace(consistent, metrics={**consistent.metrics, "test": one}), 400)
+
+    assert "force in limbs [N]" not in text(consistent)
+    assert "attention     force in limbs: errors of 1.3 times what was measured; check the sensor" in with_limb(1.26)
+    assert re.search(r"force in limbs \[N\] +230 +30", said := with_limb(0.3))
+    assert "what was measured" not in said
 
 
 def test_what_needs_attention_is_named_with_what_to_do(free: Identification) -> None:

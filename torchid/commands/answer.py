@@ -15,7 +15,7 @@ from torchid.identifiability.confounding import TotalMass
 from torchid.log_checks.weight import MAX_MASS_ERROR
 from torchid.logs.time_range import log_title
 from torchid.problem import Metrics
-from torchid.problem.metrics import ADVICE, DECISIVE_GROUPS, ERROR_GROUPS, describe_worse
+from torchid.problem.metrics import ADVICE, DECISIVE_GROUPS, ERROR_GROUPS, LIMB_GROUPS, describe_worse, group_name
 from torchid.report.loadable_urdf import massless_ends
 from torchid.report.tables import noise_advice
 
@@ -53,7 +53,7 @@ class Judged:
     def errors(self, groups: Sequence[str] = DECISIVE_GROUPS) -> Iterator[tuple[str, float, float, float | None]]:
         """Groups of rows with both errors, and what noise of the readings leaves."""
         for group in groups:
-            before, after = self.nominal.rms.get(group), self.identified.rms.get(group)
+            before, after = self.nominal.rms_of(group), self.identified.rms_of(group)
             if before is not None and after is not None:
                 yield group, before, after, self.identified.noise.get(group)
 
@@ -88,6 +88,7 @@ def _percent(share: float) -> str:
     return f"{100.0 * share:.0f}" if share >= 0.1 else f"{100.0 * share:.2g}"
 
 
+_LARGER_THAN_MEASURED = 1.05  # errors over the measured, of sensors that any fit of their limb explains better
 _CLEAR_ERRORS = 4.0  # standard errors of a total mass from which on it is not the URDF's
 
 
@@ -119,7 +120,7 @@ def answer(run: Identification) -> Answer:
         errors=judged.shown_errors(),
         total_mass=f"{run.mass} ({run.experiment.robot.format}: {run.mass.nominal:.3f} kg)",
         bodies=_bodies_text(run),
-        attention=list(_attention(run)),
+        attention=list(_attention(run, judged)),
     )
 
 
@@ -157,10 +158,11 @@ def _bodies_text(run: Identification) -> str:
     return f"{which} cannot exist, and simulators refuse them{advice}"
 
 
-def _attention(run: Identification) -> Iterator[str]:
+def _attention(run: Identification, judged: Judged) -> Iterator[str]:
     """What the user should look at, the most urgent first."""
     if run.worse:
         yield ADVICE
+    yield from _unlike_sensors(judged.identified)
     impossible = [one.term for one in run.violations if one.term is not None]
     if impossible:
         advice = "estimator.name=consistent finds the best that can be"
@@ -179,6 +181,15 @@ def _attention(run: Identification) -> Iterator[str]:
         yield one.in_short
     if run.noise.suggested:
         yield f"noise: {noise_advice(run.noise.suggested)}"
+
+
+def _unlike_sensors(identified: Metrics) -> Iterator[str]:
+    """Readings in limbs that the identified parameters explain worse than no limb at all would."""
+    for group in LIMB_GROUPS:
+        share = identified.relative_of(group)
+        if share is not None and share > _LARGER_THAN_MEASURED:
+            ratio = f"{group_name(group)}: errors of {share:.2g} times what was measured"
+            yield f"{ratio}; check the sensor's sign, unit and frame: torchid check"
 
 
 def _contradicts_nominal(mass: TotalMass) -> bool:

@@ -66,7 +66,7 @@ class EvaluatedRun:
             (name, group): error / self.usual[group]
             for name, pair in self.metrics.items()
             for group in DECISIVE_GROUPS
-            if (error := pair.identified.rms.get(group)) is not None and self.usual.get(group, 0.0) > 0.0
+            if (error := pair.identified.rms_of(group)) is not None and self.usual.get(group, 0.0) > 0.0
         }
         far = {key: ratio for key, ratio in ratios.items() if ratio >= FAR_OFF}
         if not far:
@@ -78,10 +78,10 @@ class EvaluatedRun:
 
     def _headline(self) -> str:
         texts = [
-            f"{name}: {describe_errors(group, pair.identified.rms.get(group), pair.nominal.rms.get(group))}"
+            f"{name}: {describe_errors(group, pair.identified.rms_of(group), pair.nominal.rms_of(group))}"
             for name, pair in self.metrics.items()
             for group in DECISIVE_GROUPS
-            if pair.identified.rms.get(group) is not None
+            if pair.identified.rms_of(group) is not None
         ]
         return f"identified against {self.robot.format}; {'; '.join(texts)}"
 

@@ -15,7 +15,7 @@ import yaml
 
 from torchid.commands.folder import check_free_file
 from torchid.commands.init_hints import hints, keys_for_gaps, missing_columns, notes_on_arrays
-from torchid.commands.init_proposals import Split, limb_sensors, sensor_set, split_log
+from torchid.commands.init_proposals import Split, limb_sensors, read_sensors, sensor_set, split_log
 from torchid.commands.reading import memory_needed
 from torchid.config.preprocessing import PreprocessingConfig
 from torchid.errors import ConfigError, InputError, LogError, about_file, excerpt, format_count, join_names
@@ -23,6 +23,7 @@ from torchid.fitting.checked_settings import is_along_base
 from torchid.logs import Columns, Log, Topics, read_log
 from torchid.logs.containers import LogKind, atomic_output, existing_log_kind
 from torchid.logs.file_samples import read_bag_sample, read_sample, stated_names, states_degrees, texts_in
+from torchid.logs.log import VARIANTS
 from torchid.logs.map_proposals import MapProposal, propose_map
 from torchid.logs.name_matching import KnownRobot, within
 from torchid.logs.time_range import split_range
@@ -103,9 +104,10 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> Initiated:
     read = _try(path, proposal)
     gaps = keys_for_gaps(read)
     split = split_log(read, "base_motion" in _from_feet(contacts, fields))
-    text = _text(robot, urdf, path, target, contacts, fields, proposal, gaps, split)
+    sensors = sensor_set(fields, list(proposal.columns.get("ft_wrenches", ())) or read_sensors(robot, read))
+    text = _text(robot, urdf, path, target, contacts, fields, proposal, gaps, split, sensors)
     _describe(out, robot, contacts, fields, proposal)
-    _describe_log(out, read)
+    _describe_log(out, read, fields)
     out.guessed += [f"preprocessing.{key}: {value}, {why}" for key, (value, why) in gaps.items()]
     out.guessed += [split.guessed] * bool(split.guessed)
     out.missing += [split.missing] * bool(split.missing)
@@ -298,12 +300,13 @@ def _try(path: Path, proposal: MapProposal) -> Log | InputError:
         return error
 
 
-def _describe_log(out: Initiated, read: Log | InputError) -> None:
-    """What there is of the log, or why it is not read."""
+def _describe_log(out: Initiated, read: Log | InputError, fields: set[str]) -> None:
+    """What there is of the log, by the names of the file's fields, or why it is not read."""
     if isinstance(read, InputError):
         out.missing.append(f"the log is not read with this file yet: {read.field}: {read.found}")
         return
-    has = [name for name, array in read.arrays().items() if array.size]
+    recorded = {name: variant for variant, name in VARIANTS.items() if variant in fields}
+    has = [recorded.get(name, name) for name, array in read.arrays().items() if array.size]
     out.found.append(f"{len(read)} samples over {read.time[-1] - read.time[0]:.4g} s: {', '.join(has)}")
 
 
@@ -320,6 +323,7 @@ def _text(
     proposal: MapProposal,
     gaps: dict[str, tuple[object, str]],
     split: Split,
+    sensors: str | dict[str, object],
 ) -> str:
     """The experiment file, with comments."""
     from_feet = _from_feet(contacts, fields)
@@ -350,7 +354,7 @@ def _text(
     lines += [f"# {key}: {why}" for key, (_, why) in gaps.items()]
     stated = {key: value for key, (value, _) in gaps.items()}
     lines += _entry("preprocessing", {"cutoff_hz": "auto"} | from_feet | stated)
-    lines += _entry("sensors", sensor_set(fields, list(proposal.columns.get("ft_wrenches", ()))))
+    lines += _entry("sensors", sensors)
     lines += _entry("estimator", {"name": "consistent", "ridge": split.ridge})
     lines += _entry("output", f"runs/{output.stem}")
     return "\n".join(lines) + "\n"

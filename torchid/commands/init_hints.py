@@ -21,7 +21,8 @@ _EULER = re.compile(r"(?<![a-z])(roll|pitch|yaw|rpy|euler)(?![a-z])", re.IGNOREC
 _AS_ANGLES = "base_quat_wxyz: {rpy: ...}"
 _STEP = re.compile(r"(dt|time_?step|sample_?rate|fps|rate_?hz|freq\w*)", re.IGNORECASE)
 _MOTION = ("joint_position", "base_quat_xyzw", "base_position_world", *("imu_specific_force", "imu_angular_velocity"))
-_BRIDGED_S = 0.05  # gaps that are bridged
+_BRIDGED_S = 0.05
+"""Gaps that `init` has bridged [s]."""
 
 
 def missing_columns(joints: int, fields: Collection[str], partial: Mapping[str, Sequence[str]], what: str) -> list[str]:
@@ -107,20 +108,6 @@ def _like(names: Sequence[str]) -> str:
     return f"'{excerpt(names[0])}'" + (f" and {len(names) - 1} more" if len(names) > 1 else "")
 
 
-def keys_for_gaps(log: Log | InputError) -> dict[str, tuple[object, str]]:
-    """The keys of preprocessing that a log with gaps in its motion needs, with the reason; none if it is not read."""
-    longest, at_end, name = (0.0, False, "") if isinstance(log, InputError) else _gaps_in_motion(log)
-    out: dict[str, tuple[object, str]] = {}
-    if 0.0 < longest <= _BRIDGED_S:
-        out["bridge_gaps_s"] = (_BRIDGED_S, f"as gaps of {name} take up to {longest:.2g} s")
-    if longest > _BRIDGED_S or at_end:
-        reason = (
-            f"as gaps of {name} take up to {longest:.2g} s" if longest > _BRIDGED_S else f"as {name} has one at an end"
-        )
-        out["exclude_condemned"] = (True, reason)
-    return out
-
-
 def _gaps_in_motion(log: Log) -> tuple[float, bool, str]:
     """Gaps in the motion of a log: how long the longest takes, whether some are at an end, and a field with one.
 
@@ -138,3 +125,17 @@ def _gaps_in_motion(log: Log) -> tuple[float, bool, str]:
             longest = max(longest, *np.diff(log.time[known])[np.diff(known) > 1].tolist(), 0.0)
             found = found or name
     return longest, at_end, found
+
+
+def keys_for_gaps(read: Log | InputError) -> dict[str, tuple[object, str]]:
+    """The keys of preprocessing that a log with gaps in its motion needs, with the reason."""
+    longest, at_end, name = (0.0, False, "") if isinstance(read, InputError) else _gaps_in_motion(read)
+    out: dict[str, tuple[object, str]] = {}
+    if 0.0 < longest <= _BRIDGED_S:
+        out["bridge_gaps_s"] = (_BRIDGED_S, f"as gaps of {name} take up to {longest:.2g} s")
+    if longest > _BRIDGED_S or at_end:
+        reason = (
+            f"as gaps of {name} take up to {longest:.2g} s" if longest > _BRIDGED_S else f"as {name} has one at an end"
+        )
+        out["exclude_condemned"] = (True, reason)
+    return out

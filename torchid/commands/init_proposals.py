@@ -27,6 +27,13 @@ def limb_sensors(robot: Robot) -> dict[str, str]:
     return {joint: child for joint, child in list(in_limbs.items())[:_MOST_SENSORS] if _can_be_split(robot, joint)}
 
 
+def read_sensors(robot: Robot, log: Log | InputError) -> list[str]:
+    """Sensors in limbs that a log has readings of, of those that the robot can be split at."""
+    names = () if isinstance(log, InputError) else log.ft_names
+    joints = fixed_joints(robot.path) if names else {}
+    return [name for name in names[:_MOST_SENSORS] if name in joints and _can_be_split(robot, name)]
+
+
 def _can_be_split(robot: Robot, joint: str) -> bool:
     """Whether both sides of a fixed joint have mass."""
     try:

@@ -195,7 +195,7 @@ def run_lines(run: Identification) -> list[str]:
     if run.validation is not None:
         sets["left out"] = (run.validation.identified, run.validation.nominal)
     for name, (identified, nominal) in sets.items():
-        texts = (describe_errors(group, identified.rms.get(group), nominal.rms.get(group)) for group in DECISIVE_GROUPS)
+        texts = (describe_errors(group, identified.rms_of(group), nominal.rms_of(group)) for group in DECISIVE_GROUPS)
         said.append((name, "; ".join(filter(None, texts))))
     trouble = [
         *([f"WORSE THAN {robot.format}: {describe_worse(run.worse, robot.format)}"] if run.worse else []),

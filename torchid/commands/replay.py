@@ -309,7 +309,15 @@ def _feet(contacts: Sequence[Contact], urdf: Path) -> tuple[Foot, ...]:
     Raises:
         InputError: a flat contact without collision spheres.
     """
-    return tuple(
-        point_foot(x.frame, x.radius) if x.kind == "point" else find_feet([FootConfig(frame=x.frame)], urdf)[0]
-        for x in contacts
-    )
+    feet = []
+    for contact in contacts:
+        if contact.kind == "point":
+            feet.append(point_foot(contact.frame, contact.radius))
+            continue
+        try:
+            feet += find_feet([FootConfig(frame=contact.frame)], urdf)
+        except ConfigError as error:
+            found = f"{contact.frame}: {contact.kind}, and {urdf.name} has no collision spheres at it"
+            accepted = f"collision spheres of the link {contact.frame}, or point contacts: a replay stands on these"
+            raise ConfigError.at_field("contacts", found, accepted) from error
+    return tuple(feet)

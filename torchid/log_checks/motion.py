@@ -33,23 +33,28 @@ MAX_ANGLE_RAD = 4.0 * np.pi
 #: Median speed of the joints: motors of legs reach 20 to 30 rad/s.
 MAX_SPEED_RAD_S = 40.0
 _UNIT_ADVICE = "convert joint_position, and velocities and accelerations with it, to radians"
-_UNLIMITED_JOINTS = ("continuous", "prismatic")
 
 
 def check_angle_unit(log: Log, robot: Robot | None) -> Iterator[Finding]:
-    """Findings about the unit of `joint_position`."""
+    """Findings about the unit of `joint_position`.
+
+    Continuous joints, as of wheels, may turn as far as they like, and count where most others do.
+    """
     bodies = () if robot is None else robot.bodies
-    joints = {body.joint.name: body.joint.kind for body in bodies if body.joint is not None}
-    columns = [i for i, name in enumerate(log.joint_names) if joints.get(name) not in _UNLIMITED_JOINTS]
+    joints = {body.joint.name: body.joint for body in bodies if body.joint is not None}
+    columns = [i for i, x in enumerate(map(joints.get, log.joint_names)) if x is None or x.kind != "prismatic"]
     if not columns:
         return
     position = log.joint_position[:, columns]
+    has_stops = np.array([x is None or not x.continuous for x in (joints.get(log.joint_names[i]) for i in columns)])
     moved = np.abs(position).max(axis=0) > 0.0
     far = np.abs(position).max(axis=0) > MAX_ANGLE_RAD
+    if 2 * int(far.sum()) < int(moved.sum()):
+        far &= has_stops
     names = [log.joint_names[columns[i]] for i in np.flatnonzero(far)]
     if far.any():
-        text = f"{join_names(names)}: up to {np.abs(position).max():.4g}, more than two turns: degrees?"
-        certain = 2 * int(far.sum()) >= int(moved.sum())
+        text = f"{join_names(names)}: up to {np.abs(position[:, far]).max():.4g}, more than two turns: degrees?"
+        certain = 0 < int((moved & has_stops).sum()) <= 2 * int((far & has_stops).sum())
         severity = CONDEMNED if certain else SUSPICIOUS
         yield Finding("unit", severity, "joint_position", text, _UNIT_ADVICE, tuple(names))
     elif len(log) > 2:

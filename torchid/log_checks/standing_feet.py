@@ -31,6 +31,9 @@ from torchid.sensing import Contact
 MAX_SLIP_SHARE = 0.3
 #: The same where no mistake explains it. A person whose heels lift in squats has 0.4, an orientation that is wrong 0.9.
 MAX_UNEXPLAINED_SLIP_SHARE = 0.6
+#: Motion of standing feet from which on one of them is named, if the others leave less than this share of it: a zero of
+#: 0.3 rad in one joint of a hexapod's 18 makes 0.07 to 0.1, of a humanoid's knee 0.07; without its foot 0.01 are left.
+MIN_SINGLE_SHARE, MAX_OTHERS_SHARE = 0.05, 0.25
 #: Motion of standing feet from which on it is asked whether they roll on other radii, and the radius to begin with.
 MIN_ROLLING_SHARE, _TRIAL_RADIUS_M = 0.02, 0.01
 #: Share of this motion that a corrected mistake may leave.
@@ -60,8 +63,10 @@ def check_standing_feet(
     if slip is None:
         yield Skipped(_STANDING_FEET_CHECK, "no orientation of the base, or no stance above which the base moves")
         return
-    yield from _radius_findings(log, robot, contacts, slip, poses)
+    radius = list(_radius_findings(log, robot, contacts, slip, poses))
+    yield from radius
     if slip < MAX_SLIP_SHARE:
+        yield from () if radius or derived else _single_foot(log, robot, contacts, slip, poses)
         return
     best, least = None, MAX_RESIDUAL_SHARE * slip
     for mistake in (*possible_mistakes(log), *reversed_joints(log)):
@@ -90,6 +95,23 @@ def _unexplained_motion(
     text = f"standing feet move {100 * slip:.3g} % as much as the base above them, and no usual mistake explains it"
     advice = "check signs, scales and zeros of joint positions, the base's orientation and position, and the flags"
     return Finding("standing feet", SUSPICIOUS, "all", f"{text}: {most}" if most else text, advice, tuple(moving))
+
+
+def _single_foot(
+    log: Log, robot: Robot, contacts: Sequence[Contact], slip: float, poses: LinkPoses | None
+) -> Iterator[Finding]:
+    """A finding about the one foot that moves though it stands while the others do not."""
+    if slip < MIN_SINGLE_SHARE:
+        return
+    without = {c.frame: measure_foot_slip(log, robot, [x for x in contacts if x is not c], poses) for c in contacts}
+    left = {frame: rest for frame, rest in without.items() if rest is not None}
+    frame = min(left, key=lambda name: left[name], default="")
+    if not frame or left[frame] > MAX_OTHERS_SHARE * slip:
+        return
+    text = f"{frame} moves though it stands: standing feet move {100 * slip:.2g} % as much as the base above them,"
+    text += f" {100 * left[frame]:.2g} % without it"
+    advice = "check zeros, scales and signs of the joint positions in its limb, its flags, and whether it slips"
+    yield Finding("standing feet", SUSPICIOUS, "joint_position", text, advice, (frame,))
 
 
 def _radius_findings(

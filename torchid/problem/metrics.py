@@ -17,6 +17,7 @@ from torchid.problem.extras import ExtraTerms
 from torchid.problem.predict import measured_and_predicted_forces, null_space_components, reading_variance
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
+from torchid.problem.sums_of_squares import SumsOfSquares, root_mean
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, named_sensors
 
@@ -39,13 +40,15 @@ IN_AIR = "limbs in the air"  # whose joint torques alone count where no contact 
 LIMB_GROUPS = {"ft_force": "force in limbs [N]", "ft_moment": "moment in limbs [N m]"}
 """Groups of readings of force/torque sensors in limbs."""
 
+_LABELS = ERROR_GROUPS | LIMB_GROUPS
+
 SETS = ("train", "test")
 """Sets of logs that errors are given for."""
 
 BASE_ROWS = tuple(f"base {kind} {axis}" for kind in ("force", "moment") for axis in "xyz")
 """Names of the six base rows."""
 
-DECISIVE_GROUPS = ("joint_torque", "base_force", "base_moment", WHITENED)
+DECISIVE_GROUPS = ("joint_torque", "base_force", "base_moment", *LIMB_GROUPS, WHITENED)
 """Groups of rows by which parameters are compared with the nominal ones."""
 
 ADVICE = (
@@ -86,10 +89,18 @@ class Metrics:
     noise: dict[str, float | None] = field(default_factory=dict)
     limbs_in_air: bool = False
 
+    def rms_of(self, group: str) -> float | None:
+        """Rms error of a group of `ERROR_GROUPS` or `LIMB_GROUPS`."""
+        return self.rms.get(group, self.limb_rms.get(group))
+
+    def relative_of(self, group: str) -> float | None:
+        """The same, over the rms of what was measured."""
+        return self.relative.get(group, self.limb_relative.get(group))
+
     def label(self, group: str) -> str:
-        """Name and unit of a group of `ERROR_GROUPS`, and what it is limited to."""
+        """Name and unit of such a group, and what it is limited to."""
         limit = f", {IN_AIR} [" if self.limbs_in_air and group == "joint_torque" else " ["
-        return ERROR_GROUPS[group].replace(" [", limit)
+        return _LABELS[group].replace(" [", limit)
 
     def __repr__(self) -> str:
         said = []
@@ -215,10 +226,10 @@ def worse_than_nominal(sets: Mapping[str, tuple[Metrics, Metrics]]) -> list[Wors
     worse = []
     for logs, (nominal, identified) in sets.items():
         for group in DECISIVE_GROUPS:
-            before, after = nominal.rms.get(group), identified.rms.get(group)
+            before, after = nominal.rms_of(group), identified.rms_of(group)
             if before is None or after is None:
                 continue
-            share = identified.relative.get(group)
+            share = identified.relative_of(group)
             measured = after / share if share else 0.0
             if after > _CLEARLY * before and after - before > _MATTERS * measured:
                 worse.append(WorseThanNominal(logs, group, before, after))
@@ -254,14 +265,14 @@ def describe_errors(group: str, identified: float | None, nominal: float | None)
     """Both errors of a group of rows in words, None where it has none."""
     if identified is None or nominal is None:
         return None
-    unit = ERROR_GROUPS[group].split("[")[1].rstrip("]")
+    unit = _LABELS[group].split("[")[1].rstrip("]")
     name = "whitened projected residual" if group == WHITENED else group_name(group)
     return f"{name} {identified:.3g} against {nominal:.3g} {unit}"
 
 
 def group_name(group: str) -> str:
     """Name of a group of rows, without its unit."""
-    return ERROR_GROUPS[group].split(" [")[0]
+    return _LABELS[group].split(" [")[0]
 
 
 class ForceSums:
@@ -311,7 +322,7 @@ class ForceSums:
         """Rms by group of rows, NaN for an empty group, of a robot with `base_rows` and n joints."""
         joints = self.rows.rms(slice(base_rows, base_rows + n))
         squares, count = self._in_limbs(base_rows + n)
-        force, moment = _root_mean(squares.sum(1), count.sum(1))
+        force, moment = root_mean(squares.sum(1), count.sum(1))
         return {
             "joint_torque": float(np.nanmean(joints)) if np.isfinite(joints).any() else np.nan,
             "base_force": self.rows.pooled(slice(0, 3)) if base_rows else np.nan,
@@ -327,65 +338,13 @@ class ForceSums:
         out = dict(zip(("base_force", "base_moment"), self.rows.rms(slice(0, base_rows)).reshape(-1, 3), strict=False))
         squares, count = self._in_limbs(base_rows + n)
         if len(self.rows.count) > base_rows + n:
-            out |= dict(zip(LIMB_GROUPS, _root_mean(squares, count), strict=True))
+            out |= dict(zip(LIMB_GROUPS, root_mean(squares, count), strict=True))
         return out
 
     def _in_limbs(self, first: int) -> tuple[Array, Array]:
         """Squares and their number, (2, 3): forces and moments by axis, of all force/torque sensors in limbs."""
         squares, count = (x[first:].reshape(-1, 2, 3).sum(0) for x in (self.rows.squares, self.rows.count))
         return squares, count
-
-
-class SumsOfSquares:
-    """Sums and sums of squares by row, over the samples in which the row is finite."""
-
-    def __init__(self, rows: int) -> None:
-        """Start empty."""
-        self.sum, self.squares, self.count = np.zeros(rows), np.zeros(rows), np.zeros(rows)
-
-    def add(self, x: torch.Tensor, weight: float = 1.0) -> None:
-        """Add samples (N, rows), NaN where unknown, each of which counts as `weight` samples."""
-        values = x.cpu().numpy()
-        known = np.isfinite(values)
-        if not known.all():
-            values = np.where(known, values, 0.0)
-        self.sum += weight * values.sum(0)
-        self.squares += weight * np.einsum("ij,ij->j", values, values)
-        self.count += weight * known.sum(0)
-
-    def add_squares(self, squares: float, count: int) -> None:
-        """Add the sum of squares of one row over `count` samples; their sum stays unknown."""
-        self.squares += squares
-        self.count += count
-
-    def rms(self, rows: slice = slice(None)) -> Array:
-        """Rms row by row."""
-        return _root_mean(self.squares[rows], self.count[rows])
-
-    def pooled(self, rows: slice) -> float:
-        """Rms over all components of some rows."""
-        count = self.count[rows].sum()
-        return float(np.sqrt(self.squares[rows].sum() / count)) if count else np.nan
-
-    def deviation(self, rows: slice) -> float:
-        """Rms about the mean of each row, over all of them."""
-        known = self.count[rows] > 0
-        count, total = self.count[rows][known], self.sum[rows][known]
-        if not len(count):
-            return np.nan
-        return float(np.sqrt(max((self.squares[rows][known] - total**2 / count).sum(), 0.0) / count.sum()))
-
-    def merge(self, other: SumsOfSquares) -> None:
-        """Add the sums of another."""
-        self.sum += other.sum
-        self.squares += other.squares
-        self.count += other.count
-
-
-def _root_mean(squares: Array, count: Array) -> Array:
-    """Square root of a mean, NaN of nothing."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.sqrt(squares / count)
 
 
 def finite_or_none(x: float) -> float | None:

@@ -26,7 +26,7 @@ from torchid.identifiability.contributions import Contribution, Contributions, P
 from torchid.logs.time_range import log_title
 from torchid.parameters import PARAMETERS, PER_BODY
 from torchid.problem import Metrics
-from torchid.problem.metrics import ERROR_GROUPS, IN_AIR
+from torchid.problem.metrics import ERROR_GROUPS, IN_AIR, LIMB_GROUPS
 
 WIDTH = 100
 """Columns of what is printed, at most."""
@@ -85,7 +85,8 @@ def _error_table(columns: Mapping[str, Comparison[Metrics]], of: str) -> Table:
     for name in columns:
         for parameter_set in (of, "identified"):
             table.add_column(Text(f"{name}\n{parameter_set}"), justify="right", overflow="fold")
-    for group, label in ERROR_GROUPS.items():
+    limbs = LIMB_GROUPS if any(pair.identified.limb_rms for pair in columns.values()) else {}
+    for group, label in (ERROR_GROUPS | limbs).items():
         errors = [_error_cell(m, group) for pair in columns.values() for m in pair]
         table.add_row(Text(label), *errors)
         if group == "joint_torque" and any(pair.identified.limbs_in_air for pair in columns.values()):
@@ -102,7 +103,7 @@ def _error_table(columns: Mapping[str, Comparison[Metrics]], of: str) -> Table:
 
 
 def _error_cell(metrics: Metrics, group: str) -> str:
-    rms, relative = metrics.rms.get(group), metrics.relative.get(group)
+    rms, relative = metrics.rms_of(group), metrics.relative_of(group)
     if rms is None:
         return "-"
     return f"{rms:.4g}" + ("" if relative is None else f" ({100 * relative:.3g} %)")

@@ -46,11 +46,11 @@ class BodyJoint:
     """The joint that moves a body; of kind "fixed", the weld through a force/torque sensor.
 
     `T_parent_joint`, (4, 4), is the pose of the joint frame at position 0 in the parent body's link frame; the joint
-    moves that frame about or along `axis`, (3,), a unit vector in it. `T_joint_link`, (4, 4), is the pose of the body's
-    link frame in the moved joint frame: the identity unless `base_link` reverses the joint, or the body of an MJCF file
-    has its joint off its origin. Of such files come `armature` [kg m^2 or kg], and a spring of `stiffness` [N m/rad or
-    N/m] that is at rest at a position [rad or m]. The axis of a weld is z, or
-    -z where the joint is reversed, so that the sensor reads the opposite wrench.
+    moves that frame about or along `axis`, (3,), a unit vector in it; it has no end stops if `continuous`.
+    `T_joint_link`, (4, 4), is the pose of the body's link frame in the moved joint frame: the identity unless
+    `base_link` reverses the joint, or the body of an MJCF file has its joint off its origin. Of such files come
+    `armature` [kg m^2 or kg], and a spring of `stiffness` [N m/rad or N/m] that is at rest at a position [rad or m].
+    The axis of a weld is z, or -z where the joint is reversed, so that the sensor reads the opposite wrench.
     """
 
     name: str
@@ -65,6 +65,7 @@ class BodyJoint:
     armature: float = 0.0
     stiffness: float = 0.0
     rest: float = 0.0
+    continuous: bool = False
 
 
 @dataclass
@@ -230,6 +231,7 @@ def _body_joint(tree: BodyTree, joint: TreeJoint, reverse: bool, mimic: Mimic | 
         armature=joint.armature,
         stiffness=joint.stiffness,
         rest=joint.rest,
+        continuous=joint.type == "continuous",
     )
 
 

@@ -242,7 +242,7 @@ def _print_conditions(run: Identification) -> None:
 
 
 def _print_validation(validation: CrossValidation, nominal_of: str) -> None:
-    identified, nominal = validation.identified.rms, validation.nominal.rms
-    texts = (describe_errors(group, identified.get(group), nominal.get(group)) for group in DECISIVE_GROUPS)
+    identified, nominal = validation.identified, validation.nominal
+    texts = (describe_errors(group, identified.rms_of(group), nominal.rms_of(group)) for group in DECISIVE_GROUPS)
     text = f"each of {validation.folds} blocks, against {nominal_of}: {'; '.join(filter(None, texts))}"
     print_labelled("held out", text)
