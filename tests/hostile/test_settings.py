@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchid.config import load_analysis, load_config
-from torchid.config.reading import check_yaml
+from torchid.config.yaml_text import check_yaml
 from torchid.errors import ConfigError, excerpt, is_plain
 from torchid.guards import MAX_DEPTH, MAX_NODES
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -116,3 +117,28 @@ def test_a_step_has_no_column_beside_it_and_makes_up_no_positions(tmp_path: Path
         columns = Columns(joint_order=["hip", "knee"], **{k: x for k, x in given.items() if k != "joint_order"})  # type: ignore[arg-type]
         with pytest.raises(InputError, match=found):
             read_log(saved(tmp_path / "x.npz"), columns=columns)
+
+
+@pytest.mark.parametrize("name", ["x.npz", "x.csv"])
+def test_stamps_in_two_columns_are_seconds_and_nanoseconds(tmp_path: Path, name: str) -> None:
+    path, stamp = tmp_path / name, 1_999_000_000 + 5_000_000 * np.arange(50)
+    arrays = {"stamp.sec": stamp // 10**9, "stamp.nsec": stamp % 10**9, "q_0": QPOS[:, -2], "q_1": QPOS[:, -1]}
+    if name == "x.csv":
+        rows = zip(*(x.tolist() for x in arrays.values()), strict=True)
+        path.write_text(",".join(arrays) + "\n" + "".join(",".join(map(str, row)) + "\n" for row in rows))
+    else:
+        np.savez(path, **arrays)
+    stated: dict[str, Any] = {"joint_order": ["hip", "knee"], "joint_position": {"column": "q_{index}"}}
+    time = {"column": "stamp.sec", "nanoseconds": "stamp.nsec"}
+    columns = Columns(time=time, **stated)  # type: ignore[arg-type]
+    log = read_log(path, columns=columns)
+    np.testing.assert_allclose(log.time, 1e-9 * stamp, rtol=0.0, atol=1e-15)
+    with open_log_blocks(path, tmp_path, columns) as blocks:
+        np.testing.assert_array_equal(blocks.time, log.time)
+    for entry, found in (
+        ({"step": 5, "nanoseconds": "stamp.nsec"}, "time: nanoseconds beside step"),
+        (time | {"nanoseconds": "stamp.nanosec"}, "time.nanoseconds: unknown name 'stamp.nanosec'|'stamp.nanosec'"),
+        ({"nanoseconds": "stamp.nsec"}, "time: nothing that says where it is"),
+    ):
+        with pytest.raises(InputError, match=found):
+            read_log(path, columns=Columns(time=entry, **stated))  # type: ignore[arg-type]

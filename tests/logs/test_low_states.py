@@ -271,6 +271,7 @@ MAPS: list[tuple[dict[str, Any], str]] = [
     ({"joints": [None]}, "logs.topics.low_state.joints: no name; accepted: every name once"),
     ({"joints": [*map(str, range(21))]}, "low_state.joints: 21 names, though unitree_go/msg/LowState has 20 motors"),
     ({"robot": "go2", "feet": ["a"]}, "low_state.feet: given, though nothing reads them; accepted: above, the reading"),
+    ({"robot": "g1", "above": 5}, "low_state.robot: 'g1', which sends unitree_hg/msg/LowState without foot sensors, "),
     ({"robot": "h1", "above": 5}, "low_state.feet: missing, though the foot sensors are read; accepted: contacts by"),
     ({"robot": "go2", "above": 5, "feet": ["a", "a"]}, "low_state.feet: 'a' twice; accepted: every name once"),
 ]
@@ -301,7 +302,7 @@ def test_topics_that_contradict_each_other_are_refused(tmp_path: Path) -> None:
         assert message in refused(lambda: read_log(path, given), f"{path}: logs.topics")  # noqa: B023
     humanoid = write_low_states(tmp_path / "y.mcap", moving(G1_JOINTS, 4), G1_JOINTS, HG)
     message = refused(
-        lambda: read(humanoid, robot="g1", above=3, feet=["a"]), f"{humanoid}: logs.topics.low_state.above: "
+        lambda: read(humanoid, joints=G1_JOINTS, above=3, feet=["a"]), f"{humanoid}: logs.topics.low_state.above: "
     )
     assert "set, though unitree_hg/msg/LowState has no foot sensors; accepted: no above" in message
     message = refused(lambda: read_log(path, parsed({"joint_states": TOPIC})), f"{path}: logs.topics.joint_states: ")

@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from torchid.config.reading import check_yaml
+from torchid.config.yaml_text import check_yaml
 from torchid.errors import InputError, excerpt
 from torchid.guards import MAX_STATE, check_regular
 

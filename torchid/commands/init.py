@@ -14,7 +14,7 @@ from typing import Any
 import yaml
 
 from torchid.commands.folder import check_free_file
-from torchid.commands.init_hints import hints, keys_for_gaps, missing_columns
+from torchid.commands.init_hints import hints, keys_for_gaps, missing_columns, notes_on_arrays
 from torchid.commands.init_proposals import Split, limb_sensors, read_sensors, sensor_set, split_log
 from torchid.commands.reading import memory_needed
 from torchid.config.preprocessing import PreprocessingConfig
@@ -45,6 +45,7 @@ _IMU = ("imu_specific_force", "imu_angular_velocity")
 _RATE = "base_angular_velocity_base"
 _WHAT = {"columns": "names, units and orders of the file", "topics": "what the messages of the bag hold"}
 _WELDED = "joints that the log lacks, held still; one that moves needs readings"
+_LIKE_TORQUES = "of these no name says what they are; uncomment one of torques [N m], or currents with scale: N m per A"
 _LINE = 118
 
 
@@ -130,6 +131,8 @@ def _of_columns(files: Sequence[Path], robot: Robot) -> tuple[list[_Contact], se
     contacts = _guess_contacts(robot, _stated_contacts(sample, robot), texts_in(sample))
     proposal = propose_map(sample, _known(robot, contacts), samples if len(files) > 1 else (), in_degrees)
     fields = _fields_of(sample, proposal)
+    if "joint_position" not in fields:
+        proposal.notes |= notes_on_arrays(sample, len(robot.joint_names))
     _add_imu_frame(robot, fields, proposal)
     return contacts, fields, proposal
 
@@ -262,7 +265,7 @@ def _describe(
     out.missing += missing_columns(len(robot.joint_names), fields, proposal.partial, what)
     if not set(_FORCES) & fields:
         out.missing.append("forces: neither joint torques nor contact wrenches")
-    out.missing += hints(proposal.left_out, fields, robot.joint_names, what)
+    out.missing += hints(proposal.left_out, fields, robot.joint_names, what, proposal.like_torques)
     from_feet = _from_feet(contacts, fields)
     if contacts and "contact_active" not in fields:
         instead = "detected from joint torques" if "detect_contacts" in from_feet else "set to touch throughout"
@@ -344,6 +347,9 @@ def _text(
             note = proposal.notes.get(key, "")
             lines += [f"    # guessed: {note}"] if note else []
             lines += [f"    {line}" for line in _entry(key, value)]
+        lines += [f"    # {_LIKE_TORQUES}"] * bool(proposal.like_torques)
+        for family in proposal.like_torques:
+            lines += [f"    # {line}" for line in _entry("joint_torque", family.counted_entry)]
     lines += [f"# {' and '.join(from_feet)}: nobody recorded them"] if from_feet else []
     lines += [f"# {key}: {why}" for key, (_, why) in gaps.items()]
     stated = {key: value for key, (value, _) in gaps.items()}

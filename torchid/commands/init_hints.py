@@ -9,7 +9,9 @@ import numpy as np
 
 from torchid.errors import InputError, excerpt, format_count, join_names
 from torchid.logs import Log
+from torchid.logs.column_groups import Family
 from torchid.logs.column_proposals import OF_PLATES, is_desired, propose_field
+from torchid.logs.file_samples import Columns
 from torchid.logs.log import WRENCHES
 
 _OTHER_FILE = "; if another file has it: torchid init ROBOT 'FILE + FILE@SECONDS', docs/logs.md"
@@ -41,7 +43,9 @@ def missing_columns(joints: int, fields: Collection[str], partial: Mapping[str, 
     return out
 
 
-def hints(left_out: Sequence[str], fields: Collection[str], joints: Sequence[str], what: str) -> list[str]:
+def hints(
+    left_out: Sequence[str], fields: Collection[str], joints: Sequence[str], what: str, like_torques: Sequence[Family]
+) -> list[str]:
     """What columns or topics that are left out may hold of the fields that are missing.
 
     Args:
@@ -49,8 +53,12 @@ def hints(left_out: Sequence[str], fields: Collection[str], joints: Sequence[str
         fields: of the log.
         joints: of the robot.
         what: column or topic.
+        like_torques: columns of which there is one for each joint.
     """
     out = []
+    if like_torques:
+        each = join_names([_like(one.columns) for one in like_torques])
+        out.append(f"joint_torque: no {what} says that it is one; {each} have one of each joint: see the file")
     measured = [name for name in left_out if not is_desired(name)]
     if plates := [name for name in left_out if propose_field(name) in OF_PLATES]:
         unknown = "without which foot stands on which and where each lies (docs/logs.md, Force plates)"
@@ -72,6 +80,27 @@ def hints(left_out: Sequence[str], fields: Collection[str], joints: Sequence[str
         out.append(f"time: '{steps[0]}' may be the step or the rate of the stamps, which have to be in the file")
     if not {"base_quat_wxyz", "base_quat_xyzw"} & set(fields) and (angles := [x for x in measured if _EULER.search(x)]):
         out.append(f"base_quat: {_like(angles)} may be angles of the base; give all three as {_AS_ANGLES}")
+    return out
+
+
+def notes_on_arrays(sample: Columns, joints: int) -> dict[str, str]:
+    """What arrays of a file without joint positions may be that no map takes as they are, by key.
+
+    Args:
+        sample: from `read_sample`.
+        joints: of the robot.
+    """
+    out: dict[str, str] = {}
+    for name, values in sample.items():
+        if values is None or values.ndim != 2 or values.dtype.kind not in "fiu":
+            continue
+        shape, width = f"'{excerpt(name)}' has shape {values.shape}", values.shape[1]
+        lists = {other: x for other, x in sample.items() if x is not None and x.dtype.kind not in "fiub"}
+        texts = (other for other, x in lists.items() if x.shape == (width,))
+        if (listed := next(texts, None)) is not None:
+            out["columns"] = f"{shape}; if '{excerpt(listed)}' names its columns, save both as a table, CSV or Parquet"
+        elif len(values) == joints < width:
+            out["joint_position"] = f"{shape}; if its columns are the samples, save it transposed, (N, {joints})"
     return out
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from torchid.errors import InputError
 from torchid.logs import Log
 from torchid.logs.cutoff import choose_cutoff
+from torchid.logs.log import FORCE_NORMAL, WRENCHES
 from torchid.logs.timeline import DROPPED_PERIODS
 from torchid.problem.compression import LEAST_PER_FOLD
 from torchid.robot import Robot, load_robot
@@ -44,11 +45,12 @@ def _can_be_split(robot: Robot, joint: str) -> bool:
 
 def sensor_set(fields: Collection[str], limbs: Sequence[str]) -> str | dict[str, object]:
     """The set of sensors of a run, with those in limbs at fixed joints."""
-    wrench = bool({"contact_wrench_local", "contact_wrench_world"} & set(fields))
-    named = ("full" if wrench else "joints") if "joint_torque" in fields else "contacts"
+    wrench, torque = bool(set(WRENCHES) & set(fields)), "joint_torque" in fields
+    of_contacts = wrench or FORCE_NORMAL in fields
+    named = ("full" if wrench else "joints") if torque or not of_contacts else "contacts"
     if not limbs:
         return named
-    return ({"set": named} if wrench or named == "joints" else {}) | {"ft_sensors": list(limbs)}
+    return ({"set": named} if wrench or torque else {}) | {"ft_sensors": list(limbs)}
 
 
 _TESTED = 0.2  # of a log

@@ -8,7 +8,8 @@ from typing import Any, TypedDict
 
 import numpy as np
 
-from torchid.config.reading import Settings, check_text
+from torchid.config.reading import Settings
+from torchid.config.yaml_text import check_text
 from torchid.errors import ConfigError, excerpt
 from torchid.guards import MAX_DEPTH
 from torchid.logs import Log

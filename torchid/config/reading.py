@@ -18,97 +18,12 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import TypeAdapter, ValidationError
 
+from torchid.config.yaml_text import check_yaml, explain_syntax
 from torchid.errors import ConfigError, UnknownNameError, about_file, during, excerpt, is_plain
-from torchid.guards import MAX_DEPTH, MAX_NODES, MAX_TEXT, MAX_YAML, read_bytes
+from torchid.guards import MAX_DEPTH, MAX_YAML, read_bytes
 from torchid.logs.containers import READABLE
 from torchid.logs.remote import is_url
 from torchid.settings import accepted_values
-
-_LOADER: type = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-_TAG = "tag:yaml.org,2002:"
-#: Tags that settings may have; others make dates, sets or bytes, which no key accepts.
-_KINDS = ("str", "int", "float", "bool", "null", "map", "seq", "merge")
-_NUMBERS = ("int", "float", "bool", "null")
-
-
-class _Count:
-    """Entries of the collections that are open, and of those that have an anchor."""
-
-    def __init__(self) -> None:
-        self.open: list[tuple[str | None, int]] = [(None, 0)]
-        self.anchored: dict[str, int] = {}
-
-    def add(self, entries: int) -> None:
-        anchor, count = self.open[-1]
-        self.open[-1] = (anchor, count + entries)
-        if sum(count for _, count in self.open) > MAX_NODES:
-            raise ValueError(f"more than {MAX_NODES} entries, aliases unfolded")
-
-    def start(self, anchor: str | None) -> None:
-        if len(self.open) > MAX_DEPTH:
-            raise ValueError(f"nested more than {MAX_DEPTH} deep")
-        self.open.append((anchor, 0))
-
-    def end(self) -> None:
-        anchor, count = self.open.pop()
-        if anchor is not None:
-            self.anchored[anchor] = count
-        self.add(count + 1)
-
-
-def check_yaml(text: str) -> None:
-    """Refuse YAML that unfolds beyond bounds, control characters, and interpolations `${...}`.
-
-    Raises:
-        ValueError, yaml.YAMLError: what was found.
-    """
-    if len(text) > MAX_YAML:
-        raise ValueError(f"more than {MAX_YAML} bytes")
-    count = _Count()
-    for event in yaml.parse(text, Loader=_LOADER):
-        _check_tag(event)
-        if isinstance(event, yaml.AliasEvent):
-            if event.anchor not in count.anchored:
-                raise ValueError(f"'*{excerpt(str(event.anchor))}', which stands for nothing complete")
-            count.add(count.anchored[event.anchor])
-        elif isinstance(event, yaml.CollectionStartEvent):
-            count.start(event.anchor)
-        elif isinstance(event, yaml.CollectionEndEvent):
-            count.end()
-        elif isinstance(event, yaml.ScalarEvent):
-            check_text(event.value)
-            count.add(1)
-            if event.anchor is not None:
-                count.anchored[event.anchor] = 1
-
-
-def _check_tag(event: yaml.Event) -> None:
-    """Refuse a tag that contradicts its value, whose construction would fail with errors of its own."""
-    tag = getattr(event, "tag", None)
-    if tag in (None, "!"):
-        return
-    kind = tag.removeprefix(_TAG)
-    if kind not in _KINDS:
-        raise ValueError(f"the tag '{excerpt(tag)}', which settings have no use for")
-    if isinstance(event, yaml.ScalarEvent) and kind in _NUMBERS:
-        resolved = yaml.resolver.Resolver().resolve(yaml.ScalarNode, event.value, (True, False)).removeprefix(_TAG)
-        if resolved != kind and (kind, resolved) != ("float", "int"):
-            raise ValueError(f"'{excerpt(event.value)}', which is no !!{kind}")
-
-
-def check_text(value: str) -> None:
-    """Refuse a text that no setting can be: too long, with control characters, or with an interpolation.
-
-    Raises:
-        ValueError: what was found.
-    """
-    if len(value) > MAX_TEXT:
-        raise ValueError(f"a text of {len(value)} characters, more than {MAX_TEXT}")
-    if not is_plain(value.replace("\n", "")):
-        raise ValueError(f"'{excerpt(value)}', with a control character")
-    if "${" in value:
-        raise ValueError(f"'{excerpt(value)}', but ${{...}} stands for nothing here")
-
 
 #: What YAML and OmegaConf raise at a value that is not what its tag or its key says.
 _NO_YAML = (
@@ -116,7 +31,6 @@ _NO_YAML = (
     ArithmeticError, RecursionError,
 )  # fmt: skip
 _LONGEST = 300  # characters of another package's message that a message of ours repeats
-_BRACKETS = '; names with brackets take quotes in a list: ["walk.npz[0:30]"]'
 _LONGEST_NAME, _LONGEST_PATH = 255, 4095  # bytes, of file systems
 
 T = TypeVar("T")
@@ -230,6 +144,8 @@ def _read(kind: FileKind[T], path: Path) -> Settings:
         loaded = _container(OmegaConf.create(text))
     except OSError as error:
         raise ConfigError(path, "file", f"cannot be read ({error.strerror})", f"a YAML {kind.name} file") from error
+    except yaml.MarkedYAMLError as error:
+        raise _no_settings(kind, path, *explain_syntax(error, text, "a YAML mapping")) from error
     except _NO_YAML as error:
         raise _no_settings(kind, path, f"not readable: {_why(error)}", "a YAML mapping") from error
     if not isinstance(loaded, dict):
@@ -248,8 +164,7 @@ def _why(error: Exception) -> str:
     if isinstance(error, UnicodeDecodeError):
         return "no text"
     spoken = isinstance(error, (OmegaConfBaseException, yaml.YAMLError, ValueError))
-    why = excerpt(str(error) if spoken else f"{type(error).__name__}: {error}", _LONGEST)
-    return why + _BRACKETS * ("flow sequence" in why)
+    return excerpt(str(error) if spoken else f"{type(error).__name__}: {error}", _LONGEST)
 
 
 def _parsed(text: str) -> Settings:
@@ -262,6 +177,8 @@ def _parsed(text: str) -> Settings:
         if key.count(".") + key.count("[") > MAX_DEPTH:
             raise ValueError(f"nested more than {MAX_DEPTH} deep")
         return _container(OmegaConf.from_dotlist([text]))
+    except yaml.MarkedYAMLError as error:
+        raise ConfigError.at_field(excerpt(text), *explain_syntax(error, value, "key.subkey=value")) from error
     except _NO_YAML as error:
         raise ConfigError.at_field(excerpt(text), _why(error), "key.subkey=value, in YAML") from error
 

@@ -64,8 +64,14 @@ Entry = Annotated[ColumnEntry, BeforeValidator(_column)]
 
 @dataclass(config=STRICT, frozen=True, kw_only=True)
 class TimeEntry(ColumnEntry):
-    """Stamps as a column; `step`: in its place, how much later each sample is than the one before, in the unit."""
+    """Stamps as a column.
 
+    Attributes:
+        nanoseconds: column of what is added to it [ns], of stamps in two columns.
+        step: in place of a column, how much later each sample is than the one before, in the unit.
+    """
+
+    nanoseconds: Name | None = None
     step: Positive | None = None
 
 

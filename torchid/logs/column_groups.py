@@ -19,10 +19,22 @@ from torchid.logs.units import split_unit
 
 _NUMBER = re.compile(r"\d+")
 _AXIS = re.compile(
-    r"(?<=[._\-/\[ ])([wxyz])(?=$|[\]])|(?<=[a-zFM_.\-/\[ ])([WXYZ])(?=$|[\]])|(?<=[a-zFM])([wxyz])$"
+    r"(?<=[._\-/\[ ])([wxyz])(?=$|[\]])|(?<=[a-zFM_.\-/\[ \u0080-\uffff])([WXYZ])(?=$|[\]])|(?<=[a-zFM])([wxyz])$"
     r"|(?<=[a-z])([XYZ])(?=[/_.])",
 )
 _BEHIND = re.compile(r"[_./ \[-]*\{[^{}]*\}\]?$")  # a unit: the axis in `acc_g.{axis}`
+
+
+_SECONDS, _NANOSECONDS = r"secs?|seconds", r"nano_?secs?|nsecs?|nano_?seconds|ns"
+
+
+def split_stamps(columns: Sequence[str]) -> dict[str, str]:
+    """Columns of whole seconds, with those of the nanoseconds beside them: `stamp.sec` and `stamp.nanosec`."""
+    seconds, rest = (
+        {found[1]: x for x in columns if (found := re.fullmatch(rf"(.*?)(?<![a-z])(?:{words})", x, re.IGNORECASE))}
+        for words in (_SECONDS, _NANOSECONDS)
+    )
+    return {column: rest[stem] for stem, column in seconds.items() if stem in rest}
 
 
 @dataclass(frozen=True)
@@ -72,6 +84,12 @@ class Family:
     def entry(self) -> dict[str, object]:
         """Where the columns are, as a map says it."""
         return {"columns": dict(self.by_name)} if self.by_name else {"column": self.pattern}
+
+    @property
+    def counted_entry(self) -> dict[str, object]:
+        """Likewise, with the number that counting begins with."""
+        first = min(self.numbers, default=0)
+        return self.entry | ({"first_index": first} if first > 0 else {})
 
 
 @dataclass(frozen=True)

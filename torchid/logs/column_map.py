@@ -29,6 +29,7 @@ from torchid.logs.column_entries import (
     Quaternion,
     QuaternionEntry,
     Stamps,
+    TimeEntry,
     Torque,
     TorqueEntry,
     Vector,
@@ -190,6 +191,9 @@ def list_parts(columns: Columns) -> dict[str, Part]:
         entry = getattr(columns, field)
         if entry.column or entry.columns:
             parts[field] = _part(field, field, entry)
+        if isinstance(entry, TimeEntry) and entry.nanoseconds is not None:
+            more = ColumnEntry(column=entry.nanoseconds, unit={"*": "ns"})
+            parts[f"{field}.nanoseconds"] = Part(f"{field}.nanoseconds", more, "", (), {"": ("time",)})
         if isinstance(entry, WrenchEntry):
             for name, quantity in (("force", "force"), ("moment", "torque")):
                 if (inner := getattr(entry, name)) is not None:
@@ -276,6 +280,8 @@ def _check_given(field: str, entry: ColumnEntry) -> None:
         found = f"{' and '.join(given)} together" if given else "nothing that says where it is"
         raise ConfigError.at_field(f"{KEY}.{field}", found, f"one of {', '.join(own)}")
     if given[0] not in ("column", "columns"):
+        if getattr(entry, "nanoseconds", None):
+            _check_unscaled(field, entry, ["nanoseconds"], given[0])
         unsaid = ("scale", "order") if given[0] == "step" else ("unit", "scale", "order")
         _check_unscaled(field, [x for x in unsaid if getattr(entry, x)], given[0])
     if isinstance(entry, WrenchEntry) and entry.moment is not None and entry.force is None:

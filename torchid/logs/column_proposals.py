@@ -27,19 +27,19 @@ _WORDS = (
     ("base_angular_velocity_base", rf"{OF_BASE} (ang vel|angular velocity|omega)\b"),
     ("base_quat_wxyz", rf"{OF_BASE} (q|rot|rotation)\b"),
     ("joint_acceleration", r"\b(ddqj?|qdd|thdd|qacc|joint acc|joint acceleration)\b"),
-    ("imu_angular_velocity", r"\b(gyro\w*|omega|ang vel|angular velocity)\b"),
-    ("imu_specific_force", r"\b(acc|accel\w*|linear acceleration|specific force)\b"),
+    ("imu_angular_velocity", r"\b(gyr|gyro\w*|omega|ang vel|angular velocity|drehraten?)\b"),
+    ("imu_specific_force", r"\b(acc|accel\w*|linear acceleration|specific force|beschleunigung)\b"),
     ("base_quat_wxyz", r"\b(quat\w*|orientation)\b"),
     ("contact_wrench_local", r"\b(wrench|wrenches)\b"),
     ("contact_force_normal", r"\b(foot forces?|feet forces?|contact forces?|grf|fsr)\b"),
     ("contact_active", r"\b(contacts?|touch|touches|stance)\b"),
-    ("joint_torque", r"\b(taus?|torques?|efforts?|trq|load|qfrc|drehmoment)\b"),
+    ("joint_torque", r"\b(taus?|torques?|efforts?|trq|load|qfrc|drehmoment|couples?)\b"),
     (
         "joint_velocity",
-        r"\b(dqs?|dqj|qd|qdot|thd|v|qvel|vels?|velocity|velocities|speeds?|rates?|geschwindigkeit)\b",
+        r"\b(dqs?|dqj|d q|qd|qdot|thd|v|qvel|vels?|velocity|velocities|speeds?|rates?|vitesses?)\b|geschwindigkeit\b",
     ),
-    ("joint_position", r"\b(qs?|qj|th|theta|qpos|pos|positions?|angles?|winkel)\b"),
-    ("time", rf"\b(t|ts|{_STAMPS}|ticks?|clock|sec|secs|seconds|zeit)\b"),
+    ("joint_position", r"\b(qs?|qj|th|theta|qpos|pos|positions?|angles?|winkel|gelenkwinkel)\b"),
+    ("time", rf"\b(t|ts|{_STAMPS}|ticks?|clock|sec|secs|seconds|zeit|temps)\b"),
 )
 #: Fields that a unit alone tells: of `LF_HAA [deg]`, `LF_HAA [deg/s]`.
 _BY_QUANTITY = {
@@ -49,12 +49,25 @@ _BY_QUANTITY = {
 _APART = (("linear", "angular"), ("position", "velocity", "acceleration", "torque"), ("world", "base", "local"))
 _DESIRED = re.compile(r"\b(des|desired|cmd|command|ref|target|goal|setpoint|ff)\b")
 _ANGLES = re.compile(r"\b(rpy|euler)\b")  # of the base, three: see `orientation_proposals`
+_OF_MOTOR = re.compile(r"\b(kp|kd)\b|temp|volt|err|status|state|mode|flag|count|fault|limit", re.IGNORECASE)
+_OTHER_UNITS = ("V", "°C", "C", "K", "%")
 _SPLIT = re.compile(r"[^A-Za-z]+|(?<=[a-z])(?=[A-Z])")
+#: What headers without letters of ours say, the longest first.
+_WRITTEN = {
+    "関節角速度": "joint velocity", "関節角度": "joint position", "角速度": "gyro", "加速度": "acc", "トルク": "torque",
+    "角度": "angle", "時刻": "time", "時間": "time", "关节角速度": "joint velocity", "关节速度": "joint velocity",
+    "关节角度": "joint position", "关节位置": "joint position", "力矩": "torque", "扭矩": "torque", "时间": "time",
+}  # fmt: skip
 
 
 def is_desired(column: str) -> bool:
     """Whether a column holds what a controller wants, not what was measured."""
     return bool(_DESIRED.search(" ".join(_words(column))))
+
+
+def is_no_torque(words: str, unit: str) -> bool:
+    """Whether a column of a joint says that it is no torque: desired, or a state of its motor."""
+    return is_desired(words) or _OF_MOTOR.search(words) is not None or unit in _OTHER_UNITS
 
 
 def propose_field(column: str, desired: bool = False) -> str:
@@ -83,6 +96,8 @@ def _contradicts(words: str, others: str) -> bool:
 
 
 def _words(column: str) -> list[str]:
+    for written, words in _WRITTEN.items():
+        column = column.replace(written, f" {words} ")
     return [word.lower() for word in _SPLIT.split(column) if word]
 
 

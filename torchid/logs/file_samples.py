@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+import re
+from collections import defaultdict
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,6 +25,7 @@ Columns = Mapping[str, NDArray[Any] | None]
 
 
 _NAMES = 300  # elements of a list of names
+_SORTED = 0.9  # of the steps of stamps, forwards
 
 
 def read_sample(path: Path) -> Columns:
@@ -71,8 +74,15 @@ def listed_order(sample: Columns, kind: str, robot: KnownRobot, count: int) -> t
         count: how many.
     """
     known = robot.joints if kind == "joint" else robot.feet
-    for name, values in sample.items():
-        listed = [] if values is None or values.dtype.kind in "fiub" else stated_names(sample, name)
+    texts = {
+        name: stated_names(sample, name) for name, x in sample.items() if x is not None and x.dtype.kind not in "fiub"
+    }
+    numbered = defaultdict[str, list[tuple[int, str]]](list)  # of a column for each name, such as name[3]
+    for name, one in texts.items():
+        if len(one) == 1 and (found := re.search(r"\d+(?=\D*$)", name)):
+            numbered[f"{name[: found.start()]}{{index}}{name[found.end() :]}"].append((int(found[0]), one[0]))
+    texts |= {name: [text for _, text in sorted(of)] for name, of in numbered.items()}
+    for name, listed in texts.items():
         matched = match_names(listed, known, kind) if len(listed) == count == len(known) else {}
         if len(matched) == len(known) > 0:
             return [matched[text] for text in listed], f"as '{name}' of the file lists them"
@@ -127,3 +137,19 @@ def read_bag_sample(path: Path, types: Collection[str]) -> dict[str, TopicSample
                 messages = []
             out[name] = TopicSample(channel.type, messages, counts[name])
     return out
+
+
+def increases(values: NDArray[Any] | None) -> bool:
+    """Whether numbers (N,) are stamps: of a clock that goes forwards nearly throughout."""
+    if values is None or values.ndim != 1 or len(values) < 3:
+        return False
+    return bool((np.diff(values) > 0).mean() > _SORTED)
+
+
+def side_by_side(sample: Columns, columns: Sequence[str]) -> NDArray[Any]:
+    """Numbers (N, k) of columns, or an array as it is; all in one row where columns have not as many each."""
+    values = [x for column in columns if (x := sample[column]) is not None]
+    if len(values) == 1:
+        return np.asarray(values[0])
+    alike = len({x.shape for x in values}) == 1
+    return np.stack(values, axis=-1) if alike else np.concatenate([np.ravel(x) for x in values])

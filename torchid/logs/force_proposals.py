@@ -11,6 +11,7 @@ from torchid.rounding import STD_PER_MAD
 _UPRIGHT = 0.96  # of the size of forces along z, of feet that walk
 _AIR = 0.1  # of the way from the lowest to the highest reading: of a foot in the air
 _SHARES = (0.05, 0.2)  # of that way, a threshold of contact: least and most
+_STATES = 4  # at most, such as unknown, made and lost
 _NOISE = 4.0  # standard deviations of readings in the air that it is above them
 
 
@@ -20,6 +21,12 @@ def point_along_z(forces: Any) -> bool:
     with np.errstate(all="ignore"):
         upright = np.nansum(vectors[..., 2]) / np.nansum(np.linalg.norm(vectors, axis=2))
     return bool(abs(upright) > _UPRIGHT)
+
+
+def are_states(values: Any) -> bool:
+    """Whether numbers are those of a few states, counted from 1: of which of them a foot touches nobody knows."""
+    found = np.unique(np.asarray(values, dtype=float))
+    return 2 <= len(found) <= _STATES and bool((found == np.arange(1, len(found) + 1)).all())
 
 
 def threshold(readings: Any) -> float:

@@ -164,8 +164,22 @@ def _held(flags: NDArray[Any], short: BoolArray) -> NDArray[Any]:
     return out
 
 
+_TURN = 2.0 * np.pi  # [rad]
 _TOLERANCE_TURNS = 0.05  # of a jump, which contains a step of the motion
-_LARGEST_STEP = 0.5  # [rad] of the motion on either side
+_LARGEST_STEP_TURNS = 0.5 / _TURN  # of the motion on either side
+
+
+def turn_jumps(position: FloatArray, turn: float = _TURN) -> BoolArray:
+    """Which steps (N - 1, n) of positions (N, n) are jumps by a whole turn, between small steps of the motion.
+
+    Where other joints jump at the same sample by other amounts, none is: the positions have another unit.
+    """
+    steps = np.abs(np.diff(position, axis=0)) / turn
+    with np.errstate(invalid="ignore"):
+        jumps, is_small = np.abs(steps - 1.0) < _TOLERANCE_TURNS, ~(steps >= _LARGEST_STEP_TURNS)
+    around = np.pad(is_small, ((1, 1), (0, 0)), constant_values=True)
+    jumps &= around[:-2] & around[2:]
+    return np.asarray(jumps & (jumps | is_small).all(axis=1, keepdims=True))
 
 
 def require_no_turns(log: Log) -> None:
@@ -174,15 +188,7 @@ def require_no_turns(log: Log) -> None:
     Raises:
         LogError: names the joints.
     """
-    steps = np.diff(log.joint_position, axis=0)
-    with np.errstate(invalid="ignore"):
-        jumps = np.abs(np.abs(steps) / (2.0 * np.pi) - 1.0) < _TOLERANCE_TURNS
-        if not jumps.any():
-            return
-        is_small = np.abs(steps) < _LARGEST_STEP
-    around = np.pad(is_small, ((1, 1), (0, 0)), constant_values=True)
-    jumps &= around[:-2] & around[2:]
-    jumps &= (jumps | is_small).all(axis=1, keepdims=True)  # where others jump by other amounts, all is another unit's
+    jumps = turn_jumps(log.joint_position)
     joints = np.flatnonzero(jumps.any(axis=0))
     if not len(joints):
         return

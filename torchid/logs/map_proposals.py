@@ -9,14 +9,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchid.errors import excerpt
-from torchid.logs.column_groups import Family, find_families, split_arrays
-from torchid.logs.column_proposals import OF_BASE, OF_PLATES, is_desired, propose_field
+from torchid.logs.column_groups import Family, find_families, split_arrays, split_stamps
+from torchid.logs.column_proposals import OF_BASE, OF_PLATES, is_desired, is_no_torque, propose_field
 from torchid.logs.columns import is_column
-from torchid.logs.file_samples import Columns, listed_order, stated_names
-from torchid.logs.force_proposals import point_along_z, threshold
+from torchid.logs.file_samples import Columns, increases, listed_order, side_by_side, stated_names
+from torchid.logs.force_proposals import are_states, point_along_z, threshold
 from torchid.logs.joint_orders import JOINT_ORDERS, MOTORS, numbered_joints, suitable_orders, usual_order
 from torchid.logs.log import SHAPES, VARIANTS, WRENCHES
 from torchid.logs.name_matching import SUFFIXES, KnownRobot
@@ -30,7 +29,6 @@ _SIDEWAYS = re.compile(r"(?<![a-z])(f[xy]|m[xyz])(?![a-z])", re.IGNORECASE)  # c
 _DRIVE = re.compile(r"joint|motor|current|temp|limit|volt", re.IGNORECASE)  # of a limb, but of no foot
 _FOOT = re.compile(r"foot|feet", re.IGNORECASE)
 _LAW = {"joint_position": "position", "joint_velocity": "velocity", "joint_torque": "feed_forward"}
-_SORTED = 0.9  # of the steps of stamps, forwards
 _TOUCH = 0.05  # of the robot's weight, what a contact bears at least
 
 
@@ -46,6 +44,7 @@ class MapProposal:
         fields: of the log, that a map of topics gives.
         lacking: joints of the robot without columns, if most have some.
         partial: by field that is left out for it, joints that have columns of other fields alone.
+        like_torques: columns that no field takes, one for each joint, of a log without torques.
     """
 
     columns: dict[str, Any] = field(default_factory=dict)
@@ -55,6 +54,7 @@ class MapProposal:
     left_out: list[str] = field(default_factory=list)
     lacking: list[str] = field(default_factory=list)
     partial: dict[str, list[str]] = field(default_factory=dict)
+    like_torques: list[Family] = field(default_factory=list)
 
 
 def propose_map(
@@ -87,7 +87,7 @@ class _Proposer:
 
     def propose(self) -> MapProposal:
         foreign = [name for name in self.sample if name not in self.native]
-        numeric = [name for name in foreign if self._is_numeric(name)]
+        numeric = [name for name in foreign if (x := self.sample[name]) is not None and x.dtype.kind in "fiub"]
         families, more = find_families(numeric, self.robot)
         self.out.columns |= {f"{kind}_name": pattern for kind, pattern in more.items()}
         self.joint_suffix = more.get("joint", "").removeprefix("{joint}")
@@ -95,6 +95,8 @@ class _Proposer:
         self.out.lacking = [name for name in self.joints if self.named_joints and name not in self.named_joints]
         split = self._place_parts(numeric)
         families = [one for one in families if one.columns[0] not in split]
+        self.nanoseconds = split_stamps(numeric)
+        families = [one for one in families if one.columns[0] not in self.nanoseconds.values()]
         stamps = [one for one in families if self._field(one) == "time"]
         used = [one for one in families if one not in stamps and self._place(one)]
         used += [one for one in self._stamps_first(stamps) if self._place(one)]
@@ -107,13 +109,15 @@ class _Proposer:
             used += self._place_law([one for one in families if one not in used])
         used = self._settle_contacts(used)
         taken = {column for one in used for column in one.columns} | split
+        taken |= {self.out.columns.get("time", {}).get("nanoseconds")} - {None}
         taken |= self._place_angles([name for name in numeric if name not in taken])
         self.out.left_out = [name for name in foreign if name not in taken]
         families = [one for one in families if one in used or not set(one.columns) <= taken]
         ignored = {one.as_ignored for one in families if one not in used or len(one.numbers) > len(self.joints)}
-        ignored |= {name for name in foreign if name not in numeric}
-        if ignored:
-            self.out.columns["ignore"] = sorted(ignored)
+        ignored |= {name for name in foreign if name not in numeric or name in self.nanoseconds.values()} - taken
+        self.out.columns |= {"ignore": sorted(ignored)} if ignored else {}
+        if "joint_torque" not in {*self.given, *self.out.columns}:
+            self.out.like_torques = [one for one in families if one not in used and self._is_like_torques(one)]
         with np.errstate(all="ignore"):  # of numbers that no unit explains
             units = UnitProposer(self.sample, self.out.columns, self.out.notes, self.factors)
             units.propose(self.robot.weight, not self.files)
@@ -131,10 +135,6 @@ class _Proposer:
 
     def _note(self, key: str, text: str) -> None:
         self.out.notes[key] = "; ".join(filter(None, (text, self.out.notes.get(key))))
-
-    def _is_numeric(self, name: str) -> bool:
-        values = self.sample[name]
-        return values is not None and values.dtype.kind in "fiub"
 
     def _place_parts(self, numeric: Sequence[str]) -> set[str]:
         """Arrays of which parts have become entries."""
@@ -169,7 +169,9 @@ class _Proposer:
         beside = next(iter(entry.get("columns", {}).values()), "") or entry.get("column", "joint_position")
 
         def rank(family: Family) -> tuple[bool, int]:
-            return not self._increases(family.columns[0]), -len(os.path.commonprefix([family.columns[0], beside]))
+            first = family.columns[0]
+            forwards = first in self.nanoseconds or increases(self.sample[first])
+            return not forwards, -len(os.path.commonprefix([first, beside]))
 
         return sorted(families, key=rank)
 
@@ -188,15 +190,15 @@ class _Proposer:
         again = name == "base_quat_wxyz" and "base_quat_xyzw" in known
         if not name or name in known or again or not self._fits(family, name):
             return False
-        entry: dict[str, Any] = family.entry
-        if (first := min(family.numbers, default=0)) > 0:
-            entry["first_index"] = first
+        entry: dict[str, Any] = family.counted_entry
         if name == "base_quat_wxyz":
             name = self._quaternion(family)
             if "imu" in family.words.lower():
                 self._note(name, "of the IMU, taken to be that of the base link")
-        if name == "contact_active":
-            self._add_threshold(family, entry)
+        if name == "time" and (more := self.nanoseconds.get(family.columns[0])):
+            entry["nanoseconds"] = more
+        if name == "contact_active" and not self._add_threshold(family, entry):
+            return False
         self._add_order(family, name)
         self._add_stated_unit(family, entry, name, quantities_of(name))
         if family.by_place:
@@ -216,6 +218,14 @@ class _Proposer:
         self.out.columns["other_times"] = [*others, entry]
         return True
 
+    def _is_like_torques(self, family: Family) -> bool:
+        """Whether a family that nothing says what it is has changing numbers of each joint."""
+        known = is_no_torque(family.words.replace("_", " "), family.unit)
+        if known or self._field(family) not in ("", "joint_torque") or not self._fits(family, "joint_torque"):
+            return False
+        values = side_by_side(self.sample, family.columns)
+        return values.dtype.kind in "fiu" and bool((np.ptp(values, axis=0) > 0).any())
+
     def _joints_of(self, family: Family) -> set[str]:
         """Joints of the robot that a family names."""
         if "{joint}" not in family.pattern:
@@ -230,7 +240,7 @@ class _Proposer:
     def _field(self, family: Family) -> str:
         """The field that a family probably is."""
         name, axes = family.proposed, len(family.axes) == 3
-        if not name and "time" in quantities_with(family.unit) and self._increases(family.columns[0]):
+        if not name and "time" in quantities_with(family.unit) and increases(self.sample[family.columns[0]]):
             return "time"
         if not name and axes and re.fullmatch(OF_BASE, family.words.strip(" _./").lower()):
             return "base_position_world"
@@ -244,12 +254,6 @@ class _Proposer:
         if name == "contact_force_normal" or (not name and of_foot and not _DRIVE.search(family.words)):
             return "contact_active"  # as a threshold: what it is in newtons nobody knows
         return "base_position_world" if name == "joint_position" and axes and not any(family.names) else name
-
-    def _increases(self, column: str) -> bool:
-        values = self.sample[column]
-        return (
-            values is not None and values.ndim == 1 and len(values) > 2 and bool((np.diff(values) > 0).mean() > _SORTED)
-        )
 
     def _shape(self, family: Family) -> tuple[int, ...]:
         """What a column or array of a family has of each sample."""
@@ -314,18 +318,10 @@ class _Proposer:
         if is_moment or known:
             return (known or WRENCHES)[0], "" if known else "the contact frames"
         in_order = not family.axes or family.axes[0] in "xX"
-        values = self._together(family)
+        values = side_by_side(self.sample, family.columns)
         if len(self.feet) > 2 and in_order and values.ndim > 1 and point_along_z(values):
             return WRENCHES[1], "the world, as almost all of them points along z"
         return WRENCHES[0], "the contact frames"
-
-    def _together(self, family: Family) -> NDArray[Any]:
-        """Numbers (N, columns) of a family, or its array; all in one row where columns have not as many each."""
-        values = [x for column in family.columns if (x := self.sample[column]) is not None]
-        if len(values) == 1:
-            return np.asarray(values[0])
-        alike = len({x.shape for x in values}) == 1
-        return np.stack(values, axis=-1) if alike else np.concatenate([np.ravel(x) for x in values])
 
     def _place_law(self, families: Sequence[Family]) -> list[Family]:
         """Families of a PD law, if there are gains."""
@@ -362,11 +358,17 @@ class _Proposer:
             self._note("base_quat_wxyz", found.note)
         return set(found.columns if found else ())
 
-    def _add_threshold(self, family: Family, entry: dict[str, Any]) -> None:
-        values = self._together(family)
+    def _add_threshold(self, family: Family, entry: dict[str, Any]) -> bool:
+        """Whether flags can be made of a family, with a threshold unless it has flags; not of numbers of states."""
+        values = side_by_side(self.sample, family.columns)
+        if are_states(values):
+            text = f"'{excerpt(family.columns[0])}' has numbers of states, which nothing in the file explains: not used"
+            self._note("contact_active", text)
+            return False
         if not np.isin(values, (0, 1)).all():
             entry["above"] = threshold(values)
             self.out.notes["contact_active"] = "threshold, from the readings in the air and their range"
+        return True
 
     def _add_order(self, family: Family, name: str) -> None:
         """An order of names by number, where columns have none."""

@@ -237,6 +237,8 @@ class MappedFields:
     def _mapped(self, name: str, take: Take) -> NDArray[Any]:
         if name in self._values:
             out = self._values[name].read(take)
+            if name == "time" and (more := self._values.get("time.nanoseconds")) is not None:
+                out = out + more.read(take)
             return _flagged(out, self._threshold) if name == "contact_active" else out
         if name == "joint_torque":
             return self._torque(take)

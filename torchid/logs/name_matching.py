@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 SUFFIXES = {"joint": ("", "_joint"), "contact": ("", "_foot", "_sole", "_contact", "_link", "_ankle_roll_link")}
 """What names of a URDF may have more than those of a recording."""
 
+_LETTER = "[A-Za-z0-9\u00c0-\u024f]"  # of words with accents, too: no l between those of accélération
 _MOST_TEXTS = 1000  # that are compared with all joints
 _WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
 _PLACE = re.compile(r"(?<![A-Za-z0-9])(?i:[FRHL][FRHL])[_.]?[0-9](?![A-Za-z0-9])")
@@ -47,13 +48,14 @@ class KnownRobot:
 
 def within(stem: str) -> re.Pattern[str]:
     """A name as a part of another, between letters and numbers that are none of it."""
-    return re.compile(rf"(?<![A-Za-z0-9]){re.escape(stem)}(?![A-Za-z0-9])")
+    before = rf"(?:(?<!{_LETTER})|(?<=[a-z]))" if stem[:1].isupper() else rf"(?<!{_LETTER})"  # contactFlagLF_FOOT
+    return re.compile(rf"{before}{re.escape(stem)}(?!{_LETTER})")
 
 
 def spelled(stem: str) -> re.Pattern[str]:
     """A name as a part of another, whatever its capitals and separators: left_hip_pitch in `LeftHipPitch.Position`."""
     words = [re.escape(word) for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", stem)] or [re.escape(stem)]
-    return re.compile(rf"(?<![A-Za-z0-9])(?i:{'[ _./-]?'.join(words)})(?![a-z0-9])")
+    return re.compile(rf"(?<!{_LETTER})(?i:{'[ _./-]?'.join(words)})(?![a-z0-9\u00df-\u024f])")
 
 
 def limbs(text: str) -> frozenset[str]:

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.logs.column_proposals import is_desired
-from torchid.logs.file_samples import Columns
+from torchid.logs.file_samples import Columns, side_by_side
+from torchid.logs.gaps import turn_jumps
 from torchid.logs.units import UNITS, quantities_with, split_unit
 
 _STEP = (2e-4, 0.2)  # [s]: of recordings
@@ -21,9 +22,9 @@ _TURN_S, _ALIKE = 0.3, 0.5  # over which gravity is seen to turn [s], and correl
 _TURNED = 7.0  # [rad]: no joint's position is as large throughout
 _LEVER = 1.0  # [m]: rms of no torque is as large as that of the robot's weight with it
 _FAR = 60.0  # [m]: no base is recorded as far away
-_JUMP = 0.6  # of a turn, from sample to sample
 _FREE = 0.02  # of a turn, to either side of where it begins
 _STARTS = (-0.5, -0.25, -0.75, 0.25)  # of a turn, where it may begin
+_POSITION = "joint_position"
 _TURNS = {"rad": 2.0 * np.pi, "deg": 360.0, "rev": 1.0, "mrad": 2e3 * np.pi}
 
 Numbers = NDArray[np.float64]
@@ -64,14 +65,15 @@ class UnitProposer:
         seconds = self._seconds()
         if seconds is None:
             return
-        position, velocity = self._values("joint_position"), self._values("joint_velocity")
-        factor = self._stated.get("joint_position", 1.0)
+        position, velocity = self._values(_POSITION), self._values("joint_velocity")
+        factor = self._stated.get(_POSITION, 1.0)
         if position is not None:
-            turned = "joint_position" not in self._stated and np.nanpercentile(np.abs(position), 98) > _TURNED
+            turned = _POSITION not in self._stated and np.nanpercentile(np.abs(position), 98) > _TURNED
             if turned:
-                self._set("joint_position", "deg", f"from values up to {np.nanmax(np.abs(position)):.3g}")
+                self._set(_POSITION, "deg", f"from values up to {np.nanmax(np.abs(position)):.3g}")
                 factor = UNITS["angle"]["deg"]
             self._add_turn(position)
+        self._add_native_turn()
         if position is not None and velocity is not None and one_clock:
             self._add_speed(velocity, factor * position, seconds)
         if one_clock:
@@ -89,12 +91,15 @@ class UnitProposer:
     def _seconds(self) -> Numbers | None:
         """The stamps (N,) [s]; also those of a column called `time` that has another unit."""
         if step := self._columns.get("time", {}).get("step"):
-            position = self._values("joint_position")
+            position = self._values(_POSITION)
             return None if position is None else step * np.arange(len(position))
         native = "time" not in self._columns and self._sample.get("time") is not None
         time = self._flat([self._sample["time"]]) if native else self._values("time")  # type: ignore[list-item]
         if time is None or len(time) < 3:
             return None
+        if (column := self._columns.get("time", {}).get("nanoseconds")) is not None:
+            more = self._flat([self._sample[column]])  # type: ignore[list-item]
+            time = time if more is None else time + 1e-9 * more
         step = float(np.median(np.diff(time[:, 0])))
         unit = next((u for u in ("s", "ms", "us", "ns") if _STEP[0] <= step * UNITS["time"][u] <= _STEP[1]), "s")
         if native and unit != "s" and self._columns:
@@ -102,24 +107,32 @@ class UnitProposer:
         self._set("time", unit, f"from steps of {step:.3g}")
         return np.asarray(time[:, 0] * self._stated.get("time", UNITS["time"][unit]))
 
+    def _add_native_turn(self) -> None:
+        """An entry for positions [rad] with names of the format, if they jump by a turn."""
+        named = [x for x in self._sample if x == _POSITION or x.startswith(f"{_POSITION}.")]
+        values = self._flat([x for name in named if (x := self._sample[name]) is not None])
+        if values is None or _POSITION in self._columns or not turn_jumps(values).any():
+            return
+        self._columns[_POSITION] = {"column": _POSITION if named == [_POSITION] else f"{_POSITION}.{{joint}}"}
+        self._add_turn(values)
+        if "turn_from" not in self._columns[_POSITION]:
+            del self._columns[_POSITION]
+
     def _add_turn(self, position: Numbers) -> None:
         """Where the turn begins that angles are in, where encoders jump by one."""
-        entry = self._columns["joint_position"]
-        of_file = 2.0 * np.pi / self._stated.get("joint_position", 1.0)  # in degrees, of a file that says so
+        entry = self._columns[_POSITION]
+        of_file = 2.0 * np.pi / self._stated.get(_POSITION, 1.0)  # in degrees, of a file that says so
         turn = _TURNS.get(str(entry["unit"]).lower(), 0.0) if "unit" in entry else of_file
-        steps = np.abs(np.diff(position, axis=0))
-        with np.errstate(invalid="ignore"):
-            jumps = (steps > _JUMP * turn) & (steps < (2.0 - _JUMP) * turn)
-        if not turn or not jumps.any():
+        if not turn or not turn_jumps(position, turn).any():
             return
         phase = np.mod(position / turn, 1.0)
-        for start in _STARTS:
+        for start in (*_STARTS, _middle_of_gap(phase)):
             away = np.abs(np.mod(phase - start + 0.5, 1.0) - 0.5)
             if np.nanmin(away) > _FREE:
                 entry["turn_from"] = float(f"{start * turn:.4g}")
-                self._note("joint_position", f"turns begin at {entry['turn_from']:g}, as angles jump by a whole turn")
+                self._note(_POSITION, f"turns begin at {entry['turn_from']:g}, as angles jump by a whole turn")
                 return
-        self._note("joint_position", "angles jump by a whole turn, and none of them stays within one: unwrap them")
+        self._note(_POSITION, "angles jump by a whole turn, and none of them stays within one: unwrap them")
 
     def _add_speed(self, velocity: Numbers, position: Numbers, seconds: Numbers) -> None:
         if position.shape != velocity.shape:
@@ -178,6 +191,13 @@ class UnitProposer:
         return values if np.isfinite(values).any() else None
 
 
+def _middle_of_gap(phase: Numbers) -> float:
+    """The middle of the widest part of a turn, from -0.5 to 0.5, that no angle is in, of phases in turns."""
+    known = np.sort(phase[np.isfinite(phase)])
+    gaps = np.diff(known, append=known[0] + 1.0)
+    return float((known[gaps.argmax()] + 0.5 * gaps.max() + 0.5) % 1.0 - 0.5)
+
+
 def _rms(x: Numbers) -> float:
     return float(np.sqrt(np.nanmean(x**2)))
 
@@ -187,7 +207,8 @@ def _length(x: Numbers) -> float:
 
 
 _NAMES = ("roll", "pitch", "yaw")
-_ANGLE = re.compile(r"(?<![a-z])(roll|pitch|yaw)(?![a-z])", re.IGNORECASE)
+_OTHER_NAMES = {"roulis": "roll", "tangage": "pitch", "lacet": "yaw", "nickwinkel": "pitch", "gierwinkel": "yaw"}
+_ANGLE = re.compile(rf"(?<![a-z])({'|'.join([*_NAMES, *_OTHER_NAMES])})(?![a-z])", re.IGNORECASE)
 _TRIPLE = re.compile(r"(?<![a-z])(rpy|euler\w*?)(?![a-z])", re.IGNORECASE)
 #: Words beside these in names of what turns the base, rather than a joint or a rate.
 _OF_BASE = re.compile(
@@ -196,6 +217,7 @@ _OF_BASE = re.compile(
 )
 _SPLIT = re.compile(r"[^A-Za-z]+|(?<=[a-z])(?=[A-Z])")
 _LARGEST = 6.5  # [rad]: of no angle within a turn
+_UPRIGHT = 1.6  # [rad]: roll or pitch of a base that stands or hangs upright are less
 
 
 def order_of_quaternion(arrays: Sequence[NDArray[Any]]) -> str:
@@ -241,7 +263,8 @@ def _triples(names: Sequence[str]) -> list[list[str]]:
     by_stem: dict[str, dict[str, str]] = {}
     for name in names:
         if (found := _ANGLE.search(name)) is not None:
-            by_stem.setdefault(_ANGLE.sub("*", name, count=1), {})[found[1].lower()] = name
+            word = found[1].lower()
+            by_stem.setdefault(_ANGLE.sub("*", name, count=1), {})[_OTHER_NAMES.get(word, word)] = name
     out = [[of[one] for one in _NAMES] for of in by_stem.values() if set(of) == set(_NAMES)]
     behind: dict[str, list[str]] = {}
     for name in names:
@@ -272,6 +295,9 @@ def _angles(values: Mapping[str, NDArray[Any]], unit: str) -> Angles:
     elif (largest := float(np.nanmax([np.nanmax(np.abs(x), initial=0.0) for x in values.values()]))) > _LARGEST:
         entry["unit"] = "deg"
         note += f"; deg, from values up to {largest:.3g}"
+    elif (tilt := float(np.nanmax(np.abs(side_by_side(values, columns)[:, :2]), initial=0.0))) > _UPRIGHT:
+        entry["unit"] = "deg"
+        note += f"; deg, as a base that is tilted by {tilt:.3g} rad would have fallen"
     else:
         note += f"; rad, as none exceeds {_LARGEST}"
     return Angles(entry, columns, note)

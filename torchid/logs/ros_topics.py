@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from torchid.errors import ConfigError, UnknownNameError, excerpt
-from torchid.logs.joint_orders import JOINT_ORDERS, require_joints_of
+from torchid.logs.joint_orders import GO, JOINT_ORDERS, require_joints_of
 from torchid.settings import Number
 
 _STRICT = ConfigDict(extra="forbid")
@@ -279,6 +279,13 @@ def _check_low_state(topics: Topics, low_state: LowStateTopic) -> None:
     if low_state.feet is not None and not low_state.reads_feet:
         accepted = "above, the reading from which on a foot touches, or forces: true"
         raise ConfigError.at_field(f"{key}.feet", "given, though nothing reads them", accepted)
+    robot = JOINT_ORDERS.get(low_state.robot or "")
+    if low_state.reads_feet and robot is not None and robot.message != GO:
+        reading = "forces" if low_state.forces else "above"
+        found = f"'{low_state.robot}', which sends {robot.message} without foot sensors, though {reading} is set"
+        others = ", ".join(name for name, order in JOINT_ORDERS.items() if order.message == GO)
+        accepted = f"a robot that sends {GO} ({others}), if the messages are of one, or no {reading}"
+        raise ConfigError.at_field(f"{key}.robot", found, accepted)
     if low_state.reads_feet and not low_state.feet_by_number:
         found = "missing, though the foot sensors are read"
         raise ConfigError.at_field(f"{key}.feet", found, "contacts by number in foot_force, null for what is left out")

@@ -61,7 +61,7 @@ def read_table(path: Path, columns: Columns | None = None) -> dict[str, NDArray[
 
 
 def sample_table(path: Path) -> dict[str, NDArray[Any] | None]:
-    """The columns of a table with some of their first rows, None for those without numbers.
+    """The columns of a table with some of their first rows; a text alone where it is in all, None for other texts.
 
     Raises:
         LogError: the file cannot be read, or has no rows.
@@ -73,7 +73,15 @@ def sample_table(path: Path) -> dict[str, NDArray[Any] | None]:
             raise LogError.at_field("time", "no samples", "at least one sample")
         columns = dict(zip(batch.schema.names, batch.columns, strict=True))
         read = {name: x for name, x in columns.items() if _is_number(pa, x.type) or _is_stamp(pa, x.type)}
-        return {name: _numbers(pa, read[name]) if name in read else None for name in names}
+        texts = {name: x for name, x in columns.items() if pa.types.is_string(x.type) or pa.types.is_dictionary(x.type)}
+        found = {name: _numbers(pa, x) for name, x in read.items()} | {name: _one(x) for name, x in texts.items()}
+        return {name: found.get(name) for name in names}
+
+
+def _one(values: Any) -> NDArray[Any] | None:
+    """The text (1,) that all rows of a column have; None where they differ."""
+    texts = values.unique().to_pylist()
+    return np.array(texts) if len(texts) == 1 and texts[0] else None
 
 
 def _is_number(pa: Any, type_: Any) -> bool:

@@ -119,6 +119,7 @@ def split_unit(column: str) -> tuple[str, str]:
 
 def _plain(unit: str) -> str:
     """The unit as the table spells it: without spaces, dots, powers, capitals of long ones, and words in full."""
+    unit = "g" if unit == "G" else unit
     for spelling, plain in _SPELLINGS.items():
         unit = unit.replace(spelling, plain)
     unit = _MARKS.sub("", unit)

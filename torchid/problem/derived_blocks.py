@@ -27,12 +27,11 @@ from torchid.logs.preprocess import (
 )
 from torchid.logs.spill import Filled, Spill, growing_array
 from torchid.logs.timeline import SPLINE_BLOCK
-from torchid.problem.contact_detection import Detection, DetectionConfig, detect_in_parts, name_flags
+from torchid.problem.contact_detection import Detection, DetectionConfig, Filtered, detect_in_parts, name_flags
 from torchid.problem.detection_motion import (
     MAX_GAPS,
     Prepared,
     bind_for_detection,
-    detection_cutoff_hz,
     for_detection,
     quiet,
     require_torque,
@@ -81,7 +80,7 @@ def detect_in_blocks(
     pieces: Pieces,
     folder: Path | None,
 ) -> tuple[LogBlocks, BoolArray]:
-    """As `with_detected_contacts`; three passes over motion and torques, two of which filter them.
+    """As `with_detected_contacts`; a pass over the torques, and two or more that filter them and the motion.
 
     Args:
         blocks: the log as recorded.
@@ -101,24 +100,26 @@ def detect_in_blocks(
     filled = blocks.replaced({"joint_torque": torque})
     names = motion_fields(filled, "joint_torque")
     first = for_detection(filled.read(slice(0, SPLINE_BLOCK), names))
-    cutoff_hz = detection_cutoff_hz(settings.cutoff_hz, blocks.time)
-    with quiet():
-        timeline = make_timeline(blocks.time, lacks_derivatives(first), cutoff_hz, None)
-    if timeline is None:
-        raise ValueError("nothing is filtered")
-    coverage = {name: Coverage.empty(torque.shape[1:]) for name in gapless_fields(first, timeline)}
-    for one in coverage.values():
-        one.add(np.where(torque.broken, np.nan, 0.0)[None], None)
 
-    def parts() -> Iterator[Prepared]:
-        for piece in pieces(len(timeline.output_stamps)):
-            samples, part = timeline.part(piece.start, piece.stop)
-            with quiet():
-                known = move_to_timeline(for_detection(filled.read(samples, names)), part, coverage)
-            yield bind_for_detection(known, robot, contacts)
+    def filtered(cutoff_hz: float) -> Filtered:
+        with quiet():
+            timeline = make_timeline(blocks.time, lacks_derivatives(first), cutoff_hz, None)
+        if timeline is None:
+            raise ValueError("nothing is filtered")
+        coverage = {name: Coverage.empty(torque.shape[1:]) for name in gapless_fields(first, timeline)}
+        for one in coverage.values():
+            one.add(np.where(torque.broken, np.nan, 0.0)[None], None)
 
-    time = timeline.stamps_of(blocks.time)
-    return _with_flags(blocks, contacts, detect_in_parts(parts, time, blocks.time, robot, contacts, settings, folder))
+        def parts() -> Iterator[Prepared]:
+            for piece in pieces(len(timeline.output_stamps)):
+                samples, part = timeline.part(piece.start, piece.stop)
+                with quiet():
+                    known = move_to_timeline(for_detection(filled.read(samples, names)), part, coverage)
+                yield bind_for_detection(known, robot, contacts)
+
+        return Filtered(timeline.stamps_of(blocks.time), cutoff_hz, parts)
+
+    return _with_flags(blocks, contacts, detect_in_parts(filtered, blocks.time, robot, contacts, settings, folder))
 
 
 def _require_level_or_measured(blocks: LogBlocks, contacts: Sequence[Contact]) -> None:

@@ -1,0 +1,179 @@
+"""`torchid init` of columns that do not say what they are, say it in parts, or in another language."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from dialects import ORDER, in_order, save_csv, with_velocity
+from motions import value
+from repository import DEMO
+
+from torchid.commands.init import Initiated, init
+from torchid.config import load_config
+from torchid.fitting.experiment import set_up
+from torchid.logs import Log, read_log, write_log
+
+URDF = DEMO / "quadruped.urdf"
+
+
+def recorded() -> Log:
+    return with_velocity(read_log(DEMO / "sway_train.npz").select(slice(0, 300)))
+
+
+def initiated(path: Path, urdf: Path = URDF) -> tuple[Log, Initiated, str]:
+    """The log that an experiment file of `init` reads, what was said, and the file."""
+    said = init(urdf, path, path.with_suffix(".yaml"))
+    config = load_config(path.with_suffix(".yaml"))
+    set_up(config)
+    return read_log(path, columns=config.logs.columns), said, path.with_suffix(".yaml").read_text()
+
+
+def columns_of(log: Log, names: tuple[str, str, str], first: int = 0) -> dict[str, Any]:
+    """Columns by number of position, velocity and torque, in an order of motors."""
+    given = (log.joint_position, log.joint_velocity, log.joint_torque)
+    return {
+        name.format(k + first): in_order(log, x)[:, k] for name, x in zip(names, given, strict=True) for k in range(12)
+    }
+
+
+def test_columns_that_may_be_torques_are_listed_and_take_no_more_than_a_mark_off(tmp_path: Path) -> None:
+    log = recorded()
+    columns = {"t": log.time} | columns_of(log, ("q{}", "dq{}", "actuator_output_{}"), 1)
+    columns |= {f"motor{k}_temp": log.time + k for k in range(12)} | {f"mode{k}": 0 * log.time for k in range(12)}
+    path = save_csv(tmp_path / "x.csv", columns)
+    _, said, text = initiated(path)
+    named = [line for line in said.missing if line.startswith("joint_torque: no column says that it is one")]
+    assert len(named) == 1
+    assert "'actuator_output_1' and 11 more" in named[0]
+    assert "temp" not in named[0]
+    commented = [line for line in text.splitlines() if line.startswith("    # joint_torque: ")]
+    assert len(commented) == 1
+    path.with_suffix(".yaml").write_text(text.replace(commented[0], commented[0].replace("# ", "")))
+    found = read_log(path, columns=load_config(path.with_suffix(".yaml")).logs.columns)
+    np.testing.assert_array_equal(value(found.joint_torque), in_order(log, log.joint_torque))
+
+
+def test_the_sensors_of_an_arm_without_torques_are_its_joints(tmp_path: Path) -> None:
+    log = recorded()
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_text(URDF.read_text().replace("_foot", "_tip"))
+    columns = {"t": log.time} | columns_of(log, ("q{}", "dq{}", "out{}"))
+    _, _, text = initiated(save_csv(tmp_path / "x.csv", columns), urdf)
+    settings = yaml.safe_load(text)
+    assert settings["robot"]["fixed_base"] is True
+    assert settings["sensors"] == "joints", "of which a fit says that joint_torque is missing"
+
+
+@pytest.mark.parametrize("swing", [2.0, 2.54], ids=["half a turn is free", "a fifth, between quarters"])
+@pytest.mark.parametrize("ending", ["csv", "npz"])
+def test_a_joint_with_names_of_the_format_that_jumps_by_a_turn_gets_where_its_turn_begins(
+    tmp_path: Path, ending: str, swing: float
+) -> None:
+    log = recorded()
+    position = log.joint_position.copy()
+    position[:, 2] = 2.3 - np.pi + swing * np.sin(2.0 * log.time)
+    wrapped = position.copy()
+    wrapped[:, 2] = np.mod(position[:, 2] + 2.0, 2.0 * np.pi) - 2.0
+    path = tmp_path / f"x.{ending}"
+    write_log(replace(log, joint_position=wrapped, joint_velocity=None), path)
+    assert np.abs(np.diff(wrapped, axis=0)).max() > 6.0
+    found, said, _ = initiated(path)
+    turns = (found.joint_position - position) / (2.0 * np.pi)
+    np.testing.assert_allclose(turns, np.broadcast_to(np.round(turns[0]), turns.shape), atol=1e-9)
+    assert any(line.startswith("joint_position: turns begin at ") for line in said.guessed)
+    write_log(log, tmp_path / f"y.{ending}")
+    assert "joint_position" not in initiated(tmp_path / f"y.{ending}")[2]
+
+
+def test_names_in_columns_of_text_are_the_order_of_numbers(tmp_path: Path) -> None:
+    """Of `rostopic echo -p`."""
+    log = recorded()
+    order = list(np.random.default_rng(2).permutation(12))
+    columns: dict[str, Any] = {"%time": np.round(log.time * 1e9).astype(int), "field.header.frame_id": ["x"] * len(log)}
+    columns |= {f"field.name{k}": [ORDER[j]] * len(log) for k, j in enumerate(order)}
+    for name, x in (("position", log.joint_position), ("effort", log.joint_torque)):
+        columns |= {f"field.{name}{k}": in_order(log, x)[:, j] for k, j in enumerate(order)}
+    found, said, _ = initiated(save_csv(tmp_path / "x.csv", columns))
+    np.testing.assert_array_equal(in_order(found, found.joint_position), in_order(log, log.joint_position))
+    np.testing.assert_array_equal(in_order(found, found.joint_torque), in_order(log, log.joint_torque))
+    assert any("as 'field.name{index}' of the file lists them" in line for line in said.guessed)
+
+
+def test_seconds_and_nanoseconds_in_two_columns_are_one_stamp(tmp_path: Path) -> None:
+    log = recorded()
+    stamp = np.round(log.time * 1e9).astype(np.int64) + 999_000_000
+    columns: dict[str, Any] = {"/js.header.stamp.sec": stamp // 10**9, "/js.header.stamp.nanosec": stamp % 10**9}
+    columns |= {"/imu.header.stamp.sec": stamp // 10**9, "/imu.header.stamp.nanosec": stamp % 10**9}
+    columns |= {f"/js.position[{k}]": x for k, x in enumerate(np.degrees(in_order(log, log.joint_position)).T)}
+    columns |= {f"/js.velocity[{k}]": x for k, x in enumerate(in_order(log, log.joint_velocity).T)}
+    path = save_csv(tmp_path / "x.csv", columns)
+    found, _, text = initiated(path)
+    np.testing.assert_allclose(found.time, log.time - log.time[0] + stamp[0] / 1e9, rtol=0.0, atol=1e-9)
+    entry = {"column": "/js.header.stamp.sec", "nanoseconds": "/js.header.stamp.nanosec"}
+    assert yaml.safe_load(text)["logs"]["columns"]["time"] == entry
+
+
+def test_numbers_of_states_are_no_flags(tmp_path: Path) -> None:
+    """Of feet whose contact is 1 where it is made and 2 where it is lost."""
+    log = recorded()
+    columns = {"t": log.time} | columns_of(log, ("q{}", "dq{}", "tau{}"))
+    rising = np.arange(len(log))[:, None] > [50, 90, 130, 170]
+    columns |= {f"foot_state.{k}.contact": np.where(x, 1, 2) for k, x in enumerate(rising.T)}
+    found, said, _ = initiated(save_csv(tmp_path / "x.csv", columns))
+    assert found.contact_active is None
+    assert any("'foot_state.0.contact' has numbers of states" in line for line in said.guessed)
+    columns |= {f"foot_state.{k}.contact": x.astype(int) for k, x in enumerate(rising.T)}
+    found, _, _ = initiated(save_csv(tmp_path / "y.csv", columns))
+    np.testing.assert_array_equal(value(found.contact_active), rising)
+
+
+def test_arrays_that_no_map_takes_are_named_with_what_to_do(tmp_path: Path) -> None:
+    log = recorded()
+    np.savez(tmp_path / "x.npz", t=log.time, q=log.joint_position.T, tau=value(log.joint_torque).T)
+    said = init(URDF, tmp_path / "x.npz", tmp_path / "x.yaml")
+    shape = f"' has shape (12, {len(log)}); if its columns are the samples, save it transposed, (N, 12)"
+    assert any(shape in line for line in said.guessed)
+    names = ["t", *(f"q_{name}" for name in log.joint_names)]
+    np.savez(tmp_path / "y.npz", data=np.column_stack([log.time, log.joint_position]), labels=np.array(names))
+    said = init(URDF, tmp_path / "y.npz", tmp_path / "y.yaml")
+    assert any("if 'labels' names its columns, save both as a table" in line for line in said.guessed)
+
+
+def test_small_angles_by_which_a_base_would_lie_on_its_back_in_radians_are_degrees(tmp_path: Path) -> None:
+    log = recorded()
+    columns = {"t": log.time} | columns_of(log, ("q{}", "dq{}", "tau{}"))
+    roll = 5.0 * np.sin(log.time)
+    found, _, _ = initiated(save_csv(tmp_path / "x.csv", columns | {"Roll": roll, "Pitch": 0 * roll, "Yaw": 0 * roll}))
+    np.testing.assert_allclose(value(found.base_quat_xyzw)[:, 0], np.sin(0.5 * np.radians(roll)), atol=1e-12)
+
+
+HEADERS = {
+    "German": ("Zeit [s]", "Gelenkwinkel {} [°]", "Winkelgeschwindigkeit {} [°/s]", "Drehmoment {} [Nm]",
+               "Beschleunigung {} [m/s²]", "Drehrate {} [°/s]"),
+    "French": ("temps_s", "angle_{}_deg", "vitesse_{}_deg/s", "couple_{}_Nm", "accélération_{}", "gyro_{}_deg/s"),
+    "Japanese": ("時刻[s]", "関節角度{}[deg]", "関節角速度{}[deg/s]", "トルク{}[Nm]", "加速度{}[m/s2]",
+                 "角速度{}[deg/s]"),
+    "Chinese": ("时间", "关节角度_{}[deg]", "关节速度_{}[deg/s]", "力矩_{}", "加速度_{}", "角速度_{}[deg/s]"),
+    "short": ("t", "Q_{}[deg]", "dQ_{}[deg/s]", "Tau_{}", "Acc{}(m/s2)", "Gyr{}(dps)"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("language", HEADERS)
+def test_headers_in_other_languages_say_what_they_are(tmp_path: Path, language: str) -> None:
+    time, position, velocity, torque, force, rate = HEADERS[language]
+    log, columns = recorded(), {time: recorded().time}
+    degrees = np.degrees(log.joint_position), np.degrees(value(log.joint_velocity)), log.joint_torque
+    for name, x in zip((position, velocity, torque), degrees, strict=True):
+        columns |= {name.format(joint): value(x)[:, k] for k, joint in enumerate(log.joint_names)}
+    for name, x in ((force, log.imu_specific_force), (rate, np.degrees(value(log.imu_angular_velocity)))):
+        columns |= {name.format(axis): value(x)[:, k] for k, axis in enumerate("XYZ")}
+    found, _, _ = initiated(save_csv(tmp_path / "x.csv", columns, ";", ","))
+    for name in ("joint_position", "joint_velocity", "joint_torque"):
+        np.testing.assert_allclose(in_order(found, getattr(found, name)), in_order(log, getattr(log, name)), atol=1e-12)
+    for name in ("time", "imu_specific_force", "imu_angular_velocity"):
+        np.testing.assert_allclose(getattr(found, name), getattr(log, name), atol=1e-12)

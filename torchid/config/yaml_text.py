@@ -1,0 +1,122 @@
+"""The text of a settings file: bounds on what YAML may unfold to, and where it is no YAML."""
+
+from __future__ import annotations
+
+import yaml
+
+from torchid.errors import excerpt, is_plain
+from torchid.guards import MAX_DEPTH, MAX_NODES, MAX_TEXT, MAX_YAML
+
+_LOADER: type = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_TAG = "tag:yaml.org,2002:"
+#: Tags that settings may have; others make dates, sets or bytes, which no key accepts.
+_KINDS = ("str", "int", "float", "bool", "null", "map", "seq", "merge")
+_NUMBERS = ("int", "float", "bool", "null")
+
+#: Characters that YAML keeps for itself, and what its reader says of them.
+_RESERVED, _CANNOT_BEGIN = "%@`", "cannot start any token"
+_BRACKETS = '; names with brackets take quotes in a list: ["walk.npz[0:30]"]'
+
+
+class _Count:
+    """Entries of the collections that are open, and of those that have an anchor."""
+
+    def __init__(self) -> None:
+        self.open: list[tuple[str | None, int]] = [(None, 0)]
+        self.anchored: dict[str, int] = {}
+
+    def add(self, entries: int) -> None:
+        anchor, count = self.open[-1]
+        self.open[-1] = (anchor, count + entries)
+        if sum(count for _, count in self.open) > MAX_NODES:
+            raise ValueError(f"more than {MAX_NODES} entries, aliases unfolded")
+
+    def start(self, anchor: str | None) -> None:
+        if len(self.open) > MAX_DEPTH:
+            raise ValueError(f"nested more than {MAX_DEPTH} deep")
+        self.open.append((anchor, 0))
+
+    def end(self) -> None:
+        anchor, count = self.open.pop()
+        if anchor is not None:
+            self.anchored[anchor] = count
+        self.add(count + 1)
+
+
+def check_yaml(text: str) -> None:
+    """Refuse YAML that unfolds beyond bounds, control characters, and interpolations `${...}`.
+
+    Raises:
+        ValueError, yaml.YAMLError: what was found.
+    """
+    if len(text) > MAX_YAML:
+        raise ValueError(f"more than {MAX_YAML} bytes")
+    count = _Count()
+    for event in yaml.parse(text, Loader=_LOADER):
+        _check_tag(event)
+        if isinstance(event, yaml.AliasEvent):
+            if event.anchor not in count.anchored:
+                raise ValueError(f"'*{excerpt(str(event.anchor))}', which stands for nothing complete")
+            count.add(count.anchored[event.anchor])
+        elif isinstance(event, yaml.CollectionStartEvent):
+            count.start(event.anchor)
+        elif isinstance(event, yaml.CollectionEndEvent):
+            count.end()
+        elif isinstance(event, yaml.ScalarEvent):
+            check_text(event.value)
+            count.add(1)
+            if event.anchor is not None:
+                count.anchored[event.anchor] = 1
+
+
+def _check_tag(event: yaml.Event) -> None:
+    """Refuse a tag that contradicts its value, whose construction would fail with errors of its own."""
+    tag = getattr(event, "tag", None)
+    if tag in (None, "!"):
+        return
+    kind = tag.removeprefix(_TAG)
+    if kind not in _KINDS:
+        raise ValueError(f"the tag '{excerpt(tag)}', which settings have no use for")
+    if isinstance(event, yaml.ScalarEvent) and kind in _NUMBERS:
+        resolved = yaml.resolver.Resolver().resolve(yaml.ScalarNode, event.value, (True, False)).removeprefix(_TAG)
+        if resolved != kind and (kind, resolved) != ("float", "int"):
+            raise ValueError(f"'{excerpt(event.value)}', which is no !!{kind}")
+
+
+def check_text(value: str) -> None:
+    """Refuse a text that no setting can be: too long, with control characters, or with an interpolation.
+
+    Raises:
+        ValueError: what was found.
+    """
+    if len(value) > MAX_TEXT:
+        raise ValueError(f"a text of {len(value)} characters, more than {MAX_TEXT}")
+    if not is_plain(value.replace("\n", "")):
+        raise ValueError(f"'{excerpt(value)}', with a control character")
+    if "${" in value:
+        raise ValueError(f"'{excerpt(value)}', but ${{...}} stands for nothing here")
+
+
+def explain_syntax(error: yaml.MarkedYAMLError, text: str, wanted: str) -> tuple[str, str]:
+    """What a reader of YAML found, by line, and what is accepted in its place.
+
+    Args:
+        error: of the reader.
+        text: that it read.
+        wanted: what the text should be.
+    """
+    mark, lines = error.problem_mark or error.context_mark, text.splitlines()
+    if mark is None:
+        return excerpt(str(error)), wanted
+    line, where = lines[mark.line] if mark.line < len(lines) else "", f"line {mark.line + 1}"
+    shown = excerpt(line.strip())
+    if "\t" in line[: len(line) - len(line.lstrip())]:
+        return f"{where}: a tab before '{shown}'", "spaces in front of a key"
+    begins = line[mark.column : mark.column + 1]
+    if _CANNOT_BEGIN in str(error.problem) and begins in _RESERVED:
+        return f"{where}: '{excerpt(begins)}', which no value begins with, in '{shown}'", "such a value in quotes"
+    why = f"{error.problem} {error.context}" if error.context else str(error.problem)
+    if error.context_mark is not None and error.context_mark.line != mark.line:
+        why += f" from line {error.context_mark.line + 1} on"
+    found = f"{where}, column {mark.column + 1}: {why}" + f", in '{shown}'" * bool(shown)
+    return found, wanted + _BRACKETS * ("flow sequence" in why)
