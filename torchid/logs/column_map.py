@@ -281,7 +281,7 @@ def _check_given(field: str, entry: ColumnEntry) -> None:
         raise ConfigError.at_field(f"{KEY}.{field}", found, f"one of {', '.join(own)}")
     if given[0] not in ("column", "columns"):
         if getattr(entry, "nanoseconds", None):
-            _check_unscaled(field, entry, ["nanoseconds"], given[0])
+            _check_unscaled(field, ["nanoseconds"], given[0])
         unsaid = ("scale", "order") if given[0] == "step" else ("unit", "scale", "order")
         _check_unscaled(field, [x for x in unsaid if getattr(entry, x)], given[0])
     if isinstance(entry, WrenchEntry) and entry.moment is not None and entry.force is None:

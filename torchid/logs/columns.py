@@ -198,3 +198,30 @@ def names_field(field: str) -> str:
     """The field with the names of a field's columns (`joint_names`, ...), or ""."""
     letter = next((x for x in field_shape(field)[1:2] if isinstance(x, str)), None)
     return next((name for name, of in NAME_FIELDS.items() if of == letter), "")
+
+
+def to_columns(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """The columns (N,) of a log's fields, by name.
+
+    Raises:
+        LogError: a name that no column can have, or names without any values.
+    """
+    names = {name: tuple(map(str, arrays[name])) for name in NAME_FIELDS if name in arrays}
+    columns: dict[str, NDArray[Any]] = {}
+    for field, array in arrays.items():
+        if field in NAME_FIELDS:
+            continue
+        if field == TEXT_COLUMN:
+            columns[field] = np.full(len(arrays["time"]), str(array))
+            continue
+        flat = array.reshape(len(array), -1)
+        for j, text in enumerate(column_names(field, names)):
+            if text != text.strip():
+                raise LogError.at_field(f"column '{text}'", "a space at its end", "names without")
+            columns[text] = flat[:, j]
+    check_header(list(columns))
+    layout = parse_header(list(columns))
+    for name, given in names.items():
+        if given and layout.names.get(name) != given:
+            raise LogError.at_field(name, "names without any values", "a .npz or .h5 file, or a field of them")
+    return columns

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from torchid.errors import LogError, excerpt, how_to_install
 from torchid.guards import MAX_ARRAYS, MAX_SCHEMA, check_names, check_unpacked_size
 from torchid.logs.column_map import Columns
-from torchid.logs.columns import TEXT_COLUMN, TableLayout, check_header, column_names, parse_header
+from torchid.logs.columns import TEXT_COLUMN, TableLayout, check_header, parse_header, to_columns
 from torchid.logs.containers import TEXT_TABLES, atomic_output, reader_errors_explained
-from torchid.logs.log import NAME_FIELDS
 from torchid.logs.mapped_fields import MappedFields, map_table
 from torchid.logs.table_headers import BLOCK, TextHeader, read_header
 from torchid.logs.units import IN_DEGREES, quantities_of
@@ -202,7 +201,7 @@ def save_table(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
         LogError: a name is not valid in a column, or the file cannot be written.
     """
     pa = _pyarrow(path)
-    columns = _columns(arrays)
+    columns = to_columns(arrays)
     with atomic_output(path) as temporary:
         if path.suffix.lower() == ".parquet":
             import pyarrow.parquet
@@ -370,29 +369,6 @@ def _number(column: str, word: str) -> float:
         return float(_FLAGS.get(word.strip().lower(), word.replace(",", ".")))
     except ValueError as error:
         raise LogError.at_field(f"column '{column}'", f"'{excerpt(word)}'", "true and false, or 1 and 0") from error
-
-
-def _columns(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """The columns of a log, by name."""
-    names = {name: tuple(map(str, arrays[name])) for name in NAME_FIELDS if name in arrays}
-    columns: dict[str, NDArray[Any]] = {}
-    for field, array in arrays.items():
-        if field in NAME_FIELDS:
-            continue
-        if field == TEXT_COLUMN:
-            columns[field] = np.full(len(arrays["time"]), str(array))
-            continue
-        flat = array.reshape(len(array), -1)
-        for j, text in enumerate(column_names(field, names)):
-            if text != text.strip():
-                raise LogError.at_field(f"column '{text}'", "a space at its end", "names without")
-            columns[text] = flat[:, j]
-    check_header(list(columns))
-    layout = parse_header(list(columns))
-    for name, given in names.items():
-        if given and layout.names.get(name) != given:
-            raise LogError.at_field(name, "names without any values", "a .npz or .h5 file, or a field of them")
-    return columns
 
 
 def _save_csv(pa: Any, path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
