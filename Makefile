@@ -17,6 +17,8 @@ demo: .venv/ready
 
 # One worker by core, each with one thread: with as many threads as cores in each, they wait for one another.
 test test-fast coverage: export OMP_NUM_THREADS = 1
+# Many tests run commands in processes of their own, which import what was compiled once.
+test test-fast coverage: export PYTHONDONTWRITEBYTECODE =
 
 test: .venv/ready-for-tests
 	.venv/bin/ruff check torchid scripts tests
