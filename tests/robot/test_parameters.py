@@ -32,7 +32,6 @@ def test_the_parameters_are_in_the_papers_order() -> None:
     assert parameters.PER_BODY == 12
     phi = np.arange(10.0)
     np.testing.assert_array_equal(parameters.inertia_matrix(phi), [[4, 5, 6], [5, 7, 8], [6, 8, 9]])
-    assert list(parameters.PINOCCHIO_ORDER) == PINOCCHIO_ORDER
     assert len(parameters.UNITS) == 12
 
 
@@ -41,7 +40,7 @@ def test_the_parameters_are_in_the_papers_order() -> None:
 def test_parameters_are_pinocchios_in_its_order(body: tuple[float, Array, Array]) -> None:
     expected = pin.Inertia(*body).toDynamicParameters()
     phi = parameters.inertial_vector(*body)
-    np.testing.assert_allclose(phi[list(parameters.PINOCCHIO_ORDER)], expected, rtol=0.0, atol=1e-13)
+    np.testing.assert_allclose(phi[PINOCCHIO_ORDER], expected, rtol=0.0, atol=1e-13)
 
 
 @settings(max_examples=50, deadline=None, derandomize=True)
