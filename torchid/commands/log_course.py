@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -92,7 +93,7 @@ class Course:
     kept: BoolArray | None = None
     noise: SignalNoise = field(default_factory=lambda: SignalNoise({}))
 
-    @property
+    @cached_property
     def oversampling(self) -> float:
         """Samples per independent sample of noise."""
         timelines = [stretch.timeline for stretch in self.stretches if stretch.timeline is not None]
