@@ -18,6 +18,9 @@ from torchid.cli import main
 from torchid.commands.plausibility import force_gain, implausibility, is_implausible_factor
 from torchid.estimators import LeastSquares
 from torchid.identifiability.confounding import TotalMass
+from torchid.log_checks import Checked
+from torchid.log_checks.check import check
+from torchid.logs import Log
 from torchid.problem import (
     LinearProblem,
     RowBuilder,
@@ -50,6 +53,10 @@ def downward_world(log: dict[str, Any]) -> None:
 
 def swapped_feet(log: dict[str, Any]) -> None:
     log["contact_active"] = log["contact_active"][:, [1, 0, 3, 2]]
+
+
+def late_torques_of_a_knee(log: dict[str, Any]) -> None:
+    log["joint_torque"][:, 2] = np.roll(log["joint_torque"][:, 2], 40)
 
 
 def in_degrees(log: dict[str, Any]) -> None:
@@ -157,6 +164,24 @@ def arm_problem(factor: float = 1.0) -> tuple[LinearProblem, torchid.Robot]:
     log = replace(log, joint_torque=factor * np.asarray(log.joint_torque))
     builder = RowBuilder(robot, [], named_sensors("joints", robot.n, 0))
     return linear_problem(compress([bind_log(log, robot, [])], builder), builder, robot), robot
+
+
+def test_logs_are_checked_once_for_all_doubts_of_a_fit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    checked: list[int] = []
+
+    def counted(log: Log, *settings: Any) -> Checked:
+        checked.append(len(log))
+        return replace(check(log, *settings), findings=())
+
+    monkeypatch.setattr("torchid.commands.plausibility.check", counted)
+    overrides = [*changed(tmp_path, late_torques_of_a_knee), "estimator.ridge=0.001"]
+    main(["identify", str(DEMO / "quadruped.yaml"), *overrides])
+    told = capsys.readouterr().err
+    assert "forces differ from any rigid-body model" in told
+    assert "predict worse than the URDF's" in told
+    assert len(checked) == 1
 
 
 @pytest.mark.parametrize(("factor", "stops"), [(1.0, False), (3.0, False), (-1.0, True), (1e3, True), (1e-3, True)])

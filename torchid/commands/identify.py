@@ -17,7 +17,7 @@ from torchid.commands.chosen_settings import Choices, with_chosen_settings, with
 from torchid.commands.clock import Clock
 from torchid.commands.compared_forces import compare_forces, noise_of_readings, trace_forces
 from torchid.commands.folder import RUN, check_free, claim_folder
-from torchid.commands.plausibility import require_not_worse, require_plausible
+from torchid.commands.plausibility import TrainingLogs, require_not_worse, require_plausible
 from torchid.commands.reading import LogReader, check_parts
 from torchid.commands.results import Identification, write_run
 from torchid.commands.training import Training, descent_settings, require_trainable, training_folder
@@ -173,18 +173,18 @@ class _Solved:
     mass: TotalMass
 
 
-def _solved(ready: _Prepared, evaluation: Evaluation, bars: Progress, resume: bool) -> _Solved:
+def _solved(ready: _Prepared, evaluation: Evaluation, checked: TrainingLogs, bars: Progress, resume: bool) -> _Solved:
     """The fit of prepared data, which may be that of a robot."""
     experiment, fitter, logs = ready.experiment, ready.fitter, ready.logs
     training, solve = None, None
     if experiment.config.estimator.name == "sgd":
-        require_plausible(fitter.fit(ready.parts), experiment)
+        require_plausible(fitter.fit(ready.parts), checked)
         training = Training(experiment)
         evaluate = partial(_identified_metrics, evaluation, logs)
         solve = partial(training.run, builder=fitter.builder, logs=logs, evaluate=evaluate, bars=bars, resume=resume)
     fit = fitter.fit(ready.parts, solve)
     fit, robust = _robust(fit, ready, bars)
-    mass = require_plausible(fit, experiment)
+    mass = require_plausible(fit, checked)
     warn_of_confounded(fit.extras)
     warn_of_disagreement(fit, fitter)
     return _Solved(fit, robust, training, mass)
@@ -195,10 +195,10 @@ def _identify(config: ExperimentConfig, resume: bool, bars: Progress) -> tuple[I
     clock = Clock()
     ready = _prepare(config, clock, bars)
     experiment, fitter, logs, blocks = ready.experiment, ready.fitter, ready.logs, ready.blocks
-    builder, stated = fitter.builder, bool(config.sensors.noise.forces)
+    checked, builder, stated = TrainingLogs(experiment, bars), fitter.builder, bool(config.sensors.noise.forces)
     evaluation = experiment.evaluation(noise_of_readings(experiment.config, stated))
     with clock("solve"):
-        solved = _solved(ready, evaluation, bars, resume)
+        solved = _solved(ready, evaluation, checked, bars, resume)
         fit, ready.parts = solved.fit, []
         estimate, problem = fit.estimate, fit.assembly.problem
     with clock("identifiability"):
@@ -244,7 +244,7 @@ def _identify(config: ExperimentConfig, resume: bool, bars: Progress) -> tuple[I
     )
     logs.clear()  # checks of a log and figures need room, too
     ready.blocks = blocks = []
-    require_not_worse(run.worse, experiment)
+    require_not_worse(run.worse, checked)
     return run, solved.training
 
 

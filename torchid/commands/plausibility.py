@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
+from functools import cached_property
 
 import numpy as np
+from rich.progress import Progress
 
 from torchid import parameters
 from torchid.commands.check import stretches_to_check
 from torchid.commands.reading import scene_of_log, settle_contacts
+from torchid.config.logs import LogsConfig
 from torchid.errors import (
     ImplausibleFitError,
     InputError,
@@ -46,7 +49,49 @@ _USUAL = (
 )
 
 
-def require_plausible(fit: Fit, scene: Scene) -> TotalMass:
+class TrainingLogs:
+    """The training logs of an experiment, checked once the first fit of them is doubtful."""
+
+    def __init__(self, scene: Scene, bars: Progress | None = None) -> None:
+        """Nothing is checked yet.
+
+        Args:
+            scene: the experiment.
+            bars: gets one for the checks, which take a while for long logs.
+        """
+        self.scene, self._bars = scene, bars
+
+    @cached_property
+    def finding(self) -> tuple[str, Finding] | None:
+        """The most severe finding on a large part of a stretch of a log, and the stretch; None without any.
+
+        Nothing after a stretch that is condemned as a whole is looked at, nor are logs larger than memory.
+        """
+        files = self.scene.config.logs
+        if files is None or files.compressed:
+            return None
+        task = None if self._bars is None else self._bars.add_task("checking the logs", total=None)
+        found = list(self._findings(files))
+        if self._bars is not None and task is not None:
+            self._bars.update(task, completed=1, total=1)
+        return min(found, key=lambda pair: _order(pair[1]), default=None)
+
+    def _findings(self, files: LogsConfig) -> Iterator[tuple[str, Finding]]:
+        scene, settings = self.scene, self.scene.config.preprocessing
+        for path in files.train:
+            own = scene_of_log(scene, path)
+            with suppress(InputError):  # larger than memory
+                for log, name in stretches_to_check(path, files, settings):
+                    flagged, _ = settle_contacts(log, own)
+                    checked = check(flagged, own.robot, scene.contacts, settings.filter_hz, settings.derived)
+                    severe = [one for one in checked.findings if one.severity in SEVERITIES[:2]]
+                    large = [one for one in severe if one.mask(len(checked.log)).mean() > _PART]
+                    yield from ((name, one) for one in large)
+                    if any(one.condemns_all for one in large):
+                        return
+
+
+def require_plausible(fit: Fit, logs: TrainingLogs) -> TotalMass:
     """Refuse a fit that no robot can have produced, and warn of residuals far above the stated noise.
 
     Returns:
@@ -60,7 +105,7 @@ def require_plausible(fit: Fit, scene: Scene) -> TotalMass:
     Warns:
         NumericalWarning: forces that no parameters explain, for whatever reason.
     """
-    estimate = fit.estimate
+    estimate, scene = fit.estimate, logs.scene
     if not estimate.rank:
         raise SensorError.at_field("sensors", "no parameter is in reach of them", "other sensors, contacts or logs")
     if not max(fit.assembly.problem.cost(np.zeros_like(estimate.phi)), fit.assembly.forces) > 0.0:
@@ -75,7 +120,7 @@ def require_plausible(fit: Fit, scene: Scene) -> TotalMass:
     unexplained = beyond_models(estimate, fit.assembly.problem, fit.assembly.forces)
     if reason is None and unexplained is None:
         return mass
-    log, finding = next(_findings(scene), (None, None))
+    log, finding = logs.finding or (None, None)
     if finding is not None and (reason is not None or finding.condemns_all):
         checks = f"{log}: {finding.field}: {finding.found}"
         raise ImplausibleFitError.at_field(
@@ -106,7 +151,7 @@ def _require_scales(fit: Fit) -> None:
         raise ImplausibleFitError.at_field("sensors.scales", found, accepted)
 
 
-def require_not_worse(worse: list[WorseThanNominal], scene: Scene) -> None:
+def require_not_worse(worse: list[WorseThanNominal], logs: TrainingLogs) -> None:
     """Refuse a fit that predicts worse than the URDF if the checks condemn a training log; else warn.
 
     Raises:
@@ -117,8 +162,8 @@ def require_not_worse(worse: list[WorseThanNominal], scene: Scene) -> None:
     """
     if not worse:
         return
-    message, advice = describe_worse(worse, scene.robot.format), ADVICE
-    log, finding = next(_findings(scene), (None, None))
+    message, advice = describe_worse(worse, logs.scene.robot.format), ADVICE
+    log, finding = logs.finding or (None, None)
     if finding is not None:
         message, advice = f"{message}; torchid check finds in {log}: {finding.field}: {finding.found}", finding.advice
         if finding.condemns_all:
@@ -199,29 +244,6 @@ def _reach(robot: Robot) -> float:
         if body.joint is not None:
             away[number] = away[body.parent] + np.linalg.norm(body.joint.T_parent_joint[:3, 3])
     return float((away + radius).max())
-
-
-def _findings(scene: Scene) -> Iterator[tuple[str, Finding]]:
-    """Findings on a large part of a stretch of a training log, the most severe first; none without its samples.
-
-    Stretches after one that is condemned as a whole are not looked at.
-    """
-    files = scene.config.logs
-    if files is None or files.compressed:
-        return
-    findings: list[tuple[str, Finding]] = []
-    settings = scene.config.preprocessing
-    for path in files.train:
-        own = scene_of_log(scene, path)
-        with suppress(InputError):  # larger than memory: it is not checked
-            for log, name in stretches_to_check(path, files, settings):
-                flagged, _ = settle_contacts(log, own)
-                checked = check(flagged, own.robot, scene.contacts, settings.filter_hz, settings.derived)
-                severe = (one for one in checked.findings if one.severity in SEVERITIES[:2])
-                findings += [(name, one) for one in severe if one.mask(len(checked.log)).mean() > _PART]
-                if any(one.condemns_all for _, one in findings):
-                    break
-    yield from sorted(findings, key=lambda pair: _order(pair[1]))
 
 
 def _order(finding: Finding) -> tuple[bool, int, bool]:

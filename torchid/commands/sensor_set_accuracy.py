@@ -9,7 +9,7 @@ from functools import partial
 from rich.progress import Progress
 
 from torchid import ranks
-from torchid.commands.plausibility import require_plausible
+from torchid.commands.plausibility import TrainingLogs, require_plausible
 from torchid.errors import ImplausibleFitError, LogError, warn
 from torchid.fitting.calibration import Calibration, list_confounded
 from torchid.fitting.experiment import Scene, batch_estimator
@@ -111,7 +111,7 @@ def _accuracy(
         choice = ranks.from_first(partial(scene.choose_ridge, parts, blocks, fitter, conditions), "ridge")
         settings = replace(settings, ridge=choice.ridge)
     fit = fitter.fit(parts, batch_estimator(settings, conditions).solve)
-    require_plausible(fit, scene)
+    require_plausible(fit, TrainingLogs(scene))
     estimate, problem = fit.estimate, fit.assembly.problem
     noise = estimate.residual_std
     variance = noise**2 * problem.oversampling
