@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal, get_args
 
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PlainSerializer, PlainValidator, TypeAdapter
@@ -199,13 +200,19 @@ Sensors = Annotated[SensorsConfig, BeforeValidator(spelled_out)]
 
 
 def validate_choice(field: str, sensors: ChoiceConfig, may_be_empty: bool = False) -> None:
-    """Refuse a named set together with sensors by name, and a choice without any sensor.
+    """Refuse a named set together with sensors by name, a sensor named twice, and a choice without any.
 
     Raises:
-        ConfigError: either.
+        ConfigError: one of these.
     """
     if sensors.set is not None and (sensors.joint_torques or sensors.contact_wrenches):
         raise ConfigError.at_field(field, f"set: {sensors.set} together with sensors by name", "one of the two")
+    named: dict[str, Sequence[str]] = {"joint_torques": sensors.joint_torques, "ft_sensors": sensors.ft_sensors}
+    named |= {f"contact_wrenches.{frame}": components for frame, components in sensors.contact_wrenches.items()}
+    for key, names in named.items():
+        twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
+        if twice is not None:
+            raise ConfigError.at_field(f"{field}.{key}", f"'{twice}' named twice", "each once")
     if sensors.empty and not may_be_empty:
         accepted = "full, contacts, joints, or joint_torques, contact_wrenches and ft_sensors by name"
         raise ConfigError.at_field(field, "no sensor", accepted)
