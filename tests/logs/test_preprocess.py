@@ -200,6 +200,13 @@ def test_cutoffs_outside_zero_to_nyquist_are_refused(wrong: Any) -> None:
         preprocess(sine_log(1.0, uniform()), cutoff_hz=wrong)
 
 
+def test_a_cutoff_that_no_stamps_in_ms_allow_is_answered_with_the_unit() -> None:
+    with pytest.raises(InputError, match=r"cutoff_hz: 8.0; .*below 0.25 Hz, .*\(steps of 2 s: are the stamps in s\?\)"):
+        preprocess(sine_log(1.0, 1e3 * uniform()), cutoff_hz=8.0)
+    with pytest.raises(InputError, match="median sample rate$"):
+        preprocess(sine_log(1.0, uniform()), cutoff_hz=300.0)
+
+
 @pytest.mark.parametrize("wrong", [0.0, -3.0, 5000.1, float("nan"), float("inf")])
 def test_sample_rates_that_only_invent_samples_are_refused(wrong: float) -> None:
     with pytest.raises(InputError, match=r"preprocessing.sample_rate_hz: .*below 5000 Hz"):

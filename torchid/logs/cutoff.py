@@ -12,10 +12,9 @@ from torchid.logs.log import FloatArray, Log
 from torchid.logs.preprocess import lacks_derivatives
 from torchid.logs.quaternion import make_sign_continuous
 from torchid.logs.signal_noise import SignalNoise, signal_noise
-from torchid.logs.timeline import spline_derivatives
+from torchid.logs.timeline import LONGEST_MEDIAN_STEP, spline_derivatives
 
 _LOWEST_HZ, _STEPS_PER_DECADE = 1.0, 40
-_LONGEST_STEP_S = 0.5  # median, as the checks of logs have it: longer ones are of another unit
 _SEGMENT_S = 8.0  # of the spectra: lines 1/8 Hz apart
 _USUAL_HZ = 10.0  # robots and people move below 5 Hz
 _RATE_SHARE = 0.2  # largest cutoff over the sample rate
@@ -89,8 +88,8 @@ def choose_cutoff(
     if not derived:
         return CutoffChoice(None, by_noise=False)
     steps = [float(np.median(np.diff(log.time))) for log in derived]
-    if (step := max(steps)) > _LONGEST_STEP_S:
-        accepted = f"steps of at most {_LONGEST_STEP_S:g} s, or another unit in logs.columns.time"
+    if (step := max(steps)) > LONGEST_MEDIAN_STEP:
+        accepted = f"steps of at most {LONGEST_MEDIAN_STEP:g} s, or another unit in logs.columns.time"
         raise LogError(derived[steps.index(step)].source, "time", f"a median step of {step:.3g} s", accepted)
     slowest = 1.0 / step
     slowest = slowest if sample_rate_hz is None else min(slowest, sample_rate_hz)

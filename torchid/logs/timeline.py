@@ -281,6 +281,8 @@ FEWEST_FILTERED, FEWEST_DIFFERENTIATED = 2, 2 * DROPPED_SAMPLES + 1
 LONGEST_STEP = 10.0
 #: A step shorter than this, in median steps, is worth a warning.
 SHORTEST_STEP = 0.1
+#: Longest median step [s], as the checks of logs have it: longer ones are of another unit.
+LONGEST_MEDIAN_STEP = 0.5
 #: Highest sample rate to resample to, in median sample rates.
 FASTEST = 10.0
 
@@ -313,7 +315,8 @@ def lay_out_timeline(
     if cutoff_hz is not None:
         from scipy import signal
 
-        _check_rate("cutoff_hz", cutoff_hz, 0.5 / step, "half the log's median sample rate")
+        unit = f" (steps of {step:.6g} s: are the stamps in s?)" if step > LONGEST_MEDIAN_STEP else ""
+        _check_rate("cutoff_hz", cutoff_hz, 0.5 / step, f"half the log's median sample rate{unit}")
         if np.max(np.abs(np.diff(native) - step)) > JITTER * step:
             grid = step * np.arange(math.floor(native[-1] / step + JITTER) + 1)
         low_pass = LowPass(
