@@ -118,6 +118,23 @@ def test_seconds_and_nanoseconds_in_two_columns_are_one_stamp(tmp_path: Path) ->
     assert yaml.safe_load(text)["logs"]["columns"]["time"] == entry
 
 
+@pytest.mark.parametrize("names", ["base_{}", "base_{}_m", "base.{} [mm]", "pelvis {} (m)"])
+def test_axes_of_a_base_without_another_word_are_its_position(tmp_path: Path, names: str) -> None:
+    log, scale = recorded(), 1e3 if "mm" in names else 1.0
+    columns = {"t": log.time} | columns_of(log, ("q{}", "dq{}", "tau{}"))
+    columns |= {names.format(axis): x * scale for axis, x in zip("xyz", value(log.base_position_world).T, strict=True)}
+    found, _, _ = initiated(save_csv(tmp_path / "x.csv", columns))
+    np.testing.assert_allclose(value(found.base_position_world), value(log.base_position_world), rtol=0.0, atol=1e-12)
+
+
+def test_a_base_s_axes_in_another_unit_than_of_length_are_not_its_position(tmp_path: Path) -> None:
+    log = recorded()
+    columns = {"t": log.time} | columns_of(log, ("q{}", "dq{}", "tau{}"))
+    columns |= {f"base_{axis}_deg": x for axis, x in zip("xyz", value(log.base_position_world).T, strict=True)}
+    found, _, _ = initiated(save_csv(tmp_path / "x.csv", columns))
+    assert found.base_position_world is None
+
+
 def test_numbers_of_states_are_no_flags(tmp_path: Path) -> None:
     """Of feet whose contact is 1 where it is made and 2 where it is lost."""
     log = recorded()

@@ -15,7 +15,7 @@ from torchid.logs.column_map import PLACEHOLDER
 from torchid.logs.column_proposals import propose_field
 from torchid.logs.file_samples import Columns
 from torchid.logs.name_matching import SUFFIXES, KnownRobot, joints_by_place, spelled, within
-from torchid.logs.units import split_unit
+from torchid.logs.units import quantities_with, split_unit
 
 _NUMBER = re.compile(r"\d+")
 _AXIS = re.compile(
@@ -71,6 +71,11 @@ class Family:
         return PLACEHOLDER.sub(" ", self.pattern)
 
     @property
+    def stem(self) -> str:
+        """The same without a unit, in small letters."""
+        return PLACEHOLDER.sub(" ", split_unit(self.pattern)[0]).strip(" _./").lower()
+
+    @property
     def as_ignored(self) -> str:
         """A pattern of `ignore` that its columns fit."""
         return PLACEHOLDER.sub("*", self.pattern)
@@ -79,6 +84,10 @@ class Family:
     def unit(self) -> str:
         """What the columns say of their unit, "" if nothing."""
         return split_unit(_BEHIND.sub("", self.pattern))[1] or split_unit(self.pattern)[1]
+
+    def unit_may_be(self, quantity: str) -> bool:
+        """Whether they say no unit, or one of a quantity."""
+        return not self.unit or quantity in quantities_with(self.unit)
 
     @property
     def entry(self) -> dict[str, object]:

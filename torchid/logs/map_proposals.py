@@ -242,7 +242,7 @@ class _Proposer:
         name, axes = family.proposed, len(family.axes) == 3
         if not name and "time" in quantities_with(family.unit) and increases(self.sample[family.columns[0]]):
             return "time"
-        if not name and axes and re.fullmatch(OF_BASE, family.words.strip(" _./").lower()):
+        if not name and axes and re.fullmatch(OF_BASE, family.stem) and family.unit_may_be("length"):
             return "base_position_world"
         of_foot = "{contact}" in family.pattern or _FOOT.search(family.words) is not None
         of_force = name == "contact_force_normal" or _FORCE.search(family.pattern) or _MOMENT.search(family.pattern)
@@ -253,12 +253,12 @@ class _Proposer:
             return ""
         if name == "contact_force_normal" or (not name and of_foot and not _DRIVE.search(family.words)):
             return "contact_active"  # as a threshold: what it is in newtons nobody knows
-        return "base_position_world" if name == "joint_position" and axes and not any(family.names) else name
+        of_base = name == "joint_position" and axes and not any(family.names)
+        return ("base_position_world" if family.unit_may_be("length") else "") if of_base else name
 
     def _shape(self, family: Family) -> tuple[int, ...]:
         """What a column or array of a family has of each sample."""
-        first = self.sample[family.columns[0]]
-        inner = () if first is None else first.shape[1:]
+        inner = () if (first := self.sample[family.columns[0]]) is None else first.shape[1:]
         return inner[1:] if len(inner) > 1 and inner[0] == 1 else inner
 
     def _fits(self, family: Family, name: str) -> bool:
