@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.logs.column_proposals import is_desired
+from torchid.logs.column_proposals import BASES, is_desired, words_of
 from torchid.logs.file_samples import Columns, side_by_side
 from torchid.logs.gaps import turn_jumps
 from torchid.logs.units import UNITS, quantities_with, split_unit
@@ -211,11 +211,10 @@ _OTHER_NAMES = {"roulis": "roll", "tangage": "pitch", "lacet": "yaw", "nickwinke
 _ANGLE = re.compile(rf"(?<![a-z])({'|'.join([*_NAMES, *_OTHER_NAMES])})(?![a-z])", re.IGNORECASE)
 _TRIPLE = re.compile(r"(?<![a-z])(rpy|euler\w*?)(?![a-z])", re.IGNORECASE)
 #: Words beside these in names of what turns the base, rather than a joint or a rate.
-_OF_BASE = re.compile(
-    r"(base|root|trunk|torso|pelvis|body|floating|mocap|odom|odometry|imu|ahrs|euler|rpy|orientation|attitude|angles?|"
-    r"state|states|data|pose|world|robot|est|estimated?|meas|measured|link|sensor|rotation|rot|value|x|y|z)"
+_BESIDE_ANGLES = re.compile(
+    rf"({BASES}|floating|imu|ahrs|euler|rpy|orientation|attitude|angles?|state|states|data|pose|world|robot|est|"
+    r"estimated?|meas|measured|link|sensor|rotation|rot|value|x|y|z)"
 )
-_SPLIT = re.compile(r"[^A-Za-z]+|(?<=[a-z])(?=[A-Z])")
 _LARGEST = 6.5  # [rad]: of no angle within a turn
 _UPRIGHT = 1.6  # [rad]: roll or pitch of a base that stands or hangs upright are less
 
@@ -253,7 +252,7 @@ def find_angles(sample: Columns, names: Sequence[str]) -> Angles | None:
     for columns in (*_triples(list(known)), *arrays):
         stem, unit = split_unit(columns[0])
         of_angle = not unit or "angle" in quantities_with(unit)
-        if of_angle and all(_OF_BASE.fullmatch(word) for word in _words(_ANGLE.sub("", _TRIPLE.sub("", stem)))):
+        if of_angle and all(_BESIDE_ANGLES.fullmatch(word) for word in words_of(_ANGLE.sub("", _TRIPLE.sub("", stem)))):
             return _angles({name: known[name] for name in columns}, unit)
     return None
 
@@ -279,10 +278,6 @@ def _in_turn(names: Sequence[str]) -> bool:
         return False
     changed = [[(a, b) for a, b in zip(*pair, strict=True) if a != b] for pair in pairwise(names)]
     return all(len(of) == 1 and ord(of[0][1]) == ord(of[0][0]) + 1 for of in changed)
-
-
-def _words(text: str) -> list[str]:
-    return [word.lower() for word in _SPLIT.split(text) if word]
 
 
 def _angles(values: Mapping[str, NDArray[Any]], unit: str) -> Angles:
