@@ -29,7 +29,7 @@ from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import TriangularFactor
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples, concatenate
-from torchid.rounding import RANK_TOLERANCE, is_significant
+from torchid.rounding import RANK_TOLERANCE, column_scale, is_significant
 
 LEAST_SIGNAL = 1.0 / 3.0
 """Share of the information on a combination of parameters that remains at least: all but that may be noise.
@@ -211,8 +211,7 @@ def corrected_triangle(factor: TriangularFactor, prior: ColumnPrior) -> Correcte
     if not factor.surplus:
         return CorrectedTriangle(R)
     rows, rhs, surplus = R[:, :-1], R[:, -1], factor.whole_surplus().numpy()
-    size = np.linalg.norm(rows, axis=0)
-    scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
+    size, scale = np.linalg.norm(rows, axis=0), column_scale(rows)
     U, values, Vh = np.linalg.svd(rows * scale, full_matrices=False)
     kept = is_significant(values, _RESOLVED)
     other = is_significant(values, RANK_TOLERANCE) & ~kept
