@@ -15,7 +15,7 @@ import yaml
 
 from torchid.commands.folder import check_free_file
 from torchid.commands.init_hints import hints, keys_for_gaps, missing_columns, notes_on_arrays
-from torchid.commands.init_proposals import Split, limb_sensors, read_sensors, sensor_set, split_log
+from torchid.commands.init_proposals import Split, limb_sensors, proposed_sensors, read_sensors, split_log
 from torchid.commands.reading import memory_needed
 from torchid.config.preprocessing import PreprocessingConfig
 from torchid.errors import ConfigError, InputError, LogError, about_file, excerpt, format_count, join_names
@@ -104,7 +104,7 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> Initiated:
     read = _try(path, proposal)
     gaps = keys_for_gaps(read)
     split = split_log(read, "base_motion" in _from_feet(contacts, fields))
-    sensors = sensor_set(fields, list(proposal.columns.get("ft_wrenches", ())) or read_sensors(robot, read))
+    sensors = proposed_sensors(fields, list(proposal.columns.get("ft_wrenches", ())) or read_sensors(robot, read))
     text = _text(robot, urdf, path, target, contacts, fields, proposal, gaps, split, sensors)
     _describe(out, robot, contacts, fields, proposal)
     _describe_log(out, read, fields)

@@ -48,7 +48,7 @@ def resolve_contacts(settings: Sequence[ContactConfig], robot: Robot) -> tuple[t
     return tuple(out), _describe(out, sources)
 
 
-def read_along_normals(contacts: Sequence[Contact], sensors: ChoiceConfig) -> tuple[Contact, ...]:
+def with_scalar_sensors(contacts: Sequence[Contact], sensors: ChoiceConfig) -> tuple[Contact, ...]:
     """The contacts, those with a scalar sensor (`fn`) read along the ground's normal."""
     scalar = {frame for frame, names in sensors.contact_wrenches.items() if NORMAL_FORCE in names}
     return tuple(replace(x, along_normal=True) if x.frame in scalar else x for x in contacts)

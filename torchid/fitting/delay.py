@@ -15,7 +15,7 @@ from torchid.errors import LogError, warn
 from torchid.estimators import LeastSquares
 from torchid.fitting.fit import Fit, LogFitter
 from torchid.identifiability.confounding import ExtraEstimate
-from torchid.logs.delay import stretches, within
+from torchid.logs.delay import recorded_at_delays, stretches
 from torchid.logs.timeline import spline_degree
 from torchid.parameters import Array
 from torchid.problem import ExtraTerms, RowBuilder, Samples
@@ -259,7 +259,7 @@ def _torques(logs: Sequence[Samples], fitter: LogFitter, most: int) -> list[_Tor
     dofs = torch.from_numpy(np.flatnonzero(fitter.builder.sensors.torque[: fitter.robot.n]))
     for log in logs:
         time = log.time.numpy()
-        chosen = np.flatnonzero(within(time, (EARLIEST, LATEST)))[::step]
+        chosen = np.flatnonzero(recorded_at_delays(time, (EARLIEST, LATEST)))[::step]
         if log.torque is None or not len(chosen):
             continue
         oversampling = max(1.0, log.oversampling / step)

@@ -22,7 +22,7 @@ def with_delayed_torques(log: Log, delay: float) -> Log:
     """
     if not delay or log.joint_torque is None:
         return log
-    torque, kept = np.empty_like(log.joint_torque), within(log.time, (delay,))
+    torque, kept = np.empty_like(log.joint_torque), recorded_at_delays(log.time, (delay,))
     if not kept.any():
         found = f"{log.time[-1] - log.time[0]:.3g} s, no longer than actuators.delay of {delay:g} s"
         raise LogError(log.source, "time", found, "a longer log")
@@ -35,7 +35,7 @@ def with_delayed_torques(log: Log, delay: float) -> Log:
     return replace(log, joint_torque=torque).select(whole if kept[whole].all() else chosen)
 
 
-def within(time: FloatArray, delays: tuple[float, ...]) -> BoolArray:
+def recorded_at_delays(time: FloatArray, delays: tuple[float, ...]) -> BoolArray:
     """Stamps (N,) [s] that are, by each of some delays [s], within what was recorded without a break, (N,)."""
     kept = np.zeros(len(time), dtype=bool)
     for stretch in stretches(time):

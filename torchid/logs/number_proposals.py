@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.logs.column_proposals import BASES, is_desired, words_of
-from torchid.logs.file_samples import Columns, side_by_side
+from torchid.logs.file_samples import FileSample, side_by_side
 from torchid.logs.gaps import turn_jumps
 from torchid.logs.units import UNITS, quantities_with, split_unit
 
@@ -30,7 +30,7 @@ _TURNS = {"rad": 2.0 * np.pi, "deg": 360.0, "rev": 1.0, "mrad": 2e3 * np.pi}
 Numbers = NDArray[np.float64]
 
 
-def step_of_stamps(sample: Columns) -> tuple[str, float] | None:
+def step_of_stamps(sample: FileSample) -> tuple[str, float] | None:
     """The name and the value [s] of a number that is the step between samples, of a recording without stamps."""
     for name, values in sample.items():
         if values is None or not values.size or values.dtype.kind not in "fiu" or not _STEP_NAME.fullmatch(name):
@@ -44,7 +44,7 @@ def step_of_stamps(sample: Columns) -> tuple[str, float] | None:
 class UnitProposer:
     """Adds units to the entries of a map, with a note for each."""
 
-    def __init__(self, sample: Columns, columns: dict[str, Any], notes: dict[str, str], stated: Mapping[str, float]):
+    def __init__(self, sample: FileSample, columns: dict[str, Any], notes: dict[str, str], stated: Mapping[str, float]):
         """Of a map that is being made.
 
         Args:
@@ -240,7 +240,7 @@ class Angles:
     note: str
 
 
-def find_angles(sample: Columns, names: Sequence[str]) -> Angles | None:
+def find_angles(sample: FileSample, names: Sequence[str]) -> Angles | None:
     """Roll, pitch and yaw of the base, as three columns or as an array (N, 3); None where no names say so.
 
     Args:

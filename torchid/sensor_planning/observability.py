@@ -25,7 +25,7 @@ from torchid.sensor_planning.demands import (
     contained_candidates,
     demands,
     orthonormal_basis,
-    read_along_normals,
+    with_scalar_candidates,
 )
 
 _ZERO = 1e-5  # share of a unit vector that counts as zero
@@ -118,7 +118,7 @@ def assess_sensors(
     """
     if robot.fixed_base:
         return []
-    contacts = read_along_normals(contacts, choice, sensors)
+    contacts = with_scalar_candidates(contacts, choice, sensors)
     choice = [
         c for c in choice if c.kind != "normal_force" or (c.contact is not None and contacts[c.contact].along_normal)
     ]
