@@ -30,7 +30,7 @@ from torchid.logs.time_range import split_range
 from torchid.logs.topic_proposals import USED_TYPES, frame_of, propose_topics
 from torchid.regressor.kinematics import GRAVITY_WORLD
 from torchid.robot import CollisionShapes, Robot, load_robot
-from torchid.robot.urdf import is_bolted, position_limits
+from torchid.robot.urdf import has_fixed_base, position_limits
 from torchid.robot.xml_files import is_mjcf
 
 _FEET = (r"foot|feet", r"sole", r"ankle_roll|ankle_flexion", r"toe|ankle|paw|hoof")
@@ -97,7 +97,7 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> Initiated:
     files = [file.path for file in part.files]
     check_free_file(target, "--output", False, [urdf, *files])
     is_bag = existing_log_kind(part.file) is LogKind.BAG
-    robot = load_robot(urdf, fixed_base=is_bolted(Path(urdf)))
+    robot = load_robot(urdf, fixed_base=has_fixed_base(Path(urdf)))
     contacts, fields, proposal = _of_bag(part.file, robot) if is_bag else _of_columns(files, robot)
     out = Initiated(target)
     _state_flags(contacts, fields, proposal)

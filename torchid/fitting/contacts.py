@@ -60,7 +60,7 @@ def suited_to_preprocessing(
     """The contacts, after making sure that flags and a base's motion can follow from them where settings want that.
 
     Raises:
-        ConfigError: a bolted base, closed loops, feet that are too few even if all stand, normals of several floors, or
+        ConfigError: a fixed base, closed loops, feet that are too few even if all stand, normals of several floors, or
             thresholds of detection that contradict each other.
     """
     settings = config.preprocessing

@@ -221,7 +221,7 @@ def set_up_scene(config: ExperimentConfig | AnalyzeConfig) -> Scene:
         field = _ft_field(config, error.name)
         raise UnknownNameError.at_field(field, error.name, error.valid, error.what) from error
     if not robot.nv:
-        raise ConfigError.at_field("robot", "a bolted base without a joint, which never moves", "a robot that can move")
+        raise ConfigError.at_field("robot", "a fixed base without a joint, which never moves", "a robot that can move")
     if config.logs is not None:
         require_maps_of(robot, config.logs)
     contacts, rolling = resolve_contacts(config.contacts, robot)

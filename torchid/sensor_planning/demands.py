@@ -261,7 +261,7 @@ def demands(
     seed: int = 0,
     joint_position: Array | None = None,
 ) -> list[Demand]:
-    """Demands of some contact states, each group of contacts once; none for a bolted base.
+    """Demands of some contact states, each group of contacts once; none for a fixed base.
 
     Args:
         robot: the robot.

@@ -104,7 +104,7 @@ def assess_sensors(
     seed: int = 0,
     postures: Mapping[ContactState, Array] | None = None,
 ) -> list[BaseObservability]:
-    """Observability of the base with a sensor set in every contact state, from S_b V_x; none for a bolted base.
+    """Observability of the base with a sensor set in every contact state, from S_b V_x; none for a fixed base.
 
     Args:
         robot: the robot.

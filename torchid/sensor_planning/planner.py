@@ -320,7 +320,7 @@ def _removals(problem: PlanningProblem, chosen: Sequence[Candidate], report: Ste
 
 
 def _base_rank(problem: PlanningProblem, chosen: Sequence[Candidate]) -> int | None:
-    """Least rank(S_b V_x) over the states, each at a generic posture; None for a bolted base."""
+    """Least rank(S_b V_x) over the states, each at a generic posture; None for a fixed base."""
     if problem.robot.fixed_base:
         return None
     postures = random_postures(problem.robot, _TRIED, np.random.default_rng(problem.seed))
