@@ -15,7 +15,7 @@ from torchid.commands.cache_entries import cached_parts, factors_key
 from torchid.commands.cached_reading import CachedReader, open_reader
 from torchid.commands.chosen_settings import Choices, with_chosen_settings, with_ridge
 from torchid.commands.clock import Clock
-from torchid.commands.compared_forces import compare_forces, noise_of_readings, trace_forces
+from torchid.commands.evaluate import compare_forces, noise_of_readings, trace_forces
 from torchid.commands.folder import RUN, check_free, claim_folder
 from torchid.commands.plausibility import TrainingLogs, require_not_worse, require_plausible
 from torchid.commands.reading import LogReader, check_parts
