@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from torchid.errors import LogError, about_file
-from torchid.logs.coverage import measure_coverage, warn_of_gaps
+from torchid.logs.gaps import measure_coverage, warn_of_gaps
 from torchid.logs.log import FloatArray, Log
 from torchid.logs.preprocess import (
     gapless_fields,

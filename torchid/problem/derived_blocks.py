@@ -13,8 +13,8 @@ from torchid.errors import LogError
 from torchid.logs import Log
 from torchid.logs.arrays import parse_names
 from torchid.logs.blocks import LogBlocks
-from torchid.logs.coverage import Coverage
 from torchid.logs.flags import ContactThreshold, MeasuredForces, flags_by_force
+from torchid.logs.gaps import Coverage
 from torchid.logs.lazy_arrays import Computed, GapsFilled
 from torchid.logs.log import CONTACT_READINGS, FLAGS, FORCE_NORMAL, NORMALS, WRENCHES, BoolArray, FloatArray
 from torchid.logs.preprocess import (
