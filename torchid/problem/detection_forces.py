@@ -43,7 +43,7 @@ def normal_forces(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz
     """Forces of the ground along its normal by the URDF's dynamics.
 
     Of all wrenches of all contacts, as if each could carry, those that balance measured joint torques, gravity and
-    inertia best, weighed least squares over the joints' and the base's rows. A base of which neither pose nor IMU was
+    inertia best, weighted least squares over the joints' and the base's rows. A base of which neither pose nor IMU was
     recorded counts as still, and tilted as if all feet stood.
 
     Args:
