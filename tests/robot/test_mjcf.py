@@ -108,7 +108,7 @@ def test_included_files_are_read_and_stand_in_what_is_written(tmp_path: Path) ->
     (tmp_path / "out").mkdir()
     found = survey(tmp_path / "scene.xml", tmp_path / "out")
     assert found.written < 1e-13
-    assert "include" not in (tmp_path / "out" / "scene.xml").read_text()
+    assert "<include" not in (tmp_path / "out" / "scene.xml").read_text()
 
 
 def test_a_missing_mesh_matters_only_where_it_gives_a_body_its_inertia(tmp_path: Path) -> None:
@@ -127,14 +127,10 @@ POLYNOMIAL = '<equality>\n<joint joint1="j" polycoef="0 1 2 0 0"/></equality>'
 TENDON = '<tendon>\n<fixed name="t" stiffness="3"><joint joint="j" coef="1"/></fixed></tendon>'
 REFUSED = {
     "ball": (BODY.format("", '\n<joint name="j" type="ball"/>', ""), "<joint> 'j', line 4: type ball"),
-    "mocap": (
-        BODY.format("", HINGE.format(""), OTHER),
-        "<weld>, line 4: a constraint to what is not part of the robot",
-    ),
     "law": (BODY.format("", HINGE.format(""), POLYNOMIAL), "<joint>, line 4: an equality constraint"),
     "tendon": (BODY.format("", HINGE.format(""), TENDON), "<fixed> 't', line 4: a tendon with stiffness"),
     "gravcomp": (BODY.format(' gravcomp="1"', HINGE.format(""), ""), "<body> 'b', line 3: gravcomp 1"),
-    "locked": (BODY.format("", HINGE.format(' damping="1e11"'), ""), "<joint> 'j', line 3: damping 1e+11"),
+    "locked": (BODY.format("", HINGE.format(' damping="1e13"'), ""), "<joint> 'j', line 3: damping 1e+13"),
     "fluid": (BODY.format("", HINGE.format(""), '<option\n density="1000"/>'), "<option>, line 4: density 1000"),
     "damped base": (
         BODY.format("", '<joint type="free" damping="1"/>', ""),
@@ -271,7 +267,7 @@ def test_a_limited_tendon_or_an_inactive_loop_changes_nothing(tmp_path: Path) ->
     robot = robot_of(BODY.format("", HINGE.format(""), tendon + loop), tmp_path, True)
     states = States.random(robot)
     own = torchid_forces(robot, robot.nominal, robot.armature, states)
-    assert difference(own, mujoco_forces(MjcfModel(robot.path).model, robot, states)) < 1e-13
+    assert difference(own, mujoco_forces(MjcfModel(robot.path), robot, states)) < 1e-13
 
 
 def test_what_mujoco_multiplies_is_written_with_what_was_identified_to_the_last_digit_and_the_rest_to_six(

@@ -42,14 +42,11 @@ def check_model(model: MjcfModel) -> None:
 
 
 def _check_equality(model: MjcfModel, equality: Any) -> None:
-    """Refuse all but a loop of the robot."""
+    """Refuse all but a loop or a tie of the robot."""
     kind = equality_kind(equality)
     if kind not in LOOPS:
         accepted = "joint1 = c0 + c1 joint2 alone" if kind == "joint" else "connect, weld, or a linear joint"
         model.refuse(equality, kind, equality.name, "an equality constraint", accepted)
-    if not is_loop(model, equality):
-        found = "a constraint to what is not part of the robot"
-        model.refuse(equality, kind, equality.name, found, "two bodies of the robot")
 
 
 def _check_body(model: MjcfModel, body: Any) -> None:
@@ -144,11 +141,11 @@ def _touches(model: MjcfModel, equality: Any, members: set[str]) -> bool:
     return bool(on & members)
 
 
-def is_loop(model: MjcfModel, equality: Any) -> bool:
-    """Whether an equality constraint is active and keeps two bodies of the robot together."""
+def is_held(model: MjcfModel, equality: Any) -> bool:
+    """Whether an equality constraint is active and holds a body of the robot to another body, of the robot or not."""
     if not equality.active or equality_kind(equality) not in LOOPS:
         return False
-    return {model.base, *model.members}.issuperset(loop_bodies(model, equality))
+    return not {*model.members}.isdisjoint(loop_bodies(model, equality))
 
 
 def loop_bodies(model: MjcfModel, equality: Any) -> tuple[int, int]:
