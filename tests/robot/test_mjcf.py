@@ -238,6 +238,14 @@ def test_a_robot_without_a_free_joint_must_be_said_to_be_bolted(tmp_path: Path) 
         robot_of(BOLTED, tmp_path)
 
 
+def test_of_the_world_nothing_is_written_nor_said(tmp_path: Path) -> None:
+    """As of a robot whose first joints are welded, whose links then belong to the world."""
+    robot = robot_of(BOLTED, tmp_path, True)
+    phi = robot.nominal.copy()
+    phi[0, 0] = -1.0
+    assert identified_robot(robot, phi, FittedJoints()) == identified_robot(robot, robot.nominal, FittedJoints())
+
+
 @pytest.mark.parametrize(
     ("option", "gravity"),
     [('<option gravity="0 0 -1.6"/>', "0 0 -1.6"), ('<option><flag gravity="disable"/></option>', "0 0 0")],
