@@ -47,6 +47,10 @@ BOLTED = """<mujoco><compiler inertiafromgeom="true" settotalmass="7"/>
    <geom size=".02"/></body></body></body></worldbody>
 <equality><joint joint1="right_finger" joint2="left_finger" polycoef="0.02 0.5 0 0 0"/></equality></mujoco>"""
 
+TENDON_OF_TWO = """<tendon><fixed name="t"><joint joint="left_finger" coef="2"/><joint joint="right_finger" coef="-4"/>
+ </fixed></tendon><equality><tendon tendon1="t" polycoef=".03 1 0 0 0"/></equality></mujoco>"""
+TIED = re.sub("<equality>.*", TENDON_OF_TWO, BOLTED)
+
 
 def robot_of(text: str, folder: Path, fixed_base: bool = False) -> Robot:
     path = folder / "robot.xml"
@@ -54,7 +58,7 @@ def robot_of(text: str, folder: Path, fixed_base: bool = False) -> Robot:
     return load_robot(path, fixed_base=fixed_base)
 
 
-@pytest.mark.parametrize(("text", "velocities"), [(FREE, 10), (BOLTED, 2)], ids=["free", "bolted"])
+@pytest.mark.parametrize(("text", "velocities"), [(FREE, 10), (BOLTED, 2), (TIED, 2)], ids=["free", "bolted", "tied"])
 def test_inverse_dynamics_are_those_of_mujoco_and_what_is_written_is_what_is_read(
     text: str, velocities: int, tmp_path: Path
 ) -> None:
@@ -65,6 +69,19 @@ def test_inverse_dynamics_are_those_of_mujoco_and_what_is_written_is_what_is_rea
     assert found.inverse_dynamics < 1e-13
     assert found.read_again < 1e-13
     assert found.written < 1e-13
+
+
+@pytest.mark.parametrize("text", [BOLTED, TIED], ids=["joints", "a tendon"])
+def test_joints_follow_each_other_where_mujocos_equality_holds(text: str, tmp_path: Path) -> None:
+    robot = robot_of(text.replace('name="right_finger"', 'name="right_finger" ref="-.2"'), tmp_path, fixed_base=True)
+    model = MjcfModel(robot.path).model
+    data, (matrix, constant) = mujoco.MjData(model), robot.joint_map
+    for q in np.random.default_rng(0).uniform(-1.0, 1.0, (5, 2)):
+        at = dict(zip((body.name for body in robot.bodies[1:]), matrix @ q + constant, strict=True))
+        data.qpos[:] = [at[name] for name in ("arm", "left", "right")]
+        mujoco.mj_forward(model, data)
+        assert len(data.efc_pos) == 1
+        np.testing.assert_allclose(data.efc_pos, 0.0, atol=1e-15)
 
 
 def test_a_base_inside_the_tree_has_the_same_joint_torques(tmp_path: Path) -> None:
@@ -124,9 +141,16 @@ BODY = '<mujoco>\n<worldbody>\n<body name="b"{}>{}<geom size=".1"/><site name="s
 HINGE = '<joint name="j"{}/>'
 OTHER = '<worldbody><body name="m" mocap="true"/></worldbody><equality>\n<weld body1="m" body2="b"/></equality>'
 POLYNOMIAL = '<equality>\n<joint joint1="j" polycoef="0 1 2 0 0"/></equality>'
+COUPLED = """<worldbody><body><joint name="k"/><geom size=".1"/><body><joint name="l"/><geom size=".1"/></body></body>
+ </worldbody><tendon><fixed name="t"><joint joint="j" coef="1"/><joint joint="k" coef="1"/><joint joint="l" coef="1"/>
+ </fixed></tendon><equality><tendon tendon1="t"/></equality>"""
 TENDON = '<tendon>\n<fixed name="t" stiffness="3"><joint joint="j" coef="1"/></fixed></tendon>'
 REFUSED = {
     "ball": (BODY.format("", '\n<joint name="j" type="ball"/>', ""), "<joint> 'j', line 4: type ball"),
+    "tendon of three": (
+        BODY.format("", HINGE.format(""), COUPLED),
+        "<tendon>, line 5: an equality constraint; accepted: one fixed tendon of two joints",
+    ),
     "law": (BODY.format("", HINGE.format(""), POLYNOMIAL), "<joint>, line 4: an equality constraint"),
     "tendon": (BODY.format("", HINGE.format(""), TENDON), "<fixed> 't', line 4: a tendon with stiffness"),
     "gravcomp": (BODY.format(' gravcomp="1"', HINGE.format(""), ""), "<body> 'b', line 3: gravcomp 1"),
