@@ -11,6 +11,7 @@ from typing import Any, NoReturn, TypeAlias
 
 from torchid import __version__
 from torchid.boundary import importing, plain_streams, run_guarded, run_in_ranks
+from torchid.copies import copies_allowed
 from torchid.errors import ConfigError, during
 from torchid.ranks import end_process, is_launched_first, share_work
 
@@ -42,10 +43,12 @@ def run() -> NoReturn:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; 0 on success, 2 on bad input, 1 on anything else."""
+    is_function = arguments is not None
     try:
-        return run_in_ranks("torchid", lambda: _main(arguments))
+        with nullcontext() if is_function else copies_allowed():
+            return run_in_ranks("torchid", lambda: _main(arguments))
     finally:
-        if arguments is not None:  # whoever calls this as a function goes on
+        if is_function:  # whoever calls it goes on
             gc.unfreeze()
 
 
