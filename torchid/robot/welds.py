@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from torchid.errors import ConfigError, UnknownNameError
-from torchid.robot.tree import joint_motion, joint_origin, resolve_mimics
+from torchid.robot.tree import joint_origin, joint_transform, resolve_mimics
 from torchid.robot.urdf import MOVING_TYPES, TreeJoint, position_limits
 
 WELD_FIELD = "robot.weld"
@@ -109,7 +109,7 @@ def weld_joints(joints: Sequence[TreeJoint], positions: Mapping[str, float]) -> 
     """The joints, those with a position fixed there."""
 
     def welded(joint: TreeJoint) -> TreeJoint:
-        origin = joint_origin(joint) @ joint_motion(joint, positions[joint.name])
+        origin = joint_origin(joint) @ joint_transform(joint, positions[joint.name])
         changes: dict[str, Any] = {"type": "fixed", "mimic": None, "origin": origin}
         return replace(joint, **changes)
 
