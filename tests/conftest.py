@@ -94,7 +94,7 @@ def place() -> Iterator[Path]:
         yield Path(name)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def server() -> Iterator[Commands]:
     """What runs commands in processes of their own."""
     with commands() as running:
