@@ -66,7 +66,7 @@ def assert_same(logs: Identification, factors: Identification) -> None:
 
 @pytest.mark.parametrize(
     "overrides",
-    [(), ("estimator.ridge=auto",), ("estimator={name: consistent, ridge: 0.001}",)],
+    [(), ("estimator={name: consistent, ridge: auto}",), ("estimator={name: consistent, ridge: 0.001}",)],
     ids=["least squares", "ridge auto", "consistent"],
 )
 def test_the_demo_from_its_factor_is_the_demo_from_its_log(tmp_path: Path, overrides: tuple[str, ...]) -> None:
