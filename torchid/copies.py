@@ -16,6 +16,7 @@ from functools import partial
 from multiprocessing.connection import Connection
 from typing import Generic, TypeVar
 
+from torchid.ranks import is_launched
 from torchid.staging import interrupts_deferred
 
 T = TypeVar("T")
@@ -33,6 +34,11 @@ def copies_allowed() -> Iterator[None]:
         yield
     finally:
         _allowed = False
+
+
+def can_copy() -> bool:
+    """Whether copies of this process may be made now."""
+    return _allowed and not _uses_a_gpu() and not is_launched()  # torchrun has started processes for all cores
 
 
 class Copy(Generic[T]):
@@ -53,7 +59,7 @@ class Copy(Generic[T]):
         self._results: Connection | None = None
 
     def __enter__(self) -> Copy[T]:
-        if _allowed and not _uses_a_gpu():
+        if can_copy():
             context = multiprocessing.get_context("fork")
             with interrupts_deferred(), suppress(OSError):  # no memory, or too many processes
                 self._results, sender = context.Pipe(duplex=False)
@@ -75,7 +81,7 @@ class Copy(Generic[T]):
         """What the function returns, or raises."""
         if self._results is not None:
             with suppress(EOFError, OSError, pickle.UnpicklingError):
-                done, value = self._results.recv()
+                done, value = pickle.loads(self._results.recv_bytes())
                 if done:
                     return value
         return self._work()
@@ -145,4 +151,4 @@ def _call(work: Callable[[], T], results: Connection, sender: Connection) -> Non
         warnings.simplefilter("ignore", PendingDeprecationWarning)
         message = (True, work())
     with suppress(Exception):
-        sender.send(message)
+        sender.send_bytes(pickle.dumps(message))  # `send` would leave tensors behind in this process

@@ -168,16 +168,18 @@ def require_same(value: object, about: str) -> None:
 
 
 def own_share(sizes: Sequence[int]) -> slice:
-    """The successive pieces, of these sizes, that this process works on; those of all processes are about equal.
+    """The successive pieces, of these sizes, that this process works on; those of all processes are about equal."""
+    return share_of(sizes, rank(), world_size())
+
+
+def share_of(sizes: Sequence[int], number: int, count: int) -> slice:
+    """The successive pieces, of these sizes, that one of so many works on; all have about as much.
 
     Successive, as pieces of one log and contact state reduce to one result.
     """
     total, ends = max(sum(sizes), 1), list(accumulate(sizes))
-    owners = [
-        min(int(world_size() * (end - size / 2) / total), world_size() - 1)
-        for size, end in zip(sizes, ends, strict=True)
-    ]
-    return slice(owners.index(rank()), len(owners) - owners[::-1].index(rank())) if rank() in owners else slice(0)
+    owners = [min(int(count * (end - size / 2) / total), count - 1) for size, end in zip(sizes, ends, strict=True)]
+    return slice(owners.index(number), len(owners) - owners[::-1].index(number)) if number in owners else slice(0)
 
 
 def share_out(items: Sequence[T], compute: Callable[[T], Result], about: str, sizes: Sequence[int]) -> list[Result]:
@@ -245,6 +247,11 @@ def share_work() -> Iterator[None]:
             raise
         finally:
             _sharing = None
+
+
+def is_launched() -> bool:
+    """Whether torchrun has started this process beside others."""
+    return _launched is not None
 
 
 def is_launched_first() -> bool:

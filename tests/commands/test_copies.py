@@ -12,6 +12,7 @@ import warnings
 from pathlib import Path
 
 import pytest
+import torch
 from demo import shortened_demo
 
 from torchid import copies
@@ -33,6 +34,13 @@ def test_a_library_makes_no_copies_of_the_process_that_uses_it() -> None:
     assert {process for process in share_between_copies(range(4), lambda _: os.getpid(), 2)} == {os.getpid()}
     with Copy(os.getpid) as copy:
         assert copy.result() == os.getpid()
+
+
+def test_tensors_outlive_the_copy_that_made_them() -> None:
+    with copies_allowed(), Copy(lambda: (os.getpid(), torch.arange(1000.0))) as copy:
+        process, values = copy.result()
+    assert process != os.getpid()
+    assert torch.equal(values, torch.arange(1000.0))
 
 
 def test_an_error_is_that_of_this_process() -> None:

@@ -129,6 +129,7 @@ class LargeLog:
         add: Callable[[Samples, int, int], None],
         with_unloaded: bool = True,
         own: Callable[[Sequence[int]], slice] = lambda _: slice(None),
+        threads: int | None = None,
     ) -> None:
         """Read, preprocess and bind some successive blocks of the log; which ones makes no difference to their samples.
 
@@ -136,6 +137,7 @@ class LargeLog:
             add: called with the samples of each block, the number of the first of them, and how many the log has.
             with_unloaded: as in `samples`.
             own: which of the log's blocks, from the numbers of their samples; all by default.
+            threads: that work on blocks, 0 for this one alone; by default as many as torch would use.
         """
         needs_flags = self.settings.needs_flags
         with about_file(self.path), open_log_blocks(self.path, self.folder, self.columns, needs_flags) as opened:
@@ -149,7 +151,8 @@ class LargeLog:
             row, total = row_numbers(kept, mine[0][1].start if mine else 0, len(course.time))
             if mine:
                 mine[0][0].follow_signs(mine[0][1].start, max(SPLINE_BLOCK, int(BLOCK_GB * GIGABYTE / 32)))
-            threads = 0 if self.folder is not None else thread_count()  # on a disk because memory is short
+            threads = thread_count() if threads is None else threads
+            threads = 0 if self.folder is not None else threads  # on a disk because memory is short
             read = (stretch.read(piece) for stretch, piece in mine)
             with closing(_in_threads(partial(self._bound, course), read, threads)) as bound:
                 for piece, samples in bound:

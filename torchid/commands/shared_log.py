@@ -7,9 +7,10 @@ import io
 import platform
 import uuid
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -20,8 +21,10 @@ from torchid.commands.cache import Files, written_file
 from torchid.commands.cache_entries import ReadLog, Said, named_tensors, samples_entry
 from torchid.commands.large_log import LargeLog
 from torchid.commands.manifest import file_checksum
+from torchid.copies import can_copy, share_between_copies
 from torchid.fitting.noise import recorded_sensors
 from torchid.problem import Samples
+from torchid.problem.chunks import thread_count
 from torchid.sensing import SensorSet
 
 
@@ -50,8 +53,8 @@ class _Share:
 def read_together(log: LargeLog, with_unloaded: bool, folder: Path, most: float) -> tuple[dict[str, Any], Files] | None:
     """Fill the files of an entry with the samples of a log; its document and its files.
 
-    All processes that share the work call this together. Blocks do not depend on each other, so that the samples are
-    those of one process to the last bit.
+    All processes that share the work call this together; one alone makes copies, which wait for no lock of Python's as
+    threads do. Blocks do not depend on each other, so that the samples are those of one process to the last bit.
 
     Args:
         log: the log.
@@ -62,15 +65,25 @@ def read_together(log: LargeLog, with_unloaded: bool, folder: Path, most: float)
     Returns:
         None in all processes but the first; there, too, if one has failed: who reads the log alone meets the reason.
     """
-    share = _fill(log, with_unloaded, _Rows(folder, log, most))
-    shares = ranks.gather(share, "blocks of a log")
+    copied = can_copy() and ranks.world_size() == 1 and log.folder is None
+    count = thread_count() if copied else 1
+
+    def fill(number: int) -> _Share:
+        own = partial(ranks.share_of, number=number, count=count) if copied else ranks.own_share
+        return _fill(log, with_unloaded, _Rows(folder, log, most), own, 0 if copied else None)
+
+    own_shares = share_between_copies(range(count), fill, count)
+    shares = [share for of_process in ranks.gather(own_shares, "blocks of a log") for share in of_process]
     likes = [one.like for one in shares if one.like is not None]
     if any(one.failed for one in shares) or not likes:
         return None
     names = list(named_tensors(likes[0]))
     paths = [folder / f"{name}.npy" for name in names]
     sizes = ranks.as_first([path.stat().st_size if ranks.is_first() else 0 for path in paths], "sizes of files")
-    sums = ranks.share_out(paths, _checksum, "checksums of files", sizes)
+    if copied:
+        sums = share_between_copies(paths, _checksum, count)
+    else:
+        sums = ranks.share_out(paths, _checksum, "checksums of files", sizes)
     if not all(sums) or not ranks.is_first():  # the first one moves the files to their place
         return None
     recorded = [one.recorded for one in shares if one.recorded is not None]
@@ -84,19 +97,21 @@ def read_together(log: LargeLog, with_unloaded: bool, folder: Path, most: float)
     return document, files
 
 
-def _fill(log: LargeLog, with_unloaded: bool, rows: _Rows) -> _Share:
-    """Write this process's share of a log."""
+def _fill(
+    log: LargeLog, with_unloaded: bool, rows: _Rows, share: Callable[[Sequence[int]], slice], threads: int | None
+) -> _Share:
+    """Write the share of a log that a function chooses, in so many threads."""
     common, failed = 0, False
 
     def own(sizes: Sequence[int]) -> slice:
         nonlocal common
         common = len(caught)
-        return ranks.own_share(sizes)
+        return share(sizes)
 
     with closing(rows), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            log.each_block(rows.add, with_unloaded, own)
+            log.each_block(rows.add, with_unloaded, own, threads)
         except Exception:  # noqa: B902 - all processes meet it, and say it, when they read the log
             failed = True
     said = [(one.category, str(one.message)) for one in caught]
