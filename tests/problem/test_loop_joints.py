@@ -39,8 +39,9 @@ def smooth(w: LoopWorld, count: int = 2000) -> Log:
     """A log of motors that swing."""
     time, rng = 0.002 * np.arange(count), np.random.default_rng(0)
     motors = tuple(name for name in w.robot.joint_names if name not in w.robot.passive)
-    position = [0.3 * np.sin(2.0 * np.pi * rng.uniform(0.3, 1.0) * time + rng.uniform(0.0, 6.0)) for _ in motors]
-    return Log("swing.npz", time, motors, np.stack(position, axis=1))
+    size = np.where(np.isin(motors, w.robot.sliding), 0.03, 0.3)  # m or rad
+    swings = [np.sin(2.0 * np.pi * rng.uniform(0.3, 1.0) * time + rng.uniform(0.0, 6.0)) for _ in motors]
+    return Log("swing.npz", time, motors, size * np.stack(swings, axis=1))
 
 
 @robots
