@@ -60,6 +60,19 @@ def test_the_forces_of_a_base_alone_need_no_inertia_at_all() -> None:
     assert len(force.inertial) < 0.4 * len(moment.inertial)
 
 
+def test_a_foot_that_the_ground_holds_is_in_no_combination_of_rows() -> None:
+    sole = torchid.Contact(FEET[0].frame, "flat")
+    builder = RowBuilder(ROBOT, [sole], sensor_set("joints", ROBOT, [sole]))
+    layout, held = builder.columns.layout, builder.frames[0][0]
+    of_held = set(range(layout.starts[held], layout.starts[held + 1]))
+    (block,) = builder.layout((True,)).blocks.of_rank(3)
+    assert set(range(layout.count)) - set(block.inertial) == of_held
+    samples, _ = random_samples(ROBOT, [sole], 30, 3, states=1)
+    W = builder.rows_by_sample(samples, (True,))[1][:, :, block.rows]
+    twists = builder.contact_jacobian(samples)[:, 0] @ W  # of the foot, in the motions whose virtual work the rows are
+    assert 0.0 < twists.abs().max() < 1e-12 * W.abs().max()
+
+
 @pytest.mark.parametrize("sensors", ["full", "contacts", "joints", "mixed"])
 def test_the_basis_is_zero_where_blocks_say_so(sensors: str) -> None:
     samples, _ = random_samples(ROBOT, FEET, 30, 3, states=1)

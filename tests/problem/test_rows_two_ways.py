@@ -64,7 +64,7 @@ def test_both_ways_give_the_same_equations_up_to_a_rotation(name: str) -> None:
     (A, b), (A_fast, b_fast) = (way(SENSOR_SETS[name]) for way in (by_public_modules, by_row_builder))
     size = np.linalg.norm(A, axis=0) + 1e-3 * np.linalg.norm(A)
     np.testing.assert_allclose(
-        A_fast.T @ A_fast / np.outer(size, size), A.T @ A / np.outer(size, size), rtol=0.0, atol=1e-13
+        A_fast.T @ A_fast / np.outer(size, size), A.T @ A / np.outer(size, size), rtol=0.0, atol=1e-14
     )
-    np.testing.assert_allclose(A_fast.T @ b_fast / size, A.T @ b / size, rtol=0.0, atol=1e-13 * np.linalg.norm(b))
+    np.testing.assert_allclose(A_fast.T @ b_fast / size, A.T @ b / size, rtol=0.0, atol=1e-14 * np.linalg.norm(b))
     assert np.linalg.norm(b_fast) == pytest.approx(np.linalg.norm(b), rel=1e-13)

@@ -50,7 +50,7 @@ def test_they_span_the_same_space_under_the_same_noise(feet: str, measured: int,
     W = W.permute(2, 0, 1)
     batch_first = [x.permute(2, 0, 1) for x in (A, J_m)]
     ((_, expected),) = whitened_null_space(batch_first[0], row_std, batch_first[1], wrench_std, axes)
-    torch.testing.assert_close(W @ W.mT, expected @ expected.mT, rtol=0.0, atol=1e-12)
+    torch.testing.assert_close(W @ W.mT, expected @ expected.mT, rtol=0.0, atol=1e-13)
     assert (batch_first[0] @ W).abs().max() < 1e-13
 
 
@@ -63,3 +63,16 @@ def test_a_straight_leg_is_left_to_the_general_way() -> None:
     W, suspect = limb_null_space(limbs, places, row_std, J_m, wrench_std)
     assert torch.nonzero(suspect)[:, 0].tolist() == [7, 9, 11]
     assert W[..., ~suspect].isfinite().all()
+
+
+def test_noise_stays_white_to_rounding_where_a_leg_is_nearly_straight() -> None:
+    """A Cholesky factor of the covariance squares its condition: 1e-12 here."""
+    limbs, places, A, J_m = random_limbs((3, 3, 3), 0)
+    for limb in limbs:
+        limb[:, BASE + 2] = limb[:, BASE + 1] + 0.05 * limb[:, BASE + 2]
+    row_std, wrench_std = noise(A.shape[1], 0)
+    W, suspect = limb_null_space(limbs, places, row_std, J_m, wrench_std)
+    white = (row_std[:, None, None] * W)[..., ~suspect].permute(2, 0, 1)
+    assert (~suspect).sum() > SAMPLES // 2
+    identity = torch.eye(6, dtype=W.dtype).expand(len(white), 6, 6)
+    torch.testing.assert_close(white.mT @ white, identity, rtol=0.0, atol=3e-14)

@@ -107,6 +107,11 @@ class ContactBody:
     components: tuple[tuple[int, int], ...]
     joints: tuple[int, ...]
 
+    @property
+    def is_held(self) -> bool:
+        """Whether all six components of a wrench on it are unmeasured, so that no combination of rows moves it."""
+        return [part.rows.shape for part in self.unmeasured] == [(_WRENCH, _WRENCH)]
+
 
 @dataclass(frozen=True)
 class ContactStateLayout:
@@ -218,6 +223,7 @@ class ContactStateLayouts:
                 [body.joints for body in bodies],
                 sum(body.count for body in bodies) + sum(len(loop.wrenches) for loop in loops),
                 [(column, *self._met(extra, coupled, bodies)) for column, extra in extras],
+                [body.body for body in bodies if body.is_held],
             ),
         )
         return self._cache[key]

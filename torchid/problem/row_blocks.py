@@ -126,6 +126,7 @@ class RowBlocks:
         contacts: Sequence[Sequence[int]],
         unmeasured: int,
         extras: Sequence[tuple[int, Sequence[int], bool]],
+        held: Sequence[int] = (),
     ) -> None:
         """Work out what combines with what.
 
@@ -137,7 +138,9 @@ class RowBlocks:
             contacts: coupled joints above each body in contact.
             unmeasured: number of unmeasured wrench components in contact.
             extras: extra parameters: column, joints that it depends on, whether it depends on the base.
+            held: nodes whose contacts exert all six components of a wrench, unmeasured ones.
         """
+        self._held = held
         self._tree, self._layout, self._moved, self._friction = tree, layout, moved, friction
         self._extras, self._unmeasured = extras, unmeasured
         joints = {joint: node for node, joint, _ in moved}  # the last node that each moves
@@ -196,7 +199,8 @@ class RowBlocks:
             for column, of_joints, of_base in self._extras
             if (of_base and base != "none") or not set(joints).isdisjoint(of_joints)
         )
-        return row_block(self._tree, self._layout, rows, [x for x in chosen if x[1] in joints], base, extras)
+        moved = [x for x in chosen if x[1] in joints]
+        return row_block(self._tree, self._layout, rows, moved, base, extras, self._held)
 
 
 def row_block(
@@ -206,8 +210,12 @@ def row_block(
     moved: Sequence[tuple[int, int, float, tuple[int, int]]],
     base: str = "none",
     extras: tuple[int, ...] = (),
+    held: Sequence[int] = (),
 ) -> RowBlock:
     """A block of rows.
+
+    What W combines moves no node that the ground holds: `A_x W = 0` says so. Their path sums are zero, and with them
+    the columns of all nodes that move with one.
 
     Args:
         tree: the robot's constants.
@@ -216,14 +224,16 @@ def row_block(
         moved: nodes that the joints move, ascending: node, joint, ratio of its motion, its two friction columns.
         base: base rows that are combined: "all", "force" or "none".
         extras: columns of extra parameters.
+        held: nodes that the ground holds, each by six unmeasured components of a wrench.
     """
     numbers = {node: number for number, (node, *_) in enumerate(moved, start=base != "none")}
     sources: list[int | None] = [None if base == "none" else 0]
     for node in range(1, tree.n_nodes):
         sources.append(numbers.get(node, sources[tree.parents[node]]))
     light = [base == "force" and source == 0 for source in sources]
+    zero = {None, *(sources[node] for node in held)}
     kept = [
-        tuple(k for k in all_kept if not is_light or k < parameters.INERTIA.start) if source is not None else ()
+        () if source in zero else tuple(k for k in all_kept if not is_light or k < parameters.INERTIA.start)
         for all_kept, is_light, source in zip(layout.kept, light, sources, strict=True)
     ]
     nodes = tuple(_runs(layout, kept, sources))

@@ -14,8 +14,9 @@ from torch import Tensor
 BASE = 6
 """Rows of the base in a generalized force."""
 
-_WELL_CONDITIONED = 1e3  # of a limb, in the Frobenius norm: a knee that is not straight
-_PIVOT = 1e-4  # of the covariance, relative to its diagonal: below it, its square root loses digits
+_WELL_CONDITIONED = 1e4  # of a limb, in the Frobenius norm: a knee that is not straight
+_PIVOT = 1e-6  # what is left of the square of a column: below it, the columns are nearly dependent
+_OF_BASE = (slice(0, 3), slice(3, BASE))  # force and moment
 
 
 def limb_null_space(
@@ -29,8 +30,9 @@ def limb_null_space(
     """Bases W of the null space of A, the limbs' rows, under which the projected noise is white, batch-last.
 
     With the base's motion given, `A V = 0` leaves each limb one motion: V is the identity on the base and `-L^-1 B` on
-    a limb with rows `[B L]`. `W = V C^-T`, with `C C^T` the covariance of `V^T` noise, is zero in the base's moment in
-    its first three columns, as C is triangular.
+    a limb with rows `[B L]`. Columns of V, by their effect on each reading in units of its noise, are made orthonormal
+    one after the other: `W = V R^-1` with R triangular, so that the first three columns of W are zero in the base's
+    moment.
 
     Args:
         limbs: (k, 6 + k, B) each, rows of unmeasured wrench components in the base's rows and in the limb's k joints.
@@ -45,35 +47,44 @@ def limb_null_space(
         W, (m, 6, B), and whether each sample is suspect, (B,): a limb is singular or nearly so, and its W worthless.
     """
     m, samples = len(row_std), limbs[0].shape[-1]
-    # columns that are combined until the covariance, in the first rows, is triangular; the others are V
-    both = row_std.new_empty(BASE + m, BASE, samples)
-    covariance, V = both[:BASE], both[BASE:]
-    both[: 2 * BASE] = 0.0
-    V[:BASE].diagonal().fill_(1.0)
-    suspect = torch.zeros(samples, dtype=torch.bool, device=V.device)
+    white = row_std.new_empty(m + len(J_m), BASE, samples)  # what the columns of V do to each reading, by its noise
+    suspect = torch.zeros(samples, dtype=torch.bool, device=white.device)
     for k in dict.fromkeys(len(limb) for limb in limbs):
         alike = [number for number, limb in enumerate(limbs) if len(limb) == k]
         motion, condition = _solve([limbs[number] for number in alike])
         suspect |= ~(condition < _WELL_CONDITIONED**2)  # so written, undefined ones are suspect too
-        V[BASE:].index_copy_(0, torch.cat([joints[number] for number in alike]), motion)
-    variance = row_std**2
+        white[BASE:m].index_copy_(0, torch.cat([joints[number] for number in alike]), motion)
+    base, own = white[:BASE], white[BASE:m]
+    for row, J, std in zip(white[m:], J_m, wrench_std, strict=True):
+        row[:] = std * ((J[BASE:, None] * own).sum(0) + J[:BASE])
+    own *= row_std[BASE:, None, None]
+    base[:] = 0.0
     if axes is None:
-        covariance.diagonal().copy_(variance[:BASE])
+        base.diagonal().copy_(row_std[:BASE])
     else:
-        covariance[:3, :3] = ((axes * variance[:3]) @ axes.mT).permute(1, 2, 0)
-        covariance[3:, 3:] = ((axes * variance[3:BASE]) @ axes.mT).permute(1, 2, 0)
-    for row, std in zip(V[BASE:], row_std[BASE:], strict=True):
-        scaled = std * row
-        covariance.addcmul_(scaled[:, None], scaled)
-    for row, std in zip(J_m, wrench_std, strict=True):
-        through_contact = std * (row[:, None] * V).sum(0)
-        covariance.addcmul_(through_contact[:, None], through_contact)
-    least = _PIVOT * covariance.diagonal().mT
-    for j in range(BASE):
-        suspect |= ~(covariance[j, j] > least[j])
-        column = both[j:, j].mul_(covariance[j, j].rsqrt())
-        both[j:, j + 1 :].addcmul_(column[:, None], column[1 : BASE - j], value=-1)
-    return V, suspect
+        base[:3, :3], base[3:, 3:] = ((axes * row_std[rows]).permute(2, 1, 0) for rows in _OF_BASE)
+    _orthonormalize(white, suspect)
+    own /= row_std[BASE:, None, None]
+    if axes is None:
+        base /= row_std[:BASE, None, None]
+    else:
+        for rows in _OF_BASE:
+            base[rows] = ((axes / row_std[rows]) @ base[rows].permute(2, 0, 1)).permute(1, 2, 0)
+    return white[:m], suspect
+
+
+def _orthonormalize(columns: Tensor, suspect: Tensor) -> None:
+    """Make the columns of matrices (m, n, B) orthonormal in place, each by those before it; name those that fail.
+
+    By the modified Gram-Schmidt process: a Cholesky factor of their products would square their condition.
+    """
+    least = _PIVOT * columns.square().sum(0)
+    for j in range(columns.shape[1]):
+        column, rest = columns[:, j], columns[:, j + 1 :]
+        size = column.square().sum(0)
+        suspect |= ~(size > least[j])
+        column *= size.rsqrt_()
+        rest.addcmul_(column[:, None], (column[:, None] * rest).sum(0), value=-1)
 
 
 def _solve(limbs: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
