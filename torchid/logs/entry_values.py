@@ -78,7 +78,8 @@ class EntryValues:
             raise LogError.at_field(f"'{column}'", "a single value", "a row for each sample")
         if array.shape[1:] != shape and (array.shape[2:] != shape[1:] or not self.of.has_all_names(array.shape[1:2])):
             names = f", one for each name of its order ({self.of.labels[0]}, ...)" if self.of.labels and shape else ""
-            raise LogError.at_field(f"'{column}'", f"shape {_n_by(array.shape[1:])}", f"{_n_by(shape)}{names}")
+            turned = f"; '{column}.T' if its columns are the samples" if array.shape[:1] == shape else ""
+            raise LogError.at_field(f"'{column}'", f"shape {_n_by(array.shape[1:])}", f"{_n_by(shape)}{names}{turned}")
         return np.asarray(array, dtype=np.float64)
 
     def _shape(self) -> tuple[int, ...]:
@@ -165,6 +166,6 @@ def _joint_turns(part: Part, names: Sequence[str], in_degrees: Collection[str]) 
         return None
     starts = values_by_name(f"{KEY}.{part.key}.turn_from", part.entry.turn_from, names)
     units = values_by_name(f"{KEY}.{part.key}.unit", part.entry.unit, names)
-    of_names = [units.get(name, "deg" if name in in_degrees else "rad") for name in names]
-    angle = [unit_factor(f"{KEY}.{part.key}.turn_from", unit, ("angle",)) for unit in of_names]
+    of_names = {name: units.get(name, "deg" if name in in_degrees else "rad") for name in names}
+    angle = [unit_factor(f"{KEY}.{part.key}.turn_from", of_names[x], ("angle",)) if x in starts else 1.0 for x in names]
     return np.array([starts.get(name, np.nan) for name in names]), 2.0 * np.pi / np.array(angle)
