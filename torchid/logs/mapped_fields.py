@@ -22,7 +22,7 @@ from torchid.logs.log import FORCE_NORMAL, NAME_FIELDS, POINTS, SHAPES, VARIANTS
 from torchid.logs.quaternion import quaternion_of_rpy
 from torchid.logs.units import unit_factor
 
-_PD = "joint_torque.pd"
+_PD, _CURRENT = "joint_torque.pd", "joint_torque.current"
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,9 @@ class MappedFields:
         return self._active(take) if name == "contact_active" else self._wrench(name, take)
 
     def _torque(self, take: Take) -> FloatArray:
-        """What a PD law gives, (N, n) [N m or N]."""
+        """What currents or a PD law give, (N, n) [N m or N]."""
+        if _CURRENT in self._values:
+            return self._values[_CURRENT].read(take) * self._torque_per_current()
         terms: list[FloatArray] = []
         for gain, desired, measured in (("kp", "position", "joint_position"), ("kd", "velocity", "joint_velocity")):
             gains = self._gains(gain, take)
@@ -207,12 +209,27 @@ class MappedFields:
             raise LogError.at_field(
                 f"{KEY}.contact_active.above", "set, without a force", "a column, or contact forces"
             )
+        self._check_stated()
+        return self
+
+    def _check_stated(self) -> None:
+        """Make sure that numbers by name are there of all joints and contacts."""
         for name in ("kp", "kd"):
             if (gains := getattr(self._law, name, None)) is not None and gains.value:
                 self._stated_gains(name, gains)
+        if _CURRENT in self._values:
+            self._torque_per_current()
         if self.columns.plates:
             self._poses()
-        return self
+
+    def _torque_per_current(self) -> FloatArray:
+        """Torques or forces of joints for the currents of their motors, (n,) [N m/A or N/A]."""
+        entry, joints = self.columns.joint_torque, self.names["joint_names"]
+        factors = np.ones(len(joints))
+        for name, what in (("torque_constant", "torque constant"), ("gear_ratio", "gear ratio")):
+            given = getattr(getattr(entry, "current", None), name)
+            factors *= values_of_all(f"{KEY}.{_CURRENT}.{name}", what, given, "joint", joints)
+        return factors
 
     def _gains(self, name: str, take: Take) -> FloatArray | None:
         gains: Gains | None = getattr(self._law, name, None)
