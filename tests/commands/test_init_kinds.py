@@ -294,6 +294,40 @@ def test_fields_of_records_are_arrays(tmp_path: Path, suffix: str) -> None:
     np.testing.assert_array_equal(value(found.base_position_world), value(log.base_position_world))
 
 
+@pytest.mark.parametrize("suffix", [".npz", ".h5"])
+def test_records_have_a_field_for_each_joint(tmp_path: Path, suffix: str) -> None:
+    log, path = recorded(), tmp_path / f"x{suffix}"
+    of_joint = [("pos", "f8"), ("vel", "f8"), ("torque", "f8"), ("fault", "u2")]
+    records = np.zeros(len(log), [("stamp", "f8"), *((name, of_joint) for name in ORDER)])
+    records["stamp"] = log.time
+    for what, x in (("pos", log.joint_position), ("vel", log.joint_velocity), ("torque", log.joint_torque)):
+        for name, values in zip(ORDER, in_order(log, x).T, strict=True):
+            records[name][what] = values
+    if suffix == ".npz":
+        np.savez(path, records=records)
+    else:
+        with h5py.File(path, "w") as file:
+            file["robot/records"] = records
+    found, _, text = initiated(path)
+    root = "records" if suffix == ".npz" else "robot/records"
+    assert yaml.safe_load(text)["logs"]["columns"]["joint_position"] == f"{root}['{{joint}}']['pos']"
+    assert_recorded(found, log)
+
+
+def test_a_gyroscope_in_degrees_is_known_by_how_the_base_turns(tmp_path: Path) -> None:
+    """Its accelerometer reads more than gravity."""
+    log, rng = recorded(), np.random.default_rng(0)
+    tilt = 0.05 * np.sin(3.0 * log.time)
+    quat = Rotation.from_rotvec(np.outer(tilt, [1.0, 0.0, 0.0])).as_quat()
+    rate = np.outer(0.15 * np.cos(3.0 * log.time), [1.0, 0.0, 0.0])
+    force = [0.0, 0.0, 9.81] + 3.0 * rng.normal(size=(len(log), 3))
+    arrays = arrays_of(log) | {"base_quat": quat, "imu_acc": force}
+    for name, factor in (("rad", 1.0), ("deg", 180.0 / np.pi)):
+        np.savez(tmp_path / f"{name}.npz", **arrays, imu_gyro=factor * rate)
+        found, _, _ = initiated(tmp_path / f"{name}.npz")
+        np.testing.assert_allclose(value(found.imu_angular_velocity), rate, atol=1e-12)
+
+
 def test_python_objects_are_refused_in_a_line_and_left_out_where_nobody_needs_them(tmp_path: Path) -> None:
     log = recorded()
     rows = [{"t": t, "q": q} for t, q in zip(log.time, log.joint_position, strict=True)]

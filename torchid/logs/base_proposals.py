@@ -24,7 +24,8 @@ _PLACE = {"p", "pos", "position", "positions", "xyz", "r", "loc", "location", "t
 _TURN = {"q", "e", "o", "ori", "orient", "orientation", "quat", "quaternion", "rot", "rotation", "attitude"}
 _WHOSE = re.compile(
     r"base|root|trunk|torso|pelvis|body|floating|mocap|odom|odometry|state|states|data|pose|world|robot|est|"
-    r"estimated?|meas|measured|link|vicon|optitrack|ground|truth|gt|global"
+    r"estimated?|meas|measured|link|vicon|optitrack|ground|truth|gt|global|"
+    r"basis|rumpf"
 )
 _SPLIT = re.compile(r"[^A-Za-z]+|(?<=[a-z])(?=[A-Z])")
 
@@ -79,7 +80,7 @@ def order_of_quaternion(arrays: Sequence[NDArray[Any]], force: NDArray[Any] | No
         force: (N, 3), specific force in any unit, if there is one.
     """
     flat = np.concatenate([np.asarray(x, dtype=float).reshape(len(x), -1) for x in arrays], axis=1)
-    up = {"wxyz": _up(np.roll(flat, -1, axis=1)), "xyzw": _up(flat)}
+    up = {"wxyz": vertical_in_base(np.roll(flat, -1, axis=1)), "xyzw": vertical_in_base(flat)}
     vertical = np.tile([0.0, 0.0, 1.0], (len(flat), 1))
     for along, why in (
         (force, "by which gravity is where the accelerometer reads it"),
@@ -97,8 +98,8 @@ def order_of_quaternion(arrays: Sequence[NDArray[Any]], force: NDArray[Any] | No
     return ("xyzw" if is_last else "wxyz"), "with w as the largest"
 
 
-def _up(quat_xyzw: FloatArray) -> FloatArray:
-    """The world's z axis (N, 3) in the base frame."""
+def vertical_in_base(quat_xyzw: FloatArray) -> FloatArray:
+    """The world's z axis (N, 3) in the base frame, of quaternions (N, 4)."""
     x, y, z, w = quat_xyzw.T
     return np.stack([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)], axis=1)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import LogError
-from torchid.logs.arrays import parse_names, with_parts
+from torchid.logs.arrays import fields_of_records, parse_names, with_parts
 from torchid.logs.column_entries import KEY, Gains, PdLaw
-from torchid.logs.column_map import Columns, check_columns, list_parts, values_by_name, values_of_all
+from torchid.logs.column_map import PLACEHOLDER, Columns, check_columns, list_parts, values_by_name, values_of_all
 from torchid.logs.column_matching import columns_of_file, match_columns
 from torchid.logs.columns import TEXT_COLUMN, TableLayout, is_column, parse_header
 from torchid.logs.entry_values import EntryValues, Take, entry_values
@@ -305,10 +306,9 @@ def map_arrays(columns: Columns, given: Sequence[str], load: Take) -> MappedFiel
     """
     check_columns(columns)
     columns = columns_of_file(columns, given)
-    texts = (
-        text for part in list_parts(columns).values() for text in (part.entry.column, *part.entry.columns.values())
-    )
-    given = with_parts(given, (text for text in texts if text))
+    entries = [part.entry for part in list_parts(columns).values()]
+    texts = [text for entry in entries for text in (entry.column, *entry.columns.values()) if text]
+    given = with_parts(given, [name for text in texts for name in _named_fields(text, given, load)])
     named = {name: parse_names(name, load(name)) for name in NAME_FIELDS if name in given}
     matching = match_columns(columns, given, lambda name: name in SHAPES or name in VARIANTS, named)
     if matching is None:
@@ -316,3 +316,12 @@ def map_arrays(columns: Columns, given: Sequence[str], load: Take) -> MappedFiel
     native = {name: (name,) for name in matching.others}
     values = entry_values(matching.matched, matching.names)
     return MappedFields(matching.names, columns, native, values).check()
+
+
+def _named_fields(text: str, given: Sequence[str], load: Take) -> list[str]:
+    """The fields of records that a pattern of their names means; a name that is no such pattern itself."""
+    root = text.partition("['")[0]
+    if root == text or root not in given or not PLACEHOLDER.search(text):
+        return [text]
+    regex = re.compile(".+".join(re.escape(part) for part in PLACEHOLDER.sub("\0", text).split("\0")))
+    return [name for name, _ in fields_of_records(root, load(root)) if regex.fullmatch(name)]

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchid.logs.base_proposals import vertical_in_base
 from torchid.logs.file_samples import Columns, stated_names
 from torchid.logs.gaps import turn_jumps
 from torchid.logs.joint_orders import names_by_number
@@ -211,11 +212,13 @@ class UnitProposer:
         return unit
 
     def _add_rate(self, seconds: Numbers) -> None:
-        """The unit of an IMU's angular velocity, by how fast its specific force, almost gravity, turns in its frame."""
-        force, rate = self._values("imu_specific_force"), self._values("imu_angular_velocity")
-        if force is None or rate is None or not force.shape == rate.shape == (len(seconds), 3):
+        """The unit of an IMU's angular velocity, by how fast the vertical turns in its frame.
+
+        By the base's quaternion; without one by the specific force, which is almost gravity.
+        """
+        rate, up = self._values("imu_angular_velocity"), self._vertical()
+        if rate is None or up is None or not up.shape == rate.shape == (len(seconds), 3):
             return
-        up = force / np.linalg.norm(force, axis=1, keepdims=True)
         step = float(np.median(np.diff(seconds)))
         turned = np.cumsum(-np.cross(rate, up) * step, axis=0)
         lag = min(max(1, round(_TURN_S / step)), len(seconds) - 1)
@@ -223,8 +226,20 @@ class UnitProposer:
         ratio = np.nansum(expected * found) / max(float(np.nansum(expected**2)), 1e-12)
         alike = np.nansum(expected * found) / np.sqrt(np.nansum(expected**2) * np.nansum(found**2) + 1e-12)
         if alike > _ALIKE and ratio < np.sqrt(UNITS["angle"]["deg"]):
-            why = f"as gravity turns {ratio:.2g} times as fast as in rad/s"
+            why = f"as the vertical turns {ratio:.2g} times as fast as in rad/s"
             self._set("imu_angular_velocity", "deg/s", why)
+
+    def _vertical(self) -> Numbers | None:
+        """The world's z axis (N, 3) in the base or IMU frame, about; None where nothing says so."""
+        for order in ("xyzw", "wxyz"):
+            entry = self._columns.get(f"base_quat_{order}", {})
+            if (
+                "axis" not in entry.get("column", "axis").lower()
+                and (quat := self._values(f"base_quat_{order}")) is not None
+            ):
+                return vertical_in_base(quat if order == "xyzw" else np.roll(quat, -1, axis=1))
+        force = self._values("imu_specific_force")
+        return None if force is None else force / np.linalg.norm(force, axis=1, keepdims=True)
 
     def _set(self, name: str, unit: str, why: str) -> None:
         entry = self._columns.get(name)
