@@ -28,7 +28,7 @@ from torchid.parameters import FRICTION, INERTIA, Array, perturb_parameters
 from torchid.report.mjcf_files import identified_mjcf
 from torchid.robot import Robot
 from torchid.robot.mjcf_model import MjcfModel
-from torchid.robot.urdf import is_bolted, parse_xml
+from torchid.robot.urdf import has_fixed_base, parse_xml
 
 _STATES = 5
 
@@ -139,7 +139,7 @@ class Survey:
 def survey(path: Path, folder: Path) -> Survey:
     """Compare one file; `folder` for what is written."""
     try:
-        robot = load_robot(path, fixed_base=is_bolted(path))
+        robot = load_robot(path, fixed_base=has_fixed_base(path))
     except ValueError as error:
         return Survey(path.name, refusal=str(error).replace(f"{path}: ", ""))
     states = States.random(robot)

@@ -279,7 +279,7 @@ def _compress(options: argparse.Namespace) -> None:
     with importing():
         from torchid.commands.compress import compress
         from torchid.config import load_config
-        from torchid.terminal.compression import print_compression
+        from torchid.terminal.identification import print_compression
 
     print_compression(compress(load_config(options.file, options.overrides), options.output))
 

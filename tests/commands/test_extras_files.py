@@ -18,8 +18,8 @@ from synthetic import Array, Oracle, load, make_log
 from welded import CONTACTS, SENSORS, STATES, machine
 
 from torchid.cli import main
+from torchid.commands.chosen_settings import WidthReader
 from torchid.commands.reading import LogReader
-from torchid.commands.width_reader import WidthReader
 from torchid.config import load_config
 from torchid.fitting.calibration import Calibration
 from torchid.fitting.experiment import set_up

@@ -66,10 +66,10 @@ class Identification:
         experiment: robot, contacts, sensors and settings, with the noise and the ridge that were used.
         estimate: the fit.
         extras: offsets, scales and actuator terms.
-        noise: that rows were weighed with.
+        noise: that rows were weighted with.
         motion_noise: what noise of the motion had added to the normal equations.
         misfit: what the fit leaves of the forces, and what noise would leave.
-        robust: how outliers were weighed down, if so.
+        robust: how outliers were down-weighted, if so.
         states: contact states of the training logs.
         by_state: what each of them determines on its own.
         contributions: what each training log, contact state and sensor adds.

@@ -18,7 +18,7 @@ from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, relative_tolera
 from torchid.settings import NotNegative, Tolerance, validate_settings
 
 IDENTIFIED, PRIOR, COMBINED = "identified", "dominated by the prior", "only in combination"
-UNOBSERVABLE, FIXED = "cannot be seen", "fixed"
+UNOBSERVABLE, FIXED = "unobservable", "fixed"
 VERDICTS = (IDENTIFIED, PRIOR, COMBINED, UNOBSERVABLE, FIXED)
 
 _OBSERVABLE = 1e-12  # squared share in the row space: that of a finger in a sum with the trunk's mass is 1e-7
@@ -85,7 +85,7 @@ class Estimate:
 
         "identified": the data determine it and have the larger share; "dominated by the prior": they determine it, but
         the nominal value has the larger share; "only in combination": they determine only sums with other parameters,
-        however large their share; "cannot be seen": unobservable, no row depends on it; "fixed": not free.
+        however large their share; "unobservable": no row depends on it; "fixed": not free.
 
         Source: the three kinds of Atkeson, An, Hollerbach, IJRR 1986, and the prior.
         """

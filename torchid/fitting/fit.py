@@ -149,7 +149,7 @@ class LogFitter:
         return replace(assembly, problem=problem, if_known=known, **known_of)  # type: ignore[arg-type]
 
     def build_problem(self, parts: Sequence[Part]) -> LogProblem:
-        """The problem of compressed logs, readings of contact sensors in the air weighed by their own noise.
+        """The problem of compressed logs, readings of contact sensors in the air weighted by their own noise.
 
         A first least-squares fit shows by how much all other rows miss the stated noise.
         """
@@ -157,8 +157,8 @@ class LogFitter:
         if not any(part.unloaded for part in parts):
             return LogProblem(list(parts), assembly)
         first = self.least_squares.solve(assembly.problem)
-        weighed = [_with_own_noise(part, first.residual_std) for part in parts]
-        return LogProblem(weighed, self.assemble(weighed))
+        weighted = [_with_own_noise(part, first.residual_std) for part in parts]
+        return LogProblem(weighted, self.assemble(weighted))
 
     def solve_problem(self, problem: LogProblem, solve: Solve | None = None) -> Fit:
         """Solve what `build_problem` has built; `solve` instead of the estimator's."""

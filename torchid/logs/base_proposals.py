@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.logs.column_groups import Family
-from torchid.logs.column_proposals import is_desired
-from torchid.logs.file_samples import Columns, side_by_side
+from torchid.logs.column_proposals import BASES, is_desired, words_of
+from torchid.logs.file_samples import FileSample, side_by_side
 from torchid.logs.log import FloatArray
 from torchid.logs.units import quantities_with, split_unit
 
@@ -23,14 +23,13 @@ _CLEAR = 0.05  # of a mean cosine, by which one order of a quaternion is better 
 _PLACE = {"p", "pos", "position", "positions", "xyz", "r", "loc", "location", "translation", "trans"}
 _TURN = {"q", "e", "o", "ori", "orient", "orientation", "quat", "quaternion", "rot", "rotation", "attitude"}
 _WHOSE = re.compile(
-    r"base|root|trunk|torso|pelvis|body|floating|mocap|odom|odometry|state|states|data|pose|world|robot|est|"
+    rf"{BASES}|floating|state|states|data|pose|world|robot|est|"
     r"estimated?|meas|measured|link|vicon|optitrack|ground|truth|gt|global|"
     r"basis|rumpf"
 )
-_SPLIT = re.compile(r"[^A-Za-z]+|(?<=[a-z])(?=[A-Z])")
 
 
-def field_of_base(family: Family, sample: Columns) -> str:
+def field_of_base(family: Family, sample: FileSample) -> str:
     """The field of the base that three or four numbers are whose names say little, by their values; "" for none.
 
     Names say that something is a position, or nothing beside its axes, and of nothing else than the base whose it is:
@@ -42,7 +41,7 @@ def field_of_base(family: Family, sample: Columns) -> str:
     if values.dtype.kind not in "fiu" or values.ndim < 2 or len(values) < 3:
         return ""
     numbers = np.asarray(values, dtype=float).reshape(len(values), -1)
-    words = [word.lower() for word in _SPLIT.split(family.stem) if word]
+    words = words_of(family.stem)
     other = {word for word in words if not _WHOSE.fullmatch(word)}
     axes = "".join(sorted(family.axes)).lower()
     if numbers.shape[1] == 3 and axes in ("", "xyz") and family.unit_may_be("length"):
@@ -109,8 +108,8 @@ _OTHER_NAMES = {"roulis": "roll", "tangage": "pitch", "lacet": "yaw", "nickwinke
 _ANGLE = re.compile(rf"(?<![a-z])({'|'.join([*_NAMES, *_OTHER_NAMES])})(?![a-z])", re.IGNORECASE)
 _TRIPLE = re.compile(r"(?<![a-z])(rpy|euler\w*?)(?![a-z])", re.IGNORECASE)
 #: Words beside these in names of what turns the base, rather than a joint or a rate.
-_OF_BASE = re.compile(
-    r"(base|root|trunk|torso|pelvis|body|floating|mocap|odom|odometry|imu|ahrs|euler|rpy|orientation|attitude|angles?|"
+_BESIDE_ANGLES = re.compile(
+    rf"({BASES}|floating|imu|ahrs|euler|rpy|orientation|attitude|angles?|"
     r"state|states|data|pose|world|robot|est|estimated?|meas|measured|link|sensor|rotation|rot|value|x|y|z)"
 )
 _LARGEST = 6.5  # [rad]: of no angle within a turn
@@ -132,7 +131,7 @@ class Angles:
     note: str
 
 
-def find_angles(sample: Columns, names: Sequence[str]) -> Angles | None:
+def find_angles(sample: FileSample, names: Sequence[str]) -> Angles | None:
     """Roll, pitch and yaw of the base, as three columns or as an array (N, 3); None where no names say so.
 
     Args:
@@ -144,7 +143,7 @@ def find_angles(sample: Columns, names: Sequence[str]) -> Angles | None:
     for columns in (*_triples(list(known)), *arrays):
         stem, unit = split_unit(columns[0])
         of_angle = not unit or "angle" in quantities_with(unit)
-        if of_angle and all(_OF_BASE.fullmatch(word) for word in _words(_ANGLE.sub("", _TRIPLE.sub("", stem)))):
+        if of_angle and all(_BESIDE_ANGLES.fullmatch(word) for word in words_of(_ANGLE.sub("", _TRIPLE.sub("", stem)))):
             return _angles({name: known[name] for name in columns}, unit)
     return None
 
@@ -170,10 +169,6 @@ def _in_turn(names: Sequence[str]) -> bool:
         return False
     changed = [[(a, b) for a, b in zip(*pair, strict=True) if a != b] for pair in pairwise(names)]
     return all(len(of) == 1 and ord(of[0][1]) == ord(of[0][0]) + 1 for of in changed)
-
-
-def _words(text: str) -> list[str]:
-    return [word.lower() for word in _SPLIT.split(text) if word]
 
 
 def _angles(values: Mapping[str, NDArray[Any]], unit: str) -> Angles:

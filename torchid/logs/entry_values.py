@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from torchid.errors import LogError
 from torchid.logs.column_entries import KEY, AngleEntry, ColumnEntry, Gains, VectorEntry
-from torchid.logs.column_map import Part, values_by_name
+from torchid.logs.column_map import EntryPart, values_by_name
 from torchid.logs.column_matching import Matched
 from torchid.logs.log import FloatArray
 from torchid.logs.units import IN_DEGREES, TRANSLATION, unit_factor
@@ -127,7 +127,7 @@ def _names_in_degrees(matched: Matched) -> set[str]:
     return {*matched.names, ""} - moving
 
 
-def _element_factors(part: Part, names: Sequence[str], in_degrees: Collection[str]) -> FloatArray | None:
+def _element_factors(part: EntryPart, names: Sequence[str], in_degrees: Collection[str]) -> FloatArray | None:
     """What the elements of a sample are multiplied by, (n,), (k,) or (n, k); None where that is 1.
 
     Args:
@@ -157,7 +157,9 @@ def _element_factors(part: Part, names: Sequence[str], in_degrees: Collection[st
     return None if (out == 1.0).all() else out.reshape(shape)
 
 
-def _joint_turns(part: Part, names: Sequence[str], in_degrees: Collection[str]) -> tuple[FloatArray, FloatArray] | None:
+def _joint_turns(
+    part: EntryPart, names: Sequence[str], in_degrees: Collection[str]
+) -> tuple[FloatArray, FloatArray] | None:
     """Where the turn of each joint begins, NaN for one that is taken as it is, and how much a turn is, each (n,).
 
     As in `_element_factors`.

@@ -9,7 +9,7 @@ import numpy as np
 
 from torchid.logs.column_groups import Family
 from torchid.logs.column_proposals import OF_BASE, OF_PLATES, is_no_torque
-from torchid.logs.file_samples import Columns, increases, side_by_side, stated_names
+from torchid.logs.file_samples import FileSample, increases, side_by_side, stated_names
 from torchid.logs.force_proposals import FORCE, MOMENT
 from torchid.logs.joint_orders import JOINT_ORDERS, MOTORS, numbered_joints, suitable_orders
 from torchid.logs.name_matching import KnownRobot
@@ -32,7 +32,7 @@ class FieldMatcher:
         partial: by field that is left out for it, joints that have columns of other fields alone.
     """
 
-    def __init__(self, sample: Columns, robot: KnownRobot) -> None:
+    def __init__(self, sample: FileSample, robot: KnownRobot) -> None:
         self.sample, self.robot = sample, robot
         self.stated = stated_names(sample, "joint_names")
         self.names_stated = bool(self.stated) and set(self.stated) <= set(robot.joints)

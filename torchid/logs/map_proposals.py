@@ -17,7 +17,7 @@ from torchid.logs.column_groups import Family, find_families, split_arrays, spli
 from torchid.logs.column_proposals import is_desired, propose_field
 from torchid.logs.columns import is_column
 from torchid.logs.field_matching import FieldMatcher
-from torchid.logs.file_samples import Columns, increases, listed_order, side_by_side
+from torchid.logs.file_samples import FileSample, increases, listed_order, side_by_side
 from torchid.logs.force_proposals import MOMENT, are_states, point_along_z, threshold
 from torchid.logs.joint_orders import JOINT_ORDERS, numbered_joints, usual_order
 from torchid.logs.log import SHAPES, VARIANTS, WRENCHES
@@ -57,7 +57,7 @@ class MapProposal:
 
 
 def propose_map(
-    sample: Columns, robot: KnownRobot, files: Sequence[Collection[str]] = (), in_degrees: Collection[str] = ()
+    sample: FileSample, robot: KnownRobot, files: Sequence[Collection[str]] = (), in_degrees: Collection[str] = ()
 ) -> MapProposal:
     """Sort foreign columns into fields of a log by what they are called and what is in them.
 
@@ -75,7 +75,7 @@ def propose_map(
 
 class _Proposer:
     def __init__(
-        self, sample: Columns, robot: KnownRobot, files: Sequence[Collection[str]], in_degrees: Collection[str]
+        self, sample: FileSample, robot: KnownRobot, files: Sequence[Collection[str]], in_degrees: Collection[str]
     ) -> None:
         self.sample, self.robot, self.files, self.in_degrees = dict(sample), robot, files, in_degrees
         self.match = FieldMatcher(self.sample, robot)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.logs.base_proposals import vertical_in_base
-from torchid.logs.file_samples import Columns, stated_names
+from torchid.logs.file_samples import FileSample, stated_names
 from torchid.logs.gaps import turn_jumps
 from torchid.logs.joint_orders import names_by_number
 from torchid.logs.units import OF_JOINTS, UNITS, unit_factor
@@ -29,7 +29,7 @@ _TURNS = {"rad": 2.0 * np.pi, "deg": 360.0, "rev": 1.0, "mrad": 2e3 * np.pi}
 Numbers = NDArray[np.float64]
 
 
-def step_of_stamps(sample: Columns) -> tuple[str, float] | None:
+def step_of_stamps(sample: FileSample) -> tuple[str, float] | None:
     """The name and the value [s] of a number that is the step between samples, of a recording without stamps."""
     for name, values in sample.items():
         if values is None or not values.size or values.dtype.kind not in "fiu" or not _STEP_NAME.fullmatch(name):
@@ -43,7 +43,7 @@ def step_of_stamps(sample: Columns) -> tuple[str, float] | None:
 class UnitProposer:
     """Adds units to the entries of a map, with a note for each."""
 
-    def __init__(self, sample: Columns, columns: dict[str, Any], notes: dict[str, str], stated: Mapping[str, float]):
+    def __init__(self, sample: FileSample, columns: dict[str, Any], notes: dict[str, str], stated: Mapping[str, float]):
         """Of a map that is being made.
 
         Args:

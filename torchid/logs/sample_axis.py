@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from torchid.errors import excerpt
 from torchid.logs.column_proposals import propose_field
-from torchid.logs.file_samples import Columns, increases
+from torchid.logs.file_samples import FileSample, increases
 
 _FEW = 2  # arrays that agree about a length, of files without stamps
 
 
-def with_samples_first(sample: Columns, joints: int) -> tuple[Columns, dict[str, str]]:
+def with_samples_first(sample: FileSample, joints: int) -> tuple[FileSample, dict[str, str]]:
     """Arrays with a row for each sample, those that were transposed for it by the name `NAME.T`; and notes on them.
 
     How many samples there are is what stamps say, else the last length of several arrays. Nothing is transposed that
@@ -42,7 +42,7 @@ def with_samples_first(sample: Columns, joints: int) -> tuple[Columns, dict[str,
     return out | {f"{name}.T": matrices[name].T for name in turned}, notes
 
 
-def _count(sample: Columns, matrices: Collection[NDArray[np.generic]]) -> int:
+def _count(sample: FileSample, matrices: Collection[NDArray[np.generic]]) -> int:
     """How many samples there are, 0 where arrays do not say so."""
     flat = {name: x for name, x in sample.items() if x is not None and x.size == max(x.shape, default=0) > 2}
     for name, x in flat.items():

@@ -51,6 +51,7 @@ _PLAIN_DECADES, _ROUNDING = 3.0, 1e-9
 _FEW_DECADES = 1e3  # span of an axis on which 2 and 5 are labelled, too
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _FLOOR = "noise of the readings alone"
+_MOST_BARS = 20  # of a kind of contributions
 #: 5 % larger than with the usual 6, in two thirds of the time.
 _COMPRESSION = 3
 #: Dates in files, without which the same run writes the same files.
@@ -190,14 +191,14 @@ def identifiability_figure(body_names: Sequence[str], estimate: Estimate) -> Fig
 
 
 @matplotlib.rc_context(STYLE)
-def contribution_figure(groups: Mapping[str, Sequence[tuple[str, float]]], max_rows: int = 20) -> Figure:
+def contribution_figure(groups: Mapping[str, Sequence[tuple[str, float]]]) -> Figure:
     """Bits lost without each log, contact state or sensor, by group: pairs of name and bits, the largest first.
 
     Groups of one are left out if there are others.
     """
     several = {group: pairs for group, pairs in groups.items() if len(pairs) > 1}  # one alone has all that there is
     shown = {
-        group: sorted(pairs, key=lambda pair: -pair[1])[:max_rows]
+        group: sorted(pairs, key=lambda pair: -pair[1])[:_MOST_BARS]
         for group, pairs in (several or groups).items()
         if pairs
     }
