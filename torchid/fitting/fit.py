@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchid.errors import TorchidWarning, UnknownNameError
 from torchid.estimators import Estimate, LeastSquares
+from torchid.estimators.least_squares import Minimizer
 from torchid.fitting.known_masses import TOTAL, KnownMass, with_known_masses
 from torchid.identifiability.block_scatter import BlockScatter, block_scatter
 from torchid.identifiability.confounding import ExtraEstimate, estimate_extras, mass_weights
@@ -41,6 +42,9 @@ class BatchEstimator(Protocol):
 
     def solve(self, problem: LinearProblem) -> Estimate:
         """Fit the free parameters."""
+
+    def minimize(self, problem: LinearProblem) -> Minimizer:
+        """The parameters of `solve` alone, without statistics."""
 
 
 @dataclass(frozen=True)
