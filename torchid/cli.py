@@ -198,7 +198,7 @@ def _add_work_on_logs(commands: _Commands) -> None:
     check.set_defaults(command=_check)
     convert = commands.add_parser("convert", help=_CONVERT, description=_CONVERT)
     convert.add_argument(
-        "source", metavar="IN", help="log: .npz, .h5, .csv, .parquet, .mot, .sto, or a bag of ROS messages"
+        "source", metavar="IN", help="log: .npz, .h5, .mat, .csv, .txt, .parquet, .mot, .sto, or a bag of ROS messages"
     )
     convert.add_argument("target", metavar="OUT", help="file to write: .npz, .h5, .csv or .parquet")
     convert.add_argument("--topics", metavar="FILE", help="experiment file with logs.topics, the map of a bag's topics")
@@ -214,7 +214,7 @@ def _add_starts(commands: _Commands) -> None:
     init.add_argument(
         "log",
         metavar="LOG",
-        help="table, arrays or bag: .csv, .parquet, .mot, .sto, .npz, .h5, .mcap, .db3, .bag; "
+        help="table, arrays or bag: .csv, .txt, .parquet, .mot, .sto, .npz, .h5, .mat, .mcap, .db3, .bag; "
         "or several, 'FILE + FILE@SECONDS'",
     )
     init.add_argument("--output", default="experiment.yaml", metavar="FILE", help="file to write, a new one")

@@ -9,36 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from dialects import ORDER, in_order, save_csv, with_velocity
+from dialects import ORDER, in_order, save_csv
+from initiated import URDF, columns_of, initiated, recorded
 from motions import value
-from repository import DEMO
 
-from torchid.commands.init import Initiated, init
+from torchid.commands.init import init
 from torchid.config import load_config
-from torchid.fitting.experiment import set_up
-from torchid.logs import Log, read_log, write_log
-
-URDF = DEMO / "quadruped.urdf"
-
-
-def recorded() -> Log:
-    return with_velocity(read_log(DEMO / "sway_train.npz").select(slice(0, 300)))
-
-
-def initiated(path: Path, urdf: Path = URDF) -> tuple[Log, Initiated, str]:
-    """The log that an experiment file of `init` reads, what was said, and the file."""
-    said = init(urdf, path, path.with_suffix(".yaml"))
-    config = load_config(path.with_suffix(".yaml"))
-    set_up(config)
-    return read_log(path, columns=config.logs.columns), said, path.with_suffix(".yaml").read_text()
-
-
-def columns_of(log: Log, names: tuple[str, str, str], first: int = 0) -> dict[str, Any]:
-    """Columns by number of position, velocity and torque, in an order of motors."""
-    given = (log.joint_position, log.joint_velocity, log.joint_torque)
-    return {
-        name.format(k + first): in_order(log, x)[:, k] for name, x in zip(names, given, strict=True) for k in range(12)
-    }
+from torchid.logs import read_log, write_log
 
 
 def test_columns_that_may_be_torques_are_listed_and_take_no_more_than_a_mark_off(tmp_path: Path) -> None:
@@ -151,10 +128,6 @@ def test_numbers_of_states_are_no_flags(tmp_path: Path) -> None:
 
 def test_arrays_that_no_map_takes_are_named_with_what_to_do(tmp_path: Path) -> None:
     log = recorded()
-    np.savez(tmp_path / "x.npz", t=log.time, q=log.joint_position.T, tau=value(log.joint_torque).T)
-    said = init(URDF, tmp_path / "x.npz", tmp_path / "x.yaml")
-    shape = f"' has shape (12, {len(log)}); if its columns are the samples, save it transposed, (N, 12)"
-    assert any(shape in line for line in said.guessed)
     names = ["t", *(f"q_{name}" for name in log.joint_names)]
     np.savez(tmp_path / "y.npz", data=np.column_stack([log.time, log.joint_position]), labels=np.array(names))
     said = init(URDF, tmp_path / "y.npz", tmp_path / "y.yaml")

@@ -58,6 +58,36 @@ def test_columns_that_an_array_has_not_are_refused(tmp_path: Path, text: str) ->
         read_log(saved(tmp_path / "x.npz"), columns=columns)
 
 
+@pytest.mark.parametrize("folder", [False, True], ids=["in memory", "on the disk"])
+@pytest.mark.parametrize("suffix", [".npz", ".h5", "chunks.h5"])
+def test_transposed_arrays_and_fields_of_records_are_fields_whole_and_in_blocks(
+    tmp_path: Path, suffix: str, folder: bool
+) -> None:
+    records = np.zeros(50, [("time", "f8"), ("state", [("q", "f8", (2,)), ("mode", "i4")])])
+    records["time"], records["state"]["q"] = TIME, QPOS[:, 7:]
+    path = tmp_path / f"x{suffix}"
+    if suffix == ".npz":
+        np.savez(path, all=records, qpos=QPOS.T)
+    else:
+        packed: dict[str, Any] = {"chunks": (3, 16), "compression": "gzip"} if suffix == "chunks.h5" else {}
+        with h5py.File(path, "w") as file:
+            file["all"] = records
+            file.create_dataset("qpos", data=QPOS.T, **packed)
+    stated = MAP | {"time": {"column": "all['time']"}, "joint_position": {"column": "all['state']['q']"}}
+    stated |= {"base_position_world": {"column": "qpos.T[0:3]"}, "base_quat_wxyz": {"column": "qpos.T[3:7]"}}
+    columns = Columns(**(stated | {"joint_torque": {"column": "qpos.T[7:]"}}))  # type: ignore[arg-type]
+    log = read_log(path, columns=columns)
+    np.testing.assert_array_equal(log.joint_position, QPOS[:, 7:])
+    np.testing.assert_array_equal(log.joint_torque, QPOS[:, 7:])
+    np.testing.assert_array_equal(log.base_position_world, QPOS[:, :3])
+    with open_log_blocks(path, tmp_path if folder else None, columns) as blocks:
+        some = blocks.read(slice(20, 30))
+    np.testing.assert_array_equal(some.time, TIME[20:30])
+    np.testing.assert_array_equal(some.joint_position, QPOS[20:30, 7:])
+    np.testing.assert_array_equal(some.base_position_world, QPOS[20:30, :3])
+    np.testing.assert_array_equal(some.base_quat_xyzw, log.base_quat_xyzw[20:30])
+
+
 def test_an_array_without_an_entry_stays_unknown(tmp_path: Path) -> None:
     assert "qpos" in log_refusal(saved(tmp_path / "x.npz"))
 

@@ -109,6 +109,21 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
         "unknown name 'q'",
     ),
     (POSITION + "joint_torque: {unit: N mm, pd: {kd: 1}}", {}, "joint_torque: unit beside pd, which it says nothing"),
+    (
+        POSITION + "joint_torque: {current: {column: 'r_{index}', torque_constant: {hip: 1}, gear_ratio: 9}}",
+        {"r_0": TIME, "r_1": TIME},
+        "joint_torque.current.torque_constant: no torque constant of knee; accepted: one for every joint",
+    ),
+    (
+        POSITION + "joint_torque: {current: {column: 'r_{index}', unit: N m, torque_constant: 1, gear_ratio: 9}}",
+        {"r_0": TIME, "r_1": TIME},
+        "joint_torque.current.unit: 'N m', a unit of torque; accepted: A, mA",
+    ),
+    (
+        POSITION + "joint_torque: {current: {torque_constant: 1, gear_ratio: 9}}",
+        {},
+        "joint_torque.current: nothing that says where it is; accepted: one of column, columns",
+    ),
     (POSITION + "contact_active: {above: 3}", {}, "contact_active.above: set, without a force; accepted: a column"),
     (
         POSITION + "contact_active: {above: 3, always: [a]}",
@@ -170,6 +185,16 @@ BAD_ARRAYS: list[tuple[str, dict[str, Any], str]] = [
     (ORDER + "joint_position: p", {}, "logs.columns.joint_position: 'p', no such column; accepted: "),
     (ORDER + "joint_position: q", {"q": np.array([["a", "b"]] * 3)}, "'q': values of type <U1; accepted: real numbers"),
     (ORDER + "joint_position: q", {"q": np.array(1.0)}, "'q': a single value"),
+    (ORDER + "joint_position: q", {"q": np.ones((2, 3))}, "'q': shape (N, 3); accepted: (N, 2), one for each name of"),
+    (ORDER + "joint_position: q.T", {"q": np.ones((2, 3, 1))}, "'q.T': an array of shape (2, 3, 1); accepted: one of"),
+    (ORDER + "joint_position: p.T", {}, "logs.columns.joint_position: 'p.T', no such column; accepted: "),
+    (ORDER + "joint_position: \"q['a']\"", {}, "'q['a']': an array of shape (N, 2); accepted: an array of records"),
+    (
+        ORDER + "joint_position: \"q['a']\"",
+        {"q": np.zeros(3, [("b", "f8", (2,)), ("c", "f8")])},
+        "'q['a']': no such field; accepted: fields of 'q': b, c",
+    ),
+    (ORDER + "joint_position: q", {"q": np.array([{}, []], dtype=object)}, "q: Python objects (pickled), references"),
     (
         ORDER + "joint_position: q",
         {"q": np.ones((4, 2))},

@@ -227,6 +227,22 @@ def test_a_pd_law_gives_the_torque(tmp_path: Path) -> None:
         np.testing.assert_allclose(log.joint_torque, expected, rtol=1e-14, atol=1e-14, err_msg=law)
 
 
+def test_currents_times_constants_and_gears_are_torques(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    q, current = rng.standard_normal((2, 3, 2))
+    text = "joint_order: [l_hip, l_knee]\njoint_position: q\njoint_torque: {current: {%s}}"
+    for entry, factor in (
+        ("column: i, torque_constant: 0.1, gear_ratio: 9", [0.9, 0.9]),
+        ('column: i, unit: mA, torque_constant: {"*": 0.1, l_knee: 0.2}, gear_ratio: {"*": 9, "*_hip": 6}',
+         [0.6e-3, 1.8e-3]),
+        ("column: i, scale: {l_hip: -1, l_knee: 1}, torque_constant: 0.1, gear_ratio: 9", [-0.9, 0.9]),
+        ("column: i, order: [l_knee, l_hip], torque_constant: {l_hip: 1, l_knee: 2}, gear_ratio: 1", None),
+    ):  # fmt: skip
+        log = mapped_arrays(tmp_path, text % entry, q=q, i=current)
+        expected = current[:, ::-1] * [1.0, 2.0] if factor is None else current * factor
+        np.testing.assert_allclose(log.joint_torque, expected, rtol=1e-14, err_msg=entry)
+
+
 def test_gains_may_be_columns_of_a_table(tmp_path: Path) -> None:
     text = POSITION + 'joint_torque: {pd: {kp: "kp_{index}", position: "goal_{index}"}}'
     columns = {"kp_0": [1, 2, 3], "kp_1": [10, 20, 30], "goal_0": [2, 2, 2], "goal_1": [5, 5, 5]}

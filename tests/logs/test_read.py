@@ -254,9 +254,9 @@ def test_absent_and_foreign_files_are_named(tmp_path: Path) -> None:
     assert "no such file" in log_refusal(tmp_path / "absent.npz")
     (tmp_path / "folder.npz").mkdir()
     assert "a folder" in log_refusal(tmp_path / "folder.npz")
-    (tmp_path / "log.mat").write_text("time\n0\n")
-    accepted = ".npz, .h5, .hdf5, .csv, .parquet, .mot, .sto, .bag, .mcap, .db3"
-    assert f"extension '.mat'; accepted: {accepted}" in log_refusal(tmp_path / "log.mat")
+    (tmp_path / "log.xls").write_text("time\n0\n")
+    accepted = ".npz, .h5, .hdf5, .csv, .parquet, .mat, .tsv, .txt, .dat, .mot, .sto, .bag, .mcap, .db3"
+    assert f"extension '.xls'; accepted: {accepted}" in log_refusal(tmp_path / "log.xls")
     for suffix in SUFFIXES:
         (tmp_path / f"text{suffix}").write_text("not a log")
         assert "cannot be read" in log_refusal(tmp_path / f"text{suffix}")
@@ -267,11 +267,11 @@ def test_absent_and_foreign_files_are_named(tmp_path: Path) -> None:
 def test_pickled_objects_are_refused(tmp_path: Path) -> None:
     objects = np.array([{}, 1], dtype=object)
     np.savez(tmp_path / "x.npz", **changed(joint_names=objects))
-    assert "joint_names: cannot be read" in log_refusal(tmp_path / "x.npz")
+    assert "joint_names: Python objects (pickled), references or ragged rows" in log_refusal(tmp_path / "x.npz")
     ragged = h5py.vlen_dtype(np.float64)
     with h5py.File(write_arrays(tmp_path / "x.h5", changed(time=None)), "a") as file:
         file.create_dataset("time", (N,), dtype=ragged)
-    assert "time: values of type object" in log_refusal(tmp_path / "x.h5")
+    assert "time: Python objects (pickled), references or ragged rows" in log_refusal(tmp_path / "x.h5")
 
 
 def test_without_h5py_the_message_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,7 @@ import yaml
 
 from torchid.commands.folder import check_free_file
 from torchid.commands.init_hints import hints, keys_for_gaps, missing_columns, notes_on_arrays
-from torchid.commands.init_proposals import Split, limb_sensors, proposed_sensors, read_sensors, split_log
+from torchid.commands.init_proposals import Split, like_torques, limb_sensors, proposed_sensors, read_sensors, split_log
 from torchid.commands.reading import memory_needed
 from torchid.config.preprocessing import PreprocessingConfig
 from torchid.errors import ConfigError, InputError, LogError, about_file, excerpt, format_count, join_names
@@ -45,7 +45,6 @@ _IMU = ("imu_specific_force", "imu_angular_velocity")
 _RATE = "base_angular_velocity_base"
 _WHAT = {"columns": "names, units and orders of the file", "topics": "what the messages of the bag hold"}
 _WELDED = "joints that the log lacks, held still; one that moves needs readings"
-_LIKE_TORQUES = "of these no name says what they are; uncomment one of torques [N m], or currents with scale: N m per A"
 _LINE = 118
 
 
@@ -151,7 +150,7 @@ def _known(robot: Robot, contacts: Sequence[_Contact]) -> KnownRobot:
     on_base, elsewhere = ([name for name, (body, _) in robot.links.items() if bool(body) == x] for x in (False, True))
     feet, weight = [contact.frame for contact in contacts], -GRAVITY_WORLD[2] * float(robot.nominal[:, 0].sum())
     known = robot.joint_names, feet, robot.path.stem, weight, robot.base_link, on_base, elsewhere, limb_sensors(robot)
-    return KnownRobot(*known, [link for link in on_base if is_along_base(robot, link)])
+    return KnownRobot(*known, [link for link in on_base if is_along_base(robot, link)], robot.sliding)
 
 
 def _stated_contacts(sample: Any, robot: Robot) -> list[str]:
@@ -347,9 +346,10 @@ def _text(
             note = proposal.notes.get(key, "")
             lines += [f"    # guessed: {note}"] if note else []
             lines += [f"    {line}" for line in _entry(key, value)]
-        lines += [f"    # {_LIKE_TORQUES}"] * bool(proposal.like_torques)
-        for family in proposal.like_torques:
-            lines += [f"    # {line}" for line in _entry("joint_torque", family.counted_entry)]
+        remark, entries = like_torques(proposal.like_torques)
+        lines += [
+            f"    # {line}" for line in [remark, *(x for one in entries for x in _entry("joint_torque", one))] if line
+        ]
     lines += [f"# {' and '.join(from_feet)}: nobody recorded them"] if from_feet else []
     lines += [f"# {key}: {why}" for key, (_, why) in gaps.items()]
     stated = {key: value for key, (value, _) in gaps.items()}

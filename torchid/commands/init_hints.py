@@ -10,12 +10,11 @@ import numpy as np
 from torchid.errors import InputError, excerpt, format_count, join_names
 from torchid.logs import Log
 from torchid.logs.column_groups import Family
-from torchid.logs.column_proposals import OF_PLATES, is_desired, propose_field
+from torchid.logs.column_proposals import OF_PLATES, is_current, is_desired, propose_field
 from torchid.logs.file_samples import FileSample
 from torchid.logs.log import WRENCHES
 
 _OTHER_FILE = "; if another file has it: torchid init ROBOT 'FILE + FILE@SECONDS', docs/logs.md"
-_CURRENT = re.compile(r"current(?!.*limit)|(?<![a-z])amps?(?![a-z])|(?<![a-z])iq(?![a-z])", re.IGNORECASE)
 _LIMB_SENSOR = re.compile(r"(?<![a-z])(ft|loadcell|load_cell)(?![a-z]).*[xyz]$|(?<![a-z])fts?(?![a-z])", re.IGNORECASE)
 _EULER = re.compile(r"(?<![a-z])(roll|pitch|yaw|rpy|euler)(?![a-z])", re.IGNORECASE)
 _AS_ANGLES = "base_quat_wxyz: {rpy: ...}"
@@ -56,9 +55,6 @@ def hints(
         like_torques: columns of which there is one for each joint.
     """
     out = []
-    if like_torques:
-        each = join_names([_like(one.columns) for one in like_torques])
-        out.append(f"joint_torque: no {what} says that it is one; {each} have one of each joint: see the file")
     measured = [name for name in left_out if not is_desired(name)]
     if plates := [name for name in left_out if propose_field(name) in OF_PLATES]:
         unknown = "without which foot stands on which and where each lies (docs/logs.md, Force plates)"
@@ -70,9 +66,7 @@ def hints(
             f"joint_position: {format_count(len(positions), what)} like '{excerpt(positions[0])}' may be of other"
             f" joints; {names}: is it the one that was recorded?"
         )
-    if "joint_torque" not in fields and (currents := [name for name in measured if _CURRENT.search(name)]):
-        how = "scale: N m of the joint per A, its torque constant times the gear ratio, by joint"
-        out.append(f"joint_torque: {_like(currents)} may be currents of motors; give them as joint_torque with {how}")
+    out += _torque_hint([] if "joint_torque" in fields else measured, what, like_torques)
     if not {"ft_wrench", *WRENCHES} & set(fields) and (sensors := [x for x in measured if _LIMB_SENSOR.search(x)]):
         where = "contact_wrench_local of the foot's frame, or ft_wrench of a fixed joint in the limb"
         out.append(f"forces at the feet: {_like(sensors)} may be force/torque sensors: {where} (docs/sensors.md)")
@@ -81,6 +75,18 @@ def hints(
     if not {"base_quat_wxyz", "base_quat_xyzw"} & set(fields) and (angles := [x for x in measured if _EULER.search(x)]):
         out.append(f"base_quat: {_like(angles)} may be angles of the base; give all three as {_AS_ANGLES}")
     return out
+
+
+def _torque_hint(measured: Sequence[str], what: str, like_torques: Sequence[Family]) -> list[str]:
+    """What may be torques, or currents of motors, of a log without torques that has columns that are left out."""
+    each = join_names([_like(one.columns) for one in like_torques])
+    if any(one.is_current for one in like_torques):
+        return [f"joint_torque: {each} may be currents of motors; put torque constants and gear ratios in the file"]
+    if like_torques:
+        return [f"joint_torque: no {what} says that it is one; {each} have one of each joint: see the file"]
+    currents = [name for name in measured if is_current(name)]
+    more = "of some joints: joint_torque.current needs one of each (docs/logs.md)"
+    return [f"joint_torque: {_like(currents)} may be currents of motors, {more}"] if currents else []
 
 
 def notes_on_arrays(sample: FileSample, joints: int) -> dict[str, str]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from torchid.errors import InputError
 from torchid.logs import Log
+from torchid.logs.column_groups import Family
 from torchid.logs.cutoff import choose_cutoff
 from torchid.logs.log import FORCE_NORMAL, WRENCHES
 from torchid.logs.timeline import DROPPED_PERIODS
@@ -51,6 +52,24 @@ def proposed_sensors(fields: Collection[str], limbs: Sequence[str]) -> str | dic
     if not limbs:
         return named
     return ({"set": named} if wrench or torque else {}) | {"ft_sensors": list(limbs)}
+
+
+_LIKE_TORQUES = "of these no name says what they are; uncomment one of torques [N m]"
+_LIKE_CURRENTS = (
+    'currents of motors: put in N m/A for KT and gears for GEAR, numbers, or by joint {"*": 9, "*_knee": 12}'
+)
+
+
+def like_torques(families: Sequence[Family]) -> tuple[str, list[dict[str, object]]]:
+    """What to do with columns that may be torques, or currents of motors, "" without any; and entries of these."""
+    currents = any(family.is_current for family in families)
+    entries = [family.counted_entry for family in families]
+    if currents:
+        for entry, family in zip(entries, families, strict=True):
+            entry |= {"unit": family.unit} if family.unit not in ("", "A") else {}
+            entry |= {"torque_constant": "KT", "gear_ratio": "GEAR"}
+        entries = [{"current": entry} for entry in entries]
+    return (_LIKE_CURRENTS if currents else _LIKE_TORQUES if families else ""), entries
 
 
 _TESTED = 0.2  # of a log

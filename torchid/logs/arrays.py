@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,62 +44,144 @@ def parse_frame(name: str, array: NDArray[Any]) -> str:
     return parse_names(name, array.reshape(1))[0]
 
 
-_PART = re.compile(r"(.+)\[(\d*):(\d*)\]")
+_COLUMNS = re.compile(r"(.+)\[(\d*):(\d*)\]")
+_FIELD = re.compile(r"(.+)\['([^'\[\]]+)'\]")
+_TRANSPOSED = re.compile(r"(.+)\.T")
 
 Array = NDArray[Any]
 
 
+@dataclass(frozen=True)
+class _Part:
+    """What a name means of another array: some columns, a field of records, or the transposed array.
+
+    Attributes:
+        text: the name.
+        of: name of the other array, or part.
+        columns: first and last of `[3:7]`.
+        field: of `['q']`.
+    """
+
+    text: str
+    of: str
+    columns: tuple[str, str] | None = None
+    field: str | None = None
+
+    @classmethod
+    def of_name(cls, text: str) -> _Part | None:
+        """What a name means; None for one of an array as it is."""
+        if (match := _COLUMNS.fullmatch(text)) is not None:
+            return cls(text, match[1], columns=(match[2], match[3]))
+        if (match := _FIELD.fullmatch(text)) is not None:
+            return cls(text, match[1], field=match[2])
+        match = _TRANSPOSED.fullmatch(text)
+        return None if match is None else cls(text, match[1])
+
+    @property
+    def is_transposed(self) -> bool:
+        """Whether samples are the columns of the other array."""
+        return self.columns is None and self.field is None
+
+    def __call__(self, array: Array) -> Array:
+        """The part of an array, or of some of its rows."""
+        self.require(array.dtype, array.shape)
+        if self.columns is not None:
+            return np.asarray(array[:, self.slice(array.shape)])
+        return np.asarray(array.T if self.field is None else array[self.field])
+
+    def require(self, dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
+        """Make sure that an array has the part; LogError where it has not."""
+        by_samples = f"an array of shape ({', '.join(map(str, ('N', *shape[1:])))})"
+        if self.columns is not None:
+            self.slice(shape)
+        elif self.field is not None and self.field not in (dtype.names or ()):
+            accepted = f"fields of '{self.of}': {', '.join(dtype.names)}" if dtype.names else "an array of records"
+            raise LogError.at_field(f"'{self.text}'", "no such field" if dtype.names else by_samples, accepted)
+        elif self.is_transposed and len(shape) != 2:
+            raise LogError.at_field(f"'{self.text}'", f"an array of shape {shape}", "one of rows and columns")
+
+    def slice(self, shape: tuple[int, ...]) -> slice:
+        """The columns, of an array of a shape; LogError where it has not so many."""
+        first, last = self.columns or ("", "")
+        start, stop = int(first or 0), int(last) if last else None
+        width = shape[1] if len(shape) > 1 else 0
+        if start >= (width if stop is None else stop) or (stop or 0) > width:
+            found = f"an array of shape ({', '.join(map(str, ('N', *shape[1:])))})"
+            raise LogError.at_field(f"'{self.text}'", found, "columns that it has, counted from 0")
+        return slice(start, stop)
+
+
+def _root(text: str, given: Collection[str]) -> str | None:
+    """The array of a file that a name means a part of, or the name itself; None where there is none."""
+    while text not in given:
+        if (part := _Part.of_name(text)) is None:
+            return None
+        text = part.of
+    return text
+
+
+_A = TypeVar("_A", bound=LazyArray)
+
+
+def require_plain(name: str, array: _A) -> _A:
+    """The array itself; LogError for one of Python objects, which no reader of a log loads."""
+    if array.dtype.hasobject:
+        accepted = "plain arrays, one for each field: numpy.savez(path, time=..., q=...)"
+        raise LogError.at_field(name, "Python objects (pickled), references or ragged rows", accepted)
+    return array
+
+
+def fields_of_records(name: str, array: Array) -> Iterator[tuple[str, Array]]:
+    """The fields of an array of records, by the names that mean them, of records in records too; else the array."""
+    if not array.dtype.names:
+        yield name, array
+    for field in array.dtype.names or ():
+        yield from fields_of_records(f"{name}['{field}']", array[field])
+
+
 def with_parts(given: Sequence[str], wanted: Iterable[str]) -> list[str]:
     """Names of arrays, those of which a map wants parts replaced by these."""
-    parts, whole = dict[str, list[str]](), set[str]()
+    parts = dict[str, list[str]]()
     for text in wanted:
-        whole.add(text)
-        match = _PART.fullmatch(text)
-        if match is not None and text not in given and match[1] in given:
-            parts.setdefault(match[1], []).append(text)
-    for name in whole & set(parts):
-        parts[name].append(name)
+        if (root := _root(text, given)) is not None:
+            parts.setdefault(root, []).append(text)
     return [text for name in given for text in dict.fromkeys(parts.get(name, [name]))]
 
 
-def load_part(name: str, given: Sequence[str], load: Callable[[str], Array]) -> Array:
+def load_part(name: str, given: Collection[str], load: Callable[[str], Array]) -> Array:
     """An array of a file, or the part of one that a name of `with_parts` means.
 
     Raises:
-        LogError: an array that has not so many columns.
+        LogError: an array that has no such part.
     """
-    if name in given or (match := _PART.fullmatch(name)) is None:
+    if name in given or (part := _Part.of_name(name)) is None:
         return load(name)
-    array = load(match[1])
-    return np.asarray(array[:, _columns(match, array.shape)])
+    return part(load_part(part.of, given, load))
 
 
 class LazyPart:
-    """Some columns of an array that is read where it is sliced."""
+    """A part of an array that is read where it is sliced."""
 
-    def __init__(self, array: LazyArray, match: re.Match[str]) -> None:
+    def __init__(self, array: LazyArray, part: _Part) -> None:
         """The part of an array that a name means; LogError where it has not so many columns."""
-        self._array, self._columns = array, _columns(match, array.shape)
-        width = len(range(*self._columns.indices(array.shape[1])))
-        self.dtype, self.shape = array.dtype, (array.shape[0], width, *array.shape[2:])
+        part.require(array.dtype, array.shape)
+        self._array, self._part = array, part
+        if part.is_transposed:
+            self.dtype, self.shape = array.dtype, array.shape[::-1]
+            return
+        example = part(np.empty((0, *array.shape[1:]), array.dtype))
+        self.dtype, self.shape = example.dtype, (array.shape[0], *example.shape[1:])
 
     def __getitem__(self, rows: slice) -> Array:
-        """Some rows."""
-        return np.asarray(self._array[rows][:, self._columns])
+        """Some rows; of a transposed array one of its own rows is read at a time."""
+        if not self._part.is_transposed:
+            return self._part(np.asarray(self._array[rows]))
+        of_rows = (np.asarray(self._array[k : k + 1])[0, rows] for k in range(self.shape[1]))
+        return np.stack(list(of_rows), axis=1)
 
 
-def lazy_part(name: str, given: Sequence[str], lazy: Callable[[str], LazyArray]) -> LazyArray:
+def lazy_part(name: str, given: Collection[str], lazy: Callable[[str], LazyArray]) -> LazyArray:
     """As `load_part`, of arrays that are read where they are sliced."""
-    if name in given or (match := _PART.fullmatch(name)) is None:
+    if name in given or (part := _Part.of_name(name)) is None:
         return lazy(name)
-    return LazyPart(lazy(match[1]), match)
-
-
-def _columns(match: re.Match[str], shape: tuple[int, ...]) -> slice:
-    """The columns that a name means, of an array of a shape."""
-    start, stop = int(match[2] or 0), int(match[3]) if match[3] else None
-    width = shape[1] if len(shape) > 1 else 0
-    if start >= (width if stop is None else stop) or (stop or 0) > width:
-        found = f"an array of shape ({', '.join(map(str, ('N', *shape[1:])))})"
-        raise LogError.at_field(f"'{match[0]}'", found, "columns that it has, counted from 0")
-    return slice(start, stop)
+    return LazyPart(lazy_part(part.of, given, lazy), part)

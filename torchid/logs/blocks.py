@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import LogError, about_file
-from torchid.logs.arrays import lazy_part, parse_names
+from torchid.logs.arrays import lazy_part, parse_names, require_plain
 from torchid.logs.column_map import Columns
 from torchid.logs.containers import Container, LogKind, existing_log_kind, open_container, reader_errors_explained
 from torchid.logs.force_plates import about_world_origin
@@ -237,11 +237,11 @@ def _open_arrays(
 
     def load(name: str) -> NDArray[Any]:
         with reader_errors_explained(name, _ACCEPTED):
-            return container.load(name)
+            return require_plain(name, container.load(name))
 
     def lazy(name: str) -> LazyArray:
         with reader_errors_explained(name, _ACCEPTED):
-            return container.lazy(name, folder)
+            return require_plain(name, container.lazy(name, folder))
 
     given = list(container.declared_bytes())
     mapped = None if columns is None else map_arrays(columns, given, load)

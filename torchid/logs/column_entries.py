@@ -118,10 +118,24 @@ class PdLaw:
 
 
 @dataclass(config=STRICT, frozen=True, kw_only=True)
+class CurrentEntry(ColumnEntry):
+    """Currents of motors as columns [A], of which torques are made.
+
+    Attributes:
+        torque_constant: by pattern of the joint or one for all, torque of the motor for its current [N m/A].
+        gear_ratio: likewise, turns of the motor for one of the joint (radians for a metre of a slide).
+    """
+
+    torque_constant: Annotated[dict[str, Number], BeforeValidator(_for_all)]
+    gear_ratio: Annotated[dict[str, Number], BeforeValidator(_for_all)]
+
+
+@dataclass(config=STRICT, frozen=True, kw_only=True)
 class TorqueEntry(ColumnEntry):
-    """Torques as columns, or of a PD law."""
+    """Torques as columns, of a PD law, or of the currents of motors."""
 
     pd: PdLaw | None = None
+    current: CurrentEntry | None = None
 
 
 @dataclass(config=STRICT, frozen=True, kw_only=True)

@@ -12,15 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.logs.column_map import PLACEHOLDER
-from torchid.logs.column_proposals import propose_field
+from torchid.logs.column_proposals import is_current, propose_field
 from torchid.logs.file_samples import FileSample
 from torchid.logs.name_matching import SUFFIXES, KnownRobot, joints_by_place, spelled, within
-from torchid.logs.units import quantities_with, split_unit
+from torchid.logs.units import OF_JOINTS, quantities_with, split_unit
 
 _NUMBER = re.compile(r"\d+")
 _AXIS = re.compile(
     r"(?<=[._\-/\[ ])([wxyz])(?=$|[\]])|(?<=[a-zFM_.\-/\[ \u0080-\uffff])([WXYZ])(?=$|[\]])|(?<=[a-zFM])([wxyz])$"
-    r"|(?<=[a-z])([XYZ])(?=[/_.])",
+    r"|(?<=[a-z])([XYZ])(?=[/_.])|^([wxyzWXYZ])$|(?<=(?<![A-Za-z])[PQ])([WXYZ])$",
 )
 _BEHIND = re.compile(r"[_./ \[-]*\{[^{}]*\}\]?$")  # a unit: the axis in `acc_g.{axis}`
 
@@ -49,6 +49,7 @@ class Family:
         axes: likewise.
         by_name: by name of the URDF, its column, where the file spells names in another way; a pattern does not do.
         by_place: whether names are those of limbs with a number of the joint in each.
+        units: by column, where joints have different ones.
     """
 
     pattern: str
@@ -58,6 +59,7 @@ class Family:
     axes: tuple[str, ...]
     by_name: Mapping[str, str] = field(default_factory=dict)
     by_place: bool = False
+    units: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def proposed(self) -> str:
@@ -84,6 +86,11 @@ class Family:
     def unit(self) -> str:
         """What the columns say of their unit, "" if nothing."""
         return split_unit(_BEHIND.sub("", self.pattern))[1] or split_unit(self.pattern)[1]
+
+    @property
+    def is_current(self) -> bool:
+        """Whether the columns may be currents of motors."""
+        return is_current(self.words.replace("_", " "), self.unit)
 
     def unit_may_be(self, quantity: str) -> bool:
         """Whether they say no unit, or one of a quantity."""
@@ -143,10 +150,49 @@ def find_families(columns: Sequence[str], robot: KnownRobot) -> tuple[list[Famil
         pattern, name, number, axis = _pattern(column, kinds, False) if alone else split
         found[pattern].append((column, name, number, axis))
     out = []
-    for pattern, members in found.items():
-        out += _families(pattern, members, kinds)
+    for patterns in _apart_from_units(found):
+        some = [one for pattern in patterns for one in found[pattern]]
+        joined = len(patterns) > 1
+        out += [_with_units(patterns[0], some, kinds[0])] if joined else _families(patterns[0], some, kinds)
     more = {one.kind: f"{{{one.kind}}}{one.suffix}" for one in kinds if one.names and one.exact and one.suffix}
     return out, more
+
+
+def _apart_from_units(found: Mapping[str, Sequence[tuple[str, str, str, str]]]) -> list[list[str]]:
+    """Patterns of columns, those together that differ in units that joints may have side by side, most columns first.
+
+    A slide's position is in mm, that of a hinge in degrees.
+    """
+    by_stem = defaultdict[str, list[str]](list)
+    for pattern in found:
+        of_joints = "{joint}" in pattern or "{index}" in pattern
+        by_stem[split_unit(pattern)[0] if of_joints else pattern].append(pattern)
+    out = []
+    for patterns in by_stem.values():
+        units = [set(quantities_with(unit)) for one in patterns if (unit := split_unit(one)[1])]
+        members = [(name or number, axis) for one in patterns for _, name, number, axis in found[one]]
+        once = len(set(members)) == len(members) and not any(axis for _, axis in members)
+        if len(patterns) > 1 and once and any(all(unit & set(pair) for unit in units) for pair in OF_JOINTS.values()):
+            out.append(sorted(patterns, key=lambda one: -len(found[one])))
+        else:
+            out += [[one] for one in patterns]
+    return out
+
+
+def _with_units(pattern: str, members: Sequence[tuple[str, str, str, str]], joints: _Stems) -> Family:
+    """The family of columns of joints whose units differ."""
+    members = sorted(members, key=lambda member: int(member[2] or 0))
+    by_name = {joints.names[name]: column for column, name, *_ in members if name}
+    return Family(
+        pattern,
+        [column for column, *_ in members],
+        tuple(name for _, name, *_ in members),
+        tuple(int(number) for *_, number, _ in members if number),
+        ("",),
+        by_name,
+        joints.by_place,
+        {column: split_unit(column)[1] for column, *_ in members},
+    )
 
 
 def _families(pattern: str, members: Sequence[tuple[str, str, str, str]], kinds: Sequence[_Stems]) -> list[Family]:

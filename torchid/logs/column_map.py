@@ -205,6 +205,9 @@ def list_parts(columns: Columns) -> dict[str, EntryPart]:
             parts[f"{field}.rpy"] = EntryPart(f"{field}.rpy", entry.rpy, "", _RPY, quantities)
         if isinstance(entry, TorqueEntry) and entry.pd is not None:
             parts |= _pd_parts(entry.pd)
+        if isinstance(entry, TorqueEntry) and entry.current is not None:
+            key = f"{field}.current"
+            parts[key] = EntryPart(key, entry.current, names_field(field), (), {"": ("current",)})
     return parts
 
 
@@ -266,6 +269,7 @@ def _check_given(field: str, entry: ColumnEntry) -> None:
         "column": entry.column,
         "columns": entry.columns,
         "pd": getattr(entry, "pd", None),
+        "current": getattr(entry, "current", None),
         "always": getattr(entry, "always", None),
         "force": getattr(entry, "force", None),
         "step": getattr(entry, "step", None),
@@ -288,6 +292,8 @@ def _check_given(field: str, entry: ColumnEntry) -> None:
         raise ConfigError.at_field(f"{KEY}.{field}", "moment without force", "force, with or without moment")
     if isinstance(entry, TorqueEntry) and entry.pd is not None:
         _check_law(entry.pd)
+    if isinstance(entry, TorqueEntry) and entry.current is not None:
+        _check_given(f"{field}.current", entry.current)
 
 
 def _check_unscaled(field: str, given: list[str], beside: str) -> None:

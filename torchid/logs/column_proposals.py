@@ -34,7 +34,7 @@ _WORDS = (
     ("contact_wrench_local", r"\b(wrench|wrenches)\b"),
     ("contact_force_normal", r"\b(foot forces?|feet forces?|contact forces?|grf|fsr)\b"),
     ("contact_active", r"\b(contacts?|touch|touches|stance)\b"),
-    ("joint_torque", r"\b(taus?|torques?|efforts?|trq|load|qfrc|drehmoment|couples?)\b"),
+    ("joint_torque", r"\b(taus?|torques?|efforts?|eff|trq|load|qfrc|drehmoment|couples?)\b"),
     (
         "joint_velocity",
         r"\b(dqs?|dqj|d q|qd|qdot|thd|v|qvel|vels?|velocity|velocities|speeds?|rates?|vitesses?)\b|geschwindigkeit\b",
@@ -51,6 +51,7 @@ _APART = (("linear", "angular"), ("position", "velocity", "acceleration", "torqu
 _DESIRED = re.compile(r"\b(des|desired|cmd|command|ref|target|goal|setpoint|ff)\b")
 _ANGLES = re.compile(r"\b(rpy|euler)\b")  # of the base, three: see `orientation_proposals`
 _OF_MOTOR = re.compile(r"\b(kp|kd)\b|temp|volt|err|status|state|mode|flag|count|fault|limit", re.IGNORECASE)
+_CURRENT = re.compile(r"(?i:current(?!.*limit)|(?<![a-z])(amps?|iq|i|cur)(?![a-z]))|[_ ]m?A$")
 _OTHER_UNITS = ("V", "°C", "C", "K", "%")
 _SPLIT = re.compile(r"[^A-Za-z]+|(?<=[a-z])(?=[A-Z])")
 #: What headers without letters of ours say, the longest first.
@@ -71,6 +72,11 @@ def is_no_torque(words: str, unit: str) -> bool:
     return is_desired(words) or _OF_MOTOR.search(words) is not None or unit in _OTHER_UNITS
 
 
+def is_current(words: str, unit: str = "") -> bool:
+    """Whether columns may be currents of motors."""
+    return "current" in quantities_with(unit) or (not unit and _CURRENT.search(words) is not None)
+
+
 def propose_field(column: str, desired: bool = False) -> str:
     """The field of a log that a column probably holds, "" if nothing is plausible.
 
@@ -87,6 +93,8 @@ def propose_field(column: str, desired: bool = False) -> str:
     if (not desired and _DESIRED.search(words)) or _ANGLES.search(words):
         return ""
     named = next((field for field, pattern in _WORDS if re.search(pattern, words)), "")
+    if named == "joint_torque" and ("current" in quantities_with(unit) or words.endswith((" current", " iq"))):
+        return ""
     return named or next((_BY_QUANTITY[x] for x in quantities_with(unit) if x in _BY_QUANTITY), "")
 
 

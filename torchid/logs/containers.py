@@ -25,19 +25,21 @@ from torchid.staging import atomic_file
 
 # --------------------------------------------------------------------------------------------------- kinds of log files
 
-#: Containers of named arrays.
-ARRAYS = (".npz", ".h5", ".hdf5")
+#: Containers of named arrays; Matlab's (`save -v7.3`) are HDF5.
+_WRITTEN = (".npz", ".h5", ".hdf5")
+ARRAYS = (*_WRITTEN, ".mat")
 #: Tables of OpenSim, motions and storages: text with lines before the names of the columns.
 OPENSIM = (".mot", ".sto")
-#: Tables of text.
-TEXT_TABLES = (".csv", *OPENSIM)
+#: Tables of text, by whatever their cells are separated.
+_PLAIN_TEXT = (".tsv", ".txt", ".dat")
+TEXT_TABLES = (".csv", *_PLAIN_TEXT, *OPENSIM)
 TABLES = (*TEXT_TABLES, ".parquet")
 #: Logs that torchid compress has made factors of.
 FACTORS = ".factor"
 #: Files of ROS 1 (.bag) and ROS 2; those of ROS 2 may also lie in a folder.
 BAGS = (".bag", ".mcap", ".db3")
-WRITABLE = (*ARRAYS, ".csv", ".parquet")
-READABLE = (*WRITABLE, *OPENSIM, *BAGS)
+WRITABLE = (*_WRITTEN, ".csv", ".parquet")
+READABLE = (*WRITABLE, ".mat", *_PLAIN_TEXT, *OPENSIM, *BAGS)
 
 
 class LogKind(Enum):
@@ -163,12 +165,20 @@ def open_container(path: Path, whole: bool = True) -> Iterator[Container]:
                 container = stack.enter_context(open_npz(path))
             else:
                 h5py = import_h5py(path)
+                _require_hdf5(path, suffix, h5py)
                 container = Hdf5(stack.enter_context(h5py.File(path, "r")), h5py, path.stat().st_size)
             total = sum(container.declared_bytes().values())
         if whole and total > MAX_ARRAYS:
             raise LogError(path, "file", f"arrays of {total} bytes", f"at most {MAX_ARRAYS} bytes in all")
         check_unpacked_size(path, total)
         yield container
+
+
+def _require_hdf5(path: Path, suffix: str, h5py: Any) -> None:
+    """Refuse a file of Matlab that is no HDF5 file."""
+    if suffix == ".mat" and not h5py.is_hdf5(path):
+        accepted = "one that Matlab saved with -v7.3, or a .npz (scipy.io.loadmat, numpy.savez)"
+        raise LogError(path, "file", "no HDF5, as Matlab's files of before 7.3", accepted)
 
 
 @contextlib.contextmanager
@@ -241,6 +251,10 @@ class _Npz:
     def load(self, name: str) -> NDArray[Any]:
         """The array `name`."""
         entry = self._entry(name)
+        with self._archive.open(entry) as stream:
+            shape, _, dtype = _read_header(stream)
+        if dtype.hasobject:  # pickled, which whoever reads a field refuses
+            return np.broadcast_to(np.array(None, dtype=object), shape)
         with self._archive.open(entry) as stream, _python_2_headers_allowed():
             array: NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)
         return array

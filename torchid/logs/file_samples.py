@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import TorchidError
+from torchid.logs.arrays import fields_of_records, require_plain
 from torchid.logs.containers import LogKind, existing_log_kind, list_bag_files, open_container, reader_errors_explained
 from torchid.logs.name_matching import KnownRobot, match_names
 from torchid.logs.ros_messages import make_deserializer
@@ -41,8 +42,12 @@ def read_sample(path: Path) -> FileSample:
         for name in container.declared_bytes():
             with reader_errors_explained(name, "a plain array of numbers, truth values or text"):
                 array = container.load(name)
-            is_list = array.ndim == 1 and len(array) <= _NAMES
-            out[name] = array if array.dtype.kind in "fiub" or is_list else None
+            for part, values in fields_of_records(name, array):
+                is_list = values.ndim == 1 and len(values) <= _NAMES
+                is_plain = values.dtype.kind in "fiub" or (is_list and values.dtype.kind in "SU")
+                out[part] = values if is_plain else None
+        if out and not any(x is not None for x in out.values()):
+            require_plain(name, array)
     return out
 
 

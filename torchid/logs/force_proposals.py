@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
 
 from torchid.rounding import STD_PER_MAD
+
+FORCE = re.compile(r"force|(?<![a-z])f\{axis", re.IGNORECASE)
+MOMENT = re.compile(r"moment|torque|(?<![a-z])[mt]\{axis", re.IGNORECASE)
+"""In patterns of columns."""
 
 _UPRIGHT = 0.96  # of the size of forces along z, of feet that walk
 _AIR = 0.1  # of the way from the lowest to the highest reading: of a foot in the air

@@ -23,6 +23,7 @@ _ACCEPTED = "gzip or lzf, shuffle and fletcher32, each once (h5repack rewrites o
 #: Bytes of a checksum, bytes that are unpacked at a time, and bytes of an array's header in a file.
 _CHECKSUM_BYTES, _PIECE_BYTES, _HEADER_BYTES = 4, 2**22, 4096
 _DEPTH = 8  # of groups in groups
+_OF_MATLAB = ("#refs#", "#subsystem#")  # what cells and objects of its files refer to
 
 
 class Hdf5:
@@ -44,7 +45,7 @@ class Hdf5:
         for prefix, group in groups:
             count += len(group)
             check_fields((), count)
-            for name in group:
+            for name in group if prefix else [name for name in group if name not in _OF_MATLAB]:
                 inner = group[name] if isinstance(group.get(name, getlink=True), self._h5py.HardLink) else None
                 if isinstance(inner, self._h5py.Group) and len(inner) and prefix.count("/") < _DEPTH:
                     groups.append((f"{prefix}{name}/", inner))

@@ -87,6 +87,11 @@ def order_by_name(kind: str, order: object) -> object:
     return [*robot.joints, *[None] * (MOTORS[robot.message] - len(robot.joints))]
 
 
+def names_by_number(order: Sequence[str] | str) -> list[str]:
+    """Joints of an order that a map states, without those that the robot has not."""
+    return list(JOINT_ORDERS[order].names) if isinstance(order, str) else list(order)
+
+
 def suitable_orders(joints: Collection[str], robot: str = "") -> list[str]:
     """Robots whose joints a URDF has, those with most of them first, then one that a text names."""
     fitting = [name for name, order in JOINT_ORDERS.items() if set(order.names) <= set(joints)]

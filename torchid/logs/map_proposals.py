@@ -9,25 +9,24 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from torchid.errors import excerpt
+from torchid.logs.base_proposals import field_of_base, find_angles, order_of_quaternion
 from torchid.logs.column_groups import Family, find_families, split_arrays, split_stamps
-from torchid.logs.column_proposals import OF_BASE, OF_PLATES, is_desired, is_no_torque, propose_field
+from torchid.logs.column_proposals import is_desired, propose_field
 from torchid.logs.columns import is_column
-from torchid.logs.file_samples import FileSample, increases, listed_order, side_by_side, stated_names
-from torchid.logs.force_proposals import are_states, point_along_z, threshold
-from torchid.logs.joint_orders import JOINT_ORDERS, MOTORS, numbered_joints, suitable_orders, usual_order
+from torchid.logs.field_matching import FieldMatcher
+from torchid.logs.file_samples import FileSample, increases, listed_order, side_by_side
+from torchid.logs.force_proposals import MOMENT, are_states, point_along_z, threshold
+from torchid.logs.joint_orders import JOINT_ORDERS, numbered_joints, usual_order
 from torchid.logs.log import SHAPES, VARIANTS, WRENCHES
 from torchid.logs.name_matching import SUFFIXES, KnownRobot
-from torchid.logs.number_proposals import UnitProposer, find_angles, order_of_quaternion, step_of_stamps
+from torchid.logs.number_proposals import UnitProposer, step_of_stamps
+from torchid.logs.sample_axis import with_samples_first
 from torchid.logs.units import IN_DEGREES, quantities_of, quantities_with, unit_factor
 
 _GAINS = re.compile(r"\b(kp|kd)\b", re.IGNORECASE)
-_FORCE = re.compile(r"force|(?<![a-z])f\{axis", re.IGNORECASE)
-_MOMENT = re.compile(r"moment|torque|(?<![a-z])[mt]\{axis", re.IGNORECASE)
-_SIDEWAYS = re.compile(r"(?<![a-z])(f[xy]|m[xyz])(?![a-z])", re.IGNORECASE)  # components that tell of no contact
-_DRIVE = re.compile(r"joint|motor|current|temp|limit|volt", re.IGNORECASE)  # of a limb, but of no foot
-_FOOT = re.compile(r"foot|feet", re.IGNORECASE)
 _LAW = {"joint_position": "position", "joint_velocity": "velocity", "joint_torque": "feed_forward"}
 _TOUCH = 0.05  # of the robot's weight, what a contact bears at least
 
@@ -68,38 +67,43 @@ def propose_map(
         files: columns of each of several files that are one log, whose stamps may differ in name.
         in_degrees: columns of files whose header says that angles are in degrees.
     """
-    return _Proposer(sample, robot, files, in_degrees).propose()
+    sample, notes = with_samples_first(sample, len(robot.joints))
+    out = _Proposer(sample, robot, files, in_degrees).propose()
+    out.notes = notes | out.notes
+    return out
 
 
 class _Proposer:
     def __init__(
         self, sample: FileSample, robot: KnownRobot, files: Sequence[Collection[str]], in_degrees: Collection[str]
     ) -> None:
-        self.sample, self.robot, self.files, self.in_degrees = sample, robot, files, in_degrees
+        self.sample, self.robot, self.files, self.in_degrees = dict(sample), robot, files, in_degrees
+        self.match = FieldMatcher(self.sample, robot)
         self.joints, self.feet = robot.joints, robot.feet
         self.native = {name for name in sample if is_column(name) or name in (*SHAPES, *VARIANTS)}
         self.given = {name.partition(".")[0] for name in self.native}
         self.out = MapProposal()
-        stated = stated_names(sample, "joint_names")
-        self.names_stated = bool(stated) and set(stated) <= set(self.joints)
-        self.named_joints = set(stated) if self.names_stated else set[str]()
-        self.joint_suffix, self.factors = "", dict[str, float]()  # factors of units that columns state, by key
+        self.factors = dict[str, float]()  # of units that columns state, by key
+        self.force: NDArray[Any] | None = None  # that an accelerometer reads
 
     def propose(self) -> MapProposal:
         foreign = [name for name in self.sample if name not in self.native]
         numeric = [name for name in foreign if (x := self.sample[name]) is not None and x.dtype.kind in "fiub"]
         families, more = find_families(numeric, self.robot)
         self.out.columns |= {f"{kind}_name": pattern for kind, pattern in more.items()}
-        self.joint_suffix = more.get("joint", "").removeprefix("{joint}")
-        self.named_joints = self.named_joints or self._all_named(families)
-        self.out.lacking = [name for name in self.joints if self.named_joints and name not in self.named_joints]
+        self.match.look_at(families, more)
+        if named := self.match.named_joints:
+            self.out.lacking = [name for name in self.joints if name not in named]
+        of_force = (one for one in families if one.proposed == "imu_specific_force" and len(one.columns) in (1, 3))
+        self.force = next((side_by_side(self.sample, one.columns) for one in of_force), None)
         split = self._place_parts(numeric)
         families = [one for one in families if one.columns[0] not in split]
         self.nanoseconds = split_stamps(numeric)
         families = [one for one in families if one.columns[0] not in self.nanoseconds.values()]
-        stamps = [one for one in families if self._field(one) == "time"]
+        stamps = [one for one in families if self.match.field(one) == "time"]
         used = [one for one in families if one not in stamps and self._place(one)]
         used += [one for one in self._stamps_first(stamps) if self._place(one)]
+        used += self._place_of_base([one for one in families if one not in used])
         if "time" in self.out.columns:
             self.out.columns = {"time": self.out.columns["time"], **self.out.columns}
         elif "time" not in self.given and (found := step_of_stamps(self.sample)):
@@ -111,16 +115,18 @@ class _Proposer:
         taken = {column for one in used for column in one.columns} | split
         taken |= {self.out.columns.get("time", {}).get("nanoseconds")} - {None}
         taken |= self._place_angles([name for name in numeric if name not in taken])
+        self.out.partial = self.match.partial
         self.out.left_out = [name for name in foreign if name not in taken]
         families = [one for one in families if one in used or not set(one.columns) <= taken]
         ignored = {one.as_ignored for one in families if one not in used or len(one.numbers) > len(self.joints)}
         ignored |= {name for name in foreign if name not in numeric or name in self.nanoseconds.values()} - taken
         self.out.columns |= {"ignore": sorted(ignored)} if ignored else {}
         if "joint_torque" not in {*self.given, *self.out.columns}:
-            self.out.like_torques = [one for one in families if one not in used and self._is_like_torques(one)]
+            alike = [one for one in families if one not in used and self.match.is_like_torques(one)]
+            self.out.like_torques = [one for one in alike if one.is_current] or alike
         with np.errstate(all="ignore"):  # of numbers that no unit explains
             units = UnitProposer(self.sample, self.out.columns, self.out.notes, self.factors)
-            units.propose(self.robot.weight, not self.files)
+            units.propose(self.robot.weight, not self.files, self.robot.slides)
         return self.out
 
     def _settle_contacts(self, used: list[Family]) -> list[Family]:
@@ -152,7 +158,7 @@ class _Proposer:
         """Make some columns of an array an entry."""
         (start, _, stop), text = columns.strip("[]").partition(":"), f"{name}{columns}"
         part = np.asarray(self.sample[name])[:, int(start) : int(stop) if stop else None]
-        self.sample = {**self.sample, text: part}
+        self.sample[text] = part
         family = Family(text, [text], ("",), (), ("",))
         if field == "base_quat_wxyz":
             field = self._quaternion(family)
@@ -177,18 +183,25 @@ class _Proposer:
 
     # ----------------------------------------------------------------------------------------------------- fields
 
-    def _place(self, family: Family) -> bool:
-        """Whether a family has become an entry."""
+    def _place_of_base(self, families: Sequence[Family]) -> list[Family]:
+        """Families that have become the pose of a base that stands on feet, by what their numbers are."""
+        if not self.feet:  # of an arm, that of its hand
+            return []
+        named = [(one, field) for one in families if (field := field_of_base(one, self.sample))]
+        return [one for one, field in sorted(named, key=lambda pair: not pair[0].stem) if self._place(one, field)]
+
+    def _place(self, family: Family, name: str = "") -> bool:
+        """Whether a family has become an entry; `name`: of which field, by default the one that it probably is."""
         if is_desired(family.words) or _GAINS.search(family.words.replace("_", " ")):
             return False
-        name = self._field(family)
-        if name == "contact_wrench_local" and (len(family.axes) == 3 or self._shape(family)[1:] == (3,)):
+        name = name or self.match.field(family)
+        if name == "contact_wrench_local" and (len(family.axes) == 3 or self.match.shape(family)[1:] == (3,)):
             return self._place_force(family)
         if name == "time" and name in self.out.columns:
             return self._place_other_time(family)
         known = {*self.given, *self.out.columns}
         again = name == "base_quat_wxyz" and "base_quat_xyzw" in known
-        if not name or name in known or again or not self._fits(family, name):
+        if not name or name in known or again or not self.match.fits(family, name):
             return False
         entry: dict[str, Any] = family.counted_entry
         if name == "base_quat_wxyz":
@@ -211,96 +224,23 @@ class _Proposer:
         others = self.out.columns.get("other_times", [])
         known = [entry["column"] for entry in (self.out.columns["time"], *others)]
         ours = [given for given in self.files if family.columns[0] in given]
-        if not ours or any(column in given for given in ours for column in known) or not self._fits(family, "time"):
+        if (
+            not ours
+            or any(column in given for given in ours for column in known)
+            or not self.match.fits(family, "time")
+        ):
             return False
         entry: dict[str, Any] = family.entry
         self._add_stated_unit(family, entry, "other_times", ("time",))
         self.out.columns["other_times"] = [*others, entry]
         return True
 
-    def _is_like_torques(self, family: Family) -> bool:
-        """Whether a family that nothing says what it is has changing numbers of each joint."""
-        known = is_no_torque(family.words.replace("_", " "), family.unit)
-        if known or self._field(family) not in ("", "joint_torque") or not self._fits(family, "joint_torque"):
-            return False
-        values = side_by_side(self.sample, family.columns)
-        return values.dtype.kind in "fiu" and bool((np.ptp(values, axis=0) > 0).any())
-
-    def _joints_of(self, family: Family) -> set[str]:
-        """Joints of the robot that a family names."""
-        if "{joint}" not in family.pattern:
-            return set()
-        return set(family.by_name) or {f"{name}{self.joint_suffix}" for name in family.names if name}
-
-    def _all_named(self, families: Sequence[Family]) -> set[str]:
-        """Joints that any column names, if more than half of them; none where columns name fewer."""
-        named = {name for one in families for name in self._joints_of(one)}
-        return named if 2 * len(named) > len(self.joints) else set()
-
-    def _field(self, family: Family) -> str:
-        """The field that a family probably is."""
-        name, axes = family.proposed, len(family.axes) == 3
-        if not name and "time" in quantities_with(family.unit) and increases(self.sample[family.columns[0]]):
-            return "time"
-        if not name and axes and re.fullmatch(OF_BASE, family.stem) and family.unit_may_be("length"):
-            return "base_position_world"
-        of_foot = "{contact}" in family.pattern or _FOOT.search(family.words) is not None
-        of_force = name == "contact_force_normal" or _FORCE.search(family.pattern) or _MOMENT.search(family.pattern)
-        shape = self._shape(family)
-        if of_force and ((axes and of_foot) or (len(family.columns) == 1 and shape == (len(self.feet), 3))):
-            return "contact_wrench_local"
-        if of_foot and (_SIDEWAYS.search(family.words) or quantities_with(family.unit)[:1] == ("torque",)):
-            return ""
-        if name == "contact_force_normal" or (not name and of_foot and not _DRIVE.search(family.words)):
-            return "contact_active"  # as a threshold: what it is in newtons nobody knows
-        of_base = name == "joint_position" and axes and not any(family.names)
-        return ("base_position_world" if family.unit_may_be("length") else "") if of_base else name
-
-    def _shape(self, family: Family) -> tuple[int, ...]:
-        """What a column or array of a family has of each sample."""
-        inner = () if (first := self.sample[family.columns[0]]) is None else first.shape[1:]
-        return inner[1:] if len(inner) > 1 and inner[0] == 1 else inner
-
-    def _fits(self, family: Family, name: str) -> bool:
-        """Whether a family has as many columns as a field."""
-        first = self.sample[family.columns[0]]
-        if first is None or not first.ndim or name in OF_PLATES:
-            return False
-        inner = int(np.prod(self._shape(family)))
-        count = max(inner, len(family.columns)) if inner == 1 or len(family.columns) == 1 else 0
-        if name == "time":
-            return count == 1
-        if ("{contact}" if name.startswith("joint_") else "{joint}") in family.pattern:
-            return False
-        if name.startswith("joint_"):
-            return self._fits_joints(family, name, count)
-        if name.startswith("contact_wrench"):
-            return count == 6 * len(self.feet) > 0
-        if name.startswith("contact_"):
-            return count == len(self.feet) > 0 and not any(family.axes)
-        axes = "".join(sorted(family.axes)).lower()
-        return count == (4 if "quat" in name else 3) and (not axes or axes == ("wxyz" if "quat" in name else "xyz"))
-
-    def _fits_joints(self, family: Family, field: str, count: int) -> bool:
-        """Whether a family has a column for each joint, or for each that positions are there of."""
-        named = self._joints_of(family)
-        slots = {MOTORS[JOINT_ORDERS[name].message] for name in suitable_orders(self.joints)}
-        if named:
-            whole = named == (self.named_joints or set(self.joints))
-            if not whole and 2 * len(named) > len(self.joints):
-                self.out.partial[field] = [x for x in self.joints if x in self.named_joints - named]
-        else:
-            whole = count in (len(self.joints), *slots, *([len(self.named_joints)] if self.names_stated else []))
-            whole |= not self.names_stated and len(numbered_joints(self.joints, count)) == count > 2
-        enough = whole or (count >= len(self.joints) and bool(family.numbers))
-        return enough and len(self.joints) > 0 and not any(family.axes)
-
     def _place_force(self, family: Family) -> bool:
         """Whether a family is the forces or the moments of contacts."""
         has_axes = "".join(sorted(family.axes)).lower() == "xyz" and len(family.columns) == 3 * len(self.feet)
-        if not has_axes and self._shape(family) != (len(self.feet), 3):
+        if not has_axes and self.match.shape(family) != (len(self.feet), 3):
             return False
-        is_moment = bool(_MOMENT.search(family.pattern))
+        is_moment = bool(MOMENT.search(family.pattern))
         (field, why), part = self._frame_of_forces(family, is_moment), "moment" if is_moment else "force"
         if part in (wrench := self.out.columns.get(field, {})) or set(WRENCHES) & self.given:
             return False
@@ -330,7 +270,7 @@ class _Proposer:
             words = family.words.replace("_", " ").lower()
             gain, what = _GAINS.search(words), propose_field(family.words, desired=True)
             key = gain[1].lower() if gain else _LAW.get(what, "")
-            if key and key not in law and (gain or self._fits(family, what)):
+            if key and key not in law and (gain or self.match.fits(family, what)):
                 law[key] = family.entry
                 if not gain:
                     self._add_stated_unit(family, law[key], f"joint_torque.pd.{key}", quantities_of(what))
@@ -343,10 +283,12 @@ class _Proposer:
 
     def _quaternion(self, family: Family) -> str:
         """The field of a quaternion in the order that it has."""
-        order = None if not any(family.axes) else "xyzw" if family.axes[0] in "xX" else "wxyz"
-        if order is None:
-            order = order_of_quaternion([x for column in family.columns if (x := self.sample[column]) is not None])
-            self.out.notes[f"base_quat_{order}"] = "order of components, with w as the largest"
+        stated = re.search("xyzw|wxyz", family.words.lower())
+        order = stated[0] if stated else "xyzw" if family.axes[0] in ("x", "X") else "wxyz"
+        if not stated and not any(family.axes):
+            arrays = [x for column in family.columns if (x := self.sample[column]) is not None]
+            order, why = order_of_quaternion(arrays, self.force)
+            self.out.notes[f"base_quat_{order}"] = f"order of components, {why}"
         return f"base_quat_{order}"
 
     def _place_angles(self, columns: Sequence[str]) -> set[str]:
@@ -374,15 +316,30 @@ class _Proposer:
         """An order of names by number, where columns have none."""
         kind = next((kind for kind in SUFFIXES if name.startswith(f"{kind}_")), "")
         key = f"{kind}_order"
-        if not kind or any(family.names) or key in self.out.columns or (kind == "joint" and self.names_stated):
+        if not kind or any(family.names) or key in self.out.columns or (kind == "joint" and self.match.names_stated):
             return
-        numbers = len(family.numbers) or int(np.prod(self._shape(family)[:1]))
+        numbers = len(family.numbers) or int(np.prod(self.match.shape(family)[:1]))
         order, how = listed_order(self.sample, kind, self.robot, numbers) or usual_order(kind, self.robot, numbers)
         self.out.columns[key] = order
-        listed = JOINT_ORDERS[order].names if isinstance(order, str) else order
+        listed = [name for name in self._order() if name] if kind == "joint" else order
         if kind == "joint" and not self.out.lacking:
             self.out.lacking = [name for name in self.joints if name not in listed]
         self.out.notes[key] = f"{how}; compare it with the manual of the robot, and with what torchid check says"
+
+    def _add_units(self, family: Family, entry: dict[str, Any]) -> None:
+        """Columns and units by joint, of a family whose columns have different ones."""
+        if "columns" not in entry:
+            by_number = dict(zip(self._order(), family.columns, strict=False))
+            entry.clear()
+            entry["columns"] = {name: column for name, column in by_number.items() if name}
+        units = {name: family.units[column] for name, column in entry["columns"].items()}
+        entry["unit"] = {"*": family.unit} | {name: unit for name, unit in units.items() if unit != family.unit}
+        entry["unit"] = {name: unit for name, unit in entry["unit"].items() if unit}
+
+    def _order(self) -> list[str | None]:
+        """Joints by number."""
+        order = self.out.columns.get("joint_order", list(self.match.stated))
+        return list(JOINT_ORDERS[order].joints) if isinstance(order, str) else list(order)
 
     def _add_stated_unit(self, family: Family, entry: dict[str, Any], key: str, quantities: tuple[str, ...]) -> None:
         """The unit in the names of columns, for the field that they are; a note where it is none of that field."""
@@ -396,5 +353,7 @@ class _Proposer:
             self.out.notes[key] = f"unit '{excerpt(family.unit)}' of its columns is none of {known}; give it as unit"
             return
         self.factors[key] = unit_factor(key, family.unit, quantities)
-        if self.factors[key] != 1.0:
+        if family.units:
+            self._add_units(family, entry)
+        elif self.factors[key] != 1.0:
             entry["unit"] = family.unit

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,89 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import LogError
-from torchid.logs.arrays import parse_names, with_parts
-from torchid.logs.column_entries import KEY, ColumnEntry, Gains, PdLaw, VectorEntry
-from torchid.logs.column_map import Columns, check_columns, list_parts, values_by_name, values_of_all
-from torchid.logs.column_matching import Matched, columns_of_file, match_columns
+from torchid.logs.arrays import fields_of_records, parse_names, with_parts
+from torchid.logs.column_entries import KEY, Gains, PdLaw
+from torchid.logs.column_map import PLACEHOLDER, Columns, check_columns, list_parts, values_by_name, values_of_all
+from torchid.logs.column_matching import columns_of_file, match_columns
 from torchid.logs.columns import TEXT_COLUMN, TableLayout, is_column, parse_header
-from torchid.logs.entry_units import element_factors, joint_turns, names_in_degrees
+from torchid.logs.entry_values import EntryValues, Take, entry_values
 from torchid.logs.force_plates import PlatePoses
 from torchid.logs.log import FORCE_NORMAL, NAME_FIELDS, POINTS, SHAPES, VARIANTS, WRENCHES, FloatArray
 from torchid.logs.quaternion import quaternion_of_rpy
 from torchid.logs.units import unit_factor
 
-Take = Callable[[str], NDArray[Any]]
-"""The values (N, ...) of a column or an array."""
-
-_PD = "joint_torque.pd"
-
-
-@dataclass(frozen=True)
-class _Values:
-    """How the numbers of an entry come from its columns.
-
-    Attributes:
-        of: the columns.
-        order: which names of these, in the order of the log; None for all as they are.
-        factors: of a sample's elements, units and signs; None for 1.
-        turns: in the unit of the columns where the turn of each joint begins that its angle is counted in, and how much
-            a turn is, each (n,); None for angles as they are.
-    """
-
-    of: Matched
-    order: list[int] | None
-    factors: FloatArray | None
-    turns: tuple[FloatArray, FloatArray] | None
-
-    def read(self, take: Take) -> FloatArray:
-        """The numbers (N, ...), or of gains that hold throughout (1, ...).
-
-        Raises:
-            LogError: a column of another shape or of no numbers.
-        """
-        arrays = [self._numbers(column, take(column)) for column in self.of.columns]
-        lengths = [len(array) for array in arrays]
-        if len(set(lengths)) > 1:
-            other = next(index for index, length in enumerate(lengths) if length != lengths[0])
-            found, accepted = f"{lengths[other]} samples", f"{lengths[0]}, as '{self.of.columns[0]}' has"
-            raise LogError.at_field(f"'{self.of.columns[other]}'", found, accepted)
-        if not self.of.by_name and not self.of.by_component:
-            out = arrays[0]
-        else:
-            inner = self.of.by_name and bool(self.of.part.components) and not self.of.by_component
-            out = np.stack(arrays, axis=1 if inner else -1)
-            if self.of.by_name and self.of.by_component:
-                out = out.reshape(len(out), len(self.of.labels), len(self.of.part.components))
-        if self.order is not None:
-            out = out[:, self.order]
-        if self.turns is not None:
-            start, turn = self.turns
-            out = np.where(np.isfinite(start), start + np.mod(out - np.nan_to_num(start), turn), out)
-        out = out if self.factors is None else np.asarray(out * self.factors)
-        return _with_zeros(out, self.of.part.entry)
-
-    def _numbers(self, column: str, array: NDArray[Any]) -> FloatArray:
-        if array.dtype.kind not in "fiub":
-            raise LogError.at_field(f"'{column}'", f"values of type {array.dtype}", "real numbers")
-        shape = self._shape()
-        if isinstance(self.of.part.entry, Gains) and array.shape == shape:
-            array = array[None]  # the same at all samples
-        if array.ndim == 1 and int(np.prod(shape)) == 1:
-            array = array.reshape(-1, *shape)
-        if array.ndim == len(shape) + 2 and array.shape[1] == 1:  # one row of each sample, as of Matlab's tables
-            array = array[:, 0]
-        if array.ndim == 0:
-            raise LogError.at_field(f"'{column}'", "a single value", "a row for each sample")
-        if array.shape[1:] != shape and (array.shape[2:] != shape[1:] or not self.of.has_all_names(array.shape[1:2])):
-            names = f", one for each name of its order ({self.of.labels[0]}, ...)" if self.of.labels and shape else ""
-            raise LogError.at_field(f"'{column}'", f"shape {_n_by(array.shape[1:])}", f"{_n_by(shape)}{names}")
-        return np.asarray(array, dtype=np.float64)
-
-    def _shape(self) -> tuple[int, ...]:
-        """What a column has of each sample."""
-        names = (len(self.of.labels),) if self.of.part.kind and not self.of.by_name else ()
-        components = (len(self.of.part.components),) if self.of.part.components and not self.of.by_component else ()
-        return names + components
+_PD, _CURRENT = "joint_torque.pd", "joint_torque.current"
 
 
 @dataclass(frozen=True)
@@ -109,7 +39,7 @@ class MappedFields:
     names: Mapping[str, tuple[str, ...]]
     columns: Columns
     native: Mapping[str, tuple[str, ...]]
-    _values: Mapping[str, _Values]
+    _values: Mapping[str, EntryValues]
     _layout: TableLayout | None = field(default=None)
 
     @property
@@ -249,7 +179,9 @@ class MappedFields:
         return self._active(take) if name == "contact_active" else self._wrench(name, take)
 
     def _torque(self, take: Take) -> FloatArray:
-        """What a PD law gives, (N, n) [N m or N]."""
+        """What currents or a PD law give, (N, n) [N m or N]."""
+        if _CURRENT in self._values:
+            return self._values[_CURRENT].read(take) * self._torque_per_current()
         terms: list[FloatArray] = []
         for gain, desired, measured in (("kp", "position", "joint_position"), ("kd", "velocity", "joint_velocity")):
             gains = self._gains(gain, take)
@@ -278,12 +210,27 @@ class MappedFields:
             raise LogError.at_field(
                 f"{KEY}.contact_active.above", "set, without a force", "a column, or contact forces"
             )
+        self._check_stated()
+        return self
+
+    def _check_stated(self) -> None:
+        """Make sure that numbers by name are there of all joints and contacts."""
         for name in ("kp", "kd"):
             if (gains := getattr(self._law, name, None)) is not None and gains.value:
                 self._stated_gains(name, gains)
+        if _CURRENT in self._values:
+            self._torque_per_current()
         if self.columns.plates:
             self._poses()
-        return self
+
+    def _torque_per_current(self) -> FloatArray:
+        """Torques or forces of joints for the currents of their motors, (n,) [N m/A or N/A]."""
+        entry, joints = self.columns.joint_torque, self.names["joint_names"]
+        factors = np.ones(len(joints))
+        for name, what in (("torque_constant", "torque constant"), ("gear_ratio", "gear ratio")):
+            given = getattr(getattr(entry, "current", None), name)
+            factors *= values_of_all(f"{KEY}.{_CURRENT}.{name}", what, given, "joint", joints)
+        return factors
 
     def _gains(self, name: str, take: Take) -> FloatArray | None:
         gains: Gains | None = getattr(self._law, name, None)
@@ -325,36 +272,9 @@ class MappedFields:
         return np.concatenate([force, np.full_like(force, np.nan) if moment is None else moment.read(take)], axis=2)
 
 
-def _with_zeros(out: FloatArray, entry: ColumnEntry) -> FloatArray:
-    """Vectors (N, C, 3) of what an entry has of them, (N, C, k)."""
-    if not isinstance(entry, VectorEntry) or entry.axes is None:
-        return out
-    whole = np.zeros((*out.shape[:-1], 3))
-    whole[..., ["xyz".index(axis) for axis in entry.axes]] = out
-    return whole
-
-
-def _n_by(shape: tuple[int, ...]) -> str:
-    return f"({', '.join(map(str, ('N', *shape)))})"
-
-
 def _flagged(values: FloatArray, above: float | None) -> FloatArray:
     """1 where a number is above a threshold, 0 where it is not; NaN stays, for whoever checks flags."""
     return values if above is None else np.where(np.isnan(values), np.nan, values > above)
-
-
-def _values(
-    matched: Mapping[str, Matched], names: Mapping[str, tuple[str, ...]], in_degrees: bool = False
-) -> dict[str, _Values]:
-    out = {}
-    for key, one in matched.items():
-        common = names.get(one.part.names_field, ())
-        order = [one.labels.index(name) for name in common]
-        kept = None if order == list(range(len(one.labels))) else order
-        turning = names_in_degrees(one) if in_degrees else set[str]()
-        factors, turns = element_factors(one.part, common, turning), joint_turns(one.part, common, turning)
-        out[key] = _Values(one, kept, factors, turns)
-    return out
 
 
 def map_table(columns: Columns, header: Sequence[str], in_degrees: bool = False) -> MappedFields | None:
@@ -369,7 +289,7 @@ def map_table(columns: Columns, header: Sequence[str], in_degrees: bool = False)
     if matching is None:
         return None
     layout = parse_header(matching.others, matching.names)
-    values = _values(matching.matched, layout.names, in_degrees)
+    values = entry_values(matching.matched, layout.names, in_degrees)
     return MappedFields(layout.names, columns, layout.columns, values, layout).check()
 
 
@@ -386,14 +306,22 @@ def map_arrays(columns: Columns, given: Sequence[str], load: Take) -> MappedFiel
     """
     check_columns(columns)
     columns = columns_of_file(columns, given)
-    texts = (
-        text for part in list_parts(columns).values() for text in (part.entry.column, *part.entry.columns.values())
-    )
-    given = with_parts(given, (text for text in texts if text))
+    entries = [part.entry for part in list_parts(columns).values()]
+    texts = [text for entry in entries for text in (entry.column, *entry.columns.values()) if text]
+    given = with_parts(given, [name for text in texts for name in _named_fields(text, given, load)])
     named = {name: parse_names(name, load(name)) for name in NAME_FIELDS if name in given}
     matching = match_columns(columns, given, lambda name: name in SHAPES or name in VARIANTS, named)
     if matching is None:
         return None
     native = {name: (name,) for name in matching.others}
-    values = _values(matching.matched, matching.names)
+    values = entry_values(matching.matched, matching.names)
     return MappedFields(matching.names, columns, native, values).check()
+
+
+def _named_fields(text: str, given: Sequence[str], load: Take) -> list[str]:
+    """The fields of records that a pattern of their names means; a name that is no such pattern itself."""
+    root = text.partition("['")[0]
+    if root == text or root not in given or not PLACEHOLDER.search(text):
+        return [text]
+    regex = re.compile(".+".join(re.escape(part) for part in PLACEHOLDER.sub("\0", text).split("\0")))
+    return [name for name, _ in fields_of_records(root, load(root)) if regex.fullmatch(name)]

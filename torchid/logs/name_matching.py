@@ -32,6 +32,7 @@ class KnownRobot:
         base_link: its base.
         on_base: links of its base; `along_base`: those with its axes.
         elsewhere: all others.
+        slides: joints that are prismatic.
         limb_sensors: children of the fixed joints in limbs that are called force or torque sensors, by joint.
     """
 
@@ -44,6 +45,7 @@ class KnownRobot:
     elsewhere: Sequence[str]
     limb_sensors: Mapping[str, str] = field(default_factory=dict)
     along_base: Sequence[str] = ()
+    slides: Sequence[str] = ()
 
 
 def within(stem: str) -> re.Pattern[str]:

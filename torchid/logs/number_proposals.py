@@ -1,20 +1,19 @@
-"""What numbers of foreign columns say of themselves, where nobody stated it: units, turns, rotations."""
+"""What numbers of foreign columns say of themselves, where nobody stated it: units, and where turns begin."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from itertools import pairwise
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.logs.column_proposals import BASES, is_desired, words_of
-from torchid.logs.file_samples import FileSample, side_by_side
+from torchid.logs.base_proposals import vertical_in_base
+from torchid.logs.file_samples import FileSample, stated_names
 from torchid.logs.gaps import turn_jumps
-from torchid.logs.units import UNITS, quantities_with, split_unit
+from torchid.logs.joint_orders import names_by_number
+from torchid.logs.units import OF_JOINTS, UNITS, unit_factor
 
 _STEP = (2e-4, 0.2)  # [s]: of recordings
 _STEP_NAME = re.compile(r"(sim_?|control_?)?(dt|time_?step)(_s)?", re.IGNORECASE)
@@ -55,27 +54,27 @@ class UnitProposer:
         """
         self._sample, self._columns, self._notes, self._stated = sample, columns, notes, stated
 
-    def propose(self, weight: float, one_clock: bool) -> None:
+    def propose(self, weight: float, one_clock: bool, slides: Collection[str] = ()) -> None:
         """Add units that are not SI units, and where turns begin.
 
         Args:
             weight: of the robot [N].
             one_clock: whether all columns have the same stamps.
+            slides: joints that are prismatic.
         """
         seconds = self._seconds()
         if seconds is None:
             return
         position, velocity = self._values(_POSITION), self._values("joint_velocity")
-        factor = self._stated.get(_POSITION, 1.0)
         if position is not None:
-            turned = _POSITION not in self._stated and np.nanpercentile(np.abs(position), 98) > _TURNED
-            if turned:
-                self._set(_POSITION, "deg", f"from values up to {np.nanmax(np.abs(position)):.3g}")
-                factor = UNITS["angle"]["deg"]
+            names = self._joints(_POSITION, position.shape[1])
+            slide = np.isin(names, list(slides))
+            if _POSITION not in self._stated:
+                self._add_position_unit(position, slide)
             self._add_turn(position)
+            if velocity is not None and one_clock:
+                self._add_speed(velocity, position * self._position_factors(names), seconds, slide)
         self._add_native_turn()
-        if position is not None and velocity is not None and one_clock:
-            self._add_speed(velocity, factor * position, seconds)
         if one_clock:
             self._add_rate(seconds)
         for name, is_it, unit, why in (
@@ -87,6 +86,50 @@ class UnitProposer:
             values = self._values(name)
             if values is not None and is_it(values):
                 self._set(name, unit, why)
+
+    def _joints(self, name: str, count: int) -> list[str]:
+        """Joints by column of an entry, as many as there are columns; "" for each where the map does not say."""
+        entry, unknown = self._columns[name], [""] * count
+        if "columns" in entry:
+            return list(entry["columns"])
+        if "{joint}" in entry["column"]:
+            before, _, after = entry["column"].partition("{joint}")
+            fits = [x for x in self._sample if x.startswith(before) and x.endswith(after)]
+            spelled = self._columns.get("joint_name", "{joint}")
+            names = [spelled.replace("{joint}", x[len(before) : len(x) - len(after)]) for x in fits]
+        else:
+            names = names_by_number(self._columns.get("joint_order", stated_names(self._sample, "joint_names")))
+        return names if len(names) == count else unknown
+
+    def _add_position_unit(self, position: Numbers, slide: NDArray[np.bool_]) -> None:
+        """Units of positions by how large those of hinges and slides are."""
+        found = dict[str, str]()
+        for unit, where in (("deg", ~slide), ("mm", slide)):
+            some = np.abs(position[:, where])
+            if np.isfinite(some).any() and np.nanpercentile(some, 98) > _TURNED:
+                found[unit] = f"from values up to {np.nanmax(some):.3g}"
+        if not found:
+            return
+        if not slide.any():
+            self._set(_POSITION, "deg", found["deg"])
+            return
+        names = zip(self._joints(_POSITION, position.shape[1]), slide, strict=True)
+        of_slides = {name: "mm" if "mm" in found else "m" for name, is_slide in names if is_slide}
+        self._columns[_POSITION]["unit"] = ({"*": "deg"} if "deg" in found else {}) | of_slides
+        self._note(_POSITION, ", ".join(f"{unit}, {why}" for unit, why in found.items()))
+
+    def _units(self, name: str) -> dict[str, str]:
+        """Units of an entry by pattern."""
+        unit = self._columns[name].get("unit", {})
+        return dict(unit) if isinstance(unit, dict) else {"*": unit}
+
+    def _position_factors(self, names: Sequence[str]) -> Numbers:
+        """What positions of joints are multiplied by, (n,) or ()."""
+        units = self._units(_POSITION)
+        if not units:
+            return np.array(self._stated.get(_POSITION, 1.0))
+        of_names = (units.get(name, units.get("*", "rad")) for name in names)
+        return np.array([unit_factor(_POSITION, unit, OF_JOINTS[_POSITION]) for unit in of_names])
 
     def _seconds(self) -> Numbers | None:
         """The stamps (N,) [s]; also those of a column called `time` that has another unit."""
@@ -119,37 +162,63 @@ class UnitProposer:
             del self._columns[_POSITION]
 
     def _add_turn(self, position: Numbers) -> None:
-        """Where the turn begins that angles are in, where encoders jump by one."""
+        """Where the turn begins that angles are in, where encoders jump by one: one place for all, or by joint."""
         entry = self._columns[_POSITION]
         of_file = 2.0 * np.pi / self._stated.get(_POSITION, 1.0)  # in degrees, of a file that says so
-        turn = _TURNS.get(str(entry["unit"]).lower(), 0.0) if "unit" in entry else of_file
-        if not turn or not turn_jumps(position, turn).any():
+        units = self._units(_POSITION)
+        turn = _TURNS.get(units["*"].lower(), 0.0) if "*" in units else of_file
+        names = self._joints(_POSITION, position.shape[1])
+        turning = np.array([units.get(name, "") not in UNITS["length"] for name in names])
+        jumping = turn_jumps(position, turn).any(axis=0) & turning if turn else np.zeros(len(names), dtype=bool)
+        if not jumping.any():
             return
-        phase = np.mod(position / turn, 1.0)
-        for start in (*_STARTS, _middle_of_gap(phase)):
-            away = np.abs(np.mod(phase - start + 0.5, 1.0) - 0.5)
-            if np.nanmin(away) > _FREE:
-                entry["turn_from"] = float(f"{start * turn:.4g}")
-                self._note(_POSITION, f"turns begin at {entry['turn_from']:g}, as angles jump by a whole turn")
-                return
-        self._note(_POSITION, "angles jump by a whole turn, and none of them stays within one: unwrap them")
+        start = _turn_start(position[:, turning], turn)
+        by_joint = {name: _turn_start(x[:, None], turn) for name, x in zip(names, position.T, strict=True)}
+        by_joint = {name: by_joint[name] for name, jumps in zip(names, jumping, strict=True) if jumps}
+        if start is not None and turning.all():
+            entry["turn_from"] = start
+        elif all(by_joint) and None not in by_joint.values():
+            entry["turn_from"] = by_joint
+        else:
+            found = "angles jump by a whole turn, and none of them stays within one: unwrap them"
+            self._note(_POSITION, found)
+            return
+        starts = ", ".join(f"{x:g}" for x in dict.fromkeys(by_joint.values() if start is None else [start]))
+        self._note(_POSITION, f"turns begin at {starts}, as angles jump by a whole turn")
 
-    def _add_speed(self, velocity: Numbers, position: Numbers, seconds: Numbers) -> None:
+    def _add_speed(self, velocity: Numbers, position: Numbers, seconds: Numbers, slide: NDArray[np.bool_]) -> None:
+        """The unit of velocities, by the slope of positions [rad, m]."""
         if position.shape != velocity.shape:
             return
         slope = np.gradient(position, seconds, axis=0)
         slope = np.where(np.abs(slope) * np.median(np.diff(seconds)) > 1.0, np.nan, slope)  # a jump of a turn
+        of_slides = self._speed_unit(velocity[:, slide], slope[:, slide], "velocity", ("m/s", "mm/s"))
+        candidates = ("rad/s", "deg/s", "rpm", "rev/s")
+        of_hinges = self._speed_unit(velocity[:, ~slide], slope[:, ~slide], "angular velocity", candidates)
+        if "joint_velocity" not in self._stated and (of_hinges, of_slides) != ("rad/s", "m/s"):
+            names = zip(self._joints(_POSITION, len(slide)), slide, strict=True)
+            by_joint = {name: of_slides for name, is_slide in names if is_slide}
+            self._columns["joint_velocity"]["unit"] = {"*": of_hinges} | by_joint if by_joint else of_hinges
+
+    def _speed_unit(self, velocity: Numbers, slope: Numbers, quantity: str, candidates: Sequence[str]) -> str:
+        """The unit of velocities of which the slope of positions is known [rad/s, m/s]; the first without any."""
+        if not velocity.size or "joint_velocity" in self._stated:
+            return candidates[0]
         ratio = float(np.sqrt(np.nanmean(velocity**2) / max(float(np.nanmean(slope**2)), 1e-12)))
-        units = {unit: 1.0 / UNITS["angular velocity"][unit] for unit in ("rad/s", "deg/s", "rpm", "rev/s")}
-        unit = min(units, key=lambda unit: abs(np.log(max(ratio, 1e-9) / units[unit])))
-        self._set("joint_velocity", unit, f"as they are {ratio:.3g} times the slope of the positions")
+        expected = {unit: 1.0 / UNITS[quantity][unit] for unit in candidates}
+        unit = min(expected, key=lambda unit: abs(np.log(max(ratio, 1e-9) / expected[unit])))
+        if unit != candidates[0]:
+            self._note("joint_velocity", f"{unit}, as they are {ratio:.3g} times the slope of the positions")
+        return unit
 
     def _add_rate(self, seconds: Numbers) -> None:
-        """The unit of an IMU's angular velocity, by how fast its specific force, almost gravity, turns in its frame."""
-        force, rate = self._values("imu_specific_force"), self._values("imu_angular_velocity")
-        if force is None or rate is None or not force.shape == rate.shape == (len(seconds), 3):
+        """The unit of an IMU's angular velocity, by how fast the vertical turns in its frame.
+
+        By the base's quaternion; without one by the specific force, which is almost gravity.
+        """
+        rate, up = self._values("imu_angular_velocity"), self._vertical()
+        if rate is None or up is None or not up.shape == rate.shape == (len(seconds), 3):
             return
-        up = force / np.linalg.norm(force, axis=1, keepdims=True)
         step = float(np.median(np.diff(seconds)))
         turned = np.cumsum(-np.cross(rate, up) * step, axis=0)
         lag = min(max(1, round(_TURN_S / step)), len(seconds) - 1)
@@ -157,8 +226,20 @@ class UnitProposer:
         ratio = np.nansum(expected * found) / max(float(np.nansum(expected**2)), 1e-12)
         alike = np.nansum(expected * found) / np.sqrt(np.nansum(expected**2) * np.nansum(found**2) + 1e-12)
         if alike > _ALIKE and ratio < np.sqrt(UNITS["angle"]["deg"]):
-            why = f"as gravity turns {ratio:.2g} times as fast as in rad/s"
+            why = f"as the vertical turns {ratio:.2g} times as fast as in rad/s"
             self._set("imu_angular_velocity", "deg/s", why)
+
+    def _vertical(self) -> Numbers | None:
+        """The world's z axis (N, 3) in the base or IMU frame, about; None where nothing says so."""
+        for order in ("xyzw", "wxyz"):
+            entry = self._columns.get(f"base_quat_{order}", {})
+            if (
+                "axis" not in entry.get("column", "axis").lower()
+                and (quat := self._values(f"base_quat_{order}")) is not None
+            ):
+                return vertical_in_base(quat if order == "xyzw" else np.roll(quat, -1, axis=1))
+        force = self._values("imu_specific_force")
+        return None if force is None else force / np.linalg.norm(force, axis=1, keepdims=True)
 
     def _set(self, name: str, unit: str, why: str) -> None:
         entry = self._columns.get(name)
@@ -191,6 +272,16 @@ class UnitProposer:
         return values if np.isfinite(values).any() else None
 
 
+def _turn_start(position: Numbers, turn: float) -> float | None:
+    """Where a turn begins that all angles stay within; None where there is no such place."""
+    phase = np.mod(position / turn, 1.0)
+    for start in (*_STARTS, _middle_of_gap(phase)):
+        away = np.abs(np.mod(phase - start + 0.5, 1.0) - 0.5)
+        if np.nanmin(away) > _FREE:
+            return float(f"{start * turn:.4g}")
+    return None
+
+
 def _middle_of_gap(phase: Numbers) -> float:
     """The middle of the widest part of a turn, from -0.5 to 0.5, that no angle is in, of phases in turns."""
     known = np.sort(phase[np.isfinite(phase)])
@@ -204,95 +295,3 @@ def _rms(x: Numbers) -> float:
 
 def _length(x: Numbers) -> float:
     return float(np.nanmedian(np.linalg.norm(x, axis=1)))
-
-
-_NAMES = ("roll", "pitch", "yaw")
-_OTHER_NAMES = {"roulis": "roll", "tangage": "pitch", "lacet": "yaw", "nickwinkel": "pitch", "gierwinkel": "yaw"}
-_ANGLE = re.compile(rf"(?<![a-z])({'|'.join([*_NAMES, *_OTHER_NAMES])})(?![a-z])", re.IGNORECASE)
-_TRIPLE = re.compile(r"(?<![a-z])(rpy|euler\w*?)(?![a-z])", re.IGNORECASE)
-#: Words beside these in names of what turns the base, rather than a joint or a rate.
-_BESIDE_ANGLES = re.compile(
-    rf"({BASES}|floating|imu|ahrs|euler|rpy|orientation|attitude|angles?|state|states|data|pose|world|robot|est|"
-    r"estimated?|meas|measured|link|sensor|rotation|rot|value|x|y|z)"
-)
-_LARGEST = 6.5  # [rad]: of no angle within a turn
-_UPRIGHT = 1.6  # [rad]: roll or pitch of a base that stands or hangs upright are less
-
-
-def order_of_quaternion(arrays: Sequence[NDArray[Any]]) -> str:
-    """Order of a quaternion's components, as columns or as an array: w is the largest of a base that stands upright."""
-    flat = np.concatenate([np.atleast_2d(x).T if x.ndim == 1 else x for x in arrays], axis=1)
-    return "xyzw" if np.nansum(np.abs(flat[:, 3])) > np.nansum(np.abs(flat[:, 0])) else "wxyz"
-
-
-@dataclass(frozen=True)
-class Angles:
-    """Columns of angles of the base.
-
-    Attributes:
-        entry: of a map.
-        columns: that it has.
-        note: what was guessed.
-    """
-
-    entry: dict[str, Any]
-    columns: list[str]
-    note: str
-
-
-def find_angles(sample: FileSample, names: Sequence[str]) -> Angles | None:
-    """Roll, pitch and yaw of the base, as three columns or as an array (N, 3); None where no names say so.
-
-    Args:
-        sample: from `read_sample`.
-        names: of columns that may be.
-    """
-    known = {name: x for name in names if (x := sample[name]) is not None and not is_desired(name)}
-    arrays = [[name] for name, x in known.items() if _TRIPLE.search(name) and x.shape[1:] == (len(_NAMES),)]
-    for columns in (*_triples(list(known)), *arrays):
-        stem, unit = split_unit(columns[0])
-        of_angle = not unit or "angle" in quantities_with(unit)
-        if of_angle and all(_BESIDE_ANGLES.fullmatch(word) for word in words_of(_ANGLE.sub("", _TRIPLE.sub("", stem)))):
-            return _angles({name: known[name] for name in columns}, unit)
-    return None
-
-
-def _triples(names: Sequence[str]) -> list[list[str]]:
-    """Three columns each that differ in the name of an angle, or in an axis or a number behind `rpy` or `euler`."""
-    by_stem: dict[str, dict[str, str]] = {}
-    for name in names:
-        if (found := _ANGLE.search(name)) is not None:
-            word = found[1].lower()
-            by_stem.setdefault(_ANGLE.sub("*", name, count=1), {})[_OTHER_NAMES.get(word, word)] = name
-    out = [[of[one] for one in _NAMES] for of in by_stem.values() if set(of) == set(_NAMES)]
-    behind: dict[str, list[str]] = {}
-    for name in names:
-        if _TRIPLE.search(name) and (found := re.search(r"[xyz\d](?=\W*$)", split_unit(name)[0])) is not None:
-            behind.setdefault(name[: found.start()], []).append(name)
-    return out + [sorted(of) for of in behind.values() if len(of) == len(_NAMES) and _in_turn(sorted(of))]
-
-
-def _in_turn(names: Sequence[str]) -> bool:
-    """Whether names of one length differ in characters that follow one another."""
-    if len({len(name) for name in names}) > 1:
-        return False
-    changed = [[(a, b) for a, b in zip(*pair, strict=True) if a != b] for pair in pairwise(names)]
-    return all(len(of) == 1 and ord(of[0][1]) == ord(of[0][0]) + 1 for of in changed)
-
-
-def _angles(values: Mapping[str, NDArray[Any]], unit: str) -> Angles:
-    columns = list(values)
-    one = len(columns) == 1
-    entry: dict[str, Any] = {"column": columns[0]} if one else {"columns": dict(zip(_NAMES, columns, strict=True))}
-    note = "angles of the base about the world's x, then y, then z, as in a URDF"
-    if unit:
-        entry["unit"] = unit
-    elif (largest := float(np.nanmax([np.nanmax(np.abs(x), initial=0.0) for x in values.values()]))) > _LARGEST:
-        entry["unit"] = "deg"
-        note += f"; deg, from values up to {largest:.3g}"
-    elif (tilt := float(np.nanmax(np.abs(side_by_side(values, columns)[:, :2]), initial=0.0))) > _UPRIGHT:
-        entry["unit"] = "deg"
-        note += f"; deg, as a base that is tilted by {tilt:.3g} rad would have fallen"
-    else:
-        note += f"; rad, as none exceeds {_LARGEST}"
-    return Angles(entry, columns, note)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import LogError, about_file, current_file, during
-from torchid.logs.arrays import load_part, parse_frame, parse_names
+from torchid.logs.arrays import load_part, parse_frame, parse_names, require_plain
 from torchid.logs.column_map import Columns
 from torchid.logs.column_proposals import is_foreign, unknown_columns
 from torchid.logs.containers import (
@@ -154,7 +154,7 @@ def _read_arrays(
 
         def load(name: str) -> NDArray[Any]:
             with reader_errors_explained(name, "a plain array of numbers, truth values or text"):
-                return container.load(name)
+                return require_plain(name, container.load(name))
 
         def take(name: str) -> NDArray[Any]:
             return load_part(name, names, load)

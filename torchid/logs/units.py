@@ -25,6 +25,7 @@ UNITS: dict[str, dict[str, float]] = {
         "kgm": _GRAVITY, "kgcm": 1e-2 * _GRAVITY, "kgmm": 1e-3 * _GRAVITY, "gcm": 1e-5 * _GRAVITY,
     },
     "force": {"N": 1.0, "mN": 1e-3, "kN": 1e3, "kg": _GRAVITY, "g": 1e-3 * _GRAVITY, "lbf": _POUND},
+    "current": {"A": 1.0, "mA": 1e-3},
 }  # fmt: skip
 
 _ANGULAR = {"angular_velocity": "angular velocity", "angular_acceleration": "angular acceleration"}
@@ -32,7 +33,8 @@ _LINEAR = {
     "specific_force": "acceleration", "linear_acceleration": "acceleration", "linear_velocity": "velocity",
     "position": "length",
 }  # fmt: skip
-_OF_JOINTS = {
+#: What numbers of a hinge and of a slide are.
+OF_JOINTS = {
     "joint_position": ("angle", "length"),
     "joint_velocity": ("angular velocity", "velocity"),
     "joint_acceleration": ("angular acceleration", "acceleration"),
@@ -46,7 +48,7 @@ _SPELLINGS = {
 _MARKS = re.compile(r"[ ·.*^]")
 _POWERS = {"s-1": "/s", "s-2": "/s2", "/s/s": "/s2", "N-m": "Nm", "nm": "Nm"}
 _BRACKETS = re.compile(r"(.*?)\s*(?:\[([^\[\]{}]*)\]|\(([^(){}]*)\))\s*")
-_INSIDE = re.compile(r"\d+|[wxyzWXYZ]|[fm][xyz]")  # of brackets: a number or a component, no unit
+_INSIDE = re.compile(r"\d+|[wxyzWXYZ]|[fm][xyz]|'.*'")  # of brackets: a number, component or field of records, no unit
 
 
 #: Units of numbers about an axis in a file whose angles are in degrees.
@@ -62,8 +64,8 @@ def quantities_of(field: str, component: str = "") -> tuple[str, ...]:
     """
     if field == "time":
         return ("time",)
-    if field in _OF_JOINTS:
-        return _OF_JOINTS[field]
+    if field in OF_JOINTS:
+        return OF_JOINTS[field]
     if field == "contact_wrench_point_world":
         return ("length",)
     if field == "contact_force_normal":
@@ -112,7 +114,7 @@ def split_unit(column: str) -> tuple[str, str]:
     for start in (found.start() for found in re.finditer(r"[_ .](?=[^_ .])", column)):
         text = column[start + 1 :].replace("_per_", "/")
         for unit in (text.replace("_", "/"), text.replace("_", "")):
-            if quantities_with(unit):
+            if quantities_with(unit) and unit != "A":  # which is a letter as well
                 return column[:start].rstrip("_ ."), unit
     return column, ""
 
