@@ -17,8 +17,9 @@ import argparse
 import statistics
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +34,6 @@ from torchid.estimators import Consistent, LeastSquares
 from torchid.parameters import FRICTION, Array, perturb_parameters
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
 from torchid.problem.base_motion import BaseMotion
-from torchid.problem.chunk_dynamics import ChunkDynamics
 from torchid.problem.chunks import chunk_size
 from torchid.regressor import FrameJacobian, Regressor
 from torchid.robot import Robot, load_robot
@@ -86,6 +86,31 @@ def random_samples(robot: Robot, contacts: int, count: int) -> Samples:
     position, velocity, acceleration, torque = (normal(count, robot.n) for _ in range(4))
     time_stamps = torch.arange(count, dtype=torch.float64)
     return Samples("random", time_stamps, position, velocity, acceleration, base, torque, None, False, active)
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A robot with random samples, and the builder of its rows."""
+
+    robot: Robot
+    builder: RowBuilder
+    samples: Samples
+
+    @classmethod
+    def of(cls, case: Case, count: int, device: torch.device = _CPU, noise: SensorNoise | None = None) -> Bench:
+        """With so many samples, on the CPU."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", TorchidWarning)
+            robot = load_robot(robots_folder() / case.urdf)
+        contacts = [Contact(foot, case.kind) for foot in case.feet]
+        sensors = named_sensors("joints", robot.n, len(contacts), noise)
+        builder = RowBuilder(robot, contacts, sensors).to(device)
+        return cls(robot, builder, random_samples(robot, len(contacts), count))
+
+    def fit(self, estimator: LeastSquares | Consistent | None = None) -> None:
+        """From arrays to parameters."""
+        problem = linear_problem(compress([self.samples], self.builder), self.builder, self.robot)
+        (estimator or LeastSquares()).solve(problem)
 
 
 class PerSample:
@@ -175,31 +200,22 @@ def torques_of(robot: Robot, case: Case, samples: Samples, phi: Array, noise: fl
 
 def measure_consistent(count: int, repeats: int, device: torch.device) -> dict[str, float]:
     """Median seconds from the arrays of a log of Solo12 to parameters."""
-    case = CASES[0]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", TorchidWarning)
-        robot = load_robot(robots_folder() / case.urdf)
-    contacts = [Contact(foot, case.kind) for foot in case.feet]
-    noise = 0.1
-    sensors = named_sensors("joints", robot.n, len(contacts), SensorNoise(noise))
-    builder = RowBuilder(robot, contacts, sensors).to(device)
-    phi = perturb_parameters(robot.nominal, 0.2, np.random.default_rng(0))
+    case, noise = CASES[0], 0.1
+    bench = Bench.of(case, count, device, SensorNoise(noise))
+    phi = perturb_parameters(bench.robot.nominal, 0.2, np.random.default_rng(0))
     phi[1:, FRICTION] = 0.1
-    samples = torques_of(robot, case, random_samples(robot, len(contacts), count), phi.flatten(), noise)
+    bench = replace(bench, samples=torques_of(bench.robot, case, bench.samples, phi.flatten(), noise))
     estimators: dict[str, LeastSquares | Consistent] = {
         "least squares": LeastSquares(1e-4),
         "consistent, barrier": Consistent(1e-4),
         "consistent, certified": Consistent(1e-4, method="certified"),
     }
-
-    def pipeline(estimator: LeastSquares | Consistent) -> Callable[[], object]:
-        return lambda: estimator.solve(linear_problem(compress([samples], builder), builder, robot))
-
-    return medians({name: (pipeline(estimator), 10**6) for name, estimator in estimators.items()}, repeats, device)
+    pipelines = {name: (partial(bench.fit, estimator), 10**6) for name, estimator in estimators.items()}
+    return medians(pipelines, repeats, device)
 
 
 def medians(
-    pipelines: dict[str, tuple[Callable[[], object], int]], repeats: int, device: torch.device = _CPU
+    pipelines: Mapping[str, tuple[Callable[[], object], int]], repeats: int, device: torch.device = _CPU
 ) -> dict[str, float]:
     """Median microseconds per sample; the pipelines take turns, so that other load affects all alike."""
     times: dict[str, list[float]] = {name: [] for name in pipelines}
@@ -224,19 +240,12 @@ def measure(
     case: Case, count: int, repeats: int, device: torch.device, limits: Limits
 ) -> tuple[dict[str, float], Stages]:
     """Medians of microseconds per sample of one robot, and its stages."""
-    urdf = robots_folder() / case.urdf
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", TorchidWarning)
-        robot = load_robot(urdf)
-    contacts = [Contact(foot, case.kind) for foot in case.feet]
-    builder = RowBuilder(robot, contacts, named_sensors("joints", robot.n, len(contacts))).to(device)
-    samples = random_samples(robot, len(contacts), count)
-    per_sample, regressor = PerSample(urdf, robot, case), Regressor(robot).to(device)
+    bench = Bench.of(case, count, device)
+    robot, builder, samples = bench.robot, bench.builder, bench.samples
+    per_sample = PerSample(robots_folder() / case.urdf, robot, case)
+    regressor = Regressor(robot).to(device)
     there, step = samples.to(device), 1024 if device.type == "cpu" else chunk_size(device)
     few = samples[torch.arange(0, count, 32)]
-
-    def pipeline() -> None:
-        LeastSquares().solve(linear_problem(compress([samples], builder), builder, robot))
 
     def in_chunks(work: Callable[[Samples], object]) -> Callable[[], None]:
         def run() -> None:
@@ -246,16 +255,13 @@ def measure(
 
         return run
 
-    def reduced(part: Samples) -> ChunkDynamics:
-        return builder.dynamics(part)
-
     pipelines: dict[str, tuple[Callable[[], object], int]] = {
         "K, Pinocchio": (lambda: per_sample.regressors(few), len(few)),
         "K, torchid, 12 L columns": (in_chunks(lambda part: regressor.from_motion(part.motion())), count),
-        "wrench columns, torchid": (in_chunks(reduced), count),
+        "wrench columns, torchid": (in_chunks(builder.dynamics), count),
         "per sample, lstsq": (lambda: per_sample.by_stack(few), len(few)),
         "per sample, Gram": (lambda: per_sample.by_gram(few), len(few)),
-        "torchid": (pipeline, count),
+        "torchid": (bench.fit, count),
     }
     return medians(pipelines, repeats, device), measure_stages(builder, samples, limits)
 

@@ -14,24 +14,17 @@ import resource
 import subprocess
 import sys
 import time
-import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from benchmark import CASES, Case, PerSample, medians, random_samples, robots_folder
+from benchmark import CASES, Bench, Case, PerSample, medians, robots_folder
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
-from torchid.errors import TorchidWarning
-from torchid.estimators import LeastSquares
-from torchid.problem import RowBuilder, Samples, compress, linear_problem
 from torchid.ranks import join_launched, leave_launched, share_work
 from torchid.report.figures import save_figure
-from torchid.robot import Robot, load_robot
-from torchid.sensing import Contact, named_sensors
 
 ROBOTS = (
     Case("Bolt", "bolt_description/robots/bolt.urdf", ("FL_FOOT", "FR_FOOT"), "point"),
@@ -39,29 +32,6 @@ ROBOTS = (
     Case("Talos", "talos_data/robots/talos_reduced.urdf", ("left_sole_link", "right_sole_link"), "flat"),
     Case("Centauro", "centauro_description/urdf/centauro.urdf", tuple(f"wheel_{k}" for k in range(1, 5)), "point"),
 )
-
-
-@dataclass(frozen=True)
-class Bench:
-    """A robot with random samples, and the builder of its rows."""
-
-    robot: Robot
-    builder: RowBuilder
-    samples: Samples
-
-    @classmethod
-    def of(cls, case: Case, count: int) -> Bench:
-        """With so many samples."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", TorchidWarning)
-            robot = load_robot(robots_folder() / case.urdf)
-        contacts = [Contact(foot, case.kind) for foot in case.feet]
-        builder = RowBuilder(robot, contacts, named_sensors("joints", robot.n, len(contacts)))
-        return cls(robot, builder, random_samples(robot, len(contacts), count))
-
-    def fit(self) -> None:
-        """From arrays to parameters."""
-        LeastSquares().solve(linear_problem(compress([self.samples], self.builder), self.builder, self.robot))
 
 
 def measure_bodies(case: Case, repeats: int) -> dict[str, float]:

@@ -28,7 +28,7 @@ from torchid.parameters import FRICTION, INERTIA, Array, perturb_parameters
 from torchid.report.mjcf_files import identified_mjcf
 from torchid.robot import Robot
 from torchid.robot.mjcf_model import MjcfModel
-from torchid.robot.urdf import is_bolted, parse_xml
+from torchid.robot.urdf import has_fixed_base, parse_xml
 
 _STATES = 5
 
@@ -61,18 +61,19 @@ def torchid_forces(robot: Robot, phi: Array, armature: Array, states: States) ->
     return forces
 
 
-def mujoco_forces(model: mujoco.MjModel, robot: Robot, states: States) -> Array:
+def mujoco_forces(source: MjcfModel, robot: Robot, states: States) -> Array:
     """`mj_inverse` without constraints and with dry friction as MuJoCo reads it, in torchid's rows, (B, nv).
 
     MuJoCo has linear velocities and accelerations of a free base along the world's axes, angular ones along the base's.
     """
+    model = source.model
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     model.opt.gravity = [0.0, 0.0, -9.81]
     model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)  # as torchid, which warns of it
     data, base, (matrix, constant), out = mujoco.MjData(model), robot.base_rows, robot.joint_map, []
-    ids = [model.joint(body.joint.name).id for body in robot.bodies if body.joint is not None]
+    ids = [source.joints.index(body.joint.name) for body in robot.bodies if body.joint is not None]
     at, rate = model.jnt_qposadr[ids], model.jnt_dofadr[ids]
-    free = int(model.body(robot.base_link).jntadr[0]) if base else -1
+    free = int(model.body_jntadr[source.base]) if base else -1
     for q, v, a in zip(states.q, states.v, states.a, strict=True):
         mujoco.mj_resetData(model, data)
         data.qpos[at] = matrix @ q[7 if base else 0 :] + constant
@@ -91,8 +92,9 @@ def mujoco_forces(model: mujoco.MjModel, robot: Robot, states: States) -> Array:
 
 
 def difference(one: Array, other: Array) -> float:
-    """Largest difference over the largest number."""
-    return float(np.abs(one - other).max() / np.abs(other).max())
+    """Largest difference over the largest number of its column, (B, n) both: a joint's damping may be 1e11."""
+    off, largest = np.abs(one - other).max(axis=0), np.abs(other).max(axis=0)
+    return float(np.divide(off, largest, out=off, where=largest > 0.0).max(initial=0.0))
 
 
 def largest_change(phi: Array, before: Array) -> float:
@@ -139,21 +141,30 @@ class Survey:
 def survey(path: Path, folder: Path) -> Survey:
     """Compare one file; `folder` for what is written."""
     try:
-        robot = load_robot(path, fixed_base=is_bolted(path))
+        robot = load_robot(path, fixed_base=has_fixed_base(path))
     except ValueError as error:
         return Survey(path.name, refusal=str(error).replace(f"{path}: ", ""))
     states = States.random(robot)
-    read = mujoco_forces(MjcfModel(path).model, robot, states)
+    read = mujoco_forces(MjcfModel(path), robot, states)
     found = difference(torchid_forces(robot, robot.nominal, robot.armature, states), read)
     phi, armature = perturbed(robot)
     file = folder / f"{path.stem}.xml"
-    file.write_bytes(identified_mjcf(robot, phi, armature))
+    file.write_bytes(_finding_meshes(identified_mjcf(robot, phi, armature), path))
     again = load_robot(file, fixed_base=robot.fixed_base)
-    model = MjcfModel(file).model
     by_joint = np.array([armature[name] for name in robot.joint_names])
-    written = difference(mujoco_forces(model, robot, states), torchid_forces(robot, phi, by_joint, states))
-    same = max(largest_change(again.nominal, phi), difference(again.armature, by_joint))
+    written = difference(mujoco_forces(MjcfModel(file), robot, states), torchid_forces(robot, phi, by_joint, states))
+    same = max(largest_change(again.nominal, phi), difference(again.armature[None], by_joint[None]))
     return Survey(path.name, robot, found, same, written)
+
+
+def _finding_meshes(text: bytes, source: Path) -> bytes:
+    """A model that is not beside the file that it was made of, with the full path of its meshes."""
+    root = etree.fromstring(text)
+    compilers = root.findall("compiler") or [etree.SubElement(root, "compiler")]
+    for compiler in compilers:
+        named = compiler.get("meshdir") or compiler.get("assetdir") or ""
+        compiler.set("meshdir", str(source.resolve().parent / named))
+    return etree.tostring(root)
 
 
 def saved_by_mujoco(urdf: Path, folder: Path) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import tempfile
@@ -11,6 +12,7 @@ from pathlib import Path
 import pytest
 from demo import shortened_demo
 from hostile_commands import Commands, commands
+from made_once import made_once
 from run_figures import draw, draw_nothing
 from synthetic import load
 
@@ -18,6 +20,13 @@ import torchid
 from torchid.robot import Robot
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a run started in the background inherits one that is ignored
+gc.disable()  # until all tests are collected, which leaves 600,000 objects and no garbage
+
+
+def pytest_collection_finish() -> None:
+    """Look for garbage less often than after every 700 new objects, which takes a tenth of all tests' time."""
+    gc.set_threshold(20_000, 10, 10)
+    gc.enable()
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -25,6 +34,7 @@ def _elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Work in a folder of its own: results without an absolute path go to the working folder."""
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setenv("PYTHONPATH", str(Path(torchid.__file__).parents[1]), os.pathsep)  # of child processes
+        monkeypatch.delenv("PYTHONDONTWRITEBYTECODE", raising=False)  # of these too: they compile torchid once
         monkeypatch.delenv("COLUMNS", raising=False)  # of the terminal that tests are started from
         monkeypatch.chdir(tmp_path_factory.mktemp("work"))
         yield
@@ -72,9 +82,7 @@ def biped_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     from torchid.commands.simulate import simulate
 
-    output = tmp_path_factory.mktemp("simulations") / "biped"
-    simulate(short(output))
-    return output
+    return made_once(tmp_path_factory, "biped", lambda output: simulate(short(output)))
 
 
 @pytest.fixture(scope="module")

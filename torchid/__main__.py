@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
+from torchid.cli import run
 
-from torchid.cli import main
-
-sys.exit(main())
+run()

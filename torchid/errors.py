@@ -171,10 +171,10 @@ def _prefixed(source: object, text: str) -> str:
     return f"{source}: {text}" if str(source) else text
 
 
-def _nearest_names(name: str, valid: Iterable[str], limit: int = 3) -> str:
+def _nearest_names(name: str, valid: Iterable[str]) -> str:
     """The names in `valid` closest to `name`, or the first few of them, as one readable string."""
     valid = list(valid)
-    close = difflib.get_close_matches(name, valid, n=limit, cutoff=0.5)
+    close = difflib.get_close_matches(name, valid, n=3, cutoff=0.5)
     if close:
         return ", ".join(close)
     shown = ", ".join(valid[:8])

@@ -72,8 +72,9 @@ MAX_STATE = 10_000
 #: Bytes and links of a URDF: the largest of the tested robots has 0.2 MB and 130 links. pytorch-kinematics takes 2 s
 #: for a chain of 300 joints and overflows its stack at 800.
 MAX_URDF, MAX_LINKS = 8 * MEBIBYTE, 300
-#: Size of a number in a URDF, in any unit: products stay within the range of float64.
-MAX_NUMBER = 1e9
+#: Size of a number in a URDF, in any unit: products stay within the range of float64. Slides that must not move have a
+#: damping of 1e11 in published models.
+MAX_NUMBER = 1e12
 #: Bytes of a mesh file (the largest known one has 29 MB), and of the shapes in a COLLADA file, counted per use.
 MAX_MESH, MAX_UNFOLDED = 32 * MEBIBYTE, 64 * MEBIBYTE
 #: Parts of a text mesh (trimesh takes 1 ms for each), and bytes of a line (trimesh splits long lines slowly).

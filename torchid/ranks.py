@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import timedelta
 from itertools import accumulate, chain
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from torchid.errors import InputError, TorchidError
 
@@ -315,6 +315,11 @@ def leave_launched(status: int) -> int:
         with suppress(LostRankError):
             statuses = _launched.exchange(_STATUS, status)
             status = statuses[0] or max(statuses)
+    end_process(status)
+
+
+def end_process(status: int) -> NoReturn:
+    """End this process at once, without taking libraries down one by one."""
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError, ValueError):
             stream.flush()

@@ -1,4 +1,4 @@
-"""Numbers of numerical practice that packages share: tolerances of rank with what applies them, and a robust scale."""
+"""Numerical practice that packages share: tolerances of rank with what applies them, scales of columns and errors."""
 
 from __future__ import annotations
 
@@ -29,6 +29,12 @@ MAD_PER_STD = 0.6745
 
 STD_PER_MAD = 1.4826
 """Its inverse, as rounded in the literature on outliers."""
+
+
+def column_scale(A: Array) -> Array:
+    """What makes the columns of A, (R, n), of norm 1, (n,); 0 for columns of zeros."""
+    norms = np.linalg.norm(A, axis=0)
+    return np.divide(1.0, norms, out=np.zeros_like(norms), where=norms > 0.0)
 
 
 def relative_tolerance(tolerance: float, shape: tuple[int, ...], eps: float = float(np.finfo(float).eps)) -> float:

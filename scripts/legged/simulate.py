@@ -28,7 +28,7 @@ class Exact:
     Attributes:
         log: positions, velocities, accelerations, torques and contact forces of the same instants.
         rate: generalized velocity half a step later, (N, 6 + n): the rate of the positions in a simulation with steps.
-        arm: from the frames' origins to where the ground acts, mean weighed by force, (N, F, 3) [m], world axes.
+        arm: from the frames' origins to where the ground acts, mean weighted by force, (N, F, 3) [m], world axes.
     """
 
     log: Log

@@ -15,7 +15,7 @@ from paper.fits import Series, compress_groups, predict_series
 from paper.results import NOMINAL, TRUE, Ranks, Record, Results
 from paper.settings import SHOWN, SQUATS, TRAINING, UNSEEN, Condition, Study, conditions
 from torchid import parameters, ranks
-from torchid.commands.simulate import nominal_parameters, simulate
+from torchid.commands.simulate import perturbed_parameters, simulate
 from torchid.config import load_config
 from torchid.errors import ConfigError, about_file
 from torchid.fitting.experiment import Experiment, set_up
@@ -161,7 +161,7 @@ class Reproduction:
     def _nominals(self) -> list[Array]:
         """Nominal parameters (L, 12), one per draw."""
         settings = self.study.simulation.nominal
-        return [nominal_parameters(self._robot, settings, draw) for draw in range(self.study.nominal_draws)]
+        return [perturbed_parameters(self._robot, settings, draw) for draw in range(self.study.nominal_draws)]
 
     def _true(self, friction: bool) -> Array:
         """Parameters (L, 12) of the simulated robot."""

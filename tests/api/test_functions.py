@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from demo import FAST_ESTIMATOR, shortened_demo
 from repository import DEMO
 from run_folders import names_in
 
@@ -26,25 +27,36 @@ LOG = torchid.Log(source="log", time=np.zeros(1), joint_names=("a",), joint_posi
 UNPHYSICAL = "ignore:identified.urdf:torchid.errors.TorchidWarning"
 
 
-def sections() -> dict[str, Any]:
+def sections(demo: Path = DEMO) -> dict[str, Any]:
     """The demo as a user writes it in Python."""
-    settings = yaml.safe_load(FILE.read_text())
+    settings = yaml.safe_load((demo / "quadruped.yaml").read_text())
     del settings["output"]
-    settings["robot"] = DEMO / "quadruped.urdf"
-    settings["logs"] = {"train": [DEMO / "sway_train.npz"], "test": (str(DEMO / "sway_test.npz"),)}
+    settings["robot"] = demo / "quadruped.urdf"
+    settings["logs"] = {"train": [demo / "sway_train.npz"], "test": (str(demo / "sway_test.npz"),)}
     settings["preprocessing"]["cutoff_hz"] = np.float64(settings["preprocessing"]["cutoff_hz"])
     return settings
 
 
 @pytest.fixture(scope="module")
-def result() -> torchid.Identification:
-    return torchid.identify(FILE, output=None)
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The demo with less of its logs, and with its own estimator."""
+    folder = shortened_demo(tmp_path_factory.mktemp("short") / "demo", 600)
+    file = folder / "quadruped.yaml"
+    file.write_text(
+        file.read_text().replace(f"estimator: {FAST_ESTIMATOR}", "estimator: {name: consistent, ridge: auto}")
+    )
+    return folder
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def result(demo: Path) -> torchid.Identification:
+    return torchid.identify(demo / "quadruped.yaml", output=None)
+
+
+@pytest.fixture(scope="module")
+def folder(demo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     output = tmp_path_factory.mktemp("runs") / "demo"
-    assert main(["identify", str(FILE), f"output={output}", "preprocessing.cache_gb=0"]) == 0
+    assert main(["identify", str(demo / "quadruped.yaml"), f"output={output}", "preprocessing.cache_gb=0"]) == 0
     return output
 
 
@@ -62,8 +74,8 @@ def test_the_function_finds_what_the_command_writes_to_the_last_bit(
     assert {key for key, value in document["config"].items() if value != written[key]} == {"output", "preprocessing"}
 
 
-def test_keywords_alone_find_what_the_file_finds(result: torchid.Identification) -> None:
-    np.testing.assert_array_equal(torchid.identify(**sections()).phi, result.phi)
+def test_keywords_alone_find_what_the_file_finds(demo: Path, result: torchid.Identification) -> None:
+    np.testing.assert_array_equal(torchid.identify(**sections(demo)).phi, result.phi)
 
 
 def test_keywords_override_a_file_as_the_command_line_does() -> None:
@@ -73,24 +85,24 @@ def test_keywords_override_a_file_as_the_command_line_does() -> None:
 
 
 def test_without_an_output_nothing_is_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, result: torchid.Identification
+    demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, result: torchid.Identification
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    torchid.identify(FILE, output=None)
-    torchid.evaluate(result, DEMO / "sway_test.npz")
-    torchid.check(FILE)
+    torchid.identify(demo / "quadruped.yaml", output=None)
+    torchid.evaluate(result, demo / "sway_test.npz")
+    torchid.check(demo / "quadruped.yaml")
     assert names_in(tmp_path) == []
-    assert not (DEMO / "runs").exists()
+    assert not (demo / "runs").exists()
 
 
 def test_a_descent_without_an_output_leaves_nothing_and_ends_where_it_does_with_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    descent = {"name": "sgd", "training": {"epochs": 2}}
-    silent = torchid.identify(FILE, estimator=descent, output=None)
+    descent = {"name": "sgd", "ridge": 0.1, "training": {"epochs": 2}}
+    silent = torchid.identify(demo / "quadruped.yaml", estimator=descent, output=None)
     assert names_in(tmp_path) == []
-    written = torchid.identify(FILE, estimator=descent, output="run", preprocessing={"cache_gb": 0})
+    written = torchid.identify(demo / "quadruped.yaml", estimator=descent, output="run", preprocessing={"cache_gb": 0})
     assert names_in(tmp_path) == ["run"]
     np.testing.assert_array_equal(silent.phi, written.phi)
 
@@ -160,19 +172,21 @@ def test_the_table_has_a_row_for_each_parameter(result: torchid.Identification) 
 
 
 @pytest.mark.filterwarnings(UNPHYSICAL)
-def test_the_urdf_is_that_of_the_run_and_replaces_nothing(result: torchid.Identification, tmp_path: Path) -> None:
+def test_the_urdf_is_that_of_the_run_and_replaces_nothing(
+    demo: Path, result: torchid.Identification, tmp_path: Path
+) -> None:
     path = result.to_urdf(tmp_path / "out.urdf")
     assert path.read_bytes() == identified_urdf(result.experiment.robot, result.phi)
     with pytest.raises(ConfigError, match="path: exists; accepted: a new file, or overwrite=True in place of a file"):
         result.to_urdf(path)
     result.to_urdf(path, overwrite=True)
     with pytest.raises(ConfigError, match="is or belongs to what is read"):
-        result.to_urdf(DEMO / "quadruped.urdf", overwrite=True)
+        result.to_urdf(demo / "quadruped.urdf", overwrite=True)
 
 
-def test_a_result_and_its_folder_are_evaluated_alike(result: torchid.Identification, folder: Path) -> None:
-    of_result = torchid.evaluate(result, DEMO / "sway_test.npz")
-    of_folder = torchid.evaluate(folder, [DEMO / "sway_test.npz"])
+def test_a_result_and_its_folder_are_evaluated_alike(demo: Path, result: torchid.Identification, folder: Path) -> None:
+    of_result = torchid.evaluate(result, demo / "sway_test.npz")
+    of_folder = torchid.evaluate(folder, [demo / "sway_test.npz"])
     assert of_result.to_dict() == of_folder.to_dict()
     assert of_folder.output is None
     assert not (folder / "evaluation").exists()
@@ -181,27 +195,27 @@ def test_a_result_and_its_folder_are_evaluated_alike(result: torchid.Identificat
 
 
 @pytest.mark.filterwarnings(UNPHYSICAL, "ignore::torchid.errors.ConfoundedWarning")
-def test_offsets_of_a_result_are_those_of_its_folder(tmp_path: Path) -> None:
+def test_offsets_of_a_result_are_those_of_its_folder(demo: Path, tmp_path: Path) -> None:
     offsets = {"set": "joints", "offsets": {"joint_torque": "all"}, "noise": {"joint_torque": 0.1}}
-    result = torchid.identify(FILE, sensors=offsets, output=tmp_path / "run")
-    of_result = torchid.evaluate(result, DEMO / "sway_test.npz")
-    assert of_result.to_dict() == torchid.evaluate(tmp_path / "run", DEMO / "sway_test.npz").to_dict()
-    written = torchid.evaluate(result, DEMO / "sway_test.npz", write=True)
+    result = torchid.identify(demo / "quadruped.yaml", sensors=offsets, output=tmp_path / "run")
+    of_result = torchid.evaluate(result, demo / "sway_test.npz")
+    assert of_result.to_dict() == torchid.evaluate(tmp_path / "run", demo / "sway_test.npz").to_dict()
+    written = torchid.evaluate(result, demo / "sway_test.npz", write=True)
     assert written.output == tmp_path / "run" / "evaluation" / "sway_test"
     assert json.loads((written.output / "metrics.json").read_text()) == json.loads(json.dumps(of_result.to_dict()))
 
 
-def test_logs_are_checked_from_files_and_from_memory(capsys: pytest.CaptureFixture[str]) -> None:
-    checked = torchid.check(FILE)
+def test_logs_are_checked_from_files_and_from_memory(demo: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    checked = torchid.check(demo / "quadruped.yaml")
     assert [Path(one.log.source).name for one in checked] == ["sway_train.npz", "sway_test.npz"]
     assert checked.usable
-    (alone,) = torchid.check(DEMO / "sway_test.npz", robot=DEMO / "quadruped.urdf")
-    assert len(alone.skipped) < len(torchid.check(torchid.read_log(DEMO / "sway_test.npz")).skipped)
+    (alone,) = torchid.check(demo / "sway_test.npz", robot=demo / "quadruped.urdf")
+    assert len(alone.skipped) < len(torchid.check(torchid.read_log(demo / "sway_test.npz")).skipped)
     assert capsys.readouterr().out == ""
 
 
-def test_an_analysis_has_what_the_command_writes(tmp_path: Path) -> None:
-    analysis = torchid.analyze(FILE, output=tmp_path / "run")
+def test_an_analysis_has_what_the_command_writes(demo: Path, tmp_path: Path) -> None:
+    analysis = torchid.analyze(demo / "quadruped.yaml", output=tmp_path / "run")
     written = json.loads((tmp_path / "run.analysis" / "analysis.json").read_text())
     assert json.loads(json.dumps(analysis.to_dict())) == written
 

@@ -34,7 +34,7 @@ def things() -> Mapping[str, object]:
     fit = fitter.fit(parts)
     batches = torchid.MiniBatches([samples], builder)
     result = torchid.identify(FILE, output=None)
-    analysis = torchid.analyze(FILE, output=None)
+    analysis = torchid.analyze(FILE, output=None, estimator={"ridge": 0.01})
     checked = torchid.check(FILE)
     return {
         "log": log,

@@ -44,6 +44,7 @@ def experiment(
         write_log(change(read_log(DEMO / f"sway_{name}.npz")), folder / f"{name}{suffix}")
         settings["logs"][name] = [f"{name}{suffix}"]
     settings["robot"]["urdf"] = str(DEMO / "quadruped.urdf")
+    settings["estimator"]["ridge"] = 0.01
     settings["preprocessing"] |= {"contact_margin_s": 0.02, "cache_gb": 0} | preprocessing
     settings |= {"sensors": FULL, "output": str(folder / "run")}
     (folder / "run.yaml").write_text(yaml.safe_dump(settings))

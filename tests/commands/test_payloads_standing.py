@@ -50,7 +50,7 @@ def carrying(log: Log, seconds: float) -> Log:
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Path]:
     """Folders of the runs by the number of processes."""
-    folder, seconds = tmp_path_factory.mktemp("payloads"), 12.0
+    folder, seconds = tmp_path_factory.mktemp("payloads"), 6.0
     log = recorded(MACHINE, truth(MACHINE, 0, seconds=seconds), seed=0, noise=0.0)
     log = replace(log, contact_wrench_local=None, base_quat_xyzw=None, base_position_world=None)
     write_log(log, folder / "walk.npz")

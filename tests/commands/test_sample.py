@@ -112,6 +112,8 @@ def test_runs_without_a_posterior_are_refused_with_advice(run: Path, tmp_path: P
         sample(old)
     with pytest.raises(ConfigError, match=r"no config\.yaml in it"):
         sample(tmp_path)
+    with pytest.raises(torchid.TorchidError, match="none: RUN: no such file or folder; accepted: a run of this"):
+        torchid.PosteriorSampler(tmp_path / "none")
 
 
 def test_files_that_stand_there_stay_without_overwrite(run: Path, tmp_path: Path) -> None:

@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fleets import walks
-from shared_work import TORCHRUN, TWO, finish, lines_of_torchid
+from shared_work import TORCHRUN, finish, finish_forked, lines_of_torchid
+
+from torchid.cli import main
 
 
 @pytest.mark.slow
@@ -37,11 +39,14 @@ def told(printed: str) -> list[str]:
     return [line for line in printed.splitlines() if "written to" not in line]
 
 
+def compressed_by(processes: int, file: Path, output: Path) -> tuple[int, str, str]:
+    return finish_forked(processes, lambda: main(["compress", str(file), "--output", str(output)]))
+
+
 def test_a_log_that_one_process_cannot_compress_ends_all_in_one_line(tmp_path: Path) -> None:
     file = walks(tmp_path / "walks", "biped", (2.0, 1.5), sensors={"set": "full"})
     (tmp_path / "walks" / "right.npz").write_bytes(b"no log")
-    command = (*TWO, "-m", "--", "torchid", "compress", str(file), "--output", str(tmp_path / "factors"))
-    status, printed, complained = finish(command)
+    status, printed, complained = compressed_by(2, file, tmp_path / "factors")
     assert status != 0
     assert not printed
     (line,) = lines_of_torchid(complained)
@@ -57,9 +62,8 @@ def test_warnings_of_other_processes_are_told_by_the_first(tmp_path: Path) -> No
     fields["contact_wrench_local"][40:44] = np.nan  # a gap
     np.savez(tmp_path / "walks" / "right.npz", **fields)
     warned = []
-    for number, before in enumerate(((sys.executable, "-m"), (*TWO, "-m", "--"))):
-        output = str(tmp_path / str(number))
-        status, _, complained = finish((*before, "torchid", "compress", str(file), "--output", output))
+    for processes in (1, 2):
+        status, _, complained = compressed_by(processes, file, tmp_path / str(processes))
         assert status == 0, complained
         warned.append([line for line in complained.splitlines() if "right.npz" in line and "torchid: " in line])
     assert warned[0]

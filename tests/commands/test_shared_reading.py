@@ -3,70 +3,73 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+import torch.distributed as dist  # noqa: TID251
 from demo import shortened_demo
 from large import SMALL, experiment, recorded, tensors
-from shared_work import TORCHRUN, finish
+from shared_work import finish_forked
 
 from torchid import ranks
+from torchid.commands import large_log, reading
 from torchid.commands.cache import FOLDER
 from torchid.commands.cached_reading import CachedReader, _shares, open_cache
 from torchid.commands.reading import LogReader
 from torchid.config import load_config
 from torchid.fitting.experiment import set_up
+from torchid.problem import Samples
 
-#: What each of two processes does: reads logs of several experiments, and says which of them it has opened.
-PROGRAM = """
-import hashlib, json, os, sys, warnings
-from pathlib import Path
-from torchid import ranks
-from torchid.commands import large_log, reading
-from torchid.commands.cached_reading import CachedReader, open_cache
-from torchid.config import load_config
-from torchid.fitting.experiment import set_up
-import torch.distributed as dist
 
-def digest(samples):
-    both = {**vars(samples), **{"base " + name: x for name, x in vars(samples.base).items()}}
+def digest(samples: Samples) -> str:
+    both = {**vars(samples), **{f"base {name}": x for name, x in vars(samples.base).items()}}
     data = [x.numpy().tobytes() for name, x in sorted(both.items()) if hasattr(x, "numpy")]
     return hashlib.sha256(b"".join(data)).hexdigest()
 
-opened, read_log = [], reading.read_log
-reading.read_log = lambda path, *rest, **named: [opened.append(Path(path).name), read_log(path, *rest, **named)][1]
-bound, bind = [], large_log.LargeLog._bound
-large_log.LargeLog._bound = lambda log, cover, block: [bound.append(block.piece.start), bind(log, cover, block)][1]
-dist.init_process_group("gloo")
-rank, found = dist.get_rank(), []
-for file, *more in json.loads(sys.argv[1]):
-    opened.clear()
-    bound.clear()
-    reading._WHOLE_GB, large_log.BLOCK_GB = (0.0, 1e-4) if "in blocks" in more else (0.04, 0.01)
-    more = [x for x in more if x != "in blocks"]
-    said = []
-    with warnings.catch_warnings(record=True) as said, ranks.share_work():
-        warnings.simplefilter("always")
-        scene = set_up(load_config(file, [x.replace("RANK", str(rank)) for x in more]))
-        cache = open_cache(scene)
-        try:
-            reader = reading.LogReader(scene) if cache is None else CachedReader(scene, cache)
-            logs = reader.read(scene.config.logs.train, scene.sensors)
-            error = ""
-        except ValueError as failure:
-            logs, error = [], str(failure)
-    entry = {"opened": list(opened), "logs": [digest(x) for x in logs], "error": error, "cache": cache is not None}
-    entry["blocks"] = sorted(bound)
-    found.append(entry | {"said": [str(x.message) for x in said], "sources": [x.source for x in logs]})
-Path(sys.argv[2], f"{rank}.json").write_text(json.dumps(found))
-sys.stdout.flush()
-os._exit(0)
-"""
+
+def read_all(calls: Sequence[Sequence[str]], folder: Path) -> int:
+    """What each of two processes does: reads logs of several experiments, and writes which of them it has opened."""
+    opened: list[str] = []
+    bound: list[int] = []
+    read_log, bind = reading.read_log, large_log.LargeLog._bound
+
+    def open_and_read(path: Path, *rest: Any, **named: Any) -> Any:
+        opened.append(Path(path).name)
+        return read_log(path, *rest, **named)
+
+    def note_and_bind(log: Any, cover: Any, block: Any) -> Any:
+        bound.append(block.piece.start)
+        return bind(log, cover, block)
+
+    reading.read_log, large_log.LargeLog._bound = open_and_read, note_and_bind  # type: ignore[method-assign]
+    dist.init_process_group("gloo")
+    rank, found = dist.get_rank(), []
+    for file, *more in calls:
+        opened.clear()
+        bound.clear()
+        reading._WHOLE_GB, large_log.BLOCK_GB = (0.0, 1e-4) if "in blocks" in more else (0.04, 0.01)
+        overrides = [x.replace("RANK", str(rank)) for x in more if x != "in blocks"]
+        with warnings.catch_warnings(record=True) as said, ranks.share_work():
+            warnings.simplefilter("always")
+            scene = set_up(load_config(Path(file), overrides))
+            cache, logs, error = open_cache(scene), [], ""
+            try:
+                reader = LogReader(scene) if cache is None else CachedReader(scene, cache)
+                logs = reader.read(scene.config.logs.train, scene.sensors)
+            except ValueError as failure:
+                error = str(failure)
+        entry = {"opened": list(opened), "logs": [digest(x) for x in logs], "error": error, "cache": cache is not None}
+        entry |= {"blocks": sorted(bound), "said": [str(x.message) for x in said], "sources": [x.source for x in logs]}
+        found.append(entry)
+    (folder / f"{rank}.json").write_text(json.dumps(found))
+    return 0
 
 
 @pytest.fixture(scope="module")
@@ -117,9 +120,8 @@ def read(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Any]]:
         "little room": [three, f"output={folder / 'little' / 'run'}", "preprocessing.cache_gb=0.001"],
     }
     common = ["logs.test=[]", "preprocessing.cutoff_hz=8"]
-    (folder / "program.py").write_text(PROGRAM)
-    calls = json.dumps([[file, *common, *more] for more in runs.values()])
-    status, _, complained = finish([*TORCHRUN, "2", str(folder / "program.py"), calls, str(folder)])
+    calls = [[file, *common, *more] for more in runs.values()]
+    status, _, complained = finish_forked(2, lambda: read_all(calls, folder))
     assert status == 0, complained
     both = [json.loads((folder / f"{rank}.json").read_text()) for rank in range(2)]
     return {name: [one[number] for one in both] for number, name in enumerate(runs)}

@@ -245,6 +245,16 @@ class TestCertifiedEntropic(ConsistentContract):
     accuracy = 2e-5
 
 
+@pytest.mark.parametrize(
+    "estimator", [LeastSquares(), LeastSquares(RIDGE), Consistent(), Consistent(RIDGE), Consistent(RIDGE, certify=True)]
+)
+def test_the_parameters_alone_are_those_of_the_estimate_to_the_last_bit(estimator: LeastSquares | Consistent) -> None:
+    alone, estimate = estimator.minimize(usual_problem()), estimator.solve(usual_problem())
+    assert np.array_equal(alone.phi, estimate.phi)
+    assert alone.psi is None
+    assert estimate.psi is None
+
+
 class RowBatches:
     """The rows of a problem as mini-batches of samples of one row each: what a `Trainer` needs of `MiniBatches`."""
 

@@ -41,7 +41,7 @@ def parameters_of(posterior: Posterior, deviations: Array) -> Array:
     return phi.reshape(len(phi), -1, 12)
 
 
-@pytest.mark.parametrize("seed", range(25))
+@pytest.mark.parametrize("seed", [*range(8), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(8, 25))])
 def test_every_sample_meets_every_condition(seed: int) -> None:
     case = random_case(np.random.default_rng(seed))
     posterior = posterior_of(case.problem, case.conditions, noise=0.05)
@@ -76,7 +76,7 @@ def test_friction_that_data_want_negative_is_a_truncated_normal(distance: float)
     """Of a mean so many standard deviations below 0."""
     problem = replace(nothing_seen(GOOD), A=np.eye(12)[10:11] * 100.0, b=np.array([-distance]))
     posterior = posterior_of(problem, Conditions())
-    deviations, _ = drawn(posterior, 40_000)
+    deviations, _ = drawn(posterior, 20_000)
     friction = parameters_of(posterior, deviations)[:, 0, 10]
     t = np.linspace(0.0, 0.12 / max(distance, 1.0), 100_001)
     density = np.exp(-0.5 * (100.0 * t + distance) ** 2 + 0.5 * distance**2 - 0.5 * ((t - GOOD[0, 10]) / 0.2) ** 2)
@@ -97,8 +97,10 @@ def test_the_barrier_has_the_mean_of_an_exponential_tail() -> None:
     np.testing.assert_allclose(np.sqrt(found.covariance[friction, friction]), 2.0 / rate, rtol=1e-3)
 
 
-@pytest.mark.parametrize("prior_error", [pytest.param(0.2, marks=pytest.mark.slow), 0.6])
-def test_mean_and_covariance_are_those_of_long_chains_where_bodies_are_cut_off(prior_error: float) -> None:
+@pytest.mark.parametrize(
+    ("prior_error", "steps"), [(0.6, 2000), *(pytest.param(x, 5000, marks=pytest.mark.slow) for x in (0.2, 0.6))]
+)
+def test_mean_and_covariance_are_those_of_long_chains_where_bodies_are_cut_off(prior_error: float, steps: int) -> None:
     problem, _ = active_case(3)
     posterior = posterior_of(problem, Conditions(1e-3), noise=0.1)
     conic = posterior.conic_problem(prior_error)
@@ -106,8 +108,8 @@ def test_mean_and_covariance_are_those_of_long_chains_where_bodies_are_cut_off(p
     assert sampler.near
     x = sampler.draw(40_000, torch.Generator().manual_seed(1)).numpy()
     chain, states = LongChain(conic, posterior.owners(), 1000, seed=2), []
-    chain.run(2000)
-    chain.run(5000, lambda x: states.append(x.copy()), every=25)
+    chain.run(2 * steps // 5)
+    chain.run(steps, lambda x: states.append(x.copy()), every=25)
     reference = np.concatenate(states)
     mean, deviation = reference.mean(axis=0), reference.std(axis=0)
     np.testing.assert_allclose((x.mean(axis=0) - mean) / deviation, 0.0, atol=0.05)

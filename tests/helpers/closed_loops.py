@@ -24,12 +24,12 @@ _OPTIONS = """<compiler angle="radian"/><option jacobian="dense"/>
  <default><joint damping="0.3" armature="0.01"/><geom contype="0" conaffinity="0"/></default>"""
 
 
-def _ankle(side: str, y: float) -> str:
-    """A leg whose ankle, a universal joint, is moved by two cranks on the shank through rods with ball ends."""
-    rods = ""
+def _ankle(side: str, y: float, linear: bool) -> str:
+    """A leg whose ankle, a universal joint, two cranks or linear motors on the shank move by rods with ball ends."""
+    rods, motor = "", 'type="slide" axis="0 0 1"' if linear else 'axis="0 1 0"'
     for name, x in (("front", 0.05), ("back", -0.05)):
         rods += f"""<body name="{side}_{name}_crank" pos="{x} 0.03 -0.1">
-         <joint name="{side}_{name}_motor" axis="0 1 0"/>
+         <joint name="{side}_{name}_motor" {motor}/>
          <geom type="capsule" fromto="0 0 0 {x} 0 0" size=".01" mass=".2"/>
          <body name="{side}_{name}_rod" pos="{x} 0 0"><joint name="{side}_{name}_rod_x" axis="1 0 0"/>
           <joint name="{side}_{name}_rod_y" axis="0 1 0"/>
@@ -45,7 +45,7 @@ def _ankle(side: str, y: float) -> str:
       </body></body>"""
 
 
-def _biped() -> str:
+def _biped(linear: bool) -> str:
     closures = "".join(
         f'<connect name="{side}_{rod}" body1="{side}_{rod}_rod" body2="{side}_foot" anchor="0 .01 -.2"/>'
         for side in ("left", "right")
@@ -58,7 +58,7 @@ def _biped() -> str:
     )
     return f"""<mujoco>{_OPTIONS}<worldbody><body name="pelvis" pos="0 0 1"><freejoint/>
      <geom type="box" size=".1 .15 .1" pos=".02 0 .05" mass="9"/>
-     {_ankle("left", 0.1)}{_ankle("right", -0.1)}</body></worldbody>
+     {_ankle("left", 0.1, linear)}{_ankle("right", -0.1, linear)}</body></worldbody>
      <equality>{closures}</equality><actuator>{motors}</actuator></mujoco>"""
 
 
@@ -89,13 +89,20 @@ def _leg(weld: bool) -> str:
      <actuator><motor joint="abduction"/><motor joint="hip"/><motor joint="crank"/></actuator></mujoco>"""
 
 
-MODELS = {"biped": _biped(), "four-bar leg": _leg(weld=False), "welded coupler": _leg(weld=True)}
+MODELS = {
+    "biped": _biped(linear=False),
+    "biped with linear motors": _biped(linear=True),
+    "four-bar leg": _leg(weld=False),
+    "welded coupler": _leg(weld=True),
+}
+_SOLES = (Contact("left_sole", "flat"), Contact("right_sole", "flat"))
 FEET = {
-    "biped": (Contact("left_sole", "flat"), Contact("right_sole", "flat")),
+    "biped": _SOLES,
+    "biped with linear motors": _SOLES,
     "four-bar leg": (Contact("toe", "point"),),
     "welded coupler": (Contact("toe", "point"),),
 }
-RANKS = {"biped": 12, "four-bar leg": 2, "welded coupler": 3}
+RANKS = {"biped": 12, "biped with linear motors": 12, "four-bar leg": 2, "welded coupler": 3}
 """Independent constraints of all loops."""
 
 

@@ -7,12 +7,15 @@ import os
 import signal
 import subprocess
 import sys
+import time
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from socket import socket
+from tempfile import TemporaryFile
+from typing import Any, NoReturn
 
 import numpy as np
 import yaml
@@ -118,6 +121,66 @@ def finish(command: Sequence[str]) -> tuple[int, str, str]:
     with started(command) as process:
         printed, complained = process.communicate(timeout=400)
     return process.returncode, printed, complained
+
+
+def finish_forked(processes: int, run: Callable[[], int], folders: Sequence[Path] = ()) -> tuple[int, str, str]:
+    """`finish` of what forks of this process run, in which everything is set that torchrun sets.
+
+    They have nothing to import, and nobody ends those that another one leaves behind. Each may have a folder of its
+    own to work in. The status is the largest of theirs.
+    """
+    with socket() as free:
+        free.bind(("localhost", 0))
+        common = {"WORLD_SIZE": str(processes), "MASTER_ADDR": "localhost", "MASTER_PORT": str(free.getsockname()[1])}
+    with TemporaryFile("w+") as printed, TemporaryFile("w+") as complained:
+        pids = []
+        for rank in range(processes):
+            pid = os.fork()
+            if pid == 0:
+                os.environ.update(common | {"RANK": str(rank), "LOCAL_RANK": str(rank)})
+                os.chdir(folders[rank] if folders else ".")
+                _become(run, printed.fileno(), complained.fileno())
+            pids.append(pid)
+        try:
+            statuses = [_status_of(pid) for pid in pids]
+        finally:
+            for pid in pids:
+                with suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+        texts = []
+        for stream in (printed, complained):
+            stream.seek(0)
+            texts.append(stream.read())
+    return max(statuses), texts[0], texts[1]
+
+
+def _become(run: Callable[[], int], printed: int, complained: int) -> NoReturn:
+    """Run something in this process, whose streams are files, and end with its status."""
+    status = 70
+    try:
+        for own, (name, file) in zip((1, 2), (("stdout", printed), ("stderr", complained)), strict=True):
+            os.dup2(file, own)
+            setattr(sys, name, os.fdopen(own, "w", buffering=1, closefd=False))
+        warnings.resetwarnings()  # of pytest, which makes errors of them
+        status = run()
+    finally:
+        sys.stderr.flush()
+        os._exit(status)
+
+
+def _status_of(pid: int, timeout: float = 60.0) -> int:
+    """Exit status of a child once it has ended by itself.
+
+    Raises:
+        TimeoutError: it has not.
+    """
+    until = time.monotonic() + timeout
+    while time.monotonic() < until:
+        ended, status = os.waitpid(pid, os.WNOHANG)
+        if ended:
+            return os.waitstatus_to_exitcode(status)
+        time.sleep(0.01)
+    raise TimeoutError(f"a process goes on after {timeout:.0f} s")
 
 
 def run_all(processes: int, folder: Path, runs: Sequence[tuple[str, Path, Sequence[str]]]) -> None:

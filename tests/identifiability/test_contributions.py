@@ -67,7 +67,7 @@ def test_every_parameter_gets_the_verdict_that_its_share_and_the_rows_call_for()
     A = np.array([[1.0, 0, 0, 0, 0, 1.0], [0, 0.1, 0, 0, 0, 1.0], [0, 0, 1.0, 1.0, 0, 1.0]])
     problem = replace(problem_of(A, np.ones(3)), free=np.array([True, True, True, True, True, False]))
     estimate = LeastSquares(0.1).solve(problem)
-    expected = ["identified", "dominated by the prior", *["only in combination"] * 2, "cannot be seen", "fixed"]
+    expected = ["identified", "dominated by the prior", *["only in combination"] * 2, "unobservable", "fixed"]
     assert estimate.verdict.tolist() == expected
     assert np.isnan(estimate.data_share).tolist() == [False] * 5 + [True]
     assert estimate.verdict_counts() == dict(zip(VERDICTS, (1, 1, 2, 1, 1), strict=True))
@@ -77,7 +77,7 @@ def test_every_parameter_gets_the_verdict_that_its_share_and_the_rows_call_for()
 
 def test_marks_stand_for_verdicts_and_bodies_with_nothing_free_are_left_out() -> None:
     verdicts = np.full((3, parameters.PER_BODY), "fixed", dtype=object)
-    verdicts[1, :4] = ["identified", "dominated by the prior", "only in combination", "cannot be seen"]
+    verdicts[1, :4] = ["identified", "dominated by the prior", "only in combination", "unobservable"]
     text = table_text(verdict_table(["trunk", "arm", "dummy"], verdicts.flatten()))
     (row,) = [line for line in text.splitlines() if "arm" in line]
     assert row.split() == ["arm", "*", "p", "+", "."]

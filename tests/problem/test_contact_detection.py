@@ -29,7 +29,8 @@ from torchid.problem.contact_detection import (
     detect_contacts,
     with_detected_contacts,
 )
-from torchid.problem.detection_forces import normal_forces
+from torchid.problem.detection_forces import ForcesAlongNormals
+from torchid.problem.detection_motion import prepare
 from torchid.robot import Robot
 from torchid.sensing import Contact
 
@@ -151,6 +152,12 @@ def test_no_parameters_are_fitted_where_something_else_carries_the_robot(monkeyp
         assert fitted == expected
 
 
+def normal_forces(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: float) -> tuple[Array, Array]:
+    """Stamps (K,) [s] of a filtered log, and forces (K, C) [N] along the ground's normal."""
+    whole = prepare(log, robot, contacts, cutoff_hz)
+    return whole.log.time, ForcesAlongNormals.of([whole], len(whole.log), robot, contacts).of_part(whole)
+
+
 def test_samples_whose_flags_may_be_wrong_are_not_certain() -> None:
     """Both ends are known to a filter's period, and stances too short to count are in doubt."""
     true, exact = walked(QUADRUPED)
@@ -159,10 +166,10 @@ def test_samples_whose_flags_may_be_wrong_are_not_certain() -> None:
     ends = (time < 2.0 / DEFAULT.cutoff_hz - 0.01) | (time > time[-1] - 2.0 / DEFAULT.cutoff_hz + 0.01)
     assert not found.certain[ends].any()
     assert found.certain[~ends].mean() > 0.9
-    forces = normal_forces(noisy(QUADRUPED), true.robot, QUADRUPED.contacts(), DEFAULT.cutoff_hz)
-    samples = np.searchsorted(exact.log.time, forces.time - 1e-9)
+    stamps, forces = normal_forces(noisy(QUADRUPED), true.robot, QUADRUPED.contacts(), DEFAULT.cutoff_hz)
+    samples = np.searchsorted(exact.log.time, stamps - 1e-9)
     weight = 9.81 * float(true.robot.nominal[:, 0].sum())
-    doubtful = ((forces.force > DEFAULT.touch * weight) & ~found.active[samples]).any(axis=1)
+    doubtful = ((forces > DEFAULT.touch * weight) & ~found.active[samples]).any(axis=1)
     assert doubtful.any(), "impacts and swings load a foot for a moment"
     assert not found.certain[samples][doubtful].any()
 
@@ -178,13 +185,13 @@ def test_point_feet_are_told_without_an_imu(legged: Legged, recorded: dict[str, 
 
 def test_armature_and_friction_are_not_taken_for_loads() -> None:
     true, exact = walked(QUADRUPED)
-    found = normal_forces(noisy(QUADRUPED), true.robot, QUADRUPED.contacts(), DEFAULT.cutoff_hz)
-    samples = np.searchsorted(exact.log.time, found.time - 1e-9)
+    stamps, found = normal_forces(noisy(QUADRUPED), true.robot, QUADRUPED.contacts(), DEFAULT.cutoff_hz)
+    samples = np.searchsorted(exact.log.time, stamps - 1e-9)
     air = ~value(exact.log.contact_active)[samples]
     force = value(exact.log.contact_wrench_world)[samples, :, 2]
     weight = 9.81 * float(true.robot.nominal[:, 0].sum())
-    assert np.percentile(np.abs(found.force[air]), 80.0) < 0.02 * weight
-    assert np.sqrt(np.square(found.force - force).mean()) < 0.04 * weight
+    assert np.percentile(np.abs(found[air]), 80.0) < 0.02 * weight
+    assert np.sqrt(np.square(found - force).mean()) < 0.04 * weight
 
 
 def test_the_order_of_joints_does_not_matter_and_contacts_keep_theirs() -> None:
@@ -254,8 +261,8 @@ def test_loads_of_a_robot_that_stands_are_worked_out() -> None:
     weight = 9.81 * float(robot_of(stance("quadruped").machine).nominal[:, 0].sum())
     loads = weight * np.array([0.3, 0.2, 0.3, 0.2])
     log, contacts = still(loads)
-    found = normal_forces(log, robot_of(stance("quadruped").machine), contacts, 10.0)
-    np.testing.assert_allclose(found.force, np.tile(loads, (len(found.time), 1)), rtol=0.0, atol=0.02 * weight)
+    stamps, found = normal_forces(log, robot_of(stance("quadruped").machine), contacts, 10.0)
+    np.testing.assert_allclose(found, np.tile(loads, (len(stamps), 1)), rtol=0.0, atol=0.02 * weight)
 
 
 @pytest.mark.parametrize("carried", [0.0, 0.01], ids=["held in the air", "lying on its belly"])

@@ -82,7 +82,7 @@ def test_samples_with_more_noise_are_off_as_much_as_those_of_noisy_logs(kind: st
     assert noise.turns_force is (kind == "pose")
     size = torch.ones(len(clean), 1, dtype=torch.float64)
     found, expected = (
-        (off.T @ off / len(off)).numpy() for off in (apart(noise.shaken(clean, size), clean), apart(noisy, clean))
+        (off.T @ off / len(off)).numpy() for off in (apart(noise.perturbed(clean, size), clean), apart(noisy, clean))
     )
     deviation = np.sqrt(np.diag(expected))
     assert (deviation > 0.0).all()
@@ -97,14 +97,14 @@ def test_pairs_are_opposite_and_a_piece_gets_what_the_whole_gets(robot: Robot) -
     noise = samples.motion_noise
     assert noise is not None
     size = torch.ones(len(samples), 1, dtype=torch.float64)
-    up, down = noise.shaken(samples, size), noise.shaken(samples, -size)
+    up, down = noise.perturbed(samples, size), noise.perturbed(samples, -size)
     for name in FIELDS:
         a, b, middle = (getattr(x, name) for x in (up, down, samples))
         assert torch.allclose(a + b, 2.0 * middle, rtol=0.0, atol=1e-9)
-    piece = noise.shaken(samples[100:200], size[100:200])
+    piece = noise.perturbed(samples[100:200], size[100:200])
     assert torch.equal(piece.joint_acceleration, up.joint_acceleration[100:200])
     assert torch.equal(piece.base.specific_force, up.base.specific_force[100:200])
-    assert torch.equal(noise.shaken(samples, 0.0 * size).joint_position, samples.joint_position)
+    assert torch.equal(noise.perturbed(samples, 0.0 * size).joint_position, samples.joint_position)
 
 
 def test_sides_look_random(robot: Robot) -> None:
@@ -129,6 +129,6 @@ def test_a_bolted_base_has_noise_of_joints_alone(robot: Robot, tmp_path: Path) -
     noise = samples.motion_noise
     assert noise is not None
     assert not noise.base.any()
-    shaken = noise.shaken(samples, torch.ones(len(samples), 1, dtype=torch.float64))
-    off = (shaken.joint_position - samples.joint_position).std(0).numpy()
+    perturbed = noise.perturbed(samples, torch.ones(len(samples), 1, dtype=torch.float64))
+    off = (perturbed.joint_position - samples.joint_position).std(0).numpy()
     assert off[0] / off[1] == pytest.approx(0.25, rel=0.1), "in the robot's order"

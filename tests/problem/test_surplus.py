@@ -89,8 +89,8 @@ def draws(samples: Samples, count: int) -> Iterator[Samples]:
         z = torch.randn(len(samples), 18, generator=generator, dtype=torch.float64)
         q, v, a = torch.einsum("jkl,bjl->kbj", noise.joints, z[:, :6].unflatten(1, (2, 3)))
         base = z[:, 6:] @ noise.base.T
-        shaken = noise.shaken(samples, torch.zeros(len(samples), 1, dtype=torch.float64))
-        moved = shaken.base
+        perturbed = noise.perturbed(samples, torch.zeros(len(samples), 1, dtype=torch.float64))
+        moved = perturbed.base
         if moved.specific_force is not None:
             turn = torch.linalg.cross(base[:, :3], samples.base.specific_force)
             moved = replace(
@@ -153,7 +153,7 @@ def test_contacts_of_different_rank_are_told_apart(robot: Robot, builder: RowBui
 def test_long_logs_are_sampled(robot: Robot, builder: RowBuilder, monkeypatch: pytest.MonkeyPatch) -> None:
     samples = motion(robot, 6000)
     whole = compress([samples], builder).whole_surplus().numpy()
-    monkeypatch.setattr("torchid.problem.surplus._SHAKEN", 1500)
+    monkeypatch.setattr("torchid.problem.surplus._PERTURBED", 1500)
     sampled = compress([samples], builder).whole_surplus().numpy()
     size = np.sqrt(np.diag(gram(compress([samples], builder))).clip(1e-9))
     off, scaled = ((x / np.outer(size, size)) for x in (sampled - whole, whole))

@@ -47,6 +47,10 @@ BOLTED = """<mujoco><compiler inertiafromgeom="true" settotalmass="7"/>
    <geom size=".02"/></body></body></body></worldbody>
 <equality><joint joint1="right_finger" joint2="left_finger" polycoef="0.02 0.5 0 0 0"/></equality></mujoco>"""
 
+TENDON_OF_TWO = """<tendon><fixed name="t"><joint joint="left_finger" coef="2"/><joint joint="right_finger" coef="-4"/>
+ </fixed></tendon><equality><tendon tendon1="t" polycoef=".03 1 0 0 0"/></equality></mujoco>"""
+TIED = re.sub("<equality>.*", TENDON_OF_TWO, BOLTED)
+
 
 def robot_of(text: str, folder: Path, fixed_base: bool = False) -> Robot:
     path = folder / "robot.xml"
@@ -54,7 +58,7 @@ def robot_of(text: str, folder: Path, fixed_base: bool = False) -> Robot:
     return load_robot(path, fixed_base=fixed_base)
 
 
-@pytest.mark.parametrize(("text", "velocities"), [(FREE, 10), (BOLTED, 2)], ids=["free", "bolted"])
+@pytest.mark.parametrize(("text", "velocities"), [(FREE, 10), (BOLTED, 2), (TIED, 2)], ids=["free", "bolted", "tied"])
 def test_inverse_dynamics_are_those_of_mujoco_and_what_is_written_is_what_is_read(
     text: str, velocities: int, tmp_path: Path
 ) -> None:
@@ -65,6 +69,19 @@ def test_inverse_dynamics_are_those_of_mujoco_and_what_is_written_is_what_is_rea
     assert found.inverse_dynamics < 1e-13
     assert found.read_again < 1e-13
     assert found.written < 1e-13
+
+
+@pytest.mark.parametrize("text", [BOLTED, TIED], ids=["joints", "a tendon"])
+def test_joints_follow_each_other_where_mujocos_equality_holds(text: str, tmp_path: Path) -> None:
+    robot = robot_of(text.replace('name="right_finger"', 'name="right_finger" ref="-.2"'), tmp_path, fixed_base=True)
+    model = MjcfModel(robot.path).model
+    data, (matrix, constant) = mujoco.MjData(model), robot.joint_map
+    for q in np.random.default_rng(0).uniform(-1.0, 1.0, (5, 2)):
+        at = dict(zip((body.name for body in robot.bodies[1:]), matrix @ q + constant, strict=True))
+        data.qpos[:] = [at[name] for name in ("arm", "left", "right")]
+        mujoco.mj_forward(model, data)
+        assert len(data.efc_pos) == 1
+        np.testing.assert_allclose(data.efc_pos, 0.0, atol=1e-15)
 
 
 def test_a_base_inside_the_tree_has_the_same_joint_torques(tmp_path: Path) -> None:
@@ -108,7 +125,7 @@ def test_included_files_are_read_and_stand_in_what_is_written(tmp_path: Path) ->
     (tmp_path / "out").mkdir()
     found = survey(tmp_path / "scene.xml", tmp_path / "out")
     assert found.written < 1e-13
-    assert "include" not in (tmp_path / "out" / "scene.xml").read_text()
+    assert "<include" not in (tmp_path / "out" / "scene.xml").read_text()
 
 
 def test_a_missing_mesh_matters_only_where_it_gives_a_body_its_inertia(tmp_path: Path) -> None:
@@ -124,17 +141,20 @@ BODY = '<mujoco>\n<worldbody>\n<body name="b"{}>{}<geom size=".1"/><site name="s
 HINGE = '<joint name="j"{}/>'
 OTHER = '<worldbody><body name="m" mocap="true"/></worldbody><equality>\n<weld body1="m" body2="b"/></equality>'
 POLYNOMIAL = '<equality>\n<joint joint1="j" polycoef="0 1 2 0 0"/></equality>'
+COUPLED = """<worldbody><body><joint name="k"/><geom size=".1"/><body><joint name="l"/><geom size=".1"/></body></body>
+ </worldbody><tendon><fixed name="t"><joint joint="j" coef="1"/><joint joint="k" coef="1"/><joint joint="l" coef="1"/>
+ </fixed></tendon><equality><tendon tendon1="t"/></equality>"""
 TENDON = '<tendon>\n<fixed name="t" stiffness="3"><joint joint="j" coef="1"/></fixed></tendon>'
 REFUSED = {
     "ball": (BODY.format("", '\n<joint name="j" type="ball"/>', ""), "<joint> 'j', line 4: type ball"),
-    "mocap": (
-        BODY.format("", HINGE.format(""), OTHER),
-        "<weld>, line 4: a constraint to what is not part of the robot",
+    "tendon of three": (
+        BODY.format("", HINGE.format(""), COUPLED),
+        "<tendon>, line 5: an equality constraint; accepted: one fixed tendon of two joints",
     ),
     "law": (BODY.format("", HINGE.format(""), POLYNOMIAL), "<joint>, line 4: an equality constraint"),
     "tendon": (BODY.format("", HINGE.format(""), TENDON), "<fixed> 't', line 4: a tendon with stiffness"),
     "gravcomp": (BODY.format(' gravcomp="1"', HINGE.format(""), ""), "<body> 'b', line 3: gravcomp 1"),
-    "locked": (BODY.format("", HINGE.format(' damping="1e11"'), ""), "<joint> 'j', line 3: damping 1e+11"),
+    "locked": (BODY.format("", HINGE.format(' damping="1e13"'), ""), "<joint> 'j', line 3: damping 1e+13"),
     "fluid": (BODY.format("", HINGE.format(""), '<option\n density="1000"/>'), "<option>, line 4: density 1000"),
     "damped base": (
         BODY.format("", '<joint type="free" damping="1"/>', ""),
@@ -242,6 +262,14 @@ def test_a_robot_without_a_free_joint_must_be_said_to_be_bolted(tmp_path: Path) 
         robot_of(BOLTED, tmp_path)
 
 
+def test_of_the_world_nothing_is_written_nor_said(tmp_path: Path) -> None:
+    """As of a robot whose first joints are welded, whose links then belong to the world."""
+    robot = robot_of(BOLTED, tmp_path, True)
+    phi = robot.nominal.copy()
+    phi[0, 0] = -1.0
+    assert identified_robot(robot, phi, FittedJoints()) == identified_robot(robot, robot.nominal, FittedJoints())
+
+
 @pytest.mark.parametrize(
     ("option", "gravity"),
     [('<option gravity="0 0 -1.6"/>', "0 0 -1.6"), ('<option><flag gravity="disable"/></option>', "0 0 0")],
@@ -271,7 +299,7 @@ def test_a_limited_tendon_or_an_inactive_loop_changes_nothing(tmp_path: Path) ->
     robot = robot_of(BODY.format("", HINGE.format(""), tendon + loop), tmp_path, True)
     states = States.random(robot)
     own = torchid_forces(robot, robot.nominal, robot.armature, states)
-    assert difference(own, mujoco_forces(MjcfModel(robot.path).model, robot, states)) < 1e-13
+    assert difference(own, mujoco_forces(MjcfModel(robot.path), robot, states)) < 1e-13
 
 
 def test_what_mujoco_multiplies_is_written_with_what_was_identified_to_the_last_digit_and_the_rest_to_six(

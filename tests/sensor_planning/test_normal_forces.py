@@ -19,8 +19,8 @@ from torchid.sensor_planning.demands import (
     candidates,
     count_channels,
     demands,
-    read_along_normals,
     sensor_set,
+    with_scalar_candidates,
 )
 from torchid.sensor_planning.observability import assess_sensors
 from torchid.sensor_planning.planner import PlanningProblem, plan_sensors
@@ -53,7 +53,7 @@ def test_all_sets_without_a_sensor_to_spare_are_those_that_trying_every_set_find
     machine = MACHINES[name]
     robot = machine.robot(tmp_path)
     choice = candidates(robot, machine.contacts, per=per, normal_forces=[c.frame for c in machine.contacts])
-    contacts = read_along_normals(machine.contacts, choice)
+    contacts = with_scalar_candidates(machine.contacts, choice)
     assert all(contact.along_normal for contact in contacts)
     seen = Machine(machine.chains, contacts, machine.states)
     wanted = demands(robot, contacts, machine.states, choice)
@@ -80,9 +80,9 @@ def test_a_scalar_sensor_is_one_channel_named_and_priced_by_itself() -> None:
     assert count_channels(choice) == 9, "the device reads what the scalar sensor does"
     (alone,) = candidates(robot, contacts, [], "none", {"left_ankle_roll_link.fn": 0.3}, normal_forces=frames[:1])
     assert (alone.name, alone.cost) == ("left_ankle_roll_link.fn", 0.3)
-    assert read_along_normals(contacts, candidates(robot, contacts)) == contacts
-    assert [contact.along_normal for contact in read_along_normals(contacts, [alone])] == [True, False]
-    axes = candidates(robot, read_along_normals(contacts, choice)[1:], [], "axis")
+    assert with_scalar_candidates(contacts, candidates(robot, contacts)) == contacts
+    assert [contact.along_normal for contact in with_scalar_candidates(contacts, [alone])] == [True, False]
+    axes = candidates(robot, with_scalar_candidates(contacts, choice)[1:], [], "axis")
     assert [c.name for c in axes] == [f"right_rubber_hand.{k}" for k in ("fx", "fy", "fn")]
     with pytest.raises(UnknownNameError, match=r"candidates.normal_forces: unknown name 'left_foot'; accepted: left_"):
         candidates(robot, contacts, normal_forces=["left_foot"])
@@ -98,7 +98,7 @@ def test_leaving_sensors_out_of_the_rows_is_building_the_rows_without_them(kinds
     robot = load(SOLO12)
     contacts = tuple(Contact(frame, kind) for frame, kind in zip(NAMES, kinds, strict=True))
     offered = candidates(robot, contacts, normal_forces=NAMES[:3])
-    contacts, rng = read_along_normals(contacts, offered), np.random.default_rng(2)
+    contacts, rng = with_scalar_candidates(contacts, offered), np.random.default_rng(2)
     logs = structural_samples(robot, contacts, GAIT, 25)
     prior = parameter_scale(robot.nominal).flatten()
     for fixed in ((), ("FL_HAA", "FL_FOOT", "FR_FOOT.fn")):
@@ -153,7 +153,7 @@ def test_they_are_remedies_where_no_single_axes_of_the_contact_are_read() -> Non
         (check,) = assess_sensors(robot, FEET, GAIT[:1], sensors, choice)
         assert check.lost is not None
         assert {c.name for c in check.lost.remedies} == remedies
-    along = read_along_normals(FEET, choice)
+    along = with_scalar_candidates(FEET, choice)
     cured = chosen_sensors(robot.joint_names, along, [*torques, "FL_HFE"], {"FL_FOOT": ["fn"], "FR_FOOT": ["fn"]})
     (check,) = assess_sensors(robot, along, GAIT[:1], cured, choice)
     assert (check.generic.rank, check.lost) == (6, None)

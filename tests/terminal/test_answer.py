@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from demo import shortened_demo
 from repository import DEMO
 
 from torchid.cli import main
@@ -180,9 +181,9 @@ def test_names_are_never_broken_however_narrow_the_terminal(consistent: Identifi
 def test_all_tables_are_printed_when_asked_for_and_nothing_when_asked_to_be_quiet(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    printed = {}
+    printed, file = {}, str(shortened_demo(tmp_path / "demo", 300) / "quadruped.yaml")
     for option in ("--quiet", "--verbose", "-q", "-v", None):
-        command = ["identify", str(DEMO / "quadruped.yaml"), f"output={tmp_path / str(option)}", "logs.test=[]"]
+        command = ["identify", file, f"output={tmp_path / str(option)}", "logs.test=[]"]
         assert main([*command, *([] if option is None else [option])]) == 0
         printed[option] = capsys.readouterr().out
     assert printed["--quiet"] == printed["-q"] == ""
@@ -193,4 +194,4 @@ def test_all_tables_are_printed_when_asked_for_and_nothing_when_asked_to_be_quie
         assert title in printed["-v"]
         assert title not in printed[None]
     with pytest.raises(SystemExit):
-        main(["identify", str(DEMO / "quadruped.yaml"), "-q", "-v"])
+        main(["identify", file, "-q", "-v"])

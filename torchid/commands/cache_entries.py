@@ -185,7 +185,7 @@ def factors_key(experiment: Experiment, builder: RowBuilder, samples: Sequence[s
     """The name of the factors of training logs: of whatever changes the last bit of one.
 
     Args:
-        experiment: with the noise that rows are weighed with.
+        experiment: with the noise that rows are weighted with.
         builder: of the rows.
         samples: names of the samples of each log, see `CachedReader.keys`.
         blocks: the logs in folds.

@@ -53,7 +53,7 @@ class Compression:
     Attributes:
         files: that were written.
         states: contact states of all logs.
-        noise: that rows were weighed with.
+        noise: that rows were weighted with.
         output: the folder.
         rolling: which contacts roll, on what.
     """

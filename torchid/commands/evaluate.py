@@ -1,4 +1,4 @@
-"""`torchid evaluate`: errors of the parameters of a finished run on further logs."""
+"""`torchid evaluate`: errors of the parameters of a finished run on further logs, and forces beside measured ones."""
 
 from __future__ import annotations
 
@@ -8,34 +8,42 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+import torch
 from rich.progress import Progress
 
 from torchid import ranks
-from torchid.commands.compared_forces import compare_forces, noise_of_readings
 from torchid.commands.folder import EVALUATION, RUN, check_free, new_folder, refuse_link, write_json
 from torchid.commands.reading import LogReader
 from torchid.commands.results import Identification, draw_forces
-from torchid.config import load_config
+from torchid.config import ExperimentConfig, load_config
 from torchid.errors import ConfigError, about_file, during, warn
 from torchid.fitting.calibration import Calibration, Comparison
 from torchid.fitting.cross_validation import Scorer
 from torchid.fitting.experiment import Experiment, require_device, set_up
 from torchid.guards import MAX_JSON, MAX_YAML, read_bytes
-from torchid.logs.time_range import split_range
+from torchid.logs.time_range import log_title, split_range
 from torchid.parameters import Array
-from torchid.problem import Metrics
+from torchid.problem import Evaluation, Metrics, Samples
 from torchid.problem.chunks import one_thread
+from torchid.problem.contact_state import state_name
 from torchid.problem.metrics import DECISIVE_GROUPS, WHITENED, describe_errors, group_name
+from torchid.problem.predict import at_motors, force_series, noise_series, projected_forces
 from torchid.report.figures import error_figure, save_figures
 from torchid.report.forces import ForceSeries
 from torchid.report.parameter_files import read_parameters, read_shared_extras
 from torchid.report.tables import progress_bars
+from torchid.report.traces import LogForces
 from torchid.reprs import short_repr
 from torchid.robot import Robot
+from torchid.sensing import SensorNoise
 
 _SETTINGS = "config.yaml"
 FAR_OFF = 5.0
 """Times the error on the run's own logs from which on a log is not one of the same robot, moving otherwise."""
+_SAMPLES = 3000
+_TRACED = 10_000  # of a whole log: the rows of the fit take 0.1 ms each
+_SERIES = ("measured", "nominal", "identified", "noise")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -307,3 +315,53 @@ def _usual(documents: Sequence[Mapping[str, object]]) -> dict[str, float]:
             if isinstance(error, float):
                 usual[group] = max(error, usual.get(group, 0.0))
     return usual
+
+
+def noise_of_readings(config: ExperimentConfig, stated: bool) -> SensorNoise | None:
+    """The noise of readings as recorded, NaN where it is unknown; None where it is not `stated` of any sensor.
+
+    Noise that was estimated beside a stated one is in proportion to it. Without any, it comes from the residuals
+    themselves, which it could not judge.
+    """
+    return SensorNoise.of_known(config.sensors.noise.forces) if stated else None
+
+
+def compare_forces(
+    evaluation: Evaluation, samples: Samples, compared: Comparison[Calibration], chosen: slice = slice(_SAMPLES)
+) -> ForceSeries:
+    """Forces of chosen samples of a log: nominal, identified, and measured as the latter calibrates it.
+
+    Each prediction is as far from what was measured as from readings that are calibrated for it.
+    """
+    measured, predicted = [], []
+    for one in compared:
+        (read,) = one.calibrate([samples])
+        part = read[chosen]
+        series = force_series(evaluation.builder, part, one.parameters(evaluation)[None])
+        readings, forces = at_motors(evaluation.builder, part, np.stack([series[0], *series[1]]))
+        measured.append(readings)
+        predicted.append(forces)
+    nominal = predicted[0] + np.nan_to_num(measured[1] - measured[0])  # NaN: not measured
+    noise = None if evaluation.noise is None else noise_series(evaluation.builder, part, evaluation.noise)
+    return ForceSeries(log_title(samples.source), part.time.numpy(), measured[1], nominal, predicted[1], noise)
+
+
+def trace_forces(evaluation: Evaluation, samples: Samples, compared: Comparison[Calibration]) -> LogForces:
+    """Forces of a whole log as recorded, and in the rows of the fit; of a long log every k-th sample."""
+    step = max(1, -(-len(samples) // _TRACED))
+    recorded = compare_forces(evaluation, samples, compared, slice(None, None, step))
+    part, builder = samples.every(step), compared.identified.builder
+    projected = projected_forces(builder, part, torch.stack([one.columns(builder, samples) for one in compared]))
+    present = list(dict.fromkeys(map(tuple, part.active.tolist())))
+    names = {state: state_name(builder.contacts, state) for state in present}
+    rate = 1.0 / float(samples.time.diff().median()) if len(samples) > 1 else np.nan
+    return LogForces(
+        recorded=recorded,
+        projected=replace(
+            recorded, **dict(zip(_SERIES, (projected.measured, *projected.predicted, projected.noise), strict=True))
+        ),
+        states=tuple(names.values()),
+        state=np.array([present.index(tuple(active)) for active in part.active.tolist()]),
+        step=step,
+        bandwidth=0.5 * rate / max(samples.oversampling, step),
+    )

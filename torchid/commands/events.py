@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
     from torchid.commands.results import Identification
 
 
-def write_events(run: Identification, folder: Path, figures: Mapping[str, bytes]) -> None:
+def write_events(run: Identification, folder: Path, figures: Callable[[], Mapping[str, bytes]]) -> None:
     """Write errors, losses, verdicts, settings and figures of a run; a descent has written its epochs before.
 
     Args:
         run: a finished one.
         folder: of its files.
-        figures: PNG by name.
+        figures: gives PNG by name, once they are drawn.
     """
     from torchid.report.tensorboard import RunEvents  # takes 0.3 s, which runs that write nothing need not
 
@@ -48,7 +48,7 @@ def write_events(run: Identification, folder: Path, figures: Mapping[str, bytes]
         events.write_identifiability(
             last, estimate, run.contributions.total, table_text(verdict_counts_table(run.by_state, estimate))
         )
-        events.write_summary(dump_config(run.experiment.config), figures, last)
+        events.write_summary(dump_config(run.experiment.config), figures(), last)
         events.write_hyperparameters(hyperparameters(run.experiment.config), _final(run), last)
 
 

@@ -15,7 +15,7 @@ from torchid.commands.cache_entries import cached_parts, factors_key
 from torchid.commands.cached_reading import CachedReader, open_reader
 from torchid.commands.chosen_settings import Choices, with_chosen_settings, with_ridge
 from torchid.commands.clock import Clock
-from torchid.commands.compared_forces import compare_forces, noise_of_readings, trace_forces
+from torchid.commands.evaluate import compare_forces, noise_of_readings, trace_forces
 from torchid.commands.folder import RUN, check_free, claim_folder
 from torchid.commands.plausibility import TrainingLogs, require_not_worse, require_plausible
 from torchid.commands.reading import LogReader, check_parts
@@ -83,7 +83,7 @@ def identify(config: ExperimentConfig, resume: bool = False) -> Identification:
 
 @dataclass
 class _Data:
-    """Training logs in folds, or factors of them, with the noise that they are weighed with, and compressed; test logs.
+    """Training logs in folds, or factors of them, with the noise of their weights, and compressed; test logs.
 
     `experiment`: with that noise, and what the logs have chosen. `factors`: files that the training logs come from, if
     they do. `reused`: what an earlier run has left in the cache, in words. `reader`: that the logs come from.
@@ -165,7 +165,7 @@ def _data_of_factors(experiment: Experiment, clock: Clock, bars: Progress) -> _D
 
 @dataclass(frozen=True)
 class _Solved:
-    """A fit, how outliers were weighed down and how it was trained, if so, and the total mass."""
+    """A fit, how outliers were down-weighted and how it was trained, if so, and the total mass."""
 
     fit: Fit
     robust: RobustSummary | None
@@ -294,7 +294,7 @@ def _compressed(
 
 
 def _robust(fit: Fit, ready: _Prepared, bars: Progress) -> tuple[Fit, RobustSummary | None]:
-    """The fit with outliers weighed down, if the settings say so; only batch estimators can.
+    """The fit with outliers down-weighted, if the settings say so; only batch estimators can.
 
     Warns:
         NumericalWarning: the passes were too few.

@@ -15,7 +15,7 @@ import yaml
 
 from torchid.commands.folder import check_free_file
 from torchid.commands.init_hints import hints, keys_for_gaps, missing_columns, notes_on_arrays
-from torchid.commands.init_proposals import Split, limb_sensors, read_sensors, sensor_set, split_log
+from torchid.commands.init_proposals import Split, limb_sensors, proposed_sensors, read_sensors, split_log
 from torchid.commands.reading import memory_needed
 from torchid.config.preprocessing import PreprocessingConfig
 from torchid.errors import ConfigError, InputError, LogError, about_file, excerpt, format_count, join_names
@@ -30,7 +30,7 @@ from torchid.logs.time_range import split_range
 from torchid.logs.topic_proposals import USED_TYPES, frame_of, propose_topics
 from torchid.regressor.kinematics import GRAVITY_WORLD
 from torchid.robot import CollisionShapes, Robot, load_robot
-from torchid.robot.urdf import is_bolted, position_limits
+from torchid.robot.urdf import has_fixed_base, position_limits
 from torchid.robot.xml_files import is_mjcf
 
 _FEET = (r"foot|feet", r"sole", r"ankle_roll|ankle_flexion", r"toe|ankle|paw|hoof")
@@ -97,14 +97,14 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> Initiated:
     files = [file.path for file in part.files]
     check_free_file(target, "--output", False, [urdf, *files])
     is_bag = existing_log_kind(part.file) is LogKind.BAG
-    robot = load_robot(urdf, fixed_base=is_bolted(Path(urdf)))
+    robot = load_robot(urdf, fixed_base=has_fixed_base(Path(urdf)))
     contacts, fields, proposal = _of_bag(part.file, robot) if is_bag else _of_columns(files, robot)
     out = Initiated(target)
     _state_flags(contacts, fields, proposal)
     read = _try(path, proposal)
     gaps = keys_for_gaps(read)
     split = split_log(read, "base_motion" in _from_feet(contacts, fields))
-    sensors = sensor_set(fields, list(proposal.columns.get("ft_wrenches", ())) or read_sensors(robot, read))
+    sensors = proposed_sensors(fields, list(proposal.columns.get("ft_wrenches", ())) or read_sensors(robot, read))
     text = _text(robot, urdf, path, target, contacts, fields, proposal, gaps, split, sensors)
     _describe(out, robot, contacts, fields, proposal)
     _describe_log(out, read, fields)

@@ -11,7 +11,7 @@ from torchid.errors import InputError, excerpt, format_count, join_names
 from torchid.logs import Log
 from torchid.logs.column_groups import Family
 from torchid.logs.column_proposals import OF_PLATES, is_desired, propose_field
-from torchid.logs.file_samples import Columns
+from torchid.logs.file_samples import FileSample
 from torchid.logs.log import WRENCHES
 
 _OTHER_FILE = "; if another file has it: torchid init ROBOT 'FILE + FILE@SECONDS', docs/logs.md"
@@ -83,7 +83,7 @@ def hints(
     return out
 
 
-def notes_on_arrays(sample: Columns, joints: int) -> dict[str, str]:
+def notes_on_arrays(sample: FileSample, joints: int) -> dict[str, str]:
     """What arrays of a file without joint positions may be that no map takes as they are, by key.
 
     Args:

@@ -43,7 +43,7 @@ def _can_be_split(robot: Robot, joint: str) -> bool:
     return True
 
 
-def sensor_set(fields: Collection[str], limbs: Sequence[str]) -> str | dict[str, object]:
+def proposed_sensors(fields: Collection[str], limbs: Sequence[str]) -> str | dict[str, object]:
     """The set of sensors of a run, with those in limbs at fixed joints."""
     wrench, torque = bool(set(WRENCHES) & set(fields)), "joint_torque" in fields
     of_contacts = wrench or FORCE_NORMAL in fields

@@ -21,7 +21,7 @@ from torchid.config.preprocessing import PreprocessingConfig
 from torchid.errors import LogError, about_file
 from torchid.logs import Columns, Log
 from torchid.logs.blocks import GIGABYTE, LogBlocks, bridge_in_blocks, count_samples_from, open_log_blocks
-from torchid.logs.coverage import Coverage, warn_of_gaps
+from torchid.logs.gaps import Coverage, warn_of_gaps
 from torchid.logs.log import CONTACT_READINGS, NORMALS, BoolArray
 from torchid.logs.preprocess import (
     away_from_changes,

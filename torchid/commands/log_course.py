@@ -12,7 +12,7 @@ import numpy as np
 from torchid.errors import LogError
 from torchid.logs import Log
 from torchid.logs.blocks import LogBlocks
-from torchid.logs.coverage import Coverage
+from torchid.logs.gaps import Coverage
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import find_unloaded, move_to_timeline, unloaded_readings
 from torchid.logs.signal_noise import SignalNoise

@@ -21,10 +21,10 @@ from torchid.log_checks.check import check
 from torchid.logs import Log, read_log
 from torchid.logs.blocks import GIGABYTE, log_bytes
 from torchid.logs.containers import LogKind, existing_log_kind
-from torchid.logs.delay import with_delayed_torques
 from torchid.logs.flags import with_flags_by_force
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import away_from_changes, away_from_stamps, preprocess
+from torchid.logs.stretches import with_delayed_torques
 from torchid.logs.time_range import LogPart, split_range
 from torchid.parameters import Array
 from torchid.problem import Samples, bind_log

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,7 @@ from torchid.commands.named_results import BodyEstimate, ParameterTable, body_es
 from torchid.commands.report import DATA, report_document, write_page
 from torchid.commands.training import Training, body_eigenvalues
 from torchid.config import dump_config, inputs_of
+from torchid.copies import in_copies
 from torchid.errors import during
 from torchid.estimators import ConstrainedEstimate, Estimate, Violation
 from torchid.fitting.calibration import Comparison, list_confounded
@@ -35,15 +37,16 @@ from torchid.logs.containers import atomic_output
 from torchid.logs.time_range import log_title
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Metrics
+from torchid.problem.chunks import thread_count
 from torchid.problem.metrics import SETS, WorseThanNominal, describe_worse, worse_than_nominal
 from torchid.problem.surplus import NoiseShares
 from torchid.report import FittedJoints, identified_name, identified_robot, identified_urdf, parameters_document
 from torchid.report.figures import (
+    Drawn,
     contribution_figure,
+    draw_for,
     error_figure,
     identifiability_figure,
-    png_of,
-    save_figures,
 )
 from torchid.report.forces import ForceSeries, force_figure
 from torchid.report.parameter_figures import extra_figure, parameter_figure
@@ -66,10 +69,10 @@ class Identification:
         experiment: robot, contacts, sensors and settings, with the noise and the ridge that were used.
         estimate: the fit.
         extras: offsets, scales and actuator terms.
-        noise: that rows were weighed with.
+        noise: that rows were weighted with.
         motion_noise: what noise of the motion had added to the normal equations.
         misfit: what the fit leaves of the forces, and what noise would leave.
-        robust: how outliers were weighed down, if so.
+        robust: how outliers were down-weighted, if so.
         states: contact states of the training logs.
         by_state: what each of them determines on its own.
         contributions: what each training log, contact state and sensor adds.
@@ -211,33 +214,55 @@ def write_run(run: Identification, output: Path, overwrite: bool = False, traini
     """
     config, robot = replace(run.experiment.config, output=output), run.experiment.robot
     run = replace(run, experiment=replace(run.experiment, config=config))
-    figures = {
-        **({} if run.forces is None else {"forces": draw_forces(run.forces, robot)}),
-        "errors": error_figure(run.metrics, robot.format),
-        "parameters": parameter_figure(
-            robot.body_names, robot.nominal, run.estimate, _joint_kinds(robot), robot.format
-        ),
-        "identifiability": identifiability_figure(robot.body_names, run.estimate),
-        "contributions": contribution_figure(_bits(run.contributions)),
-    }
-    if run.extras:
-        figures["extras"] = extra_figure(run.extras)
-    if run.ridge is not None:
-        figures["ridge"] = ridge_figure(run.ridge, robot.format)
-    with during("writing", output), new_folder(output, overwrite) as folder:
+    with during("writing", output), new_folder(output, overwrite) as folder, _drawing(run, folder) as drawn:
         (folder / "config.yaml").write_text(dump_config(config))
         write_json(folder / "parameters.json", parameters_document(robot, run.estimate, run.by_state, run.extras))
         write_json(folder / "metrics.json", _metrics_document(run))
         write_posterior(folder / POSTERIOR, run.posterior)
         (folder / identified_name(robot)).write_bytes(identified_robot(robot, run.phi, run.fitted_joints))
-        files = save_figures(figures, folder, config.figures.format)
-        if training is not None:
-            training.copy_curves(folder)
-        write_events(run, folder, {name: png_of(figure, files[name]) for name, figure in figures.items()})
         write_json(folder / DATA, report_document(run))
         write_page(folder, output)
+        if training is not None:
+            training.copy_curves(folder)
+        write_events(run, folder, partial(_write_figures, drawn))
     if training is not None:
         training.remove_checkpoint()
+
+
+def _figures(run: Identification) -> dict[str, Callable[[], Figure]]:
+    """What makes the figures of a run, by name, in the order in which they are to be seen."""
+    robot, estimate = run.experiment.robot, run.estimate
+    bodies = robot.body_names
+    figures: dict[str, Callable[[], Figure]] = {}
+    if run.forces is not None:
+        figures["forces"] = partial(draw_forces, run.forces, robot)
+    figures["errors"] = partial(error_figure, run.metrics, robot.format)
+    kinds = _joint_kinds(robot)
+    figures["parameters"] = partial(parameter_figure, bodies, robot.nominal, estimate, kinds, robot.format)
+    figures["identifiability"] = partial(identifiability_figure, bodies, estimate)
+    figures["contributions"] = partial(contribution_figure, _bits(run.contributions))
+    if run.extras:
+        figures["extras"] = partial(extra_figure, run.extras)
+    if run.ridge is not None:
+        figures["ridge"] = partial(ridge_figure, run.ridge, robot.format)
+    return figures
+
+
+@contextmanager
+def _drawing(run: Identification, folder: Path) -> Iterator[Callable[[], dict[Path, Drawn]]]:
+    """Copies of this process that draw figures for files in a folder; what is yielded waits for them."""
+    form = run.experiment.config.figures.format
+    files = [(folder / f"{name}.{form}", make) for name, make in _figures(run).items()]
+    with in_copies(files, lambda file: draw_for(*file), thread_count()) as drawn:
+        yield lambda: dict(zip((path for path, _ in files), drawn(), strict=True))
+
+
+def _write_figures(drawn: Callable[[], Mapping[Path, Drawn]]) -> dict[str, bytes]:
+    """Write figures to their files once they are drawn; PNG by name."""
+    done = drawn()
+    for path, figure in done.items():
+        path.write_bytes(figure.file)
+    return {path.stem: figure.png for path, figure in done.items()}
 
 
 def _joint_kinds(robot: Robot) -> set[str]:

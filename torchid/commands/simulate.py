@@ -55,7 +55,7 @@ def simulate(config: SimulationConfig) -> dict[str, Stability]:
         stabilities = _in_processes(config, folder, lambda seconds: bars.update(bar, completed=seconds))
         (folder / "simulation.yaml").write_text(dump(config))
         write_json(folder / "stability.json", {name: asdict(stability) for name, stability in stabilities.items()})
-        nominal = identified_robot(robot, nominal_parameters(robot, config.nominal), FittedJoints())
+        nominal = identified_robot(robot, perturbed_parameters(robot, config.nominal), FittedJoints())
         (folder / nominal_name(config)).write_bytes(nominal)
     return stabilities
 
@@ -72,7 +72,7 @@ def simulated_balls(config: SimulationConfig) -> str:
     return ", ".join(rolling) + (" (collision spheres)" if rolling else "")
 
 
-def nominal_parameters(robot: Robot, settings: NominalConfig, draw: int = 0) -> Array:
+def perturbed_parameters(robot: Robot, settings: NominalConfig, draw: int = 0) -> Array:
     """Parameters (L, 12) that an identification starts from, off from those of the simulated robot."""
     return parameters.perturb_parameters(robot.nominal, settings.error, np.random.default_rng([settings.seed, draw]))
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchid.errors import NumericalWarning, warn
 from torchid.estimators.conic_problem import ConicProblem, Solution
-from torchid.estimators.strict_feasibility import damped_inverse, find_strictly_feasible
+from torchid.estimators.strict_feasibility import ConicTensors, damped_inverse, find_strictly_feasible
 from torchid.problem.chunks import one_thread
 
 _STEPS = 200
@@ -102,29 +102,24 @@ class _Direction:
     y: Tensor
 
 
-class _PrimalDual:
-    """Newton steps on a problem, whose arrays it holds as tensors."""
+class _PrimalDual(ConicTensors):
+    """Newton steps on a problem."""
 
     def __init__(self, problem: ConicProblem) -> None:
-        self.problem = problem
-        self.F0, self.F = torch.from_numpy(problem.F0), torch.from_numpy(problem.F)
-        self.variables, self.weights = torch.from_numpy(problem.variables), torch.from_numpy(problem.weights)
-        self.G, self.h = torch.from_numpy(problem.G), torch.from_numpy(problem.h)
-        self.H = torch.from_numpy(problem.hessian)
+        super().__init__(problem)
+        self.weights = torch.from_numpy(problem.weights)
         self.null_space = torch.from_numpy(problem.null_space) if len(problem.e) else None
         self.eye = torch.eye(4, dtype=self.F0.dtype)
 
     def start(self, x: np.ndarray) -> _Point:
         """A strictly feasible x, (n,), with the multipliers of a point of the central path."""
-        factors = self._factors(torch.from_numpy(x.copy()))
-        if factors is None:
-            raise np.linalg.LinAlgError("by rounding, the starting point is not strictly feasible")
+        factors = self.feasible_factors(torch.from_numpy(x.copy()))
         kappa = max(self.problem.objective(x), self.problem.floor) / max(self.problem.degree, 1)
         Z = (self.weights + kappa)[:, None, None] * self.eye
         return self._point(torch.from_numpy(x.copy()), factors, Z, kappa / factors[1])
 
     def _point(self, x: Tensor, factors: tuple[Tensor, Tensor], Z: Tensor, y: Tensor) -> _Point:
-        """The point x, (n,), of these `_factors`, with its multipliers."""
+        """The point x, (n,), of these `factors`, with its multipliers."""
         root, slack = factors
         whitening = torch.linalg.solve_triangular(root, self.eye, upper=False)
         off = torch.linalg.eigvalsh(Z - self.weights[:, None, None] * self.eye)
@@ -150,7 +145,7 @@ class _PrimalDual:
             promised = -float(self.problem.gradient(point.x.numpy()) @ affine.x.numpy())
             move = solve(max(kappa, promised / max(self.problem.degree, 1)), none, none)
             length = min(1.0, _SHARE * self._longest(point, Z_root, move))
-        while (factors := self._factors(point.x + length * move.x)) is None and length > _SHORTEST:
+        while (factors := self.factors(point.x + length * move.x)) is None and length > _SHORTEST:
             length *= 0.5  # infeasible by rounding alone
         if factors is None:
             return None
@@ -193,12 +188,6 @@ class _PrimalDual:
         eigenvalues = torch.linalg.eigvalsh(torch.cat([move.blocks, relative_Z])).ravel()
         rates = torch.cat([eigenvalues, move.slack / point.slack, move.y / point.y])
         return 1.0 / max(-float(rates.min()), 1e-9) if len(rates) else 1.0
-
-    def _factors(self, x: Tensor) -> tuple[Tensor, Tensor] | None:
-        """Cholesky factors (K, 4, 4) of the blocks and slacks (M,) of the rows; None where x is infeasible."""
-        root, failed = torch.linalg.cholesky_ex(self.F0 + (x[self.variables, None, None] * self.F).sum(1))
-        slack = self.G @ x - self.h
-        return None if failed.any() or not (slack > 0.0).all() else (root, slack)
 
 
 def _symmetric(A: Tensor) -> Tensor:

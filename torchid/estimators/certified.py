@@ -15,6 +15,7 @@ from torchid.estimators.strict_feasibility import find_strictly_feasible
 from torchid.parameters import Array
 from torchid.problem.chunks import one_thread
 
+_TOLERANCE = 1e-10  # relative gap that Clarabel is asked for
 _LOOSE = 1e-6  # relative gap above which the next try follows, and after the last one a warning
 _OUTSIDE = 1e-8  # violation of a condition, in units of the scale, above which the next try follows
 _FAR = 1e-7  # violation above which there is a warning after the last try
@@ -29,7 +30,7 @@ class _SolverError(Exception):
     """Clarabel found no point."""
 
 
-def solve_certified(problem: ConicProblem, tolerance: float = 1e-10) -> Solution:
+def solve_certified(problem: ConicProblem) -> Solution:
     """Solve with Clarabel, a primal-dual interior-point method, whose multipliers certify its solution.
 
     Raises:
@@ -44,7 +45,7 @@ def solve_certified(problem: ConicProblem, tolerance: float = 1e-10) -> Solution
     solutions, status = [], ""
     for unit, share in tries:
         try:
-            solutions.append(_solve(problem, unit, share * tolerance))
+            solutions.append(_solve(problem, unit, share * _TOLERANCE))
         except _SolverError as error:
             status = str(error)
             continue

@@ -17,7 +17,7 @@ from torchid.parameters import Array
 from torchid.problem.chunks import one_thread
 
 _CHAINS = 512  # that find out how many passes make a state new
-_TRIES = 24  # on an ellipse, after which a chain stays where it is; each halves the arc
+_TRIES = (3, 6, 15)  # on an ellipse, at once, after which a chain stays where it is; each halves the arc
 _INSIDE = 1e-12  # least pivot of a block and slack of a row, relative to the mean's: above what rounding can hide
 _ALIKE = 0.25  # correlation of a coordinate with what it was, in all chains, below which states count as new
 _MOST_WHOLE, _MOST_APART, _MOST = 5, 8, 200  # passes after which each kind of moves counts as too slow
@@ -296,18 +296,24 @@ class EllipticalSlice(torch.nn.Module):
         angle = 2.0 * math.pi * uniform()
         least, most = angle - 2.0 * math.pi, angle
         out, left = torch.zeros_like(angle), torch.arange(len(angle), device=angle.device)
-        for _ in range(_TRIES):
-            there = now + along * (1.0 - torch.cos(angle)) + across * torch.sin(angle)
-            fits = inside(there[:cut].view(-1, 10, len(angle)) + self.unit, there[cut:])
-            fits &= self._excess(there, cut, near) >= level
-            out[left[fits]] = angle[fits]
-            rest = torch.nonzero(~fits)[:, 0]
+        for count in _TRIES:
+            tried = angle.new_empty(count, len(angle))
+            for number in range(count):  # as if all before had failed, so that these need not be known to have
+                tried[number] = angle
+                least, most = torch.where(angle < 0.0, angle, least), torch.where(angle < 0.0, most, angle)
+                angle = torch.lerp(least, most, _uniform(now, generator)())
+            versed, sine = 1.0 - torch.cos(tried), torch.sin(tried)
+            there = (now[:, None] + along[:, None] * versed + across[:, None] * sine).flatten(1)
+            fits = inside(there[:cut].view(-1, 10, there.shape[1]) + self.unit, there[cut:])
+            fits &= self._excess(there, cut, near) >= level.repeat(count)
+            failed = (~fits).view(count, -1).to(torch.int64).cumprod(0).sum(0)  # before the first that fits
+            found = torch.nonzero(failed < count)[:, 0]
+            out[left[found]] = tried[failed[found], found]
+            rest = torch.nonzero(failed == count)[:, 0]
             if not len(rest):
                 break
             left, level, angle, least, most = (x[rest] for x in (left, level, angle, least, most))
             now, along, across = (x.index_select(1, rest) for x in (now, along, across))
-            least, most = torch.where(angle < 0.0, angle, least), torch.where(angle < 0.0, most, angle)
-            angle = least + (most - least) * _uniform(now, generator)()
         return out
 
     def _excess(self, entries: Tensor, cut: int, near: tuple[Tensor, Tensor]) -> Tensor:

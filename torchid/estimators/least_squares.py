@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -18,7 +19,7 @@ from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, relative_tolera
 from torchid.settings import NotNegative, Tolerance, validate_settings
 
 IDENTIFIED, PRIOR, COMBINED = "identified", "dominated by the prior", "only in combination"
-UNOBSERVABLE, FIXED = "cannot be seen", "fixed"
+UNOBSERVABLE, FIXED = "unobservable", "fixed"
 VERDICTS = (IDENTIFIED, PRIOR, COMBINED, UNOBSERVABLE, FIXED)
 
 _OBSERVABLE = 1e-12  # squared share in the row space: that of a finger in a sum with the trunk's mass is 1e-7
@@ -85,7 +86,7 @@ class Estimate:
 
         "identified": the data determine it and have the larger share; "dominated by the prior": they determine it, but
         the nominal value has the larger share; "only in combination": they determine only sums with other parameters,
-        however large their share; "cannot be seen": unobservable, no row depends on it; "fixed": not free.
+        however large their share; "unobservable": no row depends on it; "fixed": not free.
 
         Source: the three kinds of Atkeson, An, Hollerbach, IJRR 1986, and the prior.
         """
@@ -104,6 +105,13 @@ def residual_std(cost: float, rows: int, rank: int, oversampling: float) -> floa
     short that no variance would remain must have motion outside the band; its rows count as independent but fewer.
     """
     return float(np.sqrt(cost / max(rows - oversampling * rank, (rows - rank) / oversampling, 1.0)))
+
+
+class Minimizer(NamedTuple):
+    """What minimizes an estimator's objective: `phi` and `psi` of its `Estimate`, without any statistics."""
+
+    phi: Array
+    psi: Array | None = None
 
 
 @dataclass(frozen=True, repr=False)
@@ -183,6 +191,30 @@ class LeastSquares(Regularized):
     """
 
     @report_rounding("least_squares")
+    @one_thread()
+    def minimize(self, problem: LinearProblem) -> Minimizer:
+        """The parameters of `solve` alone.
+
+        Raises:
+            InputError: a decomposition failed.
+        """
+        return Minimizer(_moved(problem, self._gain(problem)))
+
+    def _gain(self, problem: LinearProblem) -> Array:
+        """What takes residuals at the nominal parameters to deviations of the free ones in their scale, (P', R)."""
+        pinv, *_ = self._pseudo_inverse(problem)
+        if not self.ridge:
+            return pinv
+        A = problem.A[:, problem.free] * problem.scale[problem.free]
+        return np.asarray(pinv @ (A @ _ridge_inverse(A, self.ridge * problem.rows)))  # no rounding in A's null space
+
+    def _pseudo_inverse(self, problem: LinearProblem) -> tuple[Array, Array, int]:
+        """Minimum-norm inverse of the free, scaled columns, their singular values and rank."""
+        A = problem.A[:, problem.free] * problem.scale[problem.free]
+        key = "pseudo-inverse", self.rank_tolerance
+        return problem.shared(key, lambda: _pseudo_inverse(A, self.rank_tolerance))
+
+    @report_rounding("least_squares")
     @one_thread()  # twice as fast as two on some hundred columns
     def solve(self, problem: LinearProblem) -> Estimate:
         """Fit the free parameters.
@@ -195,17 +227,10 @@ class LeastSquares(Regularized):
             InputError: a decomposition failed.
         """
         free, scale = problem.free, problem.scale[problem.free]
-        A = problem.A[:, free] * scale
-        b = problem.b - problem.A @ problem.nominal
-        pinv, values, rank = problem.shared(
-            ("pseudo-inverse", self.rank_tolerance), lambda: _pseudo_inverse(A, self.rank_tolerance)
-        )
+        A, gain = problem.A[:, free] * scale, self._gain(problem)
+        pinv, values, rank = self._pseudo_inverse(problem)
         null_share = np.linalg.norm(np.eye(A.shape[1]) - pinv @ A, axis=1)  # of each parameter in the null space
-        gain = pinv
-        if self.ridge > 0.0:
-            gain = pinv @ (A @ _ridge_inverse(A, self.ridge * problem.rows))  # no rounding in A's null space
-        phi = problem.nominal.copy()
-        phi[free] += scale * (gain @ b)
+        phi = _moved(problem, gain)
         cost = problem.cost(phi)
         noise = np.sqrt(problem.oversampling) * residual_std(cost, problem.rows, rank, problem.oversampling)
         observable, identifiable = np.zeros(len(phi), dtype=bool), np.zeros(len(phi), dtype=bool)
@@ -231,6 +256,13 @@ class LeastSquares(Regularized):
             rows=problem.rows,
             oversampling=problem.oversampling,
         )
+
+
+def _moved(problem: LinearProblem, gain: Array) -> Array:
+    """Parameters (P,) by what takes residuals at the nominal ones to deviations of the free ones."""
+    phi = problem.nominal.copy()
+    phi[problem.free] += problem.scale[problem.free] * (gain @ (problem.b - problem.A @ problem.nominal))
+    return phi
 
 
 def _pseudo_inverse(A: Array, tolerance: float) -> tuple[Array, Array, int]:

@@ -24,6 +24,7 @@ Consistency = Literal["log_cholesky", "penalties"]
 ResidualMode = Literal["joint", "parameters_first", "alternating"]
 
 _FREE = ("residual_weight", "weight_choice")  # entries of a saved state that are None before the first epoch
+_LOGARITHMIC = 1e-4  # of an eigenvalue, below which a penalty goes on as a tangent of its logarithm
 _SCHEDULED = ("lr", "momentum", "betas")  # options of optimizer groups that schedules change
 
 
@@ -140,10 +141,10 @@ def penalties(scaled: Tensor, bodies: Tensor, margin: float, weights: PenaltyWei
     return out
 
 
-def _extended_log(x: Tensor, least: float = 1e-4) -> Tensor:
-    """The logarithm, and below `least` its tangent, so that the gradient of an infeasible body points inside."""
-    inside = x.clamp_min(least)
-    return inside.log() + (x - inside) / least
+def _extended_log(x: Tensor) -> Tensor:
+    """The logarithm, and below `_LOGARITHMIC` its tangent, so that the gradient of an infeasible body points inside."""
+    inside = x.clamp_min(_LOGARITHMIC)
+    return inside.log() + (x - inside) / _LOGARITHMIC
 
 
 @dataclass(frozen=True)

@@ -95,22 +95,42 @@ def _phase_one(problem: ConicProblem, kappa: float) -> ConicProblem:
     )
 
 
-class _CentralPath:
-    """The central path of a problem, whose arrays it holds as tensors."""
+class ConicTensors:
+    """A conic problem with its arrays as tensors, for Newton steps in torch."""
 
     def __init__(self, problem: ConicProblem) -> None:
+        """They share memory with the arrays."""
         self.problem = problem
         self.F0, self.F = torch.from_numpy(problem.F0), torch.from_numpy(problem.F)
         self.variables = torch.from_numpy(problem.variables)
         self.G, self.h = torch.from_numpy(problem.G), torch.from_numpy(problem.h)
-        self.H, self.null_space = torch.from_numpy(problem.hessian), torch.from_numpy(problem.null_space)
+        self.H = torch.from_numpy(problem.hessian)
+
+    def factors(self, x: Tensor) -> tuple[Tensor, Tensor] | None:
+        """Cholesky factors (K, 4, 4) of the blocks and slacks (M,) of the rows at x, (n,); None if it is infeasible."""
+        root, failed = torch.linalg.cholesky_ex(self.F0 + (x[self.variables, None, None] * self.F).sum(1))
+        slack = self.G @ x - self.h
+        return None if failed.any() or not (slack > 0.0).all() else (root, slack)
+
+    def feasible_factors(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """The same of a point that is strictly feasible; LinAlgError where rounding says that it is not."""
+        factors = self.factors(x)
+        if factors is None:
+            raise np.linalg.LinAlgError("by rounding, the starting point is not strictly feasible")
+        return factors
+
+
+class _CentralPath(ConicTensors):
+    """The central path of a problem."""
+
+    def __init__(self, problem: ConicProblem) -> None:
+        super().__init__(problem)
+        self.null_space = torch.from_numpy(problem.null_space)
 
     def centre(self, start: Array, kappa: float, patience: int) -> tuple[Array, int]:
         """The path at barrier weight `kappa` from a strictly feasible `start`, (n,): its point, and the steps."""
         x, N = torch.from_numpy(start), self.null_space
-        factors = self._factors(x)
-        if factors is None:
-            raise np.linalg.LinAlgError("by rounding, the starting point is not strictly feasible")
+        factors = self.feasible_factors(x)
         most = min(_STEPS, patience)
         for steps in range(1, most + 1):
             root, slack = factors
@@ -127,21 +147,14 @@ class _CentralPath:
             change = (move[self.variables, None, None] * whitened).sum(1)  # of the blocks, relative
             rates = torch.cat([torch.linalg.eigvalsh(change).ravel(), self.G @ move / slack]).numpy()
             length = _step_length(float(quadratic_gradient @ move), float(move @ self.H @ move), rates, kappa)
-            while (after := self._factors(x + length * move)) is None and length > _SHORTEST:
+            while (after := self.factors(x + length * move)) is None and length > _SHORTEST:
                 length *= 0.5  # infeasible by rounding alone
             if after is None:
                 break
             x, factors = x + length * move, after
-        if decrement <= _CENTRED and self._factors(x + move) is not None:
+        if decrement <= _CENTRED and self.factors(x + move) is not None:
             x = x + move
         return x.numpy(), steps
-
-    def _factors(self, x: Tensor) -> tuple[Tensor, Tensor] | None:
-        """Cholesky factors (K, 4, 4) of the blocks and slacks (M,) of the rows; None where x is infeasible."""
-        blocks = self.F0 + (x[self.variables, None, None] * self.F).sum(1)
-        root, failed = torch.linalg.cholesky_ex(blocks)
-        slack = self.G @ x - self.h
-        return None if failed.any() or not (slack > 0.0).all() else (root, slack)
 
     def _derivatives(
         self, quadratic_gradient: Tensor, whitened: Tensor, slack: Tensor, kappa: float

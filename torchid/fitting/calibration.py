@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torchid.errors import ConfoundedWarning, LogError, about_file, current_file, join_names, warn, warn_about_file
+from torchid.estimators.least_squares import Minimizer
 from torchid.fitting.fit import Fit, LogFitter
 from torchid.fitting.robust import RobustLoss, fit_extras_robustly
 from torchid.identifiability.confounding import ExtraEstimate, disagreements, estimate_extras
@@ -20,6 +21,7 @@ from torchid.parameters import Array
 from torchid.problem import Evaluation, RowBuilder, Samples, assemble, compress_parts
 from torchid.problem.compressed_log import Block, CompressedBlock
 from torchid.problem.compression import Part
+from torchid.problem.elimination import Assembly
 from torchid.problem.extras import ACTUATORS, Extra
 from torchid.problem.predict import calibrate_readings
 from torchid.problem.samples import require_forces
@@ -158,6 +160,28 @@ def calibrations(
         Calibration(robot=robot, builder=builder, phi=robot.nominal.flatten(), values=nominal, loss=loss),
         Calibration(robot=robot, builder=builder, phi=fit.estimate.phi, values=identified, loss=loss),
     )
+
+
+def calibration_at(
+    assembly: Assembly, minimizer: Minimizer, robot: Robot, builder: RowBuilder, loss: RobustLoss | None = None
+) -> Calibration:
+    """Parameters that an estimator has found, with the extra parameters that fit them best.
+
+    Args:
+        assembly: of compressed logs.
+        minimizer: for its problem.
+        robot: the robot.
+        builder: of the rows.
+        loss: as in `Calibration`.
+    """
+    extras = zip(assembly.eliminations, assembly.extras_at(*minimizer), strict=True)
+    values = {
+        (one.log, extra.label): float(value)
+        for one, found in extras
+        for extra, value, std in zip(one.extras, found, one.std_if_known, strict=True)
+        if np.isfinite(std)
+    }
+    return Calibration(robot=robot, builder=builder, phi=minimizer.phi, values=values, loss=loss)
 
 
 _NAMED = 6  # sensors or bodies that a warning names

@@ -48,7 +48,7 @@ def resolve_contacts(settings: Sequence[ContactConfig], robot: Robot) -> tuple[t
     return tuple(out), _describe(out, sources)
 
 
-def read_along_normals(contacts: Sequence[Contact], sensors: ChoiceConfig) -> tuple[Contact, ...]:
+def with_scalar_sensors(contacts: Sequence[Contact], sensors: ChoiceConfig) -> tuple[Contact, ...]:
     """The contacts, those with a scalar sensor (`fn`) read along the ground's normal."""
     scalar = {frame for frame, names in sensors.contact_wrenches.items() if NORMAL_FORCE in names}
     return tuple(replace(x, along_normal=True) if x.frame in scalar else x for x in contacts)
@@ -60,7 +60,7 @@ def suited_to_preprocessing(
     """The contacts, after making sure that flags and a base's motion can follow from them where settings want that.
 
     Raises:
-        ConfigError: a bolted base, closed loops, feet that are too few even if all stand, normals of several floors, or
+        ConfigError: a fixed base, closed loops, feet that are too few even if all stand, normals of several floors, or
             thresholds of detection that contradict each other.
     """
     settings = config.preprocessing

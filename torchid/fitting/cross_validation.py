@@ -9,14 +9,15 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from torchid.copies import share_between_copies
 from torchid.errors import LogError, TorchidWarning
-from torchid.fitting.calibration import Calibration, Comparison, calibrations
+from torchid.fitting.calibration import Calibration, Comparison, calibration_at, calibrations
 from torchid.fitting.fit import BatchEstimator, Fit, LogFitter
 from torchid.fitting.residual_squares import ResidualSquares, residuals_of_samples, sum_residuals
 from torchid.fitting.robust import RobustLoss
 from torchid.parameters import Array
 from torchid.problem import Evaluation, ExtraTerms, Metrics, RowBuilder, Samples
-from torchid.problem.chunks import ProgressCallback, one_thread
+from torchid.problem.chunks import ProgressCallback, one_thread, thread_count
 from torchid.problem.compressed_log import Block
 from torchid.problem.compression import Part, compress_in_blocks, merge_states, split_into_folds
 from torchid.problem.extras import recorded_components
@@ -139,11 +140,13 @@ def choose_ridge(
     if len(folds) < 2:
         raise _too_few(blocks)
     together = merge_states(parts, fitter.builder)
+
+    def held_out(fold: int) -> Array:
+        return _held_out_squares(fold, together, blocks, fitter, estimators, loss, done)
+
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", TorchidWarning)  # the fit says the same
-        squares = np.array(
-            [_held_out_squares(fold, together, blocks, fitter, estimators, loss, done) for fold in folds]
-        )
+        squares = np.array(share_between_copies(folds, held_out, thread_count()))
     means = squares.mean(axis=0)
     apart = squares - squares[:, [int(means.argmin())]]
     error = apart.std(axis=0, ddof=1) / np.sqrt(len(folds))
@@ -168,17 +171,16 @@ def _held_out_squares(
     done: Callable[[int], None] | None,
 ) -> Array:
     """Mean squares on a fold of what each estimator fits without it."""
-    problem = fitter.build_problem([part for part in parts if part.fold != fold])
+    assembly = fitter.build_problem([part for part in parts if part.fold != fold]).assembly
     logs, own = [x for x in blocks if x.fold == fold], [x for x in parts if x.fold == fold]
-    out = []
+    fitted = []
     for estimator in estimators:
-        fit = fitter.solve_problem(problem, estimator.solve)
-        identified = calibrations(fit, fitter.robot, fitter.builder, loss).identified
-        (left,) = sum_residuals(fitter.builder, logs, own, [identified])
-        out.append(left.error / max(left.rows, 1))
+        fitted.append(
+            calibration_at(assembly, estimator.minimize(assembly.problem), fitter.robot, fitter.builder, loss)
+        )
         if done is not None:
             done(1)
-    return np.array(out)
+    return np.array([left.error / max(left.rows, 1) for left in sum_residuals(fitter.builder, logs, own, fitted)])
 
 
 def _too_few(logs: Sequence[Block]) -> LogError:

@@ -15,7 +15,7 @@ from torchid.errors import LogError, warn
 from torchid.estimators import LeastSquares
 from torchid.fitting.fit import Fit, LogFitter
 from torchid.identifiability.confounding import ExtraEstimate
-from torchid.logs.delay import stretches, within
+from torchid.logs.stretches import recorded_at_delays, unbroken_stretches
 from torchid.logs.timeline import spline_degree
 from torchid.parameters import Array
 from torchid.problem import ExtraTerms, RowBuilder, Samples
@@ -259,13 +259,13 @@ def _torques(logs: Sequence[Samples], fitter: LogFitter, most: int) -> list[_Tor
     dofs = torch.from_numpy(np.flatnonzero(fitter.builder.sensors.torque[: fitter.robot.n]))
     for log in logs:
         time = log.time.numpy()
-        chosen = np.flatnonzero(within(time, (EARLIEST, LATEST)))[::step]
+        chosen = np.flatnonzero(recorded_at_delays(time, (EARLIEST, LATEST)))[::step]
         if log.torque is None or not len(chosen):
             continue
         oversampling = max(1.0, log.oversampling / step)
         some = replace(log[torch.from_numpy(chosen)], oversampling=oversampling, folder=None, motion_noise=None)
         recorded, splines = log.torque[:, dofs].numpy(), list[tuple[Tensor, BSpline]]()
-        for stretch in stretches(time):
+        for stretch in unbroken_stretches(time):
             own = np.flatnonzero((chosen >= stretch.start) & (chosen < stretch.stop))
             if len(own):
                 degree = spline_degree(stretch.stop - stretch.start)

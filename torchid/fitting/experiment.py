@@ -18,7 +18,7 @@ from torchid.errors import ConfigError, LogError, UnknownNameError, warn_about_f
 from torchid.estimators import Conditions, Consistent, Enclosure, LeastSquares, Mirror
 from torchid.fitting.calibration import Calibration, Comparison, calibrations
 from torchid.fitting.checked_settings import check_scale_groups, check_terms, require_maps_of
-from torchid.fitting.contacts import read_along_normals, resolve_contacts, suited_to_preprocessing
+from torchid.fitting.contacts import resolve_contacts, suited_to_preprocessing, with_scalar_sensors
 from torchid.fitting.cross_validation import RIDGES, RidgeChoice, choose_ridge
 from torchid.fitting.fit import Fit, LogFitter, frozen_parameters
 from torchid.fitting.known_masses import known_masses
@@ -221,11 +221,11 @@ def set_up_scene(config: ExperimentConfig | AnalyzeConfig) -> Scene:
         field = _ft_field(config, error.name)
         raise UnknownNameError.at_field(field, error.name, error.valid, error.what) from error
     if not robot.nv:
-        raise ConfigError.at_field("robot", "a bolted base without a joint, which never moves", "a robot that can move")
+        raise ConfigError.at_field("robot", "a fixed base without a joint, which never moves", "a robot that can move")
     if config.logs is not None:
         require_maps_of(robot, config.logs)
     contacts, rolling = resolve_contacts(config.contacts, robot)
-    contacts = suited_to_preprocessing(read_along_normals(contacts, config.sensors), config, robot)
+    contacts = suited_to_preprocessing(with_scalar_sensors(contacts, config.sensors), config, robot)
     stated = [replace(c, radius=contact.radius) for c, contact in zip(config.contacts, contacts, strict=True)]
     scene = Scene(config=replace(config, contacts=stated), robot=robot, contacts=contacts, rolling=rolling)
     check_scale_groups(scene.terms, robot, contacts)

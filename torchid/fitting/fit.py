@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchid.errors import TorchidWarning, UnknownNameError
 from torchid.estimators import Estimate, LeastSquares
+from torchid.estimators.least_squares import Minimizer
 from torchid.fitting.known_masses import TOTAL, KnownMass, with_known_masses
 from torchid.identifiability.block_scatter import BlockScatter, block_scatter
 from torchid.identifiability.confounding import ExtraEstimate, estimate_extras, mass_weights
@@ -41,6 +42,9 @@ class BatchEstimator(Protocol):
 
     def solve(self, problem: LinearProblem) -> Estimate:
         """Fit the free parameters."""
+
+    def minimize(self, problem: LinearProblem) -> Minimizer:
+        """The parameters of `solve` alone, without statistics."""
 
 
 @dataclass(frozen=True)
@@ -149,7 +153,7 @@ class LogFitter:
         return replace(assembly, problem=problem, if_known=known, **known_of)  # type: ignore[arg-type]
 
     def build_problem(self, parts: Sequence[Part]) -> LogProblem:
-        """The problem of compressed logs, readings of contact sensors in the air weighed by their own noise.
+        """The problem of compressed logs, readings of contact sensors in the air weighted by their own noise.
 
         A first least-squares fit shows by how much all other rows miss the stated noise.
         """
@@ -157,8 +161,8 @@ class LogFitter:
         if not any(part.unloaded for part in parts):
             return LogProblem(list(parts), assembly)
         first = self.least_squares.solve(assembly.problem)
-        weighed = [_with_own_noise(part, first.residual_std) for part in parts]
-        return LogProblem(weighed, self.assemble(weighed))
+        weighted = [_with_own_noise(part, first.residual_std) for part in parts]
+        return LogProblem(weighted, self.assemble(weighted))
 
     def solve_problem(self, problem: LogProblem, solve: Solve | None = None) -> Fit:
         """Solve what `build_problem` has built; `solve` instead of the estimator's."""

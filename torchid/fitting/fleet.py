@@ -44,9 +44,9 @@ class Fleet:
     """Compressed training logs of one fit, that belong together.
 
     Attributes:
-        experiment: with the noise that they were weighed with.
+        experiment: with the noise that they were weighted with.
         files: the logs.
-        noise: that they were weighed with, as if it had been stated.
+        noise: that they were weighted with, as if it had been stated.
         states: their contact states.
     """
 
@@ -96,7 +96,7 @@ def _require_different_logs(paths: Sequence[Path], files: Sequence[FactorFile]) 
 
 
 def _require_stated_noise(experiment: Experiment, model: RowModel, path: Path) -> None:
-    """Refuse an experiment that states other noise than factors were weighed with."""
+    """Refuse an experiment that states other noise than factors were weighted with."""
     used, stated = model.noise, std_by_group(experiment.noise)
     for key in experiment.config.sensors.noise.forces:
         groups = [name for name in used if name.partition(".")[0] == key]

@@ -111,7 +111,7 @@ def with_known_masses(
     Args:
         problem: in the bodies' parameters.
         masses: that are known.
-        noise: standard deviation of whitened rows, correlation counted, by which stated deviations are weighed.
+        noise: standard deviation of whitened rows, correlation counted, by which stated deviations are weighted.
         homogeneous: whether the rows say nothing of how large all forces are. None at all fit them best then, so that a
             mass with a standard deviation would shrink: one is eliminated too, and its row has the deviation alone.
     """

@@ -98,7 +98,7 @@ def misfit(
 
     Args:
         estimate: of the training logs.
-        noise: that rows were weighed with.
+        noise: that rows were weighted with.
         scatter: of the estimate between blocks of these logs.
         friction: that was not fitted.
     """

@@ -1,4 +1,4 @@
-"""The noise that rows are weighed with: as stated, and estimated from the residuals of a fit where it is not."""
+"""The noise that rows are weighted with: as stated, and estimated from the residuals of a fit where it is not."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class GroupNoise:
 
     `origin`: "stated", "estimated", "at most" (drowned in other noise: an upper bound), "confounded" (residuals show
     little but its sum with other noise) or "assumed" (too few readings). `used`: standard deviation that rows were
-    weighed with; `residual`: that of the residuals, None if they do not determine it.
+    weighted with; `residual`: that of the residuals, None if they do not determine it.
     """
 
     group: str
@@ -43,7 +43,7 @@ class GroupNoise:
 
 @dataclass(frozen=True)
 class NoiseSummary:
-    """What rows were weighed with.
+    """What rows were weighted with.
 
     `groups`: those that the sensors have. `suggested`: keys of `sensors.noise` with what residuals show instead of
     what is stated, empty where they do not contradict it. `passes`: fits of a sample of the logs that it took.
@@ -60,7 +60,7 @@ class NoiseSummary:
 def estimate_noise(
     logs: Sequence[Samples | LogElsewhere], fitter: LogFitter, stated: Collection[str] = ()
 ) -> NoiseSummary:
-    """The noise of sensors, by fits of a sample of the logs that are weighed anew until the noise settles.
+    """The noise of sensors, by fits of a sample of the logs that are weighted again until the noise settles.
 
     Where some noise is stated and some not, the stated one counts as right but for a common factor: a filter leaves
     less of it than was recorded. What is estimated is given in the same proportion::

@@ -140,9 +140,9 @@ def read_posterior(path: Path) -> FittedPosterior:
         InputError: there is none, or the file is damaged.
     """
     file = path / POSTERIOR if path.is_dir() else path
-    if path.is_dir() and not file.is_file():
+    if not file.exists():
         accepted = "a run of this version: torchid identify writes it, overwrite=true replaces a run"
-        raise InputError(path, "RUN", f"no {POSTERIOR} in it", accepted)
+        raise InputError(path, "RUN", f"no {POSTERIOR} in it" if path.is_dir() else "no such file or folder", accepted)
     try:
         with during("reading", file), open_container(file) as container:
             arrays = {name: container.load(name) for name in container.declared_bytes()}

@@ -192,13 +192,13 @@ def _some_rows(logs: Sequence[Samples], surplus: Mapping[PartKey, Surplus], step
 
 @dataclass(frozen=True)
 class _Point:
-    """Where rows are weighed: the parameters of a fit, and the scale of residuals."""
+    """Where rows are weighted: the parameters of a fit, and the scale of residuals."""
 
     fit: Fit
     scale: float
 
     def beyond(self, fit: Fit, scale: float, stretch: float) -> _Point:
-        """Beyond a fit of the rows as they are weighed here, which falls short of the best by so much."""
+        """Beyond a fit of the rows as they are weighted here, which falls short of the best by so much."""
         step = min(stretch, _FARTHEST)
         earlier = {(x.log, x.extra.label): x.value for x in self.fit.extras}
 
@@ -246,7 +246,7 @@ def fit_extras_robustly(
     columns: Callable[[Array], Tensor],
     loss: RobustLoss,
 ) -> Array:
-    """Extra parameters of a log, (M,), with outliers weighed down and everything else known, as in `fit_robustly`.
+    """Extra parameters of a log, (M,), with outliers down-weighted and everything else known, as in `fit_robustly`.
 
     Args:
         log: a bound log.

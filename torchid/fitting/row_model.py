@@ -121,7 +121,7 @@ def require_same_rows(path: object, found: RowModel, expected: RowModel, referen
 
 
 def require_same_noise(path: object, found: RowModel, expected: RowModel, reference: object) -> None:
-    """Refuse factors that were weighed with other noise than others, of rows that are alike otherwise.
+    """Refuse factors that were weighted with other noise than others, of rows that are alike otherwise.
 
     Raises:
         LogError: names the noise, its value and the accepted one.

@@ -11,11 +11,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import minimize, minimize_scalar
 
+from torchid.copies import share_between_copies
 from torchid.errors import warn
 from torchid.estimators import LeastSquares
 from torchid.fitting.fit import LogFitter
 from torchid.parameters import Array
 from torchid.problem import Samples, compress_parts
+from torchid.problem.chunks import thread_count
 from torchid.problem.sampled_rows import SampledRows
 
 LARGEST_TILT = 0.3
@@ -25,6 +27,7 @@ _GAIN = 1e-3  # of the residual, by which a value has to beat none
 _WIDTHS = tuple(10.0 ** np.arange(-3.0, 0.25, 0.5))
 _WIDTH_SETTLED = 1e-3  # of the logarithm of the width, to base 10
 _WIDTH_DIGITS = 4
+_AT_ONCE = 1024  # samples: fewer lose to dispatch
 _TILT_RIDGE = 1e-6  # the residual is smooth in the tilt where the data determine some parameters badly
 _TILT_SAMPLES = 2000  # of all logs, evenly spaced
 _TILT_SETTLED = 1e-6  # of the residual's square
@@ -67,17 +70,25 @@ def choose_sign_width(
 
     def left(width: float | None) -> float:
         logs, fitter = logs_and_fitter(width)
-        rows = SampledRows(logs, fitter.builder)
+        rows = SampledRows(logs, fitter.builder, _AT_ONCE)
         estimator = LeastSquares(rank_tolerance=fitter.estimator.rank_tolerance)
-        residual = fitter.fit(rows.compress(np.ones(len(rows.groups))), estimator.solve).estimate.residual_std
-        found[width] = np.inf if residual is None else residual
+        problem = fitter.build_problem(rows.compress(np.ones(len(rows.groups)))).assembly.problem
+        return estimator.solve(problem).residual_std
+
+    def tried(width: float) -> float:
+        found[width] = left(width)
         return found[width]
 
-    best = int(np.argmin([left(width) for width in _WIDTHS]))
+    first, *others = _WIDTHS
+    tried(first)  # reads the logs, which copies of this process then have
+    *rest, sign = share_between_copies([*others, None], left, thread_count())
+    found |= dict(zip(others, rest, strict=True))
+    best = int(np.argmin(list(found.values())))
     between = [np.log10(_WIDTHS[max(best - 1, 0)]), np.log10(_WIDTHS[min(best + 1, len(_WIDTHS) - 1)])]
-    minimize_scalar(lambda x: left(10.0**x), bounds=between, method="bounded", options={"xatol": _WIDTH_SETTLED})
+    minimize_scalar(lambda x: tried(10.0**x), bounds=between, method="bounded", options={"xatol": _WIDTH_SETTLED})
+    found[None] = sign
     width = min(found, key=lambda one: found[one])
-    gains = found[width] < (1.0 - _GAIN) * left(None)
+    gains = found[width] < (1.0 - _GAIN) * sign
     chosen = float(f"{width:.{_WIDTH_DIGITS}g}") if gains and width is not None else None
     return SignWidthChoice(chosen, tuple(found), tuple(found.values()))
 

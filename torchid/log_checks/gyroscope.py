@@ -8,7 +8,7 @@ import numpy as np
 
 from torchid.errors import InputError
 from torchid.log_checks.findings import CONDEMNED, SUSPICIOUS, Finding, Skipped, median_step, widen_mask
-from torchid.log_checks.model import default_cutoff_hz, link_poses, preprocess_pieces
+from torchid.log_checks.model import default_cutoff_hz, preprocess_pieces, recorded_link_poses
 from torchid.log_checks.units import advise_units, units_of_ratio
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
@@ -57,7 +57,7 @@ def _turning(
     log: Log, robot: Robot, contacts: Sequence[Contact], R_base_imu: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Vectors [m] that keep still in the world, their rates in the base, and the gyroscope's readings, (M, 3) each."""
-    poses, feet = link_poses(log, robot), [c for c in contacts if c.frame in log.contact_names]
+    poses, feet = recorded_link_poses(log, robot), [c for c in contacts if c.frame in log.contact_names]
     feet = [c for c in feet if c.radius <= _MAX_RADIUS_M and c.frame in poses]
     ends = max(1, round(_STANCE_END_S / median_step(log)))
     omega = np.asarray(log.imu_angular_velocity) @ R_base_imu.T

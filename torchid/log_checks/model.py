@@ -143,7 +143,7 @@ LinkPoses = dict[str, torch.Tensor]
 """Poses (N, 4, 4) in the base of the robot's links, by name."""
 
 
-def link_poses(log: Log, robot: Robot) -> LinkPoses:
+def recorded_link_poses(log: Log, robot: Robot) -> LinkPoses:
     """Poses of the links at the samples of a log of all the robot's joints."""
     order = [log.joint_names.index(name) for name in robot.joint_names]
     return robot.link_poses(torch.from_numpy(log.joint_position[:, order]))

@@ -77,7 +77,7 @@ _MAX_COMPARED_SAMPLES = 20000
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class DerivativeComparison:
     """A recorded derivative of c channels compared with the derivative of its base.
 
     Attributes:
@@ -96,7 +96,9 @@ class Comparison:
     misfit: float
 
 
-def compare_derivative(time: FloatArray, base: FloatArray, derivative: FloatArray, order: int = 1) -> Comparison | None:
+def compare_derivative(
+    time: FloatArray, base: FloatArray, derivative: FloatArray, order: int = 1
+) -> DerivativeComparison | None:
     """Compare a derivative (N, c) of some order with its base (N, c), N stamps [s]; None if the log is too short."""
     step = float(np.median(np.diff(time))) if len(time) > 1 else LAG_S
     lag = max(2, round(LAG_S / step))
@@ -123,7 +125,7 @@ def compare_derivative(time: FloatArray, base: FloatArray, derivative: FloatArra
         ratio, highest = (np.take_along_axis(x, best, axis=0)[0] for x in (inner / size, correlation))
     delay = _interpolate_maximum(np.abs(correlation), best[0]) - MAX_DELAY_SAMPLES
     ratio, highest, delay = (np.where(moves, x, np.nan) for x in (ratio, highest, delay))
-    return Comparison(ratio, highest, delay, excess, min(misfits))
+    return DerivativeComparison(ratio, highest, delay, excess, min(misfits))
 
 
 def _integrate(time: FloatArray, values: FloatArray) -> FloatArray:
@@ -179,7 +181,7 @@ def check_derivatives(log: Log) -> Iterator[Finding | Skipped]:
 
 
 def _derivative_findings(
-    comparison: Comparison, name: str, base: str, channels: tuple[str, ...], order: int = 1
+    comparison: DerivativeComparison, name: str, base: str, channels: tuple[str, ...], order: int = 1
 ) -> Iterator[Finding]:
     """Findings about one derivative and its channels."""
     follows = np.abs(comparison.correlation) >= MIN_CORRELATION  # NaN compares false
@@ -224,7 +226,7 @@ def _meaning(ratio: float, name: str, base: str, order: int | None) -> tuple[str
     return describe_units(units), f"{advise_units(units)}; without a map convert it, or leave the field out"
 
 
-def _frame_findings(log: Log, name: str, base: str, order: int, comparison: Comparison) -> Iterator[Finding]:
+def _frame_findings(log: Log, name: str, base: str, order: int, comparison: DerivativeComparison) -> Iterator[Finding]:
     """Findings about a vector of the base that is in the other frame, or that contains gravity."""
     if (
         name == "base_linear_acceleration_world"

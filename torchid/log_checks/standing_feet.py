@@ -15,8 +15,8 @@ from torchid.log_checks.model import (
     MAX_DIFFERENTIATED_SAMPLES,
     LinkPoses,
     default_cutoff_hz,
-    link_poses,
     preprocess_pieces,
+    recorded_link_poses,
 )
 from torchid.logs import Log
 from torchid.logs.log import FloatArray
@@ -58,7 +58,7 @@ def check_standing_feet(
         return
     log = log.select(slice(None, None, max(1, len(log) // _MAX_COMPARED_SAMPLES)))
     has_poses = log.base_quat_xyzw is not None and set(log.joint_names) == set(robot.joint_names)
-    poses = link_poses(log, robot) if has_poses else None
+    poses = recorded_link_poses(log, robot) if has_poses else None
     slip = measure_foot_slip(log, robot, contacts, poses)
     if slip is None:
         yield Skipped(_STANDING_FEET_CHECK, "no orientation of the base, or no stance above which the base moves")
@@ -152,7 +152,7 @@ def measure_foot_slip(
     feet = [c for c in contacts if c.frame in log.contact_names and c.frame in robot.links]
     if log.base_quat_xyzw is None or log.contact_active is None or set(log.joint_names) != set(robot.joint_names):
         return None
-    poses = poses or link_poses(log, robot)
+    poses = poses or recorded_link_poses(log, robot)
     active = {c.frame: log.contact_active[:, log.contact_names.index(c.frame)] for c in feet}
     rolled = {c.frame: _rolled(log, c, poses[c.frame].numpy()) for c in feet}
     parts: list[tuple[float, float, int]] = []

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from torchid.log_checks.findings import CONDEMNED, NOTE, SUSPICIOUS, Finding, Skipped, median_step, widen_mask
-from torchid.log_checks.model import link_poses
+from torchid.log_checks.model import recorded_link_poses
 from torchid.log_checks.units import advise_units, units_of_ratio
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
@@ -100,7 +100,7 @@ def _vertical_force(log: Log, robot: Robot | None) -> FloatArray | str:
 
 
 def _rotate_to_world(log: Log, robot: Robot, force: FloatArray) -> FloatArray:
-    poses = link_poses(log, robot)
+    poses = recorded_link_poses(log, robot)
     rotated = [
         np.einsum("nij,nj->ni", poses[name][:, :3, :3].numpy(), force[:, index])
         for index, name in enumerate(log.contact_names)
@@ -198,7 +198,7 @@ def _height_above_feet(log: Log, robot: Robot, upward: FloatArray) -> float | No
         return None
     known = [index for index, name in enumerate(log.contact_names) if name in robot.links]
     samples = np.linspace(0, len(log) - 1, min(_MAX_POSE_SAMPLES, len(log))).astype(int)
-    poses, active = link_poses(log.select(samples), robot), log.contact_active[samples]
+    poses, active = recorded_link_poses(log.select(samples), robot), log.contact_active[samples]
     mean = upward.mean(axis=0)
     heights = [-(poses[log.contact_names[k]][:, :3, 3].numpy() @ mean)[active[:, k]] for k in known]
     all_heights = np.concatenate(heights) if heights else np.zeros(0)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from torchid.logs.column_map import PLACEHOLDER
 from torchid.logs.column_proposals import propose_field
-from torchid.logs.file_samples import Columns
+from torchid.logs.file_samples import FileSample
 from torchid.logs.name_matching import SUFFIXES, KnownRobot, joints_by_place, spelled, within
 from torchid.logs.units import quantities_with, split_unit
 
@@ -217,7 +217,7 @@ def _pattern(column: str, kinds: Sequence[_Stems], split_axes: bool = True) -> t
 _UNIT = 1e-3  # of the length of quaternions from 1
 
 
-def split_arrays(sample: Columns, names: Sequence[str], joints: Collection[int]) -> list[tuple[str, str, str]]:
+def split_arrays(sample: FileSample, names: Sequence[str], joints: Collection[int]) -> list[tuple[str, str, str]]:
     """Arrays that hold several fields side by side: their name, the columns and the field that these are.
 
     Those of simulators and of libraries for dynamics: a position of the base and a quaternion, whose length is 1

@@ -156,7 +156,7 @@ def values_of_all(key: str, what: str, given: Mapping[str, _X], kind: str, label
 
 
 @dataclasses.dataclass(frozen=True)
-class Part:
+class EntryPart:
     """A field of a log, or a part that it is computed from, as one entry gives it.
 
     Attributes:
@@ -184,39 +184,39 @@ class Part:
         return (*([self.kind] if self.kind else []), "index", *(AXES if self.components else ()))
 
 
-def list_parts(columns: Columns) -> dict[str, Part]:
+def list_parts(columns: Columns) -> dict[str, EntryPart]:
     """All entries that have columns or arrays of their own, by key."""
-    parts: dict[str, Part] = {}
+    parts: dict[str, EntryPart] = {}
     for field in columns.fields:
         entry = getattr(columns, field)
         if entry.column or entry.columns:
             parts[field] = _part(field, field, entry)
         if isinstance(entry, TimeEntry) and entry.nanoseconds is not None:
             more = ColumnEntry(column=entry.nanoseconds, unit={"*": "ns"})
-            parts[f"{field}.nanoseconds"] = Part(f"{field}.nanoseconds", more, "", (), {"": ("time",)})
+            parts[f"{field}.nanoseconds"] = EntryPart(f"{field}.nanoseconds", more, "", (), {"": ("time",)})
         if isinstance(entry, WrenchEntry):
             for name, quantity in (("force", "force"), ("moment", "torque")):
                 if (inner := getattr(entry, name)) is not None:
                     axes = tuple(getattr(inner, "axes", None) or _XYZ)
                     quantities = dict.fromkeys(axes, (quantity,))
-                    parts[f"{field}.{name}"] = Part(f"{field}.{name}", inner, names_field(field), axes, quantities)
+                    parts[f"{field}.{name}"] = EntryPart(f"{field}.{name}", inner, names_field(field), axes, quantities)
         if isinstance(entry, QuaternionEntry) and entry.rpy is not None:
             quantities = dict.fromkeys(_RPY, ("angle",))
-            parts[f"{field}.rpy"] = Part(f"{field}.rpy", entry.rpy, "", _RPY, quantities)
+            parts[f"{field}.rpy"] = EntryPart(f"{field}.rpy", entry.rpy, "", _RPY, quantities)
         if isinstance(entry, TorqueEntry) and entry.pd is not None:
             parts |= _pd_parts(entry.pd)
     return parts
 
 
-def _part(key: str, field: str, entry: ColumnEntry) -> Part:
+def _part(key: str, field: str, entry: ColumnEntry) -> EntryPart:
     """An entry that is like a field of a log."""
     components = tuple(getattr(entry, "axes", None) or component_names(field))
     raw = isinstance(entry, (FlagEntry, Gains))
     quantities = {name: () if raw else quantities_of(field, name) for name in components or ("",)}
-    return Part(key, entry, names_field(field), components, quantities)
+    return EntryPart(key, entry, names_field(field), components, quantities)
 
 
-def _pd_parts(law: PdLaw) -> dict[str, Part]:
+def _pd_parts(law: PdLaw) -> dict[str, EntryPart]:
     like = {"position": "joint_position", "velocity": "joint_velocity", "feed_forward": "joint_torque"}
     like |= dict.fromkeys(("kp", "kd"), "joint_torque")
     parts = {}
@@ -318,7 +318,7 @@ def _check_law(law: PdLaw) -> None:
             raise ConfigError.at_field(f"{key}.{name}", "not one of value, column and columns", accepted)
 
 
-def _check_part(part: Part) -> None:
+def _check_part(part: EntryPart) -> None:
     """Check patterns, names and units of an entry."""
     key, entry = f"{KEY}.{part.key}", part.entry
     if entry.column and entry.columns:
@@ -336,7 +336,7 @@ def _check_part(part: Part) -> None:
         unit_factor(f"{key}.unit", unit, quantities)
 
 
-def _check_pattern(key: str, part: Part, text: str) -> None:
+def _check_pattern(key: str, part: EntryPart, text: str) -> None:
     found = [name for name, _ in PLACEHOLDER.findall(text)]
     wrong = [name for name in found if name not in part.placeholders]
     several = [name for name in found if found.count(name) > 1]

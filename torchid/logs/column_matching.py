@@ -10,7 +10,7 @@ from typing import Any
 
 from torchid.errors import ConfigError, LogError, excerpt, join_names
 from torchid.logs.column_entries import KEY, TimeEntry
-from torchid.logs.column_map import AXES, PLACEHOLDER, Columns, Part, fits, letters_of, list_parts
+from torchid.logs.column_map import AXES, PLACEHOLDER, Columns, EntryPart, fits, letters_of, list_parts
 from torchid.logs.column_proposals import name_unknown
 from torchid.logs.columns import KINDS
 from torchid.logs.log import CONTACT_READINGS, IMU_FIELDS, WRENCHES, UnknownFieldError
@@ -31,7 +31,7 @@ class Matched:
         by_component: whether every component has.
     """
 
-    part: Part
+    part: EntryPart
     labels: tuple[str | None, ...]
     columns: tuple[str, ...]
     by_name: bool
@@ -125,7 +125,7 @@ class _Search:
         fixed = (column for one in self._fixed_by_key.values() for column in one.columns)
         return any(self._found.values()) or any(column in self._known for column in fixed)
 
-    def match(self, part: Part) -> Matched:
+    def match(self, part: EntryPart) -> Matched:
         """The columns of an entry; LogError where some are missing."""
         one = self._fixed_by_key.get(part.key) or self._named_by_columns(part)
         missing = [column for column in one.columns if column not in self._known]
@@ -136,7 +136,7 @@ class _Search:
             raise UnknownFieldError.at_field(f"{KEY}.{part.key}", missing[0], unused, f"no such column{more}")
         return one
 
-    def _require_numbers(self, part: Part, missing: str) -> None:
+    def _require_numbers(self, part: EntryPart, missing: str) -> None:
         """Refuse an entry whose columns are all there but numbered from another first one."""
         first = 1 - min(part.entry.first_index, 1)
         if "{index" not in (part.entry.column or "") or first == part.entry.first_index:
@@ -152,7 +152,7 @@ class _Search:
 
     # ------------------------------------------------------------------- entries whose names the map or the file states
 
-    def _fixed(self, part: Part) -> Matched | None:
+    def _fixed(self, part: EntryPart) -> Matched | None:
         """The columns of an entry whose names are stated; None for names that columns alone have."""
         entry, holders = part.entry, [name for name, _ in PLACEHOLDER.findall(part.entry.column or "")]
         if entry.columns:
@@ -176,12 +176,12 @@ class _Search:
                 columns += of_name
         return Matched(part, tuple(x for x in order if x or not by_name), tuple(columns), by_name, _splits(part, text))
 
-    def _no_order(self, part: Part) -> list[str | None]:
+    def _no_order(self, part: EntryPart) -> list[str | None]:
         field = f"{KEY}.{part.key}.order"
         accepted = f"names of the {part.kind}s in the order of '{part.entry.column}', or {KEY}.{part.kind}_order"
         raise ConfigError.at_field(field, "missing", accepted)
 
-    def _listed(self, part: Part) -> Matched:
+    def _listed(self, part: EntryPart) -> Matched:
         """The columns of an entry that names each."""
         entry = part.entry
         if not part.kind:
@@ -195,7 +195,7 @@ class _Search:
             raise ConfigError.at_field(f"{KEY}.{part.key}.columns", found, "{axis} in all or in none")
         return Matched(part, tuple(entry.columns), tuple(columns), True, splits.pop())
 
-    def _stem(self, part: Part, name: str) -> str:
+    def _stem(self, part: EntryPart, name: str) -> str:
         """What a file calls a joint or contact."""
         before, after = self._name_parts(part)
         if not name.startswith(before) or not name.endswith(after) or len(name) <= len(before) + len(after):
@@ -203,7 +203,7 @@ class _Search:
             raise ConfigError.at_field(f"{KEY}.{part.kind}_name", found, f"a pattern of all names of {part.kind}s")
         return name[len(before) : len(name) - len(after)]
 
-    def _name_parts(self, part: Part) -> tuple[str, str]:
+    def _name_parts(self, part: EntryPart) -> tuple[str, str]:
         before, _, after = self._columns.name_of(part.kind).partition(f"{{{part.kind}}}")
         return before, after
 
@@ -228,7 +228,7 @@ class _Search:
             found[best[0]].append((text, named[best[0]]))
         return found
 
-    def _named_by_columns(self, part: Part) -> Matched:
+    def _named_by_columns(self, part: EntryPart) -> Matched:
         """An entry whose names are those in its columns, in their order."""
         text = part.entry.column or ""
         stems = dict.fromkeys(stem for _, stem in self._found[part.key])
@@ -241,7 +241,7 @@ class _Search:
         return Matched(part, labels, tuple(columns), True, _splits(part, text))
 
 
-def _without_names(part: Part, text: str, holders: Sequence[str]) -> Matched:
+def _without_names(part: EntryPart, text: str, holders: Sequence[str]) -> Matched:
     """An entry of a field without names, in which `{index}` is that of a component."""
     if "index" not in holders:
         return Matched(part, (), tuple(_spelled(part, text, 0, "")), False, _splits(part, text))
@@ -249,12 +249,12 @@ def _without_names(part: Part, text: str, holders: Sequence[str]) -> Matched:
     return Matched(part, (), tuple(_filled(text, {}, number) for number in numbers), False, bool(part.components))
 
 
-def _splits(part: Part, text: str) -> bool:
+def _splits(part: EntryPart, text: str) -> bool:
     """Whether a pattern has a column for each component."""
     return bool(part.components) and any(name in AXES for name, _ in PLACEHOLDER.findall(text))
 
 
-def _spelled(part: Part, text: str, number: int, stem: str) -> list[str]:
+def _spelled(part: EntryPart, text: str, number: int, stem: str) -> list[str]:
     """The columns of a pattern for one name."""
     axes = part.components if _splits(part, text) else ("",)
     return [_filled(text, {part.kind: stem, "axis": axis, "AXIS": axis.upper()}, number) for axis in axes]
@@ -268,7 +268,7 @@ def _filled(text: str, values: Mapping[str, str], number: int) -> str:
     return PLACEHOLDER.sub(value, text)
 
 
-def _regex(part: Part, text: str) -> re.Pattern[str]:
+def _regex(part: EntryPart, text: str) -> re.Pattern[str]:
     """Columns that fit a pattern of an entry; the group `name` has the name."""
     out, end = "", 0
     axes = "|".join(part.components)

@@ -14,8 +14,9 @@ _FIELDS = tuple(name for name in (*SHAPES, *VARIANTS) if name not in NAME_FIELDS
 _LISTED, _LONGEST = 12, 60
 #: What force plates read; under which foot each lies, no name of a column says.
 OF_PLATES = (WRENCHES[1], POINTS)
-#: The base, as recordings call it.
-OF_BASE = r"\b(base|root|trunk|torso|pelvis|body|floating base|mocap|odom|odometry)"
+#: Words for the base in recordings, and how names of columns begin with one.
+BASES = "base|root|trunk|torso|pelvis|body|mocap|odom|odometry"
+OF_BASE = rf"\b({BASES}|floating base)"
 _STAMPS = r"(time|timestamps?|stamps?|tstamps?)"
 #: Words that recordings have for a field, by what the name of a column contains; the first that fits counts.
 _WORDS = (
@@ -62,7 +63,7 @@ _WRITTEN = {
 
 def is_desired(column: str) -> bool:
     """Whether a column holds what a controller wants, not what was measured."""
-    return bool(_DESIRED.search(" ".join(_words(column))))
+    return bool(_DESIRED.search(" ".join(words_of(column))))
 
 
 def is_no_torque(words: str, unit: str) -> bool:
@@ -78,10 +79,10 @@ def propose_field(column: str, desired: bool = False) -> str:
         desired: whether a desired value counts as one that was measured.
     """
     column, unit = split_unit(column)
-    words = " ".join(_words(column))
+    words = " ".join(words_of(column))
     close = difflib.get_close_matches(column.partition(".")[0], _FIELDS, n=1, cutoff=0.8)
     of_base = bool(close) and "imu" in words.split() and not close[0].startswith("imu")
-    if close and not of_base and not _contradicts(words, " ".join(_words(close[0]))):
+    if close and not of_base and not _contradicts(words, " ".join(words_of(close[0]))):
         return close[0]
     if (not desired and _DESIRED.search(words)) or _ANGLES.search(words):
         return ""
@@ -95,7 +96,8 @@ def _contradicts(words: str, others: str) -> bool:
     return any(one and other and one != other for one, other in pairs)
 
 
-def _words(column: str) -> list[str]:
+def words_of(column: str) -> list[str]:
+    """Words of a column's name, in lower case, what its letters say in other scripts among them."""
     for written, words in _WRITTEN.items():
         column = column.replace(written, f" {words} ")
     return [word.lower() for word in _SPLIT.split(column) if word]
@@ -105,7 +107,7 @@ def name_unknown(columns: Sequence[str]) -> str:
     """Columns, with what each may be, in one line: `'timestamp' (time?), 'q_0' and 11 like it (joint_position?)`."""
     alike: dict[tuple[str, ...], list[str]] = {}
     for column in columns:
-        proposed, words = propose_field(column), _words(split_unit(column)[0]) or [column]
+        proposed, words = propose_field(column), words_of(split_unit(column)[0]) or [column]
         if proposed and len(words) > 1 and words[-1] in ("w", "x", "y", "z"):
             words.pop()
         alike.setdefault((proposed, words[-1], "" if proposed else words[0]), []).append(column)

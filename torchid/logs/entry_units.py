@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from torchid.logs.column_entries import KEY, AngleEntry
-from torchid.logs.column_map import Part, values_by_name
+from torchid.logs.column_map import EntryPart, values_by_name
 from torchid.logs.column_matching import Matched
 from torchid.logs.log import FloatArray
 from torchid.logs.units import IN_DEGREES, TRANSLATION, unit_factor
@@ -23,7 +23,7 @@ def names_in_degrees(matched: Matched) -> set[str]:
     return {*matched.names, ""} - moving
 
 
-def element_factors(part: Part, names: Sequence[str], in_degrees: Collection[str]) -> FloatArray | None:
+def element_factors(part: EntryPart, names: Sequence[str], in_degrees: Collection[str]) -> FloatArray | None:
     """What the elements of a sample are multiplied by, (n,), (k,) or (n, k); None where that is 1.
 
     Args:
@@ -53,7 +53,9 @@ def element_factors(part: Part, names: Sequence[str], in_degrees: Collection[str
     return None if (out == 1.0).all() else out.reshape(shape)
 
 
-def joint_turns(part: Part, names: Sequence[str], in_degrees: Collection[str]) -> tuple[FloatArray, FloatArray] | None:
+def joint_turns(
+    part: EntryPart, names: Sequence[str], in_degrees: Collection[str]
+) -> tuple[FloatArray, FloatArray] | None:
     """Where the turn of each joint begins, NaN for one that is taken as it is, and how much a turn is, each (n,).
 
     As in `element_factors`.

@@ -20,7 +20,7 @@ from torchid.logs.ros_read import list_channels, open_bag_file
 from torchid.logs.table_headers import read_header
 from torchid.logs.tables import is_text_table, sample_table
 
-Columns = Mapping[str, NDArray[Any] | None]
+FileSample = Mapping[str, NDArray[Any] | None]
 """Columns of a table or arrays with some of their rows, some of them names; None for what is neither."""
 
 
@@ -28,7 +28,7 @@ _NAMES = 300  # elements of a list of names
 _SORTED = 0.9  # of the steps of stamps, forwards
 
 
-def read_sample(path: Path) -> Columns:
+def read_sample(path: Path) -> FileSample:
     """The columns of a table or the arrays of a file, with some of the rows of tables.
 
     Raises:
@@ -51,20 +51,20 @@ def states_degrees(path: Path) -> bool:
     return existing_log_kind(path) is LogKind.TABLE and is_text_table(path) and read_header(path).in_degrees
 
 
-def stated_names(sample: Columns, field: str) -> list[str]:
+def stated_names(sample: FileSample, field: str) -> list[str]:
     """Names of joints, contacts or sensors that a file of arrays states."""
     stated = sample.get(field)
     names = [] if stated is None else np.ravel(stated).tolist()
     return [name.decode(errors="replace") if isinstance(name, bytes) else str(name) for name in names]
 
 
-def texts_in(sample: Columns) -> list[str]:
+def texts_in(sample: FileSample) -> list[str]:
     """Names of columns and arrays, and all that lists of names in them have."""
     listed = [name for name, x in sample.items() if x is not None and x.dtype.kind not in "fiub"]
     return [*sample, *(text for name in listed for text in stated_names(sample, name))]
 
 
-def listed_order(sample: Columns, kind: str, robot: KnownRobot, count: int) -> tuple[list[str], str] | None:
+def listed_order(sample: FileSample, kind: str, robot: KnownRobot, count: int) -> tuple[list[str], str] | None:
     """So many names of joints or feet that some array of a file lists, and which; None where none does.
 
     Args:
@@ -146,7 +146,7 @@ def increases(values: NDArray[Any] | None) -> bool:
     return bool((np.diff(values) > 0).mean() > _SORTED)
 
 
-def side_by_side(sample: Columns, columns: Sequence[str]) -> NDArray[Any]:
+def side_by_side(sample: FileSample, columns: Sequence[str]) -> NDArray[Any]:
     """Numbers (N, k) of columns, or an array as it is; all in one row where columns have not as many each."""
     values = [x for column in columns if (x := sample[column]) is not None]
     if len(values) == 1:

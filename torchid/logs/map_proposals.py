@@ -14,7 +14,7 @@ from torchid.errors import excerpt
 from torchid.logs.column_groups import Family, find_families, split_arrays, split_stamps
 from torchid.logs.column_proposals import OF_BASE, OF_PLATES, is_desired, is_no_torque, propose_field
 from torchid.logs.columns import is_column
-from torchid.logs.file_samples import Columns, increases, listed_order, side_by_side, stated_names
+from torchid.logs.file_samples import FileSample, increases, listed_order, side_by_side, stated_names
 from torchid.logs.force_proposals import are_states, point_along_z, threshold
 from torchid.logs.joint_orders import JOINT_ORDERS, MOTORS, numbered_joints, suitable_orders, usual_order
 from torchid.logs.log import SHAPES, VARIANTS, WRENCHES
@@ -58,7 +58,7 @@ class MapProposal:
 
 
 def propose_map(
-    sample: Columns, robot: KnownRobot, files: Sequence[Collection[str]] = (), in_degrees: Collection[str] = ()
+    sample: FileSample, robot: KnownRobot, files: Sequence[Collection[str]] = (), in_degrees: Collection[str] = ()
 ) -> MapProposal:
     """Sort foreign columns into fields of a log by what they are called and what is in them.
 
@@ -73,7 +73,7 @@ def propose_map(
 
 class _Proposer:
     def __init__(
-        self, sample: Columns, robot: KnownRobot, files: Sequence[Collection[str]], in_degrees: Collection[str]
+        self, sample: FileSample, robot: KnownRobot, files: Sequence[Collection[str]], in_degrees: Collection[str]
     ) -> None:
         self.sample, self.robot, self.files, self.in_degrees = sample, robot, files, in_degrees
         self.joints, self.feet = robot.joints, robot.feet

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.logs.column_proposals import is_desired
-from torchid.logs.file_samples import Columns, side_by_side
+from torchid.logs.column_proposals import BASES, is_desired, words_of
+from torchid.logs.file_samples import FileSample, side_by_side
 from torchid.logs.gaps import turn_jumps
 from torchid.logs.units import UNITS, quantities_with, split_unit
 
@@ -30,7 +30,7 @@ _TURNS = {"rad": 2.0 * np.pi, "deg": 360.0, "rev": 1.0, "mrad": 2e3 * np.pi}
 Numbers = NDArray[np.float64]
 
 
-def step_of_stamps(sample: Columns) -> tuple[str, float] | None:
+def step_of_stamps(sample: FileSample) -> tuple[str, float] | None:
     """The name and the value [s] of a number that is the step between samples, of a recording without stamps."""
     for name, values in sample.items():
         if values is None or not values.size or values.dtype.kind not in "fiu" or not _STEP_NAME.fullmatch(name):
@@ -44,7 +44,7 @@ def step_of_stamps(sample: Columns) -> tuple[str, float] | None:
 class UnitProposer:
     """Adds units to the entries of a map, with a note for each."""
 
-    def __init__(self, sample: Columns, columns: dict[str, Any], notes: dict[str, str], stated: Mapping[str, float]):
+    def __init__(self, sample: FileSample, columns: dict[str, Any], notes: dict[str, str], stated: Mapping[str, float]):
         """Of a map that is being made.
 
         Args:
@@ -211,11 +211,10 @@ _OTHER_NAMES = {"roulis": "roll", "tangage": "pitch", "lacet": "yaw", "nickwinke
 _ANGLE = re.compile(rf"(?<![a-z])({'|'.join([*_NAMES, *_OTHER_NAMES])})(?![a-z])", re.IGNORECASE)
 _TRIPLE = re.compile(r"(?<![a-z])(rpy|euler\w*?)(?![a-z])", re.IGNORECASE)
 #: Words beside these in names of what turns the base, rather than a joint or a rate.
-_OF_BASE = re.compile(
-    r"(base|root|trunk|torso|pelvis|body|floating|mocap|odom|odometry|imu|ahrs|euler|rpy|orientation|attitude|angles?|"
-    r"state|states|data|pose|world|robot|est|estimated?|meas|measured|link|sensor|rotation|rot|value|x|y|z)"
+_BESIDE_ANGLES = re.compile(
+    rf"({BASES}|floating|imu|ahrs|euler|rpy|orientation|attitude|angles?|state|states|data|pose|world|robot|est|"
+    r"estimated?|meas|measured|link|sensor|rotation|rot|value|x|y|z)"
 )
-_SPLIT = re.compile(r"[^A-Za-z]+|(?<=[a-z])(?=[A-Z])")
 _LARGEST = 6.5  # [rad]: of no angle within a turn
 _UPRIGHT = 1.6  # [rad]: roll or pitch of a base that stands or hangs upright are less
 
@@ -241,7 +240,7 @@ class Angles:
     note: str
 
 
-def find_angles(sample: Columns, names: Sequence[str]) -> Angles | None:
+def find_angles(sample: FileSample, names: Sequence[str]) -> Angles | None:
     """Roll, pitch and yaw of the base, as three columns or as an array (N, 3); None where no names say so.
 
     Args:
@@ -253,7 +252,7 @@ def find_angles(sample: Columns, names: Sequence[str]) -> Angles | None:
     for columns in (*_triples(list(known)), *arrays):
         stem, unit = split_unit(columns[0])
         of_angle = not unit or "angle" in quantities_with(unit)
-        if of_angle and all(_OF_BASE.fullmatch(word) for word in _words(_ANGLE.sub("", _TRIPLE.sub("", stem)))):
+        if of_angle and all(_BESIDE_ANGLES.fullmatch(word) for word in words_of(_ANGLE.sub("", _TRIPLE.sub("", stem)))):
             return _angles({name: known[name] for name in columns}, unit)
     return None
 
@@ -279,10 +278,6 @@ def _in_turn(names: Sequence[str]) -> bool:
         return False
     changed = [[(a, b) for a, b in zip(*pair, strict=True) if a != b] for pair in pairwise(names)]
     return all(len(of) == 1 and ord(of[0][1]) == ord(of[0][0]) + 1 for of in changed)
-
-
-def _words(text: str) -> list[str]:
-    return [word.lower() for word in _SPLIT.split(text) if word]
 
 
 def _angles(values: Mapping[str, NDArray[Any]], unit: str) -> Angles:

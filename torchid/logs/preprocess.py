@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from torchid.errors import InputError, LogError, about_file
-from torchid.logs.coverage import Coverage, measure_coverage, warn_of_gaps
-from torchid.logs.gaps import require_no_turns
+from torchid.logs.gaps import Coverage, measure_coverage, require_no_turns, warn_of_gaps
 from torchid.logs.log import (
     CONTACT_READINGS,
     NAN_ALLOWED,

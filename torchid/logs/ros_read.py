@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import LogError, UnknownNameError, how_to_install, warn_about_file
+from torchid.errors import LogError, UnknownNameError, how_to_install, join_names, warn_about_file
 from torchid.logs.alignment import Series
 from torchid.logs.containers import list_bag_files, reader_errors_explained
 from torchid.logs.log import FloatArray
@@ -221,9 +221,7 @@ def open_bag_file(path: Path) -> Iterator[BagFile]:
 
 
 def _listed(channels: Mapping[str, Channel]) -> str:
-    shown = [f"{name} ({channel.type})" for name, channel in list(channels.items())[:_LISTED]]
-    more = len(channels) - len(shown)
-    return (", ".join(shown) or "no topics") + (f", and {more} more" if more else "")
+    return join_names([f"{name} ({channel.type})" for name, channel in channels.items()], _LISTED) or "no topics"
 
 
 def _decoder(topic: AnyTopic) -> Decoder:

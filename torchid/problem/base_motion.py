@@ -52,7 +52,7 @@ class BaseMotion:
 
     @classmethod
     def from_coordinates(cls, q: Tensor, v: Tensor, a: Tensor, fixed_base: bool = False) -> BaseMotion:
-        """The base's motion in q (B, n + 7), v, a (B, n + 6), as `Regressor` takes them; empty for a bolted base."""
+        """The base's motion in q (B, n + 7), v, a (B, n + 6), as `Regressor` takes them; empty for a fixed base."""
         if fixed_base:
             return cls()
         motion = motion_from_state(q, v, a, q.shape[1] - 7)
@@ -107,7 +107,7 @@ def levelled_base_axes(rotation_world_base: Tensor) -> Tensor:
 
 
 def base_motion(log: Log, robot: Robot) -> BaseMotion:
-    """Motion of the robot's base in a preprocessed log; for a bolted base only its orientation.
+    """Motion of the robot's base in a preprocessed log; for a fixed base only its orientation.
 
     An IMU is preferred: the dynamics depend on just what it measures, without differentiation. The orientation is kept
     for wrenches along world axes.
@@ -138,7 +138,7 @@ def _recorded_base(log: Log, robot: Robot) -> BaseMotion:
 def position_for_moments(log: Log, robot: Robot, contacts: Sequence[Contact]) -> Tensor | None:
     """Position of the base in the world, (N, 3) [m], where moments of contacts are about the world's origin; else None.
 
-    A bolted base of which no pose was recorded is the world.
+    A fixed base of which no pose was recorded is the world.
 
     Raises:
         LogError: it was not recorded.

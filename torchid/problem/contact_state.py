@@ -43,7 +43,7 @@ def state_name(contacts: Sequence[Contact], state: ContactState) -> str:
     return " + ".join(contact.frame for contact, active in zip(contacts, state, strict=True) if active) or IN_THE_AIR
 
 
-class Columns:
+class RowColumns:
     """Columns of the rows: those of `reduced_layout`, then two friction columns for each of the L - 1 joints.
 
     `count`: their number, without the right-hand side.
@@ -151,7 +151,7 @@ class ContactStateLayouts:
     def __init__(
         self,
         robot: Robot,
-        columns: Columns,
+        columns: RowColumns,
         contacts: Sequence[Contact],
         sensors: SensorSet,
         extras: Sequence[Extra] = (),

@@ -13,8 +13,8 @@ from torchid.errors import LogError
 from torchid.logs import Log
 from torchid.logs.arrays import parse_names
 from torchid.logs.blocks import LogBlocks
-from torchid.logs.coverage import Coverage
 from torchid.logs.flags import ContactThreshold, MeasuredForces, flags_by_force
+from torchid.logs.gaps import Coverage
 from torchid.logs.lazy_arrays import Computed, GapsFilled
 from torchid.logs.log import CONTACT_READINGS, FLAGS, FORCE_NORMAL, NORMALS, WRENCHES, BoolArray, FloatArray
 from torchid.logs.preprocess import (
@@ -36,7 +36,7 @@ from torchid.problem.detection_motion import (
     quiet,
     require_torque,
 )
-from torchid.problem.floor_pose import Foot, Footing, ways_up
+from torchid.problem.floor_pose import Footing, StanceFoot, ways_up
 from torchid.problem.standing import (
     Stretches,
     feet_poses,
@@ -167,7 +167,7 @@ def stand_in_blocks(
 
     def footing(samples: slice) -> Footing:
         poses = feet_poses(joints(samples), robot, contacts)
-        feet = [Foot.of(x, poses[x.frame], axis) for x, axis in zip(contacts, axes, strict=True)]
+        feet = [StanceFoot.of(x, poses[x.frame], axis) for x, axis in zip(contacts, axes, strict=True)]
         return Footing.of(feet, points_that_stand(active[samples], contacts))
 
     quats, positions = (growing_array(blocks.source, folder, len(blocks)) for _ in range(2))

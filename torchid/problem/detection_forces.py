@@ -9,9 +9,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
-from torchid.problem.detection_motion import Prepared, prepare
+from torchid.problem.detection_motion import Prepared
 from torchid.problem.predict import force_series
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples, concatenate
@@ -32,37 +31,12 @@ _FREE = 10.0  # standard deviation of a contact force that nothing determines, i
 
 
 @dataclasses.dataclass(frozen=True)
-class NormalForces:
-    """Forces (K, C) [N] along the ground's normal at stamps (K,) [s]."""
-
-    time: FloatArray
-    force: FloatArray
-
-
-def normal_forces(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: float) -> NormalForces:
-    """Forces of the ground along its normal by the URDF's dynamics.
+class ForcesAlongNormals:
+    """Forces along the ground's normal by the URDF's dynamics, with the armature and friction (m, 3) of a log's joints.
 
     Of all wrenches of all contacts, as if each could carry, those that balance measured joint torques, gravity and
-    inertia best, weighed least squares over the joints' and the base's rows. A base of which neither pose nor IMU was
+    inertia best, weighted least squares over the joints' and the base's rows. A base of which neither pose nor IMU was
     recorded counts as still, and tilted as if all feet stood.
-
-    Args:
-        log: as recorded, with joint torques.
-        robot: the robot, whose base floats.
-        contacts: that may stand.
-        cutoff_hz: of the filter [Hz], lower where the log is slow.
-
-    Raises:
-        InputError: no torques, fewer than three of joints above a contact, joints that are missing, or as `preprocess`.
-    """
-    whole = prepare(log, robot, contacts, cutoff_hz)
-    forces = ForcesAlongNormals.of([whole], len(whole.log), robot, contacts)
-    return NormalForces(whole.log.time, forces.of_part(whole))
-
-
-@dataclasses.dataclass(frozen=True)
-class ForcesAlongNormals:
-    """Forces along the ground's normal, with the armature and friction (m, 3) of the log's joints.
 
     Attributes:
         balance: of which they are worked out.

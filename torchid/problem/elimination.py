@@ -17,7 +17,7 @@ from torchid.problem.linear import LinearProblem
 from torchid.problem.rows import RowBuilder
 from torchid.problem.surplus import NoiseShares, corrected_triangle
 from torchid.robot import Robot
-from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, is_significant
+from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, column_scale, is_significant
 
 _NEVER_NEGATIVE = ("armature", "stiffness")
 _DIRECTIONS = {"forwards": 1.0, "backwards": -1.0}
@@ -180,8 +180,7 @@ def _held_together(logs: Sequence[tuple[Array, Array | None]]) -> Array | None:
         return None
     rows = np.concatenate([rest[:, :-1] for rest, _ in logs])
     lacking = [np.zeros((len(rest), width)) if held is None else rest[:, :-1] @ held for rest, held in logs]
-    size = np.linalg.norm(rows, axis=0)
-    scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
+    scale = column_scale(rows)
     return np.asarray(scale[:, None] * (np.linalg.pinv(rows * scale, rcond=RANK_TOLERANCE) @ np.concatenate(lacking)))
 
 
@@ -209,8 +208,7 @@ def eliminate_columns(X: Array, unknown: Sequence[int]) -> Array:
     if not unknown:
         return X
     columns = X[:, list(unknown)]
-    size = np.linalg.norm(columns, axis=0)
-    return _project_off(columns / np.where(size > 0.0, size, 1.0), np.delete(X, unknown, axis=1))[-1]
+    return _project_off(columns * column_scale(columns), np.delete(X, unknown, axis=1))[-1]
 
 
 def _project_off(columns: Array, rest: Array) -> tuple[Array, Array, Array, Array]:

@@ -28,7 +28,7 @@ def points_of(contact: Contact) -> int:
 
 
 @dataclass(frozen=True)
-class Foot:
+class StanceFoot:
     """A contact, and in the base frame its rotation (N, 3, 3) and points (N, P, 3) [m] of a floor that it stands on."""
 
     contact: Contact
@@ -36,7 +36,7 @@ class Foot:
     points: FloatArray
 
     @classmethod
-    def of(cls, contact: Contact, pose: FloatArray, sole_axis: int = 2) -> Foot:
+    def of(cls, contact: Contact, pose: FloatArray, sole_axis: int = 2) -> StanceFoot:
         """A foot with poses (N, 4, 4) in the base; `sole_axis` of a flat one's frame is along the floor's normal."""
         rotation, origin = pose[:, :3, :3], pose[:, :3, 3]
         axes = np.eye(3)
@@ -120,12 +120,12 @@ def _fit_planes(points: FloatArray, radius: FloatArray) -> tuple[FloatArray, Flo
 class Footing:
     """Feet of N successive samples above their floor, in the base frame; `points`: of all feet, (N, P, 3) [m]."""
 
-    feet: Sequence[Foot]
+    feet: Sequence[StanceFoot]
     points: FloatArray
     floor: Floor
 
     @classmethod
-    def of(cls, feet: Sequence[Foot], stands: BoolArray) -> Footing:
+    def of(cls, feet: Sequence[StanceFoot], stands: BoolArray) -> Footing:
         """Of feet of whose P points these stand, (N, P)."""
         points = np.concatenate([foot.points for foot in feet], axis=1)
         radius = np.concatenate([np.full(foot.points.shape[1], foot.contact.radius) for foot in feet])
@@ -133,7 +133,7 @@ class Footing:
 
     def __getitem__(self, samples: slice) -> Footing:
         """Some of the samples."""
-        feet = [Foot(foot.contact, foot.rotation[samples], foot.points[samples]) for foot in self.feet]
+        feet = [StanceFoot(foot.contact, foot.rotation[samples], foot.points[samples]) for foot in self.feet]
         floor = Floor(self.floor.up[samples], self.floor.height[samples], self.floor.uneven[samples])
         return Footing(feet, self.points[samples], floor)
 
@@ -229,7 +229,7 @@ class Walk:
         return max(both, key=lambda yaw: float(ahead @ (_about_z(np.array([yaw]))[0] @ forward)))
 
 
-def _rolled(feet: Sequence[Foot], rotation: FloatArray) -> FloatArray:
+def _rolled(feet: Sequence[StanceFoot], rotation: FloatArray) -> FloatArray:
     """How far the points of feet have rolled along the floor since the first sample, (M, P, 2) [m].
 
     Args:

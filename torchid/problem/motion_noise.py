@@ -47,7 +47,7 @@ class MotionNoise:
     base: Tensor
     turns_force: bool = False
 
-    def shaken(self, samples: Samples, size: Tensor) -> Samples:
+    def perturbed(self, samples: Samples, size: Tensor) -> Samples:
         """Samples with as much noise of the motion again, times a `size`, (B, 1).
 
         Each of some independent sources has one standard deviation, to one side or the other, which is drawn by the
@@ -87,7 +87,7 @@ def bind_motion_noise(
     Args:
         log: the log.
         joints: its joints' columns, in the robot's order.
-        fixed_base: whether the base is bolted down.
+        fixed_base: whether the base does not move.
         imu: rotation of the IMU's frame into the base's and its origin there, (3,) [m]; None without one.
     """
     noise = log.motion_noise

@@ -13,7 +13,7 @@ from torchid.parameters import Array
 from torchid.problem.base_motion import levelled_base_axes
 from torchid.problem.chunk_dynamics import ChunkDynamics, ChunkKinematics, Workspace, Workspaces
 from torchid.problem.contact_rows import ContactRows, contact_rows, whitened_bases
-from torchid.problem.contact_state import Columns, ContactState, ContactStateLayout, ContactStateLayouts
+from torchid.problem.contact_state import ContactState, ContactStateLayout, ContactStateLayouts, RowColumns
 from torchid.problem.extra_columns import KnownTorques, dof_extra_column, extra_columns
 from torchid.problem.extras import ExtraTerms, list_extras
 from torchid.problem.loop_forces import MotorForces
@@ -68,9 +68,9 @@ class RowBuilder(nn.Module):
     """Rows of `W^T [K_columns | f]`: W a basis of V_x's span under which the projected sensor noise is white.
 
     The fast implementation of the equations that `torchid.Projection` computes from `torchid.Regressor` and
-    `torchid.FrameJacobian`, up to a rotation of each sample's rows, in fewer columns (see `Columns`). It shares their
-    functions in `torchid.regressor` and `torchid.sensing.projection`, but processes samples one contact state at a
-    time, where all shapes are constant, and multiplies W^T with the bodies' wrenches without forming K.
+    `torchid.FrameJacobian`, up to a rotation of each sample's rows, in fewer columns (see `RowColumns`). It shares
+    their functions in `torchid.regressor` and `torchid.sensing.projection`, but processes samples one contact state
+    at a time, where all shapes are constant, and multiplies W^T with the bodies' wrenches without forming K.
     `tests/problem/test_rows_two_ways.py` compares both; read the reference implementation first.
 
     `frames`: node of each contact, and the pose of the contact frame in the node's joint frame, (4, 4) [m]. `width`:
@@ -94,7 +94,7 @@ class RowBuilder(nn.Module):
         self.known_torques = KnownTorques(robot, self.extras)
         self.motors = MotorForces(robot)
         self.tree = KinematicTree(robot, terms.sign_width)
-        self.columns = Columns(self.tree)
+        self.columns = RowColumns(self.tree)
         self.contacts = tuple(contacts)
         self.sensors = sensors
         self._layouts = ContactStateLayouts(robot, self.columns, contacts, sensors, self.extras)

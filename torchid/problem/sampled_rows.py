@@ -90,10 +90,15 @@ class SampledRows:
 
     @one_thread()
     @torch.no_grad()
-    def __init__(self, logs: Sequence[Samples | LogElsewhere], builder: RowBuilder) -> None:
+    def __init__(self, logs: Sequence[Samples | LogElsewhere], builder: RowBuilder, chunk: int = _CHUNK) -> None:
         """Compute the rows of random samples, always the same ones.
 
         Logs elsewhere are those of processes that share the work, each with successive ones; all get the rows of all.
+
+        Args:
+            logs: bound logs.
+            builder: of their rows.
+            chunk: samples at a time; their number rounds otherwise, which moves an ill-determined noise by per cents.
         """
         self.builder = builder
         names = _source_names(builder)
@@ -103,7 +108,7 @@ class SampledRows:
         self._std = torch.tensor([stated[name] for name in names], dtype=torch.float64)
         n_rows = builder.tree.n_rows
         most = min(_SAMPLES, _BYTES // (8 * max(n_rows, 1) * (builder.width + 1 + len(names))))
-        self.chunks = [self._chunk(part, state) for part, state in _random_chunks(logs, max(most, 1))]
+        self.chunks = [self._chunk(part, state) for part, state in _random_chunks(logs, max(most, 1), chunk)]
         elsewhere = any(isinstance(log, LogElsewhere) for log in logs)
         if any(ranks.gather(elsewhere, "logs that others have")):
             self.chunks = list(chain.from_iterable(ranks.gather(self.chunks, "samples for the noise")))
@@ -167,7 +172,6 @@ class SampledRows:
         rows are taken together, as another basis of their span must not make a difference.
         """
         parts: dict[tuple[str, ContactState], Part] = {}
-        every = tuple(range(self.builder.width))
         for chunk in self.whitened(variance):
             key = chunk.log, chunk.state
             part = parts.setdefault(key, Part(*key, TriangularFactor(self.builder.width), 0))
@@ -177,8 +181,18 @@ class SampledRows:
                 size = torch.linalg.vector_norm(rows[..., :-1] @ columns[chunk.log] - rows[..., -1], dim=1)
                 limit = _radius(present.sum(1))
                 rows = rows * (limit / size).clamp_max(1.0).sqrt()[:, None, None]
-            part.factor.add(every, rows[present], chunk.oversampling)
+            for support, slots in _supports(rows).items():
+                own = rows[:, torch.tensor(slots)[:, None], torch.tensor([*support, self.builder.width])]
+                part.factor.add(support, own[present[:, slots]], chunk.oversampling)
         return list(parts.values())
+
+
+def _supports(rows: Tensor) -> dict[tuple[int, ...], list[int]]:
+    """Columns in which rows (B, n_rows, width + 1), right-hand side last, are not zero: numbers of rows by these."""
+    out: dict[tuple[int, ...], list[int]] = {}
+    for slot, used in enumerate((rows[..., :-1] != 0.0).any(0).numpy()):
+        out.setdefault(tuple(np.flatnonzero(used).tolist()), []).append(slot)
+    return out
 
 
 def _radius(rows: Tensor) -> Tensor:
@@ -196,7 +210,9 @@ def _source_names(builder: RowBuilder) -> list[str]:
     return [*BASE_GROUPS[: builder.tree.base_rows], *dofs, *contacts]
 
 
-def _random_chunks(logs: Sequence[Samples | LogElsewhere], most: int) -> Iterator[tuple[Samples, ContactState]]:
+def _random_chunks(
+    logs: Sequence[Samples | LogElsewhere], most: int, chunk: int
+) -> Iterator[tuple[Samples, ContactState]]:
     """About `most` random samples (regular ones could be in phase with a gait), log by log and state by state.
 
     Of filtered logs at most four for every independent sample: more would add little.
@@ -208,5 +224,5 @@ def _random_chunks(logs: Sequence[Samples | LogElsewhere], most: int) -> Iterato
         if isinstance(log, LogElsewhere):
             continue
         chosen = replace(log[index], oversampling=max(1.0, log.oversampling * count / len(log)), folder=None)
-        for state, where in chunks_by_state(chosen, _CHUNK):
+        for state, where in chunks_by_state(chosen, chunk):
             yield chosen[where], state

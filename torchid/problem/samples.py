@@ -42,7 +42,7 @@ class Samples:
         source: the log's file, for messages and tables.
         time: (N,) [s].
         joint_position, joint_velocity, joint_acceleration: (N, n).
-        base: motion of the base and, if known, its orientation; empty for a bolted base.
+        base: motion of the base and, if known, its orientation; empty for a fixed base.
         torque: (N, n + 6 F) [N m, N, N m] by the robot's `dof_names`: joint torques, then wrenches of sensors in limbs;
             NaN where not measured, or None.
         wrench: (N, C, 6), NaN where not measured, or None; along world axes if `wrench_in_world`, else the frames'.
@@ -152,7 +152,7 @@ class Samples:
         """The motion of these samples, for the regressor."""
         base, zero = self.base, self.time.new_zeros(len(self), 3)
         force = base.specific_force
-        if force is None:  # of a bolted base
+        if force is None:  # of a fixed base
             force = torch.stack([zero[:, 0] - g for g in GRAVITY_WORLD], dim=1)
             if (rotation := base.rotation) is not None:
                 force = (rotation.mT @ force[..., None])[..., 0]
@@ -166,7 +166,7 @@ class Samples:
 
         Base position and base linear velocity are 0: the dynamics do not depend on them, and logs need not have them.
         An orientation that was not measured is the identity: given the specific force, the dynamics do not depend on it
-        either. A bolted base has joints only.
+        either. A fixed base has joints only.
         """
         q, v, a = self.joint_position, self.joint_velocity, self.joint_acceleration
         base, zero = self.base, self.time.new_zeros(len(self), 3)

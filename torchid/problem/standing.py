@@ -18,8 +18,8 @@ from torchid.logs.quaternion import make_sign_continuous
 from torchid.logs.stretches import preprocess_stretches
 from torchid.problem.floor_pose import (
     FEWEST_POINTS,
-    Foot,
     Footing,
+    StanceFoot,
     Walk,
     find_sole_axis,
     points_of,
@@ -143,7 +143,7 @@ def stand_on_feet(log: Log, robot: Robot, contacts: Sequence[Contact]) -> Standi
         poses = feet_poses(log, robot, contacts)
         soles = [ways_up(poses[x.frame])[active[:, i]] for i, x in enumerate(contacts)]
         axes = sole_axes(contacts, [way.mean(axis=0) if len(way) else None for way in soles])
-        feet = [Foot.of(x, poses[x.frame], axis) for x, axis in zip(contacts, axes, strict=True)]
+        feet = [StanceFoot.of(x, poses[x.frame], axis) for x, axis in zip(contacts, axes, strict=True)]
     whole = Footing.of(feet, points_that_stand(active, contacts))
     quat, position = np.full((len(log), 4), np.nan), np.full((len(log), 3), np.nan)
 

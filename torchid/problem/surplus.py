@@ -29,7 +29,7 @@ from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import TriangularFactor
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples, concatenate
-from torchid.rounding import RANK_TOLERANCE, is_significant
+from torchid.rounding import RANK_TOLERANCE, column_scale, is_significant
 
 LEAST_SIGNAL = 1.0 / 3.0
 """Share of the information on a combination of parameters that remains at least: all but that may be noise.
@@ -39,7 +39,7 @@ combination. Less is taken off, and the nominal parameters make up for what is t
 """
 
 _MOST_SIGNAL = 2.0  # beyond, it is rounding, of combinations that the rows hardly determine
-_SHAKEN = 20_000  # samples of all logs, evenly spread; as many again say little more of averages
+_PERTURBED = 20_000  # samples of all logs, evenly spread; as many again say little more of averages
 _NEGLIGIBLE = 1e-5  # share of noise in any combination: far below all standard errors
 _RESOLVED = 1e-5  # least singular value, of columns of unit size, along which a difference of squares is no rounding
 
@@ -89,7 +89,7 @@ def compress_surplus(
         key: which rows belong together.
         progress: called with 0 where some of the samples of a piece have been taken.
     """
-    step = ranks.as_first(max(1, sum(map(len, pieces)) // _SHAKEN), "samples with noise")
+    step = ranks.as_first(max(1, sum(map(len, pieces)) // _PERTURBED), "samples with noise")
     by_log: dict[str, list[Samples]] = {}
     for piece in pieces:
         if piece.motion_noise is not None and len(piece):
@@ -151,8 +151,8 @@ def _surplus_of_chunks(
         ends = torch.bincount(of_piece - 1, minlength=len(own)).cumsum(0).tolist()
         spans = [(number, start, end) for number, (start, end) in enumerate(pairwise([0, *ends])) if end > start]
         side = torch.tensor([0.0, 1.0, -1.0]).to(samples.time).repeat_interleave(count)
-        shaken = noise.shaken(samples[torch.arange(count, device=samples.time.device).repeat(3)], side[:, None])
-        for rows, index in builder.blocks(shaken, state, workspace):
+        perturbed = noise.perturbed(samples[torch.arange(count, device=samples.time.device).repeat(3)], side[:, None])
+        for rows, index in builder.blocks(perturbed, state, workspace):
             for number, start, end in spans:
                 sums = out.setdefault((samples.source, number, state), {})
                 for copy, weight in enumerate((-1.0, 0.5, 0.5)):
@@ -211,8 +211,7 @@ def corrected_triangle(factor: TriangularFactor, prior: ColumnPrior) -> Correcte
     if not factor.surplus:
         return CorrectedTriangle(R)
     rows, rhs, surplus = R[:, :-1], R[:, -1], factor.whole_surplus().numpy()
-    size = np.linalg.norm(rows, axis=0)
-    scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
+    size, scale = np.linalg.norm(rows, axis=0), column_scale(rows)
     U, values, Vh = np.linalg.svd(rows * scale, full_matrices=False)
     kept = is_significant(values, _RESOLVED)
     other = is_significant(values, RANK_TOLERANCE) & ~kept

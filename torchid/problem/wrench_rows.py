@@ -69,7 +69,7 @@ def wrenches_at_ground(
 
 @dataclass(frozen=True)
 class FramePoses:
-    """Poses of a contact's frame in the world, or in a bolted base of which no pose was recorded.
+    """Poses of a contact's frame in the world, or in a fixed base of which no pose was recorded.
 
     `rotation`: (B, 3, 3), frame to world. `origin`: (B, 3) [m]; None for wrenches that are about it already.
     """

@@ -65,7 +65,7 @@ def motion_from_state(
         v: (B, nv): base linear and angular velocity in the base frame, then joints.
         a: (B, nv): d/dt of `v`.
         n: number of independent joints.
-        fixed_base: whether the base is bolted, with its axes those of the world.
+        fixed_base: whether the base is fixed, with its axes those of the world.
         gravity: (3,), in the world [m/s^2].
 
     Raises:

@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import numpy as np
+
 from torchid import parameters
 from torchid.parameters import Array
 from torchid.robot import Robot
@@ -34,28 +36,31 @@ class JointParameters:
 
 
 def joint_parameters(robot: Robot, phi: Array, armature: Mapping[str, float]) -> list[JointParameters]:
-    """Of all joints that move, also of those that mimic others.
+    """Of the independent joints: one that mimics another has no actuator, its armature and friction are the other's.
+
+    By the ratio k of their positions, armature and viscous friction count k^2 times, Coulomb friction |k| times.
 
     Args:
         robot: the robot.
         phi: identified parameters, (L, 12).
         armature: by joint [kg m^2 or kg], of those whose armature was fitted; others have that of the robot's file.
     """
+    ratio = np.abs(robot.joint_map[0])
+    coulomb, viscous = ratio.T @ phi[1:, parameters.COULOMB], (ratio**2).T @ phi[1:, parameters.VISCOUS]
     return [
         JointParameters(
-            name=body.joint.name,
-            kind=body.joint.kind,
-            armature=float(armature.get(body.joint.name, body.joint.armature)),
-            coulomb=float(values[parameters.COULOMB]),
-            viscous=float(values[parameters.VISCOUS]),
+            name=name,
+            kind="prismatic" if name in robot.sliding else "revolute",
+            armature=float(armature.get(name, robot.armature[k])),
+            coulomb=float(coulomb[k]),
+            viscous=float(viscous[k]),
         )
-        for body, values in zip(robot.bodies, phi, strict=True)
-        if body.joint is not None and body.joint.kind != "fixed"
+        for k, name in enumerate(robot.joint_names)
     ]
 
 
 def isaaclab_text(joints: Sequence[JointParameters], source: str) -> str:
-    """Python text of an `ImplicitActuatorCfg` with all joints by name.
+    """Python text of an `ImplicitActuatorCfg` with all independent joints by name.
 
     Args:
         joints: from `joint_parameters`.

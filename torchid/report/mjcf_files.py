@@ -48,7 +48,8 @@ def identified_mjcf(
     number = {name: i for i, name in enumerate(model.bodies)}
     explicit = _state_inertias(root, model)
     rest = without_links_beyond_welds(robot, phi)
-    warn_if_inconsistent(robot, rest, NAME)
+    moving = np.array([[body.name != model.bodies[0]] for body in robot.bodies])  # the world has no inertia there
+    warn_if_inconsistent(robot, moving * rest, NAME)
     written = set[int]()
     for body, values, own, before in zip(robot.bodies, rest, phi, robot.nominal, strict=True):
         if np.array_equal(own[parameters.INERTIAL], before[parameters.INERTIAL]) or body.name == model.bodies[0]:

@@ -15,7 +15,7 @@ QUANTILES = (0.025, 0.25, 0.5, 0.75, 0.975)
 _DIGITS = 4  # of correlations
 
 
-def sample_table(samples: ParameterSamples) -> Array:
+def table_of_draws(samples: ParameterSamples) -> Array:
     """All samples, (N, 12 L + S), in the order of `FittedPosterior.parameter_names`."""
     parts = samples.phi.flatten(1), samples.extras
     return np.concatenate([part.cpu().numpy() for part in parts], axis=1)
@@ -26,7 +26,7 @@ def sample_arrays(
 ) -> dict[str, NDArray[Any]]:
     """What the file of samples holds, by name; `about` has numbers that say how they were drawn."""
     return {
-        "samples": sample_table(samples),
+        "samples": table_of_draws(samples),
         "names": np.array(fitted.parameter_names),
         "units": np.array(_units(fitted)),
         "nominal": np.append(fitted.posterior.nominal, np.full(len(fitted.extra_names), np.nan)),
@@ -45,7 +45,7 @@ def ranges_document(fitted: FittedPosterior, samples: ParameterSamples, about: M
         samples: of it.
         about: numbers that say how they were drawn.
     """
-    table = sample_table(samples)
+    table = table_of_draws(samples)
     mean, deviation = table.mean(axis=0), table.std(axis=0)
     moving = np.flatnonzero(np.append(fitted.posterior.free, np.ones(len(fitted.extra_names), dtype=bool)))
     quantiles = np.quantile(table[:, moving], QUANTILES, axis=0)

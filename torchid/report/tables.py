@@ -31,6 +31,7 @@ from torchid.problem.metrics import ERROR_GROUPS, IN_AIR, LIMB_GROUPS
 WIDTH = 100
 """Columns of what is printed, at most."""
 
+_MOST_ROWS = 12  # of contributions of a kind, and of conditions
 MARKS = {IDENTIFIED: "*", PRIOR: "p", COMBINED: "+", UNOBSERVABLE: ".", FIXED: ""}
 
 
@@ -189,7 +190,7 @@ def verdict_counts_table(by_state: Mapping[str, Estimate], together: Estimate) -
     return table
 
 
-def contribution_table(contributions: Contributions, max_rows: int = 12) -> Table:
+def contribution_table(contributions: Contributions) -> Table:
     """Information that each log, contact state and sensor (if known) contributes, the largest of each kind."""
     of_sensors = "contact state and sensor" if contributions.sensors else "and contact state"
     comma = "," if contributions.sensors else ""
@@ -200,29 +201,29 @@ def contribution_table(contributions: Contributions, max_rows: int = 12) -> Tabl
         "logs": contributions.logs, "contact states": contributions.states, "sensors": contributions.sensors
     }  # fmt: skip
     for kind, members in kinds.items():
-        for member in sorted(members, key=lambda x: -x.bits)[:max_rows]:
+        for member in sorted(members, key=lambda x: -x.bits)[:_MOST_ROWS]:
             counts = ("", "", "")
             if isinstance(member, PartContribution):
                 counts = (str(member.samples), str(member.rank), str(member.rank_lost))
             name = log_title(member.name) if kind == "logs" else member.name
             table.add_row(Text(name), *counts, f"{member.determined:.1f}", f"{member.bits:.1f}")
-        if len(members) > max_rows:
-            table.add_row(f"and {len(members) - max_rows} more {kind}")
+        if len(members) > _MOST_ROWS:
+            table.add_row(f"and {len(members) - _MOST_ROWS} more {kind}")
         table.add_section()
     total = contributions.total
     table.add_row("everything", "", "", "", f"{total.determined:.1f}", f"{total.bits:.1f}")
     return table
 
 
-def violation_table(violations: Sequence[Mapping[str, Any]], max_rows: int = 12) -> Table:
+def violation_table(violations: Sequence[Mapping[str, Any]]) -> Table:
     """The first of the conditions that parameters break, by body."""
     title = "Conditions that the identified parameters break"
-    if len(violations) > max_rows:
-        title += f", the first {max_rows} of {len(violations)}"
+    if len(violations) > _MOST_ROWS:
+        title += f", the first {_MOST_ROWS} of {len(violations)}"
     table = Table(title=title, title_justify="left")
     for heading in ("body", "condition", "off by"):
         table.add_column(heading, justify="right" if heading == "off by" else "left")
-    for violation in violations[:max_rows]:
+    for violation in violations[:_MOST_ROWS]:
         amount = Text(f"{violation['amount']:.3g} {violation['unit']}")
         table.add_row(Text(violation["body"] or violation["term"] or "all"), Text(str(violation["condition"])), amount)
     return table

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from torchid.errors import ConfigError, UnknownNameError
+from torchid.errors import ConfigError, UnknownNameError, warn
 from torchid.parameters import Array
 from torchid.robot.urdf import TreeJoint, parse_xml
 from torchid.robot.welds import matching_joints
@@ -43,8 +43,17 @@ class Loop:
 
 
 def loops_of_file(path: Path) -> tuple[Loop, ...]:
-    """The loops that a robot's file has: `connect` and `weld` of MJCF; a URDF never says."""
-    found = parse_xml(path).getroot().findall(f"{OWN}loop")
+    """The loops that a robot's file has: `connect` and `weld` of MJCF; a URDF never says.
+
+    Warns:
+        TorchidWarning: some hold the robot to what is no part of it, as a mocap body: contacts, if they are named.
+    """
+    root = parse_xml(path).getroot()
+    for tie in root.findall(f"{OWN}tie"):
+        held = "holds the robot to what is no part of it, by a force that is left out"
+        contact = f"{{frame: {tie.get('frame')}, type: {'point' if tie.get('type') == 'point' else 'flat'}}}"
+        warn(f"{path}: {tie.get('where')}: {held}; where it acted in a log: contacts: [{contact}]")
+    found = root.findall(f"{OWN}loop")
     return tuple(Loop((str(x.get("one")), str(x.get("other"))), str(x.get("type"))) for x in found)
 
 

@@ -18,7 +18,7 @@ from torchid.robot.mjcf_checks import (
     check_model,
     driven_joints,
     equality_kind,
-    is_loop,
+    is_held,
     loop_bodies,
     loop_frames,
     mimic_of,
@@ -153,18 +153,22 @@ class _Document:
                 etree.SubElement(element, "geometry").append(shape)
 
     def _add_loops(self) -> None:
-        """Loops, with links for their frames, and which joints no motor drives."""
+        """Loops and what else holds the robot, with links for their frames, and which joints no motor drives."""
         model = self.model
-        loops = [x for x in model.spec.equalities if is_loop(model, x)]
-        for number, loop in enumerate(loops, start=1):
-            name, bodies = loop.name or f"loop{number}", loop_bodies(model, loop)
+        for number, held in enumerate((x for x in model.spec.equalities if is_held(model, x)), start=1):
+            name, poses = held.name or f"loop{number}", loop_frames(model, held)
             links = [
                 str(self._frame(body, f"{name} of {model.bodies[body]}", "loop", T).get("name"))
-                for body, T in zip(bodies, loop_frames(model, loop), strict=True)
+                for body, T in zip(loop_bodies(model, held), poses, strict=True)
+                if body in (model.base, *model.members)
             ]
-            kind = LOOPS[equality_kind(loop)]
-            etree.SubElement(self.root, f"{OWN}loop", one=links[0], other=links[1], type=kind)
-        driven = driven_joints(model) if loops else None
+            kind = equality_kind(held)
+            if len(links) == 1:  # to a mocap body, or to scenery
+                where = model.label(held, kind, held.name)
+                etree.SubElement(self.root, f"{OWN}tie", frame=links[0], type=LOOPS[kind], where=where)
+            else:
+                etree.SubElement(self.root, f"{OWN}loop", one=links[0], other=links[1], type=LOOPS[kind])
+        driven = driven_joints(model) if self.root.find(f"{OWN}loop") is not None else None
         for joint in self.root.findall("joint"):
             dynamics = joint.find("dynamics")
             if driven is not None and dynamics is not None and joint.get("name") not in driven:

@@ -42,14 +42,12 @@ def check_model(model: MjcfModel) -> None:
 
 
 def _check_equality(model: MjcfModel, equality: Any) -> None:
-    """Refuse all but a loop of the robot."""
+    """Refuse all but a loop or a tie of the robot."""
     kind = equality_kind(equality)
     if kind not in LOOPS:
-        accepted = "joint1 = c0 + c1 joint2 alone" if kind == "joint" else "connect, weld, or a linear joint"
+        linear = {"joint": "joint1 = c0 + c1 joint2 alone", "tendon": "one fixed tendon of two joints"}
+        accepted = linear.get(kind, "connect, weld, or a linear joint")
         model.refuse(equality, kind, equality.name, "an equality constraint", accepted)
-    if not is_loop(model, equality):
-        found = "a constraint to what is not part of the robot"
-        model.refuse(equality, kind, equality.name, found, "two bodies of the robot")
 
 
 def _check_body(model: MjcfModel, body: Any) -> None:
@@ -119,6 +117,8 @@ def mimic_of(model: MjcfModel, equality: Any) -> tuple[str, str, float, float] |
 
     MuJoCo's polynomial is of deviations from the joints' reference positions.
     """
+    if equality_kind(equality) == "tendon" and equality.active:
+        return _mimic_of_tendon(model, equality)
     if equality_kind(equality) != "joint" or not (equality.active and equality.name1 and equality.name2):
         return None
     c0, c1, *rest = equality.data[:5]
@@ -127,6 +127,19 @@ def mimic_of(model: MjcfModel, equality: Any) -> tuple[str, str, float, float] |
     follower, master = (model.model.joint(name) for name in (equality.name1, equality.name2))
     reference = [float(model.model.qpos0[int(joint.qposadr[0])]) for joint in (follower, master)]
     return equality.name1, equality.name2, float(c1), float(c0 + reference[0] - c1 * reference[1])
+
+
+def _mimic_of_tendon(model: MjcfModel, equality: Any) -> tuple[str, str, float, float] | None:
+    """As `mimic_of`, of the two joints of a fixed tendon of constant length; the second follows the first."""
+    of, tendon = model.model, int(model.model.eq_obj1id[equality.id])
+    wraps = slice(int(of.tendon_adr[tendon]), int(of.tendon_adr[tendon] + of.tendon_num[tendon]))
+    if equality.name2 or list(of.wrap_type[wraps]) != [int(mujoco.mjtWrap.mjWRAP_JOINT)] * 2:
+        return None
+    (master, follower), (a, b) = map(int, of.wrap_objid[wraps]), map(float, of.wrap_prm[wraps])
+    if not b:
+        return None
+    start, end = (float(of.qpos0[int(of.jnt_qposadr[joint])]) for joint in (master, follower))
+    return model.joints[follower], model.joints[master], -a / b, end + (float(equality.data[0]) + a * start) / b
 
 
 def _touches(model: MjcfModel, equality: Any, members: set[str]) -> bool:
@@ -144,11 +157,11 @@ def _touches(model: MjcfModel, equality: Any, members: set[str]) -> bool:
     return bool(on & members)
 
 
-def is_loop(model: MjcfModel, equality: Any) -> bool:
-    """Whether an equality constraint is active and keeps two bodies of the robot together."""
+def is_held(model: MjcfModel, equality: Any) -> bool:
+    """Whether an equality constraint is active and holds a body of the robot to another body, of the robot or not."""
     if not equality.active or equality_kind(equality) not in LOOPS:
         return False
-    return {model.base, *model.members}.issuperset(loop_bodies(model, equality))
+    return not {*model.members}.isdisjoint(loop_bodies(model, equality))
 
 
 def loop_bodies(model: MjcfModel, equality: Any) -> tuple[int, int]:

@@ -126,10 +126,14 @@ class MjcfModel:
         Raises:
             UrdfError: always.
         """
+        raise UrdfError(self.path, self.label(element, tag, name), found, accepted)
+
+    def label(self, element: Any, tag: str, name: str) -> str:
+        """An element of the specification by tag, name and line: "<joint> 'knee', line 12 of leg.xml"."""
         line = _LINE.search(str(getattr(element, "info", "")))
         refers_to = [x for x in (getattr(element, key, "") for key in ("name1", "name2")) if x]
         where = self.text.where(tag, name, int(line[1]) if line else 0, refers_to)
-        raise UrdfError(self.path, f"<{tag}>{f' {name!r}' if name else ''}{where}", found, accepted)
+        return f"<{tag}>{f' {name!r}' if name else ''}{where}"
 
     # ------------------------------------------------------------------------------------------------------ reading
 

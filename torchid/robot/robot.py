@@ -36,7 +36,7 @@ from torchid.robot.tree import (
     link_poses,
     nominal_parameters,
 )
-from torchid.robot.urdf import is_bolted, read_urdf
+from torchid.robot.urdf import has_fixed_base, read_urdf
 from torchid.robot.welds import links_beyond, weld_joints, weld_positions
 from torchid.robot.xml_files import file_kind
 
@@ -257,7 +257,7 @@ def load_robot(
 
     Args:
         path: the file; meshes are not opened, but for those of an MJCF file that a body's inertia is made of.
-        base_link: the link that becomes the floating (or bolted) base, by default the root of the URDF.
+        base_link: the link that becomes the floating (or fixed) base, by default the root of the URDF.
         fixed_base: True if the base does not move.
         ft_joints: fixed joints with a force/torque sensor: the links beyond form a body of their own.
         weld: names or patterns of joints that are held, at 0 or at the position [rad or m] that a mapping gives.
@@ -279,8 +279,8 @@ def load_robot(
     path = Path(path)
     with during("reading", path):
         links, joints = read_urdf(path)
-        if not fixed_base and is_bolted(path):
-            found = "none, so that the robot is bolted to the world"
+        if not fixed_base and has_fixed_base(path):
+            found = "none, so that its base is fixed to the world"
             raise UrdfError(path, "<freejoint>", found, "robot.fixed_base: true, or a free joint of the base's body")
     welded = weld_positions(path, joints, weld if isinstance(weld, Mapping) else dict.fromkeys(weld, 0.0))
     with during("reading", path):

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from torchid.errors import ConfigError
+from torchid.errors import ConfigError, join_names
 from torchid.parameters import Array
 from torchid.robot.robot import Robot
 
@@ -92,8 +92,9 @@ def _by_name(
             raise ConfigError.at_field(field, f"{name} answers to {' and to '.join(others)}", "one counterpart")
     pairs = [(i, names.index(images[name][0])) for i, name in enumerate(names) if images[name]]
     if not pairs:
-        some = ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
-        raise ConfigError.at_field(field, f"no two bodies differ in '{left}' and '{right}'", f"parts of names: {some}")
+        raise ConfigError.at_field(
+            field, f"no two bodies differ in '{left}' and '{right}'", f"parts of names: {join_names(names)}"
+        )
     return [(i, j) for i, j in pairs if i < j and not (names[i] in apart and names[j] in apart)]
 
 

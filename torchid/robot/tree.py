@@ -239,12 +239,12 @@ def _locked_pose(joint: TreeJoint, reverse: bool, mimics: dict[str, Mimic]) -> A
     """Pose of the next link in the previous one, seen from the base, across a joint that does not move."""
     T_parent_child = joint_origin(joint)
     if joint.name in mimics:
-        T_parent_child = T_parent_child @ joint_motion(joint, mimics[joint.name].offset)
+        T_parent_child = T_parent_child @ joint_transform(joint, mimics[joint.name].offset)
     T_parent_child = T_parent_child @ _child_offset(joint)
     return _inverse(T_parent_child) if reverse else T_parent_child
 
 
-def joint_motion(joint: TreeJoint, position: float) -> Array:
+def joint_transform(joint: TreeJoint, position: float) -> Array:
     """Pose of the child link in a joint's frame at a position [rad or m], (4, 4)."""
     axis, T = joint.axis / np.linalg.norm(joint.axis), np.eye(4)
     if joint.type == "prismatic":

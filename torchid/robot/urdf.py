@@ -54,7 +54,7 @@ def parse_xml(path: Path) -> etree._ElementTree:
     return urdf_document(path)
 
 
-def is_bolted(path: Path) -> bool:
+def has_fixed_base(path: Path) -> bool:
     """Whether a robot's file says that its base does not move: MJCF without a free joint; a URDF never says."""
     if not is_mjcf(path):
         return False

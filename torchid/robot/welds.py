@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from torchid.errors import ConfigError, UnknownNameError
-from torchid.robot.tree import joint_motion, joint_origin, resolve_mimics
+from torchid.errors import ConfigError, UnknownNameError, join_names
+from torchid.robot.tree import joint_origin, joint_transform, resolve_mimics
 from torchid.robot.urdf import MOVING_TYPES, TreeJoint, position_limits
 
 WELD_FIELD = "robot.weld"
@@ -90,7 +90,7 @@ def matching_joints(field: str, key: str, moving: Iterable[str], names: Iterable
     pattern, moving = any(sign in key for sign in "*?"), list(moving)
     matches = [name for name in moving if (fnmatchcase(name, key) if pattern else name == key)]
     if not matches and pattern:
-        raise ConfigError.at_field(field, f"'{key}' matches no joint that moves", f"among {_first(moving)}")
+        raise ConfigError.at_field(field, f"'{key}' matches no joint that moves", f"among {join_names(moving)}")
     if not matches:
         raise UnknownNameError.at_field(field, key, moving, "a fixed joint" if key in names else "")
     return matches
@@ -100,16 +100,11 @@ def _field(key: str) -> str:
     return f"{WELD_FIELD}.{key}"
 
 
-def _first(names: Iterable[str], most: int = 6) -> str:
-    names = list(names)
-    return ", ".join(names[:most]) + (", ..." if len(names) > most else "")
-
-
 def weld_joints(joints: Sequence[TreeJoint], positions: Mapping[str, float]) -> list[TreeJoint]:
     """The joints, those with a position fixed there."""
 
     def welded(joint: TreeJoint) -> TreeJoint:
-        origin = joint_origin(joint) @ joint_motion(joint, positions[joint.name])
+        origin = joint_origin(joint) @ joint_transform(joint, positions[joint.name])
         changes: dict[str, Any] = {"type": "fixed", "mimic": None, "origin": origin}
         return replace(joint, **changes)
 

@@ -36,7 +36,7 @@ class Candidate:
 
     `kind`: one of `KINDS`. `dofs`: indices in the robot's `dof_names` that a torque sensor, or a force/torque sensor in
     a limb, measures. `contact`: index of the contact, and `components`, in `WRENCH_COMPONENTS`, of a sensor there; that
-    of a scalar sensor is the one along the ground's normal of a contact with such axes, see `read_along_normals`.
+    of a scalar sensor is the one along the ground's normal of a contact with such axes, see `with_scalar_candidates`.
     `name`: the joint; the contact's frame for a whole device, "l_sole.fx" for one axis of it, "l_sole.fn" for a scalar
     sensor.
     """
@@ -157,7 +157,7 @@ def _with_costs(offered: Sequence[Candidate], costs: Mapping[str, float]) -> tup
     return tuple(replace(c, cost=float(price)) for c, price in zip(offered, prices, strict=True))
 
 
-def read_along_normals(
+def with_scalar_candidates(
     contacts: Sequence[Contact], candidates: Iterable[Candidate], sensors: SensorSet | None = None
 ) -> tuple[Contact, ...]:
     """The contacts, those at which there are candidates of kind "normal_force" with the ground's axes.
@@ -261,7 +261,7 @@ def demands(
     seed: int = 0,
     joint_position: Array | None = None,
 ) -> list[Demand]:
-    """Demands of some contact states, each group of contacts once; none for a bolted base.
+    """Demands of some contact states, each group of contacts once; none for a fixed base.
 
     Args:
         robot: the robot.

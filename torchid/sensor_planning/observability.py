@@ -25,7 +25,7 @@ from torchid.sensor_planning.demands import (
     contained_candidates,
     demands,
     orthonormal_basis,
-    read_along_normals,
+    with_scalar_candidates,
 )
 
 _ZERO = 1e-5  # share of a unit vector that counts as zero
@@ -104,7 +104,7 @@ def assess_sensors(
     seed: int = 0,
     postures: Mapping[ContactState, Array] | None = None,
 ) -> list[BaseObservability]:
-    """Observability of the base with a sensor set in every contact state, from S_b V_x; none for a bolted base.
+    """Observability of the base with a sensor set in every contact state, from S_b V_x; none for a fixed base.
 
     Args:
         robot: the robot.
@@ -118,7 +118,7 @@ def assess_sensors(
     """
     if robot.fixed_base:
         return []
-    contacts = read_along_normals(contacts, choice, sensors)
+    contacts = with_scalar_candidates(contacts, choice, sensors)
     choice = [
         c for c in choice if c.kind != "normal_force" or (c.contact is not None and contacts[c.contact].along_normal)
     ]

@@ -19,7 +19,14 @@ from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet
 from torchid.sensing.projection import base_rank
-from torchid.sensor_planning.demands import Candidate, candidates, demands, read_along_normals, sensor_set, total_cost
+from torchid.sensor_planning.demands import (
+    Candidate,
+    candidates,
+    demands,
+    sensor_set,
+    total_cost,
+    with_scalar_candidates,
+)
 from torchid.sensor_planning.observability import BaseObservability, assess_sensors, base_values
 from torchid.sensor_planning.ranking import (
     MotionStack,
@@ -69,7 +76,7 @@ class PlanningProblem:
 
     def __post_init__(self) -> None:
         """Give contacts the axes that scalar sensors read along."""
-        object.__setattr__(self, "contacts", read_along_normals(self.contacts, self.candidates))
+        object.__setattr__(self, "contacts", with_scalar_candidates(self.contacts, self.candidates))
 
     @cached_property
     def stack(self) -> MotionStack:
@@ -313,7 +320,7 @@ def _removals(problem: PlanningProblem, chosen: Sequence[Candidate], report: Ste
 
 
 def _base_rank(problem: PlanningProblem, chosen: Sequence[Candidate]) -> int | None:
-    """Least rank(S_b V_x) over the states, each at a generic posture; None for a bolted base."""
+    """Least rank(S_b V_x) over the states, each at a generic posture; None for a fixed base."""
     if problem.robot.fixed_base:
         return None
     postures = random_postures(problem.robot, _TRIED, np.random.default_rng(problem.seed))

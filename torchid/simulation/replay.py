@@ -33,8 +33,8 @@ class ReplayedLog:
         time: (N,) [s].
         position, velocity: (N, n), of the joints [rad or m, rad/s or m/s].
         torque: (N, n), of the joints [N m or N].
-        quat_xyzw: (N, 4), base to world; None of a bolted base that stands upright.
-        angular_velocity: (N, 3), of the base in its own axes [rad/s]; None of a bolted one.
+        quat_xyzw: (N, 4), base to world; None of a fixed base that stands upright.
+        angular_velocity: (N, 3), of the base in its own axes [rad/s]; None of a fixed one.
         active: (N, F) bool, which feet stand on the floor.
     """
 
@@ -110,7 +110,7 @@ class Drift:
     Attributes:
         time: (T,) since the beginning of a window [s].
         joints: (W, T, n), position of the joints less that of the log [rad or m].
-        tilt: (W, T), angle between the base's orientations [rad]; None of a bolted base.
+        tilt: (W, T), angle between the base's orientations [rad]; None of a fixed base.
     """
 
     time: Array
@@ -142,7 +142,7 @@ def replay_log(
     Args:
         model: the robot.
         log: the log.
-        feet: what stands on the floor, in the order of `log.active`; not used for a bolted base.
+        feet: what stands on the floor, in the order of `log.active`; not used for a fixed base.
         windows: (W, 2) int, from `ReplayedLog.windows`.
         times: (T,) since the beginning of a window at which the drift is wanted [s], ascending.
         progress: called with the number of windows done.

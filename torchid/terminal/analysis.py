@@ -115,7 +115,7 @@ def _headline(scenarios: Sequence[ScenarioAnalysis]) -> str:
 def _stack_headline(scenario: ScenarioAnalysis) -> str:
     """What sensors determine that are judged by all samples together."""
     plan, base = scenario.plan, scenario.base
-    if scenario.proposed is not None:  # of a bolted robot
+    if scenario.proposed is not None:  # of a robot with a fixed base
         found = f"{base.rank} combinations of {int(base.free.sum())} parameters"
         return f"The sensors of the file determine at best {found}, all samples together"
     sensors = f"{len(plan.chosen)} of {len(plan.problem.candidates)} sensors"

@@ -10,7 +10,7 @@ from torchid.commands.sample import DrawnSamples
 from torchid.errors import format_count
 from torchid.parameters import COULOMB, MASS, PARAMETERS, PER_BODY, Array
 from torchid.problem.metrics import describe_worse, worse_than_nominal
-from torchid.report.sample_files import sample_table
+from torchid.report.sample_files import table_of_draws
 from torchid.report.tables import error_tables, print_tables, terminal_width
 from torchid.terminal.lines import LABEL, column_lines, error_lines, labelled, wrap_words
 
@@ -81,7 +81,7 @@ def sample_lines(drawn: DrawnSamples, width: int, verbose: bool = False) -> list
         width: of the terminal.
         verbose: with all parameters.
     """
-    fitted, table = drawn.fitted, sample_table(drawn.samples)
+    fitted, table = drawn.fitted, table_of_draws(drawn.samples)
     total = np.quantile(table[:, MASS : len(fitted.posterior.nominal) : PER_BODY].sum(axis=1), _ENDS)
     lines = wrap_words(
         f"{format_count(len(table), 'sample')}, each inside all conditions; 95 % of them have a total mass of "

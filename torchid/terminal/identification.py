@@ -1,4 +1,4 @@
-"""What `torchid identify` prints: the answer on one screen, or all that a run says of its fit."""
+"""What `torchid identify` prints, the answer on one screen or all that a run says of its fit, and `compress`."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from textwrap import shorten
 import numpy as np
 
 from torchid.commands.answer import answer
+from torchid.commands.compress import Compression
 from torchid.commands.results import Identification
 from torchid.commands.training import body_eigenvalues
 from torchid.errors import join_names
@@ -19,6 +20,7 @@ from torchid.fitting.misfit import Misfit
 from torchid.parameters import PARAMETERS, PER_BODY, Array
 from torchid.problem.metrics import ADVICE, DECISIVE_GROUPS, WorseThanNominal, describe_errors, describe_worse
 from torchid.report.tables import (
+    compression_table,
     contribution_table,
     error_tables,
     extra_table,
@@ -250,3 +252,12 @@ def _print_validation(validation: CrossValidation, nominal_of: str) -> None:
     texts = (describe_errors(group, identified.rms_of(group), nominal.rms_of(group)) for group in DECISIVE_GROUPS)
     text = f"each of {validation.folds} blocks, against {nominal_of}: {'; '.join(filter(None, texts))}"
     print_labelled("held out", text)
+
+
+def print_compression(done: Compression) -> None:
+    """Print contact states, noise, and the files of factors."""
+    print_tables(state_table([asdict(state) for state in done.states]))
+    print_noise(done.noise)
+    print_tables(compression_table([asdict(file) for file in done.files]))
+    print_rolling(done.rolling)
+    print(f"written to    {done.output}")

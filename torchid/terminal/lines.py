@@ -100,7 +100,7 @@ def print_rolling(rolling: str) -> None:
 
 
 def print_noise(noise: NoiseSummary) -> None:
-    """Print the noise that rows were weighed with, and what should be stated where residuals contradict it."""
+    """Print the noise that rows were weighted with, and what should be stated where residuals contradict it."""
     print_tables(noise_table([asdict(group) for group in noise.groups]))
     if noise.suggested:
         print_labelled("noise", noise_advice(noise.suggested))

@@ -1,0 +1,33 @@
+"""Joints for simulators have the friction and inertia that the equations have, and none is there that nobody drives."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from synthetic import random_states
+
+from torchid import Regressor, parameters
+from torchid.report.joint_exports import isaaclab_text, joint_parameters, parameters_export
+from torchid.robot import Robot
+
+
+def test_joints_have_the_friction_of_those_that_mimic_them(small: Robot) -> None:
+    """Torques at the independent joints are those of the regressor, the follower's friction in the slide's."""
+    rng, phi = np.random.default_rng(0), np.zeros_like(small.nominal)
+    phi[1:, parameters.FRICTION] = rng.uniform(0.1, 1.0, (len(phi) - 1, 2))
+    q, v, a = random_states(rng, small.n, 20)
+    rows = (Regressor(small)(*map(torch.tensor, (q, v, a))).numpy() @ phi.flatten())[:, small.base_rows :]
+    of_joints = zip(joint_parameters(small, phi, {}), v[:, small.base_rows :].T, strict=True)
+    torque = [joint.coulomb * np.sign(speed) + joint.viscous * speed for joint, speed in of_joints]
+    np.testing.assert_allclose(np.column_stack(torque), rows, rtol=0.0, atol=1e-14)
+
+
+def test_a_joint_that_mimics_another_is_no_actuator(small: Robot) -> None:
+    joints = joint_parameters(small, small.nominal, {"slide": 0.3})
+    assert [joint.name for joint in joints] == ["hinge", "slide", "branch"]
+    assert [joint.kind for joint in joints] == ["revolute", "prismatic", "revolute"]
+    assert "follower" not in isaaclab_text(joints, "a run")
+    document = parameters_export(small, small.nominal, joints)["joints"]
+    assert document["slide"]["armature"] == pytest.approx(0.3)
+    assert set(document) == {"hinge", "slide", "branch"}

@@ -1,0 +1,148 @@
+"""Copies of this process, by fork, that work on its other cores: nothing has to be imported or handed over to them.
+
+Whoever calls torchid as a library may have threads that a copy lacks: only the command line allows copies.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import pickle
+import signal
+import sys
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
+from multiprocessing.connection import Connection
+from typing import Generic, TypeVar
+
+from torchid.staging import interrupts_deferred
+
+T = TypeVar("T")
+Item = TypeVar("Item")
+
+_allowed = False
+
+
+@contextmanager
+def copies_allowed() -> Iterator[None]:
+    """Let functions within the block be called by copies of this process, on systems where that is safe."""
+    global _allowed
+    _allowed = sys.platform == "linux"  # libraries of macOS fail in copies, Windows has none
+    try:
+        yield
+    finally:
+        _allowed = False
+
+
+class Copy(Generic[T]):
+    """A copy of this process that calls a function, in a `with` block at whose end it is gone.
+
+    Where copies are not allowed, or the copy meets a warning, an error or its end, this process calls the function
+    itself when it needs the result: it says whatever there is to say.
+    """
+
+    def __init__(self, work: Callable[[], T]) -> None:
+        """Start it.
+
+        Args:
+            work: what it calls; the result pickles.
+        """
+        self._work = work
+        self._process: multiprocessing.context.ForkProcess | None = None
+        self._results: Connection | None = None
+
+    def __enter__(self) -> Copy[T]:
+        if _allowed and not _uses_a_gpu():
+            context = multiprocessing.get_context("fork")
+            with interrupts_deferred(), suppress(OSError):  # no memory, or too many processes
+                self._results, sender = context.Pipe(duplex=False)
+                with sender, warnings.catch_warnings():
+                    warnings.simplefilter("ignore", DeprecationWarning)  # Python 3.12: of threads that a copy lacks
+                    ends = self._results, sender
+                    self._process = context.Process(target=_call, args=(self._work, *ends), daemon=True)
+                    self._process.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._process is not None and self._process.pid is not None:
+            self._process.kill()
+            self._process.join()
+        if self._results is not None:
+            self._results.close()
+
+    def result(self) -> T:
+        """What the function returns, or raises."""
+        if self._results is not None:
+            with suppress(EOFError, OSError, pickle.UnpicklingError):
+                done, value = self._results.recv()
+                if done:
+                    return value
+        return self._work()
+
+
+@contextmanager
+def in_copies(items: Sequence[Item], work: Callable[[Item], T], count: int) -> Iterator[Callable[[], list[T]]]:
+    """Copies of this process that work on some items within the block, while this process does something else.
+
+    Args:
+        items: about the same work each.
+        work: a function of one; its result pickles.
+        count: of copies.
+
+    Yields:
+        What waits for them: the results in the order of the items.
+    """
+    count = min(count, len(items))
+
+    def share(first: int) -> list[T]:
+        return [work(item) for item in items[first::count]]
+
+    def results() -> list[T]:
+        shares = [copy.result() for copy in copies]
+        return [shares[number % count][number // count] for number in range(len(items))]
+
+    with ExitStack() as stack:
+        copies = [stack.enter_context(Copy(partial(share, first))) for first in range(count)]
+        yield results
+
+
+def share_between_copies(items: Sequence[Item], work: Callable[[Item], T], count: int) -> list[T]:
+    """What a function makes of each of some items, in their order; this process works on some, its copies on others.
+
+    Args:
+        items: about the same work each.
+        work: a function of one; its result pickles.
+        count: of processes, this one included.
+    """
+    count = max(min(count, len(items)), 1)
+    others = [item for number, item in enumerate(items) if number % count]
+    with in_copies(others, work, count - 1) as results:
+        own = [work(item) for item in items[::count]]
+        rest = iter(results())
+    return [next(rest) if number % count else own[number // count] for number in range(len(items))]
+
+
+def _uses_a_gpu() -> bool:
+    """Whether this process has a connection to a GPU, which a copy cannot use."""
+    torch = sys.modules.get("torch")
+    return torch is not None and torch.cuda.is_initialized()
+
+
+def _call(work: Callable[[], T], results: Connection, sender: Connection) -> None:
+    """Send what a function returns, or that it did not without a warning."""
+    global _allowed
+    _allowed = False
+    results.close()  # so that sending fails once the original has gone
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that waits, which ends this one
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    if (torch := sys.modules.get("torch")) is not None:
+        torch.set_num_threads(1)  # threads of the original are not there
+    message: tuple[bool, T | None] = (False, None)
+    with suppress(Exception), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.simplefilter("ignore", DeprecationWarning)
+        warnings.simplefilter("ignore", PendingDeprecationWarning)
+        message = (True, work())
+    with suppress(Exception):
+        sender.send(message)
