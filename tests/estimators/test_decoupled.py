@@ -48,7 +48,7 @@ def test_a_body_that_no_row_sees_stays_nominal_and_changes_nothing(prior: Prior,
     assert found.objective == without.objective
     assert np.abs(deviation(problem, found.phi)[1]).max() > 0.01, "others move"
     assert not found.observable[unseen].any()
-    assert (found.verdict[unseen] == "cannot be seen").all()
+    assert (found.verdict[unseen] == "unobservable").all()
 
 
 def test_a_total_mass_or_mirror_image_couples_what_no_row_sees() -> None:
