@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from faults import found, only
+from scipy.spatial.transform import Rotation
 from synthetic import Array
 from welded import machine
 
@@ -68,6 +70,17 @@ def test_a_reversed_sensor_and_one_of_another_gain_are_named_whatever_their_offs
         heavy = only(seen(lambda wrench, offset=offset: offset + 1.5 * wrench), "weight")  # type: ignore[misc]
         assert (heavy.severity, heavy.channels) == (SUSPICIOUS, ("ankle_ft",))
         assert "reads 1.5 times" in heavy.found
+
+
+@pytest.mark.parametrize("rpy", [(0, 0, 90), (90, 0, 0), (0, -90, 180)])
+def test_a_sensor_mounted_in_another_right_angle_is_named_with_the_axes(seen: Seen, rpy: tuple[int, ...]) -> None:
+    to_sensor = Rotation.from_euler("xyz", rpy, degrees=True).as_matrix()
+    turned = only(seen(lambda wrench: wrench @ np.kron(np.eye(2), to_sensor.T)), "frame", "ft_wrench")
+    assert (turned.severity, turned.channels) == (SUSPICIOUS, ("ankle_ft",))
+    words = re.search(r"x, y, z are (-?[xyz]), (-?[xyz]), (-?[xyz]) of the readings", turned.advice)
+    assert words is not None
+    back = [np.eye(3)["xyz".index(word[-1])] * (-1.0 if word[0] == "-" else 1.0) for word in words.groups()]
+    np.testing.assert_allclose(np.array(back) @ to_sensor, np.eye(3), atol=1e-12)
 
 
 def test_a_sensor_with_gaps_is_not_judged_and_said_so(seen: Seen) -> None:

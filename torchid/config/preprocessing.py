@@ -29,7 +29,7 @@ def _threshold(value: object) -> object:
 class PreprocessingConfig:
     """Zero-phase low-pass [Hz] and resampling [Hz]; None leaves the signals as they are.
 
-    `cutoff_hz`: auto, the one beyond which derived accelerations of the training logs are more noise than motion.
+    `cutoff_hz`: auto, one that the motion of the training logs and its noise ask for, see `choose_cutoff`.
     `bridge_gaps_s`: gaps (NaN) of at most so long [s] are filled before anything else is done; None leaves them.
     `contact_margin_s`: samples that are dropped before and after each change of contact [s], None for none.
     `detect_contacts`: true, or its settings, for contact flags from joint torques (`DetectionConfig`) in the place of

@@ -14,6 +14,7 @@ from torchid.estimators.barrier import solve_barrier
 from torchid.estimators.conditions import Conditions, validate_parameters
 from torchid.estimators.conic_formulation import Prior, build_conic_problem
 from torchid.estimators.conic_problem import ConicProblem, Solution
+from torchid.estimators.decoupled import with_decoupled_fixed
 from torchid.estimators.least_squares import ConstrainedEstimate, Minimizer, Regularized, report_rounding
 from torchid.estimators.ridge_limit import RidgeLimit, ridge_limit
 from torchid.parameters import Array
@@ -52,9 +53,9 @@ class Consistent(Regularized):
     With `ridge` 0 the limit for ridge -> 0, the least prior among all minimizers: parameters that the data do not
     determine stay nominal. With active conditions that limit need not exist, see `ridge_limit`.
 
-    Parameters that are not free stay nominal, whether or not they meet the conditions (see `violations`). "barrier"
-    stays strictly inside them; "certified" meets them to the accuracy of its solver, mostly 1e-9 of the scale, and
-    warns beyond 1e-7.
+    Parameters that are not free stay nominal, whether or not they meet the conditions (see `violations`); so do those
+    that neither rows nor conditions couple to others. "barrier" stays strictly inside them; "certified" meets them to
+    the accuracy of its solver, mostly 1e-9 of the scale, and warns beyond 1e-7.
 
     Attributes:
         prior: "euclidean", ||(phi - nominal) / scale||^2; "pullback", sum of ||J_0^-1/2 (J - J_0) J_0^-1/2||^2 over
@@ -116,10 +117,11 @@ class Consistent(Regularized):
         return self._minimum(problem, certify=False).minimizer
 
     def _minimum(self, problem: LinearProblem, certify: bool) -> _Minimum:
-        data = build_conic_problem(problem, self.conditions, self.ridge, self.prior)
+        coupled = with_decoupled_fixed(problem, self.conditions)
+        data = build_conic_problem(coupled, self.conditions, self.ridge, self.prior)
         limit = RidgeLimit(data)
         if self.ridge == 0.0 and len(data.linear):
-            limit = ridge_limit(problem, self.conditions, self.prior, self.rank_tolerance)
+            limit = ridge_limit(coupled, self.conditions, self.prior, self.rank_tolerance)
         conic = limit.conic
         solution = _solve(conic, self.method, limit.tolerance)
         certified_gap = None
@@ -130,8 +132,8 @@ class Consistent(Regularized):
         if conic is not data:
             solution = limit.without_ridge(solution, data)
         phi, psi = problem.nominal.copy(), None
-        moved, terms = np.split(data.deviations @ solution.x, [int(problem.free.sum())])
-        phi[problem.free] += problem.scale[problem.free] * moved
+        moved, terms = np.split(data.deviations @ solution.x, [int(coupled.free.sum())])
+        phi[coupled.free] += problem.scale[coupled.free] * moved
         if problem.terms is not None:
             psi = problem.terms.size * terms
         return _Minimum(Minimizer(phi, psi), data, solution, certified_gap)

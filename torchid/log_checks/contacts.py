@@ -19,6 +19,7 @@ from torchid.log_checks.findings import (
     find_spans,
     median_step,
 )
+from torchid.log_checks.mistakes import quarter_turns
 from torchid.log_checks.model import (
     COMPARED_SAMPLES,
     bind_some_samples,
@@ -202,6 +203,8 @@ def _delay_findings(log: Log, contact: _Contact, size: FloatArray, weight: float
 _MIN_AIR_SAMPLES = 20
 #: Correlation of reading and model that separates the weight beyond a sensor from its offset: the limb must turn.
 _MIN_CORRELATION = 0.9
+#: Misfit of a sensor's forces that loads and offsets do not make, and the share of it that another frame may leave.
+_MIN_FRAME_MISFIT, _MAX_TURNED_SHARE = 0.7, 0.35
 _LIMB_SENSOR_CHECK = "limb sensors in the air"
 
 
@@ -244,12 +247,28 @@ def _contacts_beyond(robot: Robot, contacts: Sequence[Contact], name: str) -> li
     return [number for number, contact in enumerate(contacts) if is_beyond(robot.links[contact.frame][0])]
 
 
+def _turned_sensor(measured: FloatArray, model: FloatArray) -> str | None:
+    """The quarter turn that makes measured forces (M, 3) those of the model, in words, if they are not without one."""
+
+    def misfit(forces: FloatArray) -> float:
+        return float(np.linalg.norm(forces - model)) / max(float(np.linalg.norm(model)), 1e-9)
+
+    as_read = misfit(measured)
+    left, words = min((misfit(measured @ R.T), words) for words, R in quarter_turns())
+    return words if as_read > _MIN_FRAME_MISFIT and left < _MAX_TURNED_SHARE * as_read else None
+
+
 def _limb_sensor_findings(name: str, measured: FloatArray, model: FloatArray, robot: Robot) -> Iterator[Finding]:
     """Findings about measured forces (M, 3) of a sensor against those of the URDF's bodies, (M, 3)."""
     weight = float(np.linalg.norm(model.mean(axis=0)))
     x, y = model - model.mean(axis=0), measured - measured.mean(axis=0)
     product = float((x * y).sum())
     correlated = abs(product) > _MIN_CORRELATION * np.linalg.norm(x) * np.linalg.norm(y)
+    if not correlated and (turned := _turned_sensor(measured, model)) is not None:
+        text = f"{name}: in the air it reads what hangs on it by the {robot.format} along axes turned by right angles"
+        advice = f"turn forces and moments into the joint's child frame, whose {turned}"
+        yield Finding("frame", SUSPICIOUS, "ft_wrench", text, advice, (name,))
+        return
     gain = product / float(np.square(x).sum()) if correlated else 1.0
     text = f"{name}: in the air it reads {gain:.3g} times what hangs on it by the {robot.format} ({weight:.3g} N)"
     if gain < 0.0:

@@ -8,6 +8,7 @@ import numpy as np
 
 from torchid.errors import InputError, join_names
 from torchid.log_checks.findings import CONDEMNED, SUSPICIOUS, Finding, Skipped
+from torchid.log_checks.lag_and_tilt import check_lag_and_tilt
 from torchid.log_checks.mistakes import possible_mistakes
 from torchid.log_checks.model import (
     MAX_TRIAL_DIFFERENTIATED_SAMPLES,
@@ -99,16 +100,32 @@ def check_forces_against_urdf(
     if log.joint_torque is None and log.contact_wrench is None:
         yield Skipped(_FORCE_CHECK, "neither joint torques nor contact wrenches")
         return
+    yield from _misfit_findings(log, samples, robot, contacts, cutoff, derived)
+
+
+def _misfit_findings(
+    log: Log,
+    samples: Sequence[Samples],
+    robot: Robot,
+    contacts: Sequence[Contact],
+    cutoff: float,
+    derived: tuple[str, ...],
+) -> Iterator[Finding | Skipped]:
+    """The mistake that explains forces unlike the URDF's, or single deviations of forces that are like them."""
     fit = fit_nominal_model(samples, robot, contacts)
     explanation = None
     if fit.misfit > MAX_MISFIT:
         explanation = _best_mistake(log, robot, contacts, cutoff, fit, derived)
-    scale = _fit_time_scale(log, robot, contacts) if explanation is None else None
-    explanation = explanation or _time_scale_finding(scale)
     if explanation is not None:
         yield explanation
         return
-    if fit.misfit > MAX_MISFIT and (scale is None or scale.recorded > MAX_UNEXPLAINED_RATIO):
+    moved, unexplained = check_lag_and_tilt(log, robot, contacts, cutoff, derived)
+    scale = None if moved else _fit_time_scale(log, robot, contacts)
+    if found := moved or [one for one in [_time_scale_finding(scale)] if one is not None]:
+        yield from found
+        return
+    unexplained = unexplained if scale is None else min(unexplained, scale.recorded)
+    if fit.misfit > MAX_MISFIT and unexplained > MAX_UNEXPLAINED_RATIO:
         alike = list(_common_gain_findings(fit_torque_gains(samples, robot, contacts)))
         yield from alike
         if alike:

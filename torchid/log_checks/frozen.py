@@ -55,6 +55,8 @@ _FLOAT32_ROUNDING_SHARE = 2.0 * float(np.finfo(np.float32).eps)
 _MIN_GRID_SHARE, _MIN_GRID_STEPS, _MAX_GRID_QUANTA, _GRID_TOLERANCE_QUANTA = 0.95, 10, 10.5, 0.1
 #: Quantiles of the step size at which a quantum is looked for.
 _SMALL_STEP_QUANTILES = (0.001, 0.005, 0.02)
+#: Turn [degrees] from which on a base moves.
+_MIN_TURN_DEG = 1.0
 #: Runs of repeats in one channel above which none is checked: coarse channels repeat all the time.
 _MAX_RUNS = 20000
 
@@ -331,6 +333,24 @@ def _smallest_difference(sides: list[FloatArray], rounding: FloatArray) -> Float
     sizes = np.concatenate([*sides, *(np.abs(np.diff(side, axis=1)) for side in sides)], axis=1)
     least = np.where(sizes > rounding, sizes, np.inf).min(axis=1)  # NaN compares false
     return np.where(np.isfinite(least), least, 0.0)
+
+
+def check_still_base(log: Log) -> Iterator[Finding]:
+    """A finding about a position of the base that never changes although the base turns: nobody measured it.
+
+    A base that is held neither turns nor moves, and one that turns about its origin for good is none.
+    """
+    position, quat = log.base_position_world, log.base_quat_xyzw
+    if position is None or quat is None or np.ptp(position, axis=0).any():
+        return
+    turned = np.degrees(2.0 * np.arccos(np.clip(np.abs(quat @ quat[0]), 0.0, 1.0))).max()
+    if turned < _MIN_TURN_DEG:
+        return
+    text = f"one position throughout, though the base turns by {turned:.2g} degrees"
+    others = (log.base_linear_velocity_world, log.base_linear_acceleration_world, log.imu_specific_force)
+    severity = SUSPICIOUS if all(other is None for other in others) else NOTE  # else nothing is derived from it
+    advice = "leave it out and give an IMU or the base's velocity, or set preprocessing.base_motion: contacts"
+    yield Finding("constant position", severity, "base_position_world", text, advice)
 
 
 def check_scalar_wrenches(log: Log) -> Iterator[Finding]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -177,6 +178,21 @@ def _unit_mistakes(field: str, quantity: str) -> Iterator[Mistake]:
         yield Mistake(field, f"in {units}", advice, _multiply(field, factor))
 
 
+def quarter_turns() -> Iterator[tuple[str, NDArray[np.float64]]]:
+    """Sensors mounted in other right angles: how to get the frame's components, and the matrix (3, 3) that does."""
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            R = np.diag(signs) @ np.eye(3)[list(order)]
+            if np.linalg.det(R) > 0.0 and not np.array_equal(R, np.eye(3)):
+                axes = ("-" * (sign < 0.0) + "xyz"[axis] for sign, axis in zip(signs, order, strict=True))
+                yield f"x, y, z are {', '.join(axes)} of the readings", R
+
+
+def _turn_wrench(field: str, R: NDArray[np.float64]) -> Callable[[Log], Log]:
+    both = np.kron(np.eye(2), R)
+    return _change(lambda log: {field: getattr(log, field) @ both.T})
+
+
 def _wrench_mistakes(field: str, other: str) -> Iterator[Mistake]:
     reverse = "reverse it: wrenches are what the ground exerts on the robot"
     yield Mistake(field, "all reversed", reverse, _multiply(field, -1.0))
@@ -189,6 +205,10 @@ def _wrench_mistakes(field: str, other: str) -> Iterator[Mistake]:
     axes = "along the world's axes" if other == WRENCHES[1] else "along the contact frames' axes"
     moved = _change(lambda log: {other: getattr(log, field), field: None, "moments_about_world_origin": False})
     yield Mistake(field, axes, f"call it {other}", moved)
+    if field == WRENCHES[0]:
+        for axes, R in quarter_turns():
+            turn = f"turn forces and moments into the contact frames, whose {axes}"
+            yield Mistake(field, "along axes turned by right angles", turn, _turn_wrench(field, R))
 
 
 def _flip_world(log: Log) -> Log:

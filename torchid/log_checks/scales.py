@@ -42,7 +42,7 @@ _TINY = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class _NormalEquations:
+class NormalEquations:
     """Normal equations of whitened rows [K, Y], K scaled by the prior's standard deviations, by blocks of time.
 
     Attributes:
@@ -65,7 +65,7 @@ class _NormalEquations:
         return np.asarray(G - C.T @ np.linalg.solve(H, C))
 
 
-def _measured_sensors(samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact]) -> SensorSet:
+def measured_sensors(samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact]) -> SensorSet:
     """The sensors that are read in all samples; their noise is the unmodelled force of each kind."""
     torque = np.zeros(robot.n_dofs, bool)
     wrench = np.zeros((len(contacts), 6), bool)
@@ -100,7 +100,7 @@ def _missing_friction_scale(samples: Sequence[Samples], robot: Robot) -> FloatAr
     return np.maximum(out, _TINY)
 
 
-def _prior_columns(builder: RowBuilder, robot: Robot, samples: Sequence[Samples]) -> FloatArray:
+def prior_columns(builder: RowBuilder, robot: Robot, samples: Sequence[Samples]) -> FloatArray:
     """Matrix (columns, P) from parameters in standard deviations of the prior to the builder's columns."""
     scale = URDF_ERROR * parameter_scale(robot.nominal)
     scale[:, parameters.FRICTION] = 0.0
@@ -115,7 +115,7 @@ def _prior_columns(builder: RowBuilder, robot: Robot, samples: Sequence[Samples]
 
 
 @torch.no_grad()
-def _whitened_rows(builder: RowBuilder, samples: Samples) -> tuple[FloatArray, FloatArray, BoolArray]:
+def whitened_rows(builder: RowBuilder, samples: Samples) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Whitened rows (N, n_rows, columns + 1), their bases W (N, n_rows, n_rows), and which rows are not zero."""
     n_rows = builder.tree.n_rows
     rows, W = np.zeros((len(samples), n_rows, builder.width + 1)), np.zeros((len(samples), n_rows, n_rows))
@@ -126,7 +126,7 @@ def _whitened_rows(builder: RowBuilder, samples: Samples) -> tuple[FloatArray, F
     return rows, W, np.asarray(np.abs(W).any(axis=1))
 
 
-def _accumulate_blocks(parts: Sequence[tuple[FloatArray, FloatArray, BoolArray]]) -> _NormalEquations:
+def accumulate_blocks(parts: Sequence[tuple[FloatArray, FloatArray, BoolArray]]) -> NormalEquations:
     """Normal equations of parts of a log: K (N, n_rows, P), Y (N, n_rows, k) and which rows are not zero."""
     K, Y, equations = (np.concatenate(part) for part in zip(*parts, strict=True))
     products = []
@@ -134,7 +134,7 @@ def _accumulate_blocks(parts: Sequence[tuple[FloatArray, FloatArray, BoolArray]]
         A, B = K[block].reshape(-1, K.shape[2]), Y[block].reshape(-1, Y.shape[2])
         products.append((A.T @ A, A.T @ B, B.T @ B))
     KtK, KtY, YtY = (np.array(product) for product in zip(*products, strict=True))
-    return _NormalEquations(KtK, KtY, YtY, int(equations.sum()))
+    return NormalEquations(KtK, KtY, YtY, int(equations.sum()))
 
 
 # -------------------------------------------------------------------------------------------------------- scale of time
@@ -206,27 +206,27 @@ def fit_time_scale(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_h
         return bind_some_samples(logs, robot, contacts, TIME_SCALE_SAMPLES)
 
     recorded, doubled, at_rest = samples_at(1.0), samples_at(2.0), samples_at(_REST_FACTOR)
-    sensors = _measured_sensors(recorded, robot, contacts)
+    sensors = measured_sensors(recorded, robot, contacts)
     if not (sensors.torque[: robot.n] & ~robot.is_passive[: robot.n]).any() and not sensors.wrench.any():
         return None  # no force was measured: any factor explains none
     builder = RowBuilder(robot, contacts, sensors)
     parts = []
-    columns = _prior_columns(builder, robot, recorded)
+    columns = prior_columns(builder, robot, recorded)
     phi = robot.nominal.flatten()[None]
     for one, two, rest in zip(recorded, doubled, at_rest, strict=True):
-        rows, W, equations = _whitened_rows(builder, rest)
+        rows, W, equations = whitened_rows(builder, rest)
         total, slower, gravity = (force_series(builder, part, phi)[1][0] for part in (one, two, rest))
         quadratic = 2.0 * (total - gravity) - 4.0 * (slower - gravity)
         terms = [gravity, total - gravity - quadratic, quadratic]
         projected = [rows[..., -1], *(np.einsum("nvr,nv->nr", W, term) for term in terms)]
         rate = one.joint_velocity
-        extra = _joint_terms(builder, W, torch.sign(rate), rate, one.joint_acceleration, torch.ones_like(rate))
+        extra = joint_terms(builder, W, torch.sign(rate), rate, one.joint_acceleration, torch.ones_like(rate))
         K = np.concatenate([rows[..., :-1] @ columns, *extra], axis=2)
         parts.append((K, np.stack(projected, axis=2), equations))
-    return _best_factor(_accumulate_blocks(parts))
+    return _best_factor(accumulate_blocks(parts))
 
 
-def _joint_terms(builder: RowBuilder, W: FloatArray, *values: torch.Tensor) -> list[FloatArray]:
+def joint_terms(builder: RowBuilder, W: FloatArray, *values: torch.Tensor) -> list[FloatArray]:
     """Columns of joint torques in proportion to values (N, n), scaled by the prior whatever the size of the values."""
     base = builder.tree.base_rows
     out = []
@@ -237,7 +237,7 @@ def _joint_terms(builder: RowBuilder, W: FloatArray, *values: torch.Tensor) -> l
     return out
 
 
-def _best_factor(equations: _NormalEquations) -> TimeScale:
+def _best_factor(equations: NormalEquations) -> TimeScale:
     u = np.stack([np.ones_like(_TIME_FACTORS), -np.ones_like(_TIME_FACTORS), -1 / _TIME_FACTORS, -1 / _TIME_FACTORS**2])
 
     def cost(block: int | None) -> FloatArray:
@@ -276,16 +276,16 @@ class TorqueGains:
 
 def fit_torque_gains(samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact]) -> TorqueGains | None:
     """Factors of single torques and the point of wrenches; None where neither was measured."""
-    sensors = _measured_sensors(samples, robot, contacts)
+    sensors = measured_sensors(samples, robot, contacts)
     joints = np.flatnonzero((sensors.torque & ~robot.is_passive)[: robot.n])
     if not len(joints) and not _has_moments(sensors.wrench):
         return None
     builder = RowBuilder(robot, contacts, sensors)
-    columns = _prior_columns(builder, robot, samples)
+    columns = prior_columns(builder, robot, samples)
     nominal = builder.columns.parameter_map @ robot.nominal.flatten()
     parts = []
     for part in samples:
-        rows, W, equations = _whitened_rows(builder, part)
+        rows, W, equations = whitened_rows(builder, part)
         torque = np.zeros((len(part), builder.tree.base_rows + robot.n_dofs, len(joints)))
         for index, joint in enumerate(joints):
             torque[:, builder.tree.base_rows + joint, index] = builder.recorded_torque(part)[:, joint].numpy()
@@ -294,10 +294,10 @@ def fit_torque_gains(samples: Sequence[Samples], robot: Robot, contacts: Sequenc
         contact_part = rows[..., -1] - projected[..., : len(joints)].sum(axis=2)
         target = rows[..., :-1] @ nominal - contact_part
         rate = part.joint_velocity
-        extra = _joint_terms(builder, W, torch.sign(rate), rate, torch.ones_like(rate))
+        extra = joint_terms(builder, W, torch.sign(rate), rate, torch.ones_like(rate))
         K = np.concatenate([rows[..., :-1] @ columns, *extra], axis=2)
         parts.append((K, np.concatenate([target[..., None], projected], axis=2), equations))
-    return _solve_gains(_accumulate_blocks(parts), joints)
+    return _solve_gains(accumulate_blocks(parts), joints)
 
 
 def _point_shift_forces(builder: RowBuilder, samples: Samples, measured: np.ndarray) -> FloatArray:
@@ -321,7 +321,7 @@ def _has_moments(measured: np.ndarray) -> bool:
     return bool(measured.size and measured.all())
 
 
-def _solve_gains(equations: _NormalEquations, joints: np.ndarray) -> TorqueGains:
+def _solve_gains(equations: NormalEquations, joints: np.ndarray) -> TorqueGains:
     m = len(joints)
     prior_mean = np.append(np.ones(m), np.zeros(3))
     precision = np.append(np.full(m, _GAIN_PRIOR_STD), np.full(3, _POINT_PRIOR_STD_M)) ** -2.0

@@ -1,0 +1,115 @@
+"""Torques that are late, gravity that is not along the log's vertical, and a base that turns in one place."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from faults import demo_log, of_demo, only
+from mistaken import Case, case_of, checked
+from motions import value
+from scipy.spatial.transform import Rotation
+from synthetic import Array
+from walking import MACHINES
+
+from torchid.log_checks import NOTE, SUSPICIOUS, Checked
+from torchid.log_checks.frozen import check_still_base
+from torchid.logs import Log
+from torchid.logs.stretches import with_delayed_torques
+
+VECTORS = ("base_position_world", "base_linear_velocity_world", "base_linear_acceleration_world")
+
+
+def alarms(found: Checked) -> list[tuple[str, str]]:
+    return [(one.name, one.field) for one in found.findings if one.severity != NOTE]
+
+
+def tilted(log: Log, rotvec_deg: Array) -> Log:
+    """The same motion as told in a world that is turned."""
+    R = Rotation.from_rotvec(np.radians(rotvec_deg))
+    turned: dict[str, Any] = {name: R.apply(x) for name in VECTORS if (x := getattr(log, name)) is not None}
+    if log.contact_wrench_world is not None:
+        turned["contact_wrench_world"] = log.contact_wrench_world @ np.kron(np.eye(2), R.as_matrix().T)
+    return replace(log, base_quat_xyzw=(R * Rotation.from_quat(value(log.base_quat_xyzw))).as_quat(), **turned)
+
+
+OF_FILTERS_MS = 5.0  # those of the sensors of some robots are late by 10 ms
+CASES = [("arm", "contacts"), ("quadruped", "full"), ("biped", "joints")]
+
+
+@pytest.mark.parametrize("seconds", [0.1, -0.06])
+@pytest.mark.parametrize(("machine", "sensors"), CASES)
+def test_torques_that_are_late_or_early_are_named_with_the_time(machine: str, sensors: str, seconds: float) -> None:
+    case = case_of(MACHINES[machine], sensors)
+    finding = only(checked(case, with_delayed_torques(case.log, seconds)), "delay", "joint_torque")
+    assert finding.severity == SUSPICIOUS
+    found = re.match(r"torques are ([\d.]+) \+- ([\d.]+) ms (later|earlier)", finding.found)
+    assert found is not None
+    late = float(found[1]) * (1.0 if found[3] == "later" else -1.0)
+    assert late == pytest.approx(1e3 * seconds + OF_FILTERS_MS, abs=8.0)
+    assert float(found[2]) < 10.0
+    shift = re.search(r"actuators.delay: (-?[\d.]+)$", finding.advice)
+    assert shift is not None
+    assert float(shift[1]) == pytest.approx(-1e-3 * late, rel=0.06)
+
+
+@pytest.mark.parametrize("machine", ["quadruped", "biped", "demo"])
+def test_a_world_that_is_tilted_is_named_with_the_angles(machine: str) -> None:
+    case: Case | None = None if machine == "demo" else case_of(MACHINES[machine], "full")
+    log = demo_log() if case is None else case.log
+    slanting = tilted(log, np.array([9.6, -7.2, 0.0]))
+    finding = only(of_demo(slanting) if case is None else checked(case, slanting), "tilt", "base_quat_xyzw")
+    assert finding.severity == SUSPICIOUS
+    found = re.match(r"gravity is ([\d.]+) degrees from down \(([-\d.]+) and ([-\d.]+) about the world", finding.found)
+    assert found is not None
+    assert float(found[2]) == pytest.approx(9.6, abs=2.0)
+    assert float(found[3]) == pytest.approx(-7.2, abs=2.0)
+    assert "base_tilt: auto" in finding.advice
+
+
+def test_an_arm_on_a_table_that_slants_is_told_so() -> None:
+    case = case_of(MACHINES["arm"], "contacts")
+    gravity = Rotation.from_rotvec(np.radians([0.0, 12.0, 0.0])).apply([0.0, 0.0, -9.81])
+    torque = slanting_torque(case, gravity)
+    finding = only(checked(case, replace(case.log, joint_torque=torque)), "tilt", "base")
+    assert "about the base's own x and y axes" in finding.found
+    assert re.match(r"gravity is 1[0-4]", finding.found)
+
+
+def slanting_torque(case: Case, gravity: Array) -> Array:
+    """Recorded torques with what another direction of gravity adds to them, by Pinocchio and the URDF."""
+    pin = pytest.importorskip("pinocchio")
+    model = pin.buildModelFromUrdf(str(case.machine.urdf))
+    data, q = model.createData(), case.log.joint_position
+    order = [model.getJointId(name) - 1 for name in case.log.joint_names]
+    loads = []
+    for g in (gravity, np.array([0.0, 0.0, -9.81])):
+        model.gravity.linear = g
+        at = np.zeros((len(q), model.nv))
+        at[:, order] = q
+        loads.append(np.array([pin.computeGeneralizedGravity(model, data, one) for one in at])[:, order])
+    return np.asarray(value(case.log.joint_torque) + loads[0] - loads[1])
+
+
+def test_a_base_that_turns_in_one_place_is_named_unless_nothing_is_derived_from_that() -> None:
+    rates: dict[str, Any] = dict.fromkeys(VECTORS[1:])
+    log = demo_log()
+    still = replace(log, base_position_world=np.tile(value(log.base_position_world)[:1], (len(log), 1)), **rates)
+    finding = only(of_demo(still), "constant position", "base_position_world")
+    assert finding.severity == SUSPICIOUS
+    assert "the base turns by 19 degrees" in finding.found
+    assert "base_motion: contacts" in finding.advice
+    moving = replace(still, base_linear_velocity_world=0.1 * np.random.default_rng(0).normal(size=(len(log), 3)))
+    (known,) = check_still_base(moving)
+    assert known.severity == NOTE
+    assert not list(check_still_base(replace(still, base_quat_xyzw=np.tile([0.0, 0.0, 0.0, 1.0], (len(log), 1)))))
+
+
+def test_clean_logs_give_no_alarm() -> None:
+    assert alarms(of_demo(demo_log())) == []
+    for machine, sensors in CASES:
+        case = case_of(MACHINES[machine], sensors)
+        assert alarms(checked(case, case.log)) == [], machine

@@ -1,0 +1,223 @@
+"""How late torques are, and how far gravity is from the log's vertical, estimated for all URDFs near the given one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from torchid.errors import InputError
+from torchid.log_checks.findings import SUSPICIOUS, Finding
+from torchid.log_checks.model import MAX_TRIAL_DIFFERENTIATED_SAMPLES, bind_some_samples, preprocess_pieces
+from torchid.log_checks.scales import (
+    BLOCKS,
+    CORRELATED_SAMPLES,
+    accumulate_blocks,
+    joint_terms,
+    measured_sensors,
+    prior_columns,
+    whitened_rows,
+)
+from torchid.logs import Log
+from torchid.logs.log import FloatArray
+from torchid.logs.stretches import with_delayed_torques
+from torchid.problem import RowBuilder, Samples
+from torchid.problem.predict import force_series
+from torchid.regressor.kinematics import GRAVITY_WORLD
+from torchid.robot import Robot
+from torchid.sensing import Contact
+
+#: Samples that are compared.
+_SAMPLES = 240
+#: Lag and tilt that are reported: filters of sensors are late by 10 ms, and a table is level to 2 degrees.
+MIN_LAG_S, MIN_TILT_DEG = 0.025, 6.0
+#: Size of such a deviation in standard deviations, and the share of it that every block of time must show.
+_MIN_STANDARD_DEVIATIONS, _MIN_BLOCK_SHARE = 4.0, 0.5
+#: Unexplained forces without the deviation over those with it (1.2 at most in logs without a mistake), and what it may
+#: leave: more, and the forces are another robot's.
+_MIN_UNEXPLAINED_RATIO, _MAX_LEFT = 1.25, 1.5
+#: Prior standard deviations of the lag [s] and of the tilt [rad].
+_LAG_PRIOR_STD_S, _TILT_PRIOR_STD_RAD = 0.2, 0.3
+#: Times that torques are shifted by what the slope of their readings says, which is exact for small lags alone.
+_SHIFTS, _LEAST_SHIFT_S = 8, 2e-3
+_SMALL_ANGLE = 1e-4
+
+Columns = Callable[[RowBuilder, Samples, int], FloatArray]
+"""Change of the generalized forces that are required (N, n_rows, k) by a unit of each unknown, of samples by number."""
+
+
+@dataclass(frozen=True, eq=False)
+class Deviation:
+    """Unknowns beside the parameters, estimated with these.
+
+    Attributes:
+        value, spread: (k,), of the whole log, and their standard deviations.
+        blocks: (BLOCKS, k), by block of time.
+        without, left: forces that the best URDF near the given one leaves unexplained without the unknowns and with
+            them, rms in `UNMODELLED_FORCE_SHARE` of the forces.
+    """
+
+    value: FloatArray
+    spread: FloatArray
+    blocks: FloatArray
+    without: float
+    left: float
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the largest unknown is certain, every block agrees, and forces are explained much better with it."""
+        k = int(np.argmax(np.abs(self.value)))
+        agree = self.blocks[:, k] * np.sign(self.value[k]) > _MIN_BLOCK_SHARE * abs(self.value[k])
+        certain = abs(self.value[k]) > _MIN_STANDARD_DEVIATIONS * self.spread[k]
+        improves = self.without > _MIN_UNEXPLAINED_RATIO * self.left and self.left < _MAX_LEFT
+        return bool(certain and agree.all() and improves)
+
+    @property
+    def gain(self) -> str:
+        """How much better forces are explained with it."""
+        return f"{self.without / max(self.left, 1e-9):.2g} times as much is unexplained otherwise"
+
+
+def check_lag_and_tilt(
+    log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: float, derived: tuple[str, ...] = ()
+) -> tuple[list[Finding], float]:
+    """Findings about torques that are later or earlier than the motion, and about a vertical that gravity is not along.
+
+    The number is what the best URDF near the given one leaves unexplained without either, in
+    `UNMODELLED_FORCE_SHARE` of the forces; infinite where nothing could be compared.
+
+    Args:
+        log: the log.
+        robot: the robot.
+        contacts: of it.
+        cutoff_hz: of the filter.
+        derived: how names of fields begin that nobody recorded.
+    """
+    try:
+        lag = fit_lag(log, robot, contacts, cutoff_hz)
+        tilt = fit_tilt(log, robot, contacts, cutoff_hz) if not "base_quat_xyzw".startswith(derived) else None
+    except InputError:  # reported by `check_forces_against_urdf`
+        return [], np.inf
+    unexplained = min((x.without for x in (lag, tilt) if x is not None), default=np.inf)
+    return [*_lag_findings(lag), *_tilt_findings(tilt, robot)], unexplained
+
+
+def _lag_findings(lag: Deviation | None) -> Iterator[Finding]:
+    if lag is not None and abs(lag.value[0]) > MIN_LAG_S and lag.is_clear:
+        seconds, late = float(lag.value[0]), "later" if lag.value[0] > 0.0 else "earlier"
+        text = f"torques are {1e3 * abs(seconds):.3g} +- {1e3 * lag.spread[0]:.2g} ms {late} than the motion"
+        advice = f"check their stamps and filters, or set actuators.delay: {-seconds:.2g}"
+        yield Finding("delay", SUSPICIOUS, "joint_torque", f"{text}: {lag.gain}", advice)
+
+
+def _tilt_findings(tilt: Deviation | None, robot: Robot) -> Iterator[Finding]:
+    if tilt is not None and np.linalg.norm(tilt.value) > np.radians(MIN_TILT_DEG) and tilt.is_clear:
+        x, y = np.degrees(tilt.value)
+        of = "the base's own" if robot.fixed_base else "the world's"
+        text = f"gravity is {np.hypot(x, y):.2g} degrees from down ({x:.2g} and {y:.2g} about {of} x and y axes)"
+        field = "base" if robot.fixed_base else "base_quat_xyzw"
+        advice = "check the mounting of the base" if robot.fixed_base else "check that the world's z axis points up"
+        yield Finding("tilt", SUSPICIOUS, field, f"{text}: {tilt.gain}", f"{advice}, or set robot.base_tilt: auto")
+
+
+def fit_lag(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: float) -> Deviation | None:
+    """By how much joint torques are later than the motion, (1,) [s]; None where no torque was measured.
+
+    Raises:
+        InputError: the log cannot be filtered, or does not match the robot.
+    """
+    if log.joint_torque is None:
+        return None
+    out, shift = None, 0.0
+    for _ in range(_SHIFTS):
+        moved = with_delayed_torques(log, -shift)
+        pieces = preprocess_pieces(moved, cutoff_hz, MAX_TRIAL_DIFFERENTIATED_SAMPLES)
+        slopes = [replace(one, joint_torque=_slope(one)) for one in pieces]
+        rates = bind_some_samples(slopes, robot, contacts, _SAMPLES)
+
+        def columns(builder: RowBuilder, part: Samples, number: int, rates: Sequence[Samples] = rates) -> FloatArray:
+            torque = np.zeros((len(part), builder.tree.n_rows, 1))
+            base = builder.tree.base_rows
+            torque[:, base : base + robot.n, 0] = builder.recorded_torque(rates[number])[:, : robot.n].numpy()
+            return np.nan_to_num(torque)
+
+        found = _fit(bind_some_samples(pieces, robot, contacts, _SAMPLES), robot, contacts, columns, _LAG_PRIOR_STD_S)
+        if found is None:
+            return None
+        without = found.without if out is None else out.without
+        out = replace(found, value=found.value + shift, blocks=found.blocks + shift, without=without)
+        shift = float(out.value[0])
+        if abs(found.value[0]) < _LEAST_SHIFT_S or abs(shift) > 2.0 * _LAG_PRIOR_STD_S:
+            break
+    return out
+
+
+def _slope(log: Log) -> FloatArray | None:
+    return None if log.joint_torque is None else np.gradient(log.joint_torque, log.time, axis=0)
+
+
+def fit_tilt(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: float) -> Deviation | None:
+    """By how much gravity is turned about x and y from where the log says it is, (2,) [rad].
+
+    The axes are the world's, of a bolted base its own. None where no force was measured, or an IMU felt gravity.
+
+    Raises:
+        InputError: as `fit_lag`.
+    """
+    if log.imu_specific_force is not None and not robot.fixed_base:
+        return None
+    pieces = preprocess_pieces(log, cutoff_hz, MAX_TRIAL_DIFFERENTIATED_SAMPLES)
+    samples = bind_some_samples(pieces, robot, contacts, _SAMPLES)
+
+    def columns(builder: RowBuilder, part: Samples, number: int) -> FloatArray:
+        phi = robot.nominal.flatten()[None]
+        level = force_series(builder, part, phi)[1][0]
+        turned = [force_series(builder, _turned(part, axis), phi)[1][0] for axis in range(2)]
+        return np.stack([level - one for one in turned], axis=2) / _SMALL_ANGLE
+
+    return _fit(samples, robot, contacts, columns, _TILT_PRIOR_STD_RAD)
+
+
+def _turned(samples: Samples, axis: int) -> Samples:
+    """Samples in which gravity is turned by a small angle about an axis of the world, or of a bolted base."""
+    base, angle = samples.base, _SMALL_ANGLE * np.eye(3)[axis]
+    if base.specific_force is None or base.rotation is None:
+        return replace(samples, base=base.tilted(-angle[:2], len(samples)))
+    change = base.specific_force.new_tensor(np.cross(angle, GRAVITY_WORLD))
+    return replace(samples, base=replace(base, specific_force=base.specific_force - change @ base.rotation))
+
+
+def _fit(
+    samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact], columns: Columns, prior_std: float
+) -> Deviation | None:
+    """Unknowns by their columns, beside parameters, friction, armature and offsets of torques."""
+    sensors = measured_sensors(samples, robot, contacts)
+    if not (sensors.torque[: robot.n] & ~robot.is_passive[: robot.n]).any() and not sensors.wrench.any():
+        return None
+    builder = RowBuilder(robot, contacts, sensors)
+    prior = prior_columns(builder, robot, samples)
+    nominal = builder.columns.parameter_map @ robot.nominal.flatten()
+    parts = []
+    for number, part in enumerate(samples):
+        rows, W, equations = whitened_rows(builder, part)
+        target = rows[..., :-1] @ nominal - rows[..., -1]
+        projected = np.einsum("nvr,nvk->nrk", W, columns(builder, part, number))
+        rate = part.joint_velocity
+        extra = joint_terms(builder, W, torch.sign(rate), rate, part.joint_acceleration, torch.ones_like(rate))
+        K = np.concatenate([rows[..., :-1] @ prior, *extra], axis=2)
+        parts.append((K, np.concatenate([target[..., None], projected], axis=2), equations))
+    normal = accumulate_blocks(parts)
+
+    def solve(block: int | None) -> tuple[FloatArray, FloatArray, float, float]:
+        G = normal.unexplained(block)
+        H = G[1:, 1:] + CORRELATED_SAMPLES / prior_std**2 * np.eye(len(G) - 1)
+        x = np.linalg.solve(H, G[1:, 0])
+        left = G[0, 0] - 2.0 * G[0, 1:] @ x + x @ G[1:, 1:] @ x
+        return np.asarray(x), np.asarray(np.diag(np.linalg.inv(H))), float(G[0, 0]), float(left)
+
+    value, variance, without, left = solve(None)
+    unexplained = np.sqrt(np.maximum([without, left], 0.0) / max(normal.rows, 1))
+    spread = np.sqrt(CORRELATED_SAMPLES * max(1.0, float(unexplained[1]) ** 2) * variance)
+    return Deviation(value, spread, np.array([solve(block)[0] for block in range(BLOCKS)]), *map(float, unexplained))
