@@ -58,7 +58,7 @@ def started(urdf: Path, bag: Path) -> tuple[Initiated, dict[str, Any], Log]:
 
 
 def test_a_bag_of_every_type_is_read_as_it_was_recorded(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    log = with_velocity(read_log(DEMO / "sway_train.npz").select(slice(0, 120)))
+    log = with_velocity(read_log(DEMO / "sway_train.npz").select(slice(0, 300)))
     path = write_bag(tmp_path / "x.mcap", entries_of(log))
     said, topics, again = started(URDF, path)
     assert said.missing == []

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from torchid.logs import Log
 from torchid.logs.joint_orders import JOINT_ORDERS, MOTORS
+from torchid.logs.log import FloatArray
 from torchid.robot import Robot
 
 Array = NDArray[Any]
@@ -153,8 +154,16 @@ def stem(name: str) -> str:
     return name
 
 
+SLIDES = ("panda_finger_joint1",)
+
+
+def shown(joint: str, values: FloatArray, of_hinges: float) -> FloatArray:
+    """Positions or velocities of a joint as its driver shows them: times a factor, those of slides in mm."""
+    return values * (1e3 if joint in SLIDES else of_hinges)
+
+
 def numbered_csv(path: Path, motion: Motion) -> Path:
-    """Motors by number from 1 on, in degrees, rpm and ms, feet by number from 0 on.
+    """Motors by number from 1 on, in degrees, rpm and ms (slides in mm and mm/s), feet by number from 0 on.
 
     Numbers are in the order of the URDF, those of a Go2 as its maker has them.
     """
@@ -163,8 +172,9 @@ def numbered_csv(path: Path, motion: Motion) -> Path:
     is_go2 = set(log.joint_names) == set(GO2)
     order = [log.joint_names.index(name) for name in (GO2 if is_go2 else log.joint_names)]
     for number, k in enumerate(order, 1):
-        columns[f"motor{number}_position"] = np.degrees(log.joint_position[:, k])
-        columns[f"motor{number}_speed"] = value(log.joint_velocity)[:, k] * 30.0 / np.pi
+        joint = log.joint_names[k]
+        columns[f"motor{number}_position"] = shown(joint, log.joint_position[:, k], 180.0 / np.pi)
+        columns[f"motor{number}_speed"] = shown(joint, value(log.joint_velocity)[:, k], 30.0 / np.pi)
         columns[f"motor{number}_torque"] = value(log.joint_torque)[:, k]
         columns[f"motor{number}_temperature"] = np.full(SAMPLES, 40)
     feet = FEET if is_go2 else log.contact_names
@@ -206,9 +216,9 @@ def camel_csv(path: Path, motion: Motion) -> Path:
     """Names in capitals without separators, as of a controller in C++ or of a spreadsheet, in an order of their own."""
     log, columns = motion.log, {"Time": motion.log.time}
     for k in shuffled(log):
-        name = camel(log.joint_names[k])
-        columns[f"{name}.Position"] = np.degrees(log.joint_position[:, k])
-        columns[f"{name}.Velocity"] = np.degrees(value(log.joint_velocity)[:, k])
+        joint, name = log.joint_names[k], camel(log.joint_names[k])
+        columns[f"{name}.Position"] = shown(joint, log.joint_position[:, k], 180.0 / np.pi)
+        columns[f"{name}.Velocity"] = shown(joint, value(log.joint_velocity)[:, k], 180.0 / np.pi)
         columns[f"{name}.Torque"] = value(log.joint_torque)[:, k]
     columns |= {f"Gyro.{axis}": x for axis, x in zip("XYZ", _parts(log.imu_angular_velocity), strict=False)}
     columns |= {f"Accelerometer.{axis}": x for axis, x in zip("XYZ", _parts(log.imu_specific_force), strict=False)}

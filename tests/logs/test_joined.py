@@ -232,7 +232,7 @@ def test_files_that_make_up_no_log_are_refused_in_one_line(log: Log, tmp_path: P
         "motion.npz + foreign.npz": "foreign.npz: ",
         "torques.npz + motion.npz[9:]": "time range: [9:] of a log that lasts 4 s",
         "motion.npz + walk.mcap": "walk.mcap: file: a bag, one of several files",
-        "motion.npz + torques.txt": "torques.txt: file: extension '.txt'",
+        "motion.npz + torques.wav": "torques.wav: file: extension '.wav'",
     }
     for name, found in refusals.items():
         with pytest.raises(LogError) as raised:
