@@ -58,7 +58,10 @@ def assert_recorded(found: Log, log: Log) -> None:
 @pytest.mark.parametrize(
     "names", [("X", "Y", "Z"), ("p1", "p2", "p3"), ("pos_0", "pos_1", "pos_2"), ("x [mm]", "y [mm]", "z [mm]")]
 )
-@pytest.mark.parametrize("quaternion", [("QW", "QX", "QY", "QZ"), ("e0", "e1", "e2", "e3"), ("ow", "ox", "oy", "oz")])
+@pytest.mark.parametrize(
+    "quaternion",
+    [("QW", "QX", "QY", "QZ"), ("Qw", "Qx", "Qy", "Qz"), ("e0", "e1", "e2", "e3"), ("ow", "ox", "oy", "oz")],
+)
 def test_the_pose_of_a_base_is_known_by_its_numbers(
     tmp_path: Path, names: tuple[str, ...], quaternion: tuple[str, ...]
 ) -> None:

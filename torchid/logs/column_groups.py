@@ -20,7 +20,7 @@ from torchid.logs.units import OF_JOINTS, quantities_with, split_unit
 _NUMBER = re.compile(r"\d+")
 _AXIS = re.compile(
     r"(?<=[._\-/\[ ])([wxyz])(?=$|[\]])|(?<=[a-zFM_.\-/\[ \u0080-\uffff])([WXYZ])(?=$|[\]])|(?<=[a-zFM])([wxyz])$"
-    r"|(?<=[a-z])([XYZ])(?=[/_.])|^([wxyzWXYZ])$|(?<=(?<![A-Za-z])[PQ])([WXYZ])$",
+    r"|(?<=[a-z])([XYZ])(?=[/_.])|^([wxyzWXYZ])$|(?<=(?<![A-Za-z])[PQ])([WXYZwxyz])$",
 )
 _BEHIND = re.compile(r"[_./ \[-]*\{[^{}]*\}\]?$")  # a unit: the axis in `acc_g.{axis}`
 
