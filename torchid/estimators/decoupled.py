@@ -17,7 +17,7 @@ def with_decoupled_fixed(problem: LinearProblem, conditions: Conditions) -> Line
     """The problem with bodies and friction fixed that no row sees and whose nominal values are allowed.
 
     A solver ends within a tolerance of the least objective, which parameters that only a small ridge holds hardly
-    change: a KUKA's bolted base drifts by 8e-3 of its scale with a ridge of 1e-7. It also keeps away from conditions
+    change: a KUKA's fixed base drifts by 8e-3 of its scale with a ridge of 1e-7. It also keeps away from conditions
     that nothing pushes them to.
 
     Args:

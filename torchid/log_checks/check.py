@@ -148,13 +148,11 @@ def check(
     if units := list(check_angle_unit(repaired, robot)):  # thresholds of position steps are in radians
         results = [x for x in results if not (isinstance(x, Finding) and x.name == "step" and x.whole)]
     results += [*units, *([] if "contact_active" in derived else check_contact_flags(repaired, robot))]
-    results += check_scalar_wrenches(repaired)
-    results += check_still_base(repaired)
+    results += [*check_scalar_wrenches(repaired), *check_still_base(repaired)]
     repaired = repair_log(log, _findings(results))
     blocking = _blocking_finding(results)
     if blocking is None or blocking.field != "time":
-        results += check_derivatives(repaired)
-        results += check_angular_velocity(repaired, robot)
+        results += [*check_derivatives(repaired), *check_angular_velocity(repaired, robot)]
         results += check_accelerometer(repaired, robot)
     if _blocking_finding(results) is None:
         results += unclosed or check_loops(repaired, robot)

@@ -161,7 +161,7 @@ def _slope(log: Log) -> FloatArray | None:
 def fit_tilt(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: float) -> Deviation | None:
     """By how much gravity is turned about x and y from where the log says it is, (2,) [rad].
 
-    The axes are the world's, of a bolted base its own. None where no force was measured, or an IMU felt gravity.
+    The axes are the world's, of a fixed base its own. None where no force was measured, or an IMU felt gravity.
 
     Raises:
         InputError: as `fit_lag`.
@@ -181,7 +181,7 @@ def fit_tilt(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: flo
 
 
 def _turned(samples: Samples, axis: int) -> Samples:
-    """Samples in which gravity is turned by a small angle about an axis of the world, or of a bolted base."""
+    """Samples in which gravity is turned by a small angle about an axis of the world, or of a fixed base."""
     base, angle = samples.base, _SMALL_ANGLE * np.eye(3)[axis]
     if base.specific_force is None or base.rotation is None:
         return replace(samples, base=base.tilted(-angle[:2], len(samples)))
