@@ -77,7 +77,7 @@ def test_a_log_that_is_not_usable_ends_with_status_one(folder: Path, capsys: pyt
     assert main(["check", str(folder / "quadruped.yaml")]) == 1
     printed = capsys.readouterr().out
     assert printed.startswith("0 of 2 logs are free of usual mistakes; 1 is not usable; 1 is usable")
-    assert "rejected     joint_position, unit in sway_train.npz: " in printed
+    assert "rejected      joint_position, unit in sway_train.npz: " in printed
 
 
 @pytest.mark.parametrize("samples", [1, 4])
