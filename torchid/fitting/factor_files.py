@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field, TypeAdapter
+from pydantic import Field, TypeAdapter
 from pydantic.dataclasses import dataclass
 
 from torchid import __version__
@@ -28,7 +28,7 @@ from torchid.problem.compressed_log import CompressedLog, piece_spans
 from torchid.problem.compression import FOLDS, block_spans
 from torchid.reprs import short_repr
 from torchid.robot.payloads import Payload
-from torchid.settings import NotNegative, Number
+from torchid.settings import STRICT, NotNegative, Number
 from torchid.staging import atomic_file
 
 FORMAT = 2
@@ -38,7 +38,6 @@ _ACCEPTED = f"a whole {FACTORS} file, as torchid compress writes it"
 _GEOMETRY = ("T_parent_joint", "T_joint_link", "joint_map", "joint_constant", "contact_node", "T_node_contact")
 _EXTRAS = ("sensors.offsets", "sensors.scales", "actuators")
 _LARGEST = 1e30  # of a number: squares stay within the range of float64
-_STRICT = ConfigDict(extra="forbid")
 _Whole = Annotated[int, Field(ge=0, le=2**53)]
 _Text = Annotated[str, Field(max_length=10 * MAX_LETTERS)]
 
@@ -71,7 +70,7 @@ class FactorFile:
     __repr__ = short_repr
 
 
-@dataclass(config=_STRICT, frozen=True)
+@dataclass(config=STRICT, frozen=True)
 class _State:
     name: _Text
     samples: _Whole
@@ -82,14 +81,14 @@ class _State:
     base_rank_shares: dict[int, NotNegative]
 
 
-@dataclass(config=_STRICT, frozen=True)
+@dataclass(config=STRICT, frozen=True)
 class _Unloaded:
     start: _Whole
     stop: _Whole
     parts: list[PackedPart]
 
 
-@dataclass(config=_STRICT, frozen=True)
+@dataclass(config=STRICT, frozen=True)
 class _Description:
     format: int
     torchid: _Text

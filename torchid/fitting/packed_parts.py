@@ -8,19 +8,19 @@ from typing import Annotated
 
 import numpy as np
 import torch
-from pydantic import ConfigDict, Field
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from torchid.guards import MAX_LETTERS
 from torchid.parameters import Array
 from torchid.problem import TriangularFactor
 from torchid.problem.compression import Part
-from torchid.settings import NotNegative
+from torchid.settings import STRICT, NotNegative
 
 _Whole = Annotated[int, Field(ge=0, le=2**53)]
 
 
-@dataclass(config=ConfigDict(extra="forbid"), frozen=True)
+@dataclass(config=STRICT, frozen=True)
 class PackedPart:
     """A part but for the numbers of its triangles, as documents of JSON have it.
 

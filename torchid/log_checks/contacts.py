@@ -26,11 +26,12 @@ from torchid.log_checks.model import (
     default_cutoff_hz,
     preprocess_pieces,
 )
-from torchid.log_checks.weight import GRAVITY, MAX_MASS_ERROR
+from torchid.log_checks.weight import MAX_MASS_ERROR
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.problem import RowBuilder
 from torchid.problem.predict import force_series
+from torchid.regressor.kinematics import GRAVITY
 from torchid.robot import Robot
 from torchid.rounding import STD_PER_MAD
 from torchid.sensing import Contact, named_sensors

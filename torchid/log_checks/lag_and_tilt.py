@@ -12,8 +12,8 @@ from torchid.errors import InputError
 from torchid.log_checks.findings import SUSPICIOUS, Finding
 from torchid.log_checks.model import MAX_TRIAL_DIFFERENTIATED_SAMPLES, bind_some_samples, preprocess_pieces
 from torchid.log_checks.scales import (
-    BLOCKS,
     CORRELATED_SAMPLES,
+    TIME_BLOCKS,
     accumulate_blocks,
     joint_terms,
     measured_sensors,
@@ -44,7 +44,7 @@ _LAG_PRIOR_STD_S, _TILT_PRIOR_STD_RAD = 0.2, 0.3
 _SHIFTS, _LEAST_SHIFT_S = 8, 2e-3
 _SMALL_ANGLE = 1e-4
 
-Columns = Callable[[RowBuilder, Samples, int], FloatArray]
+UnknownColumns = Callable[[RowBuilder, Samples, int], FloatArray]
 """Change of the generalized forces that are required (N, n_rows, k) by a unit of each unknown, of samples by number."""
 
 
@@ -54,7 +54,7 @@ class Deviation:
 
     Attributes:
         value, spread: (k,), of the whole log, and their standard deviations.
-        blocks: (BLOCKS, k), by block of time.
+        blocks: (TIME_BLOCKS, k), by block of time.
         without, left: forces that the best URDF near the given one leaves unexplained without the unknowns and with
             them, rms in `UNMODELLED_FORCE_SHARE` of the forces.
     """
@@ -190,7 +190,7 @@ def _turned(samples: Samples, axis: int) -> Samples:
 
 
 def _fit(
-    samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact], columns: Columns, prior_std: float
+    samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact], columns: UnknownColumns, prior_std: float
 ) -> Deviation | None:
     """Unknowns by their columns, beside parameters, friction, armature and offsets of torques."""
     sensors = measured_sensors(samples, robot, contacts)
@@ -220,4 +220,6 @@ def _fit(
     value, variance, without, left = solve(None)
     unexplained = np.sqrt(np.maximum([without, left], 0.0) / max(normal.rows, 1))
     spread = np.sqrt(CORRELATED_SAMPLES * max(1.0, float(unexplained[1]) ** 2) * variance)
-    return Deviation(value, spread, np.array([solve(block)[0] for block in range(BLOCKS)]), *map(float, unexplained))
+    return Deviation(
+        value, spread, np.array([solve(block)[0] for block in range(TIME_BLOCKS)]), *map(float, unexplained)
+    )

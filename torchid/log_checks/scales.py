@@ -37,7 +37,7 @@ UNMODELLED_FORCE_SHARE = 0.05
 #: Successive samples that count as one: of 240 out of ten seconds, errors of friction and flexibility are correlated.
 CORRELATED_SAMPLES = 10.0
 #: Blocks of time whose estimates are compared.
-BLOCKS = 6
+TIME_BLOCKS = 6
 _TINY = 1e-9
 
 
@@ -46,9 +46,9 @@ class NormalEquations:
     """Normal equations of whitened rows [K, Y], K scaled by the prior's standard deviations, by blocks of time.
 
     Attributes:
-        KtK: (BLOCKS, P, P).
-        KtY: (BLOCKS, P, k).
-        YtY: (BLOCKS, k, k).
+        KtK: (TIME_BLOCKS, P, P).
+        KtY: (TIME_BLOCKS, P, k).
+        YtY: (TIME_BLOCKS, k, k).
         rows: number of rows.
     """
 
@@ -130,7 +130,7 @@ def accumulate_blocks(parts: Sequence[tuple[FloatArray, FloatArray, BoolArray]])
     """Normal equations of parts of a log: K (N, n_rows, P), Y (N, n_rows, k) and which rows are not zero."""
     K, Y, equations = (np.concatenate(part) for part in zip(*parts, strict=True))
     products = []
-    for block in np.array_split(np.arange(len(K)), BLOCKS):
+    for block in np.array_split(np.arange(len(K)), TIME_BLOCKS):
         A, B = K[block].reshape(-1, K.shape[2]), Y[block].reshape(-1, Y.shape[2])
         products.append((A.T @ A, A.T @ B, B.T @ B))
     KtK, KtY, YtY = (np.array(product) for product in zip(*products, strict=True))
@@ -244,7 +244,7 @@ def _best_factor(equations: NormalEquations) -> TimeScale:
         return np.asarray(np.einsum("ks,kl,ls->s", u, equations.unexplained(block), u))
 
     total = cost(None)
-    blocks = np.array([_TIME_FACTORS[np.argmin(cost(block))] for block in range(BLOCKS)])
+    blocks = np.array([_TIME_FACTORS[np.argmin(cost(block))] for block in range(TIME_BLOCKS)])
     best, unity = int(np.argmin(total)), int(np.argmin(np.abs(np.log(_TIME_FACTORS))))
     residual = np.sqrt(np.maximum(total, 0.0) / max(equations.rows, 1))
     return TimeScale(float(_TIME_FACTORS[best]), blocks, *(float(residual[i]) for i in (best, unity, -1)))
@@ -262,8 +262,8 @@ class TorqueGains:
         gain: (m,) factors.
         point: (3,) [m] in the contact frames.
         spread: (m + 3,) standard deviations of both.
-        blocks: (BLOCKS, m + 3), both by block of time.
-        common: factor of all torques alike, its standard deviation, and by block, (BLOCKS,); None without torques.
+        blocks: (TIME_BLOCKS, m + 3), both by block of time.
+        common: factor of all torques alike, its standard deviation, and by block, (TIME_BLOCKS,); None without torques.
     """
 
     joints: np.ndarray
@@ -349,7 +349,7 @@ def _solve_gains(equations: NormalEquations, joints: np.ndarray) -> TorqueGains:
 def _with_blocks(
     solve: Callable[[int | None], tuple[FloatArray, FloatArray, float]], rows: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Unknowns (k,) of all samples, their standard deviations, and those of each block, (BLOCKS, k)."""
+    """Unknowns (k,) of all samples, their standard deviations, and those of each block, (TIME_BLOCKS, k)."""
     x, variance, residual = solve(None)
     size = max(1.0, residual / max(rows, 1))
-    return x, np.sqrt(CORRELATED_SAMPLES * size * variance), np.array([solve(block)[0] for block in range(BLOCKS)])
+    return x, np.sqrt(CORRELATED_SAMPLES * size * variance), np.array([solve(block)[0] for block in range(TIME_BLOCKS)])

@@ -43,7 +43,7 @@ from torchid.logs.ros_topics import (
 )
 
 if TYPE_CHECKING:
-    from torchid.logs.ros_files import BagFile, Channel
+    from torchid.logs.ros_files import BagChannel, BagFile
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +113,7 @@ class _Bag:
     """A bag with the roles of its topics; several roles may share a topic."""
 
     topics: Topics
-    channels: Mapping[str, Channel]
+    channels: Mapping[str, BagChannel]
     decoders: dict[str, Decoder] = field(default_factory=dict)
     rows: dict[str, TopicMessages] = field(default_factory=dict)
 
@@ -181,13 +181,13 @@ def read_bag(
     }
 
 
-def list_channels(files: list[Path]) -> dict[str, Channel]:
+def list_channels(files: list[Path]) -> dict[str, BagChannel]:
     """The topics of a bag.
 
     Raises:
         LogError: it is damaged, or a topic has several types.
     """
-    channels: dict[str, Channel] = {}
+    channels: dict[str, BagChannel] = {}
     for file in files:
         with open_bag_file(file) as opened:
             for channel in opened.channels():
@@ -220,7 +220,7 @@ def open_bag_file(path: Path) -> Iterator[BagFile]:
         yield file
 
 
-def _listed(channels: Mapping[str, Channel]) -> str:
+def _listed(channels: Mapping[str, BagChannel]) -> str:
     return join_names([f"{name} ({channel.type})" for name, channel in channels.items()], _LISTED) or "no topics"
 
 

@@ -15,7 +15,7 @@ from torchid.errors import InputError, during, join_names, warn
 from torchid.estimators import Estimate
 from torchid.guards import MAX_JSON, read_bytes
 from torchid.identifiability.confounding import ExtraEstimate
-from torchid.parameters import PARAMETERS, PER_BODY, UNITS, Array
+from torchid.parameters import PARAMETER_UNITS, PARAMETERS, PER_BODY, Array
 from torchid.report.loadable_urdf import bound_massless_links, resolve_meshes
 from torchid.robot import Robot
 from torchid.robot.urdf import drop_repeated_origins, parse_xml
@@ -39,7 +39,7 @@ def parameters_document(
     nominal = [{"nominal": _by_name(phi)} for phi in robot.nominal]
     identified = _by_body(robot, estimate, identified=estimate.phi)
     return {
-        "units": dict(zip(PARAMETERS, UNITS, strict=True)),
+        "units": dict(zip(PARAMETERS, PARAMETER_UNITS, strict=True)),
         "frame": "each body's link frame, inertia about its origin",
         "massless": list(robot.massless),
         "verdicts": estimate.verdict_counts(),
