@@ -37,7 +37,8 @@ from torchid.report.analysis import (
     observability_document,
     sensor_plan_document,
 )
-from torchid.report.figures import save_figures, tree_figure
+from torchid.report.figure_style import save_figures
+from torchid.report.figures import tree_figure
 from torchid.report.tables import progress_bars
 from torchid.reprs import short_repr
 from torchid.sensing import Contact, SensorSet

@@ -41,16 +41,10 @@ from torchid.problem.chunks import thread_count
 from torchid.problem.metrics import LOG_SETS, WorseThanNominal, describe_worse, worse_than_nominal
 from torchid.problem.noise_gram import NoiseShares
 from torchid.report import FittedJoints, identified_name, identified_robot, identified_urdf, parameters_document
-from torchid.report.figures import (
-    Drawn,
-    contribution_figure,
-    draw_for,
-    error_figure,
-    identifiability_figure,
-)
+from torchid.report.figure_style import Drawn, draw_for
+from torchid.report.figures import contribution_figure, error_figure, identifiability_figure, ridge_figure
 from torchid.report.forces import ForceSeries, force_figure
 from torchid.report.parameter_figures import extra_figure, parameter_figure
-from torchid.report.ridge import ridge_figure
 from torchid.report.traces import LogForces
 from torchid.robot import Robot
 
