@@ -14,8 +14,18 @@ from typing import Any
 import yaml
 
 from torchid.commands.folder import check_free_file
-from torchid.commands.init_hints import hints, keys_for_gaps, missing_columns, notes_on_arrays
-from torchid.commands.init_proposals import Split, like_torques, limb_sensors, proposed_sensors, read_sensors, split_log
+from torchid.commands.init_proposals import (
+    Split,
+    hints,
+    keys_for_gaps,
+    like_torques,
+    limb_sensors,
+    missing_columns,
+    notes_on_arrays,
+    proposed_sensors,
+    read_sensors,
+    split_log,
+)
 from torchid.commands.reading import memory_needed
 from torchid.config.preprocessing import PreprocessingConfig
 from torchid.errors import ConfigError, InputError, LogError, about_file, excerpt, format_count, join_names
