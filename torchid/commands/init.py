@@ -38,7 +38,7 @@ from torchid.logs.map_proposals import MapProposal, propose_map
 from torchid.logs.name_matching import KnownRobot, within
 from torchid.logs.time_range import split_range
 from torchid.logs.topic_proposals import USED_TYPES, frame_of, propose_topics
-from torchid.regressor.kinematics import GRAVITY_WORLD
+from torchid.regressor.kinematics import GRAVITY
 from torchid.robot import CollisionShapes, Robot, load_robot
 from torchid.robot.urdf import has_fixed_base, position_limits
 from torchid.robot.xml_files import is_mjcf
@@ -158,7 +158,7 @@ def _of_bag(file: Path, robot: Robot) -> tuple[list[_Contact], set[str], MapProp
 def _known(robot: Robot, contacts: Sequence[_Contact]) -> KnownRobot:
     """What the proposal of a map knows of the robot."""
     on_base, elsewhere = ([name for name, (body, _) in robot.links.items() if bool(body) == x] for x in (False, True))
-    feet, weight = [contact.frame for contact in contacts], -GRAVITY_WORLD[2] * float(robot.nominal[:, 0].sum())
+    feet, weight = [contact.frame for contact in contacts], GRAVITY * float(robot.nominal[:, 0].sum())
     known = robot.joint_names, feet, robot.path.stem, weight, robot.base_link, on_base, elsewhere, limb_sensors(robot)
     return KnownRobot(*known, [link for link in on_base if is_along_base(robot, link)], robot.sliding)
 

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 
 from torchid.errors import InputError
 from torchid.log_checks.findings import SUSPICIOUS, Finding
@@ -15,8 +14,9 @@ from torchid.log_checks.scales import (
     CORRELATED_SAMPLES,
     TIME_BLOCKS,
     accumulate_blocks,
-    joint_terms,
+    deviation_columns,
     measured_sensors,
+    measures_force,
     prior_columns,
     whitened_rows,
 )
@@ -194,7 +194,7 @@ def _fit(
 ) -> Deviation | None:
     """Unknowns by their columns, beside parameters, friction, armature and offsets of torques."""
     sensors = measured_sensors(samples, robot, contacts)
-    if not (sensors.torque[: robot.n] & ~robot.is_passive[: robot.n]).any() and not sensors.wrench.any():
+    if not measures_force(sensors, robot):
         return None
     builder = RowBuilder(robot, contacts, sensors)
     prior = prior_columns(builder, robot, samples)
@@ -204,9 +204,7 @@ def _fit(
         rows, W, equations = whitened_rows(builder, part)
         target = rows[..., :-1] @ nominal - rows[..., -1]
         projected = np.einsum("nvr,nvk->nrk", W, columns(builder, part, number))
-        rate = part.joint_velocity
-        extra = joint_terms(builder, W, torch.sign(rate), rate, part.joint_acceleration, torch.ones_like(rate))
-        K = np.concatenate([rows[..., :-1] @ prior, *extra], axis=2)
+        K = deviation_columns(builder, rows, W, part, prior)
         parts.append((K, np.concatenate([target[..., None], projected], axis=2), equations))
     normal = accumulate_blocks(parts)
 

@@ -22,7 +22,7 @@ from torchid.problem import RowBuilder, Samples
 from torchid.problem.chunks import chunks_by_state, one_thread
 from torchid.problem.linear import parameter_scale
 from torchid.problem.predict import force_series
-from torchid.regressor.kinematics import GRAVITY_WORLD
+from torchid.regressor.kinematics import GRAVITY
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet
 
@@ -82,10 +82,15 @@ def measured_sensors(samples: Sequence[Samples], robot: Robot, contacts: Sequenc
                 if part.wrench is not None
             ]
             wrench[k, list(contact.components)] = np.isfinite(np.concatenate(known)).all()
-    weight = -GRAVITY_WORLD[2] * float(robot.nominal[:, parameters.MASS].sum())
+    weight = GRAVITY * float(robot.nominal[:, parameters.MASS].sum())
     moment = size or 0.1 * weight
     noise = SensorNoise(*(max(UNMODELLED_FORCE_SHARE * x, _TINY) for x in (moment, 0.5 * weight, moment)))
     return SensorSet(torque | robot.is_passive, wrench, noise)
+
+
+def measures_force(sensors: SensorSet, robot: Robot) -> bool:
+    """Whether a motor's torque or a contact's wrench is measured."""
+    return bool((sensors.torque & ~robot.is_passive)[: robot.n].any() or sensors.wrench.any())
 
 
 def _missing_friction_scale(samples: Sequence[Samples], robot: Robot) -> FloatArray:
@@ -207,8 +212,8 @@ def fit_time_scale(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_h
 
     recorded, doubled, at_rest = samples_at(1.0), samples_at(2.0), samples_at(_REST_FACTOR)
     sensors = measured_sensors(recorded, robot, contacts)
-    if not (sensors.torque[: robot.n] & ~robot.is_passive[: robot.n]).any() and not sensors.wrench.any():
-        return None  # no force was measured: any factor explains none
+    if not measures_force(sensors, robot):
+        return None  # any factor explains none
     builder = RowBuilder(robot, contacts, sensors)
     parts = []
     columns = prior_columns(builder, robot, recorded)
@@ -219,14 +224,31 @@ def fit_time_scale(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_h
         quadratic = 2.0 * (total - gravity) - 4.0 * (slower - gravity)
         terms = [gravity, total - gravity - quadratic, quadratic]
         projected = [rows[..., -1], *(np.einsum("nvr,nv->nr", W, term) for term in terms)]
-        rate = one.joint_velocity
-        extra = joint_terms(builder, W, torch.sign(rate), rate, one.joint_acceleration, torch.ones_like(rate))
-        K = np.concatenate([rows[..., :-1] @ columns, *extra], axis=2)
+        K = deviation_columns(builder, rows, W, one, columns)
         parts.append((K, np.stack(projected, axis=2), equations))
     return _best_factor(accumulate_blocks(parts))
 
 
-def joint_terms(builder: RowBuilder, W: FloatArray, *values: torch.Tensor) -> list[FloatArray]:
+def deviation_columns(
+    builder: RowBuilder, rows: FloatArray, W: FloatArray, samples: Samples, prior: FloatArray, armature: bool = True
+) -> FloatArray:
+    """Columns (N, n_rows, P) of what may differ from the URDF: parameters, friction, armature, offsets of torques.
+
+    Args:
+        builder: of the rows.
+        rows: from `whitened_rows`.
+        W: their bases.
+        samples: whose motion friction and armature follow.
+        prior: from `prior_columns`.
+        armature: whether it is among them.
+    """
+    rate = samples.joint_velocity
+    accelerated = [samples.joint_acceleration] if armature else []
+    terms = _joint_terms(builder, W, torch.sign(rate), rate, *accelerated, torch.ones_like(rate))
+    return np.concatenate([rows[..., :-1] @ prior, *terms], axis=2)
+
+
+def _joint_terms(builder: RowBuilder, W: FloatArray, *values: torch.Tensor) -> list[FloatArray]:
     """Columns of joint torques in proportion to values (N, n), scaled by the prior whatever the size of the values."""
     base = builder.tree.base_rows
     out = []
@@ -293,9 +315,7 @@ def fit_torque_gains(samples: Sequence[Samples], robot: Robot, contacts: Sequenc
         projected = np.einsum("nvr,nvk->nrk", W, terms)
         contact_part = rows[..., -1] - projected[..., : len(joints)].sum(axis=2)
         target = rows[..., :-1] @ nominal - contact_part
-        rate = part.joint_velocity
-        extra = joint_terms(builder, W, torch.sign(rate), rate, torch.ones_like(rate))
-        K = np.concatenate([rows[..., :-1] @ columns, *extra], axis=2)
+        K = deviation_columns(builder, rows, W, part, columns, armature=False)
         parts.append((K, np.concatenate([target[..., None], projected], axis=2), equations))
     return _solve_gains(accumulate_blocks(parts), joints)
 
