@@ -66,7 +66,7 @@ class CompressedLog:
         """Number of equations, without those of readings in the air."""
         return sum(part.factor.rows for part in self.pieces)
 
-    def block(self, start: int, stop: int, fold: int, builder: RowBuilder) -> CompressedBlock:
+    def block(self, start: int, stop: int, fold: int) -> CompressedBlock:
         """A block of the log."""
         spans = piece_spans(self.samples, self.blocks)
         pieces = zip(spans, self.pieces, strict=True)
@@ -152,7 +152,7 @@ def fold_compressed(logs: Sequence[CompressedLog], builder: RowBuilder) -> list[
         sum(len(log) / log.oversampling for log in logs), sum(len(log.by_state) for log in logs), builder
     )
     layout = lay_out_folds([len(log) for log in logs], count, [log.blocks for log in logs])
-    return [log.block(*block, builder) for log, blocks in zip(logs, layout, strict=True) for block in blocks]
+    return [log.block(*block) for log, blocks in zip(logs, layout, strict=True) for block in blocks]
 
 
 def merge_blocks(blocks: Sequence[CompressedBlock], builder: RowBuilder) -> list[Part]:
