@@ -15,7 +15,7 @@ from torchid.logs.column_proposals import OF_PLATES, is_current, is_desired, pro
 from torchid.logs.cutoff import choose_cutoff
 from torchid.logs.file_samples import FileSample
 from torchid.logs.log import FORCE_NORMAL, WRENCHES
-from torchid.logs.timeline import DROPPED_PERIODS
+from torchid.logs.low_pass import DROPPED_PERIODS
 from torchid.problem.compression import LEAST_PER_FOLD
 from torchid.robot import Robot, load_robot
 from torchid.robot.urdf import fixed_joints
