@@ -19,7 +19,8 @@ from pages import figures_of
 
 import torchid
 from torchid.cli import main
-from torchid.commands.export import EXPORT_FORMATS, export
+from torchid.commands import EXPORT_FORMATS
+from torchid.commands.export import export
 from torchid.commands.reading import LogReader
 from torchid.commands.report import report
 from torchid.config import load_config

@@ -6,6 +6,7 @@ import json
 import warnings
 from pathlib import Path
 
+from torchid.commands import EXPORT_FORMATS
 from torchid.commands.evaluate import FittedRun, read_run
 from torchid.commands.folder import check_free_file
 from torchid.config import inputs_of
@@ -17,8 +18,6 @@ from torchid.report.joint_exports import isaaclab_text, joint_parameters, parame
 from torchid.robot import Robot
 from torchid.robot.xml_files import is_mjcf
 from torchid.staging import atomic_file
-
-EXPORT_FORMATS = ("mjcf", "urdf", "isaaclab", "json")
 
 
 def export(run: str | Path, form: str, output: str | Path | None = None, overwrite: bool = False) -> str:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import torch
 
+from torchid.commands import SAMPLE_FORMATS
 from torchid.commands.evaluate import read_run, require_run
 from torchid.commands.export import robot_text
 from torchid.commands.folder import SAMPLES, check_free, check_free_file, new_folder
@@ -25,7 +26,6 @@ from torchid.staging import atomic_file
 ROBOTS = ("urdf", "mjcf")
 """Formats with a file for each sample."""
 
-SAMPLE_FORMATS = ("npz", *ROBOTS, "ranges")
 COUNT, COUNT_OF_ROBOTS = 10_000, 20
 MOST, MOST_ROBOTS = 200_000, 10_000
 """Samples at most: of a humanoid, 0.6 GB; files of robots in one folder."""
