@@ -81,7 +81,7 @@ MASS_ACCEPTED = "a number greater than 0, or a mapping with value and std [kg]"
 
 Mass = Annotated[MassConfig, BeforeValidator(_mass)]
 
-Loss = Literal["huber", "tukey"]
+LossKind = Literal["huber", "tukey"]
 
 
 @dataclass(config=STRICT, frozen=True)
@@ -92,17 +92,17 @@ class RobustConfig:
     `passes` at most.
     """
 
-    loss: Loss
+    loss: LossKind
     tuning: Positive | None = None
     passes: Count = 50
 
 
 def _by_loss(value: object) -> object:
     """A robust fit as a mapping, where it may be a loss alone."""
-    return {"loss": value} if value in get_args(Loss) else value
+    return {"loss": value} if value in get_args(LossKind) else value
 
 
-ROBUST_ACCEPTED = f"{', '.join(get_args(Loss))}, or a mapping with loss, tuning and passes"
+ROBUST_ACCEPTED = f"{', '.join(get_args(LossKind))}, or a mapping with loss, tuning and passes"
 """Accepted for a robust fit, in messages."""
 
 Robust = Annotated[RobustConfig, BeforeValidator(_by_loss)]

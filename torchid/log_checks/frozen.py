@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from torchid.errors import format_count, join_names
 from torchid.log_checks.findings import (
+    NEIGHBOUR_STEPS,
     NOTE,
     REJECTED,
     SUSPICIOUS,
@@ -34,8 +35,6 @@ DEAD_BAND_FIELDS = (*RATE_FIELDS, "joint_torque", "ft_wrench", *CONTACT_READINGS
 FORCE_FIELDS = ("joint_torque", "ft_wrench", "imu_specific_force", *CONTACT_READINGS)
 #: Logarithm (base 10) of the probability of a run of repeats by chance: none in a million samples.
 MAX_LOG10_PROBABILITY = -8.0
-#: Steps on either side that a run is compared with.
-NEIGHBOUR_STEPS = 10
 #: Typical step in quanta below which repeats are expected: a slow channel on a coarse grid repeats itself.
 _MIN_STEP_QUANTA = 4.0
 #: Speed next to a run over that on the same side of it; a robot that stops smoothly is slower. Noisy channels are

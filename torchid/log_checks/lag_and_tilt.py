@@ -18,7 +18,7 @@ from torchid.log_checks.scales import (
     measured_sensors,
     measures_force,
     prior_columns,
-    whitened_rows,
+    rows_with_bases,
 )
 from torchid.logs import Log
 from torchid.logs.log import FloatArray
@@ -201,7 +201,7 @@ def _fit(
     nominal = builder.columns.parameter_map @ robot.nominal.flatten()
     parts = []
     for number, part in enumerate(samples):
-        rows, W, equations = whitened_rows(builder, part)
+        rows, W, equations = rows_with_bases(builder, part)
         target = rows[..., :-1] @ nominal - rows[..., -1]
         projected = np.einsum("nvr,nvk->nrk", W, columns(builder, part, number))
         K = deviation_columns(builder, rows, W, part, prior)

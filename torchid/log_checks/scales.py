@@ -120,7 +120,7 @@ def prior_columns(builder: RowBuilder, robot: Robot, samples: Sequence[Samples])
 
 
 @torch.no_grad()
-def whitened_rows(builder: RowBuilder, samples: Samples) -> tuple[FloatArray, FloatArray, BoolArray]:
+def rows_with_bases(builder: RowBuilder, samples: Samples) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Whitened rows (N, n_rows, columns + 1), their bases W (N, n_rows, n_rows), and which rows are not zero."""
     n_rows = builder.tree.n_rows
     rows, W = np.zeros((len(samples), n_rows, builder.width + 1)), np.zeros((len(samples), n_rows, n_rows))
@@ -219,7 +219,7 @@ def fit_time_scale(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_h
     columns = prior_columns(builder, robot, recorded)
     phi = robot.nominal.flatten()[None]
     for one, two, rest in zip(recorded, doubled, at_rest, strict=True):
-        rows, W, equations = whitened_rows(builder, rest)
+        rows, W, equations = rows_with_bases(builder, rest)
         total, slower, gravity = (force_series(builder, part, phi)[1][0] for part in (one, two, rest))
         quadratic = 2.0 * (total - gravity) - 4.0 * (slower - gravity)
         terms = [gravity, total - gravity - quadratic, quadratic]
@@ -236,7 +236,7 @@ def deviation_columns(
 
     Args:
         builder: of the rows.
-        rows: from `whitened_rows`.
+        rows: from `rows_with_bases`.
         W: their bases.
         samples: whose motion friction and armature follow.
         prior: from `prior_columns`.
@@ -307,7 +307,7 @@ def fit_torque_gains(samples: Sequence[Samples], robot: Robot, contacts: Sequenc
     nominal = builder.columns.parameter_map @ robot.nominal.flatten()
     parts = []
     for part in samples:
-        rows, W, equations = whitened_rows(builder, part)
+        rows, W, equations = rows_with_bases(builder, part)
         torque = np.zeros((len(part), builder.tree.base_rows + robot.n_dofs, len(joints)))
         for index, joint in enumerate(joints):
             torque[:, builder.tree.base_rows + joint, index] = builder.recorded_torque(part)[:, joint].numpy()
