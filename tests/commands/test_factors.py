@@ -105,6 +105,8 @@ def test_several_logs_from_their_factors_are_fitted_as_from_the_logs(
     logs, factors = fitted_twice(walks(tmp_path, machine, seconds, **settings))
     assert_same(logs, factors)
     assert logs.noise.noise == factors.noise.noise
+    assert [one.origin for one in logs.noise.groups] == [one.origin for one in factors.noise.groups]
+    assert logs.misfit.expected is factors.misfit.expected is None
     assert (logs.ridge is None) == (factors.ridge is None)
     if logs.ridge is not None and factors.ridge is not None:
         assert factors.ridge.ridge == logs.ridge.ridge

@@ -98,7 +98,7 @@ def compress(config: ExperimentConfig, output: str | Path) -> Compression:
         together = merge_state_reports(chain.from_iterable(ranks.gather(states, "contact states")))
         require_base(together, config.sensors.on_base_lost)
         noise = experiment.estimate_noise(_with_those_elsewhere(logs), experiment.sensors)
-        factors = _compressed(with_noise(experiment, noise), paths, logs, states, excluded, bars)
+        factors = _compressed(with_noise(experiment, noise), noise, paths, logs, states, excluded, bars)
         files = _write_all(names, zip(names[share], factors, strict=True), output, config.overwrite)
     return Compression(files=files, states=together, noise=noise, output=output, rolling=experiment.rolling)
 
@@ -150,6 +150,7 @@ def _read(
 
 def _compressed(
     experiment: Experiment,
+    noise: NoiseSummary,
     paths: Sequence[Path],
     logs: Sequence[Samples],
     states: Sequence[list[StateReport]],
@@ -159,6 +160,7 @@ def _compressed(
     """The logs one by one: only one at a time is in memory twice."""
     builder = experiment.builder(experiment.sensors)
     model = row_model(experiment, builder)
+    origins = {one.group: one.origin for one in noise.groups if one.origin != "stated"}
     streaming = bars.add_task("streaming samples", total=sum(map(len, logs)))
     for path, log, own, left_out in zip(paths, logs, states, excluded, strict=True):
         yield FactorFile(
@@ -170,6 +172,7 @@ def _compressed(
             left_out,
             own,
             payloads=[asdict(one) for one in experiment.config.logs.payloads_of(path)],
+            noise_origins=origins,
         )
 
 

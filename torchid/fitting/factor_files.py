@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, field
 from dataclasses import dataclass as plain_dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +54,7 @@ class FactorFile:
         states: contact states of the log.
         version: of torchid that compressed it.
         payloads: what the robot carried, of which the rows are free; as settings.
+        noise_origins: of `model.noise` by group, as `GroupNoise` has them; "stated" of groups that are not in it.
     """
 
     log: CompressedLog
@@ -65,6 +66,7 @@ class FactorFile:
     states: list[StateReport] = field(default_factory=list)
     version: str = __version__
     payloads: list[dict[str, Any]] = field(default_factory=list)
+    noise_origins: dict[str, str] = field(default_factory=dict)
 
     __repr__ = short_repr
 
@@ -106,6 +108,7 @@ class _Description:
     supports: list[list[Whole]]
     states: list[_State]
     payloads: list[Payload] = field(default_factory=list)
+    noise_origins: dict[str, Literal["estimated", "at most", "confounded", "assumed"]] = field(default_factory=dict)
 
 
 _DESCRIPTION: TypeAdapter[_Description] = TypeAdapter(_Description)
@@ -205,6 +208,8 @@ def _packed(factors: FactorFile) -> tuple[dict[str, object], Array]:
     }
     if factors.payloads:  # a file of a robot without stays what it was
         description["payloads"] = factors.payloads
+    if factors.noise_origins:
+        description["noise_origins"] = factors.noise_origins
     return description, packer.values
 
 
@@ -232,6 +237,7 @@ def _read(path: Path, container: Container) -> FactorFile:
         [StateReport(**vars(state)) for state in description.states],
         description.torchid,
         [asdict(payload) for payload in description.payloads],
+        dict(description.noise_origins),
     )
 
 

@@ -46,7 +46,7 @@ class Fleet:
     Attributes:
         experiment: with the noise that they were weighted with.
         files: the logs.
-        noise: that they were weighted with, as if it had been stated.
+        noise: that they were weighted with.
         states: their contact states.
     """
 
@@ -79,9 +79,12 @@ def read_fleet(experiment: Experiment, on_read: Callable[[Path], None] | None = 
             on_read(path)
     _require_different_logs(paths, files)
     _require_stated_noise(experiment, files[0].model, paths[0])
-    groups = files[0].model.noise
+    groups, origins = files[0].model.noise, files[0].noise_origins
     noise = noise_of_groups(std_by_group(experiment.noise) | groups)
-    listed = [GroupNoise(name, "N" if "force" in name else "N m", "stated", x, None) for name, x in groups.items()]
+    listed = [
+        GroupNoise(name, "N" if "force" in name else "N m", origins.get(name, "stated"), x, None)
+        for name, x in groups.items()
+    ]
     summary = NoiseSummary(noise, listed, {}, 0)
     return Fleet(with_noise(experiment, summary), files, summary, merge_state_reports(one.states for one in files))
 
