@@ -16,6 +16,7 @@ MOMENT = re.compile(r"moment|torque|(?<![a-z])[mt]\{axis", re.IGNORECASE)
 _UPRIGHT = 0.96  # of the size of forces along z, of feet that walk
 _AIR = 0.1  # of the way from the lowest to the highest reading: of a foot in the air
 _SHARES = (0.05, 0.2)  # of that way, a threshold of contact: least and most
+LEAST_GRAVITY = 0.25  # share of the power of an accelerometer's readings that their mean has
 _STATES = 4  # at most, such as unknown, made and lost
 _NOISE = 4.0  # standard deviations of readings in the air that it is above them
 
@@ -26,6 +27,14 @@ def point_along_z(forces: Any) -> bool:
     with np.errstate(all="ignore"):
         upright = np.nansum(vectors[..., 2]) / np.nansum(np.linalg.norm(vectors, axis=2))
     return bool(abs(upright) > _UPRIGHT)
+
+
+def gravity_share(readings: Any) -> float:
+    """The share of the power of accelerations (N, 3) that their mean has: most of it where gravity is in them."""
+    vectors = np.reshape(np.asarray(readings, dtype=float), (len(readings), -1))
+    with np.errstate(all="ignore"):
+        constant, size = np.nanmean(vectors, axis=0), np.nanmean(np.square(vectors), axis=0)
+        return float(np.square(constant).sum() / size.sum())
 
 
 def are_states(values: Any) -> bool:

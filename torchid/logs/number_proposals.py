@@ -19,6 +19,7 @@ _STEP = (2e-4, 0.2)  # [s]: of recordings
 _STEP_NAME = re.compile(r"(sim_?|control_?)?(dt|time_?step)(_s)?", re.IGNORECASE)
 _TURN_S, _ALIKE = 0.3, 0.5  # over which gravity is seen to turn [s], and correlation with the angular velocity
 _TURNED = 7.0  # [rad]: no joint's position is as large throughout
+_MOST_DEGREES = 720.0  # whole numbers up to which may be angles
 _LEVER = 1.0  # [m]: rms of no torque is as large as that of the robot's weight with it
 _FAR = 60.0  # [m]: no base is recorded as far away
 _FREE = 0.02  # of a turn, to either side of where it begins
@@ -72,7 +73,7 @@ class UnitProposer:
             if _POSITION not in self._stated:
                 self._add_position_unit(position, slide)
             self._add_turn(position)
-            if velocity is not None and one_clock:
+            if velocity is not None and one_clock and not self._are_counts(position):
                 self._add_speed(velocity, position * self._position_factors(names), seconds, slide)
         self._add_native_turn()
         if one_clock:
@@ -103,6 +104,9 @@ class UnitProposer:
 
     def _add_position_unit(self, position: Numbers, slide: NDArray[np.bool_]) -> None:
         """Units of positions by how large those of hinges and slides are."""
+        if self._are_counts(position):
+            self._note(_POSITION, "whole numbers, as of an encoder: give scale, 2π over the counts of a turn")
+            return
         found = dict[str, str]()
         for unit, where in (("deg", ~slide), ("mm", slide)):
             some = np.abs(position[:, where])
@@ -117,6 +121,11 @@ class UnitProposer:
         of_slides = {name: "mm" if "mm" in found else "m" for name, is_slide in names if is_slide}
         self._columns[_POSITION]["unit"] = ({"*": "deg"} if "deg" in found else {}) | of_slides
         self._note(_POSITION, ", ".join(f"{unit}, {why}" for unit, why in found.items()))
+
+    @staticmethod
+    def _are_counts(position: Numbers) -> bool:
+        """Whether positions are whole numbers beyond those of angles in degrees."""
+        return bool((np.mod(position, 1.0) == 0.0).all() and np.abs(position).max() > _MOST_DEGREES)
 
     def _units(self, name: str) -> dict[str, str]:
         """Units of an entry by pattern."""
