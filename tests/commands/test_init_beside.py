@@ -109,3 +109,13 @@ def test_nanos_and_accelerations_of_joints_are_known(tmp_path: Path) -> None:
     found, _, _ = initiated(path)
     np.testing.assert_allclose(np.diff(found.time), np.diff(log.time), rtol=0.0, atol=2e-9)
     np.testing.assert_array_equal(found.joint_acceleration, rates["acceleration"])
+
+
+def test_a_base_that_moves_without_a_foot_is_named(tmp_path: Path) -> None:
+    log, urdf = recorded(), tmp_path / "crawler.urdf"
+    urdf.write_text(URDF.read_text().replace("_foot", "_tip"))
+    columns = {"t": log.time} | columns_of(log, ("q{}", "dq{}", "tau{}"))
+    columns |= {f"base_q{axis}": x for axis, x in zip("wxyz", wxyz(log).T, strict=True)}
+    columns |= {f"base_{axis}": x for axis, x in zip("xyz", value(log.base_position_world).T, strict=True)}
+    said = init(urdf, save_csv(tmp_path / "x.csv", columns), tmp_path / "x.yaml")
+    assert any(text.startswith("contacts: no link is called a foot") for text in said.missing)

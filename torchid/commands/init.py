@@ -267,6 +267,8 @@ def _describe(
         out.missing.append("forces: neither joint torques nor contact wrenches")
     out.missing += hints(proposal.left_out, fields, robot.joint_names, what, proposal.like_torques)
     from_feet = _from_feet(contacts, fields)
+    if not contacts and not robot.fixed_base and not _is_fixed(contacts, fields):
+        out.missing.append("contacts: no link is called a foot; name the frames that touch the ground, if any")
     if contacts and "contact_active" not in fields:
         instead = "detected from joint torques" if "detect_contacts" in from_feet else "set to touch throughout"
         out.missing.append(f"contact_active: which foot touches when; {instead}")
