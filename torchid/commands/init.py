@@ -53,7 +53,10 @@ _FORCES = ("joint_torque", "contact_wrench_local", "contact_wrench_world", "cont
 _POSE = ("base_quat_wxyz", "base_quat_xyzw")
 _IMU = ("imu_specific_force", "imu_angular_velocity")
 _RATE = "base_angular_velocity_base"
-_WHAT = {"columns": "names, units and orders of the file", "topics": "what the messages of the bag hold"}
+_WHAT = {
+    "columns": "names, units and orders of the file: docs/tables.md",
+    "topics": "what the messages of the bag hold: docs/bags.md",
+}
 _WELDED = "joints that the log lacks, held still; one that moves needs readings"
 _LINE = 118
 
@@ -355,7 +358,7 @@ def _text(
     lines += ["logs:", f"  train: {_flow([name if whole else f'{name}[:80%]'])}"]
     lines += [] if whole else [f"  test: {_flow([f'{name}[80%:]'])}"]
     if proposal.columns:
-        lines.append(f"  {proposal.key}:  # {_WHAT[proposal.key]}: docs/logs.md")
+        lines.append(f"  {proposal.key}:  # {_WHAT[proposal.key]}")
         for key, value in proposal.columns.items():
             note = proposal.notes.get(key, "")
             lines += [f"    # guessed: {note}"] if note else []

@@ -172,7 +172,7 @@ def hints(
     out = []
     measured = [name for name in left_out if not is_desired(name)]
     if plates := [name for name in left_out if propose_field(name) in OF_PLATES]:
-        unknown = "without which foot stands on which and where each lies (docs/logs.md, Force plates)"
+        unknown = "without which foot stands on which and where each lies (docs/tables.md, Force plates)"
         out.append(f"contact_wrench_world: {join_names(plates)} may be readings of force plates, {unknown}")
     positions = [name for name in measured if propose_field(name) == "joint_position"]
     if "joint_position" not in fields and len(positions) > 2:
@@ -200,7 +200,7 @@ def _torque_hint(measured: Sequence[str], what: str, like_torques: Sequence[Fami
     if like_torques:
         return [f"joint_torque: no {what} says that it is one; {each} have one of each joint: see the file"]
     currents = [name for name in measured if is_current(name)]
-    more = "of some joints: joint_torque.current needs one of each (docs/logs.md)"
+    more = "of some joints: joint_torque.current needs one of each (docs/tables.md)"
     return [f"joint_torque: {_like(currents)} may be currents of motors, {more}"] if currents else []
 
 

@@ -156,7 +156,7 @@ def fold_compressed(logs: Sequence[CompressedLog], builder: RowBuilder) -> list[
 
 
 def merge_blocks(blocks: Sequence[CompressedBlock], builder: RowBuilder) -> list[Part]:
-    """The parts of all blocks, as `merge_states` has those of samples: one for each log and fold."""
+    """The factors of all blocks, as `LogFitter.fit` takes them; readings in the air merged for each log and fold."""
     parts = [part for block in blocks for part in block.parts]
     loaded = [part for part in parts if not part.unloaded]
     unloaded = [part for part in parts if part.unloaded]

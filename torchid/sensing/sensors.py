@@ -242,7 +242,7 @@ def chosen_sensors(
     noise: SensorNoise | None = None,
     ft: int = 0,
 ) -> SensorSet:
-    """A set chosen by name.
+    """A sensor set, chosen by the names of joints and of components of contact wrenches.
 
     Args:
         joint_names: the robot's independent joints.
