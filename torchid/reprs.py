@@ -14,6 +14,11 @@ _UNBROKEN = "\N{NO-BREAK SPACE}"
 _TEXT = 60  # characters of one value
 
 
+def decimal(value: float, digits: int = 3) -> str:
+    """A number with so many decimals, or with three significant digits if these would be fewer, as of grams in kg."""
+    return f"{value:.3g}" if 0.0 < abs(value) < 10.0 ** (2 - digits) else f"{value:.{digits}f}"
+
+
 def short_repr(thing: object) -> str:
     """The class with its `_headline()`, if it has one, and what its fields hold: numbers, names, shapes.
 

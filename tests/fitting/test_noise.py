@@ -293,6 +293,19 @@ def test_exact_logs_and_logs_of_a_few_samples_leave_noise_that_is_positive(scene
     assert "assumed" in origins(few).values()
 
 
+@pytest.mark.parametrize("size", [1e-9, 1e3])
+def test_noise_that_nobody_stated_is_as_much_smaller_as_the_robot(scene: Scene, size: float) -> None:
+    """Of robots of millimetres, whose torques are nanonewtonmetres, and of those of tons."""
+    samples = pushed(scene, np.random.default_rng(0))
+    assert samples.torque is not None
+    assert samples.wrench is not None
+    scaled = replace(samples, torque=size * samples.torque, wrench=size * samples.wrench)
+    experiment = scene.experiment()
+    found, expected = (experiment.estimate_noise([one], experiment.sensors).noise for one in (scaled, samples))
+    assert found.joint_torque == pytest.approx(size * expected.joint_torque, rel=0.05)
+    assert found.contact_force == pytest.approx(size * expected.contact_force, rel=0.05)
+
+
 def test_the_same_logs_give_the_same_noise_and_settings_that_state_it(scene: Scene) -> None:
     experiment, samples = scene.experiment(), pushed(scene, np.random.default_rng(0))
     found, again = (experiment.estimate_noise([samples], experiment.sensors) for _ in range(2))

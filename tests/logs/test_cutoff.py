@@ -170,3 +170,18 @@ def test_the_motion_of_a_base_that_is_worked_out_of_joints_does_not_count() -> N
     both = replace(joints, base_quat_xyzw=turn.base_quat_xyzw)
     assert choose_cutoff([both], base_is_derived=True) == choose_cutoff([joints])
     assert choose_cutoff([both]).cutoff_hz != choose_cutoff([joints]).cutoff_hz
+
+
+@pytest.mark.parametrize("std", [1e-4, 3e-4])
+def test_the_weight_of_a_body_is_at_most_one_percent_of_noise(std: float) -> None:
+    """Joints that shake fast ask for a high cutoff, at which a position's noise is as large as gravity."""
+    shaking, stated = encoders(30.0, 1e-5)[1], {"joint_position": 1e-5}
+    slow, upright = 0.05 * wander(3, 0.4, 3), np.tile([0.0, 0.0, 0.0, 1.0], (COUNT, 1))
+    clean = replace(shaking, base_position_world=slow, base_quat_xyzw=upright)
+    noisy = replace(clean, base_position_world=slow + noise(3, std))
+    free, bounded = (choose_cutoff([log], stated).cutoff_hz for log in (clean, noisy))
+    assert free is not None
+    assert bounded is not None
+    gravity = 9.81**2
+    assert error(clean, noisy, "base_linear_acceleration_world", free) > 0.1 * gravity, "it matters"
+    assert 0.005 * gravity < error(clean, noisy, "base_linear_acceleration_world", bounded) < 0.015 * gravity

@@ -18,6 +18,7 @@ from torchid.problem import Metrics
 from torchid.problem.metrics import ADVICE, DECISIVE_GROUPS, ERROR_GROUPS, LIMB_GROUPS, describe_worse, group_name
 from torchid.report.tables import noise_advice
 from torchid.report.urdf_files import massless_ends
+from torchid.reprs import decimal
 
 if TYPE_CHECKING:
     from torchid.commands.results import Identification
@@ -118,7 +119,7 @@ def answer(run: Identification) -> Answer:
     return Answer(
         headline=_headline(run, judged),
         errors=judged.shown_errors(),
-        total_mass=f"{run.mass} ({run.experiment.robot.format}: {run.mass.nominal:.3f} kg)",
+        total_mass=f"{run.mass} ({run.experiment.robot.format}: {decimal(run.mass.nominal)} kg)",
         bodies=_bodies_text(run),
         attention=list(_attention(run, judged)),
     )

@@ -163,7 +163,8 @@ def _known(robot: Robot, contacts: Sequence[_Contact]) -> KnownRobot:
     on_base, elsewhere = ([name for name, (body, _) in robot.links.items() if bool(body) == x] for x in (False, True))
     feet, weight = [contact.frame for contact in contacts], GRAVITY * float(robot.nominal[:, 0].sum())
     known = robot.joint_names, feet, robot.path.stem, weight, robot.base_link, on_base, elsewhere, limb_sensors(robot)
-    return KnownRobot(*known, [link for link in on_base if is_along_base(robot, link)], robot.sliding)
+    moving = [body.joint.name for body in robot.bodies if body.joint is not None and body.joint.kind != "fixed"]
+    return KnownRobot(*known, [link for link in on_base if is_along_base(robot, link)], robot.sliding, moving)
 
 
 def _stated_contacts(sample: Any, robot: Robot) -> list[str]:
@@ -279,12 +280,15 @@ def _describe(
         out.missing.append("forces: neither joint torques nor contact wrenches")
     out.missing += hints(proposal.left_out, fields, robot.joint_names, what, proposal.like_torques)
     from_feet = _from_feet(contacts, fields)
+    if not contacts and not robot.fixed_base and not _is_fixed(contacts, fields):
+        out.missing.append("contacts: no link is called a foot; name the frames that touch the ground, if any")
     if contacts and "contact_active" not in fields:
         instead = "detected from joint torques" if "detect_contacts" in from_feet else "set to touch throughout"
         out.missing.append(f"contact_active: which foot touches when; {instead}")
     if _lacks_base_motion(contacts, fields):
         instead = "; taken from the feet that stand" if "base_motion" in from_feet else ""
-        out.missing.append(f"motion of the base: neither its pose nor an IMU{instead}")
+        lacks = "its orientation alone, no position or IMU" if set(_POSE) & fields else "neither its pose nor an IMU"
+        out.missing.append(f"motion of the base: {lacks}{instead}")
 
 
 def _describe_found(

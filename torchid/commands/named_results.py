@@ -18,6 +18,7 @@ from torchid.estimators import Estimate
 from torchid.parameters import PARAMETER_UNITS, PARAMETERS, PER_BODY, Array
 from torchid.problem.metrics import DECISIVE_GROUPS, describe_errors, describe_worse
 from torchid.report.tables import table_text
+from torchid.reprs import decimal
 from torchid.robot import Robot
 
 if TYPE_CHECKING:
@@ -190,7 +191,7 @@ def run_lines(run: Identification) -> list[str]:
     said = [("data", f"{format_count(run.samples, 'sample')} of {format_count(len(config.logs.train), 'log')}")]
     said += [("parameters", f"{estimate.phi.size}: {counts}")]
     if not robot.fixed_base:
-        said.append(("total mass", f"{run.mass} ({robot.format}: {run.mass.nominal:.3f} kg)"))
+        said.append(("total mass", f"{run.mass} ({robot.format}: {decimal(run.mass.nominal)} kg)"))
     sets = {name: (pair.identified, pair.nominal) for name, pair in run.metrics.items()}
     if run.validation is not None:
         sets["left out"] = (run.validation.identified, run.validation.nominal)

@@ -15,6 +15,7 @@ from torchid.problem.chunks import one_thread
 from torchid.problem.compression import Part, merge_factors
 from torchid.problem.elimination import Assembly, Elimination
 from torchid.problem.extras import Extra
+from torchid.reprs import decimal
 from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE
 
 INFLATION_LIMIT = 10.0
@@ -191,7 +192,7 @@ class TotalMass:
     def __str__(self) -> str:
         """The total mass with its standard error, or the reason why it is not determined."""
         if self.determined:
-            return f"{self.value:.3f} ± {self.standard_error:.2g} kg"
+            return f"{decimal(self.value)} ± {self.standard_error:.2g} kg"
         if not self.separable:
             return "not determined: confounded with offsets"
         known = f", standard error {self.standard_error:.2g} kg" if np.isfinite(self.standard_error) else ""

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.logs.column_groups import Family
+from torchid.logs.column_map import PLACEHOLDER
 from torchid.logs.column_proposals import BASES, is_desired, words_of
 from torchid.logs.file_samples import FileSample, side_by_side
 from torchid.logs.log import FloatArray
@@ -20,7 +21,7 @@ from torchid.logs.units import quantities_with, split_unit
 _UNIT = 1e-3  # of the length of quaternions from 1
 _STEPS = 0.1  # of the range of a path: as large no step of one is, in the median
 _CLEAR = 0.05  # of a mean cosine, by which one order of a quaternion is better than the other
-_PLACE = {"p", "pos", "position", "positions", "xyz", "r", "loc", "location", "translation", "trans"}
+_PLACE = {"p", "pos", "position", "positions", "xyz", "r", "loc", "location", "translation", "trans", "lage"}
 _TURN = {"q", "e", "o", "ori", "orient", "orientation", "quat", "quaternion", "rot", "rotation", "attitude"}
 _WHOSE = re.compile(
     rf"{BASES}|floating|state|states|data|pose|world|robot|est|"
@@ -51,6 +52,28 @@ def field_of_base(family: Family, sample: FileSample) -> str:
         named = other <= _TURN and (bool(other) or axes == "wxyz")
         return "base_quat_wxyz" if named and _is_unit(numbers) else ""
     return ""
+
+
+def is_beside(family: Family, quaternion: str, sample: FileSample) -> bool:
+    """Whether three numbers are the position that belongs to a quaternion, by their names and as they are a path.
+
+    Args:
+        family: of three columns, or of an array.
+        quaternion: columns of a map: `state.quat[{index}]`, beside which `state.p[{index}]` is the position.
+        sample: of the file.
+    """
+    of_place, of_turn = (words_of(PLACEHOLDER.sub(" ", split_unit(x)[0])) for x in (family.pattern, quaternion))
+    whose = [word for word in of_place if word not in _PLACE]
+    values = side_by_side(sample, family.columns)
+    numbers = values.reshape(len(values), -1) if values.ndim and values.dtype.kind in "fiu" else np.empty((0, 0))
+    return (
+        bool(whose)
+        and whose == [word for word in of_turn if word not in _TURN]
+        and numbers.shape[1:] == (3,)
+        and "".join(sorted(family.axes)).lower() in ("", "xyz")
+        and family.unit_may_be("length")
+        and _is_path(numbers.astype(float))
+    )
 
 
 def _is_path(numbers: FloatArray) -> bool:

@@ -25,7 +25,8 @@ _AXIS = re.compile(
 _BEHIND = re.compile(r"[_./ \[-]*\{[^{}]*\}\]?$")  # a unit: the axis in `acc_g.{axis}`
 
 
-_SECONDS, _NANOSECONDS = r"secs?|seconds", r"nano_?secs?|nsecs?|nano_?seconds|ns"
+_OF_A_JOINT = {"imu_angular_velocity": "joint_velocity", "imu_specific_force": "joint_acceleration"}
+_SECONDS, _NANOSECONDS = r"secs?|seconds", r"nano_?secs?|nsecs?|nano_?seconds|nanos|ns"
 
 
 def split_stamps(columns: Sequence[str]) -> dict[str, str]:
@@ -63,9 +64,9 @@ class Family:
 
     @property
     def proposed(self) -> str:
-        """The field that its words say it is, "" without any; of joints an angular velocity is theirs."""
+        """The field that its words say it is, "" if none; of joints angular velocity and acceleration are theirs."""
         found = propose_field(self.words)
-        return "joint_velocity" if found == "imu_angular_velocity" and "{joint}" in self.pattern else found
+        return _OF_A_JOINT.get(found, found) if "{joint}" in self.pattern else found
 
     @property
     def words(self) -> str:

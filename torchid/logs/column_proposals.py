@@ -27,9 +27,9 @@ _WORDS = (
     ("base_linear_velocity_world", rf"{OF_BASE} (lin vel|linear vel|linear velocity|vel|velocity)\b"),
     ("base_angular_velocity_base", rf"{OF_BASE} (ang vel|angular velocity|omega)\b"),
     ("base_quat_wxyz", rf"{OF_BASE} (q|rot|rotation)\b"),
-    ("joint_acceleration", r"\b(ddqj?|qdd|thdd|qacc|joint acc|joint acceleration)\b"),
-    ("imu_angular_velocity", r"\b(gyr|gyro\w*|omega|ang vel|angular velocity|drehraten?)\b"),
-    ("imu_specific_force", r"\b(acc|accel\w*|linear acceleration|specific force|beschleunigung)\b"),
+    ("joint_acceleration", r"\b(ddqj?|qdd|thdd|qacc|joints? acc|joints? accelerations?)\b"),
+    ("imu_angular_velocity", r"\b(gyr|gyro\w*|omega|ang vel|angular velocity|drehraten?|imu g)\b"),
+    ("imu_specific_force", r"\b(acc|accel\w*|linear acceleration|specific force|beschleunigung|imu a)\b"),
     ("base_quat_wxyz", r"\b(quat\w*|orientation)\b"),
     ("contact_wrench_local", r"\b(wrench|wrenches)\b"),
     ("contact_force_normal", r"\b(foot forces?|feet forces?|contact forces?|grf|fsr)\b"),
@@ -40,7 +40,7 @@ _WORDS = (
         r"\b(dqs?|dqj|d q|qd|qdot|thd|v|qvel|vels?|velocity|velocities|speeds?|rates?|vitesses?)\b|geschwindigkeit\b",
     ),
     ("joint_position", r"\b(qs?|qj|th|theta|qpos|pos|positions?|angles?|winkel|gelenkwinkel)\b"),
-    ("time", rf"\b(t|ts|{_STAMPS}|ticks?|clock|sec|secs|seconds|zeit|temps)\b"),
+    ("time", rf"\b(t|ts|{_STAMPS}|ticks?|clock|millis|sec|secs|seconds|zeit|temps)\b"),
 )
 #: Fields that a unit alone tells: of `LF_HAA [deg]`, `LF_HAA [deg/s]`.
 _BY_QUANTITY = {

@@ -23,6 +23,9 @@ _RATE_SHARE = 0.2  # largest cutoff over the sample rate
 _NOISE_SHARE = 5e-4
 #: What a filter must leave, whatever the noise, and where a motion ends, as shares of the power of accelerations.
 _KEPT_SHARE, _MOTION_SHARE = 0.95, 0.99
+#: Of the power of gravity, what noise of the base's derived linear acceleration may be, whatever motion is lost: masses
+#: come out as much too small, while a filter leaves equations true that are linear in the motion.
+_WEIGHT_SHARE, _GRAVITY = 0.01, 9.81  # [1], [m/s^2]
 #: Forces of a motion have its harmonics: gravity and Coriolis terms are not linear in wide angles.
 _HARMONICS = 6.0
 #: What an acceleration is worked out of, the first that was recorded, with the number of derivatives.
@@ -42,6 +45,7 @@ _SOURCES = (
         ("base_position_world", 2),
     ),
 )
+_OF_WEIGHT = ("base_linear_velocity_world", "base_position_world")
 
 
 @dataclass(frozen=True)
@@ -84,7 +88,8 @@ def choose_cutoff(
     it. Gravity and Coriolis terms are not: of wide angles they have harmonics, which a filter takes off the forces and
     changes in those of the filtered motion. The cutoff is therefore six times as high as the motion, but for noise: it
     is at most 0.05 % of the power of the derived accelerations, unless a twentieth of the motion's power would be lost.
-    Joints [rad or m] and the base [rad, m] count together.
+    Joints [rad or m] and the base [rad, m] count together. In the linear acceleration of a base, where it is derived,
+    noise is at most 1 % of the power of gravity, whatever would be lost.
 
     Args:
         logs: as recorded, or long parts of them.
@@ -106,39 +111,49 @@ def choose_cutoff(
     slowest = slowest if sample_rate_hz is None else min(slowest, sample_rate_hz)
     decades = np.log10(max(_RATE_SHARE * slowest / _LOWEST_HZ, 1.0))
     candidates = _LOWEST_HZ * np.logspace(0.0, decades, 1 + int(_STEPS_PER_DECADE * decades))
-    motion, noise = np.zeros(len(candidates)), np.zeros(len(candidates))
+    motion, noise, of_base = np.zeros((3, len(candidates)))  # of_base: noise of its derived linear acceleration
+    gravity = 0.0
     for log in derived:
-        for of_motion, of_noise in _powers(log, signal_noise(log, None, stated), candidates, base_is_derived):
+        for of_motion, of_noise, name in _powers(log, signal_noise(log, None, stated), candidates, base_is_derived):
             motion, noise = motion + of_motion, noise + of_noise
+            if name in _OF_WEIGHT:
+                of_base += of_noise
+                gravity += float(log.time[-1] - log.time[0]) * _GRAVITY**2
     usual = usual_cutoff_hz(slowest)
     if not noise.any():
         return CutoffChoice(float(f"{usual:.2g}"), by_noise=False)
     last = int(np.argmax(motion - noise))  # beyond, there is more noise than motion
     least, end = (candidates[np.argmax(motion >= share * motion[last])] for share in (_KEPT_SHARE, _MOTION_SHARE))
     quiet = candidates[noise <= _NOISE_SHARE * motion[last]].max(initial=least)
-    found = max(least, min(quiet, max(usual, _HARMONICS * end)))
+    still = candidates[of_base <= _WEIGHT_SHARE * gravity].max(initial=candidates[0])
+    found = min(still, max(least, min(quiet, max(usual, _HARMONICS * end))))
     return CutoffChoice(float(f"{found:.2g}"), by_noise=True, motion_hz=float(f"{end:.2g}"))
 
 
 def _powers(
     log: Log, noise: SignalNoise, candidates: FloatArray, base_is_derived: bool
-) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Power of accelerations up to each cutoff (n,) [Hz], of the motion and of its noise, times the log's length."""
+) -> Iterator[tuple[FloatArray, FloatArray, str]]:
+    """Power of accelerations up to each cutoff (n,) [Hz], of the motion and of its noise, times the log's length.
+
+    With each the field that they are worked out of.
+    """
     from scipy.signal import welch  # as in `LowPass`
 
     rate = (len(log) - 1) / float(log.time[-1] - log.time[0])
-    for values, std, order in _noisy_sources(log, noise, base_is_derived):
+    for name, values, std, order in _noisy_sources(log, noise, base_is_derived):
         even = spline_derivatives(log.time, values, np.linspace(log.time[0], log.time[-1], len(log)), (0,))[0]
         length = min(len(log), int(np.ceil(_SEGMENT_S * rate)))
         frequency, power = welch(even, fs=rate, nperseg=length, axis=0, detrend="linear")
         of_noise = np.full(len(frequency), 2.0 * float(np.square(std).sum()) / rate)
         densities = np.stack([power.sum(axis=1) - of_noise, of_noise])
         upto = np.cumsum(densities * (2.0 * np.pi * frequency) ** (2 * order), axis=1) * frequency[1] * len(log) / rate
-        yield np.interp(candidates, frequency, upto[0]), np.interp(candidates, frequency, upto[1])
+        yield np.interp(candidates, frequency, upto[0]), np.interp(candidates, frequency, upto[1]), name
 
 
-def _noisy_sources(log: Log, noise: SignalNoise, base_is_derived: bool) -> Iterator[tuple[FloatArray, FloatArray, int]]:
-    """What accelerations are worked out of: channels (N, c) with noise, its standard deviations, and how often."""
+def _noisy_sources(
+    log: Log, noise: SignalNoise, base_is_derived: bool
+) -> Iterator[tuple[str, FloatArray, FloatArray, int]]:
+    """What accelerations are worked out of: field, channels (N, c) with noise, its standard deviations, how often."""
     for sources in _SOURCES[: 1 if base_is_derived else None]:
         name, order = next((pair for pair in sources if getattr(log, pair[0]) is not None), ("", 0))
         std = noise.std.get(name)
@@ -146,6 +161,6 @@ def _noisy_sources(log: Log, noise: SignalNoise, base_is_derived: bool) -> Itera
             continue
         values: FloatArray = getattr(log, name)
         if name == "base_quat_xyzw":
-            yield 2.0 * make_sign_continuous(values), std, order  # half angles
+            yield name, 2.0 * make_sign_continuous(values), std, order  # half angles
         else:
-            yield values[:, std > 0.0], std[std > 0.0], order
+            yield name, values[:, std > 0.0], std[std > 0.0], order

@@ -98,7 +98,7 @@ def suitable_orders(joints: Collection[str], robot: str = "") -> list[str]:
     return sorted(fitting, key=lambda name: (-len(JOINT_ORDERS[name].names), name not in robot))
 
 
-def usual_order(kind: str, robot: KnownRobot, count: int) -> tuple[list[str] | str, str]:
+def usual_order(kind: str, robot: KnownRobot, count: int) -> tuple[list[str | None] | list[str] | str, str]:
     """The order of numbers that joints or feet probably have, or the name of the robot that has it; and whose that is.
 
     Args:
@@ -112,6 +112,8 @@ def usual_order(kind: str, robot: KnownRobot, count: int) -> tuple[list[str] | s
         is_whole = set(order.names) == set(names) or count < len(names)
         if is_whole and count >= len(order.joints):
             return name, f"that of {name}, whose joints the robot has"
+    if kind == "joint" and count == len(robot.moving) > len(names):
+        return [x if x in names else None for x in robot.moving], "as in the robot's file, with those that mimic others"
     if kind == "joint" and count < len(names):
         return numbered_joints(names, count), "names that differ in a number"
     is_alike = any("thigh" in joint or "calf" in joint for joint in robot.joints)

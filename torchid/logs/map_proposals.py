@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import excerpt
-from torchid.logs.base_proposals import field_of_base, find_angles, order_of_quaternion
+from torchid.logs.base_proposals import field_of_base, find_angles, is_beside, order_of_quaternion
 from torchid.logs.column_groups import Family, find_families, split_arrays, split_stamps
+from torchid.logs.column_map import fits
 from torchid.logs.column_proposals import is_desired, propose_field
 from torchid.logs.columns import is_column
 from torchid.logs.field_matching import MOMENT, FieldMatcher
@@ -21,7 +22,15 @@ from torchid.logs.file_samples import FileSample, increases, listed_order, side_
 from torchid.logs.joint_orders import JOINT_ORDERS, numbered_joints, usual_order
 from torchid.logs.log import SHAPES, VARIANTS, WRENCHES
 from torchid.logs.name_matching import SUFFIXES, KnownRobot
-from torchid.logs.number_proposals import UnitProposer, are_states, point_along_z, step_of_stamps, threshold
+from torchid.logs.number_proposals import (
+    LEAST_GRAVITY,
+    UnitProposer,
+    are_states,
+    gravity_share,
+    point_along_z,
+    step_of_stamps,
+    threshold,
+)
 from torchid.logs.units import IN_DEGREES, quantities_of, quantities_with, unit_factor
 
 _GAINS = re.compile(r"\b(kp|kd)\b", re.IGNORECASE)
@@ -65,9 +74,13 @@ def propose_map(
         files: columns of each of several files that are one log, whose stamps may differ in name.
         in_degrees: columns of files whose header says that angles are in degrees.
     """
-    sample, notes = with_samples_first(sample, len(robot.joints))
-    out = _Proposer(sample, robot, files, in_degrees).propose()
+    turned, notes = with_samples_first(sample, len(robot.joints))
+    out = _Proposer(turned, robot, files, in_degrees).propose()
     out.notes = notes | out.notes
+    if notes and "ignore" in out.columns:  # by their names in the file
+        apart = [name for name in turned if name not in sample]
+        ignored = (x.removesuffix(".T") if any(fits(one, x) for one in apart) else x for x in out.columns["ignore"])
+        out.columns["ignore"] = sorted(set(ignored))
     return out
 
 
@@ -92,7 +105,8 @@ class _Proposer:
         self.match.look_at(families, more)
         if named := self.match.named_joints:
             self.out.lacking = [name for name in self.joints if name not in named]
-        of_force = (one for one in families if one.proposed == "imu_specific_force" and len(one.columns) in (1, 3))
+        families = sorted(families, key=self._lacks_gravity)
+        of_force = (one for one in families if self._lacks_gravity(one) < 0.0)
         self.force = next((side_by_side(self.sample, one.columns) for one in of_force), None)
         split = self._place_parts(numeric)
         families = [one for one in families if one.columns[0] not in split]
@@ -126,6 +140,13 @@ class _Proposer:
             units = UnitProposer(self.sample, self.out.columns, self.out.notes, self.factors)
             units.propose(self.robot.weight, not self.files, self.robot.slides)
         return self.out
+
+    def _lacks_gravity(self, family: Family) -> float:
+        """Minus the share of gravity in what may be an accelerometer, 0 for all else."""
+        if family.proposed != "imu_specific_force" or len(family.columns) not in (1, 3):
+            return 0.0
+        values = side_by_side(self.sample, family.columns)
+        return -gravity_share(values) if values.shape[1:] == (3,) and values.dtype.kind in "fiu" else 0.0
 
     def _settle_contacts(self, used: list[Family]) -> list[Family]:
         """The families in use without moments of contacts that have no force; flags by forces where none are."""
@@ -186,7 +207,10 @@ class _Proposer:
         if not self.feet:  # of an arm, that of its hand
             return []
         named = [(one, field) for one in families if (field := field_of_base(one, self.sample))]
-        return [one for one, field in sorted(named, key=lambda pair: not pair[0].stem) if self._place(one, field)]
+        placed = [one for one, field in sorted(named, key=lambda pair: not pair[0].stem) if self._place(one, field)]
+        turns = [self.out.columns.get(f"base_quat_{order}", {}).get("column", "") for order in ("xyzw", "wxyz")]
+        beside = [one for one in families if any(x and is_beside(one, x, self.sample) for x in turns)]
+        return placed + [one for one in beside if one not in placed and self._place(one, "base_position_world")]
 
     def _place(self, family: Family, name: str = "") -> bool:
         """Whether a family has become an entry; `name`: of which field, by default the one that it probably is."""
@@ -208,7 +232,7 @@ class _Proposer:
                 self._note(name, "of the IMU, taken to be that of the base link")
         if name == "time" and (more := self.nanoseconds.get(family.columns[0])):
             entry["nanoseconds"] = more
-        if name == "contact_active" and not self._add_threshold(family, entry):
+        if not self._has_readings_of(family, name, entry):
             return False
         self._add_order(family, name)
         self._add_stated_unit(family, entry, name, quantities_of(name))
@@ -216,6 +240,15 @@ class _Proposer:
             self._note(name, "joints by their limb and number, counted from the base outwards")
         self.out.columns[name] = entry
         return True
+
+    def _has_readings_of(self, family: Family, name: str, entry: dict[str, Any]) -> bool:
+        """Whether the numbers of a family may be those of a field; flags get a threshold."""
+        if name == "contact_active":
+            return self._add_threshold(family, entry)
+        is_free = name == "imu_specific_force" and not family.unit and -self._lacks_gravity(family) < LEAST_GRAVITY
+        if is_free:
+            self._note(name, f"not '{excerpt(family.columns[0])}', which is without gravity")
+        return not is_free
 
     def _place_other_time(self, family: Family) -> bool:
         """Whether a family is the stamps of a file that has none yet."""

@@ -33,6 +33,7 @@ class KnownRobot:
         on_base: links of its base; `along_base`: those with its axes.
         elsewhere: all others.
         slides: joints that are prismatic.
+        moving: all joints that move, those too that mimic others.
         limb_sensors: children of the fixed joints in limbs that are called force or torque sensors, by joint.
     """
 
@@ -46,6 +47,7 @@ class KnownRobot:
     limb_sensors: Mapping[str, str] = field(default_factory=dict)
     along_base: Sequence[str] = ()
     slides: Sequence[str] = ()
+    moving: Sequence[str] = ()
 
 
 def within(stem: str) -> re.Pattern[str]:

@@ -20,6 +20,7 @@ _STEP = (2e-4, 0.2)  # [s]: of recordings
 _STEP_NAME = re.compile(r"(sim_?|control_?)?(dt|time_?step)(_s)?", re.IGNORECASE)
 _TURN_S, _ALIKE = 0.3, 0.5  # over which gravity is seen to turn [s], and correlation with the angular velocity
 _TURNED = 7.0  # [rad]: no joint's position is as large throughout
+_MOST_DEGREES = 720.0  # whole numbers up to which may be angles
 _LEVER = 1.0  # [m]: rms of no torque is as large as that of the robot's weight with it
 _FAR = 60.0  # [m]: no base is recorded as far away
 _FREE = 0.02  # of a turn, to either side of where it begins
@@ -73,7 +74,7 @@ class UnitProposer:
             if _POSITION not in self._stated:
                 self._add_position_unit(position, slide)
             self._add_turn(position)
-            if velocity is not None and one_clock:
+            if velocity is not None and one_clock and not self._are_counts(position):
                 self._add_speed(velocity, position * self._position_factors(names), seconds, slide)
         self._add_native_turn()
         if one_clock:
@@ -104,6 +105,9 @@ class UnitProposer:
 
     def _add_position_unit(self, position: Numbers, slide: NDArray[np.bool_]) -> None:
         """Units of positions by how large those of hinges and slides are."""
+        if self._are_counts(position):
+            self._note(_POSITION, "whole numbers, as of an encoder: give scale, 2π over the counts of a turn")
+            return
         found = dict[str, str]()
         for unit, where in (("deg", ~slide), ("mm", slide)):
             some = np.abs(position[:, where])
@@ -118,6 +122,11 @@ class UnitProposer:
         of_slides = {name: "mm" if "mm" in found else "m" for name, is_slide in names if is_slide}
         self._columns[_POSITION]["unit"] = ({"*": "deg"} if "deg" in found else {}) | of_slides
         self._note(_POSITION, ", ".join(f"{unit}, {why}" for unit, why in found.items()))
+
+    @staticmethod
+    def _are_counts(position: Numbers) -> bool:
+        """Whether positions are whole numbers beyond those of angles in degrees."""
+        return bool((np.mod(position, 1.0) == 0.0).all() and np.abs(position).max() > _MOST_DEGREES)
 
     def _units(self, name: str) -> dict[str, str]:
         """Units of an entry by pattern."""
@@ -303,6 +312,7 @@ def _length(x: Numbers) -> float:
 _UPRIGHT = 0.96  # of the size of forces along z, of feet that walk
 _AIR = 0.1  # of the way from the lowest to the highest reading: of a foot in the air
 _SHARES = (0.05, 0.2)  # of that way, a threshold of contact: least and most
+LEAST_GRAVITY = 0.25  # share of the power of an accelerometer's readings that their mean has
 _STATES = 4  # at most, such as unknown, made and lost
 _NOISE = 4.0  # standard deviations of readings in the air that it is above them
 
@@ -313,6 +323,14 @@ def point_along_z(forces: Any) -> bool:
     with np.errstate(all="ignore"):
         upright = np.nansum(vectors[..., 2]) / np.nansum(np.linalg.norm(vectors, axis=2))
     return bool(abs(upright) > _UPRIGHT)
+
+
+def gravity_share(readings: Any) -> float:
+    """The share of the power of accelerations (N, 3) that their mean has: most of it where gravity is in them."""
+    vectors = np.reshape(np.asarray(readings, dtype=float), (len(readings), -1))
+    with np.errstate(all="ignore"):
+        constant, size = np.nanmean(vectors, axis=0), np.nanmean(np.square(vectors), axis=0)
+        return float(np.square(constant).sum() / size.sum())
 
 
 def are_states(values: Any) -> bool:

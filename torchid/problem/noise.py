@@ -29,7 +29,9 @@ _CLIPPED = 0.99501  # E[min(x^2, 9)] of standard normal x
 _HELD = 0.005  # weight of the previous variances against the residuals: determines confounded ones
 _LEAST_STEP = 0.05  # least factor of a variance in one step
 _SHARE = 0.01  # least share of a group in the variance along its own directions: a tenth of the deviation there
-_SMALLEST = 1e-3  # of the stated noise, least standard deviation: exact logs leave only rounding
+#: Of the stated noise, least standard deviation: exact logs leave only rounding. Where none is stated it is of the
+#: forces themselves, if these are less than what is guessed, as those of robots of millimetres are.
+_SMALLEST = 1e-3
 _LEFT = 0.1  # least share of the residual's degrees of freedom that a group is assigned
 _FEW = 20.0  # least number of independent readings: a standard deviation to 16 %
 _NEGLIGIBLE = 1e-9  # share of a source's variance in the rows below which it is projected out
@@ -93,6 +95,9 @@ class VarianceComponentEstimator:
         self._blocks = np.zeros((count, len(blocks)))  # (G, unknown variances)
         for number, block in enumerate(blocks):
             self._blocks[block, number] = 1.0
+        forces = float(np.sqrt(np.mean([chunk.rows[..., -1].square().mean().item() for chunk in rows.chunks])))
+        self._smallest = np.full(count, _SMALLEST)
+        self._smallest[free] *= min(forces, 1.0) if forces > 0.0 else 1.0
 
     @one_thread()
     @torch.no_grad()
@@ -100,7 +105,7 @@ class VarianceComponentEstimator:
         """Variances at which the expected covariance of the residuals equals the observed one.
 
         Residuals are clipped. A fit makes them smaller; each group is corrected by the leverage of its own directions.
-        Its standard deviation is at least a tenth of that along its directions, and a thousandth of the stated noise.
+        Its standard deviation is at least a tenth of that along its directions, and `_SMALLEST` of the stated noise.
 
         Args:
             variance: (G,), initial values, with which the parameters were fitted.
@@ -113,7 +118,7 @@ class VarianceComponentEstimator:
         for _ in range(_STEPS):
             share = np.divide(t, count, out=np.ones_like(t), where=count > 0.0)
             step = self._step(M, q, estimated)
-            least = np.maximum(_SHARE / np.maximum(share, 1e-12), _SMALLEST**2 / variance)
+            least = np.maximum(_SHARE / np.maximum(share, 1e-12), self._smallest**2 / variance)
             least_of_block = np.where(self._blocks > 0.0, least[:, None], 0.0).max(axis=0, initial=0.0)
             step = np.where(estimated, np.maximum(step, least_of_block), 1.0)
             factor = self._blocks @ step

@@ -31,6 +31,7 @@ from torchid.report.tables import (
     verdict_table,
     violation_table,
 )
+from torchid.reprs import decimal
 from torchid.robot import Robot
 from torchid.terminal.lines import (
     CUT,
@@ -54,6 +55,7 @@ _LEGEND = {
     PRIOR: "p mostly the {of}'s",
     UNOBSERVABLE: ". unobservable",
 }
+_MOST_DIGITS = 5  # behind the point
 _MARKS = {IDENTIFIED: " ", COMBINED: "+", PRIOR: "p", UNOBSERVABLE: ".", FIXED: "="}
 
 
@@ -119,13 +121,18 @@ def _columns(robot: Robot, estimate: Estimate, bodies: Sequence[int]) -> list[tu
     def cells(parameter: int) -> list[str]:
         return [_cell(*(x[k, parameter] for x in (phi, error, verdict))) for k in bodies]
 
+    masses = [
+        cell if "±" in cell or not cell else f"{decimal(phi[k, _MASS])} {cell[-1]}"
+        for k, cell in zip(bodies, cells(_MASS), strict=True)
+    ]
+
     joints = [robot.bodies[k].joint for k in bodies]
     kinds = {joint.kind for joint in joints if joint is not None}
     force = "N m" if "prismatic" not in kinds else "N m, N"
     moved = [_center_moved(nominal[k], phi[k], verdict[k]) for k in bodies]
     return [
-        ("mass [kg]", cells(_MASS)),
-        (f"{robot.format} [kg]", [f"{nominal[k, _MASS]:.3f}" for k in bodies]),
+        ("mass [kg]", masses),
+        (f"{robot.format} [kg]", [decimal(nominal[k, _MASS]) for k in bodies]),
         (f"Coulomb [{force}]", cells(_COULOMB)),
         ("CoM moved [mm]", moved),
         (f"viscous [{_per_speed(kinds)}]", cells(_VISCOUS)),
@@ -141,8 +148,11 @@ def _cell(value: float, error: float, verdict: str) -> str:
     if verdict == FIXED:
         return ""
     known = verdict == IDENTIFIED and np.isfinite(error) and error > 0.0
-    digits = min(max(1 - int(np.floor(np.log10(error))), 0), 5) if known else 3
-    text = f"{value:.{digits}f} ± {error:.{digits}f}" if known else f"{value:.{digits}f}"
+    digits = max(1 - int(np.floor(np.log10(error))), 0) if known else 3
+    if known and digits <= _MOST_DIGITS:
+        text = f"{value:.{digits}f} ± {error:.{digits}f}"
+    else:
+        text = f"{round(value, digits):.3g} ± {error:.2g}" if known else f"{value:.3f}"
     return f"{text} {_MARKS[verdict]}"
 
 
@@ -226,7 +236,7 @@ def _print_fit(run: Identification) -> None:
     _print_conditions(run)
     if isinstance(estimate, SgdEstimate):
         print_labelled("training", f"{estimate.epochs} epochs, parameters of epoch {estimate.best_epoch}")
-    print_labelled("total mass", f"{run.mass} ({robot.format}: {run.mass.nominal:.3f} kg)")
+    print_labelled("total mass", f"{run.mass} ({robot.format}: {decimal(run.mass.nominal)} kg)")
     if run.robust is not None:
         kept = f"{100 * run.robust.mean_weight:.3g} % of the weight kept"
         print_labelled("robust", f"{run.robust.loss}, {kept}, {run.robust.passes} passes")
