@@ -176,6 +176,17 @@ def test_samples_near_changes_of_detected_contacts_are_dropped(written: Written)
     assert counts[1] < counts[0] - 50
 
 
+def test_contacts_that_may_stand_count_unless_something_takes_them_to_keep_still(written: Written) -> None:
+    """Samples in which they may are dropped then: there are some where thresholds are high."""
+    counts = []
+    for more in ({}, {"max_slip": 100.0}):
+        file = written(lambda log: replace(log, **NO_FLAGS), detect_contacts={"touch": 0.2}, **more)
+        scene = set_up(load_config(file))
+        samples = LogReader(scene).read(scene.config.logs.train, scene.sensors)[0]
+        counts.append(len(samples))
+    assert counts[1] < counts[0] - 20, counts
+
+
 def test_the_checks_do_not_reject_flags_that_they_were_not_given(written: Written) -> None:
     file = written(lambda log: replace(log, **NO_FLAGS), detect_contacts=True)
     checked = check_experiment(file)[0]

@@ -13,7 +13,7 @@ from motions import value
 
 from torchid.logs.preprocess import away_from_changes
 from torchid.problem import LinearProblem
-from torchid.problem.contact_detection import fitted_parameters, most_probable
+from torchid.problem.detection_forces import fitted_parameters, most_probable
 from torchid.problem.detection_motion import prepare
 
 

@@ -50,6 +50,7 @@ from torchid.problem.derived_blocks import (
     flag_by_force_in_blocks,
     motion_fields,
     stand_in_blocks,
+    with_flags,
     zero_in_blocks,
 )
 from torchid.problem.log_joints import distances_from_welds, warn_of_moving_welds
@@ -181,7 +182,9 @@ class LargeLog:
         settings, rest = self.settings, (partial(self._pieces, blocks), self.folder)
         if settings.detect_contacts is not None and self.contacts:
             robot = self.robot if self.loaded is None else self.loaded
-            return _Settled(*detect_in_blocks(blocks, robot, self.contacts, settings.detect_contacts, *rest))
+            found = detect_in_blocks(blocks, robot, self.contacts, settings.detect_contacts, *rest)
+            active, certain = found.flags(settings.takes_possible_contacts)
+            return _Settled(with_flags(blocks, self.contacts, active), certain)
         if settings.contact_threshold is not None:
             return _Settled(*flag_by_force_in_blocks(blocks, settings.contact_threshold, *rest))
         return _Settled(blocks)
@@ -229,7 +232,7 @@ class LargeLog:
         checked = settings.max_slip is not None and bool(self.contacts)
         if checked:
             parts.append(self._standing_firmly(course, contacts))
-        if settings.margin_s is not None:
+        if settings.margin_s is not None and settings.detect_contacts is None:
             away = away_from_changes(contacts, course.time, settings.margin_s)
             parts += [] if away is None else [away]
         if certain is not None and not certain.all():

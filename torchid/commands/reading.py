@@ -137,7 +137,7 @@ class LogReader:
             samples = drop_rejected(samples, checked, settings.filter_hz, derived=log is not clean)
             self.excluded[str(path)] = count - len(samples)
         kept = None if slip is None else np.isin(samples.time.numpy(), slip, invert=True)
-        if settings.margin_s is not None:
+        if settings.margin_s is not None and settings.detect_contacts is None:
             away = away_from_changes(recorded, samples.time.numpy(), settings.margin_s)
             kept = away if kept is None else kept if away is None else kept & away
         if not certain.all():
@@ -242,7 +242,8 @@ def _with_flags(log: Log, scene: Scene) -> tuple[Log, BoolArray]:
     """A log with contact flags as recorded, from joint torques or from forces, and where they are certain."""
     settings = scene.config.preprocessing
     if settings.detect_contacts is not None:
-        return with_detected_contacts(log, scene.robot, scene.contacts, settings.detect_contacts)
+        rest = settings.detect_contacts, settings.takes_possible_contacts
+        return with_detected_contacts(log, scene.robot, scene.contacts, *rest)
     if settings.contact_threshold is not None:
         return with_flags_by_force(log, settings.contact_threshold)
     return log, np.ones(len(log), dtype=bool)

@@ -79,6 +79,11 @@ class PreprocessingConfig:
         return flags if self.base_motion is None else (*flags, "base_")
 
     @property
+    def takes_possible_contacts(self) -> bool:
+        """Whether detected flags may be those of contacts that may stand: nothing takes it that they keep still."""
+        return self.base_motion is None and self.max_slip is None
+
+    @property
     def needs_flags(self) -> bool:
         """Whether nothing but a log says which contact touches when."""
         return self.detect_contacts is None and self.contact_threshold is None

@@ -166,3 +166,9 @@ def runs(flags: BoolArray) -> list[tuple[int, int]]:
     """First samples of the runs of flags (N,) that are set, and those after them."""
     ends = np.flatnonzero(np.diff(flags.astype(np.int8), prepend=0, append=0))
     return [(int(start), int(stop)) for start, stop in ends.reshape(-1, 2)]
+
+
+def beside_changes(flags: BoolArray) -> BoolArray:
+    """Which samples (N,) are the last before a change of flags (N, C), or the first after it."""
+    changed = (flags[1:] != flags[:-1]).any(axis=1)
+    return np.asarray(np.append(changed, False) | np.insert(changed, 0, False))

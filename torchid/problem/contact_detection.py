@@ -12,26 +12,18 @@ import torch
 from numpy.typing import NDArray
 from pydantic.dataclasses import dataclass
 
-from torchid import ranks
 from torchid.errors import LogError
 from torchid.logs import Log
-from torchid.logs.flags import hysteresis, runs, samples_of, without_short
+from torchid.logs.flags import beside_changes, hysteresis, runs, samples_of, without_short
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import find_unloaded
 from torchid.logs.spill import growing_array
-from torchid.parameters import FRICTION, PER_BODY
-from torchid.problem.compression import compress_parts
 from torchid.problem.contact_slip import base_velocity, contact_velocities
-from torchid.problem.detection_forces import ForcesAlongNormals
+from torchid.problem.detection_forces import ForcesAlongNormals, fitted_parameters
 from torchid.problem.detection_motion import Prepared, detection_cutoff_hz, prepare
-from torchid.problem.elimination import assemble
-from torchid.problem.extras import ExtraTerms
-from torchid.problem.linear import PRIOR_DEVIATION, LinearProblem
-from torchid.problem.rows import RowBuilder
-from torchid.problem.samples import Samples
 from torchid.robot import Robot
 from torchid.rounding import STD_PER_MAD
-from torchid.sensing import Contact, named_sensors
+from torchid.sensing import Contact
 from torchid.settings import STRICT, NotNegative, Positive
 
 _SUPPORTED = 0.25  # of the weight: what contact forces may leave of it in samples that parameters are fitted to
@@ -48,12 +40,13 @@ class DetectionConfig:
     weight by the URDF. Where the base's motion was measured, it stands also while it carries more than `light` and
     keeps still, for twice `shortest_s` at least. Torques are low-pass filtered before (`cutoff_hz`, zero phase);
     stances and swings shorter than `shortest_s` [s] are none. Samples within `margin_s` [s] of a change are dropped, as
-    are those within `preprocessing.contact_margin_s`.
+    are those within `preprocessing.contact_margin_s`. Contacts of which it is not certain that they are in the air
+    count as standing in all others: a force that may be zero costs a few equations, one that is ignored biases a fit.
 
     With `refit`, where the base's acceleration is known, parameters are then fitted to each log with the contacts that
     were found, and contacts detected again with these: by thresholds that are lower in the same ratio, three standard
     deviations of what feet seem to carry in the air, and with a wider filter as long as these leave `touch` as it is.
-    Samples in which both thresholds differ are dropped.
+    A contact that stands by either counts as standing, and samples about changes by the stated ones are dropped.
     """
 
     touch: Positive = 0.02
@@ -66,14 +59,25 @@ class DetectionConfig:
 
 
 def with_detected_contacts(
-    log: Log, robot: Robot, contacts: Sequence[Contact], settings: DetectionConfig | None = None
+    log: Log,
+    robot: Robot,
+    contacts: Sequence[Contact],
+    settings: DetectionConfig | None = None,
+    possible: bool = False,
 ) -> tuple[Log, BoolArray]:
     """The log with flags of all contacts by `detect_contacts` in the place of what it has, and where they are certain.
+
+    Args:
+        log: as recorded.
+        robot: the robot.
+        contacts: that may stand.
+        settings: thresholds.
+        possible: as of `Detection.flags`.
 
     Raises:
         LogError: as `detect_contacts`; wrenches without the name of a contact.
     """
-    active, certain = detect_contacts(log, robot, contacts, settings or DetectionConfig())
+    active, certain = detect_contacts(log, robot, contacts, settings or DetectionConfig()).flags(possible)
     bare = log.contact_wrench is None and log.contact_force_normal is None and log.contact_normal_world is None
     names, flags = name_flags(log.source, () if bare else log.contact_names, contacts, active)
     return dataclasses.replace(log, contact_names=names, contact_active=flags), certain
@@ -108,12 +112,24 @@ class Detection(NamedTuple):
 
     Attributes:
         active: (N, C).
-        certain: samples (N,) that a fit may trust: neither those at both ends of a log, which the filter spoils, nor
-            stances that were too short to count.
+        certain: samples (N,) whose `active` a fit may trust: neither those at both ends of a log, which the filter
+            spoils, nor those beside changes, nor stances that were too short to count.
+        possible: (N, C), `active` and contacts that may carry something all the same.
+        clear: samples (N,) without ends and changes, by the stated thresholds, in which no other contact carries any.
     """
 
     active: BoolArray
     certain: BoolArray
+    possible: BoolArray
+    clear: BoolArray
+
+    def flags(self, possible: bool) -> tuple[BoolArray, BoolArray]:
+        """Flags (N, C), and samples (N,) that a fit may trust them in: of contacts that stand, or of possible ones.
+
+        A contact that may stand is none to work a pose out of. Of unknown forces it may have one: nothing but the
+        equations that it takes is lost where that is zero.
+        """
+        return (self.possible, self.clear) if possible else (self.active, self.certain)
 
 
 def detect_contacts(log: Log, robot: Robot, contacts: Sequence[Contact], settings: DetectionConfig) -> Detection:
@@ -130,7 +146,8 @@ def detect_contacts(log: Log, robot: Robot, contacts: Sequence[Contact], setting
         InputError: a cutoff that does not suit the log.
     """
     if not contacts:
-        return Detection(np.zeros((len(log), 0), dtype=bool), np.ones(len(log), dtype=bool))
+        none, every = np.zeros((len(log), 0), dtype=bool), np.ones(len(log), dtype=bool)
+        return Detection(none, every, none, every)
 
     def filtered(cutoff_hz: float) -> Filtered:
         whole = prepare(log, robot, contacts, cutoff_hz)
@@ -180,7 +197,8 @@ def detect_in_parts(
         found, time = sharp.finer(in_the_air, sharp.cutoff_hz > known.cutoff_hz), sharp.time
     inside = (stamps >= time[0]) & (stamps <= time[-1])
     nearest = _nearest(time, stamps)
-    return Detection(found.active[nearest], inside & found.certain[nearest])
+    active, certain, possible, clear = (part[nearest] for part in found)
+    return Detection(active, inside & certain, possible, inside & clear)
 
 
 def _nearest(time: FloatArray, stamps: FloatArray) -> NDArray[np.intp]:
@@ -237,7 +255,8 @@ class _Seen:
         if self.velocity is not None:
             loaded |= keep_still(self.velocity, self.in_world, loaded, self.share > settings.light, 2 * shortest)
         flags = np.stack([without_short(one, shortest) for one in loaded.T], axis=1)
-        return Detection(flags, ~np.asarray((loaded & ~flags).any(axis=1)))
+        clear = ~beside_changes(flags)
+        return Detection(flags, clear & ~(loaded & ~flags).any(axis=1), flags | loaded, clear)
 
     def noise(self, in_the_air: BoolArray) -> float:
         """Standard deviation of the share that contacts seem to carry in the air (K, C); infinite of few samples."""
@@ -250,14 +269,18 @@ class _Seen:
 
         Certain is what the settings' own thresholds say too: they differ from before a foot touches until it carries
         something, with an impact between. Of sharp signals feet that scuff the floor are not certain either; elsewhere
-        noise would pass for them.
+        noise would pass for them. In the air is what stands by neither, as far away as the filter lets a scuff be seen.
         """
         found = self.judged()
         factor = float(np.clip(_DEVIATIONS * self.noise(in_the_air) / self.settings.touch, _LOWEST, 1.0))
         lower = {name: factor * getattr(self.settings, name) for name in ("touch", "lift", "light")}
         finer = dataclasses.replace(self, settings=dataclasses.replace(self.settings, **lower)).judged()
-        certain = found.certain & (finer.active == found.active).all(axis=1)
-        return Detection(finer.active, certain & finer.certain if is_sharp else certain)
+        certain = found.certain & finer.clear & (finer.active == found.active).all(axis=1)
+        possible = found.possible | finer.active
+        if is_sharp:
+            certain &= finer.certain
+            possible = ~find_unloaded(self.time, possible | finer.possible, self.smear_s)
+        return Detection(finer.active, certain, possible, found.clear)
 
 
 def _sharpest(
@@ -355,43 +378,4 @@ def _against_standing(velocity: FloatArray, standing: BoolArray) -> FloatArray:
         others[:, contact] = np.nan
         some = np.isfinite(others[:, :, 0]).any(axis=1)
         out[some, contact] = velocity[some, contact] - np.nanmedian(others[some], axis=1)
-    return out
-
-
-_PASSES = 3  # over the variance of what the parameters leave, which settles at once
-
-
-def fitted_parameters(samples: Samples, robot: Robot, contacts: Sequence[Contact]) -> FloatArray:
-    """Parameters (L, 12) of a robot without friction, which was fitted with them, as armatures were.
-
-    Args:
-        samples: with joint torques and the contacts that stand; torques without a value count as not measured.
-        robot: for the prior.
-        contacts: none of which is measured.
-    """
-    sensors = named_sensors("joints", robot.n, len(contacts), ft=len(robot.ft_names))
-    if samples.torque is not None:
-        sensors = dataclasses.replace(sensors, torque=sensors.torque & samples.torque.isfinite().all(dim=0).numpy())
-    builder = RowBuilder(robot, contacts, sensors, ExtraTerms(armature=True))
-    with ranks.apart():  # each process has logs of its own
-        problem = assemble(compress_parts([samples], builder), builder, robot).problem
-    phi = most_probable(problem).reshape(-1, PER_BODY)
-    phi[:, FRICTION] = robot.nominal[:, FRICTION]
-    return phi
-
-
-def most_probable(problem: LinearProblem) -> FloatArray:
-    """Parameters (P,) that are most probable by data and nominal values, with the noise that the data themselves show.
-
-    The prior is that of `PRIOR_DEVIATION`; MacKay, Bayesian Interpolation, 1992, with the prior's width known.
-    """
-    unit = problem.scale[problem.free] * PRIOR_DEVIATION
-    A, b = problem.A[:, problem.free] * unit, problem.b - problem.A @ problem.nominal
-    information, x = A.T @ A, np.zeros(len(unit))
-    for _ in range(_PASSES):
-        left = A @ x - b
-        variance = problem.oversampling * (left @ left + problem.residual) / max(problem.rows, 1)
-        x = np.linalg.lstsq(information + variance * np.eye(len(unit)), A.T @ b, rcond=None)[0]
-    out = problem.nominal.copy()
-    out[problem.free] += unit * x
     return out

@@ -79,8 +79,8 @@ def detect_in_blocks(
     settings: DetectionConfig,
     pieces: Pieces,
     folder: Path | None,
-) -> tuple[LogBlocks, BoolArray]:
-    """As `with_detected_contacts`; a pass over the torques, and two or more that filter them and the motion.
+) -> Detection:
+    """As `detect_contacts`; a pass over the torques, and two or more that filter them and the motion.
 
     Args:
         blocks: the log as recorded.
@@ -91,7 +91,7 @@ def detect_in_blocks(
         folder: with room for forces and velocities of the contacts; None: in memory.
 
     Raises:
-        InputError: as `with_detected_contacts`; a tilted floor below a base whose tilt nobody measured.
+        InputError: as `detect_contacts`; a tilted floor below a base whose tilt nobody measured.
     """
     require_torque(blocks.source, "joint_torque" in blocks.fields)
     _require_level_or_measured(blocks, contacts)
@@ -119,7 +119,7 @@ def detect_in_blocks(
 
         return Filtered(timeline.stamps_of(blocks.time), cutoff_hz, parts)
 
-    return _with_flags(blocks, contacts, detect_in_parts(filtered, blocks.time, robot, contacts, settings, folder))
+    return detect_in_parts(filtered, blocks.time, robot, contacts, settings, folder)
 
 
 def _require_level_or_measured(blocks: LogBlocks, contacts: Sequence[Contact]) -> None:
@@ -131,12 +131,12 @@ def _require_level_or_measured(blocks: LogBlocks, contacts: Sequence[Contact]) -
         raise LogError(blocks.source, "base_quat_xyzw", found, accepted)
 
 
-def _with_flags(blocks: LogBlocks, contacts: Sequence[Contact], found: Detection) -> tuple[LogBlocks, BoolArray]:
-    """The log with the flags that were found."""
+def with_flags(blocks: LogBlocks, contacts: Sequence[Contact], active: BoolArray) -> LogBlocks:
+    """The log with flags (N, C) of an experiment's contacts; LogError as `name_flags`."""
     has_readings = any(name in blocks.fields for name in (*CONTACT_READINGS, NORMALS))
     given = contact_names(blocks) if has_readings else ()
-    names, flags = name_flags(blocks.source, given, contacts, found.active)
-    return blocks.replaced({"contact_active": flags}, {"contact_names": np.array(names, dtype=np.str_)}), found.certain
+    names, flags = name_flags(blocks.source, given, contacts, active)
+    return blocks.replaced({"contact_active": flags}, {"contact_names": np.array(names, dtype=np.str_)})
 
 
 # -------------------------------------------------------------------------------------------------------- standing base
