@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
-from torchid.errors import InputError
+from torchid.errors import InputError, TorchidWarning
 from torchid.logs import Log
 from torchid.logs.column_groups import Family
 from torchid.logs.cutoff import choose_cutoff
@@ -38,7 +39,9 @@ def read_sensors(robot: Robot, log: Log | InputError) -> list[str]:
 def _can_be_split(robot: Robot, joint: str) -> bool:
     """Whether both sides of a fixed joint have mass."""
     try:
-        load_robot(robot.path, ft_joints=[joint])
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", TorchidWarning)  # said of the whole robot
+            load_robot(robot.path, ft_joints=[joint])
     except InputError:
         return False
     return True
