@@ -137,6 +137,10 @@ _FRICTION = "N m or N; N m s/rad or N s/m"
 _UNITS = {
     "robot.weld": "rad or m",
     "robot.base_tilt": "rad",
+    "robot.loops.max_gap": "m",
+    "robot.loops.max_angle": "rad",
+    "actuators.delay": "s",
+    "logs.columns.joint_torque.current.torque_constant": "N m/A",
     "sensors.noise.joint_torque": "N m or N",
     **dict.fromkeys((f"sensors.noise.{x}_force" for x in ("contact", "base", "ft")), "N"),
     **dict.fromkeys((f"sensors.noise.{x}_moment" for x in ("contact", "base", "ft")), "N m"),

@@ -11,25 +11,30 @@ from typing import Any, NoReturn, TypeAlias
 
 from torchid import __version__
 from torchid.boundary import importing, plain_streams, run_guarded, run_in_ranks
+from torchid.commands import EXPORT_FORMATS, SAMPLE_FORMATS
 from torchid.copies import copies_allowed
 from torchid.errors import ConfigError, during
 from torchid.ranks import end_process, is_launched_first, share_work
 
-_IDENTIFY = "fit the parameters of an experiment file and write a run folder"
-_COMPRESS = "compress the training logs of an experiment file to small files of factors, which identify fits too"
+_IDENTIFY = "fit a robot to the logs of an experiment file and write a run folder"
+_COMPRESS = "compress the training logs of an experiment file to small files, which identify fits in their place"
 _EVALUATE = "predict the forces of further logs with the parameters of a run"
-_REPLAY = "drive the robot in MuJoCo with the torques of a log, and say how far it drifts (needs the extra [sim])"
+_REPLAY = "drive the robot in MuJoCo with the torques of a log, and say how far it drifts (extra [sim])"
 _EXPORT = "write the identified parameters of a run for a simulator: MJCF, URDF, Isaac Lab's actuators, or JSON"
-_FORMATS = ("mjcf", "urdf", "isaaclab", "json")  # those of torchid.commands.export, which takes long to import
-_SAMPLE = "draw parameter sets from what the data of a run and a prior leave open, for domain randomization"
-_SAMPLE_FORMATS = ("npz", "urdf", "mjcf", "ranges")  # those of torchid.commands.sample
-_REPORT = "make report.html of a run anew, with what the checks of its logs find (needs the extra [report])"
-_ANALYZE = "analyze what sensors and motion determine, and plan the smallest sensor set"
-_INIT = "write an experiment file for a robot and a log, with a map of its columns or topics, and say what was guessed"
+_SAMPLE = "draw robots from what the logs of a run leave open, for domain randomization"
+_REPORT = "make report.html of a run anew, with what the checks of its logs find (extra [report])"
+_ANALYZE = "say what sensors and motion can determine, and find the smallest sensor set"
+_INIT = "write an experiment file for a robot and a log, and say what was guessed"
 _DEMO = "identify the demo's quadruped, or copy the examples that ship with torchid"
 _CONVERT = "write a log of any type as .npz, .h5, .csv or .parquet"
-_CHECK = "check logs for errors before a fit"
-_SIMULATE = "simulate a robot and write the logs of its sensors (needs the extra [sim])"
+_CHECK = "say what is wrong with logs, and what to do"
+_SIMULATE = "simulate a robot and write the logs of its sensors (extra [sim])"
+_FIRST_STEPS = """first steps with a robot of your own:
+  torchid init robot.urdf walk.csv --output robot.yaml
+  torchid check robot.yaml
+  torchid identify robot.yaml
+
+torchid COMMAND --help lists the options of a command."""
 _SHELLS = ("bash", "zsh")
 _Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 _SHARED = ("identify", "compress", "evaluate", "analyze")
@@ -79,7 +84,12 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="torchid", description="Identify a robot's inertia and friction from logs.")
+    parser = argparse.ArgumentParser(
+        prog="torchid",
+        description="Identify a robot's inertia and friction from logs.",
+        epilog=_FIRST_STEPS,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument("--version", action="version", version=f"torchid {__version__}")
     parser.add_argument(
         "--print-completion",
@@ -88,7 +98,7 @@ def _parser() -> argparse.ArgumentParser:
         help="print a script that completes commands, options and files in this shell",
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for add in (_add_fits, _add_uses_of_runs, _add_studies, _add_work_on_logs, _add_starts):
+    for add in (_add_starts, _add_fits, _add_uses_of_runs, _add_studies, _add_work_on_logs):
         add(commands)
     for name, command in commands.choices.items():
         command.add_argument("--debug", action="store_true", help="show the traceback of an unexpected error")
@@ -97,18 +107,26 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_fits(commands: _Commands) -> None:
-    """Commands that fit, or prepare a fit."""
+    """Commands that take an experiment file: before a fit, and the fit."""
+    check = commands.add_parser("check", help=_CHECK, description=_CHECK)
+    _add_file(check, "experiment file (YAML), or a log", "with an experiment file")
+    check.add_argument(
+        "--urdf", metavar="FILE", help="robot of a log, URDF or MJCF; without it, checks against a robot are skipped"
+    )
+    check.add_argument("--base-link", metavar="LINK", help="base of that robot, if it is not the URDF's root")
+    check.add_argument("--fixed-base", action="store_true", help="the base of that robot is fixed")
+    check.add_argument("--topics", metavar="FILE", help="experiment file with logs.topics, the map of a bag's topics")
+    check.add_argument("--columns", metavar="FILE", help="experiment file with logs.columns, a map of columns")
+    check.add_argument("--json", metavar="FILE", help="write all findings to a .json file")
+    check.add_argument("--figure", metavar="FILE", help="write an overview of all channels (.png, .pdf or .svg)")
+    check.add_argument("--overwrite", action="store_true", help="replace these two files if they exist")
+    _add_amount(check)
+    check.set_defaults(command=_check)
     identify = commands.add_parser("identify", help=_IDENTIFY, description=_IDENTIFY)
-    identify.add_argument("file", help="experiment file (YAML)")
-    identify.add_argument("overrides", nargs="*", default=[], help="key.subkey=value, for example estimator.ridge=0.01")
+    _add_file(identify, "experiment file (YAML)", "for example estimator.ridge=0.01")
     _add_amount(identify)
     identify.add_argument("--resume", action="store_true", help="continue an interrupted training (sgd)")
     identify.set_defaults(command=_identify)
-    compress = commands.add_parser("compress", help=_COMPRESS, description=_COMPRESS)
-    compress.add_argument("file", help="experiment file (YAML)")
-    compress.add_argument("overrides", nargs="*", default=[], help="key.subkey=value, for example overwrite=true")
-    compress.add_argument("--output", required=True, metavar="FOLDER", help="folder to write: a .factor file per log")
-    compress.set_defaults(command=_compress)
 
 
 def _add_uses_of_runs(commands: _Commands) -> None:
@@ -136,7 +154,7 @@ def _add_uses_of_runs(commands: _Commands) -> None:
     replay.set_defaults(command=_replay)
     export = commands.add_parser("export", help=_EXPORT, description=_EXPORT)
     export.add_argument("run", help="run folder")
-    export.add_argument("--format", required=True, choices=_FORMATS, help="what to write")
+    export.add_argument("--format", required=True, choices=EXPORT_FORMATS, help="what to write")
     export.add_argument("--output", metavar="FILE", help="file to write (default: standard output)")
     export.add_argument("--overwrite", action="store_true", help="replace this file if it exists")
     export.set_defaults(command=_export)
@@ -151,12 +169,12 @@ def _add_sample(commands: _Commands) -> None:
     sample.add_argument("run", help="run folder")
     sample.add_argument("--count", type=int, metavar="N", help="number of sets (default: 10000, of robots' files 20)")
     what = "arrays with names, a file of the robot for each set, or ranges and correlations (default: by --output)"
-    sample.add_argument("--format", choices=_SAMPLE_FORMATS, help=what)
+    sample.add_argument("--format", choices=SAMPLE_FORMATS, help=what)
     sample.add_argument("--output", metavar="FILE", help="FILE.npz, FILE.json, or a folder for robots' files")
-    prior = "standard deviation of the robot file's parameters, as a share of each body (default: 0.2)"
+    prior = "how far off the robot file may be: a standard deviation, as a share of each body (default: 0.2)"
     sample.add_argument("--prior-error", type=float, default=0.2, metavar="SHARE", help=prior)
-    sample.add_argument("--seed", type=int, default=0, metavar="N", help="of the random numbers (default: 0)")
-    sample.add_argument("--overwrite", action="store_true", help="replace what stands there")
+    sample.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the random numbers (default: 0)")
+    sample.add_argument("--overwrite", action="store_true", help="replace what exists there")
     _add_amount(sample)
     sample.set_defaults(command=_sample)
 
@@ -164,38 +182,17 @@ def _add_sample(commands: _Commands) -> None:
 def _add_studies(commands: _Commands) -> None:
     """Commands that need no recorded log."""
     analyze = commands.add_parser("analyze", help=_ANALYZE, description=_ANALYZE)
-    analyze.add_argument("file", help="experiment file (YAML); logs and sensors may be left out")
-    analyze.add_argument(
-        "overrides", nargs="*", default=[], help="key.subkey=value, for example analysis.candidates.contacts=axis"
-    )
+    _add_file(analyze, "experiment file (YAML), also without logs", "as analysis.candidates.contacts=axis")
     _add_amount(analyze)
     analyze.set_defaults(command=_analyze)
     simulate = commands.add_parser("simulate", help=_SIMULATE, description=_SIMULATE)
-    simulate.add_argument("file", help="simulation file (YAML)")
-    simulate.add_argument(
-        "overrides", nargs="*", default=[], help="key.subkey=value, for example sensors.bias.enabled=true"
-    )
+    _add_file(simulate, "simulation file (YAML)", "for example sensors.bias.enabled=true")
     _add_amount(simulate)
     simulate.set_defaults(command=_simulate)
 
 
 def _add_work_on_logs(commands: _Commands) -> None:
-    """Commands that take logs as they were recorded."""
-    check = commands.add_parser("check", help=_CHECK, description=_CHECK)
-    check.add_argument("file", help="experiment file (YAML), whose logs are checked against its robot, or a log")
-    check.add_argument("overrides", nargs="*", default=[], help="key.subkey=value, with an experiment file")
-    check.add_argument(
-        "--urdf", metavar="FILE", help="robot of a log, URDF or MJCF; without it, checks against a robot are skipped"
-    )
-    check.add_argument("--base-link", metavar="LINK", help="base of that robot, if it is not the URDF's root")
-    check.add_argument("--fixed-base", action="store_true", help="the base of that robot is fixed")
-    check.add_argument("--topics", metavar="FILE", help="experiment file with logs.topics, the map of a bag's topics")
-    check.add_argument("--columns", metavar="FILE", help="experiment file with logs.columns, a map of columns")
-    check.add_argument("--json", metavar="FILE", help="write all findings to a .json file")
-    check.add_argument("--figure", metavar="FILE", help="write an overview of all channels (.png, .pdf or .svg)")
-    check.add_argument("--overwrite", action="store_true", help="replace these two files if they exist")
-    _add_amount(check)
-    check.set_defaults(command=_check)
+    """Commands that write logs anew."""
     convert = commands.add_parser("convert", help=_CONVERT, description=_CONVERT)
     convert.add_argument(
         "source", metavar="IN", help="log: .npz, .h5, .mat, .csv, .txt, .parquet, .mot, .sto, or a bag of ROS messages"
@@ -205,10 +202,21 @@ def _add_work_on_logs(commands: _Commands) -> None:
     convert.add_argument("--columns", metavar="FILE", help="experiment file with logs.columns, a map of columns")
     convert.add_argument("--overwrite", action="store_true", help="replace OUT if it exists")
     convert.set_defaults(command=_convert)
+    compress = commands.add_parser("compress", help=_COMPRESS, description=_COMPRESS)
+    _add_file(compress, "experiment file (YAML)", "for example overwrite=true")
+    compress.add_argument("--output", required=True, metavar="FOLDER", help="folder to write: a .factor file per log")
+    compress.set_defaults(command=_compress)
 
 
 def _add_starts(commands: _Commands) -> None:
     """Commands that one begins with."""
+    demo = commands.add_parser("demo", help=_DEMO, description=_DEMO)
+    demo.add_argument("overrides", nargs="*", default=[], help="key.subkey=value, as of identify")
+    place = demo.add_mutually_exclusive_group()
+    place.add_argument("--output", metavar="FOLDER", help="run folder to write (default: runs/quadruped)")
+    place.add_argument("--copy", metavar="FOLDER", help="fit nothing; copy the examples to a new folder, to edit them")
+    _add_amount(demo)
+    demo.set_defaults(command=_demo)
     init = commands.add_parser("init", help=_INIT, description=_INIT)
     init.add_argument("urdf", metavar="ROBOT", help="the robot, a URDF or MJCF file")
     init.add_argument(
@@ -217,15 +225,9 @@ def _add_starts(commands: _Commands) -> None:
         help="table, arrays or bag: .csv, .txt, .parquet, .mot, .sto, .npz, .h5, .mat, .mcap, .db3, .bag; "
         "or several, 'FILE + FILE@SECONDS'",
     )
-    init.add_argument("--output", default="experiment.yaml", metavar="FILE", help="file to write, a new one")
+    what = "file to write, a new one (default: experiment.yaml)"
+    init.add_argument("--output", default="experiment.yaml", metavar="FILE", help=what)
     init.set_defaults(command=_init)
-    demo = commands.add_parser("demo", help=_DEMO, description=_DEMO)
-    demo.add_argument("overrides", nargs="*", default=[], help="key.subkey=value, as of identify")
-    what = demo.add_mutually_exclusive_group()
-    what.add_argument("--output", metavar="FOLDER", help="run folder to write (default: runs/quadruped)")
-    what.add_argument("--copy", metavar="FOLDER", help="fit nothing; copy the examples to a new folder, to edit them")
-    _add_amount(demo)
-    demo.set_defaults(command=_demo)
 
 
 class _PrintCompletion(argparse.Action):
@@ -241,6 +243,11 @@ class _PrintCompletion(argparse.Action):
                 if action.dest not in ("overrides", "base_link", "device") and action.nargs != 0:
                     action.complete = shtab.DIRECTORY if action.metavar == "FOLDER" else shtab.FILE
         parser.exit(run_guarded("torchid", lambda: print(shtab.complete(parser, values[1]))))
+
+
+def _add_file(command: argparse.ArgumentParser, what: str, example: str) -> None:
+    command.add_argument("file", help=what)
+    command.add_argument("overrides", nargs="*", default=[], help=f"key.subkey=value, {example}")
 
 
 def _add_amount(command: argparse.ArgumentParser) -> None:

@@ -21,7 +21,7 @@ from torchid.config import load_analysis, load_simulation
 from torchid.logs import write_log
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
-ELSEWHERE = {"python.md", "recipes.md", "README.md"}  # whose Python other tests run
+ELSEWHERE = {"python.md", "recipes.md"}  # whose Python other tests run
 
 
 def blocks(language: str) -> list[Any]:
@@ -78,6 +78,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     log = make_log(Oracle.of(robot), [("l_sole", 6), ("r_sole", 6)], states, 240, rng)
     still = np.tile([0.0, 0.0, 0.0, 1.0], (len(log.time), 1))  # which a filter leaves
     write_log(dataclasses.replace(log, base_quat_xyzw=still), folder / "walk.npz")
+    feet = [{"frame": frame, "type": "flat"} for frame in ("l_sole", "r_sole")]
+    write_log(log, folder / "turning.npz")
+    least = {"robot": "robot.urdf", "contacts": feet, "logs": ["turning.npz"], "sensors": "full"}
+    (folder / "robot.yaml").write_text(yaml.safe_dump(least | {"estimator": {"ridge": 0.01}}))
     return folder
 
 

@@ -91,6 +91,9 @@ def test_every_number_of_the_file_has_a_unit() -> None:
     assert units["estimator.total_mass.std"][1] == "kg"
     assert units["sensors.noise.angular_velocity"][1] == "rad/s"
     assert units["estimator.ridge"][1] == "1"
+    assert (units["robot.loops.max_gap"][1], units["robot.loops.max_angle"][1]) == ("m", "rad")
+    assert (units["actuators.delay"][1], units["actuators.sign_width"][1]) == ("s", "rad/s or m/s")
+    assert units["logs.columns.joint_torque.current.torque_constant"][1] == "N m/A"
 
 
 def test_public_names_are_described(site: Path) -> None:

@@ -30,7 +30,7 @@ def test_a_run_gives_the_noise_beside_its_errors(tmp_path: Path, capsys: pytest.
     assert found["train"]["projected_residual"] == pytest.approx(0.38, abs=0.01)
     for value in (found["train"]["base_force"], found["test"]["base_moment"]):
         assert f"{value:.4g}" in printed
-    assert printed.count("noise of readings") == 4
+    assert printed.count("│   noise alone") == 4
     assert main(["evaluate", str(run), "--log", str(demo / "sway_test.npz")]) == 0
     evaluated = json.loads((run / "evaluation/sway_test/metrics.json").read_text())["sway_test"]
     assert evaluated["noise_floor"] == pytest.approx(found["test"], rel=1e-9)
@@ -46,7 +46,7 @@ def test_noise_that_residuals_show_is_no_measure_of_them(tmp_path: Path, capsys:
     assert main(["identify", "--verbose", str(demo / "quadruped.yaml"), f"output={run}"]) == 0
     assert floors(run) == {"train": {}, "test": {}}
     assert main(["evaluate", str(run), "--log", str(demo / "sway_test.npz")]) == 0
-    assert "noise of readings" not in capsys.readouterr().out
+    assert "│   noise alone" not in capsys.readouterr().out
 
 
 def series(noise: Array | None) -> ForceSeries:

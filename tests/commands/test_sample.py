@@ -32,7 +32,7 @@ def test_npz_has_names_and_bodies_that_exist(run: Path, tmp_path: Path, capsys: 
     out = tmp_path / "s.npz"
     assert main(["sample", str(run), "--count", "500", "--output", str(out)]) == 0
     printed = capsys.readouterr().out
-    assert "500 samples, each inside all conditions" in printed
+    assert "500 robots that can exist" in printed
     assert max(map(len, printed.splitlines())) <= 100
     with np.load(out) as arrays:
         samples, names = arrays["samples"], arrays["names"].tolist()

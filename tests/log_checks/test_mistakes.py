@@ -19,7 +19,7 @@ from torchid.log_checks.standing_feet import measure_foot_slip
 from torchid.regressor import Regressor
 
 BY_NAME = {mistake.name: mistake for mistake in MISTAKES}
-#: Cells of the whole table that are not named, and why: see docs/checking.md.
+#: Cells of the whole table that are not named, and why: see docs/measurements.md.
 UNNAMED = {("wrenches about another point", "biped", "contacts")}
 #: Of a robot that walks upright along the world's x axis, with all sensors.
 UPRIGHT = (

@@ -56,7 +56,7 @@ OPTIMIZERS: dict[str, OptimizerUse] = {
     "Rprop": OptimizerUse({"lr": 0.2}, full_batch=True),
     "SGD": OptimizerUse({"lr": 0.5}, {"momentum": 0.9, "nesterov": True}),
 }
-"""The supported optimizers: those that converge to the closed form (figures in docs/estimators.md)."""
+"""The supported optimizers: those that converge to the closed form (figures in docs/measurements.md)."""
 
 
 def optimizer_names() -> list[str]:

@@ -112,7 +112,7 @@ class BaseParameters(nn.Module):
 def base_parameters(
     problem: LinearProblem, tolerance: float = RANK_TOLERANCE, preference: Array | None = None
 ) -> BaseParameters:
-    """Base parameters of a problem.
+    """The combinations of parameters that the rows of a problem depend on, and those that they do not.
 
     Columns are scaled to norm 1, so that a finger's inertia counts as much as the torso's mass. A pivoted QR
     factorization of their null space decides which parameters are regrouped into the others. Source: Gautier,

@@ -69,7 +69,7 @@ def read_log(
     bridge_gaps_s: float | None = None,
     needs_flags: bool = True,
 ) -> Log:
-    """Read a log: arrays (.npz, never pickled, .h5, .hdf5), a table (.csv, .parquet) or a bag of ROS messages.
+    """Read a log: arrays (.npz, .h5, .mat), a table (.csv, .txt, .parquet, OpenSim's .mot) or a bag of ROS messages.
 
     Quaternions come back in the order xyzw, renormalised and without sign flips; linear velocity and acceleration of
     the base in the world frame, angular ones in the base frame. An acceleration's components are only rotated: it is

@@ -123,7 +123,7 @@ def compress_in_blocks(
     progress: ProgressCallback | None = None,
     weight_rows: RowWeighting | None = None,
 ) -> list[Part]:
-    """As `compress_parts`, but with a factor for each of some blocks of successive samples in every fold, too.
+    """As `compress_parts`, but each fold in blocks of successive samples, whose scatter widens standard errors.
 
     Args:
         logs: as `split_into_folds` cuts them.
@@ -244,9 +244,7 @@ def merge_factors(factors: Iterable[TriangularFactor], builder: RowBuilder) -> T
 
 @one_thread()
 def linear_problem(factor: TriangularFactor, builder: RowBuilder, robot: Robot, friction: bool = True) -> LinearProblem:
-    """The problem in all 12 L parameters from the factor of the regrouped columns.
-
-    Which parameters are free is decided by `free_parameters`.
+    """Pose the linear problem in all 12 L parameters of the bodies from a factor that `compress` made.
 
     Raises:
         ValueError: the builder has extra parameters; `assemble` eliminates them.

@@ -95,10 +95,16 @@ class Assembly:
 
 @one_thread()
 def assemble(parts: Sequence[Part], builder: RowBuilder, robot: Robot, friction: bool = True) -> Assembly:
-    """The linear problem of all parts in the bodies' parameters.
+    """Pose the linear problem in the bodies' parameters (12 L,), with all extra parameters eliminated.
 
     Orthogonal projection eliminates first the unknowns of each log, then those of all logs. It changes neither the
     least-squares solution nor the noise of the rows.
+
+    Args:
+        parts: factors of logs, from `compress_parts` or `compress_in_blocks`.
+        builder: of their rows, with their extra parameters.
+        robot: with the nominal parameters.
+        friction: whether friction is free.
     """
     everything = merge_factors((part.factor for part in parts), builder)
     prior = column_prior(builder, robot, friction)

@@ -99,7 +99,7 @@ def _error_table(columns: Mapping[str, Comparison[Metrics]], of: str) -> Table:
         floors = [pair.identified.noise.get(group) for pair in columns.values()]
         if any(floor is not None for floor in floors):
             cells = (("", "-" if floor is None else f"{floor:.4g}") for floor in floors)
-            table.add_row("  noise of readings", *(cell for pair in cells for cell in pair))
+            table.add_row("  noise alone", *(cell for pair in cells for cell in pair))
     return table
 
 

@@ -84,8 +84,8 @@ def sample_lines(drawn: DrawnSamples, width: int, verbose: bool = False) -> list
     fitted, table = drawn.fitted, table_of_draws(drawn.samples)
     total = np.quantile(table[:, MASS : len(fitted.posterior.nominal) : PER_BODY].sum(axis=1), _ENDS)
     lines = wrap_words(
-        f"{format_count(len(table), 'sample')}, each inside all conditions; 95 % of them have a total mass of "
-        f"{total[0]:.4g} to {total[2]:.4g} kg. Prior: {100.0 * drawn.prior_error:g} % of each body.",
+        f"{format_count(len(table), 'robot')} that can exist; 95 % of them weigh {total[0]:.4g} to {total[2]:.4g} kg. "
+        f"Prior: nominal bodies may be off by {100.0 * drawn.prior_error:g} % (--prior-error).",
         width,
         "  ",
     )
@@ -95,10 +95,9 @@ def sample_lines(drawn: DrawnSamples, width: int, verbose: bool = False) -> list
     columns = [
         (title, [f"{x:.4g}" for x in row]) for title, row in zip(("2.5 %", "median", "97.5 %"), ranges, strict=True)
     ]
-    lines += column_lines(("widest, masses and friction" if not verbose else "parameter", names), columns, width)
-    if drawn.output is not None:
-        lines.append(f"{'written to':{LABEL}}{drawn.output}")
-    return lines
+    lines += column_lines(("widest, in SI units" if not verbose else "parameter", names), columns, width)
+    where = "no file: --output samples.npz, ranges.json or, with --format urdf, a folder"
+    return [*lines, f"{'written to':{LABEL}}{where if drawn.output is None else drawn.output}"]
 
 
 def _shown(drawn: DrawnSamples, table: Array, verbose: bool) -> list[int]:
