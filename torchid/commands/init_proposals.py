@@ -3,20 +3,13 @@
 from __future__ import annotations
 
 import re
-<<<<<<< HEAD
 import warnings
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
-
-from torchid.errors import InputError, TorchidWarning
-=======
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from torchid.errors import InputError, excerpt, format_count, join_names
->>>>>>> main
+from torchid.errors import InputError, TorchidWarning, excerpt, format_count, join_names
 from torchid.logs import Log
 from torchid.logs.column_groups import Family
 from torchid.logs.column_proposals import OF_PLATES, is_current, is_desired, propose_field
