@@ -153,7 +153,7 @@ def missing_columns(joints: int, fields: Collection[str], partial: Mapping[str, 
     """
     partial = {name: of for name, of in partial.items() if name not in fields}
     out = [f"{name}: no {what} of numbers of {join_names(of)}, but of all others" for name, of in partial.items()]
-    for name in ("time", "joint_position"):
+    for name in ("time", "joint_position") if joints else ("time",):
         if name not in {*fields, *partial}:
             of_joints = f", of most of {joints} joints" * (name != "time")
             out.append(f"{name}: no {what}s that look like it{of_joints}{_OTHER_FILE * (what == 'column')}")
@@ -178,7 +178,7 @@ def hints(
         unknown = "without which foot stands on which and where each lies (docs/tables.md, Force plates)"
         out.append(f"contact_wrench_world: {join_names(plates)} may be readings of force plates, {unknown}")
     positions = [name for name in measured if propose_field(name) == "joint_position"]
-    if "joint_position" not in fields and len(positions) > 2:
+    if joints and "joint_position" not in fields and len(positions) > 2:
         names = f"those of this robot are {join_names(joints)}"
         out.append(
             f"joint_position: {format_count(len(positions), what)} like '{excerpt(positions[0])}' may be of other"
