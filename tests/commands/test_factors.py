@@ -18,7 +18,9 @@ import torchid
 from torchid.cli import main
 from torchid.commands.results import Identification
 from torchid.config import load_config
+from torchid.fitting.experiment import set_up
 from torchid.fitting.factor_files import FactorFile, read_factors, write_factors
+from torchid.fitting.fleet import read_fleet
 from torchid.problem.metrics import ERROR_GROUPS, WHITENED
 
 pytestmark = [
@@ -159,6 +161,18 @@ def test_a_run_of_factors_says_what_it_can(fleet: Path, tmp_path: Path, capsys: 
     events.Reload()
     assert "training/samples_per_second" not in events.Tags()["scalars"]
     assert main(["evaluate", str(output), "--log", str(fleet / "sway_test.npz")]) == 0
+
+
+def test_the_cutoff_that_was_left_to_the_logs_is_printed_and_fits_their_factors(
+    fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    auto = [str(fleet / "logs.yaml"), "preprocessing.cutoff_hz=auto"]
+    assert main(["compress", *auto, "--output", str(tmp_path / "f")]) == 0
+    (printed,) = [line.split() for line in capsys.readouterr().out.splitlines() if line.startswith("cutoff")]
+    factors = [f"logs.train=[{tmp_path}/f/*.factor]", f"output={tmp_path / 'run'}"]
+    assert "accepted: what compress printed" in refusal(["identify", *auto, *factors], tmp_path, capsys)
+    settings = load_config(fleet / "logs.yaml", [*factors, "logs.test=[]", f"preprocessing.cutoff_hz={printed[1]}"])
+    assert len(read_fleet(set_up(settings)).files[0].log) > 0
 
 
 def test_the_table_of_files_says_what_is_in_them(

@@ -14,10 +14,10 @@ from synthetic import UR5
 
 import torchid
 from torchid.cli import main
-from torchid.fitting.misfit import Misfit, UnfittedFriction, unfitted_friction
+from torchid.fitting.misfit import Misfit, UnfittedFriction, beyond_models, unfitted_friction
 from torchid.fitting.noise import GroupNoise
 from torchid.parameters import FRICTION
-from torchid.problem import bind_log
+from torchid.problem import LinearProblem, bind_log
 
 UNITS = (("N m", "N m s/rad"), ("N", "N s/m"))
 UNPHYSICAL = "ignore::torchid.errors.TorchidWarning"
@@ -116,3 +116,14 @@ def test_friction_that_the_model_lacks_is_said_before_all_else(
     assert lacking["unfitted_friction"] > 100.0
     assert "friction, which is not fitted, explains" in lacking["message"]
     assert told["false"][1].startswith("NOT EXPLAINED: the model does not explain these forces: residuals are 11 times")
+
+
+def test_only_noise_that_was_stated_makes_a_large_residual_unlike_any_model() -> None:
+    rng = np.random.default_rng(0)
+    A, forces = rng.normal(size=(200, 4)), np.full(4, 100.0)
+    problem = LinearProblem(
+        A, A @ forces + 8.0 * rng.normal(size=200), 0.0, 200, np.zeros(4), np.ones(4), np.ones(4, bool)
+    )
+    estimate = torchid.LeastSquares(ridge=0.0).solve(problem)
+    assert "times the stated sensor noise" in (beyond_models(estimate, problem) or "")
+    assert beyond_models(estimate, problem, noise_stated=False) is None

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from demo import DEMO
+from synthetic import UR5, Oracle, load
 
 import torchid
 from torchid.errors import InputError
@@ -77,6 +78,23 @@ def test_samples_are_as_wide_as_standard_errors_where_the_data_speak(run: torchi
     deviation = samples.phi.flatten(1).numpy().std(axis=0)
     ratio = deviation[known] / estimate.standard_error[known]
     assert 0.4 < np.median(ratio) < 1.3  # mirror images share what both legs say of them
+
+
+def test_friction_that_is_many_times_the_usual_stays_where_the_data_have_it(tmp_path: Path) -> None:
+    robot, rng = load(UR5, fixed_base=True), np.random.default_rng(0)
+    oracle, time = Oracle.of(robot), np.arange(1500) / 100.0
+    phase = 2.0 * np.pi * time[:, None] * rng.uniform(0.2, 0.5, robot.n) + rng.uniform(0.0, 6.0, robot.n)
+    rate = np.gradient(phase, time, axis=0)
+    q, v, a = 0.8 * np.sin(phase), 0.8 * rate * np.cos(phase), -0.8 * rate**2 * np.sin(phase)
+    torque = oracle.frictionless_forces(q, v, a) + 40.0 * np.sign(v) + 15.0 * v + rng.normal(size=q.shape)
+    log = {"joint_position": q, "joint_velocity": v, "joint_acceleration": a, "joint_torque": torque}
+    np.savez(tmp_path / "log.npz", time=time, joint_names=np.array(robot.joint_names), **log)
+    run = torchid.identify(
+        robot={"urdf": UR5, "fixed_base": True}, sensors="joints", logs={"train": [tmp_path / "log.npz"]}, output=None
+    )
+    friction = torchid.PosteriorSampler(run.posterior).sample(1000, torch.Generator().manual_seed(0)).coulomb_friction
+    mean, error = friction[:, 1:].mean(0).numpy(), run.estimate.standard_error.reshape(-1, 12)[1:, 10]
+    assert np.abs(mean - 40.0).max() < 4.0 * error.max()
 
 
 def test_a_sampler_of_less_than_float64_says_so(run: torchid.Identification) -> None:

@@ -23,6 +23,7 @@ from torchid.log_checks import NOTE, REJECTED, SUSPICIOUS, Checked, scales
 from torchid.log_checks.check import check
 from torchid.logs import Log, read_log
 from torchid.logs.preprocess import preprocess
+from torchid.parameters import VISCOUS
 from torchid.robot import Robot, load_robot
 from torchid.sensing import Contact
 
@@ -61,6 +62,22 @@ def test_forces_of_a_robot_that_differs_from_its_urdf_by_a_fifth_are_not_complai
     for checked in (of_arm(), of_demo(demo_log())):
         assert checked.verdict == "usable"
         assert {one.name for one in checked.findings} <= {"weight"}
+
+
+def test_friction_of_the_urdf_that_the_forces_contradict_is_named_and_nothing_is_rejected() -> None:
+    robot, log = arm()
+    nominal = robot.nominal.copy()
+    nominal[2, VISCOUS] = 400.0
+    stated = replace(robot, nominal=nominal)
+    checked = check(log, stated, (), 5.0)
+    friction = only(checked, "friction")
+    assert friction.severity == NOTE
+    assert f"without the friction that it states: viscous up to 400 in {robot.joint_names[1]}" in friction.found
+    assert checked.verdict == "usable"
+    reversed_too = check(rescaled(log, [1], -1.0), stated, (), 5.0)
+    assert only(reversed_too, "sign").channels == (robot.joint_names[1],), "judged without that friction"
+    degrees = check(replace(log, joint_position=np.rad2deg(log.joint_position)), stated, (), 5.0)
+    assert any("degrees" in one.found and one.severity == REJECTED for one in degrees.findings)
 
 
 @pytest.mark.parametrize("joint", [1, 3])

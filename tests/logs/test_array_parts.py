@@ -51,6 +51,16 @@ def test_parts_of_an_array_are_fields_whole_and_in_blocks(tmp_path: Path, suffix
     np.testing.assert_array_equal(some.base_position_world, QPOS[20:30, :3])
 
 
+@pytest.mark.parametrize("shape", [(50, 6), (50, 1, 6)])
+def test_a_wrench_of_one_contact_needs_no_axis_for_its_name(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    wrench = RNG.normal(size=shape)
+    np.savez(tmp_path / "x.npz", time=TIME, qpos=QPOS, tau=QPOS[:, -2:], thrust=wrench)
+    entries = {"contact_order": ["body"], "contact_wrench_local": {"column": "thrust"}}
+    columns = Columns(**MAP, **entries, contact_active={"always": ["body"]})  # type: ignore[arg-type]
+    found = read_log(tmp_path / "x.npz", columns=columns).contact_wrench_local
+    np.testing.assert_array_equal(found, wrench.reshape(50, 1, 6))
+
+
 @pytest.mark.parametrize("text", ["qpos[7:12]", "qpos[9:]", "qpos[4:4]", "time[0:2]"])
 def test_columns_that_an_array_has_not_are_refused(tmp_path: Path, text: str) -> None:
     columns = Columns(**{**MAP, "joint_position": {"column": text}, "time": {"column": "time"}})  # type: ignore[arg-type]

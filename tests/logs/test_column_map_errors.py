@@ -213,8 +213,8 @@ BAD_ARRAYS: list[tuple[str, dict[str, Any], str]] = [
     ),
     (
         ORDER + "joint_position: q\nft_wrench: w\nsensor_order: [s]",
-        {"w": np.ones((3, 6))},
-        "'w': shape (N, 6); accepted",
+        {"w": np.ones((3, 5))},
+        "'w': shape (N, 5); accepted",
     ),
     (
         ORDER + "joint_position: q\njoint_velocity: v",

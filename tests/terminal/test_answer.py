@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,8 @@ from torchid.cli import main
 from torchid.commands.identify import identify
 from torchid.commands.results import Identification
 from torchid.config import load_config
-from torchid.estimators.least_squares import COMBINED, IDENTIFIED
+from torchid.estimators import SgdEstimate
+from torchid.estimators.least_squares import COMBINED, IDENTIFIED, ConstrainedEstimate
 from torchid.parameters import PER_BODY
 from torchid.problem import Metrics
 from torchid.problem.metrics import DECISIVE_GROUPS, LIMB_GROUPS, WHITENED, WorseThanNominal
@@ -104,6 +105,21 @@ def test_a_total_mass_that_contradicts_the_urdf_needs_attention(consistent: Iden
     assert "attention     the total mass is 0.4 times the URDF's: weigh the robot" in text(light, 400)
     vague = replace(light, mass=replace(light.mass, standard_error=0.4 * consistent.mass.nominal))
     assert "times the URDF's" not in text(vague)
+
+
+def test_a_descent_that_ended_many_standard_errors_from_the_least_says_so(consistent: Identification) -> None:
+    own = {x.name for x in fields(ConstrainedEstimate)}
+    shared = {name: x for name, x in vars(consistent.estimate).items() if name in own}
+    least = consistent.estimate.cost / consistent.estimate.rows
+    noise = consistent.estimate.oversampling * consistent.estimate.residual_std**2 / consistent.estimate.rows
+    for deviation, told in ((1.0, False), (5.0, True)):
+        away = least + deviation**2 * consistent.estimate.rank * noise
+        descent = {"objective": away, "unconstrained": least, "epochs": 9, "best_epoch": 9, "residual": None}
+        estimate = SgdEstimate(**shared | descent)
+        assert estimate.deviation == pytest.approx(deviation)
+        said = text(replace(consistent, estimate=estimate), 400)
+        assert ("attention     the descent has not converged" in said) is told
+        assert ("off by 5 standard errors" in said) is told
 
 
 def test_residuals_that_cannot_contradict_the_model_are_said_to_show_nothing(consistent: Identification) -> None:

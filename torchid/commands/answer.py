@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from torchid.errors import join_names
-from torchid.estimators import Estimate
+from torchid.estimators import Estimate, SgdEstimate
 from torchid.fitting.calibration import list_confounded
 from torchid.identifiability.confounding import TotalMass
 from torchid.log_checks.weight import MAX_MASS_ERROR
@@ -90,6 +90,7 @@ def _percent(share: float) -> str:
 
 
 _LARGER_THAN_MEASURED = 1.05  # errors over the measured, of sensors that any fit of their limb explains better
+_FAR_FROM_LEAST = 3.0  # standard errors by noise, rms; those that are printed count the scatter of blocks, too
 _CLEAR_ERRORS = 4.0  # standard errors of a total mass from which on it is not the URDF's
 
 
@@ -163,6 +164,8 @@ def _attention(run: Identification, judged: Judged) -> Iterator[str]:
     """What the user should look at, the most urgent first."""
     if run.worse:
         yield ADVICE
+    if isinstance(run.estimate, SgdEstimate) and run.estimate.deviation > _FAR_FROM_LEAST:
+        yield _unfinished(run.estimate)
     yield from _unlike_sensors(judged.identified)
     impossible = [one.term for one in run.violations if one.term is not None]
     if impossible:
@@ -182,6 +185,16 @@ def _attention(run: Identification, judged: Judged) -> Iterator[str]:
         yield one.in_short
     if run.noise.suggested:
         yield f"noise: {noise_advice(run.noise.suggested)}"
+
+
+def _unfinished(estimate: SgdEstimate) -> str:
+    """That a descent ended far from where least squares, whose standard errors it has, would end."""
+    objective = estimate.objective / (estimate.unconstrained or estimate.objective)
+    return (
+        f"the descent has not converged: its objective is {objective:.3g} times the least, its parameters are off by"
+        f" {estimate.deviation:.2g} standard errors, which are those of least squares; more estimator.training.epochs,"
+        " optimizer LBFGS, or estimator.name=consistent"
+    )
 
 
 def _unlike_sensors(identified: Metrics) -> Iterator[str]:

@@ -14,7 +14,7 @@ from pathlib import Path
 from rich.progress import Progress
 
 from torchid import ranks
-from torchid.commands.chosen_settings import with_chosen_settings
+from torchid.commands.chosen_settings import Choices, with_chosen_settings
 from torchid.commands.folder import COMPRESSED, check_free, new_folder
 from torchid.commands.manifest import file_checksum
 from torchid.commands.reading import LogReader
@@ -56,6 +56,7 @@ class Compression:
         noise: that rows were weighted with.
         output: the folder.
         rolling: which contacts roll, on what.
+        choices: settings that were left to the logs.
     """
 
     files: list[CompressedFile]
@@ -63,6 +64,7 @@ class Compression:
     noise: NoiseSummary
     output: Path
     rolling: str
+    choices: Choices
 
 
 @one_thread()
@@ -90,7 +92,7 @@ def compress(config: ExperimentConfig, output: str | Path) -> Compression:
     share = ranks.own_share(ranks.as_first([_size(path) for path in config.logs.train], "sizes of the logs"))
     paths = config.logs.train[share]
     with progress_bars() as bars:
-        experiment, _ = with_chosen_settings(set_up(config), bars)
+        experiment, choices = with_chosen_settings(set_up(config), bars)
         builder = experiment.builder(experiment.sensors)
         with _told_by_first(), ranks.apart():
             logs, excluded = _read(experiment, paths, output, bars)
@@ -100,7 +102,9 @@ def compress(config: ExperimentConfig, output: str | Path) -> Compression:
         noise = experiment.estimate_noise(_with_those_elsewhere(logs), experiment.sensors)
         factors = _compressed(with_noise(experiment, noise), noise, paths, logs, states, excluded, bars)
         files = _write_all(names, zip(names[share], factors, strict=True), output, config.overwrite)
-    return Compression(files=files, states=together, noise=noise, output=output, rolling=experiment.rolling)
+    return Compression(
+        files=files, states=together, noise=noise, output=output, rolling=experiment.rolling, choices=choices
+    )
 
 
 def _file_names(logs: Sequence[Path]) -> list[str]:

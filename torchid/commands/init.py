@@ -83,6 +83,9 @@ class Initiated:
         return "\n".join([*lines, f"written to    {self.output}; next: torchid check {self.output}"])
 
 
+_HOLDS_THE_BASE = "what carries it, feet or the thrust of rotors, is a contact of a frame (docs/sensors.md)"
+
+
 @dataclass(frozen=True)
 class _Contact:
     frame: str
@@ -278,6 +281,8 @@ def _describe(
     out.missing += missing_columns(len(robot.joint_names), fields, proposal.partial, what)
     if not set(_FORCES) & fields:
         out.missing.append("forces: neither joint torques nor contact wrenches")
+    if not contacts and not robot.fixed_base and not _is_fixed(contacts, fields):
+        out.missing.append(f"contacts: none, so that nothing but gravity acts on the base; {_HOLDS_THE_BASE}")
     out.missing += hints(proposal.left_out, fields, robot.joint_names, what, proposal.like_torques)
     from_feet = _from_feet(contacts, fields)
     if not contacts and not robot.fixed_base and not _is_fixed(contacts, fields):

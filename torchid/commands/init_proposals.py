@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from torchid.errors import InputError, excerpt, format_count, join_names
+from torchid.errors import InputError, TorchidWarning, excerpt, format_count, join_names
 from torchid.logs import Log
 from torchid.logs.column_groups import Family
 from torchid.logs.column_proposals import OF_PLATES, is_current, is_desired, propose_field
@@ -42,7 +43,9 @@ def read_sensors(robot: Robot, log: Log | InputError) -> list[str]:
 def _can_be_split(robot: Robot, joint: str) -> bool:
     """Whether both sides of a fixed joint have mass."""
     try:
-        load_robot(robot.path, ft_joints=[joint])
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", TorchidWarning)  # said of the whole robot
+            load_robot(robot.path, ft_joints=[joint])
     except InputError:
         return False
     return True
@@ -150,7 +153,7 @@ def missing_columns(joints: int, fields: Collection[str], partial: Mapping[str, 
     """
     partial = {name: of for name, of in partial.items() if name not in fields}
     out = [f"{name}: no {what} of numbers of {join_names(of)}, but of all others" for name, of in partial.items()]
-    for name in ("time", "joint_position"):
+    for name in ("time", "joint_position") if joints else ("time",):
         if name not in {*fields, *partial}:
             of_joints = f", of most of {joints} joints" * (name != "time")
             out.append(f"{name}: no {what}s that look like it{of_joints}{_OTHER_FILE * (what == 'column')}")
@@ -175,7 +178,7 @@ def hints(
         unknown = "without which foot stands on which and where each lies (docs/tables.md, Force plates)"
         out.append(f"contact_wrench_world: {join_names(plates)} may be readings of force plates, {unknown}")
     positions = [name for name in measured if propose_field(name) == "joint_position"]
-    if "joint_position" not in fields and len(positions) > 2:
+    if joints and "joint_position" not in fields and len(positions) > 2:
         names = f"those of this robot are {join_names(joints)}"
         out.append(
             f"joint_position: {format_count(len(positions), what)} like '{excerpt(positions[0])}' may be of other"

@@ -21,7 +21,7 @@ from torchid.errors import (
     join_names,
     warn_about_file,
 )
-from torchid.estimators import LeastSquares
+from torchid.estimators import LeastSquares, SgdEstimate
 from torchid.fitting.experiment import Scene
 from torchid.fitting.fit import Fit
 from torchid.fitting.misfit import beyond_models
@@ -117,7 +117,9 @@ def require_plausible(fit: Fit, logs: TrainingLogs) -> TotalMass:
     by_data = LeastSquares(rank_tolerance=tolerance).solve(fit.assembly.problem)
     mass, mass_by_data = (total_mass(fit.assembly, x, tolerance, block_error) for x in (estimate, by_data))
     reason = implausibility(fit.assembly.data or fit.assembly.problem, estimate.phi, mass_by_data, scene.robot)
-    unexplained = beyond_models(estimate, fit.assembly.problem, fit.assembly.forces)
+    unexplained = None  # a descent that is not finished leaves much that a model explains
+    if not isinstance(estimate, SgdEstimate):
+        unexplained = beyond_models(estimate, fit.assembly.problem, fit.assembly.forces, scene.noise_stated)
     if reason is None and unexplained is None:
         return mass
     log, finding = logs.finding or (None, None)

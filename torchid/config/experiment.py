@@ -328,10 +328,15 @@ def _check_factors(config: _Common, logs: LogsConfig) -> None:
     unfit = (
         ("estimator.name", "sgd", config.estimator.name == "sgd", "least_squares or consistent"),
         ("estimator.robust", "set", config.estimator.robust is not None, "null"),
-        ("preprocessing.cutoff_hz", "auto", config.preprocessing.cutoff_hz == "auto", "that which they were made with"),
-        ("actuators.sign_width", "auto", config.actuators.sign_width == "auto", "the width that they were made with"),
-        ("actuators.delay", "auto", config.actuators.delay == "auto", "the delay that they were made with"),
-        ("robot.base_tilt", "auto", config.robot.base_tilt == "auto", "the tilt that they were made with"),
+        (
+            "preprocessing.cutoff_hz",
+            "auto",
+            config.preprocessing.cutoff_hz == "auto",
+            "what compress printed",
+        ),
+        ("actuators.sign_width", "auto", config.actuators.sign_width == "auto", "the width that compress printed"),
+        ("actuators.delay", "auto", config.actuators.delay == "auto", "the delay that compress printed"),
+        ("robot.base_tilt", "auto", config.robot.base_tilt == "auto", "the tilt that compress printed"),
         (
             "preprocessing.exclude_rejected",
             "true",

@@ -140,6 +140,15 @@ class ConstrainedEstimate(Estimate):
         """The increase as a share of the unconstrained objective; None if that is unknown or 0."""
         return None if self.increase is None or not self.unconstrained else self.increase / self.unconstrained
 
+    @property
+    def deviation(self) -> float:
+        """Distance from the least objective in standard errors by noise, rms over the determined combinations."""
+        if self.increase is None or not self.unconstrained or not self.rank:
+            return 0.0
+        noise = residual_std(self.unconstrained * self.rows, self.rows, self.rank, self.oversampling)
+        squared = max(self.increase, 0.0) * self.rows / (self.oversampling * self.rank)
+        return float(np.sqrt(squared)) / max(noise, 1e-300)
+
 
 @contextmanager
 def report_rounding(estimator: str) -> Iterator[None]:

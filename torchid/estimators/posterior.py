@@ -56,7 +56,7 @@ class Posterior:
         Its variables are those of the free parameters (see `build_conic_problem`), and then the extra parameters in
         units of their size. The prior is the pull-back one (Lee, Wensing, Park 2020): J_0^-1/2 (J - J_0) J_0^-1/2 of
         each body's pseudo-inertia has entries of standard deviation `prior_error`, and friction one of that share of
-        1 N m and 1 N m s/rad.
+        its scale, 1 N m and 1 N m s/rad or more.
 
         Raises:
             InputError: the conditions exclude each other.

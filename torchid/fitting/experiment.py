@@ -47,12 +47,14 @@ class Scene:
         robot: the robot.
         contacts: the contacts in use.
         rolling: what the contacts that roll roll on, and where that is stated, "" if none does.
+        noise_stated: whether a user has stated any noise of the forces, once others are estimated (`with_noise`).
     """
 
     config: ExperimentConfig | AnalyzeConfig
     robot: Robot
     contacts: tuple[Contact, ...]
     rolling: str = ""
+    noise_stated: bool = True
 
     __repr__ = short_repr
 
@@ -189,7 +191,9 @@ def with_noise(scene: S, summary: NoiseSummary) -> S:
     keys = {one.group.partition(".")[0] for one in summary.groups}
     estimated = {name: x for name, x in vars(summary.noise).items() if name in keys}
     noise = replace(config.sensors.noise, **estimated | config.sensors.noise.forces)
-    stated = replace(scene, config=replace(config, sensors=replace(config.sensors, noise=noise)))
+    any_stated = any(one.origin == "stated" for one in summary.groups)
+    config = replace(config, sensors=replace(config.sensors, noise=noise))
+    stated = replace(scene, config=config, noise_stated=any_stated)
     if isinstance(stated, Experiment):
         return replace(stated, sensors=replace(stated.sensors, noise=summary.noise))
     return stated

@@ -121,16 +121,20 @@ def misfit(
     )
 
 
-def beyond_models(estimate: Estimate, problem: LinearProblem, forces: float = 0.0) -> str | None:
+def beyond_models(
+    estimate: Estimate, problem: LinearProblem, forces: float = 0.0, noise_stated: bool = True
+) -> str | None:
     """Why forces are not those of any robot with noise, in words; None if they may be. Far more than a `Misfit`.
 
     Args:
         estimate: of a fit, which may be far from the best.
         problem: that was solved.
         forces: squared norm of the weighted forces, if offsets and scales that were eliminated have taken some of it.
+        noise_stated: whether a user has stated noise. One that is estimated is that of most readings: a lift that
+            carries 200 N beside wrists of 0.05 N m leaves many times as much.
     """
     left = np.sqrt(estimate.cost / max(estimate.rows, 1))
-    if left > _UNEXPLAINED:
+    if noise_stated and left > _UNEXPLAINED:
         return f"forces differ from any rigid-body model by {left:.3g} times the stated sensor noise"
     forces = max(problem.cost(np.zeros_like(estimate.phi)), forces, np.finfo(float).tiny)
     share = np.sqrt(estimate.cost / forces)

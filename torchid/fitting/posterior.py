@@ -84,16 +84,17 @@ def fitted_posterior(fit: Fit, robot: Robot, conditions: Conditions) -> FittedPo
         D = np.concatenate([np.zeros((len(D), len(extras))), np.linalg.pinv(one.inverse) / noise_of_rows])
         b = np.concatenate([b, one.z / noise_of_rows])
     joints = (body.joint for body in robot.bodies)
+    found = {one.extra.label: one.value for one in fit.extras if not one.log}
     return FittedPosterior(
         posterior=Posterior(
             A=A,
             D=D,
             b=b,
             nominal=problem.nominal,
-            scale=problem.scale,
+            scale=_scale_of_prior(problem.scale, estimate.phi - problem.nominal),
             free=problem.free,
             conditions=conditions,
-            extra_size=np.array([extra.size for extra in extras]),
+            extra_size=np.array([max(extra.size, abs(found.get(extra.label, 0.0))) for extra in extras]),
             extra_lower=np.array([0.0 if extra.what == "armature" else -np.inf for extra in extras]),
         ),
         body_names=tuple(robot.body_names),
@@ -101,6 +102,22 @@ def fitted_posterior(fit: Fit, robot: Robot, conditions: Conditions) -> FittedPo
         extra_names=tuple(extra.label for extra in extras),
         extra_units=tuple(extra.unit for extra in extras),
     )
+
+
+def _scale_of_prior(scale: Array, moved: Array) -> Array:
+    """Units of the parameters, (12 L,), in which the prior is stated: friction is as uncertain as it was found to be.
+
+    Files of robots seldom state friction, and a joint may have 0.01 or 100 N m of it: one width for all would draw
+    samples away from data that are many times as sharp.
+
+    Args:
+        scale: (12 L,), of the fit.
+        moved: (12 L,), how far the estimate is from the nominal parameters.
+    """
+    out = scale.copy()
+    friction, found = (x.reshape(-1, PER_BODY)[:, parameters.FRICTION] for x in (out, np.abs(moved)))
+    friction[...] = np.maximum(friction, found / PRIOR_ERROR)
+    return out
 
 
 def posterior_arrays(fitted: FittedPosterior) -> dict[str, NDArray[Any]]:

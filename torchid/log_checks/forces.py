@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from torchid.errors import InputError, join_names
-from torchid.log_checks.findings import REJECTED, SUSPICIOUS, Finding, Skipped
+from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, Finding, Skipped
 from torchid.log_checks.lag_and_tilt import check_lag_and_tilt
 from torchid.log_checks.mistakes import possible_mistakes
 from torchid.log_checks.model import (
@@ -23,6 +24,7 @@ from torchid.log_checks.model import (
 from torchid.log_checks.scales import TimeScale, TorqueGains, fit_time_scale, fit_torque_gains, motion_cutoff_hz
 from torchid.logs import Log
 from torchid.logs.log import WRENCHES, BoolArray, FloatArray
+from torchid.parameters import COULOMB, FRICTION, VISCOUS
 from torchid.problem import Samples
 from torchid.robot import Robot
 from torchid.sensing import Contact
@@ -114,6 +116,11 @@ def _misfit_findings(
     """The mistake that explains forces unlike the URDF's, or single deviations of forces that are like them."""
     fit = fit_nominal_model(samples, robot, contacts)
     explanation = None
+    if fit.misfit > MAX_MISFIT and (bare := _without_friction(robot)) is not None:
+        without = fit_nominal_model(samples, bare, contacts)
+        if without.misfit <= MAX_MISFIT:
+            yield _friction_finding(robot, fit, without)
+            robot, fit = bare, without
     if fit.misfit > MAX_MISFIT:
         explanation = _best_mistake(log, robot, contacts, cutoff, fit, derived)
     if explanation is not None:
@@ -142,6 +149,27 @@ def _misfit_findings(
     yield from torques
     if not any(isinstance(item, Finding) for item in torques):
         yield from _gain_and_point_findings(log, samples, robot, contacts)
+
+
+def _without_friction(robot: Robot) -> Robot | None:
+    """The robot without the friction that its file states; None if it states none."""
+    nominal = robot.nominal.copy()
+    nominal[:, FRICTION] = 0.0
+    return replace(robot, nominal=nominal) if robot.nominal[:, FRICTION].any() else None
+
+
+def _friction_finding(robot: Robot, stated: ModelFit, without: ModelFit) -> Finding:
+    """Friction in the robot's file that the forces contradict, and nothing else; the largest of each kind is named."""
+    largest = []
+    for number, kind in ((COULOMB, "Coulomb"), (VISCOUS, "viscous")):
+        body = robot.bodies[int(np.argmax(np.abs(robot.nominal[:, number])))]
+        if (value := robot.nominal[robot.bodies.index(body), number]) and body.joint is not None:
+            largest.append(f"{kind} up to {value:g} in {body.joint.name}")
+    text = (
+        f"measured forces differ from the {robot.format}'s by {_percent(stated.misfit)}, "
+        f"by {_percent(without.misfit)} without the friction that it states: {', '.join(largest)}"
+    )
+    return Finding("friction", NOTE, "all", text, f"nothing, as a fit finds friction; or 0 in the {robot.format}")
 
 
 def _best_mistake(

@@ -46,7 +46,10 @@ def parse_frame(name: str, array: NDArray[Any]) -> str:
 
 _COLUMNS = re.compile(r"(.+)\[(\d*):(\d*)\]")
 _FIELD = re.compile(r"(.+)\['([^'\[\]]+)'\]")
-_TRANSPOSED = re.compile(r"(.+)\.T")
+TRANSPOSED = ".T"
+"""Behind the name of an array whose columns are the samples."""
+
+_TRANSPOSED = re.compile(rf"(.+){re.escape(TRANSPOSED)}")
 
 AnyArray = NDArray[Any]
 

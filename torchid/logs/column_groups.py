@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchid.logs.arrays import TRANSPOSED
 from torchid.logs.column_map import PLACEHOLDER
 from torchid.logs.column_proposals import is_current, propose_field
 from torchid.logs.file_samples import FileSample
@@ -79,9 +80,10 @@ class Family:
         return PLACEHOLDER.sub(" ", split_unit(self.pattern)[0]).strip(" _./").lower()
 
     @property
-    def as_ignored(self) -> str:
-        """A pattern of `ignore` that its columns fit."""
-        return PLACEHOLDER.sub("*", self.pattern)
+    def as_ignored(self) -> list[str]:
+        """Patterns of `ignore` that its columns fit, as the file names them; no column of another name fits all."""
+        pattern = PLACEHOLDER.sub("*", self.pattern.removesuffix(TRANSPOSED))
+        return self.columns if pattern == "*" else [pattern]
 
     @property
     def unit(self) -> str:

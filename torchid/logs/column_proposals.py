@@ -7,6 +7,7 @@ import re
 from collections.abc import Sequence
 
 from torchid.errors import LogError, excerpt
+from torchid.logs.arrays import TRANSPOSED
 from torchid.logs.log import NAME_FIELDS, POINTS, SHAPES, VARIANTS, WRENCHES
 from torchid.logs.units import quantities_with, split_unit
 
@@ -84,7 +85,7 @@ def propose_field(column: str, desired: bool = False) -> str:
         column: its name.
         desired: whether a desired value counts as one that was measured.
     """
-    column, unit = split_unit(column)
+    column, unit = split_unit(column.removesuffix(TRANSPOSED))
     words = " ".join(words_of(column))
     close = difflib.get_close_matches(column.partition(".")[0], _FIELDS, n=1, cutoff=0.8)
     of_base = bool(close) and "imu" in words.split() and not close[0].startswith("imu")

@@ -70,8 +70,8 @@ class EntryValues:
         shape = self._shape()
         if isinstance(self.of.part.entry, Gains) and array.shape == shape:
             array = array[None]  # the same at all samples
-        if array.ndim == 1 and int(np.prod(shape)) == 1:
-            array = array.reshape(-1, *shape)
+        if shape[:1] == (1,) and array.ndim == len(shape) and array.shape[1:] == shape[1:]:
+            array = array[:, None]  # of one name, without an axis for it
         if array.ndim == len(shape) + 2 and array.shape[1] == 1:  # one row of each sample, as of Matlab's tables
             array = array[:, 0]
         if array.ndim == 0:

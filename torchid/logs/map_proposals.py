@@ -130,7 +130,12 @@ class _Proposer:
         self.out.partial = self.match.partial
         self.out.left_out = [name for name in foreign if name not in taken]
         families = [one for one in families if one in used or not set(one.columns) <= taken]
-        ignored = {one.as_ignored for one in families if one not in used or len(one.numbers) > len(self.joints)}
+        ignored = {
+            pattern
+            for one in families
+            if one not in used or len(one.numbers) > len(self.joints)
+            for pattern in one.as_ignored
+        }
         ignored |= {name for name in foreign if name not in numeric or name in self.nanoseconds.values()} - taken
         self.out.columns |= {"ignore": sorted(ignored)} if ignored else {}
         if "joint_torque" not in {*self.given, *self.out.columns}:
@@ -203,8 +208,8 @@ class _Proposer:
     # ----------------------------------------------------------------------------------------------------- fields
 
     def _place_of_base(self, families: Sequence[Family]) -> list[Family]:
-        """Families that have become the pose of a base that stands on feet, by what their numbers are."""
-        if not self.feet:  # of an arm, that of its hand
+        """Families that have become the pose of a base, of a robot with feet or of a single body, by their numbers."""
+        if not self.feet and self.joints:  # of an arm, that of its hand
             return []
         named = [(one, field) for one in families if (field := field_of_base(one, self.sample))]
         placed = [one for one, field in sorted(named, key=lambda pair: not pair[0].stem) if self._place(one, field)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from textwrap import shorten
 
@@ -230,9 +230,7 @@ def _print_fit(run: Identification) -> None:
         print_labelled("motion noise", str(run.motion_noise))
     if run.validation is not None:
         _print_validation(run.validation, run.experiment.robot.format)
-    for name, choice in {**run.choices.by_name(), "ridge": run.ridge}.items():
-        if choice is not None:
-            print_labelled(name, str(choice))
+    _print_choices({**run.choices.by_name(), "ridge": run.ridge})
     _print_conditions(run)
     if isinstance(estimate, SgdEstimate):
         print_labelled("training", f"{estimate.epochs} epochs, parameters of epoch {estimate.best_epoch}")
@@ -257,6 +255,13 @@ def _print_conditions(run: Identification) -> None:
         print_labelled("certified", f"objective within {estimate.certified_gap:.1g} of the other method's")
 
 
+def _print_choices(choices: Mapping[str, object]) -> None:
+    """Settings that were left to the logs, by name; None for what was stated."""
+    for name, choice in choices.items():
+        if choice is not None:
+            print_labelled(name, str(choice))
+
+
 def _print_validation(validation: CrossValidation, nominal_of: str) -> None:
     identified, nominal = validation.identified, validation.nominal
     texts = (describe_errors(group, identified.rms_of(group), nominal.rms_of(group)) for group in DECISIVE_GROUPS)
@@ -270,4 +275,5 @@ def print_compression(done: Compression) -> None:
     print_noise(done.noise)
     print_tables(compression_table([asdict(file) for file in done.files]))
     print_rolling(done.rolling)
+    _print_choices(done.choices.by_name())
     print(f"written to    {done.output}")
