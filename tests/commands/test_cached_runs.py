@@ -130,7 +130,7 @@ CHANGED = {
     "contact_threshold": 30.0,
     "zero_in_air": True,
     "base_motion": "contacts",
-    "exclude_condemned": True,
+    "exclude_rejected": True,
     "memory_gb": 3.0,
     "cache_gb": 5.0,
 }
@@ -304,7 +304,7 @@ def test_excluded_samples_are_said_and_counted_again(demo: Path, tmp_path: Path)
         arrays = dict(archive)
     arrays["joint_torque"][100:103, 2] += 1e4
     np.savez(log, **arrays)
-    more = (f"output={tmp_path / 'run'}", "preprocessing.exclude_condemned=true")
+    more = (f"output={tmp_path / 'run'}", "preprocessing.exclude_rejected=true")
     without, first, second = read_twice(tmp_path / "demo" / demo.name, *more)
     assert first == second == without
     assert without[1][str(log)] > 0

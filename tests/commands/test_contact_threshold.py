@@ -94,7 +94,7 @@ def test_factors_and_evaluation_take_the_same_flags(tmp_path: Path, simulated: A
     assert main(["evaluate", str(tmp_path / "run"), "--log", str(tmp_path / "test.npz")]) == 0
 
 
-def test_wrong_flags_are_replaced_and_not_condemned(tmp_path: Path) -> None:
+def test_wrong_flags_are_replaced_and_not_rejected(tmp_path: Path) -> None:
     def late(log: Log) -> Log:
         return replace(log, contact_active=np.roll(value(log.contact_active), 25, axis=0))
 

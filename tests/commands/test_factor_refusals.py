@@ -77,8 +77,8 @@ NEEDS_SAMPLES = {
     "sgd": ("estimator={name: sgd}", "estimator.name: sgd, but logs.train names factors"),
     "robust": ("estimator.robust=huber", "estimator.robust: set, but logs.train names factors"),
     "exclusion": (
-        "preprocessing.exclude_condemned=true",
-        "preprocessing.exclude_condemned: true, but logs.train",
+        "preprocessing.exclude_rejected=true",
+        "preprocessing.exclude_rejected: true, but logs.train",
     ),
     "noise": (
         "sensors.noise.joint_torque=0.2",

@@ -187,13 +187,13 @@ def test_nothing_is_replaced_but_what_torchid_wrote(
     assert "mine.factor, which torchid did not write" in refusal([*line, "overwrite=true"], tmp_path, capsys)
 
 
-def test_condemned_samples_are_left_out_when_logs_are_compressed(fleet: Path, tmp_path: Path) -> None:
+def test_rejected_samples_are_left_out_when_logs_are_compressed(fleet: Path, tmp_path: Path) -> None:
     with np.load(fleet / "sway_train.npz") as log:
         fields = dict(log)
     fields["joint_torque"] = fields["joint_torque"].copy()
     fields["joint_torque"][100, 3] += 500.0
     np.savez(tmp_path / "spike.npz", **fields)
-    overrides = [f"logs.train=[{tmp_path / 'spike.npz'}]", "preprocessing.exclude_condemned=true"]
+    overrides = [f"logs.train=[{tmp_path / 'spike.npz'}]", "preprocessing.exclude_rejected=true"]
     assert main(["compress", str(fleet / "logs.yaml"), "--output", str(tmp_path / "f"), *overrides]) == 0
     found = read_factors(tmp_path / "f" / "spike.factor")
     assert found.excluded > 0
@@ -209,7 +209,7 @@ def test_an_implausible_fit_is_refused_without_a_look_for_samples(
     assert main(["compress", str(fleet / "logs.yaml"), logs, "--output", str(tmp_path / "f")]) == 0
     capsys.readouterr()
     looked: list[Path] = []
-    monkeypatch.setattr("torchid.commands.plausibility.stretches_to_check", lambda path, *_: looked.append(path))
+    monkeypatch.setattr("torchid.commands.plausibility.segments_to_check", lambda path, *_: looked.append(path))
     factors = f"logs.train=[{tmp_path / 'f' / 'reversed.factor'}]"
     message = refusal(["identify", str(fleet / "experiment.yaml"), factors], tmp_path, capsys)
     assert "usual reasons: torques or wrenches of the opposite sign" in message

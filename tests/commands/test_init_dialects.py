@@ -207,7 +207,7 @@ def test_an_accelerometer_goes_with_the_angular_velocity_of_the_base_and_an_imu_
 
 def test_short_gaps_in_the_motion_are_bridged_and_long_ones_excluded(tmp_path: Path) -> None:
     q, _, tau = motion(12)
-    for last, key in ((103, "bridge_gaps_s: 0.05"), (150, "exclude_condemned: true")):
+    for last, key in ((103, "bridge_gaps_s: 0.05"), (150, "exclude_rejected: true")):
         gappy = q.copy()
         gappy[100:last, 3] = np.nan
         np.savez(tmp_path / f"{last}.npz", t=TIME, q=gappy, tau=tau)

@@ -183,12 +183,12 @@ def test_a_run_gives_the_same_parameters_and_leaves_nothing_beside_its_folder(tm
     assert sorted(os.listdir(tmp_path)) == ["large", "log.h5", "log.npz", "run.yaml", "whole"]
 
 
-def test_samples_that_are_condemned_are_not_left_out_of_a_log_that_is_never_seen_whole(
+def test_samples_that_are_rejected_are_not_left_out_of_a_log_that_is_never_seen_whole(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = experiment(tmp_path, recorded(2_000))
-    line = refusal(["identify", str(file), SMALL, "preprocessing.exclude_condemned=true"], tmp_path, capsys)
-    assert "preprocessing.exclude_condemned" in line
+    line = refusal(["identify", str(file), SMALL, "preprocessing.exclude_rejected=true"], tmp_path, capsys)
+    assert "preprocessing.exclude_rejected" in line
     assert "memory_gb" in line
 
 

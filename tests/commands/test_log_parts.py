@@ -59,7 +59,7 @@ def read(demo: Path, logs: list[str], *overrides: str) -> list[Samples]:
         ("preprocessing.cutoff_hz=8",),
         ("preprocessing.cutoff_hz=null",),
         ("preprocessing={cutoff_hz: 8, sample_rate_hz: 50, contact_margin_s: 0.05}",),
-        ("preprocessing.exclude_condemned=true",),
+        ("preprocessing.exclude_rejected=true",),
     ],
 )
 def test_no_filter_carries_samples_from_one_part_into_the_other(demo: Path, settings: tuple[str, ...]) -> None:

@@ -121,18 +121,18 @@ def in_degrees_at_the_end(log: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "stretch"), [(in_degrees, "433 to 866"), (in_degrees_at_the_end, "867 to 1299")], ids=["middle", "end"]
+    ("change", "segment"), [(in_degrees, "433 to 866"), (in_degrees_at_the_end, "867 to 1299")], ids=["middle", "end"]
 )
-def test_a_long_log_is_looked_at_in_stretches(
+def test_a_long_log_is_looked_at_in_segments(
     tmp_path: Path,
     change: Callable[[dict[str, Any]], None],
-    stretch: str,
+    segment: str,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("torchid.commands.check.MOST_CHECKED", 500)
     assert main(["identify", str(DEMO / "quadruped.yaml"), *changed(tmp_path, change), RIDGE]) == 2
-    assert f"torchid check finds in train.npz (samples {stretch} of 1300, counted from there): joint_position: " in (
+    assert f"torchid check finds in train.npz (samples {segment} of 1300, counted from there): joint_position: " in (
         capsys.readouterr().err
     )
 

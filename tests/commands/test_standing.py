@@ -111,7 +111,7 @@ def test_the_checks_find_reversed_torques_without_the_base(written: Written) -> 
     assert any(finding.field == "joint_torque" for finding in checked.findings)
 
 
-def test_the_checks_condemn_a_log_in_which_nothing_stands(written: Written) -> None:
+def test_the_checks_reject_a_log_in_which_nothing_stands(written: Written) -> None:
     def in_the_air(log: Log) -> Log:
         return replace(log, **NO_BASE, contact_active=np.zeros_like(value(log.contact_active)))
 
@@ -120,13 +120,13 @@ def test_the_checks_condemn_a_log_in_which_nothing_stands(written: Written) -> N
     assert finding.found.startswith("no contact stands in any sample")
 
 
-def test_samples_that_the_checks_condemn_are_left_out_too(written: Written) -> None:
+def test_samples_that_the_checks_reject_are_left_out_too(written: Written) -> None:
     def with_spike(log: Log) -> Log:
         position = log.joint_position.copy()
         position[500:503, 2] += 1.5
         return replace(log, **NO_BASE, joint_position=position)
 
-    scene = set_up(load_config(written(with_spike, base_motion="contacts", exclude_condemned=True)))
+    scene = set_up(load_config(written(with_spike, base_motion="contacts", exclude_rejected=True)))
     reader = LogReader(scene)
     with pytest.warns(TorchidWarning, match="samples excluded"):
         (samples,) = reader.read(scene.config.logs.train, scene.sensors)
@@ -176,7 +176,7 @@ def test_samples_near_changes_of_detected_contacts_are_dropped(written: Written)
     assert counts[1] < counts[0] - 50
 
 
-def test_the_checks_do_not_condemn_flags_that_they_were_not_given(written: Written) -> None:
+def test_the_checks_do_not_reject_flags_that_they_were_not_given(written: Written) -> None:
     file = written(lambda log: replace(log, **NO_FLAGS), detect_contacts=True)
     checked = check_experiment(file)[0]
     assert checked.usable

@@ -357,6 +357,10 @@ def test_a_value_of_the_wrong_kind_is_refused_by_its_place(file: Path, settings:
             "analysis.compare.b.contact_wrenches: found ['a']; accepted: a mapping from frames of contacts to compon",
         ),
         ("estimator.symmetry={}", "symmetry.left, estimator.symmetry.right: missing; accepted: estimator.symmetry.l"),
+        (
+            "preprocessing.exclude_condemned=true",
+            "preprocessing: unknown name 'exclude_condemned'; accepted: exclude_rejected",
+        ),
         ("memory_gb=4", "key: unknown name 'memory_gb'; accepted: preprocessing.memory_gb"),
         ("seed=4", "key: unknown name 'seed'; accepted: estimator.training.seed, analysis.seed"),
         ("preprocessing.armature=true", "preprocessing: unknown name 'armature'; accepted: actuators.armature"),

@@ -56,7 +56,7 @@ def test_frames_that_are_sent_again_are_one_row_of_the_table(folder: Path, capsy
     write_log(replace(log.select(again), time=log.time), folder / "sway_train.npz")
     assert main(["check", "--verbose", str(folder / "sway_train.npz")]) == 0
     printed = capsys.readouterr().out
-    assert printed.count("condemned") == 1
+    assert printed.count("rejected") == 1
     assert "likewise" in printed
     assert "usable without 6 of 400 samples" in printed
 
@@ -77,7 +77,7 @@ def test_a_log_that_is_not_usable_ends_with_status_one(folder: Path, capsys: pyt
     assert main(["check", str(folder / "quadruped.yaml")]) == 1
     printed = capsys.readouterr().out
     assert printed.startswith("0 of 2 logs are free of usual mistakes; 1 is not usable; 1 is usable")
-    assert "condemned     joint_position, unit in sway_train.npz: " in printed
+    assert "rejected      joint_position, unit in sway_train.npz: " in printed
 
 
 @pytest.mark.parametrize("samples", [1, 4])
@@ -103,7 +103,7 @@ def test_an_overview_gives_the_range_of_every_channel_and_names_only_what_there_
     (axes,) = log_check_figure([spiked]).axes
     legend = axes.get_legend()
     assert legend is not None
-    assert [text.get_text() for text in legend.get_texts()] == ["condemned"]
+    assert [text.get_text() for text in legend.get_texts()] == ["rejected"]
     (beside,) = axes.child_axes
     names, ranges = ([label.get_text() for label in x.get_yticklabels()] for x in (axes, beside))
     told = dict(zip(names, ranges, strict=True))
@@ -127,8 +127,8 @@ def test_findings_and_an_overview_are_written_whole(folder: Path, tmp_path: Path
     document, figure = tmp_path / "out" / "found.json", tmp_path / "out" / "found.png"
     assert main(["check", str(folder / "sway_test.npz"), "--json", str(document), "--figure", str(figure)]) == 0
     (log,) = json.loads(document.read_text())["logs"]
-    assert (log["samples"], log["usable"], log["condemned_samples"]) == (400, True, 1)
-    (spike,) = (finding for finding in log["findings"] if finding["severity"] == "condemned")
+    assert (log["samples"], log["usable"], log["rejected_samples"]) == (400, True, 1)
+    (spike,) = (finding for finding in log["findings"] if finding["severity"] == "rejected")
     assert (spike["name"], spike["field"], spike["channels"]) == ("spike", "joint_torque", ["front_right_hip"])
     assert spike["spans"] == [
         {"first": 123, "last": 123, "count": 1, "start_s": 1.23, "end_s": 1.23, "channel": "front_right_hip"}
@@ -205,7 +205,7 @@ def test_a_recorded_person_is_usable_and_weighs_less_than_the_urdf(tmp_path: Pat
     assert {x["severity"] for x in weight.values()} == {"note"}
     assert "60.03 kg at rest" in weight["static1"]["found"]
     assert "62.6 kg" in weight["static1"]["found"]
-    assert [log["condemned_samples"] for log in found.values()] == [0, 2, 0]  # the last two poses jump by 0.26 rad
+    assert [log["rejected_samples"] for log in found.values()] == [0, 2, 0]  # the last two poses jump by 0.26 rad
     names = {finding["name"] for log in found.values() for finding in log["findings"]}
     assert names <= {"weight", "constant", "saturated", "step"}
 
@@ -216,5 +216,5 @@ def test_the_shipped_demo_is_usable_without_reserve(capsys: pytest.CaptureFixtur
     assert main(["check", str(tmp_path / "quadruped.yaml")]) == 0
     printed = capsys.readouterr().out
     assert printed.startswith("2 of 2 logs are free of usual mistakes\n")
-    assert "condemned" not in printed
+    assert "rejected" not in printed
     assert "suspicious" not in printed

@@ -1,4 +1,4 @@
-"""Condemned samples are left out of a fit, with what the filter makes of them, and the fit is that of a clean log."""
+"""Rejected samples are left out of a fit, with what the filter makes of them, and the fit is that of a clean log."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from motions import value
 from torchid.cli import main
 from torchid.errors import LogError, TorchidWarning
 from torchid.estimators import Estimate, LeastSquares
-from torchid.log_checks import drop_condemned
+from torchid.log_checks import drop_rejected
 from torchid.log_checks.check import check, excluded_stamps
 from torchid.logs import Log, read_log, write_log
 from torchid.logs.preprocess import preprocess
@@ -50,10 +50,10 @@ def quietly_excluding(log: Log) -> Samples:
     checked = check(log, demo_robot(), CONTACTS, CUTOFF)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", TorchidWarning)
-        return drop_condemned(processed(checked.repaired), checked, CUTOFF, derived=True)
+        return drop_rejected(processed(checked.repaired), checked, CUTOFF, derived=True)
 
 
-def test_without_condemned_samples_the_parameters_are_those_of_the_clean_log() -> None:
+def test_without_rejected_samples_the_parameters_are_those_of_the_clean_log() -> None:
     kept = quietly_excluding(spiked())
     clean = processed(demo_log())
     same = np.isin(clean.time.numpy(), kept.time.numpy())
@@ -78,7 +78,7 @@ def test_holes_in_poses_are_found_and_left_out_where_that_is_asked_for(tmp_path:
         read_log(tmp_path / "holes.npz")
     log = read_log(tmp_path / "holes.npz", allow_gaps=True)
     checked = check(log, demo_robot(), CONTACTS, CUTOFF)
-    assert sorted(np.flatnonzero(checked.condemned)) == [*range(300, 310), *range(700, 705)]
+    assert sorted(np.flatnonzero(checked.rejected)) == [*range(300, 310), *range(700, 705)]
     kept, clean = quietly_excluding(log), processed(demo_log())
     same = clean[np.flatnonzero(np.isin(clean.time.numpy(), kept.time.numpy()))]
     assert len(kept) == len(same) > 0.9 * len(clean)
@@ -103,7 +103,7 @@ def test_samples_are_left_out_over_the_reach_of_the_filter_and_two_more(cutoff: 
     assert abs(gone[-1] - (6.5 + margin)) < 0.0101
 
 
-def test_a_log_that_is_not_processed_loses_its_condemned_samples_alone() -> None:
+def test_a_log_that_is_not_processed_loses_its_rejected_samples_alone() -> None:
     log = changed(preprocess(demo_log()), "joint_torque", lambda t: t.__setitem__((slice(650, 653), 4), 300.0))
     checked = check(log)
     assert np.flatnonzero(excluded_stamps(checked, log.time, None, derived=False)).tolist() == [650, 651, 652]
@@ -112,7 +112,7 @@ def test_a_log_that_is_not_processed_loses_its_condemned_samples_alone() -> None
 
 def test_a_clean_log_is_returned_as_it_is_without_a_word() -> None:
     samples, checked = processed(demo_log()), check(demo_log(), demo_robot(), CONTACTS, CUTOFF)
-    assert drop_condemned(samples, checked, CUTOFF, derived=True) is samples
+    assert drop_rejected(samples, checked, CUTOFF, derived=True) is samples
 
 
 def test_what_is_left_out_is_told_with_the_reasons() -> None:
@@ -120,13 +120,13 @@ def test_what_is_left_out_is_told_with_the_reasons() -> None:
     with pytest.warns(
         TorchidWarning, match=r"sway_train.npz: \d+ of 1250 samples excluded: .*spike at samples 200, 431"
     ):
-        drop_condemned(processed(checked.repaired), checked, CUTOFF, derived=True)
+        drop_rejected(processed(checked.repaired), checked, CUTOFF, derived=True)
 
 
 def test_a_log_that_is_not_usable_is_refused_in_one_line() -> None:
     log = replace(demo_log(), joint_position=np.degrees(demo_log().joint_position))
-    with pytest.raises(LogError, match=r"not usable: joint_position: unit; accepted: .*exclude_condemned: false"):
-        drop_condemned(processed(demo_log()), check(log), CUTOFF, derived=True)
+    with pytest.raises(LogError, match=r"not usable: joint_position: unit; accepted: .*exclude_rejected: false"):
+        drop_rejected(processed(demo_log()), check(log), CUTOFF, derived=True)
 
 
 def test_identify_and_evaluate_count_what_they_leave_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -135,7 +135,7 @@ def test_identify_and_evaluate_count_what_they_leave_out(tmp_path: Path, capsys:
     torque = value(log.joint_torque).copy()
     torque[250, 3] += 200.0
     write_log(replace(log, joint_torque=torque), folder / "sway_train.npz")
-    run, key = tmp_path / "run", "preprocessing.exclude_condemned=true"
+    run, key = tmp_path / "run", "preprocessing.exclude_rejected=true"
     assert main(["identify", str(folder / "quadruped.yaml"), f"output={run}", key]) == 0
     told = [line for line in capsys.readouterr().err.splitlines() if "excluded" in line]
     assert len(told) == 1

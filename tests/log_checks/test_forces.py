@@ -20,7 +20,7 @@ from synthetic import PANDA, Oracle, load
 from thinned import SLOW
 from walking import MACHINES, robot_of
 
-from torchid.log_checks import CONDEMNED, NOTE, SUSPICIOUS, Checked, scales
+from torchid.log_checks import NOTE, REJECTED, SUSPICIOUS, Checked, scales
 from torchid.log_checks.check import check
 from torchid.logs import Log, read_log
 from torchid.logs.preprocess import preprocess
@@ -68,7 +68,7 @@ def test_forces_of_a_robot_that_differs_from_its_urdf_by_a_fifth_are_not_complai
 def test_a_reversed_torque_of_a_bolted_arm_is_named(joint: int) -> None:
     checked = of_arm(lambda log: rescaled(log, [joint], -1.0))
     sign = only(checked, "sign")
-    assert (sign.severity, sign.channels) == (CONDEMNED, (arm()[0].joint_names[joint],))
+    assert (sign.severity, sign.channels) == (REJECTED, (arm()[0].joint_names[joint],))
     assert not checked.usable
 
 
@@ -123,7 +123,7 @@ def test_torques_that_are_all_zero_say_nothing_of_time() -> None:
 def test_factors_that_one_block_of_time_makes_up_are_compared_within_blocks(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Of a stretch of wrong readings, in which the joints of reference have factors of 0.02 and all others fit."""
+    """Of a segment of wrong readings, in which the joints of reference have factors of 0.02 and all others fit."""
     robot, log = arm()
     shape = (scales.BLOCKS, 5 + 3)
     blocks = np.where(np.arange(8) < 5, 1.1, 0.0) * np.ones(shape)
@@ -186,7 +186,7 @@ def misnamed(log: Log) -> Log:
 def test_a_usual_mistake_is_named_by_what_it_explains(mistake: Callable[[Log], Log], field: str, text: str) -> None:
     checked = of_demo(mistake(demo_log().select(slice(0, 600))))
     explained = only(checked, EXPLAINED)
-    assert (explained.severity, explained.field) == (CONDEMNED, field)
+    assert (explained.severity, explained.field) == (REJECTED, field)
     assert explained.found.startswith(text)
     assert "another robot" not in explained.advice
     assert not checked.usable
@@ -213,10 +213,10 @@ def test_one_joint_in_degrees_is_named() -> None:
     assert not found(checked, "forces")
 
 
-def test_one_torque_in_another_unit_is_condemned_by_name() -> None:
+def test_one_torque_in_another_unit_is_rejected_by_name() -> None:
     robot, log = arm()
     finding = only(check(rescaled(log, [1], 1e3), robot, (), 5.0), "unit")
-    assert (finding.severity, finding.channels) == (CONDEMNED, (robot.joint_names[1],))
+    assert (finding.severity, finding.channels) == (REJECTED, (robot.joint_names[1],))
     assert "in mN m" in finding.found
 
 

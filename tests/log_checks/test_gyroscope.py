@@ -11,7 +11,7 @@ from mistaken import CUTOFF, Case, case_of
 from motions import value
 from walking import MACHINES, robot_of
 
-from torchid.log_checks import CONDEMNED, SUSPICIOUS, Finding, Skipped
+from torchid.log_checks import REJECTED, SUSPICIOUS, Finding, Skipped
 from torchid.log_checks.gyroscope import check_gyroscope
 from torchid.logs import Log
 
@@ -41,10 +41,10 @@ def test_a_gyroscope_reads_how_the_base_turns_above_the_feet_that_stand(walker: 
 @pytest.mark.parametrize(
     ("change", "severity", "name", "words"),
     [
-        (np.degrees, CONDEMNED, "unit", "in deg/s"),
-        (lambda omega: -omega, CONDEMNED, "sign", "reversed"),
-        (lambda omega: omega[:, [1, 0, 2]] * [1.0, -1.0, 1.0], CONDEMNED, "frame", "along other axes"),
-        (lambda omega: omega * [1.0, -1.0, -1.0], CONDEMNED, "frame", "along other axes"),
+        (np.degrees, REJECTED, "unit", "in deg/s"),
+        (lambda omega: -omega, REJECTED, "sign", "reversed"),
+        (lambda omega: omega[:, [1, 0, 2]] * [1.0, -1.0, 1.0], REJECTED, "frame", "along other axes"),
+        (lambda omega: omega * [1.0, -1.0, -1.0], REJECTED, "frame", "along other axes"),
         (lambda omega: omega + [0.3, 0.0, 0.0], SUSPICIOUS, "offset", r"without a steady (0.3"),
         (lambda omega: 2.0 * omega, SUSPICIOUS, "ratio", "times 0.5"),
         (lambda omega: omega[::-1], SUSPICIOUS, "standing feet", "no usual mistake explains it"),

@@ -19,7 +19,7 @@ from walking import MACHINES
 from torchid.log_checks import NOTE, SUSPICIOUS, Checked
 from torchid.log_checks.frozen import check_still_base
 from torchid.logs import Log
-from torchid.logs.stretches import with_delayed_torques
+from torchid.logs.segments import with_delayed_torques
 
 VECTORS = ("base_position_world", "base_linear_velocity_world", "base_linear_acceleration_world")
 

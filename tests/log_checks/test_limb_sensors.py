@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from synthetic import Array
 from welded import machine
 
-from torchid.log_checks import CONDEMNED, NOTE, SUSPICIOUS, Checked
+from torchid.log_checks import NOTE, REJECTED, SUSPICIOUS, Checked
 from torchid.log_checks.check import check
 from torchid.logs import Log
 from torchid.regressor import Regressor
@@ -66,7 +66,7 @@ def test_an_offset_is_named_with_its_size(seen: Seen) -> None:
 def test_a_reversed_sensor_and_one_of_another_gain_are_named_whatever_their_offset(seen: Seen) -> None:
     for offset in (0.0, 20.0):
         turned = only(seen(lambda wrench, offset=offset: offset - wrench), "sign", "ft_wrench")  # type: ignore[misc]
-        assert (turned.severity, turned.channels) == (CONDEMNED, ("ankle_ft",))
+        assert (turned.severity, turned.channels) == (REJECTED, ("ankle_ft",))
         heavy = only(seen(lambda wrench, offset=offset: offset + 1.5 * wrench), "weight")  # type: ignore[misc]
         assert (heavy.severity, heavy.channels) == (SUSPICIOUS, ("ankle_ft",))
         assert "reads 1.5 times" in heavy.found

@@ -12,7 +12,7 @@ from faults import HERE, changed, demo_log, found, moving, only, places, with_ra
 from motions import position, value
 from repository import SHARED
 
-from torchid.log_checks import CONDEMNED, NOTE, SUSPICIOUS
+from torchid.log_checks import NOTE, REJECTED, SUSPICIOUS
 from torchid.log_checks.check import check, repair_log
 from torchid.log_checks.spikes import find_jumps
 from torchid.logs import Log
@@ -37,7 +37,7 @@ def stop(first: int, last: int, columns: object = slice(None)) -> Callable[[Arra
 
 
 @pytest.mark.parametrize("log", [demo_log(), moving(), with_rates(moving())], ids=["demo", "moving", "with rates"])
-def test_a_clean_log_has_no_condemned_samples(log: Log) -> None:
+def test_a_clean_log_has_no_rejected_samples(log: Log) -> None:
     checked = check(log)
     assert checked.verdict == "usable"
     assert not [one for one in checked.findings if one.severity != NOTE]
@@ -50,7 +50,7 @@ def test_a_clean_log_has_no_condemned_samples(log: Log) -> None:
 )
 def test_a_spike_is_found_at_its_samples(field: str, column: int, size: float, last: int) -> None:
     spike = only(check(changed(demo_log(), field, put((slice(HERE, last + 1), column), size))), "spike")
-    assert (spike.severity, spike.field) == (CONDEMNED, field)
+    assert (spike.severity, spike.field) == (REJECTED, field)
     assert places(spike) == {(HERE, last)}
     assert len(spike.channels) == 1
 
@@ -70,7 +70,7 @@ def test_a_spike_of_the_orientation_is_found_in_degrees() -> None:
     assert " deg " in spike.found
 
 
-def test_a_reading_that_is_lost_for_a_while_is_condemned_from_end_to_end() -> None:
+def test_a_reading_that_is_lost_for_a_while_is_rejected_from_end_to_end() -> None:
     noise = 1e-4 * np.random.default_rng(1).normal(size=40)
     log = changed(demo_log(), "joint_position", lambda q: q.__setitem__((slice(HERE, HERE + 40), 2), noise))
     assert places(only(check(log), "spike")) == {(HERE, HERE + 39)}
@@ -90,7 +90,7 @@ def test_a_torque_may_step_which_is_only_worth_a_look() -> None:
     checked = check(changed(demo_log(), "joint_torque", put((slice(HERE, None), 2), 30.0)))
     step = only(checked, "step")
     assert (step.severity, places(step)) == (SUSPICIOUS, {(HERE - 1, HERE)})
-    assert not checked.condemned.any()
+    assert not checked.rejected.any()
 
 
 @pytest.mark.parametrize("peak", [0.0, 900.0])
@@ -107,7 +107,7 @@ def test_a_heel_strike_without_a_contact_flag_is_no_step_but_a_reset_is(peak: fl
     checked = check(replace(log, ft_names=("ankle",), ft_wrench=wrench))
     steps = {(one.field, places(one).pop()) for one in found(checked, "step")}
     assert steps == ({("ft_wrench", (3169, 3170))} if reset else set())
-    assert not checked.condemned.any()
+    assert not checked.rejected.any()
 
 
 def test_a_wrapped_angle_costs_two_samples_and_is_unwrapped() -> None:
@@ -148,14 +148,14 @@ def test_heavy_tailed_noise_has_no_spikes() -> None:
 
 @pytest.mark.parametrize("field", ["joint_position", "joint_torque"])
 @pytest.mark.parametrize("last", [HERE, HERE + 9])
-def test_a_frame_that_is_sent_again_is_condemned(field: str, last: int) -> None:
+def test_a_frame_that_is_sent_again_is_rejected(field: str, last: int) -> None:
     frozen = only(check(changed(demo_log(), field, stop(HERE, last))), "frozen")
     assert (frozen.field, places(frozen)) == (field, {(HERE, last)})
     assert len(frozen.channels) == 12
 
 
 @pytest.mark.parametrize("field", ["joint_position", "joint_torque"])
-def test_one_channel_that_freezes_is_condemned_by_name(field: str) -> None:
+def test_one_channel_that_freezes_is_rejected_by_name(field: str) -> None:
     frozen = only(check(changed(demo_log(), field, stop(HERE, HERE + 19, 4))), "frozen")
     assert (frozen.channels, places(frozen)) == (("front_right_thigh",), {(HERE, HERE + 19)})
 
@@ -192,7 +192,7 @@ def test_rest_and_slow_motion_on_a_grid_are_no_fault(quantum: float, blur: str) 
     sways = q[:1] + 1e-4 * np.sin(3.0 * log.time)[:, None]
     for joints in (creeps, stands, sways):
         checked = check(replace(log, joint_position=read(joints)))
-        assert not checked.condemned.any()
+        assert not checked.rejected.any()
         assert {one.name for one in checked.findings} <= {"constant"}
 
 
@@ -206,7 +206,7 @@ def test_a_pose_that_arrives_at_half_the_rate_and_irregularly_is_held(quantum: f
     log = Log("walk.npz", time, ("a", "b", "c"), position(time), base_position_world=place[latest.clip(0)])
     checked = check(log)
     assert "every 2 samples" in only(checked, "held", "base_position_world").found
-    assert not checked.condemned.any()
+    assert not checked.rejected.any()
 
 
 def test_a_joint_that_is_sent_at_a_lower_rate_than_the_others_is_named() -> None:
@@ -235,17 +235,17 @@ def test_a_driver_that_reads_nothing_below_some_size_is_not_frozen(field: str) -
     finding = only(check(dead), "dead band")
     assert (finding.severity, finding.field) == (SUSPICIOUS, field)
     assert "below 0.1" in finding.found
-    assert not check(dead).condemned.any()
+    assert not check(dead).rejected.any()
 
 
-def test_a_torque_that_was_recorded_at_a_lower_rate_and_held_is_named_but_not_condemned() -> None:
+def test_a_torque_that_was_recorded_at_a_lower_rate_and_held_is_named_but_not_rejected() -> None:
     held = replace(demo_log(), joint_torque=value(demo_log().joint_torque)[np.arange(1300) // 4 * 4])
     checked = check(held)
     assert "every 4 samples" in only(checked, "held").found
-    assert not checked.condemned.any()
+    assert not checked.rejected.any()
 
 
-def test_a_saturated_torque_is_condemned_where_it_is_saturated() -> None:
+def test_a_saturated_torque_is_rejected_where_it_is_saturated() -> None:
     torque = value(demo_log().joint_torque)
     limit = np.percentile(torque[:, 2], 90.0)
     checked = check(
@@ -254,9 +254,9 @@ def test_a_saturated_torque_is_condemned_where_it_is_saturated() -> None:
     assert only(checked, "saturated").channels == ("front_left_knee",)
     at_limit = torque[:, 2] >= limit
     first = np.flatnonzero(at_limit)[0]
-    assert checked.condemned[first], "the first sample at the limit is as wrong as those that repeat it"
-    assert np.mean(checked.condemned[at_limit]) > 0.9
-    assert not checked.condemned[~at_limit].any()
+    assert checked.rejected[first], "the first sample at the limit is as wrong as those that repeat it"
+    assert np.mean(checked.rejected[at_limit]) > 0.9
+    assert not checked.rejected[~at_limit].any()
 
 
 def test_a_torque_of_zero_throughout_is_suspicious_and_a_joint_that_never_moves_a_note() -> None:
@@ -280,22 +280,22 @@ def test_forces_that_stay_at_one_value_while_joints_move_are_suspicious_also_bes
     assert all(one.severity != SUSPICIOUS for one in found(check(torque), "constant", "joint_torque"))
 
 
-def test_holes_in_a_channel_are_condemned_and_a_channel_that_is_not_there_is_not() -> None:
+def test_holes_in_a_channel_are_rejected_and_a_channel_that_is_not_there_is_not() -> None:
     holes = check(changed(demo_log(), "joint_torque", put((slice(200, 210), 1), np.nan)))
     assert places(only(holes, "not measured")) == {(200, 209)}
     assert np.isfinite(value(holes.repaired.joint_torque)).all()
     absent = check(changed(demo_log(), "joint_torque", lambda t: t[:, 1].fill(np.nan)))
     assert only(absent, "not measured").severity == NOTE
-    assert not absent.condemned.any()
+    assert not absent.rejected.any()
 
 
-def test_values_that_nothing_can_have_are_condemned() -> None:
+def test_values_that_nothing_can_have_are_rejected() -> None:
     checked = check(changed(demo_log(), "joint_torque", put((HERE, 3), 1e200)))
     assert places(only(checked, "absurd")) == {(HERE, HERE)}
     assert not check(changed(demo_log(), "joint_torque", put(slice(None), 1e200))).usable
 
 
-def test_a_repaired_log_differs_where_it_was_condemned_and_nowhere_else() -> None:
+def test_a_repaired_log_differs_where_it_was_rejected_and_nowhere_else() -> None:
     log = changed(demo_log(), "joint_position", put((HERE, 2), 0.3))
     checked = check(log)
     difference = checked.repaired.joint_position != log.joint_position
@@ -319,7 +319,7 @@ def test_a_gap_is_named_with_what_is_missing_and_a_long_one_makes_the_log_useles
     assert long.reasons == ("time: gap",)
 
 
-def test_of_two_stamps_that_nearly_coincide_one_is_condemned() -> None:
+def test_of_two_stamps_that_nearly_coincide_one_is_rejected() -> None:
     time = demo_log().time.copy()
     time[HERE] = time[HERE - 1] + 1e-4
     assert places(only(check(replace(demo_log(), time=time)), "coincident stamps")) == {(HERE, HERE)}
@@ -343,5 +343,5 @@ def test_a_recorded_quadruped_that_stands_and_sways_keeps_its_samples() -> None:
     q, v, tau = (recorded[name].astype(float) for name in ("joint_position", "joint_velocity", "torque_estimate"))
     names = tuple(map(str, recorded["joint_names"]))
     checked = check(Log("go2", recorded["time"].astype(float), names, q, joint_velocity=v, joint_torque=tau))
-    assert checked.condemned.sum() <= 1
+    assert checked.rejected.sum() <= 1
     assert not found(checked, "held")

@@ -14,7 +14,7 @@ from faults import changed, demo_log, demo_robot, found, moving, of_demo, only, 
 from motions import angles, omega_base, position, slope, uniform, value, velocity
 from scipy.spatial.transform import Rotation
 
-from torchid.log_checks import CONDEMNED, NOTE, SUSPICIOUS, Checked, Finding
+from torchid.log_checks import NOTE, REJECTED, SUSPICIOUS, Checked, Finding
 from torchid.log_checks.check import check
 from torchid.log_checks.motion import check_angle_unit, compare_derivative
 from torchid.log_checks.weight import check_weight
@@ -104,7 +104,7 @@ def test_velocities_in_radians_betray_positions_in_degrees() -> None:
 def test_a_velocity_of_the_wrong_sign_is_named_by_joint() -> None:
     wrong = changed(flying(), "joint_velocity", lambda v: v[:, 1].__imul__(-1.0))
     finding = only(check(replace(wrong, joint_acceleration=None)), "unit or sign")
-    assert (finding.channels, finding.severity) == (("b",), CONDEMNED)
+    assert (finding.channels, finding.severity) == (("b",), REJECTED)
     assert "sign" in finding.found
 
 
@@ -135,7 +135,7 @@ def test_a_vector_in_another_frame_than_its_name_says_is_named(field: str) -> No
     if field.endswith("velocity_world"):
         fields["base_linear_acceleration_world"] = None
     finding = only(check(replace(log, **fields)), "frame")
-    assert (finding.field, finding.severity) == (field, CONDEMNED)
+    assert (finding.field, finding.severity) == (field, REJECTED)
     assert "in the base frame" in finding.found
 
 
@@ -152,7 +152,7 @@ def test_an_angular_velocity_in_the_other_frame_is_named() -> None:
         log, base_angular_velocity_base=turn.apply(omega_base(log.time)), base_angular_acceleration_base=None
     )
     finding = only(check(wrong), "frame or order")
-    assert (finding.field, finding.severity) == ("base_angular_velocity_base", CONDEMNED)
+    assert (finding.field, finding.severity) == ("base_angular_velocity_base", REJECTED)
     assert "world frame" in finding.found
 
 
@@ -172,7 +172,7 @@ def test_a_quaternion_of_the_other_order_than_its_name_says_is_named(tmp_path: A
             arrays[f"base_angular_velocity_{frame}"] = turned
     np.savez(tmp_path / "wrong.npz", **arrays)
     finding = only(check(read_log(tmp_path / "wrong.npz")), "frame or order")
-    assert (finding.field, finding.severity) == ("base_quat_xyzw", CONDEMNED)
+    assert (finding.field, finding.severity) == ("base_quat_xyzw", REJECTED)
     assert "order" in finding.found
 
 
@@ -226,7 +226,7 @@ def test_an_accelerometer_at_rest_reads_gravity() -> None:
     assert {one.severity for one in check(resting()).findings} == {NOTE}
     force = value(resting().imu_specific_force)
     for factor, name, severity in (
-        (1.0 / 9.81, "unit", CONDEMNED), (1.05, "gravity", SUSPICIOUS), (0.01, "gravity", CONDEMNED)
+        (1.0 / 9.81, "unit", REJECTED), (1.05, "gravity", SUSPICIOUS), (0.01, "gravity", REJECTED)
     ):  # fmt: skip
         assert only(check(resting(imu_specific_force=factor * force)), name).severity == severity
 
@@ -243,19 +243,19 @@ def test_gravity_as_the_accelerometer_sees_it_is_compared_with_the_orientation()
     assert only(check(replace(log, imu_specific_force=tilted), robot), "gravity").severity == SUSPICIOUS
 
 
-def test_a_force_while_a_contact_is_inactive_is_condemned() -> None:
+def test_a_force_while_a_contact_is_inactive_is_rejected() -> None:
     log = changed(demo_log(), "contact_active", lambda c: c.__setitem__((slice(640, 690), 1), False))
     finding = only(check(log), "force without contact")
     assert (finding.channels, places(finding)) == (("front_right_foot",), {(640, 689)})
-    assert finding.severity == CONDEMNED
+    assert finding.severity == REJECTED
     assert value(check(log).repaired.contact_active)[640:690, 1].all()
 
 
 @pytest.mark.parametrize("flags", [np.zeros_like, np.logical_not], ids=["all off", "inverted"])
-def test_feet_that_carry_the_robot_while_no_flag_says_so_are_condemned(flags: Any) -> None:
+def test_feet_that_carry_the_robot_while_no_flag_says_so_are_rejected(flags: Any) -> None:
     log = replace(demo_log(), contact_active=flags(value(demo_log().contact_active)))
     finding = only(of_demo(log), "force without contact")
-    assert (finding.severity, set(finding.channels)) == (CONDEMNED, set(log.contact_names))
+    assert (finding.severity, set(finding.channels)) == (REJECTED, set(log.contact_names))
     assert not of_demo(log).usable
 
 
@@ -342,8 +342,8 @@ def test_what_the_feet_carry_at_rest_is_compared_with_the_weight() -> None:
     log = carried().log
     assert not list(check_weight(log, demo_robot()))
     for factor, name, severity in (
-        (1.05, "weight", NOTE), (1.5, "weight", SUSPICIOUS), (1e-3, "unit", CONDEMNED), (1.0 / 9.81, "unit", CONDEMNED),
-        (-1.0, "sign", CONDEMNED),
+        (1.05, "weight", NOTE), (1.5, "weight", SUSPICIOUS), (1e-3, "unit", REJECTED), (1.0 / 9.81, "unit", REJECTED),
+        (-1.0, "sign", REJECTED),
     ):  # fmt: skip
         (finding,) = check_weight(scaled(log, "contact_wrench_world", factor), demo_robot())
         assert (finding.name, finding.severity) == (name, severity)  # type: ignore[union-attr]

@@ -10,7 +10,7 @@ from motions import value
 from stances import stance
 from walking import robot_of
 
-from torchid.log_checks import CONDEMNED, SUSPICIOUS, Finding
+from torchid.log_checks import REJECTED, SUSPICIOUS, Finding
 from torchid.log_checks.standing_feet import check_standing_feet
 from torchid.logs import Log
 
@@ -33,7 +33,7 @@ def test_the_pose_in_a_left_handed_world_is_named_with_its_axis(axis: int) -> No
     log = STANCE.measured
     quat, position = value(log.base_quat_xyzw) * [*-signs, 1.0], value(log.base_position_world) * signs
     (finding,) = findings(replace(log, base_quat_xyzw=quat, base_position_world=position))
-    assert (finding.severity, finding.field) == (CONDEMNED, "base_quat_xyzw")
+    assert (finding.severity, finding.field) == (REJECTED, "base_quat_xyzw")
     assert f"left-handed world, whose {'xyz'[axis]} axis is reversed" in finding.found
 
 
@@ -43,7 +43,7 @@ def test_a_reversed_joint_is_named_and_how_to_reverse_it() -> None:
     position = log.joint_position.copy()
     position[:, joint] *= -1.0
     (finding,) = findings(replace(log, joint_position=position))
-    assert (finding.severity, finding.field) == (CONDEMNED, "joint_position")
+    assert (finding.severity, finding.field) == (REJECTED, "joint_position")
     assert finding.found.startswith(f"{name} reversed")
     assert f"{{{name}: -1}}" in finding.advice
 

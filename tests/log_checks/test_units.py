@@ -11,7 +11,7 @@ from faults import changed, demo_log, found, moving, of_demo, only, scaled, with
 from motions import uniform, value
 from thinned import slow_but
 
-from torchid.log_checks import CONDEMNED, NOTE
+from torchid.log_checks import NOTE, REJECTED
 from torchid.log_checks.check import check
 from torchid.log_checks.units import other_units, units_of_derivative_ratio, units_of_ratio
 from torchid.logs import Log
@@ -29,7 +29,7 @@ def test_joint_velocities_in_any_unit_are_named_joint_by_joint(unit: str, joints
     factor = UNITS["angular velocity"][unit]
     log = changed(with_velocity(moving()), "joint_velocity", lambda v: v[:, joints].__itruediv__(factor))
     finding = only(check(log), "unit or sign", "joint_velocity")
-    assert (finding.severity, finding.channels) == (CONDEMNED, log.joint_names[joints])
+    assert (finding.severity, finding.channels) == (REJECTED, log.joint_names[joints])
     assert f"joint_velocity is in {unit}" in finding.found
     assert f"logs.columns.joint_velocity.unit: {unit}" in finding.advice
 
@@ -79,7 +79,7 @@ def shaken(unit: float, gravity: float = 9.80665) -> Log:
 @pytest.mark.parametrize("unit", ["g", "mg", "mm/s2", "cm/s2"])
 def test_an_accelerometer_in_another_unit_is_named_without_rest(unit: str) -> None:
     finding = only(check(shaken(UNITS["acceleration"][unit])), "unit", "imu_specific_force")
-    assert finding.severity == CONDEMNED
+    assert finding.severity == REJECTED
     assert re.search(f"logs.columns.imu_specific_force.unit: [^;]*{unit}", finding.advice)
 
 
@@ -92,7 +92,7 @@ def test_an_accelerometer_in_si_units_is_in_none_other(gravity: float) -> None:
 def test_joint_torques_in_another_unit_are_named(unit: str) -> None:
     checked = of_demo(scaled(demo_log().select(slice(0, 600)), "joint_torque", 1.0 / UNITS["torque"][unit]))
     finding = only(checked, "unit, sign or frame")
-    assert (finding.severity, finding.field) == (CONDEMNED, "joint_torque")
+    assert (finding.severity, finding.field) == (REJECTED, "joint_torque")
     assert f"logs.columns.joint_torque.unit: {unit}" in finding.advice
 
 
@@ -100,7 +100,7 @@ def test_joint_torques_in_another_unit_are_named(unit: str) -> None:
 def test_a_base_position_in_another_unit_is_named_by_standing_feet(unit: str) -> None:
     log = demo_log().select(slice(0, 600))
     finding = only(of_demo(scaled(log, "base_position_world", 1.0 / UNITS["length"][unit])), "unit, sign or frame")
-    assert (finding.severity, finding.field) == (CONDEMNED, "base_position_world")
+    assert (finding.severity, finding.field) == (REJECTED, "base_position_world")
     assert f"logs.columns.base_position_world.unit: {unit}" in finding.advice
 
 

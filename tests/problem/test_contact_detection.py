@@ -295,12 +295,12 @@ def test_feet_of_a_robot_that_something_else_carries_do_not_stand(carried: float
 # -------------------------------------------------------------------------------------------------- checks and refusals
 
 
-def test_flags_that_were_made_are_not_condemned_by_the_checks() -> None:
+def test_flags_that_were_made_are_not_rejected_by_the_checks() -> None:
     true, _ = walked(QUADRUPED)
     log, contacts = noisy(QUADRUPED), QUADRUPED.contacts()
     late = replace(log, contact_active=np.roll(value(log.contact_active), 20, axis=0))
-    condemned = [x.field for x in check(late, true.robot, contacts).findings if x.severity == "condemned"]
-    assert "contact_active" in condemned
+    rejected = [x.field for x in check(late, true.robot, contacts).findings if x.severity == "rejected"]
+    assert "contact_active" in rejected
     for made in (late, with_detected_contacts(late, true.robot, contacts)[0]):
         findings = check(made, true.robot, contacts, derived=("contact_active",)).findings
         assert not [x for x in findings if x.field in ("contact_active", "contact_names")]

@@ -1,4 +1,4 @@
-"""The base's motion from the feet that stand: its pose, its derivatives, gaps between stretches, and refusals."""
+"""The base's motion from the feet that stand: its pose, its derivatives, gaps between segments, and refusals."""
 
 from __future__ import annotations
 
@@ -80,9 +80,9 @@ def test_a_walk_that_is_read_in_parts_is_that_of_the_whole_log(tmp_path: Path, n
         return (slice(start, min(start + most, count)) for start in range(0, count, most))
 
     for folder in (None, tmp_path):
-        stood, stretches = stand_in_blocks(blocks, robot_of(case.machine), case.contacts(), pieces, folder)
-        assert (stretches.stretches, stretches.dropped) == (whole.stretches, whole.dropped)
-        assert stretches.uneven == pytest.approx(whole.uneven, abs=1e-9)
+        stood, segments = stand_in_blocks(blocks, robot_of(case.machine), case.contacts(), pieces, folder)
+        assert (segments.segments, segments.dropped) == (whole.segments, whole.dropped)
+        assert segments.uneven == pytest.approx(whole.uneven, abs=1e-9)
         assert stood.fields.keys() == {"joint_position", "contact_active", "base_quat_xyzw", "base_position_world"}
         assert "imu_frame" not in stood.names
         for field in ("base_quat_xyzw", "base_position_world"):
@@ -101,7 +101,7 @@ def test_the_pose_above_standing_feet_is_that_of_the_base(
 ) -> None:
     case = stance(name, normal, 0.0, lifts)
     standing = found(case)
-    assert standing.stretches == (slice(0, len(case.log)),)
+    assert standing.segments == (slice(0, len(case.log)),)
     assert standing.dropped == {}
     assert standing.uneven < 1e-7
     assert_same_pose(standing, case, EXACT)
@@ -260,17 +260,17 @@ def test_nothing_is_differentiated_across_samples_with_too_few_feet(rates: tuple
     np.testing.assert_allclose(forces[0], np.concatenate(forces[1:]), rtol=0.0, atol=1e-9)
 
 
-def test_stretches_too_short_for_the_filter_are_dropped_and_counted() -> None:
+def test_segments_too_short_for_the_filter_are_dropped_and_counted() -> None:
     case = stance("quadruped")
     robot, contacts = robot_of(case.machine), case.contacts()
     log = without(without(with_gap(case), 0, slice(100, 103)), 3, slice(100, 103))
-    with pytest.warns(TorchidWarning, match=r"33 of 160 .*feet stand: 23, stretches too short to differentiate: 10"):
+    with pytest.warns(TorchidWarning, match=r"33 of 160 .*feet stand: 23, segments too short to differentiate: 10"):
         whole = preprocess_standing(log, robot, contacts, 12.0, None)
     assert not ((whole.time > log.time[69]) & (whole.time < log.time[103])).any()
     with pytest.warns(TorchidWarning, match="23 of 160"):
         assert ((unfiltered := preprocess_standing(log, robot, contacts, None, None)).time < log.time[100]).sum() > 66
     assert len(unfiltered) == 160 - 23 - 3 * 4
-    message = refused(lambda: preprocess_standing(log, robot, contacts, 4.0, None), "quadruped: time: stretches of at")
+    message = refused(lambda: preprocess_standing(log, robot, contacts, 4.0, None), "quadruped: time: segments of at")
     assert "more than 1 s" in message
 
 
@@ -279,7 +279,7 @@ def test_a_heading_is_kept_by_two_feet_that_stand_through_a_gap(foot: int) -> No
     case = stance("quadruped", ASKEW)
     log = without(without(case.log, foot, slice(70, 90)), 1, slice(70, 90))
     standing = found(case, log)
-    assert standing.stretches == (slice(0, 70), slice(90, 160))
+    assert standing.segments == (slice(0, 70), slice(90, 160))
     assert_same_pose(standing, case, EXACT, slice(0, 70))
     assert_same_pose(standing, case, 1e-8, slice(90, None))
     unknown = np.isnan(value(standing.log.base_quat_xyzw)).all(axis=1)
@@ -290,10 +290,10 @@ def test_a_heading_that_is_lost_on_a_slope_ends_what_is_used() -> None:
     lifted = stance("humanoid", ASKEW).log
     lifted = without(without(lifted, 0, slice(70, 90)), 1, slice(70, 90))
     standing = found(stance("humanoid", ASKEW), lifted)
-    assert standing.stretches == (slice(0, 70),)
+    assert standing.segments == (slice(0, 70),)
     assert standing.dropped == {"too few feet stand": 20, "heading on a floor that is not level": 70}
     level = found(stance("humanoid"), lifted, stance("humanoid").contacts())
-    assert level.stretches == (slice(0, 70), slice(90, 160))
+    assert level.segments == (slice(0, 70), slice(90, 160))
 
 
 # ------------------------------------------------------------------------------------------------------------- refusals
@@ -333,7 +333,7 @@ def test_feet_in_a_line_say_nothing_of_the_tilt_about_it() -> None:
     refused(lambda: found(case, log, contacts), line, LogError)
     standing = found(case, replace(log, joint_position=bent), contacts)
     assert standing.dropped == {"feet in a line": 100}
-    assert standing.stretches == (slice(100, 160),)
+    assert standing.segments == (slice(100, 160),)
 
 
 def test_a_sole_that_has_no_axis_towards_the_base_is_refused() -> None:

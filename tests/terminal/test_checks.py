@@ -12,17 +12,17 @@ import numpy as np
 import pytest
 
 from torchid.cli import main
-from torchid.log_checks import CONDEMNED, NOTE, SUSPICIOUS, Checked, Finding, Skipped, Span
+from torchid.log_checks import NOTE, REJECTED, SUSPICIOUS, Checked, Finding, Skipped, Span
 from torchid.logs import Log, write_log
 from torchid.terminal.checks import check_lines
 from torchid.terminal.lines import LINES
 
 LONG = "front_left_limb_of_a_robot_with_names_that_fill_a_whole_line_of_any_terminal"
 SPIKE = Finding(
-    "spike", CONDEMNED, "joint_torque", "excursions of 200 N m in front_right_hip, which no motion explains",
+    "spike", REJECTED, "joint_torque", "excursions of 200 N m in front_right_hip, which no motion explains",
     "leave out; check for a loose contact", ("front_right_hip",), (Span(3, 5, "front_right_hip"),),
 )  # fmt: skip
-DEGREES = Finding("unit", CONDEMNED, "joint_position", "more than two turns: degrees", "convert to radians")
+DEGREES = Finding("unit", REJECTED, "joint_position", "more than two turns: degrees", "convert to radians")
 SIGN = Finding("sign", SUSPICIOUS, "contact_wrench_local", "the total is negative", "reverse")
 WEIGHT = Finding("weight", NOTE, "contact_wrench_local", "contacts carry 21.36 kg, the URDF weighs 20.8 kg", "none")
 
@@ -60,8 +60,8 @@ def test_the_verdict_comes_first_and_the_worst_finding_next_with_what_to_do() ->
     logs = [checked("clean", WEIGHT), checked("spiked", SPIKE, SIGN), checked("degrees", DEGREES)]
     assert text(logs).startswith(
         "1 of 3 logs is free of usual mistakes; 1 is not usable; 1 is usable without some samples "
-        "condemned joint_position, unit in degrees.npz: more than two turns: degrees do: convert to radians "
-        "condemned joint_torque, spike in spiked.npz: excursions of 200 N m"
+        "rejected joint_position, unit in degrees.npz: more than two turns: degrees do: convert to radians "
+        "rejected joint_torque, spike in spiked.npz: excursions of 200 N m"
     )
     rows = [line.split() for line in check_lines(logs, (), 100) if re.match(r"\w+\.npz ", line)]
     assert rows == [
@@ -81,7 +81,7 @@ def test_one_log_is_named_with_its_verdict() -> None:
 @pytest.mark.parametrize("width", [60, 100])
 def test_every_finding_is_shown_or_counted(width: int) -> None:
     names = [f"kind_{k}" for k in range(12)]
-    severities = [CONDEMNED, SUSPICIOUS, NOTE]
+    severities = [REJECTED, SUSPICIOUS, NOTE]
     logs = [checked("walk", *(replace(SPIKE, name=name, severity=s) for s in severities for name in names))]
     lines = check_lines(logs, (), width)
     shown = sum(line.startswith((*severities,)) for line in lines)
@@ -89,7 +89,7 @@ def test_every_finding_is_shown_or_counted(width: int) -> None:
     counted = {s: int(n) for s, n in re.findall(rf"({'|'.join(severities)}) (\d+)", rest)}
     assert rest.startswith(f"{sum(counted.values())} more: ")
     assert shown + sum(counted.values()) == 36
-    assert counted == {CONDEMNED: 12 - shown, SUSPICIOUS: 12, NOTE: 12}, "the most severe are shown"
+    assert counted == {REJECTED: 12 - shown, SUSPICIOUS: 12, NOTE: 12}, "the most severe are shown"
 
 
 def test_what_several_logs_share_is_said_once_and_where_all_of_it_is() -> None:

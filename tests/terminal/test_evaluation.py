@@ -90,7 +90,7 @@ def test_the_worst_log_comes_first_and_what_is_worse_than_the_urdf_is_said(evalu
 
 def test_samples_left_out_are_counted(evaluated: EvaluatedRun) -> None:
     lines = evaluation_lines(replace(evaluated, excluded={"sway_test": 12}), 80)
-    assert "left out      12 samples that torchid check condemns" in lines
+    assert "left out      12 samples that torchid check rejects" in lines
     assert not any("left out" in line for line in evaluation_lines(evaluated, 80))
 
 

@@ -199,7 +199,7 @@ def factors_key(experiment: Experiment, builder: RowBuilder, samples: Sequence[s
             "noise": vars(sensors.noise),
             "terms": vars(experiment.terms),
             "blocks": [[sources.index(block.source), len(block), block.fold] for block in blocks],
-            "surplus": [block.motion_noise is not None for block in blocks],
+            "motion_noise": [block.motion_noise is not None for block in blocks],
             "device": builder.device.type,
             "shares": [worker_count(builder.device), ranks.world_size()],  # rows are added up by each
         }
@@ -259,10 +259,10 @@ def _unpacked(entry: Entry, builder: RowBuilder, sources: Sequence[str]) -> list
     ):
         part = reader.read(sources[source], packed, unloaded)
         factor = part.factor
-        blocks, surplus = (
-            {support: x.to(builder.device) for support, x in by.items()} for by in (factor.blocks, factor.surplus)
+        blocks, noise_gram = (
+            {support: x.to(builder.device) for support, x in by.items()} for by in (factor.blocks, factor.noise_gram)
         )
-        moved = TriangularFactor.from_blocks(columns, factor.rows, factor.independent_rows, blocks, surplus)
+        moved = TriangularFactor.from_blocks(columns, factor.rows, factor.independent_rows, blocks, noise_gram)
         parts.append(replace(part, factor=moved, fold=fold, block=block))
     if reader.numbers_left:
         raise ValueError("more numbers than are described")

@@ -211,7 +211,7 @@ class CachedReader(LogReader):
         if content is None:
             return None
         settings = self.scene.config.preprocessing
-        drops = settings.exclude_condemned or settings.margin_s is not None or settings.max_slip is not None
+        drops = settings.exclude_rejected or settings.margin_s is not None or settings.max_slip is not None
         masks = None if required is None or not drops else [required.torque.tolist(), required.wrench.tolist()]
         blocks = None if together is None else settings.memory_gb
         part = split_range(path)

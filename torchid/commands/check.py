@@ -161,8 +161,8 @@ def _read_log_to_check(path: Path, logs: LogsConfig, settings: PreprocessingConf
     return _read_with_gaps(path, logs, settings)
 
 
-def stretches_to_check(path: Path, logs: LogsConfig, settings: PreprocessingConfig) -> Iterator[tuple[Log, str]]:
-    """One of the logs of an experiment in equal stretches of at most `MOST_CHECKED` samples, the middle first.
+def segments_to_check(path: Path, logs: LogsConfig, settings: PreprocessingConfig) -> Iterator[tuple[Log, str]]:
+    """One of the logs of an experiment in equal segments of at most `MOST_CHECKED` samples, the middle first.
 
     Each has a name that says which.
 
@@ -170,19 +170,19 @@ def stretches_to_check(path: Path, logs: LogsConfig, settings: PreprocessingConf
         LogError: as `_read_log_to_check`.
     """
     _require_memory(path, settings)
-    yield from recorded_stretches(path, logs, settings)
+    yield from recorded_segments(path, logs, settings)
 
 
-def recorded_stretches(path: Path, logs: LogsConfig, settings: PreprocessingConfig) -> Iterator[tuple[Log, str]]:
-    """As `stretches_to_check`, of a log of any size."""
+def recorded_segments(path: Path, logs: LogsConfig, settings: PreprocessingConfig) -> Iterator[tuple[Log, str]]:
+    """As `segments_to_check`, of a log of any size."""
     if settings.bridge_gaps_s is not None or existing_log_kind(path) in (LogKind.BAG, LogKind.JOINED):
         log = _read_with_gaps(path, logs, settings)
-        for stretch in _stretches(len(log)):
-            yield log.select(stretch), _stretch_name(path, stretch, len(log))
+        for segment in _segments(len(log)):
+            yield log.select(segment), _segment_name(path, segment, len(log))
         return
     with open_log_blocks(path, None, logs.columns, settings.needs_flags) as blocks:
-        for stretch in _stretches(len(blocks)):
-            yield blocks.read(stretch, allow_gaps=True), _stretch_name(path, stretch, len(blocks))
+        for segment in _segments(len(blocks)):
+            yield blocks.read(segment, allow_gaps=True), _segment_name(path, segment, len(blocks))
 
 
 def _read_with_gaps(path: Path, logs: LogsConfig, settings: PreprocessingConfig) -> Log:
@@ -197,17 +197,17 @@ def _read_with_gaps(path: Path, logs: LogsConfig, settings: PreprocessingConfig)
     )
 
 
-def _stretches(samples: int) -> list[slice]:
+def _segments(samples: int) -> list[slice]:
     ends = np.linspace(0, samples, -(-samples // MOST_CHECKED) + 1).round().astype(int).tolist()
-    stretches = [slice(*pair) for pair in pairwise(ends)]
-    return sorted(stretches, key=lambda stretch: abs(stretch.start + stretch.stop - samples))
+    segments = [slice(*pair) for pair in pairwise(ends)]
+    return sorted(segments, key=lambda segment: abs(segment.start + segment.stop - samples))
 
 
-def _stretch_name(path: Path, stretch: slice, samples: int) -> str:
+def _segment_name(path: Path, segment: slice, samples: int) -> str:
     name = log_title(path)
-    if stretch.stop - stretch.start == samples:
+    if segment.stop - segment.start == samples:
         return name
-    return f"{name} (samples {stretch.start} to {stretch.stop - 1} of {samples}, counted from there)"
+    return f"{name} (samples {segment.start} to {segment.stop - 1} of {samples}, counted from there)"
 
 
 def _require_memory(path: Path, settings: PreprocessingConfig) -> None:

@@ -13,7 +13,7 @@ from rich.progress import Progress
 from torch import Tensor
 
 from torchid import ranks
-from torchid.commands.check import recorded_stretches
+from torchid.commands.check import recorded_segments
 from torchid.commands.reading import LogReader
 from torchid.errors import about_file, warn_about_file
 from torchid.estimators import Conditions
@@ -106,7 +106,7 @@ def _cutoff(scene: Scene) -> CutoffChoice:
     settings, files = scene.config.preprocessing, scene.config.logs
     if files is None:
         return CutoffChoice(None, by_noise=False)
-    logs = [next(recorded_stretches(path, files, settings))[0] for path in files.train]
+    logs = [next(recorded_segments(path, files, settings))[0] for path in files.train]
     stated, from_feet = scene.config.sensors.noise.motion, settings.base_motion is not None
     return choose_cutoff(logs, stated, settings.sample_rate_hz, base_is_derived=from_feet)
 
@@ -180,7 +180,7 @@ class _Directions:
 class WidthReader(LogReader):
     """Reads logs that fit into memory once for all widths; others anew for each, since the filter comes after friction.
 
-    So are logs whose base moves as the feet say: they are filtered in stretches.
+    So are logs whose base moves as the feet say: they are filtered in segments.
     """
 
     def __init__(self, scene: Scene) -> None:

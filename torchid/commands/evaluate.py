@@ -52,7 +52,7 @@ class EvaluatedRun:
 
     Attributes:
         metrics: errors of the nominal and of the identified parameters, by the name of a log.
-        excluded: condemned samples left out, by the name of a log.
+        excluded: rejected samples left out, by the name of a log.
         forces: of the first samples of the first log, as measured and as predicted.
         robot: whose they are.
         usual: errors on the own logs of the run, by group of rows, the larger of train and test.

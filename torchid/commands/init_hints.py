@@ -143,5 +143,5 @@ def keys_for_gaps(read: Log | InputError) -> dict[str, tuple[object, str]]:
         reason = (
             f"as gaps of {name} take up to {longest:.2g} s" if longest > _BRIDGED_S else f"as {name} has one at an end"
         )
-        out["exclude_condemned"] = (True, reason)
+        out["exclude_rejected"] = (True, reason)
     return out

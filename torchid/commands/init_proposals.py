@@ -74,7 +74,7 @@ def like_torques(families: Sequence[Family]) -> tuple[str, list[dict[str, object
 
 _TESTED = 0.2  # of a log
 _FEWEST_FOLDS = 2
-_SURPLUS = 1.1  # of samples to choose the ridge by, as their number is known once they are filtered
+_FOLD_MARGIN = 1.1  # more samples than folds need, as their number is known once they are filtered
 _LEAST_TEST = 1.5  # of what a filter spoils at both ends: a third of a test is left
 _RIDGE = 1e-3  # where nothing can be left out to choose it by
 
@@ -111,7 +111,7 @@ def split_log(log: Log | InputError, base_is_derived: bool = False) -> Split:
     length = float(log.time[-1] - log.time[0])
     spoiled = 0.0 if cutoff_hz is None else 2.0 * DROPPED_PERIODS / cutoff_hz
     independent_hz = (len(log) - 1) / length if cutoff_hz is None else 2.0 * cutoff_hz
-    folded = spoiled + _SURPLUS * _FEWEST_FOLDS * LEAST_PER_FOLD / independent_hz
+    folded = spoiled + _FOLD_MARGIN * _FEWEST_FOLDS * LEAST_PER_FOLD / independent_hz
     if _TESTED * length >= _LEAST_TEST * spoiled and (1.0 - _TESTED) * length >= folded:
         return Split()
     filtered = "" if cutoff_hz is None else f" (the filter of {cutoff_hz:g} Hz spoils {spoiled:.2g} s)"

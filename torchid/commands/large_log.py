@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchid.commands.log_course import Block, Course, Stretch, in_the_air, require_kept, row_numbers
+from torchid.commands.log_course import Block, Course, Segment, in_the_air, require_kept, row_numbers
 from torchid.config.preprocessing import PreprocessingConfig
 from torchid.errors import LogError, about_file
 from torchid.logs import Columns, Log
@@ -30,9 +30,9 @@ from torchid.logs.preprocess import (
     lacks_derivatives,
     make_timeline,
 )
+from torchid.logs.segments import count_samples, long_segments
 from torchid.logs.signal_noise import MOST_SAMPLES, signal_noise, warn_of_noisy_accelerations
 from torchid.logs.spill import Filled, MappedPages, Spill, growing_array
-from torchid.logs.stretches import count_samples, long_stretches
 from torchid.logs.timeline import SPLINE_BLOCK, Timeline
 from torchid.problem import Samples, bind_log
 from torchid.problem.base_motion import BaseMotion
@@ -54,7 +54,7 @@ from torchid.problem.derived_blocks import (
 )
 from torchid.problem.log_joints import distances_from_welds, warn_of_moving_welds
 from torchid.problem.samples import require_forces
-from torchid.problem.standing import Stretches, warn_of_standing
+from torchid.problem.standing import StandingSegments, warn_of_standing
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
 
@@ -75,7 +75,7 @@ class _Settled:
 
     blocks: LogBlocks
     certain: BoolArray | None = None
-    standing: Stretches | None = None
+    standing: StandingSegments | None = None
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,7 @@ class LargeLog:
                 mine[0][0].follow_signs(mine[0][1].start, max(SPLINE_BLOCK, int(BLOCK_GB * GIGABYTE / 32)))
             threads = thread_count() if threads is None else threads
             threads = 0 if self.folder is not None else threads  # on a disk because memory is short
-            read = (stretch.read(piece) for stretch, piece in mine)
+            read = (segment.read(piece) for segment, piece in mine)
             with closing(_in_threads(partial(self._bound, course), read, threads)) as bound:
                 for piece, samples in bound:
                     if course.longest.in_the_air is None:
@@ -189,8 +189,8 @@ class LargeLog:
     def _course(self, settled: _Settled, with_unloaded: bool) -> Course:
         """What of a log must be known before its blocks can be worked on, which takes a pass or two over it."""
         blocks, settings, standing = settled.blocks, self.settings, settled.standing
-        chosen = [slice(0, len(blocks))] if standing is None else standing.stretches
-        longest = max(chosen, key=lambda stretch: stretch.stop - stretch.start)
+        chosen = [slice(0, len(blocks))] if standing is None else standing.segments
+        longest = max(chosen, key=lambda segment: segment.stop - segment.start)
         start = blocks if standing is None else blocks.part(longest)
         first = start.read(slice(0, min(len(start), MOST_SAMPLES)))
         rates = settings.filter_hz, settings.sample_rate_hz, self.sign_width
@@ -199,27 +199,27 @@ class LargeLog:
         contacts = None if first.contact_active is None else contacts_alone(blocks, partial(self._pieces, blocks))
         air = None if contacts is None or not with_unloaded else in_the_air(contacts)
         if standing is None or whole is None:
-            stretches: tuple[Stretch, ...] = (Stretch(blocks, whole, 0, air),)
+            segments: tuple[Segment, ...] = (Segment(blocks, whole, 0, air),)
         else:
-            stretches = self._stretches(blocks, standing, whole, air)
-        time = np.concatenate([stretch.time for stretch in stretches])
+            segments = self._segments(blocks, standing, whole, air)
+        time = np.concatenate([segment.time for segment in segments])
         stated = self.motion_noise if standing is None else {}
-        course = Course(stretches, coverage, time)
+        course = Course(segments, coverage, time)
         course = replace(course, noise=signal_noise(first, course.longest.timeline, stated))
         return course if contacts is None else replace(course, kept=self._kept(course, contacts, settled.certain))
 
-    def _stretches(
-        self, blocks: LogBlocks, standing: Stretches, whole: Timeline, air: BoolArray | None
-    ) -> tuple[Stretch, ...]:
-        """The stretches of a log with a pose that are long enough, each with its timeline; warns of the others."""
-        out, first, settings = list[Stretch](), 0, self.settings
-        usable = long_stretches(blocks.time, standing.stretches, whole)
-        for stretch in usable:
-            part = blocks.part(stretch)
+    def _segments(
+        self, blocks: LogBlocks, standing: StandingSegments, whole: Timeline, air: BoolArray | None
+    ) -> tuple[Segment, ...]:
+        """The segments of a log with a pose that are long enough, each with its timeline; warns of the others."""
+        out, first, settings = list[Segment](), 0, self.settings
+        usable = long_segments(blocks.time, standing.segments, whole)
+        for segment in usable:
+            part = blocks.part(segment)
             timeline = make_timeline(part.time, True, settings.filter_hz, settings.sample_rate_hz, self.sign_width)
-            out.append(Stretch(part, timeline, first, None if air is None else air[stretch]))
+            out.append(Segment(part, timeline, first, None if air is None else air[segment]))
             first += len(out[-1].time)
-        too_short = count_samples(standing.stretches) - count_samples(usable)
+        too_short = count_samples(standing.segments) - count_samples(usable)
         warn_of_standing(blocks.source, len(blocks), standing, too_short)
         return tuple(out)
 
@@ -249,8 +249,8 @@ class LargeLog:
         away = away_from_own_changes(contacts, course.time, self.contacts, settings.filter_hz)
         speeds = growing_array(self.path, self.folder, len(course.time))
         known = settings.base_motion is None
-        for stretch, piece in course.pieces(self._step(blocks, len(course.time))):
-            log = stretch.read(piece, motion).preprocessed(course.coverage)
+        for segment, piece in course.pieces(self._step(blocks, len(course.time))):
+            log = segment.read(piece, motion).preprocessed(course.coverage)
             samples = bind_log(log, self.robot, self.contacts)
             base = base_velocity(log, samples) if known else None
             known = base is not None

@@ -34,7 +34,7 @@ class Block:
 
 
 @dataclass(frozen=True)
-class Stretch:
+class Segment:
     """Successive samples of a log that are preprocessed by themselves.
 
     Attributes:
@@ -80,14 +80,14 @@ class Course:
     """What is known of a whole log before its blocks are worked on.
 
     Attributes:
-        stretches: of it, in their order.
+        segments: of it, in their order.
         coverage: of its fields that must have no gap.
         time: stamps of the preprocessed log [s].
         kept: which of its samples, None for all.
         noise: of the recorded motion.
     """
 
-    stretches: tuple[Stretch, ...]
+    segments: tuple[Segment, ...]
     coverage: Mapping[str, Coverage]
     time: FloatArray
     kept: BoolArray | None = None
@@ -96,21 +96,21 @@ class Course:
     @cached_property
     def oversampling(self) -> float:
         """Samples per independent sample of noise."""
-        timelines = [stretch.timeline for stretch in self.stretches if stretch.timeline is not None]
+        timelines = [segment.timeline for segment in self.segments if segment.timeline is not None]
         bandwidths = [x.bandwidth_hz for x in timelines if x.bandwidth_hz is not None]
         return oversampling(self.time, min(bandwidths, default=None))
 
     @property
-    def longest(self) -> Stretch:
-        """The stretch that stands for all."""
-        return max(self.stretches, key=lambda stretch: len(stretch.blocks))
+    def longest(self) -> Segment:
+        """The segment that stands for all."""
+        return max(self.segments, key=lambda segment: len(segment.blocks))
 
-    def pieces(self, step: int) -> Iterator[tuple[Stretch, slice]]:
-        """The samples of the preprocessed log in parts of at most so many, each with its stretch."""
-        for stretch in self.stretches:
-            first, stop = stretch.first, stretch.first + len(stretch.time)
+    def pieces(self, step: int) -> Iterator[tuple[Segment, slice]]:
+        """The samples of the preprocessed log in parts of at most so many, each with its segment."""
+        for segment in self.segments:
+            first, stop = segment.first, segment.first + len(segment.time)
             for start in range(first, stop, step):
-                yield stretch, slice(start, min(start + step, stop))
+                yield segment, slice(start, min(start + step, stop))
 
 
 def in_the_air(contacts: Log) -> BoolArray | None:

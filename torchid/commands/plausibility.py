@@ -10,7 +10,7 @@ import numpy as np
 from rich.progress import Progress
 
 from torchid import parameters
-from torchid.commands.check import stretches_to_check
+from torchid.commands.check import segments_to_check
 from torchid.commands.reading import scene_of_log, settle_contacts
 from torchid.config.logs import LogsConfig
 from torchid.errors import (
@@ -63,9 +63,9 @@ class TrainingLogs:
 
     @cached_property
     def finding(self) -> tuple[str, Finding] | None:
-        """The most severe finding on a large part of a stretch of a log, and the stretch; None without any.
+        """The most severe finding on a large part of a segment of a log, and the segment; None without any.
 
-        Nothing after a stretch that is condemned as a whole is looked at, nor are logs larger than memory.
+        Nothing after a segment that is rejected as a whole is looked at, nor are logs larger than memory.
         """
         files = self.scene.config.logs
         if files is None or files.compressed:
@@ -81,13 +81,13 @@ class TrainingLogs:
         for path in files.train:
             own = scene_of_log(scene, path)
             with suppress(InputError):  # larger than memory
-                for log, name in stretches_to_check(path, files, settings):
+                for log, name in segments_to_check(path, files, settings):
                     flagged, _ = settle_contacts(log, own)
                     checked = check(flagged, own.robot, scene.contacts, settings.filter_hz, settings.derived)
                     severe = [one for one in checked.findings if one.severity in SEVERITIES[:2]]
                     large = [one for one in severe if one.mask(len(checked.log)).mean() > _PART]
                     yield from ((name, one) for one in large)
-                    if any(one.condemns_all for one in large):
+                    if any(one.rejects_all for one in large):
                         return
 
 
@@ -100,7 +100,7 @@ def require_plausible(fit: Fit, logs: TrainingLogs) -> TotalMass:
     Raises:
         SensorError: no parameter is in reach of the sensors.
         ImplausibleFitError: forces that are all 0, parameters that no robot has, forces that no parameters explain in a
-            log that the checks condemn, or scales that neither the data nor a known mass determines.
+            log that the checks reject, or scales that neither the data nor a known mass determines.
 
     Warns:
         NumericalWarning: forces that no parameters explain, for whatever reason.
@@ -121,7 +121,7 @@ def require_plausible(fit: Fit, logs: TrainingLogs) -> TotalMass:
     if reason is None and unexplained is None:
         return mass
     log, finding = logs.finding or (None, None)
-    if finding is not None and (reason is not None or finding.condemns_all):
+    if finding is not None and (reason is not None or finding.rejects_all):
         checks = f"{log}: {finding.field}: {finding.found}"
         raise ImplausibleFitError.at_field(
             "logs", f"{reason or unexplained}; torchid check finds in {checks}", finding.advice
@@ -152,7 +152,7 @@ def _require_scales(fit: Fit) -> None:
 
 
 def require_not_worse(worse: list[WorseThanNominal], logs: TrainingLogs) -> None:
-    """Refuse a fit that predicts worse than the URDF if the checks condemn a training log; else warn.
+    """Refuse a fit that predicts worse than the URDF if the checks reject a training log; else warn.
 
     Raises:
         ImplausibleFitError: the parameters of a log that is not usable.
@@ -166,7 +166,7 @@ def require_not_worse(worse: list[WorseThanNominal], logs: TrainingLogs) -> None
     log, finding = logs.finding or (None, None)
     if finding is not None:
         message, advice = f"{message}; torchid check finds in {log}: {finding.field}: {finding.found}", finding.advice
-        if finding.condemns_all:
+        if finding.rejects_all:
             raise ImplausibleFitError.at_field("logs", message, advice)
     warn_about_file(f"{message}; {advice}", NumericalWarning)
 

@@ -16,7 +16,7 @@ from torchid.commands.log_course import require_kept
 from torchid.config.logs import require_apart
 from torchid.errors import ConfigError, LogError
 from torchid.fitting.experiment import S, Scene
-from torchid.log_checks import Checked, drop_condemned
+from torchid.log_checks import Checked, drop_rejected
 from torchid.log_checks.check import check
 from torchid.logs import Log, read_log
 from torchid.logs.blocks import GIGABYTE, log_bytes
@@ -24,7 +24,7 @@ from torchid.logs.containers import LogKind, existing_log_kind
 from torchid.logs.flags import with_flags_by_force
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import away_from_changes, away_from_stamps, preprocess
-from torchid.logs.stretches import with_delayed_torques
+from torchid.logs.segments import with_delayed_torques
 from torchid.logs.time_range import LogPart, split_range
 from torchid.parameters import Array
 from torchid.problem import Samples, bind_log
@@ -49,7 +49,7 @@ class LogReader:
     Attributes:
         scene: robot, contacts and settings.
         folder: on whose disk logs are kept, as long as they are used.
-        excluded: how many samples of each log were left out because they are condemned, by path.
+        excluded: how many samples of each log were left out because they are rejected, by path.
     """
 
     def __init__(self, scene: Scene, folder: Path | None = None) -> None:
@@ -113,7 +113,7 @@ class LogReader:
         if self._takes_blocks(path, log_bytes(path, GIGABYTE * _WHOLE_GB) / GIGABYTE):
             return self._large_log(path, required, None).samples(fits_contact_offsets(self.scene))
         topics, columns = (None, None) if files is None else (files.topics, files.columns)
-        allow_gaps, bridge_gaps_s = settings.exclude_condemned, settings.bridge_gaps_s
+        allow_gaps, bridge_gaps_s = settings.exclude_rejected, settings.bridge_gaps_s
         read = read_log(
             path,
             topics,
@@ -134,7 +134,7 @@ class LogReader:
             samples = replace(samples, unloaded=None)
         if checked is not None:
             count = len(samples)
-            samples = drop_condemned(samples, checked, settings.filter_hz, derived=log is not clean)
+            samples = drop_rejected(samples, checked, settings.filter_hz, derived=log is not clean)
             self.excluded[str(path)] = count - len(samples)
         kept = None if slip is None else np.isin(samples.time.numpy(), slip, invert=True)
         if settings.margin_s is not None:
@@ -181,10 +181,10 @@ class LogReader:
         if self.scene.config.actuators.known_delay:
             found = f"set for arrays of {together:.2g} GB, which are not in memory at once"
             raise LogError(path, "actuators.delay", found, f"{needed}, or parts of the log")
-        if settings.exclude_condemned:
+        if settings.exclude_rejected:
             found = f"set for arrays of {together:.2g} GB, which are not in memory at once"
             accepted = f"{needed}, or parts of the logs that torchid check passes"
-            raise LogError(path, "preprocessing.exclude_condemned", found, accepted)
+            raise LogError(path, "preprocessing.exclude_rejected", found, accepted)
         return self._large_log(path, required, self.folder).samples(fits_contact_offsets(self.scene))
 
     def _takes_blocks(self, path: Path, gigabytes: float) -> bool:
@@ -195,7 +195,7 @@ class LogReader:
         settings = self.scene.config.preprocessing
         filled = settings.bridge_gaps_s is not None or settings.zero_in_air
         delayed = bool(self.scene.config.actuators.known_delay)
-        whole = settings.exclude_condemned or settings.derived or filled or delayed or split_range(path).joins
+        whole = settings.exclude_rejected or settings.derived or filled or delayed or split_range(path).joins
         return gigabytes > _WHOLE_GB and not whole and not self.scene.robot.loops
 
     def _large_log(self, path: Path, required: SensorSet | None, folder: Path | None) -> LargeLog:
@@ -220,9 +220,9 @@ class LogReader:
         return self.scene.config.sensors.noise.motion
 
     def _checked(self, log: Log, robot: Robot) -> Checked | None:
-        """What the checks of a log say, if condemned samples are to be left out."""
+        """What the checks of a log say, if rejected samples are to be left out."""
         settings = self.scene.config.preprocessing
-        if not settings.exclude_condemned:
+        if not settings.exclude_rejected:
             return None
         return check(log, robot, self.scene.contacts, settings.filter_hz, settings.derived)
 

@@ -39,7 +39,7 @@ from torchid.parameters import PER_BODY, Array
 from torchid.problem import Metrics
 from torchid.problem.chunks import thread_count
 from torchid.problem.metrics import SETS, WorseThanNominal, describe_worse, worse_than_nominal
-from torchid.problem.surplus import NoiseShares
+from torchid.problem.noise_gram import NoiseShares
 from torchid.report import FittedJoints, identified_name, identified_robot, identified_urdf, parameters_document
 from torchid.report.figures import (
     Drawn,
@@ -82,7 +82,7 @@ class Identification:
         seconds: by step of the run.
         samples: number of training samples.
         factors: the training logs, where they came compressed.
-        excluded: condemned samples left out, by log.
+        excluded: rejected samples left out, by log.
         mass: the total mass and how well it is known.
         posterior: of the parameters, which `PosteriorSampler` draws from.
         validation: errors on held-out blocks, None where the samples are too few to leave some out.

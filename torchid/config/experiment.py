@@ -335,9 +335,9 @@ def _check_factors(config: _Common, logs: LogsConfig) -> None:
         ("actuators.delay", "auto", config.actuators.delay == "auto", "the delay that they were made with"),
         ("robot.base_tilt", "auto", config.robot.base_tilt == "auto", "the tilt that they were made with"),
         (
-            "preprocessing.exclude_condemned",
+            "preprocessing.exclude_rejected",
             "true",
-            config.preprocessing.exclude_condemned,
+            config.preprocessing.exclude_rejected,
             "false, as torchid compress has left them out if it was told so",
         ),
     )

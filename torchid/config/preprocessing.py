@@ -39,7 +39,7 @@ class PreprocessingConfig:
     `base_motion`: contacts, from the feet that stand on a floor, whatever was recorded of it; None for as recorded.
     `max_slip`: speed [m/s] above which a contact that should stand slips, so that the sample is dropped; auto, from the
     noise of each contact's velocity; None keeps all.
-    `exclude_condemned`: leave out the samples that `torchid check` condemns.
+    `exclude_rejected`: leave out the samples that `torchid check` rejects.
     `memory_gb`: a log whose arrays take more [GB] is read block by block, and its samples are kept on the disk.
     `cache_gb`: room [GB] for samples and factors that later runs of `identify` find beside the output; 0 for none.
     """
@@ -53,7 +53,7 @@ class PreprocessingConfig:
     zero_in_air: bool = False
     base_motion: Literal["contacts"] | None = None
     max_slip: PositiveOrAuto = None
-    exclude_condemned: bool = False
+    exclude_rejected: bool = False
     memory_gb: Positive = 2.0
     cache_gb: NotNegative = 2.0
 

@@ -15,7 +15,7 @@ from torchid.errors import LogError, warn
 from torchid.estimators import LeastSquares
 from torchid.fitting.fit import Fit, LogFitter
 from torchid.identifiability.confounding import ExtraEstimate
-from torchid.logs.stretches import recorded_at_delays, unbroken_stretches
+from torchid.logs.segments import recorded_at_delays, unbroken_segments
 from torchid.logs.timeline import spline_degree
 from torchid.parameters import Array
 from torchid.problem import ExtraTerms, RowBuilder, Samples
@@ -265,11 +265,11 @@ def _torques(logs: Sequence[Samples], fitter: LogFitter, most: int) -> list[_Tor
         oversampling = max(1.0, log.oversampling / step)
         some = replace(log[torch.from_numpy(chosen)], oversampling=oversampling, folder=None, motion_noise=None)
         recorded, splines = log.torque[:, dofs].numpy(), list[tuple[Tensor, BSpline]]()
-        for stretch in unbroken_stretches(time):
-            own = np.flatnonzero((chosen >= stretch.start) & (chosen < stretch.stop))
+        for segment in unbroken_segments(time):
+            own = np.flatnonzero((chosen >= segment.start) & (chosen < segment.stop))
             if len(own):
-                degree = spline_degree(stretch.stop - stretch.start)
-                splines.append((torch.from_numpy(own), make_interp_spline(time[stretch], recorded[stretch], k=degree)))
+                degree = spline_degree(segment.stop - segment.start)
+                splines.append((torch.from_numpy(own), make_interp_spline(time[segment], recorded[segment], k=degree)))
         out.append(_Torques(some, dofs, splines))
     if not out:
         found = f"auto, but none is longer than the {LATEST - EARLIEST:g} s of delays that are tried"

@@ -52,7 +52,7 @@ class FactorFile:
         model: what the rows were formed with.
         name: of the log's file; `sha256`: its checksum, "" if it is not known.
         duration: of the log [s].
-        excluded: condemned samples that were left out.
+        excluded: rejected samples that were left out.
         states: contact states of the log.
         version: of torchid that compressed it.
         payloads: what the robot carried, of which the rows are free; as settings.

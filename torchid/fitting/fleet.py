@@ -22,7 +22,7 @@ _APART = (
     "zero_in_air",
     "base_motion",
     "max_slip",
-    "exclude_condemned",
+    "exclude_rejected",
     "memory_gb",
     "cache_gb",
 )

@@ -25,7 +25,7 @@ class PackedPart:
     """A part but for the numbers of its triangles, as documents of JSON have it.
 
     `state`: a digit for each contact; `triangles`: number of the support, rows, whether packed as a triangle;
-    `surplus`: numbers of the supports.
+    `noise_gram`: numbers of the supports.
     """
 
     state: str
@@ -34,7 +34,7 @@ class PackedPart:
     independent_rows: NotNegative
     gated: list[_Whole]
     triangles: list[tuple[_Whole, _Whole, bool]]
-    surplus: list[_Whole]
+    noise_gram: Annotated[list[_Whole], Field(alias="surplus")]  # as files of this format call it
 
 
 class PartPacker:
@@ -64,7 +64,7 @@ class PartPacker:
                 packed = len(rows) == rows.shape[1] and not np.tril(rows, -1).any()
                 self._values.append(rows[np.triu_indices(len(rows))] if packed else rows.ravel())
                 triangles.append((self._number(support), len(rows), packed))
-            for x in part.factor.surplus.values():
+            for x in part.factor.noise_gram.values():
                 self._values.append(x.cpu().numpy()[np.triu_indices(len(x))])
             out.append(
                 {
@@ -74,7 +74,7 @@ class PartPacker:
                     "independent_rows": part.factor.independent_rows,
                     "gated": sorted(part.gated),
                     "triangles": triangles,
-                    "surplus": [self._number(support) for support in part.factor.surplus],
+                    "surplus": [self._number(support) for support in part.factor.noise_gram],
                 }
             )
         return out
@@ -116,7 +116,7 @@ class PartReader:
 
     def read(self, source: str, one: PackedPart, unloaded: bool = False) -> Part:
         """The next part, of a log of this name."""
-        self._triangles += 1 + len(one.triangles) + len(one.surplus)
+        self._triangles += 1 + len(one.triangles) + len(one.noise_gram)
         if self._triangles > self._most:
             raise ValueError(f"more than {self._most} triangles")
         if len(one.state) != self._contacts or set(one.state) - {"0", "1"}:
@@ -129,14 +129,14 @@ class PartReader:
         for number, rows, packed in one.triangles:
             support = self._supports[number]
             triangles[support] = self._stream.triangle(len(support) + 1, rows, packed)
-        surplus = {}
-        for number in one.surplus:
+        noise_gram = {}
+        for number in one.noise_gram:
             width = len(self._supports[number]) + 1
             half = self._stream.triangle(width, width, packed=True)
-            surplus[self._supports[number]] = half + half.triu(1).T
-        if len(triangles) != len(one.triangles) or len(surplus) != len(one.surplus):
+            noise_gram[self._supports[number]] = half + half.triu(1).T
+        if len(triangles) != len(one.triangles) or len(noise_gram) != len(one.noise_gram):
             raise ValueError("the same columns twice")
-        factor = TriangularFactor.from_blocks(self._columns, one.rows, one.independent_rows, triangles, surplus)
+        factor = TriangularFactor.from_blocks(self._columns, one.rows, one.independent_rows, triangles, noise_gram)
         state = tuple(digit == "1" for digit in one.state)
         return Part(source, state, factor, one.samples, unloaded=unloaded, gated=set(one.gated))
 

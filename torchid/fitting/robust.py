@@ -25,14 +25,14 @@ from torchid.problem.compression import (
     Part,
     PartKey,
     RowWeighting,
-    add_surplus,
+    add_noise_gram,
     compress_in_blocks,
     cut_into_blocks,
     merge_factors,
-    surplus_by_part,
+    noise_gram_by_part,
 )
+from torchid.problem.noise_gram import NoiseGram, noise_gram_of_share
 from torchid.problem.samples import concatenate
-from torchid.problem.surplus import Surplus, surplus_of_share
 from torchid.rounding import MAD_PER_STD
 
 TUNING = {"huber": 1.345, "tukey": 4.685}
@@ -149,15 +149,17 @@ def fit_robustly(
         parts = compress_in_blocks(logs, builder, progress=progress) if parts is None else parts
         first = fitter.fit(parts, solve)
     if parts is None:
-        surplus = surplus_by_part(cut_into_blocks(logs, builder), builder)
+        noise_gram = noise_gram_by_part(cut_into_blocks(logs, builder), builder)
     else:
-        surplus = {part.key: part.factor.surplus for part in parts if part.factor.surplus}
+        noise_gram = {part.key: part.factor.noise_gram for part in parts if part.factor.noise_gram}
     start, first_pass = _Point(first, first.estimate.residual_std), 0
     step = min(sum(map(len, logs)) // _ROUGH_SAMPLES, min(map(len, logs)) // _LEAST_ROUGH)
     step = min(step, max(_ROUGH_STEP, sum(map(len, logs)) // _MOST_ROUGH))
     if step >= _WORTHWHILE:
-        start, first_pass = _passes(_some_rows(logs, surplus, step, fitter), loss, start, solve=solve).next, _START
-    every = _Rows(fitter, partial(compress_in_blocks, logs, builder, progress), surplus, {log.source for log in logs})
+        start, first_pass = _passes(_some_rows(logs, noise_gram, step, fitter), loss, start, solve=solve).next, _START
+    every = _Rows(
+        fitter, partial(compress_in_blocks, logs, builder, progress), noise_gram, {log.source for log in logs}
+    )
     found = _passes(every, loss, start, first_pass, solve)
     summary = RobustSummary(
         loss=loss.kind,
@@ -172,21 +174,21 @@ def fit_robustly(
 
 @dataclass(frozen=True)
 class _Rows:
-    """Rows to pass over: what compresses them with weights, the surplus of the parts, and the logs that they are of."""
+    """Rows to pass over: what compresses them with weights, noise Gram matrices of the parts, and the logs."""
 
     fitter: LogFitter
     compress: Callable[[RowWeighting], list[Part]]
-    surplus: Mapping[PartKey, Surplus]
+    noise_gram: Mapping[PartKey, NoiseGram]
     sources: set[str]
 
 
-def _some_rows(logs: Sequence[Samples], surplus: Mapping[PartKey, Surplus], step: int, fitter: LogFitter) -> _Rows:
+def _some_rows(logs: Sequence[Samples], noise_gram: Mapping[PartKey, NoiseGram], step: int, fitter: LogFitter) -> _Rows:
     """Those of every so many samples, in one part of each log and contact state."""
     by_log: dict[str, list[Samples]] = {}
     for log in logs:
         by_log.setdefault(log.source, []).append(log.every(step))
     some = [replace(concatenate(pieces), fold=0, block=0) for pieces in by_log.values()]
-    of_some = surplus_of_share(surplus, lambda key: (*key[:2], 0, 0, key[4]), 1.0 / step)
+    of_some = noise_gram_of_share(noise_gram, lambda key: (*key[:2], 0, 0, key[4]), 1.0 / step)
     return _Rows(fitter, lambda weigh: compress_parts(some, fitter.builder, weight_rows=weigh), of_some, set(by_log))
 
 
@@ -197,9 +199,9 @@ class _Point:
     fit: Fit
     scale: float
 
-    def beyond(self, fit: Fit, scale: float, stretch: float) -> _Point:
+    def beyond(self, fit: Fit, scale: float, newton_ratio: float) -> _Point:
         """Beyond a fit of the rows as they are weighted here, which falls short of the best by so much."""
-        step = min(stretch, _FARTHEST)
+        step = min(newton_ratio, _FARTHEST)
         earlier = {(x.log, x.extra.label): x.value for x in self.fit.extras}
 
         def further(x: ExtraEstimate) -> ExtraEstimate:
@@ -231,11 +233,11 @@ def _passes(rows: _Rows, loss: RobustLoss, start: _Point, first_pass: int = 0, s
         reweighting = Reweighting(current, by_log, max(at.scale, _TINY))
         parts, done = rows.compress(reweighting), done + 1
         reweighting.gather()
-        add_surplus(parts, rows.surplus, reweighting.mean_weight)
+        add_noise_gram(parts, rows.noise_gram, reweighting.mean_weight)
         fit, scale = fitter.fit(parts, solve), reweighting.median_scale
         settled = current == loss and _settled(fit, at.fit, at.scale, scale)
         converged = ranks.as_first(settled, "convergence")
-        at = at.beyond(fit, scale, reweighting.stretch)
+        at = at.beyond(fit, scale, reweighting.newton_ratio)
     return _Passes(fit, at, reweighting, done, converged)
 
 
@@ -332,8 +334,8 @@ class Reweighting:
         return float(self._sums[1] / max(self._sums[0], 1.0))
 
     @property
-    def stretch(self) -> float:
-        """By how much leaving rows out moves the estimate, over what it does in least squares with these weights."""
+    def newton_ratio(self) -> float:
+        """Newton's step over that of least squares with these weights, and so is what leaving rows out does."""
         return float(self._sums[1] / self._sums[3]) if self._sums[3] > _LEAST_SLOPE * self._sums[0] else 1.0
 
     def deviation(self, unknowns: float) -> float:
@@ -395,4 +397,4 @@ def _with_errors(fit: Fit, reweighting: Reweighting) -> Fit:
     assembly = replace(fit.assembly, problem=replace(problem, residual=problem.residual + added))
     extras = [replace(x, noise_error=factor * x.noise_error) for x in fit.extras]
     out = replace(fit, assembly=assembly, estimate=estimate, extras=extras)
-    return out if fit.scatter is None else with_block_errors(out, fit.scatter, reweighting.stretch)
+    return out if fit.scatter is None else with_block_errors(out, fit.scatter, reweighting.newton_ratio)

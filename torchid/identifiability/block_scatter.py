@@ -91,8 +91,8 @@ def block_scatter(
     basis = np.zeros((len(problem.nominal), covariance.root.shape[1]))  # of unit variance by the rows alone
     basis[problem.free] = covariance.scale[:, None] * covariance.root
     best = problem.nominal + basis @ (basis.T @ (problem.A.T @ (problem.b - problem.A @ problem.nominal)))
-    gradients, of_rows, surplus = _by_block(parts, numbers, builder, assembly, best, basis)
-    shares = of_rows - surplus
+    gradients, of_rows, of_noise = _by_block(parts, numbers, builder, assembly, best, basis)
+    shares = of_rows - of_noise
     scores = gradients["bodies"] @ basis
     noise = (
         problem.oversampling * residual_std(problem.cost(best), problem.rows, basis.shape[1], problem.oversampling) ** 2
@@ -147,15 +147,15 @@ def _by_block(
     phi: Array,
     basis: Array,
 ) -> tuple[dict[str, Array], Array, Array]:
-    """Gradients of half the squared residuals of each block, (G, columns), its share of information, and its surplus.
+    """Gradients of half the squared residuals of each block, (G, columns), its share of information, and noise in it.
 
-    Gradients, of which the surplus is taken off, are by "bodies", all parameters with the extra ones at their best, and
-    by the log of each elimination, its extra parameters with those of single logs at their best. Shares and surplus are
-    (G, r, r), by the columns of the basis.
+    Gradients, without what noise of the motion adds, are by "bodies", all parameters with the extra ones at their best,
+    and by the log of each elimination, its extra parameters with those of single logs at their best. Shares and noise
+    are (G, r, r), by the columns of the basis.
     """
     count = max(numbers.values()) + 1
     gradients = {name: np.zeros((count, width)) for name, width in _widths(assembly).items()}
-    shares, surplus = (np.zeros((count, basis.shape[1], basis.shape[1])) for _ in range(2))
+    shares, of_noise = (np.zeros((count, basis.shape[1], basis.shape[1])) for _ in range(2))
     columns, along = None, basis
     for part in sorted((part for part in parts if not part.unloaded), key=lambda part: part.source):
         if columns is None or columns.source != part.source:
@@ -168,11 +168,11 @@ def _by_block(
             columns.add_gradient(gradients, number, at, rows[:, :-1].T @ residual)
             projected = rows[:, :-1] @ along[at]
             shares[number] += projected.T @ projected
-        for support, tensor in part.factor.surplus.items():
+        for support, tensor in part.factor.noise_gram.items():
             more, at = np.ascontiguousarray(tensor.cpu().double().numpy()), list(support)
             columns.add_gradient(gradients, number, at, more[:-1, :-1] @ columns.values[at] - more[:-1, -1])
-            surplus[number] += along[at].T @ more[:-1, :-1] @ along[at]
-    return gradients, shares, surplus
+            of_noise[number] += along[at].T @ more[:-1, :-1] @ along[at]
+    return gradients, shares, of_noise
 
 
 def _name(log: str) -> str:

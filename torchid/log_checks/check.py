@@ -1,4 +1,4 @@
-"""All checks of one log in their order, repair of the log, and exclusion of condemned samples."""
+"""All checks of one log in their order, repair of the log, and exclusion of rejected samples."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from torchid.log_checks.contacts import (
     subtract_contact_offsets,
 )
 from torchid.log_checks.findings import (
-    CONDEMNED,
+    REJECTED,
     SEVERITIES,
     Finding,
     Skipped,
@@ -52,8 +52,8 @@ from torchid.reprs import short_repr
 from torchid.robot import Robot
 from torchid.sensing import Contact
 
-#: Share of condemned samples above which a log is not usable.
-MAX_CONDEMNED_SHARE = 0.5
+#: Share of rejected samples above which a log is not usable.
+MAX_REJECTED_SHARE = 0.5
 #: Descriptions and spans that one line of text lists.
 _MAX_LISTED_TEXTS, _MAX_LISTED_SPANS = 3, 4
 
@@ -64,7 +64,7 @@ class Checked:
 
     Attributes:
         log: as it was read.
-        repaired: with condemned values interpolated, so that a filter does not smear them.
+        repaired: with rejected values interpolated, so that a filter does not smear them.
         findings: the most severe first.
         skipped: checks that could not be made.
         rolling: which contacts were taken to roll, on what, "" if none was.
@@ -86,9 +86,9 @@ class Checked:
         return f"{log_title(self.log.source)}, {len(self.log)} samples, {self.verdict} ({found})"
 
     @cached_property
-    def condemned(self) -> BoolArray:
+    def rejected(self) -> BoolArray:
         """Samples (N,) that must not be fitted."""
-        return condemned_samples(self.findings, len(self.log))
+        return rejected_samples(self.findings, len(self.log))
 
     @property
     def usable(self) -> bool:
@@ -98,16 +98,16 @@ class Checked:
     @property
     def reasons(self) -> tuple[str, ...]:
         """Why the log cannot be used; empty if it can."""
-        whole = tuple(f"{f.field}: {f.name}" for f in self.findings if f.condemns_all)
-        share = float(self.condemned.mean()) if len(self.log) else 1.0
-        if not whole and share > MAX_CONDEMNED_SHARE:
-            return (f"{100 * share:.3g} % of its samples are condemned",)
+        whole = tuple(f"{f.field}: {f.name}" for f in self.findings if f.rejects_all)
+        share = float(self.rejected.mean()) if len(self.log) else 1.0
+        if not whole and share > MAX_REJECTED_SHARE:
+            return (f"{100 * share:.3g} % of its samples are rejected",)
         return tuple(dict.fromkeys(whole))
 
     @property
     def verdict(self) -> str:
         """Whether the log is usable, in one line."""
-        count = int(self.condemned.sum())
+        count = int(self.rejected.sum())
         if self.reasons:
             return f"not usable: {'; '.join(self.reasons)}"
         return f"usable without {count} of {len(self.log)} samples" if count else "usable"
@@ -129,7 +129,7 @@ def check(
         cutoff_hz: cutoff [Hz] of the filter that the log will be preprocessed with; None for the default.
         derived: how names of fields begin that nobody recorded, which are not to blame for anything. contact_active:
             of a log that has got flags from its torques. base_: motion of the base will follow from the feet that
-            stand; forces are compared with the URDF in the longest stretch in which enough of them do.
+            stand; forces are compared with the URDF in the longest segment in which enough of them do.
     """
     log, unclosed = completed(without_welded_joints(log, robot), robot)
     contacts = [replace(contact, along_normal=False) for contact in contacts]  # wrenches are what is checked
@@ -176,11 +176,11 @@ def check(
 
 
 def _longest_standing(log: Log, robot: Robot, contacts: Sequence[Contact]) -> tuple[Log, list[Finding]]:
-    """The longest stretch in which enough feet stand; or the log, and why there is none."""
+    """The longest segment in which enough feet stand; or the log, and why there is none."""
     try:
         return longest_standing(log, robot, contacts), []
     except InputError as error:
-        return log, [Finding("does not fit", CONDEMNED, error.field, error.found, f"give {error.accepted}")]
+        return log, [Finding("does not fit", REJECTED, error.field, error.found, f"give {error.accepted}")]
 
 
 def _findings(results: Iterable[Finding | Skipped]) -> Iterator[Finding]:
@@ -188,12 +188,12 @@ def _findings(results: Iterable[Finding | Skipped]) -> Iterator[Finding]:
 
 
 def _blocking_finding(results: Iterable[Finding | Skipped]) -> Finding | None:
-    """The first finding that condemns the whole log: later checks cannot rely on its field."""
-    return next((finding for finding in _findings(results) if finding.condemns_all), None)
+    """The first finding that rejects the whole log: later checks cannot rely on its field."""
+    return next((finding for finding in _findings(results) if finding.rejects_all), None)
 
 
 def _skip_dependent(blocking: Finding) -> Skipped:
-    return Skipped("all further checks", f"{blocking.field} is condemned throughout: {blocking.name}")
+    return Skipped("all further checks", f"{blocking.field} is rejected throughout: {blocking.name}")
 
 
 def _collect(log: Log, repaired: Log, results: Sequence[Finding | Skipped]) -> Checked:
@@ -217,29 +217,29 @@ def _merge_alike(findings: Iterable[Finding]) -> Iterator[Finding]:
         )
 
 
-def condemned_samples(findings: Iterable[Finding], samples: int) -> BoolArray:
-    """Which of `samples` samples are condemned by any finding, (N,)."""
+def rejected_samples(findings: Iterable[Finding], samples: int) -> BoolArray:
+    """Which of `samples` samples are rejected by any finding, (N,)."""
     mask = np.zeros(samples, bool)
     for finding in findings:
-        if finding.severity == CONDEMNED:
+        if finding.severity == REJECTED:
             mask |= finding.mask(samples)
     return mask
 
 
 def repair_log(log: Log, findings: Iterable[Finding]) -> Log:
-    """The log with condemned values interpolated and without jumps that are not motions.
+    """The log with rejected values interpolated and without jumps that are not motions.
 
     Only the channels of a finding change: its samples are left out of the fit, but not out of the filter. Contact flags
     that miss a force are set. Findings about the whole log change nothing.
     """
-    local = [finding for finding in findings if finding.severity == CONDEMNED and not finding.whole]
+    local = [finding for finding in findings if finding.severity == REJECTED and not finding.whole]
     changed: dict[str, Any] = {}
     for field in dict.fromkeys(field for finding in local for field in _affected_fields(log, finding.field)):
         flat = np.array(getattr(log, field), dtype=np.float64).reshape(len(log), -1)
         bad = np.zeros(flat.shape, dtype=bool)
         for finding in local:
             if finding.field in (field, "time"):
-                _mark_condemned(finding, channel_names(log, field), flat, bad)
+                _mark_rejected(finding, channel_names(log, field), flat, bad)
         _interpolate(log.time, flat, bad)
         if field == "base_quat_xyzw":
             flat /= np.linalg.norm(flat, axis=1, keepdims=True)
@@ -259,8 +259,8 @@ def _affected_fields(log: Log, field: str) -> list[str]:
     return [] if field == "contact_active" else [field]
 
 
-def _mark_condemned(finding: Finding, names: tuple[str, ...], flat: FloatArray, bad: BoolArray) -> None:
-    """Mark the condemned values of the channels (N, c) in `bad`, and subtract the finding's shifts."""
+def _mark_rejected(finding: Finding, names: tuple[str, ...], flat: FloatArray, bad: BoolArray) -> None:
+    """Mark the rejected values of the channels (N, c) in `bad`, and subtract the finding's shifts."""
     for span in finding.spans:
         columns = names.index(span.channel) if span.channel in names else slice(None)
         bad[span.first : span.last + 1, columns] = True
@@ -278,7 +278,7 @@ def _interpolate(time: FloatArray, flat: FloatArray, bad: BoolArray) -> None:
 
 
 def excluded_stamps(checked: Checked, time: FloatArray, cutoff_hz: float | None, derived: bool) -> BoolArray:
-    """Which stamps (K,) [s] of a preprocessed log are affected by condemned samples.
+    """Which stamps (K,) [s] of a preprocessed log are affected by rejected samples.
 
     Args:
         checked: the log as recorded.
@@ -290,14 +290,14 @@ def excluded_stamps(checked: Checked, time: FloatArray, cutoff_hz: float | None,
     margin = JITTER * step + (DROPPED_SAMPLES * step if derived else 0.0)
     if cutoff_hz is not None:
         margin += REACH_PERIODS / cutoff_hz
-    condemned = checked.log.time[checked.condemned]
-    nearest = np.searchsorted(condemned, time)
-    padded = np.concatenate([[-np.inf], condemned, [np.inf]])
+    rejected = checked.log.time[checked.rejected]
+    nearest = np.searchsorted(rejected, time)
+    padded = np.concatenate([[-np.inf], rejected, [np.inf]])
     return np.asarray((time - padded[nearest] <= margin) | (padded[nearest + 1] - time <= margin))
 
 
-def drop_condemned(samples: Samples, checked: Checked, cutoff_hz: float | None, derived: bool) -> Samples:
-    """The samples that condemned samples do not affect; see `excluded_stamps`.
+def drop_rejected(samples: Samples, checked: Checked, cutoff_hz: float | None, derived: bool) -> Samples:
+    """The samples that rejected samples do not affect; see `excluded_stamps`.
 
     Raises:
         LogError: the log is not usable, or no sample is left.
@@ -307,23 +307,23 @@ def drop_condemned(samples: Samples, checked: Checked, cutoff_hz: float | None, 
     """
     source = samples.source
     if not checked.usable:
-        accepted = "a log that torchid check finds usable, or preprocessing.exclude_condemned: false"
-        raise LogError(source, "preprocessing.exclude_condemned", checked.verdict, accepted)
+        accepted = "a log that torchid check finds usable, or preprocessing.exclude_rejected: false"
+        raise LogError(source, "preprocessing.exclude_rejected", checked.verdict, accepted)
     excluded = excluded_stamps(checked, samples.time.cpu().numpy(), cutoff_hz, derived)
     if not excluded.any():
         return samples
     reasons = _exclusion_reasons(checked)
     if excluded.all():
-        raise LogError(source, "preprocessing.exclude_condemned", f"no sample left: {reasons}", "a longer log")
+        raise LogError(source, "preprocessing.exclude_rejected", f"no sample left: {reasons}", "a longer log")
     warn(f"{log_title(source)}: {excluded.sum()} of {len(samples)} samples excluded: {reasons}")
     return samples[torch.from_numpy(np.flatnonzero(~excluded))]
 
 
 def _exclusion_reasons(checked: Checked) -> str:
-    """Names of the condemning findings with their samples."""
+    """Names of the rejecting findings with their samples."""
     reasons = []
     for finding in checked.findings:
-        if finding.severity == CONDEMNED:
+        if finding.severity == REJECTED:
             spans = list(dict.fromkeys(str(span) for span in finding.spans))
             more = f" and {len(spans) - _MAX_LISTED_SPANS} more" if len(spans) > _MAX_LISTED_SPANS else ""
             reasons.append(f"{finding.field} {finding.name} at samples {', '.join(spans[:_MAX_LISTED_SPANS])}{more}")

@@ -10,8 +10,8 @@ import numpy as np
 
 from torchid.errors import InputError, format_count
 from torchid.log_checks.findings import (
-    CONDEMNED,
     NOTE,
+    REJECTED,
     SUSPICIOUS,
     Finding,
     Skipped,
@@ -155,7 +155,7 @@ def _load_findings(log: Log, contact: _Contact, size: FloatArray, weight: float)
         text = f"{contact.name}: inactive with up to {size[loaded].max():.3g} N, in {samples}"
         advice = "set the flag where there is a force: forces of inactive contacts are ignored"
         spans = tuple(find_spans(loaded, contact.name))
-        yield Finding("force without contact", CONDEMNED, "contact_active", text, advice, (contact.name,), spans)
+        yield Finding("force without contact", REJECTED, "contact_active", text, advice, (contact.name,), spans)
     longest = max(1, round(_MAX_UNLOADED_S / median_step(log)))
     threshold = MIN_ACTIVE_WEIGHT_SHARE * weight
     unloaded = contact.active & (size < threshold)
@@ -273,7 +273,7 @@ def _limb_sensor_findings(name: str, measured: FloatArray, model: FloatArray, ro
     text = f"{name}: in the air it reads {gain:.3g} times what hangs on it by the {robot.format} ({weight:.3g} N)"
     if gain < 0.0:
         advice = "reverse it: the wrench that the parent side exerts on the child side"
-        yield Finding("sign", CONDEMNED, "ft_wrench", text, advice, (name,))
+        yield Finding("sign", REJECTED, "ft_wrench", text, advice, (name,))
         return
     if abs(gain - 1.0) > MAX_MASS_ERROR:
         advice = "check the sensor's unit and gain, and the load that is mounted beyond it"

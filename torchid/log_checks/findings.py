@@ -13,13 +13,13 @@ from torchid.logs.log import CONTACT_READINGS, NORMALS, BoolArray, FloatArray, c
 from torchid.parameters import WRENCH_COMPONENTS
 
 #: The samples must not be fitted.
-CONDEMNED = "condemned"
+REJECTED = "rejected"
 #: The user should inspect the samples; a fit may be right.
 SUSPICIOUS = "suspicious"
 #: Information; nothing has to be done.
 NOTE = "note"
 
-SEVERITIES = (CONDEMNED, SUSPICIOUS, NOTE)
+SEVERITIES = (REJECTED, SUSPICIOUS, NOTE)
 
 
 @dataclass(frozen=True)
@@ -71,9 +71,9 @@ class Finding:
         return self.everywhere or not self.spans
 
     @property
-    def condemns_all(self) -> bool:
+    def rejects_all(self) -> bool:
         """Whether no sample of the log may be fitted."""
-        return self.severity == CONDEMNED and self.whole
+        return self.severity == REJECTED and self.whole
 
     def mask(self, samples: int) -> BoolArray:
         """Which of `samples` samples the finding concerns."""

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from torchid.errors import InputError, join_names
-from torchid.log_checks.findings import CONDEMNED, SUSPICIOUS, Finding, Skipped
+from torchid.log_checks.findings import REJECTED, SUSPICIOUS, Finding, Skipped
 from torchid.log_checks.lag_and_tilt import check_lag_and_tilt
 from torchid.log_checks.mistakes import possible_mistakes
 from torchid.log_checks.model import (
@@ -95,7 +95,7 @@ def check_forces_against_urdf(
     try:
         samples = bind_some_samples(logs, robot, contacts)
     except InputError as error:
-        yield Finding("does not fit", CONDEMNED, error.field, error.found, f"give {error.accepted}")
+        yield Finding("does not fit", REJECTED, error.field, error.found, f"give {error.accepted}")
         return
     if log.joint_torque is None and log.contact_wrench is None:
         yield Skipped(_FORCE_CHECK, "neither joint torques nor contact wrenches")
@@ -167,7 +167,7 @@ def _best_mistake(
         f"by {_percent(least)} once corrected"
     )
     advice = best.advice + f"; or is {robot.path.name} another robot's?" * (least > MAX_CLEAR_MISFIT)
-    return Finding("unit, sign or frame", CONDEMNED, best.field, f"{best.description}: {text}", advice)
+    return Finding("unit, sign or frame", REJECTED, best.field, f"{best.description}: {text}", advice)
 
 
 def _may_explain(field: str, fit: ModelFit) -> bool:
@@ -193,13 +193,13 @@ def _torque_findings(robot: Robot, fit: TorqueFit) -> Iterator[Finding | Skipped
 
     is_reversed = fit.implausible & (fit.gain < -1.0 / _SIGN_TOLERANCE_RATIO) & (fit.gain > -_SIGN_TOLERANCE_RATIO)
     if is_reversed.any():
-        yield finding("sign", CONDEMNED, is_reversed, "reversed; ", "reverse these torques")
+        yield finding("sign", REJECTED, is_reversed, "reversed; ", "reverse these torques")
     scaled = fit.implausible & ~is_reversed
     for factor, unit in TORQUE_UNIT_FACTORS.items():
         low, high = factor / _UNIT_TOLERANCE_RATIO, factor * _UNIT_TOLERANCE_RATIO
         in_unit = fit.implausible & (fit.gain > low) & (fit.gain < high)
         if in_unit.any():
-            yield finding("unit", CONDEMNED, in_unit, f"{unit}; ", f"multiply by {factor:g}")
+            yield finding("unit", REJECTED, in_unit, f"{unit}; ", f"multiply by {factor:g}")
             scaled = scaled & ~in_unit
     if scaled.any():
         yield finding("scale", SUSPICIOUS, scaled, "", "check gear ratios, torque constants and units")
@@ -237,7 +237,7 @@ def _time_scale_finding(scale: TimeScale | None) -> Finding | None:
     prefix = f"in {units[0]}: " if units else ""
     text = f"{prefix}gravity and inertia make up the measured forces if time is multiplied by {factor:.3g}"
     advice = "give seconds; check the sample rate that the stamps were made from"
-    return Finding("unit", CONDEMNED, "time", text, advice)
+    return Finding("unit", REJECTED, "time", text, advice)
 
 
 def _gain_and_point_findings(

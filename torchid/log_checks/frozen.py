@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from torchid.errors import format_count, join_names
 from torchid.log_checks.findings import (
-    CONDEMNED,
     NOTE,
+    REJECTED,
     SUSPICIOUS,
     ChannelGroup,
     Finding,
@@ -188,7 +188,7 @@ def _frozen_finding(group: ChannelGroup, channels: str, frozen: _RunsByChannel, 
     prefix = f"{group.name}, " if group.name else ""
     text = f"{prefix}{channels}: repeated to the last bit while the robot moves, {times}"
     advice = "leave these samples out; look for lost messages or a stalled driver"
-    return Finding("frozen", CONDEMNED, group.field, text, advice, tuple(name for name, _ in frozen), spans)
+    return Finding("frozen", REJECTED, group.field, text, advice, tuple(name for name, _ in frozen), spans)
 
 
 def _saturated_finding(group: ChannelGroup, limits: list[tuple[str, Runs, float]]) -> Finding:
@@ -205,7 +205,7 @@ def _saturated_finding(group: ChannelGroup, limits: list[tuple[str, Runs, float]
         advice = "none if these are the joints' stops; else widen the bounds of the encoder or inverse kinematics"
         return Finding("saturated", SUSPICIOUS, group.field, text, advice, names, spans)
     advice = "leave these samples out, or raise the sensor's range"
-    return Finding("saturated", CONDEMNED, group.field, text, advice, names, spans)
+    return Finding("saturated", REJECTED, group.field, text, advice, names, spans)
 
 
 def _held_finding(group: ChannelGroup, held: list[tuple[str, float]]) -> Finding:

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from torchid.errors import InputError
-from torchid.log_checks.findings import CONDEMNED, SUSPICIOUS, Finding, Skipped, median_step, widen_mask
+from torchid.log_checks.findings import REJECTED, SUSPICIOUS, Finding, Skipped, median_step, widen_mask
 from torchid.log_checks.model import default_cutoff_hz, preprocess_pieces, recorded_link_poses
 from torchid.log_checks.units import advise_units, units_of_ratio
 from torchid.logs import Log
@@ -113,7 +113,7 @@ def _compare(vectors: FloatArray, rates: FloatArray, omega: FloatArray) -> Itera
     matrix = _least_squares(vectors, rates, omega)
     if (rest := left(omega @ matrix.T)) < limit:
         found = f"{text}, {100 * rest:.2g} % along other axes"
-        yield Finding("frame", CONDEMNED, _FIELD, found, "imu_frame is the frame along whose axes the IMU reads")
+        yield Finding("frame", REJECTED, _FIELD, found, "imu_frame is the frame along whose axes the IMU reads")
     elif difference > MAX_UNEXPLAINED_DIFFERENCE:
         advice = "check unit, axes and imu_frame, signs and zeros of joint positions, and the flags"
         yield Finding("standing feet", SUSPICIOUS, _FIELD, f"{text}, and no usual mistake explains it", advice)
@@ -121,10 +121,10 @@ def _compare(vectors: FloatArray, rates: FloatArray, omega: FloatArray) -> Itera
 
 def _factor_finding(factor: float, text: str) -> Finding:
     if factor < 0.0 and abs(factor + 1.0) < _UNIT_TOLERANCE:
-        return Finding("sign", CONDEMNED, _FIELD, f"reversed: {text}", "reverse it")
+        return Finding("sign", REJECTED, _FIELD, f"reversed: {text}", "reverse it")
     units = units_of_ratio(1.0 / factor, ("angular velocity",), _UNIT_TOLERANCE) if factor > 0.0 else ()
     if units:
-        return Finding("unit", CONDEMNED, _FIELD, f"in {' or '.join(units)}: {text}", advise_units({_FIELD: units}))
+        return Finding("unit", REJECTED, _FIELD, f"in {' or '.join(units)}: {text}", advise_units({_FIELD: units}))
     return Finding("ratio", SUSPICIOUS, _FIELD, text, "check its unit and range")
 
 

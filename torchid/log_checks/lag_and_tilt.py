@@ -22,7 +22,7 @@ from torchid.log_checks.scales import (
 )
 from torchid.logs import Log
 from torchid.logs.log import FloatArray
-from torchid.logs.stretches import with_delayed_torques
+from torchid.logs.segments import with_delayed_torques
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.predict import force_series
 from torchid.regressor.kinematics import GRAVITY_WORLD

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from torchid.errors import LogError, join_names
-from torchid.log_checks.findings import CONDEMNED, NOTE, SUSPICIOUS, Finding, Skipped, channel_names
+from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, Finding, Skipped, channel_names
 from torchid.log_checks.units import UNIT_TOLERANCE, advise_units, describe_units, units_of_derivative_ratio
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
@@ -55,7 +55,7 @@ def check_angle_unit(log: Log, robot: Robot | None) -> Iterator[Finding]:
     if far.any():
         text = f"{join_names(names)}: up to {np.abs(position[:, far]).max():.4g}, more than two turns: degrees?"
         certain = 0 < int((moved & has_stops).sum()) <= 2 * int((far & has_stops).sum())
-        severity = CONDEMNED if certain else SUSPICIOUS
+        severity = REJECTED if certain else SUSPICIOUS
         yield Finding("unit", severity, "joint_position", text, _UNIT_ADVICE, tuple(names))
     elif len(log) > 2:
         speed = np.percentile(np.abs(np.diff(position, axis=0)) / np.diff(log.time)[:, None], 90.0, axis=0)
@@ -196,7 +196,7 @@ def _derivative_findings(
     for meaning in dict.fromkeys(meaning for meaning in meanings if meaning is not None):
         mask = np.array([other == meaning for other in meanings])
         text = f"{comparison.ratio[mask][0]:.4g} times the derivative of {base}: {meaning[0]}"
-        yield _finding("unit or sign", CONDEMNED, name, channels, mask, text, meaning[1])
+        yield _finding("unit or sign", REJECTED, name, channels, mask, text, meaning[1])
     off = follows & ~named & (np.abs(comparison.ratio - 1.0) > MAX_RATIO_ERROR)
     if off.any():
         worst = int(np.argmax(np.abs(np.log(np.where(off, np.abs(comparison.ratio), 1.0) + _TINY))))
@@ -236,7 +236,7 @@ def _frame_findings(log: Log, name: str, base: str, order: int, comparison: Deri
             f"{comparison.excess[2]:+.2f} m/s^2 along z on average beyond the derivative of {base}: it contains gravity"
         )
         advice = "give d/dt of the velocity, or name it imu_specific_force"
-        yield Finding("gravity", CONDEMNED, name, text, advice, ("z",))
+        yield Finding("gravity", REJECTED, name, text, advice, ("z",))
     if not name.startswith("base_linear") or log.base_quat_xyzw is None or comparison.misfit < MAX_MISFIT:
         return
     for rotate, actual in ((rotate_to_world, "base"), (rotate_to_base, "world")):
@@ -244,7 +244,7 @@ def _frame_findings(log: Log, name: str, base: str, order: int, comparison: Deri
         trial = compare_derivative(log.time, getattr(log, base), rotated, order)
         if trial is not None and trial.misfit < MAX_RESIDUAL_SHARE * comparison.misfit:
             text = f"follows {base} if it is in the {actual} frame, not in the frame of its name"
-            yield Finding("frame", CONDEMNED, name, text, f"call it {name.replace('world', actual)}")
+            yield Finding("frame", REJECTED, name, text, f"call it {name.replace('world', actual)}")
 
 
 def _finding(
@@ -280,7 +280,7 @@ def check_angular_velocity(log: Log, robot: Robot | None) -> Iterator[Finding | 
         if mistake is None:
             yield from _derivative_findings(comparison, field, "base_quat", ("x", "y", "z"))
         else:
-            yield Finding("frame or order", CONDEMNED, mistake.field or field, mistake.description, mistake.advice)
+            yield Finding("frame or order", REJECTED, mistake.field or field, mistake.description, mistake.advice)
 
 
 def _recorded_velocities(log: Log, robot: Robot | None) -> Iterator[tuple[str, FloatArray]]:
@@ -346,7 +346,7 @@ def completed(log: Log, robot: Robot | None) -> tuple[Log, list[Finding]]:
     try:
         return with_loop_joints(log, robot), []
     except LogError as error:
-        finding = Finding("open loop", CONDEMNED, "joint_position", error.found, f"give {error.accepted}")
+        finding = Finding("open loop", REJECTED, "joint_position", error.found, f"give {error.accepted}")
         return log, [finding]
 
 
@@ -359,7 +359,7 @@ def check_loops(log: Log, robot: Robot | None) -> Iterator[Finding]:
         if gap.is_open:
             advice = f"look for other frames, zeros of encoders or signs; accepted is {gap.accepted}"
             text = f"{gap.loop.label} are apart by {gap}"
-            yield Finding("open loop", CONDEMNED, "joint_position", text, advice, gap.loop.frames)
+            yield Finding("open loop", REJECTED, "joint_position", text, advice, gap.loop.frames)
         else:
             text = f"{gap.loop.label} are together up to {gap}"
             yield Finding("closed loop", NOTE, "joint_position", text, f"nothing: accepted is {gap.accepted}")

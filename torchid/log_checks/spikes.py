@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from torchid.errors import format_count, join_names
 from torchid.log_checks.findings import (
-    CONDEMNED,
     NOTE,
+    REJECTED,
     SUSPICIOUS,
     ChannelGroup,
     Finding,
@@ -90,7 +90,7 @@ def check_jumps(log: Log, groups: Iterable[ChannelGroup]) -> Iterator[Finding]:
         if spikes and field.endswith(_ACCELERATION_SUFFIXES):
             yield _finding("spike", SUSPICIOUS, field, spikes, "none if there was an impact")
         elif spikes:
-            yield _finding("spike", CONDEMNED, field, spikes, "leave these samples out; look for a loose contact")
+            yield _finding("spike", REJECTED, field, spikes, "leave these samples out; look for a loose contact")
         if field in POSITION_FIELDS:
             yield from _position_steps(field, steps, len(log))
         elif steps and field in _FORCE_FIELDS:
@@ -167,7 +167,7 @@ def _is_reset(values: FloatArray, jump: Jump) -> bool:
 
 
 def _position_steps(field: str, steps: _Jumps, samples: int) -> Iterator[Finding]:
-    """Findings about steps of positions: the zero differs on one side, which is condemned if it is short."""
+    """Findings about steps of positions: the zero differs on one side, which is rejected if it is short."""
     kinds: dict[str, _Jumps] = {}
     for name, jump in steps:
         largest = max(abs(step.size) for _, step in steps if step.first == jump.first)
@@ -177,21 +177,21 @@ def _position_steps(field: str, steps: _Jumps, samples: int) -> Iterator[Finding
             spans = tuple(_span(name, jump, 2.0 * np.pi * _turns(jump)) for name, jump in jumps)
             advice = f"logs.columns.{field}.turn_from, where its turn begins, such as -180 of deg; or unwrap it"
             advice = advice if field == "joint_position" else "unwrap the angle"
-            yield _finding("wrapped angle", CONDEMNED, field, jumps, advice, spans)
+            yield _finding("wrapped angle", REJECTED, field, jumps, advice, spans)
         elif kind == "displacement":
             spans = tuple(_span(name, jump, jump.size) for name, jump in jumps)
             advice = "leave these samples out; only the motion of the base matters, not its position"
-            yield _finding("step", CONDEMNED, field, jumps, advice, spans)
+            yield _finding("step", REJECTED, field, jumps, advice, spans)
         elif kind == "harmless":
             advice = "none at this size; look for a marker or an encoder that slipped"
             yield _finding("step", NOTE, field, jumps, advice)
         elif kind == "short":
             spans = tuple(_shorter_side(jump, name, samples) for name, jump in jumps)
             advice = "leave out the shorter side, which has another zero"
-            yield _finding("step", CONDEMNED, field, jumps, advice, spans)
+            yield _finding("step", REJECTED, field, jumps, advice, spans)
         else:
             advice = "split the log there and determine which part has the right zero"
-            yield dataclasses.replace(_finding("step", CONDEMNED, field, jumps, advice), everywhere=True)
+            yield dataclasses.replace(_finding("step", REJECTED, field, jumps, advice), everywhere=True)
 
 
 def _step_kind(field: str, jump: Jump, largest: float, samples: int) -> str:

@@ -8,10 +8,10 @@ import numpy as np
 
 from torchid.errors import format_count, join_names
 from torchid.log_checks.findings import (
-    CONDEMNED,
     MIN_GAP_STEPS,
     NON_SIGNAL_FIELDS,
     NOTE,
+    REJECTED,
     SUSPICIOUS,
     Finding,
     Span,
@@ -50,7 +50,7 @@ def check_magnitudes(log: Log) -> Iterator[Finding]:
         )
         rare = bad.any(axis=1).mean() <= MAX_MISSING_SHARE
         spans = tuple(span for column in columns for span in find_spans(bad[:, column], names[column])) if rare else ()
-        yield Finding("absurd", CONDEMNED, field, text, "look for uninitialised memory or an overflow", channels, spans)
+        yield Finding("absurd", REJECTED, field, text, "look for uninitialised memory or an overflow", channels, spans)
 
 
 def check_missing_values(log: Log) -> Iterator[Finding]:
@@ -86,8 +86,8 @@ def _missing_findings(log: Log, field: str) -> Iterator[Finding]:
         if field in NAN_ALLOWED:
             advice = "leave these samples out; a filter would lose the channels throughout"
         else:
-            advice = "leave these samples out (exclude_condemned): motion must be known throughout"
-        yield Finding("not measured", CONDEMNED, field, text, advice, tuple(holes), spans)
+            advice = "leave these samples out (exclude_rejected): motion must be known throughout"
+        yield Finding("not measured", REJECTED, field, text, advice, tuple(holes), spans)
     if gone:
         entire = all(share == 1.0 for _, share in gone.values())
         extent = "throughout" if entire else f"in {100 * max(share for _, share in gone.values()):.3g} % at most"
@@ -96,7 +96,7 @@ def _missing_findings(log: Log, field: str) -> Iterator[Finding]:
             advice = "record it throughout, or leave the field out if other fields give this motion"
         else:
             advice = "none, unless it is one of the sensors" if entire else "leave it out of the sensors"
-        severity = CONDEMNED if needed else NOTE
+        severity = REJECTED if needed else NOTE
         yield Finding("not measured", severity, field, f"{join_names(list(gone))}: NaN {extent}", advice, tuple(gone))
 
 
@@ -119,7 +119,7 @@ def check_time_stamps(log: Log) -> Iterator[Finding]:
     if len(log) < FEWEST_DIFFERENTIATED and lacks_derivatives(log):
         text = f"{format_count(len(log), 'sample')}: velocities and accelerations cannot be derived"
         advice = f"record {FEWEST_DIFFERENTIATED} samples or more, or give every velocity and acceleration"
-        yield Finding("too short", CONDEMNED, "time", text, advice)
+        yield Finding("too short", REJECTED, "time", text, advice)
     if len(log) < 3:
         return
     steps = np.diff(log.time)
@@ -139,13 +139,13 @@ def check_time_stamps(log: Log) -> Iterator[Finding]:
         below = f"{format_count(len(numbers), 'step')} below {SHORTEST_STEP:g} of the median"
         text = f"{below}, the first of {steps[first]:.3g} s after sample {first}: noise is amplified there"
         spans = tuple(Span(int(i) + 1, int(i) + 1) for i in numbers)
-        yield Finding("coincident stamps", CONDEMNED, "time", text, "drop one sample of each pair", spans=spans)
+        yield Finding("coincident stamps", REJECTED, "time", text, "drop one sample of each pair", spans=spans)
 
 
 def _unit_finding(median: float) -> Finding:
     likely = [unit for unit, ticks in _TICKS_PER_S.items() if median / ticks <= MAX_MEDIAN_STEP_S]
     guess = f"; are these {likely[0]}? Then {_TICKS_PER_S[likely[0]] / median:.4g} Hz" if likely else ""
-    return Finding("unit", CONDEMNED, "time", f"median step {median:.4g} s{guess}", "convert the stamps to seconds")
+    return Finding("unit", REJECTED, "time", f"median step {median:.4g} s{guess}", "convert the stamps to seconds")
 
 
 def _jitter_finding(log: Log, steps: FloatArray, rms: float, largest: float, long: BoolArray) -> Finding:
@@ -177,6 +177,6 @@ def _gap_finding(steps: FloatArray, median: float, long: BoolArray) -> Finding:
     text = f"{missing}; longest {steps[longest]:.4g} s after sample {longest}"
     if steps[longest] > LONGEST_STEP * median:
         advice = f"split the log after sample {longest}: no spline crosses more than {LONGEST_STEP:g} steps"
-        return Finding("gap", CONDEMNED, "time", text, advice)
+        return Finding("gap", REJECTED, "time", text, advice)
     advice = f"keep preprocessing.cutoff_hz well below {0.5 / steps[longest]:.3g}: half a period fits in the gap then"
     return Finding("gap", SUSPICIOUS, "time", text, advice, spans=tuple(Span(int(i), int(i) + 1) for i in numbers))

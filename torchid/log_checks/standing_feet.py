@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from torchid.errors import InputError, join_names
-from torchid.log_checks.findings import CONDEMNED, SUSPICIOUS, Finding, Skipped, find_spans, median_step
+from torchid.log_checks.findings import REJECTED, SUSPICIOUS, Finding, Skipped, find_spans, median_step
 from torchid.log_checks.mistakes import possible_mistakes, reversed_joints
 from torchid.log_checks.model import (
     MAX_DIFFERENTIATED_SAMPLES,
@@ -80,7 +80,7 @@ def check_standing_feet(
     if best is not None:
         share = f"{100 * slip:.3g} % as much as the base above them, {100 * least:.2g} % once corrected"
         text = f"{best.description}: standing feet move {share}"
-        yield Finding("unit, sign or frame", CONDEMNED, best.field, text, best.advice)
+        yield Finding("unit, sign or frame", REJECTED, best.field, text, best.advice)
     elif slip > MAX_UNEXPLAINED_SLIP_SHARE:
         yield _unexplained_motion(log, robot, contacts, slip, poses)
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from torchid.log_checks.findings import CONDEMNED, NOTE, SUSPICIOUS, Finding, Skipped, median_step, widen_mask
+from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, Finding, Skipped, median_step, widen_mask
 from torchid.log_checks.model import recorded_link_poses
 from torchid.log_checks.units import advise_units, units_of_ratio
 from torchid.logs import Log
@@ -57,7 +57,7 @@ def _weight_findings(carried: float, when: str, field: str, robot: Robot | None)
     mass = carried / GRAVITY
     if carried < 0.0:
         text = f"contacts pull with {-carried:.4g} N {when}"
-        yield Finding("sign", CONDEMNED, field, text, "reverse it: wrenches are what the ground exerts on the robot")
+        yield Finding("sign", REJECTED, field, text, "reverse it: wrenches are what the ground exerts on the robot")
         return
     if robot is None:
         text = f"contacts carry {mass:.4g} kg {when}"
@@ -70,7 +70,7 @@ def _weight_findings(carried: float, when: str, field: str, robot: Robot | None)
     )
     if units := units_of_ratio(ratio, ("force",)):
         text = f"contacts carry {ratio:.3g} of the weight {when}: forces in {' or '.join(units)}?"
-        yield Finding("unit", CONDEMNED, field, text, "convert forces to N and moments to N m")
+        yield Finding("unit", REJECTED, field, text, "convert forces to N and moments to N m")
         return
     if abs(ratio - 1.0) > MAX_MASS_ERROR:
         advice = "check for an unmeasured contact, a payload, an offset or gain of a sensor"
@@ -134,7 +134,7 @@ def check_accelerometer(log: Log, robot: Robot | None) -> Iterator[Finding | Ski
         yield _accelerometer_unit_finding(f"{size:.4g} at rest", units)
     elif size < 0.1 * GRAVITY:
         advice = "give the reading of the accelerometer: acceleration minus gravity, upward at rest"
-        yield Finding("gravity", CONDEMNED, name, f"{text}: gravity has been taken out", advice)
+        yield Finding("gravity", REJECTED, name, f"{text}: gravity has been taken out", advice)
     elif abs(size / GRAVITY - 1.0) > _MAX_ACCELEROMETER_ERROR:
         yield Finding("gravity", SUSPICIOUS, name, f"{text}, gravity is {GRAVITY}", "calibrate the accelerometer")
     if units or size > 0.5 * GRAVITY:
@@ -162,7 +162,7 @@ def _accelerometer_unit_in_motion(log: Log) -> Finding | None:
 def _accelerometer_unit_finding(text: str, units: tuple[str, ...]) -> Finding:
     field = "imu_specific_force"
     advice = f"{advise_units({field: units})}; without a map convert it to m/s^2"
-    return Finding("unit", CONDEMNED, field, f"{text}: in {' or '.join(units)}", advice)
+    return Finding("unit", REJECTED, field, f"{text}: in {' or '.join(units)}", advice)
 
 
 def _tilt_findings(log: Log, robot: Robot | None, still: BoolArray, when: str) -> Iterator[Finding | Skipped]:
@@ -185,11 +185,11 @@ def _tilt_findings(log: Log, robot: Robot | None, still: BoolArray, when: str) -
     if height is None or height < 0.0:
         below = "" if height is None else ", and the base hangs below the feet that carry it"
         advice = "reverse it if it is gravity minus acceleration; else check the IMU's frame and the quaternion's order"
-        yield Finding("gravity", CONDEMNED, name, f"{text}{below}: reversed?", advice)
+        yield Finding("gravity", REJECTED, name, f"{text}{below}: reversed?", advice)
     else:
         text = f"imu_specific_force {text}, and the base is above its feet: a world whose z axis points down?"
         advice = "rotate the world so that z points up; else check the order of the quaternion"
-        yield Finding("gravity", CONDEMNED, "base_quat_xyzw", text, advice)
+        yield Finding("gravity", REJECTED, "base_quat_xyzw", text, advice)
 
 
 def _height_above_feet(log: Log, robot: Robot, upward: FloatArray) -> float | None:

@@ -124,7 +124,7 @@ class LowPass:
         return np.asarray(np.square(np.abs(response)))
 
 
-@cache  # takes 20 ms, and logs, or stretches of one, mostly have one filter
+@cache  # takes 20 ms, and logs, or segments of one, mostly have one filter
 def _noise_share(sections: bytes) -> float:
     """Of a filter, from its second-order sections."""
     from scipy import signal

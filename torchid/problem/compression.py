@@ -15,10 +15,10 @@ from torchid.parameters import Array
 from torchid.problem.chunks import ProgressCallback, chunks_by_state, map_chunks, one_thread, worker_count
 from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import PRIOR_DEVIATION, LinearProblem, TriangularFactor, parameter_scale
+from torchid.problem.noise_gram import ColumnPrior, NoiseGram, corrected_triangle, estimate_noise_gram
 from torchid.problem.row_compressor import RowCompressor
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
-from torchid.problem.surplus import ColumnPrior, Surplus, compress_surplus, corrected_triangle
 from torchid.problem.unloaded_sensors import unloaded_offset_equations
 from torchid.reprs import short_repr
 from torchid.robot import Robot
@@ -91,7 +91,7 @@ def compress_by_state(
     parts = _merge_parts(
         map_chunks(logs, builder, partial(_compress_chunks, builder, by_log=False), chunk, threads, progress)
     )
-    add_surplus(parts, compress_surplus(logs, builder, lambda _, state: _key(None, state)))
+    add_noise_gram(parts, estimate_noise_gram(logs, builder, lambda _, state: _key(None, state)))
     return {part.state: part.factor for part in parts}
 
 
@@ -106,12 +106,13 @@ def compress_parts(
     """As `compress`, but with a factor for every contact state in every log and fold, in the order of the logs.
 
     Logs of one source count as one. Unknown offsets of contact sensors have further parts, of readings in the air.
-    `weight_rows` weights all other rows before they are added; their factors then have no surplus, see `add_surplus`.
+    `weight_rows` weights all other rows before they are added; their factors then have no noise Gram matrix, see
+    `add_noise_gram`.
     """
     reduce = partial(_compress_chunks, builder, by_log=True, weight_rows=weight_rows)
     parts = _merge_parts(map_chunks(logs, builder, reduce, chunk, threads, progress))
     if weight_rows is None:
-        add_surplus(parts, surplus_by_part(logs, builder, progress))
+        add_noise_gram(parts, noise_gram_by_part(logs, builder, progress))
     order = list(dict.fromkeys(samples.source for samples in logs))
     return sorted(parts, key=lambda part: order.index(part.source))
 
@@ -190,14 +191,14 @@ def _compress_chunks(
     return list(parts.values())
 
 
-def surplus_by_part(
+def noise_gram_by_part(
     logs: Sequence[Samples], builder: RowBuilder, progress: ProgressCallback | None = None
-) -> dict[PartKey, Surplus]:
-    """The surplus of each part of some logs, to `add_surplus`, from the noise of their motion.
+) -> dict[PartKey, NoiseGram]:
+    """The noise Gram matrix of each part of some logs, to `add_noise_gram`.
 
-    Args: as `compress_surplus`.
+    Args: as `estimate_noise_gram`.
     """
-    return compress_surplus(logs, builder, _key, progress)
+    return estimate_noise_gram(logs, builder, _key, progress)
 
 
 def _key(samples: Samples | None, state: ContactState, unloaded: bool = False) -> PartKey:
@@ -207,10 +208,10 @@ def _key(samples: Samples | None, state: ContactState, unloaded: bool = False) -
     return samples.source, state, samples.fold, samples.block, unloaded
 
 
-def add_surplus(parts: Sequence[Part], surplus: Mapping[PartKey, Surplus], weight: float = 1.0) -> None:
-    """Add its surplus to the factor of each part, times the mean weight of its rows."""
+def add_noise_gram(parts: Sequence[Part], noise_gram: Mapping[PartKey, NoiseGram], weight: float = 1.0) -> None:
+    """Add its noise Gram matrix to the factor of each part, times the mean weight of its rows."""
     for part in parts:
-        part.factor.add_surplus(surplus.get(part.key, {}), weight)
+        part.factor.add_noise_gram(noise_gram.get(part.key, {}), weight)
 
 
 def compress_unloaded(logs: Sequence[Samples], builder: RowBuilder) -> list[Part]:

@@ -38,7 +38,7 @@ from torchid.problem.detection_motion import (
 )
 from torchid.problem.floor_pose import Footing, StanceFoot, ways_up
 from torchid.problem.standing import (
-    Stretches,
+    StandingSegments,
     feet_poses,
     points_that_stand,
     require_floor_normals,
@@ -144,8 +144,8 @@ def _with_flags(blocks: LogBlocks, contacts: Sequence[Contact], found: Detection
 
 def stand_in_blocks(
     blocks: LogBlocks, robot: Robot, contacts: Sequence[Contact], pieces: Pieces, folder: Path | None
-) -> tuple[LogBlocks, Stretches]:
-    """As `stand_on_feet`: the log with the pose of its base in the stretches where it is known; passes over the joints.
+) -> tuple[LogBlocks, StandingSegments]:
+    """As `stand_on_feet`: the log with the pose of its base in the segments where it is known; passes over the joints.
 
     Args:
         blocks: the log, with flags.

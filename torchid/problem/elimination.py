@@ -14,8 +14,8 @@ from torchid.problem.compression import Part, column_prior, merge_factors, probl
 from torchid.problem.eliminated_terms import EliminatedTerms, SignCondition
 from torchid.problem.extras import Extra
 from torchid.problem.linear import LinearProblem
+from torchid.problem.noise_gram import NoiseShares, corrected_triangle
 from torchid.problem.rows import RowBuilder
-from torchid.problem.surplus import NoiseShares, corrected_triangle
 from torchid.robot import Robot
 from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, column_scale, is_significant
 

@@ -164,15 +164,15 @@ class Walk:
         self._last = 0  # first sample after it
 
     def begin(self, start: int) -> bool:
-        """Forget points that were lifted before a stretch; whether those that are left tell its heading."""
+        """Forget points that were lifted before a segment; whether those that are left tell its heading."""
         stayed = self._stands[self._last : start + 1].all(axis=0)
         self._places[~stayed] = np.nan
         return bool(np.isfinite(self._places).all(axis=1).sum() >= 2)
 
     def along(self, runs: Sequence[slice], footing: Footing) -> tuple[FloatArray, FloatArray]:
-        """Rotations (M, 3, 3) to the world and positions (M, 3) [m] in it, along the runs of a stretch.
+        """Rotations (M, 3, 3) to the world and positions (M, 3) [m] in it, along the runs of a segment.
 
-        A stretch may be walked in parts, of which each begins with the last sample of the part before.
+        A segment may be walked in parts, of which each begins with the last sample of the part before.
 
         Args:
             runs: of samples on the same feet, without a gap.

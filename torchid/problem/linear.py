@@ -158,8 +158,8 @@ class TriangularFactor:
     Attributes:
         columns: of the rows, without the right-hand side.
         rows, independent_rows: that were added.
-        surplus: what noise of the motion adds to X^T X on average, by the columns of the rows that have it,
-            (len(support) + 1, len(support) + 1); an estimate, see `torchid.problem.surplus`.
+        noise_gram: what noise of the motion adds to X^T X on average, by the columns of the rows that have it,
+            (len(support) + 1, len(support) + 1); an estimate, see `torchid.problem.noise_gram`.
     """
 
     __repr__ = short_repr
@@ -173,7 +173,7 @@ class TriangularFactor:
         self.rows = 0
         self.independent_rows = 0.0
         self._blocks: dict[tuple[int, ...], Tensor] = {}
-        self.surplus: dict[tuple[int, ...], Tensor] = {}
+        self.noise_gram: dict[tuple[int, ...], Tensor] = {}
 
     @classmethod
     def from_blocks(
@@ -182,12 +182,12 @@ class TriangularFactor:
         rows: int,
         independent_rows: float,
         blocks: Mapping[tuple[int, ...], Tensor],
-        surplus: Mapping[tuple[int, ...], Tensor] | None = None,
+        noise_gram: Mapping[tuple[int, ...], Tensor] | None = None,
     ) -> TriangularFactor:
-        """The factor that has these `blocks`, of so many rows, and this surplus."""
+        """The factor that has these `blocks`, of so many rows, and this noise Gram matrix."""
         out = cls(columns)
         out.rows, out.independent_rows, out._blocks = rows, independent_rows, dict(blocks)
-        out.surplus = dict(surplus or {})
+        out.noise_gram = dict(noise_gram or {})
         return out
 
     @property
@@ -197,12 +197,14 @@ class TriangularFactor:
 
     def __getstate__(self) -> dict[str, object]:
         """What another process gets: on the CPU, as it may have another device."""
-        tensors = {"_blocks": self._blocks, "surplus": self.surplus}
+        tensors = {"_blocks": self._blocks, "noise_gram": self.noise_gram}
         return vars(self) | {name: {at: x.cpu().numpy() for at, x in by.items()} for name, by in tensors.items()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take over what another process sent."""
-        arrays = {name: {at: torch.from_numpy(x) for at, x in state[name].items()} for name in ("_blocks", "surplus")}
+        arrays = {
+            name: {at: torch.from_numpy(x) for at, x in state[name].items()} for name in ("_blocks", "noise_gram")
+        }
         vars(self).update(state | arrays)
 
     @property
@@ -254,19 +256,19 @@ class TriangularFactor:
         self.independent_rows += other.independent_rows
         for support, block in other._blocks.items():
             self.absorb(support, block)
-        self.add_surplus(other.surplus)
+        self.add_noise_gram(other.noise_gram)
 
-    def add_surplus(self, surplus: Mapping[tuple[int, ...], Tensor], weight: float = 1.0) -> None:
-        """Add to the surplus, by columns, times the weight of rows."""
-        for support, x in surplus.items():
-            before = self.surplus.get(support)
-            self.surplus[support] = weight * x if before is None else before + weight * x
+    def add_noise_gram(self, noise_gram: Mapping[tuple[int, ...], Tensor], weight: float = 1.0) -> None:
+        """Add to the noise Gram matrix, by columns, times the weight of rows."""
+        for support, x in noise_gram.items():
+            before = self.noise_gram.get(support)
+            self.noise_gram[support] = weight * x if before is None else before + weight * x
 
     def scaled(self, factor: float) -> TriangularFactor:
         """The factor of the same rows times a number."""
         blocks = {support: factor * block for support, block in self._blocks.items()}
-        surplus = {support: factor**2 * x for support, x in self.surplus.items()}
-        return TriangularFactor.from_blocks(self.columns, self.rows, self.independent_rows, blocks, surplus)
+        noise_gram = {support: factor**2 * x for support, x in self.noise_gram.items()}
+        return TriangularFactor.from_blocks(self.columns, self.rows, self.independent_rows, blocks, noise_gram)
 
     def compact(self) -> TriangularFactor:
         """The factor on the CPU, as one triangle in all columns if that has fewer numbers than its blocks."""
@@ -274,12 +276,12 @@ class TriangularFactor:
         numbers = sum(rows * width - (rows * (rows - 1) // 2 if rows == width else 0) for rows, width in sizes)
         if numbers <= (self.columns + 1) * (self.columns + 2) // 2:
             blocks = {support: block.to("cpu", torch.float64) for support, block in self._blocks.items()}
-            surplus = {support: x.to("cpu", torch.float64) for support, x in self.surplus.items()}
+            noise_gram = {support: x.to("cpu", torch.float64) for support, x in self.noise_gram.items()}
         else:
             every = tuple(range(self.columns))
             blocks = {every: self.triangle().triu()}
-            surplus = {every: self.whole_surplus()} if self.surplus else {}
-        return TriangularFactor.from_blocks(self.columns, self.rows, self.independent_rows, blocks, surplus)
+            noise_gram = {every: self.whole_noise_gram()} if self.noise_gram else {}
+        return TriangularFactor.from_blocks(self.columns, self.rows, self.independent_rows, blocks, noise_gram)
 
     def triangle(self) -> Tensor:
         """Upper triangular R, (columns + 1, columns + 1), float64 on the CPU."""
@@ -291,10 +293,10 @@ class TriangularFactor:
             scattered.append(wide)
         return triangularize(torch.cat([rows.T for rows in scattered], dim=1).T)
 
-    def whole_surplus(self) -> Tensor:
-        """The surplus of X^T X, (columns + 1, columns + 1), float64 on the CPU."""
+    def whole_noise_gram(self) -> Tensor:
+        """What noise adds to X^T X, (columns + 1, columns + 1), float64 on the CPU."""
         total = torch.zeros(self.columns + 1, self.columns + 1, dtype=torch.float64)
-        for support, x in self.surplus.items():
+        for support, x in self.noise_gram.items():
             at = torch.tensor([*support, self.columns])
             total[at[:, None], at] += x.to("cpu", torch.float64)
         return total

@@ -15,7 +15,7 @@ from torchid.errors import LogError, about_file, warn
 from torchid.logs import Log
 from torchid.logs.log import NORMALS, BoolArray, FloatArray
 from torchid.logs.quaternion import make_sign_continuous
-from torchid.logs.stretches import preprocess_stretches
+from torchid.logs.segments import preprocess_segments
 from torchid.problem.floor_pose import (
     FEWEST_POINTS,
     Footing,
@@ -40,22 +40,22 @@ _HEADING_TOLERANCE = 0.02  # of a recorded normal's components against the state
 
 
 @dataclass(frozen=True)
-class Stretches:
+class StandingSegments:
     """Where enough feet of a log stand to say how its base does.
 
     Attributes:
-        stretches: of successive samples with a pose; nothing may be differentiated across their ends.
+        segments: of successive samples with a pose; nothing may be differentiated across their ends.
         dropped: number of samples without a pose, by the reason.
         uneven: rms distance of the feet that stand from one floor [m].
     """
 
-    stretches: tuple[slice, ...]
+    segments: tuple[slice, ...]
     dropped: dict[str, int]
     uneven: float
 
 
 @dataclass(frozen=True)
-class StandingBase(Stretches):
+class StandingBase(StandingSegments):
     """A log with the pose of the base wherever enough feet stand.
 
     Attributes:
@@ -85,20 +85,20 @@ def preprocess_standing(
         sign_width: likewise.
 
     Raises:
-        InputError: as `stand_on_feet` and `preprocess`, or no stretch is long enough for the filter.
+        InputError: as `stand_on_feet` and `preprocess`, or no segment is long enough for the filter.
 
     Warns:
         TorchidWarning: as `preprocess`; number of samples left out, with the reasons; feet that are not on one floor.
     """
     standing = stand_on_feet(log, robot, contacts)
-    out, too_short = preprocess_stretches(standing.log, standing.stretches, cutoff_hz, sample_rate_hz, sign_width)
+    out, too_short = preprocess_segments(standing.log, standing.segments, cutoff_hz, sample_rate_hz, sign_width)
     warn_of_standing(log.source, len(log), standing, too_short)
     return out
 
 
-def warn_of_standing(source: str, count: int, standing: Stretches, too_short: int) -> None:
-    """Say which of so many samples are left out, some in stretches that are too short, and whether feet are uneven."""
-    dropped = standing.dropped | ({"stretches too short to differentiate": too_short} if too_short else {})
+def warn_of_standing(source: str, count: int, standing: StandingSegments, too_short: int) -> None:
+    """Say which of so many samples are left out, some in segments that are too short, and whether feet are uneven."""
+    dropped = standing.dropped | ({"segments too short to differentiate": too_short} if too_short else {})
     if dropped:
         reasons = ", ".join(f"{reason}: {number}" for reason, number in dropped.items())
         what = f"{sum(dropped.values())} of {count} samples left out, base motion unknown"
@@ -110,18 +110,18 @@ def warn_of_standing(source: str, count: int, standing: Stretches, too_short: in
 
 
 def longest_standing(log: Log, robot: Robot, contacts: Sequence[Contact]) -> Log:
-    """The longest stretch of a log with the pose of the base from the feet that stand; LogError as `stand_on_feet`."""
+    """The longest segment of a log with the pose of the base from the feet that stand; LogError as `stand_on_feet`."""
     standing = stand_on_feet(log, robot, contacts)
-    return standing.log.select(max(standing.stretches, key=lambda stretch: stretch.stop - stretch.start))
+    return standing.log.select(max(standing.segments, key=lambda segment: segment.stop - segment.start))
 
 
 def stand_on_feet(log: Log, robot: Robot, contacts: Sequence[Contact]) -> StandingBase:
     """Pose of the base in the world from the feet that stand on a floor, which has the contacts' common normal.
 
     The floor goes through the world's origin. Tilt and height follow from the feet of each sample alone, heading and
-    place from feet that keep theirs, or roll, while they stand; least squares over all feet. At the start of a stretch
+    place from feet that keep theirs, or roll, while they stand; least squares over all feet. At the start of a segment
     from which on no two points stay, the base's x axis lies above the world's: on a level floor the dynamics do not
-    depend on that, and on another only the first such stretch has a pose.
+    depend on that, and on another only the first such segment has a pose.
 
     A frame of a flat foot has one axis along the floor's normal, the nearest to the way up to the base; such frames
     are equally high above the floor. A point or line with a radius is that high above it.
@@ -155,7 +155,7 @@ def stand_on_feet(log: Log, robot: Robot, contacts: Sequence[Contact]) -> Standi
         "imu_frame": ""
     }
     fields |= {"base_quat_xyzw": quat, "base_position_world": position, NORMALS: None}
-    return StandingBase(found.stretches, found.dropped, found.uneven, dataclasses.replace(log, **fields))
+    return StandingBase(found.segments, found.dropped, found.uneven, dataclasses.replace(log, **fields))
 
 
 def stand_in_parts(
@@ -165,7 +165,7 @@ def stand_in_parts(
     footing: Callable[[slice], Footing],
     parts: Sequence[slice],
     add: Callable[[slice, FloatArray, FloatArray], None],
-) -> Stretches:
+) -> StandingSegments:
     """As `stand_on_feet`, of a log whose feet are worked out part by part.
 
     Args:
@@ -188,17 +188,17 @@ def stand_in_parts(
     _require_some(source, active, known, few)
     normal = contacts[0].normal
     walk = Walk(stands, normal)
-    stretches: list[slice] = []
+    segments: list[slice] = []
     for runs in split_at_lost_feet(stands, known):
         samples = slice(runs[0].start, runs[-1].stop)
-        if walk.begin(samples.start) or normal == UP or not stretches:
+        if walk.begin(samples.start) or normal == UP or not segments:
             _walk_along(walk, runs, footing, [part.start for part in parts], add)
-            stretches.append(samples)
+            segments.append(samples)
         else:
             lost = "heading on a floor that is not level"
             dropped[lost] = dropped.get(lost, 0) + samples.stop - samples.start
     named = {reason: count for reason, count in dropped.items() if count}
-    return Stretches(tuple(stretches), named, float(np.sqrt(uneven / max(counted, 1))))
+    return StandingSegments(tuple(segments), named, float(np.sqrt(uneven / max(counted, 1))))
 
 
 def _walk_along(
@@ -208,7 +208,7 @@ def _walk_along(
     starts: Sequence[int],
     add: Callable[[slice, FloatArray, FloatArray], None],
 ) -> None:
-    """Walk along a stretch, in parts that begin at some of the samples `starts`."""
+    """Walk along a segment, in parts that begin at some of the samples `starts`."""
     first, last = runs[0].start, runs[-1].stop
     borders = [first, *(start for start in starts if first < start < last), last]
     before: FloatArray | None = None

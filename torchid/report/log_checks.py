@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from torchid.errors import excerpt, join_names
-from torchid.log_checks import CONDEMNED, NOTE, SUSPICIOUS, Checked, Finding, Span
+from torchid.log_checks import NOTE, REJECTED, SUSPICIOUS, Checked, Finding, Span
 from torchid.log_checks.findings import channel_names, channel_unit
 from torchid.logs import Log
 from torchid.logs.log import FloatArray
@@ -24,7 +24,7 @@ from torchid.logs.time_range import log_title
 from torchid.report import palette
 from torchid.report.figures import STYLE
 
-COLORS = {CONDEMNED: palette.NOMINAL, SUSPICIOUS: "#e69f00", NOTE: palette.IDENTIFIED}
+COLORS = {REJECTED: palette.NOMINAL, SUSPICIOUS: "#e69f00", NOTE: palette.IDENTIFIED}
 #: Height of a row and of a panel's title, and width of the figure [inches].
 _ROW, _HEAD, _WIDTH = 0.16, 1.0, 10.0
 #: Characters of a title's line at font size 9, and of a title.
@@ -61,7 +61,7 @@ def _title(checked: Checked) -> str:
 
 
 def _marked_findings(checked: Checked) -> list[Finding]:
-    """Condemned and suspicious findings about some samples."""
+    """Rejected and suspicious findings about some samples."""
     return [finding for finding in checked.findings if finding.severity != NOTE and finding.spans]
 
 
@@ -183,7 +183,7 @@ def _log_entry(checked: Checked) -> dict[str, Any]:
         "seconds": float(log.time[-1] - log.time[0]),
         "usable": checked.usable,
         "verdict": checked.verdict,
-        "condemned_samples": int(checked.condemned.sum()),
+        "rejected_samples": int(checked.rejected.sum()),
         "findings": [_finding_entry(finding, log.time) for finding in checked.findings],
         "not_checked": [{"name": skip.name, "reason": skip.reason} for skip in checked.skipped],
     }

@@ -16,7 +16,7 @@ _BINS = 1000  # of an envelope, each a minimum and a maximum
 _MOST_ROWS = 6
 _MOST_SPANS = 300  # of contact states
 _GAP = 5.0  # median steps that are a gap
-_SHORTEST, _LONGEST = 64, 1024  # samples of a spectrum's segment
+_SHORTEST, _LONGEST = 64, 1024  # samples of a window of a spectrum
 _BEYOND = 2.0  # frequencies are shown up to so many times the band of the noise
 
 
@@ -139,19 +139,19 @@ def _spans(time: Array, state: np.ndarray) -> list[tuple[float, float, int]]:
 
 
 def _spectrum(series: ForceSeries, row: int, time: Array, bandwidth: float) -> dict[str, Any] | None:
-    """Amplitude density of both errors in the longest stretch without gaps, and that of the noise; None if short."""
+    """Amplitude density of both errors in the longest segment without gaps, and that of the noise; None if short."""
     errors = np.stack([series.nominal[:, row], series.identified[:, row]]) - series.measured[:, row]
-    stretch = _longest_stretch(time, np.asarray(np.isfinite(errors).all(axis=0)))
-    count = stretch.stop - stretch.start
+    segment = _longest_segment(time, np.asarray(np.isfinite(errors).all(axis=0)))
+    count = segment.stop - segment.start
     if count < _SHORTEST or not bandwidth > 0.0:
         return None
-    rate = (count - 1) / (time[stretch.stop - 1] - time[stretch.start])
+    rate = (count - 1) / (time[segment.stop - 1] - time[segment.start])
     from scipy.signal import welch  # takes 0.1 s, which commands that draw nothing need not
 
-    segment = int(np.clip(count // 4, _SHORTEST, _LONGEST))
-    frequency, density = welch(errors[:, stretch], rate, nperseg=segment)
+    window = int(np.clip(count // 4, _SHORTEST, _LONGEST))
+    frequency, density = welch(errors[:, segment], rate, nperseg=window)
     shown = (frequency > 0.0) & (frequency <= _BEYOND * bandwidth)
-    noise = None if series.noise is None else _rms(series.noise[stretch, row])
+    noise = None if series.noise is None else _rms(series.noise[segment, row])
     return {
         "frequency": packed(frequency[shown]),
         "nominal": packed(np.sqrt(density[0, shown])),
@@ -161,7 +161,7 @@ def _spectrum(series: ForceSeries, row: int, time: Array, bandwidth: float) -> d
     }
 
 
-def _longest_stretch(time: Array, known: np.ndarray) -> slice:
+def _longest_segment(time: Array, known: np.ndarray) -> slice:
     """Samples in a row that are known and without a gap."""
     steps = np.diff(time)
     breaks = np.append(steps > _GAP * np.median(steps), True) if len(steps) else np.ones(len(time), bool)

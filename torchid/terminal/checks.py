@@ -82,7 +82,7 @@ class _Alike:
 
 
 def _alike(checked: Sequence[Checked]) -> list[_Alike]:
-    """All findings, the most severe first, then what condemns whole logs, then what concerns most logs."""
+    """All findings, the most severe first, then what rejects whole logs, then what concerns most logs."""
     groups: dict[tuple[str, ...], dict[str, list[Finding]]] = {}
     for log in checked:
         for found in group_alike(log.findings):
@@ -91,7 +91,7 @@ def _alike(checked: Sequence[Checked]) -> list[_Alike]:
             groups.setdefault(kind, {}).setdefault(str(log.log.source), []).extend(found)
 
     def urgency(one: _Alike) -> tuple[int, bool, int]:
-        return SEVERITIES.index(one.first.severity), not one.first.condemns_all, -len(one.by_log)
+        return SEVERITIES.index(one.first.severity), not one.first.rejects_all, -len(one.by_log)
 
     return sorted(map(_Alike, groups.values()), key=urgency)
 
@@ -108,7 +108,7 @@ def _headline(checked: Sequence[Checked]) -> str:
     clean = sum(map(_is_clean, checked))
     counts = {
         "not usable": sum(not log.usable for log in checked),
-        "usable without some samples": sum(log.usable and bool(log.condemned.any()) for log in checked),
+        "usable without some samples": sum(log.usable and bool(log.rejected.any()) for log in checked),
     }
     rest = "".join(f"; {count} {'is' if count == 1 else 'are'} {what}" for what, count in counts.items() if count)
     return (
@@ -169,11 +169,11 @@ def _log_lines(checked: Sequence[Checked], room: int, width: int) -> list[str]:
 
 def _badness(log: Checked) -> tuple[float, ...]:
     counts = Counter(finding.severity for finding in log.findings)
-    return (not log.usable, float(log.condemned.mean()), *(counts[severity] for severity in SEVERITIES))
+    return (not log.usable, float(log.rejected.mean()), *(counts[severity] for severity in SEVERITIES))
 
 
 def _usable_text(log: Checked) -> str:
-    count = int(log.condemned.sum())
+    count = int(log.rejected.sum())
     return "no" if not log.usable else f"without {format_count(count, 'sample')}" if count else "yes"
 
 

@@ -44,7 +44,7 @@ def evaluation_lines(evaluated: EvaluatedRun, width: int) -> list[str]:
         lines += labelled("attention", far, width, _ATTENTION_LINES)
     left_out = sum(evaluated.excluded.values())
     if left_out:
-        lines.append(f"{'left out':{LABEL}}{left_out} samples that torchid check condemns")
+        lines.append(f"{'left out':{LABEL}}{left_out} samples that torchid check rejects")
     return [*lines, f"{'written to':{LABEL}}{evaluated.output}"]
 
 

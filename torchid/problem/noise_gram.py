@@ -44,7 +44,7 @@ _NEGLIGIBLE = 1e-5  # share of noise in any combination: far below all standard 
 _RESOLVED = 1e-5  # least singular value, of columns of unit size, along which a difference of squares is no rounding
 
 Support = tuple[int, ...]
-Surplus = dict[Support, Tensor]
+NoiseGram = dict[Support, Tensor]
 Key = TypeVar("Key", bound=Hashable)
 Other = TypeVar("Other", bound=Hashable)
 
@@ -75,13 +75,13 @@ class NoiseShares:
         return text
 
 
-def compress_surplus(
+def estimate_noise_gram(
     pieces: Sequence[Samples],
     builder: RowBuilder,
     key: Callable[[Samples, ContactState], Key],
     progress: ProgressCallback | None = None,
-) -> dict[Key, Surplus]:
-    """The surplus of the rows of some logs by the noise of their motion; none of logs without noise.
+) -> dict[Key, NoiseGram]:
+    """What noise of their motion adds to X^T X of the rows of some logs; nothing without noise.
 
     Args:
         pieces: of bound logs, in the order of their samples.
@@ -95,26 +95,28 @@ def compress_surplus(
         if piece.motion_noise is not None and len(piece):
             by_log.setdefault(piece.source, []).append(piece)
     logs = [concatenate([_spread(piece, step, progress) for piece in of_log]) for of_log in by_log.values()]
-    total: dict[Key, Surplus] = {}
+    total: dict[Key, NoiseGram] = {}
     if not logs:
         return total
-    for of_worker in map_chunks(logs, builder, partial(_surplus_of_chunks, builder, by_log)):
-        for (source, number, state), surplus in of_worker.items():
-            halves = {support: x.triu() for support, x in surplus.items()}
+    for of_worker in map_chunks(logs, builder, partial(_noise_gram_of_chunks, builder, by_log)):
+        for (source, number, state), noise_gram in of_worker.items():
+            halves = {support: x.triu() for support, x in noise_gram.items()}
             both = {support: x + x.triu(1).T for support, x in halves.items()}  # to the last bit, as files have one
             _add(total.setdefault(key(by_log[source][number], state), {}), both, float(step))
     return total
 
 
-def _add(total: Surplus, surplus: Surplus, weight: float) -> None:
-    for support, x in surplus.items():
+def _add(total: NoiseGram, noise_gram: NoiseGram, weight: float) -> None:
+    for support, x in noise_gram.items():
         total[support] = total[support] + weight * x if support in total else weight * x
 
 
-def surplus_of_share(surplus: Mapping[Key, Surplus], key: Callable[[Key], Other], share: float) -> dict[Other, Surplus]:
-    """About the surplus of an evenly spread share of the rows, by another key of theirs."""
-    total: dict[Other, Surplus] = {}
-    for one, of_one in surplus.items():
+def noise_gram_of_share(
+    noise_gram: Mapping[Key, NoiseGram], key: Callable[[Key], Other], share: float
+) -> dict[Other, NoiseGram]:
+    """About the noise Gram matrix of an evenly spread share of the rows, by another key of theirs."""
+    total: dict[Other, NoiseGram] = {}
+    for one, of_one in noise_gram.items():
         _add(total.setdefault(key(one), {}), of_one, share)
     return total
 
@@ -136,11 +138,11 @@ _Place = tuple[str, int, ContactState]
 
 
 @torch.no_grad()
-def _surplus_of_chunks(
+def _noise_gram_of_chunks(
     builder: RowBuilder, pieces: Mapping[str, Sequence[Samples]], chunks: Iterator[tuple[Samples, ContactState]]
-) -> dict[_Place, Surplus]:
-    """The surplus by log, number of the piece and contact state: half of what pairs of samples with noise have more."""
-    out: dict[_Place, Surplus] = {}
+) -> dict[_Place, NoiseGram]:
+    """By log, number of the piece and contact state: half of what pairs of samples with noise have more."""
+    out: dict[_Place, NoiseGram] = {}
     workspace = Workspace()
     for samples, state in chunks:
         noise, count, own = samples.motion_noise, len(samples), pieces[samples.source]
@@ -179,7 +181,7 @@ class ColumnPrior:
 
 @dataclass(frozen=True)
 class CorrectedTriangle:
-    """A factor without its surplus.
+    """A factor without what noise of the motion adds.
 
     Attributes:
         R: (columns + 1, columns + 1), upper triangular, right-hand side last.
@@ -196,7 +198,7 @@ class CorrectedTriangle:
 
 @one_thread()
 def corrected_triangle(factor: TriangularFactor, prior: ColumnPrior) -> CorrectedTriangle:
-    """A factor without its surplus: what noise of the motion adds to its rows.
+    """A factor without what noise of the motion adds to its rows.
 
     Residuals remain those of the rows at the parameters that fit R best. With a share of noise s in the information on
     a combination, of which 1 - `LEAST_SIGNAL` is taken off at most, the combination follows its data by
@@ -208,21 +210,21 @@ def corrected_triangle(factor: TriangularFactor, prior: ColumnPrior) -> Correcte
         prior: of the parameters in its columns.
     """
     R = factor.triangle().numpy()
-    if not factor.surplus:
+    if not factor.noise_gram:
         return CorrectedTriangle(R)
-    rows, rhs, surplus = R[:, :-1], R[:, -1], factor.whole_surplus().numpy()
+    rows, rhs, noise_gram = R[:, :-1], R[:, -1], factor.whole_noise_gram().numpy()
     size, scale = np.linalg.norm(rows, axis=0), column_scale(rows)
     U, values, Vh = np.linalg.svd(rows * scale, full_matrices=False)
     kept = is_significant(values, _RESOLVED)
     other = is_significant(values, RANK_TOLERANCE) & ~kept
     whitening = scale[:, None] * Vh[kept].T / values[kept]  # rows @ whitening has orthonormal columns
-    noise = whitening.T @ surplus[:-1, :-1] @ whitening
+    noise = whitening.T @ noise_gram[:-1, :-1] @ whitening
     shares, turn = np.linalg.eigh(0.5 * (noise + noise.T))
     if np.abs(shares).max(initial=0.0) < _NEGLIGIBLE:
         return CorrectedTriangle(R, NoiseShares.of(shares))
     left = np.clip(1.0 - shares, LEAST_SIGNAL, _MOST_SIGNAL)
     combinations = turn.T @ (values[kept, None] * Vh[kept] * size)
-    target = turn.T @ (U[:, kept].T @ rhs - whitening.T @ surplus[:-1, -1])
+    target = turn.T @ (U[:, kept].T @ rhs - whitening.T @ noise_gram[:-1, -1])
     remaining = np.where(shares > 1.0 - LEAST_SIGNAL, left - np.maximum(1.0 - shares, 0.0), 0.0)
     target += remaining * (combinations[:, : len(prior.nominal)] @ prior.nominal)
     best = whitening @ (turn @ (target / left))

@@ -1,4 +1,4 @@
-"""Stretches of a log without a break: preprocessed each by itself, and joint torques that act later than recorded."""
+"""Segments of a log without a break: preprocessed each by itself, and joint torques that act later than recorded."""
 
 from __future__ import annotations
 
@@ -23,27 +23,27 @@ from torchid.logs.signal_noise import signal_noise, warn_of_noisy_accelerations
 from torchid.logs.timeline import DROPPED_PERIODS, FEWEST_DIFFERENTIATED, LONGEST_STEP, Timeline, spline_derivatives
 
 
-def preprocess_stretches(
+def preprocess_segments(
     log: Log,
-    stretches: Sequence[slice],
+    segments: Sequence[slice],
     cutoff_hz: float | None,
     sample_rate_hz: float | None,
     sign_width: float | None = None,
 ) -> tuple[Log, int]:
-    """As `preprocess`, of stretches of a log without what is between them.
+    """As `preprocess`, of segments of a log without what is between them.
 
     Args:
-        log: as recorded; between stretches fields may be NaN that have no gaps else.
-        stretches: of its samples.
+        log: as recorded; between segments fields may be NaN that have no gaps else.
+        segments: of its samples.
         cutoff_hz: as of `preprocess`.
         sample_rate_hz: likewise.
         sign_width: likewise.
 
     Returns:
-        One log of all stretches, and how many samples were in stretches too short for the filter or for derivatives.
+        One log of all segments, and how many samples were in segments too short for the filter or for derivatives.
 
     Raises:
-        InputError: as `preprocess`, or all stretches are too short.
+        InputError: as `preprocess`, or all segments are too short.
 
     Warns:
         TorchidWarning: as `preprocess`.
@@ -51,59 +51,59 @@ def preprocess_stretches(
     with about_file(log.source):
         whole = make_timeline(log.time, lacks_derivatives(log), cutoff_hz, sample_rate_hz, sign_width)
         if whole is None:
-            return _joined([log.select(stretch) for stretch in stretches]), 0
-        usable = long_stretches(log.time, stretches, whole)
+            return _joined([log.select(segment) for segment in segments]), 0
+        usable = long_segments(log.time, segments, whole)
     coverage = {name: measure_coverage(log, name) for name in gapless_fields(log, whole)}
     for name, found_of in coverage.items():
         warn_of_gaps(log, name, found_of)
     log = dataclasses.replace(log, contact_unloaded=unloaded_readings(log))
     parts = []
-    longest_of = max(usable, key=lambda stretch: stretch.stop - stretch.start)
-    for stretch in usable:
-        part = log.select(stretch)
+    longest_of = max(usable, key=lambda segment: segment.stop - segment.start)
+    for segment in usable:
+        part = log.select(segment)
         with about_file(log.source):
             timeline = make_timeline(part.time, True, cutoff_hz, sample_rate_hz, sign_width)
         if timeline is None:
             raise ValueError("nothing to derive")
         parts.append(move_to_timeline(part, timeline, coverage))
-        if stretch is longest_of:
+        if segment is longest_of:
             with about_file(log.source):
                 warn_of_noisy_accelerations(part, parts[-1], timeline, signal_noise(part, timeline))
-    return _joined(parts), count_samples(stretches) - count_samples(usable)
+    return _joined(parts), count_samples(segments) - count_samples(usable)
 
 
-def long_stretches(time: FloatArray, stretches: Sequence[slice], whole: Timeline) -> list[slice]:
-    """The stretches that are long enough for the filter and for derivatives; LogError if none is.
+def long_segments(time: FloatArray, segments: Sequence[slice], whole: Timeline) -> list[slice]:
+    """The segments that are long enough for the filter and for derivatives; LogError if none is.
 
     Args:
         time: stamps of the log as recorded (N,) [s].
-        stretches: of its samples.
+        segments: of its samples.
         whole: what its timeline would be without gaps.
     """
-    usable = [stretch for stretch in stretches if _is_long_enough(time, stretch, whole)]
+    usable = [segment for segment in segments if _is_long_enough(time, segment, whole)]
     if not usable:
-        longest = max((time[x.stop - 1] - time[x.start] for x in stretches), default=0.0)
+        longest = max((time[x.stop - 1] - time[x.start] for x in segments), default=0.0)
         cutoff_hz = whole.cutoff_hz
         needed = f"more than {2.0 * DROPPED_PERIODS / cutoff_hz:.3g} s" if cutoff_hz else "more samples"
-        found = f"stretches of at most {longest:.3g} s without a gap"
+        found = f"segments of at most {longest:.3g} s without a gap"
         raise LogError.at_field("time", found, f"{needed}, of which both ends are dropped, or a higher cutoff_hz")
     return usable
 
 
-def count_samples(stretches: Sequence[slice]) -> int:
-    """How many samples stretches have together."""
-    return sum(stretch.stop - stretch.start for stretch in stretches)
+def count_samples(segments: Sequence[slice]) -> int:
+    """How many samples segments have together."""
+    return sum(segment.stop - segment.start for segment in segments)
 
 
-def _is_long_enough(time: FloatArray, stretch: slice, whole: Timeline) -> bool:
-    """Whether two samples or more of a stretch are left, and two of those that it is resampled to."""
-    count = stretch.stop - stretch.start
+def _is_long_enough(time: FloatArray, segment: slice, whole: Timeline) -> bool:
+    """Whether two samples or more of a segment are left, and two of those that it is resampled to."""
+    count = segment.stop - segment.start
     if count <= FEWEST_DIFFERENTIATED:
         return False
     if whole.low_pass is None or whole.cutoff_hz is None:
         return True
     step = float(np.median(np.diff(time)))
-    left = time[stretch.stop - 1] - time[stretch.start] - 2.0 * DROPPED_PERIODS / whole.cutoff_hz
+    left = time[segment.stop - 1] - time[segment.start] - 2.0 * DROPPED_PERIODS / whole.cutoff_hz
     rate = step if whole.output is None else max(step, float(np.median(np.diff(whole.output))))
     return bool(left > 2.0 * rate and count > 2 * whole.low_pass.padding)
 
@@ -132,10 +132,10 @@ def with_delayed_torques(log: Log, delay: float) -> Log:
     if not kept.any():
         found = f"{log.time[-1] - log.time[0]:.3g} s, no longer than actuators.delay of {delay:g} s"
         raise LogError(log.source, "time", found, "a longer log")
-    for stretch in unbroken_stretches(log.time):
-        at = stretch.start + np.flatnonzero(kept[stretch])
+    for segment in unbroken_segments(log.time):
+        at = segment.start + np.flatnonzero(kept[segment])
         if len(at):
-            torque[at] = _between(log.time[stretch], log.joint_torque[stretch], log.time[at] - delay)
+            torque[at] = _between(log.time[segment], log.joint_torque[segment], log.time[at] - delay)
     chosen = np.flatnonzero(kept)
     whole = slice(int(chosen[0]), int(chosen[-1]) + 1)
     return replace(log, joint_torque=torque).select(whole if kept[whole].all() else chosen)
@@ -144,13 +144,13 @@ def with_delayed_torques(log: Log, delay: float) -> Log:
 def recorded_at_delays(time: FloatArray, delays: tuple[float, ...]) -> BoolArray:
     """Stamps (N,) [s] that are, by each of some delays [s], within what was recorded without a break, (N,)."""
     kept = np.zeros(len(time), dtype=bool)
-    for stretch in unbroken_stretches(time):
-        own = time[stretch]
-        kept[stretch] = np.all([(own - delay >= own[0]) & (own - delay <= own[-1]) for delay in delays], axis=0)
+    for segment in unbroken_segments(time):
+        own = time[segment]
+        kept[segment] = np.all([(own - delay >= own[0]) & (own - delay <= own[-1]) for delay in delays], axis=0)
     return kept
 
 
-def unbroken_stretches(time: FloatArray) -> Iterator[slice]:
+def unbroken_segments(time: FloatArray) -> Iterator[slice]:
     """Samples without a longer step than a spline is drawn across."""
     steps = np.diff(time)
     ends = np.flatnonzero(steps > LONGEST_STEP * np.median(steps)) + 1 if len(steps) else np.zeros(0, dtype=int)

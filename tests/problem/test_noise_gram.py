@@ -26,7 +26,7 @@ from torchid.problem.compression import (
 )
 from torchid.problem.linear import parameter_scale
 from torchid.problem.motion_noise import MotionNoise
-from torchid.problem.surplus import LEAST_SIGNAL, ColumnPrior, NoiseShares, corrected_triangle
+from torchid.problem.noise_gram import LEAST_SIGNAL, ColumnPrior, NoiseShares, corrected_triangle
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, named_sensors
 
@@ -109,35 +109,35 @@ def draws(samples: Samples, count: int) -> Iterator[Samples]:
         )
 
 
-def test_the_surplus_is_what_noise_adds_on_average(robot: Robot, builder: RowBuilder) -> None:
+def test_the_noise_gram_is_what_noise_adds_on_average(robot: Robot, builder: RowBuilder) -> None:
     samples = motion(robot, 2000, 0.04)
     found = compress([samples], builder)
     plain = gram(compress([replace(samples, motion_noise=None)], builder))
     assert np.array_equal(gram(found), plain), "the factor itself stays"
     noisy = [gram(compress([one], builder)) for one in draws(samples, 40)]
     size = np.sqrt(np.diag(plain)).clip(1e-9)
-    expected, scatter, surplus = (
+    expected, scatter, noise_gram = (
         x / np.outer(size, size)
-        for x in (np.mean(noisy, axis=0) - plain, np.std(noisy, axis=0), found.whole_surplus().numpy())
+        for x in (np.mean(noisy, axis=0) - plain, np.std(noisy, axis=0), found.whole_noise_gram().numpy())
     )
     chance = np.linalg.norm(scatter) / np.sqrt(40)
-    assert np.linalg.norm(surplus - expected) < 2.0 * chance + 0.1 * np.linalg.norm(expected)
+    assert np.linalg.norm(noise_gram - expected) < 2.0 * chance + 0.1 * np.linalg.norm(expected)
     assert np.linalg.norm(expected) > 3.0 * chance, "or nothing is shown"
 
 
 def test_parts_and_blocks_have_their_own_and_together_that_of_all(robot: Robot, builder: RowBuilder) -> None:
     samples = motion(robot, 2000)
-    whole = compress([samples], builder).whole_surplus()
+    whole = compress([samples], builder).whole_noise_gram()
     parts = compress_in_blocks(split_into_folds([samples], builder), builder)
     assert len({(part.fold, part.block) for part in parts}) > 10
-    assert all(part.factor.surplus for part in parts)
-    together = merge_factors((part.factor for part in parts), builder).whole_surplus()
+    assert all(part.factor.noise_gram for part in parts)
+    together = merge_factors((part.factor for part in parts), builder).whole_noise_gram()
     assert torch.allclose(together, whole, rtol=0.0, atol=1e-12 * float(whole.norm()))
     one = next(part for part in parts if part.fold == 2 and part.block == 1)
     own = [x for x in split_into_folds([samples], builder) if x.fold == 2]
     cut = [x[int(len(x) * k / 4) : int(len(x) * (k + 1) / 4)] for x in own for k in (1,)]
-    alone = {part.state: part.factor.whole_surplus() for part in compress_parts(cut, builder)}
-    assert torch.allclose(one.factor.whole_surplus(), alone[one.state], rtol=0.0, atol=1e-9)
+    alone = {part.state: part.factor.whole_noise_gram() for part in compress_parts(cut, builder)}
+    assert torch.allclose(one.factor.whole_noise_gram(), alone[one.state], rtol=0.0, atol=1e-9)
 
 
 def test_contacts_of_different_rank_are_told_apart(robot: Robot, builder: RowBuilder) -> None:
@@ -145,32 +145,32 @@ def test_contacts_of_different_rank_are_told_apart(robot: Robot, builder: RowBui
     straight = samples.joint_position.clone()
     straight[::3] = 0.0  # contacts on one axis
     mixed = replace(samples, joint_position=straight, active=torch.ones_like(samples.active))
-    whole = compress([mixed], builder).whole_surplus()
-    alone = [compress([replace(mixed[k : k + 1])], builder).whole_surplus() for k in range(len(mixed))]
+    whole = compress([mixed], builder).whole_noise_gram()
+    alone = [compress([replace(mixed[k : k + 1])], builder).whole_noise_gram() for k in range(len(mixed))]
     assert torch.allclose(whole, torch.stack(alone).sum(0), rtol=0.0, atol=1e-10 * float(whole.norm()))
 
 
 def test_long_logs_are_sampled(robot: Robot, builder: RowBuilder, monkeypatch: pytest.MonkeyPatch) -> None:
     samples = motion(robot, 6000)
-    whole = compress([samples], builder).whole_surplus().numpy()
-    monkeypatch.setattr("torchid.problem.surplus._PERTURBED", 1500)
-    sampled = compress([samples], builder).whole_surplus().numpy()
+    whole = compress([samples], builder).whole_noise_gram().numpy()
+    monkeypatch.setattr("torchid.problem.noise_gram._PERTURBED", 1500)
+    sampled = compress([samples], builder).whole_noise_gram().numpy()
     size = np.sqrt(np.diag(gram(compress([samples], builder))).clip(1e-9))
     off, scaled = ((x / np.outer(size, size)) for x in (sampled - whole, whole))
     assert 0.0 < np.linalg.norm(off) < 0.3 * np.linalg.norm(scaled)
 
 
-def test_a_corrected_factor_is_that_of_the_rows_without_their_surplus(robot: Robot, builder: RowBuilder) -> None:
+def test_a_corrected_factor_is_that_of_the_rows_without_noise(robot: Robot, builder: RowBuilder) -> None:
     factor = compress([motion(robot, 2000, 0.01)], builder)
     corrected_factor = corrected_triangle(factor, column_prior(builder, robot))
     R, noise = corrected_factor.R, corrected_factor.noise
     assert corrected_factor.held is None
-    plain, surplus = gram(factor), factor.whole_surplus().numpy()
+    plain, noise_gram = gram(factor), factor.whole_noise_gram().numpy()
     assert 0.0 < noise.largest < 1.0 - LEAST_SIGNAL
     assert noise.lost == 0
     corrected = R.T @ R
     size = np.sqrt(np.diag(plain))[:-1].clip(1e-9)
-    off = (corrected - (plain - surplus)) / np.outer(np.append(size, size.max()), np.append(size, size.max()))
+    off = (corrected - (plain - noise_gram)) / np.outer(np.append(size, size.max()), np.append(size, size.max()))
     assert np.abs(off[:-1]).max() < 1e-9, "all but the square of the right-hand side"
     best = np.linalg.lstsq(R[:-1, :-1], R[:-1, -1], rcond=1e-9)[0]
     rows = factor.triangle().numpy()
@@ -203,12 +203,12 @@ def factor_with(shares: tuple[float, ...], phi: np.ndarray) -> tuple[TriangularF
     U, values, Vh = np.linalg.svd(X, full_matrices=False)
     turn = np.linalg.qr(rng.normal(size=(count, count)))[0]
     combinations = turn.T @ (values[:, None] * Vh)
-    surplus = np.zeros((count + 1, count + 1))
-    surplus[:-1, :-1] = combinations.T * shares @ combinations
-    surplus[:-1, -1] = surplus[-1, :-1] = X.T @ y - (X.T @ X - surplus[:-1, :-1]) @ phi
+    noise_gram = np.zeros((count + 1, count + 1))
+    noise_gram[:-1, :-1] = combinations.T * shares @ combinations
+    noise_gram[:-1, -1] = noise_gram[-1, :-1] = X.T @ y - (X.T @ X - noise_gram[:-1, :-1]) @ phi
     factor, support = TriangularFactor(count), tuple(range(count))
     factor.add(support, torch.from_numpy(np.column_stack([X, y])))
-    factor.add_surplus({support: torch.from_numpy(surplus)})
+    factor.add_noise_gram({support: torch.from_numpy(noise_gram)})
     return factor, combinations
 
 
@@ -242,7 +242,8 @@ def test_combinations_with_more_noise_than_information_keep_to_the_prior() -> No
     for share in (1.5, 1000.0):
         factor, combinations = factor_with((0.1, share), np.array([1.0, 1.0]))
         gained = gram(factor)[:-1, -1]
-        factor.surplus[0, 1][:-1, -1] = factor.surplus[0, 1][-1, :-1] = torch.from_numpy(gained)  # forces tell nothing
+        of_noise = factor.noise_gram[0, 1]
+        of_noise[:-1, -1] = of_noise[-1, :-1] = torch.from_numpy(gained)  # forces tell nothing
         corrected = corrected_triangle(factor, prior)
         best = np.linalg.solve(corrected.R[:-1, :-1], corrected.R[:-1, -1])
         assert combinations[1] @ best == pytest.approx(combinations[1] @ prior.nominal, rel=1e-9)
@@ -278,7 +279,7 @@ def test_intervals_hold_what_data_that_are_mostly_noise_leave_to_the_prior(robot
 
 def test_without_noise_nothing_changes(robot: Robot, builder: RowBuilder) -> None:
     factor = compress([replace(motion(robot, 300), motion_noise=None)], builder)
-    assert not factor.surplus
+    assert not factor.noise_gram
     prior = column_prior(builder, robot)
     corrected = corrected_triangle(factor, prior)
     R, noise = corrected.R, corrected.noise
@@ -291,14 +292,14 @@ def test_without_noise_nothing_changes(robot: Robot, builder: RowBuilder) -> Non
     )
 
 
-def test_scaled_merged_and_compact_factors_take_their_surplus_along(robot: Robot, builder: RowBuilder) -> None:
+def test_scaled_merged_and_compact_factors_take_their_noise_gram_along(robot: Robot, builder: RowBuilder) -> None:
     one, two = (compress([motion(robot, count)], builder) for count in (300, 700))
-    expected = 4.0 * one.whole_surplus() + two.whole_surplus()
+    expected = 4.0 * one.whole_noise_gram() + two.whole_noise_gram()
     both = one.scaled(2.0)
     both.merge(two)
-    assert torch.allclose(both.whole_surplus(), expected, rtol=1e-12)
-    assert torch.allclose(both.compact().whole_surplus(), expected, rtol=1e-12)
-    assert not one.surplus.keys() - both.surplus.keys()
+    assert torch.allclose(both.whole_noise_gram(), expected, rtol=1e-12)
+    assert torch.allclose(both.compact().whole_noise_gram(), expected, rtol=1e-12)
+    assert not one.noise_gram.keys() - both.noise_gram.keys()
 
 
 def test_parameters_of_noisy_motion_are_no_more_too_small(robot: Robot) -> None:
