@@ -98,13 +98,10 @@ def test_the_barrier_has_the_mean_of_an_exponential_tail() -> None:
 
 
 @pytest.mark.parametrize(
-    ("bodies", "prior_error", "steps"),
-    [(1, 0.6, 2000), *(pytest.param(2, x, 5000, marks=pytest.mark.slow) for x in (0.2, 0.6))],
+    ("prior_error", "steps"), [(0.6, 2000), *(pytest.param(x, 5000, marks=pytest.mark.slow) for x in (0.2, 0.6))]
 )
-def test_mean_and_covariance_are_those_of_long_chains_where_bodies_are_cut_off(
-    bodies: int, prior_error: float, steps: int
-) -> None:
-    problem, _ = active_case(3, bodies)
+def test_mean_and_covariance_are_those_of_long_chains_where_bodies_are_cut_off(prior_error: float, steps: int) -> None:
+    problem, _ = active_case(3)
     posterior = posterior_of(problem, Conditions(1e-3), noise=0.1)
     conic = posterior.conic_problem(prior_error)
     sampler = TruncatedGaussian(conic, posterior.owners())
