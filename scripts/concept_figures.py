@@ -22,8 +22,15 @@ from torchid.commands.results import Identification
 from torchid.identifiability.structure import structural_problem
 from torchid.parameters import PARAMETERS, PER_BODY, Array
 from torchid.problem.predict import force_series, null_space_part
-from torchid.report.figures import STYLE, identifiability_figure, save_figures
-from torchid.report.palette import IDENTIFIED, MEASURED, NOISE, NOMINAL
+from torchid.report.figure_style import (
+    IDENTIFIED_COLOR,
+    MEASURED_COLOR,
+    NOISE_COLOR,
+    NOMINAL_COLOR,
+    STYLE,
+    save_figures,
+)
+from torchid.report.figures import identifiability_figure
 from torchid.report.parameter_figures import INTERVAL
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -35,7 +42,7 @@ STATES = {
     "in the air": [(False, False, False, False)],
     "all of these": [(True, True, True, True), (True, False, False, True), (False, False, False, False)],
 }
-SENSORS = {"contacts": NOMINAL, "joints": IDENTIFIED, "full": MEASURED}
+SENSORS = {"contacts": NOMINAL_COLOR, "joints": IDENTIFIED_COLOR, "full": MEASURED_COLOR}
 
 
 def main() -> int:
@@ -81,7 +88,7 @@ def projection_figure(time: Array, before: Array, after: Array) -> Figure:
     rows = ("base force z [N]", "front_left_knee [N m]")
     for column, (what, values) in enumerate({"K φ - Sᵀ τ": before, "V Vᵀ (K φ - Sᵀ τ)": after}.items()):
         for axis, name, series in zip(axes[:, column], rows, values, strict=True):
-            axis.plot(time, series, color=(NOMINAL, IDENTIFIED)[column], linewidth=1.0)
+            axis.plot(time, series, color=(NOMINAL_COLOR, IDENTIFIED_COLOR)[column], linewidth=1.0)
             axis.set_title(f"{what}: rms {np.sqrt(np.mean(series**2)):.3g}", loc="left")
             axis.set_ylabel(name)
             axis.set_xlim(0.0, time[-1])
@@ -130,9 +137,11 @@ def interval_figure(run: Identification) -> Figure:
     for axis, (name, true) in zip(figure.subplots(1, 2, sharey=True), TRUE_FRICTION.items(), strict=True):
         k, place = PARAMETERS.index(name), range(len(names))
         reach = INTERVAL * errors[1:, k]
-        axis.errorbar(run.phi[1:, k], place, xerr=reach, fmt="o", color=IDENTIFIED, capsize=2, label="identified, 95 %")
-        axis.axvline(true, color=MEASURED, linewidth=1.0, linestyle="--", label="truth of the simulation")
-        axis.axvline(0.0, color=NOISE, linewidth=0.8)
+        axis.errorbar(
+            run.phi[1:, k], place, xerr=reach, fmt="o", color=IDENTIFIED_COLOR, capsize=2, label="identified, 95 %"
+        )
+        axis.axvline(true, color=MEASURED_COLOR, linewidth=1.0, linestyle="--", label="truth of the simulation")
+        axis.axvline(0.0, color=NOISE_COLOR, linewidth=0.8)
         axis.set_yticks(place, names)
         axis.set_xlabel(units[name])
     axis.invert_yaxis()

@@ -32,8 +32,8 @@ from torchid.boundary import run_guarded
 from torchid.fitting.posterior import ParameterSamples
 from torchid.logs import Log, write_log
 from torchid.parameters import FRICTION, Array, perturb_parameters
+from torchid.report.figure_style import CATEGORY_COLORS, IDENTIFIED_COLOR, MEASURED_COLOR, NOISE_COLOR, NOMINAL_COLOR
 from torchid.report.mjcf_of_urdf import mjcf_of_urdf
-from torchid.report.palette import CATEGORIES, IDENTIFIED, MEASURED, NOISE, NOMINAL
 from torchid.robot import Robot
 
 _URDF = Path(torchid.__file__).parent / "demo" / "quadruped.urdf"
@@ -162,7 +162,9 @@ def draw(found: dict[str, tuple[list[float], list[float]]], path: Path) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    colours = dict(zip(found, (MEASURED, NOMINAL, NOISE, IDENTIFIED, CATEGORIES[0]), strict=True))
+    colours = dict(
+        zip(found, (MEASURED_COLOR, NOMINAL_COLOR, NOISE_COLOR, IDENTIFIED_COLOR, CATEGORY_COLORS[0]), strict=True)
+    )
     figure, axes = plt.subplots(1, 2, figsize=(9.0, 2.8), sharey=True, layout="constrained")
     titles = "tracking error [mrad rms]", "distance from the true robot's motion [mrad rms]"
     rng = np.random.default_rng(0)
@@ -173,7 +175,7 @@ def draw(found: dict[str, tuple[list[float], list[float]]], path: Path) -> None:
             axis.plot(x, -height + spread, "o" if len(x) > 1 else "D", color=colours[name], ms=4 if len(x) > 1 else 7)
         axis.set_xlabel(title)
         axis.grid(axis="x", alpha=0.3)
-    axes[0].axvline(1e3 * found["true robot"][0][0], color=MEASURED, lw=0.8)
+    axes[0].axvline(1e3 * found["true robot"][0][0], color=MEASURED_COLOR, lw=0.8)
     axes[0].set_yticks([-height for height in range(len(found))], list(found))
     figure.savefig(path, dpi=100)
 

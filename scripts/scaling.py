@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
 from torchid.ranks import join_launched, leave_launched, share_work
-from torchid.report.figures import save_figure
+from torchid.report.figure_style import save_figure
 
 ROBOTS = (
     Case("Bolt", "bolt_description/robots/bolt.urdf", ("FL_FOOT", "FR_FOOT"), "point"),

@@ -11,6 +11,7 @@ from typing import Any, NoReturn, TypeAlias
 
 from torchid import __version__
 from torchid.boundary import importing, plain_streams, run_guarded, run_in_ranks
+from torchid.commands import EXPORT_FORMATS, SAMPLE_FORMATS
 from torchid.copies import copies_allowed
 from torchid.errors import ConfigError, during
 from torchid.ranks import end_process, is_launched_first, share_work
@@ -20,9 +21,7 @@ _COMPRESS = "compress the training logs of an experiment file to small files of 
 _EVALUATE = "predict the forces of further logs with the parameters of a run"
 _REPLAY = "drive the robot in MuJoCo with the torques of a log, and say how far it drifts (needs the extra [sim])"
 _EXPORT = "write the identified parameters of a run for a simulator: MJCF, URDF, Isaac Lab's actuators, or JSON"
-_FORMATS = ("mjcf", "urdf", "isaaclab", "json")  # those of torchid.commands.export, which takes long to import
 _SAMPLE = "draw parameter sets from what the data of a run and a prior leave open, for domain randomization"
-_SAMPLE_FORMATS = ("npz", "urdf", "mjcf", "ranges")  # those of torchid.commands.sample
 _REPORT = "make report.html of a run anew, with what the checks of its logs find (needs the extra [report])"
 _ANALYZE = "analyze what sensors and motion determine, and plan the smallest sensor set"
 _INIT = "write an experiment file for a robot and a log, with a map of its columns or topics, and say what was guessed"
@@ -136,7 +135,7 @@ def _add_uses_of_runs(commands: _Commands) -> None:
     replay.set_defaults(command=_replay)
     export = commands.add_parser("export", help=_EXPORT, description=_EXPORT)
     export.add_argument("run", help="run folder")
-    export.add_argument("--format", required=True, choices=_FORMATS, help="what to write")
+    export.add_argument("--format", required=True, choices=EXPORT_FORMATS, help="what to write")
     export.add_argument("--output", metavar="FILE", help="file to write (default: standard output)")
     export.add_argument("--overwrite", action="store_true", help="replace this file if it exists")
     export.set_defaults(command=_export)
@@ -151,7 +150,7 @@ def _add_sample(commands: _Commands) -> None:
     sample.add_argument("run", help="run folder")
     sample.add_argument("--count", type=int, metavar="N", help="number of sets (default: 10000, of robots' files 20)")
     what = "arrays with names, a file of the robot for each set, or ranges and correlations (default: by --output)"
-    sample.add_argument("--format", choices=_SAMPLE_FORMATS, help=what)
+    sample.add_argument("--format", choices=SAMPLE_FORMATS, help=what)
     sample.add_argument("--output", metavar="FILE", help="FILE.npz, FILE.json, or a folder for robots' files")
     prior = "standard deviation of the robot file's parameters, as a share of each body (default: 0.2)"
     sample.add_argument("--prior-error", type=float, default=0.2, metavar="SHARE", help=prior)

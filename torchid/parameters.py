@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 PARAMETERS = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "fc", "fv")
-UNITS = ("kg", *["kg m"] * 3, *["kg m^2"] * 6, "N m", "N m s/rad")
+PARAMETER_UNITS = ("kg", *["kg m"] * 3, *["kg m^2"] * 6, "N m", "N m s/rad")
 PER_BODY = len(PARAMETERS)
 INERTIAL = slice(0, 10)
 MASS = 0

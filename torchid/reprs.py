@@ -9,7 +9,7 @@ from textwrap import wrap
 
 from torchid.errors import join_names
 
-LINES, _WIDTH = 10, 110
+REPR_LINES, _WIDTH = 10, 110
 _UNBROKEN = "\N{NO-BREAK SPACE}"
 _TEXT = 60  # characters of one value
 
@@ -27,7 +27,7 @@ def short_repr(thing: object) -> str:
         lines = wrap(title, _WIDTH, subsequent_indent="  ")
         lines += wrap(", ".join(_fields(thing, title)), _WIDTH, initial_indent="  ", subsequent_indent="  ")
     lines = [line.replace(_UNBROKEN, " ") for line in lines]
-    return "\n".join(lines if len(lines) <= LINES else [*lines[: LINES - 1], "  ..."])
+    return "\n".join(lines if len(lines) <= REPR_LINES else [*lines[: REPR_LINES - 1], "  ..."])
 
 
 def _fields(thing: object, title: str) -> Iterator[str]:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
-from pydantic import AfterValidator, BeforeValidator, Field, PlainValidator, TypeAdapter, ValidationError
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PlainValidator, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
 
@@ -35,6 +35,9 @@ def _number_or(words: tuple[str | None, ...], number: Any, accepted: str) -> Pla
     return PlainValidator(validate)
 
 
+STRICT = ConfigDict(extra="forbid")
+"""Of blocks of settings: a key that is none is refused."""
+
 AUTO: Literal["auto"] = "auto"
 """A value that the data choose."""
 
@@ -62,6 +65,7 @@ BelowOne = Annotated[Number, Field(ge=0.0, lt=1.0)]
 Tolerance = Annotated[Number, Field(gt=0.0, lt=1.0)]
 Count = Annotated[int, BeforeValidator(_not_bool), Field(ge=1)]
 Seed = Annotated[int, BeforeValidator(_not_bool), Field(ge=0)]
+Name = Annotated[str, Field(min_length=1)]
 NamedClass = Annotated[dict[str, Any], AfterValidator(_has_name)]
 """A class of another package by its name, and its options: `{name: Adam, lr: 0.05}`."""
 

@@ -17,12 +17,11 @@ from paper.settings import SHOWN
 from torchid.commands.folder import write_json
 from torchid.parameters import Array
 from torchid.problem.metrics import ROW_GROUPS, group_name
-from torchid.report.figures import STYLE, label_decades, save_figure
-from torchid.report.palette import IDENTIFIED, NOISE, NOMINAL
+from torchid.report.figure_style import IDENTIFIED_COLOR, NOISE_COLOR, NOMINAL_COLOR, STYLE, label_decades, save_figure
 from torchid.report.tables import table_text
 from torchid.report.tensorboard import write_comparison
 
-_COLORS = (NOMINAL, IDENTIFIED, "#009e73", "#cc79a7", "#e69f00", NOISE)  # of Okabe and Ito
+_COLORS = (NOMINAL_COLOR, IDENTIFIED_COLOR, "#009e73", "#cc79a7", "#e69f00", NOISE_COLOR)  # of Okabe and Ito
 
 
 @dataclass(frozen=True)

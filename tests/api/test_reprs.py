@@ -13,7 +13,7 @@ from repository import DEMO
 import torchid
 from torchid.config import load_config
 from torchid.fitting.experiment import set_up
-from torchid.reprs import LINES, short_repr
+from torchid.reprs import REPR_LINES, short_repr
 
 FILE = DEMO / "quadruped.yaml"
 
@@ -88,7 +88,7 @@ def things() -> Mapping[str, object]:
 def test_no_repr_is_longer_than_ten_lines(things: Mapping[str, object]) -> None:
     for name, thing in things.items():
         lines = repr(thing).splitlines()
-        assert 1 <= len(lines) <= LINES, name
+        assert 1 <= len(lines) <= REPR_LINES, name
         assert max(map(len, lines)) <= 200, name
         assert " object at 0x" not in repr(thing), name
 

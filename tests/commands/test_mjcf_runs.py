@@ -19,7 +19,8 @@ from pages import figures_of
 
 import torchid
 from torchid.cli import main
-from torchid.commands.export import FORMATS, export
+from torchid.commands import EXPORT_FORMATS
+from torchid.commands.export import export
 from torchid.commands.reading import LogReader
 from torchid.commands.report import report
 from torchid.config import load_config
@@ -100,7 +101,7 @@ def test_the_written_mjcf_has_the_parameters_of_the_run(runs: dict[str, Path]) -
 
 
 @pytest.mark.parametrize("key", ["urdf", "mjcf"])
-@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("form", EXPORT_FORMATS)
 @pytest.mark.filterwarnings("ignore:URDF. has no armature")
 def test_every_format_is_what_its_reader_reads(
     form: str, key: str, runs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -12,7 +12,7 @@ from matplotlib.image import imread
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from torchid.cli import main
-from torchid.report.figures import save_figure
+from torchid.report.figure_style import save_figure
 
 _RUN = ("forces", "errors", "parameters", "identifiability", "contributions")
 

@@ -14,8 +14,8 @@ from true_robots import true_parameters
 
 from torchid.estimators import Estimate, LeastSquares
 from torchid.logs import Log, read_log, write_log
+from torchid.logs.low_pass import FILTER_ORDER
 from torchid.logs.preprocess import preprocess
-from torchid.logs.timeline import FILTER_ORDER
 from torchid.problem import LinearProblem, RowBuilder, Samples, bind_log, compress, linear_problem
 from torchid.robot import Robot
 from torchid.sensing import SensorNoise, named_sensors

@@ -34,7 +34,7 @@ from torchid.problem import (
 )
 from torchid.problem.compression import FOLDS, compress_in_blocks, merge_folds, merge_states, split_into_folds
 from torchid.problem.metrics import ROW_GROUPS, WHITENED, describe_worse, worse_than_nominal
-from torchid.report.ridge import ridge_figure
+from torchid.report.figures import ridge_figure
 from torchid.sensing import Contact, SensorNoise, named_sensors
 
 FEET = [f"{place}_foot" for place in ("front_left", "front_right", "rear_left", "rear_right")]

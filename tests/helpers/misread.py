@@ -16,8 +16,8 @@ from welded import CONTACTS, SENSORS, STATES, machine
 from torchid.logs import Log
 from torchid.parameters import WRENCH_COMPONENTS
 from torchid.problem import ExtraTerms, RowBuilder
-from torchid.problem.extras import recorded_components
 from torchid.robot import Robot
+from torchid.sensing.sensors import recorded_components
 
 KINDS = {"f": "force", "m": "moment"}
 WIDTH = 0.3  # [rad/s] of the sign of velocities

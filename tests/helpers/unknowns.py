@@ -11,9 +11,9 @@ from torchid.estimators import Consistent, Estimate, LeastSquares
 from torchid.identifiability.confounding import ExtraEstimate, estimate_extras
 from torchid.problem import ExtraTerms, RowBuilder, Samples, assemble, compress_parts
 from torchid.problem.elimination import Assembly
-from torchid.problem.extras import recorded_components
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
+from torchid.sensing.sensors import recorded_components
 
 
 @dataclass(frozen=True)

@@ -125,7 +125,7 @@ def test_factors_that_one_block_of_time_makes_up_are_compared_within_blocks(
 ) -> None:
     """Of a segment of wrong readings, in which the joints of reference have factors of 0.02 and all others fit."""
     robot, log = arm()
-    shape = (scales.BLOCKS, 5 + 3)
+    shape = (scales.TIME_BLOCKS, 5 + 3)
     blocks = np.where(np.arange(8) < 5, 1.1, 0.0) * np.ones(shape)
     blocks[0, :3] = 0.02
     gains = scales.TorqueGains(

@@ -15,7 +15,7 @@ from rosbags import rosbag2
 from torchid.errors import InputError
 from torchid.logs import read_log
 from torchid.logs.joint_orders import GO, HG
-from torchid.logs.ros_files import Channel
+from torchid.logs.ros_files import BagChannel
 from torchid.logs.ros_messages import make_deserializer
 
 
@@ -60,7 +60,7 @@ def test_members_lie_where_the_idl_files_of_the_sdk_have_them(kind: str) -> None
         "machine": 5,
         "it": 77,
     }
-    message = make_deserializer(TOPIC, Channel(TOPIC, kind, "cdr"))(packed(layout(kind), numbers))
+    message = make_deserializer(TOPIC, BagChannel(TOPIC, kind, "cdr"))(packed(layout(kind), numbers))
     for i, motor in enumerate(message.motor_state):
         assert (motor.q, motor.dq, motor.tau_est) == tuple(numbers[f"{name}{i}"] for name in ("q", "dq", "tau"))
     for name, found in (("gyro", message.imu_state.gyroscope), ("acc", message.imu_state.accelerometer)):

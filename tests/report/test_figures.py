@@ -14,7 +14,8 @@ from torchid.estimators.least_squares import COMBINED, FIXED
 from torchid.fitting.calibration import Comparison
 from torchid.parameters import PER_BODY
 from torchid.problem import Metrics
-from torchid.report.figures import contribution_figure, decade, error_figure, identifiability_figure, label_decades
+from torchid.report.figure_style import decade, label_decades
+from torchid.report.figures import contribution_figure, error_figure, identifiability_figure
 
 
 def metrics(rms: float, noise: float | None) -> Metrics:

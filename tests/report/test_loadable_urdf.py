@@ -21,8 +21,8 @@ from torchid import parameters
 from torchid.errors import TorchidWarning
 from torchid.logs import write_log
 from torchid.report import identified_urdf
-from torchid.report.loadable_urdf import SMALLEST
 from torchid.report.mjcf_of_urdf import mjcf_of_urdf
+from torchid.report.urdf_files import SMALLEST
 from torchid.robot import Robot
 
 HUMAN = ROBOTS / "human_description/robots/human.urdf"

@@ -32,7 +32,7 @@ def test_the_parameters_are_in_the_papers_order() -> None:
     assert parameters.PER_BODY == 12
     phi = np.arange(10.0)
     np.testing.assert_array_equal(parameters.inertia_matrix(phi), [[4, 5, 6], [5, 7, 8], [6, 8, 9]])
-    assert len(parameters.UNITS) == 12
+    assert len(parameters.PARAMETER_UNITS) == 12
 
 
 @settings(max_examples=50, deadline=None, derandomize=True)

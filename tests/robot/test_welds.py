@@ -16,7 +16,7 @@ from torchid.errors import InputError, TorchidWarning
 from torchid.logs import Log
 from torchid.problem.log_joints import without_welded_joints
 from torchid.problem.samples import joint_order
-from torchid.report.parameter_files import identified_urdf
+from torchid.report.urdf_files import identified_urdf
 from torchid.robot import Robot, load_robot
 
 TURNED = '<origin xyz="0.1 -0.2 0.3" rpy="0.4 -0.7 1.1"/><axis xyz="0.6 0 0.8"/>'

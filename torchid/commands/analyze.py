@@ -27,7 +27,6 @@ from torchid.problem import Samples
 from torchid.problem.chunks import chunks_by_state, one_thread
 from torchid.problem.compression import free_parameters
 from torchid.problem.contact_state import ContactState
-from torchid.problem.extras import measured_components
 from torchid.problem.linear import parameter_scale
 from torchid.report.analysis import (
     SetAccuracy,
@@ -37,11 +36,12 @@ from torchid.report.analysis import (
     observability_document,
     sensor_plan_document,
 )
-from torchid.report.figures import save_figures, tree_figure
+from torchid.report.figure_style import save_figures
+from torchid.report.figures import tree_figure
 from torchid.report.tables import progress_bars
 from torchid.reprs import short_repr
 from torchid.sensing import Contact, SensorSet
-from torchid.sensing.sensors import NORMAL_FORCE
+from torchid.sensing.sensors import NORMAL_FORCE, measured_components
 from torchid.sensor_planning.demands import Candidate, candidates, count_channels, sensor_set
 from torchid.sensor_planning.observability import BaseObservability
 from torchid.sensor_planning.planner import PlanningProblem, SensorPlan, plan_sensors

@@ -16,8 +16,8 @@ from torchid.log_checks.weight import MAX_MASS_ERROR
 from torchid.logs.time_range import log_title
 from torchid.problem import Metrics
 from torchid.problem.metrics import ADVICE, DECISIVE_GROUPS, ERROR_GROUPS, LIMB_GROUPS, describe_worse, group_name
-from torchid.report.loadable_urdf import massless_ends
 from torchid.report.tables import noise_advice
+from torchid.report.urdf_files import massless_ends
 
 if TYPE_CHECKING:
     from torchid.commands.results import Identification

@@ -53,7 +53,7 @@ Files = Mapping[str, Mapping[str, Any]]
 
 
 @dataclass(frozen=True)
-class Entry:
+class CacheEntry:
     """What was stored: a document of JSON, and arrays that are mapped to their files and cannot be written to."""
 
     document: Mapping[str, Any]
@@ -107,7 +107,7 @@ class Cache:
         """Whether there is an entry, damaged or not."""
         return (self.folder / key / _DESCRIPTION).is_file()
 
-    def load(self, key: str) -> Entry | None:
+    def load(self, key: str) -> CacheEntry | None:
         """The entry of a key, None if there is none.
 
         Warns:
@@ -371,19 +371,19 @@ def _describe(folder: Path, key: str, document: Mapping[str, Any], files: Files)
     (folder / _DESCRIPTION).write_text(json.dumps(checked))
 
 
-def _read(folder: Path, key: str) -> Entry:
+def _read(folder: Path, key: str) -> CacheEntry:
     """Any exception where an entry is damaged, or none of this key."""
     path = folder / _DESCRIPTION
     if path.stat().st_size > _LARGEST:
         raise _DamagedError(f"{_DESCRIPTION} of {path.stat().st_size} bytes")
     checked = json.loads(path.read_bytes())
-    text = checked["entry"]
-    if hashlib.sha256(text.encode()).hexdigest() != checked["sha256"]:
+    if hashlib.sha256(checked["entry"].encode()).hexdigest() != checked["sha256"]:
         raise _DamagedError(f"{_DESCRIPTION} has changed")
-    entry = json.loads(text)
+    entry = json.loads(checked["entry"])
     if entry["key"] != key:
         raise _DamagedError("of another name")
-    return Entry(entry["document"], {name: _mapped(folder / f"{name}.npy", x) for name, x in entry["files"].items()})
+    arrays = {name: _mapped(folder / f"{name}.npy", x) for name, x in entry["files"].items()}
+    return CacheEntry(entry["document"], arrays)
 
 
 def _mapped(path: Path, written: Mapping[str, Any]) -> NDArray[Any]:

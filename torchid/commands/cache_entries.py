@@ -18,7 +18,7 @@ from pydantic import TypeAdapter
 from torch import Tensor
 
 from torchid import ranks
-from torchid.commands.cache import Cache, Entry, content_key, tensor_of
+from torchid.commands.cache import Cache, CacheEntry, content_key, tensor_of
 from torchid.commands.manifest import file_checksum
 from torchid.commands.reading import fits_contact_offsets
 from torchid.config.robot import RobotConfig
@@ -122,7 +122,7 @@ def samples_entry(read: ReadLog) -> tuple[dict[str, Any], dict[str, NDArray[Any]
     return document, arrays
 
 
-def samples_of_entry(entry: Entry, source: str, folder: Path | None) -> ReadLog:
+def samples_of_entry(entry: CacheEntry, source: str, folder: Path | None) -> ReadLog:
     """What was stored, of a log of this name; any exception where that is something else.
 
     Args:
@@ -247,7 +247,7 @@ def _packed(parts: Sequence[Part], sources: Sequence[str]) -> tuple[dict[str, An
     return document, {"values": packer.values}
 
 
-def _unpacked(entry: Entry, builder: RowBuilder, sources: Sequence[str]) -> list[Part]:
+def _unpacked(entry: CacheEntry, builder: RowBuilder, sources: Sequence[str]) -> list[Part]:
     """What was stored, of logs of these names; any exception where that is something else."""
     document, columns = entry.document, builder.width
     reader = PartReader(

@@ -26,8 +26,8 @@ from torchid.logs.tables import is_text_table
 from torchid.logs.time_range import split_range
 from torchid.problem import Samples
 from torchid.problem.chunks import ProgressCallback
-from torchid.problem.extras import recorded_components
 from torchid.sensing import SensorSet
+from torchid.sensing.sensors import recorded_components
 
 _LET_GO = 8  # chunks after which pages that samples are mapped to leave the memory of the process
 

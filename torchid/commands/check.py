@@ -27,7 +27,7 @@ from torchid.logs import Columns, Log, Topics, read_log, write_log
 from torchid.logs.blocks import open_log_blocks
 from torchid.logs.containers import LogKind, atomic_output, existing_log_kind, new_log_kind
 from torchid.logs.time_range import log_title, split_range
-from torchid.report.figures import save_figure
+from torchid.report.figure_style import save_figure
 from torchid.report.log_checks import log_check_document, log_check_figure
 from torchid.report.tables import progress_bars
 from torchid.robot import CollisionShapes, load_robot

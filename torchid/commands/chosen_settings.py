@@ -35,7 +35,7 @@ from torchid.problem.samples import joint_order
 from torchid.sensing import SensorSet
 from torchid.settings import AUTO
 
-Choice = TypeVar("Choice")
+Chosen = TypeVar("Chosen")
 _UNFILTERED = (
     "actuators.delay: auto without a filter: noise between samples is smaller than at them, which draws the delay to "
     "half a step; accepted: a preprocessing.cutoff_hz, or auto"
@@ -93,7 +93,7 @@ def with_chosen_settings(scene: S, bars: Progress) -> tuple[S, Choices]:
     return scene, Choices(cutoff, tilt, width, delay)
 
 
-def _chosen(name: str, choose: Callable[[], Choice], bars: Progress) -> Choice:
+def _chosen(name: str, choose: Callable[[], Chosen], bars: Progress) -> Chosen:
     """What the first process chooses."""
     bar = bars.add_task(f"choosing the {name}", total=None)
     choice = ranks.from_first(choose, name)

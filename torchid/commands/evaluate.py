@@ -29,7 +29,8 @@ from torchid.problem.chunks import one_thread
 from torchid.problem.contact_state import state_name
 from torchid.problem.metrics import DECISIVE_GROUPS, WHITENED, describe_errors, group_name
 from torchid.problem.predict import at_motors, force_series, noise_series, projected_forces
-from torchid.report.figures import error_figure, save_figures
+from torchid.report.figure_style import save_figures
+from torchid.report.figures import error_figure
 from torchid.report.forces import ForceSeries
 from torchid.report.parameter_files import read_parameters, read_shared_extras
 from torchid.report.tables import progress_bars

@@ -13,7 +13,7 @@ from torchid.commands.training import body_eigenvalues, known_parameters
 from torchid.config import ExperimentConfig, dump_config
 from torchid.estimators import ConstrainedEstimate, SgdEstimate
 from torchid.problem import Metrics
-from torchid.problem.metrics import SETS
+from torchid.problem.metrics import LOG_SETS
 from torchid.report.tables import table_text, verdict_counts_table
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def _final(run: Identification) -> dict[str, float]:
     estimate = run.estimate
     final = {
         f"{name}_{group}": value
-        for name in reversed(SETS)  # test logs first: TensorBoard shows the first few
+        for name in reversed(LOG_SETS)  # test logs first: TensorBoard shows the first few
         if name in run.metrics
         for group, value in run.metrics[name].identified.relative.items()
         if value is not None

@@ -6,6 +6,7 @@ import json
 import warnings
 from pathlib import Path
 
+from torchid.commands import EXPORT_FORMATS
 from torchid.commands.evaluate import FittedRun, read_run
 from torchid.commands.folder import check_free_file
 from torchid.config import inputs_of
@@ -18,16 +19,14 @@ from torchid.robot import Robot
 from torchid.robot.xml_files import is_mjcf
 from torchid.staging import atomic_file
 
-FORMATS = ("mjcf", "urdf", "isaaclab", "json")
-
 
 def export(run: str | Path, form: str, output: str | Path | None = None, overwrite: bool = False) -> str:
     """Identified parameters of a run: a model of the robot, actuators of Isaac Lab, or a plain document.
 
     Args:
         run: folder that `identify` wrote.
-        form: one of `FORMATS`. "mjcf": the robot's own file, or one made of its URDF; "urdf" likewise; "isaaclab": a
-            Python module with an `ImplicitActuatorCfg`; "json": bodies and joints.
+        form: one of `EXPORT_FORMATS`. "mjcf": the robot's own file, or one made of its URDF; "urdf" likewise;
+            "isaaclab": a Python module with an `ImplicitActuatorCfg`; "json": bodies and joints.
         output: file to write; None: none is.
         overwrite: whether a file there may be replaced.
 
@@ -42,8 +41,8 @@ def export(run: str | Path, form: str, output: str | Path | None = None, overwri
         TorchidWarning: what the format cannot say, or what simulators will refuse.
     """
     folder, target = Path(run), None if output is None else Path(output)
-    if form not in FORMATS:
-        raise ConfigError("command line", "--format", f"'{form}'", ", ".join(FORMATS))
+    if form not in EXPORT_FORMATS:
+        raise ConfigError("command line", "--format", f"'{form}'", ", ".join(EXPORT_FORMATS))
     fitted = read_run(folder)
     if target is not None:
         check_free_file(target, "--output", overwrite, [folder, *inputs_of(fitted.experiment.config)])
@@ -63,7 +62,7 @@ def _fitted_joints(fitted: FittedRun) -> FittedJoints:
 
 
 def robot_text(form: str, robot: Robot, phi: Array, fitted: FittedJoints, folder: Path) -> str:
-    """The robot of a run with parameters phi, (L, 12), and what was fitted of joints, as text in one of `FORMATS`.
+    """The robot of a run with parameters phi, (L, 12), and what was fitted of joints, as text.
 
     Raises:
         InputError: as `export`.

@@ -44,7 +44,7 @@ from torchid.problem.chunks import ProgressCallback, one_thread
 from torchid.problem.compressed_log import Block, fold_compressed, merge_blocks
 from torchid.problem.compression import Part, compress_in_blocks, merge_folds, merge_states, split_into_folds
 from torchid.problem.contact_state import ContactState, state_name
-from torchid.problem.metrics import SETS
+from torchid.problem.metrics import LOG_SETS
 from torchid.report.tables import progress_bars
 
 
@@ -385,4 +385,4 @@ def _scores(
 def _identified_metrics(
     evaluation: Evaluation, logs: Mapping[str, Sequence[Samples]], phi: Array
 ) -> dict[str, Metrics]:
-    return {name: evaluation.metrics(logs[name], phi[None])[0] for name in SETS if logs[name]}
+    return {name: evaluation.metrics(logs[name], phi[None])[0] for name in LOG_SETS if logs[name]}

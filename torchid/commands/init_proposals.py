@@ -1,17 +1,21 @@
-"""What `torchid init` proposes for a run: its sensors, the parts of a log for training and test."""
+"""What `torchid init` proposes for a run, sensors, filters and parts of a log, and hints at columns left out."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
-from torchid.errors import InputError
+import numpy as np
+
+from torchid.errors import InputError, excerpt, format_count, join_names
 from torchid.logs import Log
 from torchid.logs.column_groups import Family
+from torchid.logs.column_proposals import OF_PLATES, is_current, is_desired, propose_field
 from torchid.logs.cutoff import choose_cutoff
+from torchid.logs.file_samples import FileSample
 from torchid.logs.log import FORCE_NORMAL, WRENCHES
-from torchid.logs.timeline import DROPPED_PERIODS
+from torchid.logs.low_pass import DROPPED_PERIODS
 from torchid.problem.compression import LEAST_PER_FOLD
 from torchid.robot import Robot, load_robot
 from torchid.robot.urdf import fixed_joints
@@ -121,3 +125,141 @@ def split_log(log: Log | InputError, base_is_derived: bool = False) -> Split:
     if length >= folded:
         return Split(False, guessed=guessed)
     return Split(False, _RIDGE, f"{guessed}, or to choose the ridge by ({_RIDGE:g})")
+
+
+# ---------------------------------------------------------------------------------------------------------------- hints
+
+_OTHER_FILE = "; if another file has it: torchid init ROBOT 'FILE + FILE@SECONDS', docs/logs.md"
+_LIMB_SENSOR = re.compile(r"(?<![a-z])(ft|loadcell|load_cell)(?![a-z]).*[xyz]$|(?<![a-z])fts?(?![a-z])", re.IGNORECASE)
+_EULER = re.compile(r"(?<![a-z])(roll|pitch|yaw|rpy|euler)(?![a-z])", re.IGNORECASE)
+_AS_ANGLES = "base_quat_wxyz: {rpy: ...}"
+_STEP = re.compile(r"(dt|time_?step|sample_?rate|fps|rate_?hz|freq\w*)", re.IGNORECASE)
+_MOTION = ("joint_position", "base_quat_xyzw", "base_position_world", *("imu_specific_force", "imu_angular_velocity"))
+_BRIDGED_S = 0.05
+"""Gaps that `init` has bridged [s]."""
+
+
+def missing_columns(joints: int, fields: Collection[str], partial: Mapping[str, Sequence[str]], what: str) -> list[str]:
+    """What stamps and fields of joints lack, in words.
+
+    Args:
+        joints: how many the robot has.
+        fields: of the log.
+        partial: by field, joints that have columns of other fields alone.
+        what: column or topic.
+    """
+    partial = {name: of for name, of in partial.items() if name not in fields}
+    out = [f"{name}: no {what} of numbers of {join_names(of)}, but of all others" for name, of in partial.items()]
+    for name in ("time", "joint_position"):
+        if name not in {*fields, *partial}:
+            of_joints = f", of most of {joints} joints" * (name != "time")
+            out.append(f"{name}: no {what}s that look like it{of_joints}{_OTHER_FILE * (what == 'column')}")
+    return out
+
+
+def hints(
+    left_out: Sequence[str], fields: Collection[str], joints: Sequence[str], what: str, like_torques: Sequence[Family]
+) -> list[str]:
+    """What columns or topics that are left out may hold of the fields that are missing.
+
+    Args:
+        left_out: their names.
+        fields: of the log.
+        joints: of the robot.
+        what: column or topic.
+        like_torques: columns of which there is one for each joint.
+    """
+    out = []
+    measured = [name for name in left_out if not is_desired(name)]
+    if plates := [name for name in left_out if propose_field(name) in OF_PLATES]:
+        unknown = "without which foot stands on which and where each lies (docs/logs.md, Force plates)"
+        out.append(f"contact_wrench_world: {join_names(plates)} may be readings of force plates, {unknown}")
+    positions = [name for name in measured if propose_field(name) == "joint_position"]
+    if "joint_position" not in fields and len(positions) > 2:
+        names = f"those of this robot are {join_names(joints)}"
+        out.append(
+            f"joint_position: {format_count(len(positions), what)} like '{excerpt(positions[0])}' may be of other"
+            f" joints; {names}: is it the one that was recorded?"
+        )
+    out += _torque_hint([] if "joint_torque" in fields else measured, what, like_torques)
+    if not {"ft_wrench", *WRENCHES} & set(fields) and (sensors := [x for x in measured if _LIMB_SENSOR.search(x)]):
+        where = "contact_wrench_local of the foot's frame, or ft_wrench of a fixed joint in the limb"
+        out.append(f"forces at the feet: {_like(sensors)} may be force/torque sensors: {where} (docs/sensors.md)")
+    if "time" not in fields and (steps := [name for name in left_out if _STEP.fullmatch(name)]):
+        out.append(f"time: '{steps[0]}' may be the step or the rate of the stamps, which have to be in the file")
+    if not {"base_quat_wxyz", "base_quat_xyzw"} & set(fields) and (angles := [x for x in measured if _EULER.search(x)]):
+        out.append(f"base_quat: {_like(angles)} may be angles of the base; give all three as {_AS_ANGLES}")
+    return out
+
+
+def _torque_hint(measured: Sequence[str], what: str, like_torques: Sequence[Family]) -> list[str]:
+    """What may be torques, or currents of motors, of a log without torques that has columns that are left out."""
+    each = join_names([_like(one.columns) for one in like_torques])
+    if any(one.is_current for one in like_torques):
+        return [f"joint_torque: {each} may be currents of motors; put torque constants and gear ratios in the file"]
+    if like_torques:
+        return [f"joint_torque: no {what} says that it is one; {each} have one of each joint: see the file"]
+    currents = [name for name in measured if is_current(name)]
+    more = "of some joints: joint_torque.current needs one of each (docs/logs.md)"
+    return [f"joint_torque: {_like(currents)} may be currents of motors, {more}"] if currents else []
+
+
+def notes_on_arrays(sample: FileSample, joints: int) -> dict[str, str]:
+    """What arrays of a file without joint positions may be that no map takes as they are, by key.
+
+    Args:
+        sample: from `read_sample`.
+        joints: of the robot.
+    """
+    out: dict[str, str] = {}
+    for name, values in sample.items():
+        if values is None or values.ndim != 2 or values.dtype.kind not in "fiu":
+            continue
+        shape, width = f"'{excerpt(name)}' has shape {values.shape}", values.shape[1]
+        lists = {other: x for other, x in sample.items() if x is not None and x.dtype.kind not in "fiub"}
+        texts = (other for other, x in lists.items() if x.shape == (width,))
+        if (listed := next(texts, None)) is not None:
+            out["columns"] = f"{shape}; if '{excerpt(listed)}' names its columns, save both as a table, CSV or Parquet"
+        elif len(values) == joints < width:
+            out["joint_position"] = f"{shape}; if its columns are the samples, save it transposed, (N, {joints})"
+    return out
+
+
+def _like(names: Sequence[str]) -> str:
+    return f"'{excerpt(names[0])}'" + (f" and {len(names) - 1} more" if len(names) > 1 else "")
+
+
+# ----------------------------------------------------------------------------------------------------------------- gaps
+
+
+def _gaps_in_motion(log: Log) -> tuple[float, bool, str]:
+    """Gaps in the motion of a log: how long the longest takes, whether some are at an end, and a field with one.
+
+    The length [s] is that from the value before to that after; gaps at an end do not count for it. Channels that are
+    NaN throughout are none.
+    """
+    longest, at_end, found = 0.0, False, ""
+    for name in _MOTION:
+        values = getattr(log, name)
+        for missing in () if values is None else np.isnan(values).reshape(len(log), -1).T:
+            known = np.flatnonzero(~missing)
+            if not missing.any() or len(known) < 2:
+                continue
+            at_end |= bool(missing[0] or missing[-1])
+            longest = max(longest, *np.diff(log.time[known])[np.diff(known) > 1].tolist(), 0.0)
+            found = found or name
+    return longest, at_end, found
+
+
+def keys_for_gaps(read: Log | InputError) -> dict[str, tuple[object, str]]:
+    """The keys of preprocessing that a log with gaps in its motion needs, with the reason."""
+    longest, at_end, name = (0.0, False, "") if isinstance(read, InputError) else _gaps_in_motion(read)
+    out: dict[str, tuple[object, str]] = {}
+    if 0.0 < longest <= _BRIDGED_S:
+        out["bridge_gaps_s"] = (_BRIDGED_S, f"as gaps of {name} take up to {longest:.2g} s")
+    if longest > _BRIDGED_S or at_end:
+        reason = (
+            f"as gaps of {name} take up to {longest:.2g} s" if longest > _BRIDGED_S else f"as {name} has one at an end"
+        )
+        out["exclude_rejected"] = (True, reason)
+    return out

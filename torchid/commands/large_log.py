@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchid.commands.log_course import Block, Course, Segment, in_the_air, require_kept, row_numbers
+from torchid.commands.log_course import Course, RecordedBlock, Segment, in_the_air, require_kept, row_numbers
 from torchid.config.preprocessing import PreprocessingConfig
 from torchid.errors import LogError, about_file
 from torchid.logs import Columns, Log
@@ -288,7 +288,7 @@ class LargeLog:
             warn_of_gaps(first, name, coverage)
         return coverages
 
-    def _bound(self, course: Course, block: Block) -> tuple[slice, Samples]:
+    def _bound(self, course: Course, block: RecordedBlock) -> tuple[slice, Samples]:
         """The numbers of a block's samples, and these; errors count from the beginning."""
         log = block.preprocessed(course.coverage)
         if block.timeline is not None and block.piece.start == course.longest.first:  # this block stands for all
@@ -305,7 +305,7 @@ class LargeLog:
 
 
 def _in_threads(
-    bind: Callable[[Block], tuple[slice, Samples]], blocks: Iterator[Block], threads: int
+    bind: Callable[[RecordedBlock], tuple[slice, Samples]], blocks: Iterator[RecordedBlock], threads: int
 ) -> Generator[tuple[slice, Samples], None, None]:
     """What becomes of each block, in their order; they are read here, a few ahead of those that are worked on.
 

@@ -21,7 +21,7 @@ from torchid.problem.samples import oversampling
 
 
 @dataclass(frozen=True)
-class Block:
+class RecordedBlock:
     """A part of the samples of a preprocessed log: their numbers, and what they are made of, as it was recorded."""
 
     piece: slice
@@ -54,13 +54,13 @@ class Segment:
         """Stamps of its samples in the preprocessed log [s]."""
         return self.blocks.time if self.timeline is None else self.timeline.stamps_of(self.blocks.time)
 
-    def read(self, piece: slice, only: tuple[str, ...] | None = None) -> Block:
+    def read(self, piece: slice, only: tuple[str, ...] | None = None) -> RecordedBlock:
         """What a part of the preprocessed log depends on; with `only` some fields, no readings in the air."""
         samples, part = self._part(piece.start, piece.stop)
         log = self.blocks.read(samples, only)
         if self.in_the_air is not None and only is None:
             log = replace(log, contact_unloaded=unloaded_readings(log, self.in_the_air[samples]))
-        return Block(piece, log, part)
+        return RecordedBlock(piece, log, part)
 
     def follow_signs(self, start: int, step: int) -> None:
         """Read quaternions up to a sample of the preprocessed log, whose signs go on from those, so many at a time."""

@@ -15,7 +15,7 @@ from rich.text import Text
 from torchid import parameters
 from torchid.errors import UnknownNameError, format_count
 from torchid.estimators import Estimate
-from torchid.parameters import PARAMETERS, PER_BODY, UNITS, Array
+from torchid.parameters import PARAMETER_UNITS, PARAMETERS, PER_BODY, Array
 from torchid.problem.metrics import DECISIVE_GROUPS, describe_errors, describe_worse
 from torchid.report.tables import table_text
 from torchid.robot import Robot
@@ -83,7 +83,7 @@ class BodyValues(_OfBody):
     def _lines(self) -> Iterator[tuple[str, float, str]]:
         """Inertia in two lines would be read as a matrix; mass, moments and friction are what is looked for first."""
         for name in ("m", "mcx", "mcy", "mcz", "Ixx", "Iyy", "Izz", "fc", "fv"):
-            yield name, self[name], UNITS[PARAMETERS.index(name)]
+            yield name, self[name], PARAMETER_UNITS[PARAMETERS.index(name)]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -233,7 +233,7 @@ def parameter_table(robot: Robot, estimate: Estimate) -> ParameterTable:
     rows = ParameterTable()
     for name in robot.body_names:
         body = body_estimate(robot, estimate, name)
-        for parameter, unit in zip(PARAMETERS, UNITS, strict=True):
+        for parameter, unit in zip(PARAMETERS, PARAMETER_UNITS, strict=True):
             rows.append(
                 {
                     "body": name,

@@ -21,8 +21,8 @@ from torchid.problem import Samples
 from torchid.problem.chunks import one_thread
 from torchid.problem.extras import ACTUATORS
 from torchid.report import identified_name
-from torchid.report.drift_figure import drift_figure
-from torchid.report.figures import save_figures
+from torchid.report.figure_style import save_figures
+from torchid.report.figures import drift_figure
 from torchid.report.tables import progress_bars
 from torchid.reprs import short_repr
 from torchid.robot import Robot

@@ -38,19 +38,13 @@ from torchid.logs.time_range import log_title
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Metrics
 from torchid.problem.chunks import thread_count
-from torchid.problem.metrics import SETS, WorseThanNominal, describe_worse, worse_than_nominal
+from torchid.problem.metrics import LOG_SETS, WorseThanNominal, describe_worse, worse_than_nominal
 from torchid.problem.noise_gram import NoiseShares
 from torchid.report import FittedJoints, identified_name, identified_robot, identified_urdf, parameters_document
-from torchid.report.figures import (
-    Drawn,
-    contribution_figure,
-    draw_for,
-    error_figure,
-    identifiability_figure,
-)
+from torchid.report.figure_style import Drawn, draw_for
+from torchid.report.figures import contribution_figure, error_figure, identifiability_figure, ridge_figure
 from torchid.report.forces import ForceSeries, force_figure
 from torchid.report.parameter_figures import extra_figure, parameter_figure
-from torchid.report.ridge import ridge_figure
 from torchid.report.traces import LogForces
 from torchid.robot import Robot
 
@@ -278,7 +272,7 @@ def _metrics_document(run: Identification) -> dict[str, object]:
     """What `metrics.json` holds: errors of the identified and of the nominal parameters."""
     estimate, robot = run.estimate, run.experiment.robot
     document: dict[str, object] = {}
-    for name in SETS:
+    for name in LOG_SETS:
         pair = run.metrics.get(name)
         document[name] = None if pair is None else pair.identified.as_dict()
         document[f"{name}_nominal"] = None if pair is None else pair.nominal.as_dict()

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import torch
 
+from torchid.commands import SAMPLE_FORMATS
 from torchid.commands.evaluate import read_run, require_run
 from torchid.commands.export import robot_text
 from torchid.commands.folder import SAMPLES, check_free, check_free_file, new_folder
@@ -25,7 +26,6 @@ from torchid.staging import atomic_file
 ROBOTS = ("urdf", "mjcf")
 """Formats with a file for each sample."""
 
-FORMATS = ("npz", *ROBOTS, "ranges")
 COUNT, COUNT_OF_ROBOTS = 10_000, 20
 MOST, MOST_ROBOTS = 200_000, 10_000
 """Samples at most: of a humanoid, 0.6 GB; files of robots in one folder."""
@@ -73,8 +73,8 @@ def sample(
     Args:
         run: folder that `identify` wrote.
         count: of sets; None: `COUNT`, or `COUNT_OF_ROBOTS` where each has a file.
-        form: one of `FORMATS`: "npz", arrays with names; "urdf", "mjcf": a folder with a robot for each set; "ranges":
-            quantiles of each parameter and their correlations, JSON. None: what the extension of `output` says.
+        form: one of `SAMPLE_FORMATS`: "npz", arrays with names; "urdf", "mjcf": a folder with a robot for each set;
+            "ranges": quantiles of each parameter and their correlations, JSON. None: as `output` says by its extension.
         output: file or folder to write; None: nothing is.
         prior_error: standard deviation of the nominal parameters, as a share of each body.
         seed: of the random numbers.
@@ -106,8 +106,8 @@ def sample(
 
 def _form(form: str | None, out: Path | None) -> str:
     """The format, from the extension of the output where it is not given."""
-    if form is not None and form not in FORMATS:
-        raise ConfigError("command line", "--format", f"'{form}'", ", ".join(FORMATS))
+    if form is not None and form not in SAMPLE_FORMATS:
+        raise ConfigError("command line", "--format", f"'{form}'", ", ".join(SAMPLE_FORMATS))
     by_suffix = None if out is None else _BY_SUFFIX.get(out.suffix.lower())
     if out is not None and form is None and by_suffix is None:
         found = f"'{out.name}', whose extension says no format"

@@ -18,10 +18,10 @@ from torchid.parameters import Array
 from torchid.problem import Evaluation, ExtraTerms, RowBuilder, Samples, assemble, compress_parts
 from torchid.problem.compression import split_into_folds
 from torchid.problem.elimination import Assembly
-from torchid.problem.extras import measured_components
 from torchid.problem.samples import require_forces
 from torchid.report.analysis import SetAccuracy
 from torchid.sensing import SensorSet, named_sensors, with_ft_sensors
+from torchid.sensing.sensors import measured_components
 
 
 def accuracies(

@@ -8,14 +8,26 @@ from typing import Annotated, Any, Literal, TypeVar, get_args
 from pydantic import BeforeValidator, Field
 from pydantic.dataclasses import dataclass
 
-from torchid.config.sensors import STRICT
 from torchid.errors import ConfigError
 from torchid.estimators import Conditions, Consistent, LeastSquares, PenaltyWeights, Sgd, TrainingSettings
 from torchid.estimators.conditions import EnclosureKind
 from torchid.estimators.conic_formulation import Prior
 from torchid.estimators.consistent import Method
 from torchid.estimators.sgd import Consistency
-from torchid.settings import AUTO, BelowOne, Count, NotNegative, Number, Positive, Ridge, RidgeRule, Seed, Tolerance
+from torchid.settings import (
+    AUTO,
+    STRICT,
+    BelowOne,
+    Count,
+    Name,
+    NotNegative,
+    Number,
+    Positive,
+    Ridge,
+    RidgeRule,
+    Seed,
+    Tolerance,
+)
 
 ESTIMATORS: dict[str, type[LeastSquares | Consistent | Sgd]] = {
     "least_squares": LeastSquares,
@@ -32,8 +44,8 @@ Interval = Annotated[list[Number | None], Field(min_length=2, max_length=2)]
 class SymmetryConfig:
     """Bodies whose names differ in `left` and `right` are mirror images along the base link's axis `normal`."""
 
-    left: Annotated[str, Field(min_length=1)]
-    right: Annotated[str, Field(min_length=1)]
+    left: Name
+    right: Name
     normal: Literal["x", "y", "z"] = "y"
 
 
@@ -69,7 +81,7 @@ MASS_ACCEPTED = "a number greater than 0, or a mapping with value and std [kg]"
 
 Mass = Annotated[MassConfig, BeforeValidator(_mass)]
 
-Loss = Literal["huber", "tukey"]
+LossKind = Literal["huber", "tukey"]
 
 
 @dataclass(config=STRICT, frozen=True)
@@ -80,23 +92,23 @@ class RobustConfig:
     `passes` at most.
     """
 
-    loss: Loss
+    loss: LossKind
     tuning: Positive | None = None
     passes: Count = 50
 
 
 def _by_loss(value: object) -> object:
     """A robust fit as a mapping, where it may be a loss alone."""
-    return {"loss": value} if value in get_args(Loss) else value
+    return {"loss": value} if value in get_args(LossKind) else value
 
 
-ROBUST_ACCEPTED = f"{', '.join(get_args(Loss))}, or a mapping with loss, tuning and passes"
+ROBUST_ACCEPTED = f"{', '.join(get_args(LossKind))}, or a mapping with loss, tuning and passes"
 """Accepted for a robust fit, in messages."""
 
 Robust = Annotated[RobustConfig, BeforeValidator(_by_loss)]
 
 
-Settings = TypeVar("Settings", LeastSquares, Consistent, Sgd)
+Solver = TypeVar("Solver", LeastSquares, Consistent, Sgd)
 
 
 @dataclass(config=STRICT, frozen=True)
@@ -181,7 +193,7 @@ class EstimatorConfig(_ConditionsConfig, _FitConfig):
         """
         return self._settings(Consistent, conditions=conditions)
 
-    def _settings(self, estimator: type[Settings], **given: Any) -> Settings:
+    def _settings(self, estimator: type[Solver], **given: Any) -> Solver:
         """An estimator with its fields taken from here, from `training`, or as given."""
         values = vars(self) | vars(self.training) | {"ridge": self.numeric_ridge} | given
         return estimator(**{key: values[key] for key in _fields(estimator) if key in values})

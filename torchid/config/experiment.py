@@ -23,7 +23,6 @@ from torchid.config.sensors import (
     COMPONENTS_ACCEPTED,
     GROUPS_ACCEPTED,
     SCOPES_ACCEPTED,
-    STRICT,
     WRENCHES_ACCEPTED,
     Choice,
     ContactConfig,
@@ -38,9 +37,8 @@ from torchid.errors import ConfigError, about_file
 from torchid.logs.column_map import check_columns
 from torchid.logs.containers import FACTORS
 from torchid.logs.ros_topics import check_topics
-from torchid.settings import NumberOrAuto, Positive, PositiveOrAuto, Seed
+from torchid.settings import STRICT, Name, NumberOrAuto, Positive, PositiveOrAuto, Seed
 
-Name = Annotated[str, Field(min_length=1)]
 Scenarios = dict[FileName, Annotated[list[list[str]], Field(min_length=1)]]
 
 

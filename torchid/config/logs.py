@@ -13,18 +13,18 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
-from torchid.config.sensors import STRICT
 from torchid.errors import ConfigError, LogError, UnknownNameError, excerpt, warn_about_file
 from torchid.logs import Columns, Topics
 from torchid.logs.containers import FACTORS, READABLE, list_bag_files
 from torchid.logs.remote import RemoteFile, as_path, list_matching
 from torchid.logs.time_range import JOINED, JOINED_ACCEPTED, LogFile, LogPart, join_files, split_range
 from torchid.robot.payloads import INERTIA_ACCEPTED, Payload
+from torchid.settings import STRICT
 
 SETS = ("train", "test", "validation")
 """Keys of `logs` that list logs."""
 
-FOLDS = 5
+_USUAL_FOLDS = 5
 """Folds that a log is cut into where an entry names one and not their number."""
 
 _KEYS = ("file", "files", "from", "to", "fold", "without_fold", "of", "payload")
@@ -162,7 +162,7 @@ def _names(field: str, entry: object) -> Iterator[object]:
         start, stop = (_bound(f"{field}.{key}", entry.get(key)) for key in ("from", "to"))
         yield f"{file}[{start}:{stop}]" if bounds else file
         return
-    number = _count(f"{field}.of", entry.get("of", FOLDS), 2)
+    number = _count(f"{field}.of", entry.get("of", _USUAL_FOLDS), 2)
     fold = _count(f"{field}.{folds[0]}", entry[folds[0]], 1, number)
     yield from (f"{file}{text}" for text in _fold_ranges(fold, number, folds[0] == "without_fold"))
 

@@ -8,12 +8,12 @@ from typing import TypeVar
 from pydantic.dataclasses import dataclass
 
 from torchid.config.reading import FileKind, Settings, load
-from torchid.config.sensors import STRICT
 from torchid.errors import about_file
 from torchid.logs import Columns, Topics
 from torchid.logs.column_map import check_columns
 from torchid.logs.joint_orders import JOINT_ORDERS
 from torchid.logs.ros_topics import check_topics
+from torchid.settings import STRICT
 
 _ORDER = f"a list of names, or a robot: {', '.join(JOINT_ORDERS)}"
 MAPS_ACCEPTED = {

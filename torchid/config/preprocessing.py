@@ -7,10 +7,9 @@ from typing import Annotated, Literal
 from pydantic import BeforeValidator
 from pydantic.dataclasses import dataclass
 
-from torchid.config.sensors import STRICT
 from torchid.logs.flags import ContactThreshold
 from torchid.problem.contact_detection import DetectionConfig
-from torchid.settings import NotNegative, Positive, PositiveOrAuto
+from torchid.settings import STRICT, NotNegative, Positive, PositiveOrAuto
 
 
 def _switch(value: object) -> object:

@@ -9,11 +9,11 @@ from typing import Annotated, Literal
 from pydantic import BeforeValidator, Field, FiniteFloat, PlainSerializer, PlainValidator, TypeAdapter
 from pydantic.dataclasses import dataclass
 
-from torchid.config.sensors import STRICT, as_list
+from torchid.config.sensors import as_list
 from torchid.errors import ConfigError
 from torchid.robot.loops import MAX_ANGLE, MAX_GAP, Loop
 from torchid.robot.xml_files import is_mjcf
-from torchid.settings import AUTO, Number, Positive
+from torchid.settings import AUTO, STRICT, Number, Positive
 
 
 def _at_zero(value: object) -> object:

@@ -7,15 +7,13 @@ import re
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PlainSerializer, PlainValidator, TypeAdapter
+from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, PlainValidator, TypeAdapter
 from pydantic.dataclasses import dataclass
 
 from torchid.errors import ConfigError
 from torchid.logs.signal_noise import STATED_FIELDS
 from torchid.problem.extras import CHANNELS
-from torchid.settings import AUTO, NotNegative, NotNegativeOrAuto, Number, Positive
-
-STRICT = ConfigDict(extra="forbid")
+from torchid.settings import AUTO, STRICT, NotNegative, NotNegativeOrAuto, Number, Positive
 
 
 def _torch_device(value: str) -> str:
@@ -160,11 +158,12 @@ def _is_name(value: object) -> bool:
     return isinstance(value, str) and bool(value)
 
 
-Channel = Literal["joint_torque", "contact_force", "contact_moment", "ft_force", "ft_moment"]
+ChannelKind = Literal["joint_torque", "contact_force", "contact_moment", "ft_force", "ft_moment"]
 Scope = Literal["log", "all"]
-Scopes = Annotated[dict[Channel, Scope], BeforeValidator(_every_channel)]
+Scopes = Annotated[dict[ChannelKind, Scope], BeforeValidator(_every_channel)]
 Scales = Annotated[
-    dict[Channel, Annotated[Scope | list[list[str]], PlainValidator(_scope_or_groups)]], BeforeValidator(_every_channel)
+    dict[ChannelKind, Annotated[Scope | list[list[str]], PlainValidator(_scope_or_groups)]],
+    BeforeValidator(_every_channel),
 ]
 SCOPES_ACCEPTED = f"log, all, or a mapping from kinds of channels ({', '.join(CHANNELS)}) to log or all"
 """Accepted for `Scopes`, in messages."""

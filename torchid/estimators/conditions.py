@@ -217,7 +217,7 @@ def _bound_violations(phi: Array, scale: Array, conditions: Conditions, toleranc
         name = parameters.PARAMETERS[number]
         negative = number >= parameters.FRICTION.start and phi[body, number] < 0.0
         condition = f"{name} negative" if negative else f"{name} beyond its bounds"
-        out.append(Violation(int(body), condition, float(beyond[body, number]), parameters.UNITS[number]))
+        out.append(Violation(int(body), condition, float(beyond[body, number]), parameters.PARAMETER_UNITS[number]))
     return out
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from typing import Literal
 
@@ -11,17 +11,17 @@ import numpy as np
 from torchid import parameters
 from torchid.errors import InputError, how_to_install
 from torchid.estimators.barrier import solve_barrier
-from torchid.estimators.conditions import Conditions, validate_parameters
+from torchid.estimators.conditions import Conditions, validate_parameters, violations
 from torchid.estimators.conic_formulation import Prior, build_conic_problem
 from torchid.estimators.conic_problem import ConicProblem, Solution
-from torchid.estimators.decoupled import with_decoupled_fixed
 from torchid.estimators.least_squares import ConstrainedEstimate, Minimizer, Regularized, report_rounding
 from torchid.estimators.ridge_limit import RidgeLimit, ridge_limit
-from torchid.parameters import Array
+from torchid.parameters import PER_BODY, Array
 from torchid.problem import LinearProblem
 from torchid.problem.chunks import one_thread
 from torchid.problem.eliminated_terms import AT_BOUND
 from torchid.reprs import short_repr
+from torchid.rounding import relative_tolerance
 
 Method = Literal["barrier", "certified"]
 
@@ -117,7 +117,7 @@ class Consistent(Regularized):
         return self._minimum(problem, certify=False).minimizer
 
     def _minimum(self, problem: LinearProblem, certify: bool) -> _Minimum:
-        coupled = with_decoupled_fixed(problem, self.conditions)
+        coupled = _with_decoupled_fixed(problem, self.conditions)
         data = build_conic_problem(coupled, self.conditions, self.ridge, self.prior)
         limit = RidgeLimit(data)
         if self.ridge == 0.0 and len(data.linear):
@@ -211,3 +211,41 @@ def _solve(conic: ConicProblem, method: Method, tolerance: float = 1e-9) -> Solu
     from torchid.estimators.certified import solve_certified
 
     return solve_certified(conic)
+
+
+# ------------------------------------------------------------------------------------------------- what nothing couples
+
+
+def _with_decoupled_fixed(problem: LinearProblem, conditions: Conditions) -> LinearProblem:
+    """The problem with bodies and friction fixed that no row sees and whose nominal values are allowed.
+
+    A solver ends within a tolerance of the least objective, which parameters that only a small ridge holds hardly
+    change: a KUKA's fixed base drifts by 8e-3 of its scale with a ridge of 1e-7. It also keeps away from conditions
+    that nothing pushes them to.
+
+    Args:
+        problem: its parameters are those of bodies.
+        conditions: on the parameters. Bodies that one ties to others (the total mass, mirror images) stay as they are.
+    """
+    unseen = (problem.free & ~_seen(problem)).reshape(-1, PER_BODY)
+    nominal, scale = (x.reshape(-1, PER_BODY) for x in (problem.nominal, problem.scale))
+    apart = replace(conditions, total_mass=None, mirrors=())
+    for violation in violations(nominal, scale, apart, tolerance=0.0):
+        if violation.body is not None:
+            unseen[violation.body] = False
+    for mirror in conditions.mirrors:
+        unseen[[mirror.body, mirror.image]] = False
+    inertial = unseen[:, parameters.INERTIAL]
+    inertial[:] = inertial.all(axis=1, keepdims=True) & (conditions.total_mass is None)
+    return replace(problem, free=problem.free & ~unseen.ravel()) if unseen.any() else problem
+
+
+def _seen(problem: LinearProblem) -> np.ndarray:
+    """Parameters that rows, or terms that conditions bound, depend on, (P,) bool."""
+    size = np.linalg.norm(problem.A, axis=0) * problem.scale
+    seen = size > relative_tolerance(0.0, problem.A.shape) * size.max(initial=0.0)
+    if problem.terms is not None:
+        seen |= problem.terms.C.any(axis=0)
+        for condition in problem.terms.conditions:
+            seen |= condition.parameters != 0.0
+    return np.asarray(seen)

@@ -20,8 +20,8 @@ from torchid.problem import Evaluation, ExtraTerms, Metrics, RowBuilder, Samples
 from torchid.problem.chunks import ProgressCallback, one_thread, thread_count
 from torchid.problem.compressed_log import Block
 from torchid.problem.compression import Part, compress_in_blocks, merge_states, split_into_folds
-from torchid.problem.extras import recorded_components
 from torchid.problem.metrics import ForceSums
+from torchid.sensing.sensors import recorded_components
 from torchid.settings import RidgeRule
 
 RIDGES = tuple(float(f"1e{power}") for power in range(-7, 2))

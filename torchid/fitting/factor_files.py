@@ -12,12 +12,12 @@ from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field, TypeAdapter
+from pydantic import Field, TypeAdapter
 from pydantic.dataclasses import dataclass
 
 from torchid import __version__
 from torchid.errors import LogError, about_file, during, excerpt
-from torchid.fitting.packed_parts import PackedPart, PartPacker, PartReader
+from torchid.fitting.packed_parts import PackedPart, PartPacker, PartReader, Whole
 from torchid.fitting.row_model import RowModel, Value
 from torchid.guards import MAX_ARRAYS, MAX_DESCRIPTION, MAX_LETTERS, MAX_TRIANGLES, check_unpacked_size
 from torchid.identifiability.base_parameters import StateReport
@@ -28,7 +28,7 @@ from torchid.problem.compressed_log import CompressedLog, piece_spans
 from torchid.problem.compression import FOLDS, block_spans
 from torchid.reprs import short_repr
 from torchid.robot.payloads import Payload
-from torchid.settings import NotNegative, Number
+from torchid.settings import STRICT, NotNegative, Number
 from torchid.staging import atomic_file
 
 FORMAT = 2
@@ -38,8 +38,6 @@ _ACCEPTED = f"a whole {FACTORS} file, as torchid compress writes it"
 _GEOMETRY = ("T_parent_joint", "T_joint_link", "joint_map", "joint_constant", "contact_node", "T_node_contact")
 _EXTRAS = ("sensors.offsets", "sensors.scales", "actuators")
 _LARGEST = 1e30  # of a number: squares stay within the range of float64
-_STRICT = ConfigDict(extra="forbid")
-_Whole = Annotated[int, Field(ge=0, le=2**53)]
 _Text = Annotated[str, Field(max_length=10 * MAX_LETTERS)]
 
 
@@ -71,25 +69,25 @@ class FactorFile:
     __repr__ = short_repr
 
 
-@dataclass(config=_STRICT, frozen=True)
+@dataclass(config=STRICT, frozen=True)
 class _State:
     name: _Text
-    samples: _Whole
-    rows: _Whole
-    base_rank: _Whole | None
+    samples: Whole
+    rows: Whole
+    base_rank: Whole | None
     base_singular_value: NotNegative | None
     base_full_share: NotNegative | None
     base_rank_shares: dict[int, NotNegative]
 
 
-@dataclass(config=_STRICT, frozen=True)
+@dataclass(config=STRICT, frozen=True)
 class _Unloaded:
-    start: _Whole
-    stop: _Whole
+    start: Whole
+    stop: Whole
     parts: list[PackedPart]
 
 
-@dataclass(config=_STRICT, frozen=True)
+@dataclass(config=STRICT, frozen=True)
 class _Description:
     format: int
     torchid: _Text
@@ -98,14 +96,14 @@ class _Description:
     samples: Annotated[int, Field(ge=1, le=2**53)]
     oversampling: Annotated[Number, Field(ge=1.0)]
     duration_s: NotNegative
-    excluded: _Whole
+    excluded: Whole
     blocks: Annotated[int, Field(ge=1, le=FOLDS)]
     settings: dict[str, Value]
     noise: dict[str, Annotated[Number, Field(gt=0.0)]]
     pieces: list[PackedPart]
     by_state: list[PackedPart]
     unloaded: list[_Unloaded]
-    supports: list[list[_Whole]]
+    supports: list[list[Whole]]
     states: list[_State]
     payloads: list[Payload] = field(default_factory=list)
 

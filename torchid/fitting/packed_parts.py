@@ -8,19 +8,19 @@ from typing import Annotated
 
 import numpy as np
 import torch
-from pydantic import ConfigDict, Field
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from torchid.guards import MAX_LETTERS
 from torchid.parameters import Array
 from torchid.problem import TriangularFactor
 from torchid.problem.compression import Part
-from torchid.settings import NotNegative
+from torchid.settings import STRICT, NotNegative
 
-_Whole = Annotated[int, Field(ge=0, le=2**53)]
+Whole = Annotated[int, Field(ge=0, le=2**53)]
 
 
-@dataclass(config=ConfigDict(extra="forbid"), frozen=True)
+@dataclass(config=STRICT, frozen=True)
 class PackedPart:
     """A part but for the numbers of its triangles, as documents of JSON have it.
 
@@ -29,12 +29,12 @@ class PackedPart:
     """
 
     state: str
-    samples: _Whole
-    rows: _Whole
+    samples: Whole
+    rows: Whole
     independent_rows: NotNegative
-    gated: list[_Whole]
-    triangles: list[tuple[_Whole, _Whole, bool]]
-    noise_gram: Annotated[list[_Whole], Field(alias="surplus")]  # as files of this format call it
+    gated: list[Whole]
+    triangles: list[tuple[Whole, Whole, bool]]
+    noise_gram: Annotated[list[Whole], Field(alias="surplus")]  # as files of this format call it
 
 
 class PartPacker:

@@ -10,13 +10,13 @@ import numpy as np
 from torchid.errors import LogError, join_names
 from torchid.parameters import Array
 from torchid.problem import RowBuilder
-from torchid.problem.extras import measured_components
 from torchid.problem.sampled_rows import noise_of_sensors
 from torchid.reprs import short_repr
 from torchid.robot import Robot
 from torchid.robot.tree import BodyJoint
 from torchid.rounding import KINEMATIC_TOLERANCE
 from torchid.sensing import Contact
+from torchid.sensing.sensors import measured_components
 
 Value = bool | int | float | str | list[str] | None
 

@@ -14,12 +14,12 @@ from torchid.parameters import Array
 from torchid.problem import LinearProblem, RowBuilder, Samples
 from torchid.problem.chunks import ProgressCallback, chunks_by_state, one_thread, subsample_states
 from torchid.problem.contact_state import ContactState
-from torchid.problem.extras import measured_components
 from torchid.problem.metrics import ROW_GROUPS, ForceSums, finite_or_none
 from torchid.problem.predict import null_space_components, predict_forces
 from torchid.problem.unloaded_sensors import unloaded_offset_equations
 from torchid.rounding import KINEMATIC_TOLERANCE, RANK_TOLERANCE
 from torchid.sensing import SensorNoise
+from torchid.sensing.sensors import measured_components
 
 SAMPLES = 2000
 """Approximate number of samples whose rows represent those of all."""

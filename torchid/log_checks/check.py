@@ -16,6 +16,7 @@ from torchid.errors import InputError, LogError, warn
 from torchid.log_checks.contacts import (
     check_contact_flags,
     check_limb_sensors,
+    check_scalar_wrenches,
     subtract_contact_offsets,
 )
 from torchid.log_checks.findings import (
@@ -28,7 +29,7 @@ from torchid.log_checks.findings import (
     median_step,
 )
 from torchid.log_checks.forces import check_forces_against_urdf
-from torchid.log_checks.frozen import check_repeats, check_scalar_wrenches, check_still_base
+from torchid.log_checks.frozen import check_repeats, check_still_base
 from torchid.log_checks.gyroscope import check_gyroscope
 from torchid.log_checks.motion import (
     check_angle_unit,
@@ -43,8 +44,9 @@ from torchid.log_checks.standing_feet import check_slip, check_standing_feet
 from torchid.log_checks.weight import check_accelerometer, check_weight
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
+from torchid.logs.low_pass import REACH_PERIODS
 from torchid.logs.time_range import log_title
-from torchid.logs.timeline import DROPPED_SAMPLES, JITTER, REACH_PERIODS
+from torchid.logs.timeline import DROPPED_SAMPLES, JITTER
 from torchid.problem import Samples
 from torchid.problem.log_joints import without_welded_joints
 from torchid.problem.standing import longest_standing

@@ -1,4 +1,4 @@
-"""Contact flags against forces, and force/torque sensors in limbs without contact."""
+"""Contact flags against forces, wrenches of scalar sensors, and sensors in limbs without contact."""
 
 from __future__ import annotations
 
@@ -26,11 +26,13 @@ from torchid.log_checks.model import (
     default_cutoff_hz,
     preprocess_pieces,
 )
-from torchid.log_checks.weight import GRAVITY, MAX_MASS_ERROR
+from torchid.log_checks.weight import MAX_MASS_ERROR
 from torchid.logs import Log
-from torchid.logs.log import BoolArray, FloatArray
+from torchid.logs.log import FORCE_NORMAL, BoolArray, FloatArray
+from torchid.parameters import WRENCH_COMPONENTS
 from torchid.problem import RowBuilder
 from torchid.problem.predict import force_series
+from torchid.regressor.kinematics import GRAVITY
 from torchid.robot import Robot
 from torchid.rounding import STD_PER_MAD
 from torchid.sensing import Contact, named_sensors
@@ -195,6 +197,25 @@ def _delay_findings(log: Log, contact: _Contact, size: FloatArray, weight: float
     spans = tuple(Span(int(i), int(i) + 1, contact.name) for i in flags)
     advice = "shift contact_active, or derive it from the forces"
     yield Finding("delay", SUSPICIOUS, "contact_active", text, advice, (contact.name,), spans)
+
+
+def check_scalar_wrenches(log: Log) -> Iterator[Finding]:
+    """Findings about wrenches of which one force alone is ever other than 0: a scalar sensor's reading among zeros."""
+    wrench, active = log.contact_wrench, log.contact_active
+    if wrench is None or active is None:
+        return
+    for index, name in enumerate(log.contact_names):
+        touching = wrench[active[:, index], index]
+        present = np.nan_to_num(touching).any(axis=0)
+        forces = np.flatnonzero(present[:3])
+        if len(forces) != 1 or present[3:].any() or np.isnan(touching[:, :3]).any():
+            continue
+        text = f"{name}: all but {WRENCH_COMPONENTS[forces[0]]} is 0 throughout, as of a scalar sensor"
+        advice = (
+            f"give it as {FORCE_NORMAL}, with sensors.contact_wrenches: {{FRAME: [fn]}}: zeros are fitted as measured "
+            "forces along the frame's axes"
+        )
+        yield Finding("scalar sensor", SUSPICIOUS, log.contact_wrench_field, text, advice, (name,))
 
 
 # ---------------------------------------------------------------------------------------------- limb sensors in the air

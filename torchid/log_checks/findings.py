@@ -21,6 +21,9 @@ NOTE = "note"
 
 SEVERITIES = (REJECTED, SUSPICIOUS, NOTE)
 
+#: Steps on either side that a step or a run of repeats is compared with.
+NEIGHBOUR_STEPS = 10
+
 
 @dataclass(frozen=True)
 class Span:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from torchid.errors import format_count, join_names
 from torchid.log_checks.findings import (
+    NEIGHBOUR_STEPS,
     NOTE,
     REJECTED,
     SUSPICIOUS,
@@ -22,8 +23,7 @@ from torchid.log_checks.findings import (
 )
 from torchid.log_checks.model import MIN_MOTION
 from torchid.logs import Log
-from torchid.logs.log import CONTACT_READINGS, FORCE_NORMAL, WRENCHES, BoolArray, FloatArray
-from torchid.parameters import WRENCH_COMPONENTS
+from torchid.logs.log import CONTACT_READINGS, WRENCHES, BoolArray, FloatArray
 
 #: Samples at one extreme value from which on it is a limit of the sensor.
 MIN_SAMPLES_AT_LIMIT = 5
@@ -35,8 +35,6 @@ DEAD_BAND_FIELDS = (*RATE_FIELDS, "joint_torque", "ft_wrench", *CONTACT_READINGS
 FORCE_FIELDS = ("joint_torque", "ft_wrench", "imu_specific_force", *CONTACT_READINGS)
 #: Logarithm (base 10) of the probability of a run of repeats by chance: none in a million samples.
 MAX_LOG10_PROBABILITY = -8.0
-#: Steps on either side that a run is compared with.
-NEIGHBOUR_STEPS = 10
 #: Typical step in quanta below which repeats are expected: a slow channel on a coarse grid repeats itself.
 _MIN_STEP_QUANTA = 4.0
 #: Speed next to a run over that on the same side of it; a robot that stops smoothly is slower. Noisy channels are
@@ -351,22 +349,3 @@ def check_still_base(log: Log) -> Iterator[Finding]:
     severity = SUSPICIOUS if all(other is None for other in others) else NOTE  # else nothing is derived from it
     advice = "leave it out and give an IMU or the base's velocity, or set preprocessing.base_motion: contacts"
     yield Finding("constant position", severity, "base_position_world", text, advice)
-
-
-def check_scalar_wrenches(log: Log) -> Iterator[Finding]:
-    """Findings about wrenches of which one force alone is ever other than 0: a scalar sensor's reading among zeros."""
-    wrench, active = log.contact_wrench, log.contact_active
-    if wrench is None or active is None:
-        return
-    for index, name in enumerate(log.contact_names):
-        touching = wrench[active[:, index], index]
-        present = np.nan_to_num(touching).any(axis=0)
-        forces = np.flatnonzero(present[:3])
-        if len(forces) != 1 or present[3:].any() or np.isnan(touching[:, :3]).any():
-            continue
-        text = f"{name}: all but {WRENCH_COMPONENTS[forces[0]]} is 0 throughout, as of a scalar sensor"
-        advice = (
-            f"give it as {FORCE_NORMAL}, with sensors.contact_wrenches: {{FRAME: [fn]}}: zeros are fitted as measured "
-            "forces along the frame's axes"
-        )
-        yield Finding("scalar sensor", SUSPICIOUS, log.contact_wrench_field, text, advice, (name,))

@@ -6,19 +6,19 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 
 from torchid.errors import InputError
 from torchid.log_checks.findings import SUSPICIOUS, Finding
 from torchid.log_checks.model import MAX_TRIAL_DIFFERENTIATED_SAMPLES, bind_some_samples, preprocess_pieces
 from torchid.log_checks.scales import (
-    BLOCKS,
     CORRELATED_SAMPLES,
+    TIME_BLOCKS,
     accumulate_blocks,
-    joint_terms,
+    deviation_columns,
     measured_sensors,
+    measures_force,
     prior_columns,
-    whitened_rows,
+    rows_with_bases,
 )
 from torchid.logs import Log
 from torchid.logs.log import FloatArray
@@ -44,7 +44,7 @@ _LAG_PRIOR_STD_S, _TILT_PRIOR_STD_RAD = 0.2, 0.3
 _SHIFTS, _LEAST_SHIFT_S = 8, 2e-3
 _SMALL_ANGLE = 1e-4
 
-Columns = Callable[[RowBuilder, Samples, int], FloatArray]
+UnknownColumns = Callable[[RowBuilder, Samples, int], FloatArray]
 """Change of the generalized forces that are required (N, n_rows, k) by a unit of each unknown, of samples by number."""
 
 
@@ -54,7 +54,7 @@ class Deviation:
 
     Attributes:
         value, spread: (k,), of the whole log, and their standard deviations.
-        blocks: (BLOCKS, k), by block of time.
+        blocks: (TIME_BLOCKS, k), by block of time.
         without, left: forces that the best URDF near the given one leaves unexplained without the unknowns and with
             them, rms in `UNMODELLED_FORCE_SHARE` of the forces.
     """
@@ -190,23 +190,21 @@ def _turned(samples: Samples, axis: int) -> Samples:
 
 
 def _fit(
-    samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact], columns: Columns, prior_std: float
+    samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact], columns: UnknownColumns, prior_std: float
 ) -> Deviation | None:
     """Unknowns by their columns, beside parameters, friction, armature and offsets of torques."""
     sensors = measured_sensors(samples, robot, contacts)
-    if not (sensors.torque[: robot.n] & ~robot.is_passive[: robot.n]).any() and not sensors.wrench.any():
+    if not measures_force(sensors, robot):
         return None
     builder = RowBuilder(robot, contacts, sensors)
     prior = prior_columns(builder, robot, samples)
     nominal = builder.columns.parameter_map @ robot.nominal.flatten()
     parts = []
     for number, part in enumerate(samples):
-        rows, W, equations = whitened_rows(builder, part)
+        rows, W, equations = rows_with_bases(builder, part)
         target = rows[..., :-1] @ nominal - rows[..., -1]
         projected = np.einsum("nvr,nvk->nrk", W, columns(builder, part, number))
-        rate = part.joint_velocity
-        extra = joint_terms(builder, W, torch.sign(rate), rate, part.joint_acceleration, torch.ones_like(rate))
-        K = np.concatenate([rows[..., :-1] @ prior, *extra], axis=2)
+        K = deviation_columns(builder, rows, W, part, prior)
         parts.append((K, np.concatenate([target[..., None], projected], axis=2), equations))
     normal = accumulate_blocks(parts)
 
@@ -220,4 +218,6 @@ def _fit(
     value, variance, without, left = solve(None)
     unexplained = np.sqrt(np.maximum([without, left], 0.0) / max(normal.rows, 1))
     spread = np.sqrt(CORRELATED_SAMPLES * max(1.0, float(unexplained[1]) ** 2) * variance)
-    return Deviation(value, spread, np.array([solve(block)[0] for block in range(BLOCKS)]), *map(float, unexplained))
+    return Deviation(
+        value, spread, np.array([solve(block)[0] for block in range(TIME_BLOCKS)]), *map(float, unexplained)
+    )

@@ -22,7 +22,7 @@ from torchid.logs.quaternion import (
     rotate_to_world,
 )
 from torchid.problem.closed_loops import loop_gaps, with_loop_joints
-from torchid.regressor.kinematics import GRAVITY_WORLD
+from torchid.regressor.kinematics import GRAVITY
 from torchid.robot import Robot
 from torchid.rounding import STD_PER_MAD
 
@@ -228,10 +228,7 @@ def _meaning(ratio: float, name: str, base: str, order: int | None) -> tuple[str
 
 def _frame_findings(log: Log, name: str, base: str, order: int, comparison: DerivativeComparison) -> Iterator[Finding]:
     """Findings about a vector of the base that is in the other frame, or that contains gravity."""
-    if (
-        name == "base_linear_acceleration_world"
-        and abs(abs(comparison.excess[2] / GRAVITY_WORLD[2]) - 1.0) < UNIT_TOLERANCE
-    ):
+    if name == "base_linear_acceleration_world" and abs(abs(comparison.excess[2] / GRAVITY) - 1.0) < UNIT_TOLERANCE:
         text = (
             f"{comparison.excess[2]:+.2f} m/s^2 along z on average beyond the derivative of {base}: it contains gravity"
         )

@@ -22,7 +22,7 @@ from torchid.problem import RowBuilder, Samples
 from torchid.problem.chunks import chunks_by_state, one_thread
 from torchid.problem.linear import parameter_scale
 from torchid.problem.predict import force_series
-from torchid.regressor.kinematics import GRAVITY_WORLD
+from torchid.regressor.kinematics import GRAVITY
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet
 
@@ -37,7 +37,7 @@ UNMODELLED_FORCE_SHARE = 0.05
 #: Successive samples that count as one: of 240 out of ten seconds, errors of friction and flexibility are correlated.
 CORRELATED_SAMPLES = 10.0
 #: Blocks of time whose estimates are compared.
-BLOCKS = 6
+TIME_BLOCKS = 6
 _TINY = 1e-9
 
 
@@ -46,9 +46,9 @@ class NormalEquations:
     """Normal equations of whitened rows [K, Y], K scaled by the prior's standard deviations, by blocks of time.
 
     Attributes:
-        KtK: (BLOCKS, P, P).
-        KtY: (BLOCKS, P, k).
-        YtY: (BLOCKS, k, k).
+        KtK: (TIME_BLOCKS, P, P).
+        KtY: (TIME_BLOCKS, P, k).
+        YtY: (TIME_BLOCKS, k, k).
         rows: number of rows.
     """
 
@@ -82,10 +82,15 @@ def measured_sensors(samples: Sequence[Samples], robot: Robot, contacts: Sequenc
                 if part.wrench is not None
             ]
             wrench[k, list(contact.components)] = np.isfinite(np.concatenate(known)).all()
-    weight = -GRAVITY_WORLD[2] * float(robot.nominal[:, parameters.MASS].sum())
+    weight = GRAVITY * float(robot.nominal[:, parameters.MASS].sum())
     moment = size or 0.1 * weight
     noise = SensorNoise(*(max(UNMODELLED_FORCE_SHARE * x, _TINY) for x in (moment, 0.5 * weight, moment)))
     return SensorSet(torque | robot.is_passive, wrench, noise)
+
+
+def measures_force(sensors: SensorSet, robot: Robot) -> bool:
+    """Whether a motor's torque or a contact's wrench is measured."""
+    return bool((sensors.torque & ~robot.is_passive)[: robot.n].any() or sensors.wrench.any())
 
 
 def _missing_friction_scale(samples: Sequence[Samples], robot: Robot) -> FloatArray:
@@ -115,7 +120,7 @@ def prior_columns(builder: RowBuilder, robot: Robot, samples: Sequence[Samples])
 
 
 @torch.no_grad()
-def whitened_rows(builder: RowBuilder, samples: Samples) -> tuple[FloatArray, FloatArray, BoolArray]:
+def rows_with_bases(builder: RowBuilder, samples: Samples) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Whitened rows (N, n_rows, columns + 1), their bases W (N, n_rows, n_rows), and which rows are not zero."""
     n_rows = builder.tree.n_rows
     rows, W = np.zeros((len(samples), n_rows, builder.width + 1)), np.zeros((len(samples), n_rows, n_rows))
@@ -130,7 +135,7 @@ def accumulate_blocks(parts: Sequence[tuple[FloatArray, FloatArray, BoolArray]])
     """Normal equations of parts of a log: K (N, n_rows, P), Y (N, n_rows, k) and which rows are not zero."""
     K, Y, equations = (np.concatenate(part) for part in zip(*parts, strict=True))
     products = []
-    for block in np.array_split(np.arange(len(K)), BLOCKS):
+    for block in np.array_split(np.arange(len(K)), TIME_BLOCKS):
         A, B = K[block].reshape(-1, K.shape[2]), Y[block].reshape(-1, Y.shape[2])
         products.append((A.T @ A, A.T @ B, B.T @ B))
     KtK, KtY, YtY = (np.array(product) for product in zip(*products, strict=True))
@@ -207,26 +212,43 @@ def fit_time_scale(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_h
 
     recorded, doubled, at_rest = samples_at(1.0), samples_at(2.0), samples_at(_REST_FACTOR)
     sensors = measured_sensors(recorded, robot, contacts)
-    if not (sensors.torque[: robot.n] & ~robot.is_passive[: robot.n]).any() and not sensors.wrench.any():
-        return None  # no force was measured: any factor explains none
+    if not measures_force(sensors, robot):
+        return None  # any factor explains none
     builder = RowBuilder(robot, contacts, sensors)
     parts = []
     columns = prior_columns(builder, robot, recorded)
     phi = robot.nominal.flatten()[None]
     for one, two, rest in zip(recorded, doubled, at_rest, strict=True):
-        rows, W, equations = whitened_rows(builder, rest)
+        rows, W, equations = rows_with_bases(builder, rest)
         total, slower, gravity = (force_series(builder, part, phi)[1][0] for part in (one, two, rest))
         quadratic = 2.0 * (total - gravity) - 4.0 * (slower - gravity)
         terms = [gravity, total - gravity - quadratic, quadratic]
         projected = [rows[..., -1], *(np.einsum("nvr,nv->nr", W, term) for term in terms)]
-        rate = one.joint_velocity
-        extra = joint_terms(builder, W, torch.sign(rate), rate, one.joint_acceleration, torch.ones_like(rate))
-        K = np.concatenate([rows[..., :-1] @ columns, *extra], axis=2)
+        K = deviation_columns(builder, rows, W, one, columns)
         parts.append((K, np.stack(projected, axis=2), equations))
     return _best_factor(accumulate_blocks(parts))
 
 
-def joint_terms(builder: RowBuilder, W: FloatArray, *values: torch.Tensor) -> list[FloatArray]:
+def deviation_columns(
+    builder: RowBuilder, rows: FloatArray, W: FloatArray, samples: Samples, prior: FloatArray, armature: bool = True
+) -> FloatArray:
+    """Columns (N, n_rows, P) of what may differ from the URDF: parameters, friction, armature, offsets of torques.
+
+    Args:
+        builder: of the rows.
+        rows: from `rows_with_bases`.
+        W: their bases.
+        samples: whose motion friction and armature follow.
+        prior: from `prior_columns`.
+        armature: whether it is among them.
+    """
+    rate = samples.joint_velocity
+    accelerated = [samples.joint_acceleration] if armature else []
+    terms = _joint_terms(builder, W, torch.sign(rate), rate, *accelerated, torch.ones_like(rate))
+    return np.concatenate([rows[..., :-1] @ prior, *terms], axis=2)
+
+
+def _joint_terms(builder: RowBuilder, W: FloatArray, *values: torch.Tensor) -> list[FloatArray]:
     """Columns of joint torques in proportion to values (N, n), scaled by the prior whatever the size of the values."""
     base = builder.tree.base_rows
     out = []
@@ -244,7 +266,7 @@ def _best_factor(equations: NormalEquations) -> TimeScale:
         return np.asarray(np.einsum("ks,kl,ls->s", u, equations.unexplained(block), u))
 
     total = cost(None)
-    blocks = np.array([_TIME_FACTORS[np.argmin(cost(block))] for block in range(BLOCKS)])
+    blocks = np.array([_TIME_FACTORS[np.argmin(cost(block))] for block in range(TIME_BLOCKS)])
     best, unity = int(np.argmin(total)), int(np.argmin(np.abs(np.log(_TIME_FACTORS))))
     residual = np.sqrt(np.maximum(total, 0.0) / max(equations.rows, 1))
     return TimeScale(float(_TIME_FACTORS[best]), blocks, *(float(residual[i]) for i in (best, unity, -1)))
@@ -262,8 +284,8 @@ class TorqueGains:
         gain: (m,) factors.
         point: (3,) [m] in the contact frames.
         spread: (m + 3,) standard deviations of both.
-        blocks: (BLOCKS, m + 3), both by block of time.
-        common: factor of all torques alike, its standard deviation, and by block, (BLOCKS,); None without torques.
+        blocks: (TIME_BLOCKS, m + 3), both by block of time.
+        common: factor of all torques alike, its standard deviation, and by block, (TIME_BLOCKS,); None without torques.
     """
 
     joints: np.ndarray
@@ -285,7 +307,7 @@ def fit_torque_gains(samples: Sequence[Samples], robot: Robot, contacts: Sequenc
     nominal = builder.columns.parameter_map @ robot.nominal.flatten()
     parts = []
     for part in samples:
-        rows, W, equations = whitened_rows(builder, part)
+        rows, W, equations = rows_with_bases(builder, part)
         torque = np.zeros((len(part), builder.tree.base_rows + robot.n_dofs, len(joints)))
         for index, joint in enumerate(joints):
             torque[:, builder.tree.base_rows + joint, index] = builder.recorded_torque(part)[:, joint].numpy()
@@ -293,9 +315,7 @@ def fit_torque_gains(samples: Sequence[Samples], robot: Robot, contacts: Sequenc
         projected = np.einsum("nvr,nvk->nrk", W, terms)
         contact_part = rows[..., -1] - projected[..., : len(joints)].sum(axis=2)
         target = rows[..., :-1] @ nominal - contact_part
-        rate = part.joint_velocity
-        extra = joint_terms(builder, W, torch.sign(rate), rate, torch.ones_like(rate))
-        K = np.concatenate([rows[..., :-1] @ columns, *extra], axis=2)
+        K = deviation_columns(builder, rows, W, part, columns, armature=False)
         parts.append((K, np.concatenate([target[..., None], projected], axis=2), equations))
     return _solve_gains(accumulate_blocks(parts), joints)
 
@@ -349,7 +369,7 @@ def _solve_gains(equations: NormalEquations, joints: np.ndarray) -> TorqueGains:
 def _with_blocks(
     solve: Callable[[int | None], tuple[FloatArray, FloatArray, float]], rows: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Unknowns (k,) of all samples, their standard deviations, and those of each block, (BLOCKS, k)."""
+    """Unknowns (k,) of all samples, their standard deviations, and those of each block, (TIME_BLOCKS, k)."""
     x, variance, residual = solve(None)
     size = max(1.0, residual / max(rows, 1))
-    return x, np.sqrt(CORRELATED_SAMPLES * size * variance), np.array([solve(block)[0] for block in range(BLOCKS)])
+    return x, np.sqrt(CORRELATED_SAMPLES * size * variance), np.array([solve(block)[0] for block in range(TIME_BLOCKS)])

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from torchid.errors import format_count, join_names
 from torchid.log_checks.findings import (
+    NEIGHBOUR_STEPS,
     NOTE,
     REJECTED,
     SUSPICIOUS,
@@ -242,8 +243,8 @@ def _span(channel: str, jump: Jump, shift: float = 0.0) -> Span:
 
 #: Jump over the local noise: heavy-tailed (Laplacian) noise exceeds it once in 10^7 samples.
 MIN_JUMP_SPREADS = 12.0
-#: Steps on either side that a step is compared with, and steps per block of the noise estimate.
-NEIGHBOUR_STEPS, SPREAD_BLOCK_STEPS = 10, 128
+#: Steps per block of the noise estimate.
+SPREAD_BLOCK_STEPS = 128
 #: Longest excursion that counts as a spike.
 MAX_SPIKE_SAMPLES = 5
 #: Sum of both jumps of an excursion over the larger one: of a spike, and of a longer one, in which the robot moves.

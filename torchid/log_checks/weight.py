@@ -12,10 +12,9 @@ from torchid.log_checks.units import advise_units, units_of_ratio
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.quaternion import rotate_to_world
-from torchid.regressor.kinematics import GRAVITY_WORLD
+from torchid.regressor.kinematics import GRAVITY
 from torchid.robot import Robot
 
-GRAVITY = -GRAVITY_WORLD[2]
 #: Relative error of the carried mass that is noted, and that no CAD model has.
 MIN_NOTED_MASS_ERROR, MAX_MASS_ERROR = 0.02, 0.2
 #: Rest that the check needs, or else the length of log over which it averages: a change of speed of 1 m/s between its

@@ -48,7 +48,7 @@ _COLUMNS = re.compile(r"(.+)\[(\d*):(\d*)\]")
 _FIELD = re.compile(r"(.+)\['([^'\[\]]+)'\]")
 _TRANSPOSED = re.compile(r"(.+)\.T")
 
-Array = NDArray[Any]
+AnyArray = NDArray[Any]
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class _Part:
         """Whether samples are the columns of the other array."""
         return self.columns is None and self.field is None
 
-    def __call__(self, array: Array) -> Array:
+    def __call__(self, array: AnyArray) -> AnyArray:
         """The part of an array, or of some of its rows."""
         self.require(array.dtype, array.shape)
         if self.columns is not None:
@@ -131,7 +131,7 @@ def require_plain(name: str, array: _A) -> _A:
     return array
 
 
-def fields_of_records(name: str, array: Array) -> Iterator[tuple[str, Array]]:
+def fields_of_records(name: str, array: AnyArray) -> Iterator[tuple[str, AnyArray]]:
     """The fields of an array of records, by the names that mean them, of records in records too; else the array."""
     if not array.dtype.names:
         yield name, array
@@ -148,7 +148,7 @@ def with_parts(given: Sequence[str], wanted: Iterable[str]) -> list[str]:
     return [text for name in given for text in dict.fromkeys(parts.get(name, [name]))]
 
 
-def load_part(name: str, given: Collection[str], load: Callable[[str], Array]) -> Array:
+def load_part(name: str, given: Collection[str], load: Callable[[str], AnyArray]) -> AnyArray:
     """An array of a file, or the part of one that a name of `with_parts` means.
 
     Raises:
@@ -172,7 +172,7 @@ class LazyPart:
         example = part(np.empty((0, *array.shape[1:]), array.dtype))
         self.dtype, self.shape = example.dtype, (array.shape[0], *example.shape[1:])
 
-    def __getitem__(self, rows: slice) -> Array:
+    def __getitem__(self, rows: slice) -> AnyArray:
         """Some rows; of a transposed array one of its own rows is read at a time."""
         if not self._part.is_transposed:
             return self._part(np.asarray(self._array[rows]))

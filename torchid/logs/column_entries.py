@@ -6,14 +6,12 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, ConfigDict, Field
+from pydantic import BeforeValidator, Field
 from pydantic.dataclasses import dataclass
 
-from torchid.settings import Number, Positive
+from torchid.settings import STRICT, Name, Number, Positive
 
 KEY = "logs.columns"
-STRICT = ConfigDict(extra="forbid")
-Name = Annotated[str, Field(min_length=1)]
 Names = list[Name]
 _EVERYTHING = "*"
 _Three = tuple[Number, Number, Number]

@@ -15,14 +15,12 @@ from pydantic.dataclasses import dataclass
 from torchid.errors import ConfigError, UnknownNameError, excerpt, join_names
 from torchid.logs.column_entries import (
     KEY,
-    STRICT,
     Angle,
     ColumnEntry,
     Entry,
     FlagEntry,
     Flags,
     Gains,
-    Name,
     Names,
     PdLaw,
     Plate,
@@ -40,6 +38,7 @@ from torchid.logs.columns import KINDS, component_names, names_field
 from torchid.logs.joint_orders import order_by_name, require_joints_of, robot_with_order
 from torchid.logs.log import WRENCHES
 from torchid.logs.units import quantities_of, unit_factor
+from torchid.settings import STRICT, Name
 
 _X = TypeVar("_X")
 _XYZ, _RPY = ("x", "y", "z"), ("roll", "pitch", "yaw")

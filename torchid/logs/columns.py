@@ -21,7 +21,7 @@ from torchid.parameters import WRENCH_COMPONENTS
 TEXT_COLUMN = "imu_frame"
 COLUMN_FIELDS = tuple(name for name in (*SHAPES, *VARIANTS) if name not in NAME_FIELDS)
 #: Characters in the name of a column, which contains that of a joint.
-MAX_LETTERS = 2 * MAX_NAME
+MAX_COLUMN_LETTERS = 2 * MAX_NAME
 
 _UNIT = re.compile(r"\[.*\]$|\(.*\)$")
 KINDS = {"joint_names": "joint", "contact_names": "contact", "ft_names": "sensor"}
@@ -118,9 +118,9 @@ def check_header(texts: Sequence[str]) -> None:
         raise LogError.at_field("file", f"{len(texts)} columns", f"at most {MAX_COLUMNS}")
     seen = set[str]()
     for text in texts:
-        if len(text) > MAX_LETTERS or not is_plain(text):
+        if len(text) > MAX_COLUMN_LETTERS or not is_plain(text):
             found = f"a name of {len(text)} characters: {excerpt(text)}"
-            raise LogError.at_field("header", found, f"names of one line and at most {MAX_LETTERS} characters")
+            raise LogError.at_field("header", found, f"names of one line and at most {MAX_COLUMN_LETTERS} characters")
         if text in seen:
             raise LogError.at_field(f"column '{text}'", "given twice", "every column once")
         seen.add(text)

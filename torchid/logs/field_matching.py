@@ -10,10 +10,13 @@ import numpy as np
 from torchid.logs.column_groups import Family
 from torchid.logs.column_proposals import OF_BASE, OF_PLATES, is_no_torque
 from torchid.logs.file_samples import FileSample, increases, side_by_side, stated_names
-from torchid.logs.force_proposals import FORCE, MOMENT
 from torchid.logs.joint_orders import JOINT_ORDERS, MOTORS, numbered_joints, suitable_orders
 from torchid.logs.name_matching import KnownRobot
 from torchid.logs.units import quantities_with
+
+FORCE = re.compile(r"force|(?<![a-z])f\{axis", re.IGNORECASE)
+MOMENT = re.compile(r"moment|torque|(?<![a-z])[mt]\{axis", re.IGNORECASE)
+"""In patterns of columns."""
 
 _SIDEWAYS = re.compile(r"(?<![a-z])(f[xy]|m[xyz])(?![a-z])", re.IGNORECASE)  # components that tell of no contact
 _DRIVE = re.compile(r"joint|motor|current|temp|limit|volt", re.IGNORECASE)  # of a limb, but of no foot

@@ -6,17 +6,16 @@ import dataclasses
 from collections.abc import Iterable
 
 import numpy as np
-from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
 from torchid.errors import LogError, about_file
 from torchid.logs.log import FORCE_NORMAL, BoolArray, FloatArray, Log, describe_element, normalize_normals
-from torchid.settings import NotNegative, Positive
+from torchid.settings import STRICT, NotNegative, Positive
 
 KEY = "preprocessing.contact_threshold"
 
 
-@dataclass(config=ConfigDict(extra="forbid"), frozen=True)
+@dataclass(config=STRICT, frozen=True)
 class ContactThreshold:
     """When a contact stands by its force: from where that exceeds `above` [N] until it is below `below` [N].
 

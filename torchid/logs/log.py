@@ -262,7 +262,7 @@ def column_labels(name: str, names: Mapping[str, tuple[str, ...]]) -> tuple[str,
 
 
 #: Deviation of the norm of a quaternion or a normal from 1 up to which it is normalised.
-UNIT_TOLERANCE = 1e-3
+NORM_TOLERANCE = 1e-3
 #: Deviation of the norm of a normalised quaternion from 1.
 ROUNDING = 4.0 * np.finfo(np.float64).eps
 #: Size of a value in any unit: products of several stay within the range of float64.
@@ -346,11 +346,11 @@ def normalize_quaternions(name: str, quat: FloatArray, allow_nan: bool = False) 
     check_finite(name, quat, allow_nan=allow_nan)
     with np.errstate(over="ignore"):  # an infinite norm is refused below
         norm = np.linalg.norm(quat, axis=1)
-    bad = ~((np.abs(norm - 1.0) <= UNIT_TOLERANCE) | np.isnan(norm))
+    bad = ~((np.abs(norm - 1.0) <= NORM_TOLERANCE) | np.isnan(norm))
     if bad.any():
         i = int(np.argmax(bad))
         found = f"norm {norm[i]:.6g} at sample {i}"
-        raise LogError.at_field(name, found, f"unit quaternions, to {UNIT_TOLERANCE:g}")
+        raise LogError.at_field(name, found, f"unit quaternions, to {NORM_TOLERANCE:g}")
     norm[np.abs(norm - 1.0) <= ROUNDING] = 1.0  # normalised quaternions stay bit for bit
     return np.asarray(quat / norm[:, None], dtype=np.float64)
 
@@ -362,12 +362,12 @@ def normalize_normals(normals: FloatArray, active: BoolArray, labels: tuple[str,
     """
     with np.errstate(over="ignore", invalid="ignore"):
         norm = np.linalg.norm(normals, axis=2)
-        known = np.abs(norm - 1.0) <= UNIT_TOLERANCE
+        known = np.abs(norm - 1.0) <= NORM_TOLERANCE
     bad = active & ~known
     if bad.any():
         sample, contact = (int(i) for i in np.unravel_index(np.argmax(bad), bad.shape))
         found = f"norm {norm[sample, contact]:.6g} at {describe_element((sample, contact), labels)}, while in contact"
-        raise LogError.at_field(NORMALS, found, f"unit vectors, to {UNIT_TOLERANCE:g}")
+        raise LogError.at_field(NORMALS, found, f"unit vectors, to {NORM_TOLERANCE:g}")
     norm[np.abs(norm - 1.0) <= ROUNDING] = 1.0
     return np.where(known[..., None], normals / np.where(known, norm, 1.0)[..., None], np.nan)
 

@@ -16,14 +16,12 @@ from torchid.logs.base_proposals import field_of_base, find_angles, order_of_qua
 from torchid.logs.column_groups import Family, find_families, split_arrays, split_stamps
 from torchid.logs.column_proposals import is_desired, propose_field
 from torchid.logs.columns import is_column
-from torchid.logs.field_matching import FieldMatcher
-from torchid.logs.file_samples import FileSample, increases, listed_order, side_by_side
-from torchid.logs.force_proposals import MOMENT, are_states, point_along_z, threshold
+from torchid.logs.field_matching import MOMENT, FieldMatcher
+from torchid.logs.file_samples import FileSample, increases, listed_order, side_by_side, with_samples_first
 from torchid.logs.joint_orders import JOINT_ORDERS, numbered_joints, usual_order
 from torchid.logs.log import SHAPES, VARIANTS, WRENCHES
 from torchid.logs.name_matching import SUFFIXES, KnownRobot
-from torchid.logs.number_proposals import UnitProposer, step_of_stamps
-from torchid.logs.sample_axis import with_samples_first
+from torchid.logs.number_proposals import UnitProposer, are_states, point_along_z, step_of_stamps, threshold
 from torchid.logs.units import IN_DEGREES, quantities_of, quantities_with, unit_factor
 
 _GAINS = re.compile(r"\b(kp|kd)\b", re.IGNORECASE)

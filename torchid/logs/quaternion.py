@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from torchid.errors import LogError
-from torchid.logs.log import UNIT_TOLERANCE, FloatArray
+from torchid.logs.log import NORM_TOLERANCE, FloatArray
 
 
 def make_sign_continuous(quat: FloatArray) -> FloatArray:
@@ -41,7 +41,7 @@ def require_unit(topic: str, quat: FloatArray, key: str) -> FloatArray:
     """
     with np.errstate(over="ignore", invalid="ignore"):
         norm = np.linalg.norm(quat, axis=1)
-        bad = ~(np.abs(norm - 1.0) <= UNIT_TOLERANCE)
+        bad = ~(np.abs(norm - 1.0) <= NORM_TOLERANCE)
     if bad.any():
         found = f"a quaternion of the IMU of norm {norm[bad][0]:.4g}"
         raise LogError.at_field(topic, found, f"unit quaternions, or {key}.orientation: false")

@@ -28,7 +28,7 @@ from torchid.guards import MAX_RECORD, MAX_TOPICS, Budget, require_plain_name
 
 
 @dataclass(frozen=True)
-class Channel:
+class BagChannel:
     """A topic with its message type, such as `sensor_msgs/msg/Imu`, and its serialization (cdr, ros1)."""
 
     topic: str
@@ -57,7 +57,7 @@ class BagFile(Protocol):
     def close(self) -> None:
         """Close the file."""
 
-    def channels(self) -> list[Channel]:
+    def channels(self) -> list[BagChannel]:
         """All topics, possibly with duplicates."""
 
     def records(self, topics: Collection[str]) -> Iterator[Record]:
@@ -81,7 +81,7 @@ class McapFile:
         """Close the file."""
         self._stream.close()
 
-    def channels(self) -> list[Channel]:
+    def channels(self) -> list[BagChannel]:
         """All topics."""
         types: dict[int, str] = {}
         found: dict[int, McapChannel] = {}
@@ -92,7 +92,7 @@ class McapFile:
                 found[record.id] = record
             if len(types) + len(found) > 2 * MAX_TOPICS:
                 raise ValueError(f"more than {MAX_TOPICS} topics")
-        return [Channel(x.topic, types.get(x.schema_id, "unknown"), x.message_encoding) for x in found.values()]
+        return [BagChannel(x.topic, types.get(x.schema_id, "unknown"), x.message_encoding) for x in found.values()]
 
     def records(self, topics: Collection[str]) -> Iterator[Record]:
         """The messages of some topics."""
@@ -204,11 +204,11 @@ class Ros1File:
         """Close the file."""
         self._reader.close()
 
-    def channels(self) -> list[Channel]:
+    def channels(self) -> list[BagChannel]:
         """All topics."""
         if len(self._reader.connections) > MAX_TOPICS:
             raise ValueError(f"more than {MAX_TOPICS} topics")
-        return [Channel(x.topic, x.msgtype, "ros1") for x in self._reader.connections]
+        return [BagChannel(x.topic, x.msgtype, "ros1") for x in self._reader.connections]
 
     def records(self, topics: Collection[str]) -> Iterator[Record]:
         """The messages of some topics."""
@@ -246,12 +246,12 @@ class SqliteFile:
         if any(hidden for *_, hidden in columns):
             raise ValueError(f"table '{table}' has computed columns")
 
-    def channels(self) -> list[Channel]:
+    def channels(self) -> list[BagChannel]:
         """All topics."""
         rows = self._connection.execute("SELECT name, type, serialization_format FROM topics").fetchmany(MAX_TOPICS + 1)
         if len(rows) > MAX_TOPICS:
             raise ValueError(f"more than {MAX_TOPICS} topics")
-        return [Channel(str(name), str(kind), str(encoding)) for name, kind, encoding in rows]
+        return [BagChannel(str(name), str(kind), str(encoding)) for name, kind, encoding in rows]
 
     def records(self, topics: Collection[str]) -> Iterator[Record]:
         """The messages of some topics."""

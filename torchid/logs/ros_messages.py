@@ -18,7 +18,7 @@ from torchid.logs.quaternion import require_unit
 from torchid.logs.ros_low_state import LowState, register
 
 if TYPE_CHECKING:
-    from torchid.logs.ros_files import Channel
+    from torchid.logs.ros_files import BagChannel
 
 _IMU = "logs.topics.imu"
 _ZSTD = b"\x28\xb5\x2f\xfd"
@@ -37,7 +37,7 @@ class Decoder(Protocol):
         """The fields of a log in rows (N, k)."""
 
 
-def make_deserializer(topic: str, channel: Channel) -> Callable[[bytes], Any]:
+def make_deserializer(topic: str, channel: BagChannel) -> Callable[[bytes], Any]:
     """The function that deserializes the messages of a channel, by definitions of ROS and Unitree, not the bag's own.
 
     Raises:

@@ -43,7 +43,7 @@ from torchid.logs.ros_topics import (
 )
 
 if TYPE_CHECKING:
-    from torchid.logs.ros_files import BagFile, Channel
+    from torchid.logs.ros_files import BagChannel, BagFile
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +113,7 @@ class _Bag:
     """A bag with the roles of its topics; several roles may share a topic."""
 
     topics: Topics
-    channels: Mapping[str, Channel]
+    channels: Mapping[str, BagChannel]
     decoders: dict[str, Decoder] = field(default_factory=dict)
     rows: dict[str, TopicMessages] = field(default_factory=dict)
 
@@ -181,13 +181,13 @@ def read_bag(
     }
 
 
-def list_channels(files: list[Path]) -> dict[str, Channel]:
+def list_channels(files: list[Path]) -> dict[str, BagChannel]:
     """The topics of a bag.
 
     Raises:
         LogError: it is damaged, or a topic has several types.
     """
-    channels: dict[str, Channel] = {}
+    channels: dict[str, BagChannel] = {}
     for file in files:
         with open_bag_file(file) as opened:
             for channel in opened.channels():
@@ -220,7 +220,7 @@ def open_bag_file(path: Path) -> Iterator[BagFile]:
         yield file
 
 
-def _listed(channels: Mapping[str, Channel]) -> str:
+def _listed(channels: Mapping[str, BagChannel]) -> str:
     return join_names([f"{name} ({channel.type})" for name, channel in channels.items()], _LISTED) or "no topics"
 
 
@@ -286,7 +286,7 @@ def _contacts(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries])
     out: dict[str, NDArray[Any]] = {"contact_names": np.array(names), "contact_active": active}
     if bag.topics.contact_wrenches:
         nothing = np.full((len(clock.stamps), 6), np.nan)
-        wrenches = [_wrench(bag, clock, series, f"contact_wrenches.{name}", nothing) for name in names]
+        wrenches = [_wrench(clock, series, f"contact_wrenches.{name}", nothing) for name in names]
         out["contact_wrench_local"] = np.stack(wrenches, axis=1)
         for name, topic in bag.topics.contact_wrenches.items():
             _check_frame(bag, f"contact_wrenches.{name}", topic.frame or name)
@@ -332,7 +332,7 @@ def _active(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries], n
 
 
 def _wrench(
-    bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries], role: str, nothing: FloatArray | None = None
+    clock: _CommonClock, series: Mapping[str, TopicSeries], role: str, nothing: FloatArray | None = None
 ) -> FloatArray:
     return clock.align(series[role])["wrench"] if nothing is None or role in series else nothing
 
@@ -341,7 +341,7 @@ def _ft_sensors(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries
     names = tuple(bag.topics.ft_wrenches)
     if not names:
         return {}
-    wrenches = [_wrench(bag, clock, series, f"ft_wrenches.{name}") for name in names]
+    wrenches = [_wrench(clock, series, f"ft_wrenches.{name}") for name in names]
     for name, topic in bag.topics.ft_wrenches.items():
         _check_frame(bag, f"ft_wrenches.{name}", topic.frame, f"the child frame of joint '{name}'")
     return {"ft_names": np.array(names), "ft_wrench": np.stack(wrenches, axis=1)}

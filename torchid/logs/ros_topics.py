@@ -6,31 +6,29 @@ import dataclasses
 from collections.abc import Collection
 from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, ConfigDict, Field
+from pydantic import BeforeValidator, Field
 from pydantic.dataclasses import dataclass
 
 from torchid.errors import ConfigError, UnknownNameError, excerpt
 from torchid.logs.joint_orders import GO, JOINT_ORDERS, require_joints_of
-from torchid.settings import Number
+from torchid.settings import STRICT, Name, Number
 
-_STRICT = ConfigDict(extra="forbid")
-_Name = Annotated[str, Field(min_length=1)]
 _Force = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
 
-@dataclass(config=_STRICT, frozen=True)
+@dataclass(config=STRICT, frozen=True)
 class JointTopic:
     """`sensor_msgs/JointState`: `joints` are the joints to read, by default all of the first message.
 
     `names` are the URDF's names of those that the messages call otherwise, by what they call them.
     """
 
-    topic: _Name
-    joints: Annotated[list[_Name], Field(min_length=1)] | None = None
-    names: dict[_Name, _Name] = dataclasses.field(default_factory=dict)
+    topic: Name
+    joints: Annotated[list[Name], Field(min_length=1)] | None = None
+    names: dict[Name, Name] = dataclasses.field(default_factory=dict)
 
 
-@dataclass(config=_STRICT, frozen=True)
+@dataclass(config=STRICT, frozen=True)
 class ImuTopic:
     """`sensor_msgs/Imu`.
 
@@ -40,12 +38,12 @@ class ImuTopic:
         orientation: whether its orientation is that of the base, along whose axes `frame`, stated, has to be.
     """
 
-    topic: _Name
-    frame: _Name | None = None
+    topic: Name
+    frame: Name | None = None
     orientation: bool = False
 
 
-@dataclass(config=_STRICT, frozen=True)
+@dataclass(config=STRICT, frozen=True)
 class OdometryTopic:
     """`nav_msgs/Odometry` of the base link.
 
@@ -53,12 +51,12 @@ class OdometryTopic:
     `child_frame_id`, that of the base link.
     """
 
-    topic: _Name
+    topic: Name
     twist: Literal["child", "world", "none"] = "child"
-    frame: _Name | None = None
+    frame: Name | None = None
 
 
-@dataclass(config=_STRICT, frozen=True)
+@dataclass(config=STRICT, frozen=True)
 class WrenchTopic:
     """`geometry_msgs/WrenchStamped` or `Wrench`.
 
@@ -66,12 +64,12 @@ class WrenchTopic:
     the expected `header.frame_id`, by default the contact's frame; in a limb, the name of the joint's child frame.
     """
 
-    topic: _Name
+    topic: Name
     sign: Literal[1, -1] = 1
-    frame: _Name | None = None
+    frame: Name | None = None
 
 
-@dataclass(config=_STRICT, frozen=True)
+@dataclass(config=STRICT, frozen=True)
 class ForceTopic:
     """A force along the ground's normal: a number of `std_msgs`, one of an array, or one component of a wrench.
 
@@ -80,21 +78,21 @@ class ForceTopic:
     a foot that is pressed on the ground reads less than 0.
     """
 
-    topic: _Name
+    topic: Name
     index: Annotated[int, Field(ge=0, strict=True)] | None = None
     component: Literal["fx", "fy", "fz"] | None = None
     sign: Literal[1, -1] = 1
 
 
-@dataclass(config=_STRICT, frozen=True)
+@dataclass(config=STRICT, frozen=True)
 class ContactTopic:
     """`std_msgs/Bool`, or a contact that is `always` active."""
 
-    topic: _Name | None = None
+    topic: Name | None = None
     always: bool = False
 
 
-@dataclass(config=_STRICT, frozen=True)
+@dataclass(config=STRICT, frozen=True)
 class LowStateTopic:
     """`LowState` of `unitree_go` or `unitree_hg`: all motors, the IMU, and of the first four foot sensors.
 
@@ -111,12 +109,12 @@ class LowStateTopic:
             has to fit the times of receipt.
     """
 
-    topic: _Name
-    robot: _Name | None = None
-    joints: Annotated[list[_Name | None], Field(min_length=1)] | None = None
-    frame: _Name | None = None
+    topic: Name
+    robot: Name | None = None
+    joints: Annotated[list[Name | None], Field(min_length=1)] | None = None
+    frame: Name | None = None
     orientation: bool = True
-    feet: Annotated[list[_Name | None], Field(min_length=1, max_length=4)] | None = None
+    feet: Annotated[list[Name | None], Field(min_length=1, max_length=4)] | None = None
     above: Number | None = None
     forces: bool = False
     stamps: Literal["tick", "receipt"] | None = None
@@ -152,7 +150,7 @@ _Forces = dict[str, Annotated[ForceTopic, BeforeValidator(_topic)]]
 _Contacts = dict[str, Annotated[ContactTopic, BeforeValidator(_contact)]]
 
 
-@dataclass(config=_STRICT, frozen=True, kw_only=True)
+@dataclass(config=STRICT, frozen=True, kw_only=True)
 class Topics:
     """The topics of a bag; a name alone is a topic with default settings.
 

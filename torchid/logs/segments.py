@@ -12,6 +12,7 @@ import numpy as np
 from torchid.errors import LogError, about_file
 from torchid.logs.gaps import measure_coverage, warn_of_gaps
 from torchid.logs.log import BoolArray, FloatArray, Log
+from torchid.logs.low_pass import DROPPED_PERIODS
 from torchid.logs.preprocess import (
     gapless_fields,
     lacks_derivatives,
@@ -20,7 +21,7 @@ from torchid.logs.preprocess import (
     unloaded_readings,
 )
 from torchid.logs.signal_noise import signal_noise, warn_of_noisy_accelerations
-from torchid.logs.timeline import DROPPED_PERIODS, FEWEST_DIFFERENTIATED, LONGEST_STEP, Timeline, spline_derivatives
+from torchid.logs.timeline import FEWEST_DIFFERENTIATED, LONGEST_STEP, Timeline, spline_derivatives
 
 
 def preprocess_segments(

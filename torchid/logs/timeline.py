@@ -6,13 +6,13 @@ import math
 import numbers
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
 
 from torchid.errors import InputError, LogError, warn_about_file
 from torchid.logs.log import BoolArray, FloatArray, check_time
+from torchid.logs.low_pass import DROPPED_PERIODS, REACH_PERIODS, LowPass
 
 # -------------------------------------------------------------------------------------------------------------- splines
 
@@ -77,60 +77,6 @@ def joint_spline_derivatives(
 
 #: Steps that differ by less than this share of the median step count as uniform.
 JITTER = 1e-6
-_FREQUENCIES = 2**16
-#: Remaining effect of a sample outside of a block: a hundredth of rounding, since modes of a filter that runs twice
-#: decay like a polynomial times an exponential.
-_SETTLED = 1e-18
-#: Values that are filtered by one call: each takes 0.2 ms beside the filter, which makes several copies of what it is
-#: given.
-_FILTERED_AT_ONCE = 2**14
-
-
-@dataclass(frozen=True, eq=False)
-class LowPass:
-    """A zero-phase filter: the second-order sections of one pass, and how many samples each end is extended by."""
-
-    sections: FloatArray
-    padding: int
-
-    def __call__(self, values: FloatArray) -> FloatArray:
-        """Filter every channel of uniformly sampled values (M, ...) forward and backward."""
-        from scipy import signal  # takes 0.4 s, which runs that find their samples in a cache need not
-
-        flat = values.reshape(len(values), -1)
-        out = np.empty(flat.shape)
-        together = max(1, _FILTERED_AT_ONCE // max(len(flat), 1))
-        for first in range(0, flat.shape[1], together):
-            columns = slice(first, first + together)
-            out[:, columns] = signal.sosfiltfilt(self.sections, flat[:, columns], axis=0, padlen=self.padding)
-        return out.reshape(values.shape)
-
-    @property
-    def settling(self) -> int:
-        """Samples after which earlier ones have no effect: the slowest mode has decayed to rounding."""
-        slowest = max(float(np.max(np.abs(np.roots(section[3:])))) for section in self.sections)
-        return math.ceil(math.log(_SETTLED) / math.log(slowest))
-
-    @property
-    def noise_share(self) -> float:
-        """Share of the power of white noise that passes: equivalent noise bandwidth over half the sample rate."""
-        return _noise_share(self.sections.tobytes())
-
-    def gain(self, cycles: FloatArray) -> FloatArray:
-        """By how much amplitudes change at frequencies (K,) [1/samples], in both passes together."""
-        from scipy import signal
-
-        _, response = signal.sosfreqz(self.sections, worN=2.0 * np.pi * cycles)
-        return np.asarray(np.square(np.abs(response)))
-
-
-@cache  # takes 20 ms, and logs, or segments of one, mostly have one filter
-def _noise_share(sections: bytes) -> float:
-    """Of a filter, from its second-order sections."""
-    from scipy import signal
-
-    _, response = signal.sosfreqz(np.frombuffer(sections).reshape(-1, 6), worN=_FREQUENCIES, whole=True)
-    return float(np.mean(np.abs(response) ** 4))  # two passes, and power goes with the amplitude squared
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,8 +127,8 @@ class Timeline:
     def part(self, first: int, last: int) -> tuple[slice, Timeline]:
         """What a part of the output's stamps depends on: samples of the log, and the timeline from these to the part.
 
-        The same numbers come out as from the whole, but for a remainder of `_SETTLED` and rounding: filter and spline
-        reach into the neighbourhood, and the spline is drawn through the same blocks of samples.
+        The same numbers come out as from the whole, but for rounding: filter (`LowPass.settling`) and spline reach into
+        the neighbourhood, and the spline is drawn through the same blocks of samples.
         """
         at = self.output_stamps[first:last]
         spoiled = 0 if self.low_pass is None else self.low_pass.settling + self.low_pass.padding
@@ -268,15 +214,6 @@ def _around(stamps: FloatArray, at: FloatArray, beyond: int) -> slice:
 
 # --------------------------------------------------------------------------------------------------------------- layout
 
-#: Order of the Butterworth filter, which runs forward and backward: the gain at the cutoff is 1/2.
-FILTER_ORDER = 4
-#: Periods of the cutoff that are dropped at each end of a filtered log. The filter does not know what came before, and
-#: its error on an acceleration is 5 % of that signal's rms after 1 period, 2 to 3 % after 1.5, under 1 % after 2
-#: (3 % for a base that spins once a second, whose quaternion has a large second derivative even at constant rate).
-DROPPED_PERIODS = 2.0
-#: Periods of the cutoff over which the filter smears a force: 2 % of a step are left beyond, 0.05 % of one that takes
-#: two periods.
-REACH_PERIODS = 1.0
 #: Samples dropped at each end where an unfiltered log is differentiated: the spline multiplies noise 8.5 times more at
 #: the first sample than inside the log, 2.4 times more at the second and 1.3 times at the third.
 DROPPED_SAMPLES = 2
@@ -318,16 +255,11 @@ def lay_out_timeline(
     dropped = DROPPED_SAMPLES if differentiates else 0
     kept = slice(dropped, len(native) - dropped)
     if cutoff_hz is not None:
-        from scipy import signal
-
         unit = f" (steps of {step:.6g} s: are the stamps in s?)" if step > LONGEST_MEDIAN_STEP else ""
         _check_rate("cutoff_hz", cutoff_hz, 0.5 / step, f"half the log's median sample rate{unit}")
         if np.max(np.abs(np.diff(native) - step)) > JITTER * step:
             grid = step * np.arange(math.floor(native[-1] / step + JITTER) + 1)
-        low_pass = LowPass(
-            sections=signal.butter(FILTER_ORDER, cutoff_hz, fs=1.0 / step, output="sos"),
-            padding=max(15, math.ceil(1.0 / (cutoff_hz * step))),
-        )
+        low_pass = LowPass.butterworth(cutoff_hz, step)
         kept = _unspoiled(grid, step, cutoff_hz, low_pass.padding)
     output = None
     if sample_rate_hz is not None:

@@ -10,11 +10,11 @@ import numpy as np
 from torchid.errors import format_count
 from torchid.logs.column_proposals import is_desired
 from torchid.logs.file_samples import TopicSample
-from torchid.logs.force_proposals import threshold
 from torchid.logs.joint_orders import JOINT_ORDERS, suitable_orders, usual_order
-from torchid.logs.log import UNIT_TOLERANCE
+from torchid.logs.log import NORM_TOLERANCE
 from torchid.logs.map_proposals import MapProposal
 from torchid.logs.name_matching import KnownRobot, match_joints, match_names, spelled
+from torchid.logs.number_proposals import threshold
 from torchid.logs.ros_low_state import LowState
 from torchid.logs.ros_messages import ContactFlag, Imu, JointStates, NormalForce, Odometry, Wrench
 
@@ -200,7 +200,7 @@ class _Proposer:
         messages = self.topics[entry["topic"]].messages
         turns = np.array([[getattr(message.orientation, axis) for axis in "xyzw"] for message in messages])
         known = all(message.orientation_covariance[0] != -1.0 for message in messages)
-        if known and np.any(turns != turns[0]) and np.allclose(np.linalg.norm(turns, axis=1), 1.0, atol=UNIT_TOLERANCE):
+        if known and np.any(turns != turns[0]) and np.allclose(np.linalg.norm(turns, axis=1), 1.0, atol=NORM_TOLERANCE):
             entry["orientation"] = True
             self.out.fields.add("base_quat_xyzw")
             what = "orientation: the IMU's, an estimate of its own, is that of the base"

@@ -22,7 +22,7 @@ from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.reprs import short_repr
 
-Span = tuple[int, int]
+SampleSpan = tuple[int, int]
 """First of some successive samples of a log, and the end."""
 
 
@@ -51,7 +51,7 @@ class CompressedLog:
     blocks: int
     pieces: list[Part]
     by_state: list[Part]
-    unloaded: dict[Span, list[Part]]
+    unloaded: dict[SampleSpan, list[Part]]
 
     __repr__ = short_repr
 
@@ -66,7 +66,7 @@ class CompressedLog:
         """Number of equations, without those of readings in the air."""
         return sum(part.factor.rows for part in self.pieces)
 
-    def block(self, start: int, stop: int, fold: int, builder: RowBuilder) -> CompressedBlock:
+    def block(self, start: int, stop: int, fold: int) -> CompressedBlock:
         """A block of the log."""
         spans = piece_spans(self.samples, self.blocks)
         pieces = zip(spans, self.pieces, strict=True)
@@ -102,7 +102,7 @@ Block = Samples | CompressedBlock
 """Samples of one log in one fold, or what they compress to."""
 
 
-def piece_spans(samples: int, blocks: int) -> list[Span]:
+def piece_spans(samples: int, blocks: int) -> list[SampleSpan]:
     """Pieces of a log that make up the blocks of every number of blocks up to a largest one."""
     ends = sorted({end for count in range(1, blocks + 1) for span in block_spans(samples, count) for end in span})
     return list(zip(ends, ends[1:], strict=False))
@@ -130,7 +130,7 @@ def compress_log(log: Samples, builder: RowBuilder, progress: ProgressCallback |
         for part in compress_parts(_cut(log, piece_spans(len(log), blocks)), builder, progress=progress)
         if not part.unloaded
     ]
-    unloaded: dict[Span, list[Part]] = {}
+    unloaded: dict[SampleSpan, list[Part]] = {}
     for count in range(1, blocks + 1):
         spans = block_spans(len(log), count)
         for part in _compact(compress_unloaded(_cut(log, spans), builder)):
@@ -152,7 +152,7 @@ def fold_compressed(logs: Sequence[CompressedLog], builder: RowBuilder) -> list[
         sum(len(log) / log.oversampling for log in logs), sum(len(log.by_state) for log in logs), builder
     )
     layout = lay_out_folds([len(log) for log in logs], count, [log.blocks for log in logs])
-    return [log.block(*block, builder) for log, blocks in zip(logs, layout, strict=True) for block in blocks]
+    return [log.block(*block) for log, blocks in zip(logs, layout, strict=True) for block in blocks]
 
 
 def merge_blocks(blocks: Sequence[CompressedBlock], builder: RowBuilder) -> list[Part]:
@@ -169,6 +169,6 @@ def _compact(parts: Sequence[Part]) -> list[Part]:
     return [replace(part, factor=part.factor.compact()) for part in parts]
 
 
-def _cut(log: Samples, spans: Sequence[Span]) -> list[Samples]:
+def _cut(log: Samples, spans: Sequence[SampleSpan]) -> list[Samples]:
     """The samples of each span, with its number as their fold."""
     return [replace(log if len(spans) == 1 else log[start:stop], fold=k) for k, (start, stop) in enumerate(spans)]

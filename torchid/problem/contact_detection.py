@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
 from torchid import ranks
@@ -33,7 +32,7 @@ from torchid.problem.samples import Samples
 from torchid.robot import Robot
 from torchid.rounding import STD_PER_MAD
 from torchid.sensing import Contact, named_sensors
-from torchid.settings import NotNegative, Positive
+from torchid.settings import STRICT, NotNegative, Positive
 
 _SUPPORTED = 0.25  # of the weight: what contact forces may leave of it in samples that parameters are fitted to
 _LEAST_FITTED = 100  # samples
@@ -41,7 +40,7 @@ _DEVIATIONS = 3.0  # of what feet seem to carry in the air, to which thresholds 
 _LOWEST = 0.01  # of the stated thresholds
 
 
-@dataclass(config=ConfigDict(extra="forbid"), frozen=True)
+@dataclass(config=STRICT, frozen=True)
 class DetectionConfig:
     """How contacts are detected.
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchid import parameters
 from torchid.parameters import Array
-from torchid.problem.extras import Extra, measured_components
+from torchid.problem.extras import Extra
 from torchid.problem.loop_forces import LoopLayouts, LoopRows
 from torchid.problem.row_blocks import RowBlock, RowBlocks, row_block
 from torchid.problem.wrench_rows import Acting, WrenchRows
@@ -30,6 +30,7 @@ from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 from torchid.rounding import KINEMATIC_TOLERANCE, is_significant
 from torchid.sensing import Contact, SensorSet
+from torchid.sensing.sensors import measured_components
 
 _INERTIAL = parameters.INERTIAL.stop
 ContactState = tuple[bool, ...]

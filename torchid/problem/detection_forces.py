@@ -15,11 +15,10 @@ from torchid.problem.predict import force_series
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples, concatenate
 from torchid.regressor import FrameJacobian
-from torchid.regressor.kinematics import GRAVITY_WORLD
+from torchid.regressor.kinematics import GRAVITY
 from torchid.robot import Robot
 from torchid.sensing import Contact, named_sensors
 
-GRAVITY = -GRAVITY_WORLD[2]
 _DAMPING = 1e-3  # of actuators' terms, against the share that samples have of them
 _LARGEST = 1.0, 100.0, 100.0  # armature [kg m^2] and friction [N m, N m s/rad] that nothing determines
 _SIGN_WIDTH = 0.001  # rad/s, below which friction is not sure of its sign

@@ -12,6 +12,7 @@ from torchid.logs.column_map import fits
 from torchid.reprs import short_repr
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
+from torchid.sensing.sensors import recorded_components
 
 CHANNELS = ("joint_torque", "contact_force", "contact_moment", "ft_force", "ft_moment")
 """Kinds of sensor channels, as `SensorNoise` has them."""
@@ -183,24 +184,3 @@ def _channels(robot: Robot, contacts: Sequence[Contact], sensors: SensorSet) -> 
     for index, k in np.argwhere(recorded_components(contacts, sensors, in_world=True)).tolist():
         kind = "contact_force" if k < 3 else "contact_moment"
         yield Channel(kind, contacts[index].frame, contacts[index].component_name(k), (), ((index, k),))
-
-
-def measured_components(contacts: Sequence[Contact], sensors: SensorSet) -> np.ndarray:
-    """Measured components (C, 6) that the contacts can exert, along the frames' axes."""
-    possible = np.zeros((len(contacts), 6), dtype=bool)
-    for index, contact in enumerate(contacts):
-        possible[index, list(contact.components)] = True
-    return possible & sensors.wrench
-
-
-def recorded_components(contacts: Sequence[Contact], sensors: SensorSet, in_world: bool) -> np.ndarray:
-    """Recorded components (C, 6) from which the measured ones are computed: whole vectors if along world axes.
-
-    Of a contact that is read along the ground's normal they are those that are measured.
-    """
-    measured = measured_components(contacts, sensors)
-    if not in_world:
-        return measured
-    whole = measured.reshape(-1, 2, 3).any(axis=2)
-    turned = np.array([not contact.along_normal for contact in contacts], dtype=bool)[:, None]
-    return np.where(turned, np.repeat(whole, 3, axis=1), measured)

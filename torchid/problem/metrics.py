@@ -42,7 +42,7 @@ LIMB_GROUPS = {"ft_force": "force in limbs [N]", "ft_moment": "moment in limbs [
 
 _LABELS = ERROR_GROUPS | LIMB_GROUPS
 
-SETS = ("train", "test")
+LOG_SETS = ("train", "test")
 """Sets of logs that errors are given for."""
 
 BASE_ROWS = tuple(f"base {kind} {axis}" for kind in ("force", "moment") for axis in "xyz")

@@ -16,11 +16,11 @@ from torchid.parameters import Array
 from torchid.problem.chunks import chunks_by_state, one_thread
 from torchid.problem.compression import Part
 from torchid.problem.contact_state import ContactState
-from torchid.problem.extras import measured_components
 from torchid.problem.linear import TriangularFactor
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.sensing import SensorNoise
+from torchid.sensing.sensors import measured_components
 
 BASE_GROUPS = tuple(f"base_{kind}.{axis}" for kind in ("force", "moment") for axis in "xyz")
 NOISE_GROUPS = ("joint_torque", "contact_force", "contact_moment", *BASE_GROUPS, "ft_force", "ft_moment")

@@ -19,7 +19,6 @@ from torchid.logs.spill import MappedPages
 from torchid.parameters import WRENCH_COMPONENTS, Array
 from torchid.problem.base_motion import BaseMotion, base_motion, imu_pose, position_for_moments
 from torchid.problem.closed_loops import FOLLOW, require_closed_loops
-from torchid.problem.extras import recorded_components
 from torchid.problem.log_joints import columns_in_order, recorded_torques, require_limb_sensors
 from torchid.problem.motion_noise import MotionNoise, bind_motion_noise
 from torchid.regressor import Motion
@@ -27,7 +26,7 @@ from torchid.regressor.kinematics import GRAVITY_WORLD, rotation_matrix
 from torchid.reprs import short_repr
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
-from torchid.sensing.sensors import NORMAL_FORCE, NORMAL_INDEX
+from torchid.sensing.sensors import NORMAL_FORCE, NORMAL_INDEX, recorded_components
 
 _LISTED = 6
 _FAR_APART = 8  # samples per chosen one, beyond which a page holds few of these

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from torchid.regressor.tree import KinematicTree
 
-GRAVITY_WORLD = (0.0, 0.0, -9.81)
+GRAVITY = 9.81  # [m/s^2]
+GRAVITY_WORLD = (0.0, 0.0, -GRAVITY)
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,7 @@ from torchid.identifiability.base_parameters import BaseParameters, format_base_
 from torchid.identifiability.information import ExpectedErrors
 from torchid.problem import Metrics
 from torchid.problem.metrics import ROW_GROUPS, group_name
-from torchid.report import palette
-from torchid.report.figures import STYLE, label_decades
+from torchid.report.figure_style import IDENTIFIED_COLOR, MEASURED_COLOR, NOISE_COLOR, STYLE, label_decades
 from torchid.rounding import BASE_RANK_TOLERANCE
 from torchid.sensor_planning.demands import Candidate
 from torchid.sensor_planning.observability import BaseObservability, LostBase, PostureSummary
@@ -33,7 +32,7 @@ _MAX_SETS, _MAX_REMEDIES, _BASE_DIRECTIONS = 5, 8, 6
 #: Smallest singular value of S_b V_x: below, the noise of the base's rows is a thousand times that of the sensors.
 _MIN_SINGULAR_VALUE = 1e-3
 #: Markers and colors of expected and measured errors.
-_MODEL, _EXPECTED, _MEASURED = ("o", palette.IDENTIFIED), ("s", palette.NOISE), ("D", palette.MEASURED)
+_MODEL, _EXPECTED, _MEASURED = ("o", IDENTIFIED_COLOR), ("s", NOISE_COLOR), ("D", MEASURED_COLOR)
 
 
 def sensor_plan_document(plan: SensorPlan) -> dict[str, Any]:

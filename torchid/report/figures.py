@@ -1,135 +1,47 @@
-"""Figures of a run and of a robot's tree; style of all figures."""
+"""Figures of a run, of how its ridge was chosen, of its replay, and of a robot's tree."""
 
 from __future__ import annotations
 
-import io
-import math
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Collection, Mapping, Sequence
 from textwrap import fill
 from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.text import Text
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from torchid.errors import during, escape
 from torchid.estimators import Estimate
 from torchid.estimators.least_squares import FIXED
 from torchid.fitting.calibration import Comparison
-from torchid.parameters import PARAMETERS, PER_BODY, WRENCH_COMPONENTS
+from torchid.fitting.cross_validation import RidgeChoice
+from torchid.parameters import PARAMETERS, PER_BODY, WRENCH_COMPONENTS, Array
 from torchid.problem import Metrics
 from torchid.problem.metrics import ERROR_GROUPS, group_name
-from torchid.report import palette
+from torchid.report.figure_style import (
+    IDENTIFIED_COLOR,
+    MEASURED_COLOR,
+    NOMINAL_COLOR,
+    STYLE,
+    decade,
+    decade_formatter,
+    label_decades,
+)
 from torchid.report.tables import MARKS, marks_legend
 from torchid.robot import Robot
 from torchid.robot.tree import BodyJoint
 from torchid.sensing import Contact
 
-STYLE: dict[Any, Any] = {
-    "font.size": 9,
-    "text.parse_math": False,  # names may hold dollar signs
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.alpha": 0.3,
-    "axes.titley": 1.0,  # looked for above the ticks, it takes an eighth of the time
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "legend.frameon": False,
-    "pdf.fonttype": 42,  # letters that editors keep and journals accept
-    "svg.hashsalt": "torchid",  # the same figure is the same file
-}
-#: Up to which power of ten axes have plain numbers, and how far off a power rounding is.
-_PLAIN_DECADES, _ROUNDING = 3.0, 1e-9
-_FEW_DECADES = 1e3  # span of an axis on which 2 and 5 are labelled, too
-_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _FLOOR = "noise of the readings alone"
 _MOST_BARS = 20  # of a kind of contributions
-#: 5 % larger than with the usual 6, in two thirds of the time.
-_COMPRESSION = 3
-#: Dates in files, without which the same run writes the same files.
-_DATES = {"pdf": "CreationDate", "svg": "Date"}
 #: Colors of sensors and links in the tree, and its column width, row height and legend width [inches].
-_TORQUE, _WRENCH, _LIMB, _PLAIN, _LOADED = palette.IDENTIFIED, "#009e73", "#cc79a7", "0.75", "0.3"
+_TORQUE, _WRENCH, _LIMB, _PLAIN, _LOADED = IDENTIFIED_COLOR, "#009e73", "#cc79a7", "0.75", "0.3"
 _COLUMN, _ROW, _LEGEND = 2.1, 0.3, 7.4
 
 Position = tuple[float, int]
 """Column and row in the figure of a tree."""
-
-
-def save_figure(figure: Figure, path: Path, kind: str | None = None) -> None:
-    """Write a figure to a file, see `figure_bytes`."""
-    with during("drawing", path):
-        path.write_bytes(figure_bytes(figure, (kind or path.suffix[1:]).lower()))
-
-
-def figure_bytes(figure: Figure, form: str) -> bytes:
-    """A figure as the content of a file of type "png", "pdf" or "svg", with control characters in its texts escaped.
-
-    The style is that of the figure: matplotlib creates tick labels only now, and they may contain dollar signs.
-    """
-    content = io.BytesIO()
-    with matplotlib.rc_context(STYLE):
-        for text in figure.findobj(Text):
-            text.set_text(escape(text.get_text(), "\n"))
-        figure.set_dpi(130)
-        if form == "png":
-            canvas = FigureCanvasAgg(figure)  # `savefig` draws all of it twice, once for the layout
-            canvas.print_png(content, pil_kwargs={"compress_level": _COMPRESSION})
-        else:
-            figure.savefig(content, format=form, metadata={_DATES[form]: None})
-    return content.getvalue()
-
-
-def save_figures(figures: Mapping[str, Figure], folder: Path, form: str) -> None:
-    """Write figures by name, in the format of that extension."""
-    for name, figure in figures.items():
-        save_figure(figure, folder / f"{name}.{form}")
-
-
-@dataclass(frozen=True)
-class Drawn:
-    """A figure as the content of its file, and as PNG."""
-
-    file: bytes
-    png: bytes
-
-
-def draw_for(path: Path, make: Callable[[], Figure]) -> Drawn:
-    """A figure that a function makes, for a file of a type by its extension."""
-    with during("drawing", path):
-        figure, form = make(), path.suffix[1:]
-        file = figure_bytes(figure, form)
-        return Drawn(file, file if form == "png" else figure_bytes(figure, "png"))
-
-
-def decade(value: float) -> str:
-    """A power of ten as axes show it; what matplotlib writes is a formula, which names forbid (`STYLE`)."""
-    exponent = math.log10(value)
-    if abs(exponent) <= _PLAIN_DECADES or abs(exponent - round(exponent)) > _ROUNDING:
-        return f"{value:g}"
-    return "10" + str(round(exponent)).translate(_SUPERSCRIPTS)
-
-
-def _decade_formatter() -> FuncFormatter:
-    """Of the ticks of a logarithmic axis."""
-    return FuncFormatter(lambda value, _: decade(value))
-
-
-def label_decades(axis: Axis) -> None:
-    """Label 1, 2 and 5 of each power of ten of a logarithmic axis, however little of one it spans."""
-    low, high = sorted(axis.get_view_interval())
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < _FEW_DECADES * low else (1.0,)))
-    axis.set_major_formatter(_decade_formatter())
-    axis.set_minor_formatter(NullFormatter())
 
 
 # ---------------------------------------------------------------------------------------------------- errors
@@ -143,7 +55,7 @@ def error_figure(sets: Mapping[str, Comparison[Metrics]], of: str = "URDF") -> F
     for axis, (name, (nominal, identified)) in zip(axes, sets.items(), strict=True):
         groups = [group for group in ERROR_GROUPS if nominal.relative.get(group) is not None]
         index = np.arange(len(groups))
-        pairs = ((-0.2, nominal, palette.NOMINAL, of), (0.2, identified, palette.IDENTIFIED, "identified"))
+        pairs = ((-0.2, nominal, NOMINAL_COLOR, of), (0.2, identified, IDENTIFIED_COLOR, "identified"))
         for shift, metrics, color, label in pairs:
             heights = [100.0 * (metrics.relative.get(group) or 0.0) for group in groups]
             bars = axis.bar(index + shift, heights, 0.38, color=color, label=label)
@@ -168,7 +80,7 @@ def _draw_noise(axis: Axes, metrics: Metrics, groups: Sequence[str]) -> None:
     for place, group in enumerate(groups):
         noise, rms, relative = (x.get(group) for x in (metrics.noise, metrics.rms, metrics.relative))
         if noise and rms and relative:
-            axis.hlines(100.0 * noise * relative / rms, place - 0.4, place + 0.4, colors=palette.MEASURED, label=_FLOOR)
+            axis.hlines(100.0 * noise * relative / rms, place - 0.4, place + 0.4, colors=MEASURED_COLOR, label=_FLOOR)
 
 
 # ----------------------------------------------------------------------------------------------------- identifiability
@@ -193,8 +105,8 @@ def identifiability_figure(body_names: Sequence[str], estimate: Estimate) -> Fig
     left.set_title(marks_legend(), loc="left", fontsize=8)
     figure.colorbar(image, ax=left, label="share of the data", pad=0.01)
     values = estimate.singular_values
-    right.semilogy(np.arange(1, len(values) + 1), values, ".", color=palette.IDENTIFIED, markersize=4)
-    right.yaxis.set_major_formatter(_decade_formatter())
+    right.semilogy(np.arange(1, len(values) + 1), values, ".", color=IDENTIFIED_COLOR, markersize=4)
+    right.yaxis.set_major_formatter(decade_formatter())
     right.axvline(estimate.rank + 0.5, color="0.5", linewidth=0.8)
     right.set_title(f"singular values, rank {estimate.rank}", loc="left", fontsize=8)
     right.set_xlabel("number")
@@ -220,7 +132,7 @@ def contribution_figure(groups: Mapping[str, Sequence[tuple[str, float]]]) -> Fi
     axes = figure.subplots(len(shown), 1, squeeze=False, height_ratios=[count + 0.8 for count in counts])[:, 0]
     for axis, (group, pairs) in zip(axes, shown.items(), strict=True):
         names, bits = zip(*pairs, strict=True)
-        bars = axis.barh(range(len(pairs)), bits, 0.7, color=palette.IDENTIFIED)
+        bars = axis.barh(range(len(pairs)), bits, 0.7, color=IDENTIFIED_COLOR)
         axis.bar_label(bars, fmt="%.3g", fontsize=8, padding=2)
         axis.set_yticks(range(len(pairs)), [fill(name, 60) for name in names], fontsize=7)
         axis.set_ylim(len(pairs) - 0.4, -0.6)
@@ -365,3 +277,117 @@ def _legend(welds: bool) -> list[Line2D]:
         Line2D([], [], color=_LOADED, linewidth=2.2, label="constrained by contacts"),
         *(in_limbs if welds else []),
     ]
+
+
+# ---------------------------------------------------------------------------------------------------- ridge
+
+_WIDE_RATIO = 5.0  # ratio of errors from which on decades tell more than differences
+
+
+@matplotlib.rc_context(STYLE)
+def ridge_figure(choice: RidgeChoice, of: str = "URDF") -> Figure:
+    """Mean square of whitened residuals on held-out folds by ridge, on logarithmic axes.
+
+    The band is a standard error of the difference from the least, fold by fold, on either side; ridges where it reaches
+    down to the least are shaded: the data hardly tell them from the chosen one. Ridges of 0 have no place on the axis.
+    """
+    tried, mean, error = (np.array(x) for x in (choice.tried, choice.mean_square, choice.standard_error))
+    least = float(mean.min())
+    within = (mean - error <= least) & (tried > 0.0)
+    shown = tried > 0.0
+    figure = Figure(figsize=(6.4, 3.8), layout="constrained")
+    axes = figure.subplots()
+    axes.set_xscale("log")
+    if mean.max() > _WIDE_RATIO * max(least, np.finfo(float).tiny):
+        axes.set_yscale("log")
+    low = mean - error if axes.get_yscale() == "linear" else np.maximum(mean - error, 0.5 * least)
+    band = axes.fill_between(
+        tried[shown], low[shown], (mean + error)[shown], color=IDENTIFIED_COLOR, alpha=0.25, linewidth=0
+    )
+    (curve,) = axes.plot(tried[shown], mean[shown], "o-", color=IDENTIFIED_COLOR, markersize=4)
+    line = axes.axhline(least, color="0.3", linewidth=1.0, linestyle="--")
+    handles = [curve, band, line]
+    labels = ["held-out folds", "± a standard error of the difference from the least", f"least: {least:.4g}"]
+    if within.any():
+        edge = np.sqrt(10.0)
+        handles.append(
+            axes.axvspan(tried[within].min() / edge, tried[within].max() * edge, color="0.9", zorder=0, linewidth=0)
+        )
+        labels.append("within a standard error of the least")
+    if choice.ridge > 0.0:
+        at = float(mean[list(choice.tried).index(choice.ridge)])
+        (marker,) = axes.plot(choice.ridge, at, "D", color=NOMINAL_COLOR, markersize=8, markerfacecolor="none")
+        handles.append(marker)
+        what = "chosen" if choice.rule == "least" else "chosen, the largest of these"
+        labels.append(f"{what}: {choice.ridge:g}, {at:.4g}")
+    axes.set_xticks(tried[shown], [decade(ridge) for ridge in tried[shown]])
+    axes.minorticks_off()
+    if axes.get_yscale() == "log":
+        label_decades(axes.yaxis)
+    axes.set_xlim(tried[shown].min() / 2.0, tried[shown].max() * 2.0)
+    axes.set_xlabel(f"ridge: weight of the {of} against the mean square of the rows [1]")
+    axes.set_ylabel("mean square of whitened residuals\non held-out folds [noise²]")
+    figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=8)
+    figure.suptitle("Ridge by cross-validation", x=0.01, ha="left")
+    return figure
+
+
+# ---------------------------------------------------------------------------------------------------- replay
+
+
+@matplotlib.rc_context(STYLE)
+def drift_figure(
+    source: str,
+    time: Array,
+    quartiles: Mapping[str, Comparison[Array]],
+    by_joint: Mapping[str, Comparison[float]],
+    units: Sequence[str],
+    of: str,
+) -> Figure:
+    """Drift over the time since the beginning of a window, median and quartiles, and at its end by joint.
+
+    On logarithmic axes, as robots that spin and those that hardly drift are compared.
+
+    Args:
+        source: name of the log.
+        time: (T,) [s].
+        quartiles: (3, T) each, over windows, by what drifts, with its unit.
+        by_joint: at the end of the windows.
+        units: of the joints, "rad" or "m".
+        of: what the robot's file is.
+    """
+    tall = max(0.22 * len(by_joint) + 1.4, 1.9 * len(quartiles) + 0.8)
+    figure = Figure(figsize=(11.0, tall), layout="constrained")
+    grid = figure.add_gridspec(len(quartiles), 2, width_ratios=(1.0, 1.1))
+    for row, (name, (nominal, identified)) in enumerate(quartiles.items()):
+        axis = figure.add_subplot(grid[row, 0])
+        for label, color, (low, middle, high) in (
+            (of, NOMINAL_COLOR, nominal),
+            ("identified", IDENTIFIED_COLOR, identified),
+        ):
+            axis.fill_between(time, low, high, color=color, alpha=0.2, linewidth=0.0)
+            axis.plot(time, middle, color=color, label=label)
+        if min(nominal.min(), identified.min()) > 0.0:
+            axis.set_yscale("log")
+            label_decades(axis.yaxis)
+        axis.set_ylabel(f"drift, {name}")
+        axis.set_xlim(0.0, float(time[-1]))
+    axis.set_xlabel("time since the beginning of a window [s]")
+    joints = figure.add_subplot(grid[:, 1])
+    rows = np.arange(len(by_joint))
+    nominal, identified = (
+        np.array([getattr(pair, x) for pair in by_joint.values()]) for x in ("nominal", "identified")
+    )
+    for color, values in ((NOMINAL_COLOR, nominal), (IDENTIFIED_COLOR, identified)):
+        joints.plot(values, rows, "o", color=color)
+    if min(nominal.min(), identified.min()) > 0.0:
+        joints.set_xscale("log")
+        label_decades(joints.xaxis)
+    joints.set_yticks(rows, list(by_joint))
+    joints.invert_yaxis()
+    joints.set_xlabel(f"median drift after {time[-1]:g} s [{', '.join(dict.fromkeys(units))}]")
+    figure.suptitle(
+        f"Drift of a robot driven by the torques of {source}: median of windows, and quartiles", x=0.01, ha="left"
+    )
+    figure.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    return figure

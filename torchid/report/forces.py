@@ -12,8 +12,7 @@ from matplotlib.figure import Figure
 
 from torchid.parameters import Array
 from torchid.problem.metrics import BASE_ROWS
-from torchid.report.figures import STYLE
-from torchid.report.palette import IDENTIFIED, MEASURED, NOMINAL
+from torchid.report.figure_style import IDENTIFIED_COLOR, MEASURED_COLOR, NOMINAL_COLOR, STYLE
 
 _NOISE = "0.8"
 _MOST_ROWS = 6
@@ -48,10 +47,10 @@ def force_figure(
     figure = Figure(figsize=(12.0, 1.7 * max(len(rows), 1) + 0.8), layout="constrained")
     axes = figure.subplots(max(len(rows), 1), 2, sharex=True, squeeze=False, width_ratios=(3, 2))
     for (forces, errors), row in zip(axes, rows, strict=False):
-        forces.plot(series.time, series.measured[:, row], color=MEASURED, linewidth=1.6, label="measured")
-        forces.plot(series.time, series.nominal[:, row], color=NOMINAL, linewidth=1.0, label=f"predicted, {of}")
+        forces.plot(series.time, series.measured[:, row], color=MEASURED_COLOR, linewidth=1.6, label="measured")
+        forces.plot(series.time, series.nominal[:, row], color=NOMINAL_COLOR, linewidth=1.0, label=f"predicted, {of}")
         label = "predicted, identified"
-        forces.plot(series.time, series.identified[:, row], color=IDENTIFIED, linewidth=1.0, label=label)
+        forces.plot(series.time, series.identified[:, row], color=IDENTIFIED_COLOR, linewidth=1.0, label=label)
         name, unit = name_row(row, base_rows, dof_names, sliding)
         forces.set_title(name, loc="left", fontsize=9)
         forces.set_ylabel(f"[{unit}]")
@@ -78,8 +77,8 @@ def _draw_errors(axis: Axes, series: ForceSeries, row: int, unit: str) -> None:
         axis.fill_between(series.time, -2.0 * std, 2.0 * std, color=_NOISE, linewidth=0, label=label)
         largest = max(largest, float(2.0 * np.nanmax(std)))
         text = f", noise alone {np.sqrt(np.nanmean(std**2)):.3g}"
-    axis.plot(series.time, nominal, color=NOMINAL, linewidth=0.8)
-    axis.plot(series.time, identified, color=IDENTIFIED, linewidth=0.8)
+    axis.plot(series.time, nominal, color=NOMINAL_COLOR, linewidth=0.8)
+    axis.plot(series.time, identified, color=IDENTIFIED_COLOR, linewidth=0.8)
     if largest > 0.0:
         axis.set_ylim(-_SHOWN * largest, _SHOWN * largest)
     rms = np.sqrt(np.nanmean(np.square(identified))) if np.isfinite(identified).any() else np.nan

@@ -21,10 +21,9 @@ from torchid.log_checks.findings import channel_names, channel_unit
 from torchid.logs import Log
 from torchid.logs.log import FloatArray
 from torchid.logs.time_range import log_title
-from torchid.report import palette
-from torchid.report.figures import STYLE
+from torchid.report.figure_style import IDENTIFIED_COLOR, NOMINAL_COLOR, STYLE
 
-COLORS = {REJECTED: palette.NOMINAL, SUSPICIOUS: "#e69f00", NOTE: palette.IDENTIFIED}
+COLORS = {REJECTED: NOMINAL_COLOR, SUSPICIOUS: "#e69f00", NOTE: IDENTIFIED_COLOR}
 #: Height of a row and of a panel's title, and width of the figure [inches].
 _ROW, _HEAD, _WIDTH = 0.16, 1.0, 10.0
 #: Characters of a title's line at font size 9, and of a title.

@@ -11,7 +11,7 @@ from lxml import etree
 from torchid import parameters
 from torchid.errors import InputError, join_names, warn
 from torchid.parameters import Array
-from torchid.report.parameter_files import warn_if_inconsistent, without_links_beyond_welds
+from torchid.report.urdf_files import warn_if_inconsistent, without_links_beyond_welds
 from torchid.robot import Robot
 from torchid.robot.mjcf_model import MjcfModel, complaint, parse_model
 from torchid.robot.mjcf_text import body_elements

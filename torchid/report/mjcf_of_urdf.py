@@ -12,9 +12,8 @@ from scipy.spatial.transform import Rotation
 from torchid import parameters
 from torchid.errors import join_names, warn
 from torchid.parameters import Array
-from torchid.report.loadable_urdf import mass_bounds
 from torchid.report.mjcf_files import inertial_element, numbers_text
-from torchid.report.parameter_files import warn_if_inconsistent, without_links_beyond_welds
+from torchid.report.urdf_files import mass_bounds, warn_if_inconsistent, without_links_beyond_welds
 from torchid.robot import Robot
 from torchid.robot.tree import Mimic, joint_origin, link_parameters, resolve_mimics
 from torchid.robot.urdf import MOVING_TYPES, MeshError, TreeJoint, mesh_path, parse_xml, position_limits, read_urdf

@@ -15,7 +15,7 @@ from torchid.errors import escape
 from torchid.estimators.least_squares import FIXED, IDENTIFIED
 from torchid.logs.time_range import log_title
 from torchid.parameters import INERTIAL, PARAMETERS, Array
-from torchid.report import palette
+from torchid.report.figure_style import CATEGORY_COLORS, IDENTIFIED_COLOR, MEASURED_COLOR, NOISE_COLOR, NOMINAL_COLOR
 from torchid.report.parameter_figures import INTERVAL
 from torchid.report.traces import packed
 
@@ -23,7 +23,7 @@ Figure = dict[str, Any]
 
 _COMMONEST = "#ffffff"
 _GRID, _TEXT = "#e5e5e5", "#222222"
-_MEASURED, _NOMINAL, _IDENTIFIED = (palette.MEASURED, 1.6), (palette.NOMINAL, 1.1), (palette.IDENTIFIED, 1.1)
+_MEASURED, _NOMINAL, _IDENTIFIED = (MEASURED_COLOR, 1.6), (NOMINAL_COLOR, 1.1), (IDENTIFIED_COLOR, 1.1)
 #: Pixels of panels, of what is above and below all of them, between two rows and within one; of a bar, and its text.
 _FORCE, _ERROR, _SPECTRUM, _TOP, _BOTTOM, _BETWEEN, _WITHIN = 150, 90, 150, 40, 45, 40, 22
 _BAR, _LINE = 24, 15
@@ -78,11 +78,9 @@ def spectrum_panels(panels: Sequence[Mapping[str, Any]], of: str) -> Figure | No
                 data.append(_line(spectrum["frequency"], values, axis, label, color, width + 0.3, number == 0))
         if spectrum["noise"]:
             floor = _line(
-                spectrum["band"], [spectrum["noise"]] * 2, axis, "noise of the readings", palette.NOISE, 2, False
+                spectrum["band"], [spectrum["noise"]] * 2, axis, "noise of the readings", NOISE_COLOR, 2, False
             )
-            data.append(
-                floor | {"line": {"color": palette.NOISE, "width": 2, "dash": "dash"}, "showlegend": number == 0}
-            )
+            data.append(floor | {"line": {"color": NOISE_COLOR, "width": 2, "dash": "dash"}, "showlegend": number == 0})
         layout[_key(axis)] |= {"type": "log", "dtick": 1, "exponentformat": "power"}
     layout["xaxis"] |= {"type": "log", "title": {"text": "frequency [Hz]"}}
     return {"data": data, "layout": layout}
@@ -99,13 +97,13 @@ def parameter_bars(bodies: Sequence[Mapping[str, Any]], parameter: str, unit: st
         hover.append(f"{_text(body['name'])}: {value:.5g} {unit}, {verdict}")
         bars.append(INTERVAL * error if verdict == IDENTIFIED and error is not None else None)
     nominal, identified = ([body[kind][parameter] for body in shown] for kind in ("nominal", "identified"))
-    data = [_markers(nominal, of, palette.NOMINAL, "diamond-open")]
+    data = [_markers(nominal, of, NOMINAL_COLOR, "diamond-open")]
     kinds = ((True, "identified, 95 %", "circle"), (False, f"known in sums, or mostly the {of}'s", "circle-open"))
     for known, name, symbol in kinds:  # apart: Plotly draws the caps of intervals that there are none of
         values = [x if (bar is not None) is known else None for x, bar in zip(identified, bars, strict=True)]
         if any(x is not None for x in values):
-            points = _markers(values, name, palette.IDENTIFIED, symbol) | {"hovertext": hover, "hoverinfo": "text"}
-            interval = {"array": bars, "color": palette.IDENTIFIED, "thickness": 1.5, "width": 3}
+            points = _markers(values, name, IDENTIFIED_COLOR, symbol) | {"hovertext": hover, "hoverinfo": "text"}
+            interval = {"array": bars, "color": IDENTIFIED_COLOR, "thickness": 1.5, "width": 3}
             data.append(points | ({"error_x": interval} if known else {}))
     return {"data": data, "layout": _list_layout([_label(body["name"]) for body in shown], f"[{unit}]")}
 
@@ -129,7 +127,7 @@ def contribution_bars(parts: Sequence[Mapping[str, Any]], of_logs: bool = False)
         "x": [part["bits"] for part in shown],
         "y": list(range(len(shown))),
         "width": 0.7,
-        "marker": {"color": palette.IDENTIFIED},
+        "marker": {"color": IDENTIFIED_COLOR},
         "texttemplate": "%{x:.3g}",
         "hovertext": [_text(name) for name in names],
         "hoverinfo": "text+x",
@@ -159,7 +157,7 @@ def ellipsoid_scene(
         The figure, None where nothing can be drawn, and the identified bodies with mass whose inertia is impossible.
     """
     frames = [np.array(pose, dtype=np.float64) for pose in poses]
-    kinds = {"nominal": (of, palette.MEASURED, 0.25), "identified": ("identified", palette.IDENTIFIED, 0.4)}
+    kinds = {"nominal": (of, MEASURED_COLOR, 0.25), "identified": ("identified", IDENTIFIED_COLOR, 0.4)}
     data, impossible, drawn = [], [], [frame[None, :3, 3] for frame in frames]
     for kind, (label, color, opacity) in kinds.items():
         points, names = [], []
@@ -291,7 +289,7 @@ def _band(axis: str, noise: float) -> Figure:
         "y0": -2.0 * noise,
         "y1": 2.0 * noise,
     }
-    return place | {"fillcolor": palette.NOISE, "opacity": 0.35, "line": {"width": 0}, "layer": "below"}
+    return place | {"fillcolor": NOISE_COLOR, "opacity": 0.35, "line": {"width": 0}, "layer": "below"}
 
 
 def _state_bands(states: Mapping[str, Any]) -> list[Figure]:
@@ -311,9 +309,7 @@ def state_color(states: Mapping[str, Any], number: int) -> str:
     spans = states["spans"]
     lasted = [sum(end - start for start, end, other in spans if other == k) for k in range(len(states["names"]))]
     longest = lasted.index(max(lasted))
-    return (
-        _COMMONEST if number == longest else palette.CATEGORIES[(number - (number > longest)) % len(palette.CATEGORIES)]
-    )
+    return _COMMONEST if number == longest else CATEGORY_COLORS[(number - (number > longest)) % len(CATEGORY_COLORS)]
 
 
 def _label(name: str) -> str:

@@ -17,8 +17,7 @@ from torchid.estimators.least_squares import FIXED, IDENTIFIED
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.logs.time_range import log_title
 from torchid.parameters import INERTIAL, PARAMETERS, PER_BODY, Array
-from torchid.report import palette
-from torchid.report.figures import STYLE
+from torchid.report.figure_style import CATEGORY_COLORS, IDENTIFIED_COLOR, MEASURED_COLOR, NOMINAL_COLOR, STYLE
 
 INTERVAL = 1.96
 """Standard errors on either side of a 95 % interval."""
@@ -89,24 +88,24 @@ def _title(name: str, kinds: Collection[str]) -> str:
 def _draw(axis: Axes, before: Array, after: Array, known: np.ndarray, bars: Array | None) -> None:
     """The URDF's values and the identified, some with error bars, one row for each body."""
     rows = np.arange(len(before))
-    axis.plot(before, rows - 0.16, "D", markerfacecolor="none", color=palette.NOMINAL, markersize=4.5)
+    axis.plot(before, rows - 0.16, "D", markerfacecolor="none", color=NOMINAL_COLOR, markersize=4.5)
     if bars is not None:
-        axis.errorbar(after, rows + 0.16, xerr=bars, fmt="none", ecolor=palette.IDENTIFIED, elinewidth=1.1, capsize=2)
-    for chosen, face in ((known, palette.IDENTIFIED), (~known, "white")):
+        axis.errorbar(after, rows + 0.16, xerr=bars, fmt="none", ecolor=IDENTIFIED_COLOR, elinewidth=1.1, capsize=2)
+    for chosen, face in ((known, IDENTIFIED_COLOR), (~known, "white")):
         real = chosen & (after >= 0.0)
         axis.plot(
-            after[real], rows[real] + 0.16, "o", markerfacecolor=face, color=palette.IDENTIFIED, markersize=5, zorder=3
+            after[real], rows[real] + 0.16, "o", markerfacecolor=face, color=IDENTIFIED_COLOR, markersize=5, zorder=3
         )
     negative = after < 0.0
-    axis.plot(after[negative], rows[negative] + 0.16, "X", color=palette.MEASURED, markersize=6, zorder=3)
+    axis.plot(after[negative], rows[negative] + 0.16, "X", color=MEASURED_COLOR, markersize=6, zorder=3)
 
 
 def _legend(axis: Axes, of: str, impossible: bool) -> list[matplotlib.artist.Artist]:
     """Handles with labels, drawn outside of what is seen."""
-    kinds = [("D", palette.NOMINAL, "none", of), ("o", palette.IDENTIFIED, palette.IDENTIFIED, "identified, 95 %")]
-    kinds.append(("o", palette.IDENTIFIED, "white", f"known in sums, or the {of}'s"))
+    kinds = [("D", NOMINAL_COLOR, "none", of), ("o", IDENTIFIED_COLOR, IDENTIFIED_COLOR, "identified, 95 %")]
+    kinds.append(("o", IDENTIFIED_COLOR, "white", f"known in sums, or the {of}'s"))
     if impossible:
-        kinds.append(("X", palette.MEASURED, palette.MEASURED, "cannot exist"))
+        kinds.append(("X", MEASURED_COLOR, MEASURED_COLOR, "cannot exist"))
     return [
         axis.plot([], [], mark, color=color, markerfacecolor=face, label=label)[0] for mark, color, face, label in kinds
     ]
@@ -133,7 +132,7 @@ def extra_figure(extras: Sequence[ExtraEstimate]) -> Figure:
     figure = Figure(figsize=(9.0, max(height, 2.4)), layout="constrained")
     heights = [len(rows[unit]) + 1 for unit in units]
     axes = figure.subplots(len(units), 1, squeeze=False, gridspec_kw={"height_ratios": heights})
-    chosen = [color for color in palette.CATEGORIES[::-1] if color != palette.NOMINAL]
+    chosen = [color for color in CATEGORY_COLORS[::-1] if color != NOMINAL_COLOR]
     colors = {log: chosen[number % len(chosen)] for number, log in enumerate(logs)}
     for axis, unit in zip(axes[:, 0], units, strict=True):
         in_panel = [x for x in extras if x.extra.unit == unit and x.extra.label in rows[unit]]

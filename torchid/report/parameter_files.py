@@ -1,4 +1,4 @@
-"""Files of identified parameters: `parameters.json`, and the URDF with new inertias and friction."""
+"""Files of identified parameters, `parameters.json`: written and read."""
 
 from __future__ import annotations
 
@@ -8,21 +8,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from lxml import etree
 
-from torchid import parameters
-from torchid.errors import InputError, during, join_names, warn
+from torchid.errors import InputError, during
 from torchid.estimators import Estimate
 from torchid.guards import MAX_JSON, read_bytes
 from torchid.identifiability.confounding import ExtraEstimate
-from torchid.parameters import PARAMETERS, PER_BODY, UNITS, Array
-from torchid.report.loadable_urdf import bound_massless_links, resolve_meshes
+from torchid.parameters import PARAMETER_UNITS, PARAMETERS, PER_BODY, Array
 from torchid.robot import Robot
-from torchid.robot.urdf import drop_repeated_origins, parse_xml
-from torchid.robot.xml_files import is_mjcf, plain_urdf
 
 _MAX_NUMBER = 1e100  # products and squares stay within the range of float64
-_ROUNDING = 1e-12  # of a body's mass: below it the link that gives it its name has none
 
 
 def parameters_document(
@@ -39,7 +33,7 @@ def parameters_document(
     nominal = [{"nominal": _by_name(phi)} for phi in robot.nominal]
     identified = _by_body(robot, estimate, identified=estimate.phi)
     return {
-        "units": dict(zip(PARAMETERS, UNITS, strict=True)),
+        "units": dict(zip(PARAMETERS, PARAMETER_UNITS, strict=True)),
         "frame": "each body's link frame, inertia about its origin",
         "massless": list(robot.massless),
         "verdicts": estimate.verdict_counts(),
@@ -157,97 +151,3 @@ def _check_number(path: Path, field: str, value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= _MAX_NUMBER:
         raise InputError(path, field, f"{value!r}", "a number between -1e100 and 1e100")
     return float(value)
-
-
-def identified_urdf(robot: Robot, phi: Array, full_mesh_paths: bool = False) -> bytes:
-    """The URDF with parameters `phi`, (L, 12).
-
-    The inertia of a body is that of the link with its name; links welded to it have none. Links beyond a joint that
-    the experiment welds keep the URDF's, and the rest of the body's is written. Of an MJCF robot it is the URDF that
-    says the same of bodies, joints and friction.
-
-    Args:
-        robot: the robot.
-        phi: its parameters.
-        full_mesh_paths: whether meshes are named as `resolve_meshes` does, or as they were.
-
-    Warns:
-        TorchidWarning: inconsistent bodies, or negative friction, which simulators (and `load_robot`) refuse; meshes
-            that are not found.
-    """
-    tree = parse_xml(robot.path)
-    drop_repeated_origins(tree.getroot())
-    links = {link.get("name"): link for link in tree.getroot().findall("link")}
-    joints = {joint.get("name"): joint for joint in tree.getroot().findall("joint")}
-    phi = without_links_beyond_welds(robot, phi)
-    warn_if_inconsistent(robot, phi)
-    for body, values in zip(robot.bodies, phi, strict=True):
-        if body.joint is not None and body.joint.kind != "fixed":
-            _set_friction(joints[body.joint.name], values)
-        if not body.massless or values[parameters.INERTIAL].any():
-            for name in (link for link in body.links if link not in robot.links_beyond_welds):
-                _set_inertial(links[name], values if name == body.name and values[parameters.MASS] else None)
-    bound_massless_links(tree.getroot(), robot, phi)
-    if is_mjcf(robot.path):
-        plain_urdf(tree.getroot())
-    elif full_mesh_paths:
-        resolve_meshes(tree.getroot(), robot.path, "identified.urdf")
-    etree.indent(tree)
-    return etree.tostring(tree, xml_declaration=True, encoding="utf-8")
-
-
-def without_links_beyond_welds(robot: Robot, phi: Array) -> Array:
-    """Parameters (L, 12) of the bodies without what links beyond welded joints have in the URDF."""
-    rest = phi.copy()
-    for name, inertial in robot.links_beyond_welds.items():
-        rest[robot.links[name][0], parameters.INERTIAL] -= inertial
-    rounding = np.abs(rest[:, parameters.MASS]) <= _ROUNDING * np.abs(phi[:, parameters.MASS])
-    rest[rounding, parameters.INERTIAL] = 0.0
-    return rest
-
-
-def warn_if_inconsistent(robot: Robot, phi: Array, file: str = "identified.urdf") -> None:
-    """Warn of what simulators refuse in a file with parameters (L, 12)."""
-    inconsistent = (phi[:, parameters.MASS] < 0.0) | (parameters.consistency_margin(phi) < parameters.POSSIBLE_MARGIN)
-    bodies = [robot.bodies[number] for number in np.flatnonzero(phi.any(axis=1) & inconsistent)]
-    if bodies:
-        names = join_names([body.name for body in bodies])
-        message = f"{file}: no distribution of positive mass has the parameters of {names}"
-        warn(f"{message}; simulators will refuse or misread them")
-    negative = [robot.bodies[number] for number in np.flatnonzero((phi[:, parameters.FRICTION] < 0.0).any(axis=1))]
-    joints = [body.joint.name for body in negative if body.joint is not None]
-    if joints:
-        warn(f"{file}: negative friction at {join_names(joints)}; simulators and torchid refuse it")
-
-
-def _set_inertial(link: etree._Element, values: Array | None) -> None:
-    """Write the parameters (12,) of a link, or None for a link whose inertia belongs to another one.
-
-    The latter has an explicit mass of 0 kg: for a link with collision shapes and without `<inertial>`, MuJoCo assumes
-    the density of water, Bullet 1 kg.
-    """
-    before = link.findall("inertial")
-    for inertial in before:
-        link.remove(inertial)
-    if values is not None:
-        link.insert(0, _inertial_element(*parameters.mass_com_inertia(values)))
-    elif before or link.find("collision") is not None:
-        link.insert(0, _inertial_element(0.0, np.zeros(3), np.zeros((3, 3))))
-
-
-def _inertial_element(mass: float, com: Array, inertia: Array) -> etree._Element:
-    element = etree.Element("inertial")
-    etree.SubElement(element, "origin", xyz=" ".join(repr(float(x)) for x in com), rpy="0 0 0")
-    etree.SubElement(element, "mass", value=repr(mass))
-    numbers = {f"i{'xyz'[row]}{'xyz'[k]}": repr(float(inertia[row, k])) for row, k in parameters.INERTIA_AXES}
-    etree.SubElement(element, "inertia", numbers)
-    return element
-
-
-def _set_friction(joint: etree._Element, values: Array) -> None:
-    dynamics = joint.find("dynamics")
-    if dynamics is None and not values[parameters.FRICTION].any():
-        return
-    dynamics = etree.SubElement(joint, "dynamics") if dynamics is None else dynamics
-    for name, value in zip(("friction", "damping"), values[parameters.FRICTION], strict=True):
-        dynamics.set(name, repr(float(value)))

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from torchid.errors import join_names, warn
 from torchid.parameters import Array
 from torchid.problem.extras import Extra
-from torchid.report.parameter_files import identified_urdf
+from torchid.report.urdf_files import identified_urdf
 from torchid.robot import Robot
 from torchid.robot.xml_files import is_mjcf
 

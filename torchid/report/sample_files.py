@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.fitting.posterior import FittedPosterior, ParameterSamples
-from torchid.parameters import PARAMETERS, PER_BODY, UNITS, Array
+from torchid.parameters import PARAMETER_UNITS, PARAMETERS, PER_BODY, Array
 
 QUANTILES = (0.025, 0.25, 0.5, 0.75, 0.975)
 _DIGITS = 4  # of correlations
@@ -72,4 +72,4 @@ def ranges_document(fitted: FittedPosterior, samples: ParameterSamples, about: M
 
 
 def _units(fitted: FittedPosterior) -> tuple[str, ...]:
-    return (*(UNITS * (len(fitted.posterior.nominal) // PER_BODY)), *fitted.extra_units)
+    return (*(PARAMETER_UNITS * (len(fitted.posterior.nominal) // PER_BODY)), *fitted.extra_units)

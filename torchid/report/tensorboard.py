@@ -17,7 +17,7 @@ from torchid.estimators import ConstrainedEstimate, Epoch, Estimate
 from torchid.fitting.cross_validation import RidgeChoice
 from torchid.identifiability.information import InformationGain
 from torchid.problem import Metrics
-from torchid.problem.metrics import ERROR_GROUPS, ROW_GROUPS, SETS
+from torchid.problem.metrics import ERROR_GROUPS, LOG_SETS, ROW_GROUPS
 from torchid.report.parameter_figures import INTERVAL
 
 _RGBA = 4  # colour space in Summary.Image
@@ -57,7 +57,7 @@ class RunEvents:
             tags = [f"error_relative_{name}{kind}" for name in _CHARTED for kind in (_NOMINAL, "")]
             layout["errors, share of measured"] = _charts(tags, ERROR_GROUPS)
         if bodies and by_epoch is not None:
-            tags = [f"{_BY_EPOCH}error_relative_{name}" for name in SETS]
+            tags = [f"{_BY_EPOCH}error_relative_{name}" for name in LOG_SETS]
             layout["errors by epoch, share of measured"] = _charts(tags, ROW_GROUPS)
         if by_epoch is not None:
             losses = [f"loss{of}/data$" for of in ("", "_held_out", "_unseen")]

@@ -7,19 +7,19 @@ from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
-from pydantic import ConfigDict, Field
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from torchid import parameters
 from torchid.errors import ConfigError
 from torchid.parameters import Array
 from torchid.robot.robot import Robot
-from torchid.settings import Number, Positive
+from torchid.settings import STRICT, Name, Number, Positive
 
 INERTIA_ACCEPTED = "ixx, ixy, ixz, iyy, iyz, izz [kg m^2] about the payload's centre of mass, of a body that can be"
 
 
-@dataclass(config=ConfigDict(extra="forbid"), frozen=True)
+@dataclass(config=STRICT, frozen=True)
 class Payload:
     """A load that is fixed to a link.
 
@@ -31,7 +31,7 @@ class Payload:
             mass by default.
     """
 
-    link: Annotated[str, Field(min_length=1)]
+    link: Name
     mass: Positive
     center_of_mass: Annotated[tuple[Number, ...], Field(min_length=3, max_length=3)]
     inertia: Annotated[tuple[Number, ...], Field(min_length=6, max_length=6)] = (0.0,) * 6

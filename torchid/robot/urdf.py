@@ -267,7 +267,7 @@ def _check_values(path: Path, links: list[Link], joints: list[Joint]) -> None:
             raise UrdfError(path, f"{field}, <axis>", f"'{joint.axis}'", "three numbers, not all zero")
 
 
-FORMATS = ("stl", "obj", "dae", "ply", "off")
+MESH_FORMATS = ("stl", "obj", "dae", "ply", "off")
 _PART_KEYWORD = {"obj": b"usemtl"}  # keyword that starts a part of a mesh
 _BYTES_PER_INSTANCE = 2**15  # [bytes] added for every instance of a geometry: bounds the time that loading takes
 
@@ -284,8 +284,8 @@ def mesh_content(urdf: Path, filename: str) -> tuple[str, bytes]:
     """
     path = mesh_path(urdf, filename)
     kind = path.suffix.lower().removeprefix(".")
-    if kind not in FORMATS:
-        raise MeshError(f"{excerpt(filename)}: none of {', '.join(FORMATS)}")
+    if kind not in MESH_FORMATS:
+        raise MeshError(f"{excerpt(filename)}: none of {', '.join(MESH_FORMATS)}")
     try:
         content = read_bytes(path, MAX_MESH)
         if kind == "dae":

@@ -296,3 +296,24 @@ def _check_scalar(field_name: str, contact: Contact, names: Sequence[str]) -> No
         accepted = f"{', '.join(contact.component_names)}; {NORMAL_FORCE} if the experiment's own sensors have it too "
         accepted += "(in Python: a Contact with along_normal=True)"
         raise SensorError.at_field(field_name, found, accepted)
+
+
+def measured_components(contacts: Sequence[Contact], sensors: SensorSet) -> np.ndarray:
+    """Measured components (C, 6) that the contacts can exert, along the frames' axes."""
+    possible = np.zeros((len(contacts), 6), dtype=bool)
+    for index, contact in enumerate(contacts):
+        possible[index, list(contact.components)] = True
+    return possible & sensors.wrench
+
+
+def recorded_components(contacts: Sequence[Contact], sensors: SensorSet, in_world: bool) -> np.ndarray:
+    """Recorded components (C, 6) from which the measured ones are computed: whole vectors if along world axes.
+
+    Of a contact that is read along the ground's normal they are those that are measured.
+    """
+    measured = measured_components(contacts, sensors)
+    if not in_world:
+        return measured
+    whole = measured.reshape(-1, 2, 3).any(axis=2)
+    turned = np.array([not contact.along_normal for contact in contacts], dtype=bool)[:, None]
+    return np.where(turned, np.repeat(whole, 3, axis=1), measured)

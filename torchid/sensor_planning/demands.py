@@ -14,12 +14,11 @@ from torchid.identifiability.structure import closed_postures, random_postures, 
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.contact_state import ContactState
-from torchid.problem.extras import measured_components
 from torchid.robot import Robot
 from torchid.robot.loops import LOOPS_FIELD
 from torchid.rounding import BASE_RANK_TOLERANCE
 from torchid.sensing import Contact, SensorNoise, SensorSet
-from torchid.sensing.sensors import NORMAL_FORCE, NORMAL_INDEX
+from torchid.sensing.sensors import NORMAL_FORCE, NORMAL_INDEX, measured_components
 
 KINDS = ("joint_torque", "contact", "normal_force", "ft_sensor")
 PER = ("device", "axis", "none")
