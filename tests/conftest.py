@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import signal
+import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,6 +21,7 @@ import torchid
 from torchid.robot import Robot
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a run started in the background inherits one that is ignored
+sys.dont_write_bytecode = False  # rewriting the assertions of all tests anew takes each worker 8 s
 gc.disable()  # until all tests are collected, which leaves 600,000 objects and no garbage
 
 
@@ -78,11 +80,13 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Robot:
 @pytest.fixture(scope="session")
 def biped_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What `torchid simulate` writes of the shipped biped, every motion cut to seconds."""
+    from forked import forked_simulations
     from simulated import short
 
     from torchid.commands.simulate import simulate
 
-    return made_once(tmp_path_factory, "biped", lambda output: simulate(short(output)))
+    with forked_simulations():
+        return made_once(tmp_path_factory, "biped", lambda output: simulate(short(output)))
 
 
 @pytest.fixture(scope="module")

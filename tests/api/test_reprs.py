@@ -33,7 +33,7 @@ def things() -> Mapping[str, object]:
     parts = torchid.compress_parts([samples], builder)
     fit = fitter.fit(parts)
     batches = torchid.MiniBatches([samples], builder)
-    result = torchid.identify(FILE, output=None)
+    result = torchid.identify(FILE, output=None, estimator={"ridge": 0.01})
     analysis = torchid.analyze(FILE, output=None, estimator={"ridge": 0.01})
     checked = torchid.check(FILE)
     return {

@@ -30,7 +30,7 @@ SETS = ("full", "contacts", "joints", "reduced", "analysis")
 def test_the_demo_runs_without_extras_from_a_package_that_cannot_be_written(tmp_path: Path) -> None:
     """Of a copy of the package, in a process that sees no other and none of what the extras bring."""
     site, work = tmp_path / "site", tmp_path / "work"
-    shutil.copytree(ROOT / "torchid", site / "torchid", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(ROOT / "torchid", site / "torchid")
     work.mkdir()
     before = sorted(site.rglob("*"))
     for path in (site, *before):

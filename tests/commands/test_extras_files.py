@@ -54,7 +54,7 @@ def files(folder: Path, deviation: float) -> tuple[Path, dict[tuple[str, str], f
         "logs": {"train": ["first.npz", "second.npz"]},
         "sensors": {"set": "full", "ft_sensors": list(SENSORS), "offsets": "log"},
         "actuators": {"armature": True, "asymmetric_coulomb": True, "sign_width": WIDTH},
-        "estimator": {"name": "least_squares"},
+        "estimator": {"name": "least_squares", "ridge": 0.0},
         "output": str(folder / "run"),
     }  # fmt: skip
     (folder / "experiment.yaml").write_text(yaml.safe_dump(experiment))

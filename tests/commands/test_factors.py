@@ -68,7 +68,11 @@ def assert_same(logs: Identification, factors: Identification) -> None:
 
 @pytest.mark.parametrize(
     "overrides",
-    [(), ("estimator={name: consistent, ridge: auto}",), ("estimator={name: consistent, ridge: 0.001}",)],
+    [
+        (),
+        ("estimator={name: consistent, ridge: auto}",),
+        pytest.param(("estimator={name: consistent, ridge: 0.001}",), marks=pytest.mark.slow),
+    ],
     ids=["least squares", "ridge auto", "consistent"],
 )
 def test_the_demo_from_its_factor_is_the_demo_from_its_log(tmp_path: Path, overrides: tuple[str, ...]) -> None:
@@ -87,7 +91,7 @@ def test_the_demo_from_its_factor_is_the_demo_from_its_log(tmp_path: Path, overr
 @pytest.mark.parametrize(
     ("machine", "seconds", "settings"),
     [
-        ("arm", (6.0,), {}),
+        pytest.param("arm", (6.0,), {}, marks=pytest.mark.slow),
         ("arm", (3.0, 4.0, 3.0), {"actuators": {"armature": True, "torque_offset": True}}),
         ("biped", (4.0, 3.0, 6.0), {"sensors": OFFSETS}),
         pytest.param(

@@ -172,7 +172,10 @@ def test_a_map_of_plates_is_read_block_by_block_as_a_whole(
 @pytest.mark.parametrize("off", [0.0, 0.1])
 def test_a_plate_that_lies_elsewhere_is_noticed(off: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A person on two plates, said to be 10 cm from where they are."""
-    urdf, log = SHARED / "human_squats" / "human.urdf", read_log(SHARED / "human_squats" / "squats1.npz")
+    urdf, log = (
+        SHARED / "human_squats" / "human.urdf",
+        read_log(SHARED / "human_squats" / "squats1.npz").select(slice(0, 1000)),
+    )
     wrench = value(log.contact_wrench_world)
     moments = wrench[..., 3:] + np.cross(feet_of(log, urdf)[0] - [off, 0.0, 0.0], wrench[..., :3])
     turned = np.concatenate([wrench[..., :3], moments], axis=2)

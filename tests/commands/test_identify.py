@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from demo import FAST_ESTIMATOR
 from loadable import assert_loads
 from repository import CONFIGS, DEMO, SHARED
 from run_folders import names_in
@@ -29,6 +30,7 @@ from torchid.parameters import PARAMETERS
 from torchid.report import identified_urdf
 from torchid.report.tables import print_tables, state_table
 
+FAST = f"estimator={json.dumps(FAST_ESTIMATOR)}"
 UNPHYSICAL = "ignore:identified.urdf:torchid.errors.TorchidWarning"
 
 
@@ -233,7 +235,7 @@ def test_positions_in_degrees_stop_a_run_that_names_them(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], noise: tuple[str, ...]
 ) -> None:
     demo_with(tmp_path / "demo", joint_position=np.rad2deg)
-    assert main(["identify", str(tmp_path / "demo" / "quadruped.yaml"), *noise]) == 2
+    assert main(["identify", str(tmp_path / "demo" / "quadruped.yaml"), FAST, *noise]) == 2
     told = capsys.readouterr().err.splitlines()[-1]
     assert "torchid check finds in sway_train.npz: joint_position: " in told
     assert "degrees?; accepted: convert joint_position" in told
@@ -250,7 +252,7 @@ def test_torques_of_no_robot_are_noticed_and_the_fit_called_worse_than_the_urdf(
     rng = np.random.default_rng(0)
     demo_with(tmp_path / "demo", joint_torque=lambda torque: 50.0 * rng.normal(size=torque.shape))
     file, output = tmp_path / "demo" / "quadruped.yaml", tmp_path / "run"
-    assert main(["identify", str(file), f"output={output}", *noise]) == 0
+    assert main(["identify", str(file), f"output={output}", FAST, *noise]) == 0
     printed = capsys.readouterr()
     assert said in printed.err
     assert printed.out.startswith("WORSE THAN URDF: the identified parameters predict worse")

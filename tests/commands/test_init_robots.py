@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from foreign_robots import DIALECTS, Motion, compared, moved, recorded_fields
 from synthetic import G1, ROBOTS
+from thinned import each_once
 
 from torchid.commands.init import init
 from torchid.config import load_config
@@ -42,8 +43,7 @@ def motion_of(robot: str) -> Motion:
     return moved(loaded, feet, imu_frame or loaded.base_link, seed=3)
 
 
-@pytest.mark.parametrize("dialect", DIALECTS)
-@pytest.mark.parametrize("robot", MACHINES)
+@pytest.mark.parametrize(("robot", "dialect"), each_once([*MACHINES], [*DIALECTS], rounds=2))
 def test_all_that_was_recorded_is_found_with_its_numbers(tmp_path: Path, robot: str, dialect: str) -> None:
     urdf, feet, _ = MACHINES[robot]
     name, write, _ = DIALECTS[dialect]

@@ -22,6 +22,7 @@ from large import (
     samples_of,
 )
 from motions import RATE
+from thinned import each_once
 
 from torchid.errors import InputError, LogError, TorchidWarning
 from torchid.logs import read_log, write_log
@@ -36,12 +37,12 @@ SETTINGS = {
     "away from contact changes": ({"contact_margin_s": 0.05, "cutoff_hz": 20}, 1e-10),
 }
 
+SUFFIXES = (".npz", ".csv", ".parquet", ".h5")
 
-@pytest.mark.parametrize(("settings", "tolerance"), SETTINGS.values(), ids=SETTINGS.keys())
-@pytest.mark.parametrize("jitter", [0.0, 0.3], ids=["uniform", "jittered"])
-def test_blocks_give_the_samples_of_the_whole_log(
-    tmp_path: Path, settings: dict[str, float], tolerance: float, jitter: float
-) -> None:
+
+@pytest.mark.parametrize(("name", "jitter"), each_once([*SETTINGS], [0.0, 0.3]))
+def test_blocks_give_the_samples_of_the_whole_log(tmp_path: Path, name: str, jitter: float) -> None:
+    settings, tolerance = SETTINGS[name]
     file = experiment(tmp_path, recorded(jitter=jitter), ".h5")
     whole, large = samples_of(file, *overrides(settings)), samples_of(file, *overrides(settings), SMALL)
     assert is_on_disk(large)
@@ -56,11 +57,11 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torchid.commands.large_log.BLOCK_GB", 1e-4)
 
 
-@pytest.mark.parametrize(("settings", "tolerance"), SETTINGS.values(), ids=SETTINGS.keys())
-@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize(("name", "threads"), each_once([*SETTINGS], [3, 1]))
 def test_a_long_log_in_memory_is_worked_on_in_blocks_by_threads(
-    tmp_path: Path, settings: dict[str, float], tolerance: float, threads: int, request: pytest.FixtureRequest
+    tmp_path: Path, name: str, threads: int, request: pytest.FixtureRequest
 ) -> None:
+    settings, tolerance = SETTINGS[name]
     file = experiment(tmp_path, recorded(jitter=0.3))
     whole, before = samples_of(file, *overrides(settings)), torch.get_num_threads()
     request.getfixturevalue("small_blocks")
@@ -74,8 +75,7 @@ def test_a_long_log_in_memory_is_worked_on_in_blocks_by_threads(
     assert sorted(os.listdir(tmp_path)) == ["log.npz", "run.yaml"]
 
 
-@pytest.mark.parametrize("cutoff", ["null", "20"])
-@pytest.mark.parametrize("suffix", [".npz", ".csv", ".parquet", ".h5"])
+@pytest.mark.parametrize(("suffix", "cutoff"), each_once(SUFFIXES, ["null", "20"]))
 def test_normals_of_the_ground_come_in_blocks_too(
     tmp_path: Path, suffix: str, cutoff: str, request: pytest.FixtureRequest
 ) -> None:
@@ -93,7 +93,7 @@ def test_normals_of_the_ground_come_in_blocks_too(
         assert_same(samples_of(file, *settings, *more), whole, 1e-10)
 
 
-@pytest.mark.parametrize("suffix", [".npz", ".csv", ".parquet", ".h5"])
+@pytest.mark.parametrize("suffix", SUFFIXES)
 def test_forces_along_the_normal_come_in_blocks_too(
     tmp_path: Path, suffix: str, request: pytest.FixtureRequest
 ) -> None:
@@ -118,8 +118,7 @@ def test_forces_along_the_normal_come_in_blocks_too(
         assert blocks.has_force_normal
 
 
-@pytest.mark.parametrize("suffix", [".npz", ".csv", ".parquet", ".h5"])
-@pytest.mark.parametrize("terms", ["{}", "{contact_force: log}"])
+@pytest.mark.parametrize(("suffix", "terms"), each_once(SUFFIXES, ["{contact_force: log}", "{}"]))
 def test_readings_in_the_air_are_kept_where_offsets_are_fitted(
     tmp_path: Path, suffix: str, terms: str, request: pytest.FixtureRequest
 ) -> None:
@@ -155,7 +154,7 @@ def test_the_neighbourhood_of_a_block_is_as_long_as_the_filter_remembers() -> No
         assert response[30_000 + low_pass.settling // 2 :].max() > 1e-15 * response.max(), "no longer than needed"
 
 
-@pytest.mark.parametrize("suffix", [".npz", ".csv", ".parquet", ".h5"])
+@pytest.mark.parametrize("suffix", SUFFIXES)
 def test_files_of_all_kinds_stream(tmp_path: Path, suffix: str) -> None:
     file = experiment(tmp_path, recorded(9_000), suffix)
     whole, large = (samples_of(file, *overrides({"cutoff_hz": 20}, "full"), *more, required=False)

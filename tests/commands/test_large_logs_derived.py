@@ -16,6 +16,7 @@ from demo import DEMO
 from large import SMALL, assert_same, is_on_disk, samples_of
 from motions import value
 from refusals import refusal
+from thinned import slow_but
 from walking import MACHINES, recorded, truth
 
 from torchid.logs import Log, write_log
@@ -148,10 +149,13 @@ SETTINGS: dict[str, tuple[Callable[[Log], Log], float, dict[str, Any]]] = {
 }
 
 
-@pytest.mark.parametrize(("change", "radius", "more"), SETTINGS.values(), ids=SETTINGS.keys())
-def test_blocks_give_the_samples_and_warnings_of_the_whole_log(
-    tmp_path: Path, change: Callable[[Log], Log], radius: float, more: dict[str, Any]
-) -> None:
+#: Of which others hold all that they are made of.
+PARTS = ("base", "base, unfiltered", "flags by force", "zeros", "zeros, then flags", "gaps", "gaps, flags")
+
+
+@pytest.mark.parametrize("name", slow_but(SETTINGS.keys() - PARTS, SETTINGS))
+def test_blocks_give_the_samples_and_warnings_of_the_whole_log(tmp_path: Path, name: str) -> None:
+    change, radius, more = SETTINGS[name]
     file = written(tmp_path, change, radius, **more)
 
     def read(*overrides: str) -> tuple[Any, list[str]]:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from demo import FAST_ESTIMATOR
 from repository import DEMO
 from synthetic import UR5, Oracle, load, make_log
 
@@ -29,6 +30,8 @@ from torchid.problem import (
     linear_problem,
 )
 from torchid.sensing import named_sensors
+
+RIDGE = f"estimator={json.dumps(FAST_ESTIMATOR)}"
 
 # ---------------------------------------------------------------------------------------------- whole runs
 
@@ -81,13 +84,17 @@ def changed(folder: Path, change: Callable[[dict[str, Any]], None]) -> list[str]
             ["sensors.set=joints"],
             ("total mass is -21.38", "opposite sign", "joint_torque: all reversed"),
         ),
-        (silent_torques, ["sensors.set=joints"], ("all measured forces are 0", "NaN where nobody measured")),
-        (reversed_torques, ["estimator={name: least_squares, ridge: 0.001}"], ("total mass is -21.38", "all reversed")),
-        (reversed_torques, ["sensors.set=full"], ("times the stated sensor noise", "joint_torque: all reversed")),
-        (reversed_wrenches, ["sensors.set=contacts"], ("opposite sign", "contact_wrench_local: all reversed")),
-        (downward_world, ["sensors.set=joints"], ("total mass is -", "opposite sign")),
-        (swapped_feet, ["sensors.set=joints"], ("total mass is -", "opposite sign", "contact_active: ")),
-        (in_degrees, ["sensors.set=joints"], ("torchid check finds in train.npz: joint_position", "degrees")),
+        (silent_torques, ["sensors.set=joints", RIDGE], ("all measured forces are 0", "NaN where nobody measured")),
+        (reversed_torques, [RIDGE], ("total mass is -21.38", "all reversed")),
+        (
+            reversed_torques,
+            ["sensors.set=full", RIDGE],
+            ("times the stated sensor noise", "joint_torque: all reversed"),
+        ),
+        (reversed_wrenches, ["sensors.set=contacts", RIDGE], ("opposite sign", "contact_wrench_local: all reversed")),
+        (downward_world, ["sensors.set=joints", RIDGE], ("total mass is -", "opposite sign")),
+        (swapped_feet, ["sensors.set=joints", RIDGE], ("total mass is -", "opposite sign", "contact_active: ")),
+        (in_degrees, ["sensors.set=joints", RIDGE], ("torchid check finds in train.npz: joint_position", "degrees")),
     ],
     ids=lambda x: x.__name__ if callable(x) else "".join(x),
 )
@@ -124,7 +131,7 @@ def test_a_long_log_is_looked_at_in_segments(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("torchid.commands.check.MOST_CHECKED", 500)
-    assert main(["identify", str(DEMO / "quadruped.yaml"), *changed(tmp_path, change), "sensors.set=joints"]) == 2
+    assert main(["identify", str(DEMO / "quadruped.yaml"), *changed(tmp_path, change), RIDGE]) == 2
     assert f"torchid check finds in train.npz (samples {segment} of 1300, counted from there): joint_position: " in (
         capsys.readouterr().err
     )
@@ -140,8 +147,7 @@ def scalars_of_the_feet(log: dict[str, Any]) -> None:
 def test_a_fit_that_predicts_worse_than_the_urdf_says_so_first(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    closest = "estimator={name: least_squares, ridge: 0.001}"
-    options = [*changed(tmp_path, scalars_of_the_feet), "sensors.set=contacts", closest]
+    options = [*changed(tmp_path, scalars_of_the_feet), "sensors.set=contacts", RIDGE]
     assert main(["identify", str(DEMO / "quadruped.yaml"), *options]) == 0
     printed = capsys.readouterr()
     headline, *_ = printed.out.splitlines()

@@ -9,6 +9,7 @@ import shutil
 import signal
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from demo import shortened_demo
 from repository import DEMO
 from run_folders import names_in
 from shared_work import (
+    SMALL_CHUNK,
     TWO,
     children,
     differences,
@@ -68,6 +70,14 @@ def experiments(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         fields = {key: x if "names" in key else x[:3] for key, x in log.items()}
     np.savez(short / "log0.npz", **fields)
     return files | {"short": short / "experiment.yaml"}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _small_chunks() -> Iterator[None]:
+    """Short logs have some of them, in this process and in its forks."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr("torchid.problem.chunks._LEAST", SMALL_CHUNK)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -331,7 +341,8 @@ def test_a_killed_process_ends_all_and_leaves_nothing_or_all(
     drawn, output = random.Random(seed), tmp_path / "runs" / "run"
     status = killed_after(seconds * drawn.uniform(0.3, 1.0), [*command, f"output={output}"], drawn.randrange(2))
     assert_nothing_or_whole(output, parameters, status)
-    status, _, complained = finish([*command, f"output={output}", "overwrite=true"])
+    again = [*command[command.index("identify") :], f"output={output}", "overwrite=true"]
+    status, _, complained = finish_forked(2, lambda: main(again))
     assert status == 0, complained
     assert (output / "parameters.json").read_bytes() == parameters
     assert names_in(output.parent) == ["run"]

@@ -10,6 +10,7 @@ import pytest
 from demo import shortened_demo
 from large import SMALL, Fields, assert_same, experiment, is_on_disk, overrides, recorded, samples_of
 from refusals import refusal
+from thinned import each_once
 
 from torchid.cli import main
 from torchid.errors import TorchidWarning
@@ -79,8 +80,7 @@ def stepping(with_imu: bool) -> Fields:
     return fields
 
 
-@pytest.mark.parametrize("limit", ["auto", "0.3"])
-@pytest.mark.parametrize("with_imu", [False, True], ids=["pose", "imu"])
+@pytest.mark.parametrize(("with_imu", "limit"), each_once([False, True], ["0.3", "auto"]))
 def test_blocks_of_a_long_log_lose_the_samples_that_the_whole_log_loses(
     tmp_path: Path, with_imu: bool, limit: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -13,6 +13,7 @@ import pytest
 import torch
 from descents import World, arm, demo, half_way, still
 from synthetic import Array
+from thinned import slow_but
 from torch import Tensor, nn
 
 from torchid import parameters
@@ -305,7 +306,9 @@ def same(one: Any, other: Any) -> bool:
     return torch.equal(one, other) if isinstance(one, Tensor) else one == other
 
 
-@pytest.mark.parametrize("name", SETTINGS)
+@pytest.mark.parametrize(
+    "name", slow_but([name for name in SETTINGS if "alone" not in name or "LBFGS" in name], SETTINGS)
+)
 def test_a_descent_taken_up_again_after_any_epoch_is_the_uninterrupted_one_to_the_last_bit(
     name: str, tmp_path: Path
 ) -> None:

@@ -60,9 +60,12 @@ def test_it_is_found_beside_armatures_springs_offsets_and_scales() -> None:
     assert found.found == pytest.approx(DELAY, abs=2e-6)
 
 
-def test_intervals_of_95_percent_hold_the_delay_of_noisy_logs() -> None:
+@pytest.mark.parametrize(
+    "estimator", [LeastSquares(), pytest.param(Consistent(), marks=pytest.mark.slow)], ids=["plain", "consistent"]
+)
+def test_intervals_of_95_percent_hold_the_delay_of_noisy_logs(estimator: LeastSquares | Consistent) -> None:
     logs = [preprocess(recorded(noise=NOISE, seed=seed), cutoff_hz=30.0) for seed in range(40)]
-    found = [chosen(log, estimator=Consistent()) for log in logs]
+    found = [chosen(log, estimator=estimator) for log in logs]
     held = sum(one.interval[0] <= DELAY <= one.interval[1] for one in found)
     assert held >= 35  # of 40; 38 expected, fewer than 35 of every 21st draw
     scatter = np.std([one.found for one in found])
@@ -116,7 +119,7 @@ def test_a_delay_reaches_across_no_break_of_a_log_and_knows_nothing_beside_what_
         with_delayed_torques(log, 9.0)
 
 
-@pytest.mark.parametrize("sensors", ["joints", "full"])
+@pytest.mark.parametrize("sensors", ["joints", pytest.param("full", marks=pytest.mark.slow)])
 def test_torques_of_a_quadruped_on_its_feet_are_found_to_be_as_late_as_they_are(sensors: str) -> None:
     """The demo's noisy log has no delay; its torques are then taken from 4 ms later."""
     scene = set_up(load_config(DEMO / "quadruped.yaml", [f"sensors.set={sensors}"]))

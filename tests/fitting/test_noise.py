@@ -12,6 +12,7 @@ from intervals import covered
 from scipy import stats
 from scipy.spatial.transform import Rotation
 from synthetic import SOLO12, Array, Oracle, load, make_log
+from thinned import slow_but
 from true_robots import true_parameters
 
 from torchid.config import load_config
@@ -199,7 +200,7 @@ def check_intervals(scene: Scene, sensors: str, repeats: int) -> None:
     assert told["base_force.x"] == told["base_force.y"] == told["base_moment.x"] == "estimated"
 
 
-@pytest.mark.parametrize("sensors", ["full", "contacts", "joints"])
+@pytest.mark.parametrize("sensors", slow_but(["full", "joints"], ["full", "contacts", "joints"]))
 def test_intervals_hold_the_truth_with_the_noise_that_residuals_show(scene: Scene, sensors: str) -> None:
     check_intervals(scene, sensors, QUICK)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from typing import ClassVar
 
 import numpy as np
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 from intervals import FEET, REPETITIONS, STATES, covered, noisy_torques
 from scipy.optimize import least_squares
 from synthetic import SOLO12, UR5, Array, Oracle, load, make_log
+from thinned import SLOW, slow_but
 from true_robots import true_parameters
 from urdfs import inertial, joint, link, write
 
@@ -194,9 +196,10 @@ def quadruped(samples: int = 400) -> Bench:
 # --------------------------------------------------------------------------------------------------------- repetitions
 
 
-@pytest.mark.parametrize("repetitions", [40, pytest.param(REPETITIONS, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("share", [0.0, 0.05])
-@pytest.mark.parametrize("kind", LOSSES)
+@pytest.mark.parametrize(("repetitions", "share", "kind"), [
+    (40, 0.0, "huber"), (40, 0.05, "tukey"),
+    *(pytest.param(*case, marks=SLOW) for case in product([REPETITIONS], [0.0, 0.05], LOSSES)),
+])  # fmt: skip
 def test_intervals_of_robust_fits_hold_the_truth_with_and_without_outliers(
     arm: Bench, kind: str, share: float, repetitions: int
 ) -> None:
@@ -237,7 +240,7 @@ def test_gross_outliers_in_a_twentieth_of_the_torques_leave_the_parameters_where
     assert 0.8 < found.mean_weight < 0.96
 
 
-@pytest.mark.parametrize("kind", LOSSES)
+@pytest.mark.parametrize("kind", slow_but(["tukey"], LOSSES))
 def test_passes_over_some_samples_save_passes_over_all_and_change_nothing(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -260,7 +263,7 @@ def test_passes_over_some_samples_save_passes_over_all_and_change_nothing(
     np.testing.assert_array_equal(kept.estimate.phi, bench.fits(kind, *uneven)[1].estimate.phi, "each log keeps 200")
 
 
-@pytest.mark.parametrize("kind", LOSSES)
+@pytest.mark.parametrize("kind", slow_but(["huber"], LOSSES))
 def test_rows_that_mix_joints_are_robust_as_long_as_few_samples_are_hit(kind: str) -> None:
     bench, rng = quadruped(), np.random.default_rng(3)
     log = bench.clean
@@ -328,7 +331,7 @@ def test_the_fixed_point_is_that_of_other_algorithms_at_the_same_scale(
         np.testing.assert_allclose(A @ phi, A @ solved.x, rtol=0.0, atol=1e-4)
 
 
-@pytest.mark.parametrize("kind", LOSSES)
+@pytest.mark.parametrize("kind", slow_but(["tukey"], LOSSES))
 def test_the_order_of_chunks_and_the_number_of_threads_do_not_matter(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

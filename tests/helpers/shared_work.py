@@ -23,13 +23,15 @@ import yaml
 ROOT = Path(__file__).resolve().parents[2]
 TORCHRUN = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node")
 TWO = (*TORCHRUN, "2")
+SMALL_CHUNK = 512
 RANDOM = {"noise": {"joint_torque": 0.1, "contact_force": 0.5, "contact_moment": 0.05}}
 
 
 def write_experiments(folder: Path) -> dict[str, Path]:
     """Experiment files of a quadruped, a bolted arm and a biped with offsets of its own in each of two logs.
 
-    The arm's log has folds of more than one chunk, so that processes share them; the biped's are short.
+    The arm's log has folds of more than one chunk of `SMALL_CHUNK` samples, so that processes share them; the biped's
+    are short.
     """
     from synthetic import PANDA, Oracle, load, make_log
 
@@ -39,8 +41,8 @@ def write_experiments(folder: Path) -> dict[str, Path]:
     feet = [f"{leg}_foot" for leg in ("front_left", "front_right", "rear_left", "rear_right")]
     walks = [[True] * 4, [True, False, False, True], [False, True, True, False]]
     robots: dict[str, Any] = {
-        "quadruped": (demo / "quadruped.urdf", False, [(foot, 3) for foot in feet], walks, [2500], "joints"),
-        "arm": (PANDA, True, [], [[]], [10800], "joints"),
+        "quadruped": (demo / "quadruped.urdf", False, [(foot, 3) for foot in feet], walks, [1500], "joints"),
+        "arm": (PANDA, True, [], [[]], [2700], "joints"),
         "biped": (
             ROOT / "configs" / "biped.urdf",
             False,

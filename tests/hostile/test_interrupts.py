@@ -100,7 +100,7 @@ def test_a_command_stopped_at_any_moment_leaves_all_or_nothing(
             assert hidden(out) == [], f"{case}: left by the killed command"
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.slow)])
 def test_a_run_that_is_replaced_is_there_at_any_moment(
     place: Path, server: Commands, run: Path, tmp_path: Path, number: signal.Signals
 ) -> None:

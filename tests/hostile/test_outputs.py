@@ -116,7 +116,7 @@ def test_the_folder_of_the_logs_and_that_of_the_call_are_not_replaced(
 # ----------------------------------------------------------------------------------------------------------------- disk
 
 
-@pytest.mark.parametrize("largest", [0, 2000, 20_000, 40_000])
+@pytest.mark.parametrize("largest", [0, pytest.param(2000, marks=pytest.mark.slow), 20_000, 40_000])
 def test_a_full_disk_ends_a_run_in_one_line_with_nothing_left(place: Path, server: Commands, largest: int) -> None:
     """Largest files of 0 bytes to just below those of a run."""
     before = files_in(place / "demo")

@@ -17,6 +17,7 @@ from recordings import in_world
 from repository import SHARED
 from scipy.spatial.transform import Rotation
 from synthetic import PANDA, Oracle, load
+from thinned import SLOW
 from walking import MACHINES, robot_of
 
 from torchid.log_checks import NOTE, REJECTED, SUSPICIOUS, Checked, scales
@@ -186,9 +187,11 @@ def misnamed(log: Log) -> Log:
     ("mistake", "field", "text"),
     [
         (lambda log: scaled(log, "joint_torque", 1e3), "joint_torque", "in Nmm or mNm"),
-        (lambda log: scaled(log, "joint_torque", 1e-3), "joint_torque", "in kNm"),
-        (lambda log: scaled(log, "joint_torque", -1.0), "joint_torque", "all reversed"),
-        (lambda log: scaled(log, "contact_wrench_local", 1e-3), "contact_wrench_local", "in kN"),
+        pytest.param(lambda log: scaled(log, "joint_torque", 1e-3), "joint_torque", "in kNm", marks=SLOW),
+        pytest.param(lambda log: scaled(log, "joint_torque", -1.0), "joint_torque", "all reversed", marks=SLOW),
+        pytest.param(
+            lambda log: scaled(log, "contact_wrench_local", 1e-3), "contact_wrench_local", "in kN", marks=SLOW
+        ),
         (lambda log: scaled(log, "contact_wrench_local", 1.0 / 9.81), "contact_wrench_local", "in kg"),
         (lambda log: scaled(log, "contact_wrench_local", -1.0), "contact_wrench_local", "all reversed"),
         (misnamed, "contact_wrench_local", "along the world's axes"),

@@ -13,6 +13,7 @@ from mistaken import Case, case_of, checked
 from motions import value
 from scipy.spatial.transform import Rotation
 from synthetic import Array
+from thinned import each_once
 from walking import MACHINES
 
 from torchid.log_checks import NOTE, SUSPICIOUS, Checked
@@ -40,9 +41,9 @@ OF_FILTERS_MS = 5.0  # those of the sensors of some robots are late by 10 ms
 CASES = [("arm", "contacts"), ("quadruped", "full"), ("biped", "joints")]
 
 
-@pytest.mark.parametrize("seconds", [0.1, -0.06])
-@pytest.mark.parametrize(("machine", "sensors"), CASES)
-def test_torques_that_are_late_or_early_are_named_with_the_time(machine: str, sensors: str, seconds: float) -> None:
+@pytest.mark.parametrize(("robot", "seconds"), each_once(CASES, [0.1, -0.06]))
+def test_torques_that_are_late_or_early_are_named_with_the_time(robot: tuple[str, str], seconds: float) -> None:
+    machine, sensors = robot
     case = case_of(MACHINES[machine], sensors)
     finding = only(checked(case, with_delayed_torques(case.log, seconds)), "delay", "joint_torque")
     assert finding.severity == SUSPICIOUS

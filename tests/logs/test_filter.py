@@ -12,7 +12,7 @@ from motions import RATE, jittered, moving_log, position, sine_log, uniform, val
 from torchid.logs import Log
 from torchid.logs.log import FloatArray
 from torchid.logs.preprocess import preprocess
-from torchid.logs.timeline import spline_derivatives
+from torchid.logs.timeline import lay_out_timeline, spline_derivatives
 
 
 @pytest.mark.parametrize("hertz", [3.0, 10.0, 20.0, 40.0, 100.0])
@@ -113,6 +113,16 @@ def test_deriving_alone_copies_nothing_that_the_log_gives() -> None:
     out = preprocess(log)
     for name in ("time", "joint_position", "joint_torque", "base_position_world"):
         assert np.shares_memory(getattr(out, name), getattr(log, name)), name
+
+
+@pytest.mark.parametrize("samples", [300, 3_000, 20_000])
+def test_a_channel_among_others_is_filtered_as_it_is_alone(samples: int) -> None:
+    low_pass = lay_out_timeline(np.arange(samples) / RATE, 20.0, None, differentiates=False).low_pass
+    assert low_pass is not None
+    channels = np.random.default_rng(0).standard_normal((samples, 7, 2))
+    together = low_pass(channels)
+    for place in np.ndindex(7, 2):
+        np.testing.assert_array_equal(together[(slice(None), *place)], low_pass(channels[(slice(None), *place)]))
 
 
 def test_memory_stays_within_three_times_the_log() -> None:

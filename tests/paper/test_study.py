@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from forked import forked_simulations
 from paper.results import NOMINAL, TRUE, Record, Results, examine_claims
 from repository import ROOT
 from script_calls import call
@@ -29,7 +30,8 @@ TRAINING = ("all runs", "squats alone")
 def study(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """The folder of a quick study, and what it printed."""
     folder = tmp_path_factory.mktemp("study") / "paper"
-    status, out, err = call("reproduce_paper", "--quick", "--output", str(folder))
+    with forked_simulations():
+        status, out, err = call("reproduce_paper", "--quick", "--output", str(folder))
     assert status == 0, err
     return folder, out
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from thinned import slow_but
 from walking import MACHINES, recorded, robot_of, truth
 
 from torchid.logs.preprocess import preprocess
@@ -55,7 +56,11 @@ def assert_same(found: Sequence[Part], expected: Sequence[Part]) -> None:
 
 
 @pytest.mark.parametrize(
-    "lengths", [(1500,), (700, 800), (750, 750), (1200, 150, 150), (300, 1200), (100,) * 14, (700, 30, 700)]
+    "lengths",
+    slow_but(
+        [(1500,), (700, 800), (100,) * 14, (700, 30, 700)],
+        [(1500,), (700, 800), (750, 750), (1200, 150, 150), (300, 1200), (100,) * 14, (700, 30, 700)],
+    ),
 )
 def test_blocks_of_compressed_logs_are_those_of_their_samples(
     walk: tuple[RowBuilder, Samples], lengths: tuple[int, ...]
@@ -113,4 +118,4 @@ def test_what_a_log_compresses_to_does_not_grow_with_it(walk: tuple[RowBuilder, 
         }
         return replace(log, base=log.base.map(lambda x: torch.cat([x] * times)), **tensors)
 
-    assert numbers(repeated(8)) <= 1.005 * numbers(repeated(4))
+    assert numbers(repeated(4)) <= 1.005 * numbers(repeated(2))

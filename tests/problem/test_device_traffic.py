@@ -16,6 +16,7 @@ import torch
 from device_traffic import DEVICE, DeviceTraffic
 from random_samples import random_samples, sensor_set
 from synthetic import G1, PANDA, SOLO12, load
+from thinned import SLOW
 from torch import Tensor
 from welded import CONTACTS, SENSORS, machine
 
@@ -81,13 +82,13 @@ def traffic(builder: RowBuilder, chunks: Chunks) -> dict[str, int]:
 @pytest.mark.parametrize(
     ("name", "sensors", "world", "terms"),
     [
-        ("quadruped", "joints", False, ExtraTerms()),
+        pytest.param("quadruped", "joints", False, ExtraTerms(), marks=SLOW),
         ("quadruped", "full", False, TERMS),
-        ("quadruped", "mixed", True, ExtraTerms()),
-        ("humanoid", "joints", False, TERMS),
+        pytest.param("quadruped", "mixed", True, ExtraTerms(), marks=SLOW),
+        pytest.param("humanoid", "joints", False, TERMS, marks=SLOW),
         ("humanoid", "contacts", True, ExtraTerms()),
         ("bolted arm", "joints", False, ExtraTerms()),
-        ("bolted arm", "mixed", True, TERMS),
+        pytest.param("bolted arm", "mixed", True, TERMS, marks=SLOW),
         ("sensors in limbs", "mixed", True, TERMS),
     ],
 )

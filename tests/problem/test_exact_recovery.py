@@ -9,6 +9,7 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
+from thinned import each_once
 from true_robots import (
     EXACT,
     KINDS,
@@ -186,8 +187,7 @@ def usual(sensors: str) -> Estimate:
     return fit(world("ANYmal"), sensors_of(world("ANYmal"), sensors), noisy_logs(), chunk=2048)
 
 
-@pytest.mark.parametrize("way", WAYS)
-@pytest.mark.parametrize("sensors", ["joints", "mixed"])
+@pytest.mark.parametrize(("way", "sensors"), each_once([*WAYS], ["joints", "mixed"]))
 def test_how_samples_are_cut_ordered_and_shared_out_does_not_change_the_result(way: str, sensors: str) -> None:
     w = world("ANYmal")
     expected, estimate = usual(sensors), WAYS[way](w, sensors_of(w, sensors))

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from stances import Stance, stance
 from synthetic import Array
+from thinned import each_once
 from walking import robot_of
 
 from torchid.errors import LogError, TorchidWarning, UnknownNameError
@@ -56,18 +58,17 @@ def without(log: Log, foot: int, samples: slice = slice(None)) -> Log:
     return replace(log, contact_active=active)
 
 
-CASES = {
-    "points": stance("quadruped", LEVEL, 0.0, ((1, 50, 90),)),
-    "balls on a slope": stance("quadruped", ASKEW, 0.022, ((1, 50, 90), (2, 120, 140))),
-    "soles": stance("biped", AHEAD, 0.0, ((0, 40, 70),)),
+CASES: dict[str, Callable[[], Stance]] = {
+    "points": partial(stance, "quadruped", LEVEL, 0.0, ((1, 50, 90),)),
+    "balls on a slope": partial(stance, "quadruped", ASKEW, 0.022, ((1, 50, 90), (2, 120, 140))),
+    "soles": partial(stance, "biped", AHEAD, 0.0, ((0, 40, 70),)),
 }
 
 
-@pytest.mark.parametrize("name", CASES)
-@pytest.mark.parametrize("most", [1, 7, 64])
+@pytest.mark.parametrize(("name", "most"), each_once([*CASES], [1, 7, 64]))
 def test_a_walk_that_is_read_in_parts_is_that_of_the_whole_log(tmp_path: Path, name: str, most: int) -> None:
     """Wherever the parts end: in a stance, at a change of feet, or between samples without enough feet."""
-    case = CASES[name]
+    case = CASES[name]()
     log = without(without(without(case.log, 0, slice(100, 110)), 1, slice(100, 110)), 2 % len(case.contacts()))
     whole = found(case, log) if name != "points" else found(case, log := without(case.log, 0, slice(60, 70)))
     names = {"joint_names": np.array(log.joint_names), "contact_names": np.array(log.contact_names)}

@@ -182,8 +182,10 @@ def test_collisions_of_a_format_that_mujoco_does_not_read_are_kept_as_comments_a
 
 @pytest.mark.parametrize(
     ("urdf", "file", "feet"),
-    [(BIPED, CONFIGS / "biped_full.yaml", SOLES), (TALOS_FULL, None, ("left_sole_link", "right_sole_link"))],
-    ids=["biped", "Talos"],
+    [
+        pytest.param(BIPED, CONFIGS / "biped_full.yaml", SOLES, id="biped", marks=pytest.mark.slow),
+        pytest.param(TALOS_FULL, None, ("left_sole_link", "right_sole_link"), id="Talos"),
+    ],
 )
 def test_a_run_of_a_humanoid_writes_what_loads(
     urdf: Path, file: Path | None, feet: tuple[str, str], tmp_path: Path

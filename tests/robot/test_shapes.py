@@ -345,7 +345,12 @@ def support(shape: object, direction: Array) -> float:
 
 @pytest.mark.parametrize(
     ("urdf", "prefer"),
-    [(G1, "collision"), (SOLO12, "visual"), (TALOS, "collision"), (PANDA, "collision")],
+    [
+        (G1, "collision"),
+        (SOLO12, "visual"),
+        pytest.param(TALOS, "collision", marks=pytest.mark.slow),
+        (PANDA, "collision"),
+    ],
     ids=lambda value: value if isinstance(value, str) else value.stem,
 )
 def test_boxes_of_real_robots_touch_the_shapes_that_pinocchio_reads(urdf: Path, prefer: ShapeKind) -> None:

@@ -91,7 +91,8 @@ def closing_forces(
 cases = pytest.mark.parametrize(
     ("name", "per"),
     [
-        *((name, "device") for name in KINDS),
+        *((name, "device") for name in KINDS if name != "G1"),
+        pytest.param("G1", "device", marks=pytest.mark.slow),
         ("ANYmal", "axis"),
         *(pytest.param(name, "axis", marks=pytest.mark.slow) for name in ("G1", "Talos")),
     ],

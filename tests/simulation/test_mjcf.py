@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from forked import forked_simulations
 from simulated import QUADRUPED, quadruped, squat
 
 from torchid.cli import main
@@ -53,7 +54,8 @@ def test_armatures_are_in_the_torques_and_the_nominal_robot_keeps_them(tmp_path:
     np.testing.assert_allclose(plant.model.dof_armature[6:], 0.05)
     np.testing.assert_allclose(light.model.dof_armature[6:], 0.0)
     (tmp_path / "sim.yaml").write_text(dump(config))
-    assert main(["simulate", str(tmp_path / "sim.yaml"), f"output={tmp_path / 'out'}"]) == 0
+    with forked_simulations():
+        assert main(["simulate", str(tmp_path / "sim.yaml"), f"output={tmp_path / 'out'}"]) == 0
     nominal = load_robot(tmp_path / "out" / "nominal.xml")
     np.testing.assert_allclose(nominal.armature, 0.05)
     assert np.abs(nominal.nominal[:, 0] / ROBOT.nominal[:, 0] - 1.0).max() > 0.05

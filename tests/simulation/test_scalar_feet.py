@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from forked import forked_simulations
 from motions import value
 from refusals import refusal
 from simulated import QUADRUPED, feet_of, quadruped
@@ -58,7 +59,8 @@ def walked(tmp_path_factory: pytest.TempPathFactory) -> Walked:
     feet = [replace(foot, sensor="fn" if foot.frame in SCALAR else "wrench") for foot in config.feet]
     config = replace(config, feet=feet, output=folder / "simulation")
     (folder / "simulation.yaml").write_text(dump(config))
-    assert main(["simulate", str(folder / "simulation.yaml")]) == 0
+    with forked_simulations():
+        assert main(["simulate", str(folder / "simulation.yaml")]) == 0
     return Walked(config)
 
 

@@ -57,7 +57,7 @@ def test_what_is_redirected_is_as_wide_as_columns_says(
 
 
 @pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
-@pytest.mark.parametrize("width", [80, 100])
+@pytest.mark.parametrize("width", [80, pytest.param(100, marks=pytest.mark.slow)])
 def test_no_line_of_a_command_is_wider_than_that(
     width: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -28,6 +28,8 @@ from torchid.simulation import LEAD_S, Stability, sensor_log, set_up_simulation
 from torchid.simulation.feet import find_feet
 
 _POLL_S = 0.2
+START = "spawn"
+"""How processes begin: forks would inherit threads, of which a command has some."""
 
 
 def simulate(config: SimulationConfig) -> dict[str, Stability]:
@@ -79,7 +81,7 @@ def perturbed_parameters(robot: Robot, settings: NominalConfig, draw: int = 0) -
 
 def _in_processes(config: SimulationConfig, folder: Path, progress: Callable[[float], None]) -> dict[str, Stability]:
     """Simulate every motion, the longest first; `progress` gets the seconds simulated so far."""
-    context = multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context(START)
     done = context.Value("d", 0.0)
     workers = min(os.cpu_count() or 1, len(config.motions))
     pool = ProcessPoolExecutor(workers, context, _start_worker, (done,))
