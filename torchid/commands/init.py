@@ -14,6 +14,7 @@ from typing import Any
 import yaml
 
 from torchid.commands.folder import check_free_file
+from torchid.commands.init_contacts import GuessedContact, guess_contacts, stated_contacts
 from torchid.commands.init_proposals import (
     Split,
     hints,
@@ -32,23 +33,17 @@ from torchid.errors import ConfigError, InputError, LogError, about_file, excerp
 from torchid.fitting.checked_settings import is_along_base
 from torchid.logs import Columns, Log, Topics, read_log
 from torchid.logs.containers import LogKind, atomic_output, existing_log_kind
-from torchid.logs.file_samples import read_bag_sample, read_sample, stated_names, states_degrees, texts_in
+from torchid.logs.file_samples import read_bag_sample, read_sample, states_degrees, texts_in
 from torchid.logs.log import VARIANTS
 from torchid.logs.map_proposals import MapProposal, propose_map
-from torchid.logs.name_matching import KnownRobot, within
+from torchid.logs.name_matching import KnownRobot
 from torchid.logs.time_range import split_range
 from torchid.logs.topic_proposals import USED_TYPES, frame_of, propose_topics
 from torchid.regressor.kinematics import GRAVITY
-from torchid.robot import CollisionShapes, Robot, load_robot
+from torchid.robot import Robot, load_robot
 from torchid.robot.urdf import has_fixed_base, position_limits
 from torchid.robot.xml_files import is_mjcf
 
-_FEET = (r"foot|feet", r"sole", r"ankle_roll|ankle_flexion", r"toe|ankle|paw|hoof")
-"""Words in names of links that touch the ground, the surest first."""
-
-_ON_FEET = r"sensor|imu|camera|bumper|laser"
-_IN_LIMBS = r"(?<![a-z])ft(?![a-z])"
-_NAMED = r"foot|feet|sole"
 _FORCES = ("joint_torque", "contact_wrench_local", "contact_wrench_world", "contact_force_normal", "ft_wrench")
 _POSE = ("base_quat_wxyz", "base_quat_xyzw")
 _IMU = ("imu_specific_force", "imu_angular_velocity")
@@ -84,12 +79,6 @@ class Initiated:
 
 
 _HOLDS_THE_BASE = "what carries it, feet or the thrust of rotors, is a contact of a frame (docs/sensors.md)"
-
-
-@dataclass(frozen=True)
-class _Contact:
-    frame: str
-    type: str
 
 
 def init(urdf: str | Path, log: str | Path, output: str | Path) -> Initiated:
@@ -131,7 +120,7 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> Initiated:
     return out
 
 
-def _of_columns(files: Sequence[Path], robot: Robot) -> tuple[list[_Contact], set[str], MapProposal]:
+def _of_columns(files: Sequence[Path], robot: Robot) -> tuple[list[GuessedContact], set[str], MapProposal]:
     """Contacts, fields and a map of a table or arrays, or of several that are one log."""
     samples, in_degrees, size = [], set[str](), 0.0
     for file in files:
@@ -143,7 +132,7 @@ def _of_columns(files: Sequence[Path], robot: Robot) -> tuple[list[_Contact], se
             samples.append(read_sample(file))
             in_degrees |= set(samples[-1]) if states_degrees(file) else set()
     sample = {name: values for of_file in reversed(samples) for name, values in of_file.items()}
-    contacts = _guess_contacts(robot, _stated_contacts(sample, robot), texts_in(sample))
+    contacts = guess_contacts(robot, stated_contacts(sample, robot), texts_in(sample))
     proposal = propose_map(sample, _known(robot, contacts), samples if len(files) > 1 else (), in_degrees)
     fields = _fields_of(sample, proposal)
     if "joint_position" not in fields:
@@ -152,56 +141,22 @@ def _of_columns(files: Sequence[Path], robot: Robot) -> tuple[list[_Contact], se
     return contacts, fields, proposal
 
 
-def _of_bag(file: Path, robot: Robot) -> tuple[list[_Contact], set[str], MapProposal]:
+def _of_bag(file: Path, robot: Robot) -> tuple[list[GuessedContact], set[str], MapProposal]:
     """Contacts, fields and a map of the topics of a bag."""
     with about_file(file):
         sample = read_bag_sample(file, USED_TYPES)
-    contacts = _guess_contacts(robot, [], [f"{frame_of(topic)} {name}" for name, topic in sample.items()])
+    contacts = guess_contacts(robot, [], [f"{frame_of(topic)} {name}" for name, topic in sample.items()])
     proposal = propose_topics(sample, _known(robot, contacts))
     return contacts, proposal.fields, proposal
 
 
-def _known(robot: Robot, contacts: Sequence[_Contact]) -> KnownRobot:
+def _known(robot: Robot, contacts: Sequence[GuessedContact]) -> KnownRobot:
     """What the proposal of a map knows of the robot."""
     on_base, elsewhere = ([name for name, (body, _) in robot.links.items() if bool(body) == x] for x in (False, True))
     feet, weight = [contact.frame for contact in contacts], GRAVITY * float(robot.nominal[:, 0].sum())
     known = robot.joint_names, feet, robot.path.stem, weight, robot.base_link, on_base, elsewhere, limb_sensors(robot)
     moving = [body.joint.name for body in robot.bodies if body.joint is not None and body.joint.kind != "fixed"]
     return KnownRobot(*known, [link for link in on_base if is_along_base(robot, link)], robot.sliding, moving)
-
-
-def _stated_contacts(sample: Any, robot: Robot) -> list[str]:
-    """Contacts that a log in the format names, as far as the robot has them."""
-    names = stated_names(sample, "contact_names")
-    names += [name.split(".")[1] for name in sample if re.fullmatch(r"contact_active\.[^.]+", name)]
-    return [name for name in dict.fromkeys(names) if name in robot.links]
-
-
-def _guess_contacts(robot: Robot, stated: Sequence[str], texts: Sequence[str]) -> list[_Contact]:
-    """Feet: links of outermost bodies with the surest word in their names, one of each body, spheres first.
-
-    Those that the log names, in one of its texts, count before all others.
-    """
-    shapes = CollisionShapes(robot)
-    inner = {body.parent for body in robot.bodies}
-    texts = [text.lower() for text in texts if not re.search(_IN_LIMBS, text, re.IGNORECASE)]
-    named = [name for name in robot.links if any(within(name.lower()).search(text) for text in texts)]
-    frames = list(stated)
-    for words, links in ((_NAMED, named), *((words, list(robot.links)) for words in _FEET)) if not frames else ():
-        by_body: dict[int, list[str]] = {}
-        for name in links:
-            body, is_foot = robot.links[name][0], re.search(words, name, re.IGNORECASE)
-            if body and body not in inner and is_foot and not re.search(_ON_FEET, name, re.IGNORECASE):
-                by_body.setdefault(body, []).append(name)
-        frames = [
-            min(names, key=lambda name: (shapes.about(name) is None, "sole" not in name.lower(), len(name)))
-            for names in by_body.values()
-        ]
-        if len(frames) > 1:
-            break
-        frames = []
-    flat = len(frames) < 3
-    return [_Contact(x, "flat" if flat and shapes.about(x) is None else "point") for x in frames]
 
 
 def _fields_of(sample: Any, proposal: MapProposal) -> set[str]:
@@ -234,16 +189,16 @@ def _as_ignored(pattern: str) -> str:
     return re.sub(r"\{[^{}]*\}", "*", pattern)
 
 
-def _is_fixed(contacts: Sequence[_Contact], fields: set[str]) -> bool:
+def _is_fixed(contacts: Sequence[GuessedContact], fields: set[str]) -> bool:
     return not contacts and not {*_POSE, *_IMU} & fields
 
 
-def _lacks_base_motion(contacts: Sequence[_Contact], fields: set[str]) -> bool:
+def _lacks_base_motion(contacts: Sequence[GuessedContact], fields: set[str]) -> bool:
     pose = set(_POSE) & fields and "base_position_world" in fields
     return not _is_fixed(contacts, fields) and not pose and not set(_IMU) <= fields
 
 
-def _from_feet(contacts: Sequence[_Contact], fields: set[str]) -> dict[str, object]:
+def _from_feet(contacts: Sequence[GuessedContact], fields: set[str]) -> dict[str, object]:
     """Keys of preprocessing that take what nobody recorded from joints and feet, if there are enough of these."""
     out: dict[str, object] = {}
     kinds = [contact.type for contact in contacts]
@@ -254,7 +209,7 @@ def _from_feet(contacts: Sequence[_Contact], fields: set[str]) -> dict[str, obje
     return out
 
 
-def _state_flags(contacts: Sequence[_Contact], fields: set[str], proposal: MapProposal) -> None:
+def _state_flags(contacts: Sequence[GuessedContact], fields: set[str], proposal: MapProposal) -> None:
     """Let every foot touch throughout, where neither the log nor torques say which does."""
     if contacts and "contact_active" not in fields and "detect_contacts" not in _from_feet(contacts, fields):
         always = [contact.frame for contact in contacts]
@@ -264,7 +219,7 @@ def _state_flags(contacts: Sequence[_Contact], fields: set[str], proposal: MapPr
 
 
 def _describe(
-    out: Initiated, robot: Robot, contacts: Sequence[_Contact], fields: set[str], proposal: MapProposal
+    out: Initiated, robot: Robot, contacts: Sequence[GuessedContact], fields: set[str], proposal: MapProposal
 ) -> None:
     """What was found, guessed and missed, in lines."""
     what = proposal.key.removesuffix("s")
@@ -297,7 +252,7 @@ def _describe(
 
 
 def _describe_found(
-    out: Initiated, robot: Robot, contacts: Sequence[_Contact], fields: set[str], proposal: MapProposal
+    out: Initiated, robot: Robot, contacts: Sequence[GuessedContact], fields: set[str], proposal: MapProposal
 ) -> None:
     """The robot, and what of a map there is."""
     frames = join_names([contact.frame for contact in contacts])
@@ -339,7 +294,7 @@ def _text(
     urdf: str | Path,
     log: Path,
     output: Path,
-    contacts: Sequence[_Contact],
+    contacts: Sequence[GuessedContact],
     fields: set[str],
     proposal: MapProposal,
     gaps: dict[str, tuple[object, str]],
