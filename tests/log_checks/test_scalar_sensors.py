@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from torchid.log_checks import SUSPICIOUS
 from torchid.log_checks.check import check
-from torchid.log_checks.frozen import check_scalar_wrenches
+from torchid.log_checks.contacts import check_scalar_wrenches
 from torchid.logs import Log
 from torchid.logs.log import WRENCHES
 
