@@ -269,7 +269,8 @@ class _Seen:
 
         Certain is what the settings' own thresholds say too: they differ from before a foot touches until it carries
         something, with an impact between. Of sharp signals feet that scuff the floor are not certain either; elsewhere
-        noise would pass for them. In the air is what stands by neither, as far away as the filter lets a scuff be seen.
+        noise would pass for them. In the air is what stands by neither, twice as far away as the filter lets a scuff be
+        seen: once around, a touch that is too light to be seen at its beginning is left in the air.
         """
         found = self.judged()
         factor = float(np.clip(_DEVIATIONS * self.noise(in_the_air) / self.settings.touch, _LOWEST, 1.0))
@@ -279,7 +280,7 @@ class _Seen:
         possible = found.possible | finer.active
         if is_sharp:
             certain &= finer.certain
-            possible = ~find_unloaded(self.time, possible | finer.possible, self.smear_s)
+            possible = ~find_unloaded(self.time, possible | finer.possible, 2.0 * self.smear_s)
         return Detection(finer.active, certain, possible, found.clear)
 
 
