@@ -78,6 +78,12 @@ def test_one_log_is_named_with_its_verdict() -> None:
     assert "not checked 1 check: forces against the model (no robot (--urdf))" in text([checked("walk")])
 
 
+def test_a_check_that_logs_lack_for_several_reasons_is_named_once() -> None:
+    still = replace(checked("rest"), skipped=(Skipped("forces against the model", "nothing moves"),))
+    reasons = "no robot (--urdf), 2 of 3 logs; nothing moves, 1 of 3 logs"
+    assert f"not checked 1 check: forces against the model ({reasons})" in text([checked("a"), still, checked("b")])
+
+
 @pytest.mark.parametrize("width", [60, 100])
 def test_every_finding_is_shown_or_counted(width: int) -> None:
     names = [f"kind_{k}" for k in range(12)]

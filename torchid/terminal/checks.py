@@ -180,9 +180,10 @@ def _usable_text(log: Checked) -> str:
 def _skipped_lines(checked: Sequence[Checked], most: int, width: int) -> list[str]:
     """Checks that could not be made, with the reasons, and the number of logs if it is not all."""
     logs = Counter(skip for log in checked for skip in dict.fromkeys(log.skipped))
-    texts = [
-        f"{skip.name} ({skip.reason}{'' if count == len(checked) else f'; {count} of {len(checked)} logs'})"
-        for skip, count in logs.items()
-    ]
+    reasons: dict[str, list[str]] = {}
+    for skip, count in logs.items():
+        of_some = "" if count == len(checked) else f", {count} of {len(checked)} logs"
+        reasons.setdefault(skip.name, []).append(f"{skip.reason}{of_some}")
+    texts = [f"{name} ({'; '.join(of_name)})" for name, of_name in reasons.items()]
     text = f"{format_count(len(texts), 'check')}: {'; '.join(texts)}"
     return labelled("not checked", text, width, most) if texts else []
