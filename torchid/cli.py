@@ -115,8 +115,7 @@ def _add_fits(commands: _Commands) -> None:
     )
     check.add_argument("--base-link", metavar="LINK", help="base of that robot, if it is not the URDF's root")
     check.add_argument("--fixed-base", action="store_true", help="the base of that robot is fixed")
-    check.add_argument("--topics", metavar="FILE", help="experiment file with logs.topics, the map of a bag's topics")
-    check.add_argument("--columns", metavar="FILE", help="experiment file with logs.columns, a map of columns")
+    _add_maps(check)
     check.add_argument("--json", metavar="FILE", help="write all findings to a .json file")
     check.add_argument("--figure", metavar="FILE", help="write an overview of all channels (.png, .pdf or .svg)")
     check.add_argument("--overwrite", action="store_true", help="replace these two files if they exist")
@@ -191,6 +190,12 @@ def _add_studies(commands: _Commands) -> None:
     simulate.set_defaults(command=_simulate)
 
 
+def _add_maps(command: argparse.ArgumentParser) -> None:
+    """Options that say what is in a foreign log."""
+    command.add_argument("--topics", metavar="FILE", help="experiment file with logs.topics, the map of a bag's topics")
+    command.add_argument("--columns", metavar="FILE", help="experiment file with logs.columns, a map of columns")
+
+
 def _add_work_on_logs(commands: _Commands) -> None:
     """Commands that write logs anew."""
     convert = commands.add_parser("convert", help=_CONVERT, description=_CONVERT)
@@ -198,8 +203,7 @@ def _add_work_on_logs(commands: _Commands) -> None:
         "source", metavar="IN", help="log: .npz, .h5, .mat, .csv, .txt, .parquet, .mot, .sto, or a bag of ROS messages"
     )
     convert.add_argument("target", metavar="OUT", help="file to write: .npz, .h5, .csv or .parquet")
-    convert.add_argument("--topics", metavar="FILE", help="experiment file with logs.topics, the map of a bag's topics")
-    convert.add_argument("--columns", metavar="FILE", help="experiment file with logs.columns, a map of columns")
+    _add_maps(convert)
     convert.add_argument("--overwrite", action="store_true", help="replace OUT if it exists")
     convert.set_defaults(command=_convert)
     compress = commands.add_parser("compress", help=_COMPRESS, description=_COMPRESS)

@@ -1,4 +1,4 @@
-"""Order of a body's parameters and of a wrench's components, and functions of the parameters."""
+"""Order of a body's parameters and of a wrench's components, functions of the parameters, and gravity."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ COULOMB, VISCOUS = 10, 11
 
 INERTIA_AXES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """Row and column of each of the six inertia numbers in the inertia matrix."""
+
+GRAVITY = 9.81  # [m/s^2]
 
 WRENCH_COMPONENTS = ("fx", "fy", "fz", "mx", "my", "mz")
 """Order of the components of a wrench: force [N], then moment [N m]."""

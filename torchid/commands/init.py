@@ -39,7 +39,7 @@ from torchid.logs.map_proposals import MapProposal, propose_map
 from torchid.logs.name_matching import KnownRobot
 from torchid.logs.time_range import split_range
 from torchid.logs.topic_proposals import USED_TYPES, frame_of, propose_topics
-from torchid.regressor.kinematics import GRAVITY
+from torchid.parameters import GRAVITY
 from torchid.robot import Robot, load_robot
 from torchid.robot.urdf import has_fixed_base, position_limits
 from torchid.robot.xml_files import is_mjcf
@@ -78,7 +78,10 @@ class Initiated:
         return "\n".join([*lines, f"written to    {self.output}; next: torchid check {self.output}"])
 
 
-_HOLDS_THE_BASE = "what carries it, feet or the thrust of rotors, is a contact of a frame (docs/sensors.md)"
+_NO_CONTACT = (
+    "contacts: no link is called a foot, so that nothing but gravity acts on the base; name the frames that touch the"
+    " ground, or that rotors push at (docs/contacts.md)"
+)
 
 
 def init(urdf: str | Path, log: str | Path, output: str | Path) -> Initiated:
@@ -237,11 +240,9 @@ def _describe(
     if not set(_FORCES) & fields:
         out.missing.append("forces: neither joint torques nor contact wrenches")
     if not contacts and not robot.fixed_base and not _is_fixed(contacts, fields):
-        out.missing.append(f"contacts: none, so that nothing but gravity acts on the base; {_HOLDS_THE_BASE}")
+        out.missing.append(_NO_CONTACT)
     out.missing += hints(proposal.left_out, fields, robot.joint_names, what, proposal.like_torques)
     from_feet = _from_feet(contacts, fields)
-    if not contacts and not robot.fixed_base and not _is_fixed(contacts, fields):
-        out.missing.append("contacts: no link is called a foot; name the frames that touch the ground, if any")
     if contacts and "contact_active" not in fields:
         instead = "detected from joint torques" if "detect_contacts" in from_feet else "set to touch throughout"
         out.missing.append(f"contact_active: which foot touches when; {instead}")

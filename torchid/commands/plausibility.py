@@ -29,7 +29,7 @@ from torchid.identifiability.confounding import TotalMass, total_mass
 from torchid.log_checks import Finding
 from torchid.log_checks.check import check
 from torchid.log_checks.findings import SEVERITIES
-from torchid.parameters import PARAMETERS, PER_BODY, Array
+from torchid.parameters import GRAVITY, PARAMETERS, PER_BODY, Array
 from torchid.problem import LinearProblem
 from torchid.problem.chunks import one_thread
 from torchid.problem.metrics import ADVICE, WorseThanNominal, describe_worse
@@ -39,7 +39,6 @@ from torchid.rounding import is_significant
 LARGEST_FACTOR = 10.0
 """Factor that no model of a robot is off by: units are by a thousand, a gear by 50 to 160."""
 
-_GRAVITY = 9.81  # m/s^2
 _CLEAR = 0.5  # correlation of forces of the URDF's bodies with the measured ones, from which on their factor is clear
 _GENERAL = ("forces", "weight")  # findings that say that something is off rather than what
 _PART = 0.05  # share of a log's samples from which on a finding may be the reason
@@ -229,7 +228,7 @@ def _beyond_bounds(phi: Array, robot: Robot) -> Iterator[str]:
     reach = _reach(robot)
     bound = np.empty(PER_BODY)
     bound[parameters.MASS], bound[parameters.FIRST_MOMENT] = total, total * reach
-    bound[parameters.INERTIA], bound[parameters.FRICTION] = total * reach**2, total * _GRAVITY * max(reach, 1.0)
+    bound[parameters.INERTIA], bound[parameters.FRICTION] = total * reach**2, total * GRAVITY * max(reach, 1.0)
     beyond = ~(np.abs(phi) <= LARGEST_FACTOR * np.maximum(bound, np.abs(robot.nominal)))
     for body, parameter in np.argwhere(beyond):
         fitted = f"{robot.body_names[body]} has {PARAMETERS[parameter]} = {phi[body, parameter]:.3g}"

@@ -29,10 +29,9 @@ from torchid.log_checks.model import (
 from torchid.log_checks.weight import MAX_MASS_ERROR
 from torchid.logs import Log
 from torchid.logs.log import FORCE_NORMAL, BoolArray, FloatArray
-from torchid.parameters import WRENCH_COMPONENTS
+from torchid.parameters import GRAVITY, WRENCH_COMPONENTS
 from torchid.problem import RowBuilder
 from torchid.problem.predict import force_series
-from torchid.regressor.kinematics import GRAVITY
 from torchid.robot import Robot
 from torchid.rounding import STD_PER_MAD
 from torchid.sensing import Contact, named_sensors

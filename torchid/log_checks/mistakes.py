@@ -18,7 +18,7 @@ from torchid.log_checks.units import advise_units, other_units
 from torchid.logs import Log
 from torchid.logs.log import WRENCHES
 from torchid.logs.quaternion import inverse_rotation, make_sign_continuous
-from torchid.regressor.kinematics import GRAVITY
+from torchid.parameters import GRAVITY
 
 #: Parts of names that differ between left and right, and between front and rear.
 _SIDES = ("left right", "Left Right", "LEFT RIGHT", "l r", "L R", "FL FR", "RL RR", "HL HR", "LF RF", "LH RH")

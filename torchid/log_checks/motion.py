@@ -21,8 +21,8 @@ from torchid.logs.quaternion import (
     rotate_to_base,
     rotate_to_world,
 )
+from torchid.parameters import GRAVITY
 from torchid.problem.closed_loops import loop_gaps, with_loop_joints
-from torchid.regressor.kinematics import GRAVITY
 from torchid.robot import Robot
 from torchid.rounding import STD_PER_MAD
 

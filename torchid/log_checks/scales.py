@@ -18,11 +18,11 @@ from torchid.log_checks.model import (
 )
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
+from torchid.parameters import GRAVITY
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.chunks import chunks_by_state, one_thread
 from torchid.problem.linear import parameter_scale
 from torchid.problem.predict import force_series
-from torchid.regressor.kinematics import GRAVITY
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet
 

@@ -12,7 +12,7 @@ from torchid.log_checks.units import advise_units, units_of_ratio
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.quaternion import rotate_to_world
-from torchid.regressor.kinematics import GRAVITY
+from torchid.parameters import GRAVITY
 from torchid.robot import Robot
 
 #: Relative error of the carried mass that is noted, and that no CAD model has.

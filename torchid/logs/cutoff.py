@@ -13,6 +13,7 @@ from torchid.logs.preprocess import lacks_derivatives
 from torchid.logs.quaternion import make_sign_continuous
 from torchid.logs.signal_noise import SignalNoise, signal_noise
 from torchid.logs.timeline import LONGEST_MEDIAN_STEP, spline_derivatives
+from torchid.parameters import GRAVITY
 
 _LOWEST_HZ, _STEPS_PER_DECADE = 1.0, 40
 _SEGMENT_S = 8.0  # of the spectra: lines 1/8 Hz apart
@@ -25,7 +26,7 @@ _NOISE_SHARE = 5e-4
 _KEPT_SHARE, _MOTION_SHARE = 0.95, 0.99
 #: Of the power of gravity, what noise of the base's derived linear acceleration may be, whatever motion is lost: masses
 #: come out as much too small, while a filter leaves equations true that are linear in the motion.
-_WEIGHT_SHARE, _GRAVITY = 0.01, 9.81  # [1], [m/s^2]
+_WEIGHT_SHARE = 0.01
 #: Forces of a motion have its harmonics: gravity and Coriolis terms are not linear in wide angles.
 _HARMONICS = 6.0
 #: What an acceleration is worked out of, the first that was recorded, with the number of derivatives.
@@ -118,7 +119,7 @@ def choose_cutoff(
             motion, noise = motion + of_motion, noise + of_noise
             if name in _OF_WEIGHT:
                 of_base += of_noise
-                gravity += float(log.time[-1] - log.time[0]) * _GRAVITY**2
+                gravity += float(log.time[-1] - log.time[0]) * GRAVITY**2
     usual = usual_cutoff_hz(slowest)
     if not noise.any():
         return CutoffChoice(float(f"{usual:.2g}"), by_noise=False)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from torchid import ranks
 from torchid.logs.log import BoolArray, FloatArray
-from torchid.parameters import FRICTION, PER_BODY
+from torchid.parameters import FRICTION, GRAVITY, PER_BODY
 from torchid.problem.compression import compress_parts
 from torchid.problem.detection_motion import Prepared
 from torchid.problem.elimination import assemble
@@ -21,7 +21,6 @@ from torchid.problem.predict import force_series
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples, concatenate
 from torchid.regressor import FrameJacobian
-from torchid.regressor.kinematics import GRAVITY
 from torchid.robot import Robot
 from torchid.sensing import Contact, named_sensors
 

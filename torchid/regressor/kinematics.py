@@ -9,9 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchid.parameters import GRAVITY
 from torchid.regressor.tree import KinematicTree
 
-GRAVITY = 9.81  # [m/s^2]
 GRAVITY_WORLD = (0.0, 0.0, -GRAVITY)
 
 

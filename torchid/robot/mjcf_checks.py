@@ -9,13 +9,12 @@ import numpy as np
 
 from torchid.errors import UrdfError, warn
 from torchid.guards import MAX_NUMBER
-from torchid.parameters import Array
+from torchid.parameters import GRAVITY, Array
 from torchid.robot.mjcf_model import MjcfModel, mujoco, pose
 
 LOOPS = {"connect": "point", "weld": "weld"}
 """Type of the loop that an equality constraint closes, by its tag."""
 
-_GRAVITY = 9.81  # m/s^2
 _CLOSE = 0.02  # m/s^2: 9.8 and 9.81 are the same planet
 
 
@@ -108,7 +107,7 @@ def _check_medium(model: MjcfModel) -> None:
             raise UrdfError(model.path, f"<option>{line}", f"{name} {getattr(option, name):g}", f"{name} 0: no fluid")
     off = option.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY
     gravity = np.zeros(3) if off else option.gravity
-    if np.abs(gravity - [0.0, 0.0, -_GRAVITY]).max() > _CLOSE:
+    if np.abs(gravity - [0.0, 0.0, -GRAVITY]).max() > _CLOSE:
         warn(f"{model.path}: gravity {_numbers(gravity)}; the Earth's along -z is used")
 
 
