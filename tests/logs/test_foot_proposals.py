@@ -86,6 +86,13 @@ def test_one_force_of_each_foot_by_french_sides_is_a_flag_above_a_threshold() ->
     assert 0.0 < entry["above"] < 0.2 * WEIGHT
 
 
+def test_feet_without_names_are_in_the_order_of_the_legs_in_a_list_of_joints() -> None:
+    legs = ("FL", "FR", "RL", "RR")
+    forces = np.stack([swinging(k) for k in range(4)], axis=1)
+    out = proposed(QUADRUPED, {"names": np.array([f"{x}_hip" for x in legs]), "foot_forces": forces})
+    assert out.columns["contact_order"] == [f"{x}_foot" for x in legs]
+
+
 def pose() -> tuple[np.ndarray, Rotation, np.ndarray]:
     """Position (N, 3), orientation and world velocity (N, 3) of a base that turns far."""
     wave = np.stack([np.sin(2.0 * TIME), np.cos(3.0 * TIME), np.sin(TIME)], axis=1)

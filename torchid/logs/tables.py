@@ -32,6 +32,7 @@ _PARQUET = {
     "page_checksum_verification": True,
 }
 _BAD_CELL = re.compile(r"In CSV column #(\d+): (?:Row #(\d+): )?.*?invalid value '(.{0,40})", re.DOTALL)
+_SHORT_ROW = re.compile(r".*?Row #(\d+): Expected (\d+) columns, got (\d+)", re.DOTALL)
 _PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 _QUOTES = "'\n"
 _EMPTY = ["", " ", "  ", "nan", "NaN", "NAN"]
@@ -256,13 +257,25 @@ def _read_csv(pa: Any, path: Path, columns: Columns | None, whole: bool) -> Iter
             for batch in _bounded(path, reader, len(types), whole):
                 yield layout, batch
         except pa.ArrowInvalid as error:
-            bad = _BAD_CELL.match(str(error))
-            if bad is None:
+            if (bad := _bad_cell(path, header, error)) is None:
                 raise
-            column, row, found = bad.groups()
-            where = "" if row is None else f" in row {row}"
-            text = f"'{excerpt(found.strip(_QUOTES))}'{where}"
-            raise LogError(path, f"column '{header.texts[int(column)]}'", text, _NUMBERS) from error
+            raise bad from error
+
+
+def _bad_cell(path: Path, header: TextHeader, error: Exception) -> LogError | None:
+    """The error of a cell that is no number, or of a row with too many cells or too few; None for any other."""
+    if row := _SHORT_ROW.match(str(error)):
+        return LogError(path, f"row {row[1]}", f"{row[3]} cells", f"{row[2]} cells, as there are names")
+    bad = _BAD_CELL.match(str(error))
+    if bad is None:
+        return None
+    column, row_number, found = bad.groups()
+    where = "" if row_number is None else f" in row {row_number}"
+    found = found.strip(_QUOTES)
+    other = "." if header.decimal_mark == "," else ","
+    mixed = found.count(other) == 1 and found.replace(other, "").lstrip("-").isdigit()
+    accepted = f"the decimal mark '{header.decimal_mark}' throughout, as in other rows" if mixed else _NUMBERS
+    return LogError(path, f"column '{header.texts[int(column)]}'", f"'{excerpt(found)}'{where}", accepted)
 
 
 def _read_parquet(pa: Any, path: Path, columns: Columns | None, whole: bool) -> Iterator[tuple[_Layout, Any]]:
