@@ -350,6 +350,7 @@ WELDS = tuple(f"{leg}_sole" for leg in LEGS)
 
 
 @pytest.mark.filterwarnings("ignore::torchid.errors.MasslessBodyWarning")
+@pytest.mark.usefixtures("figures")
 def test_sensors_in_limbs_are_planned_named_and_drawn(experiment: Path) -> None:
     """A dear knee: a three-axis reading of the lower leg's weld takes its place, and the proposal is checked."""
     file = asked(

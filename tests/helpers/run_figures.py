@@ -9,9 +9,12 @@ from pathlib import Path
 import pytest
 from matplotlib.figure import Figure
 
-FIGURES = ("draw_forces", "error_figure", "parameter_figure", "identifiability_figure", "contribution_figure")
+FIGURES = (
+    *("draw_forces", "error_figure", "parameter_figure", "identifiability_figure", "contribution_figure"),
+    *("extra_figure", "ridge_figure", "tree_figure", "accuracy_figure"),
+)
 PAGE, EVENTS = "write_page", "write_events"
-_MODULES = [import_module(f"torchid.commands.{name}") for name in ("results", "evaluate")]
+_MODULES = [import_module(f"torchid.commands.{name}") for name in ("results", "evaluate", "analyze")]
 _DRAWN = [
     (module, name, vars(module)[name])
     for module in _MODULES
@@ -21,7 +24,7 @@ _DRAWN = [
 
 
 def draw_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Runs of `torchid identify` and `evaluate` in this process write small white figures, no page and no events."""
+    """Commands in this process write small white figures, no page of a run and no events."""
     for module, name, _ in _DRAWN:
         monkeypatch.setattr(
             module, name, _write_nothing if name == EVENTS else lambda *_, **__: Figure(figsize=(1.0, 1.0))
