@@ -12,8 +12,8 @@ from torch import Tensor
 from torchid.estimators import LeastSquares
 from torchid.fitting.fit import LogFitter
 from torchid.parameters import Array
-from torchid.problem import LinearProblem, Samples
-from torchid.problem.noise import GroupVariances, VarianceComponentEstimator
+from torchid.problem import Samples
+from torchid.problem.noise import GroupVariances, VarianceComponentEstimator, fitted_directions
 from torchid.problem.sampled_rows import BASE_GROUPS, LogElsewhere, SampledRows, noise_of_groups, std_by_group
 from torchid.reprs import short_repr
 from torchid.robot import Robot
@@ -83,15 +83,15 @@ def estimate_noise(
     variance, columns, passes = np.ones(len(rows.groups)), None, 0
     estimator = VarianceComponentEstimator(rows, tied)
     while True:
-        columns, problem = _fit_rows(rows, variance, columns, fitter)
+        columns, directions = _fit_rows(rows, variance, columns, fitter)
         passes += 1
         if len(tied) == len(rows.groups):
             break
-        components = estimator.estimate(variance, columns, problem)
+        components = estimator.estimate(variance, columns, directions)
         variance = components.variance
         if components.change < _SETTLED or passes == _PASSES:
             break
-    free = VarianceComponentEstimator(rows).estimate(variance, columns, problem) if tied else components
+    free = VarianceComponentEstimator(rows).estimate(variance, columns, directions) if tied else components
     common = variance[rows.groups.index(tied[0])] if tied else 1.0
     used = np.where(
         np.isin(rows.groups, tied), rows.reference_std, _rounded(rows.reference_std * np.sqrt(variance / common))
@@ -127,12 +127,13 @@ def recorded_sensors(
 
 def _fit_rows(
     rows: SampledRows, variance: Array, before: Mapping[str, Tensor] | None, fitter: LogFitter
-) -> tuple[Mapping[str, Tensor], LinearProblem]:
-    """Parameters by log in the builder's columns, and the problem, by least squares without regularization."""
+) -> tuple[Mapping[str, Tensor], Mapping[str, Tensor]]:
+    """Parameters by log in the builder's columns, and where they were free, by least squares without regularization."""
     estimator = LeastSquares(rank_tolerance=fitter.estimator.rank_tolerance)
     fit = fitter.fit(rows.compress(variance, before), estimator.solve)
-    columns = {chunk.log: fit.columns(rows.builder, chunk.log) for chunk in rows.chunks}
-    return {log: x.to("cpu", torch.float64) for log, x in columns.items()}, fit.assembly.problem
+    logs = dict.fromkeys(chunk.log for chunk in rows.chunks)
+    columns = {log: fit.columns(rows.builder, log).to("cpu", torch.float64) for log in logs}
+    return columns, {log: fitted_directions(fit.assembly, rows.builder, log) for log in logs}
 
 
 def _rounded(values: Array) -> Array:

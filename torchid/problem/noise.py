@@ -19,7 +19,7 @@ from torch import Tensor
 
 from torchid.parameters import Array
 from torchid.problem.chunks import one_thread
-from torchid.problem.linear import LinearProblem
+from torchid.problem.elimination import Assembly
 from torchid.problem.rows import RowBuilder
 from torchid.problem.sampled_rows import CLIP, SampledRows
 from torchid.rounding import MAD_PER_STD, is_significant
@@ -101,7 +101,9 @@ class VarianceComponentEstimator:
 
     @one_thread()
     @torch.no_grad()
-    def estimate(self, variance: Array, columns: Mapping[str, Tensor], problem: LinearProblem) -> GroupVariances:
+    def estimate(
+        self, variance: Array, columns: Mapping[str, Tensor], directions: Mapping[str, Tensor]
+    ) -> GroupVariances:
         """Variances at which the expected covariance of the residuals equals the observed one.
 
         Residuals are clipped. A fit makes them smaller; each group is corrected by the leverage of its own directions.
@@ -110,9 +112,9 @@ class VarianceComponentEstimator:
         Args:
             variance: (G,), initial values, with which the parameters were fitted.
             columns: parameters in the builder's columns, (width,), by log.
-            problem: of the fit.
+            directions: that the fit was free in, by log, from `fitted_directions`.
         """
-        residuals, start = self._residuals(variance, columns, problem), variance
+        residuals, start = self._residuals(variance, columns, directions), variance
         estimated = (residuals.independent > _FEW) @ self._blocks > 0.0
         first, *_ = M, q, t, count = self._moments(residuals, variance)
         for _ in range(_STEPS):
@@ -172,13 +174,16 @@ class VarianceComponentEstimator:
                 q[group] = t[group] * _clipped_variance(scores[present] / np.sqrt(own[present]), own[present])
         return M.numpy(), q / residuals.left, t, n
 
-    def _residuals(self, variance: Array, columns: Mapping[str, Tensor], problem: LinearProblem) -> _Residuals:
-        rows, group_of, directions = self.rows, self.rows.group_of, _fitted_directions(problem, self.rows.builder)
+    def _residuals(
+        self, variance: Array, columns: Mapping[str, Tensor], directions: Mapping[str, Tensor]
+    ) -> _Residuals:
+        rows, group_of = self.rows, self.rows.group_of
         leverages, size, readings = (np.zeros(len(variance)) for _ in range(3))
         for chunk in rows.whitened(variance):
             own = chunk.sources.square().sum(2)
             thinned = slice(None, None, _THINNED)
-            leverage = (chunk.sources[thinned] @ (chunk.rows[thinned, :, :-1] @ directions)).square().sum((0, 2))
+            fitted = chunk.rows[thinned, :, :-1] @ directions[chunk.log]
+            leverage = (chunk.sources[thinned] @ fitted).square().sum((0, 2))
             np.add.at(leverages, group_of, chunk.oversampling * leverage.numpy())
             np.add.at(size, group_of, own[thinned].sum(0).numpy())
             np.add.at(readings, group_of, (own > _NEGLIGIBLE).sum(0).numpy() / chunk.oversampling)
@@ -203,14 +208,26 @@ def _change(M: Array, factor: Array) -> float:
     return float(np.abs(np.sqrt(after) - 1.0).max(initial=0.0))
 
 
-def _fitted_directions(problem: LinearProblem, builder: RowBuilder) -> Tensor:
-    """G, (width, rank), with `|x G|^2` the leverage of a whitened row x; that of the few extras is neglected."""
+def fitted_directions(assembly: Assembly, builder: RowBuilder, log: str) -> Tensor:
+    """G, (width, k), with `|x G|^2` the leverage of a whitened row x of a log in a fit, extra parameters included."""
+    problem = assembly.problem
     scale = problem.scale[problem.free]
     _, values, Vh = scipy.linalg.svd(problem.A[:, problem.free] * scale, full_matrices=False, lapack_driver="gesvd")
     kept = is_significant(values)
-    G = np.zeros((builder.width, int(kept.sum())))
-    basis = scale[:, None] * Vh[kept].T / values[kept]
-    G[: builder.columns.count] = builder.columns.parameter_map[:, problem.free] @ basis
+    found = np.zeros((len(problem.nominal), int(kept.sum())))
+    found[problem.free] = scale[:, None] * Vh[kept].T / values[kept]
+    places = {extra.label: builder.columns.count + number for number, extra in enumerate(builder.extras)}
+    own = sorted((x for x in assembly.eliminations if x.log in ("", log)), key=lambda x: x.log != "")
+    extras: list[tuple[int, Array]] = []
+    for one in own:  # those of all logs first, which those of a log depend on
+        values_of = np.hstack([-one.inverse @ one.C @ found, one.inverse])
+        extras += zip((places[extra.label] for extra in one.extras), values_of, strict=True)
+        found = np.pad(found, ((0, 0), (0, one.inverse.shape[1])))
+        found = found if one.log else np.vstack([found, values_of])
+    G = np.zeros((builder.width, found.shape[1]))
+    G[: builder.columns.count] = builder.columns.parameter_map @ found[: len(problem.nominal)]
+    for place, row in extras:
+        G[place, : len(row)] = row
     return torch.from_numpy(G)
 
 
