@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from torchid.parameters import Array
+from torchid.problem.alike_variances import information_about, prior_precision
 from torchid.problem.chunks import one_thread
 from torchid.problem.elimination import Assembly
 from torchid.problem.rows import RowBuilder
@@ -37,6 +38,7 @@ _FEW = 20.0  # least number of independent readings: a standard deviation to 16 
 _NEGLIGIBLE = 1e-9  # share of a source's variance in the rows below which it is projected out
 _STEADY, _STEPS = 0.01, 40  # relative change of the noise along the directions of any group; most steps
 _CONFOUNDED = 0.5  # relative standard error of a standard deviation
+_POOLED = 0.5  # share of the prior in what determines a variance
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,7 @@ class GroupVariances:
         share: (G,), the group's own share of the variance along its directions, between 0 and 1.
         estimated: (G,) bool, whether there were enough readings; if not, the variance is unchanged.
         error: (G,), relative standard error of the standard deviation, large where groups are confounded.
+        pooled: (G,) bool, whether it is that of groups that are alike rather than its own.
         change: largest relative change of the noise of all groups along the directions of any group since the start.
     """
 
@@ -55,6 +58,7 @@ class GroupVariances:
     share: Array
     estimated: np.ndarray
     error: Array
+    pooled: np.ndarray
     change: float
 
     @property
@@ -82,6 +86,18 @@ class _Residuals:
     independent: Array
 
 
+@dataclass(frozen=True)
+class _Prior:
+    """Of groups that are alike: `precision` of the logarithms of their variances, (G, G), zero of all others.
+
+    `weight`, (G, G), and `pull`, (G,), are its part of the equations M x = q, with x the factors of the variances.
+    """
+
+    precision: Array
+    weight: Array
+    pull: Array
+
+
 class VarianceComponentEstimator:
     """Estimates variances of groups from residuals at fitted parameters."""
 
@@ -95,9 +111,9 @@ class VarianceComponentEstimator:
         self._blocks = np.zeros((count, len(blocks)))  # (G, unknown variances)
         for number, block in enumerate(blocks):
             self._blocks[block, number] = 1.0
-        forces = float(np.sqrt(np.mean([chunk.rows[..., -1].square().mean().item() for chunk in rows.chunks])))
+        self._alike = [index for index in rows.alike if len(index) > 1 and not set(index) & set(kept)]
         self._smallest = np.full(count, _SMALLEST)
-        self._smallest[free] *= min(forces, 1.0) if forces > 0.0 else 1.0
+        self._smallest[free] *= np.minimum(_forces(rows), 1.0)[free]
 
     @one_thread()
     @torch.no_grad()
@@ -115,11 +131,12 @@ class VarianceComponentEstimator:
             directions: that the fit was free in, by log, from `fitted_directions`.
         """
         residuals, start = self._residuals(variance, columns, directions), variance
-        estimated = (residuals.independent > _FEW) @ self._blocks > 0.0
+        estimated = self._enough(residuals.independent) @ self._blocks > 0.0
         first, *_ = M, q, t, count = self._moments(residuals, variance)
         for _ in range(_STEPS):
             share = np.divide(t, count, out=np.ones_like(t), where=count > 0.0)
-            step = self._step(M, q, estimated)
+            prior = self._prior(M, q, variance, residuals)
+            step = self._step(M + prior.weight, q + prior.pull, estimated)
             least = np.maximum(_SHARE / np.maximum(share, 1e-12), self._smallest**2 / variance)
             least_of_block = np.where(self._blocks > 0.0, least[:, None], 0.0).max(axis=0, initial=0.0)
             step = np.where(estimated, np.maximum(step, least_of_block), 1.0)
@@ -128,8 +145,41 @@ class VarianceComponentEstimator:
             if _change(M, factor) < _STEADY:
                 break
             M, q, t, count = self._moments(residuals, variance)
-        error = _relative_errors(M * np.sqrt(np.outer(residuals.left, residuals.left)) / self.rows.oversampling)
-        return GroupVariances(variance, share, self._blocks @ estimated > 0.0, error, _change(first, variance / start))
+        information = self._information(M, residuals)
+        precision = self._prior(M, q, variance, residuals).precision
+        error = _relative_errors(2.0 * (information + precision))
+        return GroupVariances(
+            variance,
+            share,
+            self._blocks @ estimated > 0.0,
+            error,
+            _is_pooled(precision, error),
+            _change(first, variance / start),
+        )
+
+    def _enough(self, readings: Array) -> np.ndarray:
+        """Groups whose readings are enough for an estimate, with those of groups that are alike, (G,) bool."""
+        enough = readings > _FEW
+        for index in self._alike:
+            enough[index] = readings[index].sum() > _FEW
+        return enough
+
+    def _information(self, M: Array, residuals: _Residuals) -> Array:
+        """Fisher information of Gaussian noise on the logarithms of the variances, (G, G)."""
+        return M * np.sqrt(np.outer(residuals.left, residuals.left)) / (2.0 * self.rows.oversampling)
+
+    def _prior(self, M: Array, q: Array, variance: Array, residuals: _Residuals) -> _Prior:
+        """That groups which are alike have variances of one size, as far as residuals show it."""
+        count, rows, left = len(variance), self.rows, residuals.left
+        information = self._information(M, residuals)
+        score = left * (q - M.sum(1)) / (2.0 * rows.oversampling)
+        logarithms = np.log(np.square(rows.reference_std) * variance)
+        precision, weight = np.zeros((count, count)), np.zeros((count, count))
+        for index in self._alike:
+            known, own = information_about(index, information, score), np.ix_(index, index)
+            precision[own] = prior_precision(logarithms[index], *known)
+            weight[own] = 2.0 * rows.oversampling / left[index].mean() * precision[own]  # 0 along equal factors
+        return _Prior(precision, weight, -weight @ logarithms)
 
     def _step(self, M: Array, q: Array, estimated: np.ndarray) -> Array:
         """Factors of the unknown variances at which the squares are the expected ones; confounded ones stay near 1."""
@@ -191,6 +241,25 @@ class VarianceComponentEstimator:
         r = [chunk.rows[..., :-1] @ columns[chunk.log] - chunk.rows[..., -1] for chunk in rows.chunks]
         U = [chunk.sources for chunk in rows.chunks]
         return _Residuals(r, U, np.maximum(remaining, _LEFT), readings * np.maximum(remaining, 0.0))
+
+
+def _forces(rows: SampledRows) -> Array:
+    """Rms of what the sources of each group read, (G,), in their stated noise; of all rows where that is nothing."""
+    squares, sizes = np.zeros(len(rows.groups)), np.zeros(len(rows.groups))
+    for chunk in rows.chunks:
+        size = chunk.sources.square().sum(2)
+        along = torch.einsum("ber,br->be", chunk.sources, chunk.rows[..., -1]).square() / size.clamp_min(_NEGLIGIBLE)
+        np.add.at(squares, rows.group_of, along.sum(0).numpy())
+        np.add.at(sizes, rows.group_of, size.sum(0).numpy())
+    all_rows = float(np.mean([chunk.rows[..., -1].square().mean().item() for chunk in rows.chunks]))
+    forces = np.sqrt(np.divide(squares, sizes, out=np.zeros_like(sizes), where=sizes > 0.0))
+    return np.where(forces > 0.0, forces, np.sqrt(all_rows) or 1.0)
+
+
+def _is_pooled(precision: Array, error: Array) -> np.ndarray:
+    """Whether the prior weighs more than the residuals in a group's variance, whose deviation has such errors."""
+    own = np.diag(precision)
+    return own * np.square(2.0 * error) > _POOLED
 
 
 def _relative_errors(M: Array) -> Array:
