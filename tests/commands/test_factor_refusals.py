@@ -82,9 +82,13 @@ NEEDS_SAMPLES = {
     ),
     "noise": (
         "sensors.noise.joint_torque=0.2",
-        "sensors.noise.joint_torque: 0.2, but 0.1 in {fleet}/factors/",
+        "sensors.noise.joint_torque.front_left_hip: 0.2, but 0.1 in {fleet}/factors/",
     ),
-    "base noise": ("sensors.noise.base_force=[1,2,3]", "sensors.noise.base_force: 1, 2, 3, but 0.3, 0.3, 0.3 in"),
+    "noise of a joint": (
+        "sensors.noise.joint_torque={'*': 0.1, '*_left_knee': 0.3}",
+        "sensors.noise.joint_torque.front_left_knee: 0.3, but 0.1 in {fleet}/factors/",
+    ),
+    "base noise": ("sensors.noise.base_force=[1,2,3]", "sensors.noise.base_force.x: 1, but 0.3 in {fleet}/factors/"),
     "mixed": (
         "logs.train=[{fleet}/factors/sway_test.factor, {fleet}/sway_train.npz]",
         "logs.train: {fleet}/sway_train.npz beside factors of other logs; accepted: logs alone, or .factor files alone",
@@ -122,7 +126,7 @@ def test_files_of_different_noise_or_of_the_same_log_are_refused(
     first, other = fleet / "factors" / "sway_test.factor", tmp_path / "f" / "sway_train.factor"
     experiment = ["identify", str(fleet / "experiment.yaml"), "sensors.noise.joint_torque=null"]
     message = refusal([*experiment, f"logs.train=[{first}, {other}]"], fleet, capsys)
-    assert f"{other}: sensors.noise.joint_torque: 0.2; accepted: 0.1, as in {first}" in message
+    assert f"{other}: sensors.noise.joint_torque.front_left_hip: 0.2; accepted: 0.1, as in {first}" in message
     again = tmp_path / "again.factor"
     again.write_bytes(first.read_bytes())
     message = refusal([*experiment, f"logs.train=[{first}, {again}]"], fleet, capsys)
@@ -202,6 +206,7 @@ def first_part(description: dict[str, Any]) -> dict[str, Any]:
     return part
 
 
+ONE_NOISE = "one noise of all joints, as once"
 HOSTILE: dict[str, Callable[[dict[str, Any], dict[str, Any]], Any]] = {
     "a later format": lambda d, a: d.update(format=FORMAT + 1),
     "no format": lambda d, a: d.pop("format"),
@@ -229,7 +234,10 @@ HOSTILE: dict[str, Callable[[dict[str, Any], dict[str, Any]], Any]] = {
     "contacts as a number": lambda d, a: d["settings"].update(contacts=3.0),
     "contacts left out": lambda d, a: d["settings"].pop("contacts"),
     "no noise": lambda d, a: d["noise"].clear(),
-    "negative noise": lambda d, a: d["noise"].update(joint_torque=-1.0),
+    "negative noise": lambda d, a: d["noise"].update({"joint_torque.front_left_hip": -1.0}),
+    ONE_NOISE: lambda d, a: d.update(
+        noise={"joint_torque": 0.1} | {name: x for name, x in d["noise"].items() if "joint_torque" not in name}
+    ),
     "a longer tree": lambda d, a: a.update(T_parent_joint=np.zeros((99, 4, 4))),
     "no tree": lambda d, a: a.pop("joint_map"),
     "NaN": lambda d, a: a["values"].__setitem__(5, np.nan),
@@ -252,6 +260,9 @@ def test_hostile_files_are_refused_in_one_line(
     assert len(message) < 600
     if case == "a later format":
         assert f"{path}: format: {FORMAT + 1}, of another version of torchid; accepted: {FORMAT}" in message
+    if case == ONE_NOISE:
+        assert f"{path}: sensors.noise: joint_torque, base_force.x" in message
+        assert "accepted: joint_torque.front_left_hip" in message
 
 
 def test_damaged_files_give_a_fit_or_one_line(fleet: Path, tmp_path: Path) -> None:

@@ -10,17 +10,20 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from pydantic import TypeAdapter
 from rich.progress import Progress
 
 from torchid import ranks
 from torchid.commands.folder import EVALUATION, RUN, check_free, new_folder, refuse_link, write_json
 from torchid.commands.reading import LogReader
 from torchid.commands.results import Identification, draw_forces
-from torchid.config import ExperimentConfig, load_config
+from torchid.config import load_config
+from torchid.config.sensors import NoiseConfig
 from torchid.errors import ConfigError, about_file, during, warn
 from torchid.fitting.calibration import Calibration, Comparison
+from torchid.fitting.checked_settings import stated_noise
 from torchid.fitting.cross_validation import Scorer
-from torchid.fitting.experiment import Experiment, require_device, set_up
+from torchid.fitting.experiment import Experiment, require_device, set_up, with_estimated_noise
 from torchid.guards import MAX_JSON, MAX_YAML, read_bytes
 from torchid.logs.time_range import log_title, split_range
 from torchid.parameters import Array
@@ -37,9 +40,9 @@ from torchid.report.tables import progress_bars
 from torchid.report.traces import LogForces
 from torchid.reprs import short_repr
 from torchid.robot import Robot
-from torchid.sensing import SensorNoise
 
-_SETTINGS = "config.yaml"
+_SETTINGS, _METRICS = "config.yaml", "metrics.json"
+_NOISE: TypeAdapter[NoiseConfig] = TypeAdapter(NoiseConfig)
 FAR_OFF = 5.0
 """Times the error on the run's own logs from which on a log is not one of the same robot, moving otherwise."""
 _SAMPLES = 3000
@@ -113,13 +116,11 @@ class EvaluatedRun:
 class FittedRun:
     """What a run has found, from its folder or from memory.
 
-    `states_noise`: whether its settings stated the noise of any sensor; they have the estimated one as well.
-    `usual`: errors on its own logs, as `EvaluatedRun` has them.
+    `experiment`: with the noise that it estimated. `usual`: errors on its own logs, as `EvaluatedRun` has them.
     """
 
     experiment: Experiment
     calibrations: Comparison[Calibration]
-    states_noise: bool
     usual: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -154,6 +155,8 @@ def evaluate(
     place = _output(folder, logs, given, replaces) if write else None
     with progress_bars() as bars:
         fitted = read_run(folder, device)
+        if not fitted.usual:
+            warn(f"{folder / _METRICS}: no figures of the run; projected forces are weighed with a guess of the noise")
         evaluated = replace(_evaluate(fitted, logs, folder, bars), output=place)
         if place is not None:
             form = fitted.experiment.config.figures.format
@@ -186,11 +189,10 @@ def read_run(folder: Path, device: str | None = None) -> FittedRun:
     settings, found = folder / _SETTINGS, folder / "parameters.json"
     config = load_config(settings, [f"device={device}"] if device else [])
     with about_file(settings):
-        experiment = set_up(config)
+        experiment, usual = _with_own_metrics(set_up(config), folder / _METRICS)
     shared = Comparison(read_shared_extras(found, "nominal_value"), read_shared_extras(found, "value"))
     calibrations = _calibrations(experiment, read_parameters(found, experiment.robot), shared)
-    states, usual = _own_metrics(folder / "metrics.json")
-    return FittedRun(experiment=experiment, calibrations=calibrations, states_noise=states, usual=usual)
+    return FittedRun(experiment=experiment, calibrations=calibrations, usual=usual)
 
 
 @one_thread()
@@ -205,7 +207,6 @@ def evaluate_identification(run: Identification, logs: Sequence[str | Path], dev
     fitted = FittedRun(
         experiment=experiment,
         calibrations=_calibrations(experiment, run.phi, values),
-        states_noise=any(group.origin == "stated" for group in run.noise.groups),
         usual=_usual([pair.identified.as_dict() for pair in run.metrics.values()]),
     )
     with progress_bars() as bars:
@@ -216,7 +217,7 @@ def _evaluate(fitted: FittedRun, logs: Sequence[str | Path], folder: Path | None
     """Errors of what a run has found; `folder`: on whose disk large logs are kept."""
     experiment, compared = fitted.experiment, fitted.calibrations
     _log_names(logs)
-    evaluation = experiment.evaluation(noise_of_readings(experiment.config, fitted.states_noise))
+    evaluation = experiment.evaluation(experiment.noise_of_readings)
     reading = bars.add_task("reading logs", total=len(logs))
     reader = LogReader(experiment, folder)
     samples = reader.read([Path(log) for log in logs], None, lambda _: bars.advance(reading))
@@ -297,14 +298,16 @@ def _output(run: Path, logs: Sequence[str | Path], given: Path | None, overwrite
     return output
 
 
-def _own_metrics(path: Path) -> tuple[bool, dict[str, float]]:
-    """Whether the settings of a run stated the noise of any sensor, as they have the estimated one too; its errors."""
+def _with_own_metrics(experiment: Experiment, path: Path) -> tuple[Experiment, dict[str, float]]:
+    """A run's experiment with the noise that it estimated, and its errors; nothing of figures that cannot be read."""
     try:
         document = json.loads(read_bytes(path, MAX_JSON))
-        states = any(group["origin"] == "stated" for group in document["noise"]["groups"])
-        return states, _usual([document.get(name) or {} for name in ("train", "test")])
+        any_stated = any(group["origin"] == "stated" for group in document["noise"]["groups"])
+        used = stated_noise(_NOISE.validate_python(document["noise"]["used"]), experiment.robot)
+        usual = _usual([document.get(name) or {} for name in ("train", "test")])
     except (OSError, ValueError, LookupError, TypeError, AttributeError):
-        return False, {}
+        return experiment, {}
+    return with_estimated_noise(experiment, used, any_stated), usual
 
 
 def _usual(documents: Sequence[Mapping[str, object]]) -> dict[str, float]:
@@ -316,15 +319,6 @@ def _usual(documents: Sequence[Mapping[str, object]]) -> dict[str, float]:
             if isinstance(error, float):
                 usual[group] = max(error, usual.get(group, 0.0))
     return usual
-
-
-def noise_of_readings(config: ExperimentConfig, stated: bool) -> SensorNoise | None:
-    """The noise of readings as recorded, NaN where it is unknown; None where it is not `stated` of any sensor.
-
-    Noise that was estimated beside a stated one is in proportion to it. Without any, it comes from the residuals
-    themselves, which it could not judge.
-    """
-    return SensorNoise.of_known(config.sensors.noise.forces) if stated else None
 
 
 def compare_forces(

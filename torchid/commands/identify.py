@@ -15,7 +15,7 @@ from torchid.commands.cache_entries import cached_parts, factors_key
 from torchid.commands.cached_reading import CachedReader, open_reader
 from torchid.commands.chosen_settings import Choices, with_chosen_settings, with_ridge
 from torchid.commands.clock import Clock
-from torchid.commands.evaluate import compare_forces, noise_of_readings, trace_forces
+from torchid.commands.evaluate import compare_forces, trace_forces
 from torchid.commands.folder import RUN, check_free, claim_folder
 from torchid.commands.plausibility import TrainingLogs, require_not_worse, require_plausible
 from torchid.commands.reading import LogReader, check_parts
@@ -195,8 +195,8 @@ def _identify(config: ExperimentConfig, resume: bool, bars: Progress) -> tuple[I
     clock = Clock()
     ready = _prepare(config, clock, bars)
     experiment, fitter, logs, blocks = ready.experiment, ready.fitter, ready.logs, ready.blocks
-    checked, builder, stated = TrainingLogs(experiment, bars), fitter.builder, bool(config.sensors.noise.forces)
-    evaluation = experiment.evaluation(noise_of_readings(experiment.config, stated))
+    checked, builder = TrainingLogs(experiment, bars), fitter.builder
+    evaluation = experiment.evaluation(experiment.noise_of_readings)
     with clock("solve"):
         solved = _solved(ready, evaluation, checked, bars, resume)
         fit, ready.parts = solved.fit, []

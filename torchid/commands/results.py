@@ -40,6 +40,7 @@ from torchid.problem import Metrics
 from torchid.problem.chunks import thread_count
 from torchid.problem.metrics import LOG_SETS, WorseThanNominal, describe_worse, worse_than_nominal
 from torchid.problem.noise_gram import NoiseShares
+from torchid.problem.noise_groups import NoiseGroups
 from torchid.report import FittedJoints, identified_name, identified_robot, identified_urdf, parameters_document
 from torchid.report.figure_style import Drawn, draw_for
 from torchid.report.figures import contribution_figure, error_figure, identifiability_figure, ridge_figure
@@ -297,7 +298,11 @@ def _metrics_document(run: Identification) -> dict[str, object]:
         "confounded": [asdict(one) | {"message": str(one)} for one in list_confounded(run.extras)],
         "total_mass_nominal": float(robot.nominal[:, 0].sum()),
         "smallest_eigenvalue": body_eigenvalues(robot, estimate.phi),
-        "noise": {"groups": [asdict(one) for one in run.noise.groups], "suggested": run.noise.suggested},
+        "noise": {
+            "groups": [asdict(one) for one in run.noise.groups],
+            "used": NoiseGroups.of(robot).settings(run.noise.known),
+            "suggested": run.noise.suggested,
+        },
         "robust": None if run.robust is None else asdict(run.robust),
         "violations": run.violations_by_name(),
         "solution": _solution_document(estimate),

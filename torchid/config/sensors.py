@@ -13,7 +13,7 @@ from pydantic.dataclasses import dataclass
 from torchid.errors import ConfigError
 from torchid.logs.signal_noise import STATED_FIELDS
 from torchid.problem.extras import CHANNELS
-from torchid.settings import AUTO, STRICT, NotNegative, NotNegativeOrAuto, Number, Positive
+from torchid.settings import AUTO, STRICT, Name, NotNegative, NotNegativeOrAuto, Number, Positive
 
 
 def _torch_device(value: str) -> str:
@@ -67,6 +67,19 @@ def _normal(value: object) -> list[float] | None:
 
 _VECTOR: TypeAdapter[list[float]] = TypeAdapter(Annotated[list[Number], Field(min_length=3, max_length=3)])
 _POSITIVE: TypeAdapter[float] = TypeAdapter(Positive)
+PER_JOINT_ACCEPTED = "a number greater than 0, or one by name or pattern of the joints: {'*': 0.5, '*_wrist': 0.02}"
+
+
+def _per_joint(value: object) -> float | dict[str, float] | None:
+    """A positive number, or some by name or pattern of the joints."""
+    try:
+        return None if value is None else _POSITIVE_BY_NAME.validate_python(value)
+    except ValueError as error:
+        raise ValueError(PER_JOINT_ACCEPTED) from error
+
+
+_POSITIVE_BY_NAME: TypeAdapter[float | dict[str, float]] = TypeAdapter(Positive | dict[Name, Positive])
+PerJoint = Annotated[float | dict[str, float], PlainValidator(_per_joint)]
 PerAxis = Annotated[float | tuple[float, float, float], PlainValidator(_per_axis), PlainSerializer(as_list)]
 
 
@@ -91,11 +104,12 @@ class NoiseConfig:
     """Standard deviations of the sensors [N m, N, N m], floors of the base rows [N, N m], and noise of the motion.
 
     None: estimated from the training logs (`torchid.fitting.noise`), or those of `SensorNoise` where there are none;
-    that of the motion, in every recorded sample [rad or m, rad/s or m/s, rad, rad/s, m/s^2], from the high frequencies
-    of each log (`torchid.logs.signal_noise`), 0 for none.
+    that of joint torques for all joints, or by pattern of their names; that of the motion, in every recorded sample
+    [rad or m, rad/s or m/s, rad, rad/s, m/s^2], from the high frequencies of each log (`torchid.logs.signal_noise`), 0
+    for none.
     """
 
-    joint_torque: Positive | None = None
+    joint_torque: PerJoint | None = None
     contact_force: Positive | None = None
     contact_moment: Positive | None = None
     base_force: PerAxis | None = None

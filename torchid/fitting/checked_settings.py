@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 
 from torchid.config.logs import LogsConfig
+from torchid.config.sensors import NoiseConfig
 from torchid.errors import ConfigError, UnknownNameError
-from torchid.logs.column_map import fits, require_names
+from torchid.logs.column_entries import for_all
+from torchid.logs.column_map import fits, require_names, values_of_all
 from torchid.logs.ros_topics import Topics, require_joints
 from torchid.problem import ExtraTerms
 from torchid.problem.extras import CHANNELS, ScaleGroups, measured_channels
@@ -38,6 +40,20 @@ def check_scale_groups(terms: ExtraTerms, robot: Robot, contacts: Sequence[Conta
                     both = f"[{', '.join(group_of[name])}] and [{', '.join(group)}]"
                     raise ConfigError.at_field(field, f"'{name}' in two groups, {both}", "one group, or none, for each")
                 group_of[name] = group
+
+
+def stated_noise(config: NoiseConfig, robot: Robot) -> dict[str, Any]:
+    """What is stated of the noise of the forces, by field of `SensorNoise`.
+
+    Raises:
+        UnknownNameError: a pattern that no joint fits.
+        ConfigError: a joint without a figure, where others have one, or with two.
+    """
+    stated = config.forces
+    if (torque := stated.get("joint_torque")) is not None:
+        key, names = "sensors.noise.joint_torque", robot.joint_names
+        stated["joint_torque"] = tuple(values_of_all(key, "noise", for_all(torque), "joint", names))
+    return stated
 
 
 def check_terms(

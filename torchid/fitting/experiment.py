@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import TypeVar
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from torchid.config.sensors import ChoiceConfig
 from torchid.errors import ConfigError, LogError, UnknownNameError
 from torchid.estimators import Conditions, Consistent, LeastSquares
 from torchid.fitting.calibration import Calibration, Comparison, calibrations
-from torchid.fitting.checked_settings import check_scale_groups, check_terms, require_maps_of
+from torchid.fitting.checked_settings import check_scale_groups, check_terms, require_maps_of, stated_noise
 from torchid.fitting.conditions import conditions_from
 from torchid.fitting.contacts import resolve_contacts, suited_to_preprocessing, with_scalar_sensors
 from torchid.fitting.cross_validation import RIDGES, RidgeChoice, choose_ridge
@@ -43,21 +43,38 @@ class Scene:
         robot: the robot.
         contacts: the contacts in use.
         rolling: what the contacts that roll roll on, and where that is stated, "" if none does.
-        noise_stated: whether a user has stated any noise of the forces, once others are estimated (`with_noise`).
+        estimated_noise: by field of `SensorNoise`, what logs show of the noise that is not stated (`with_noise`).
+        noise_stated: whether a user has stated any noise of the forces, once others are estimated.
     """
 
     config: ExperimentConfig | AnalyzeConfig
     robot: Robot
     contacts: tuple[Contact, ...]
     rolling: str = ""
+    estimated_noise: Mapping[str, Any] = field(default_factory=dict)
     noise_stated: bool = True
 
     __repr__ = short_repr
 
     @property
     def noise(self) -> SensorNoise:
-        """Noise of the sensors, as stated; a guess where it is not."""
-        return SensorNoise(**self.config.sensors.noise.forces)
+        """Noise of the sensors, as stated or estimated; a guess where it is neither.
+
+        Raises:
+            InputError: as `stated_noise`.
+        """
+        return SensorNoise(**{**self.estimated_noise, **stated_noise(self.config.sensors.noise, self.robot)})
+
+    @property
+    def noise_of_readings(self) -> SensorNoise | None:
+        """The noise of readings as recorded, NaN where it is unknown; None where it is not stated of any sensor.
+
+        Noise that was estimated beside a stated one is in proportion to it. Without any, it comes from the residuals
+        themselves, which it could not judge.
+        """
+        stated = stated_noise(self.config.sensors.noise, self.robot)
+        known = {**self.estimated_noise, **stated} if self.noise_stated else stated
+        return SensorNoise.of_known(known) if known else None
 
     @property
     def terms(self) -> ExtraTerms:
@@ -182,17 +199,16 @@ S = TypeVar("S", bound=Scene)
 
 
 def with_noise(scene: S, summary: NoiseSummary) -> S:
-    """The scene with estimated noise stated in its settings, so that every later step uses it."""
-    config = scene.config
-    keys = {one.group.partition(".")[0] for one in summary.groups}
-    estimated = {name: x for name, x in vars(summary.noise).items() if name in keys}
-    noise = replace(config.sensors.noise, **estimated | config.sensors.noise.forces)
-    any_stated = any(one.origin == "stated" for one in summary.groups)
-    config = replace(config, sensors=replace(config.sensors, noise=noise))
-    stated = replace(scene, config=config, noise_stated=any_stated)
-    if isinstance(stated, Experiment):
-        return replace(stated, sensors=replace(stated.sensors, noise=summary.noise))
-    return stated
+    """The scene with estimated noise beside what its settings state, so that every later step uses it."""
+    return with_estimated_noise(scene, summary.known, summary.any_stated)
+
+
+def with_estimated_noise(scene: S, estimated: Mapping[str, Any], any_stated: bool) -> S:
+    """As `with_noise`, by field of `SensorNoise`; `any_stated`: of the noise of what the sensors read."""
+    known = replace(scene, estimated_noise=estimated, noise_stated=any_stated)
+    if isinstance(known, Experiment):
+        return replace(known, sensors=replace(known.sensors, noise=known.noise))
+    return known
 
 
 def require_device(device: str) -> None:
@@ -229,6 +245,7 @@ def set_up_scene(config: ExperimentConfig | AnalyzeConfig) -> Scene:
     stated = [replace(c, radius=contact.radius) for c, contact in zip(config.contacts, contacts, strict=True)]
     scene = Scene(config=replace(config, contacts=stated), robot=robot, contacts=contacts, rolling=rolling)
     check_scale_groups(scene.terms, robot, contacts)
+    stated_noise(config.sensors.noise, robot)
     return scene
 
 

@@ -39,6 +39,7 @@ _GEOMETRY = ("T_parent_joint", "T_joint_link", "joint_map", "joint_constant", "c
 _EXTRAS = ("sensors.offsets", "sensors.scales", "actuators")
 _LARGEST = 1e30  # of a number: squares stay within the range of float64
 _Text = Annotated[str, Field(max_length=10 * MAX_LETTERS)]
+_Origin = Literal["estimated", "pooled", "at most", "confounded", "assumed"]
 
 
 @plain_dataclass(frozen=True)
@@ -108,7 +109,7 @@ class _Description:
     supports: list[list[Whole]]
     states: list[_State]
     payloads: list[Payload] = field(default_factory=list)
-    noise_origins: dict[str, Literal["estimated", "at most", "confounded", "assumed"]] = field(default_factory=dict)
+    noise_origins: dict[str, _Origin] = field(default_factory=dict)
 
 
 _DESCRIPTION: TypeAdapter[_Description] = TypeAdapter(_Description)

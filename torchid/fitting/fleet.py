@@ -10,10 +10,10 @@ from torchid.errors import ConfigError, LogError, excerpt
 from torchid.fitting.experiment import Experiment, with_noise
 from torchid.fitting.factor_files import FactorFile, read_factors
 from torchid.fitting.noise import GroupNoise, NoiseSummary
-from torchid.fitting.row_model import RowModel, require_same_noise, require_same_rows
+from torchid.fitting.row_model import NOISE, RowModel, require_same_noise, require_same_rows
 from torchid.identifiability.base_parameters import StateReport, merge_state_reports
 from torchid.problem import RowBuilder
-from torchid.problem.sampled_rows import noise_of_groups, std_by_group
+from torchid.problem.noise_groups import NoiseGroups, noise_key
 
 _THE_EXPERIMENT = "the experiment file"
 _APART = (
@@ -79,12 +79,9 @@ def read_fleet(experiment: Experiment, on_read: Callable[[Path], None] | None = 
             on_read(path)
     _require_different_logs(paths, files)
     _require_stated_noise(experiment, files[0].model, paths[0])
-    groups, origins = files[0].model.noise, files[0].noise_origins
-    noise = noise_of_groups(std_by_group(experiment.noise) | groups)
-    listed = [
-        GroupNoise(name, "N" if "force" in name else "N m", origins.get(name, "stated"), x, None)
-        for name, x in groups.items()
-    ]
+    used, origins, groups = files[0].model.noise, files[0].noise_origins, NoiseGroups.of(experiment.robot)
+    noise = groups.noise(groups.values(experiment.noise) | used, experiment.noise)
+    listed = [GroupNoise(name, groups.unit(name), origins.get(name, "stated"), x, None) for name, x in used.items()]
     summary = NoiseSummary(noise, listed, {}, 0)
     return Fleet(with_noise(experiment, summary), files, summary, merge_state_reports(one.states for one in files))
 
@@ -100,10 +97,9 @@ def _require_different_logs(paths: Sequence[Path], files: Sequence[FactorFile]) 
 
 def _require_stated_noise(experiment: Experiment, model: RowModel, path: Path) -> None:
     """Refuse an experiment that states other noise than factors were weighted with."""
-    used, stated = model.noise, std_by_group(experiment.noise)
-    for key in experiment.config.sensors.noise.forces:
-        groups = [name for name in used if name.partition(".")[0] == key]
-        if any(abs(used[name] - stated[name]) > 1e-9 * used[name] for name in groups):
-            own, theirs = (", ".join(f"{x[name]:g}" for name in groups) for x in (stated, used))
-            accepted = f"{theirs}, or no such key, or the logs compressed with another"
-            raise ConfigError.at_field(f"sensors.noise.{key}", f"{own}, but {theirs} in {path}", accepted)
+    used, stated = model.noise, NoiseGroups.of(experiment.robot).values(experiment.noise)
+    for name, value in used.items():
+        if noise_key(name) in experiment.config.sensors.noise.forces and abs(value - stated[name]) > 1e-9 * value:
+            found = f"{stated[name]:g}, but {value:g} in {path}"
+            accepted = f"{value:g}, or no such key, or the logs compressed with another"
+            raise ConfigError.at_field(f"{NOISE}.{name}", found, accepted)

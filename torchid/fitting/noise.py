@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,9 +13,10 @@ from torch import Tensor
 from torchid.estimators import LeastSquares
 from torchid.fitting.fit import LogFitter
 from torchid.parameters import Array
-from torchid.problem import LinearProblem, Samples
-from torchid.problem.noise import GroupVariances, VarianceComponentEstimator
-from torchid.problem.sampled_rows import BASE_GROUPS, LogElsewhere, SampledRows, noise_of_groups, std_by_group
+from torchid.problem import Samples
+from torchid.problem.noise import GroupVariances, VarianceComponentEstimator, fitted_directions
+from torchid.problem.noise_groups import noise_key
+from torchid.problem.sampled_rows import LogElsewhere, SampledRows
 from torchid.reprs import short_repr
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet
@@ -27,11 +29,12 @@ _APART = 2.0  # where a standard deviation is half of what it should be, 95 % in
 
 @dataclass(frozen=True)
 class GroupNoise:
-    """Noise of a group of readings, or of base rows along an axis of the levelled base.
+    """Noise of a joint's torque, of other readings, or of base rows along an axis of the levelled base.
 
-    `origin`: "stated", "estimated", "at most" (drowned in other noise: an upper bound), "confounded" (residuals show
-    little but its sum with other noise) or "assumed" (too few readings). `used`: standard deviation that rows were
-    weighted with; `residual`: that of the residuals, None if they do not determine it.
+    `origin`: "stated", "estimated", "pooled" (residuals do not tell it from that of the other joints, and all are taken
+    together), "at most" (drowned in other noise: an upper bound), "confounded" (residuals show little but its sum with
+    other noise) or "assumed" (too few readings). `used`: standard deviation that rows were weighted with; `residual`:
+    that of the residuals, None if they do not determine it.
     """
 
     group: str
@@ -51,10 +54,21 @@ class NoiseSummary:
 
     noise: SensorNoise
     groups: list[GroupNoise]
-    suggested: dict[str, float | tuple[float, float, float]]
+    suggested: dict[str, Any]
     passes: int
 
     __repr__ = short_repr
+
+    @property
+    def any_stated(self) -> bool:
+        """Whether a user has stated any of it."""
+        return any(one.origin == "stated" for one in self.groups)
+
+    @property
+    def known(self) -> dict[str, Any]:
+        """Fields of `noise` that the sensors have a group of, with their values."""
+        keys = dict.fromkeys(noise_key(one.group) for one in self.groups)
+        return {key: getattr(self.noise, key) for key in keys}
 
 
 def estimate_noise(
@@ -79,24 +93,27 @@ def estimate_noise(
     rows = SampledRows(logs, builder)
     if not (rows.groups and rows.chunks):
         return NoiseSummary(guess, [], {}, 0)
-    tied = [name for name in rows.groups if name.partition(".")[0] in stated]
+    tied = [name for name in rows.groups if noise_key(name) in stated]
     variance, columns, passes = np.ones(len(rows.groups)), None, 0
     estimator = VarianceComponentEstimator(rows, tied)
     while True:
-        columns, problem = _fit_rows(rows, variance, columns, fitter)
+        columns, directions = _fit_rows(rows, variance, columns, fitter)
         passes += 1
         if len(tied) == len(rows.groups):
             break
-        components = estimator.estimate(variance, columns, problem)
+        components = estimator.estimate(variance, columns, directions)
         variance = components.variance
         if components.change < _SETTLED or passes == _PASSES:
             break
-    free = VarianceComponentEstimator(rows).estimate(variance, columns, problem) if tied else components
+    free = VarianceComponentEstimator(rows).estimate(variance, columns, directions) if tied else components
     common = variance[rows.groups.index(tied[0])] if tied else 1.0
     used = np.where(
         np.isin(rows.groups, tied), rows.reference_std, _rounded(rows.reference_std * np.sqrt(variance / common))
     )
-    return _summary(guess, rows, tied, used, free, passes)
+    kept = {name: x for name, x in builder.noise_groups.values(guess).items() if noise_key(name) in stated}
+    groups = _listed(rows, tied, used, free)
+    noise = builder.noise_groups.noise(kept | {one.group: one.used for one in groups}, guess)
+    return NoiseSummary(noise, groups, _suggested(rows, tied, free), passes)
 
 
 def recorded_sensors(
@@ -127,12 +144,13 @@ def recorded_sensors(
 
 def _fit_rows(
     rows: SampledRows, variance: Array, before: Mapping[str, Tensor] | None, fitter: LogFitter
-) -> tuple[Mapping[str, Tensor], LinearProblem]:
-    """Parameters by log in the builder's columns, and the problem, by least squares without regularization."""
+) -> tuple[Mapping[str, Tensor], Mapping[str, Tensor]]:
+    """Parameters by log in the builder's columns, and where they were free, by least squares without regularization."""
     estimator = LeastSquares(rank_tolerance=fitter.estimator.rank_tolerance)
     fit = fitter.fit(rows.compress(variance, before), estimator.solve)
-    columns = {chunk.log: fit.columns(rows.builder, chunk.log) for chunk in rows.chunks}
-    return {log: x.to("cpu", torch.float64) for log, x in columns.items()}, fit.assembly.problem
+    logs = dict.fromkeys(chunk.log for chunk in rows.chunks)
+    columns = {log: fit.columns(rows.builder, log).to("cpu", torch.float64) for log in logs}
+    return columns, {log: fitted_directions(fit.assembly, rows.builder, log) for log in logs}
 
 
 def _rounded(values: Array) -> Array:
@@ -140,55 +158,44 @@ def _rounded(values: Array) -> Array:
     return np.array([float(f"{x:.{_DIGITS}g}") for x in values])
 
 
-def _summary(
-    guess: SensorNoise, rows: SampledRows, tied: Sequence[str], used: Array, free: GroupVariances, passes: int
-) -> NoiseSummary:
-    deviation = _rounded(rows.reference_std * np.sqrt(free.variance))
-    groups = []
-    for index, name in enumerate(rows.groups):
-        determined = bool(free.estimated[index])
-        origin = "stated" if name in tied else _origin(free, index)
-        unit = "N" if "force" in name else "N m"
-        groups.append(
-            GroupNoise(
-                group=name,
-                unit=unit,
-                origin=origin,
-                used=float(used[index]),
-                residual=float(deviation[index]) if determined else None,
-            )
+def _listed(rows: SampledRows, tied: Sequence[str], used: Array, free: GroupVariances) -> list[GroupNoise]:
+    shown = _rounded(rows.reference_std * np.sqrt(free.variance)).tolist()
+    return [
+        GroupNoise(
+            group=name,
+            unit=rows.builder.noise_groups.unit(name),
+            origin="stated" if name in tied else _origin(free, index),
+            used=float(used[index]),
+            residual=shown[index] if free.estimated[index] else None,
         )
-    noise = noise_of_groups(std_by_group(guess) | {one.group: one.used for one in groups})
-    known = {
-        name: float(x)
-        for name, x, yes in zip(
-            rows.groups, deviation, free.estimated & ~free.upper_bound & ~free.confounded, strict=True
-        )
-        if yes
-    }
-    return NoiseSummary(noise, groups, _suggested(guess, tied, known), passes)
+        for index, name in enumerate(rows.groups)
+    ]
 
 
 def _origin(components: GroupVariances, index: int) -> str:
     if not components.estimated[index]:
         return "assumed"
-    return "at most" if components.upper_bound[index] else "confounded" if components.confounded[index] else "estimated"
+    if components.upper_bound[index]:
+        return "at most"
+    if components.confounded[index]:
+        return "confounded"
+    return "pooled" if components.pooled[index] else "estimated"
 
 
-def _suggested(
-    stated: SensorNoise, tied: Sequence[str], known: Mapping[str, float]
-) -> dict[str, float | tuple[float, float, float]]:
-    """Noise to state instead, if no common factor of at most 1 brings the stated one within a factor of two."""
-    before = std_by_group(stated)
-    ratios = [known[name] / before[name] for name in tied if name in known]
+def _suggested(rows: SampledRows, tied: Sequence[str], free: GroupVariances) -> dict[str, Any]:
+    """Noise to state instead, if no common factor of at most 1 brings the stated one within a factor of two.
+
+    Values are by the names of joints, or for the three axes, as `sensors.noise` has them.
+    """
+    found = _rounded(rows.reference_std * np.sqrt(free.variance))
+    clear = free.estimated & ~free.upper_bound & ~free.confounded
+    known = {name: float(x) for name, x, yes in zip(rows.groups, found, clear, strict=True) if yes}
+    stated = dict(zip(rows.groups, rows.reference_std, strict=True))
+    ratios = [known[name] / stated[name] for name in tied if name in known]
     if not ratios or (max(ratios) <= _APART and max(ratios) <= _APART**2 * min(ratios)):
         return {}
-    out: dict[str, float | tuple[float, float, float]] = {}
-    for name in tied:
-        key = name.partition(".")[0]
-        axes = [axis for axis in BASE_GROUPS if axis.partition(".")[0] == key]
-        if axes and all(axis in known for axis in axes):
-            out[key] = (known[axes[0]], known[axes[1]], known[axes[2]])
-        elif not axes and name in known:
-            out[key] = known[name]
-    return out
+    groups = rows.builder.noise_groups
+    shown = groups.noise(known, rows.builder.sensors.noise)
+    keys = dict.fromkeys(map(noise_key, tied))
+    whole = [key for key in keys if all(name in known for name in tied if noise_key(name) == key)]
+    return groups.settings({key: getattr(shown, key) for key in whole})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 from pydantic.dataclasses import dataclass
@@ -18,7 +18,8 @@ _Three = tuple[Number, Number, Number]
 _GAINS = ("value", "column", "columns", "order", "first_index")
 
 
-def _for_all(value: object) -> object:
+def for_all(value: Any) -> Any:
+    """A map of values by pattern, where one value is for all names."""
     return value if isinstance(value, Mapping) else {_EVERYTHING: value}
 
 
@@ -53,8 +54,8 @@ class ColumnEntry:
     columns: dict[Name, Name] = dataclasses.field(default_factory=dict)
     order: Annotated[list[Name | None], Field(min_length=1)] | None = None
     first_index: int = 0
-    unit: Annotated[dict[str, Name], BeforeValidator(_for_all)] = dataclasses.field(default_factory=dict)
-    scale: Annotated[dict[str, Number], BeforeValidator(_for_all)] = dataclasses.field(default_factory=dict)
+    unit: Annotated[dict[str, Name], BeforeValidator(for_all)] = dataclasses.field(default_factory=dict)
+    scale: Annotated[dict[str, Number], BeforeValidator(for_all)] = dataclasses.field(default_factory=dict)
 
 
 Entry = Annotated[ColumnEntry, BeforeValidator(_column)]
@@ -80,7 +81,7 @@ class AngleEntry(ColumnEntry):
     Of an encoder that jumps from 359 to 0 deg, -180 makes 359 deg -1 deg.
     """
 
-    turn_from: Annotated[dict[str, Number], BeforeValidator(_for_all)] = dataclasses.field(default_factory=dict)
+    turn_from: Annotated[dict[str, Number], BeforeValidator(for_all)] = dataclasses.field(default_factory=dict)
 
 
 @dataclass(config=STRICT, frozen=True, kw_only=True)
@@ -98,7 +99,7 @@ class QuaternionEntry(ColumnEntry):
 class Gains(ColumnEntry):
     """Gains [N m/rad, N m s/rad]: `value` by pattern of the joint or one for all, or columns, or an array (n,)."""
 
-    value: Annotated[dict[str, Number], BeforeValidator(_for_all)] = dataclasses.field(default_factory=dict)
+    value: Annotated[dict[str, Number], BeforeValidator(for_all)] = dataclasses.field(default_factory=dict)
 
 
 GainsEntry = Annotated[Gains, BeforeValidator(_gains)]
@@ -124,8 +125,8 @@ class CurrentEntry(ColumnEntry):
         gear_ratio: likewise, turns of the motor for one of the joint (radians for a metre of a slide).
     """
 
-    torque_constant: Annotated[dict[str, Number], BeforeValidator(_for_all)]
-    gear_ratio: Annotated[dict[str, Number], BeforeValidator(_for_all)]
+    torque_constant: Annotated[dict[str, Number], BeforeValidator(for_all)]
+    gear_ratio: Annotated[dict[str, Number], BeforeValidator(for_all)]
 
 
 @dataclass(config=STRICT, frozen=True, kw_only=True)

@@ -18,8 +18,9 @@ import torch
 from torch import Tensor
 
 from torchid.parameters import Array
+from torchid.problem.alike_variances import information_about, prior_precision
 from torchid.problem.chunks import one_thread
-from torchid.problem.linear import LinearProblem
+from torchid.problem.elimination import Assembly
 from torchid.problem.rows import RowBuilder
 from torchid.problem.sampled_rows import CLIP, SampledRows
 from torchid.rounding import MAD_PER_STD, is_significant
@@ -37,6 +38,7 @@ _FEW = 20.0  # least number of independent readings: a standard deviation to 16 
 _NEGLIGIBLE = 1e-9  # share of a source's variance in the rows below which it is projected out
 _STEADY, _STEPS = 0.01, 40  # relative change of the noise along the directions of any group; most steps
 _CONFOUNDED = 0.5  # relative standard error of a standard deviation
+_POOLED = 0.5  # share of the prior in what determines a variance
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,7 @@ class GroupVariances:
         share: (G,), the group's own share of the variance along its directions, between 0 and 1.
         estimated: (G,) bool, whether there were enough readings; if not, the variance is unchanged.
         error: (G,), relative standard error of the standard deviation, large where groups are confounded.
+        pooled: (G,) bool, whether it is that of groups that are alike rather than its own.
         change: largest relative change of the noise of all groups along the directions of any group since the start.
     """
 
@@ -55,6 +58,7 @@ class GroupVariances:
     share: Array
     estimated: np.ndarray
     error: Array
+    pooled: np.ndarray
     change: float
 
     @property
@@ -82,6 +86,18 @@ class _Residuals:
     independent: Array
 
 
+@dataclass(frozen=True)
+class _Prior:
+    """Of groups that are alike: `precision` of the logarithms of their variances, (G, G), zero of all others.
+
+    `weight`, (G, G), and `pull`, (G,), are its part of the equations M x = q, with x the factors of the variances.
+    """
+
+    precision: Array
+    weight: Array
+    pull: Array
+
+
 class VarianceComponentEstimator:
     """Estimates variances of groups from residuals at fitted parameters."""
 
@@ -95,13 +111,15 @@ class VarianceComponentEstimator:
         self._blocks = np.zeros((count, len(blocks)))  # (G, unknown variances)
         for number, block in enumerate(blocks):
             self._blocks[block, number] = 1.0
-        forces = float(np.sqrt(np.mean([chunk.rows[..., -1].square().mean().item() for chunk in rows.chunks])))
+        self._alike = [index for index in rows.alike if len(index) > 1 and not set(index) & set(kept)]
         self._smallest = np.full(count, _SMALLEST)
-        self._smallest[free] *= min(forces, 1.0) if forces > 0.0 else 1.0
+        self._smallest[free] *= np.minimum(_forces(rows), 1.0)[free]
 
     @one_thread()
     @torch.no_grad()
-    def estimate(self, variance: Array, columns: Mapping[str, Tensor], problem: LinearProblem) -> GroupVariances:
+    def estimate(
+        self, variance: Array, columns: Mapping[str, Tensor], directions: Mapping[str, Tensor]
+    ) -> GroupVariances:
         """Variances at which the expected covariance of the residuals equals the observed one.
 
         Residuals are clipped. A fit makes them smaller; each group is corrected by the leverage of its own directions.
@@ -110,14 +128,15 @@ class VarianceComponentEstimator:
         Args:
             variance: (G,), initial values, with which the parameters were fitted.
             columns: parameters in the builder's columns, (width,), by log.
-            problem: of the fit.
+            directions: that the fit was free in, by log, from `fitted_directions`.
         """
-        residuals, start = self._residuals(variance, columns, problem), variance
-        estimated = (residuals.independent > _FEW) @ self._blocks > 0.0
+        residuals, start = self._residuals(variance, columns, directions), variance
+        estimated = self._enough(residuals.independent) @ self._blocks > 0.0
         first, *_ = M, q, t, count = self._moments(residuals, variance)
         for _ in range(_STEPS):
             share = np.divide(t, count, out=np.ones_like(t), where=count > 0.0)
-            step = self._step(M, q, estimated)
+            prior = self._prior(M, q, variance, residuals)
+            step = self._step(M + prior.weight, q + prior.pull, estimated)
             least = np.maximum(_SHARE / np.maximum(share, 1e-12), self._smallest**2 / variance)
             least_of_block = np.where(self._blocks > 0.0, least[:, None], 0.0).max(axis=0, initial=0.0)
             step = np.where(estimated, np.maximum(step, least_of_block), 1.0)
@@ -126,8 +145,41 @@ class VarianceComponentEstimator:
             if _change(M, factor) < _STEADY:
                 break
             M, q, t, count = self._moments(residuals, variance)
-        error = _relative_errors(M * np.sqrt(np.outer(residuals.left, residuals.left)) / self.rows.oversampling)
-        return GroupVariances(variance, share, self._blocks @ estimated > 0.0, error, _change(first, variance / start))
+        information = self._information(M, residuals)
+        precision = self._prior(M, q, variance, residuals).precision
+        error = _relative_errors(2.0 * (information + precision))
+        return GroupVariances(
+            variance,
+            share,
+            self._blocks @ estimated > 0.0,
+            error,
+            _is_pooled(precision, error),
+            _change(first, variance / start),
+        )
+
+    def _enough(self, readings: Array) -> np.ndarray:
+        """Groups whose readings are enough for an estimate, with those of groups that are alike, (G,) bool."""
+        enough = readings > _FEW
+        for index in self._alike:
+            enough[index] = readings[index].sum() > _FEW
+        return enough
+
+    def _information(self, M: Array, residuals: _Residuals) -> Array:
+        """Fisher information of Gaussian noise on the logarithms of the variances, (G, G)."""
+        return M * np.sqrt(np.outer(residuals.left, residuals.left)) / (2.0 * self.rows.oversampling)
+
+    def _prior(self, M: Array, q: Array, variance: Array, residuals: _Residuals) -> _Prior:
+        """That groups which are alike have variances of one size, as far as residuals show it."""
+        count, rows, left = len(variance), self.rows, residuals.left
+        information = self._information(M, residuals)
+        score = left * (q - M.sum(1)) / (2.0 * rows.oversampling)
+        logarithms = np.log(np.square(rows.reference_std) * variance)
+        precision, weight = np.zeros((count, count)), np.zeros((count, count))
+        for index in self._alike:
+            known, own = information_about(index, information, score), np.ix_(index, index)
+            precision[own] = prior_precision(logarithms[index], *known)
+            weight[own] = 2.0 * rows.oversampling / left[index].mean() * precision[own]  # 0 along equal factors
+        return _Prior(precision, weight, -weight @ logarithms)
 
     def _step(self, M: Array, q: Array, estimated: np.ndarray) -> Array:
         """Factors of the unknown variances at which the squares are the expected ones; confounded ones stay near 1."""
@@ -172,13 +224,16 @@ class VarianceComponentEstimator:
                 q[group] = t[group] * _clipped_variance(scores[present] / np.sqrt(own[present]), own[present])
         return M.numpy(), q / residuals.left, t, n
 
-    def _residuals(self, variance: Array, columns: Mapping[str, Tensor], problem: LinearProblem) -> _Residuals:
-        rows, group_of, directions = self.rows, self.rows.group_of, _fitted_directions(problem, self.rows.builder)
+    def _residuals(
+        self, variance: Array, columns: Mapping[str, Tensor], directions: Mapping[str, Tensor]
+    ) -> _Residuals:
+        rows, group_of = self.rows, self.rows.group_of
         leverages, size, readings = (np.zeros(len(variance)) for _ in range(3))
         for chunk in rows.whitened(variance):
             own = chunk.sources.square().sum(2)
             thinned = slice(None, None, _THINNED)
-            leverage = (chunk.sources[thinned] @ (chunk.rows[thinned, :, :-1] @ directions)).square().sum((0, 2))
+            fitted = chunk.rows[thinned, :, :-1] @ directions[chunk.log]
+            leverage = (chunk.sources[thinned] @ fitted).square().sum((0, 2))
             np.add.at(leverages, group_of, chunk.oversampling * leverage.numpy())
             np.add.at(size, group_of, own[thinned].sum(0).numpy())
             np.add.at(readings, group_of, (own > _NEGLIGIBLE).sum(0).numpy() / chunk.oversampling)
@@ -186,6 +241,25 @@ class VarianceComponentEstimator:
         r = [chunk.rows[..., :-1] @ columns[chunk.log] - chunk.rows[..., -1] for chunk in rows.chunks]
         U = [chunk.sources for chunk in rows.chunks]
         return _Residuals(r, U, np.maximum(remaining, _LEFT), readings * np.maximum(remaining, 0.0))
+
+
+def _forces(rows: SampledRows) -> Array:
+    """Rms of what the sources of each group read, (G,), in their stated noise; of all rows where that is nothing."""
+    squares, sizes = np.zeros(len(rows.groups)), np.zeros(len(rows.groups))
+    for chunk in rows.chunks:
+        size = chunk.sources.square().sum(2)
+        along = torch.einsum("ber,br->be", chunk.sources, chunk.rows[..., -1]).square() / size.clamp_min(_NEGLIGIBLE)
+        np.add.at(squares, rows.group_of, along.sum(0).numpy())
+        np.add.at(sizes, rows.group_of, size.sum(0).numpy())
+    all_rows = float(np.mean([chunk.rows[..., -1].square().mean().item() for chunk in rows.chunks]))
+    forces = np.sqrt(np.divide(squares, sizes, out=np.zeros_like(sizes), where=sizes > 0.0))
+    return np.where(forces > 0.0, forces, np.sqrt(all_rows) or 1.0)
+
+
+def _is_pooled(precision: Array, error: Array) -> np.ndarray:
+    """Whether the prior weighs more than the residuals in a group's variance, whose deviation has such errors."""
+    own = np.diag(precision)
+    return own * np.square(2.0 * error) > _POOLED
 
 
 def _relative_errors(M: Array) -> Array:
@@ -203,14 +277,26 @@ def _change(M: Array, factor: Array) -> float:
     return float(np.abs(np.sqrt(after) - 1.0).max(initial=0.0))
 
 
-def _fitted_directions(problem: LinearProblem, builder: RowBuilder) -> Tensor:
-    """G, (width, rank), with `|x G|^2` the leverage of a whitened row x; that of the few extras is neglected."""
+def fitted_directions(assembly: Assembly, builder: RowBuilder, log: str) -> Tensor:
+    """G, (width, k), with `|x G|^2` the leverage of a whitened row x of a log in a fit, extra parameters included."""
+    problem = assembly.problem
     scale = problem.scale[problem.free]
     _, values, Vh = scipy.linalg.svd(problem.A[:, problem.free] * scale, full_matrices=False, lapack_driver="gesvd")
     kept = is_significant(values)
-    G = np.zeros((builder.width, int(kept.sum())))
-    basis = scale[:, None] * Vh[kept].T / values[kept]
-    G[: builder.columns.count] = builder.columns.parameter_map[:, problem.free] @ basis
+    found = np.zeros((len(problem.nominal), int(kept.sum())))
+    found[problem.free] = scale[:, None] * Vh[kept].T / values[kept]
+    places = {extra.label: builder.columns.count + number for number, extra in enumerate(builder.extras)}
+    own = sorted((x for x in assembly.eliminations if x.log in ("", log)), key=lambda x: x.log != "")
+    extras: list[tuple[int, Array]] = []
+    for one in own:  # those of all logs first, which those of a log depend on
+        values_of = np.hstack([-one.inverse @ one.C @ found, one.inverse])
+        extras += zip((places[extra.label] for extra in one.extras), values_of, strict=True)
+        found = np.pad(found, ((0, 0), (0, one.inverse.shape[1])))
+        found = found if one.log else np.vstack([found, values_of])
+    G = np.zeros((builder.width, found.shape[1]))
+    G[: builder.columns.count] = builder.columns.parameter_map @ found[: len(problem.nominal)]
+    for place, row in extras:
+        G[place, : len(row)] = row
     return torch.from_numpy(G)
 
 

@@ -17,6 +17,7 @@ from torchid.problem.contact_state import ContactState, ContactStateLayout, Cont
 from torchid.problem.extra_columns import KnownTorques, dof_extra_column, extra_columns
 from torchid.problem.extras import ExtraTerms, list_extras
 from torchid.problem.loop_forces import MotorForces
+from torchid.problem.noise_groups import NoiseGroups
 from torchid.problem.row_blocks import RowBlock, moved_rows, multiply_wrenches, subtract_payload
 from torchid.problem.samples import Samples
 from torchid.problem.wrench_rows import FramePoses
@@ -75,6 +76,7 @@ class RowBuilder(nn.Module):
 
     `frames`: node of each contact, and the pose of the contact frame in the node's joint frame, (4, 4) [m]. `width`:
     number of columns, those of the bodies' parameters and one for each of `extras`. `workspaces`: of passes over rows.
+    `noise_sources`: of `noise_groups`, the group of each base row and of each measured force.
     """
 
     def __init__(
@@ -97,6 +99,8 @@ class RowBuilder(nn.Module):
         self.columns = RowColumns(self.tree)
         self.contacts = tuple(contacts)
         self.sensors = sensors
+        self.noise_groups = NoiseGroups.of(robot)
+        self.noise_sources = self.noise_groups.sources(contacts, sensors, self.tree.base_rows)
         self._layouts = ContactStateLayouts(robot, self.columns, contacts, sensors, self.extras)
         self.frames = self._layouts.frames
         self.width = self.columns.count + len(self.extras)

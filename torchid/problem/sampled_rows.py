@@ -1,4 +1,4 @@
-"""Rows of some samples by source of noise, and the groups of sources that have one standard deviation each."""
+"""Rows of some samples by source of noise."""
 
 from __future__ import annotations
 
@@ -19,38 +19,17 @@ from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import TriangularFactor
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
-from torchid.sensing import SensorNoise
 from torchid.sensing.sensors import measured_components
-
-BASE_GROUPS = tuple(f"base_{kind}.{axis}" for kind in ("force", "moment") for axis in "xyz")
-NOISE_GROUPS = ("joint_torque", "contact_force", "contact_moment", *BASE_GROUPS, "ft_force", "ft_moment")
-"""Groups of one standard deviation each; base rows along the axes of the levelled base."""
 
 _SAMPLES, _BYTES, _CHUNK = 1000, 2**27, 256  # rows in memory: 1000 samples give a standard deviation to 2 to 3 %
 CLIP = 3.0
 """Robust standard deviations at which residuals, of impacts for instance, are clipped."""
 
 
-def std_by_group(noise: SensorNoise) -> dict[str, float]:
-    """Standard deviation of every group, by name [N, N m]."""
-    limb = noise.limb_std
-    sensors = (noise.joint_torque, noise.contact_force, noise.contact_moment)
-    return dict(zip(NOISE_GROUPS, [*sensors, *noise.base_std.tolist(), *limb], strict=True))
-
-
 def noise_of_sensors(builder: RowBuilder) -> dict[str, float]:
-    """Standard deviation of every group that a builder's sensors have, in `NOISE_GROUPS`' order [N m, N]."""
-    names = set(_source_names(builder))
-    return {name: value for name, value in std_by_group(builder.sensors.noise).items() if name in names}
-
-
-def noise_of_groups(values: Mapping[str, float]) -> SensorNoise:
-    """Sensor noise from standard deviations by group."""
-    force, moment = (
-        (values[names[0]], values[names[1]], values[names[2]]) for names in (BASE_GROUPS[:3], BASE_GROUPS[3:])
-    )
-    plain = {name: values[name] for name in NOISE_GROUPS if name not in BASE_GROUPS}
-    return SensorNoise(**plain, base_force=force, base_moment=moment)
+    """Standard deviation of every group that a builder's sensors have, in `NoiseGroups`' order [N m, N]."""
+    names, values = set(builder.noise_sources), builder.noise_groups.values(builder.sensors.noise)
+    return {name: value for name, value in values.items() if name in names}
 
 
 @dataclass(frozen=True)
@@ -84,7 +63,8 @@ class SampledRows:
 
     Attributes:
         builder: of the rows; its sensors' noise is the stated one, which variances are relative to.
-        groups: those that the sensors have, in `NOISE_GROUPS`' order.
+        groups: those that the sensors have, in `NoiseGroups`' order.
+        alike: indices of groups whose noise may be of one size.
         group_of: (E,), index among `groups` of every source of noise.
     """
 
@@ -101,11 +81,11 @@ class SampledRows:
             chunk: samples at a time; their number rounds otherwise, which moves an ill-determined noise by per cents.
         """
         self.builder = builder
-        names = _source_names(builder)
-        self.groups = tuple(name for name in NOISE_GROUPS if name in names)
+        names = builder.noise_sources
+        self.groups = tuple(noise_of_sensors(builder))
+        self.alike = builder.noise_groups.alike(self.groups)
         self.group_of = np.array([self.groups.index(name) for name in names], dtype=int)
-        stated = std_by_group(builder.sensors.noise)
-        self._std = torch.tensor([stated[name] for name in names], dtype=torch.float64)
+        self._std = torch.from_numpy(self.reference_std[self.group_of])
         n_rows = builder.tree.n_rows
         most = min(_SAMPLES, _BYTES // (8 * max(n_rows, 1) * (builder.width + 1 + len(names))))
         self.chunks = [self._chunk(part, state) for part, state in _random_chunks(logs, max(most, 1), chunk)]
@@ -116,8 +96,7 @@ class SampledRows:
     @property
     def reference_std(self) -> Array:
         """Stated standard deviation of each group, which variances are relative to, (G,) [N m, N]."""
-        stated = std_by_group(self.builder.sensors.noise)
-        return np.array([stated[name] for name in self.groups])
+        return np.array([*noise_of_sensors(self.builder).values()])
 
     @property
     def oversampling(self) -> float:
@@ -198,16 +177,6 @@ def _supports(rows: Tensor) -> dict[tuple[int, ...], list[int]]:
 def _radius(rows: Tensor) -> Tensor:
     """Size of whitened residuals of so many rows that is exceeded as seldom as `CLIP` standard deviations by one."""
     return torch.from_numpy(np.sqrt(chdtri(rows.numpy(), 2.0 * ndtr(-CLIP))))
-
-
-def _source_names(builder: RowBuilder) -> list[str]:
-    """The group of every source of noise, in the order of `SampledRows._unit_forces`."""
-    n = builder.tree.n
-    limbs = ["ft_force"] * 3 + ["ft_moment"] * 3
-    dofs = ["joint_torque" if dof < n else limbs[(dof - n) % 6] for dof in np.flatnonzero(builder.sensors.torque)]
-    components = np.argwhere(measured_components(builder.contacts, builder.sensors))[:, 1]
-    contacts = ["contact_force" if k < 3 else "contact_moment" for k in components]
-    return [*BASE_GROUPS[: builder.tree.base_rows], *dofs, *contacts]
 
 
 def _random_chunks(

@@ -32,6 +32,7 @@ WIDTH = 100
 """Columns of what is printed, at most."""
 
 _MOST_ROWS = 12  # of contributions of a kind, and of conditions
+_JOINTS = 6  # whose noise an advice spells out
 MARKS = {IDENTIFIED: "*", PRIOR: "p", COMBINED: "+", UNOBSERVABLE: ".", FIXED: ""}
 
 
@@ -151,7 +152,11 @@ def noise_table(groups: Sequence[Mapping[str, Any]]) -> Table:
 def noise_advice(suggested: Mapping[str, Any]) -> str:
     """A line with the noise that should replace stated values, where residuals contradict them."""
 
-    def text(x: float | Sequence[float]) -> str:
+    def text(x: float | Sequence[float] | Mapping[str, float]) -> str:
+        if isinstance(x, Mapping):
+            shown = [f"{name}: {value:g}" for name, value in x.items()]
+            more = [f"and {len(shown) - _JOINTS} more"] if len(shown) > _JOINTS else []
+            return "{" + ", ".join([*shown[:_JOINTS], *more]) + "}"
         return f"{x:g}" if isinstance(x, float) else "[" + ", ".join(f"{value:g}" for value in x) + "]"
 
     keys = ", ".join(f"{key}: {text(x)}" for key, x in suggested.items())

@@ -124,6 +124,9 @@ NAMED_SETS = ("full", "contacts", "joints")
 PerAxis = float | tuple[float, float, float]
 """One number for three axes, or one for each."""
 
+PerJoint = float | tuple[float, ...]
+"""One number for all joints, or one for each in the robot's order."""
+
 
 @dataclass(frozen=True)
 class SensorNoise:
@@ -132,11 +135,12 @@ class SensorNoise:
     `base_force` and `base_moment` are the errors of the base rows that are no force sensor's (differentiated motion,
     soft contacts): without them a base row in flight, where no sensor contributes noise, would count as exact. By
     default they are one contact sensor's noise, and so are those of force/torque sensors in limbs. Three numbers are
-    for the axes x, y, z of the levelled base, see `torchid.problem.base_motion.levelled_base_axes`. The defaults are
+    for the axes x, y, z of the levelled base, see `torchid.problem.base_motion.levelled_base_axes`. `joint_torque`, in
+    N of a joint that slides, may have a number for each joint, as estimates do. The defaults are
     rough, for library users and as the start of the estimation in `torchid.problem.noise`.
     """
 
-    joint_torque: float = 0.5
+    joint_torque: PerJoint = 0.5
     contact_force: float = 2.0
     contact_moment: float = 0.2
     base_force: PerAxis | None = None
@@ -169,8 +173,15 @@ class SensorNoise:
         return force, moment
 
     def dof_std(self, n: int, count: int) -> Array:
-        """Standard deviations by `Robot.dof_names`: n joint torques, then wrenches in limbs, (count,) [N m, N, N m]."""
-        return np.append(np.full(n, self.joint_torque), np.tile(np.repeat(self.limb_std, 3), (count - n) // 6))
+        """Standard deviations by `Robot.dof_names`: n joint torques, then wrenches in limbs, (count,) [N m, N, N m].
+
+        Raises:
+            SensorError: `joint_torque` has neither one number nor n.
+        """
+        joints = np.asarray(self.joint_torque, dtype=float)
+        if joints.shape not in ((), (n,)):
+            raise SensorError("noise", "joint_torque", f"{joints.size} numbers", f"one for all joints, or {n}")
+        return np.append(np.broadcast_to(joints, n), np.tile(np.repeat(self.limb_std, 3), (count - n) // 6))
 
     def scaled(self, factor: float) -> SensorNoise:
         """All standard deviations times a factor."""
