@@ -14,11 +14,11 @@ from pydantic.dataclasses import dataclass
 
 from torchid.errors import LogError
 from torchid.logs import Log
-from torchid.logs.flags import beside_changes, hysteresis, runs, samples_of, without_short
+from torchid.logs.flags import beside_changes, hysteresis, samples_of, without_short
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import find_unloaded
 from torchid.logs.spill import growing_array
-from torchid.problem.contact_slip import base_velocity, contact_velocities
+from torchid.problem.contact_slip import base_velocity, contact_velocities, keep_still
 from torchid.problem.detection_forces import ForcesAlongNormals, fitted_parameters
 from torchid.problem.detection_motion import Prepared, detection_cutoff_hz, prepare
 from torchid.robot import Robot
@@ -30,6 +30,7 @@ _SUPPORTED = 0.25  # of the weight: what contact forces may leave of it in sampl
 _LEAST_FITTED = 100  # samples
 _DEVIATIONS = 3.0  # of what feet seem to carry in the air, to which thresholds go down
 _LOWEST = 0.01  # of the stated thresholds
+_FITS, _LESS = 3, 0.9  # of parameters at most, each of which leaves that share of what feet seem to carry in the air
 
 
 @dataclass(config=STRICT, frozen=True)
@@ -46,6 +47,7 @@ class DetectionConfig:
     With `refit`, where the base's acceleration is known, parameters are then fitted to each log with the contacts that
     were found, and contacts detected again with these: by thresholds that are lower in the same ratio, three standard
     deviations of what feet seem to carry in the air, and with a wider filter as long as these leave `touch` as it is.
+    Of what that filter leaves, parameters are fitted again as long as feet seem to carry less in the air for it.
     A contact that stands by either counts as standing, and samples about changes by the stated ones are dropped.
     """
 
@@ -192,9 +194,8 @@ def detect_in_parts(
     forces = ForcesAlongNormals.of(known.parts(), len(known.time), robot, contacts)
     seen = _Seen.of(known, forces, settings, folder)
     found, time = seen.judged(), seen.time
-    if settings.refit and seen.accelerates and (again := _fitted(forces, found, seen)) is not None:
-        sharp, in_the_air = _sharpest(filtered, known, again, found, settings, folder)
-        found, time = sharp.finer(in_the_air, sharp.cutoff_hz > known.cutoff_hz), sharp.time
+    if settings.refit and seen.accelerates:
+        found, time = _detect_again(filtered, forces, seen, found, folder)
     inside = (stamps >= time[0]) & (stamps <= time[-1])
     nearest = _nearest(time, stamps)
     active, certain, possible, clear = (part[nearest] for part in found)
@@ -211,8 +212,7 @@ class _Seen:
     """What filtered signals say of contacts.
 
     Attributes:
-        time: (K,) [s].
-        cutoff_hz: of the filter.
+        known: the signals.
         share: of the weight that contacts carry, (K, C).
         velocity: (K, C, 3) [m/s], in the world or not; None where nobody knows.
         in_world: whether it is.
@@ -220,8 +220,7 @@ class _Seen:
         settings: thresholds.
     """
 
-    time: FloatArray
-    cutoff_hz: float
+    known: Filtered
     share: FloatArray
     velocity: FloatArray | None
     in_world: bool
@@ -241,12 +240,17 @@ class _Seen:
             if moves:
                 velocities.append(contact_velocities(part.samples, robot, contacts, base))
         velocity = velocities.array() if moves else None
-        return cls(known.time, known.cutoff_hz, shares.array(), velocity, in_world, accelerates, settings)
+        return cls(known, shares.array(), velocity, in_world, accelerates, settings)
+
+    @property
+    def time(self) -> FloatArray:
+        """Stamps (K,) [s]."""
+        return self.known.time
 
     @property
     def smear_s(self) -> float:
         """How far [s] from a change of contact its filtered force is seen."""
-        return 1.0 / self.cutoff_hz
+        return 1.0 / self.known.cutoff_hz
 
     def judged(self) -> Detection:
         """Which contacts stand."""
@@ -284,99 +288,91 @@ class _Seen:
         return Detection(finer.active, certain, possible, found.clear)
 
 
+def _detect_again(
+    filtered: Callable[[float], Filtered],
+    forces: ForcesAlongNormals,
+    seen: _Seen,
+    found: Detection,
+    folder: Path | None,
+) -> tuple[Detection, FloatArray]:
+    """Contacts by parameters that fit the log, and the stamps (K,) [s] of the samples in which they are known.
+
+    Where a wider filter serves, parameters are fitted again to what it leaves, with all contacts that it shows, for as
+    long as feet seem to carry less in the air for it.
+
+    Args:
+        filtered: the log at a cutoff.
+        forces: by the URDF.
+        seen: with these, at the cutoff of the settings.
+        found: which contacts stand by these.
+        folder: with room, or None.
+    """
+    time, sharp = seen.time, seen.known
+    lowest: float | None = None
+    air, ground = (find_unloaded(time, active, seen.smear_s) for active in (found.active, ~found.active))
+    again = _fitted(forces, found.active, found.certain & (air | ground).all(axis=1))
+    for more in reversed(range(_FITS)):
+        if again is None:
+            break
+        best = _sharpest(filtered, sharp, again, seen, air, folder)
+        in_the_air = air[_nearest(seen.time, best.time)]
+        noise = best.noise(in_the_air)
+        if lowest is not None and noise > _LESS * lowest:
+            break
+        time, sharp, lowest = best.time, best.known, noise
+        is_sharp = sharp.cutoff_hz > seen.known.cutoff_hz
+        found = best.finer(in_the_air, is_sharp)
+        if not is_sharp or not more:
+            break
+        by_urdf = ForcesAlongNormals.of(sharp.parts(), len(time), forces.balance.robot, forces.balance.contacts)
+        away = find_unloaded(time, ~found.clear[:, None], 2.0 * best.smear_s)[:, 0]
+        again = _fitted(by_urdf, found.possible, away)
+    return found, time
+
+
 def _sharpest(
     filtered: Callable[[float], Filtered],
     known: Filtered,
     forces: ForcesAlongNormals,
-    found: Detection,
-    settings: DetectionConfig,
+    seen: _Seen,
+    in_the_air: BoolArray,
     folder: Path | None,
-) -> tuple[_Seen, BoolArray]:
-    """What the widest filter shows whose noise leaves the thresholds as they are, and which contacts (K, C) are away.
+) -> _Seen:
+    """What the widest filter shows whose noise leaves the thresholds as they are.
 
     A filter of 20 Hz shows an impact 25 ms early, and a foot that scuffs the floor for 5 ms not at all.
 
     Args:
         filtered: the log at a cutoff.
-        known: at that of the settings.
+        known: at the least of them.
         forces: with parameters that fit the log.
-        found: which contacts stand in `known`.
-        settings: thresholds.
+        seen: settings, and stamps of those in the air.
+        in_the_air: contacts (K, C) that surely are.
         folder: with room, or None.
     """
-    in_the_air = find_unloaded(known.time, found.active, 1.0 / known.cutoff_hz)
-    best, away = _Seen.of(known, forces, settings, folder), in_the_air
+    best = _Seen.of(known, forces, seen.settings, folder)
     highest = detection_cutoff_hz(np.inf, known.time)
-    while best.cutoff_hz < highest:
-        wider = _Seen.of(filtered(min(2.0 * best.cutoff_hz, highest)), forces, settings, folder)
-        in_wider = in_the_air[_nearest(known.time, wider.time)]
-        if _DEVIATIONS * wider.noise(in_wider) > settings.touch:
+    while best.known.cutoff_hz < highest:
+        wider = _Seen.of(filtered(min(2.0 * best.known.cutoff_hz, highest)), forces, seen.settings, folder)
+        if _DEVIATIONS * wider.noise(in_the_air[_nearest(seen.time, wider.time)]) > seen.settings.touch:
             break
-        best, away = wider, in_wider
-    return best, away
+        best = wider
+    return best
 
 
-def _fitted(forces: ForcesAlongNormals, found: Detection, seen: _Seen) -> ForcesAlongNormals | None:
-    """The forces of the robot with parameters that fit its torques with the contacts that were found; None without any.
+def _fitted(forces: ForcesAlongNormals, active: BoolArray, sure: BoolArray) -> ForcesAlongNormals | None:
+    """The forces of the robot with parameters that fit its torques; None without enough samples.
 
-    Of samples away from changes in which contacts carry the robot: a belly or a rope leaves a part of its weight.
-    """
-    away = [find_unloaded(seen.time, active, seen.smear_s) for active in (found.active, ~found.active)]
-    sure = (found.certain & (away[0] | away[1]).all(axis=1))[forces.chosen]
-    kept = np.flatnonzero(sure & (forces.unexplained < _SUPPORTED * forces.balance.weight))
-    if len(kept) < _LEAST_FITTED:
-        return None
-    active = torch.from_numpy(found.active[forces.chosen[kept]])
-    samples = dataclasses.replace(forces.samples[torch.from_numpy(kept)], active=active)
-    return forces.with_parameters(fitted_parameters(samples, forces.balance.robot, forces.balance.contacts))
-
-
-LEAST_LIMIT = 0.01
-"""Speed [m/s] below which a contact always counts as still: what soft ground and filters leave of a stance."""
-
-_TOGETHER = 1 << 16  # samples whose speeds are worked out at once
-_MEDIANS = 2.0  # of the speed of contacts that surely stand, which is noise
-
-
-def keep_still(
-    velocity: FloatArray, in_world: bool, standing: BoolArray, possible: BoolArray, shortest: int
-) -> BoolArray:
-    """Which contacts that may stand move no faster than those that surely do, for some samples at least, (N, C).
+    Of samples in which contacts carry the robot: a belly or a rope leaves a part of its weight.
 
     Args:
-        velocity: of the contacts (N, C, 3) [m/s], from `contact_velocities`.
-        in_world: whether that is in the world, as the log has the velocity of its base; else speeds are those against
-            the median of the other contacts that surely stand.
-        standing: those that surely stand, (N, C).
-        possible: those that may stand, (N, C).
-        shortest: samples in a row.
+        forces: by the URDF.
+        active: which contacts (K, C) stand or may do so.
+        sure: samples (K,) in which no other does.
     """
-    speed = np.empty(standing.shape)
-    for start in range(0, len(speed), _TOGETHER):
-        part = slice(start, start + _TOGETHER)
-        seen = velocity[part] if in_world else _against_standing(velocity[part], standing[part])
-        speed[part] = np.linalg.norm(seen, axis=2)
-    noise = speed[standing & np.isfinite(speed)]
-    limit = max(LEAST_LIMIT, _MEDIANS * float(np.median(noise))) if len(noise) else LEAST_LIMIT
-    with np.errstate(invalid="ignore"):
-        still = (speed < limit) & possible
-    return np.stack([_lasting(one, shortest) for one in still.T], axis=1)
-
-
-def _lasting(flags: BoolArray, shortest: int) -> BoolArray:
-    """The flags (N,) without runs of fewer true ones."""
-    out = np.zeros_like(flags)
-    for start, stop in runs(flags):
-        out[start:stop] = stop - start >= shortest
-    return out
-
-
-def _against_standing(velocity: FloatArray, standing: BoolArray) -> FloatArray:
-    """Velocities (N, C, 3) against the median of the other contacts that stand; NaN where none does."""
-    out = np.full_like(velocity, np.nan)
-    for contact in range(velocity.shape[1]):
-        others = np.where(standing[:, :, None], velocity, np.nan)
-        others[:, contact] = np.nan
-        some = np.isfinite(others[:, :, 0]).any(axis=1)
-        out[some, contact] = velocity[some, contact] - np.nanmedian(others[some], axis=1)
-    return out
+    kept = np.flatnonzero(sure[forces.chosen] & (forces.unexplained < _SUPPORTED * forces.balance.weight))
+    if len(kept) < _LEAST_FITTED:
+        return None
+    flags = torch.from_numpy(active[forces.chosen[kept]])
+    samples = dataclasses.replace(forces.samples[torch.from_numpy(kept)], active=flags)
+    return forces.with_parameters(fitted_parameters(samples, forces.balance.robot, forces.balance.contacts))

@@ -1,4 +1,4 @@
-"""Slip: contacts that move on the ground while their flags say that they stand."""
+"""Slip: contacts that move on the ground while their flags say that they stand, and contacts that keep still."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchid.errors import warn
 from torchid.logs import Log
+from torchid.logs.flags import runs
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import near_contact_changes
 from torchid.problem.rows import RowBuilder
@@ -28,6 +29,9 @@ _NOISES = 6.0  # standard deviations of a stance's velocity, by axis, that are n
 _MEDIAN_SPEED = 1.538  # of a velocity whose three components have unit variance (Maxwell distribution)
 _STENCIL = 3.0  # steps that a derivative looks to each side
 _TOGETHER = 2048  # samples whose velocities are worked out at once
+_STILL = 0.01  # m/s below which a contact always keeps still: what soft ground and filters leave of a stance
+_STILL_MEDIANS = 2.0  # of the speed of contacts that surely stand, which is noise
+_SPEEDS_TOGETHER = 1 << 16  # samples whose speeds are worked out at once
 
 
 @dataclass(frozen=True)
@@ -205,4 +209,48 @@ def _against_others(velocity: FloatArray) -> FloatArray:
         out[more] = velocity[more] - np.nanmedian(velocity[more], axis=1, keepdims=True)
     if two.any():
         out[two] = 2.0 * (velocity[two] - np.nanmean(velocity[two], axis=1, keepdims=True))
+    return out
+
+
+def keep_still(
+    velocity: FloatArray, in_world: bool, standing: BoolArray, possible: BoolArray, shortest: int
+) -> BoolArray:
+    """Which contacts that may stand move no faster than those that surely do, for some samples at least, (N, C).
+
+    Args:
+        velocity: of the contacts (N, C, 3) [m/s], from `contact_velocities`.
+        in_world: whether that is in the world, as the log has the velocity of its base; else speeds are those against
+            the median of the other contacts that surely stand.
+        standing: those that surely stand, (N, C).
+        possible: those that may stand, (N, C).
+        shortest: samples in a row.
+    """
+    speed = np.empty(standing.shape)
+    for start in range(0, len(speed), _SPEEDS_TOGETHER):
+        part = slice(start, start + _SPEEDS_TOGETHER)
+        seen = velocity[part] if in_world else _against_standing(velocity[part], standing[part])
+        speed[part] = np.linalg.norm(seen, axis=2)
+    noise = speed[standing & np.isfinite(speed)]
+    limit = max(_STILL, _STILL_MEDIANS * float(np.median(noise))) if len(noise) else _STILL
+    with np.errstate(invalid="ignore"):
+        still = (speed < limit) & possible
+    return np.stack([_lasting(one, shortest) for one in still.T], axis=1)
+
+
+def _lasting(flags: BoolArray, shortest: int) -> BoolArray:
+    """The flags (N,) without runs of fewer true ones."""
+    out = np.zeros_like(flags)
+    for start, stop in runs(flags):
+        out[start:stop] = stop - start >= shortest
+    return out
+
+
+def _against_standing(velocity: FloatArray, standing: BoolArray) -> FloatArray:
+    """Velocities (N, C, 3) against the median of the other contacts that stand; NaN where none does."""
+    out = np.full_like(velocity, np.nan)
+    for contact in range(velocity.shape[1]):
+        others = np.where(standing[:, :, None], velocity, np.nan)
+        others[:, contact] = np.nan
+        some = np.isfinite(others[:, :, 0]).any(axis=1)
+        out[some, contact] = velocity[some, contact] - np.nanmedian(others[some], axis=1)
     return out
