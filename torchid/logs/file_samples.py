@@ -98,14 +98,21 @@ def listed_order(sample: FileSample, kind: str, robot: KnownRobot, count: int) -
 
 
 def _order_of_legs(texts: Mapping[str, Sequence[str]], robot: KnownRobot, count: int) -> tuple[list[str], str] | None:
-    """The feet in the order in which a list of all joints names their legs; None where there is none."""
+    """The feet in the order in which a list of all joints names their legs, one after the other or in turn.
+
+    None where there is no such list, or where its joints follow no order of legs: the first joints of all legs, the
+    second ones and so on must name them alike.
+    """
     by_side = {limb_and_words(foot)[0]: foot for foot in robot.feet}
     for name, listed in texts.items():
         if len(listed) == len(robot.joints) == len(match_names(listed, robot.joints, "joint")):
-            sides = dict.fromkeys(limb_and_words(text)[0] for text in listed)
-            feet = [by_side[side] for side in sides if side in by_side]
-            if len(feet) == count == len(robot.feet):
-                return feet, f"legs as '{name}' of the file lists their joints"
+            places: dict[frozenset[str], list[int]] = {}
+            for place, text in enumerate(listed):
+                if (side := limb_and_words(text)[0]) in by_side:
+                    places.setdefault(side, []).append(place)
+            in_order = all(list(turn) == sorted(turn) for turn in zip(*places.values(), strict=False))
+            if in_order and len(places) == count == len(robot.feet):
+                return [by_side[side] for side in places], f"legs as '{name}' of the file lists their joints"
     return None
 
 
