@@ -114,21 +114,33 @@ def chunks_by_state(
         workers: that take turns with the chunks of a state, of which each gets as many, unless there is but one.
     """
     active = samples.active.cpu().numpy()
-    packed = np.packbits(active, axis=1) if active.shape[1] else np.zeros((len(active), 1), np.uint8)
-    keys = packed.view(f"V{packed.shape[1]}")[:, 0]
-    unique_keys, first = np.unique(keys, return_index=True)
-    for key, sample in zip(unique_keys, first, strict=True):
-        count = -(-int(np.count_nonzero(keys == key)) // chunk)
+    starts, state_of_run = _runs(active)
+    lengths = np.diff(starts, append=len(active))
+    for number in range(state_of_run.max(initial=-1) + 1):
+        own = state_of_run == number
+        count = -(-int(lengths[own].sum()) // chunk)
         if count > 1:
             count = -(-count // workers) * workers
-        if len(unique_keys) == 1:
+        if own.all():
             ends = np.linspace(0, len(active), count + 1).astype(int).tolist()
             pieces: Iterable[slice | torch.Tensor] = (slice(*pair) for pair in pairwise(ends))
         else:
-            index = torch.from_numpy(np.flatnonzero(keys == key))
-            pieces = index.tensor_split(count)
+            pieces = torch.from_numpy(np.flatnonzero(np.repeat(own, lengths))).tensor_split(count)
+        state = tuple(active[starts[np.argmax(own)]].tolist())
         for piece in pieces:
-            yield tuple(active[sample].tolist()), piece
+            yield state, piece
+
+
+def _runs(active: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where contacts (N, C) change, the first sample included, and the number of the contact state from there on.
+
+    Few are sorted in place of all samples, of which a log may have millions.
+    """
+    packed = np.packbits(active, axis=1) if active.shape[1] else np.zeros((len(active), 1), np.uint8)
+    changes = np.flatnonzero((packed[1:] != packed[:-1]).any(axis=1)) + 1
+    starts = np.concatenate([np.arange(min(len(active), 1)), changes])
+    _, numbers = np.unique(packed[starts].view(f"V{packed.shape[1]}")[:, 0], return_inverse=True)
+    return starts, numbers
 
 
 def subsample_states(logs: Sequence[Samples], count: int) -> Iterator[tuple[Samples, ContactState, float]]:
