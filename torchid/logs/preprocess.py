@@ -142,9 +142,7 @@ def move_to_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Covera
 
 def _fields_on_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Coverage]) -> dict[str, Any]:
     """Fields that change in the preprocessed log."""
-    fields: dict[str, Any] = {
-        "time": timeline.stamps_of(log.time),
-    }
+    fields: dict[str, Any] = {"time": timeline.stamps_of(log.time)}
     fields |= _motion(log, timeline)
     for name in NAN_ALLOWED:
         if getattr(log, name) is not None:
@@ -219,12 +217,13 @@ def _direction(log: Log, smoothed: Mapping[str, FloatArray], timeline: Timeline)
     known = smoothed["joint_position"] if velocity is None else velocity
     steps, width = np.diff(timeline.grid), timeline.sign_width
     out = np.empty((len(timeline.output_stamps), known.shape[1]))
-    for column in range(known.shape[1]):  # one by one: temporaries stay small
-        x = known[:, column]
-        halfway = np.diff(x) / steps if velocity is None else 0.5 * (x[1:] + x[:-1])
-        before, after = np.append(halfway[:1], halfway), np.append(halfway, halfway[-1:])
+    together = _channels_together(len(known))
+    for start in range(0, known.shape[1], together):
+        x = known[:, start : start + together]
+        halfway = np.diff(x, axis=0) / steps[:, None] if velocity is None else 0.5 * (x[1:] + x[:-1])
+        before, after = np.concatenate([halfway[:1], halfway]), np.concatenate([halfway, halfway[-1:]])
         sign = _mean_sign(before, after) if width is None else _mean_tanh(before / width, after / width)
-        out[:, column] = timeline.evaluate(timeline.low_pass(sign), (0,))[0]
+        out[:, start : start + together] = timeline.evaluate(timeline.low_pass(sign), (0,))[0]
     return out
 
 
@@ -271,8 +270,14 @@ def _orientation(log: Log, derivatives: list[FloatArray], timeline: Timeline) ->
 
 # -------------------------------------------------------------------------------------------- fields that may have gaps
 
-#: Channels that are filtered together: few, so that copies are small compared with a long log.
-_CHANNELS_TOGETHER = 2
+#: Values that are filtered together: few, so that copies of a long log are small; many, so that a short one needs few
+#: calls.
+_VALUES_TOGETHER = 2**14
+
+
+def _channels_together(count: int) -> int:
+    """How many channels of so many samples are filtered by one call."""
+    return max(1, _VALUES_TOGETHER // max(count, 1))
 
 
 def _resample_measured(log: Log, name: str, timeline: Timeline, coverage: Coverage | None) -> FloatArray:
@@ -294,8 +299,9 @@ def _resample_measured(log: Log, name: str, timeline: Timeline, coverage: Covera
     flags = log.contact_active if name in CONTACT_READINGS else None
     complete = np.argwhere(coverage.complete)
     out = np.full((len(timeline.output_stamps), *values.shape[1:]), np.nan)
-    for start in range(0, len(complete), _CHANNELS_TOGETHER):
-        columns = (slice(None), *complete[start : start + _CHANNELS_TOGETHER].T)
+    together = _channels_together(len(values))
+    for start in range(0, len(complete), together):
+        columns = (slice(None), *complete[start : start + together].T)
         clean = values[columns]
         if flags is not None:
             clean[~flags[:, columns[1]]] = 0.0
