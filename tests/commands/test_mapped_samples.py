@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import pickle
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,6 +16,9 @@ from torchid.commands.cache import FOLDER
 from torchid.commands.cached_reading import open_reader
 from torchid.config import load_config
 from torchid.fitting.experiment import set_up
+from torchid.problem import Samples
+from torchid.problem.chunks import map_chunks
+from torchid.problem.contact_state import ContactState
 
 
 @pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
@@ -22,18 +27,19 @@ def test_a_pass_over_mapped_samples_lets_go_of_their_pages_and_finds_the_same_nu
 ) -> None:
     demo = shortened_demo(tmp_path / "demo", 300) / "quadruped.yaml"
     config = load_config(demo, [f"output={tmp_path / 'run'}"])
-    scene, done = set_up(config), []
-    reader = open_reader(scene)
-    [log] = reader.read(config.logs.train, scene.sensors)
+    scene = set_up(config)
+    [log] = open_reader(scene).read(config.logs.train, scene.sensors)
     before = {name: x.clone() for name, x in tensors(log).items()}
     assert mapped_kilobytes(tmp_path / FOLDER) > 0
-    progress = reader.progress(done.append)
-    for _ in range(7):
-        progress(3)
-    assert mapped_kilobytes(tmp_path / FOLDER) > 0
-    progress(3)
-    assert mapped_kilobytes(tmp_path / FOLDER) == 0
-    assert done == [3] * 8
+    builder, seen = scene.builder(scene.sensors), []
+
+    def look(chunks: Iterator[tuple[Samples, ContactState]]) -> None:
+        for samples, _ in chunks:
+            seen.append((mapped_kilobytes(tmp_path / FOLDER), samples.joint_position.sum()))  # reads a page
+
+    in_one_state = replace(log, active=torch.ones_like(log.active))  # whose chunks are not copied
+    map_chunks([in_one_state], builder, look, chunk=-(-len(log) // 6), threads=1)
+    assert [kilobytes > 0 for kilobytes, _ in seen] == [True, True, True, True, False, True]
     for name, x in tensors(log).items():
         assert torch.equal(x.nan_to_num(), before[name].nan_to_num()), name
 

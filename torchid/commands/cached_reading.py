@@ -7,7 +7,6 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -25,11 +24,8 @@ from torchid.logs.spill import MappedPages
 from torchid.logs.tables import is_text_table
 from torchid.logs.time_range import split_range
 from torchid.problem import Samples
-from torchid.problem.chunks import ProgressCallback
 from torchid.sensing import SensorSet
 from torchid.sensing.sensors import recorded_components
-
-_LET_GO = 8  # chunks after which pages that samples are mapped to leave the memory of the process
 
 
 def open_reader(scene: Scene) -> LogReader:
@@ -112,17 +108,6 @@ class CachedReader(LogReader):
         self._contents: dict[Path, _Content] = {}
         self._scene_content = content_of_scene(scene)
         self._mapped: list[MappedPages] = []
-
-    def progress(self, done: ProgressCallback) -> ProgressCallback:
-        """As `LogReader.progress`."""
-        calls = count(1)
-
-        def call(samples: int) -> None:
-            done(samples)
-            if next(calls) % _LET_GO == 0:
-                self.let_go()
-
-        return call
 
     def let_go(self) -> None:
         """As `LogReader.let_go`."""

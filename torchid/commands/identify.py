@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
@@ -40,7 +40,7 @@ from torchid.identifiability.confounding import TotalMass
 from torchid.identifiability.contributions import Contributions, contributions
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Evaluation, LinearProblem, Metrics, RowBuilder, Samples
-from torchid.problem.chunks import ProgressCallback, one_thread
+from torchid.problem.chunks import one_thread
 from torchid.problem.compressed_log import Block, fold_compressed, merge_blocks
 from torchid.problem.compression import Part, compress_in_blocks, merge_folds, merge_states, split_into_folds
 from torchid.problem.contact_state import ContactState, state_name
@@ -86,7 +86,7 @@ class _Data:
     """Training logs in folds, or factors of them, with the noise of their weights, and compressed; test logs.
 
     `experiment`: with that noise, and what the logs have chosen. `factors`: files that the training logs come from, if
-    they do. `reused`: what an earlier run has left in the cache, in words. `reader`: that the logs come from.
+    they do. `reused`: what an earlier run has left in the cache, in words.
     """
 
     experiment: Experiment
@@ -99,7 +99,6 @@ class _Data:
     blocks: Sequence[Block]
     parts: list[Part]
     reused: list[str]
-    reader: LogReader
     choices: Choices
 
 
@@ -143,7 +142,7 @@ def _data_of_logs(experiment: Experiment, clock: Clock, bars: Progress) -> _Data
         blocks = split_into_folds(logs["train"], builder)
         parts, there = _compressed(experiment, reader, builder, blocks, bars)
     reused = [*_reused(reader), *(["factors"] if there else [])]
-    return _Data(experiment, logs, [], reader.excluded, states, noise, builder, blocks, parts, reused, reader, choices)
+    return _Data(experiment, logs, [], reader.excluded, states, noise, builder, blocks, parts, reused, choices)
 
 
 def _data_of_factors(experiment: Experiment, clock: Clock, bars: Progress) -> _Data:
@@ -159,7 +158,7 @@ def _data_of_factors(experiment: Experiment, clock: Clock, bars: Progress) -> _D
         blocks = fold_compressed([one.log for one in fleet.files], builder)
         parts = merge_blocks(blocks, builder)
     excluded = {one.log.source: one.excluded for one in fleet.files if one.excluded}
-    same = (fleet.states, fleet.noise, builder, blocks, parts, _reused(reader), reader, Choices())
+    same = (fleet.states, fleet.noise, builder, blocks, parts, _reused(reader), Choices())
     return _Data(fleet.experiment, logs, fleet.files, excluded, *same)
 
 
@@ -211,7 +210,7 @@ def _identify(config: ExperimentConfig, resume: bool, bars: Progress) -> tuple[I
         fits = (fit, *fitter.fit_without_folds(fit.parts))
         compared, *without_folds = (experiment.calibrations(one, builder) for one in fits)
         scorer, of_blocks = Scorer(evaluation, builder), merge_states(fit.parts, builder)
-        scores = _scores(scorer, logs["test"], blocks, of_blocks, compared, without_folds, bars, ready.reader.progress)
+        scores = _scores(scorer, logs["test"], blocks, of_blocks, compared, without_folds, bars)
         shown = [*logs["test"], *logs["train"]][:1]
         forces = ranks.from_first(lambda: [compare_forces(evaluation, log, compared) for log in shown], "forces")
         traces = ranks.from_first(lambda: [trace_forces(evaluation, log, compared) for log in shown], "traces")
@@ -281,7 +280,7 @@ def _compressed(
     streaming = bars.add_task("streaming samples", total=sum(map(len, train)))
 
     def compute() -> list[Part]:
-        return compress_in_blocks(train, builder, progress=reader.progress(partial(bars.advance, streaming)))
+        return compress_in_blocks(train, builder, progress=partial(bars.advance, streaming))
 
     keys = reader.keys if isinstance(reader, CachedReader) else {}
     paths = [str(path) for path in experiment.config.logs.train]
@@ -369,11 +368,10 @@ def _scores(
     compared: Comparison[Calibration],
     without_folds: Sequence[Comparison[Calibration]],
     bars: Progress,
-    progress: Callable[[ProgressCallback], ProgressCallback],
 ) -> _Scores:
     """Metrics of the training logs, whose blocks the `parts` are of, and of the test logs."""
     unseen = sum(map(len, test))
-    done = progress(partial(bars.advance, bars.add_task("evaluating", total=scorer.scored(blocks)[1] + unseen)))
+    done = partial(bars.advance, bars.add_task("evaluating", total=scorer.scored(blocks)[1] + unseen))
     train = scorer.score_training(blocks, parts, compared, without_folds, done)
     scores = _Scores({"train": train.metrics}, {"train": train.samples}, train.cross_validation)
     if test:

@@ -30,7 +30,7 @@ class RecordedBlock:
 
     def preprocessed(self, coverage: Mapping[str, Coverage]) -> Log:
         """The samples."""
-        return self.log if self.timeline is None else move_to_timeline(self.log, self.timeline, coverage)
+        return self.log if self.timeline is None else move_to_timeline(self.log, self.timeline, coverage, is_part=True)
 
 
 @dataclass(frozen=True)

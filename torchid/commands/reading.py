@@ -28,7 +28,6 @@ from torchid.logs.segments import with_delayed_torques
 from torchid.logs.time_range import LogPart, split_range
 from torchid.parameters import Array
 from torchid.problem import Samples, bind_log
-from torchid.problem.chunks import ProgressCallback
 from torchid.problem.closed_loops import with_loop_joints
 from torchid.problem.contact_detection import with_detected_contacts
 from torchid.problem.contact_slip import measure_slip, warn_of_slip
@@ -91,10 +90,6 @@ class LogReader:
         names = ranks.as_first([log.source for log in logs], "names of the logs")  # they may lie elsewhere there
         added = [payload_of(self.scene, path) for path in paths]
         return [replace(log, source=name, payload=x) for log, name, x in zip(logs, names, added, strict=True)]
-
-    def progress(self, done: ProgressCallback) -> ProgressCallback:
-        """A callback of passes over the samples that calls `done`, and now and then `let_go`."""
-        return done
 
     def let_go(self) -> None:
         """Take pages of files that samples are mapped to out of memory; they come back where they are used."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -24,7 +23,6 @@ from torchid.problem.chunks import ProgressCallback, one_thread
 from torchid.problem.compression import (
     Part,
     PartKey,
-    RowWeighting,
     add_noise_gram,
     compress_in_blocks,
     cut_into_blocks,
@@ -32,6 +30,7 @@ from torchid.problem.compression import (
     noise_gram_by_part,
 )
 from torchid.problem.noise_gram import NoiseGram, noise_gram_of_share
+from torchid.problem.row_compressor import RowWeighting
 from torchid.problem.samples import concatenate
 from torchid.rounding import MAD_PER_STD
 
@@ -232,7 +231,6 @@ def _passes(rows: _Rows, loss: RobustLoss, start: _Point, first_pass: int = 0, s
         by_log = {source: at.fit.columns(fitter.builder, source) for source in rows.sources}
         reweighting = Reweighting(current, by_log, max(at.scale, _TINY))
         parts, done = rows.compress(reweighting), done + 1
-        reweighting.gather()
         add_noise_gram(parts, rows.noise_gram, reweighting.mean_weight)
         fit, scale = fitter.fit(parts, solve), reweighting.median_scale
         settled = current == loss and _settled(fit, at.fit, at.scale, scale)
@@ -266,7 +264,6 @@ def fit_extras_robustly(
         current = _loss_of_pass(loss, done)
         reweighting = Reweighting(current, {log.source: columns(values)}, max(scale, _TINY))
         before, values = values, solve(compress_parts([log], builder, weight_rows=reweighting))
-        reweighting.gather()
         steady = abs(reweighting.median_scale - scale) <= _STEADY * scale
         scale = reweighting.median_scale
         settled = current == loss and steady and np.allclose(values, before, rtol=_SAME, atol=_SAME)
@@ -288,7 +285,6 @@ class Reweighting:
         """
         self.loss, self.scale = loss, scale
         self._parameters = parameters
-        self._lock = threading.Lock()
         self._histogram = np.zeros(_BINS)
         self._terms: list[list[float]] = []  # rows, weights, rho'^2, rho'', rho''^2 of each chunk, as they come
 
@@ -301,17 +297,18 @@ class Reweighting:
         digits = u.abs().log10().clamp(*_DECADES)
         counts = torch.histc(digits, _BINS, *_DECADES).cpu().numpy()
         sums = [len(u), *(float(x.sum()) for x in (weight, (weight * u).square(), slope, slope.square()))]
-        with self._lock:
-            self._histogram += counts
-            self._terms.append(sums)
+        self._histogram += counts
+        self._terms.append(sums)
         return weight.sqrt()[:, None]
 
-    def gather(self) -> None:
-        """End the pass, where processes share the work: the statistics are those of all rows from now on."""
-        if ranks.world_size() > 1:
-            both = ranks.gather((self._histogram, self._terms), "residuals")
-            self._histogram = np.sum([histogram for histogram, _ in both], axis=0)
-            self._terms = [sums for _, terms in both for sums in terms]
+    def for_worker(self) -> Reweighting:
+        """As `RowWeighting.for_worker`."""
+        return Reweighting(self.loss, self._parameters, self.scale)
+
+    def add(self, other: Reweighting) -> None:
+        """As `RowWeighting.add`."""
+        self._histogram += other._histogram
+        self._terms += other._terms
 
     @property
     def _sums(self) -> Array:

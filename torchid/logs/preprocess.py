@@ -121,27 +121,28 @@ def gapless_fields(log: Log, timeline: Timeline) -> list[str]:
     return [name for name in NAN_ALLOWED if getattr(log, name) is not None]
 
 
-def move_to_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Coverage]) -> Log:
+def move_to_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Coverage], is_part: bool = False) -> Log:
     """A log, or a part of one, preprocessed to a timeline.
 
     Args:
         log: the log.
         timeline: stamps of it and of the result.
         coverage: of fields that must have no gap.
+        is_part: which contacts are in the air is told by `contact_unloaded` alone.
 
     Raises:
         LogError: a joint's position jumps by a whole turn, or is not finite.
     """
     require_no_turns(log)
     with about_file(log.source):
-        return replace(log, **_fields_on_timeline(log, timeline, coverage))
+        fields = _fields_on_timeline(log, timeline, coverage)
+        readings = log.contact_unloaded if is_part else unloaded_readings(log)
+        return replace(log, **fields, contact_unloaded=None if readings is None else timeline.hold(readings))
 
 
 def _fields_on_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Coverage]) -> dict[str, Any]:
     """Fields that change in the preprocessed log."""
-    fields: dict[str, Any] = {
-        "time": timeline.stamps_of(log.time),
-    }
+    fields: dict[str, Any] = {"time": timeline.stamps_of(log.time)}
     fields |= _motion(log, timeline)
     for name in NAN_ALLOWED:
         if getattr(log, name) is not None:
@@ -154,8 +155,6 @@ def _fields_on_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Cov
     if log.contact_normal_world is not None:
         normals = timeline.hold(nearest_known(log.contact_normal_world))
         fields[NORMALS] = np.where(fields["contact_active"][..., None], normals, np.nan)
-    if (readings := unloaded_readings(log)) is not None:
-        fields["contact_unloaded"] = timeline.hold(readings)
     if timeline.bandwidth_hz is not None:
         fields["noise_bandwidth_hz"] = min(timeline.bandwidth_hz, log.noise_bandwidth_hz or np.inf)
     return fields

@@ -15,6 +15,7 @@ import torch
 from threadpoolctl import ThreadpoolController
 
 from torchid import ranks
+from torchid.copies import can_copy, share_between_copies
 from torchid.problem.contact_state import ContactState
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
@@ -26,10 +27,14 @@ Result = TypeVar("Result")
 ProgressCallback = Callable[[int], None]
 """Called with the number of samples, or of other steps, done since the last call."""
 
+_Chosen = tuple[Samples, ContactState, "slice | torch.Tensor"]  # samples of a log in a contact state, and which
+
 CHUNK = 4096
 """Samples per chunk: fewer lose to dispatch, and to workers' waits for Python's lock; more to memory traffic."""
 
 _LEAST, _EACH = 2048, 4  # samples per chunk where there are fewer chunks than so many for each worker
+_LET_GO = 4  # chunks of a worker, after which pages that samples are mapped to leave the memory of the process
+_WORTH_COPYING = 50_000  # samples of a pass: copies save 0.8 us of each on two cores, and take 15 to 30 ms to make
 _CHUNK_OF_GPU = 4 * CHUNK  # hides launches of some microseconds behind the work of each; not measured
 
 
@@ -64,21 +69,36 @@ def map_chunks(
     sizes = [_size(samples, index) for samples, _, index in tasks]
     ranks.require_same(hash(tuple((size, state) for size, (_, state, _) in zip(sizes, tasks, strict=True))), "logs")
     share = ranks.own_share(sizes)
-    report = None if progress is None else _ProgressOfAll(progress, sum(sizes), sum(sizes[share]))
+    own, done = tasks[share], sizes[share]
+    workers = min(workers, max(len(own), 1))  # to start a thread takes as long as a small chunk
+    copied = workers > 1 and sum(done) >= _WORTH_COPYING and can_copy()
+    reported = sum(done[::workers] if copied else done)
+    report = None if progress is None else _ProgressOfAll(progress, sum(sizes), reported)
 
-    def pieces(
-        part: Iterator[tuple[Samples, ContactState, slice | torch.Tensor]],
-    ) -> Iterator[tuple[Samples, ContactState]]:
-        chosen = ((samples[index], state) for samples, state, index in part)
-        for piece, state in upload(chosen, builder.device):
-            yield piece, state
-            if report is not None:
-                report(len(piece))
+    def run(part: Iterator[_Chosen], reporting: bool = True) -> Result:
+        return reduce(_pieces(part, builder.device, report if reporting else None))
 
-    results = run_in_workers(tasks[share], lambda part: reduce(pieces(part)), workers)
+    results = _run_in_copies(own, run, workers) if copied else run_in_workers(own, run, workers)
     if report is not None:
         report(0)
     return list(chain.from_iterable(ranks.gather(results, "chunks")))
+
+
+def _pieces(
+    tasks: Iterator[_Chosen], device: torch.device, report: ProgressCallback | None
+) -> Iterator[tuple[Samples, ContactState]]:
+    """The samples of some chunks on a device; says how many of them are done."""
+
+    def chosen() -> Iterator[tuple[Samples, ContactState]]:
+        for number, (samples, state, index) in enumerate(tasks, start=1):
+            yield samples[index], state
+            if samples.pages is not None and number % _LET_GO == 0:
+                samples.pages.let_go()
+
+    for piece, state in upload(chosen(), device):
+        yield piece, state
+        if report is not None:
+            report(len(piece))
 
 
 class _ProgressOfAll:
@@ -114,21 +134,33 @@ def chunks_by_state(
         workers: that take turns with the chunks of a state, of which each gets as many, unless there is but one.
     """
     active = samples.active.cpu().numpy()
-    packed = np.packbits(active, axis=1) if active.shape[1] else np.zeros((len(active), 1), np.uint8)
-    keys = packed.view(f"V{packed.shape[1]}")[:, 0]
-    unique_keys, first = np.unique(keys, return_index=True)
-    for key, sample in zip(unique_keys, first, strict=True):
-        count = -(-int(np.count_nonzero(keys == key)) // chunk)
+    starts, state_of_run = _runs(active)
+    lengths = np.diff(starts, append=len(active))
+    for number in range(state_of_run.max(initial=-1) + 1):
+        own = state_of_run == number
+        count = -(-int(lengths[own].sum()) // chunk)
         if count > 1:
             count = -(-count // workers) * workers
-        if len(unique_keys) == 1:
+        if own.all():
             ends = np.linspace(0, len(active), count + 1).astype(int).tolist()
             pieces: Iterable[slice | torch.Tensor] = (slice(*pair) for pair in pairwise(ends))
         else:
-            index = torch.from_numpy(np.flatnonzero(keys == key))
-            pieces = index.tensor_split(count)
+            pieces = torch.from_numpy(np.flatnonzero(np.repeat(own, lengths))).tensor_split(count)
+        state = tuple(active[starts[np.argmax(own)]].tolist())
         for piece in pieces:
-            yield tuple(active[sample].tolist()), piece
+            yield state, piece
+
+
+def _runs(active: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where contacts (N, C) change, the first sample included, and the number of the contact state from there on.
+
+    Few are sorted in place of all samples, of which a log may have millions.
+    """
+    packed = np.packbits(active, axis=1) if active.shape[1] else np.zeros((len(active), 1), np.uint8)
+    changes = np.flatnonzero((packed[1:] != packed[:-1]).any(axis=1)) + 1
+    starts = np.concatenate([np.arange(min(len(active), 1)), changes])
+    _, numbers = np.unique(packed[starts].view(f"V{packed.shape[1]}")[:, 0], return_inverse=True)
+    return starts, numbers
 
 
 def subsample_states(logs: Sequence[Samples], count: int) -> Iterator[tuple[Samples, ContactState, float]]:
@@ -165,12 +197,26 @@ def run_in_workers(tasks: Sequence[Task], run: Callable[[Iterator[Task]], Result
             stop.set()
             raise
 
-    workers = min(workers, max(len(tasks), 1))  # to start a thread takes as long as a small chunk
+    workers = min(workers, max(len(tasks), 1))
     with one_thread():
         if workers == 1:
             return [work(0)]
         with ThreadPoolExecutor(workers) as pool, stopping():
             return list(pool.map(work, range(workers)))
+
+
+def _run_in_copies(tasks: Sequence[Task], run: Callable[[Iterator[Task], bool], Result], workers: int) -> list[Result]:
+    """As `run_in_workers`, to the last bit, by this process, whose chunks are reported, and copies of it.
+
+    They wait for no lock of Python's: two take 7 to 10 % less time for a sample of a quadruped than two threads.
+    """
+
+    @torch.no_grad()
+    def work(first: int) -> Result:
+        return run(iter(tasks[first::workers]), first == 0)
+
+    with one_thread():
+        return share_between_copies(range(workers), work, workers)
 
 
 def chunk_size(device: torch.device) -> int:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
 
 import numpy as np
-from torch import Tensor
 
 from torchid import parameters, ranks
 from torchid.parameters import Array
@@ -16,7 +15,7 @@ from torchid.problem.chunks import ProgressCallback, chunks_by_state, map_chunks
 from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import PRIOR_DEVIATION, LinearProblem, TriangularFactor, parameter_scale
 from torchid.problem.noise_gram import ColumnPrior, NoiseGram, corrected_triangle, estimate_noise_gram
-from torchid.problem.row_compressor import RowCompressor
+from torchid.problem.row_compressor import RowCompressor, RowWeighting
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.problem.unloaded_sensors import unloaded_offset_equations
@@ -35,9 +34,6 @@ BLOCKS = 20
 _LEAST_PER_BLOCK = 10  # independent samples
 
 _MEMORY = 2**30  # [bytes] of factors
-RowWeighting = Callable[[Samples, tuple[int, ...], Tensor], Tensor]
-"""Square roots of the weights of rows, (M, 1), from samples, columns and rows (M, columns + 1)."""
-
 PartKey = tuple[str, ContactState, int, int, bool]  # source, state, fold, block, unloaded
 
 
@@ -88,9 +84,8 @@ def compress_by_state(
     progress: ProgressCallback | None = None,
 ) -> dict[ContactState, TriangularFactor]:
     """As `compress`, but with a factor for every contact state in the logs."""
-    parts = _merge_parts(
-        map_chunks(logs, builder, partial(_compress_chunks, builder, by_log=False), chunk, threads, progress)
-    )
+    reduce = partial(_compress_chunks, builder, by_log=False)
+    parts = _merge_parts(map_chunks(logs, builder, reduce, chunk, threads, progress))
     add_noise_gram(parts, estimate_noise_gram(logs, builder, lambda _, state: _key(None, state)))
     return {part.state: part.factor for part in parts}
 
@@ -109,10 +104,18 @@ def compress_parts(
     `weight_rows` weights all other rows before they are added; their factors then have no noise Gram matrix, see
     `add_noise_gram`.
     """
-    reduce = partial(_compress_chunks, builder, by_log=True, weight_rows=weight_rows)
-    parts = _merge_parts(map_chunks(logs, builder, reduce, chunk, threads, progress))
+
+    def reduce(chunks: Iterator[tuple[Samples, ContactState]]) -> tuple[list[Part], RowWeighting | None]:
+        weighting = None if weight_rows is None else weight_rows.for_worker()
+        return _compress_chunks(builder, chunks, by_log=True, weight_rows=weighting), weighting
+
+    done = map_chunks(logs, builder, reduce, chunk, threads, progress)
+    parts = _merge_parts(of_worker for of_worker, _ in done)
     if weight_rows is None:
         add_noise_gram(parts, noise_gram_by_part(logs, builder, progress))
+    else:
+        for _, weighting in done:
+            weight_rows.add(weighting)
     order = list(dict.fromkeys(samples.source for samples in logs))
     return sorted(parts, key=lambda part: order.index(part.source))
 
@@ -216,8 +219,7 @@ def add_noise_gram(parts: Sequence[Part], noise_gram: Mapping[PartKey, NoiseGram
 
 def compress_unloaded(logs: Sequence[Samples], builder: RowBuilder) -> list[Part]:
     """Those parts of `compress_parts` that are of readings in the air."""
-    reduce = partial(_compress_chunks, builder, by_log=True, loaded=False)
-    return _merge_parts(map_chunks(logs, builder, reduce))
+    return _merge_parts(map_chunks(logs, builder, partial(_compress_chunks, builder, by_log=True, loaded=False)))
 
 
 @one_thread()

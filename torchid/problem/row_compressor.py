@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, Protocol
 
 import numpy as np
 import scipy.linalg
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from torchid.parameters import Array
 from torchid.problem.linear import TriangularFactor, triangularize
+from torchid.problem.samples import Samples
 
 _UNIT = float(np.finfo(float).eps) / 2.0
 _SAME_LEVEL = 0.03
@@ -162,6 +164,19 @@ def _unit_columns(gram: Array) -> tuple[np.ndarray, Array]:
     seen = np.flatnonzero(np.diag(gram) > 0.0)
     size = np.sqrt(np.diag(gram)[seen])
     return seen, gram[np.ix_(seen, seen)] / size / size[:, None]
+
+
+class RowWeighting(Protocol):
+    """Weighs rows, and gathers of them what it needs."""
+
+    def __call__(self, samples: Samples, support: tuple[int, ...], rows: Tensor) -> Tensor:
+        """Square roots of the weights, (M, 1), of rows (M, columns + 1) of some samples in some columns."""
+
+    def for_worker(self) -> RowWeighting:
+        """The same, which has gathered nothing, for one worker; it pickles."""
+
+    def add(self, other: Any) -> None:
+        """Add what one for a worker has gathered."""
 
 
 class RowCompressor:
