@@ -37,6 +37,7 @@ _ANGULAR = DERIVATIVE_CHAINS[2]
 #: Norm of a filtered quaternion: below, the filter removes the rotation of the base.
 _MIN_QUATERNION_NORM = 0.5
 _LEAST_CHANGE = 1e-4  # of a tanh's argument over a step, across which its mean is its middle
+_DIRECTIONS_AT_ONCE = 2**15  # values of joints: temporaries stay small
 
 
 def preprocess(
@@ -218,12 +219,14 @@ def _direction(log: Log, smoothed: Mapping[str, FloatArray], timeline: Timeline)
     known = smoothed["joint_position"] if velocity is None else velocity
     steps, width = np.diff(timeline.grid), timeline.sign_width
     out = np.empty((len(timeline.output_stamps), known.shape[1]))
-    for column in range(known.shape[1]):  # one by one: temporaries stay small
-        x = known[:, column]
-        halfway = np.diff(x) / steps if velocity is None else 0.5 * (x[1:] + x[:-1])
-        before, after = np.append(halfway[:1], halfway), np.append(halfway, halfway[-1:])
+    together = max(1, _DIRECTIONS_AT_ONCE // max(len(known), 1))
+    for first in range(0, known.shape[1], together):
+        columns = slice(first, first + together)
+        x = known[:, columns]
+        halfway = np.diff(x, axis=0) / steps[:, None] if velocity is None else 0.5 * (x[1:] + x[:-1])
+        before, after = np.concatenate([halfway[:1], halfway]), np.concatenate([halfway, halfway[-1:]])
         sign = _mean_sign(before, after) if width is None else _mean_tanh(before / width, after / width)
-        out[:, column] = timeline.evaluate(timeline.low_pass(sign), (0,))[0]
+        out[:, columns] = timeline.evaluate(timeline.low_pass(sign), (0,))[0]
     return out
 
 
