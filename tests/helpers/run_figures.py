@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 FIGURES = ("draw_forces", "error_figure", "parameter_figure", "identifiability_figure", "contribution_figure")
 PAGE = "write_page"
-_MODULES = [import_module(f"torchid.commands.{name}") for name in ("results", "evaluate")]
+_MODULES = [import_module(f"torchid.commands.{name}") for name in ("results", "run_figures", "evaluate")]
 _DRAWN = [
     (module, name, vars(module)[name]) for module in _MODULES for name in (*FIGURES, PAGE) if name in vars(module)
 ]

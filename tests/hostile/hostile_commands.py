@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from torchid.cli import main
 names = ("draw_forces", "error_figure", "parameter_figure", "identifiability_figure", "contribution_figure", "tree_figure",
          "accuracy_figure")
-for module in (torchid.commands.results, torchid.commands.evaluate, torchid.commands.analyze):
+for module in (torchid.commands.run_figures, torchid.commands.evaluate, torchid.commands.analyze):
     for name in names:
         if hasattr(module, name):
             setattr(module, name, lambda *_, **__: Figure(figsize=(1.0, 1.0)))

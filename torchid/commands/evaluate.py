@@ -15,7 +15,8 @@ from rich.progress import Progress
 from torchid import ranks
 from torchid.commands.folder import EVALUATION, RUN, check_free, new_folder, refuse_link, write_json
 from torchid.commands.reading import LogReader
-from torchid.commands.results import Identification, draw_forces
+from torchid.commands.results import Identification
+from torchid.commands.run_figures import draw_forces
 from torchid.config import ExperimentConfig, load_config
 from torchid.errors import ConfigError, about_file, during, warn
 from torchid.fitting.calibration import Calibration, Comparison
