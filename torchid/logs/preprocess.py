@@ -37,7 +37,6 @@ _ANGULAR = DERIVATIVE_CHAINS[2]
 #: Norm of a filtered quaternion: below, the filter removes the rotation of the base.
 _MIN_QUATERNION_NORM = 0.5
 _LEAST_CHANGE = 1e-4  # of a tanh's argument over a step, across which its mean is its middle
-_DIRECTIONS_AT_ONCE = 2**15  # values of joints: temporaries stay small
 
 
 def preprocess(
@@ -219,14 +218,13 @@ def _direction(log: Log, smoothed: Mapping[str, FloatArray], timeline: Timeline)
     known = smoothed["joint_position"] if velocity is None else velocity
     steps, width = np.diff(timeline.grid), timeline.sign_width
     out = np.empty((len(timeline.output_stamps), known.shape[1]))
-    together = max(1, _DIRECTIONS_AT_ONCE // max(len(known), 1))
-    for first in range(0, known.shape[1], together):
-        columns = slice(first, first + together)
-        x = known[:, columns]
+    together = _channels_together(len(known))
+    for start in range(0, known.shape[1], together):
+        x = known[:, start : start + together]
         halfway = np.diff(x, axis=0) / steps[:, None] if velocity is None else 0.5 * (x[1:] + x[:-1])
         before, after = np.concatenate([halfway[:1], halfway]), np.concatenate([halfway, halfway[-1:]])
         sign = _mean_sign(before, after) if width is None else _mean_tanh(before / width, after / width)
-        out[:, columns] = timeline.evaluate(timeline.low_pass(sign), (0,))[0]
+        out[:, start : start + together] = timeline.evaluate(timeline.low_pass(sign), (0,))[0]
     return out
 
 
@@ -273,8 +271,14 @@ def _orientation(log: Log, derivatives: list[FloatArray], timeline: Timeline) ->
 
 # -------------------------------------------------------------------------------------------- fields that may have gaps
 
-#: Channels that are filtered together: few, so that copies are small compared with a long log.
-_CHANNELS_TOGETHER = 2
+#: Values that are filtered together: few, so that copies of a long log are small; many, so that a short one needs few
+#: calls.
+_VALUES_TOGETHER = 2**14
+
+
+def _channels_together(count: int) -> int:
+    """How many channels of so many samples are filtered by one call."""
+    return max(1, _VALUES_TOGETHER // max(count, 1))
 
 
 def _resample_measured(log: Log, name: str, timeline: Timeline, coverage: Coverage | None) -> FloatArray:
@@ -296,8 +300,9 @@ def _resample_measured(log: Log, name: str, timeline: Timeline, coverage: Covera
     flags = log.contact_active if name in CONTACT_READINGS else None
     complete = np.argwhere(coverage.complete)
     out = np.full((len(timeline.output_stamps), *values.shape[1:]), np.nan)
-    for start in range(0, len(complete), _CHANNELS_TOGETHER):
-        columns = (slice(None), *complete[start : start + _CHANNELS_TOGETHER].T)
+    together = _channels_together(len(values))
+    for start in range(0, len(complete), together):
+        columns = (slice(None), *complete[start : start + together].T)
         clean = values[columns]
         if flags is not None:
             clean[~flags[:, columns[1]]] = 0.0
