@@ -5,6 +5,7 @@ Whoever calls torchid as a library may have threads that a copy lacks: only the 
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import pickle
 import signal
@@ -139,6 +140,7 @@ def _call(work: Callable[[], T], results: Connection, sender: Connection) -> Non
     """Send what a function returns, or that it did not without a warning."""
     global _allowed
     _allowed = False
+    gc.freeze()  # to look for garbage among what the original has would copy all of it
     results.close()  # so that sending fails once the original has gone
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that waits, which ends this one
     signal.signal(signal.SIGTERM, signal.SIG_DFL)

@@ -14,7 +14,7 @@ FIGURES = (
     *("extra_figure", "ridge_figure", "tree_figure", "accuracy_figure"),
 )
 PAGE, EVENTS = "write_page", "write_events"
-_MODULES = [import_module(f"torchid.commands.{name}") for name in ("results", "evaluate", "analyze")]
+_MODULES = [import_module(f"torchid.commands.{name}") for name in ("results", "run_figures", "evaluate", "analyze")]
 _DRAWN = [
     (module, name, vars(module)[name])
     for module in _MODULES

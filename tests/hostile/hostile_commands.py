@@ -22,7 +22,7 @@ import torchid.commands.compress, torchid.commands.identify, torchid.estimators.
 import torchid.terminal.analysis, torchid.terminal.finished_runs, torchid.terminal.identification
 from matplotlib.figure import Figure
 from torchid.cli import main
-for module in (torchid.commands.results, torchid.commands.evaluate, torchid.commands.analyze):
+for module in (torchid.commands.run_figures, torchid.commands.evaluate, torchid.commands.analyze):
     for name in FIGURES:
         if hasattr(module, name):
             setattr(module, name, lambda *_, **__: Figure(figsize=(1.0, 1.0)))

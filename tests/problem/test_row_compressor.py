@@ -41,6 +41,12 @@ KINDS = {"well conditioned": well_conditioned, "nearly dependent": nearly_depend
 kinds = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 
 
+@pytest.fixture(autouse=True)
+def combined_columns_of_short_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Chunks of these tests are so short that they would be factorized."""
+    monkeypatch.setattr(module, "_LEAST_ROWS", 0)
+
+
 def with_room(rows: Array) -> Tensor:
     """Rows with room above them, for `RowCompressor.add`."""
     stacked = torch.full((COLUMNS + 1, COLUMNS + 1 + len(rows)), torch.nan, dtype=torch.float64).T
@@ -182,3 +188,20 @@ def test_a_factor_is_the_same_to_the_last_bit_whatever_was_compressed_before() -
             own.add(target, tuple(range(COLUMNS)), with_room(rows))
     own.finish()
     assert torch.equal(factor.triangle(), alone.triangle())
+
+
+def test_columns_are_combined_once_a_chunk_has_many_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of few rows, Householder QR is faster."""
+    chunks, support = exact_rows(well_conditioned, 3), tuple(range(COLUMNS))
+    monkeypatch.setattr(module, "_LEAST_ROWS", 301)
+    factor, compressor = TriangularFactor(COLUMNS), RowCompressor()
+    compressor.add(factor, support, with_room(chunks[0]))
+    assert support in factor.blocks
+    factorized = factor.blocks[support].clone()
+    for rows in (np.vstack(chunks[1:]), chunks[0]):
+        compressor.add(factor, support, with_room(rows))
+        assert torch.equal(factor.blocks[support], factorized)
+    compressor.finish()
+    rows = np.vstack([*chunks, chunks[0]])
+    assert factor.rows == len(rows)
+    assert relative_difference(factor.triangle().numpy(), rows) < 1e-12

@@ -16,7 +16,8 @@ from rich.progress import Progress
 from torchid import ranks
 from torchid.commands.folder import EVALUATION, RUN, check_free, new_folder, refuse_link, write_json
 from torchid.commands.reading import LogReader
-from torchid.commands.results import Identification, draw_forces
+from torchid.commands.results import Identification
+from torchid.commands.run_figures import draw_forces
 from torchid.config import load_config
 from torchid.config.sensors import NoiseConfig
 from torchid.errors import ConfigError, about_file, during, warn

@@ -20,6 +20,7 @@ from torchid.commands.folder import RUN, check_free, claim_folder
 from torchid.commands.plausibility import TrainingLogs, require_not_worse, require_plausible
 from torchid.commands.reading import LogReader, check_parts
 from torchid.commands.results import Identification, write_run
+from torchid.commands.run_figures import Drawing, drawing, fit_figures
 from torchid.commands.training import Training, descent_settings, require_trainable, training_folder
 from torchid.config import ExperimentConfig, inputs_of
 from torchid.errors import NumericalWarning, format_count, warn_about_file
@@ -74,10 +75,10 @@ def identify(config: ExperimentConfig, resume: bool = False) -> Identification:
 
         ranks.from_first(claim, "output")
         bars = stack.enter_context(progress_bars())
-        run, training = _identify(config, resume, bars)
+        run, training, begun = _identify(config, resume, bars, stack)
         if output is not None:
             bars.add_task("writing", total=None)
-            ranks.from_first(partial(write_run, run, output, config.overwrite, training), "run folder")
+            ranks.from_first(partial(write_run, run, output, config.overwrite, training, begun), "run folder")
     return run
 
 
@@ -189,8 +190,10 @@ def _solved(ready: _Prepared, evaluation: Evaluation, checked: TrainingLogs, bar
     return _Solved(fit, robust, training, mass)
 
 
-def _identify(config: ExperimentConfig, resume: bool, bars: Progress) -> tuple[Identification, Training | None]:
-    """What the logs say, and how it was trained, if so."""
+def _identify(
+    config: ExperimentConfig, resume: bool, bars: Progress, stack: ExitStack
+) -> tuple[Identification, Training | None, Drawing | None]:
+    """What the logs say, how it was trained, if so, and figures of it that are drawn until the stack is left."""
     clock = Clock()
     ready = _prepare(config, clock, bars)
     experiment, fitter, logs, blocks = ready.experiment, ready.fitter, ready.logs, ready.blocks
@@ -200,6 +203,8 @@ def _identify(config: ExperimentConfig, resume: bool, bars: Progress) -> tuple[I
         solved = _solved(ready, evaluation, checked, bars, resume)
         fit, ready.parts = solved.fit, []
         estimate, problem = fit.estimate, fit.assembly.problem
+        figures = fit_figures(experiment.robot, estimate, fit.extras, ready.ridge)
+        begun = stack.enter_context(drawing(figures, experiment.config, spared=1)) if config.output else None
     with clock("identifiability"):
         whole = merge_folds(_with_states(fit.parts, ready.factors), builder)
         alone = _by_state(fitter, whole)
@@ -244,7 +249,7 @@ def _identify(config: ExperimentConfig, resume: bool, bars: Progress) -> tuple[I
     logs.clear()  # checks of a log and figures need room, too
     ready.blocks = blocks = []
     require_not_worse(run.worse, checked)
-    return run, solved.training
+    return run, solved.training, begun
 
 
 def _read(reader: LogReader, experiment: Experiment, bars: Progress) -> dict[str, list[Samples]]:

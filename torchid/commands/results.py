@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,9 +16,9 @@ from torchid.commands.events import write_events
 from torchid.commands.folder import RUN, check_free, check_free_file, new_folder, write_json
 from torchid.commands.named_results import BodyEstimate, ParameterTable, body_estimate, parameter_table, run_lines
 from torchid.commands.report import DATA, report_document, write_page
+from torchid.commands.run_figures import Drawing, all_figures, drawing, write_figures
 from torchid.commands.training import Training, body_eigenvalues
 from torchid.config import dump_config, inputs_of
-from torchid.copies import in_copies
 from torchid.errors import during
 from torchid.estimators import ConstrainedEstimate, Estimate, Violation
 from torchid.fitting.calibration import Comparison, list_confounded
@@ -34,23 +33,17 @@ from torchid.identifiability.base_parameters import StateReport
 from torchid.identifiability.confounding import ExtraEstimate, TotalMass
 from torchid.identifiability.contributions import Contributions
 from torchid.logs.containers import atomic_output
-from torchid.logs.time_range import log_title
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Metrics
-from torchid.problem.chunks import thread_count
 from torchid.problem.metrics import LOG_SETS, WorseThanNominal, describe_worse, worse_than_nominal
 from torchid.problem.noise_gram import NoiseShares
 from torchid.problem.noise_groups import NoiseGroups
 from torchid.report import FittedJoints, identified_name, identified_robot, identified_urdf, parameters_document
-from torchid.report.figure_style import Drawn, draw_for
-from torchid.report.figures import contribution_figure, error_figure, identifiability_figure, ridge_figure
-from torchid.report.forces import ForceSeries, force_figure
-from torchid.report.parameter_figures import extra_figure, parameter_figure
+from torchid.report.forces import ForceSeries
 from torchid.report.traces import LogForces
-from torchid.robot import Robot
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 HELD_OUT = "blocks left out of the fit"
 """Name of the training samples that cross-validation predicts, in messages."""
@@ -195,7 +188,13 @@ class Identification:
         return self.estimate.phi.reshape(-1, PER_BODY)
 
 
-def write_run(run: Identification, output: Path, overwrite: bool = False, training: Training | None = None) -> None:
+def write_run(
+    run: Identification,
+    output: Path,
+    overwrite: bool = False,
+    training: Training | None = None,
+    begun: Drawing | None = None,
+) -> None:
     """Write the run folder.
 
     Args:
@@ -203,13 +202,18 @@ def write_run(run: Identification, output: Path, overwrite: bool = False, traini
         output: the folder.
         overwrite: whether a run that stands there may be replaced.
         training: whose curves go into the folder, and whose checkpoint is then no longer needed.
+        begun: figures that are being drawn.
 
     Raises:
         ConfigError: the folder exists and may not be replaced.
     """
     config, robot = replace(run.experiment.config, output=output), run.experiment.robot
     run = replace(run, experiment=replace(run.experiment, config=config))
-    with during("writing", output), new_folder(output, overwrite) as folder, _drawing(run, folder) as drawn:
+    figures, begun = all_figures(run), begun or Drawing()
+    left = [name for name in figures if name not in begun.names]
+    left.sort(key=lambda name: name != "errors")  # of two copies one draws forces, which take longest, alone
+    rest = {name: figures[name] for name in left}
+    with during("writing", output), new_folder(output, overwrite) as folder, drawing(rest, config) as others:
         (folder / "config.yaml").write_text(dump_config(config))
         write_json(folder / "parameters.json", parameters_document(robot, run.estimate, run.by_state, run.extras))
         write_json(folder / "metrics.json", _metrics_document(run))
@@ -219,54 +223,9 @@ def write_run(run: Identification, output: Path, overwrite: bool = False, traini
         write_page(folder, output)
         if training is not None:
             training.copy_curves(folder)
-        write_events(run, folder, partial(_write_figures, drawn))
+        write_events(run, folder, lambda: write_figures(folder, config.figures.format, figures, (begun, others)))
     if training is not None:
         training.remove_checkpoint()
-
-
-def _figures(run: Identification) -> dict[str, Callable[[], Figure]]:
-    """What makes the figures of a run, by name, in the order in which they are to be seen."""
-    robot, estimate = run.experiment.robot, run.estimate
-    bodies = robot.body_names
-    figures: dict[str, Callable[[], Figure]] = {}
-    if run.forces is not None:
-        figures["forces"] = partial(draw_forces, run.forces, robot)
-    figures["errors"] = partial(error_figure, run.metrics, robot.format)
-    kinds = _joint_kinds(robot)
-    figures["parameters"] = partial(parameter_figure, bodies, robot.nominal, estimate, kinds, robot.format)
-    figures["identifiability"] = partial(identifiability_figure, bodies, estimate)
-    figures["contributions"] = partial(contribution_figure, _bits(run.contributions))
-    if run.extras:
-        figures["extras"] = partial(extra_figure, run.extras)
-    if run.ridge is not None:
-        figures["ridge"] = partial(ridge_figure, run.ridge, robot.format)
-    return figures
-
-
-@contextmanager
-def _drawing(run: Identification, folder: Path) -> Iterator[Callable[[], dict[Path, Drawn]]]:
-    """Copies of this process that draw figures for files in a folder; what is yielded waits for them."""
-    form = run.experiment.config.figures.format
-    files = [(folder / f"{name}.{form}", make) for name, make in _figures(run).items()]
-    with in_copies(files, lambda file: draw_for(*file), thread_count()) as drawn:
-        yield lambda: dict(zip((path for path, _ in files), drawn(), strict=True))
-
-
-def _write_figures(drawn: Callable[[], Mapping[Path, Drawn]]) -> dict[str, bytes]:
-    """Write figures to their files once they are drawn; PNG by name."""
-    done = drawn()
-    for path, figure in done.items():
-        path.write_bytes(figure.file)
-    return {path.stem: figure.png for path, figure in done.items()}
-
-
-def _joint_kinds(robot: Robot) -> set[str]:
-    return {body.joint.kind for body in robot.bodies if body.joint is not None}
-
-
-def draw_forces(series: ForceSeries, robot: Robot) -> Figure:
-    """The figure of forces of a log's first samples."""
-    return force_figure(series, robot.dof_names, robot.base_rows, robot.sliding, robot.format)
 
 
 def _metrics_document(run: Identification) -> dict[str, object]:
@@ -356,15 +315,6 @@ def _identifiability_document(run: Identification) -> dict[str, object]:
         "verdicts": estimate.verdict_counts(),
         "logs": [asdict(log) for log in contributions.logs],
         "sensors": [asdict(sensor) for sensor in contributions.sensors],
-    }
-
-
-def _bits(contributions: Contributions) -> dict[str, list[tuple[str, float]]]:
-    """Names and bits, by kind."""
-    return {
-        "logs": [(log_title(log.name), log.bits) for log in contributions.logs],
-        "contact states": [(state.name, state.bits) for state in contributions.states],
-        "sensors": [(sensor.name, sensor.bits) for sensor in contributions.sensors],
     }
 
 

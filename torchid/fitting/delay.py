@@ -32,6 +32,7 @@ _WIDE, _NARROW = 24, 16  # delays whose torques make up those of all between: 80
 _SAME = 1e-5  # [s]: scales of torques are those of torques that are as near as this
 _RIDGE = 1e-6  # the residual is smooth in the delay where the data determine some parameters badly
 _STEPS, _SETTLED = 8, 1e-2  # Gauss-Newton steps, and standard errors below which one ends them
+_SHRINKING = 0.8  # ratio of two steps below which their series is trusted to go on
 _QUANTILE = 1.96  # standard errors from the middle to the end of a 95 % interval
 
 
@@ -182,13 +183,21 @@ class _Delays:
         return self.with_delay.fit([self._of(part, delay, True) for part in self.parts])
 
     def best(self, delay: float) -> float:
-        """The delay that leaves least, between the ends, by steps from one [s]."""
+        """The delay that leaves least, between the ends, by steps from one [s].
+
+        Two that shrink begin a geometric series, to whose end the third goes (Aitken).
+        """
+        before = 0.0
         for _ in range(_STEPS):
             term = self.term(self.fit(delay))
             step = float(np.clip(delay + term.value, *self.ends)) - delay
             delay += step
             if not np.isfinite(term.standard_error) or abs(step) <= _SETTLED * term.standard_error:
                 break
+            ratio = step / before if before else 0.0
+            if 0.0 < ratio < _SHRINKING:
+                delay, step = float(np.clip(delay + step * ratio / (1.0 - ratio), *self.ends)), 0.0
+            before = step
         return delay
 
     @staticmethod

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from scipy.optimize import minimize, minimize_scalar
 
 from torchid.copies import share_between_copies
@@ -16,7 +17,7 @@ from torchid.errors import warn
 from torchid.estimators import LeastSquares
 from torchid.fitting.fit import LogFitter
 from torchid.parameters import Array
-from torchid.problem import Samples, compress_parts
+from torchid.problem import RowBuilder, Samples, compress_parts
 from torchid.problem.chunks import thread_count
 from torchid.problem.sampled_rows import SampledRows
 
@@ -67,10 +68,19 @@ def choose_sign_width(
             the sign.
     """
     found: dict[float | None, float] = {}
+    of_one: list[SampledRows] = []  # rows of the logs with a direction of 1, from which those of any others follow
+
+    def sampled(logs: Sequence[Samples], builder: RowBuilder) -> SampledRows:
+        if any(extra.what == "asymmetric_coulomb" for extra in builder.extras):  # its columns depend on the width, too
+            return SampledRows(logs, builder, _AT_ONCE)
+        if not of_one:
+            ones = [replace(log, direction=torch.ones_like(log.joint_velocity)) for log in logs]
+            of_one.append(SampledRows(ones, builder, _AT_ONCE))
+        return of_one[0].with_directions(logs, builder)
 
     def left(width: float | None) -> float:
         logs, fitter = logs_and_fitter(width)
-        rows = SampledRows(logs, fitter.builder, _AT_ONCE)
+        rows = sampled(logs, fitter.builder)
         estimator = LeastSquares(rank_tolerance=fitter.estimator.rank_tolerance)
         problem = fitter.build_problem(rows.compress(np.ones(len(rows.groups)))).assembly.problem
         return estimator.solve(problem).residual_std

@@ -35,6 +35,7 @@ _CERTIFIED = (16.0 * _LEAST_EIGENVALUE, 4.0 * _LEAST_EIGENVALUE, _LEAST_EIGENVAL
 """What the least eigenvalue is shown to be: the larger, the later it is looked at again."""
 
 _ROWS_PER_COLUMN = 3  # of the sample of a chunk that its columns are combined by
+_LEAST_ROWS = 2000  # of a chunk that columns are combined for: of fewer, that takes longer than Householder QR of them
 
 
 @dataclass(frozen=True)
@@ -185,7 +186,7 @@ class RowCompressor:
     A Gram matrix takes a third of the time of Householder QR, but squares the condition number, which costs half of the
     digits. Here it is one of combined columns (`ColumnLevels`), whose condition is small whatever that of the rows, and
     it is used only if its least eigenvalue shows that it is as good as QR; rows of which it is not are factorized, and
-    columns then combined anew. On a GPU, and in single precision, all are factorized.
+    columns then combined anew. Few rows, and all on a GPU and in single precision, are factorized.
     """
 
     def __init__(self) -> None:
@@ -211,11 +212,13 @@ class RowCompressor:
             self._factor = factor
         room = stacked.shape[1]
         count = stacked.shape[0] - room
-        if stacked.device.type != "cpu" or stacked.dtype != torch.float64 or count < _ROWS_PER_COLUMN * room:
+        known = self._sums.get(support)
+        least = _ROWS_PER_COLUMN * room if known else max(_LEAST_ROWS, _ROWS_PER_COLUMN * room)
+        if stacked.device.type != "cpu" or stacked.dtype != torch.float64 or count < least:
             factor.add_in_place(support, stacked, oversampling)
             return
         X = stacked.numpy()[room:].T
-        known = self._sums.get(support) or self._start(support, X)
+        known = known or self._start(support, X)
         if known is None:
             factor.add_in_place(support, stacked, oversampling)
             return

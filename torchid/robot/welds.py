@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from torchid.errors import ConfigError, UnknownNameError, join_names
-from torchid.robot.tree import joint_origin, joint_transform, resolve_mimics
-from torchid.robot.urdf import MOVING_TYPES, TreeJoint, position_limits
+from torchid.robot.tree import joint_transform, resolve_mimics
+from torchid.robot.urdf import MOVING_TYPES, position_limits
+from torchid.robot.urdf_elements import TreeJoint
 
 WELD_FIELD = "robot.weld"
 
@@ -104,7 +105,7 @@ def weld_joints(joints: Sequence[TreeJoint], positions: Mapping[str, float]) -> 
     """The joints, those with a position fixed there."""
 
     def welded(joint: TreeJoint) -> TreeJoint:
-        origin = joint_origin(joint) @ joint_transform(joint, positions[joint.name])
+        origin = joint.origin @ joint_transform(joint.type, joint.axis, positions[joint.name])
         changes: dict[str, Any] = {"type": "fixed", "mimic": None, "origin": origin}
         return replace(joint, **changes)
 

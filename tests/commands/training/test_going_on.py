@@ -180,11 +180,11 @@ def test_custom_charts_show_training_and_unseen_logs_together(run: Path) -> None
 SERVER = """
 import os, sys, time
 from matplotlib.figure import Figure
-import torchid.commands.results as results
+import torchid.commands.run_figures as run_figures
 from torchid.cli import main
 from torchid.estimators import Trainer
 for name in {figures}:
-    setattr(results, name, lambda *_: Figure())
+    setattr(run_figures, name, lambda *_: Figure())
 plain = Trainer.run_epoch
 Trainer.run_epoch = lambda trainer: time.sleep(0.03) or plain(trainer)  # or a fast machine is done before it is killed
 print("ready", flush=True)
