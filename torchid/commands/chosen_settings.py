@@ -27,6 +27,7 @@ from torchid.logs import Log
 from torchid.logs.cutoff import CutoffChoice, choose_cutoff
 from torchid.logs.log import FloatArray
 from torchid.logs.preprocess import directions, lacks_derivatives, make_timeline
+from torchid.logs.sign_filter import with_sign_filter
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.compressed_log import Block
 from torchid.problem.compression import Part
@@ -205,6 +206,7 @@ class WidthReader(LogReader):
             rates = settings.filter_hz, settings.sample_rate_hz
             with about_file(log.source):
                 timeline = make_timeline(clean.time, lacks_derivatives(clean), *rates)
-            by_width = (lambda _: None) if timeline is None else directions(clean, timeline)
+            filtered = timeline and with_sign_filter(timeline, clean)
+            by_width = (lambda _: None) if filtered is None else directions(clean, filtered)
             self._directions[log.source] = _Directions(log.time, joint_order(log, self.scene.robot), by_width)
         return log

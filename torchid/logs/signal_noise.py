@@ -124,6 +124,12 @@ def white_noise(time: FloatArray, values: FloatArray) -> FloatArray:
     return np.where(is_noise, lower, 0.0)
 
 
+def rough_noise(values: FloatArray) -> FloatArray:
+    """Standard deviation of whatever is not smooth from sample to sample in even channels (N, c), (c,)."""
+    differences = np.diff(values, n=_ORDERS[0], axis=0) / np.sqrt(comb(2 * _ORDERS[0], _ORDERS[0]))
+    return np.asarray(differences.std(axis=0))
+
+
 def _left_by_differences(values: FloatArray, order: int) -> FloatArray:
     differences = np.diff(values, n=order, axis=0) / np.sqrt(comb(2 * order, order))
     off = np.abs(differences - np.median(differences, axis=0))
