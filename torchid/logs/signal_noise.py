@@ -156,7 +156,8 @@ _NAMED = 4
 _DERIVATIVES = {
     "joint_acceleration": (("joint_velocity", 1), ("joint_position", 2)),
     "imu_angular_acceleration": (("imu_angular_velocity", 1),),
-    "base_angular_acceleration_base": (("base_angular_velocity_base", 1),),
+    "base_angular_acceleration_base": (("base_angular_velocity_base", 1), (_ORIENTATION, 2)),
+    "base_linear_acceleration_world": (("base_linear_velocity_world", 1), ("base_position_world", 2)),
 }
 _AXES = ("x", "y", "z")
 
@@ -197,7 +198,8 @@ def _noise_shares(log: Log, preprocessed: Log, noise: SignalNoise) -> Iterator[t
     """Channels of accelerations with much noise: its share of the variance, and the number of derivatives."""
     for name, sources in _DERIVATIVES.items():
         derived: FloatArray | None = getattr(preprocessed, name)
-        if getattr(log, name) is not None or derived is None:
+        unused = name.startswith("base_") and log.imu_specific_force is not None
+        if getattr(log, name) is not None or derived is None or unused:
             continue
         source, order = next(((field, order) for field, order in sources if getattr(log, field) is not None), ("", 0))
         if source not in noise.std:
