@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from torchid.errors import TorchidWarning
 from torchid.logs import Log
 from torchid.logs.log import FloatArray
 from torchid.logs.preprocess import lacks_derivatives, make_timeline, move_to_timeline, preprocess
@@ -52,7 +53,8 @@ def test_friction_reverses_as_often_as_the_joint_and_not_as_its_filtered_velocit
     timeline = timeline_of(log)
     assert timeline.low_pass is not None
     true = timeline.low_pass(np.sign(velocity))[timeline.kept]
-    found = preprocess(log, CUTOFF).joint_direction
+    with pytest.warns(TorchidWarning, match=r"joints move faster .* [34]\d % .*\.cutoff_hz of (40|80|160) or more"):
+        found = preprocess(log, CUTOFF).joint_direction
     alone = move_to_timeline(log, timeline, {}).joint_direction  # of velocities behind the timeline's own filter
     assert found is not None
     assert alone is not None
@@ -77,7 +79,8 @@ def test_steps_of_an_encoder_are_no_vibration() -> None:
 
 def test_parts_of_a_log_have_the_directions_of_the_whole() -> None:
     log, _ = recorded(0.8, velocity_noise=0.02)
-    timeline = with_sign_filter(timeline_of(log), log)
+    with pytest.warns(TorchidWarning, match="joints move faster"):
+        timeline = with_sign_filter(timeline_of(log), log)
     assert timeline.sign_low_pass is not None
     whole = move_to_timeline(log, timeline, {}).joint_direction
     samples, part = timeline.part(2000, 2600)

@@ -6,26 +6,62 @@ sign comes out too large. The sign needs no derivative, so that it bears more of
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from torchid.errors import about_file, warn_about_file
 from torchid.logs.log import FloatArray, Log
 from torchid.logs.low_pass import LowPass
 from torchid.logs.signal_noise import MOST_SAMPLES, rough_noise
 from torchid.logs.timeline import JITTER, Timeline, spline_derivatives
 
 _FEWEST = 100  # samples
+_DOUBLINGS = 8  # of the cutoff
+_MUCH = 0.05  # share of the velocities' power that is worth a warning
 _WIDEST = 0.4  # largest cutoff over the sample rate
 _EVIDENT = 0.01  # share of the velocities' power by which the error must fall: less is a few per cent of the reversals
 
 
 def with_sign_filter(timeline: Timeline, log: Log) -> Timeline:
-    """A timeline of a log, or of one whose start this is, with the filter of `wider_low_pass`."""
-    return replace(timeline, sign_low_pass=wider_low_pass(log, timeline))
+    """A timeline of a log, or of one whose start this is, with the filter of `wider_low_pass`.
+
+    Warns:
+        TorchidWarning: the timeline's own filter takes off much of the joints' motion.
+    """
+    wider = wider_low_pass(log, timeline)
+    if wider is None:
+        return timeline
+    if wider.lost > _MUCH:
+        with about_file(log.source):
+            warn_about_file(f"joints move faster than the filter lets through: {wider}")
+    return replace(timeline, sign_low_pass=wider.low_pass)
 
 
-def wider_low_pass(log: Log, timeline: Timeline) -> LowPass | None:
+@dataclass(frozen=True)
+class WiderLowPass:
+    """A filter that leaves velocities a smaller error than that of a timeline.
+
+    Attributes:
+        low_pass: the filter.
+        cutoff_hz: of it [Hz].
+        lost: by how much the error is smaller, as a share of the velocities' power.
+    """
+
+    low_pass: LowPass
+    cutoff_hz: float
+    lost: float
+
+    def __str__(self) -> str:
+        """What is lost, what follows and what helps."""
+        return (
+            f"{100.0 * self.lost:.0f} % of the power of their velocities is taken off, with whose squares forces go;"
+            " parameters may be off by more than their standard errors; accepted: preprocessing.cutoff_hz of"
+            f" {self.cutoff_hz:.3g} or more"
+        )
+
+
+def wider_low_pass(log: Log, timeline: Timeline) -> WiderLowPass | None:
     """The filter of velocities that leaves their least error, of motion that is lost and noise that is left together.
 
     None for that of the timeline, unless a wider one is clearly better.
@@ -53,13 +89,14 @@ def wider_low_pass(log: Log, timeline: Timeline) -> LowPass | None:
     if name == "joint_position":
         values = np.diff(values, axis=0) / step
         correlation = correlation[0] / step**2 * np.array([2.0, -1.0])
-    candidates = [low_pass]
-    while (cutoff := 2.0 * cutoff) < _WIDEST / step:
-        candidates.append(LowPass.butterworth(cutoff, step))
-    errors = [_error(one, values, correlation) for one in candidates]
-    best = int(np.argmin(errors))
+    cutoffs = [cutoff * 2.0**k for k in range(1, _DOUBLINGS) if cutoff * 2.0**k < _WIDEST / step]
+    wider = [LowPass.butterworth(one, step) for one in cutoffs]
+    first, *errors = (_error(one, values, correlation) for one in [low_pass, *wider])
     power = float(np.square(values).mean(axis=0).sum())
-    return candidates[best] if errors[0] - errors[best] > _EVIDENT * power else None
+    best = int(np.argmin([first, *errors])) - 1
+    if best < 0 or first - errors[best] <= _EVIDENT * power:
+        return None
+    return WiderLowPass(wider[best], cutoffs[best], (first - errors[best]) / power)
 
 
 def _error(low_pass: LowPass, values: FloatArray, correlation: FloatArray) -> float:
