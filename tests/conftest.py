@@ -14,7 +14,7 @@ import pytest
 from demo import shortened_demo
 from hostile_commands import Commands, commands
 from made_once import made_once
-from run_figures import draw, draw_nothing
+from run_figures import EVENTS, draw, draw_nothing
 from synthetic import load
 
 import torchid
@@ -44,7 +44,7 @@ def _elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def _drawing_nothing() -> Iterator[None]:
-    """Of the figures of a run a test sees white ones, unless it asks for `figures`."""
+    """Of the figures of a run a test sees white ones, of events none, unless it asks for `figures` or `events`."""
     with pytest.MonkeyPatch.context() as monkeypatch:
         draw_nothing(monkeypatch)
         yield
@@ -54,6 +54,14 @@ def _drawing_nothing() -> Iterator[None]:
 def figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Runs draw what a user sees."""
     draw(monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def events() -> Iterator[None]:
+    """Runs of this file write what TensorBoard shows."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        draw(monkeypatch, (EVENTS,))
+        yield
 
 
 @pytest.fixture(scope="module")

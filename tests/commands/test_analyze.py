@@ -284,9 +284,7 @@ def test_a_key_of_another_estimator_is_refused_without_logs_too(
     assert "estimator.com_inside" in refusal(["analyze", str(file)], experiment, capsys)
 
 
-def test_a_bolted_robot_cannot_lose_its_base_and_is_told_so(
-    experiment: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_bolted_robot_cannot_lose_its_base(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
     robot = {"urdf": str(experiment / "quadruped.urdf"), "fixed_base": True}
     file = asked(experiment, robot=robot, analysis={"criterion": "per_sample"})
     assert "accepted: stack" in refusal(["analyze", str(file)], experiment, capsys)
@@ -350,6 +348,7 @@ WELDS = tuple(f"{leg}_sole" for leg in LEGS)
 
 
 @pytest.mark.filterwarnings("ignore::torchid.errors.MasslessBodyWarning")
+@pytest.mark.usefixtures("figures")
 def test_sensors_in_limbs_are_planned_named_and_drawn(experiment: Path) -> None:
     """A dear knee: a three-axis reading of the lower leg's weld takes its place, and the proposal is checked."""
     file = asked(

@@ -16,14 +16,13 @@ import numpy as np
 import pytest
 import yaml
 from demo import shortened_demo
-from large import experiment, overrides, recorded
+from run_folders import keys_in
 from thinned import slow_but
 from trainings import trust_new_files
 
 from torchid.cli import main
 from torchid.commands.cache import FOLDER, content_key
 from torchid.commands.cache_entries import NOT_IN_SAMPLES, content_of_scene, factors_key
-from torchid.commands.cached_reading import CachedReader, open_cache
 from torchid.commands.reading import LogReader
 from torchid.config import load_config
 from torchid.config.experiment import ActuatorsConfig
@@ -37,15 +36,15 @@ from torchid.logs.signal_noise import STATED_FIELDS
 from torchid.problem.compression import split_into_folds
 
 NONE = "preprocessing.cache_gb=0"
+OFFSETS = ("sensors.set=full", "sensors.offsets={contact_force: log}")
 SGD = "estimator={name: sgd, ridge: 0.1, training: {epochs: 2, batch_size: 64}}"
 ESTIMATORS = {
     "least squares": ("estimator.ridge=0.01", "preprocessing.cutoff_hz=8"),
-    "auto": ("estimator.ridge=auto", "preprocessing.cutoff_hz=20"),
+    "auto, in blocks": ("estimator.ridge=auto", "preprocessing.cutoff_hz=20", "preprocessing.memory_gb=0.0001"),
     "consistent": ("estimator.name=consistent",),
     "offsets": ("sensors={set: full, offsets: {contact_force: log}}", "preprocessing.contact_margin_s=0.01"),
     "robust": ("estimator.robust=huber", "actuators.armature=true"),
     "descent": (SGD,),
-    "block by block": ("preprocessing.memory_gb=0.0001",),
 }
 
 
@@ -76,10 +75,6 @@ def results(run: Path) -> dict[str, Any]:
     config = yaml.safe_load((run / "config.yaml").read_text())
     del config["preprocessing"]["cache_gb"], config["output"], config["overwrite"]
     return out | {"config": config, "metrics": json.loads((run / "metrics.json").read_text()) | {"seconds": None}}
-
-
-def keys_in(folder: Path) -> set[str]:
-    return {path.name for path in (folder / FOLDER).iterdir() if path.is_dir()}
 
 
 @pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
@@ -200,15 +195,9 @@ def test_sensors_estimators_and_extra_parameters_leave_the_name_of_samples(demo:
     assert content(demo) == content(demo, *more)
 
 
-@pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
-def test_offsets_of_contacts_need_samples_with_readings_in_the_air(demo: Path, tmp_path: Path) -> None:
-    offsets = ("sensors.set=full", "sensors.offsets={contact_force: log}")
-    assert content(demo, *offsets) != content(demo)
+def test_offsets_of_contacts_need_samples_of_another_name(demo: Path) -> None:
+    assert content(demo, *OFFSETS) != content(demo)
     assert content(demo, "sensors.offsets={joint_torque: log}") == content(demo)
-    assert main(["identify", str(demo), *offsets, f"output={tmp_path / 'without'}", NONE]) == 0
-    for name, more in (("plain", ()), ("with", offsets)):
-        assert main(["identify", str(demo), *more, f"output={tmp_path / name}"]) == 0
-    assert results(tmp_path / "with") == results(tmp_path / "without")
 
 
 def test_noise_sensors_extras_and_folds_change_the_name_of_factors(demo: Path, tmp_path: Path) -> None:
@@ -263,72 +252,6 @@ def test_a_log_with_other_content_is_read_whatever_its_size_and_time_say(
     assert results(tmp_path / "after") == results(tmp_path / "without") != results(tmp_path / "before")
 
 
-# ------------------------------------------------------------------------------------------------ what reading said
-
-
-def read_twice(file: Path, *more: str) -> list[tuple[list[str], dict[str, int], int]]:
-    """What is said, what is excluded and how many samples there are, when logs are read without a cache, then twice."""
-    out = []
-    for cached in (False, True, True):
-        scene = set_up(load_config(file, more))
-        cache = open_cache(scene)
-        assert cache is not None
-        reader = CachedReader(scene, cache) if cached else LogReader(scene)
-        with pytest.warns(TorchidWarning) as said:
-            logs = reader.read(scene.config.logs.train, scene.sensors)
-        out.append(([str(x.message) for x in said], dict(reader.excluded), sum(map(len, logs))))
-    return out
-
-
-def test_warnings_are_repeated_word_for_word_and_excluded_samples_counted(tmp_path: Path) -> None:
-    fields = recorded(2_000)
-    fields["contact_wrench_local"][500:700, 1, 2] = np.nan
-    fields["contact_active"][:, 1] = True
-    file = experiment(tmp_path / "a", fields)
-    shutil.copytree(tmp_path / "a", tmp_path / "other place")
-    shutil.move(tmp_path / "other place" / "log.npz", tmp_path / "other place" / "walk.npz")
-    (tmp_path / "other place" / "run.yaml").write_text(file.read_text().replace("log.npz", "walk.npz"))
-    settings = (*overrides({"cutoff_hz": 20.0}), f"output={tmp_path / 'run'}")
-    without, first, second = read_twice(file, *settings)
-    assert first == second == without
-    assert "NaN in part of" in without[0][0]
-    *_, moved = read_twice(tmp_path / "other place" / "run.yaml", *settings)
-    assert moved[0] == [x.replace("a/log.npz", "other place/walk.npz") for x in without[0]]
-    assert len(keys_in(tmp_path)) == 1
-
-
-def test_excluded_samples_are_said_and_counted_again(demo: Path, tmp_path: Path) -> None:
-    shutil.copytree(demo.parent, tmp_path / "demo")
-    log = tmp_path / "demo" / "sway_train.npz"
-    with np.load(log) as archive:
-        arrays = dict(archive)
-    arrays["joint_torque"][100:103, 2] += 1e4
-    np.savez(log, **arrays)
-    more = (f"output={tmp_path / 'run'}", "preprocessing.exclude_rejected=true")
-    without, first, second = read_twice(tmp_path / "demo" / demo.name, *more)
-    assert first == second == without
-    assert without[1][str(log)] > 0
-
-
-def test_a_sensor_that_was_not_recorded_is_missed_as_without_a_cache(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    fields = recorded(1_000)
-    del fields["contact_wrench_local"]
-    file = experiment(tmp_path, fields)
-    scene = set_up(load_config(file, (*overrides({}), f"output={tmp_path / 'run'}")))
-    cache = open_cache(scene)
-    assert cache is not None
-    CachedReader(scene, cache).read(scene.config.logs.train, scene.sensors)
-    assert keys_in(tmp_path)
-    complaints = []
-    for more in ((), (NONE,)):
-        assert main(["identify", str(file), *overrides({}, "full"), f"output={tmp_path / 'run'}", *more]) == 2
-        complaints.append(capsys.readouterr().err)
-    assert "contact_wrench: missing" in complaints[0]
-    assert complaints[0] == complaints[1]
-
-
 # ------------------------------------------------------------------------------------------- damage, bounds, company
 
 
@@ -347,21 +270,6 @@ def test_a_run_with_damaged_entries_says_so_and_has_the_same_results(
     assert results(tmp_path / "second") == plain
     assert main(["identify", "-v", str(demo), f"output={tmp_path / 'third'}"]) == 0
     assert "from cache    samples of 2 logs, factors" in capsys.readouterr().out
-
-
-def test_entries_with_something_else_in_them_are_dropped(demo: Path, tmp_path: Path) -> None:
-    """As another program could write them, with all checksums."""
-    scene = set_up(load_config(demo, (f"output={tmp_path / 'run'}",)))
-    cache = open_cache(scene)
-    assert cache is not None
-    CachedReader(scene, cache).read(scene.config.logs.train, scene.sensors)
-    (key,) = keys_in(tmp_path)
-    for document, arrays in (({}, {}), ({"axes": {"time": [0]}}, {"time": np.zeros((2, 2))}), ({"axes": 3}, {})):
-        shutil.rmtree(cache.folder / key)
-        assert cache.save(key, document, arrays)
-        with pytest.warns(TorchidWarning, match="a damaged entry"):
-            (log,) = CachedReader(scene, cache).read(scene.config.logs.train, scene.sensors)
-        assert len(log) == 250
 
 
 @pytest.mark.slow

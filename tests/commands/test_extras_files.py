@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from demo import shortened_demo
 from misread import WIDTH, World, with_actuators
 from motions import value
 from recordings import Miscalibration
@@ -38,7 +39,7 @@ def files(folder: Path, deviation: float) -> tuple[Path, dict[tuple[str, str], f
     if deviation:
         oracle.perturb(rng, deviation)
     contacts = [(contact.frame, len(contact.components)) for contact in CONTACTS]
-    logs = [make_log(oracle, contacts, STATES, 120, rng, f"{name}.npz") for name in ("first", "second", "new")]
+    logs = [make_log(oracle, contacts, STATES, 80, rng, f"{name}.npz") for name in ("first", "second", "new")]
     ideal = [
         Miscalibration(*(np.full(shape, x) for shape in ((robot.n,), (3, 6), (len(SENSORS), 6)) for x in (0.0, 1.0)))
     ] * 3
@@ -157,9 +158,10 @@ def test_the_width_of_the_sign_is_found(run: Run) -> None:
 
 
 def test_friction_that_reverses_at_once_is_given_no_width(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    settings = ["actuators.sign_width=auto", "estimator.ridge=0.01", "preprocessing.cache_gb=0"]
+    settings = ["actuators.sign_width=auto", "preprocessing.cache_gb=0"]
     settings += [f"output={tmp_path / 'run'}"]
-    assert main(["identify", "--verbose", str(DEMO / "quadruped.yaml"), *settings]) == 0
+    file = shortened_demo(tmp_path / "demo", 600) / "quadruped.yaml"
+    assert main(["identify", "--verbose", str(file), *settings]) == 0
     assert "sign width    none: Coulomb friction with tanh(velocity / width)" in capsys.readouterr().out
     assert load_config(tmp_path / "run" / "config.yaml").actuators.sign_width is None
 

@@ -142,6 +142,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return demo_fleet(tmp_path_factory.mktemp("fleet") / "demo")
 
 
+@pytest.mark.usefixtures("events")
 def test_a_run_of_factors_says_what_it_can(fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = tmp_path / "run"
     assert main(["identify", "--verbose", str(fleet / "experiment.yaml"), f"output={output}"]) == 0

@@ -30,6 +30,8 @@ from torchid.parameters import PARAMETERS
 from torchid.report import identified_urdf
 from torchid.report.tables import print_tables, state_table
 
+pytestmark = pytest.mark.usefixtures("events")
+
 FAST = f"estimator={json.dumps(FAST_ESTIMATOR)}"
 UNPHYSICAL = "ignore:identified.urdf:torchid.errors.TorchidWarning"
 

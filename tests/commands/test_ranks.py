@@ -305,19 +305,27 @@ def test_an_item_that_fails_ends_what_a_process_does_apart(monkeypatch: pytest.M
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[str], bytes, float]:
-    """A command without its output, the parameters that it finds, and how long that takes [s]."""
+    """A command without its output, the parameters that two processes find, and how long they work on them [s]."""
     folder = shortened_demo(tmp_path_factory.mktemp("killed") / "demo", 500)
-    command = [*TWO, "-m", "torchid", "identify", str(folder / "quadruped.yaml")]
+    command = ["identify", str(folder / "quadruped.yaml")]
     begin = time.monotonic()
-    status, _, complained = finish([*command, f"output={folder / 'run'}"])
+    status, _, complained = finish_forked(2, lambda: main([*command, f"output={folder / 'run'}"]))
     assert status == 0, complained
     return command, (folder / "run/parameters.json").read_bytes(), time.monotonic() - begin
 
 
-def killed_after(seconds: float, command: list[str], victim: int) -> int:
-    """Exit status of a command of which one process was killed, all others having ended."""
-    with started(command) as process:
-        time.sleep(seconds)
+def killed_after(seconds: float, command: list[str], output: Path, victim: int) -> int:
+    """Exit status of a command of which one process was killed, so long after it had begun, all others having ended.
+
+    A command begins with the folder that its cache is kept in, once it has imported what it needs; before that where
+    the time is negative.
+    """
+    with started([*TWO, "-m", "torchid", *command, f"output={output}"]) as process:
+        while process.poll() is None and len(children(process)) < 2:
+            time.sleep(0.01)
+        while process.poll() is None and seconds >= 0.0 and not output.parent.exists():
+            time.sleep(0.01)
+        time.sleep(max(0.0, seconds))
         workers = children(process)
         if victim < len(workers):
             os.kill(workers[victim], signal.SIGKILL)
@@ -339,9 +347,9 @@ def test_a_killed_process_ends_all_and_leaves_nothing_or_all(
 ) -> None:
     command, parameters, seconds = whole
     drawn, output = random.Random(seed), tmp_path / "runs" / "run"
-    status = killed_after(seconds * drawn.uniform(0.3, 1.0), [*command, f"output={output}"], drawn.randrange(2))
+    status = killed_after(seconds * drawn.uniform(-0.2, 1.0), command, output, drawn.randrange(2))
     assert_nothing_or_whole(output, parameters, status)
-    again = [*command[command.index("identify") :], f"output={output}", "overwrite=true"]
+    again = [*command, f"output={output}", "overwrite=true"]
     status, _, complained = finish_forked(2, lambda: main(again))
     assert status == 0, complained
     assert (output / "parameters.json").read_bytes() == parameters

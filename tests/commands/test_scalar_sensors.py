@@ -120,14 +120,6 @@ def test_what_does_not_fit_is_refused_in_one_line(
     assert message in refusal(arguments, experiment.parent, capsys)
 
 
-def test_analyze_takes_a_set_with_scalar_sensors_as_proposed(experiment: Path) -> None:
-    output = experiment.parent / "runs/analysis"
-    assert main(["analyze", str(experiment), f"output={output}"]) == 0
-    accuracy = json.loads((output.with_name("analysis.analysis") / "analysis.json").read_text())["accuracy"]
-    assert accuracy["proposed"]["rank"] == 118
-    assert accuracy["proposed"]["channels"] == 16
-
-
 def analyzed(experiment: Path, name: str, *overrides: str) -> dict[str, Any]:
     """The document of an analysis with cheap scalar sensors among the candidates."""
     output = experiment.parent / "runs" / name
@@ -164,6 +156,7 @@ def test_analyze_plans_with_scalar_sensors_and_measures_the_plan(
     found = answers["accuracy"]
     assert set(found) == {"proposed", "planned for logs"}
     assert (found["proposed"]["channels"], found["planned for logs"]["channels"]) == (16, 12)
+    assert found["proposed"]["rank"] == 118
     for one in found.values():
         assert one["expected"]["nullspace"] / 3.0 < one["measured"]["nullspace"] < 3.0 * one["expected"]["nullspace"]
     assert "smallest set  12 sensors, cost 10, no cheaper set exists: " in capsys.readouterr().out

@@ -37,6 +37,8 @@ from torchid.problem.metrics import ROW_GROUPS, WHITENED, describe_worse, worse_
 from torchid.report.figures import ridge_figure
 from torchid.sensing import Contact, SensorNoise, named_sensors
 
+pytestmark = pytest.mark.usefixtures("events")
+
 FEET = [f"{place}_foot" for place in ("front_left", "front_right", "rear_left", "rear_right")]
 UNPHYSICAL = "ignore:identified.urdf:torchid.errors.TorchidWarning"
 

@@ -214,15 +214,12 @@ def test_intervals_of_robust_fits_hold_the_truth_with_and_without_outliers(
     least = 0.93 if repetitions == REPETITIONS else 0.90
     assert least < holds.mean() < 0.5 * (least + 1.0) + 0.01
     known = robust[0].verdict == "identified"
-    ratio = np.mean(np.var(phis(robust)[:, known], axis=0) / np.var(phis(plain)[:, known], axis=0))
+    variance = [np.var([estimate.phi[known] for estimate in one], axis=0) for one in (robust, plain)]
+    ratio = np.mean(variance[0] / variance[1])
     if share:
         assert ratio < 1.0 / 200.0, "14 times more accurate than least squares; measured: 20 and 22 times"
     else:
         assert ratio < (1.08 if repetitions == REPETITIONS else 1.15), "on clean noise; measured: 1.03 to 1.06"
-
-
-def phis(estimates: list[Estimate]) -> Array:
-    return np.array([estimate.phi for estimate in estimates])
 
 
 # ------------------------------------------------------------------------------------------------------- gross outliers

@@ -23,7 +23,7 @@ import yaml
 ROOT = Path(__file__).resolve().parents[2]
 TORCHRUN = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node")
 TWO = (*TORCHRUN, "2")
-SMALL_CHUNK = 512
+SMALL_CHUNK = 128
 RANDOM = {"noise": {"joint_torque": 0.1, "contact_force": 0.5, "contact_moment": 0.05}}
 
 
@@ -41,14 +41,14 @@ def write_experiments(folder: Path) -> dict[str, Path]:
     feet = [f"{leg}_foot" for leg in ("front_left", "front_right", "rear_left", "rear_right")]
     walks = [[True] * 4, [True, False, False, True], [False, True, True, False]]
     robots: dict[str, Any] = {
-        "quadruped": (demo / "quadruped.urdf", False, [(foot, 3) for foot in feet], walks, [1500], "joints"),
-        "arm": (PANDA, True, [], [[]], [2700], "joints"),
+        "quadruped": (demo / "quadruped.urdf", False, [(foot, 3) for foot in feet], walks, [500], "joints"),
+        "arm": (PANDA, True, [], [[]], [700], "joints"),
         "biped": (
             ROOT / "configs" / "biped.urdf",
             False,
             [("l_sole", 6), ("r_sole", 6)],
             [[True, True], [True, False], [False, True]],
-            [900, 700],
+            [300, 240],
             {"set": "full", "offsets": {"contact_force": "log", "contact_moment": "log"}},
         ),
     }

@@ -19,7 +19,7 @@ from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
 
 ANYMAL_B = ROBOTS / "anymal_b_simple_description/robots/anymal.urdf"
-SAMPLES, UNSEEN = 900, 200
+SAMPLES, UNSEEN = 600, 100
 EXACT = 1e-12  # of the largest force; 3e-15 measured
 
 

@@ -13,6 +13,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
+from run_figures import FIGURES
+
 _SERVER = """
 import gc, json, os, resource, signal, sys
 import h5py, jinja2, scipy.signal, torch._dynamo, torchid.commands.results, torchid.commands.evaluate, torchid.commands.analyze, torchid.commands.check
@@ -20,10 +22,8 @@ import torchid.commands.compress, torchid.commands.identify, torchid.estimators.
 import torchid.terminal.analysis, torchid.terminal.finished_runs, torchid.terminal.identification
 from matplotlib.figure import Figure
 from torchid.cli import main
-names = ("draw_forces", "error_figure", "parameter_figure", "identifiability_figure", "contribution_figure", "tree_figure",
-         "accuracy_figure")
 for module in (torchid.commands.results, torchid.commands.evaluate, torchid.commands.analyze):
-    for name in names:
+    for name in FIGURES:
         if hasattr(module, name):
             setattr(module, name, lambda *_, **__: Figure(figsize=(1.0, 1.0)))
 torchid.report.page._library()  # compressed once for all children
@@ -108,7 +108,8 @@ class Commands:
 def commands() -> Iterator[Commands]:
     """The process, until the block ends."""
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
-    with subprocess.Popen([sys.executable, "-c", _SERVER], text=True, **pipes) as process:  # type: ignore[call-overload]
+    program = f"FIGURES = {FIGURES}\n{_SERVER}"
+    with subprocess.Popen([sys.executable, "-c", program], text=True, **pipes) as process:  # type: ignore[call-overload]
         assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"
         yield Commands(process)

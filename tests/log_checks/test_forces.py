@@ -22,9 +22,11 @@ from walking import MACHINES, robot_of
 
 from torchid.log_checks import NOTE, REJECTED, SUSPICIOUS, Checked, scales
 from torchid.log_checks.check import check
+from torchid.log_checks.model import NominalModel
 from torchid.logs import Log, read_log
 from torchid.logs.preprocess import preprocess
 from torchid.parameters import VISCOUS
+from torchid.problem import bind_log
 from torchid.robot import Robot, load_robot
 from torchid.sensing import Contact
 
@@ -207,6 +209,17 @@ def test_a_usual_mistake_is_named_by_what_it_explains(mistake: Callable[[Log], L
     assert explained.found.startswith(text)
     assert "another robot" not in explained.advice
     assert not checked.usable
+
+
+def test_rows_are_laid_out_anew_where_other_torques_are_known() -> None:
+    log, robot = preprocess(demo_log().select(slice(0, 300)), CUTOFF), demo_robot()
+    fewer = changed(log, "joint_torque", lambda torque: torque[:, 4].fill(np.nan))
+    model = NominalModel(robot, CONTACTS)
+    whole, found, expected = (
+        one.compare([bind_log(part, robot, CONTACTS)])
+        for one, part in ((model, log), (model, fewer), (NominalModel(robot, CONTACTS), fewer))
+    )
+    assert found.misfit == expected.misfit != whole.misfit
 
 
 def test_a_unit_that_leaves_a_third_of_the_misfit_may_be_another_robot() -> None:

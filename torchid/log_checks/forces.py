@@ -15,10 +15,10 @@ from torchid.log_checks.model import (
     MAX_TRIAL_DIFFERENTIATED_SAMPLES,
     TRIAL_SAMPLES,
     ModelFit,
+    NominalModel,
     TorqueFit,
     bind_some_samples,
     default_cutoff_hz,
-    fit_nominal_model,
     preprocess_pieces,
 )
 from torchid.log_checks.scales import TimeScale, TorqueGains, fit_time_scale, fit_torque_gains, motion_cutoff_hz
@@ -114,15 +114,15 @@ def _misfit_findings(
     derived: tuple[str, ...],
 ) -> Iterator[Finding | Skipped]:
     """The mistake that explains forces unlike the URDF's, or single deviations of forces that are like them."""
-    fit = fit_nominal_model(samples, robot, contacts)
-    explanation = None
+    model = NominalModel(robot, contacts)
+    fit, explanation = model.compare(samples), None
     if fit.misfit > MAX_MISFIT and (bare := _without_friction(robot)) is not None:
-        without = fit_nominal_model(samples, bare, contacts)
-        if without.misfit <= MAX_MISFIT:
-            yield _friction_finding(robot, fit, without)
-            robot, fit = bare, without
+        without = NominalModel(bare, contacts)
+        if (better := without.compare(samples)).misfit <= MAX_MISFIT:
+            yield _friction_finding(robot, fit, better)
+            robot, model, fit = bare, without, better
     if fit.misfit > MAX_MISFIT:
-        explanation = _best_mistake(log, robot, contacts, cutoff, fit, derived)
+        explanation = _best_mistake(log, model, cutoff, fit, derived)
     if explanation is not None:
         yield explanation
         return
@@ -173,19 +173,19 @@ def _friction_finding(robot: Robot, stated: ModelFit, without: ModelFit) -> Find
 
 
 def _best_mistake(
-    log: Log, robot: Robot, contacts: Sequence[Contact], cutoff: float, fit: ModelFit, derived: tuple[str, ...]
+    log: Log, model: NominalModel, cutoff: float, fit: ModelFit, derived: tuple[str, ...]
 ) -> Finding | None:
     """The mistake whose correction leaves the least misfit, if that is small enough."""
-    best, least = None, MAX_RESIDUAL_SHARE * min(fit.misfit, 1.0)
+    robot, best, least = model.robot, None, MAX_RESIDUAL_SHARE * min(fit.misfit, 1.0)
     for mistake in possible_mistakes(log):
         if not _may_explain(mistake.field, fit) or mistake.field.startswith(derived):
             continue
         try:
             pieces = preprocess_pieces(mistake.correct(log), cutoff, MAX_TRIAL_DIFFERENTIATED_SAMPLES)
-            samples = bind_some_samples(pieces, robot, contacts, TRIAL_SAMPLES)
+            samples = bind_some_samples(pieces, robot, model.contacts, TRIAL_SAMPLES)
         except InputError:  # the filter does not accept the corrected log
             continue
-        trial = fit_nominal_model(samples, robot, contacts)
+        trial = model.compare(samples)
         if trial.compared == fit.compared and trial.misfit < least:  # compare the same forces only
             best, least = mistake, trial.misfit
     if best is None:

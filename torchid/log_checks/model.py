@@ -149,28 +149,45 @@ def recorded_link_poses(log: Log, robot: Robot) -> LinkPoses:
     return robot.link_poses(torch.from_numpy(log.joint_position[:, order]))
 
 
-def fit_nominal_model(samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact]) -> ModelFit:
-    """Compare the forces of some samples with those of the URDF."""
-    measured = np.zeros(robot.n, dtype=bool)
-    if all(part.torque is not None for part in samples):
-        torque = np.concatenate([part.torque[:, : robot.n].numpy() for part in samples if part.torque is not None])
-        measured = np.isfinite(torque).all(axis=0) & (np.abs(torque) > MIN_TORQUE_NM).any(axis=0)
-    sensors = named_sensors("joints", robot.n, len(contacts), ft=len(robot.ft_names))
-    known = np.append(measured, sensors.torque[robot.n :]) | robot.is_passive
-    builder = RowBuilder(robot, contacts, dataclasses.replace(sensors, torque=known))
-    forces = [force_series(builder, part, robot.nominal.flatten()[None]) for part in samples]
-    acting, required = np.concatenate([f[0] for f in forces]), np.concatenate([f[1][0] for f in forces])
-    base = robot.base_rows
-    force, moment = (_misfit(acting[:, rows], required[:, rows]) for rows in (slice(0, min(3, base)), slice(3, base)))
-    fit = None
-    if measured.any():
-        fit = _fit_projected(builder, samples, required, torque, np.flatnonzero(measured))
-        contact_part = acting[:, base : base + robot.n] - torque
-        consistent = force is not None and force < _MAX_WRENCH_MISFIT and np.isfinite(contact_part).all()
-        if (consistent or not contacts) and not fit.determined.all() and not robot.loops:
-            fit = _fit_single_rows(fit, required[:, base : base + robot.n] - contact_part, torque)
-        fit = dataclasses.replace(fit, determined=fit.determined & ~_held_by_friction(samples, torque)[fit.joints])
-    return ModelFit(fit, force, moment)
+@dataclass(frozen=True)
+class NominalModel:
+    """A robot as its file has it, whose rows are laid out once for all samples in which the same torques are known."""
+
+    robot: Robot
+    contacts: Sequence[Contact]
+    _builders: dict[bytes, RowBuilder] = dataclasses.field(default_factory=dict, init=False, repr=False)
+
+    def compare(self, samples: Sequence[Samples]) -> ModelFit:
+        """Compare the forces of some samples with those of the robot's file."""
+        robot, base = self.robot, self.robot.base_rows
+        measured = np.zeros(robot.n, dtype=bool)
+        if all(part.torque is not None for part in samples):
+            torque = np.concatenate([part.torque[:, : robot.n].numpy() for part in samples if part.torque is not None])
+            measured = np.isfinite(torque).all(axis=0) & (np.abs(torque) > MIN_TORQUE_NM).any(axis=0)
+        builder = self._builder(measured)
+        forces = [force_series(builder, part, robot.nominal.flatten()[None]) for part in samples]
+        acting, required = np.concatenate([f[0] for f in forces]), np.concatenate([f[1][0] for f in forces])
+        parts = (slice(0, min(3, base)), slice(3, base))
+        force, moment = (_misfit(acting[:, rows], required[:, rows]) for rows in parts)
+        fit = None
+        if measured.any():
+            fit = _fit_projected(builder, samples, required, torque, np.flatnonzero(measured))
+            contact_part = acting[:, base : base + robot.n] - torque
+            consistent = force is not None and force < _MAX_WRENCH_MISFIT and np.isfinite(contact_part).all()
+            if (consistent or not self.contacts) and not fit.determined.all() and not robot.loops:
+                fit = _fit_single_rows(fit, required[:, base : base + robot.n] - contact_part, torque)
+            fit = dataclasses.replace(fit, determined=fit.determined & ~_held_by_friction(samples, torque)[fit.joints])
+        return ModelFit(fit, force, moment)
+
+    def _builder(self, measured: BoolArray) -> RowBuilder:
+        """Of the rows that do not need the torques that were not measured, (n,) bool."""
+        key = measured.tobytes()
+        if key not in self._builders:
+            robot, contacts = self.robot, self.contacts
+            sensors = named_sensors("joints", robot.n, len(contacts), ft=len(robot.ft_names))
+            known = np.append(measured, sensors.torque[robot.n :]) | robot.is_passive
+            self._builders[key] = RowBuilder(robot, contacts, dataclasses.replace(sensors, torque=known))
+        return self._builders[key]
 
 
 def _held_by_friction(samples: Sequence[Samples], torque: FloatArray) -> BoolArray:

@@ -22,7 +22,7 @@ from torchid.logs.log import (
     column_labels,
 )
 from torchid.logs.quaternion import angular_acceleration_base, angular_velocity_base, make_sign_continuous
-from torchid.logs.sign_filter import with_sign_filter
+from torchid.logs.sign_filter import mean_sign, mean_tanh, with_sign_filter
 from torchid.logs.signal_noise import signal_noise, warn_of_noisy_accelerations
 from torchid.logs.timeline import JITTER, Timeline, lay_out_timeline, nearest_known
 
@@ -37,7 +37,6 @@ DERIVATIVE_CHAINS = (
 _ANGULAR = DERIVATIVE_CHAINS[2]
 #: Norm of a filtered quaternion: below, the filter removes the rotation of the base.
 _MIN_QUATERNION_NORM = 0.5
-_LEAST_CHANGE = 1e-4  # of a tanh's argument over a step, across which its mean is its middle
 
 
 def preprocess(
@@ -222,12 +221,13 @@ def _direction(log: Log, smoothed: Mapping[str, FloatArray], timeline: Timeline)
         known = replace(timeline, low_pass=wider).smooth(getattr(log, name))
     steps, width = np.diff(timeline.grid), timeline.sign_width
     out = np.empty((len(timeline.output_stamps), known.shape[1]))
-    for column in range(known.shape[1]):  # one by one: temporaries stay small
-        x = known[:, column]
-        halfway = np.diff(x) / steps if name == "joint_position" else 0.5 * (x[1:] + x[:-1])
-        before, after = np.append(halfway[:1], halfway), np.append(halfway, halfway[-1:])
-        sign = _mean_sign(before, after) if width is None else _mean_tanh(before / width, after / width)
-        out[:, column] = timeline.evaluate(timeline.low_pass(sign), (0,))[0]
+    together = _channels_together(len(known))
+    for start in range(0, known.shape[1], together):
+        x = known[:, start : start + together]
+        halfway = np.diff(x, axis=0) / steps[:, None] if name == "joint_position" else 0.5 * (x[1:] + x[:-1])
+        before, after = np.concatenate([halfway[:1], halfway]), np.concatenate([halfway, halfway[-1:]])
+        sign = mean_sign(before, after) if width is None else mean_tanh(before / width, after / width)
+        out[:, start : start + together] = timeline.evaluate(timeline.low_pass(sign), (0,))[0]
     return out
 
 
@@ -237,19 +237,6 @@ def directions(log: Log, timeline: Timeline) -> Callable[[float | None], FloatAr
     signs = timeline if timeline.sign_low_pass is None else replace(timeline, low_pass=timeline.sign_low_pass)
     smoothed = {name: signs.smooth(getattr(log, name))}
     return lambda width: _direction(log, smoothed, replace(timeline, sign_width=width, sign_low_pass=None))
-
-
-def _mean_sign(before: FloatArray, after: FloatArray) -> FloatArray:
-    """Mean of the sign of what goes from one value to another, (M,)."""
-    size = np.abs(before) + np.abs(after)
-    return np.divide(before + after, size, out=np.zeros_like(size), where=size > 0.0)
-
-
-def _mean_tanh(before: FloatArray, after: FloatArray) -> FloatArray:
-    """Likewise of the hyperbolic tangent, whose integral is log cosh."""
-    change, tanh = after - before, np.tanh(0.5 * (before + after))
-    integral = np.logaddexp(after, -after) - np.logaddexp(before, -before)
-    return np.divide(integral, change, out=tanh, where=np.abs(change) > _LEAST_CHANGE)
 
 
 def _continuous(log: Log, name: str) -> FloatArray:
@@ -275,8 +262,14 @@ def _orientation(log: Log, derivatives: list[FloatArray], timeline: Timeline) ->
 
 # -------------------------------------------------------------------------------------------- fields that may have gaps
 
-#: Channels that are filtered together: few, so that copies are small compared with a long log.
-_CHANNELS_TOGETHER = 2
+#: Values that are filtered together: few, so that copies of a long log are small; many, so that a short one needs few
+#: calls.
+_VALUES_TOGETHER = 2**14
+
+
+def _channels_together(count: int) -> int:
+    """How many channels of so many samples are filtered by one call."""
+    return max(1, _VALUES_TOGETHER // max(count, 1))
 
 
 def _resample_measured(log: Log, name: str, timeline: Timeline, coverage: Coverage | None) -> FloatArray:
@@ -298,8 +291,9 @@ def _resample_measured(log: Log, name: str, timeline: Timeline, coverage: Covera
     flags = log.contact_active if name in CONTACT_READINGS else None
     complete = np.argwhere(coverage.complete)
     out = np.full((len(timeline.output_stamps), *values.shape[1:]), np.nan)
-    for start in range(0, len(complete), _CHANNELS_TOGETHER):
-        columns = (slice(None), *complete[start : start + _CHANNELS_TOGETHER].T)
+    together = _channels_together(len(values))
+    for start in range(0, len(complete), together):
+        columns = (slice(None), *complete[start : start + together].T)
         clean = values[columns]
         if flags is not None:
             clean[~flags[:, columns[1]]] = 0.0

@@ -19,6 +19,7 @@ from torchid.logs.timeline import JITTER, Timeline, spline_derivatives
 _FEWEST = 100  # samples
 _DOUBLINGS = 8  # of the cutoff
 _MUCH = 0.05  # share of the velocities' power that is worth a warning
+_LEAST_CHANGE = 1e-4  # of a tanh's argument over a step, across which its mean is its middle
 _WIDEST = 0.4  # largest cutoff over the sample rate
 _EVIDENT = 0.01  # share of the velocities' power by which the error must fall: less is a few per cent of the reversals
 
@@ -109,3 +110,16 @@ def _error(low_pass: LowPass, values: FloatArray, correlation: FloatArray) -> fl
     response = low_pass(impulse[:, None])[len(impulse) // 2 :, 0]
     lost = float(np.square(values - low_pass(values)).mean(axis=0).sum())
     return lost + 2.0 * float(response[0] * correlation[0] + 2.0 * response[1] * correlation[1])
+
+
+def mean_sign(before: FloatArray, after: FloatArray) -> FloatArray:
+    """Mean of the sign of what goes from one value to another, (M,)."""
+    size = np.abs(before) + np.abs(after)
+    return np.divide(before + after, size, out=np.zeros_like(size), where=size > 0.0)
+
+
+def mean_tanh(before: FloatArray, after: FloatArray) -> FloatArray:
+    """Likewise of the hyperbolic tangent, whose integral is log cosh."""
+    change, tanh = after - before, np.tanh(0.5 * (before + after))
+    integral = np.logaddexp(after, -after) - np.logaddexp(before, -before)
+    return np.divide(integral, change, out=tanh, where=np.abs(change) > _LEAST_CHANGE)

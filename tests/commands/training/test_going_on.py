@@ -42,6 +42,8 @@ from torchid.estimators.least_squares import VERDICTS
 from torchid.problem.linear import parameter_scale
 from torchid.problem.metrics import ERROR_GROUPS, ROW_GROUPS
 
+pytestmark = pytest.mark.usefixtures("events")
+
 
 def test_the_run_folder_is_that_of_any_run_and_nothing_is_left_beside_it(run: Path) -> None:
     names = {"events" if path.name.startswith("events") else path.name for path in run.iterdir()}

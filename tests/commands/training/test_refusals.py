@@ -33,6 +33,8 @@ from torchid.commands.checkpoint import CHECKPOINT, load_checkpoint, save_checkp
 from torchid.config import load_config
 from torchid.errors import InputError
 
+pytestmark = pytest.mark.usefixtures("events")
+
 
 def resume_refused(experiment: Path, output: Path, capsys: pytest.CaptureFixture[str], *more: str) -> str:
     return refusal(command(experiment, output, "--resume", *more), output.parent, capsys)
