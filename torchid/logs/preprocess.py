@@ -92,6 +92,7 @@ def preprocess(
     noise = log.motion_noise or signal_noise(log, timeline, motion_noise)
     if timeline is None:
         return replace(log, motion_noise=noise) if noise.found else log
+    require_no_turns(log)  # which would pass for fast motion
     timeline = with_sign_filter(timeline, log)
     coverage = {name: measure_coverage(log, name) for name in gapless_fields(log, timeline)}
     for name, found in coverage.items():
