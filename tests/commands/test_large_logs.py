@@ -40,10 +40,6 @@ SETTINGS = {
 SUFFIXES = (".npz", ".csv", ".parquet", ".h5")
 
 
-FAST = pytest.mark.filterwarnings("ignore:.*joints move faster:torchid.errors.TorchidWarning")  # than 8 Hz
-
-
-@FAST
 @pytest.mark.parametrize(("name", "jitter"), each_once([*SETTINGS], [0.0, 0.3]))
 def test_blocks_give_the_samples_of_the_whole_log(tmp_path: Path, name: str, jitter: float) -> None:
     settings, tolerance = SETTINGS[name]
@@ -61,7 +57,6 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torchid.commands.large_log.BLOCK_GB", 1e-4)
 
 
-@FAST
 @pytest.mark.parametrize(("name", "threads"), each_once([*SETTINGS], [3, 1]))
 def test_a_long_log_in_memory_is_worked_on_in_blocks_by_threads(
     tmp_path: Path, name: str, threads: int, request: pytest.FixtureRequest

@@ -15,7 +15,6 @@ from torchid.logs.preprocess import preprocess
 from torchid.logs.timeline import lay_out_timeline, spline_derivatives
 
 
-@pytest.mark.filterwarnings("ignore:.*joints move faster:torchid.errors.TorchidWarning")
 @pytest.mark.parametrize("hertz", [3.0, 10.0, 20.0, 40.0, 100.0])
 @pytest.mark.parametrize("time", [uniform(), jittered()], ids=["uniform", "jittered"])
 def test_a_sine_keeps_its_phase_and_loses_the_butterworth_share(time: FloatArray, hertz: float) -> None:
