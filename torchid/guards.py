@@ -37,6 +37,8 @@ MAX_FIELDS, MAX_NAMES = 200, 10_000
 #: Columns of a table: a humanoid with every sensor has about 500. Entries of the lists of a schema: the schema is read
 #: before its columns are counted, and also lists groups of rows.
 MAX_COLUMNS, MAX_SCHEMA = 20_000, 2**16
+#: Numbers in each list of a column of lists, which are columns then.
+MAX_LIST = 1000
 #: Chunks of an HDF5 dataset in addition to those that the file has room for: the library takes 400 bytes for every
 #: chunk that is read, stored or not. The index of a stored chunk takes at least 40 bytes.
 MAX_CHUNKS, CHUNK_BYTES = 10_000, 40

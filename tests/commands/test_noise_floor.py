@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -79,3 +80,11 @@ def test_the_figure_has_errors_without_a_band_where_the_noise_is_unknown() -> No
 def test_a_sliding_joint_s_torque_is_shown_as_a_force() -> None:
     shown = force_figure(series(None), ["knee", "rail"], 0, ["rail"])
     assert [axis.get_ylabel() for axis in shown.axes[::2]] == ["[N m]", "[N]"]
+
+
+def test_stamps_of_a_clock_are_shown_as_seconds_since_the_first_sample() -> None:
+    as_recorded = force_figure(series(None), ["knee", "hip"], 0)
+    since_1970 = force_figure(replace(series(None), time=1.7e9 + series(None).time), ["knee", "hip"], 0)
+    for figure, label in ((as_recorded, "time [s]"), (since_1970, "time since the first sample [s]")):
+        np.testing.assert_allclose(figure.axes[0].get_lines()[0].get_xdata(), series(None).time, atol=1e-6)
+        assert {axis.get_xlabel() for axis in figure.axes} == {"", label}

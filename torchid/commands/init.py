@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -35,8 +34,9 @@ from torchid.logs import Columns, Log, Topics, read_log
 from torchid.logs.containers import LogKind, atomic_output, existing_log_kind
 from torchid.logs.file_samples import read_bag_sample, read_sample, states_degrees, texts_in
 from torchid.logs.log import VARIANTS
-from torchid.logs.map_proposals import MapProposal, propose_map
+from torchid.logs.map_proposals import propose_map
 from torchid.logs.name_matching import KnownRobot
+from torchid.logs.proposed_map import MapProposal
 from torchid.logs.time_range import split_range
 from torchid.logs.topic_proposals import USED_TYPES, frame_of, propose_topics
 from torchid.parameters import GRAVITY
@@ -175,7 +175,7 @@ def _add_imu_frame(robot: Robot, fields: set[str], proposal: MapProposal) -> Non
         fields ^= {_RATE, _IMU[1]}
     if not set(_IMU) <= fields:  # one alone is of no use
         for name in set(_IMU) & set(proposal.columns):
-            proposal.columns.setdefault("ignore", []).append(_as_ignored(proposal.columns.pop(name)["column"]))
+            proposal.leave_out(name)
             fields.discard(name)
         return
     named = [name for name, (body, _) in robot.links.items() if body == 0 and "imu" in name.lower()]
@@ -186,10 +186,6 @@ def _add_imu_frame(robot: Robot, fields: set[str], proposal: MapProposal) -> Non
     why = "from its name" if named else f"the base link, as no link of it is called imu{moving}"
     proposal.notes["imu_frame"] = why
     fields.add("imu_frame")
-
-
-def _as_ignored(pattern: str) -> str:
-    return re.sub(r"\{[^{}]*\}", "*", pattern)
 
 
 def _is_fixed(contacts: Sequence[GuessedContact], fields: set[str]) -> bool:

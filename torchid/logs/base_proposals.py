@@ -127,7 +127,10 @@ def vertical_in_base(quat_xyzw: FloatArray) -> FloatArray:
 
 
 _NAMES = ("roll", "pitch", "yaw")
-_OTHER_NAMES = {"roulis": "roll", "tangage": "pitch", "lacet": "yaw", "nickwinkel": "pitch", "gierwinkel": "yaw"}
+_OTHER_NAMES = {
+    "roulis": "roll", "tangage": "pitch", "lacet": "yaw", "nickwinkel": "pitch", "gierwinkel": "yaw",
+    "balanceo": "roll", "cabeceo": "pitch", "guinada": "yaw",
+}  # fmt: skip
 _ANGLE = re.compile(rf"(?<![a-z])({'|'.join([*_NAMES, *_OTHER_NAMES])})(?![a-z])", re.IGNORECASE)
 _TRIPLE = re.compile(r"(?<![a-z])(rpy|euler\w*?)(?![a-z])", re.IGNORECASE)
 #: Words beside these in names of what turns the base, rather than a joint or a rate.

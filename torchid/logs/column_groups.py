@@ -20,7 +20,7 @@ from torchid.logs.units import OF_JOINTS, quantities_with, split_unit
 
 _NUMBER = re.compile(r"\d+")
 _AXIS = re.compile(
-    r"(?<=[._\-/\[ ])([wxyz])(?=$|[\]])|(?<=[a-zFM_.\-/\[ \u0080-\uffff])([WXYZ])(?=$|[\]])|(?<=[a-zFM])([wxyz])$"
+    r"(?<=[._\-/\[ '])([wxyz])(?=$|\]|'\)?$)|(?<=[a-zFM_.\-/\[ \u0080-\uffff])([WXYZ])(?=$|[\]])|(?<=[a-zFM])([wxyz])$"
     r"|(?<=[a-z])([XYZ])(?=[/_.])|^([wxyzWXYZ])$|(?<=(?<![A-Za-z])[PQ])([WXYZwxyz])$",
 )
 _BEHIND = re.compile(r"[_./ \[-]*\{[^{}]*\}\]?$")  # a unit: the axis in `acc_g.{axis}`
@@ -264,13 +264,15 @@ def _pattern(column: str, kinds: Sequence[_Stems], split_axes: bool = True) -> t
 
 
 _UNIT = 1e-3  # of the length of quaternions from 1
+_TWIST = (*["base_linear_velocity_world"] * 3, *["base_angular_velocity_world"] * 3)  # columns of it
 
 
 def split_arrays(sample: FileSample, names: Sequence[str], joints: Collection[int]) -> list[tuple[str, str, str]]:
     """Arrays that hold several fields side by side: their name, the columns and the field that these are.
 
     Those of simulators and of libraries for dynamics: a position of the base and a quaternion, whose length is 1
-    throughout, with or without positions of joints behind; beside them velocities and forces, six of the base first.
+    throughout, with or without positions of joints or six velocities behind; beside them velocities and forces, six of
+    the base first.
 
     Args:
         sample: from `read_sample`.
@@ -286,11 +288,15 @@ def split_arrays(sample: FileSample, names: Sequence[str], joints: Collection[in
         if array.shape[1] - 7 in joints:
             out.append((name, "[7:]", "joint_position"))
             width = array.shape[1] - 7
+        elif array.shape[1] == 7 + len(_TWIST):
+            out += [(name, "[7:10]", _TWIST[0]), (name, "[10:13]", _TWIST[3])]
         break
-    for name in names if width else ():
+    for name in names if out else ():
         shape, field = np.asarray(sample[name]).shape, propose_field(name)
-        if shape[1:] == (6 + width,) and field in ("joint_velocity", "joint_torque"):
+        if width and shape[1:] == (6 + width,) and field in ("joint_velocity", "joint_torque"):
             out.append((name, "[6:]", field))
+        elif shape[1:] == (len(_TWIST),) and field == _TWIST[0] and (name, "[7:10]", field) not in out:
+            out += [(name, "[0:3]", _TWIST[0]), (name, "[3:6]", _TWIST[3])]
     return out
 
 

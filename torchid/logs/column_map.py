@@ -44,7 +44,7 @@ _X = TypeVar("_X")
 _XYZ, _RPY = ("x", "y", "z"), ("roll", "pitch", "yaw")
 #: `{joint}`, `{index}`, `{index:02}`, `{axis}`, `{AXIS}`.
 PLACEHOLDER = re.compile(r"\{([^{}:]*)(?::(0\d))?\}")
-AXES = ("axis", "AXIS")
+AXES = ("axis", "AXIS", "component")
 
 
 @dataclass(config=STRICT, frozen=True, kw_only=True)

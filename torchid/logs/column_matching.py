@@ -257,7 +257,10 @@ def _splits(part: EntryPart, text: str) -> bool:
 def _spelled(part: EntryPart, text: str, number: int, stem: str) -> list[str]:
     """The columns of a pattern for one name."""
     axes = part.components if _splits(part, text) else ("",)
-    return [_filled(text, {part.kind: stem, "axis": axis, "AXIS": axis.upper()}, number) for axis in axes]
+    return [
+        _filled(text, {part.kind: stem, "axis": axis, "AXIS": axis.upper(), "component": str(k)}, number)
+        for k, axis in enumerate(axes)
+    ]
 
 
 def _filled(text: str, values: Mapping[str, str], number: int) -> str:
@@ -272,7 +275,8 @@ def _regex(part: EntryPart, text: str) -> re.Pattern[str]:
     """Columns that fit a pattern of an entry; the group `name` has the name."""
     out, end = "", 0
     axes = "|".join(part.components)
-    groups = {part.kind: "(?P<name>.+)", "index": r"\d+", "axis": f"(?:{axes})", "AXIS": f"(?:{axes.upper()})"}
+    groups = {part.kind: "(?P<name>.+)", "index": r"\d+", "component": r"\d"}
+    groups |= {"axis": f"(?:{axes})", "AXIS": f"(?:{axes.upper()})"}
     for found in PLACEHOLDER.finditer(text):
         out += re.escape(text[end : found.start()]) + groups[found[1]]
         end = found.end()

@@ -25,23 +25,30 @@ _WORDS = (
     (POINTS, r"\b(cop[xyz]?|ground force p[xyz])\b"),
     (WRENCHES[1], r"\b(ground (force|torque|moment)s?|force ?plates?|fp)\b"),
     ("base_position_world", rf"{OF_BASE} (pos|position|xyz)\b"),
-    ("base_linear_velocity_world", rf"{OF_BASE} (lin vel|linear vel|linear velocity|vel|velocity)\b"),
-    ("base_angular_velocity_base", rf"{OF_BASE} (ang vel|angular velocity|omega)\b"),
+    (
+        "base_linear_velocity_world",
+        rf"{OF_BASE} (twist )?(lin ?vel|linear|lin|vel|velocity)\b",
+    ),
+    ("base_angular_velocity_base", rf"{OF_BASE} (twist )?(ang ?vel|angular|ang|omega)\b"),
     ("base_quat_wxyz", rf"{OF_BASE} (q|rot|rotation)\b"),
-    ("joint_acceleration", r"\b(ddqj?|qdd|thdd|qacc|joints? acc|joints? accelerations?)\b"),
+    ("joint_acceleration", r"\b(ddqj?|qdd|qpp|thdd|qacc|joints? acc|joints? accelerations?)\b"),
     ("imu_angular_velocity", r"\b(gyr|gyro\w*|omega|ang vel|angular velocity|drehraten?|imu g)\b"),
     ("imu_specific_force", r"\b(acc|accel\w*|linear acceleration|specific force|beschleunigung|imu a)\b"),
     ("base_quat_wxyz", r"\b(quat\w*|orientation)\b"),
     ("contact_wrench_local", r"\b(wrench|wrenches)\b"),
     ("contact_force_normal", r"\b(foot forces?|feet forces?|contact forces?|grf|fsr)\b"),
     ("contact_active", r"\b(contacts?|touch|touches|stance)\b"),
-    ("joint_torque", r"\b(taus?|torques?|efforts?|eff|trq|load|qfrc|drehmoment|couples?)\b"),
+    ("joint_torque", r"\b(taus?|torques?|efforts?|eff|trq|load|qfrc|drehmoment|couples?|par|pares)\b"),
     (
         "joint_velocity",
-        r"\b(dqs?|dqj|d q|qd|qdot|thd|v|qvel|vels?|velocity|velocities|speeds?|rates?|vitesses?)\b|geschwindigkeit\b",
+        r"\b(dqs?|dqj|d q|qd|qp|qdot|thd|v|qvel|vels?|velocity|velocities|speeds?|rates?|vitesses?|geschw)\b"
+        r"|\b(velocidad|velocidades)\b|geschwindigkeit\b",
     ),
-    ("joint_position", r"\b(qs?|qj|th|theta|qpos|pos|positions?|angles?|winkel|gelenkwinkel)\b"),
-    ("time", rf"\b(t|ts|{_STAMPS}|ticks?|clock|millis|sec|secs|seconds|zeit|temps)\b"),
+    (
+        "joint_position",
+        r"\b(observation state|qs?|qj|th|theta|qpos|pos|positions?|angles?|winkel|angulos?|posicion|gelenkwinkel)\b",
+    ),
+    ("time", rf"\b(t|ts|{_STAMPS}|ticks?|clock|millis|sec|secs|seconds|zeit|temps|tiempo)\b"),
 )
 #: Fields that a unit alone tells: of `LF_HAA [deg]`, `LF_HAA [deg/s]`.
 _BY_QUANTITY = {
@@ -49,7 +56,10 @@ _BY_QUANTITY = {
     "torque": "joint_torque",
 }  # fmt: skip
 _APART = (("linear", "angular"), ("position", "velocity", "acceleration", "torque"), ("world", "base", "local"))
-_DESIRED = re.compile(r"\b(des|desired|cmd|command|ref|target|goal|setpoint|ff)\b")
+_DESIRED = re.compile(
+    r"\b(des|desired|cmd|command(ed)?|ref|target|goal|setpoint|ff|cons|consigne|soll)\b"
+    r"|\b(taus?|torques?|j|q|dq|qd|pos) d\b"  # tau_d, tau_J_d
+)
 _ANGLES = re.compile(r"\b(rpy|euler)\b")  # of the base, three: see `orientation_proposals`
 _OF_MOTOR = re.compile(r"\b(kp|kd)\b|temp|volt|err|status|state|mode|flag|count|fault|limit", re.IGNORECASE)
 _CURRENT = re.compile(r"(?i:current(?!.*limit)|(?<![a-z])(amps?|iq|i|cur)(?![a-z]))|[_ ]m?A$")

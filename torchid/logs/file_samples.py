@@ -16,7 +16,7 @@ from torchid.errors import TorchidError, excerpt
 from torchid.logs.arrays import fields_of_records, require_plain
 from torchid.logs.column_proposals import propose_field
 from torchid.logs.containers import LogKind, existing_log_kind, list_bag_files, open_container, reader_errors_explained
-from torchid.logs.name_matching import KnownRobot, match_names
+from torchid.logs.name_matching import KnownRobot, limb_and_words, match_names
 from torchid.logs.ros_messages import make_deserializer
 from torchid.logs.ros_read import list_channels, open_bag_file
 from torchid.logs.table_headers import read_header
@@ -92,6 +92,20 @@ def listed_order(sample: FileSample, kind: str, robot: KnownRobot, count: int) -
         matched = match_names(listed, known, kind) if len(listed) == count == len(known) else {}
         if len(matched) == len(known) > 0:
             return [matched[text] for text in listed], f"as '{name}' of the file lists them"
+    if kind == "contact":
+        return _order_of_legs(texts, robot, count)
+    return None
+
+
+def _order_of_legs(texts: Mapping[str, Sequence[str]], robot: KnownRobot, count: int) -> tuple[list[str], str] | None:
+    """The feet in the order in which a list of all joints names their legs; None where there is none."""
+    by_side = {limb_and_words(foot)[0]: foot for foot in robot.feet}
+    for name, listed in texts.items():
+        if len(listed) == len(robot.joints) == len(match_names(listed, robot.joints, "joint")):
+            sides = dict.fromkeys(limb_and_words(text)[0] for text in listed)
+            feet = [by_side[side] for side in sides if side in by_side]
+            if len(feet) == count == len(robot.feet):
+                return feet, f"legs as '{name}' of the file lists their joints"
     return None
 
 

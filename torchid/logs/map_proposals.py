@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -13,12 +12,14 @@ from numpy.typing import NDArray
 
 from torchid.errors import excerpt
 from torchid.logs.base_proposals import field_of_base, find_angles, is_beside, order_of_quaternion
+from torchid.logs.base_velocities import settle_velocities
 from torchid.logs.column_groups import Family, find_families, split_arrays, split_stamps
 from torchid.logs.column_map import fits
 from torchid.logs.column_proposals import is_desired, propose_field
 from torchid.logs.columns import is_column
 from torchid.logs.field_matching import MOMENT, FieldMatcher
 from torchid.logs.file_samples import FileSample, increases, listed_order, side_by_side, with_samples_first
+from torchid.logs.foot_proposals import find_foot_readings, frame_of_forces
 from torchid.logs.joint_orders import JOINT_ORDERS, numbered_joints, usual_order
 from torchid.logs.log import SHAPES, VARIANTS, WRENCHES
 from torchid.logs.name_matching import SUFFIXES, KnownRobot
@@ -27,40 +28,15 @@ from torchid.logs.number_proposals import (
     UnitProposer,
     are_states,
     gravity_share,
-    point_along_z,
     step_of_stamps,
     threshold,
 )
+from torchid.logs.proposed_map import MapProposal
 from torchid.logs.units import IN_DEGREES, quantities_of, quantities_with, unit_factor
 
 _GAINS = re.compile(r"\b(kp|kd)\b", re.IGNORECASE)
 _LAW = {"joint_position": "position", "joint_velocity": "velocity", "joint_torque": "feed_forward"}
 _TOUCH = 0.05  # of the robot's weight, what a contact bears at least
-
-
-@dataclass
-class MapProposal:
-    """What `logs.columns`, or `logs.topics`, may say of a log.
-
-    Attributes:
-        columns: the map, as it stands in a file.
-        notes: what was guessed, by key.
-        left_out: columns that it ignores.
-        key: columns or topics.
-        fields: of the log, that a map of topics gives.
-        lacking: joints of the robot without columns, if most have some.
-        partial: by field that is left out for it, joints that have columns of other fields alone.
-        like_torques: columns that no field takes, one for each joint, of a log without torques.
-    """
-
-    columns: dict[str, Any] = field(default_factory=dict)
-    key: str = "columns"
-    fields: set[str] = field(default_factory=set)
-    notes: dict[str, str] = field(default_factory=dict)
-    left_out: list[str] = field(default_factory=list)
-    lacking: list[str] = field(default_factory=list)
-    partial: dict[str, list[str]] = field(default_factory=dict)
-    like_torques: list[Family] = field(default_factory=list)
 
 
 def propose_map(
@@ -100,7 +76,8 @@ class _Proposer:
     def propose(self) -> MapProposal:
         foreign = [name for name in self.sample if name not in self.native]
         numeric = [name for name in foreign if (x := self.sample[name]) is not None and x.dtype.kind in "fiub"]
-        families, more = find_families(numeric, self.robot)
+        of_feet = self._place_feet(numeric)
+        families, more = find_families([name for name in numeric if name not in of_feet], self.robot)
         self.out.columns |= {f"{kind}_name": pattern for kind, pattern in more.items()}
         self.match.look_at(families, more)
         if named := self.match.named_joints:
@@ -124,27 +101,29 @@ class _Proposer:
         if "joint_torque" not in {*self.given, *self.out.columns}:
             used += self._place_law([one for one in families if one not in used])
         used = self._settle_contacts(used)
-        taken = {column for one in used for column in one.columns} | split
+        taken = {column for one in used for column in one.columns} | split | of_feet
         taken |= {self.out.columns.get("time", {}).get("nanoseconds")} - {None}
         taken |= self._place_angles([name for name in numeric if name not in taken])
         self.out.partial = self.match.partial
         self.out.left_out = [name for name in foreign if name not in taken]
         families = [one for one in families if one in used or not set(one.columns) <= taken]
-        ignored = {
-            pattern
-            for one in families
-            if one not in used or len(one.numbers) > len(self.joints)
-            for pattern in one.as_ignored
-        }
+        unused = [one for one in families if one not in used or len(one.numbers) > len(self.joints)]
+        ignored = {pattern for one in unused for pattern in one.as_ignored}
         ignored |= {name for name in foreign if name not in numeric or name in self.nanoseconds.values()} - taken
         self.out.columns |= {"ignore": sorted(ignored)} if ignored else {}
         if "joint_torque" not in {*self.given, *self.out.columns}:
             alike = [one for one in families if one not in used and self.match.is_like_torques(one)]
             self.out.like_torques = [one for one in alike if one.is_current] or alike
+        self._settle_numbers()
+        return self.out
+
+    def _settle_numbers(self) -> None:
+        """Units and frames, as the numbers say."""
         with np.errstate(all="ignore"):  # of numbers that no unit explains
             units = UnitProposer(self.sample, self.out.columns, self.out.notes, self.factors)
-            units.propose(self.robot.weight, not self.files, self.robot.slides)
-        return self.out
+            seconds = units.propose(self.robot.weight, not self.files, self.robot.slides)
+            if seconds is not None and not self.files:
+                settle_velocities(self.out, units.values, seconds)
 
     def _lacks_gravity(self, family: Family) -> float:
         """Minus the share of gravity in what may be an accelerometer, 0 for all else."""
@@ -205,8 +184,6 @@ class _Proposer:
 
         return sorted(families, key=rank)
 
-    # ----------------------------------------------------------------------------------------------------- fields
-
     def _place_of_base(self, families: Sequence[Family]) -> list[Family]:
         """Families that have become the pose of a base, of a robot with feet or of a single body, by their numbers."""
         if not self.feet and self.joints:  # of an arm, that of its hand
@@ -227,8 +204,8 @@ class _Proposer:
         if name == "time" and name in self.out.columns:
             return self._place_other_time(family)
         known = {*self.given, *self.out.columns}
-        again = name == "base_quat_wxyz" and "base_quat_xyzw" in known
-        if not name or name in known or again or not self.match.fits(family, name):
+        known |= {"base_quat_wxyz"} if "base_quat_xyzw" in known else set()
+        if not name or name in known or not self.match.fits(family, name):
             return False
         entry: dict[str, Any] = family.counted_entry
         if name == "base_quat_wxyz":
@@ -271,33 +248,47 @@ class _Proposer:
         self.out.columns["other_times"] = [*others, entry]
         return True
 
+    def _place_feet(self, columns: Sequence[str]) -> set[str]:
+        """Columns of forces and flags of feet that the file names by their sides, which have become entries."""
+        taken = set[str]()
+        for one in find_foot_readings(self.sample, columns, self.robot):
+            known, entry = {*self.given, *self.out.columns}, one.family.entry
+            if one.part == "normal":
+                placed = "contact_active" not in known and self._add_threshold(one.family, entry)
+                self.out.columns |= {"contact_active": entry} if placed else {}
+            else:
+                placed = self._place_forces(one.part, one.family, one.forces(self.sample), "; feet by their sides")
+            taken |= set(one.all_columns) if placed else set()
+        return taken
+
     def _place_force(self, family: Family) -> bool:
         """Whether a family is the forces or the moments of contacts."""
         has_axes = "".join(sorted(family.axes)).lower() == "xyz" and len(family.columns) == 3 * len(self.feet)
         if not has_axes and self.match.shape(family) != (len(self.feet), 3):
             return False
-        is_moment = bool(MOMENT.search(family.pattern))
-        (field, why), part = self._frame_of_forces(family, is_moment), "moment" if is_moment else "force"
-        if part in (wrench := self.out.columns.get(field, {})) or set(WRENCHES) & self.given:
-            return False
-        self.out.columns[field] = wrench | {part: family.entry}
-        wrench = self.out.columns[field]
-        self._add_stated_unit(family, wrench[part], f"{field}.{part}", ("torque" if is_moment else "force",))
-        if why:
-            self.out.notes[field] = f"taken to act on the robot, along the axes of {why}"
-        self._add_order(family, field)
-        return True
-
-    def _frame_of_forces(self, family: Family, is_moment: bool) -> tuple[str, str]:
-        """The field of a family of forces, and why: in the world, forces of several small feet point up."""
-        known = [field for field in WRENCHES if field in self.out.columns]
-        if is_moment or known:
-            return (known or WRENCHES)[0], "" if known else "the contact frames"
         in_order = not family.axes or family.axes[0] in "xX"
-        values = side_by_side(self.sample, family.columns)
-        if len(self.feet) > 2 and in_order and values.ndim > 1 and point_along_z(values):
-            return WRENCHES[1], "the world, as almost all of them points along z"
-        return WRENCHES[0], "the contact frames"
+        forces = side_by_side(self.sample, family.columns) if in_order else np.empty(0)
+        placed = self._place_forces("moment" if MOMENT.search(family.pattern) else "force", family, forces)
+        if placed:
+            self._add_order(family, WRENCHES[0])
+        return placed
+
+    def _place_forces(self, part: str, family: Family, forces: NDArray[Any], whose: str = "") -> bool:
+        """Whether forces (N, ..., 3) of all feet, moments beside these, or wrenches have become an entry."""
+        field = next((one for one in WRENCHES if one in self.out.columns), "")
+        wrench = self.out.columns.get(field, {})
+        if set(WRENCHES) & self.given or {part, "column", "columns"} & set(wrench) or (wrench and part == "wrench"):
+            return False
+        entry: dict[str, Any] = family.entry
+        if not field:
+            field, note, scale = frame_of_forces(forces if part != "moment" else np.empty(0), self.robot)
+            entry |= {"scale": scale} if scale < 0 else {}
+            self.out.notes[field] = f"{note}{whose}"
+        elif any("scale" in of for of in wrench.values()):
+            entry["scale"] = -1
+        self._add_stated_unit(family, entry, f"{field}.{part}", ("torque" if part == "moment" else "force",))
+        self.out.columns[field] = entry if part == "wrench" else wrench | {part: entry}
+        return True
 
     def _place_law(self, families: Sequence[Family]) -> list[Family]:
         """Families of a PD law, if there are gains."""

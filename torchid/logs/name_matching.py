@@ -11,12 +11,16 @@ SUFFIXES = {"joint": ("", "_joint"), "contact": ("", "_foot", "_sole", "_contact
 
 _LETTER = "[A-Za-z0-9\u00c0-\u024f]"  # of words with accents, too: no l between those of accélération
 _MOST_TEXTS = 1000  # that are compared with all joints
-_WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
+_WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z\u00df-\u00ff]+")
 _PLACE = re.compile(r"(?<![A-Za-z0-9])(?i:[FRHL][FRHL])[_.]?[0-9](?![A-Za-z0-9])")
 _LIMBS = {
     "left": "l", "right": "r", "front": "f", "fore": "f", "rear": "b", "hind": "b", "back": "b", "l": "l", "r": "r",
     "fl": "fl", "lf": "fl", "fr": "fr", "rf": "fr", "rl": "bl", "hl": "bl", "lh": "bl", "bl": "bl", "lb": "bl",
-    "rr": "br", "hr": "br", "rh": "br", "br": "br", "rb": "br",
+    "rr": "br", "hr": "br", "rh": "br", "br": "br", "rb": "br", "vl": "fl", "vr": "fr", "avg": "fl", "avd": "fr",
+    "arg": "bl", "ard": "br", "gauche": "l", "droit": "r", "droite": "r", "avant": "f", "arriere": "b", "arrière": "b",
+    "links": "l", "linker": "l", "linkes": "l", "rechts": "r", "rechter": "r", "rechtes": "r", "vorne": "f",
+    "vorn": "f", "hinten": "b", "izquierda": "l", "izquierdo": "l", "derecha": "r", "derecho": "r", "izq": "l",
+    "der": "r", "delantera": "f", "trasera": "b",
 }  # fmt: skip
 
 
@@ -74,8 +78,8 @@ def match_joints(texts: Sequence[str], joints: Sequence[str]) -> dict[str, str]:
     several the nearest counts; where two are as near, none.
     """
     out = {text: text for text in texts if text in joints}
-    of_texts = {text: _words(text) for text in texts[:_MOST_TEXTS] if text not in out}
-    of_joints = {joint: _words(joint) for joint in joints if joint not in out}
+    of_texts = {text: limb_and_words(text) for text in texts[:_MOST_TEXTS] if text not in out}
+    of_joints = {joint: limb_and_words(joint) for joint in joints if joint not in out}
     apart = {
         (text, joint): abs(len(words) - len(others))
         for text, (limb, words) in of_texts.items()
@@ -93,7 +97,7 @@ def match_joints(texts: Sequence[str], joints: Sequence[str]) -> dict[str, str]:
     return out
 
 
-def _words(text: str) -> tuple[frozenset[str], tuple[str, ...]]:
+def limb_and_words(text: str) -> tuple[frozenset[str], tuple[str, ...]]:
     """The limb that a name of a joint means, and its other words."""
     words = [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", text)]
     return limbs(text), tuple(word for word in words if word not in _LIMBS and word != "joint")

@@ -56,8 +56,8 @@ class UnitProposer:
         """
         self._sample, self._columns, self._notes, self._stated = sample, columns, notes, stated
 
-    def propose(self, weight: float, one_clock: bool, slides: Collection[str] = ()) -> None:
-        """Add units that are not SI units, and where turns begin.
+    def propose(self, weight: float, one_clock: bool, slides: Collection[str] = ()) -> Numbers | None:
+        """Add units that are not SI units, and where turns begin; the stamps (N,) [s], None where these are not known.
 
         Args:
             weight: of the robot [N].
@@ -66,8 +66,8 @@ class UnitProposer:
         """
         seconds = self._seconds()
         if seconds is None:
-            return
-        position, velocity = self._values(_POSITION), self._values("joint_velocity")
+            return None
+        position, velocity = self.values(_POSITION), self.values("joint_velocity")
         if position is not None:
             names = self._joints(_POSITION, position.shape[1])
             slide = np.isin(names, list(slides))
@@ -85,9 +85,10 @@ class UnitProposer:
             ("imu_specific_force", lambda x: 0.7 < _length(x) < 1.4, "g", "as its length is about 1"),
             ("imu_angular_velocity", lambda x: _rms(x) > 20.0, "deg/s", "as it is too fast for rad/s"),
         ):
-            values = self._values(name)
+            values = self.values(name)
             if values is not None and is_it(values):
                 self._set(name, unit, why)
+        return seconds
 
     def _joints(self, name: str, count: int) -> list[str]:
         """Joints by column of an entry, as many as there are columns; "" for each where the map does not say."""
@@ -144,10 +145,10 @@ class UnitProposer:
     def _seconds(self) -> Numbers | None:
         """The stamps (N,) [s]; also those of a column called `time` that has another unit."""
         if step := self._columns.get("time", {}).get("step"):
-            position = self._values(_POSITION)
+            position = self.values(_POSITION)
             return None if position is None else step * np.arange(len(position))
         native = "time" not in self._columns and self._sample.get("time") is not None
-        time = self._flat([self._sample["time"]]) if native else self._values("time")  # type: ignore[list-item]
+        time = self._flat([self._sample["time"]]) if native else self.values("time")  # type: ignore[list-item]
         if time is None or len(time) < 3:
             return None
         if (column := self._columns.get("time", {}).get("nanoseconds")) is not None:
@@ -226,7 +227,7 @@ class UnitProposer:
 
         By the base's quaternion; without one by the specific force, which is almost gravity.
         """
-        rate, up = self._values("imu_angular_velocity"), self._vertical()
+        rate, up = self.values("imu_angular_velocity"), self._vertical()
         if rate is None or up is None or not up.shape == rate.shape == (len(seconds), 3):
             return
         step = float(np.median(np.diff(seconds)))
@@ -245,10 +246,10 @@ class UnitProposer:
             entry = self._columns.get(f"base_quat_{order}", {})
             if (
                 "axis" not in entry.get("column", "axis").lower()
-                and (quat := self._values(f"base_quat_{order}")) is not None
+                and (quat := self.values(f"base_quat_{order}")) is not None
             ):
                 return vertical_in_base(quat if order == "xyzw" else np.roll(quat, -1, axis=1))
-        force = self._values("imu_specific_force")
+        force = self.values("imu_specific_force")
         return None if force is None else force / np.linalg.norm(force, axis=1, keepdims=True)
 
     def _set(self, name: str, unit: str, why: str) -> None:
@@ -262,7 +263,7 @@ class UnitProposer:
     def _note(self, name: str, text: str) -> None:
         self._notes[name] = "; ".join(filter(None, (text, self._notes.get(name))))
 
-    def _values(self, name: str) -> Numbers | None:
+    def values(self, name: str) -> Numbers | None:
         """Numbers (N, k) of an entry, in the order of its columns."""
         entry = self._columns.get(name)
         if not isinstance(entry, dict) or not {"column", "columns"} & set(entry):

@@ -17,6 +17,7 @@ from torchid.logs.column_map import Columns
 from torchid.logs.columns import TEXT_COLUMN, TableLayout, check_header, parse_header, to_columns
 from torchid.logs.containers import TEXT_TABLES, atomic_output, reader_errors_explained
 from torchid.logs.mapped_fields import MappedFields, map_table
+from torchid.logs.nested_columns import NestedColumns
 from torchid.logs.table_headers import BLOCK, TextHeader, read_header
 from torchid.logs.units import IN_DEGREES, quantities_of
 
@@ -31,6 +32,7 @@ _PARQUET = {
     "page_checksum_verification": True,
 }
 _BAD_CELL = re.compile(r"In CSV column #(\d+): (?:Row #(\d+): )?.*?invalid value '(.{0,40})", re.DOTALL)
+_SHORT_ROW = re.compile(r".*?Row #(\d+): Expected (\d+) columns, got (\d+)", re.DOTALL)
 _PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 _QUOTES = "'\n"
 _EMPTY = ["", " ", "  ", "nan", "NaN", "NAN"]
@@ -132,13 +134,12 @@ def _sample_parquet(pa: Any, path: Path) -> tuple[list[str], Any]:
     import pyarrow.parquet
 
     with pyarrow.parquet.ParquetFile(path, **_PARQUET) as file:
-        leaves = {name: type_ for field in file.schema_arrow for name, type_ in _leaves(pa, field)}
-        check_header(list(leaves))
-        _check_size(path, file.metadata.num_rows, len(leaves), whole=False)
-        plain = {name for name, type_ in leaves.items() if _is_number(pa, type_) or _is_stamp(pa, type_)}
-        numbers = [name for name in leaves if name in plain]  # of lists nobody knows the size
-        batch = next(file.iter_batches(_SAMPLE, columns=numbers), None) if numbers else None
-    return list(leaves), None if batch is None else _flat(pa, batch)
+        nested = NestedColumns(pa, file)
+        check_header(nested.names)
+        _check_size(path, file.metadata.num_rows, len(nested.names), whole=False)
+        plain = [name for name, type_ in nested.types.items() if _is_number(pa, type_) or _is_stamp(pa, type_)]
+        batch = next(file.iter_batches(_SAMPLE, columns=nested.in_file(plain)), None) if plain else None
+    return nested.names, None if batch is None else nested.flat(batch)
 
 
 def table_blocks(path: Path, columns: Columns | None = None) -> Iterator[dict[str, NDArray[Any]]]:
@@ -256,27 +257,39 @@ def _read_csv(pa: Any, path: Path, columns: Columns | None, whole: bool) -> Iter
             for batch in _bounded(path, reader, len(types), whole):
                 yield layout, batch
         except pa.ArrowInvalid as error:
-            bad = _BAD_CELL.match(str(error))
-            if bad is None:
+            if (bad := _bad_cell(path, header, error)) is None:
                 raise
-            column, row, found = bad.groups()
-            where = "" if row is None else f" in row {row}"
-            text = f"'{excerpt(found.strip(_QUOTES))}'{where}"
-            raise LogError(path, f"column '{header.texts[int(column)]}'", text, _NUMBERS) from error
+            raise bad from error
+
+
+def _bad_cell(path: Path, header: TextHeader, error: Exception) -> LogError | None:
+    """The error of a cell that is no number, or of a row with too many cells or too few; None for any other."""
+    if row := _SHORT_ROW.match(str(error)):
+        return LogError(path, f"row {row[1]}", f"{row[3]} cells", f"{row[2]} cells, as there are names")
+    bad = _BAD_CELL.match(str(error))
+    if bad is None:
+        return None
+    column, row_number, found = bad.groups()
+    where = "" if row_number is None else f" in row {row_number}"
+    found = found.strip(_QUOTES)
+    other = "." if header.decimal_mark == "," else ","
+    mixed = found.count(other) == 1 and found.replace(other, "").lstrip("-").isdigit()
+    accepted = f"the decimal mark '{header.decimal_mark}' throughout, as in other rows" if mixed else _NUMBERS
+    return LogError(path, f"column '{header.texts[int(column)]}'", f"'{excerpt(found)}'{where}", accepted)
 
 
 def _read_parquet(pa: Any, path: Path, columns: Columns | None, whole: bool) -> Iterator[tuple[_Layout, Any]]:
     import pyarrow.parquet
 
     with pyarrow.parquet.ParquetFile(path, **_PARQUET) as file:
-        texts = [name for field in file.schema_arrow for name, _ in _leaves(pa, field)]
+        texts = NestedColumns(pa, file).names
         layout = _layout(texts, columns)
     # as a dictionary: one long text, repeated in every row, could fill the memory
     with pyarrow.parquet.ParquetFile(
         path, read_dictionary=[TEXT_COLUMN] if TEXT_COLUMN in texts else None, **_PARQUET
     ) as file:
-        used = set(layout.sources)
-        for name, type_ in (leaf for field in file.schema_arrow for leaf in _leaves(pa, field)):
+        used, nested = set(layout.sources), NestedColumns(pa, file)
+        for name, type_ in nested.types.items():
             number = _is_number(pa, type_) and (name in layout.flags or not pa.types.is_boolean(type_))
             number |= _is_stamp(pa, type_)
             if name in used and not (pa.types.is_dictionary(type_) if name == TEXT_COLUMN else number):
@@ -284,29 +297,9 @@ def _read_parquet(pa: Any, path: Path, columns: Columns | None, whole: bool) -> 
                 raise LogError(path, f"column '{name}'", f"values of type {type_}", accepted)
         _check_size(path, file.metadata.num_rows, len(used), whole)
         yield layout, None
-        only = None if columns is None else list(layout.sources)
+        only = None if columns is None else nested.in_file(layout.sources)
         for batch in _bounded(path, file.iter_batches(_ROWS, columns=only), len(used), whole):
-            yield layout, _flat(pa, batch)
-
-
-def _leaves(pa: Any, field: Any, outer: str = "") -> Iterator[tuple[str, Any]]:
-    """Names and types of the columns inside a column, `state.q` for q in state."""
-    name = f"{outer}{field.name}"
-    if not pa.types.is_struct(field.type):
-        yield name, field.type
-        return
-    for inner in field.type:
-        yield from _leaves(pa, inner, f"{name}.")
-
-
-def _flat(pa: Any, batch: Any) -> Any:
-    """A batch with the columns inside of others in the place of these."""
-    if not any(pa.types.is_struct(field.type) for field in batch.schema):
-        return batch
-    table = pa.Table.from_batches([batch])
-    while any(pa.types.is_struct(field.type) for field in table.schema):
-        table = table.flatten()
-    return table.combine_chunks().to_batches()[0]
+            yield layout, nested.flat(batch)
 
 
 def _bounded(path: Path, batches: Iterable[Any], columns: int, whole: bool) -> Iterator[Any]:

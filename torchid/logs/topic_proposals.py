@@ -12,9 +12,9 @@ from torchid.logs.column_proposals import is_desired
 from torchid.logs.file_samples import TopicSample
 from torchid.logs.joint_orders import JOINT_ORDERS, suitable_orders, usual_order
 from torchid.logs.log import NORM_TOLERANCE
-from torchid.logs.map_proposals import MapProposal
 from torchid.logs.name_matching import KnownRobot, match_joints, match_names, spelled
 from torchid.logs.number_proposals import threshold
+from torchid.logs.proposed_map import MapProposal
 from torchid.logs.ros_low_state import LowState
 from torchid.logs.ros_messages import ContactFlag, Imu, JointStates, NormalForce, Odometry, Wrench
 

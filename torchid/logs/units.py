@@ -43,7 +43,7 @@ OF_JOINTS = {
 _SPELLINGS = {
     "°": "deg", "µ": "u", "μ": "u", "²": "2", "⁻": "-", "kgf": "kg", "degrees": "deg", "degree": "deg",
     "radians": "rad", "milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns", "seconds": "s", "sec": "s",
-    "dps": "deg/s",
+    "dps": "deg/s", "grados": "deg", "degrés": "deg",
 }  # fmt: skip
 _MARKS = re.compile(r"[ ·.*^]")
 _POWERS = {"s-1": "/s", "s-2": "/s2", "/s/s": "/s2", "N-m": "Nm", "nm": "Nm"}

@@ -29,6 +29,7 @@ from torchid.sensing import Contact, SensorSet
 from torchid.sensing.sensors import NORMAL_FORCE, NORMAL_INDEX, recorded_components
 
 _LISTED = 6
+_AS_MEASURED = "numbers throughout, as of a sensor that is there, or sensors without it"
 _FAR_APART = 8  # samples per chosen one, beyond which a page holds few of these
 _JOINT_FIELDS = ("joint_position", "joint_velocity", "joint_acceleration")
 
@@ -369,7 +370,7 @@ def require_forces(samples: Samples, robot: Robot, contacts: Sequence[Contact], 
             sample, dof = torch.nonzero(bad)[0].tolist()
             found = f"not a finite number at sample {sample} ({int(bad[:, dof].sum())} in all)"
             field = "ft_wrench" if dof >= robot.n else "joint_torque"
-            raise LogError(samples.source, f"{field} '{robot.dof_names[dof]}'", found, "a value: it is a sensor")
+            raise LogError(samples.source, f"{field} '{robot.dof_names[dof]}'", found, _AS_MEASURED)
     needed = recorded_components(contacts, required, samples.wrench_in_world)
     if needed.any() and samples.active.any():
         if samples.wrench is None:
@@ -384,7 +385,7 @@ def require_forces(samples: Samples, robot: Robot, contacts: Sequence[Contact], 
                 raise _scalar_error(samples, contacts[contact].frame, sample, k)
             found = f"{WRENCH_COMPONENTS[k]} is not a finite number at sample {sample}, while in contact"
             field = f"contact_wrench '{contacts[contact].frame}'"
-            raise LogError(samples.source, field, found, "a value: it is a sensor")
+            raise LogError(samples.source, field, found, _AS_MEASURED)
 
 
 def _scalar_error(samples: Samples, frame: str, sample: int, k: int) -> LogError:
@@ -396,4 +397,4 @@ def _scalar_error(samples: Samples, frame: str, sample: int, k: int) -> LogError
     if not samples.has_force_normal:
         return LogError(samples.source, field, "missing", f"the field, or sensors without {NORMAL_FORCE}")
     found = f"not a finite number at sample {sample}, while in contact"
-    return LogError(samples.source, field, found, "a value: it is a sensor")
+    return LogError(samples.source, field, found, _AS_MEASURED)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import matplotlib
 import numpy as np
@@ -17,6 +17,7 @@ from torchid.report.figure_style import IDENTIFIED_COLOR, MEASURED_COLOR, NOMINA
 _NOISE = "0.8"
 _MOST_ROWS = 6
 _NEAR_0 = 0.1  # share of the time within which axes begin at 0
+_OF_A_CLOCK = 100.0  # times as long as a log lasts: stamps that say when it was recorded, as since 1970
 _SHOWN = 1.6  # errors are shown up to so many times the largest of the identified ones, or of the noise
 
 
@@ -44,6 +45,7 @@ def force_figure(
     `dof_names`, `base_rows` and `sliding` are those of the robot, `of` is what its nominal parameters are from.
     """
     rows = largest_rows(series, base_rows, _MOST_ROWS)
+    series, since = _from_its_start(series)
     figure = Figure(figsize=(12.0, 1.7 * max(len(rows), 1) + 0.8), layout="constrained")
     axes = figure.subplots(max(len(rows), 1), 2, sharex=True, squeeze=False, width_ratios=(3, 2))
     for (forces, errors), row in zip(axes, rows, strict=False):
@@ -59,11 +61,18 @@ def force_figure(
         handles, labels = (a + b for a, b in zip(*(x.get_legend_handles_labels() for x in axes[0]), strict=True))
         figure.legend(handles, labels, loc="outside lower center", ncols=4)
     for axis in axes[-1]:
-        axis.set_xlabel("time [s]")
+        axis.set_xlabel(f"time{since} [s]")
     if len(series.time) and 0.0 <= series.time[0] < _NEAR_0 * series.time[-1]:
         axes[0, 0].set_xlim(left=0.0)
     figure.suptitle(f"Generalized forces, {series.source}, and errors: predicted - measured", x=0.01, ha="left")
     return figure
+
+
+def _from_its_start(series: ForceSeries) -> tuple[ForceSeries, str]:
+    """Forces over the time since the first sample where stamps are those of a clock, and a remark on it; else as is."""
+    if not len(series.time) or series.time[0] < _OF_A_CLOCK * (series.time[-1] - series.time[0]):
+        return series, ""
+    return replace(series, time=series.time - series.time[0]), " since the first sample"
 
 
 def _draw_errors(axis: Axes, series: ForceSeries, row: int, unit: str) -> None:

@@ -1,0 +1,133 @@
+"""What `init` makes of forces, flags and velocities whose columns name sides rather than the robot's frames."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from torchid.logs.map_proposals import propose_map
+from torchid.logs.name_matching import KnownRobot
+from torchid.logs.proposed_map import MapProposal
+
+WEIGHT, N = 300.0, 400
+TIME = 0.005 * np.arange(N)
+BIPED = KnownRobot(["l_hip", "r_hip"], ["r_ankle", "l_ankle"], "biped", WEIGHT, "pelvis", ["pelvis"], [])
+LEGS = ("FR", "FL", "RR", "RL")
+QUADRUPED = KnownRobot([f"{x}_hip" for x in LEGS], [f"{x}_foot" for x in LEGS], "dog", WEIGHT, "trunk", ["trunk"], [])
+
+
+def proposed(robot: KnownRobot, columns: dict[str, Any]) -> MapProposal:
+    return propose_map({"time": TIME, **columns}, robot)
+
+
+def swinging(seed: int) -> np.ndarray:
+    """Numbers (N,) of a load that comes and goes."""
+    return WEIGHT * np.maximum(np.sin(3.0 * TIME + seed), 0.0)
+
+
+WRENCHES = {
+    "letters": ("{side}_foot_{part}{axis}", ("left", "right")),
+    "couples": ("{Side}FootForceSensor_{part}{axis}", ("Left", "Right")),
+    "numbers": ("FT_{side}_foot[{k}]", ("left", "right")),
+}
+
+
+@pytest.mark.parametrize("dialect", WRENCHES)
+def test_wrenches_named_by_sides_are_those_of_the_feet_on_these(dialect: str) -> None:
+    text, sides = WRENCHES[dialect]
+    letters = "fc" if dialect == "couples" else "fm"
+    columns = {
+        text.format(side=side, Side=side, part=letters[k // 3], axis="xyz"[k % 3], k=k): swinging(k)
+        for side in sides
+        for k in range(6)
+    }
+    entry = proposed(BIPED, columns).columns["contact_wrench_local"]
+    of_left = [
+        of["columns"]["l_ankle"] for of in ([entry] if "columns" in entry else [entry["force"], entry["moment"]])
+    ]
+    assert (
+        of_left
+        == {
+            "letters": ["left_foot_f{axis}", "left_foot_m{axis}"],
+            "couples": ["LeftFootForceSensor_f{axis}", "LeftFootForceSensor_c{axis}"],
+            "numbers": ["FT_left_foot[{component}]"],
+        }[dialect]
+    )
+
+
+def test_arrays_of_lf_and_rf_are_wrenches_of_the_left_and_right_foot_of_a_biped() -> None:
+    wrench = np.stack([swinging(k) for k in range(6)], axis=1)
+    out = proposed(BIPED, {"lf_wrench": wrench, "rf_wrench": wrench, "lh_wrench": wrench, "rh_wrench": wrench})
+    assert out.columns["contact_wrench_local"] == {"columns": {"r_ankle": "rf_wrench", "l_ankle": "lf_wrench"}}
+    assert {"lh_wrench", "rh_wrench"} <= set(out.columns["ignore"])
+
+
+def test_wrenches_of_hands_are_none_of_feet() -> None:
+    columns = {f"{side}_hand_f{axis}": swinging(k) for side in ("left", "right") for k, axis in enumerate("xyz")}
+    assert "contact_wrench_local" not in proposed(BIPED, columns).columns
+
+
+def test_forces_that_pull_a_robot_down_are_those_on_the_ground() -> None:
+    up = np.stack([np.zeros(N), np.zeros(N), 10.0 + swinging(0)], axis=1)
+    out = proposed(QUADRUPED, {f"{x.lower()}_contact_force": -up for x in LEGS})
+    entry = out.columns["contact_wrench_world"]["force"]
+    assert entry == {"columns": {f"{x}_foot": f"{x.lower()}_contact_force" for x in LEGS}, "scale": -1}
+    assert "as they pull the robot down" in out.notes["contact_wrench_world"]
+
+
+def test_one_force_of_each_foot_by_french_sides_is_a_flag_above_a_threshold() -> None:
+    sides = {"FL_foot": "avg", "FR_foot": "avd", "RL_foot": "arg", "RR_foot": "ard"}
+    columns = {f"force_pied_{x}": swinging(k) for k, x in enumerate(sides.values())}
+    entry = proposed(QUADRUPED, columns).columns["contact_active"]
+    assert entry["columns"] == {foot: f"force_pied_{x}" for foot, x in sides.items()}
+    assert 0.0 < entry["above"] < 0.2 * WEIGHT
+
+
+def test_feet_without_names_are_in_the_order_of_the_legs_in_a_list_of_joints() -> None:
+    legs = ("FL", "FR", "RL", "RR")
+    forces = np.stack([swinging(k) for k in range(4)], axis=1)
+    out = proposed(QUADRUPED, {"names": np.array([f"{x}_hip" for x in legs]), "foot_forces": forces})
+    assert out.columns["contact_order"] == [f"{x}_foot" for x in legs]
+
+
+def pose() -> tuple[np.ndarray, Rotation, np.ndarray]:
+    """Position (N, 3), orientation and world velocity (N, 3) of a base that turns far."""
+    wave = np.stack([np.sin(2.0 * TIME), np.cos(3.0 * TIME), np.sin(TIME)], axis=1)
+    slope = np.stack([2.0 * np.cos(2.0 * TIME), -3.0 * np.sin(3.0 * TIME), np.cos(TIME)], axis=1)
+    return wave, Rotation.from_rotvec(np.outer(1.5 * TIME, [0.0, 0.0, 1.0])), slope
+
+
+@pytest.mark.parametrize("frame", ["world", "base"])
+def test_the_frame_of_a_base_velocity_is_that_in_which_it_is_the_slope_of_the_pose(frame: str) -> None:
+    position, turn, slope = pose()
+    velocity = slope if frame == "world" else turn.inv().apply(slope)
+    columns = {"base_pos": position, "base_quat": turn.as_quat(), "base_lin_vel": velocity}
+    out = proposed(BIPED, columns)
+    assert out.columns[f"base_linear_velocity_{frame}"] == {"column": "base_lin_vel"}
+    assert sum("velocity" in key for key in out.columns) == 1
+
+
+def test_a_base_velocity_that_contradicts_the_pose_is_left_out() -> None:
+    position, turn, slope = pose()
+    out = proposed(BIPED, {"base_pos": position, "base_quat": turn.as_quat(), "base_lin_vel": slope[::-1]})
+    assert not any("velocity" in key for key in out.columns)
+    assert "base_lin_vel" in out.columns["ignore"]
+
+
+def test_thirteen_columns_with_a_pose_are_a_pose_and_a_twist() -> None:
+    position, turn, slope = pose()
+    rate = np.tile([0.0, 0.0, 1.5], (N, 1))
+    out = proposed(BIPED, {"root_states": np.hstack([position, turn.as_quat(), slope, rate])}).columns
+    found = {key: entry["column"] for key, entry in out.items() if key.startswith("base")}
+    assert (found["base_position_world"], found["base_quat_xyzw"]) == ("root_states[0:3]", "root_states[3:7]")
+    assert found["base_linear_velocity_world"] == "root_states[7:10]"
+    assert any(found.get(f"base_angular_velocity_{x}") == "root_states[10:13]" for x in ("world", "base"))
+
+
+@pytest.mark.parametrize("name", ["tau_d", "tau_J_d", "torque_soll", "couple_cons"])
+def test_torques_that_are_wanted_are_not_taken_for_measured_ones(name: str) -> None:
+    columns = {f"{x}_{joint}": swinging(k) for k, joint in enumerate(BIPED.joints) for x in (name, "tau")}
+    assert proposed(BIPED, columns).columns["joint_torque"] == {"column": "tau_{joint}"}
