@@ -170,12 +170,16 @@ def _add_sample(commands: _Commands) -> None:
     what = "arrays with names, a file of the robot for each set, or ranges and correlations (default: by --output)"
     sample.add_argument("--format", choices=SAMPLE_FORMATS, help=what)
     sample.add_argument("--output", metavar="FILE", help="FILE.npz, FILE.json, or a folder for robots' files")
-    prior = "how far off the robot file may be: a standard deviation, as a share of each body (default: 0.2)"
-    sample.add_argument("--prior-error", type=float, default=0.2, metavar="SHARE", help=prior)
+    prior = "how far off the robot file may be: as a share of each body; auto: as the data say (default: 0.2)"
+    sample.add_argument("--prior-error", type=_number_or_auto, default=0.2, metavar="SHARE", help=prior)
     sample.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the random numbers (default: 0)")
     sample.add_argument("--overwrite", action="store_true", help="replace what exists there")
     _add_amount(sample)
     sample.set_defaults(command=_sample)
+
+
+def _number_or_auto(text: str) -> float | str:
+    return text if text == "auto" else float(text)
 
 
 def _add_studies(commands: _Commands) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from torchid.commands.sample import sample
 from torchid.errors import ConfigError
 from torchid.fitting.posterior import POSTERIOR
 from torchid.parameters import consistency_margin
+from torchid.terminal.finished_runs import sample_lines
 
 pytestmark = pytest.mark.filterwarnings("ignore:identified:torchid.errors.TorchidWarning")
 
@@ -74,6 +76,30 @@ def test_ranges_and_correlations_are_those_of_the_samples(run: Path, tmp_path: P
     assert "trunk.fc" not in names  # the base has no joint
 
 
+def test_auto_prior_of_a_robot_near_its_file_is_the_default(run: Path) -> None:
+    auto, default = (sample(run, 20, prior_error=x) for x in ("auto", 0.2))
+    assert auto.prior_error == 0.2
+    np.testing.assert_array_equal(auto.samples.phi, default.samples.phi)
+
+
+def test_the_answer_says_that_the_prior_is_too_narrow_and_what_fits(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drawn = sample(run, 20)
+    posterior = drawn.fitted.posterior
+    light = posterior.nominal.copy()
+    light.reshape(-1, 12)[:, :10] *= 0.3  # bodies weigh three times what their file says
+    wrong = replace(drawn, fitted=replace(drawn.fitted, posterior=replace(posterior, nominal=light)))
+    assert drawn.fitted.nominal_error is not None
+    assert "too narrow" not in " ".join(sample_lines(drawn, 100))
+    text = " ".join(" ".join(sample_lines(wrong, 100)).split())
+    found = wrong.fitted.nominal_error
+    assert found is not None
+    assert found.value > 0.6
+    assert f"bodies are off the robot file by {100.0 * found.value:.2g} %" in text
+    assert "--prior-error auto" in text
+
+
 def test_the_answer_fits_on_a_screen(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["sample", str(run), "--count", "50"]) == 0
     short = capsys.readouterr().out.splitlines()
@@ -88,7 +114,7 @@ def test_the_answer_fits_on_a_screen(run: Path, capsys: pytest.CaptureFixture[st
     ("options", "complaint"),
     [
         (["--count", "0"], "--count: 0; accepted: 1 to 200000"),
-        (["--prior-error", "-1"], "--prior-error: -1; accepted: a number above 0"),
+        (["--prior-error", "-1"], "--prior-error: -1; accepted: a number above 0, at most 100, or auto"),
         (["--seed", "-1"], "--seed: -1; accepted"),
         (["--output", "x.txt"], "'x.txt', whose extension says no format; accepted: FILE.npz"),
         (["--output", "x.txt", "--format", "npz"], "'x.txt'; accepted: FILE.npz"),

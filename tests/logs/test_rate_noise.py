@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from motions import value
+from scipy.spatial.transform import Rotation
 
 from torchid.errors import TorchidWarning
 from torchid.logs import Log
@@ -72,3 +73,43 @@ def test_uneven_stamps_are_no_noise() -> None:
     time = np.arange(5000) / RATE + np.random.default_rng(2).uniform(-2e-4, 2e-4, 5000)
     log = Log("jitter.npz", time, ("a",), 0.5 * np.sin(2.0 * np.pi * time[:, None]))
     assert said(log, cutoff_hz=20.0) == said(log) == ""
+
+
+def floating(position_noise: float = 0.0, turn_noise: float = 0.0, velocity: bool = False) -> Log:
+    """A base that sways by 5 cm and 0.1 rad at 1 Hz, seen by motion capture, or with its velocity recorded."""
+    log, rng = swinging(0.0, (0.5,)), np.random.default_rng(2)
+    w, phase = 2.0 * np.pi, log.time[:, None] * 2.0 * np.pi + np.arange(3)
+    place = {"base_position_world": 0.05 * np.sin(phase), "base_linear_velocity_world": 0.05 * w * np.cos(phase)}
+    name = "base_linear_velocity_world" if velocity else "base_position_world"
+    turn = Rotation.from_rotvec(0.1 * np.sin(phase)) * Rotation.from_rotvec(turn_noise * rng.normal(size=phase.shape))
+    seen = place[name] + position_noise * rng.normal(size=phase.shape)
+    return replace(log, base_quat_xyzw=turn.as_quat(), **{name: seen})
+
+
+@pytest.mark.parametrize(("noise", "velocity"), [(1e-3, False), (3e-2, True)])
+def test_the_linear_acceleration_of_a_base_counts_as_well(noise: float, velocity: bool) -> None:
+    log, clean = floating(noise, velocity=velocity), floating(velocity=velocity)
+    text = said(log, cutoff_hz=20.0)
+    name = f"base_{'linear_velocity' if velocity else 'position'}_world z"
+    share = float(text.split(f"{name} (")[1].split(" %")[0]) / 100.0
+    with pytest.warns(TorchidWarning):
+        noisy = value(preprocess(log, 20.0).base_linear_acceleration_world)[:, 2]
+    exact = value(preprocess(clean, 20.0).base_linear_acceleration_world)[:, 2]
+    assert share == pytest.approx(np.var(noisy - exact) / np.var(noisy), rel=0.1)
+    assert said(clean, cutoff_hz=20.0) == ""
+
+
+def test_the_angular_acceleration_of_a_base_that_comes_from_its_orientation_counts_as_well() -> None:
+    log, clean = floating(turn_noise=1e-3), floating()
+    text = said(log, cutoff_hz=20.0)
+    share = float(text.split("base_quat_xyzw y (")[1].split(" %")[0]) / 100.0
+    with pytest.warns(TorchidWarning):
+        noisy = value(preprocess(log, 20.0).base_angular_acceleration_base)[:, 1]
+    exact = value(preprocess(clean, 20.0).base_angular_acceleration_base)[:, 1]
+    assert share == pytest.approx(np.var(noisy - exact) / np.var(noisy), rel=0.1)
+
+
+def test_a_base_whose_imu_is_read_needs_no_position() -> None:
+    log = floating(1e-3)
+    still = {"imu_specific_force": np.ones((len(log), 3)), "imu_angular_velocity": np.zeros((len(log), 3))}
+    assert said(replace(log, imu_frame="base", **still), cutoff_hz=20.0) == ""

@@ -17,7 +17,7 @@ from torchid.commands.results import Identification
 from torchid.config import load_config
 from torchid.estimators import SgdEstimate
 from torchid.estimators.least_squares import COMBINED, IDENTIFIED, ConstrainedEstimate
-from torchid.parameters import PER_BODY
+from torchid.parameters import INERTIAL, PER_BODY
 from torchid.problem import Metrics
 from torchid.problem.metrics import DECISIVE_GROUPS, LIMB_GROUPS, WHITENED, WorseThanNominal
 from torchid.terminal.identification import answer_lines
@@ -105,6 +105,17 @@ def test_a_total_mass_that_contradicts_the_urdf_needs_attention(consistent: Iden
     assert "attention     the total mass is 0.4 times the URDF's: weigh the robot" in text(light, 400)
     vague = replace(light, mass=replace(light.mass, standard_error=0.4 * consistent.mass.nominal))
     assert "times the URDF's" not in text(vague)
+
+
+def test_bodies_far_off_their_file_need_a_wider_prior_and_a_line_says_which(consistent: Identification) -> None:
+    fitted = consistent.posterior
+    light = fitted.posterior.nominal.copy()
+    light.reshape(-1, PER_BODY)[:, INERTIAL] *= 0.3
+    wrong = replace(fitted, posterior=replace(fitted.posterior, nominal=light))
+    said = text(replace(consistent, posterior=wrong), 400)
+    assert "torchid sample --prior-error auto" in said
+    assert str(wrong.nominal_error) in said
+    assert "--prior-error" not in text(consistent, 400)
 
 
 def test_a_descent_that_ended_many_standard_errors_from_the_least_says_so(consistent: Identification) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from torchid.errors import join_names
 from torchid.estimators import Estimate, SgdEstimate
+from torchid.estimators.nominal_error import NominalError
 from torchid.fitting.calibration import list_confounded
 from torchid.identifiability.confounding import TotalMass
 from torchid.log_checks.weight import MAX_MASS_ERROR
@@ -183,6 +184,7 @@ def _attention(run: Identification, judged: Judged) -> Iterator[str]:
         yield "these data do not determine the total mass; weigh the robot: estimator.total_mass"
     for one in list_confounded(run.extras):
         yield one.in_short
+    yield from _far_off(run.posterior.nominal_error)
     if run.noise.suggested:
         yield f"noise: {noise_advice(run.noise.suggested)}"
 
@@ -204,6 +206,12 @@ def _unlike_sensors(identified: Metrics) -> Iterator[str]:
         if share is not None and share > _LARGER_THAN_MEASURED:
             ratio = f"{group_name(group)}: errors of {share:.2g} times what was measured"
             yield f"{ratio}; check the sensor's sign, unit and frame: torchid check"
+
+
+def _far_off(nominal: NominalError | None) -> Iterator[str]:
+    """That bodies are further off their file than samples of what data leave open take them to be."""
+    if nominal is not None and nominal.prior_is_narrow:
+        yield f"{nominal}, and so may be what they do not determine: torchid sample --prior-error auto"
 
 
 def _contradicts_nominal(mass: TotalMass) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -15,7 +16,7 @@ from torch import Tensor
 from torchid import ranks
 from torchid.commands.check import recorded_segments
 from torchid.commands.reading import LogReader
-from torchid.errors import about_file, warn_about_file
+from torchid.errors import TorchidWarning, about_file, warn_about_file
 from torchid.estimators import Conditions
 from torchid.fitting.cross_validation import RidgeChoice
 from torchid.fitting.delay import DelayChoice, choose_delay
@@ -27,6 +28,7 @@ from torchid.logs import Log
 from torchid.logs.cutoff import CutoffChoice, choose_cutoff
 from torchid.logs.log import FloatArray
 from torchid.logs.preprocess import directions, lacks_derivatives, make_timeline
+from torchid.logs.sign_filter import with_sign_filter
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.compressed_log import Block
 from torchid.problem.compression import Part
@@ -205,6 +207,9 @@ class WidthReader(LogReader):
             rates = settings.filter_hz, settings.sample_rate_hz
             with about_file(log.source):
                 timeline = make_timeline(clean.time, lacks_derivatives(clean), *rates)
-            by_width = (lambda _: None) if timeline is None else directions(clean, timeline)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", TorchidWarning)  # said where the log was read
+                filtered = timeline and with_sign_filter(timeline, clean)
+            by_width = (lambda _: None) if filtered is None else directions(clean, filtered)
             self._directions[log.source] = _Directions(log.time, joint_order(log, self.scene.robot), by_width)
         return log

@@ -31,6 +31,7 @@ from torchid.logs.preprocess import (
     make_timeline,
 )
 from torchid.logs.segments import count_samples, long_segments
+from torchid.logs.sign_filter import with_sign_filter
 from torchid.logs.signal_noise import MOST_SAMPLES, signal_noise, warn_of_noisy_accelerations
 from torchid.logs.spill import Filled, MappedPages, Spill, growing_array
 from torchid.logs.timeline import SPLINE_BLOCK, Timeline
@@ -198,6 +199,7 @@ class LargeLog:
         first = start.read(slice(0, min(len(start), MOST_SAMPLES)))
         rates = settings.filter_hz, settings.sample_rate_hz, self.sign_width
         whole = make_timeline(blocks.time, lacks_derivatives(first), *rates)
+        whole = whole and with_sign_filter(whole, first)
         coverage = {} if whole is None else self._coverage(blocks, first, whole)
         contacts = None if first.contact_active is None else contacts_alone(blocks, partial(self._pieces, blocks))
         air = None if contacts is None or not with_unloaded else in_the_air(contacts)
@@ -220,6 +222,8 @@ class LargeLog:
         for segment in usable:
             part = blocks.part(segment)
             timeline = make_timeline(part.time, True, settings.filter_hz, settings.sample_rate_hz, self.sign_width)
+            if timeline is not None:
+                timeline = replace(timeline, sign_low_pass=whole.sign_low_pass)
             out.append(Segment(part, timeline, first, None if air is None else air[segment]))
             first += len(out[-1].time)
         too_short = count_samples(standing.segments) - count_samples(usable)

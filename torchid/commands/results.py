@@ -251,6 +251,7 @@ def _metrics_document(run: Identification) -> dict[str, object]:
         "residual_std": estimate.residual_std,
         "misfit": _misfit_document(run.misfit),
         "motion_noise": asdict(run.motion_noise),
+        "nominal_error": None if run.posterior.nominal_error is None else asdict(run.posterior.nominal_error),
         "total_mass": run.mass.value if run.mass.determined else None,
         "total_mass_standard_error": run.mass.standard_error if np.isfinite(run.mass.standard_error) else None,
         "total_mass_told_from_offsets": run.mass.separable,

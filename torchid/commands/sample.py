@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import torch
 
@@ -64,7 +65,7 @@ def sample(
     count: int | None = None,
     form: str | None = None,
     output: str | Path | None = None,
-    prior_error: float = PRIOR_ERROR,
+    prior_error: float | Literal["auto"] = PRIOR_ERROR,
     seed: int = 0,
     overwrite: bool = False,
 ) -> DrawnSamples:
@@ -76,7 +77,8 @@ def sample(
         form: one of `SAMPLE_FORMATS`: "npz", arrays with names; "urdf", "mjcf": a folder with a robot for each set;
             "ranges": quantiles of each parameter and their correlations, JSON. None: as `output` says by its extension.
         output: file or folder to write; None: nothing is.
-        prior_error: standard deviation of the nominal parameters, as a share of each body.
+        prior_error: standard deviation of the nominal parameters, as a share of each body, or "auto", as the data say
+            where they contradict the default.
         seed: of the random numbers.
         overwrite: whether what stands there may be replaced.
 
@@ -86,8 +88,8 @@ def sample(
     folder, out = Path(run), None if output is None else Path(output)
     form = _form(form, out)
     count = _count(count, form)
-    if not 0.0 < prior_error <= 100.0:
-        raise ConfigError("command line", "--prior-error", f"{prior_error:g}", "a number above 0, at most 100")
+    if prior_error != "auto" and not 0.0 < prior_error <= 100.0:
+        raise ConfigError("command line", "--prior-error", f"{prior_error:g}", "a number above 0, at most 100, or auto")
     if not 0 <= seed < 2**63:
         raise ConfigError("command line", "--seed", f"{seed}", "a whole number of at least 0")
     require_run(folder)
@@ -96,6 +98,7 @@ def sample(
     elif out is not None:
         check_free_file(out, "--output", overwrite, [folder])
     fitted = read_posterior(folder)
+    prior_error = fitted.prior_error(prior_error)
     samples = PosteriorSampler(fitted, prior_error).sample(count, torch.Generator().manual_seed(seed))
     drawn = DrawnSamples(fitted=fitted, samples=samples, prior_error=float(prior_error), seed=seed, output=out)
     if out is not None:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -16,6 +17,7 @@ from torch import Tensor
 from torchid import parameters
 from torchid.errors import InputError, LogError, during
 from torchid.estimators import Conditions, Enclosure, Mirror
+from torchid.estimators.nominal_error import NominalError, nominal_error
 from torchid.estimators.posterior import PRIOR_ERROR, Posterior, whitened_rows
 from torchid.estimators.truncated_gaussian import TruncatedGaussian
 from torchid.fitting.fit import Fit
@@ -59,6 +61,18 @@ class FittedPosterior:
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the parameters, "l_knee.m" and so on, and then of the extra ones."""
         return (*(f"{body}.{name}" for body in self.body_names for name in PARAMETERS), *self.extra_names)
+
+    @cached_property
+    def nominal_error(self) -> NominalError | None:
+        """How far off the nominal bodies are where the data speak; None where these determine none."""
+        return nominal_error(self.posterior)
+
+    def prior_error(self, wanted: float | Literal["auto"]) -> float:
+        """A width of the prior as a number; "auto" is the default one unless the data contradict it beyond chance."""
+        if wanted != "auto":
+            return wanted
+        found = self.nominal_error
+        return found.value if found is not None and found.clear else PRIOR_ERROR
 
 
 def fitted_posterior(fit: Fit, robot: Robot, conditions: Conditions) -> FittedPosterior:
@@ -304,19 +318,20 @@ class PosteriorSampler(torch.nn.Module):
 
     Args:
         run: folder that `torchid identify` wrote, `posterior.npz` of one, or a `FittedPosterior`.
-        prior_error: standard deviation of the nominal parameters, as a share of each body.
+        prior_error: standard deviation of the nominal parameters, as a share of each body; "auto": 0.2, or as far as
+            they are off where the data speak, if these contradict that.
 
     Raises:
         InputError: the folder is no run, or of an older version.
     """
 
-    def __init__(self, run: str | Path | FittedPosterior, prior_error: float = PRIOR_ERROR) -> None:
+    def __init__(self, run: str | Path | FittedPosterior, prior_error: float | Literal["auto"] = PRIOR_ERROR) -> None:
         """Read the posterior and prepare the sampler."""
         super().__init__()
-        if not 0.0 < prior_error < math.inf:
-            raise InputError("sampler", "prior_error", f"{prior_error:g}", "a number above 0")
+        if prior_error != "auto" and not (isinstance(prior_error, (int, float)) and 0.0 < prior_error < math.inf):
+            raise InputError("sampler", "prior_error", f"{prior_error}", "a number above 0, or 'auto'")
         self.fitted = run if isinstance(run, FittedPosterior) else read_posterior(Path(run))
-        posterior = self.fitted.posterior
+        posterior, prior_error = self.fitted.posterior, self.fitted.prior_error(prior_error)
         conic = posterior.conic_problem(prior_error)
         self.draws = TruncatedGaussian(conic, posterior.owners())
         count = int(posterior.free.sum())

@@ -22,6 +22,7 @@ from torchid.logs.log import (
     column_labels,
 )
 from torchid.logs.quaternion import angular_acceleration_base, angular_velocity_base, make_sign_continuous
+from torchid.logs.sign_filter import mean_sign, mean_tanh, with_sign_filter
 from torchid.logs.signal_noise import signal_noise, warn_of_noisy_accelerations
 from torchid.logs.timeline import JITTER, Timeline, lay_out_timeline, nearest_known
 
@@ -36,7 +37,6 @@ DERIVATIVE_CHAINS = (
 _ANGULAR = DERIVATIVE_CHAINS[2]
 #: Norm of a filtered quaternion: below, the filter removes the rotation of the base.
 _MIN_QUATERNION_NORM = 0.5
-_LEAST_CHANGE = 1e-4  # of a tanh's argument over a step, across which its mean is its middle
 
 
 def preprocess(
@@ -92,6 +92,8 @@ def preprocess(
     noise = log.motion_noise or signal_noise(log, timeline, motion_noise)
     if timeline is None:
         return replace(log, motion_noise=noise) if noise.found else log
+    require_no_turns(log)  # which would pass for fast motion
+    timeline = with_sign_filter(timeline, log)
     coverage = {name: measure_coverage(log, name) for name in gapless_fields(log, timeline)}
     for name, found in coverage.items():
         warn_of_gaps(log, name, found)
@@ -202,7 +204,7 @@ def _direction(log: Log, smoothed: Mapping[str, FloatArray], timeline: Timeline)
     """What the filter makes of the sign of the joint velocities, (K, n); None where nothing is filtered.
 
     Dry friction reverses at once, or over the width of the timeline, and the filter smears its torque as it smears all
-    others.
+    others. The velocities are filtered less, where they have reversals that the filter would take off.
 
     Args:
         log: the log.
@@ -213,16 +215,18 @@ def _direction(log: Log, smoothed: Mapping[str, FloatArray], timeline: Timeline)
         return timeline.evaluate(timeline.smooth(log.joint_direction), (0,))[0]
     if timeline.low_pass is None:
         return None
-    velocity = smoothed.get("joint_velocity")
-    known = smoothed["joint_position"] if velocity is None else velocity
+    name = "joint_position" if log.joint_velocity is None else "joint_velocity"
+    known, wider = smoothed[name], timeline.sign_low_pass
+    if wider is not None:
+        known = replace(timeline, low_pass=wider).smooth(getattr(log, name))
     steps, width = np.diff(timeline.grid), timeline.sign_width
     out = np.empty((len(timeline.output_stamps), known.shape[1]))
     together = _channels_together(len(known))
     for start in range(0, known.shape[1], together):
         x = known[:, start : start + together]
-        halfway = np.diff(x, axis=0) / steps[:, None] if velocity is None else 0.5 * (x[1:] + x[:-1])
+        halfway = np.diff(x, axis=0) / steps[:, None] if name == "joint_position" else 0.5 * (x[1:] + x[:-1])
         before, after = np.concatenate([halfway[:1], halfway]), np.concatenate([halfway, halfway[-1:]])
-        sign = _mean_sign(before, after) if width is None else _mean_tanh(before / width, after / width)
+        sign = mean_sign(before, after) if width is None else mean_tanh(before / width, after / width)
         out[:, start : start + together] = timeline.evaluate(timeline.low_pass(sign), (0,))[0]
     return out
 
@@ -230,21 +234,9 @@ def _direction(log: Log, smoothed: Mapping[str, FloatArray], timeline: Timeline)
 def directions(log: Log, timeline: Timeline) -> Callable[[float | None], FloatArray | None]:
     """`joint_direction` of the preprocessed log by the width of the sign, as `preprocess` takes it."""
     name = "joint_position" if log.joint_velocity is None else "joint_velocity"
-    smoothed = {name: timeline.smooth(getattr(log, name))}
-    return lambda width: _direction(log, smoothed, replace(timeline, sign_width=width))
-
-
-def _mean_sign(before: FloatArray, after: FloatArray) -> FloatArray:
-    """Mean of the sign of what goes from one value to another, (M,)."""
-    size = np.abs(before) + np.abs(after)
-    return np.divide(before + after, size, out=np.zeros_like(size), where=size > 0.0)
-
-
-def _mean_tanh(before: FloatArray, after: FloatArray) -> FloatArray:
-    """Likewise of the hyperbolic tangent, whose integral is log cosh."""
-    change, tanh = after - before, np.tanh(0.5 * (before + after))
-    integral = np.logaddexp(after, -after) - np.logaddexp(before, -before)
-    return np.divide(integral, change, out=tanh, where=np.abs(change) > _LEAST_CHANGE)
+    signs = timeline if timeline.sign_low_pass is None else replace(timeline, low_pass=timeline.sign_low_pass)
+    smoothed = {name: signs.smooth(getattr(log, name))}
+    return lambda width: _direction(log, smoothed, replace(timeline, sign_width=width, sign_low_pass=None))
 
 
 def _continuous(log: Log, name: str) -> FloatArray:

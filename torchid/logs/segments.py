@@ -20,6 +20,7 @@ from torchid.logs.preprocess import (
     move_to_timeline,
     unloaded_readings,
 )
+from torchid.logs.sign_filter import with_sign_filter
 from torchid.logs.signal_noise import signal_noise, warn_of_noisy_accelerations
 from torchid.logs.timeline import FEWEST_DIFFERENTIATED, LONGEST_STEP, Timeline, spline_derivatives
 
@@ -60,12 +61,14 @@ def preprocess_segments(
     log = dataclasses.replace(log, contact_unloaded=unloaded_readings(log))
     parts = []
     longest_of = max(usable, key=lambda segment: segment.stop - segment.start)
+    whole = with_sign_filter(whole, log.select(longest_of))
     for segment in usable:
         part = log.select(segment)
         with about_file(log.source):
             timeline = make_timeline(part.time, True, cutoff_hz, sample_rate_hz, sign_width)
         if timeline is None:
             raise ValueError("nothing to derive")
+        timeline = dataclasses.replace(timeline, sign_low_pass=whole.sign_low_pass)
         parts.append(move_to_timeline(part, timeline, coverage))
         if segment is longest_of:
             with about_file(log.source):

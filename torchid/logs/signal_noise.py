@@ -124,6 +124,12 @@ def white_noise(time: FloatArray, values: FloatArray) -> FloatArray:
     return np.where(is_noise, lower, 0.0)
 
 
+def rough_noise(values: FloatArray) -> FloatArray:
+    """Standard deviation of whatever is not smooth from sample to sample in even channels (N, c), (c,)."""
+    differences = np.diff(values, n=_ORDERS[0], axis=0) / np.sqrt(comb(2 * _ORDERS[0], _ORDERS[0]))
+    return np.asarray(differences.std(axis=0))
+
+
 def _left_by_differences(values: FloatArray, order: int) -> FloatArray:
     differences = np.diff(values, n=order, axis=0) / np.sqrt(comb(2 * order, order))
     off = np.abs(differences - np.median(differences, axis=0))
@@ -150,7 +156,8 @@ _NAMED = 4
 _DERIVATIVES = {
     "joint_acceleration": (("joint_velocity", 1), ("joint_position", 2)),
     "imu_angular_acceleration": (("imu_angular_velocity", 1),),
-    "base_angular_acceleration_base": (("base_angular_velocity_base", 1),),
+    "base_angular_acceleration_base": (("base_angular_velocity_base", 1), (_ORIENTATION, 2)),
+    "base_linear_acceleration_world": (("base_linear_velocity_world", 1), ("base_position_world", 2)),
 }
 _AXES = ("x", "y", "z")
 
@@ -191,7 +198,8 @@ def _noise_shares(log: Log, preprocessed: Log, noise: SignalNoise) -> Iterator[t
     """Channels of accelerations with much noise: its share of the variance, and the number of derivatives."""
     for name, sources in _DERIVATIVES.items():
         derived: FloatArray | None = getattr(preprocessed, name)
-        if getattr(log, name) is not None or derived is None:
+        unused = name.startswith("base_") and log.imu_specific_force is not None
+        if getattr(log, name) is not None or derived is None or unused:
             continue
         source, order = next(((field, order) for field, order in sources if getattr(log, field) is not None), ("", 0))
         if source not in noise.std:

@@ -85,10 +85,13 @@ def sample_lines(drawn: DrawnSamples, width: int, verbose: bool = False) -> list
     total = np.quantile(table[:, MASS : len(fitted.posterior.nominal) : PER_BODY].sum(axis=1), _ENDS)
     lines = wrap_words(
         f"{format_count(len(table), 'robot')} that can exist; 95 % of them weigh {total[0]:.4g} to {total[2]:.4g} kg. "
-        f"Prior: nominal bodies may be off by {100.0 * drawn.prior_error:g} % (--prior-error).",
+        f"Prior: nominal bodies may be off by {100.0 * drawn.prior_error:.3g} % (--prior-error).",
         width,
         "  ",
     )
+    found = fitted.nominal_error
+    if found is not None and found.prior_is_narrow and drawn.prior_error < found.value:
+        lines += wrap_words(f"  {found}: ranges are too narrow; --prior-error auto takes that.", width, "  ")
     numbers = _shown(drawn, table, verbose)
     ranges = np.quantile(table[:, numbers], _ENDS, axis=0)
     names = [fitted.parameter_names[number] for number in numbers]

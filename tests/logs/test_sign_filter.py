@@ -1,0 +1,89 @@
+"""Dry friction of joints that vibrate faster than the filter's cutoff."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from torchid.errors import TorchidWarning
+from torchid.logs import Log
+from torchid.logs.log import FloatArray
+from torchid.logs.preprocess import lacks_derivatives, make_timeline, move_to_timeline, preprocess
+from torchid.logs.sign_filter import wider_low_pass, with_sign_filter
+from torchid.logs.timeline import Timeline
+
+CUTOFF, RATE = 20.0, 500.0  # Hz
+
+
+def recorded(
+    vibration: float, velocity_noise: float = 0.0, position_noise: float = 0.0, with_velocity: bool = True
+) -> tuple[Log, FloatArray]:
+    """Two joints that swing, and vibrate at 27 and 33 Hz [rad/s]; and their true velocities."""
+    time, rng = np.arange(6000) / RATE, np.random.default_rng(0)
+    slow, fast = 2.0 * np.pi * np.array([0.4, 0.7]), 2.0 * np.pi * np.array([27.0, 33.0])
+    phase = time[:, None]
+    velocity = np.cos(slow * phase) + vibration * np.cos(fast * phase + 1.0)
+    position = np.sin(slow * phase) / slow + vibration * np.sin(fast * phase + 1.0) / fast
+    log = Log(
+        "vibrating",
+        time=time,
+        joint_names=("a", "b"),
+        joint_position=position + position_noise * rng.normal(size=position.shape),
+        joint_velocity=velocity + velocity_noise * rng.normal(size=velocity.shape) if with_velocity else None,
+    )
+    return log, velocity
+
+
+def timeline_of(log: Log, cutoff: float = CUTOFF) -> Timeline:
+    timeline = make_timeline(log.time, lacks_derivatives(log), cutoff, None)
+    assert timeline is not None
+    return timeline
+
+
+@pytest.mark.parametrize(
+    ("noise", "with_velocity"),
+    [({}, True), ({"velocity_noise": 0.02}, True), ({}, False), ({"position_noise": 2e-5}, False)],
+)
+def test_friction_reverses_as_often_as_the_joint_and_not_as_its_filtered_velocity(
+    noise: dict[str, float], with_velocity: bool
+) -> None:
+    log, velocity = recorded(0.8, with_velocity=with_velocity, **noise)
+    timeline = timeline_of(log)
+    assert timeline.low_pass is not None
+    true = timeline.low_pass(np.sign(velocity))[timeline.kept]
+    with pytest.warns(TorchidWarning, match=r"joints move faster .* [34]\d % .*\.cutoff_hz of (40|80|160) or more"):
+        found = preprocess(log, CUTOFF).joint_direction
+    alone = move_to_timeline(log, timeline, {}).joint_direction  # of velocities behind the timeline's own filter
+    assert found is not None
+    assert alone is not None
+    assert np.sqrt(np.mean((found - true) ** 2)) < 0.05
+    assert np.sqrt(np.mean((alone - true) ** 2)) > 0.15
+
+
+@pytest.mark.parametrize(
+    ("vibration", "noise"), [(0.0, {}), (0.0, {"velocity_noise": 0.1}), (0.02, {"velocity_noise": 0.02})]
+)
+def test_smooth_motion_keeps_the_filter_however_noisy(vibration: float, noise: dict[str, float]) -> None:
+    log, _ = recorded(vibration, **noise)
+    assert wider_low_pass(log, timeline_of(log)) is None
+
+
+def test_steps_of_an_encoder_are_no_vibration() -> None:
+    log, _ = recorded(0.0, with_velocity=False)
+    step = 2.0 * np.pi / 4096.0  # its velocity jumps between 0 and 0.8 rad/s from sample to sample
+    coarse = replace(log, joint_position=step * np.round(log.joint_position / step))
+    assert wider_low_pass(coarse, timeline_of(coarse)) is None
+
+
+def test_parts_of_a_log_have_the_directions_of_the_whole() -> None:
+    log, _ = recorded(0.8, velocity_noise=0.02)
+    with pytest.warns(TorchidWarning, match="joints move faster"):
+        timeline = with_sign_filter(timeline_of(log), log)
+    assert timeline.sign_low_pass is not None
+    whole = move_to_timeline(log, timeline, {}).joint_direction
+    samples, part = timeline.part(2000, 2600)
+    of_part = move_to_timeline(log.select(samples), part, {}).joint_direction
+    assert whole is not None
+    np.testing.assert_allclose(of_part, whole[2000:2600], atol=1e-12)

@@ -1,0 +1,125 @@
+"""The filter of the velocities whose sign dry friction goes with: as wide as their noise allows.
+
+A low-pass filter for accelerations takes vibration off the velocities, and with it their reversals: the mean of the
+sign comes out too large. The sign needs no derivative, so that it bears more of the noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from torchid.errors import about_file, warn_about_file
+from torchid.logs.log import FloatArray, Log
+from torchid.logs.low_pass import LowPass
+from torchid.logs.signal_noise import MOST_SAMPLES, rough_noise
+from torchid.logs.timeline import JITTER, Timeline, spline_derivatives
+
+_FEWEST = 100  # samples
+_DOUBLINGS = 8  # of the cutoff
+_MUCH = 0.05  # share of the velocities' power that is worth a warning
+_LEAST_CHANGE = 1e-4  # of a tanh's argument over a step, across which its mean is its middle
+_WIDEST = 0.4  # largest cutoff over the sample rate
+_EVIDENT = 0.01  # share of the velocities' power by which the error must fall: less is a few per cent of the reversals
+
+
+def with_sign_filter(timeline: Timeline, log: Log) -> Timeline:
+    """A timeline of a log, or of one whose start this is, with the filter of `wider_low_pass`.
+
+    Warns:
+        TorchidWarning: the timeline's own filter takes off much of the joints' motion.
+    """
+    wider = wider_low_pass(log, timeline)
+    if wider is None:
+        return timeline
+    if wider.lost > _MUCH:
+        with about_file(log.source):
+            warn_about_file(f"joints move faster than the filter lets through: {wider}")
+    return replace(timeline, sign_low_pass=wider.low_pass)
+
+
+@dataclass(frozen=True)
+class WiderLowPass:
+    """A filter that leaves velocities a smaller error than that of a timeline.
+
+    Attributes:
+        low_pass: the filter.
+        cutoff_hz: of it [Hz].
+        lost: by how much the error is smaller, as a share of the velocities' power.
+    """
+
+    low_pass: LowPass
+    cutoff_hz: float
+    lost: float
+
+    def __str__(self) -> str:
+        """What is lost, what follows and what helps."""
+        return (
+            f"{100.0 * self.lost:.0f} % of the power of their velocities is taken off, with whose squares forces go;"
+            " parameters may be off by more than their standard errors; accepted: preprocessing.cutoff_hz of"
+            f" {self.cutoff_hz:.3g} or more"
+        )
+
+
+def wider_low_pass(log: Log, timeline: Timeline) -> WiderLowPass | None:
+    """The filter of velocities that leaves their least error, of motion that is lost and noise that is left together.
+
+    None for that of the timeline, unless a wider one is clearly better.
+
+    Source: Stein's unbiased estimate of the risk (Annals of Statistics 9, 1981), of a linear filter; the noise is
+    whatever is not smooth from sample to sample, quantization included, so that it is rather too large.
+
+    Args:
+        log: as recorded, or its start.
+        timeline: that it is preprocessed to.
+    """
+    cutoff, low_pass = timeline.cutoff_hz, timeline.low_pass
+    start = log.select(slice(0, MOST_SAMPLES))
+    if cutoff is None or low_pass is None or len(start) < max(_FEWEST, 2 * low_pass.padding):
+        return None
+    name = "joint_position" if start.joint_velocity is None else "joint_velocity"
+    values: FloatArray = getattr(start, name)
+    if not values.shape[1] or not np.isfinite(values).all():
+        return None
+    step = float(np.median(np.diff(start.time)))
+    if np.ptp(np.diff(start.time)) > JITTER * step:
+        even = start.time[0] + step * np.arange(int((start.time[-1] - start.time[0]) / step) + 1)
+        values = spline_derivatives(start.time, values, even, (0,))[0]
+    correlation = np.square(rough_noise(values)).sum() * np.array([1.0, 0.0])
+    if name == "joint_position":
+        values = np.diff(values, axis=0) / step
+        correlation = correlation[0] / step**2 * np.array([2.0, -1.0])
+    cutoffs = [cutoff * 2.0**k for k in range(1, _DOUBLINGS) if cutoff * 2.0**k < _WIDEST / step]
+    wider = [LowPass.butterworth(one, step) for one in cutoffs]
+    first, *errors = (_error(one, values, correlation) for one in [low_pass, *wider])
+    power = float(np.square(values).mean(axis=0).sum())
+    best = int(np.argmin([first, *errors])) - 1
+    if best < 0 or first - errors[best] <= _EVIDENT * power:
+        return None
+    return WiderLowPass(wider[best], cutoffs[best], (first - errors[best]) / power)
+
+
+def _error(low_pass: LowPass, values: FloatArray, correlation: FloatArray) -> float:
+    """Mean squared error of filtered channels (M, n), summed, but for a constant.
+
+    `correlation`: of the noise with itself and with that of the next sample, summed over channels.
+    """
+    impulse = np.zeros(2 * low_pass.padding + 2 * low_pass.settling + 1)
+    impulse[len(impulse) // 2] = 1.0
+    response = low_pass(impulse[:, None])[len(impulse) // 2 :, 0]
+    lost = float(np.square(values - low_pass(values)).mean(axis=0).sum())
+    return lost + 2.0 * float(response[0] * correlation[0] + 2.0 * response[1] * correlation[1])
+
+
+def mean_sign(before: FloatArray, after: FloatArray) -> FloatArray:
+    """Mean of the sign of what goes from one value to another, (M,)."""
+    size = np.abs(before) + np.abs(after)
+    return np.divide(before + after, size, out=np.zeros_like(size), where=size > 0.0)
+
+
+def mean_tanh(before: FloatArray, after: FloatArray) -> FloatArray:
+    """Likewise of the hyperbolic tangent, whose integral is log cosh."""
+    change, tanh = after - before, np.tanh(0.5 * (before + after))
+    integral = np.logaddexp(after, -after) - np.logaddexp(before, -before)
+    return np.divide(integral, change, out=tanh, where=np.abs(change) > _LEAST_CHANGE)
