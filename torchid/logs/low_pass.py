@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache
 
 import numpy as np
 
@@ -43,37 +43,16 @@ class LowPass:
         return cls(sections, padding=max(15, math.ceil(1.0 / (cutoff_hz * step))))
 
     def __call__(self, values: FloatArray) -> FloatArray:
-        """Filter every channel of uniformly sampled values (M, ...) forward and backward, M above the padding.
+        """Filter every channel of uniformly sampled values (M, ...) forward and backward, M above the padding."""
+        from scipy import signal
 
-        To the last bit what `scipy.signal.sosfiltfilt` returns, in half of its time: constants are worked out once, and
-        samples of a channel lie one after the other.
-        """
         flat = values.reshape(len(values), -1)
         out = np.empty(flat.shape)
         together = max(1, _FILTERED_AT_ONCE // max(len(flat), 1))
         for first in range(0, flat.shape[1], together):
-            columns = slice(first, first + together)
-            out[:, columns] = self._both_ways(flat[:, columns].T).T
+            channels = np.ascontiguousarray(flat[:, first : first + together].T)
+            out[:, first : first + together] = signal.sosfiltfilt(self.sections, channels, padlen=self.padding).T
         return out.reshape(values.shape)
-
-    def _both_ways(self, x: FloatArray) -> FloatArray:
-        """Channels (k, M) filtered forward and backward, each end turned about its last sample to settle the filter."""
-        from scipy import signal
-
-        before = 2.0 * x[:, :1] - x[:, self.padding : 0 : -1]
-        after = 2.0 * x[:, -1:] - x[:, -2 : -2 - self.padding : -1]
-        y = np.concatenate([before, x, after], axis=1)
-        for _ in range(2):
-            y, _ = signal.sosfilt(self.sections, y, zi=self._settled[:, None] * y[:, :1])
-            y = y[:, ::-1]
-        return np.asarray(y[:, self.padding : -self.padding])
-
-    @cached_property
-    def _settled(self) -> FloatArray:
-        """State of each section, (sections, 2), after a constant 1."""
-        from scipy import signal
-
-        return np.asarray(signal.sosfilt_zi(self.sections))
 
     @property
     def settling(self) -> int:
