@@ -70,6 +70,7 @@ def refusal(path: Path, kind: type[InputError] = UrdfError, base_link: str | Non
     """The one line that loading fails with."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", TorchidWarning)
+        warnings.simplefilter("ignore", RuntimeWarning)  # yourdfpy turns angles into matrices before anyone can look
         return refused(lambda: load_robot(path, base_link), f"{path}: ", kind)
 
 

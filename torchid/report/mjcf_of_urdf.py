@@ -15,9 +15,8 @@ from torchid.parameters import Array
 from torchid.report.mjcf_files import inertial_element, numbers_text
 from torchid.report.urdf_files import mass_bounds, warn_if_inconsistent, without_links_beyond_welds
 from torchid.robot import Robot
-from torchid.robot.tree import Mimic, link_parameters, resolve_mimics
-from torchid.robot.urdf import MOVING_TYPES, MeshError, mesh_path, parse_xml, position_limits, read_urdf
-from torchid.robot.urdf_elements import TreeJoint
+from torchid.robot.tree import Mimic, joint_origin, link_parameters, resolve_mimics
+from torchid.robot.urdf import MOVING_TYPES, MeshError, TreeJoint, mesh_path, parse_xml, position_limits, read_urdf
 
 _MESHES = (".stl", ".obj")  # that MuJoCo reads
 
@@ -97,7 +96,7 @@ class _Model:
                 self._add_shape(body, shape, kind)
         for below in self._joints:
             if below.parent == name:
-                self._add_body(body, below.child, below.origin, below)
+                self._add_body(body, below.child, joint_origin(below), below)
 
     def _inertial(self, link: str) -> Array | None:
         """Parameters (12,) of a link, those of its body if that has its name; None of one without mass."""

@@ -8,8 +8,7 @@ from pathlib import Path
 
 from torchid.errors import ConfigError, UnknownNameError, warn
 from torchid.parameters import Array
-from torchid.robot.urdf import parse_xml
-from torchid.robot.urdf_elements import TreeJoint
+from torchid.robot.urdf import TreeJoint, parse_xml
 from torchid.robot.welds import matching_joints
 from torchid.robot.xml_files import OWN
 

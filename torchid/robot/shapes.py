@@ -15,13 +15,13 @@ from lxml import etree
 from scipy.optimize import minimize_scalar
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
+from yourdfpy.urdf import Inertial
 
 from torchid.errors import UrdfError, excerpt, warn
 from torchid.guards import MAX_AXES, MAX_NUMBER, MAX_POINTS, MAX_SHAPES
 from torchid.parameters import Array
 from torchid.robot.robot import Robot
 from torchid.robot.urdf import MeshError, mesh_content, parse_xml, read_urdf
-from torchid.robot.urdf_elements import Inertial
 
 ShapeKind = Literal["collision", "visual"]
 SHAPE_TAGS = ("box", "sphere", "cylinder", "capsule", "mesh")
@@ -97,8 +97,8 @@ def body_extents(robot: Robot, prefer: ShapeKind = "visual", bodies: Iterable[in
                 T_body_link = robot.links[name][1]
                 link_shapes = _link_shapes(meshes, elements[name], prefer)
                 shapes += [shape.moved(T_body_link) for shape in link_shapes]
-                if not link_shapes and (inertial := inertials[name]) is not None and inertial.mass > 0.0:
-                    inertia_boxes.append(_inertia_box(inertial).moved(T_body_link))
+                if not link_shapes and inertials[name] is not None and inertials[name].mass > 0.0:
+                    inertia_boxes.append(_inertia_box(inertials[name]).moved(T_body_link))
         except MeshError as error:
             unreadable.append(body.name)
             reasons.append(str(error))
@@ -255,7 +255,7 @@ def _require_vertices(filename: str, vertices: object) -> Array:
 
 def _inertia_box(inertial: Inertial) -> _Shape:
     """The uniform box that has a link's inertia."""
-    inertia, T = inertial.inertia, inertial.origin
+    inertia, T = np.asarray(inertial.inertia), np.eye(4) if inertial.origin is None else inertial.origin
     spread = (0.5 * np.trace(inertia) * np.eye(3) - inertia) / inertial.mass
     values, axes = np.linalg.eigh(spread)
     corners = _CORNERS * np.sqrt(3.0 * np.maximum(values, 0.0))

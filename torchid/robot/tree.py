@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from yourdfpy.urdf import Inertial, Link
 
 from torchid import parameters
 from torchid.errors import UnknownNameError, UnphysicalInertiaWarning, UrdfError, join_names, warn
 from torchid.guards import MAX_NUMBER
 from torchid.parameters import Array
-from torchid.robot.urdf import MOVING_TYPES
-from torchid.robot.urdf_elements import Inertial, Link, TreeJoint
+from torchid.robot.urdf import MOVING_TYPES, TreeJoint
 
 FT_FIELD = "force/torque sensor at a fixed joint"
 
@@ -188,6 +188,11 @@ def _start_body(tree: BodyTree, name: str, joint: BodyJoint | None) -> None:
     tree.joints.append(joint)
 
 
+def joint_origin(joint: TreeJoint) -> Array:
+    """Pose of a joint's frame in its parent link's, (4, 4) [m]."""
+    return np.eye(4) if joint.origin is None else np.asarray(joint.origin, dtype=np.float64)
+
+
 def _child_offset(joint: TreeJoint) -> Array:
     """Pose of a joint's child link in the moved joint frame, (4, 4) [m]."""
     T = np.eye(4)
@@ -209,11 +214,11 @@ def _body_joint(tree: BodyTree, joint: TreeJoint, reverse: bool, mimic: Mimic | 
         kind="fixed" if weld else "prismatic" if joint.type == "prismatic" else "revolute",
         parent=body,
         axis=-axis if reverse else axis,
-        T_parent_joint=T_body_near @ (_inverse(_child_offset(joint)) if reverse else joint.origin),
-        T_joint_link=_inverse(joint.origin) if reverse else _child_offset(joint),
+        T_parent_joint=T_body_near @ (_inverse(_child_offset(joint)) if reverse else joint_origin(joint)),
+        T_joint_link=_inverse(joint_origin(joint)) if reverse else _child_offset(joint),
         mimic=mimic,
-        damping=joint.damping,
-        friction=joint.friction,
+        damping=joint.dynamics.damping if joint.dynamics else 0.0,
+        friction=joint.dynamics.friction if joint.dynamics else 0.0,
         armature=joint.armature,
         stiffness=joint.stiffness,
         rest=joint.rest,
@@ -223,7 +228,7 @@ def _body_joint(tree: BodyTree, joint: TreeJoint, reverse: bool, mimic: Mimic | 
 
 def _locked_pose(joint: TreeJoint, reverse: bool, mimics: dict[str, Mimic]) -> Array:
     """Pose of the next link in the previous one, seen from the base, across a joint that does not move."""
-    T_parent_child = joint.origin
+    T_parent_child = joint_origin(joint)
     if joint.name in mimics:
         T_parent_child = T_parent_child @ joint_transform(joint.type, joint.axis, mimics[joint.name].offset)
     T_parent_child = T_parent_child @ _child_offset(joint)
@@ -270,8 +275,9 @@ def link_parameters(link: Link, T_body_link: Array) -> Array:
     inertial = link.inertial
     if inertial is None:
         return np.zeros(parameters.INERTIAL.stop)
+    T_link_com = np.eye(4) if inertial.origin is None else inertial.origin
     at_com = parameters.inertial_vector(inertial.mass, np.zeros(3), inertial.inertia)
-    return parameters.change_of_frame(T_body_link @ inertial.origin) @ at_com
+    return parameters.change_of_frame(T_body_link @ T_link_com) @ at_com
 
 
 def _unphysical(inertial: Inertial) -> str:

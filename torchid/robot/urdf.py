@@ -7,10 +7,14 @@ import math
 import os
 import re
 from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
+import yourdfpy
 from lxml import etree
+from yourdfpy.urdf import Joint, Link
 
 from torchid.errors import UnknownNameError, UrdfError, excerpt, is_plain
 from torchid.guards import (
@@ -24,8 +28,7 @@ from torchid.guards import (
     format_bytes,
     read_bytes,
 )
-from torchid.robot.urdf_elements import Link, TreeJoint
-from torchid.robot.xml_files import MJCF_WORLD, is_mjcf, read_xml
+from torchid.robot.xml_files import MJCF_WORLD, OWN, is_mjcf, read_xml
 
 MOVING_TYPES = ("revolute", "continuous", "prismatic")
 JOINT_TYPES = (*MOVING_TYPES, "fixed")
@@ -65,6 +68,36 @@ def drop_repeated_origins(root: etree._Element) -> None:
             element.remove(again)
 
 
+@dataclass(eq=False)
+class TreeJoint(Joint):  # type: ignore[misc]
+    """A joint with what a URDF cannot say of it.
+
+    Attributes:
+        child_offset: origin of the child link's frame in the moved joint frame, (3,) [m].
+        armature: reflected rotor inertia [kg m^2 or kg].
+        stiffness, rest: of a spring [N m/rad or N/m], and the position at which it exerts no force [rad or m].
+        passive: whether no motor drives it.
+    """
+
+    child_offset: tuple[float, ...] = (0.0, 0.0, 0.0)
+    armature: float = 0.0
+    stiffness: float = 0.0
+    rest: float = 0.0
+    passive: bool = False
+
+
+def _tree_joint(joint: Joint, element: etree._Element) -> TreeJoint:
+    """A joint with the attributes of its element that yourdfpy does not read."""
+    if joint.dynamics is not None:  # left as text by yourdfpy
+        joint.dynamics.damping = float(joint.dynamics.damping or 0.0)
+        joint.dynamics.friction = float(joint.dynamics.friction or 0.0)
+    child, dynamics = element.find("child"), element.find("dynamics")
+    offset, of = "0 0 0" if child is None else child.get(f"{OWN}xyz", "0 0 0"), getattr(dynamics, "attrib", {})
+    own: dict[str, Any] = {name: float(of.get(OWN + name, 0.0)) for name in ("armature", "stiffness", "rest")}
+    own |= {"child_offset": tuple(map(float, offset.split())), "passive": OWN + "passive" in of}
+    return TreeJoint(**vars(joint), **own)
+
+
 def read_urdf(path: Path) -> tuple[list[Link], list[TreeJoint]]:
     """Links and joints of a URDF, each element checked on its own; `build_tree` checks the tree.
 
@@ -86,11 +119,12 @@ def read_urdf(path: Path) -> tuple[list[Link], list[TreeJoint]]:
     for element in root.findall("link"):
         _check_link(path, element)
     try:
-        found = [Link.of(one) for one in root.findall("link")], [TreeJoint.of(one) for one in root.findall("joint")]
+        model = yourdfpy.URDF.load(io.BytesIO(etree.tostring(root)), build_scene_graph=False, load_meshes=False).robot
+        model.joints = [_tree_joint(*pair) for pair in zip(model.joints, root.findall("joint"), strict=True)]
     except ValueError as error:
         raise UrdfError(path, "XML", f"a number cannot be read: {error}", "decimal numbers") from error
-    _check_values(path, *found)
-    return found
+    _check_values(path, model.links, model.joints)
+    return model.links, model.joints
 
 
 def _read_elements(path: Path) -> etree._Element:
@@ -131,7 +165,7 @@ def _check_name(path: Path, field: str, name: str) -> None:
 
 
 def _check_numbers(path: Path, owner: etree._Element) -> None:
-    """Refuse attributes that are not decimal numbers, with the element's name."""
+    """Refuse attributes that are not decimal numbers; yourdfpy's error would not name the element."""
     of = f"{owner.tag!s} '{owner.get('name')}'"
     for part in owner:
         for element in part.iter():
@@ -218,7 +252,7 @@ def position_limits(path: Path) -> dict[str, tuple[float, float]]:
     return limits
 
 
-def _check_values(path: Path, links: list[Link], joints: list[TreeJoint]) -> None:
+def _check_values(path: Path, links: list[Link], joints: list[Joint]) -> None:
     """Refuse negative masses and friction, and axes that are zero."""
     for link in links:
         if link.inertial is not None and link.inertial.mass < 0.0:
@@ -226,8 +260,8 @@ def _check_values(path: Path, links: list[Link], joints: list[TreeJoint]) -> Non
             raise UrdfError(path, field, f"mass {link.inertial.mass:g} kg", "mass > 0, or 0 for a massless link")
     for joint in joints:
         field = f"joint '{joint.name}'"
-        if min(joint.damping, joint.friction) < 0.0:
-            found = f"damping {joint.damping:g}, friction {joint.friction:g}"
+        if joint.dynamics is not None and min(joint.dynamics.damping, joint.dynamics.friction) < 0.0:
+            found = f"damping {joint.dynamics.damping:g}, friction {joint.dynamics.friction:g}"
             raise UrdfError(path, f"{field}, <dynamics>", found, "numbers of at least 0")
         if joint.type in MOVING_TYPES and not np.linalg.norm(joint.axis) > 0.0:
             raise UrdfError(path, f"{field}, <axis>", f"'{joint.axis}'", "three numbers, not all zero")

@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 
 from torchid.errors import ConfigError, UnknownNameError, join_names
-from torchid.robot.tree import joint_transform, resolve_mimics
-from torchid.robot.urdf import MOVING_TYPES, position_limits
-from torchid.robot.urdf_elements import TreeJoint
+from torchid.robot.tree import joint_origin, joint_transform, resolve_mimics
+from torchid.robot.urdf import MOVING_TYPES, TreeJoint, position_limits
 
 WELD_FIELD = "robot.weld"
 
@@ -105,7 +104,7 @@ def weld_joints(joints: Sequence[TreeJoint], positions: Mapping[str, float]) -> 
     """The joints, those with a position fixed there."""
 
     def welded(joint: TreeJoint) -> TreeJoint:
-        origin = joint.origin @ joint_transform(joint.type, joint.axis, positions[joint.name])
+        origin = joint_origin(joint) @ joint_transform(joint.type, joint.axis, positions[joint.name])
         changes: dict[str, Any] = {"type": "fixed", "mimic": None, "origin": origin}
         return replace(joint, **changes)
 

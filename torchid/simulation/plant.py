@@ -16,9 +16,8 @@ from torchid.errors import UrdfError
 from torchid.parameters import Array
 from torchid.robot.loops import loops_of_file, passive_joints
 from torchid.robot.mjcf_model import mujoco
-from torchid.robot.tree import link_parameters
-from torchid.robot.urdf import drop_repeated_origins, parse_xml, read_urdf
-from torchid.robot.urdf_elements import TreeJoint
+from torchid.robot.tree import joint_origin, link_parameters
+from torchid.robot.urdf import TreeJoint, drop_repeated_origins, parse_xml, read_urdf
 from torchid.robot.welds import weld_positions
 from torchid.robot.xml_files import file_kind, is_mjcf, plain_urdf
 from torchid.simulation.feet import Foot
@@ -291,7 +290,7 @@ def _lumped_inertials(urdf: Path) -> dict[str, Array]:
     for link in links:
         carrier, T = link.name, np.eye(4)
         while carrier in fixed:
-            carrier, T = fixed[carrier].parent, fixed[carrier].origin @ T
+            carrier, T = fixed[carrier].parent, joint_origin(fixed[carrier]) @ T
         out[carrier] += link_parameters(link, T)[parameters.INERTIAL]
     return out
 

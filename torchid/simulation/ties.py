@@ -14,7 +14,7 @@ from torchid.parameters import Array
 from torchid.robot.loops import Loop
 from torchid.robot.mjcf_model import mujoco
 from torchid.robot.tree import Mimic, resolve_mimics
-from torchid.robot.urdf_elements import TreeJoint
+from torchid.robot.urdf import TreeJoint
 
 WORLD = "world link"
 """Name of a link that is called as MuJoCo's own world."""
