@@ -113,9 +113,6 @@ def test_the_chain_moves_every_joint_by_its_name_and_carries_every_link(urdf: Pa
     transforms = robot.chain.forward_kinematics(torch.from_numpy(positions))
     for name, T_base_link in robot.link_poses(torch.from_numpy(q)).items():
         np.testing.assert_array_equal(transforms[name].get_matrix(), T_base_link)
-    at_zero = robot.link_poses(torch.zeros(1, robot.n, dtype=torch.float64))
-    zero_poses = [at_zero[name][0] for name in robot.body_names]
-    np.testing.assert_allclose(robot.zero_poses, np.stack(zero_poses), rtol=0.0, atol=1e-14)
 
 
 @every_real_robot

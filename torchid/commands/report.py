@@ -7,6 +7,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import torch
+
 from torchid.commands.answer import answer
 from torchid.commands.check import check_experiment
 from torchid.commands.folder import RUN, refuse_link
@@ -16,6 +18,7 @@ from torchid.guards import MAX_JSON, MAX_YAML, read_bytes
 from torchid.report.log_checks import log_check_document
 from torchid.report.page import RunFiles, page_text, require_page, versions
 from torchid.report.traces import traces_document
+from torchid.robot import Robot
 from torchid.staging import atomic_file
 
 if TYPE_CHECKING:
@@ -33,10 +36,16 @@ def report_document(run: Identification) -> dict[str, Any]:
     return {
         "answer": asdict(answer(run)),
         "robot": {"name": robot.path.name, "base": robot.base_link, "joints": robot.n, "format": robot.format},
-        "bodies": {"parents": [max(body.parent, 0) for body in robot.bodies], "poses": robot.zero_poses.tolist()},
+        "bodies": {"parents": [max(body.parent, 0) for body in robot.bodies], "poses": _zero_poses(robot)},
         "forces": None if forces is None else traces_document(forces, robot.base_rows, robot.dof_names, robot.sliding),
         "versions": versions(),
     }
+
+
+def _zero_poses(robot: Robot) -> list[list[list[float]]]:
+    """Poses of the bodies' link frames in the base's at zero joint positions."""
+    poses = robot.link_poses(torch.zeros(1, robot.n, dtype=torch.float64))
+    return [poses[name][0].tolist() for name in robot.body_names]
 
 
 def write_page(folder: Path, output: Path) -> None:

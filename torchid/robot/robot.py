@@ -29,10 +29,11 @@ from torchid.robot.tree import (
     BodyJoint,
     BodyTree,
     JointGeometry,
+    build_chain,
     build_tree,
     joint_geometry,
-    joint_transform,
     link_parameters,
+    link_poses,
     nominal_parameters,
 )
 from torchid.robot.urdf import has_fixed_base, read_urdf
@@ -76,6 +77,7 @@ class Robot:
     bodies: tuple[Body, ...]
     links: dict[str, tuple[int, Array]] = field(repr=False)
     nominal: Array = field(repr=False)
+    chain: Chain = field(repr=False)
     welded: dict[str, float] = field(default_factory=dict)
     links_beyond_welds: dict[str, Array] = field(default_factory=dict, repr=False)
     kind_of_welded: dict[str, str] = field(default_factory=dict, repr=False)
@@ -174,14 +176,7 @@ class Robot:
     @cached_property
     def geometry(self) -> JointGeometry:
         """Joint frames and axes, one row per body."""
-        return joint_geometry([body.joint for body in self.bodies])
-
-    @cached_property
-    def chain(self) -> Chain:
-        """The chain of pytorch-kinematics."""
-        from torchid.robot.chain import build_chain  # takes 0.3 s to import
-
-        return build_chain(self.body_names, [body.joint for body in self.bodies], self.links, self.geometry)
+        return joint_geometry(self.chain, self.body_names)
 
     @cached_property
     def joint_map(self) -> tuple[Array, Array]:
@@ -218,16 +213,6 @@ class Robot:
         """Joints of the L - 1 bodies after the base."""
         return [body.joint for body in self.bodies if body.joint is not None]
 
-    @cached_property
-    def zero_poses(self) -> Array:
-        """Poses of the bodies' link frames in the base link's at independent joint positions 0, (L, 4, 4) [m]."""
-        poses = [np.eye(4)]
-        for body, position in zip(self.bodies[1:], self.joint_map[1], strict=True):
-            if (joint := body.joint) is not None:  # of a mimic joint the position may not be 0
-                moved = joint.T_parent_joint @ joint_transform(joint.kind, joint.axis, position)
-                poses.append(poses[joint.parent] @ moved @ joint.T_joint_link)
-        return np.stack(poses)
-
     def link_poses(self, joint_position: torch.Tensor) -> dict[str, torch.Tensor]:
         """Pose of every URDF link in the base link's frame, from pytorch-kinematics.
 
@@ -237,8 +222,6 @@ class Robot:
         Returns:
             `T_base_link`, (B, 4, 4) [m], by link name.
         """
-        from torchid.robot.chain import link_poses
-
         matrix, constant = (torch.as_tensor(x, dtype=torch.float64) for x in self.joint_map)
         in_depth_first_order = joint_position @ matrix.T + constant
         order = {body.joint.name: i for i, body in enumerate(self.bodies[1:]) if body.joint is not None}
@@ -313,8 +296,9 @@ def load_robot(
         beyond = links_beyond(joints, welded, body_of, tree.names)
         carried = {name: link_parameters(by_name[name], tree.links[name][1]) for name in beyond}
         kinds = {joint.name: joint.type for joint in joints if joint.name in welded}
+        chain = build_chain(tree)
         held, closed = (welded, carried, kinds), loops_of_file(path)
-        robot = Robot(path, tree.names[0], fixed_base, bodies, tree.links, nominal, *held, base_tilt)
+        robot = Robot(path, tree.names[0], fixed_base, bodies, tree.links, nominal, chain, *held, base_tilt)
     validate_loops([*loops, *closed], robot.links)
     motorless = passive_joints(joints, passive, robot.joint_names)
     return replace(robot, loops=(*loops, *closed), passive=motorless)

@@ -7,6 +7,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
 from torchid.errors import ConfigError, join_names
 from torchid.parameters import Array
@@ -54,7 +55,8 @@ def mirror_pairs(
     """
     names = robot.body_names
     pairs = _by_name(names, left, right, apart, field)
-    T = robot.zero_poses
+    poses = robot.link_poses(torch.zeros(1, robot.n, dtype=torch.float64))
+    T = np.stack([poses[name][0].numpy() for name in names])
     size = float(np.ptp(T[:, :3, 3], axis=0).max())
     D = np.eye(3)
     D["xyz".index(normal), "xyz".index(normal)] = -1.0

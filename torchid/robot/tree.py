@@ -1,4 +1,7 @@
-"""From URDF links and joints to a tree of bodies, their nominal parameters and joint frames."""
+"""From URDF links and joints to a tree of bodies, their nominal parameters and the kinematic chain.
+
+The only module that imports pytorch-kinematics.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pytorch_kinematics as pk
+import torch
+from pytorch_kinematics.frame import Frame
+from pytorch_kinematics.frame import Joint as FrameJoint
+from pytorch_kinematics.frame import Link as FrameLink
 from scipy.spatial.transform import Rotation
 from yourdfpy.urdf import Inertial, Link
 
@@ -21,6 +29,7 @@ FT_FIELD = "force/torque sensor at a fixed joint"
 _TRIANGLE_TOLERANCE = 1e-3  # URDFs carry few digits: thin plates violate the inequality by rounding alone
 _ROUNDING = 1e-6  # of the largest principal inertia
 _POINT = 1e-12  # [m^2]: below it the link is a point mass
+_MOVED = " (moved by its joint)"  # the frame a joint moves; the body's link frame may be offset from it
 
 
 @dataclass(frozen=True)
@@ -230,15 +239,15 @@ def _locked_pose(joint: TreeJoint, reverse: bool, mimics: dict[str, Mimic]) -> A
     """Pose of the next link in the previous one, seen from the base, across a joint that does not move."""
     T_parent_child = joint_origin(joint)
     if joint.name in mimics:
-        T_parent_child = T_parent_child @ joint_transform(joint.type, joint.axis, mimics[joint.name].offset)
+        T_parent_child = T_parent_child @ joint_transform(joint, mimics[joint.name].offset)
     T_parent_child = T_parent_child @ _child_offset(joint)
     return _inverse(T_parent_child) if reverse else T_parent_child
 
 
-def joint_transform(kind: str, axis: Array, position: float) -> Array:
-    """Pose of the moved frame of a joint of some kind in its frame at a position [rad or m], (4, 4)."""
-    axis, T = axis / np.linalg.norm(axis), np.eye(4)
-    if kind == "prismatic":
+def joint_transform(joint: TreeJoint, position: float) -> Array:
+    """Pose of the child link in a joint's frame at a position [rad or m], (4, 4)."""
+    axis, T = joint.axis / np.linalg.norm(joint.axis), np.eye(4)
+    if joint.type == "prismatic":
         T[:3, 3] = position * axis
     else:
         T[:3, :3] = Rotation.from_rotvec(position * axis).as_matrix()
@@ -296,7 +305,7 @@ def _unphysical(inertial: Inertial) -> str:
 
 @dataclass(frozen=True)
 class JointGeometry:
-    """Poses of joint frames, one row per body; the base's row is the identity.
+    """Poses of joint frames, one row per body of the chain; the base's row is the identity.
 
     `T_parent_joint`, (L, 4, 4): joint frame at position 0 in the parent's joint frame [m]. `axis`, (L, 3), unit
     length. `prismatic`, `welded`, (L,) bool. `T_joint_link`, (L, 4, 4): the body's link frame in its moved joint frame.
@@ -309,17 +318,59 @@ class JointGeometry:
     T_joint_link: Array
 
 
-def joint_geometry(joints: Sequence[BodyJoint | None]) -> JointGeometry:
-    """Joint frames and axes of bodies, by the joints that move them, None for the base."""
-    T_joint_link = np.stack([np.eye(4) if joint is None else joint.T_joint_link for joint in joints])
+def build_chain(tree: BodyTree) -> pk.Chain:
+    """Chain with a frame for every URDF link, by the link's name, beneath the joint frame of its body.
 
-    def in_joint_of_parent(joint: BodyJoint | None) -> Array:
-        return np.eye(4) if joint is None else T_joint_link[joint.parent] @ joint.T_parent_joint
+    The chain's root is the base link. Every moving joint is a parameter of the chain, mimic joints too.
+    """
+    moved: list[Frame] = []
+    for name, joint in zip(tree.names, tree.joints, strict=True):
+        if joint is None:
+            motion = FrameJoint(f"{name} (base)", dtype=torch.float64)
+        else:
+            T_parent_joint = _link_in_joint_frame(tree, joint.parent) @ joint.T_parent_joint
+            motion = FrameJoint(
+                joint.name, _transform(T_parent_joint), joint.kind, torch.tensor(joint.axis), dtype=torch.float64
+            )
+        frame = Frame(name + _MOVED, FrameLink(name + _MOVED), motion)
+        moved.append(frame)
+        if joint is not None:
+            moved[joint.parent].add_child(frame)
+    for name, (body, T_body_link) in tree.links.items():
+        weld = FrameJoint(
+            f"{name} (weld)", _transform(_link_in_joint_frame(tree, body) @ T_body_link), dtype=torch.float64
+        )
+        moved[body].add_child(Frame(name, FrameLink(name), weld))
+    return pk.Chain(moved[0], dtype=torch.float64)
 
+
+def joint_geometry(chain: pk.Chain, body_names: tuple[str, ...]) -> JointGeometry:
+    """Joint frames and axes of a chain, for the regressor."""
+    moved = [chain.find_frame(name + _MOVED) for name in body_names]
+    links = [chain.find_frame(name) for name in body_names]
     return JointGeometry(
-        T_parent_joint=np.stack([in_joint_of_parent(joint) for joint in joints]),
-        axis=np.stack([np.array([0.0, 0.0, 1.0]) if joint is None else joint.axis for joint in joints]),
-        prismatic=np.array([joint is not None and joint.kind == "prismatic" for joint in joints]),
-        welded=np.array([joint is not None and joint.kind == "fixed" for joint in joints]),
-        T_joint_link=T_joint_link,
+        T_parent_joint=np.stack([_matrix(frame.joint.offset) for frame in moved]),
+        axis=np.stack([frame.joint.axis.numpy() for frame in moved]),
+        prismatic=np.array([frame.joint.joint_type == "prismatic" for frame in moved]),
+        welded=np.array([frame.joint.joint_type == "fixed" for frame in moved]) & (np.arange(len(moved)) > 0),
+        T_joint_link=np.stack([_matrix(frame.joint.offset) for frame in links]),
     )
+
+
+def link_poses(chain: pk.Chain, positions: torch.Tensor) -> dict[str, torch.Tensor]:
+    """Poses `T_base_link`, (B, 4, 4) [m], of every URDF link for joint positions by the chain's order, (B, n_all)."""
+    transforms = chain.forward_kinematics(positions)
+    return {name: T.get_matrix() for name, T in transforms.items() if not name.endswith(_MOVED)}
+
+
+def _link_in_joint_frame(tree: BodyTree, body: int) -> Array:
+    joint = tree.joints[body]
+    return np.eye(4) if joint is None else joint.T_joint_link
+
+
+def _transform(T: Array) -> pk.Transform3d:
+    return pk.Transform3d(matrix=torch.tensor(T, dtype=torch.float64), dtype=torch.float64)
+
+
+def _matrix(transform: pk.Transform3d | None) -> Array:
+    return np.eye(4) if transform is None else transform.get_matrix()[0].numpy()

@@ -104,7 +104,7 @@ def weld_joints(joints: Sequence[TreeJoint], positions: Mapping[str, float]) -> 
     """The joints, those with a position fixed there."""
 
     def welded(joint: TreeJoint) -> TreeJoint:
-        origin = joint_origin(joint) @ joint_transform(joint.type, joint.axis, positions[joint.name])
+        origin = joint_origin(joint) @ joint_transform(joint, positions[joint.name])
         changes: dict[str, Any] = {"type": "fixed", "mimic": None, "origin": origin}
         return replace(joint, **changes)
 
