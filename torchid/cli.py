@@ -91,12 +91,8 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"torchid {__version__}")
-    parser.add_argument(
-        "--print-completion",
-        action=_PrintCompletion,
-        choices=_SHELLS,
-        help="print a script that completes commands, options and files in this shell",
-    )
+    what = "print a script that completes commands, options and files in this shell"
+    parser.add_argument("--print-completion", action=_PrintCompletion, choices=_SHELLS, help=what)
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for add in (_add_starts, _add_fits, _add_uses_of_runs, _add_studies, _add_work_on_logs):
         add(commands)
@@ -171,15 +167,11 @@ def _add_sample(commands: _Commands) -> None:
     sample.add_argument("--format", choices=SAMPLE_FORMATS, help=what)
     sample.add_argument("--output", metavar="FILE", help="FILE.npz, FILE.json, or a folder for robots' files")
     prior = "how far off the robot file may be: as a share of each body; auto: as the data say (default: 0.2)"
-    sample.add_argument("--prior-error", type=_number_or_auto, default=0.2, metavar="SHARE", help=prior)
+    sample.add_argument("--prior-error", default="0.2", metavar="SHARE", help=prior)
     sample.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the random numbers (default: 0)")
     sample.add_argument("--overwrite", action="store_true", help="replace what exists there")
     _add_amount(sample)
     sample.set_defaults(command=_sample)
-
-
-def _number_or_auto(text: str) -> float | str:
-    return text if text == "auto" else float(text)
 
 
 def _add_studies(commands: _Commands) -> None:
@@ -330,9 +322,10 @@ def _replay(options: argparse.Namespace) -> None:
 
 def _sample(options: argparse.Namespace) -> None:
     with importing():
-        from torchid.commands.sample import sample
+        from torchid.commands.sample import parse_prior_error, sample
         from torchid.terminal.finished_runs import print_samples
 
+    options.prior_error = parse_prior_error(options.prior_error)
     keys = ("run", "count", "format", "output", "prior_error", "seed", "overwrite")
     drawn = sample(*(getattr(options, key) for key in keys))
     if not options.quiet:

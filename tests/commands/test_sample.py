@@ -115,6 +115,7 @@ def test_the_answer_fits_on_a_screen(run: Path, capsys: pytest.CaptureFixture[st
     [
         (["--count", "0"], "--count: 0; accepted: 1 to 200000"),
         (["--prior-error", "-1"], "--prior-error: -1; accepted: a number above 0, at most 100, or auto"),
+        (["--prior-error", "wide"], "--prior-error: 'wide'; accepted: a number above 0, at most 100, or auto"),
         (["--seed", "-1"], "--seed: -1; accepted"),
         (["--output", "x.txt"], "'x.txt', whose extension says no format; accepted: FILE.npz"),
         (["--output", "x.txt", "--format", "npz"], "'x.txt'; accepted: FILE.npz"),

@@ -15,7 +15,7 @@ from torchid.commands import SAMPLE_FORMATS
 from torchid.commands.evaluate import read_run, require_run
 from torchid.commands.export import robot_text
 from torchid.commands.folder import SAMPLES, check_free, check_free_file, new_folder
-from torchid.errors import ConfigError, TorchidWarning, during
+from torchid.errors import ConfigError, TorchidWarning, during, excerpt
 from torchid.estimators.posterior import PRIOR_ERROR
 from torchid.fitting.posterior import FittedPosterior, ParameterSamples, PosteriorSampler, read_posterior
 from torchid.logs.containers import save_arrays
@@ -31,6 +31,7 @@ COUNT, COUNT_OF_ROBOTS = 10_000, 20
 MOST, MOST_ROBOTS = 200_000, 10_000
 """Samples at most: of a humanoid, 0.6 GB; files of robots in one folder."""
 
+_WIDTHS = "a number above 0, at most 100, or auto"
 _BY_SUFFIX = {".npz": "npz", ".json": "ranges"}
 
 
@@ -89,7 +90,7 @@ def sample(
     form = _form(form, out)
     count = _count(count, form)
     if prior_error != "auto" and not 0.0 < prior_error <= 100.0:
-        raise ConfigError("command line", "--prior-error", f"{prior_error:g}", "a number above 0, at most 100, or auto")
+        raise ConfigError("command line", "--prior-error", f"{prior_error:g}", _WIDTHS)
     if not 0 <= seed < 2**63:
         raise ConfigError("command line", "--seed", f"{seed}", "a whole number of at least 0")
     require_run(folder)
@@ -105,6 +106,18 @@ def sample(
         with during("writing", out):
             _write(drawn, form, folder, out, overwrite)
     return drawn
+
+
+def parse_prior_error(text: str) -> float | Literal["auto"]:
+    """A prior's width of the command line.
+
+    Raises:
+        ConfigError: neither a number nor auto.
+    """
+    try:
+        return "auto" if text == "auto" else float(text)
+    except ValueError as error:
+        raise ConfigError("command line", "--prior-error", f"'{excerpt(text)}'", _WIDTHS) from error
 
 
 def _form(form: str | None, out: Path | None) -> str:
