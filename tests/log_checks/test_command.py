@@ -17,6 +17,7 @@ from refusals import files_in, refusal
 from repository import ROOT, SHARED
 
 from torchid.cli import main
+from torchid.commands.check import check_log
 from torchid.log_checks.check import check
 from torchid.logs import Log, read_log, write_log
 from torchid.report.log_checks import log_check_figure
@@ -69,6 +70,14 @@ def test_a_log_alone_says_what_needs_a_robot(folder: Path, capsys: pytest.Captur
     printed = capsys.readouterr().out
     assert "no robot" not in printed
     assert "usable without 1 of 400 samples" in printed
+
+
+def test_feet_without_wrenches_whose_type_nobody_says_give_no_alarm(tmp_path: Path) -> None:
+    """Four feet are taken for points: shanks turn above the ground, soles would not."""
+    folder = shortened_demo(tmp_path / "demo", 600)
+    with np.load(folder / "sway_train.npz") as log:
+        np.savez(tmp_path / "bare.npz", **{name: x for name, x in log.items() if name != "contact_wrench_local"})
+    assert not check_log(tmp_path / "bare.npz", folder / "quadruped.urdf").findings
 
 
 def test_a_log_that_is_not_usable_ends_with_status_one(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -17,7 +17,7 @@ from thinned import each_once
 from walking import MACHINES
 
 from torchid.log_checks import NOTE, SUSPICIOUS, Checked
-from torchid.log_checks.frozen import check_still_base
+from torchid.log_checks.frozen import check_excitation, check_still_base
 from torchid.logs import Log
 from torchid.logs.segments import with_delayed_torques
 
@@ -107,6 +107,20 @@ def test_a_base_that_turns_in_one_place_is_named_unless_nothing_is_derived_from_
     (known,) = check_still_base(moving)
     assert known.severity == NOTE
     assert not list(check_still_base(replace(still, base_quat_xyzw=np.tile([0.0, 0.0, 0.0, 1.0], (len(log), 1)))))
+
+
+@pytest.mark.parametrize("moves", ["nothing", "a joint", "the base"])
+def test_a_log_in_which_nothing_moves_is_named(moves: str) -> None:
+    log = demo_log()
+    noise = np.random.default_rng(0).normal(scale=1e-4, size=(len(log), 1))
+    rest = {name: getattr(log, name)[:1] + noise for name in ("joint_position", "base_position_world")}
+    rest["base_quat_xyzw"] = np.tile(value(log.base_quat_xyzw)[:1], (len(log), 1))
+    if moves == "a joint":
+        rest["joint_position"][:, 3] = log.joint_position[:, 3]
+    elif moves == "the base":
+        rest["base_quat_xyzw"] = value(log.base_quat_xyzw)
+    findings = list(check_excitation(replace(log, **rest)))
+    assert [one.name for one in findings] == (["no motion"] if moves == "nothing" else [])
 
 
 def test_clean_logs_give_no_alarm() -> None:

@@ -219,12 +219,16 @@ def _require_memory(path: Path, settings: PreprocessingConfig) -> None:
 
 
 def _contact(log: Log, index: int, shapes: CollisionShapes) -> ContactConfig:
-    """A contact of a log without an experiment file: a point if it is a ball or has forces without any moment."""
+    """A contact of a log without an experiment file.
+
+    A point if it is a ball, if it has forces without any moment or, where neither is known, if there are more than two:
+    robots with many legs seldom have soles.
+    """
     wrench, name = log.contact_wrench, log.contact_names[index]
-    if shapes.about(name) is not None:
-        return ContactConfig(name, "point")
-    force, moment = (False, True) if wrench is None else (np.nan_to_num(wrench[:, index, k]).any() for k in _WRENCH)
-    return ContactConfig(name, "point" if force and not moment else "flat")
+    force, moment = (False, False) if wrench is None else (np.nan_to_num(wrench[:, index, k]).any() for k in _WRENCH)
+    many = len(log.contact_names) > 2
+    is_point = shapes.about(name) is not None or (not moment and (force or many))
+    return ContactConfig(name, "point" if is_point else "flat")
 
 
 def check_outputs(

@@ -29,7 +29,7 @@ from torchid.log_checks.findings import (
     median_step,
 )
 from torchid.log_checks.forces import check_forces_against_urdf
-from torchid.log_checks.frozen import check_repeats, check_still_base
+from torchid.log_checks.frozen import check_excitation, check_repeats, check_still_base
 from torchid.log_checks.gyroscope import check_gyroscope
 from torchid.log_checks.motion import (
     check_angle_unit,
@@ -150,7 +150,7 @@ def check(
     if units := list(check_angle_unit(repaired, robot)):  # thresholds of position steps are in radians
         results = [x for x in results if not (isinstance(x, Finding) and x.name == "step" and x.whole)]
     results += [*units, *([] if "contact_active" in derived else check_contact_flags(repaired, robot))]
-    results += [*check_scalar_wrenches(repaired), *check_still_base(repaired)]
+    results += [*check_scalar_wrenches(repaired), *check_still_base(repaired), *check_excitation(repaired)]
     repaired = repair_log(log, _findings(results))
     blocking = _blocking_finding(results)
     if blocking is None or blocking.field != "time":

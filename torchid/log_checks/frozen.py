@@ -1,4 +1,4 @@
-"""Repeated readings: frozen, saturated, held at a lower rate, constant, or in a dead band."""
+"""Readings that repeat: frozen, saturated, held at a lower rate, constant, or in a dead band; and robots at rest."""
 
 from __future__ import annotations
 
@@ -341,11 +341,28 @@ def check_still_base(log: Log) -> Iterator[Finding]:
     position, quat = log.base_position_world, log.base_quat_xyzw
     if position is None or quat is None or np.ptp(position, axis=0).any():
         return
-    turned = np.degrees(2.0 * np.arccos(np.clip(np.abs(quat @ quat[0]), 0.0, 1.0))).max()
-    if turned < _MIN_TURN_DEG:
+    if (turned := _turned_deg(quat)) < _MIN_TURN_DEG:
         return
     text = f"one position throughout, though the base turns by {turned:.2g} degrees"
     others = (log.base_linear_velocity_world, log.base_linear_acceleration_world, log.imu_specific_force)
     severity = SUSPICIOUS if all(other is None for other in others) else NOTE  # else nothing is derived from it
     advice = "leave it out and give an IMU or the base's velocity, or set preprocessing.base_motion: contacts"
     yield Finding("constant position", severity, "base_position_world", text, advice)
+
+
+def check_excitation(log: Log) -> Iterator[Finding]:
+    """A finding about a log in which nothing moves: forces of a robot at rest tell weights alone, in one posture."""
+    position, quat = log.base_position_world, log.base_quat_xyzw
+    moved = float(np.nanmax(np.ptp(log.joint_position, axis=0), initial=0.0))
+    if moved > MIN_MOTION or (position is not None and np.ptp(position, axis=0).max() > MIN_MOTION):
+        return
+    if quat is not None and _turned_deg(quat) > _MIN_TURN_DEG:
+        return
+    text = f"nothing moves: no joint by more than {moved:.2g} rad (slides: m)"
+    advice = "record motion: one posture determines what balances gravity in it, no inertia and no friction"
+    yield Finding("no motion", SUSPICIOUS, "joint_position", text, advice)
+
+
+def _turned_deg(quat: FloatArray) -> float:
+    """The largest turn [degrees] of orientations (N, 4) from the first."""
+    return float(np.degrees(2.0 * np.arccos(np.clip(np.abs(quat @ quat[0]), 0.0, 1.0))).max())
