@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from functools import cached_property
 
@@ -25,7 +25,7 @@ from torchid.estimators import LeastSquares, SgdEstimate
 from torchid.fitting.experiment import Scene
 from torchid.fitting.fit import Fit
 from torchid.fitting.misfit import beyond_models
-from torchid.identifiability.confounding import TotalMass, total_mass
+from torchid.identifiability.confounding import ExtraEstimate, TotalMass, estimate_extras, total_mass
 from torchid.log_checks import Finding
 from torchid.log_checks.check import check
 from torchid.log_checks.findings import SEVERITIES
@@ -109,11 +109,11 @@ def require_plausible(fit: Fit, logs: TrainingLogs) -> TotalMass:
         raise SensorError.at_field("sensors", "no parameter is in reach of them", "other sensors, contacts or logs")
     if not max(fit.assembly.problem.cost(np.zeros_like(estimate.phi)), fit.assembly.forces) > 0.0:
         raise ImplausibleFitError.at_field("logs", "all measured forces are 0", "forces; NaN where nobody measured any")
-    if fit.assembly.homogeneous:
-        _require_scales(fit)
     block_error = 0.0 if fit.scatter is None else fit.scatter.mass_error
     tolerance = scene.config.estimator.rank_tolerance
     by_data = LeastSquares(rank_tolerance=tolerance).solve(fit.assembly.problem)
+    if fit.assembly.homogeneous:
+        _require_scales(estimate_extras(fit.assembly, by_data, scene.robot.body_names, tolerance))
     mass, mass_by_data = (total_mass(fit.assembly, x, tolerance, block_error) for x in (estimate, by_data))
     reason = implausibility(fit.assembly.data or fit.assembly.problem, estimate.phi, mass_by_data, scene.robot)
     unexplained = None  # a descent that is not finished leaves much that a model explains
@@ -137,13 +137,16 @@ def require_plausible(fit: Fit, logs: TrainingLogs) -> TotalMass:
     return mass
 
 
-def _require_scales(fit: Fit) -> None:
+def _require_scales(by_data: Sequence[ExtraEstimate]) -> None:
     """Refuse scales of all measured forces where no forces at all, with mass where it acts on none, fit best.
+
+    Args:
+        by_data: extra parameters by the data and known masses alone: a ridge would hide where they go.
 
     Raises:
         ImplausibleFitError: names them.
     """
-    scales = {x.extra.label: 1.0 + x.value for x in fit.extras if x.extra.what == "scale"}
+    scales = {x.extra.label: 1.0 + x.value for x in by_data if x.extra.what == "scale"}
     beyond = [f"{label} {x:.2g}" for label, x in scales.items() if is_implausible_factor(x)]
     if beyond:
         found = f"of all measured forces, which no mass determines here: {join_names(beyond)}"

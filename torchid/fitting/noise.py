@@ -76,6 +76,7 @@ def estimate_noise(
 ) -> NoiseSummary:
     """The noise of sensors, by fits of a sample of the logs that are weighted again until the noise settles.
 
+    Where scales make up all of the forces, residuals say nothing, and the guess is kept.
     Where some noise is stated and some not, the stated one counts as right but for a common factor: a filter leaves
     less of it than was recorded. What is estimated is given in the same proportion::
 
@@ -95,17 +96,22 @@ def estimate_noise(
         return NoiseSummary(guess, [], {}, 0)
     tied = [name for name in rows.groups if noise_key(name) in stated]
     variance, columns, passes = np.ones(len(rows.groups)), None, 0
+    components, homogeneous = GroupVariances.unknown(len(rows.groups)), False
     estimator = VarianceComponentEstimator(rows, tied)
     while True:
-        columns, directions = _fit_rows(rows, variance, columns, fitter)
+        columns, directions, homogeneous = _fit_rows(rows, variance, columns, fitter)
         passes += 1
+        if homogeneous:  # the less force, the smaller the residuals
+            break
         if len(tied) == len(rows.groups):
             break
         components = estimator.estimate(variance, columns, directions)
         variance = components.variance
         if components.change < _SETTLED or passes == _PASSES:
             break
-    free = VarianceComponentEstimator(rows).estimate(variance, columns, directions) if tied else components
+    free = components
+    if tied and not homogeneous:
+        free = VarianceComponentEstimator(rows).estimate(variance, columns, directions)
     common = variance[rows.groups.index(tied[0])] if tied else 1.0
     used = np.where(
         np.isin(rows.groups, tied), rows.reference_std, _rounded(rows.reference_std * np.sqrt(variance / common))
@@ -144,13 +150,17 @@ def recorded_sensors(
 
 def _fit_rows(
     rows: SampledRows, variance: Array, before: Mapping[str, Tensor] | None, fitter: LogFitter
-) -> tuple[Mapping[str, Tensor], Mapping[str, Tensor]]:
-    """Parameters by log in the builder's columns, and where they were free, by least squares without regularization."""
+) -> tuple[Mapping[str, Tensor], Mapping[str, Tensor], bool]:
+    """Parameters by log in the builder's columns, where they were free, and whether no forces at all fit best.
+
+    By least squares without regularization.
+    """
     estimator = LeastSquares(rank_tolerance=fitter.estimator.rank_tolerance)
     fit = fitter.fit(rows.compress(variance, before), estimator.solve)
     logs = dict.fromkeys(chunk.log for chunk in rows.chunks)
     columns = {log: fit.columns(rows.builder, log).to("cpu", torch.float64) for log in logs}
-    return columns, {log: fitted_directions(fit.assembly, rows.builder, log) for log in logs}
+    directions = {log: fitted_directions(fit.assembly, rows.builder, log) for log in logs}
+    return columns, directions, fit.assembly.homogeneous
 
 
 def _rounded(values: Array) -> Array:

@@ -86,8 +86,7 @@ def signal_noise(log: Log, timeline: Timeline | None, stated: Mapping[str, float
         values: FloatArray | None = getattr(start, name)
         if values is None or not values.size and name != "joint_position":
             continue
-        width = 3 if name == _ORIENTATION else values.shape[1]
-        std[name] = np.full(width, known[name]) if name in known else _estimate(name, start.time, values)
+        std[name] = np.full(_width(name, values), known[name]) if name in known else _estimate(name, start.time, values)
     if (std["joint_position"] > _LARGEST).any() and "joint_position" not in known:  # no path: samples of their own
         std = {name: np.full_like(x, known.get(name, 0.0)) for name, x in std.items()}
     noise = SignalNoise(std)
@@ -96,10 +95,14 @@ def signal_noise(log: Log, timeline: Timeline | None, stated: Mapping[str, float
     return SignalNoise(std, _derivatives(float(np.median(np.diff(log.time))), timeline))
 
 
+def _width(name: str, values: FloatArray) -> int:
+    return 3 if name == _ORIENTATION else values.shape[1]
+
+
 def _estimate(name: str, time: FloatArray, values: FloatArray) -> FloatArray:
     """Standard deviation of the noise in a field (N, c), by channel."""
     if name in _DERIVED or len(time) < _FEWEST or not values.size or not np.isfinite(values).all():
-        return np.zeros(values.shape[1])
+        return np.zeros(_width(name, values))
     if name != _ORIENTATION:
         return _rounded(white_noise(time, values))
     components = white_noise(time, make_sign_continuous(values))  # half angles, of three axes in four components

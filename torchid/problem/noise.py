@@ -61,6 +61,12 @@ class GroupVariances:
     pooled: np.ndarray
     change: float
 
+    @classmethod
+    def unknown(cls, count: int) -> GroupVariances:
+        """As stated, of residuals that tell nothing."""
+        none, ones = np.zeros(count, dtype=bool), np.ones(count)
+        return cls(ones, share=ones, estimated=none, error=ones, pooled=none, change=0.0)
+
     @property
     def upper_bound(self) -> np.ndarray:
         """Groups whose noise is far below that of others: only an upper bound is known, (G,) bool."""
