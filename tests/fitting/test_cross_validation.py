@@ -19,7 +19,7 @@ from torchid.cli import main
 from torchid.config import load_config
 from torchid.errors import BaseLostError
 from torchid.fitting.cross_validation import RidgeChoice, Scorer, TrainingScore, with_all_readings
-from torchid.fitting.experiment import set_up
+from torchid.fitting.experiment import Experiment, set_up, with_estimated_noise
 from torchid.identifiability.base_parameters import StateReport, _base_statistics, require_base
 from torchid.logs import read_log
 from torchid.logs.preprocess import preprocess
@@ -103,10 +103,18 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return output
 
 
+def with_own_noise(run: Path) -> Experiment:
+    """A run's experiment with the noise that it has estimated."""
+    used = json.loads((run / "metrics.json").read_text())["noise"]["used"]
+    experiment = set_up(load_config(run / "config.yaml"))
+    fields = {key: tuple(x.values()) if isinstance(x, dict) else x for key, x in used.items()}
+    return with_estimated_noise(experiment, fields, any_stated=False)
+
+
 def test_cross_validation_is_what_refitting_by_hand_gives(run: Path, demo: tuple[RowBuilder, Samples]) -> None:
     _, log = demo
     metrics, config = json.loads((run / "metrics.json").read_text()), load_config(run / "config.yaml")
-    weighed = set_up(config)  # with the noise that the run has estimated
+    weighed = with_own_noise(run)
     builder = RowBuilder(weighed.robot, weighed.contacts, weighed.sensors)
     robot, blocks, squares, rows = torchid.load_robot(DEMO / "quadruped.urdf"), split_into_folds([log], builder), 0.0, 0
     for fold in range(FOLDS):
@@ -125,7 +133,7 @@ def test_cross_validation_is_what_refitting_by_hand_gives(run: Path, demo: tuple
 
 def test_of_long_training_logs_every_kth_sample_is_scored(run: Path, demo: tuple[RowBuilder, Samples]) -> None:
     _, log = demo
-    experiment = set_up(load_config(run / "config.yaml"))
+    experiment = with_own_noise(run)
     builder, evaluation = experiment.builder(experiment.sensors), experiment.evaluation()
     fitter, blocks = experiment.fitter(builder, experiment.conditions()), split_into_folds([log], builder)
     fit = fitter.fit(compress_in_blocks(blocks, builder))

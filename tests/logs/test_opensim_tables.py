@@ -105,7 +105,7 @@ BROKEN = {
     "nothing after it": ("version=1\nendheader\n", "header: an empty line"),
     "no rows": ("endheader\ntime\thip_r\tknee_r\tpelvis_tx\n", "time"),
     "a word": ("endheader\ntime\thip_r\tknee_r\tpelvis_tx\n0\t1\tx\t3\n1\t1\t1\t1\n", "column 'knee_r': 'x' in row 3"),
-    "a cell too few": ("endheader\ntime\thip_r\tknee_r\tpelvis_tx\n0\t1\t2\n", "file: "),
+    "a cell too few": ("endheader\ntime\thip_r\tknee_r\tpelvis_tx\n0\t1\t2\n", "row 3: 3 cells; accepted: 4 cells"),
     "spaces": ("endheader\ntime hip_r knee_r\n0 1 2\n", "header: names between spaces"),
     "maybe": ("inDegrees=maybe\nendheader\ntime\thip_r\n0\t1\n", "inDegrees: 'maybe'"),
     "no text": ("endheader\n\x00\x01\t\x02\n0\t1\n", "header: "),

@@ -265,7 +265,7 @@ def _forces(rows: SampledRows) -> Array:
 def _is_pooled(precision: Array, error: Array) -> np.ndarray:
     """Whether the prior weighs more than the residuals in a group's variance, whose deviation has such errors."""
     own = np.diag(precision)
-    return own * np.square(2.0 * error) > _POOLED
+    return (own > 0.0) & (np.square(2.0 * error) > _POOLED / np.where(own > 0.0, own, 1.0))
 
 
 def _relative_errors(M: Array) -> Array:
