@@ -8,6 +8,7 @@ import logging
 import os
 import re
 import sys
+import threading
 import traceback
 import warnings
 from collections.abc import Callable, Iterator
@@ -183,14 +184,23 @@ def plain_streams() -> Iterator[None]:
 
 @contextmanager
 def _libraries_silent(debug: bool) -> Iterator[None]:
-    """Keep log messages of libraries from standard error: they often contain text of files."""
-    handler, root = logging.NullHandler(), logging.getLogger()
+    """Keep log messages and threads of libraries from standard error: they often contain text of files.
+
+    What fails in the thread that writes event files is raised where they are written to.
+    """
+    handler, root, hook = logging.NullHandler(), logging.getLogger(), threading.excepthook
     if not debug:
         root.addHandler(handler)  # without a handler, Python writes warnings to standard error
+        threading.excepthook = _ignore
     try:
         yield
     finally:
         root.removeHandler(handler)
+        threading.excepthook = hook
+
+
+def _ignore(_: threading.ExceptHookArgs) -> None:
+    """What a thread failed of."""
 
 
 @contextmanager

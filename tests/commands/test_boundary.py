@@ -7,6 +7,7 @@ import io
 import logging
 import os
 import sys
+import threading
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -113,6 +114,23 @@ def test_a_terminal_keeps_its_colors(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stdout", screen)
     assert run_guarded("torchid", lambda: terminal_console().print(Text(EVIL, style="red"))) == 0
     assert "\x1b[31ma\\x1b[31m" in screen.getvalue()
+
+
+def test_a_thread_of_a_library_that_fails_does_not_speak_to_users(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only with --debug; whatever speaks otherwise is in its place again afterwards."""
+    said: list[object] = []
+    monkeypatch.setattr(threading, "excepthook", said.append)
+
+    def command() -> None:
+        thread = threading.Thread(target=lambda: Path("no/such/file").read_text())
+        thread.start()
+        thread.join()
+
+    assert run_guarded("torchid", command) == 0
+    assert not said
+    run_guarded("torchid", command, debug=True)
+    command()
+    assert len(said) == 2
 
 
 def test_libraries_do_not_speak_to_users(capsys: pytest.CaptureFixture[str]) -> None:
