@@ -193,7 +193,7 @@ def test_rest_and_slow_motion_on_a_grid_are_no_fault(quantum: float, blur: str) 
     for joints in (creeps, stands, sways):
         checked = check(replace(log, joint_position=read(joints)))
         assert not checked.rejected.any()
-        assert {one.name for one in checked.findings} <= {"constant"}
+        assert {one.name for one in checked.findings} <= {"constant", "no motion"}
 
 
 @pytest.mark.parametrize("quantum", [0.0, 1e-4])

@@ -351,7 +351,10 @@ def check_still_base(log: Log) -> Iterator[Finding]:
 
 
 def check_excitation(log: Log) -> Iterator[Finding]:
-    """A finding about a log in which nothing moves: forces of a robot at rest tell weights alone, in one posture."""
+    """A note of a log in which nothing moves: forces of a robot at rest tell weights alone, in one posture.
+
+    It is no fault: such logs tell offsets, or complete others.
+    """
     position, quat = log.base_position_world, log.base_quat_xyzw
     moved = float(np.nanmax(np.ptp(log.joint_position, axis=0), initial=0.0))
     if moved > MIN_MOTION or (position is not None and np.ptp(position, axis=0).max() > MIN_MOTION):
@@ -360,7 +363,7 @@ def check_excitation(log: Log) -> Iterator[Finding]:
         return
     text = f"nothing moves: no joint by more than {moved:.2g} rad (slides: m)"
     advice = "record motion: one posture determines what balances gravity in it, no inertia and no friction"
-    yield Finding("no motion", SUSPICIOUS, "joint_position", text, advice)
+    yield Finding("no motion", NOTE, "joint_position", text, advice)
 
 
 def _turned_deg(quat: FloatArray) -> float:
