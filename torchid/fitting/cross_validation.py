@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 import torch
@@ -21,7 +20,6 @@ from torchid.problem import Evaluation, ExtraTerms, Metrics, RowBuilder, Samples
 from torchid.problem.chunks import ProgressCallback, one_thread, thread_count
 from torchid.problem.compressed_log import Block
 from torchid.problem.compression import Part, compress_in_blocks, merge_states, split_into_folds
-from torchid.problem.elimination import Assembly
 from torchid.problem.metrics import ForceSums
 from torchid.sensing.sensors import recorded_components
 from torchid.settings import RidgeRule
@@ -142,22 +140,13 @@ def choose_ridge(
     if len(folds) < 2:
         raise _too_few(blocks)
     together = merge_states(parts, fitter.builder)
-    halves = [(fold, (fold + half) % 2) for fold in folds for half in (0, 1)]  # small ridges take longest
 
-    @lru_cache(maxsize=1)
-    def without(fold: int) -> Assembly:
-        return fitter.build_problem([part for part in together if part.fold != fold]).assembly
+    def held_out(fold: int) -> Array:
+        return _held_out_squares(fold, together, blocks, fitter, estimators, loss, done)
 
-    def held_out(half: tuple[int, int]) -> Array:
-        fold, first = half
-        logs, own = [x for x in blocks if x.fold == fold], [x for x in together if x.fold == fold]
-        return _held_out_squares(logs, own, without(fold), fitter, estimators[first::2], loss, done)
-
-    squares = np.empty((len(folds), len(estimators)))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", TorchidWarning)  # the fit says the same
-        for (fold, first), own in zip(halves, share_between_copies(halves, held_out, thread_count()), strict=True):
-            squares[folds.index(fold), first::2] = own
+        squares = np.array(share_between_copies(folds, held_out, thread_count()))
     means = squares.mean(axis=0)
     apart = squares - squares[:, [int(means.argmin())]]
     error = apart.std(axis=0, ddof=1) / np.sqrt(len(folds))
@@ -173,22 +162,25 @@ def choose_ridge(
 
 
 def _held_out_squares(
-    logs: Sequence[Block],
+    fold: int,
     parts: Sequence[Part],
-    without: Assembly,
+    blocks: Sequence[Block],
     fitter: LogFitter,
     estimators: Sequence[BatchEstimator],
     loss: RobustLoss | None,
     done: Callable[[int], None] | None,
 ) -> Array:
-    """Mean squares on a fold, its logs and their parts, of what each estimator fits without it."""
+    """Mean squares on a fold of what each estimator fits without it."""
+    assembly = fitter.build_problem([part for part in parts if part.fold != fold]).assembly
+    logs, own = [x for x in blocks if x.fold == fold], [x for x in parts if x.fold == fold]
     fitted = []
     for estimator in estimators:
-        minimizer = estimator.minimize(without.problem)
-        fitted.append(calibration_at(without, minimizer, fitter.robot, fitter.builder, loss))
+        fitted.append(
+            calibration_at(assembly, estimator.minimize(assembly.problem), fitter.robot, fitter.builder, loss)
+        )
         if done is not None:
             done(1)
-    return np.array([left.error / max(left.rows, 1) for left in sum_residuals(fitter.builder, logs, parts, fitted)])
+    return np.array([left.error / max(left.rows, 1) for left in sum_residuals(fitter.builder, logs, own, fitted)])
 
 
 def _too_few(logs: Sequence[Block]) -> LogError:
