@@ -76,16 +76,15 @@ def preprocess(
             for at once.
 
     Returns:
-        The preprocessed log, which shares the memory of unchanged fields: `log` itself where nothing has to be done and
-        its motion shows no noise.
+        The preprocessed log, which shares the memory of unchanged fields; `log` itself where nothing has to be done.
 
     Raises:
         InputError: `cutoff_hz` or `sample_rate_hz` does not suit the log.
         LogError: the log has too few samples or too wide gaps, or a value that is not finite.
 
     Warns:
-        TorchidWarning: a torque or wrench channel is NaN in some samples, time stamps nearly coincide, or accelerations
-            are noise to a large part.
+        TorchidWarning: a torque or wrench channel is NaN in some samples, time stamps nearly coincide, joints move
+            faster than the filter lets through, or accelerations are noise to a large part.
     """
     with about_file(log.source):
         timeline = make_timeline(log.time, lacks_derivatives(log), cutoff_hz, sample_rate_hz, sign_width)
