@@ -49,7 +49,7 @@ ESTIMATORS = {
 
 
 @pytest.fixture(autouse=True)
-def _no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+def _new_files(monkeypatch: pytest.MonkeyPatch) -> None:
     trust_new_files(monkeypatch)
 
 

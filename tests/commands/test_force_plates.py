@@ -28,7 +28,7 @@ MOTION = "motion.npz + plates.csv"
 
 
 @pytest.fixture(autouse=True)
-def _no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+def _new_files(monkeypatch: pytest.MonkeyPatch) -> None:
     trust_new_files(monkeypatch)
 
 

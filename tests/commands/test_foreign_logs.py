@@ -29,7 +29,7 @@ SMALL = "preprocessing.memory_gb=0.0001"
 
 
 @pytest.fixture(autouse=True)
-def _no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+def _new_files(monkeypatch: pytest.MonkeyPatch) -> None:
     trust_new_files(monkeypatch)
 
 

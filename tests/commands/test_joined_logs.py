@@ -28,7 +28,7 @@ NAME = "motion.npz + plates.npz@-3.0s + torques.npz"
 
 
 @pytest.fixture(autouse=True)
-def _no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+def _new_files(monkeypatch: pytest.MonkeyPatch) -> None:
     trust_new_files(monkeypatch)
 
 

@@ -31,7 +31,7 @@ FEET = [f"{leg}_foot" for leg in ("front_left", "front_right", "rear_left", "rea
 
 
 @pytest.fixture(autouse=True)
-def _no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+def _new_files(monkeypatch: pytest.MonkeyPatch) -> None:
     trust_new_files(monkeypatch)
 
 

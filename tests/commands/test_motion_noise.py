@@ -24,7 +24,7 @@ from torchid.problem.motion_noise import MotionNoise
 
 
 @pytest.fixture(autouse=True)
-def _no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+def _new_files(monkeypatch: pytest.MonkeyPatch) -> None:
     trust_new_files(monkeypatch)
 
 
