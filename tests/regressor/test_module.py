@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,6 +25,8 @@ from synthetic import (
     load,
     random_states,
 )
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 from torchid import parameters
 from torchid.errors import UnknownNameError
@@ -167,6 +170,23 @@ def test_the_regressor_is_differentiable_by_motion(small: Robot) -> None:
     weights = torch.from_numpy(np.random.default_rng(22).normal(size=(12 * len(small.bodies), 3)))
     assert torch.autograd.gradcheck(lambda q, v, a: K(q, v, a) @ weights, state)
     assert torch.autograd.gradcheck(K, state, fast_mode=True)
+
+
+def test_the_gradient_of_a_regressor_does_not_copy_it_for_every_row() -> None:
+    robot = load(G1)
+    state = [x.requires_grad_() for x in tensors(*random_states(np.random.default_rng(26), robot.n, 2))]
+    K, written = Regressor(robot)(*state), 0
+
+    class Written(TorchDispatchMode):
+        def __torch_dispatch__(self, operator: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+            nonlocal written
+            out = operator(*args, **(kwargs or {}))
+            written += sum(x.numel() for x in tree_leaves(out) if isinstance(x, torch.Tensor))
+            return out
+
+    with Written():
+        torch.autograd.grad(K, state, torch.ones_like(K))
+    assert written < 2 * robot.nv * K.numel()  # 6 times that when rows were filled in place
 
 
 def test_a_jacobian_is_differentiable_by_coordinates(small: Robot) -> None:
