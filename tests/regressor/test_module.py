@@ -30,7 +30,7 @@ from torch.utils._pytree import tree_leaves
 
 from torchid import parameters
 from torchid.errors import UnknownNameError
-from torchid.regressor import FrameJacobian, Regressor, motion_from_state
+from torchid.regressor import FrameJacobian, LoopJacobian, Regressor, motion_from_state
 from torchid.regressor.columns import all_wrench_columns, reduced_layout, reduction_matrix
 from torchid.regressor.kinematics import body_states, joint_motion, joint_screw_axes
 from torchid.regressor.regressor import joint_row, joint_rows
@@ -157,6 +157,32 @@ def test_another_precision_than_the_modules_is_refused_by_both_names(small: Robo
         with pytest.raises(TypeError, match=r"found torch.float32; accepted: torch.float64"):
             module(*arguments)
         module.float()(*arguments)
+
+
+@pytest.mark.parametrize("wrong", ["joint_velocity", "joint_acceleration"])
+def test_one_part_of_a_motion_of_another_precision_is_refused_by_name(small: Robot, wrong: str) -> None:
+    q, v, a = tensors(*random_states(np.random.default_rng(23), small.n, 2))
+    state = (q, v.float(), a) if wrong == "joint_velocity" else (q, v, a.float())
+    with pytest.raises(TypeError, match=f"{wrong}: found torch.float32; accepted: torch.float64"):
+        Regressor(small)(*state)
+
+
+def test_jacobians_refuse_coordinates_that_are_none(small: Robot) -> None:
+    q, _, _ = tensors(*random_states(np.random.default_rng(20), small.n, 3))
+    for jacobian in (FrameJacobian(small, "c"), LoopJacobian(small)):
+        with pytest.raises(TypeError, match="q: found ndarray; accepted: a tensor"):
+            jacobian(q.numpy())
+        with pytest.raises(ValueError, match=r"q: found shape \(3, 20\); accepted: \(B, 10\)"):
+            jacobian(torch.cat([q, q], 1))
+
+
+def test_a_jacobian_first_called_in_inference_mode_has_gradients_afterwards() -> None:
+    robot = load(SOLO12)
+    q, _, _ = tensors(*random_states(np.random.default_rng(20), robot.n, 3))
+    jacobian = FrameJacobian(robot, "FL_FOOT")
+    with torch.inference_mode():
+        jacobian(q)
+    assert torch.autograd.grad(jacobian(q.requires_grad_()).square().sum(), q)[0].any()
 
 
 def test_a_jacobian_of_no_link_is_refused_by_the_nearest_names() -> None:

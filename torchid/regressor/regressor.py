@@ -19,11 +19,13 @@ from torchid.regressor.kinematics import (
     Motion,
     body_states,
     cross_product,
+    independent_positions,
     joint_motion,
     joint_screw_axes,
     link_states,
     motion_from_state,
     rotation_matrix,
+    states_at_rest,
 )
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
@@ -299,14 +301,16 @@ class FrameJacobian(nn.Module):
         Returns:
             (B, 6, n_rows). n_rows = nv + 6 F: force/torque sensors in limbs add six columns each, after those of the
             joints.
+
+        Raises:
+            TypeError: `q` is not a tensor, or of another precision than the module.
+            ValueError: wrong shape of `q`.
         """
         tree = self.tree
-        zero = q.new_zeros(q.shape[0], tree.n + tree.base_rows)
-        motion = motion_from_state(q, zero, zero, tree.n, not tree.base_rows, GRAVITY_WORLD)
-        states = body_states(tree, motion, joint_motion(tree, motion))
+        states = states_at_rest(tree, independent_positions(tree, q))
         units, arms = self.get_buffer("unit_wrenches"), None
         if self.radius:
-            up = q.new_tensor([0.0, 0.0, 1.0]) if normal is None else normal
+            up = q.new_tensor([0.0, 0.0, 1.0]) if normal is None else normal.to(q)
             up = up.expand(len(q), 3)
             if tree.base_rows:
                 up = (rotation_matrix(q[:, 3:7]).mT @ up[..., None])[..., 0]
