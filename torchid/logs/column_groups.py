@@ -294,7 +294,8 @@ def split_arrays(sample: FileSample, names: Sequence[str], joints: Collection[in
     for name in names if out else ():
         shape, field = np.asarray(sample[name]).shape, propose_field(name)
         if width and shape[1:] == (6 + width,) and field in ("joint_velocity", "joint_torque"):
-            out.append((name, "[6:]", field))
+            of_base = [(name, "[0:3]", _TWIST[0]), (name, "[3:6]", _TWIST[3])] if field == "joint_velocity" else []
+            out += [*of_base, (name, "[6:]", field)]
         elif shape[1:] == (len(_TWIST),) and field == _TWIST[0] and (name, "[7:10]", field) not in out:
             out += [(name, "[0:3]", _TWIST[0]), (name, "[3:6]", _TWIST[3])]
     return out

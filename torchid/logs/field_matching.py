@@ -9,7 +9,7 @@ import numpy as np
 
 from torchid.logs.column_groups import Family
 from torchid.logs.column_proposals import OF_BASE, OF_PLATES, is_no_torque
-from torchid.logs.file_samples import FileSample, increases, side_by_side, stated_names
+from torchid.logs.file_samples import FileSample, increases, listed_order, side_by_side, stated_names
 from torchid.logs.joint_orders import JOINT_ORDERS, MOTORS, numbered_joints, suitable_orders
 from torchid.logs.name_matching import KnownRobot
 from torchid.logs.units import quantities_with
@@ -122,5 +122,6 @@ class FieldMatcher:
         else:
             whole = count in (len(self.robot.joints), *slots, *([len(self.named_joints)] if self.names_stated else []))
             whole |= not self.names_stated and len(numbered_joints(self.robot.joints, count)) == count > 2
+            whole |= listed_order(self.sample, "joint", self.robot, count) is not None
         enough = whole or (count >= len(self.robot.joints) and bool(family.numbers))
         return enough and len(self.robot.joints) > 0 and not any(family.axes)

@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import excerpt
-from torchid.logs.base_proposals import field_of_base, find_angles, is_beside, order_of_quaternion
+from torchid.logs.base_proposals import field_beside, field_of_base, find_angles, order_of_quaternion
 from torchid.logs.base_velocities import settle_velocities
 from torchid.logs.column_groups import Family, find_families, split_arrays, split_stamps
 from torchid.logs.column_map import fits
 from torchid.logs.column_proposals import is_desired, propose_field
 from torchid.logs.columns import is_column
 from torchid.logs.field_matching import MOMENT, FieldMatcher
-from torchid.logs.file_samples import FileSample, increases, listed_order, side_by_side, with_samples_first
+from torchid.logs.file_samples import FileSample, counts, increases, listed_order, side_by_side, with_samples_first
 from torchid.logs.foot_proposals import find_foot_readings, frame_of_forces
 from torchid.logs.joint_orders import JOINT_ORDERS, numbered_joints, usual_order
 from torchid.logs.log import SHAPES, VARIANTS, WRENCHES
@@ -173,14 +173,14 @@ class _Proposer:
         self._note(field, f"columns {start} to {stop or 'the last'} of '{name}'")
 
     def _stamps_first(self, families: Sequence[Family]) -> list[Family]:
-        """Families of stamps, those that increase first, of these those beside the positions of joints."""
+        """Families of stamps, those that increase first, numbers of samples last, of others those beside positions."""
         entry = self.out.columns.get("joint_position", {})
         beside = next(iter(entry.get("columns", {}).values()), "") or entry.get("column", "joint_position")
 
-        def rank(family: Family) -> tuple[bool, int]:
+        def rank(family: Family) -> tuple[bool, bool, int]:
             first = family.columns[0]
             forwards = first in self.nanoseconds or increases(self.sample[first])
-            return not forwards, -len(os.path.commonprefix([first, beside]))
+            return not forwards, counts(self.sample[first]), -len(os.path.commonprefix([first, beside]))
 
         return sorted(families, key=rank)
 
@@ -191,8 +191,9 @@ class _Proposer:
         named = [(one, field) for one in families if (field := field_of_base(one, self.sample))]
         placed = [one for one, field in sorted(named, key=lambda pair: not pair[0].stem) if self._place(one, field)]
         turns = [self.out.columns.get(f"base_quat_{order}", {}).get("column", "") for order in ("xyzw", "wxyz")]
-        beside = [one for one in families if any(x and is_beside(one, x, self.sample) for x in turns)]
-        return placed + [one for one in beside if one not in placed and self._place(one, "base_position_world")]
+        others = [(one, turn) for turn in turns if turn for one in families if one not in placed]
+        beside = [(one, field) for one, turn in others if (field := field_beside(one, turn, self.sample))]
+        return placed + [one for one, field in beside if self._place(one, field)]
 
     def _place(self, family: Family, name: str = "") -> bool:
         """Whether a family has become an entry; `name`: of which field, by default the one that it probably is."""
@@ -281,7 +282,7 @@ class _Proposer:
             return False
         entry: dict[str, Any] = family.entry
         if not field:
-            field, note, scale = frame_of_forces(forces if part != "moment" else np.empty(0), self.robot)
+            field, note, scale = frame_of_forces(forces if part != "moment" else np.empty(0), self.robot, family.words)
             entry |= {"scale": scale} if scale < 0 else {}
             self.out.notes[field] = f"{note}{whose}"
         elif any("scale" in of for of in wrench.values()):
