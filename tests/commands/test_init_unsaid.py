@@ -7,16 +7,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import yaml
 from dialects import ORDER, in_order, save_csv
 from initiated import URDF, columns_of, initiated, recorded
 from motions import value
+from refusals import refused
 from scipy.spatial.transform import Rotation
 
 from torchid.commands.init import init
 from torchid.config import load_config
-from torchid.logs import Log, read_log, write_log
+from torchid.errors import LogError
+from torchid.logs import Columns, Log, read_log, write_log
 
 
 def test_columns_that_may_be_torques_are_listed_and_take_no_more_than_a_mark_off(tmp_path: Path) -> None:
@@ -238,3 +242,22 @@ def test_a_list_of_names_may_have_more_than_the_robot(tmp_path: Path) -> None:
     for name in ("joint_position", "joint_velocity", "joint_torque"):
         np.testing.assert_array_equal(in_order(found, getattr(found, name)), in_order(log, getattr(log, name)))
     assert any(text.startswith("joint_order: as 'name' of the file lists them") for text in said.guessed)
+
+
+@pytest.mark.parametrize("kind", ["text", "lists"])
+def test_columns_that_are_no_numbers_are_named_with_the_field_that_lacks_them(tmp_path: Path, kind: str) -> None:
+    log, name = recorded(), "tau" if kind == "text" else "q"
+    rows = {what: list(in_order(log, x)) for what, x in (("q", log.joint_position), ("tau", log.joint_torque))}
+    if kind == "text":
+        rows[name] = [[f"{x} Nm" for x in row] for row in rows[name]]
+    else:
+        rows[name] = [[*row, 0.0][: 12 + k % 2] for k, row in enumerate(rows[name])]
+    columns = {what: [list(row) for row in x] for what, x in rows.items()}
+    pq.write_table(pa.table({"t": log.time, **columns}), tmp_path / "x.parquet")
+    said = init(URDF, tmp_path / "x.parquet", tmp_path / "x.yaml")
+    field = "joint_torque" if kind == "text" else "joint_position"
+    assert f"{field}: '{name}' by name, but no numbers: text, or lists of several lengths" in said.missing
+    if kind == "lists":
+        given = Columns(time="t", joint_order=ORDER, joint_position="q[{index}]", joint_torque="tau[{index}]")
+        line = refused(lambda: read_log(tmp_path / "x.parquet", columns=given), "", LogError)
+        assert "joint_position: 'q[0]' of the column 'q', which has no lists, or lists of several lengths" in line

@@ -106,6 +106,7 @@ class _Proposer:
         taken |= self._place_angles([name for name in numeric if name not in taken])
         self.out.partial = self.match.partial
         self.out.left_out = [name for name in foreign if name not in taken]
+        self.out.not_numbers = [name for name in foreign if name not in numeric]
         families = [one for one in families if one in used or not set(one.columns) <= taken]
         unused = [one for one in families if one not in used or len(one.numbers) > len(self.joints)]
         ignored = {pattern for one in unused for pattern in one.as_ignored}

@@ -20,6 +20,7 @@ class MapProposal:
         columns: the map, as it stands in a file.
         notes: what was guessed, by key.
         left_out: columns that it ignores.
+        not_numbers: of these those that are no numbers, but texts or lists of several lengths.
         key: columns or topics.
         fields: of the log, that a map of topics gives.
         lacking: joints of the robot without columns, if most have some.
@@ -28,6 +29,7 @@ class MapProposal:
     """
 
     columns: dict[str, Any] = field(default_factory=dict)
+    not_numbers: list[str] = field(default_factory=list)
     key: str = "columns"
     fields: set[str] = field(default_factory=set)
     notes: dict[str, str] = field(default_factory=dict)
