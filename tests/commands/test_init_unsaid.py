@@ -261,3 +261,29 @@ def test_columns_that_are_no_numbers_are_named_with_the_field_that_lacks_them(tm
         given = Columns(time="t", joint_order=ORDER, joint_position="q[{index}]", joint_torque="tau[{index}]")
         line = refused(lambda: read_log(tmp_path / "x.parquet", columns=given), "", LogError)
         assert "joint_position: 'q[0]' of the column 'q', which has no lists, or lists of several lengths" in line
+
+
+def test_a_gyroscope_alone_beside_an_orientation_is_the_rate_of_the_base(tmp_path: Path) -> None:
+    log = recorded()
+    rotation, angular = Rotation.from_quat(value(log.base_quat_xyzw)), twist_in_world(log)[1]
+    columns: dict[str, Any] = {"t": log.time} | columns_of(log, ("q{}", "dq{}", "tau{}"))
+    columns |= {f"base_quat_{axis}": value(log.base_quat_xyzw)[:, k] for k, axis in enumerate("xyzw")}
+    columns |= {f"omega_{axis}": rotation.inv().apply(angular)[:, k] for k, axis in enumerate("xyz")}
+    found, _, _ = initiated(save_csv(tmp_path / "x.csv", columns))
+    np.testing.assert_allclose(value(found.base_angular_velocity_base), rotation.inv().apply(angular), atol=1e-9)
+
+
+@pytest.mark.parametrize("separator", [",", ";"])
+def test_names_in_two_lines_are_joined_where_one_has_some_twice(tmp_path: Path, separator: str) -> None:
+    """Of pandas, whose columns have several levels."""
+    log = recorded()
+    joints = (("position", log.joint_position), ("velocity", log.joint_velocity), ("effort", log.joint_torque))
+    path = tmp_path / "x.csv"
+    columns = {f"{what}.{name}": value(x)[:, k] for what, x in joints for k, name in enumerate(log.joint_names)}
+    save_csv(path, {"time": log.time} | columns, separator)
+    first, _, rows = path.read_text().partition("\n")
+    levels = [name.partition(".")[::2] for name in first.split(separator)]
+    path.write_text("\n".join([*(separator.join(level) for level in zip(*levels, strict=True)), rows]))
+    found, _, _ = initiated(path)
+    np.testing.assert_array_equal(in_order(found, found.joint_torque), in_order(log, log.joint_torque))
+    np.testing.assert_allclose(found.time, log.time, atol=1e-12)

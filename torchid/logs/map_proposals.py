@@ -119,7 +119,12 @@ class _Proposer:
         return self.out
 
     def _settle_numbers(self) -> None:
-        """Units and frames, as the numbers say."""
+        """Units and frames, as the numbers say; a gyroscope alone is the angular velocity of a base that turns."""
+        entries, turns = self.out.columns, {"base_quat_wxyz", "base_quat_xyzw"}
+        rates = {"base_angular_velocity_base", "base_angular_velocity_world", "imu_specific_force"}
+        known = {*self.given, *entries}
+        if "imu_angular_velocity" in entries and turns & known and not rates & known:
+            entries["base_angular_velocity_base"] = entries.pop("imu_angular_velocity")
         with np.errstate(all="ignore"):  # of numbers that no unit explains
             units = UnitProposer(self.sample, self.out.columns, self.out.notes, self.factors)
             seconds = units.propose(self.robot.weight, not self.files, self.robot.slides)
