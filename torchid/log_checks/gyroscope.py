@@ -9,9 +9,9 @@ import numpy as np
 from torchid.errors import InputError
 from torchid.log_checks.findings import REJECTED, SUSPICIOUS, Finding, Skipped, median_step, widen_mask
 from torchid.log_checks.model import default_cutoff_hz, preprocess_pieces, recorded_link_poses
-from torchid.log_checks.units import advise_units, units_of_ratio
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
+from torchid.logs.units import advise_units, units_of_ratio
 from torchid.problem.base_motion import imu_pose
 from torchid.robot import Robot
 from torchid.sensing import Contact

@@ -15,7 +15,7 @@ from torchid.errors import LogError, UnknownNameError, warn_about_file
 from torchid.guards import MAX_ARRAYS, check_names, require_plain_name
 from torchid.logs.log import FloatArray
 from torchid.logs.quaternion import require_unit
-from torchid.logs.ros_low_state import LowState, register
+from torchid.logs.unitree import LowState, register
 
 if TYPE_CHECKING:
     from torchid.logs.ros_files import BagChannel
