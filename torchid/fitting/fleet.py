@@ -13,7 +13,7 @@ from torchid.fitting.noise import GroupNoise, NoiseSummary
 from torchid.fitting.row_model import NOISE, RowModel, require_same_noise, require_same_rows
 from torchid.identifiability.base_parameters import StateReport, merge_state_reports
 from torchid.problem import RowBuilder
-from torchid.problem.noise_groups import NoiseGroups, noise_key
+from torchid.problem.extras import NoiseGroups, noise_key
 
 _THE_EXPERIMENT = "the experiment file"
 _APART = (

@@ -14,8 +14,8 @@ from torchid.estimators import LeastSquares
 from torchid.fitting.fit import LogFitter
 from torchid.parameters import Array
 from torchid.problem import Samples
+from torchid.problem.extras import noise_key
 from torchid.problem.noise import GroupVariances, VarianceComponentEstimator, fitted_directions
-from torchid.problem.noise_groups import noise_key
 from torchid.problem.sampled_rows import LogElsewhere, SampledRows
 from torchid.reprs import short_repr
 from torchid.robot import Robot

@@ -22,7 +22,7 @@ from torchid.logs.quaternion import (
 )
 from torchid.logs.units import UNIT_TOLERANCE, advise_units, describe_units, units_of_derivative_ratio
 from torchid.parameters import GRAVITY
-from torchid.problem.closed_loops import loop_gaps, with_loop_joints
+from torchid.problem.log_joints import loop_gaps, with_loop_joints
 from torchid.robot import Robot
 from torchid.rounding import STD_PER_MAD
 

@@ -13,9 +13,8 @@ from torch import Tensor
 from torchid import parameters
 from torchid.parameters import Array
 from torchid.problem.extras import Extra
-from torchid.problem.loop_forces import LoopLayouts, LoopRows
 from torchid.problem.row_blocks import RowBlock, RowBlocks, row_block
-from torchid.problem.wrench_rows import Acting, WrenchRows
+from torchid.problem.wrench_rows import Acting, LoopLayouts, LoopRows, WrenchRows
 from torchid.regressor.columns import reduced_layout, reduction_matrix
 from torchid.regressor.kinematics import BodyStates
 from torchid.regressor.regressor import (

@@ -18,8 +18,13 @@ from torchid.logs.preprocess import unloaded_readings
 from torchid.logs.spill import MappedPages
 from torchid.parameters import WRENCH_COMPONENTS, Array
 from torchid.problem.base_motion import BaseMotion, base_motion, imu_pose, position_for_moments
-from torchid.problem.closed_loops import FOLLOW, require_closed_loops
-from torchid.problem.log_joints import columns_in_order, recorded_torques, require_limb_sensors
+from torchid.problem.log_joints import (
+    FOLLOW,
+    columns_in_order,
+    recorded_torques,
+    require_closed_loops,
+    require_limb_sensors,
+)
 from torchid.problem.motion_noise import MotionNoise, bind_motion_noise
 from torchid.regressor import Motion
 from torchid.regressor.kinematics import GRAVITY_WORLD, rotation_matrix

@@ -13,8 +13,7 @@ from torchid.errors import InputError, join_names, warn
 from torchid.parameters import Array
 from torchid.report.urdf_files import warn_if_inconsistent, without_links_beyond_welds
 from torchid.robot import Robot
-from torchid.robot.mjcf_model import MjcfModel, complaint, parse_model
-from torchid.robot.mjcf_text import body_elements
+from torchid.robot.mjcf_model import MjcfModel, body_elements, complaint, parse_model
 
 NAME = "identified.xml"
 _RULES = ("settotalmass", "boundmass", "boundinertia", "balanceinertia")
