@@ -10,7 +10,7 @@ import numpy as np
 
 from torchid.errors import join_names
 from torchid.estimators import Estimate, SgdEstimate
-from torchid.estimators.nominal_error import NominalError
+from torchid.estimators.posterior import NominalError
 from torchid.fitting.calibration import list_confounded
 from torchid.identifiability.confounding import TotalMass
 from torchid.log_checks.weight import MAX_MASS_ERROR

@@ -29,9 +29,8 @@ from torchid.estimators.conditions import term_violations
 from torchid.fitting.calibration import Calibration, Comparison, warn_of_confounded, warn_of_disagreement
 from torchid.fitting.cross_validation import CrossValidation, RidgeChoice, Scorer
 from torchid.fitting.experiment import Experiment, set_up, with_noise
-from torchid.fitting.factor_files import FactorFile
+from torchid.fitting.factor_files import FactorFile, read_fleet
 from torchid.fitting.fit import Fit, LogFitter
-from torchid.fitting.fleet import read_fleet
 from torchid.fitting.misfit import misfit, unfitted_friction
 from torchid.fitting.noise import NoiseSummary
 from torchid.fitting.posterior import fitted_posterior

@@ -17,8 +17,7 @@ from torch import Tensor
 from torchid import parameters
 from torchid.errors import InputError, LogError, during
 from torchid.estimators import Conditions, Enclosure, Mirror
-from torchid.estimators.nominal_error import NominalError, nominal_error
-from torchid.estimators.posterior import PRIOR_ERROR, Posterior, whitened_rows
+from torchid.estimators.posterior import PRIOR_ERROR, NominalError, Posterior, nominal_error, whitened_rows
 from torchid.estimators.truncated_gaussian import TruncatedGaussian
 from torchid.fitting.fit import Fit
 from torchid.identifiability.confounding import mass_weights
