@@ -35,10 +35,9 @@ from torchid.problem.metrics import DECISIVE_GROUPS, WHITENED, describe_errors, 
 from torchid.problem.predict import at_motors, force_series, noise_series, projected_forces
 from torchid.report.figure_style import save_figures
 from torchid.report.figures import error_figure
-from torchid.report.forces import ForceSeries
+from torchid.report.forces import ForceSeries, LogForces
 from torchid.report.parameter_files import read_parameters, read_shared_extras
 from torchid.report.tables import progress_bars
-from torchid.report.traces import LogForces
 from torchid.reprs import short_repr
 from torchid.robot import Robot
 

@@ -13,9 +13,10 @@ from typing import Any
 import yaml
 
 from torchid.commands.folder import check_free_file
-from torchid.commands.init_contacts import GuessedContact, guess_contacts, stated_contacts
 from torchid.commands.init_proposals import (
+    GuessedContact,
     Split,
+    guess_contacts,
     hints,
     keys_for_gaps,
     like_torques,
@@ -25,6 +26,7 @@ from torchid.commands.init_proposals import (
     proposed_sensors,
     read_sensors,
     split_log,
+    stated_contacts,
 )
 from torchid.commands.reading import memory_needed
 from torchid.config.preprocessing import PreprocessingConfig

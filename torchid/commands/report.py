@@ -15,9 +15,9 @@ from torchid.commands.folder import RUN, refuse_link
 from torchid.commands.manifest import file_checksum, read_manifest
 from torchid.errors import ConfigError, InputError, during, excerpt, warn
 from torchid.guards import MAX_JSON, MAX_YAML, read_bytes
+from torchid.report.forces import traces_document
 from torchid.report.log_checks import log_check_document
 from torchid.report.page import RunFiles, page_text, require_page, versions
-from torchid.report.traces import traces_document
 from torchid.robot import Robot
 from torchid.staging import atomic_file
 
