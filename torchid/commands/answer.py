@@ -60,11 +60,7 @@ class Judged:
                 yield group, before, after, self.identified.noise.get(group)
 
     def headline(self, *, explained: bool = True) -> str:
-        """The verdict in a sentence.
-
-        Args:
-            explained: whether the model explains the forces that it was fitted to.
-        """
+        """The verdict in a sentence; `explained`: whether the model explains the forces that it was fitted to."""
         ratios = [after / before if before else 1.0 for _, before, after, _ in self.errors()]
         if not ratios:
             return f"Nothing to compare with the {self.of} on {self.text}"

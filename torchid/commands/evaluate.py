@@ -166,11 +166,7 @@ def evaluate(
 
 
 def require_run(folder: Path) -> None:
-    """Make sure that a folder is that of a run.
-
-    Raises:
-        ConfigError: it has no settings.
-    """
+    """Make sure that a folder is that of a run. Raises ConfigError: it has no settings."""
     if not (folder / _SETTINGS).is_file():
         raise ConfigError(folder, "RUN", f"no {_SETTINGS} in it", "a folder that torchid identify wrote")
 
@@ -263,11 +259,7 @@ def _write(evaluated: EvaluatedRun, output: Path, config: Path, form: str, overw
 
 
 def _log_names(logs: Sequence[str | Path]) -> list[str]:
-    """Names of the logs, without their folders.
-
-    Raises:
-        ConfigError: two have the same, or there is none.
-    """
+    """Names of the logs, without their folders. Raises ConfigError: two have the same, or there is none."""
     names = [split_range(log).name for log in logs]
     if not names:
         raise ConfigError.at_field("logs", "none", "logs to evaluate")

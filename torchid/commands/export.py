@@ -55,7 +55,6 @@ def export(run: str | Path, form: str, output: str | Path | None = None, overwri
 
 
 def _fitted_joints(fitted: FittedRun) -> FittedJoints:
-    """What was fitted of joints."""
     calibration = fitted.calibrations.identified
     of_joints = (extra for extra in calibration.builder.extras if extra.what in ACTUATORS)
     return FittedJoints.of((extra, calibration.values[("", extra.label)]) for extra in of_joints)

@@ -62,11 +62,7 @@ class Manifest:
         return {"/".join(name.split("/")[:k]) for name in self.files for k in range(1, name.count("/") + 1)}
 
     def write(self, folder: Path) -> None:
-        """Write it into its folder, whole or not at all.
-
-        Raises:
-            OSError: it cannot be written.
-        """
+        """Write it into its folder, whole or not at all. Raises OSError: it cannot be written."""
         files = {name: {"size": size, "sha256": checksum} for name, (size, checksum) in self.files.items()}
         document = {"torchid": self.kind, "folder": self.folder, "files": files, "growing": self.growing}
         with atomic_file(folder / MANIFEST, result=False) as new:
@@ -184,7 +180,6 @@ def _look(top: Path, relative: str, manifest: Manifest, kind: FolderKind, conten
 
 
 def _look_into(top: Path, relative: str, manifest: Manifest, kind: FolderKind, contents: FolderContents) -> None:
-    """Add a folder."""
     path, above = top / relative, relative.rpartition("/")[0]
     if is_leftover(path):
         contents.leftovers.append(path)

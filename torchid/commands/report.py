@@ -92,11 +92,7 @@ def report(run: str | Path) -> Path:
 
 
 def _made(files: RunFiles, folder: Path) -> str:
-    """The page of files that somebody may have changed.
-
-    Raises:
-        InputError: they are not what a page needs.
-    """
+    """The page of files that somebody may have changed. Raises InputError: they are not what a page needs."""
     try:
         return page_text(files)
     except InputError:
@@ -107,11 +103,7 @@ def _made(files: RunFiles, folder: Path) -> str:
 
 
 def _read(folder: Path) -> RunFiles:
-    """The files of a run that its page shows.
-
-    Raises:
-        InputError: one is missing or cannot be read.
-    """
+    """The files of a run that its page shows. Raises InputError: one is missing or cannot be read."""
     parameters, metrics, data = (_document(folder, name) for name in _JSON)
     return RunFiles(
         name=folder.resolve().name,

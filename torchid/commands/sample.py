@@ -109,11 +109,7 @@ def sample(
 
 
 def parse_prior_error(text: str) -> float | Literal["auto"]:
-    """A prior's width of the command line.
-
-    Raises:
-        ConfigError: neither a number nor auto.
-    """
+    """A prior's width of the command line. Raises ConfigError: neither a number nor auto."""
     try:
         return "auto" if text == "auto" else float(text)
     except ValueError as error:

@@ -303,7 +303,6 @@ def _described(hint: Any) -> str:
 
 
 def _not_none(hint: Any) -> Any:
-    """X, of `X | None`."""
     if get_origin(hint) not in (Union, UnionType):
         return hint
     return next(inner for inner in get_args(hint) if inner is not NoneType)

@@ -77,7 +77,6 @@ class FreeParameters(LearnableParameters):
     """Any phi, an affine function of `raw`."""
 
     def __init__(self, problem: LinearProblem) -> None:
-        """Start at the nominal parameters."""
         super().__init__(problem, int(problem.free.sum()))
 
     def constrained(self, u: Tensor) -> Tensor:

@@ -196,7 +196,6 @@ class NominalError:
         return self.clear and self.value > _MUCH * self.prior
 
     def __str__(self) -> str:
-        """How far bodies are off, in words."""
         off = f"{100.0 * self.value:.2g} %, {self.value / self.prior:.2g} times what the prior says"
         return f"where the data tell, in {self.combinations} combinations, bodies are off the robot file by {off}"
 

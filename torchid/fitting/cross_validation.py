@@ -64,7 +64,6 @@ class RidgeChoice:
     rule: RidgeRule = "least"
 
     def __str__(self) -> str:
-        """The ridge, and how it was chosen."""
         within = "" if self.rule == "least" else ", the largest within one standard error of the best"
         return f"{self.ridge:g}{within}, chosen by cross-validation on blocks of the training logs"
 

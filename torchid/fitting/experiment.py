@@ -100,11 +100,7 @@ class Scene:
         return None if robust is None else RobustLoss.named(robust.loss, robust.tuning, robust.passes)
 
     def sensors_of(self, choice: ChoiceConfig) -> SensorSet:
-        """The sensors of a choice.
-
-        Raises:
-            InputError: names that do not fit the robot.
-        """
+        """The sensors of a choice. Raises InputError: names that do not fit the robot."""
         robot, contacts, noise, ft = self.robot, self.contacts, self.noise, len(self.robot.ft_names)
         if choice.set is not None:
             sensors = named_sensors(choice.set, robot.n, len(contacts), noise, ft)

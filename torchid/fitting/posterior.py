@@ -251,7 +251,6 @@ class ParameterSamples:
     __repr__ = short_repr
 
     def __len__(self) -> int:
-        """Number of sets."""
         return len(self.phi)
 
     @property
@@ -325,7 +324,6 @@ class PosteriorSampler(torch.nn.Module):
     """
 
     def __init__(self, run: str | Path | FittedPosterior, prior_error: float | Literal["auto"] = PRIOR_ERROR) -> None:
-        """Read the posterior and prepare the sampler."""
         super().__init__()
         if prior_error != "auto" and not (isinstance(prior_error, (int, float)) and 0.0 < prior_error < math.inf):
             raise InputError("sampler", "prior_error", f"{prior_error}", "a number above 0, or 'auto'")

@@ -327,7 +327,6 @@ class TopicMessages:
     """Messages of a topic in the order of receipt."""
 
     def __init__(self, topic: str, decoder: Decoder) -> None:
-        """Start without messages."""
         self.topic, self._decoder = topic, decoder
         self._stamps, self._received, self._values = array("q"), array("q"), array("d")
 

@@ -182,11 +182,7 @@ def read_bag(
 
 
 def list_channels(files: list[Path]) -> dict[str, BagChannel]:
-    """The topics of a bag.
-
-    Raises:
-        LogError: it is damaged, or a topic has several types.
-    """
+    """The topics of a bag. Raises LogError: it is damaged, or a topic has several types."""
     channels: dict[str, BagChannel] = {}
     for file in files:
         with open_bag_file(file) as opened:

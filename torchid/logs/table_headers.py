@@ -226,7 +226,6 @@ class NestedColumns:
     """
 
     def __init__(self, pa: Any, file: Any) -> None:
-        """Of an opened `pyarrow.parquet.ParquetFile`."""
         self._pa, self._lengths = pa, _list_lengths(file.metadata)
         self._lists = dict[str, int]()  # numbers in each row, by name of a column of lists
         self._list_of = dict[str, str]()  # by name of a column of numbers

@@ -312,11 +312,7 @@ def _bounded(path: Path, batches: Iterable[Any], columns: int, whole: bool) -> I
 
 
 def table_size(path: Path) -> int:
-    """Bytes of a table's numbers, without reading them.
-
-    Raises:
-        LogError: the file cannot be read.
-    """
+    """Bytes of a table's numbers, without reading them. Raises LogError: the file cannot be read."""
     _pyarrow(path)
     with _complete(path):
         if is_text_table(path):

@@ -198,12 +198,7 @@ DEFINITIONS: dict[str, str] = {
 
 
 def register(store: Any, parse: Any) -> None:
-    """Add the types to a typestore of rosbags.
-
-    Args:
-        store: the typestore.
-        parse: `rosbags.typesys.get_types_from_msg`.
-    """
+    """Add the types to a typestore of rosbags; `parse`: `rosbags.typesys.get_types_from_msg`."""
     store.register({key: value for name, text in DEFINITIONS.items() for key, value in parse(text, name).items()})
 
 

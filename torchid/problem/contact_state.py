@@ -50,7 +50,6 @@ class RowColumns:
     """
 
     def __init__(self, tree: KinematicTree) -> None:
-        """Lay out the columns of a robot."""
         self.tree = tree
         self.layout = reduced_layout(tree)
         self.joint_rows: list[JointRow] = joint_rows(tree, self.layout)
@@ -161,7 +160,6 @@ class ContactStateLayouts:
         sensors: SensorSet,
         extras: Sequence[Extra] = (),
     ) -> None:
-        """Look up the nodes that carry the contacts' frames."""
         self.extras = tuple(extras)
         self.columns = columns
         self.contacts = tuple(contacts)

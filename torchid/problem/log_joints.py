@@ -70,11 +70,7 @@ _TOLERANCE_OF_OTHERS = (0.05, "rad")
 
 
 def without_welded_joints(log: Log, robot: Robot | None) -> Log:
-    """The log without columns for welded joints.
-
-    Warns:
-        TorchidWarning: a joint that is not where it is welded.
-    """
+    """The log without columns for welded joints. Warns TorchidWarning: a joint that is not where it is welded."""
     if robot is None or robot.welded.keys().isdisjoint(log.joint_names):
         return log
     kept = [column for column, name in enumerate(log.joint_names) if name not in robot.welded]

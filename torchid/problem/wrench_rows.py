@@ -137,7 +137,6 @@ class LoopLayouts:
     """The loops of a robot; `dofs`: degrees of freedom that some of them depends on."""
 
     def __init__(self, robot: Robot) -> None:
-        """Look up where they close."""
         self._closures = LoopClosures(robot) if robot.loops else None
         self.dofs = frozenset() if self._closures is None else frozenset(self._closures.dofs)
         self._wrenches: dict[tuple[int, tuple[int, ...]], Array] = {}
@@ -183,7 +182,6 @@ class MotorForces:
     """
 
     def __init__(self, robot: Robot) -> None:
-        """Group the loops of a robot."""
         self.none = not robot.loops
         self._base, self._groups = robot.base_rows, list[_Group]()
         if self.none:

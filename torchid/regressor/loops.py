@@ -136,7 +136,6 @@ class LoopClosures:
     """
 
     def __init__(self, robot: Robot) -> None:
-        """Look the loops up in the robot's tree."""
         self.tree = KinematicTree(robot)
         self.geometries = [LoopGeometry.of(loop, robot, self.tree) for loop in robot.loops]
         self.dofs = sorted({dof for loop in self.geometries for dof in loop.dofs(self.tree)})

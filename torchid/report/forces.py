@@ -199,7 +199,6 @@ class _Thinned:
     """Envelopes of series over bins of time, which keep peaks, and gaps as NaN; short series stay as they are."""
 
     def __init__(self, time: Array) -> None:
-        """Set the stamps (N,) [s]."""
         steps = np.diff(time)
         self._gaps = np.flatnonzero(steps > _GAP * np.median(steps)) + 1 if len(steps) else np.empty(0, int)
         self._starts: np.ndarray | None = None

@@ -154,11 +154,7 @@ def _armature_of_mimics(robot: Robot) -> dict[str, float]:
 
 
 def require_loadable(text: bytes, source: Path) -> None:
-    """Make sure that MuJoCo takes a model.
-
-    Raises:
-        InputError: it does not.
-    """
+    """Make sure that MuJoCo takes a model. Raises InputError: it does not."""
     if found := complaint(text):
         raise InputError(source, "MJCF", f"MuJoCo refuses it: {found}", "a robot that MuJoCo can simulate")
 

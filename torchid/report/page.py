@@ -74,11 +74,7 @@ def _page_available() -> bool:
 
 
 def require_page() -> None:
-    """Refuse to make a page without its libraries.
-
-    Raises:
-        InputError: they are not installed.
-    """
+    """Refuse to make a page without its libraries. Raises InputError: they are not installed."""
     if not _page_available():
         raise InputError("", "report", "plotly or jinja2 is not installed", how_to_install("report"))
 

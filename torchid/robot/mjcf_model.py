@@ -43,11 +43,7 @@ class MjcfText:
     """
 
     def __init__(self, path: Path) -> None:
-        """Read the files.
-
-        Raises:
-            UrdfError: one of them is missing, or no well-formed XML, or there are too many.
-        """
+        """Read the files. Raises UrdfError: one of them is missing, or no well-formed XML, or there are too many."""
         self.path, self._files = path, dict[Path, etree._Element]()
         self.root = self._expanded(path, "mujoco")
 
@@ -177,11 +173,7 @@ class MjcfModel:
     """
 
     def __init__(self, path: Path) -> None:
-        """Read and compile a file.
-
-        Raises:
-            UrdfError: MuJoCo does not take it, or it has no joint.
-        """
+        """Read and compile a file. Raises UrdfError: MuJoCo does not take it, or it has no joint."""
         self.path, self.text = path, MjcfText(path)
         try:
             with warnings.catch_warnings():
@@ -247,11 +239,7 @@ class MjcfModel:
         return joint in self._spring_dampers
 
     def refuse(self, element: Any, tag: str, name: str, found: str, accepted: str) -> NoReturn:
-        """Refuse an element of the specification, by its line.
-
-        Raises:
-            UrdfError: always.
-        """
+        """Refuse an element of the specification, by its line. Raises UrdfError: always."""
         raise UrdfError(self.path, self.label(element, tag, name), found, accepted)
 
     def label(self, element: Any, tag: str, name: str) -> str:

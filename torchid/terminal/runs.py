@@ -81,13 +81,7 @@ def print_samples(drawn: DrawnSamples, verbose: bool = False) -> None:
 
 
 def sample_lines(drawn: DrawnSamples, width: int, verbose: bool = False) -> list[str]:
-    """A sentence, and the ranges that are widest; lines of at most so many columns.
-
-    Args:
-        drawn: the samples.
-        width: of the terminal.
-        verbose: with all parameters.
-    """
+    """A sentence, and the ranges that are widest; lines of at most so many columns."""
     fitted, table = drawn.fitted, table_of_draws(drawn.samples)
     total = np.quantile(table[:, MASS : len(fitted.posterior.nominal) : PER_BODY].sum(axis=1), _ENDS)
     lines = wrap_words(
