@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from textwrap import fill
-from typing import Any
 
 import yaml
 
@@ -139,7 +138,7 @@ def _of_columns(files: Sequence[Path], robot: Robot) -> tuple[list[GuessedContac
     sample = {name: values for of_file in reversed(samples) for name, values in of_file.items()}
     contacts = guess_contacts(robot, stated_contacts(sample, robot), texts_in(sample))
     proposal = propose_map(sample, _known(robot, contacts), samples if len(files) > 1 else (), in_degrees)
-    fields = _fields_of(sample, proposal)
+    fields = {*(name.partition(".")[0] for name in sample), *proposal.columns}
     if "joint_position" not in fields:
         proposal.notes |= notes_on_arrays(sample, len(robot.joint_names))
     _add_imu_frame(robot, fields, proposal)
@@ -162,11 +161,6 @@ def _known(robot: Robot, contacts: Sequence[GuessedContact]) -> KnownRobot:
     known = robot.joint_names, feet, robot.path.stem, weight, robot.base_link, on_base, elsewhere, limb_sensors(robot)
     moving = [body.joint.name for body in robot.bodies if body.joint is not None and body.joint.kind != "fixed"]
     return KnownRobot(*known, [link for link in on_base if is_along_base(robot, link)], robot.sliding, moving)
-
-
-def _fields_of(sample: Any, proposal: MapProposal) -> set[str]:
-    """Fields of a log that file and map have."""
-    return {*(name.partition(".")[0] for name in sample), *proposal.columns}
 
 
 def _add_imu_frame(robot: Robot, fields: set[str], proposal: MapProposal) -> None:

@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import stat
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
@@ -165,7 +165,7 @@ def inspect_folder(folder: Path, kind: FolderKind, name: str | None = None) -> F
 
 def _look(top: Path, relative: str, manifest: Manifest, kind: FolderKind, contents: FolderContents) -> None:
     """Add what is in the folder at a path relative to the top."""
-    for name, path in _entries(top / relative):
+    for name, path in [(name, top / relative / name) for name in sorted(os.listdir(top / relative))]:
         inner = f"{relative}/{name}" if relative else name
         mode = os.lstat(path).st_mode
         if stat.S_ISDIR(mode):
@@ -198,11 +198,6 @@ def _look_into(top: Path, relative: str, manifest: Manifest, kind: FolderKind, c
         contents.folders.append(path)
     else:
         contents.foreign.append(excerpt(f"{relative}/"))
-
-
-def _entries(folder: Path) -> Iterator[tuple[str, Path]]:
-    for name in sorted(os.listdir(folder)):
-        yield name, folder / name
 
 
 def _is(path: Path, size: int, checksum: str) -> bool:

@@ -78,7 +78,7 @@ def check_terms(
         UnknownNameError: a group's pattern that fits no sensor that is measured.
     """
     measured = measured_channels(robot, contacts, sensors)
-    for key, scopes in _scopes(terms).items():
+    for key, scopes in {"offsets": terms.offsets, "scales": terms.scales}.items():
         for channel, scope in scopes.items():
             if channel not in measured and (len(scopes) < len(CHANNELS) or not isinstance(scope, str)):
                 accepted = f"{', '.join(measured)}, or log or all for every kind that is measured"
@@ -92,10 +92,6 @@ def check_terms(
         if value and "joint_torque" not in measured:
             accepted = "joint torques among the sensors, or no such key"
             raise ConfigError.at_field(f"actuators.{name}", "set, but no joint torque is measured", accepted)
-
-
-def _scopes(terms: ExtraTerms) -> dict[str, Any]:
-    return {"offsets": terms.offsets, "scales": terms.scales}
 
 
 def _groups(terms: ExtraTerms) -> dict[str, ScaleGroups]:
