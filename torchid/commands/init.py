@@ -32,15 +32,15 @@ from torchid.config.preprocessing import PreprocessingConfig
 from torchid.errors import ConfigError, InputError, LogError, about_file, excerpt, format_count, join_names
 from torchid.fitting.checked_settings import is_along_base
 from torchid.logs import Columns, Log, Topics, read_log
-from torchid.logs.column_groups import MapProposal
 from torchid.logs.containers import LogKind, atomic_output, existing_log_kind
-from torchid.logs.file_samples import read_bag_sample, read_sample, states_degrees, texts_in
 from torchid.logs.log import VARIANTS
-from torchid.logs.map_proposals import propose_map
 from torchid.logs.name_matching import KnownRobot
 from torchid.logs.time_range import split_range
-from torchid.logs.topic_proposals import USED_TYPES, frame_of, propose_topics
 from torchid.parameters import GRAVITY
+from torchid.proposals.column_groups import MapProposal
+from torchid.proposals.file_samples import read_bag_sample, read_sample, states_degrees, texts_in
+from torchid.proposals.maps import propose_map
+from torchid.proposals.topics import USED_TYPES, frame_of, propose_topics
 from torchid.robot import Robot, load_robot
 from torchid.robot.urdf import has_fixed_base, position_limits
 from torchid.robot.xml_files import is_mjcf

@@ -9,14 +9,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from torchid.logs.column_groups import Family
 from torchid.logs.column_proposals import OF_BASE, OF_PLATES, is_desired, is_no_torque
-from torchid.logs.file_samples import FileSample, increases, side_by_side, stated_names
 from torchid.logs.log import WRENCHES, FloatArray
 from torchid.logs.name_matching import SUFFIXES, KnownRobot, limb_and_words, within
-from torchid.logs.number_proposals import point_along_z
 from torchid.logs.unitree import JOINT_ORDERS, MOTORS, numbered_joints, suitable_orders
 from torchid.logs.units import quantities_with, split_unit
+from torchid.proposals.column_groups import Family
+from torchid.proposals.file_samples import FileSample, increases, side_by_side, stated_names
+from torchid.proposals.numbers import point_along_z
 
 FORCE = re.compile(r"force|(?<![a-z])f\{axis", re.IGNORECASE)
 MOMENT = re.compile(r"moment|torque|(?<![a-z])[mt]\{axis", re.IGNORECASE)

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.logs.column_groups import Family, MapProposal
 from torchid.logs.column_map import PLACEHOLDER
 from torchid.logs.column_proposals import BASES, is_desired, words_of
-from torchid.logs.file_samples import FileSample, side_by_side
 from torchid.logs.log import FloatArray
 from torchid.logs.quaternion import angular_velocity_base, make_sign_continuous, rotate_to_base, rotate_to_world
 from torchid.logs.units import quantities_of, quantities_with, split_unit, unit_factor
+from torchid.proposals.column_groups import Family, MapProposal
+from torchid.proposals.file_samples import FileSample, side_by_side
 
 _UNIT = 1e-3  # of the length of quaternions from 1
 _STEPS = 0.1  # of the range of a path: as large no step of one is, in the median

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from torchid.logs.arrays import TRANSPOSED
 from torchid.logs.column_map import PLACEHOLDER
 from torchid.logs.column_proposals import is_current, propose_field
-from torchid.logs.file_samples import FileSample
 from torchid.logs.name_matching import SUFFIXES, KnownRobot, joints_by_place, spelled, within
 from torchid.logs.units import OF_JOINTS, quantities_with, split_unit
+from torchid.proposals.file_samples import FileSample
 
 _NUMBER = re.compile(r"\d+")
 _AXIS = re.compile(
