@@ -201,17 +201,13 @@ class NominalError:
 
 
 @one_thread()
-def nominal_error(posterior: Posterior, prior_error: float = PRIOR_ERROR) -> NominalError | None:
+def nominal_error(posterior: Posterior) -> NominalError | None:
     """The width of the prior by the data (empirical Bayes); None where these determine no inertial parameters.
 
     Bodies that data do not determine are taken to be as wrong as those that they do. Friction and extra parameters may
     have any value, as files seldom state them; conditions on the parameters are left out.
 
     Source: type-II maximum likelihood (MacKay, Neural Computation 4, 1992).
-
-    Args:
-        posterior: of a fit.
-        prior_error: standard deviation of the nominal parameters, as a share of each body, to compare with.
     """
     inertial = np.zeros(len(posterior.nominal), dtype=bool).reshape(-1, PER_BODY)
     inertial[:, INERTIAL] = True
@@ -228,13 +224,13 @@ def nominal_error(posterior: Posterior, prior_error: float = PRIOR_ERROR) -> Nom
     if not kept.any():
         return None
     found, variance = np.square(U[:, kept].T @ rows[:, -1]), np.square(values[kept])
-    widths = np.append(np.geomspace(NARROWEST, WIDEST, _STEPS), prior_error)
+    widths = np.append(np.geomspace(NARROWEST, WIDEST, _STEPS), PRIOR_ERROR)
     of_data = 1.0 + np.square(widths)[:, None] * variance
     likelihood = -(np.log(of_data) + found / of_data).sum(axis=1)  # twice its logarithm
     best = int(likelihood.argmax())
     return NominalError(
         value=float(widths[best]),
-        prior=prior_error,
+        prior=PRIOR_ERROR,
         evidence=float(likelihood[best] - likelihood[-1]),
         combinations=int((widths[best] ** 2 * variance > 1.0).sum()),
     )
