@@ -23,7 +23,7 @@ import yaml
 ROOT = Path(__file__).resolve().parents[2]
 TORCHRUN = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node")
 TWO = (*TORCHRUN, "2")
-SMALL_CHUNK = 128
+SMALL_CHUNK = 64
 RANDOM = {"noise": {"joint_torque": 0.1, "contact_force": 0.5, "contact_moment": 0.05}}
 
 
@@ -41,14 +41,14 @@ def write_experiments(folder: Path) -> dict[str, Path]:
     feet = [f"{leg}_foot" for leg in ("front_left", "front_right", "rear_left", "rear_right")]
     walks = [[True] * 4, [True, False, False, True], [False, True, True, False]]
     robots: dict[str, Any] = {
-        "quadruped": (demo / "quadruped.urdf", False, [(foot, 3) for foot in feet], walks, [500], "joints"),
-        "arm": (PANDA, True, [], [[]], [700], "joints"),
+        "quadruped": (demo / "quadruped.urdf", False, [(foot, 3) for foot in feet], walks, [250], "joints"),
+        "arm": (PANDA, True, [], [[]], [350], "joints"),
         "biped": (
             ROOT / "configs" / "biped.urdf",
             False,
             [("l_sole", 6), ("r_sole", 6)],
             [[True, True], [True, False], [False, True]],
-            [300, 240],
+            [150, 120],
             {"set": "full", "offsets": {"contact_force": "log", "contact_moment": "log"}},
         ),
     }
@@ -141,7 +141,7 @@ def finish_forked(processes: int, run: Callable[[], int], folders: Sequence[Path
             if pid == 0:
                 os.environ.update(common | {"RANK": str(rank), "LOCAL_RANK": str(rank)})
                 os.chdir(folders[rank] if folders else ".")
-                _become(run, printed.fileno(), complained.fileno())
+                become(run, printed.fileno(), complained.fileno())
             pids.append(pid)
         try:
             statuses = [_status_of(pid) for pid in pids]
@@ -156,7 +156,7 @@ def finish_forked(processes: int, run: Callable[[], int], folders: Sequence[Path
     return max(statuses), texts[0], texts[1]
 
 
-def _become(run: Callable[[], int], printed: int, complained: int) -> NoReturn:
+def become(run: Callable[[], int], printed: int, complained: int) -> NoReturn:
     """Run something in this process, whose streams are files, and end with its status."""
     status = 70
     try:
