@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from thinned import slow_but
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed")
 
@@ -222,7 +221,7 @@ def test_a_log_is_checked_against_a_model_as_against_its_urdf(runs: dict[str, Pa
     assert [one.name for one in of_model.findings] == [one.name for one in of_urdf.findings]
 
 
-@pytest.mark.parametrize("factor", slow_but([1.8], [0.7, 1.8, -1.0]))
+@pytest.mark.parametrize("factor", [pytest.param(0.7, marks=pytest.mark.slow), 1.8, -1.0])
 def test_findings_against_a_model_are_those_against_its_urdf_and_name_the_model(
     runs: dict[str, Path], factor: float
 ) -> None:

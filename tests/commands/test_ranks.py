@@ -9,7 +9,7 @@ import shutil
 import signal
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -349,20 +349,38 @@ def killed_after(seconds: float, command: list[str], output: Path, victim: int) 
     return process.returncode
 
 
+def killed_fork_after(seconds: float, command: list[str], output: Path, victim: int) -> int:
+    """As `killed_after`, of forks of this process, of which the other is then ended as torchrun does."""
+
+    def kill(processes: Sequence[int]) -> None:
+        until = time.monotonic() + 60.0
+        while not output.parent.exists() and time.monotonic() < until:
+            time.sleep(0.01)
+        time.sleep(seconds)
+        os.kill(processes[victim], signal.SIGKILL)
+        os.kill(processes[1 - victim], signal.SIGTERM)
+
+    return finish_forked(2, lambda: main([*command, f"output={output}"]), meanwhile=kill)[0]
+
+
 def assert_nothing_or_whole(output: Path, parameters: bytes, status: int) -> None:
     assert not output.exists() or (output / "parameters.json").read_bytes() == parameters
     assert output.exists() or status != 0
 
 
 @pytest.mark.parametrize(
-    "seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 20))]
-)  # fmt: skip
+    ("seed", "kill", "least"),
+    [
+        (0, killed_fork_after, 0.2),
+        *(pytest.param(seed, killed_after, -0.2, marks=pytest.mark.slow) for seed in range(20)),
+    ],
+)
 def test_a_killed_process_ends_all_and_leaves_nothing_or_all(
-    whole: tuple[list[str], bytes, float], tmp_path: Path, seed: int
+    whole: tuple[list[str], bytes, float], tmp_path: Path, seed: int, kill: Callable[..., int], least: float
 ) -> None:
     command, parameters, seconds = whole
     drawn, output = random.Random(seed), tmp_path / "runs" / "run"
-    status = killed_after(seconds * drawn.uniform(-0.2, 1.0), command, output, drawn.randrange(2))
+    status = kill(seconds * drawn.uniform(least, 1.0), command, output, drawn.randrange(2))
     assert_nothing_or_whole(output, parameters, status)
     again = [*command, f"output={output}", "overwrite=true"]
     status, _, complained = finish_forked(2, lambda: main(again))

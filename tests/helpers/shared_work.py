@@ -125,11 +125,16 @@ def finish(command: Sequence[str]) -> tuple[int, str, str]:
     return process.returncode, printed, complained
 
 
-def finish_forked(processes: int, run: Callable[[], int], folders: Sequence[Path] = ()) -> tuple[int, str, str]:
+def finish_forked(
+    processes: int,
+    run: Callable[[], int],
+    folders: Sequence[Path] = (),
+    meanwhile: Callable[[Sequence[int]], None] = lambda _: None,
+) -> tuple[int, str, str]:
     """`finish` of what forks of this process run, in which everything is set that torchrun sets.
 
-    They have nothing to import, and nobody ends those that another one leaves behind. Each may have a folder of its
-    own to work in. The status is the largest of theirs.
+    They have nothing to import, and nobody ends those that another one leaves behind, unless `meanwhile` does, which is
+    given the processes. Each may have a folder of its own to work in. The status is the one of theirs farthest from 0.
     """
     with socket() as free:
         free.bind(("localhost", 0))
@@ -144,6 +149,7 @@ def finish_forked(processes: int, run: Callable[[], int], folders: Sequence[Path
                 become(run, printed.fileno(), complained.fileno())
             pids.append(pid)
         try:
+            meanwhile(pids)
             statuses = [_status_of(pid) for pid in pids]
         finally:
             for pid in pids:
@@ -153,7 +159,7 @@ def finish_forked(processes: int, run: Callable[[], int], folders: Sequence[Path
         for stream in (printed, complained):
             stream.seek(0)
             texts.append(stream.read())
-    return max(statuses), texts[0], texts[1]
+    return max(statuses, key=abs), texts[0], texts[1]
 
 
 def become(run: Callable[[], int], printed: int, complained: int) -> NoReturn:
