@@ -62,7 +62,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     settings = yaml.safe_load((DEMO / "quadruped.yaml").read_text())
     settings |= {"robot": {"urdf": "moving.urdf", "weld": {KNEE: HELD}}, "logs": {"train": [_TRAIN], "test": [_TEST]}}
     settings["preprocessing"]["cache_gb"] = 0
-    settings["estimator"] = {"name": "least_squares", "ridge": 0.01}
+    settings["estimator"]["ridge"] = 0.01
     settings["sensors"]["set"] = "full"  # without the knee's torque, forces of four feet hide the base
     (folder / "experiment.yaml").write_text(yaml.safe_dump(settings))
     without = {"robot": {"urdf": "fixed.urdf"}, "logs": {"train": [f"fixed_{_TRAIN}"], "test": [f"fixed_{_TEST}"]}}
