@@ -21,7 +21,7 @@ from torchid.report import page
 _LATE = [
     *("h5py", "jinja2", "scipy.signal", "torch._dynamo", "torchid.estimators.training", "torchid.report.tensorboard"),
     *(f"torchid.commands.{name}" for name in ("check", "compress", "identify")),
-    *(f"torchid.terminal.{name}" for name in ("analysis", "finished_runs", "identification")),
+    *(f"torchid.terminal.{name}" for name in ("analysis", "identification", "runs")),
 ]
 """What commands import when they need it, and another user may not read."""
 
