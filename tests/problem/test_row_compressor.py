@@ -152,6 +152,7 @@ def test_levels_make_rows_well_conditioned_and_can_be_undone() -> None:
     unit = X / np.linalg.norm(X, axis=1, keepdims=True)
     assert np.linalg.eigvalsh(unit @ unit.T).min() > module._LEAST_EIGENVALUE
     assert 0 < len(levels.lower) < COLUMNS
+    np.testing.assert_allclose(levels.squares_before(X @ X.T), np.square(rows[:, levels.lower]).sum(0), rtol=1e-12)
     kept = np.setdiff1d(np.arange(COLUMNS + 1), levels.lower)
     np.testing.assert_array_equal(X[kept], rows.T[kept])
     R = levels.undo(np.linalg.qr(X.T, mode="r"))
