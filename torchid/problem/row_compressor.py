@@ -35,6 +35,7 @@ _CERTIFIED = (16.0 * _LEAST_EIGENVALUE, 4.0 * _LEAST_EIGENVALUE, _LEAST_EIGENVAL
 """What the least eigenvalue is shown to be: the larger, the later it is looked at again."""
 
 _ROWS_PER_COLUMN = 3  # of the sample of a chunk that its columns are combined by
+_MOST_COMBINED = 0.5  # of the columns: where more are combined, QR is as fast, and the Gram matrix mostly fails
 _LEAST_ROWS = 2000  # of a chunk that columns are combined for: of fewer, that takes longer than Householder QR of them
 
 
@@ -246,12 +247,15 @@ class RowCompressor:
         self._levels.clear()
 
     def _start(self, support: tuple[int, ...], X: Array) -> _Sum | None:
-        """A sum of nothing, columns combined as for the rows before or by some of these."""
+        """A sum of nothing, columns combined as for the rows before or by some of these; None if QR is as fast."""
         if support not in self._levels:
             some = X[:, :: max(1, X.shape[1] // (_ROWS_PER_COLUMN * len(X)))].copy()
             if not np.isfinite(some).all():
                 return None
-            self._levels[support] = ColumnLevels.of(triangularize(torch.from_numpy(some).T).numpy())
+            levels = ColumnLevels.of(triangularize(torch.from_numpy(some).T).numpy())
+            if len(levels.lower) > _MOST_COMBINED * len(X):
+                return None
+            self._levels[support] = levels
         return _Sum.of_nothing(self._levels[support])
 
     def _factorize(self, factor: TriangularFactor, support: tuple[int, ...], stacked: Tensor, known: _Sum) -> None:
