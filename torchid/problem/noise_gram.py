@@ -26,7 +26,7 @@ from torchid.parameters import Array
 from torchid.problem.chunk_dynamics import Workspace
 from torchid.problem.chunks import ProgressCallback, map_chunks, one_thread
 from torchid.problem.contact_state import ContactState
-from torchid.problem.linear import TriangularFactor
+from torchid.problem.linear import TriangularFactor, gram_matrix
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples, concatenate
 from torchid.rounding import RANK_TOLERANCE, column_scale, is_significant
@@ -161,8 +161,7 @@ def _noise_gram_of_chunks(
                     first, last = (copy * count + x for x in (start, end))
                     if isinstance(index, Tensor):  # of samples whose contacts have one rank
                         first, last = torch.searchsorted(index, torch.tensor([first, last]).to(index)).tolist()
-                    X = rows.values[:, :, first:last].flatten(1)
-                    _add(sums, {rows.block.support: X @ X.T}, weight)
+                    _add(sums, {rows.block.support: gram_matrix(rows.values[:, :, first:last].flatten(1))}, weight)
     return out
 
 
