@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,10 +25,12 @@ from synthetic import (
     load,
     random_states,
 )
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 from torchid import parameters
 from torchid.errors import UnknownNameError
-from torchid.regressor import FrameJacobian, Regressor, motion_from_state
+from torchid.regressor import FrameJacobian, LoopJacobian, Regressor, motion_from_state
 from torchid.regressor.columns import all_wrench_columns, reduced_layout, reduction_matrix
 from torchid.regressor.kinematics import body_states, joint_motion, joint_screw_axes
 from torchid.regressor.regressor import joint_row, joint_rows
@@ -156,6 +159,32 @@ def test_another_precision_than_the_modules_is_refused_by_both_names(small: Robo
         module.float()(*arguments)
 
 
+@pytest.mark.parametrize("wrong", ["joint_velocity", "joint_acceleration"])
+def test_one_part_of_a_motion_of_another_precision_is_refused_by_name(small: Robot, wrong: str) -> None:
+    q, v, a = tensors(*random_states(np.random.default_rng(23), small.n, 2))
+    state = (q, v.float(), a) if wrong == "joint_velocity" else (q, v, a.float())
+    with pytest.raises(TypeError, match=f"{wrong}: found torch.float32; accepted: torch.float64"):
+        Regressor(small)(*state)
+
+
+def test_jacobians_refuse_coordinates_that_are_none(small: Robot) -> None:
+    q, _, _ = tensors(*random_states(np.random.default_rng(20), small.n, 3))
+    for jacobian in (FrameJacobian(small, "c"), LoopJacobian(small)):
+        with pytest.raises(TypeError, match="q: found ndarray; accepted: a tensor"):
+            jacobian(q.numpy())
+        with pytest.raises(ValueError, match=r"q: found shape \(3, 20\); accepted: \(B, 10\)"):
+            jacobian(torch.cat([q, q], 1))
+
+
+def test_a_jacobian_first_called_in_inference_mode_has_gradients_afterwards() -> None:
+    robot = load(SOLO12)
+    q, _, _ = tensors(*random_states(np.random.default_rng(20), robot.n, 3))
+    jacobian = FrameJacobian(robot, "FL_FOOT")
+    with torch.inference_mode():
+        jacobian(q)
+    assert torch.autograd.grad(jacobian(q.requires_grad_()).square().sum(), q)[0].any()
+
+
 def test_a_jacobian_of_no_link_is_refused_by_the_nearest_names() -> None:
     with pytest.raises(UnknownNameError, match="unknown name 'left_anklle_roll_link'; accepted: left_ankle_roll_link"):
         FrameJacobian(load(G1), "left_anklle_roll_link")
@@ -167,6 +196,23 @@ def test_the_regressor_is_differentiable_by_motion(small: Robot) -> None:
     weights = torch.from_numpy(np.random.default_rng(22).normal(size=(12 * len(small.bodies), 3)))
     assert torch.autograd.gradcheck(lambda q, v, a: K(q, v, a) @ weights, state)
     assert torch.autograd.gradcheck(K, state, fast_mode=True)
+
+
+def test_the_gradient_of_a_regressor_does_not_copy_it_for_every_row() -> None:
+    robot = load(G1)
+    state = [x.requires_grad_() for x in tensors(*random_states(np.random.default_rng(26), robot.n, 2))]
+    K, written = Regressor(robot)(*state), 0
+
+    class Written(TorchDispatchMode):
+        def __torch_dispatch__(self, operator: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+            nonlocal written
+            out = operator(*args, **(kwargs or {}))
+            written += sum(x.numel() for x in tree_leaves(out) if isinstance(x, torch.Tensor))
+            return out
+
+    with Written():
+        torch.autograd.grad(K, state, torch.ones_like(K))
+    assert written < 2 * robot.nv * K.numel()  # 6 times that when rows were filled in place
 
 
 def test_a_jacobian_is_differentiable_by_coordinates(small: Robot) -> None:

@@ -281,3 +281,20 @@ def test_projected_forces_have_their_gradient_in_the_posture(noise: float | None
         return torch.cat([(group.K.mean(2) - group.f).square().sum(1) for group in groups])
 
     assert torch.autograd.gradcheck(squares, scene.q[:, 7:].clone().requires_grad_(), atol=1e-5, rtol=1e-6)
+
+
+@pytest.mark.parametrize("wrong", range(5), ids=["J_C", "active", "K", "torque", "wrench"])
+def test_a_part_of_a_batch_of_another_length_is_refused(wrong: int) -> None:
+    batch = (torch.ones(4, 3, 8), torch.ones(4, 3, dtype=torch.bool), *map(torch.ones, ((4, 8, 2), (4, 2), (4, 3))))
+    project = Projection([True] * 2, [False] * 3)
+    for part in (batch[wrong][:1], torch.cat([batch[wrong]] * 2)):
+        with pytest.raises(ValueError, match=r"J_C, active, K, torque, wrench: found shapes .*; accepted: \(B, 3, 8\)"):
+            project(*batch[:wrong], part, *batch[wrong + 1 :])
+
+
+def test_flags_that_are_numbers_are_refused_and_never_taken_for_indices() -> None:
+    numbers = torch.ones(4, 3, dtype=torch.int64)
+    with pytest.raises(TypeError, match=r"active: found torch.int64; accepted: torch.bool"):
+        Projection([True] * 2, [False] * 3)(
+            torch.ones(4, 3, 8), numbers, torch.ones(4, 8, 2), torch.ones(4, 2), torch.ones(4, 3)
+        )

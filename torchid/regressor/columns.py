@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import cache, cached_property
+from dataclasses import dataclass, field
+from functools import cache
 from itertools import groupby
 
 import numpy as np
@@ -26,14 +26,16 @@ _TOGETHER = 2**15  # bodies times samples: what is worked out for them stays in 
 
 @dataclass(frozen=True)
 class ColumnLayout:
-    """Columns of each body, bodies in depth-first order: `kept[body]` in the order of `torchid.parameters`."""
+    """Columns of each body, bodies in depth-first order: `kept[body]` in the order of `torchid.parameters`.
+
+    `starts`: first column of every body, then the total.
+    """
 
     kept: tuple[tuple[int, ...], ...]
+    starts: list[int] = field(init=False, compare=False)
 
-    @cached_property
-    def starts(self) -> list[int]:
-        """First column of every body, then the total."""
-        return [0, *np.cumsum([len(k) for k in self.kept]).tolist()]
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "starts", [0, *np.cumsum([len(k) for k in self.kept]).tolist()])
 
     def runs(self, bodies: range | None = None) -> Iterator[tuple[tuple[int, ...], range]]:
         """Runs of consecutive bodies that keep the same columns, of all bodies or some: the columns, the bodies."""

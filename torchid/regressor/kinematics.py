@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -107,9 +107,7 @@ def joint_motion(tree: KinematicTree, motion: Motion) -> JointMotion:
     Raises:
         TypeError: the motion's precision is not the module's.
     """
-    dtype, expected = motion.joint_position.dtype, tree.joint_map.dtype
-    if dtype != expected:
-        raise TypeError(f"motion: found {dtype}; accepted: {expected}, or the module moved with .to({dtype})")
+    _require_precision(tree, vars(motion))
     moving = tree.joint_map[:, : tree.n]
     position = moving @ motion.joint_position.T + tree.joint_constant
     velocity = moving @ motion.joint_velocity.T
@@ -168,6 +166,35 @@ def body_states(tree: KinematicTree, motion: Motion, joints: JointMotion) -> Bod
         )
     force = motion.base_specific_force.T[:, None] + tree.ancestors @ linear_joint
     return BodyStates(rotation, position, omega, alpha, force)
+
+
+def _require_precision(tree: KinematicTree, tensors: Mapping[str, Tensor | None]) -> None:
+    expected = tree.joint_map.dtype
+    for name, x in tensors.items():
+        if x is not None and x.dtype != expected:
+            raise TypeError(f"{name}: found {x.dtype}; accepted: {expected}, the module's, which .to(dtype) changes")
+
+
+def independent_positions(tree: KinematicTree, q: Tensor) -> Tensor:
+    """Positions (B, n) of the independent joints in coordinates (B, n + 7), or (B, n) for a fixed base.
+
+    Raises:
+        TypeError: `q` is not a tensor, or of another precision than the module.
+        ValueError: another shape.
+    """
+    width = tree.n + (7 if tree.base_rows else 0)
+    if not isinstance(q, Tensor):
+        raise TypeError(f"q: found {type(q).__name__}; accepted: a tensor")
+    if q.ndim != 2 or q.shape[1] != width:
+        raise ValueError(f"q: found shape {tuple(q.shape)}; accepted: (B, {width})")
+    _require_precision(tree, {"q": q})
+    return q[:, width - tree.n :]
+
+
+def states_at_rest(tree: KinematicTree, joint_position: Tensor) -> BodyStates:
+    """Poses of all joint frames at positions (B, n) of the independent joints; twists and accelerations are 0."""
+    rotation, position = joint_frame_poses(tree, tree.joint_map[:, : tree.n] @ joint_position.T + tree.joint_constant)
+    return BodyStates(rotation, position, *([torch.zeros_like(position)] * 3))
 
 
 def link_states(tree: KinematicTree, states: BodyStates) -> BodyStates:

@@ -17,9 +17,10 @@ from torchid.regressor.kinematics import (
     along_frame,
     body_states,
     frame_acceleration,
-    joint_frame_poses,
+    independent_positions,
     joint_motion,
     joint_screw_axes,
+    states_at_rest,
 )
 from torchid.regressor.regressor import wrench_transform, wrenches_at_base
 from torchid.regressor.tree import KinematicTree
@@ -171,9 +172,8 @@ class LoopClosures:
 
         Along the first frame's axes; where the loops are closed, minus the derivative of the deviations.
         """
-        rotation, position = self._poses(joint_position)
-        states = BodyStates(rotation, position, *([torch.zeros_like(position)] * 3))
-        none = position.new_zeros(0, self.tree.n_dofs, position.shape[-1])
+        states = states_at_rest(self.tree, joint_position)
+        none = states.position.new_zeros(0, self.tree.n_dofs, len(joint_position))
         rows = (loop.jacobian(self.tree, states, range(self.tree.n_dofs)) for loop in self.geometries)
         return torch.cat([none, *rows]).permute(2, 0, 1)
 
@@ -191,9 +191,7 @@ class LoopClosures:
         loop, n = self.geometries[number], self.tree.n
         generator = torch.Generator().manual_seed(0)
         q = _LARGEST * (2.0 * torch.rand(_POSTURES, n, generator=generator, dtype=torch.float64) - 1.0)
-        rotation, position = self._poses(q)
-        states = BodyStates(rotation, position, *([torch.zeros_like(position)] * 3))
-        work = loop.jacobian(self.tree, states, dofs).flatten(1).numpy()  # (k, dofs x postures)
+        work = loop.jacobian(self.tree, states_at_rest(self.tree, q), dofs).flatten(1).numpy()  # (k, dofs x postures)
         U, values, _ = np.linalg.svd(work, full_matrices=False)
         kept: Array = U[:, is_significant(values, KINEMATIC_TOLERANCE)].T @ loop.unit_wrenches
         return kept
@@ -240,8 +238,8 @@ class LoopClosures:
         return torch.cat(rows).T
 
     def _poses(self, joint_position: Tensor) -> tuple[Tensor, Tensor]:
-        position = self.tree.joint_map[:, : self.tree.n] @ joint_position.T + self.tree.joint_constant
-        return joint_frame_poses(self.tree, position)
+        states = states_at_rest(self.tree, joint_position)
+        return states.rotation, states.position
 
 
 class LoopJacobian(nn.Module):
@@ -267,6 +265,10 @@ class LoopJacobian(nn.Module):
 
         Returns:
             (B, k, n_rows).
+
+        Raises:
+            TypeError: `q` is not a tensor, or of another precision than the module.
+            ValueError: wrong shape of `q`.
         """
-        tree = self.tree
-        return nn.functional.pad(self.closures.jacobian(q[:, q.shape[1] - tree.n :]), (tree.base_rows, 0))
+        joint_position = independent_positions(self.tree, q)
+        return nn.functional.pad(self.closures.jacobian(joint_position), (self.tree.base_rows, 0))

@@ -19,11 +19,13 @@ from torchid.regressor.kinematics import (
     Motion,
     body_states,
     cross_product,
+    independent_positions,
     joint_motion,
     joint_screw_axes,
     link_states,
     motion_from_state,
     rotation_matrix,
+    states_at_rest,
 )
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
@@ -55,8 +57,9 @@ class Regressor(nn.Module):
         super().__init__()
         self.gravity = gravity
         self.tree = KinematicTree(robot, sign_width)
-        self._layout = full_layout(self.tree)
-        self._rows = joint_rows(self.tree, self._layout)
+        self._inertial = full_layout(self.tree)
+        self._columns = ColumnLayout((tuple(range(parameters.PER_BODY)),) * self.tree.n_nodes)
+        self._rows = joint_rows(self.tree, self._columns)
 
     def forward(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
         """Regressor at generalized coordinates.
@@ -78,22 +81,23 @@ class Regressor(nn.Module):
 
     def from_motion(self, motion: Motion) -> Tensor:
         """As `forward`, from a `Motion` (which has no base position, heading or linear velocity)."""
-        tree, layout = self.tree, self._layout
+        tree, columns = self.tree, self._columns
         joints = joint_motion(tree, motion)
         states = body_states(tree, motion, joints)
         screw_axes = joint_screw_axes(tree, states)
-        wrenches = all_wrench_columns(link_states(tree, states), layout)
-        K = wrenches.new_zeros(tree.base_rows + len(self._rows), tree.n_nodes, parameters.PER_BODY, wrenches.shape[-1])
-        inertial = K[:, :, parameters.INERTIAL]
-        width = parameters.INERTIAL.stop
-        if tree.base_rows:
-            inertial[: tree.base_rows] = wrenches.unflatten(1, (-1, width))
-        for index, row in enumerate(self._rows, start=tree.base_rows):
-            part = joint_row(row, tree, layout, screw_axes, wrenches)
-            inertial[index, row.start // width : row.end // width] = part.unflatten(0, (-1, width))
+        inertial = all_wrench_columns(link_states(tree, states), self._inertial).unflatten(1, (tree.n_nodes, -1))
+        wrenches = nn.functional.pad(inertial, (0, 0, 0, parameters.PER_BODY - inertial.shape[2])).flatten(1, 2)
+        zeros = wrenches.new_zeros(1, 1).expand(wrenches.shape[1:])
+        blocks = list(wrenches) if tree.base_rows else [zeros[:0]]
+        for row in self._rows:
+            block = joint_row(row, tree, columns, screw_axes, wrenches)
             for body, coulomb, viscous in friction_columns(row, joints):
-                K[index, body, parameters.COULOMB] = coulomb
-                K[index, body, parameters.VISCOUS] = viscous
+                start = columns.starts[body] - row.start
+                block[start : start + parameters.PER_BODY][parameters.FRICTION] = torch.stack([coulomb, viscous])
+            blocks += [zeros[: row.start], block, zeros[row.end :]]
+        K = torch.cat(blocks).unflatten(
+            0, (-1, tree.n_nodes, parameters.PER_BODY)
+        )  # in place, gradients copy all of it
         if len(tree.node_of) < tree.n_nodes:
             K = K[:, tree.node_of]
         return K.flatten(1, 2).permute(2, 0, 1)
@@ -148,9 +152,10 @@ def friction_columns(row: JointRow, joints: JointMotion) -> list[tuple[int, Tens
 
 
 def _torque(screw_axis: Tensor, wrenches: Tensor) -> Tensor:
-    total = screw_axis[0] * wrenches[0]
-    for k in range(1, 6):
-        total.addcmul_(screw_axis[k], wrenches[k])
+    (x, *axes), (first, *others) = screw_axis.unbind(), wrenches.unbind()
+    total = x * first
+    for axis, wrench in zip(axes, others, strict=True):
+        total.addcmul_(axis, wrench)
     return total
 
 
@@ -296,14 +301,16 @@ class FrameJacobian(nn.Module):
         Returns:
             (B, 6, n_rows). n_rows = nv + 6 F: force/torque sensors in limbs add six columns each, after those of the
             joints.
+
+        Raises:
+            TypeError: `q` is not a tensor, or of another precision than the module.
+            ValueError: wrong shape of `q`.
         """
         tree = self.tree
-        zero = q.new_zeros(q.shape[0], tree.n + tree.base_rows)
-        motion = motion_from_state(q, zero, zero, tree.n, not tree.base_rows, GRAVITY_WORLD)
-        states = body_states(tree, motion, joint_motion(tree, motion))
+        states = states_at_rest(tree, independent_positions(tree, q))
         units, arms = self.get_buffer("unit_wrenches"), None
         if self.radius:
-            up = q.new_tensor([0.0, 0.0, 1.0]) if normal is None else normal
+            up = q.new_tensor([0.0, 0.0, 1.0]) if normal is None else normal.to(q)
             up = up.expand(len(q), 3)
             if tree.base_rows:
                 up = (rotation_matrix(q[:, 3:7]).mT @ up[..., None])[..., 0]

@@ -172,7 +172,8 @@ class KinematicTree(nn.Module):
         """Numbers as an index on the module's device, (len,) int64, made once: every other would be a copy to a GPU."""
         key = tuple(numbers)
         if key not in self._indices:
-            self._indices[key] = torch.tensor(key, dtype=torch.int64, device=self.ancestors.device)
+            with torch.inference_mode(False):  # others may come back to it with gradients
+                self._indices[key] = torch.tensor(key, dtype=torch.int64, device=self.ancestors.device)
         return self._indices[key]
 
     def path_map(self, body: int, joints: Sequence[int]) -> tuple[slice | Tensor, Tensor | None]:
@@ -187,10 +188,11 @@ class KinematicTree(nn.Module):
             ratios = [[self._position_maps[node][joint] for node in path] for joint in joints]
             one_each = [[float(node == other) for other in range(len(path))] for node in range(len(path))]
             follow = bool(path) and path == list(range(path[0], body + 1))
-            self._path_maps[key] = (
-                slice(path[0], body + 1) if follow else self.index(path),
-                None if ratios == one_each else self.joint_map[self.index(path)][:, self.index(joints)].T,
-            )
+            with torch.inference_mode(False):
+                self._path_maps[key] = (
+                    slice(path[0], body + 1) if follow else self.index(path),
+                    None if ratios == one_each else self.joint_map[self.index(path)][:, self.index(joints)].T,
+                )
         return self._path_maps[key]
 
     def coulomb_sign(self, velocity: Tensor) -> Tensor:

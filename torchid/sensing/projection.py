@@ -111,7 +111,20 @@ class Projection(nn.Module):
 
         Returns:
             One group per contact state and rank, every sample in exactly one.
+
+        Raises:
+            TypeError: `active` is not bool.
+            ValueError: wrong shapes.
         """
+        rows, B, k = len(self.get_buffer("kept")), len(J_C), len(self.get_buffer("wrench_measured"))
+        accepted = ((B, k, rows), (B, k), (B, rows, *K.shape[2:3]), (B, rows - self.base_rows), (B, k))
+        if (found := tuple(tuple(x.shape) for x in (J_C, active, K, torque, wrench))) != accepted or K.ndim != 3:
+            expected = f"(B, {k}, {rows}), (B, {k}), (B, {rows}, P), (B, {rows - self.base_rows}), (B, {k})"
+            raise ValueError(
+                f"J_C, active, K, torque, wrench: found shapes {', '.join(map(str, found))}; accepted: {expected}"
+            )
+        if active.dtype != torch.bool:
+            raise TypeError(f"active: found {active.dtype}; accepted: torch.bool")
         groups: list[ProjectedGroup] = []
         if active.shape[1]:
             states, which = torch.unique(active, dim=0, return_inverse=True)
