@@ -33,7 +33,7 @@ from torchid.fitting.posterior import ParameterSamples
 from torchid.logs import Log, write_log
 from torchid.parameters import FRICTION, Array, perturb_parameters
 from torchid.report.figure_style import CATEGORY_COLORS, IDENTIFIED_COLOR, MEASURED_COLOR, NOISE_COLOR, NOMINAL_COLOR
-from torchid.report.mjcf_of_urdf import mjcf_of_urdf
+from torchid.report.mjcf_files import mjcf_of_urdf
 from torchid.robot import Robot
 
 _URDF = Path(torchid.__file__).parent / "demo" / "quadruped.urdf"

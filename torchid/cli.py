@@ -302,7 +302,7 @@ def _compress(options: argparse.Namespace) -> None:
 def _evaluate(options: argparse.Namespace) -> None:
     with importing():
         from torchid.commands.evaluate import evaluate
-        from torchid.terminal.finished_runs import print_all_errors, print_evaluation
+        from torchid.terminal.runs import print_all_errors, print_evaluation
 
     evaluated = evaluate(options.run, options.log, options.device, True, options.output, options.overwrite)
     if not options.quiet:
@@ -312,7 +312,7 @@ def _evaluate(options: argparse.Namespace) -> None:
 def _replay(options: argparse.Namespace) -> None:
     with importing():
         from torchid.commands.replay import parse_gains, replay
-        from torchid.terminal.simulators import print_replay
+        from torchid.terminal.runs import print_replay
 
     kp, kd = parse_gains("--kp", options.kp), parse_gains("--kd", options.kd)
     replayed = replay(options.run, options.log, options.window, options.output, options.overwrite, kp, kd)
@@ -323,7 +323,7 @@ def _replay(options: argparse.Namespace) -> None:
 def _sample(options: argparse.Namespace) -> None:
     with importing():
         from torchid.commands.sample import parse_prior_error, sample
-        from torchid.terminal.finished_runs import print_samples
+        from torchid.terminal.runs import print_samples
 
     options.prior_error = parse_prior_error(options.prior_error)
     keys = ("run", "count", "format", "output", "prior_error", "seed", "overwrite")
@@ -392,7 +392,7 @@ def _simulate(options: argparse.Namespace) -> None:
     with importing():
         from torchid.commands.simulate import simulate
         from torchid.config import load_simulation
-        from torchid.terminal.simulators import print_all_motions, print_simulation
+        from torchid.terminal.runs import print_all_motions, print_simulation
 
     config = load_simulation(options.file, options.overrides)
     stabilities = simulate(config)

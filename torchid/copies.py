@@ -50,11 +50,7 @@ class Copy(Generic[T]):
     """
 
     def __init__(self, work: Callable[[], T]) -> None:
-        """Start it.
-
-        Args:
-            work: what it calls; the result pickles.
-        """
+        """Start it; `work`: what it calls; the result pickles."""
         self._work = work
         self._process: multiprocessing.context.ForkProcess | None = None
         self._results: Connection | None = None

@@ -105,12 +105,7 @@ class NumericalWarning(TorchidWarning):
 
 
 def warn(message: str, category: type[TorchidWarning] = TorchidWarning) -> None:
-    """Warn, as of the line outside of torchid that led here: that is the line that a user can change.
-
-    Args:
-        message: one line.
-        category: of the warning.
-    """
+    """Warn, as of the line outside of torchid that led here: that is the line that a user can change."""
     frame, level = inspect.currentframe(), 1
     while frame is not None and str(frame.f_globals.get("__name__")).partition(".")[0] == __package__:
         frame, level = frame.f_back, level + 1

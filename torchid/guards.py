@@ -159,7 +159,6 @@ class Budget:
     """Remaining bytes, records and messages of a log file that is unpacked chunk by chunk."""
 
     def __init__(self, size: int) -> None:
-        """For a file of `size` bytes."""
         self._bytes = max_unpacked_bytes(size)
         self._records = FREE_RECORDS + size // RECORD_BYTES
         self._messages = FREE_MESSAGES + size // MESSAGE_BYTES

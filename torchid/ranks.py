@@ -158,11 +158,7 @@ def as_first(value: T, about: str) -> T:
 
 
 def require_same(value: object, about: str) -> None:
-    """Make sure that all processes have the same, before they share work on it.
-
-    Raises:
-        InputError: they have not.
-    """
+    """Make sure that all processes have the same, before they share work on it. Raises InputError: they have not."""
     if any(other != value for other in gather(value, about)):
         raise InputError("", about, "not the same in all processes", "the same files and settings on every machine")
 

@@ -14,9 +14,9 @@ _UNBROKEN = "\N{NO-BREAK SPACE}"
 _TEXT = 60  # characters of one value
 
 
-def decimal(value: float, digits: int = 3) -> str:
-    """A number with so many decimals, or with three significant digits if these would be fewer, as of grams in kg."""
-    return f"{value:.3g}" if 0.0 < abs(value) < 10.0 ** (2 - digits) else f"{value:.{digits}f}"
+def decimal(value: float) -> str:
+    """A number with three decimals, or with three significant digits if these would be fewer, as of grams in kg."""
+    return f"{value:.3g}" if 0.0 < abs(value) < 0.1 else f"{value:.3f}"
 
 
 def short_repr(thing: object) -> str:

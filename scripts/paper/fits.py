@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from torchid.estimators import Estimate
-from torchid.fitting.conditions import conditions_from
 from torchid.fitting.experiment import Experiment, batch_estimator
+from torchid.fitting.prior_knowledge import conditions_from
 from torchid.parameters import Array
 from torchid.problem import Evaluation, RowBuilder, Samples, TriangularFactor, linear_problem
 from torchid.problem.chunks import chunks_by_state

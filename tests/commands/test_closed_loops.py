@@ -28,8 +28,7 @@ from torchid.logs import Log
 from torchid.parameters import FRICTION, perturb_parameters
 from torchid.regressor.loops import LoopClosures
 from torchid.report import identified_urdf
-from torchid.report.mjcf_files import identified_mjcf
-from torchid.report.mjcf_of_urdf import mjcf_of_urdf
+from torchid.report.mjcf_files import identified_mjcf, mjcf_of_urdf
 from torchid.robot import Loop, Robot, load_robot
 
 LEG = "four-bar leg"

@@ -19,8 +19,7 @@ from torchid.cli import main
 from torchid.commands.results import Identification
 from torchid.config import load_config
 from torchid.fitting.experiment import set_up
-from torchid.fitting.factor_files import FactorFile, read_factors, write_factors
-from torchid.fitting.fleet import read_fleet
+from torchid.fitting.factor_files import FactorFile, read_factors, read_fleet, write_factors
 from torchid.problem.metrics import ERROR_GROUPS, WHITENED
 
 pytestmark = [

@@ -36,7 +36,7 @@ from torchid.config import load_config
 from torchid.errors import ConfigError, LogError, UnknownNameError
 from torchid.fitting.experiment import set_up
 from torchid.logs import Log, read_log
-from torchid.logs.joint_orders import HG, JOINT_ORDERS
+from torchid.logs.unitree import HG, JOINT_ORDERS
 from torchid.robot import load_robot
 
 URDF = DEMO / "quadruped.urdf"

@@ -14,8 +14,8 @@ from initiated import URDF, columns_of, initiated, recorded
 from motions import value
 
 from torchid.commands.init import init
-from torchid.logs.joint_orders import usual_order
 from torchid.logs.name_matching import KnownRobot
+from torchid.logs.unitree import usual_order
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from synthetic import ANYMAL, PANDA, ROBOTS, SOLO12
 from torchid.commands.init import Initiated, init
 from torchid.config import load_config
 from torchid.logs import Log, read_log
-from torchid.logs.number_proposals import point_along_z, threshold
+from torchid.proposals.numbers import point_along_z, threshold
 
 GO1, HYQ = ROBOTS / "go1_description/urdf/go1.urdf", ROBOTS / "hyq_description/robots/hyq_no_sensors.urdf"
 UR5 = ROBOTS / "ur_description/urdf/ur5_robot.urdf"

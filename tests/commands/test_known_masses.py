@@ -20,7 +20,7 @@ from torchid.commands.identify import identify
 from torchid.config import load_config
 from torchid.errors import ConfoundedWarning
 from torchid.estimators import LeastSquares
-from torchid.fitting.known_masses import KnownMass, with_known_masses
+from torchid.fitting.prior_knowledge import KnownMass, with_known_masses
 from torchid.identifiability.confounding import combination_standard_error, mass_weights
 from torchid.parameters import PER_BODY
 from torchid.problem import LinearProblem

@@ -28,8 +28,7 @@ from torchid.errors import ConfigError
 from torchid.fitting.experiment import set_up
 from torchid.problem.chunks import chunks_by_state
 from torchid.problem.predict import force_series
-from torchid.report.mjcf_files import identified_mjcf
-from torchid.report.mjcf_of_urdf import mjcf_of_urdf
+from torchid.report.mjcf_files import identified_mjcf, mjcf_of_urdf
 from torchid.robot import load_robot
 
 pytestmark = pytest.mark.filterwarnings("ignore:identified:torchid.errors.TorchidWarning")

@@ -9,8 +9,7 @@ import pytest
 from physical import random_bodies
 
 from torchid.estimators import Conditions
-from torchid.estimators.nominal_error import nominal_error
-from torchid.estimators.posterior import Posterior
+from torchid.estimators.posterior import Posterior, nominal_error
 from torchid.fitting.posterior import FittedPosterior
 
 BODIES, COMBINATIONS = 8, 30

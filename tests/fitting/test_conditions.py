@@ -24,8 +24,8 @@ from torchid.config.estimator import EstimatorConfig
 from torchid.errors import ConfigError, InputError, TorchidWarning, UnknownNameError, about_file
 from torchid.estimators import Conditions, violations
 from torchid.estimators.conditions import mirror_matrix
-from torchid.fitting.conditions import conditions_from
 from torchid.fitting.experiment import batch_estimator
+from torchid.fitting.prior_knowledge import conditions_from
 from torchid.parameters import PARAMETERS
 from torchid.problem import RowBuilder, bind_log, compress, linear_problem
 from torchid.problem.linear import parameter_scale

@@ -19,7 +19,7 @@ from torchid.fitting.experiment import Experiment, set_up
 from torchid.fitting.fit import LogFitter
 from torchid.fitting.noise import NoiseSummary
 from torchid.problem import RowBuilder, Samples, bind_log, compress_parts
-from torchid.problem.alike_variances import information_about, prior_precision
+from torchid.problem.noise import information_about, prior_precision
 from torchid.regressor import Regressor
 from torchid.sensing import SensorNoise
 

@@ -11,8 +11,8 @@ from repository import DEMO
 
 from torchid.config import load_config
 from torchid.fitting.calibration import Calibration
+from torchid.fitting.cross_validation import residuals_of_samples, sum_residuals
 from torchid.fitting.experiment import set_up
-from torchid.fitting.residual_squares import residuals_of_samples, sum_residuals
 from torchid.logs import read_log
 from torchid.logs.preprocess import preprocess
 from torchid.problem import bind_log, compress_parts

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from torchid.logs import Log
-from torchid.logs.joint_orders import JOINT_ORDERS, MOTORS
 from torchid.logs.log import FloatArray
+from torchid.logs.unitree import JOINT_ORDERS, MOTORS
 from torchid.robot import Robot
 
 Array = NDArray[Any]

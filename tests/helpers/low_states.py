@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from rosbags.typesys import get_types_from_msg
 
 from torchid.logs import Log
-from torchid.logs.joint_orders import GO, MOTORS
-from torchid.logs.ros_low_state import register
+from torchid.logs.unitree import GO, MOTORS, register
 
 register(ROS2, get_types_from_msg)
 TOPIC = "/lowstate"

@@ -19,7 +19,7 @@ _SERVER = """
 import gc, json, os, resource, signal, sys
 import h5py, jinja2, scipy.signal, torch._dynamo, torchid.commands.results, torchid.commands.evaluate, torchid.commands.analyze, torchid.commands.check
 import torchid.commands.compress, torchid.commands.identify, torchid.estimators.training, torchid.report.page, torchid.report.tensorboard
-import torchid.terminal.analysis, torchid.terminal.finished_runs, torchid.terminal.identification
+import torchid.terminal.analysis, torchid.terminal.runs, torchid.terminal.identification
 from matplotlib.figure import Figure
 from torchid.cli import main
 for module in (torchid.commands.run_figures, torchid.commands.evaluate, torchid.commands.analyze):

@@ -13,9 +13,8 @@ from thinned import slow_but
 
 from torchid.log_checks import NOTE, REJECTED
 from torchid.log_checks.check import check
-from torchid.log_checks.units import other_units, units_of_derivative_ratio, units_of_ratio
 from torchid.logs import Log
-from torchid.logs.units import UNITS
+from torchid.logs.units import UNITS, other_units, units_of_derivative_ratio, units_of_ratio
 
 
 def with_velocity(log: Log) -> Log:

@@ -19,7 +19,7 @@ from torchid.config import load_config
 from torchid.config.maps import load_columns
 from torchid.logs import Columns, Log, read_log
 from torchid.logs.blocks import open_log_blocks
-from torchid.logs.joint_orders import HG, JOINT_ORDERS
+from torchid.logs.unitree import HG, JOINT_ORDERS
 
 URDF = ROBOTS / "go2_description/urdf/go2.urdf"
 FLAGS = {"above": 5}

@@ -14,9 +14,9 @@ from rosbags import rosbag2
 
 from torchid.errors import InputError
 from torchid.logs import read_log
-from torchid.logs.joint_orders import GO, HG
 from torchid.logs.ros_files import BagChannel
 from torchid.logs.ros_messages import make_deserializer
+from torchid.logs.unitree import GO, HG
 
 
 def packed(layout: str, values: dict[str, float]) -> bytes:

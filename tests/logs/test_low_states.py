@@ -18,7 +18,7 @@ from synthetic import G1, ROBOTS, Array
 from torchid.errors import TorchidWarning
 from torchid.logs import Log, read_log
 from torchid.logs.flags import ContactThreshold, with_flags_by_force
-from torchid.logs.joint_orders import GO, HG, JOINT_ORDERS
+from torchid.logs.unitree import GO, HG, JOINT_ORDERS
 from torchid.robot import load_robot
 
 G1_JOINTS = JOINT_ORDERS["g1"].names

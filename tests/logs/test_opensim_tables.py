@@ -14,8 +14,8 @@ from torchid.config import load_config
 from torchid.errors import InputError
 from torchid.logs import Columns, Log, read_log, write_log
 from torchid.logs.blocks import log_bytes, open_log_blocks
-from torchid.logs.map_proposals import propose_map
 from torchid.logs.name_matching import KnownRobot
+from torchid.proposals.maps import propose_map
 
 TIME = np.arange(60) / 100.0
 ANGLES = np.stack([30.0 * np.sin(3.0 * TIME), 20.0 * np.cos(2.0 * TIME)], axis=1)  # deg

@@ -17,7 +17,7 @@ from torchid.errors import LogError
 from torchid.logs import Log
 from torchid.logs.preprocess import preprocess
 from torchid.problem import bind_log
-from torchid.problem.closed_loops import with_loop_joints
+from torchid.problem.log_joints import with_loop_joints
 from torchid.regressor.loops import LoopClosures
 
 robots = pytest.mark.parametrize("name", MODELS)

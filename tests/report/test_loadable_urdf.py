@@ -21,7 +21,7 @@ from torchid import parameters
 from torchid.errors import TorchidWarning
 from torchid.logs import write_log
 from torchid.report import identified_urdf
-from torchid.report.mjcf_of_urdf import mjcf_of_urdf
+from torchid.report.mjcf_files import mjcf_of_urdf
 from torchid.report.urdf_files import SMALLEST
 from torchid.robot import Robot
 

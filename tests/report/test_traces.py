@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from torchid.parameters import Array
-from torchid.report.forces import ForceSeries
-from torchid.report.traces import LogForces, traces_document
+from torchid.report.forces import ForceSeries, LogForces, traces_document
 
 RATE, STD = 200.0, 0.3
 

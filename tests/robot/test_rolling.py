@@ -13,7 +13,7 @@ from urdfs import joint, link, write
 
 from torchid.config.sensors import ContactConfig
 from torchid.errors import ConfigError, UrdfError
-from torchid.fitting.contacts import resolve_contacts
+from torchid.fitting.checked_settings import resolve_contacts
 from torchid.robot.rolling import rolled_distance
 
 

@@ -18,7 +18,7 @@ from torchid.errors import InputError
 from torchid.logs import read_log
 from torchid.problem import Evaluation, bind_log
 from torchid.problem.predict import force_series
-from torchid.report.mjcf_of_urdf import mjcf_of_urdf
+from torchid.report.mjcf_files import mjcf_of_urdf
 from torchid.robot import load_robot
 from torchid.sensing import Contact
 from torchid.simulation import set_up_simulation

@@ -19,7 +19,7 @@ from torchid.config import FootConfig, MotionConfig, load_config
 from torchid.config.sensors import ContactConfig
 from torchid.config.simulation import SimulatedRobotConfig, WaveConfig
 from torchid.estimators import LeastSquares
-from torchid.fitting.contacts import resolve_contacts
+from torchid.fitting.checked_settings import resolve_contacts
 from torchid.fitting.experiment import set_up
 from torchid.log_checks.findings import Finding
 from torchid.log_checks.standing_feet import check_standing_feet

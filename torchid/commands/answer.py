@@ -10,7 +10,7 @@ import numpy as np
 
 from torchid.errors import join_names
 from torchid.estimators import Estimate, SgdEstimate
-from torchid.estimators.nominal_error import NominalError
+from torchid.estimators.posterior import NominalError
 from torchid.fitting.calibration import list_confounded
 from torchid.identifiability.confounding import TotalMass
 from torchid.log_checks.weight import MAX_MASS_ERROR
@@ -60,11 +60,7 @@ class Judged:
                 yield group, before, after, self.identified.noise.get(group)
 
     def headline(self, *, explained: bool = True) -> str:
-        """The verdict in a sentence.
-
-        Args:
-            explained: whether the model explains the forces that it was fitted to.
-        """
+        """The verdict in a sentence; `explained`: whether the model explains the forces that it was fitted to."""
         ratios = [after / before if before else 1.0 for _, before, after, _ in self.errors()]
         if not ratios:
             return f"Nothing to compare with the {self.of} on {self.text}"

@@ -108,11 +108,7 @@ class Cache:
         return (self.folder / key / _DESCRIPTION).is_file()
 
     def load(self, key: str) -> CacheEntry | None:
-        """The entry of a key, None if there is none.
-
-        Warns:
-            TorchidWarning: the entry is damaged; it is removed.
-        """
+        """The entry of a key, None if there is none. Warns TorchidWarning: the entry is damaged; it is removed."""
         if not self.has(key):
             return None
         try:
@@ -127,11 +123,7 @@ class Cache:
         return entry
 
     def drop(self, key: str, reason: str) -> None:
-        """Remove an entry that cannot be used.
-
-        Warns:
-            TorchidWarning: names it.
-        """
+        """Remove an entry that cannot be used. Warns TorchidWarning: names it."""
         why = excerpt(" ".join(reason.split()))
         warn(f"{self.folder / key}: a damaged entry of the cache ({why}); what was in it is worked out again")
         _remove(self.folder / key)
@@ -283,11 +275,7 @@ def _place(path: Path) -> str:
 
 
 def file_states(files: Sequence[Path]) -> list[list[int]]:
-    """What of files changes when their content does, as documents of JSON have it.
-
-    Raises:
-        OSError: one is not there.
-    """
+    """What of files changes when their content does, as documents of JSON have it. Raises OSError: one is not there."""
     return [_state(file) for file in files]
 
 

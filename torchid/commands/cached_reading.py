@@ -101,7 +101,6 @@ class CachedReader(LogReader):
     """
 
     def __init__(self, scene: Scene, cache: Cache) -> None:
-        """Nothing is read yet."""
         super().__init__(scene)
         self.cache, self.keys, self.reused = cache, dict[str, str](), set[str]()
         self._new = set[str]()  # keys that were not there when this run began

@@ -186,7 +186,6 @@ class WidthReader(LogReader):
     """
 
     def __init__(self, scene: Scene) -> None:
-        """Nothing is read yet."""
         super().__init__(scene)
         self._directions: dict[str, _Directions] = {}
         self._logs: list[Samples] | None = None

@@ -21,8 +21,7 @@ from torchid.commands.reading import LogReader
 from torchid.config import ExperimentConfig, inputs_of
 from torchid.errors import ConfigError, during, excerpt
 from torchid.fitting.experiment import Experiment, set_up, with_noise
-from torchid.fitting.factor_files import FactorFile, write_factors
-from torchid.fitting.fleet import row_model
+from torchid.fitting.factor_files import FactorFile, row_model, write_factors
 from torchid.fitting.noise import NoiseSummary
 from torchid.identifiability.base_parameters import StateReport, merge_state_reports, require_base, state_reports
 from torchid.logs.containers import FACTORS, log_files

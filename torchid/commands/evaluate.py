@@ -35,10 +35,9 @@ from torchid.problem.metrics import DECISIVE_GROUPS, WHITENED, describe_errors, 
 from torchid.problem.predict import at_motors, force_series, noise_series, projected_forces
 from torchid.report.figure_style import save_figures
 from torchid.report.figures import error_figure
-from torchid.report.forces import ForceSeries
+from torchid.report.forces import ForceSeries, LogForces
 from torchid.report.parameter_files import read_parameters, read_shared_extras
 from torchid.report.tables import progress_bars
-from torchid.report.traces import LogForces
 from torchid.reprs import short_repr
 from torchid.robot import Robot
 
@@ -167,11 +166,7 @@ def evaluate(
 
 
 def require_run(folder: Path) -> None:
-    """Make sure that a folder is that of a run.
-
-    Raises:
-        ConfigError: it has no settings.
-    """
+    """Make sure that a folder is that of a run. Raises ConfigError: it has no settings."""
     if not (folder / _SETTINGS).is_file():
         raise ConfigError(folder, "RUN", f"no {_SETTINGS} in it", "a folder that torchid identify wrote")
 
@@ -264,11 +259,7 @@ def _write(evaluated: EvaluatedRun, output: Path, config: Path, form: str, overw
 
 
 def _log_names(logs: Sequence[str | Path]) -> list[str]:
-    """Names of the logs, without their folders.
-
-    Raises:
-        ConfigError: two have the same, or there is none.
-    """
+    """Names of the logs, without their folders. Raises ConfigError: two have the same, or there is none."""
     names = [split_range(log).name for log in logs]
     if not names:
         raise ConfigError.at_field("logs", "none", "logs to evaluate")

@@ -55,7 +55,6 @@ def export(run: str | Path, form: str, output: str | Path | None = None, overwri
 
 
 def _fitted_joints(fitted: FittedRun) -> FittedJoints:
-    """What was fitted of joints."""
     calibration = fitted.calibrations.identified
     of_joints = (extra for extra in calibration.builder.extras if extra.what in ACTUATORS)
     return FittedJoints.of((extra, calibration.values[("", extra.label)]) for extra in of_joints)
@@ -87,8 +86,7 @@ def _mjcf(robot: Robot, phi: Array, fitted: FittedJoints) -> bytes:
     """The robot's MJCF file, or a model made of its URDF, with meshes if MuJoCo takes them."""
     if is_mjcf(robot.path):
         return identified_robot(robot, phi, fitted)
-    from torchid.report.mjcf_files import require_loadable
-    from torchid.report.mjcf_of_urdf import mjcf_of_urdf
+    from torchid.report.mjcf_files import mjcf_of_urdf, require_loadable
 
     springs = fitted.springs(robot, "MJCF")
     text = mjcf_of_urdf(robot, phi, fitted.armature, springs=springs)

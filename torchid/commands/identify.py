@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 from rich.progress import Progress
@@ -14,7 +15,6 @@ from torchid import ranks
 from torchid.commands.cache_entries import cached_parts, factors_key
 from torchid.commands.cached_reading import CachedReader, open_reader
 from torchid.commands.chosen_settings import Choices, with_chosen_settings, with_ridge
-from torchid.commands.clock import Clock
 from torchid.commands.evaluate import compare_forces, trace_forces
 from torchid.commands.folder import RUN, check_free, claim_folder
 from torchid.commands.plausibility import TrainingLogs, require_not_worse, require_plausible
@@ -29,9 +29,8 @@ from torchid.estimators.conditions import term_violations
 from torchid.fitting.calibration import Calibration, Comparison, warn_of_confounded, warn_of_disagreement
 from torchid.fitting.cross_validation import CrossValidation, RidgeChoice, Scorer
 from torchid.fitting.experiment import Experiment, set_up, with_noise
-from torchid.fitting.factor_files import FactorFile
+from torchid.fitting.factor_files import FactorFile, read_fleet
 from torchid.fitting.fit import Fit, LogFitter
-from torchid.fitting.fleet import read_fleet
 from torchid.fitting.misfit import misfit, unfitted_friction
 from torchid.fitting.noise import NoiseSummary
 from torchid.fitting.posterior import fitted_posterior
@@ -47,6 +46,19 @@ from torchid.problem.compression import Part, compress_in_blocks, merge_folds, m
 from torchid.problem.contact_state import ContactState, state_name
 from torchid.problem.metrics import LOG_SETS
 from torchid.report.tables import progress_bars
+
+
+@dataclass
+class _Clock:
+    """Adds up seconds by step: `with clock("read"): ...`."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
 
 
 @one_thread()
@@ -112,7 +124,7 @@ class _Prepared(_Data):
     ridge: RidgeChoice | None
 
 
-def _prepare(config: ExperimentConfig, clock: Clock, bars: Progress) -> _Prepared:
+def _prepare(config: ExperimentConfig, clock: _Clock, bars: Progress) -> _Prepared:
     with clock("read"):
         experiment = set_up(config)
         conditions = experiment.conditions()
@@ -125,7 +137,7 @@ def _prepare(config: ExperimentConfig, clock: Clock, bars: Progress) -> _Prepare
     return _Prepared(**vars(data) | {"experiment": experiment}, conditions=conditions, fitter=fitter, ridge=ridge)
 
 
-def _data_of_logs(experiment: Experiment, clock: Clock, bars: Progress) -> _Data:
+def _data_of_logs(experiment: Experiment, clock: _Clock, bars: Progress) -> _Data:
     """The logs of an experiment, read and compressed."""
     with clock("settings"):
         experiment, choices = with_chosen_settings(experiment, bars)
@@ -146,7 +158,7 @@ def _data_of_logs(experiment: Experiment, clock: Clock, bars: Progress) -> _Data
     return _Data(experiment, logs, [], reader.excluded, states, noise, builder, blocks, parts, reused, choices)
 
 
-def _data_of_factors(experiment: Experiment, clock: Clock, bars: Progress) -> _Data:
+def _data_of_factors(experiment: Experiment, clock: _Clock, bars: Progress) -> _Data:
     """The logs of an experiment that fits factors of logs."""
     with clock("read"):
         reading = bars.add_task("reading factors", total=len(experiment.config.logs.train))
@@ -180,7 +192,10 @@ def _solved(ready: _Prepared, evaluation: Evaluation, checked: TrainingLogs, bar
     if experiment.config.estimator.name == "sgd":
         require_plausible(fitter.fit(ready.parts), checked)
         training = Training(experiment)
-        evaluate = partial(_identified_metrics, evaluation, logs)
+
+        def evaluate(phi: Array) -> dict[str, Metrics]:
+            return {name: evaluation.metrics(logs[name], phi[None])[0] for name in LOG_SETS if logs[name]}
+
         solve = partial(training.run, builder=fitter.builder, logs=logs, evaluate=evaluate, bars=bars, resume=resume)
     fit = fitter.fit(ready.parts, solve)
     fit, robust = _robust(fit, ready, bars)
@@ -194,7 +209,7 @@ def _identify(
     config: ExperimentConfig, resume: bool, bars: Progress, stack: ExitStack
 ) -> tuple[Identification, Training | None, Drawing | None]:
     """What the logs say, how it was trained, if so, and figures of it that are drawn until the stack is left."""
-    clock = Clock()
+    clock = _Clock()
     ready = _prepare(config, clock, bars)
     experiment, fitter, logs, blocks = ready.experiment, ready.fitter, ready.logs, ready.blocks
     checked, builder = TrainingLogs(experiment, bars), fitter.builder
@@ -383,9 +398,3 @@ def _scores(
         scores.metrics["test"] = scorer.score_logs(test, compared, done)
         scores.samples["test"] = unseen
     return scores
-
-
-def _identified_metrics(
-    evaluation: Evaluation, logs: Mapping[str, Sequence[Samples]], phi: Array
-) -> dict[str, Metrics]:
-    return {name: evaluation.metrics(logs[name], phi[None])[0] for name in LOG_SETS if logs[name]}

@@ -8,14 +8,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from textwrap import fill
-from typing import Any
 
 import yaml
 
 from torchid.commands.folder import check_free_file
-from torchid.commands.init_contacts import GuessedContact, guess_contacts, stated_contacts
 from torchid.commands.init_proposals import (
+    GuessedContact,
     Split,
+    guess_contacts,
     hints,
     keys_for_gaps,
     like_torques,
@@ -25,6 +25,7 @@ from torchid.commands.init_proposals import (
     proposed_sensors,
     read_sensors,
     split_log,
+    stated_contacts,
 )
 from torchid.commands.reading import memory_needed
 from torchid.config.preprocessing import PreprocessingConfig
@@ -32,14 +33,14 @@ from torchid.errors import ConfigError, InputError, LogError, about_file, excerp
 from torchid.fitting.checked_settings import is_along_base
 from torchid.logs import Columns, Log, Topics, read_log
 from torchid.logs.containers import LogKind, atomic_output, existing_log_kind
-from torchid.logs.file_samples import read_bag_sample, read_sample, states_degrees, texts_in
 from torchid.logs.log import VARIANTS
-from torchid.logs.map_proposals import propose_map
 from torchid.logs.name_matching import KnownRobot
-from torchid.logs.proposed_map import MapProposal
 from torchid.logs.time_range import split_range
-from torchid.logs.topic_proposals import USED_TYPES, frame_of, propose_topics
 from torchid.parameters import GRAVITY
+from torchid.proposals.column_groups import MapProposal
+from torchid.proposals.file_samples import read_bag_sample, read_sample, states_degrees, texts_in
+from torchid.proposals.maps import propose_map
+from torchid.proposals.topics import USED_TYPES, frame_of, propose_topics
 from torchid.robot import Robot, load_robot
 from torchid.robot.urdf import has_fixed_base, position_limits
 from torchid.robot.xml_files import is_mjcf
@@ -137,7 +138,7 @@ def _of_columns(files: Sequence[Path], robot: Robot) -> tuple[list[GuessedContac
     sample = {name: values for of_file in reversed(samples) for name, values in of_file.items()}
     contacts = guess_contacts(robot, stated_contacts(sample, robot), texts_in(sample))
     proposal = propose_map(sample, _known(robot, contacts), samples if len(files) > 1 else (), in_degrees)
-    fields = _fields_of(sample, proposal)
+    fields = {*(name.partition(".")[0] for name in sample), *proposal.columns}
     if "joint_position" not in fields:
         proposal.notes |= notes_on_arrays(sample, len(robot.joint_names))
     _add_imu_frame(robot, fields, proposal)
@@ -160,11 +161,6 @@ def _known(robot: Robot, contacts: Sequence[GuessedContact]) -> KnownRobot:
     known = robot.joint_names, feet, robot.path.stem, weight, robot.base_link, on_base, elsewhere, limb_sensors(robot)
     moving = [body.joint.name for body in robot.bodies if body.joint is not None and body.joint.kind != "fixed"]
     return KnownRobot(*known, [link for link in on_base if is_along_base(robot, link)], robot.sliding, moving)
-
-
-def _fields_of(sample: Any, proposal: MapProposal) -> set[str]:
-    """Fields of a log that file and map have."""
-    return {*(name.partition(".")[0] for name in sample), *proposal.columns}
 
 
 def _add_imu_frame(robot: Robot, fields: set[str], proposal: MapProposal) -> None:

@@ -357,7 +357,6 @@ class _Stored:
         self._like = samples
 
     def samples(self) -> Samples:
-        """All of them."""
         own: dict[str, Any] = {}
         base: dict[str, Tensor] = {}
         arrays = {key: spill.array() for key, spill in self._spills.items()}

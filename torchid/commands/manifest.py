@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import stat
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
@@ -62,11 +62,7 @@ class Manifest:
         return {"/".join(name.split("/")[:k]) for name in self.files for k in range(1, name.count("/") + 1)}
 
     def write(self, folder: Path) -> None:
-        """Write it into its folder, whole or not at all.
-
-        Raises:
-            OSError: it cannot be written.
-        """
+        """Write it into its folder, whole or not at all. Raises OSError: it cannot be written."""
         files = {name: {"size": size, "sha256": checksum} for name, (size, checksum) in self.files.items()}
         document = {"torchid": self.kind, "folder": self.folder, "files": files, "growing": self.growing}
         with atomic_file(folder / MANIFEST, result=False) as new:
@@ -169,7 +165,7 @@ def inspect_folder(folder: Path, kind: FolderKind, name: str | None = None) -> F
 
 def _look(top: Path, relative: str, manifest: Manifest, kind: FolderKind, contents: FolderContents) -> None:
     """Add what is in the folder at a path relative to the top."""
-    for name, path in _entries(top / relative):
+    for name, path in [(name, top / relative / name) for name in sorted(os.listdir(top / relative))]:
         inner = f"{relative}/{name}" if relative else name
         mode = os.lstat(path).st_mode
         if stat.S_ISDIR(mode):
@@ -184,7 +180,6 @@ def _look(top: Path, relative: str, manifest: Manifest, kind: FolderKind, conten
 
 
 def _look_into(top: Path, relative: str, manifest: Manifest, kind: FolderKind, contents: FolderContents) -> None:
-    """Add a folder."""
     path, above = top / relative, relative.rpartition("/")[0]
     if is_leftover(path):
         contents.leftovers.append(path)
@@ -203,11 +198,6 @@ def _look_into(top: Path, relative: str, manifest: Manifest, kind: FolderKind, c
         contents.folders.append(path)
     else:
         contents.foreign.append(excerpt(f"{relative}/"))
-
-
-def _entries(folder: Path) -> Iterator[tuple[str, Path]]:
-    for name in sorted(os.listdir(folder)):
-        yield name, folder / name
 
 
 def _is(path: Path, size: int, checksum: str) -> bool:

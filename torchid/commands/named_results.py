@@ -43,7 +43,6 @@ class _OfBody:
         return self._values[PARAMETERS.index(parameter)].item()
 
     def to_dict(self) -> dict[str, Any]:
-        """All twelve by symbol."""
         return dict(zip(PARAMETERS, self._values.tolist(), strict=True))
 
 

@@ -52,12 +52,7 @@ class TrainingLogs:
     """The training logs of an experiment, checked once the first fit of them is doubtful."""
 
     def __init__(self, scene: Scene, bars: Progress | None = None) -> None:
-        """Nothing is checked yet.
-
-        Args:
-            scene: the experiment.
-            bars: gets one for the checks, which take a while for long logs.
-        """
+        """Nothing is checked yet; `bars`: gets one for the checks, which take a while for long logs."""
         self.scene, self._bars = scene, bars
 
     @cached_property

@@ -28,10 +28,9 @@ from torchid.logs.segments import with_delayed_torques
 from torchid.logs.time_range import LogPart, split_range
 from torchid.parameters import Array
 from torchid.problem import Samples, bind_log
-from torchid.problem.closed_loops import with_loop_joints
 from torchid.problem.contact_detection import with_detected_contacts
 from torchid.problem.contact_slip import measure_slip, warn_of_slip
-from torchid.problem.log_joints import without_welded_joints
+from torchid.problem.log_joints import with_loop_joints, without_welded_joints
 from torchid.problem.standing import preprocess_standing
 from torchid.problem.unloaded_sensors import zero_in_air
 from torchid.robot import Robot, payload_parameters, with_payload

@@ -188,11 +188,7 @@ _GAIN = "a number of at least 0, or numbers by joint or pattern: 20 '*_calf=30'"
 
 
 def parse_gains(option: str, entries: Sequence[str]) -> dict[str, float]:
-    """Gains by joint or pattern, of words like 20 and *_calf=30.
-
-    Raises:
-        ConfigError: a word that is neither.
-    """
+    """Gains by joint or pattern, of words like 20 and *_calf=30. Raises ConfigError: a word that is neither."""
     gains = {}
     for entry in entries:
         name, _, number = entry.rpartition("=")
@@ -228,11 +224,7 @@ def _write(found: Replay, folder: Path, form: str) -> None:
 
 
 def _require_simple(fitted: FittedRun) -> None:
-    """Make sure that MuJoCo can move the robot as the run understands it.
-
-    Raises:
-        ConfigError: it cannot.
-    """
+    """Make sure that MuJoCo can move the robot as the run understands it. Raises ConfigError: it cannot."""
     robot = fitted.experiment.robot
     root = next(name for name, (body, pose) in robot.links.items() if body == 0 and np.array_equal(pose, np.eye(4)))
     if not robot.fixed_base and robot.base_link != root:

@@ -15,9 +15,9 @@ from torchid.commands.folder import RUN, refuse_link
 from torchid.commands.manifest import file_checksum, read_manifest
 from torchid.errors import ConfigError, InputError, during, excerpt, warn
 from torchid.guards import MAX_JSON, MAX_YAML, read_bytes
+from torchid.report.forces import traces_document
 from torchid.report.log_checks import log_check_document
 from torchid.report.page import RunFiles, page_text, require_page, versions
-from torchid.report.traces import traces_document
 from torchid.robot import Robot
 from torchid.staging import atomic_file
 
@@ -92,11 +92,7 @@ def report(run: str | Path) -> Path:
 
 
 def _made(files: RunFiles, folder: Path) -> str:
-    """The page of files that somebody may have changed.
-
-    Raises:
-        InputError: they are not what a page needs.
-    """
+    """The page of files that somebody may have changed. Raises InputError: they are not what a page needs."""
     try:
         return page_text(files)
     except InputError:
@@ -107,11 +103,7 @@ def _made(files: RunFiles, folder: Path) -> str:
 
 
 def _read(folder: Path) -> RunFiles:
-    """The files of a run that its page shows.
-
-    Raises:
-        InputError: one is missing or cannot be read.
-    """
+    """The files of a run that its page shows. Raises InputError: one is missing or cannot be read."""
     parameters, metrics, data = (_document(folder, name) for name in _JSON)
     return RunFiles(
         name=folder.resolve().name,

@@ -35,12 +35,11 @@ from torchid.identifiability.contributions import Contributions
 from torchid.logs.containers import atomic_output
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Metrics
+from torchid.problem.extras import NoiseGroups
 from torchid.problem.metrics import LOG_SETS, WorseThanNominal, describe_worse, worse_than_nominal
 from torchid.problem.noise_gram import NoiseShares
-from torchid.problem.noise_groups import NoiseGroups
 from torchid.report import FittedJoints, identified_name, identified_robot, identified_urdf, parameters_document
-from torchid.report.forces import ForceSeries
-from torchid.report.traces import LogForces
+from torchid.report.forces import ForceSeries, LogForces
 
 if TYPE_CHECKING:
     pass

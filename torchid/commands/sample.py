@@ -20,7 +20,7 @@ from torchid.estimators.posterior import PRIOR_ERROR
 from torchid.fitting.posterior import FittedPosterior, ParameterSamples, PosteriorSampler, read_posterior
 from torchid.logs.containers import save_arrays
 from torchid.report import FittedJoints
-from torchid.report.sample_files import ranges_document, sample_arrays
+from torchid.report.parameter_files import ranges_document, sample_arrays
 from torchid.reprs import short_repr
 from torchid.staging import atomic_file
 
@@ -109,11 +109,7 @@ def sample(
 
 
 def parse_prior_error(text: str) -> float | Literal["auto"]:
-    """A prior's width of the command line.
-
-    Raises:
-        ConfigError: neither a number nor auto.
-    """
+    """A prior's width of the command line. Raises ConfigError: neither a number nor auto."""
     try:
         return "auto" if text == "auto" else float(text)
     except ValueError as error:

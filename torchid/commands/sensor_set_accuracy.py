@@ -65,7 +65,6 @@ class _Reference:
     assembly: Assembly
 
     def calibration(self, phi: Array) -> Calibration:
-        """For parameters (12 L,)."""
         assembly = self.assembly
         values = {
             (elimination.log, extra.label): float(value)

@@ -140,16 +140,11 @@ class _Rows:
         self.recorded: SensorSet | None = None
 
     def close(self) -> None:
-        """Close the files."""
         for file, _ in self._files.values():
             file.close()
 
     def add(self, samples: Samples, first: int, total: int) -> None:
-        """Write samples from a number on, of so many in all.
-
-        Raises:
-            OSError: there is no room.
-        """
+        """Write samples from a number on, of so many in all. Raises OSError: there is no room."""
         for name, x in named_tensors(samples).items():
             rows = np.ascontiguousarray(x.numpy())
             if name not in self._files:

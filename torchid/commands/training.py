@@ -93,11 +93,7 @@ class Training:
     """
 
     def __init__(self, experiment: Experiment) -> None:
-        """Fix the settings.
-
-        Raises:
-            InputError: optimizer, schedule or a number that cannot be.
-        """
+        """Fix the settings. Raises InputError: optimizer, schedule or a number that cannot be."""
         config = experiment.config
         self.config, self.robot = config, experiment.robot
         self.folder = None if config.output is None else training_folder(config.output)

@@ -186,11 +186,7 @@ class EstimatorConfig(_ConditionsConfig, _FitConfig):
         return self._settings(Sgd)
 
     def consistent(self, conditions: Conditions) -> Consistent:
-        """A consistent fit with these settings.
-
-        Raises:
-            InputError: the certified method without Clarabel.
-        """
+        """A consistent fit with these settings. Raises InputError: the certified method without Clarabel."""
         return self._settings(Consistent, conditions=conditions)
 
     def _settings(self, estimator: type[Solver], **given: Any) -> Solver:

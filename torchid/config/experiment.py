@@ -12,11 +12,10 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from torchid.config.estimator import MASS_ACCEPTED, ROBUST_ACCEPTED, EstimatorConfig, validate_keys
-from torchid.config.keywords import plain_sections
 from torchid.config.logs import SETS, LogsConfig, entries_spelled_out, resolve_logs
 from torchid.config.maps import MAPS_ACCEPTED
 from torchid.config.preprocessing import PreprocessingConfig
-from torchid.config.reading import FileKind, Settings, dump, load
+from torchid.config.reading import FileKind, Settings, dump, load, plain_sections
 from torchid.config.robot import LOOPS_ACCEPTED, MJCF_SUFFIXES, WELDS_ACCEPTED, RobotConfig, require_one_file
 from torchid.config.sensors import (
     CHOICE_ACCEPTED,

@@ -75,11 +75,7 @@ class LogsConfig:
         return list(dict.fromkeys(file.path for part in parts for file in part.files))
 
     def require_samples(self, command: str) -> None:
-        """Refuse factors where samples are needed.
-
-        Raises:
-            ConfigError: names the file.
-        """
+        """Refuse factors where samples are needed. Raises ConfigError: names the file."""
         if self.compressed:
             found = f"{self.train[0]}, factors of a log, where torchid {command} needs its samples"
             raise ConfigError.at_field("logs.train", found, f"logs ({', '.join(READABLE)})")

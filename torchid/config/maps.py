@@ -11,8 +11,8 @@ from torchid.config.reading import FileKind, Settings, load
 from torchid.errors import about_file
 from torchid.logs import Columns, Topics
 from torchid.logs.column_map import check_columns
-from torchid.logs.joint_orders import JOINT_ORDERS
 from torchid.logs.ros_topics import check_topics
+from torchid.logs.unitree import JOINT_ORDERS
 from torchid.settings import STRICT
 
 _ORDER = f"a list of names, or a robot: {', '.join(JOINT_ORDERS)}"

@@ -1,4 +1,4 @@
-"""Settings files of any kind: YAML and overrides into a validated dataclass, and every error in one line."""
+"""Settings files of any kind: YAML, overrides and mappings into a validated dataclass, every error in one line."""
 
 from __future__ import annotations
 
@@ -11,16 +11,18 @@ from difflib import get_close_matches
 from fnmatch import fnmatch
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Generic, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Generic, Literal, TypedDict, TypeVar, Union, get_args, get_origin, get_type_hints
 
+import numpy as np
 import yaml
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import TypeAdapter, ValidationError
 
-from torchid.config.yaml_text import check_yaml, explain_syntax
+from torchid.config.yaml_text import check_text, check_yaml, explain_syntax
 from torchid.errors import ConfigError, UnknownNameError, about_file, during, excerpt, is_plain
 from torchid.guards import MAX_DEPTH, MAX_YAML, read_bytes
+from torchid.logs import Log
 from torchid.logs.containers import READABLE
 from torchid.logs.remote import is_url
 from torchid.settings import accepted_values
@@ -301,7 +303,61 @@ def _described(hint: Any) -> str:
 
 
 def _not_none(hint: Any) -> Any:
-    """X, of `X | None`."""
     if get_origin(hint) not in (Union, UnionType):
         return hint
     return next(inner for inner in get_args(hint) if inner is not NoneType)
+
+
+StrPath = str | os.PathLike[str]
+
+
+class Sections(TypedDict, total=False):
+    """The keys of an experiment file, with values as Python has them."""
+
+    robot: StrPath | Mapping[str, object]
+    logs: StrPath | Sequence[StrPath | Mapping[str, object]] | Mapping[str, object]
+    sensors: str | Mapping[str, object]
+    contacts: Sequence[Mapping[str, object]]
+    preprocessing: Mapping[str, object]
+    actuators: Mapping[str, object]
+    estimator: Mapping[str, object]
+    analysis: Mapping[str, object]
+    figures: Mapping[str, object]
+    device: str
+    output: StrPath | None
+    overwrite: bool
+
+
+_ACCEPTED = "text, numbers, paths, and lists and mappings of them, as in an experiment file"
+
+
+def plain_sections(sections: Mapping[str, object]) -> Settings:
+    """Values by key as YAML would have given them.
+
+    Raises:
+        ConfigError: a value that no settings file can hold; the message names its key.
+    """
+    return {key: _plain(value, key, 0) for key, value in sections.items()}
+
+
+def _plain(value: object, field: str, depth: int) -> Any:
+    if depth > MAX_DEPTH:
+        raise ConfigError.at_field(field, f"nested more than {MAX_DEPTH} deep", _ACCEPTED)
+    if isinstance(value, (np.ndarray, np.generic)):
+        value = value.tolist()
+    if isinstance(value, os.PathLike):
+        value = os.fspath(value)
+    if isinstance(value, Mapping):
+        return {key: _plain(x, f"{field}.{key}", depth + 1) for key, x in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(x, f"{field}.{number}", depth + 1) for number, x in enumerate(value)]
+    if isinstance(value, str):
+        try:
+            check_text(value)
+        except ValueError as error:
+            raise ConfigError.at_field(field, str(error), _ACCEPTED) from error
+        return str(value)
+    if value is None or isinstance(value, (bool, int, float)):
+        return value
+    accepted = f"{_ACCEPTED}; torchid.write_log makes a file of a Log" if isinstance(value, Log) else _ACCEPTED
+    raise ConfigError.at_field(field, f"found {excerpt(' '.join(repr(value).split()))}", accepted)

@@ -49,7 +49,6 @@ LOOPS_ACCEPTED = "a list of mappings: [{frames: [l_rod_end, l_ankle_pin], type: 
 
 
 def _frames(value: object) -> object:
-    """Two names."""
     if isinstance(value, (list, tuple)) and len(value) == 2 and all(isinstance(name, str) and name for name in value):
         return list(value)
     raise ValueError("two frames of the robot: [l_rod_end, l_ankle_pin]")
@@ -92,11 +91,7 @@ class RobotFile:
 
 
 def require_one_file(robot: RobotFile) -> None:
-    """Refuse a robot of no file or of two.
-
-    Raises:
-        ConfigError: names both keys.
-    """
+    """Refuse a robot of no file or of two. Raises ConfigError: names both keys."""
     if (robot.urdf is None) == (robot.mjcf is None):
         found = "missing" if robot.urdf is None else "set together with robot.mjcf"
         raise ConfigError.at_field("robot.urdf", found, "a path to a URDF, or robot.mjcf: a path to a MuJoCo model")

@@ -162,14 +162,12 @@ def _scope_or_groups(value: object) -> str | list[list[str]]:
     if isinstance(value, str) and value in get_args(Scope):
         return value
     groups = [[group] if isinstance(group, str) else group for group in value] if isinstance(value, list) else []
-    named = all(isinstance(group, list) and group and all(map(_is_name, group)) for group in groups)
+    named = all(
+        isinstance(group, list) and group and all(isinstance(name, str) and name for name in group) for group in groups
+    )
     if not (groups and named):
         raise ValueError(GROUPS_ACCEPTED)
     return groups
-
-
-def _is_name(value: object) -> bool:
-    return isinstance(value, str) and bool(value)
 
 
 ChannelKind = Literal["joint_torque", "contact_force", "contact_moment", "ft_force", "ft_moment"]

@@ -98,13 +98,7 @@ def check_text(value: str) -> None:
 
 
 def explain_syntax(error: yaml.MarkedYAMLError, text: str, wanted: str) -> tuple[str, str]:
-    """What a reader of YAML found, by line, and what is accepted in its place.
-
-    Args:
-        error: of the reader.
-        text: that it read.
-        wanted: what the text should be.
-    """
+    """What a reader of YAML found, by line, and what is accepted in its place; `wanted`: what the text should be."""
     mark, lines = error.problem_mark or error.context_mark, text.splitlines()
     if mark is None:
         return excerpt(str(error)), wanted

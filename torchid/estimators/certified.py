@@ -102,7 +102,6 @@ class _Program:
         return slice(start, start + len(b))
 
     def matrix(self) -> sparse.csc_matrix:
-        """A."""
         blocks = []
         for A, columns in self.rows:
             index = np.repeat(np.arange(len(A)), len(columns)), np.tile(columns, len(A))
@@ -169,11 +168,7 @@ def _require_log_det(program: _Program, problem: ConicProblem, block: int, start
 
 
 def _run(program: _Program, tolerance: float) -> Any:
-    """Clarabel's solution, optimal or not: the gap says by how much.
-
-    Raises:
-        _SolverError: nothing was found.
-    """
+    """Clarabel's solution, optimal or not: the gap says by how much. Raises _SolverError: nothing was found."""
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
@@ -204,6 +199,5 @@ def _smat(v: Array) -> Array:
 
 
 def _positive(Z: Array) -> Array:
-    """The nearest positive semidefinite matrix."""
     values, vectors = np.linalg.eigh(Z)
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T, dtype=np.float64)

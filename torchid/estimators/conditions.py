@@ -35,7 +35,6 @@ class Enclosure:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        """Check kind, centre, axes and size."""
         validate_settings(self)
         if np.shape(self.centre) != (3,) or not np.isfinite(self.centre).all():
             raise ValueError(f"centre: found {_short(self.centre)}; accepted: three finite numbers")
@@ -59,7 +58,6 @@ class Mirror:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        """Check that the reflection is orthogonal."""
         _check_orthogonal("reflection", self.reflection)
 
 
@@ -70,7 +68,6 @@ def _check_orthogonal(name: str, matrix: Array) -> None:
 
 
 def _short(value: object) -> str:
-    """A value on one line."""
     return " ".join(str(value).split())
 
 

@@ -103,7 +103,10 @@ def build_conic_problem(
     if prior == "pullback":
         metric = _pullback_metric(x)
     elif prior == "entropic":
-        relative = [_relative_block(x, body) for body in x.bodies]
+        relative = [
+            _Block(f"pseudo-inertia of {x.body_name(body)}", np.eye(4), parameters.PSEUDO_BASIS, x.ten(body))
+            for body in x.bodies
+        ]  # J_0^-1/2 J J_0^-1/2
         for block in relative:
             metric[block.variables] = 0.0
             linear[block.variables] = ridge * np.trace(block.F, axis1=1, axis2=2)
@@ -266,11 +269,6 @@ def _pullback_metric(x: _Variables) -> Array:
         row[:, x.ten(body)] = parameters.PSEUDO_BASIS.reshape(10, 16).T
         rows.append(row)
     return np.concatenate(rows)
-
-
-def _relative_block(x: _Variables, body: int) -> _Block:
-    """J_0^-1/2 J J_0^-1/2 of a body."""
-    return _Block(f"pseudo-inertia of {x.body_name(body)}", np.eye(4), parameters.PSEUDO_BASIS, x.ten(body))
 
 
 def _pseudo_inertia_root(scaled: Array, called: str, prior: Prior) -> Array:

@@ -77,7 +77,6 @@ class FreeParameters(LearnableParameters):
     """Any phi, an affine function of `raw`."""
 
     def __init__(self, problem: LinearProblem) -> None:
-        """Start at the nominal parameters."""
         super().__init__(problem, int(problem.free.sum()))
 
     def constrained(self, u: Tensor) -> Tensor:
@@ -117,7 +116,9 @@ class LogCholeskyParameters(LearnableParameters):
         above = np.maximum(values - margin, _LEAST_EIGENVALUE)
         nominal = torch.from_numpy((vectors * above[:, None]) @ vectors.transpose(0, 2, 1))
         self.register_buffer("root", torch.linalg.cholesky(nominal))
-        self.register_buffer("_from_pseudo", torch.from_numpy(_from_pseudo_inertia()))
+        self.register_buffer(
+            "_from_pseudo", torch.from_numpy(np.linalg.pinv(parameters.PSEUDO_BASIS.reshape(-1, 16).T))
+        )
         rows, columns = np.tril_indices(4)
         self.register_buffer("_rows", torch.from_numpy(rows))
         self.register_buffer("_columns", torch.from_numpy(columns))
@@ -143,8 +144,3 @@ class LogCholeskyParameters(LearnableParameters):
         inertial, frictional = self.get_buffer("_inertial"), self.get_buffer("_frictional")
         phi = self.nominal.masked_scatter(inertial, ten.flatten() * self.scale[inertial])
         return phi.masked_scatter(frictional, friction * self.scale[frictional])
-
-
-def _from_pseudo_inertia() -> np.ndarray:
-    """Matrix (10, 16) that takes a flattened pseudo-inertia to ten inertial numbers."""
-    return np.linalg.pinv(parameters.PSEUDO_BASIS.reshape(-1, 16).T)

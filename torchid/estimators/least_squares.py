@@ -179,11 +179,7 @@ class Regularized:
     rank_tolerance: Tolerance = field(default=RANK_TOLERANCE, kw_only=True)
 
     def __post_init__(self) -> None:
-        """Check the settings.
-
-        Raises:
-            ValueError: names the first that is not accepted.
-        """
+        """Check the settings. Raises ValueError: names the first that is not accepted."""
         validate_settings(self)
 
     @property

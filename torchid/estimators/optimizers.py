@@ -169,7 +169,6 @@ def try_out(optimizer: Mapping[str, Any], schedule: Mapping[str, Any] | None, ep
 
 
 def _split(chosen: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
-    """The name of a class, and its options."""
     options = dict(chosen)
     return options.pop("name"), options
 

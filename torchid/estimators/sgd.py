@@ -45,7 +45,6 @@ class PenaltyWeights:
     friction: NotNegative = 10.0
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         validate_settings(self)
 
     @property
@@ -196,7 +195,6 @@ class Loss(nn.Module):
         learnable: LearnableParameters,
         residual: nn.Module | None,
     ) -> None:
-        """Set parameters, module and logs."""
         super().__init__()
         self.settings = settings
         self.learnable, self.residual = learnable, residual

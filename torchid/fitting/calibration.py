@@ -215,7 +215,6 @@ class Confounded:
     advice: str
 
     def __str__(self) -> str:
-        """All in one line."""
         others = "the total mass" if self.confounded_with == (_TOTAL_MASS,) else _grouped(self.confounded_with)
         return f"{_grouped(self.extras)}: confounded with {others or 'each other'}; do not trust either; {self.advice}"
 

@@ -3,30 +3,32 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from torchid.copies import share_between_copies
 from torchid.errors import LogError, TorchidWarning
 from torchid.fitting.calibration import Calibration, Comparison, calibration_at, calibrations
 from torchid.fitting.fit import BatchEstimator, Fit, LogFitter
-from torchid.fitting.residual_squares import ResidualSquares, residuals_of_samples, sum_residuals
 from torchid.fitting.robust import RobustLoss
 from torchid.parameters import Array
 from torchid.problem import Evaluation, ExtraTerms, Metrics, RowBuilder, Samples
-from torchid.problem.chunks import ProgressCallback, one_thread, thread_count
+from torchid.problem.chunk_dynamics import Workspace
+from torchid.problem.chunks import ProgressCallback, map_chunks, one_thread, thread_count
 from torchid.problem.compressed_log import Block
-from torchid.problem.compression import Part, compress_in_blocks, merge_states, split_into_folds
+from torchid.problem.compression import Part, compress_in_blocks, compress_unloaded, merge_states, split_into_folds
+from torchid.problem.contact_state import ContactState
 from torchid.problem.metrics import ForceSums
 from torchid.sensing.sensors import recorded_components
 from torchid.settings import RidgeRule
 
 RIDGES = tuple(float(f"1e{power}") for power in range(-7, 2))
 """Ridges that are tried, in decades: finer steps change predictions by less than their spread over the folds."""
-
 
 MOST_SCORED = 100_000
 """Samples of training logs that errors of forces are computed of at most: of more, every k-th.
@@ -62,7 +64,6 @@ class RidgeChoice:
     rule: RidgeRule = "least"
 
     def __str__(self) -> str:
-        """The ridge, and how it was chosen."""
         within = "" if self.rule == "least" else ", the largest within one standard error of the best"
         return f"{self.ridge:g}{within}, chosen by cross-validation on blocks of the training logs"
 
@@ -152,13 +153,7 @@ def choose_ridge(
     error = apart.std(axis=0, ddof=1) / np.sqrt(len(folds))
     ridges = tuple(float(estimator.ridge) for estimator in estimators)
     taken = int(means.argmin()) if rule == "least" else int(np.flatnonzero(means - means.min() <= error)[-1])
-    return RidgeChoice(
-        ridge=ridges[taken],
-        tried=ridges,
-        mean_square=tuple(means.tolist()),
-        standard_error=tuple(error.tolist()),
-        rule=rule,
-    )
+    return RidgeChoice(ridges[taken], ridges, tuple(means.tolist()), tuple(error.tolist()), rule)
 
 
 def _held_out_squares(
@@ -229,7 +224,7 @@ class Scorer:
         pairs = self._force_sums(logs, compared, progress, 1)
         whole = [with_all_readings(log, self.builder) for log in logs]
         _add_squares(pairs, residuals_of_samples(self.builder, whole, compared))
-        return _comparison(self._metrics([pairs]))
+        return Comparison(*self._metrics([pairs]))
 
     def score_training(
         self,
@@ -263,7 +258,7 @@ class Scorer:
         held_out = None
         if without_folds:
             held_out = CrossValidation(len(without_folds), metrics[0 if first else 2], metrics[-1])
-        return TrainingScore(_comparison(metrics), held_out, samples)
+        return TrainingScore(Comparison(*metrics[:2]), held_out, samples)
 
     def _sums(
         self,
@@ -334,5 +329,67 @@ def with_all_readings(log: Samples, builder: RowBuilder) -> Samples:
     return log if bool(known.all()) else log[known]
 
 
-def _comparison(metrics: Sequence[Metrics]) -> Comparison[Metrics]:
-    return Comparison(metrics[0], metrics[1])
+@dataclass
+class ResidualSquares:
+    """Sums of squares of whitened rows: of their residuals, of what was measured, and of the noise a filter leaves."""
+
+    error: float = 0.0
+    measured: float = 0.0
+    noise: float = 0.0
+    rows: int = 0
+
+    def add(self, other: ResidualSquares) -> None:
+        """Add those of other rows."""
+        self.error += other.error
+        self.measured += other.measured
+        self.noise += other.noise
+        self.rows += other.rows
+
+
+@one_thread()
+def sum_residuals(
+    builder: RowBuilder, logs: Sequence[Block], parts: Sequence[Part], calibrations: Sequence[Calibration]
+) -> list[ResidualSquares]:
+    """Squares of the residuals of bound logs' rows, compressed to `parts`, at the parameters of each calibration."""
+    by_source = {log.source: log for log in reversed(logs)}
+    out = [ResidualSquares() for _ in calibrations]
+    for part in parts:
+        R, factor = part.factor.triangle(), part.factor
+        for one, squares in zip(calibrations, out, strict=True):
+            residual = R[:, :-1] @ one.columns(builder, by_source[part.source]).cpu() - R[:, -1]
+            sums = float(residual @ residual), float(R[:, -1] @ R[:, -1])
+            squares.add(ResidualSquares(*sums, factor.independent_rows, factor.rows))
+    return out
+
+
+def residuals_of_samples(
+    builder: RowBuilder, logs: Sequence[Samples], calibrations: Sequence[Calibration]
+) -> list[ResidualSquares]:
+    """As `sum_residuals`, of logs that are not compressed: rows times parameters are less work than their factors.
+
+    Args:
+        builder: of the rows.
+        logs: bound logs, of other sources each.
+        calibrations: parameters.
+    """
+    phi = {log.source: torch.stack([one.columns(builder, log) for one in calibrations], dim=1) for log in logs}
+    total = sum_residuals(builder, logs, compress_unloaded(logs, builder), calibrations)
+    for squares, measured, noise, rows in map_chunks(logs, builder, partial(_sum_chunks, builder, phi)):
+        for one, error in zip(total, squares, strict=True):
+            one.add(ResidualSquares(error, measured, noise, rows))
+    return total
+
+
+def _sum_chunks(
+    builder: RowBuilder, phi: Mapping[str, Tensor], chunks: Iterator[tuple[Samples, ContactState]]
+) -> tuple[list[float], float, float, int]:
+    """Squares of the residuals of rows at parameters (width, M) by log, (M,), and of what was measured; noise, rows."""
+    error = next(iter(phi.values())).new_zeros(next(iter(phi.values())).shape[1])
+    measured, noise, count, workspace = error.new_zeros(()), 0.0, 0, Workspace()
+    for samples, state in chunks:
+        for support, rows in builder.rows(samples, state, workspace):
+            residual = rows[:, :-1] @ phi[samples.source][builder.tree.index(support)] - rows[:, -1:]
+            error += residual.square().sum(0)
+            measured += rows[:, -1].square().sum()
+            noise, count = noise + len(rows) / samples.oversampling, count + len(rows)
+    return error.tolist(), float(measured), noise, count

@@ -16,13 +16,19 @@ from torchid.config.sensors import ChoiceConfig
 from torchid.errors import ConfigError, LogError, UnknownNameError
 from torchid.estimators import Conditions, Consistent, LeastSquares
 from torchid.fitting.calibration import Calibration, Comparison, calibrations
-from torchid.fitting.checked_settings import check_scale_groups, check_terms, require_maps_of, stated_noise
-from torchid.fitting.conditions import conditions_from
-from torchid.fitting.contacts import resolve_contacts, suited_to_preprocessing, with_scalar_sensors
+from torchid.fitting.checked_settings import (
+    check_scale_groups,
+    check_terms,
+    require_maps_of,
+    resolve_contacts,
+    stated_noise,
+    suited_to_preprocessing,
+    with_scalar_sensors,
+)
 from torchid.fitting.cross_validation import RIDGES, RidgeChoice, choose_ridge
 from torchid.fitting.fit import Fit, LogFitter, frozen_parameters
-from torchid.fitting.known_masses import known_masses
 from torchid.fitting.noise import NoiseSummary, estimate_noise, recorded_sensors
+from torchid.fitting.prior_knowledge import conditions_from, known_masses
 from torchid.fitting.robust import RobustLoss
 from torchid.problem import Evaluation, ExtraTerms, RowBuilder, Samples
 from torchid.problem.compressed_log import Block
@@ -94,11 +100,7 @@ class Scene:
         return None if robust is None else RobustLoss.named(robust.loss, robust.tuning, robust.passes)
 
     def sensors_of(self, choice: ChoiceConfig) -> SensorSet:
-        """The sensors of a choice.
-
-        Raises:
-            InputError: names that do not fit the robot.
-        """
+        """The sensors of a choice. Raises InputError: names that do not fit the robot."""
         robot, contacts, noise, ft = self.robot, self.contacts, self.noise, len(self.robot.ft_names)
         if choice.set is not None:
             sensors = named_sensors(choice.set, robot.n, len(contacts), noise, ft)

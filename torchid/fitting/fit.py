@@ -13,7 +13,7 @@ from torch import Tensor
 from torchid.errors import TorchidWarning, UnknownNameError
 from torchid.estimators import Estimate, LeastSquares
 from torchid.estimators.least_squares import Minimizer
-from torchid.fitting.known_masses import TOTAL, KnownMass, with_known_masses
+from torchid.fitting.prior_knowledge import TOTAL, KnownMass, with_known_masses
 from torchid.identifiability.block_scatter import BlockScatter, block_scatter
 from torchid.identifiability.confounding import ExtraEstimate, estimate_extras, mass_weights
 from torchid.parameters import PER_BODY

@@ -14,8 +14,8 @@ from torchid.estimators import LeastSquares
 from torchid.fitting.fit import LogFitter
 from torchid.parameters import Array
 from torchid.problem import Samples
+from torchid.problem.extras import noise_key
 from torchid.problem.noise import GroupVariances, VarianceComponentEstimator, fitted_directions
-from torchid.problem.noise_groups import noise_key
 from torchid.problem.sampled_rows import LogElsewhere, SampledRows
 from torchid.reprs import short_repr
 from torchid.robot import Robot
@@ -125,14 +125,7 @@ def estimate_noise(
 def recorded_sensors(
     robot: Robot, contacts: Sequence[Contact], logs: Sequence[Samples], noise: SensorNoise | None = None
 ) -> SensorSet:
-    """All sensors whose every value is in every log.
-
-    Args:
-        robot: the robot.
-        contacts: the contacts in use.
-        logs: bound logs.
-        noise: of the sensors.
-    """
+    """All sensors whose every value is in every log; `contacts`: the contacts in use."""
     torque = np.ones(robot.n_dofs, dtype=bool)
     wrench = np.ones((len(contacts), 6), dtype=bool)
     for log in logs:

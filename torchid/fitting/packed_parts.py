@@ -41,7 +41,6 @@ class PartPacker:
     """Takes parts apart, one after the other."""
 
     def __init__(self) -> None:
-        """Nothing is packed yet."""
         self._supports, self._values = dict[tuple[int, ...], int](), list[Array]()
 
     @property
@@ -155,7 +154,6 @@ class _Stream:
 
     @property
     def left(self) -> int:
-        """How many are left."""
         return len(self._values) - self._taken
 
     def triangle(self, width: int, rows: int, packed: bool) -> torch.Tensor:

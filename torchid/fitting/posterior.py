@@ -17,8 +17,7 @@ from torch import Tensor
 from torchid import parameters
 from torchid.errors import InputError, LogError, during
 from torchid.estimators import Conditions, Enclosure, Mirror
-from torchid.estimators.nominal_error import NominalError, nominal_error
-from torchid.estimators.posterior import PRIOR_ERROR, Posterior, whitened_rows
+from torchid.estimators.posterior import PRIOR_ERROR, NominalError, Posterior, nominal_error, whitened_rows
 from torchid.estimators.truncated_gaussian import TruncatedGaussian
 from torchid.fitting.fit import Fit
 from torchid.identifiability.confounding import mass_weights
@@ -252,7 +251,6 @@ class ParameterSamples:
     __repr__ = short_repr
 
     def __len__(self) -> int:
-        """Number of sets."""
         return len(self.phi)
 
     @property
@@ -326,7 +324,6 @@ class PosteriorSampler(torch.nn.Module):
     """
 
     def __init__(self, run: str | Path | FittedPosterior, prior_error: float | Literal["auto"] = PRIOR_ERROR) -> None:
-        """Read the posterior and prepare the sampler."""
         super().__init__()
         if prior_error != "auto" and not (isinstance(prior_error, (int, float)) and 0.0 < prior_error < math.inf):
             raise InputError("sampler", "prior_error", f"{prior_error}", "a number above 0, or 'auto'")

@@ -186,18 +186,14 @@ def unobservable_parameters(base: BaseParameters, body_names: Sequence[str]) -> 
 
 
 @one_thread()
-def structural_rank(problem: LinearProblem, tolerance: float = RANK_TOLERANCE) -> RankGap:
+def structural_rank(problem: LinearProblem) -> RankGap:
     """Rank of a problem's free columns, scaled to norm 1.
-
-    Args:
-        problem: with the rows.
-        tolerance: as in `_normalized_columns` and `rank_and_gap`.
 
     Warns:
         NumericalWarning: the rank is a matter of the tolerance.
     """
-    columns, _ = _normalized_columns(problem, tolerance)
-    return rank_and_gap(scipy.linalg.svd(columns, compute_uv=False, lapack_driver="gesvd"), tolerance)
+    columns, _ = _normalized_columns(problem, RANK_TOLERANCE)
+    return rank_and_gap(scipy.linalg.svd(columns, compute_uv=False, lapack_driver="gesvd"))
 
 
 def rank_and_gap(values: Array, tolerance: float = RANK_TOLERANCE) -> RankGap:

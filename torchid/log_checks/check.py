@@ -17,6 +17,7 @@ from torchid.log_checks.contacts import (
     check_contact_flags,
     check_limb_sensors,
     check_scalar_wrenches,
+    check_slip,
     subtract_contact_offsets,
 )
 from torchid.log_checks.findings import (
@@ -30,7 +31,6 @@ from torchid.log_checks.findings import (
 )
 from torchid.log_checks.forces import check_forces_against_urdf
 from torchid.log_checks.frozen import check_excitation, check_repeats, check_still_base
-from torchid.log_checks.gyroscope import check_gyroscope
 from torchid.log_checks.motion import (
     check_angle_unit,
     check_angular_velocity,
@@ -40,7 +40,7 @@ from torchid.log_checks.motion import (
 )
 from torchid.log_checks.spikes import check_jumps
 from torchid.log_checks.stamps import check_magnitudes, check_missing_values, check_time_stamps
-from torchid.log_checks.standing_feet import check_slip, check_standing_feet
+from torchid.log_checks.standing_feet import check_gyroscope, check_standing_feet
 from torchid.log_checks.weight import check_accelerometer, check_weight
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from torchid.errors import join_names
 from torchid.log_checks.motion import MAX_ANGLE_RAD
-from torchid.log_checks.units import advise_units, other_units
 from torchid.logs import Log
 from torchid.logs.log import WRENCHES
 from torchid.logs.quaternion import inverse_rotation, make_sign_continuous
+from torchid.logs.units import advise_units, other_units
 from torchid.parameters import GRAVITY
 
 #: Parts of names that differ between left and right, and between front and rear.

@@ -130,11 +130,7 @@ def preprocess_pieces(log: Log, cutoff_hz: float, max_samples: int = MAX_DIFFERE
 def bind_some_samples(
     logs: Sequence[Log], robot: Robot, contacts: Sequence[Contact], count: int = COMPARED_SAMPLES
 ) -> list[Samples]:
-    """About `count` evenly spread samples of filtered logs.
-
-    Raises:
-        InputError: they do not match the robot.
-    """
+    """About `count` evenly spread samples of filtered logs. Raises InputError: they do not match the robot."""
     bound = [bind_log(log, robot, contacts) for log in logs]
     return [part[torch.linspace(0, len(part) - 1, min(count // len(logs), len(part))).long()] for part in bound]
 

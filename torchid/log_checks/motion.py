@@ -10,7 +10,6 @@ import torch
 
 from torchid.errors import LogError, join_names
 from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, Finding, Skipped, channel_names
-from torchid.log_checks.units import UNIT_TOLERANCE, advise_units, describe_units, units_of_derivative_ratio
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import DERIVATIVE_CHAINS
@@ -21,8 +20,9 @@ from torchid.logs.quaternion import (
     rotate_to_base,
     rotate_to_world,
 )
+from torchid.logs.units import UNIT_TOLERANCE, advise_units, describe_units, units_of_derivative_ratio
 from torchid.parameters import GRAVITY
-from torchid.problem.closed_loops import loop_gaps, with_loop_joints
+from torchid.problem.log_joints import loop_gaps, with_loop_joints
 from torchid.robot import Robot
 from torchid.rounding import STD_PER_MAD
 

@@ -8,10 +8,10 @@ import numpy as np
 
 from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, Finding, Skipped, median_step, widen_mask
 from torchid.log_checks.model import recorded_link_poses
-from torchid.log_checks.units import advise_units, units_of_ratio
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.quaternion import rotate_to_world
+from torchid.logs.units import advise_units, units_of_ratio
 from torchid.parameters import GRAVITY
 from torchid.robot import Robot
 

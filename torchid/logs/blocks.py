@@ -85,16 +85,13 @@ class _Rows:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Shape of these rows."""
         return (self.stop - self.start, *self.array.shape[1:])
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Type of the elements."""
         return self.array.dtype
 
     def __getitem__(self, rows: slice) -> NDArray[Any]:
-        """Some of these rows."""
         start, stop, _ = rows.indices(self.stop - self.start)
         return self.array[self.start + start : self.start + stop]
 

@@ -35,8 +35,8 @@ from torchid.logs.column_entries import (
     WrenchEntry,
 )
 from torchid.logs.columns import KINDS, component_names, names_field
-from torchid.logs.joint_orders import order_by_name, require_joints_of, robot_with_order
 from torchid.logs.log import WRENCHES
+from torchid.logs.unitree import order_by_name, require_joints_of, robot_with_order
 from torchid.logs.units import quantities_of, unit_factor
 from torchid.settings import STRICT, Name
 

@@ -77,11 +77,7 @@ def existing_log_kind(path: Path) -> LogKind:
 
 
 def new_log_kind(path: Path) -> LogKind:
-    """The kind of a new log.
-
-    Raises:
-        LogError: its extension is unknown.
-    """
+    """The kind of a new log. Raises LogError: its extension is unknown."""
     return _kind(path, WRITABLE)
 
 
@@ -240,7 +236,6 @@ class _Npz:
         self._archive = archive
 
     def declared_bytes(self) -> dict[str, int]:
-        """Declared bytes of each array, by name."""
         entries = self._archive.infolist()
         check_fields((entry.filename for entry in entries), len(entries))
         sizes = {entry.filename.removesuffix(".npy"): entry.file_size for entry in entries}
@@ -249,7 +244,6 @@ class _Npz:
         return sizes
 
     def load(self, name: str) -> NDArray[Any]:
-        """The array `name`."""
         entry = self._entry(name)
         with self._archive.open(entry) as stream:
             shape, _, dtype = _read_header(stream)

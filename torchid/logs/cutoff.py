@@ -64,7 +64,6 @@ class CutoffChoice:
     motion_hz: float | None = None
 
     def __str__(self) -> str:
-        """The cutoff, and what it was chosen by."""
         if self.cutoff_hz is None:
             return "none: accelerations were recorded"
         if self.by_noise:

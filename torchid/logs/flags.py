@@ -95,11 +95,7 @@ class MeasuredForces:
 
     @classmethod
     def of(cls, source: str, parts: Iterable[Log]) -> MeasuredForces:
-        """Those of a log, from all of its samples.
-
-        Raises:
-            LogError: the log has neither.
-        """
+        """Those of a log, from all of its samples. Raises LogError: the log has neither."""
         found: MeasuredForces | None = None
         for log in parts:
             scalar, wrench = log.contact_force_normal, log.contact_wrench

@@ -165,12 +165,10 @@ class _ChunkedDataset:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Shape of the dataset."""
         return tuple(self._item.shape)
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Type of its elements."""
         return np.dtype(self._item.dtype)
 
     def __getitem__(self, rows: slice) -> NDArray[Any]:

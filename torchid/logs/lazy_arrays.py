@@ -25,7 +25,6 @@ class Computed:
     rows_of: Callable[[slice], NDArray[Any]]
 
     def __getitem__(self, rows: slice) -> NDArray[Any]:
-        """Some rows."""
         return self.rows_of(slice(*rows.indices(self.shape[0])))
 
 
@@ -33,11 +32,7 @@ class MappedArray:
     """A field whose arrays are read where it is sliced."""
 
     def __init__(self, fields: MappedFields, name: str, arrays: Mapping[str, LazyArray]) -> None:
-        """The field of a name, of open arrays.
-
-        Raises:
-            LogError: arrays that do not fit it.
-        """
+        """The field of a name, of open arrays. Raises LogError: arrays that do not fit it."""
         self._fields, self._name, self._arrays = fields, name, arrays
         self._constant = fields.constant_sources(name)
         for source in fields.sources_of(name):
@@ -52,7 +47,6 @@ class MappedArray:
         self.dtype, self.shape = first.dtype, (max(lengths.values(), default=0), *first.shape[1:])
 
     def __getitem__(self, rows: slice) -> NDArray[Any]:
-        """Some rows."""
         if self._name == "time" and self._fields.step is not None and hasattr(self, "shape"):
             start, stop, _ = rows.indices(self.shape[0])
             return self._fields.stamps(start, stop - start)
@@ -72,7 +66,6 @@ class GapsFilled:
     """
 
     def __init__(self, array: LazyArray, most_missing: float, parts: Iterable[FloatArray]) -> None:
-        """Find the gaps, which takes a pass over the array in successive parts (M, k), all of it together."""
         self.shape, self.dtype = array.shape, np.dtype(np.float64)
         self._array = array
         channels = [_Gaps() for _ in range(array.shape[1])]
@@ -89,7 +82,6 @@ class GapsFilled:
         ]
 
     def __getitem__(self, rows: slice) -> NDArray[Any]:
-        """Some rows."""
         start, _, _ = rows.indices(self.shape[0])
         out = np.array(self._array[rows], dtype=np.float64)
         out[:, self.broken] = np.nan

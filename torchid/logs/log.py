@@ -182,7 +182,6 @@ class Log:
         return f"{self.source}, {len(self)} samples in {seconds:.4g} s, in SI units"
 
     def __post_init__(self) -> None:
-        """Check shapes and types."""
         with about_file(self.source):
             self._check()
 
@@ -200,7 +199,6 @@ class Log:
             raise LogError.at_field(WRENCHES[1], f"given together with {WRENCHES[0]}", "one of the two")
 
     def __len__(self) -> int:
-        """Number of samples N."""
         return len(self.time)
 
     @property
@@ -251,12 +249,7 @@ def is_quaternion(name: str) -> bool:
 
 
 def column_labels(name: str, names: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
-    """Names of the columns of the field `name`; empty for fields without named columns.
-
-    Args:
-        name: the field.
-        names: by `NAME_FIELDS`.
-    """
+    """Names of the columns of the field `name`; empty for fields without named columns; `names`: by `NAME_FIELDS`."""
     of = f"{name.partition('_')[0]}_names"
     return names[of] if of in NAME_FIELDS else ()
 

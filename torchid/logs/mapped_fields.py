@@ -150,11 +150,7 @@ class MappedFields:
         return self.text(take) | {name: self.value(name, once) for name in self.fields}
 
     def value(self, name: str, take: Take) -> NDArray[Any]:
-        """A field (N, ...).
-
-        Raises:
-            LogError: columns that do not fit it.
-        """
+        """A field (N, ...). Raises LogError: columns that do not fit it."""
         if name in self.native:
             if self._layout is None:
                 return take(name)

@@ -332,11 +332,7 @@ def near_contact_changes(log: Log, time: FloatArray, margin: float) -> BoolArray
 
 
 def away_from_changes(log: Log, time: FloatArray, margin: float) -> BoolArray | None:
-    """Which of some stamps are not `near_contact_changes`, None for all.
-
-    Raises:
-        LogError: none is.
-    """
+    """Which of some stamps are not `near_contact_changes`, None for all. Raises LogError: none is."""
     near = near_contact_changes(log, time, margin)
     if near.all():
         found = f"no sample further than {margin:g} s from a change of contact"

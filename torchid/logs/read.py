@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import LogError, about_file, current_file, during
+from torchid.logs.alignment import read_joined
 from torchid.logs.arrays import load_part, parse_frame, parse_names, require_plain
 from torchid.logs.column_map import Columns
 from torchid.logs.column_proposals import is_foreign, unknown_columns
@@ -25,7 +26,6 @@ from torchid.logs.containers import (
 )
 from torchid.logs.force_plates import about_world_origin
 from torchid.logs.gaps import bridge_gaps, refuse_gaps
-from torchid.logs.joined import read_joined
 from torchid.logs.log import (
     CONTACT_READINGS,
     EXCLUSIVE,

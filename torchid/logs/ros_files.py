@@ -73,7 +73,6 @@ class McapFile:
     """An MCAP file, read sequentially without its index; the size of each unpacked chunk is limited."""
 
     def __init__(self, path: Path) -> None:
-        """Open the file."""
         self._stream = path.open("rb")
         self._size = max(path.stat().st_size, 1)
 
@@ -167,7 +166,6 @@ class _Reader(rosbag1.Reader):
         self.budget = Budget(path.stat().st_size)
 
     def read_chunk(self) -> Any:
-        """As in rosbags, with a limited decompressor."""
         stream: Any = self.bio
         start = stream.tell()
         chunk = super().read_chunk()
@@ -193,7 +191,6 @@ class Ros1File:
     """A .bag file."""
 
     def __init__(self, path: Path) -> None:
-        """Open the file and read its index."""
         with path.open("rb") as stream:  # the reader would read a whole line of any length
             if stream.read(len(_ROS1_MAGIC)) != _ROS1_MAGIC:
                 raise ValueError("no bag of ROS 1 in version 2.0")

@@ -15,7 +15,7 @@ from torchid.errors import LogError, UnknownNameError, warn_about_file
 from torchid.guards import MAX_ARRAYS, check_names, require_plain_name
 from torchid.logs.log import FloatArray
 from torchid.logs.quaternion import require_unit
-from torchid.logs.ros_low_state import LowState, register
+from torchid.logs.unitree import LowState, register
 
 if TYPE_CHECKING:
     from torchid.logs.ros_files import BagChannel
@@ -327,7 +327,6 @@ class TopicMessages:
     """Messages of a topic in the order of receipt."""
 
     def __init__(self, topic: str, decoder: Decoder) -> None:
-        """Start without messages."""
         self.topic, self._decoder = topic, decoder
         self._stamps, self._received, self._values = array("q"), array("q"), array("d")
 

@@ -16,7 +16,6 @@ from torchid.errors import LogError, UnknownNameError, how_to_install, join_name
 from torchid.logs.alignment import Series
 from torchid.logs.containers import list_bag_files, reader_errors_explained
 from torchid.logs.log import FloatArray
-from torchid.logs.ros_low_state import LowState
 from torchid.logs.ros_messages import (
     ContactFlag,
     Decoder,
@@ -41,6 +40,7 @@ from torchid.logs.ros_topics import (
     WrenchTopic,
     check_topics,
 )
+from torchid.logs.unitree import LowState
 
 if TYPE_CHECKING:
     from torchid.logs.ros_files import BagChannel, BagFile
@@ -182,11 +182,7 @@ def read_bag(
 
 
 def list_channels(files: list[Path]) -> dict[str, BagChannel]:
-    """The topics of a bag.
-
-    Raises:
-        LogError: it is damaged, or a topic has several types.
-    """
+    """The topics of a bag. Raises LogError: it is damaged, or a topic has several types."""
     channels: dict[str, BagChannel] = {}
     for file in files:
         with open_bag_file(file) as opened:

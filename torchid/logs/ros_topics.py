@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, Field
 from pydantic.dataclasses import dataclass
 
 from torchid.errors import ConfigError, UnknownNameError, excerpt
-from torchid.logs.joint_orders import GO, JOINT_ORDERS, require_joints_of
+from torchid.logs.unitree import GO, JOINT_ORDERS, require_joints_of
 from torchid.settings import STRICT, Name, Number
 
 _Force = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]

@@ -70,20 +70,12 @@ class Spill:
         weakref.finalize(self, self._file.close)
 
     def append(self, rows: NDArray[Any]) -> None:
-        """Add rows, all of one shape and type.
-
-        Raises:
-            SpillError: the disk is full.
-        """
+        """Add rows, all of one shape and type. Raises SpillError: the disk is full."""
         self.write(np.ascontiguousarray(rows).reshape(-1).view(np.uint8).data)
         self._rows, self._like = self._rows + len(rows), rows[:0]
 
     def write(self, data: Any) -> None:
-        """Add bytes.
-
-        Raises:
-            SpillError: the disk is full.
-        """
+        """Add bytes. Raises SpillError: the disk is full."""
         rest = memoryview(data)
         try:
             while rest:

@@ -17,8 +17,7 @@ from torchid.logs.column_map import Columns
 from torchid.logs.columns import TEXT_COLUMN, TableLayout, check_header, parse_header, to_columns
 from torchid.logs.containers import TEXT_TABLES, atomic_output, reader_errors_explained
 from torchid.logs.mapped_fields import MappedFields, map_table
-from torchid.logs.nested_columns import NestedColumns
-from torchid.logs.table_headers import BLOCK, TextHeader, read_header
+from torchid.logs.table_headers import BLOCK, NestedColumns, TextHeader, read_header
 from torchid.logs.units import IN_DEGREES, quantities_of
 
 #: Rows that are converted at a time.
@@ -313,11 +312,7 @@ def _bounded(path: Path, batches: Iterable[Any], columns: int, whole: bool) -> I
 
 
 def table_size(path: Path) -> int:
-    """Bytes of a table's numbers, without reading them.
-
-    Raises:
-        LogError: the file cannot be read.
-    """
+    """Bytes of a table's numbers, without reading them. Raises LogError: the file cannot be read."""
     _pyarrow(path)
     with _complete(path):
         if is_text_table(path):

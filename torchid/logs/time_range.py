@@ -57,11 +57,7 @@ class TimeRange:
 
     @classmethod
     def parse(cls, text: str) -> TimeRange:
-        """The range of a text such as `[0:30]`, `[-10:]` or `[:80%]`.
-
-        Raises:
-            ValueError: it is none.
-        """
+        """The range of a text such as `[0:30]`, `[-10:]` or `[:80%]`. Raises ValueError: it is none."""
         start, colon, stop = text[1:-1].partition(":")
         if text[:1] + text[-1:] != "[]" or not colon:
             raise ValueError(text)

@@ -47,7 +47,6 @@ class Batch:
         return int(self.W.any(dim=1).sum())
 
     def __getitem__(self, index: slice | Tensor) -> Batch:
-        """The rows of some samples."""
         return Batch(*(getattr(self, field.name)[index] for field in fields(self)))
 
     @property

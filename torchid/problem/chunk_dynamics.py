@@ -15,7 +15,6 @@ class Workspace:
     """Named buffers of one worker, reused: fresh memory for large arrays takes as long as the arithmetic on them."""
 
     def __init__(self) -> None:
-        """Start empty."""
         self._buffers: dict[str, Tensor] = {}
 
     def empty(self, name: str, like: Tensor, *shape: int) -> Tensor:
@@ -33,7 +32,6 @@ class Workspaces:
     """
 
     def __init__(self) -> None:
-        """Start with none."""
         self._idle: list[Workspace] = []
 
     def take(self) -> Workspace:

@@ -119,7 +119,6 @@ class _ProgressOfAll:
 
 
 def _size(samples: Samples, index: slice | torch.Tensor) -> int:
-    """Number of samples of a chunk."""
     return len(range(*index.indices(len(samples)))) if isinstance(index, slice) else len(index)
 
 

@@ -13,9 +13,8 @@ from torch import Tensor
 from torchid import parameters
 from torchid.parameters import Array
 from torchid.problem.extras import Extra
-from torchid.problem.loop_forces import LoopLayouts, LoopRows
 from torchid.problem.row_blocks import RowBlock, RowBlocks, row_block
-from torchid.problem.wrench_rows import Acting, WrenchRows
+from torchid.problem.wrench_rows import Acting, LoopLayouts, LoopRows, WrenchRows
 from torchid.regressor.columns import reduced_layout, reduction_matrix
 from torchid.regressor.kinematics import BodyStates
 from torchid.regressor.regressor import (
@@ -51,7 +50,6 @@ class RowColumns:
     """
 
     def __init__(self, tree: KinematicTree) -> None:
-        """Lay out the columns of a robot."""
         self.tree = tree
         self.layout = reduced_layout(tree)
         self.joint_rows: list[JointRow] = joint_rows(tree, self.layout)
@@ -162,7 +160,6 @@ class ContactStateLayouts:
         sensors: SensorSet,
         extras: Sequence[Extra] = (),
     ) -> None:
-        """Look up the nodes that carry the contacts' frames."""
         self.extras = tuple(extras)
         self.columns = columns
         self.contacts = tuple(contacts)

@@ -132,7 +132,6 @@ class Footing:
         return cls(feet, points, fit_floors(points, radius, stands))
 
     def __getitem__(self, samples: slice) -> Footing:
-        """Some of the samples."""
         feet = [StanceFoot(foot.contact, foot.rotation[samples], foot.points[samples]) for foot in self.feet]
         floor = Floor(self.floor.up[samples], self.floor.height[samples], self.floor.uneven[samples])
         return Footing(feet, self.points[samples], floor)

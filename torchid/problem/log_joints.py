@@ -1,19 +1,23 @@
-"""A log's joints as the robot has them: torques in its order, with passive joints and without welded ones."""
+"""A log's joints as the robot has them: torques in its order, passive and welded joints, and those that loops close."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchid.errors import LogError, warn
+from torchid.errors import LogError, join_names, warn
 from torchid.logs import Log
 from torchid.logs.log import SHAPES, FloatArray
 from torchid.logs.time_range import log_title
-from torchid.robot import Robot
+from torchid.parameters import Array
+from torchid.regressor.loops import LoopClosures
+from torchid.robot import Loop, Robot
+from torchid.robot.loops import LOOPS_FIELD
 from torchid.sensing import SensorSet
 
 _NO_TORQUE = 1e-9  # N m or N: what a simulator's log may have of a joint without a motor
@@ -66,11 +70,7 @@ _TOLERANCE_OF_OTHERS = (0.05, "rad")
 
 
 def without_welded_joints(log: Log, robot: Robot | None) -> Log:
-    """The log without columns for welded joints.
-
-    Warns:
-        TorchidWarning: a joint that is not where it is welded.
-    """
+    """The log without columns for welded joints. Warns TorchidWarning: a joint that is not where it is welded."""
     if robot is None or robot.welded.keys().isdisjoint(log.joint_names):
         return log
     kept = [column for column, name in enumerate(log.joint_names) if name not in robot.welded]
@@ -97,3 +97,196 @@ def warn_of_moving_welds(log: Log, robot: Robot, distances: FloatArray) -> None:
     if far:
         text = "; ".join(far)
         warn(f"{log_title(log.source)}: joint {text}, where robot.weld holds it: welding is an approximation here")
+
+
+FOLLOW = "; joints of loops follow from others in logs that fit into preprocessing.memory_gb"
+"""What helps where a log lacks joints of a robot with loops."""
+
+_CHUNK = 4096  # samples
+
+
+@dataclass(frozen=True)
+class LoopGap:
+    """Distance [m] and angle [rad] of a loop's frames over a log, rms and largest; the angle of a point is 0."""
+
+    loop: Loop
+    rms: float
+    largest: float
+    rms_angle: float
+    largest_angle: float
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the frames are farther apart than the loop accepts."""
+        return self.rms > self.loop.max_gap or self.rms_angle > self.loop.max_angle
+
+    @property
+    def accepted(self) -> str:
+        """Up to which distance they count as together."""
+        bound = f"rms up to {1e3 * self.loop.max_gap:.3g} mm"
+        return bound if self.loop.kind != "weld" else f"{bound} and {np.degrees(self.loop.max_angle):.3g} deg"
+
+    def __str__(self) -> str:
+        text = f"rms {1e3 * self.rms:.3g} mm, at most {1e3 * self.largest:.3g} mm"
+        if self.loop.kind != "weld":
+            return text
+        return f"{text}; rms {np.degrees(self.rms_angle):.3g} deg, at most {np.degrees(self.largest_angle):.3g} deg"
+
+
+def loop_gaps(robot: Robot, joint_position: torch.Tensor) -> list[LoopGap]:
+    """The gap of each loop of a robot at joint positions (N, n) [rad or m]."""
+    if not robot.loops or not len(joint_position):
+        return []
+    closures, parts = LoopClosures(robot), list[Array]()
+    for start in range(0, len(joint_position), _CHUNK):
+        gaps = closures.gaps(joint_position[start : start + _CHUNK].double())
+        parts.append(np.array([[x.numpy() for x in gap] for gap in gaps]))
+    sizes = np.concatenate(parts, axis=2)  # (loops, 2, N)
+    rms, largest = np.sqrt(np.square(sizes).mean(axis=2)), sizes.max(axis=2)
+    return [
+        LoopGap(loop, float(r[0]), float(x[0]), float(r[1]), float(x[1]))
+        for loop, r, x in zip(robot.loops, rms, largest, strict=True)
+    ]
+
+
+def require_closed_loops(source: str, joint_position: torch.Tensor, robot: Robot) -> None:
+    """Refuse a log in which the frames of a loop are apart.
+
+    Args:
+        source: its file.
+        joint_position: (N, n) [rad or m].
+        robot: with its loops.
+
+    Raises:
+        LogError: names the loop, how far it is open and what is accepted.
+    """
+    for number, gap in enumerate(loop_gaps(robot, joint_position)):
+        if gap.is_open:
+            accepted = f"{gap.accepted} (its max_gap, max_angle): frames that coincide, and encoders without an offset"
+            found = f"{gap.loop.label} apart by {gap}"
+            raise LogError(source, f"{LOOPS_FIELD}[{number}]", found, accepted)
+
+
+_FAR = 0.1  # rad or m, that joints move between samples which are found from the assembled posture
+_PATH = 20  # steps on the way from there
+_DETERMINED = 1e-6  # least over largest singular value, of the loops' Jacobian by the joints in question
+
+
+def with_loop_joints(log: Log, robot: Robot | None) -> Log:
+    """The log with joints of closed loops that it lacks, if the others determine them.
+
+    Positions are those that close the loops, on a path from the posture nearest to joint positions of 0; velocities and
+    accelerations, where the log has these, follow by differentiation of the constraints. Torques are NaN.
+
+    Raises:
+        LogError: joints in question that the loops do not determine, or loops that do not close.
+    """
+    if robot is None or not robot.loops:
+        return log
+    closures = LoopClosures(robot)
+    missing = [k for k, name in enumerate(robot.joint_names) if name not in log.joint_names]
+    if not missing or not set(missing) <= set(closures.dofs):
+        return log
+    known = [k for k in range(robot.n) if k not in missing]
+    order = [log.joint_names.index(robot.joint_names[k]) for k in known]
+    joints = _Joints(log, robot, closures, known, missing)
+    velocity, acceleration = (None if x is None else x[:, order] for x in (log.joint_velocity, log.joint_acceleration))
+    added = joints.motion(log.joint_position[:, order], velocity, acceleration)
+    arrays: dict[str, Any] = {}
+    for name, array in log.arrays().items():
+        if SHAPES[name] == ("N", "n"):
+            new = added.get(name, np.full((len(log), len(missing)), np.nan))
+            arrays[name] = np.concatenate([array, new], axis=1)
+    return replace(log, joint_names=(*log.joint_names, *(robot.joint_names[k] for k in missing)), **arrays)
+
+
+@dataclass(frozen=True)
+class _Joints:
+    """Joints of a robot that a log has, and those that follow from these; by the robot's order."""
+
+    log: Log
+    robot: Robot
+    closures: LoopClosures
+    known: list[int]
+    missing: list[int]
+
+    def motion(
+        self, position: FloatArray, velocity: FloatArray | None, acceleration: FloatArray | None
+    ) -> dict[str, FloatArray]:
+        """Motion (N, missing) by field, from that of the known joints (N, known)."""
+        q = torch.full((len(position), self.robot.n), torch.nan, dtype=torch.float64)
+        q[:, self.known] = torch.from_numpy(position)
+        finite = torch.isfinite(q[:, self.known]).all(1)
+        if finite.any():
+            q[finite] = self._positions(q[finite])
+        out = {"joint_position": q[:, self.missing].numpy()}
+        if velocity is None:
+            return out
+        v = self._derivative(q, velocity, None)
+        out["joint_velocity"] = v[:, self.missing].numpy()
+        if acceleration is not None:
+            out["joint_acceleration"] = self._derivative(q, acceleration, v)[:, self.missing].numpy()
+        return out
+
+    def _positions(self, q: Tensor) -> Tensor:
+        """Positions (N, n) with the missing joints where the loops close."""
+        known = q[:, self.known].numpy()
+        way = np.cumsum(np.abs(np.diff(known, axis=0, prepend=known[:1])).max(axis=1))
+        at, last = np.unique(way // _FAR, return_index=True, return_inverse=True)[1:]
+        nodes = self._from_assembled(q[at])
+        self._require_determined(nodes)
+        q = q.clone()
+        q[:, self.missing] = nodes[last][:, self.missing]
+        q = torch.cat([self.closures.fitted(part, self.missing) for part in q.split(_CHUNK)])
+        is_open = self._is_open(q)
+        if is_open.any():
+            q[is_open] = self._from_assembled(q[is_open])
+        self._require_closed(q)
+        return q
+
+    def _from_assembled(self, q: Tensor) -> Tensor:
+        """The same, step by step from the posture nearest to joint positions of 0."""
+        assembled, _ = self.closures.closed(torch.zeros(1, self.robot.n, dtype=torch.float64))
+        out, way = assembled.repeat(len(q), 1), (q - assembled)[:, self.known] / _PATH
+        for _ in range(_PATH):
+            out[:, self.known] += way
+            out = self.closures.fitted(out, self.missing)
+        out[:, self.known] = q[:, self.known]
+        return out
+
+    def _is_open(self, q: Tensor) -> Tensor:
+        """In which samples (N,) some loop is farther open than it accepts."""
+        pairs = zip(self.closures.gaps(q), self.robot.loops, strict=True)
+        each = [(gap > loop.max_gap) | (angle > loop.max_angle) for (gap, angle), loop in pairs]
+        return torch.stack(each).any(0)
+
+    def _derivative(self, q: Tensor, known: FloatArray, velocity: Tensor | None) -> Tensor:
+        """Velocities (N, n) from those of the known joints, or accelerations if velocities are given."""
+        out = q.new_zeros(len(q), self.robot.n)
+        out[:, self.known] = torch.from_numpy(known)
+        for start in range(0, len(q), _CHUNK):
+            rows = slice(start, start + _CHUNK)
+            J = self.closures.jacobian(q[rows])[..., : self.robot.n]
+            left = (J @ out[rows, :, None])[..., 0]
+            if velocity is not None:
+                left = left + self.closures.drift(q[rows], velocity[rows])
+            out[rows, self.missing] -= (torch.linalg.pinv(J[..., self.missing]) @ left[..., None])[..., 0]
+        return out
+
+    def _require_determined(self, q: Tensor) -> None:
+        J = self.closures.jacobian(q)[..., self.missing]
+        values = torch.linalg.svdvals(J)
+        if J.shape[1] < len(self.missing) or bool((values[:, -1] <= _DETERMINED * values[:, 0]).all()):
+            names = self._names(self.missing)
+            found = f"{names} of {self.robot.path.name} missing, which its loops do not determine"
+            raise LogError(self.log.source, "joint_names", found, "more joints of these loops")
+
+    def _require_closed(self, q: Tensor) -> None:
+        for number, gap in enumerate(loop_gaps(self.robot, q)) if self._is_open(q).any() else ():
+            if gap.largest > gap.loop.max_gap or gap.largest_angle > gap.loop.max_angle:
+                found = f"{gap.loop.label} apart by {gap}, whatever the positions of {self._names(self.missing)}"
+                accepted = f"{gap.accepted} in every sample: frames that coincide, and encoders without an offset"
+                raise LogError(self.log.source, f"{LOOPS_FIELD}[{number}]", found, accepted)
+
+    def _names(self, joints: Sequence[int]) -> str:
+        return join_names([self.robot.joint_names[k] for k in joints])

@@ -17,9 +17,60 @@ from torchid.problem.extras import ExtraTerms
 from torchid.problem.predict import measured_and_predicted_forces, null_space_components, reading_variance
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
-from torchid.problem.sums_of_squares import SumsOfSquares, root_mean
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, named_sensors
+
+
+class SumsOfSquares:
+    """Sums and sums of squares by row, over the samples in which the row is finite."""
+
+    def __init__(self, rows: int) -> None:
+        self.sum, self.squares, self.count = np.zeros(rows), np.zeros(rows), np.zeros(rows)
+
+    def add(self, x: torch.Tensor, weight: float = 1.0) -> None:
+        """Add samples (N, rows), NaN where unknown, each of which counts as `weight` samples."""
+        values = x.cpu().numpy()
+        known = np.isfinite(values)
+        if not known.all():
+            values = np.where(known, values, 0.0)
+        self.sum += weight * values.sum(0)
+        self.squares += weight * np.einsum("ij,ij->j", values, values)
+        self.count += weight * known.sum(0)
+
+    def add_squares(self, squares: float, count: int) -> None:
+        """Add the sum of squares of one row over `count` samples; their sum stays unknown."""
+        self.squares += squares
+        self.count += count
+
+    def rms(self, rows: slice = slice(None)) -> Array:
+        """Rms row by row, (n_rows,) [N or N m]."""
+        return root_mean(self.squares[rows], self.count[rows])
+
+    def pooled(self, rows: slice) -> float:
+        """Rms over all components of some rows."""
+        count = self.count[rows].sum()
+        return float(np.sqrt(self.squares[rows].sum() / count)) if count else np.nan
+
+    def deviation(self, rows: slice) -> float:
+        """Rms about the mean of each row, over all of them."""
+        known = self.count[rows] > 0
+        count, total = self.count[rows][known], self.sum[rows][known]
+        if not len(count):
+            return np.nan
+        return float(np.sqrt(max((self.squares[rows][known] - total**2 / count).sum(), 0.0) / count.sum()))
+
+    def merge(self, other: SumsOfSquares) -> None:
+        """Add the sums of another."""
+        self.sum += other.sum
+        self.squares += other.squares
+        self.count += other.count
+
+
+def root_mean(squares: Array, count: Array) -> Array:
+    """Square root of a mean, NaN of nothing."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.sqrt(squares / count)
+
 
 WHITENED = "projected_residual"
 """The group of the rows of a fit: whitened, and projected so that nothing unmeasured is in them."""
@@ -194,9 +245,8 @@ class Evaluation:
 
     def summarize(self, measured: ForceSums, errors: ForceSums) -> Metrics:
         """Metrics from sums of squares."""
-        base = self.robot.base_rows
-        rms, size = errors.rms(base, self.robot.n), measured.rms(base, self.robot.n)
-        n = self.robot.n
+        base, n = self.robot.base_rows, self.robot.n
+        rms, size = errors.rms(base, n), measured.rms(base, n)
         joints = slice(base, base + n)
         by_joint, joint_size = errors.rows.rms(joints), measured.rows.rms(joints)
         groups = ERROR_GROUPS if errors.whitened.count.any() else ROW_GROUPS
@@ -218,11 +268,7 @@ class Evaluation:
 
 
 def worse_than_nominal(sets: Mapping[str, tuple[Metrics, Metrics]]) -> list[WorseThanNominal]:
-    """Groups of rows where identified parameters are clearly worse than nominal ones.
-
-    Args:
-        sets: nominal and identified metrics by name of the logs.
-    """
+    """Groups of rows where identified parameters are clearly worse; `sets`: nominal and identified metrics by logs."""
     worse = []
     for logs, (nominal, identified) in sets.items():
         for group in DECISIVE_GROUPS:
@@ -284,7 +330,6 @@ class ForceSums:
     """
 
     def __init__(self, n_rows: int) -> None:
-        """Start empty."""
         self.rows, self.projected, self.whitened = SumsOfSquares(n_rows), SumsOfSquares(1), SumsOfSquares(1)
         self.noise, self.whitened_noise = SumsOfSquares(n_rows), SumsOfSquares(1)
         self.contact_forces = np.zeros(2, dtype=bool)
@@ -294,11 +339,8 @@ class ForceSums:
         """Sums over all parts."""
         out = cls(len(parts[0].rows.squares))
         for part in parts:
-            out.rows.merge(part.rows)
-            out.projected.merge(part.projected)
-            out.whitened.merge(part.whitened)
-            out.noise.merge(part.noise)
-            out.whitened_noise.merge(part.whitened_noise)
+            for name in ("rows", "projected", "whitened", "noise", "whitened_noise"):
+                getattr(out, name).merge(getattr(part, name))
             out.contact_forces |= part.contact_forces
         return out
 
@@ -309,24 +351,14 @@ class ForceSums:
 
     def noise_rms(self, base_rows: int, n: int) -> dict[str, float | None]:
         """Rms of the noise by group of rows, as `rms`; None where it is not known."""
-        joints = self.noise.rms(slice(base_rows, base_rows + n))
-        by_group = {
-            "joint_torque": float(np.nanmean(joints)) if np.isfinite(joints).any() else np.nan,
-            "base_force": self.noise.pooled(slice(0, 3)) if base_rows else np.nan,
-            "base_moment": self.noise.pooled(slice(3, 6)) if base_rows else np.nan,
-            WHITENED: self.whitened_noise.pooled(slice(None)),
-        }
+        by_group = _by_group(self.noise, base_rows, n) | {WHITENED: self.whitened_noise.pooled(slice(None))}
         return {group: finite_or_none(x) for group, x in by_group.items()}
 
     def rms(self, base_rows: int, n: int) -> dict[str, float]:
         """Rms by group of rows, NaN for an empty group, of a robot with `base_rows` and n joints."""
-        joints = self.rows.rms(slice(base_rows, base_rows + n))
         squares, count = self._in_limbs(base_rows + n)
         force, moment = root_mean(squares.sum(1), count.sum(1))
-        return {
-            "joint_torque": float(np.nanmean(joints)) if np.isfinite(joints).any() else np.nan,
-            "base_force": self.rows.pooled(slice(0, 3)) if base_rows else np.nan,
-            "base_moment": self.rows.pooled(slice(3, 6)) if base_rows else np.nan,
+        return _by_group(self.rows, base_rows, n) | {
             "ft_force": float(force),
             "ft_moment": float(moment),
             "nullspace": self.projected.pooled(slice(None)),
@@ -345,6 +377,15 @@ class ForceSums:
         """Squares and their number, (2, 3): forces and moments by axis, of all force/torque sensors in limbs."""
         squares, count = (x[first:].reshape(-1, 2, 3).sum(0) for x in (self.rows.squares, self.rows.count))
         return squares, count
+
+
+def _by_group(sums: SumsOfSquares, base_rows: int, n: int) -> dict[str, float]:
+    joints = sums.rms(slice(base_rows, base_rows + n))
+    return {
+        "joint_torque": float(np.nanmean(joints)) if np.isfinite(joints).any() else np.nan,
+        "base_force": sums.pooled(slice(0, 3)) if base_rows else np.nan,
+        "base_moment": sums.pooled(slice(3, 6)) if base_rows else np.nan,
+    }
 
 
 def finite_or_none(x: float) -> float | None:

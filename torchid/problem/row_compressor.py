@@ -118,7 +118,6 @@ class _Sum:
 
     @classmethod
     def of_nothing(cls, levels: ColumnLevels) -> _Sum:
-        """The sum of no rows."""
         return cls(levels, np.zeros_like(levels.T_unit))
 
     def add(self, X: Array) -> bool:
@@ -190,7 +189,6 @@ class RowCompressor:
     """
 
     def __init__(self) -> None:
-        """No rows yet."""
         self._factor: TriangularFactor | None = None
         # of this factor alone: it is the same to the last bit, whatever the worker had before
         self._levels: dict[tuple[int, ...], ColumnLevels] = {}

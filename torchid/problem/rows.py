@@ -15,12 +15,10 @@ from torchid.problem.chunk_dynamics import ChunkDynamics, ChunkKinematics, Works
 from torchid.problem.contact_rows import ContactRows, contact_rows, whitened_bases
 from torchid.problem.contact_state import ContactState, ContactStateLayout, ContactStateLayouts, RowColumns
 from torchid.problem.extra_columns import KnownTorques, dof_extra_column, extra_columns
-from torchid.problem.extras import ExtraTerms, list_extras
-from torchid.problem.loop_forces import MotorForces
-from torchid.problem.noise_groups import NoiseGroups
+from torchid.problem.extras import ExtraTerms, NoiseGroups, list_extras
 from torchid.problem.row_blocks import RowBlock, moved_rows, multiply_wrenches, subtract_payload
 from torchid.problem.samples import Samples
-from torchid.problem.wrench_rows import FramePoses
+from torchid.problem.wrench_rows import FramePoses, MotorForces
 from torchid.regressor.columns import all_wrench_columns
 from torchid.regressor.kinematics import body_states, joint_motion, joint_screw_axes
 from torchid.regressor.regressor import (

@@ -17,9 +17,9 @@ from torchid.logs.log import FORCE_NORMAL, FloatArray, normalize_normals
 from torchid.logs.preprocess import unloaded_readings
 from torchid.logs.spill import MappedPages
 from torchid.parameters import WRENCH_COMPONENTS, Array
+from torchid.problem import log_joints
 from torchid.problem.base_motion import BaseMotion, base_motion, imu_pose, position_for_moments
-from torchid.problem.closed_loops import FOLLOW, require_closed_loops
-from torchid.problem.log_joints import columns_in_order, recorded_torques, require_limb_sensors
+from torchid.problem.log_joints import FOLLOW, columns_in_order, recorded_torques
 from torchid.problem.motion_noise import MotionNoise, bind_motion_noise
 from torchid.regressor import Motion
 from torchid.regressor.kinematics import GRAVITY_WORLD, rotation_matrix
@@ -217,7 +217,7 @@ def bind_log(log: Log, robot: Robot, contacts: Sequence[Contact], required: Sens
     """
     order = joint_order(log, robot)
     position, velocity, acceleration = (_joints(log, name, order) for name in _JOINT_FIELDS)
-    require_closed_loops(log.source, position, robot)
+    log_joints.require_closed_loops(log.source, position, robot)
     base = replace(base_motion(log, robot), position=position_for_moments(log, robot, contacts))
     chosen, active = _contacts(log, robot, contacts)
     if log.contact_wrench_world is not None and contacts and base.quat_xyzw is None and not robot.fixed_base:
@@ -250,7 +250,7 @@ def bind_log(log: Log, robot: Robot, contacts: Sequence[Contact], required: Sens
         motion_noise=bind_motion_noise(log, order, robot.fixed_base, imu),
     )
     if required is not None:
-        require_limb_sensors(log, robot, required)
+        log_joints.require_limb_sensors(log, robot, required)
         require_forces(samples, robot, contacts, required)
     return samples
 

@@ -91,7 +91,6 @@ def _is_masked(y: Tensor) -> bool:
 
 
 def _are_masked(count: int, above: int, below: int) -> bool:
-    """The same of so many readings, of which some are above and below 0."""
     zero = count - above - below
     return zero > _MASKED_SHARE * count and min(above, below) < _ONE_SIDED * count
 

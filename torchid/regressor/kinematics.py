@@ -39,7 +39,6 @@ class Motion:
         return self.joint_position.shape[0]
 
     def __getitem__(self, index: slice | Tensor) -> Motion:
-        """The same motion at fewer samples."""
         return self._each(lambda x: x[index])
 
     def to(self, *args: Any, **kwargs: Any) -> Motion:

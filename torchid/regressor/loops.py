@@ -125,6 +125,12 @@ def _rotation_vector(R: Tensor) -> Tensor:
     return sine * torch.where(size > 0.0, _rotation_angle(R) / size.clamp_min(tiny), 1.0)
 
 
+def _damped(matrix: Tensor) -> Tensor:
+    """Products (B, k, k) of Jacobians with a little added to the diagonal, as redundant rows make them singular."""
+    unit = torch.eye(matrix.shape[1], dtype=matrix.dtype)
+    return matrix + _DAMPING * matrix.diagonal(dim1=1, dim2=2).sum(1)[:, None, None] * unit
+
+
 def _sines(R: Tensor) -> Tensor:
     return 0.5 * torch.stack([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
 
@@ -136,7 +142,6 @@ class LoopClosures:
     """
 
     def __init__(self, robot: Robot) -> None:
-        """Look the loops up in the robot's tree."""
         self.tree = KinematicTree(robot)
         self.geometries = [LoopGeometry.of(loop, robot, self.tree) for loop in robot.loops]
         self.dofs = sorted({dof for loop in self.geometries for dof in loop.dofs(self.tree)})
@@ -193,29 +198,21 @@ class LoopClosures:
         kept: Array = U[:, is_significant(values, KINEMATIC_TOLERANCE)].T @ loop.unit_wrenches
         return kept
 
-    def closed(self, joint_position: Tensor, free: Sequence[int] | None = None) -> tuple[Tensor, Tensor]:
-        """Joint positions near others at which the loops are closed, by Gauss-Newton steps of least norm.
-
-        Args:
-            joint_position: (B, n) [rad or m] to start from.
-            free: joints that move; None for all of them.
+    def closed(self, joint_position: Tensor) -> tuple[Tensor, Tensor]:
+        """Where loops are closed near joint positions (B, n) [rad or m], by Gauss-Newton steps of least norm.
 
         Returns:
             Positions (B, n), and whether the loops are closed there, (B,) bool; others may be anywhere.
         """
-        q, moving = joint_position.clone(), list(range(self.tree.n)) if free is None else list(free)
+        q = joint_position.clone()
         for _ in range(_MOST_STEPS):
             gap = self.deviations(q)
             if bool((gap.abs().amax(1) < _CLOSED).all()):
                 break
-            J = self.jacobian(q)[:, :, moving]
-            gram = J @ J.mT  # singular where rows are redundant
-            damped = gram + _DAMPING * gram.diagonal(dim1=1, dim2=2).sum(1)[:, None, None] * torch.eye(
-                gram.shape[1], dtype=q.dtype
-            )
-            step = (J.mT @ torch.linalg.solve(damped, gap[..., None]))[..., 0]
+            J = self.jacobian(q)[:, :, : self.tree.n]
+            step = (J.mT @ torch.linalg.solve(_damped(J @ J.mT), gap[..., None]))[..., 0]
             size = step.abs().amax(1, keepdim=True)
-            q[:, moving] += step * (_LARGEST_STEP / size.clamp_min(_LARGEST_STEP))
+            q += step * (_LARGEST_STEP / size.clamp_min(_LARGEST_STEP))
         return q, self.deviations(q).abs().amax(1) < _CLOSED
 
     def fitted(self, joint_position: Tensor, free: Sequence[int]) -> Tensor:
@@ -223,11 +220,7 @@ class LoopClosures:
         q, moving = joint_position.clone(), list(free)
         for _ in range(_MOST_STEPS):
             J, gap = self.jacobian(q)[:, :, moving], self.deviations(q)
-            normal = J.mT @ J
-            damped = normal + _DAMPING * normal.diagonal(dim1=1, dim2=2).sum(1)[:, None, None] * torch.eye(
-                len(moving), dtype=q.dtype
-            )
-            step = torch.linalg.solve(damped, J.mT @ gap[..., None])[..., 0]
+            step = torch.linalg.solve(_damped(J.mT @ J), J.mT @ gap[..., None])[..., 0]
             size = step.abs().amax(1, keepdim=True)
             q[:, moving] += step * (_LARGEST_STEP / size.clamp_min(_LARGEST_STEP))
             if bool((size < _STANDS).all()):

@@ -68,18 +68,9 @@ def versions() -> dict[str, str]:
     return out | {"system": platform.platform()}
 
 
-def _page_available() -> bool:
-    """Whether the libraries of a page are installed."""
-    return find_spec("plotly") is not None and find_spec("jinja2") is not None
-
-
 def require_page() -> None:
-    """Refuse to make a page without its libraries.
-
-    Raises:
-        InputError: they are not installed.
-    """
-    if not _page_available():
+    """Refuse to make a page without its libraries. Raises InputError: they are not installed."""
+    if find_spec("plotly") is None or find_spec("jinja2") is None:
         raise InputError("", "report", "plotly or jinja2 is not installed", how_to_install("report"))
 
 

@@ -16,8 +16,8 @@ from torchid.estimators.least_squares import FIXED, IDENTIFIED
 from torchid.logs.time_range import log_title
 from torchid.parameters import INERTIAL, PARAMETERS, Array
 from torchid.report.figure_style import CATEGORY_COLORS, IDENTIFIED_COLOR, MEASURED_COLOR, NOISE_COLOR, NOMINAL_COLOR
+from torchid.report.forces import packed
 from torchid.report.parameter_figures import INTERVAL
-from torchid.report.traces import packed
 
 Figure = dict[str, Any]
 

@@ -37,12 +37,7 @@ class RunEvents:
     """
 
     def __init__(self, folder: Path, since: int | None = None) -> None:
-        """Open a new event file.
-
-        Args:
-            folder: where it goes.
-            since: first step of earlier event files in the folder that is overwritten.
-        """
+        """Open a new event file; `since`: first step of earlier event files in the folder that is overwritten."""
         self._writer = SummaryWriter(str(folder), purge_step=since)
 
     def write_layout(self, bodies: Sequence[str], by_epoch: Sequence[str] | None = None) -> None:

@@ -53,20 +53,12 @@ def read_xml(path: Path, root: str | None = None) -> etree._ElementTree:
 
 
 def file_kind(path: Path) -> str:
-    """What a robot's file is: one of the values of `ROOTS`.
-
-    Raises:
-        UrdfError: as `read_xml`.
-    """
+    """What a robot's file is: one of the values of `ROOTS`. Raises UrdfError: as `read_xml`."""
     return ROOTS[str(read_xml(path).getroot().tag)]
 
 
 def is_mjcf(path: Path) -> bool:
-    """Whether a robot's file is MJCF rather than a URDF.
-
-    Raises:
-        UrdfError: as `read_xml`.
-    """
+    """Whether a robot's file is MJCF rather than a URDF. Raises UrdfError: as `read_xml`."""
     return file_kind(path) == ROOTS["mujoco"]
 
 

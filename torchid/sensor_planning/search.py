@@ -28,6 +28,7 @@ from torchid.sensor_planning.demands import (
 
 _DEVICES, _COMBINATIONS, _BATCH = 5, 100_000, 4096
 _MEMORY = 2**22  # numbers in one batch of the enumeration
+_MOST_FREE = 14  # candidates of which all sets are enumerated
 _EXACT = 1e-7  # relative accuracy of the integer program
 
 
@@ -80,7 +81,6 @@ def all_minimal_sets(
     candidates: Sequence[Candidate],
     keep: Iterable[Candidate] = (),
     exclude: Iterable[Candidate] = (),
-    limit: int = 14,
 ) -> list[tuple[Candidate, ...]] | None:
     """Every minimal sufficient set: without any one of its candidates, except kept ones, it does not suffice.
 
@@ -91,17 +91,16 @@ def all_minimal_sets(
         candidates: to choose from.
         keep: in every set.
         exclude: in none.
-        limit: largest number of candidates, without kept ones, whose sets are enumerated.
 
     Returns:
-        The sets by size; None beyond the limit.
+        The sets by size; None of more than `_MOST_FREE` candidates, kept ones aside.
 
     Raises:
         SensorError: as `_usable_candidates`.
     """
     kept, usable = _usable_candidates(demands, candidates, keep, exclude)
     free = [c for c in usable if c not in kept]
-    if len(free) > limit:
+    if len(free) > _MOST_FREE:
         return None
     numbers = np.arange(2 ** len(free))
     member = (numbers[:, None] >> np.arange(len(free))) & 1 == 1  # (sets, candidates)

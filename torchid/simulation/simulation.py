@@ -26,11 +26,7 @@ _REPORT_S = 0.25  # simulated seconds between two checks of whether the robot st
 
 
 def set_up_simulation(config: SimulationConfig) -> Simulation:
-    """Put the robot on its feet.
-
-    Raises:
-        InputError: the URDF, the feet or the posture cannot be simulated.
-    """
+    """Put the robot on its feet. Raises InputError: the URDF, the feet or the posture cannot be simulated."""
     require_kind(config.robot)
     feet = find_feet(config.feet, config.robot.path)
     plant = Plant(config.robot.path, feet, config.physics_hz, config.friction.levels, config.robot)
@@ -49,11 +45,7 @@ class Simulation:
     stance: Stance
 
     def require_support(self, support: BoolArray, field: str) -> None:
-        """Require that feet, (F,) bool, can support a robot.
-
-        Raises:
-            InputError: their contact points lie on a line.
-        """
+        """Require that feet, (F,) bool, can support a robot. Raises InputError: their contact points lie on a line."""
         standing = zip(self.feet, self.stance.feet, self.stance.rotations, support, strict=True)
         points = [middle + foot.arms @ R.T for foot, middle, R, on in standing if on]
         if not points or not form_polygon(np.concatenate(points)):
@@ -194,11 +186,7 @@ class Stability:
     unloaded: tuple[float, ...]
 
     def require_within(self, bounds: BoundsConfig, motion: str) -> None:
-        """Require that the robot stayed within the bounds of standing.
-
-        Raises:
-            InputError: a bound is broken.
-        """
+        """Require that the robot stayed within the bounds of standing. Raises InputError: a bound is broken."""
         for found, allowed in (
             (f"base height changes by {self.height_change:.3g} m", self.height_change <= bounds.height_m),
             (f"a foot slips by {1e3 * self.slip:.3g} mm", self.slip <= bounds.slip_m),
@@ -368,11 +356,7 @@ def _loaded(wrench: Array, threshold: float) -> BoolArray:
 
 
 def _require_field(log: Log, name: str) -> Array:
-    """A field of an exact log, which must have it.
-
-    Raises:
-        LogError: the log lacks it.
-    """
+    """A field of an exact log, which must have it. Raises LogError: the log lacks it."""
     values: Array | None = getattr(log, name)
     if values is None:
         raise LogError(log.source, name, "missing", "an exact log that torchid simulate wrote")

@@ -106,7 +106,6 @@ class Followers:
     """Joints of a compiled model that follow others."""
 
     def __init__(self, model: mujoco.MjModel, mimics: Mapping[str, Mimic]) -> None:
-        """Look them up."""
         joints = [(model.joint(name), model.joint(mimic.master)) for name, mimic in mimics.items()]
         self.at, self.rate, self.master_at, self.master_rate = (
             np.array([int(getattr(pair[k], key)[0]) for pair in joints], dtype=int)

@@ -36,12 +36,7 @@ def print_analysis(analysis: Analysis) -> None:
 
 
 def analysis_lines(analysis: Analysis, width: int) -> list[str]:
-    """The answer, in lines of at most so many columns, but for names that are longer.
-
-    Args:
-        analysis: a finished one.
-        width: of the terminal.
-    """
+    """The answer, in lines of at most so many columns, but for names that are longer."""
     scenarios = sorted(analysis.scenarios, key=lambda one: -_lost(one))
     lines = [*wrap_words(_headline(scenarios), width), ""]
     if len(scenarios) == 1:

@@ -21,12 +21,7 @@ _FEWEST_ROWS = 4  # of the table of logs: empty line, heading, a log, how many o
 
 
 def print_checks(checked: Sequence[Checked], written: Sequence[str | None]) -> None:
-    """Print the answer for the terminal's width.
-
-    Args:
-        checked: logs with findings.
-        written: files that have all of it, if any.
-    """
+    """Print the answer for the terminal's width; `written`: files that have all of it, if any."""
     print("\n".join(check_lines(checked, written, terminal_width())))
 
 

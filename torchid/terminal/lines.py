@@ -51,11 +51,6 @@ def print_labelled(label: str, text: str) -> None:
     print("\n".join(labelled(label, text, terminal_width())))
 
 
-def _table_lines(table: Table, width: int) -> list[str]:
-    """Lines of a table, not wider than so many columns."""
-    return [line.rstrip() for line in table_text(table, width).splitlines()]
-
-
 def column_lines(
     names: tuple[str, Sequence[str]], columns: Sequence[tuple[str, Sequence[str]]], width: int
 ) -> list[str]:
@@ -74,7 +69,7 @@ def column_lines(
             table.add_column(Text(heading), justify="right", no_wrap=True)
         for name, *cells in zip(names[1], *(cells for _, cells in shown), strict=True):
             table.add_row(Text(one_line(name)), *(Text(cell) for cell in cells))
-        lines = _table_lines(table, _ANY_WIDTH)
+        lines = [line.rstrip() for line in table_text(table, _ANY_WIDTH).splitlines()]
         if len(shown) <= 1 or max(map(len, lines)) <= width:
             return lines
         shown.pop()

@@ -1,17 +1,123 @@
-"""What commands that run MuJoCo print: how the robot stood (`simulate`), how far it drifts (`replay`)."""
+"""What commands on a run print, `evaluate`, `sample` and `replay`, and `simulate` of how the robot stood."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict
 
+import numpy as np
+
+from torchid.commands.answer import Judged
+from torchid.commands.evaluate import EvaluatedRun
 from torchid.commands.replay import Replay
+from torchid.commands.sample import DrawnSamples
 from torchid.commands.simulate import nominal_name, simulated_balls
 from torchid.config import SimulationConfig
 from torchid.errors import format_count
-from torchid.report.tables import print_tables, stability_table, terminal_width
+from torchid.parameters import COULOMB, MASS, PARAMETERS, PER_BODY, Array
+from torchid.problem.metrics import describe_worse, worse_than_nominal
+from torchid.report.parameter_files import table_of_draws
+from torchid.report.tables import error_tables, print_tables, stability_table, terminal_width
 from torchid.simulation import Stability
-from torchid.terminal.lines import LABEL, LINES, column_lines, labelled, print_rolling, wrap_words
+from torchid.terminal.lines import LABEL, LINES, column_lines, error_lines, labelled, print_rolling, wrap_words
+
+MOST_LOGS = 8
+"""Logs of which a sentence is printed each: two lines at 80 columns, within a screen."""
+
+_ATTENTION_LINES = 3
+
+
+def print_evaluation(evaluated: EvaluatedRun) -> None:
+    """Print the answer for the terminal's width."""
+    print("\n".join(evaluation_lines(evaluated, terminal_width())))
+
+
+def evaluation_lines(evaluated: EvaluatedRun, width: int) -> list[str]:
+    """A sentence by log, the worst first, and of a single log the errors; lines of at most so many columns.
+
+    Args:
+        evaluated: of one log or several.
+        width: of the terminal.
+    """
+    of = evaluated.robot.format
+    judged = [Judged(name, pair.nominal, pair.identified, of) for name, pair in evaluated.metrics.items()]
+    judged.sort(key=_worst, reverse=True)
+    lines = [line for one in judged[:MOST_LOGS] for line in wrap_words(_sentence(one), width, "  ")]
+    if len(judged) > MOST_LOGS:
+        lines.append(f"and {len(judged) - MOST_LOGS} logs that are predicted better than these: --verbose")
+    if len(judged) == 1:
+        lines += error_lines(judged[0].shown_errors(), width, of)
+    if (far := evaluated.far_off()) is not None:
+        lines += labelled("attention", far, width, _ATTENTION_LINES)
+    left_out = sum(evaluated.excluded.values())
+    if left_out:
+        lines.append(f"{'left out':{LABEL}}{left_out} samples that torchid check rejects")
+    return [*lines, f"{'written to':{LABEL}}{evaluated.output}"]
+
+
+def print_all_errors(evaluated: EvaluatedRun) -> None:
+    """Print the errors of all logs by group of rows."""
+    print_tables(*error_tables(evaluated.metrics, evaluated.robot.format))
+    print(f"{'written to':{LABEL}}{evaluated.output}")
+
+
+def _sentence(one: Judged) -> str:
+    worse = worse_than_nominal({one.text: (one.nominal, one.identified)})
+    return f"WORSE THAN {one.of}: {describe_worse(worse, one.of)}" if worse else one.headline()
+
+
+def _worst(one: Judged) -> float:
+    """The largest error of a group as a share of the URDF's."""
+    return max((after / before if before else 1.0 for _, before, after, _ in one.errors()), default=0.0)
+
+
+_ENDS = (0.025, 0.5, 0.975)
+_MOST_PARAMETERS = 5  # bodies and joints in the answer
+
+
+def print_samples(drawn: DrawnSamples, verbose: bool = False) -> None:
+    """Print the answer for the terminal's width; `verbose`: with all parameters."""
+    print("\n".join(sample_lines(drawn, terminal_width(), verbose)))
+
+
+def sample_lines(drawn: DrawnSamples, width: int, verbose: bool = False) -> list[str]:
+    """A sentence, and the ranges that are widest; lines of at most so many columns."""
+    fitted, table = drawn.fitted, table_of_draws(drawn.samples)
+    total = np.quantile(table[:, MASS : len(fitted.posterior.nominal) : PER_BODY].sum(axis=1), _ENDS)
+    lines = wrap_words(
+        f"{format_count(len(table), 'robot')} that can exist; 95 % of them weigh {total[0]:.4g} to {total[2]:.4g} kg. "
+        f"Prior: nominal bodies may be off by {100.0 * drawn.prior_error:.3g} % (--prior-error).",
+        width,
+        "  ",
+    )
+    found = fitted.nominal_error
+    if found is not None and found.prior_is_narrow and drawn.prior_error < found.value:
+        lines += wrap_words(f"  {found}: ranges are too narrow; --prior-error auto takes that.", width, "  ")
+    numbers = _shown(drawn, table, verbose)
+    ranges = np.quantile(table[:, numbers], _ENDS, axis=0)
+    names = [fitted.parameter_names[number] for number in numbers]
+    columns = [
+        (title, [f"{x:.4g}" for x in row]) for title, row in zip(("2.5 %", "median", "97.5 %"), ranges, strict=True)
+    ]
+    lines += column_lines(("widest, in SI units" if not verbose else "parameter", names), columns, width)
+    where = "no file: --output samples.npz, ranges.json or, with --format urdf, a folder"
+    return [*lines, f"{'written to':{LABEL}}{where if drawn.output is None else drawn.output}"]
+
+
+def _shown(drawn: DrawnSamples, table: Array, verbose: bool) -> list[int]:
+    """Numbers of the parameters that are shown: of masses and Coulomb friction those that range most."""
+    posterior = drawn.fitted.posterior
+    if verbose:
+        return [*np.flatnonzero(posterior.free).tolist(), *range(len(posterior.nominal), table.shape[1])]
+    relative = np.zeros(len(posterior.nominal))
+    relative[posterior.free] = (table.std(axis=0)[: len(relative)] / posterior.scale)[posterior.free]
+    out = []
+    for parameter in (MASS, COULOMB):
+        of_bodies = np.arange(parameter, len(relative), len(PARAMETERS))
+        widest = of_bodies[np.argsort(-relative[of_bodies], kind="stable")][:_MOST_PARAMETERS]
+        out += sorted(number for number in widest.tolist() if relative[number] > 0.0)
+    return [*out, *range(len(posterior.nominal), min(table.shape[1], len(posterior.nominal) + _MOST_PARAMETERS))]
+
 
 _TEXT_LINES = 2
 
@@ -99,7 +205,7 @@ def replay_lines(replayed: Replay, width: int, verbose: bool = False) -> list[st
         width: of the terminal.
         verbose: with all joints.
     """
-    lines = wrap_words(_sentence(replayed), width, "  ")
+    lines = wrap_words(_drift(replayed), width, "  ")
     rows = [(name, who) for name in replayed.at(replayed.window) for who in (replayed.of, "identified")]
     columns = [
         (f"{time:g} s", [f"{replayed.at(time)[name][who == 'identified']:.4g}" for name, who in rows])
@@ -120,7 +226,7 @@ def replay_lines(replayed: Replay, width: int, verbose: bool = False) -> list[st
     return lines
 
 
-def _sentence(replayed: Replay) -> str:
+def _drift(replayed: Replay) -> str:
     """How much less the identified robot drifts."""
     shares = [
         f"{name.partition(' [')[0]} {100.0 * after / before:.2g} %" if before else name

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.logs.base_proposals import vertical_in_base
-from torchid.logs.file_samples import FileSample, stated_names
 from torchid.logs.gaps import turn_jumps
-from torchid.logs.joint_orders import names_by_number
+from torchid.logs.unitree import names_by_number
 from torchid.logs.units import OF_JOINTS, UNITS, unit_factor
+from torchid.proposals.base import vertical_in_base
+from torchid.proposals.file_samples import FileSample, stated_names
 from torchid.rounding import STD_PER_MAD
 
 _STEP = (2e-4, 0.2)  # [s]: of recordings

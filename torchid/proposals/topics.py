@@ -9,14 +9,13 @@ import numpy as np
 
 from torchid.errors import format_count
 from torchid.logs.column_proposals import is_desired
-from torchid.logs.file_samples import TopicSample
-from torchid.logs.joint_orders import JOINT_ORDERS, suitable_orders, usual_order
 from torchid.logs.log import NORM_TOLERANCE
 from torchid.logs.name_matching import KnownRobot, match_joints, match_names, spelled
-from torchid.logs.number_proposals import threshold
-from torchid.logs.proposed_map import MapProposal
-from torchid.logs.ros_low_state import LowState
 from torchid.logs.ros_messages import ContactFlag, Imu, JointStates, NormalForce, Odometry, Wrench
+from torchid.logs.unitree import JOINT_ORDERS, LowState, suitable_orders, usual_order
+from torchid.proposals.column_groups import MapProposal
+from torchid.proposals.file_samples import TopicSample
+from torchid.proposals.numbers import threshold
 
 _DECODERS = (JointStates, LowState, Imu, Odometry, Wrench, NormalForce, ContactFlag)
 USED_TYPES: frozenset[str] = frozenset(name for decoder in _DECODERS for name in decoder.types)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from torchid.logs.map_proposals import propose_map
 from torchid.logs.name_matching import KnownRobot
-from torchid.logs.proposed_map import MapProposal
+from torchid.proposals.column_groups import MapProposal
+from torchid.proposals.maps import propose_map
 
 WEIGHT, N = 300.0, 400
 TIME = 0.005 * np.arange(N)

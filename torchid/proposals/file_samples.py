@@ -136,11 +136,7 @@ class TopicSample:
 
 
 def read_bag_sample(path: Path, types: Collection[str]) -> dict[str, TopicSample]:
-    """Every topic of a bag, and messages of those that have one of some types.
-
-    Raises:
-        LogError: the bag is damaged.
-    """
+    """Every topic of a bag, and messages of those that have one of some types. Raises LogError: the bag is damaged."""
     files = list_bag_files(path)
     channels = list_channels(files)
     raw: dict[str, list[bytes]] = {name: [] for name, channel in channels.items() if channel.type in types}

@@ -1,4 +1,4 @@
-"""Foreign columns that belong together: those that differ in a name, a number or an axis, those of one array."""
+"""Foreign columns that belong together, as those that differ in a name, number or axis, and a map proposed for them."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from torchid.logs.arrays import TRANSPOSED
 from torchid.logs.column_map import PLACEHOLDER
 from torchid.logs.column_proposals import is_current, propose_field
-from torchid.logs.file_samples import FileSample
 from torchid.logs.name_matching import SUFFIXES, KnownRobot, joints_by_place, spelled, within
 from torchid.logs.units import OF_JOINTS, quantities_with, split_unit
+from torchid.proposals.file_samples import FileSample
 
 _NUMBER = re.compile(r"\d+")
 _AXIS = re.compile(
@@ -307,3 +307,39 @@ def _has_pose(array: NDArray[Any]) -> bool:
     length = np.linalg.norm(array[:, 3:7], axis=1)
     known = length[np.isfinite(length)]
     return bool(len(known)) and float(np.abs(known - 1.0).max()) < _UNIT
+
+
+_PART = re.compile(r"\[\d*:\d*\]$")  # columns of an array
+
+
+@dataclass
+class MapProposal:
+    """What `logs.columns`, or `logs.topics`, may say of a log.
+
+    Attributes:
+        columns: the map, as it stands in a file.
+        notes: what was guessed, by key.
+        left_out: columns that it ignores.
+        key: columns or topics.
+        fields: of the log, that a map of topics gives.
+        lacking: joints of the robot without columns, if most have some.
+        partial: by field that is left out for it, joints that have columns of other fields alone.
+        like_torques: columns that no field takes, one for each joint, of a log without torques.
+    """
+
+    columns: dict[str, Any] = field(default_factory=dict)
+    key: str = "columns"
+    fields: set[str] = field(default_factory=set)
+    notes: dict[str, str] = field(default_factory=dict)
+    left_out: list[str] = field(default_factory=list)
+    lacking: list[str] = field(default_factory=list)
+    partial: dict[str, list[str]] = field(default_factory=dict)
+    like_torques: list[Family] = field(default_factory=list)
+
+    def leave_out(self, name: str) -> None:
+        """Ignore the columns of an entry instead of reading them, but for those that are a part of an array."""
+        entry = self.columns.pop(name)
+        texts = entry["columns"].values() if "columns" in entry else [entry["column"]]
+        patterns = {PLACEHOLDER.sub("*", text) for text in texts if not _PART.search(text)}
+        if ignored := sorted({*self.columns.pop("ignore", []), *patterns}):
+            self.columns["ignore"] = ignored

@@ -11,19 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import excerpt
-from torchid.logs.base_proposals import field_of_base, find_angles, is_beside, order_of_quaternion
-from torchid.logs.base_velocities import settle_velocities
-from torchid.logs.column_groups import Family, find_families, split_arrays, split_stamps
 from torchid.logs.column_map import fits
 from torchid.logs.column_proposals import is_desired, propose_field
 from torchid.logs.columns import is_column
-from torchid.logs.field_matching import MOMENT, FieldMatcher
-from torchid.logs.file_samples import FileSample, increases, listed_order, side_by_side, with_samples_first
-from torchid.logs.foot_proposals import find_foot_readings, frame_of_forces
-from torchid.logs.joint_orders import JOINT_ORDERS, numbered_joints, usual_order
 from torchid.logs.log import SHAPES, VARIANTS, WRENCHES
 from torchid.logs.name_matching import SUFFIXES, KnownRobot
-from torchid.logs.number_proposals import (
+from torchid.logs.unitree import JOINT_ORDERS, numbered_joints, usual_order
+from torchid.logs.units import IN_DEGREES, quantities_of, quantities_with, unit_factor
+from torchid.proposals.base import field_of_base, find_angles, is_beside, order_of_quaternion, settle_velocities
+from torchid.proposals.column_groups import Family, MapProposal, find_families, split_arrays, split_stamps
+from torchid.proposals.fields import MOMENT, FieldMatcher, find_foot_readings, frame_of_forces
+from torchid.proposals.file_samples import FileSample, increases, listed_order, side_by_side, with_samples_first
+from torchid.proposals.numbers import (
     LEAST_GRAVITY,
     UnitProposer,
     are_states,
@@ -31,8 +30,6 @@ from torchid.logs.number_proposals import (
     step_of_stamps,
     threshold,
 )
-from torchid.logs.proposed_map import MapProposal
-from torchid.logs.units import IN_DEGREES, quantities_of, quantities_with, unit_factor
 
 _GAINS = re.compile(r"\b(kp|kd)\b", re.IGNORECASE)
 _LAW = {"joint_position": "position", "joint_velocity": "velocity", "joint_torque": "feed_forward"}
