@@ -1,4 +1,4 @@
-"""Feet that stand by their flags: what their motion shows of orientation, joints, gyroscope, names, radii and the base's pose."""
+"""Feet that stand by their flags: what they show of orientation, joints, gyroscope, names, radii and the base's pose."""
 
 from __future__ import annotations
 
