@@ -1,4 +1,4 @@
-"""Feet that stand by their flags: what they show of orientation, joints, gyroscope, names, radii and the base's pose."""
+"""Feet that stand: what they show of orientation, joints, gyroscope, names, radii and the base's pose."""
 
 from __future__ import annotations
 
@@ -166,10 +166,7 @@ def _pose_finding(x: FloatArray, slip: float, left: float) -> Finding:
     parts += [f"turned about it by ({turn}) degrees"] if x[3:6].any() else []
     parts += [f"{1e3 * abs(x[6]):.0f} ms {'late' if x[6] > 0.0 else 'early'}"] if x[6] else []
     text = f"standing feet move {100 * slip:.2g} % as much as the base above them, {100 * left:.2g} % of that if the"
-    advice = (
-        "give the pose of the base link itself: a frame where the markers are may be robot.base_link, and files that"
-    )
-    advice += " are late have shift_s"
+    advice = "give the pose of the base link itself; shift_s delays files of a log"
     return Finding("frame", SUSPICIOUS, "base_quat_xyzw", f"{text} base's pose is {join_names(parts)}", advice)
 
 
