@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from demo import shortened_demo
-from hostile_commands import Commands, commands
+from hostile_commands import Commands
 from made_once import made_once
 from run_figures import EVENTS, draw, draw_nothing
 from synthetic import load
@@ -107,7 +107,6 @@ def place() -> Iterator[Path]:
 
 
 @pytest.fixture(scope="session")
-def server() -> Iterator[Commands]:
+def server() -> Commands:
     """What runs commands in processes of their own."""
-    with commands() as running:
-        yield running
+    return Commands()

@@ -76,8 +76,11 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
     """The parsed command line; overrides may also follow options, which argparse does not support."""
     parser = _parser()
     options, rest = parser.parse_known_args(arguments)
-    if rest and (not hasattr(options, "overrides") or any(text.startswith("-") for text in rest)):
-        parser.error(f"unrecognized arguments: {' '.join(rest)}")
+    keys = [text.lstrip("-").partition("=")[0].replace("-", "_") for text in rest if text.startswith("-")]
+    has_settings = hasattr(options, "overrides")
+    if keys or (rest and not has_settings):
+        accepted = f"; accepted: settings of the file as {keys[0]}=VALUE" if has_settings else ""
+        parser.error(f"unrecognized arguments: {' '.join(rest)}{accepted}")
     if rest:
         options.overrides = [*options.overrides, *rest]
     return options
@@ -106,9 +109,7 @@ def _add_fits(commands: _Commands) -> None:
     """Commands that take an experiment file: before a fit, and the fit."""
     check = commands.add_parser("check", help=_CHECK, description=_CHECK)
     _add_file(check, "experiment file (YAML), or a log", "with an experiment file")
-    check.add_argument(
-        "--urdf", metavar="FILE", help="robot of a log, URDF or MJCF; without it, checks against a robot are skipped"
-    )
+    check.add_argument("--urdf", metavar="FILE", help="robot of a log, URDF or MJCF; without it checks are fewer")
     check.add_argument("--base-link", metavar="LINK", help="base of that robot, if it is not the URDF's root")
     check.add_argument("--fixed-base", action="store_true", help="the base of that robot is fixed")
     _add_maps(check)
@@ -128,9 +129,7 @@ def _add_uses_of_runs(commands: _Commands) -> None:
     """Commands that take the folder of a run."""
     evaluate = commands.add_parser("evaluate", help=_EVALUATE, description=_EVALUATE)
     evaluate.add_argument("run", help="run folder")
-    evaluate.add_argument(
-        "--log", action="append", required=True, metavar="FILE", help="log to evaluate; may be repeated"
-    )
+    evaluate.add_argument("--log", action="append", required=True, metavar="FILE", help="log; may be repeated")
     evaluate.add_argument("--output", metavar="FOLDER", help="folder to write (default: RUN/evaluation/LOG)")
     evaluate.add_argument("--overwrite", action="store_true", help="replace an earlier evaluation in this folder")
     evaluate.add_argument("--device", help="device, by default that of the run: cpu, cuda, cuda:0, ...")

@@ -143,7 +143,7 @@ def check_fields(names: Iterable[str | bytes], count: int) -> None:
 def check_names(shape: Sequence[int], longest: int = 0) -> None:
     """Raise ValueError where an array of text of this shape has too many or too long names."""
     if math.prod(shape) > MAX_NAMES:
-        raise ValueError(f"{math.prod(shape)} names, more than the {MAX_NAMES} that an array may have")
+        raise ValueError(f"{math.prod(shape)} texts, where at most {MAX_NAMES} are names, and none are numbers")
     if longest > MAX_LETTERS:
         raise ValueError(f"a name of {longest} characters, more than {MAX_LETTERS}")
 

@@ -49,6 +49,15 @@ def test_dir_shows_public_names_only() -> None:
     assert dir(torchid) == shown
 
 
+def test_no_module_gives_a_constant_two_values() -> None:
+    """As of two modules that became one, where the later value counts for both."""
+    for path in (ROOT / "torchid").rglob("*.py"):
+        assigned = [node for node in ast.parse(path.read_text()).body if isinstance(node, ast.Assign)]
+        targets = (name for node in assigned for target in node.targets for name in ast.walk(target))
+        names = [name.id for name in targets if isinstance(name, ast.Name)]
+        assert sorted(names) == sorted(set(names)), path
+
+
 def test_the_stub_names_exactly_what_there_is() -> None:
     tree = ast.parse(STUB.read_text())
     imported = {alias.name for node in tree.body if isinstance(node, ast.ImportFrom) for alias in node.names}

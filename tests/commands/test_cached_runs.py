@@ -78,7 +78,7 @@ def results(run: Path) -> dict[str, Any]:
 
 
 @pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
-@pytest.mark.parametrize("name", slow_but(ESTIMATORS.keys() - {"least squares", "consistent"}, ESTIMATORS))
+@pytest.mark.parametrize("name", slow_but(ESTIMATORS.keys() - {"least squares", "consistent", "robust"}, ESTIMATORS))
 def test_a_run_from_the_cache_has_the_results_of_one_without_to_the_last_bit(
     demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:

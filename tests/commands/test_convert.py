@@ -72,11 +72,13 @@ def test_the_same_motion_gives_the_same_log_whatever_the_file(demo: Path, suffix
         np.testing.assert_allclose(again.arrays()[field], values, rtol=0, atol=1e-12)
 
 
-SLOW = [pytest.param(suffix, marks=pytest.mark.slow) for suffix in (".h5", ".parquet", ".bag", ".db3", "folder")]
+SLOW = [
+    pytest.param(suffix, marks=pytest.mark.slow) for suffix in (".csv", ".h5", ".parquet", ".bag", ".db3", "folder")
+]
 
 
 @pytest.mark.filterwarnings("ignore:.*no stamps:torchid.errors.TorchidWarning")
-@pytest.mark.parametrize("suffix", [".csv", ".mcap", *SLOW])
+@pytest.mark.parametrize("suffix", [".mcap", *SLOW])
 def test_the_same_motion_gives_the_same_parameters_whatever_the_file(
     demo: Path, expected: dict[str, Any], suffix: str
 ) -> None:

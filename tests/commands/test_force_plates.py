@@ -19,6 +19,7 @@ from refusals import refusal
 from repository import SHARED
 from scipy.spatial.transform import Rotation
 from simulated import BIPED, feet_of
+from thinned import slow_but
 from trainings import trust_new_files
 
 from torchid.cli import main
@@ -76,7 +77,7 @@ def recorded(folder: Path, laboratory: str, log: Log) -> str:
     return text
 
 
-@pytest.mark.parametrize("laboratory", LABORATORIES)
+@pytest.mark.parametrize("laboratory", slow_but(["plates", "OpenSim"], LABORATORIES))
 def test_a_fit_to_plates_is_that_to_wrenches_at_the_soles(
     laboratory: str, tmp_path: Path, expected: tuple[np.ndarray, dict[str, float]]
 ) -> None:

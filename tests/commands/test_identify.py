@@ -248,7 +248,10 @@ def test_positions_in_degrees_stop_a_run_that_names_them(
 
 @pytest.mark.parametrize(
     ("noise", "said"),
-    [((), "times the stated sensor noise"), (("sensors.noise={}",), "no rigid-body model explains 9")],
+    [
+        pytest.param((), "times the stated sensor noise", marks=pytest.mark.slow),
+        (("sensors.noise={}",), "no rigid-body model explains 9"),
+    ],
     ids=["stated", "estimated"],
 )
 def test_torques_of_no_robot_are_noticed_and_the_fit_called_worse_than_the_urdf(

@@ -6,29 +6,32 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 RARE = ("tensorboard", "scipy.stats", "scipy.signal", "pyarrow", "h5py")
 """For event files, filters, and files of other types."""
 
 
-def test_commands_import_nothing_that_most_runs_do_without() -> None:
+@pytest.fixture(scope="module")
+def found() -> list[str]:
+    """What a fresh process prints: rare modules that commands have imported, and what is said of its garbage."""
     code = (
-        "import sys; import torchid.cli, torchid.commands.identify, torchid.terminal.identification; "
+        "import gc, sys; import torchid.cli, torchid.commands.identify, torchid.terminal.identification; "
         "assert 'torchid.sensor_planning' not in sys.modules; import torchid.api; "
-        f"print([name for name in {RARE} if name in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
-
-
-def test_what_a_command_imports_is_never_looked_through_for_garbage_again() -> None:
-    code = (
-        "import gc, sys; from torchid.cli import main; "
+        f"print([name for name in {RARE} if name in sys.modules]); from torchid.cli import main; "
         "main(['identify', 'no_such_file.yaml']); left = gc.get_freeze_count(); "
         "sys.argv[1:] = ['identify', 'no_such_file.yaml']; main(); "
         "print(gc.isenabled(), left == 0, gc.get_freeze_count() > 50_000 > len(gc.get_objects()))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "True True True", "but by whoever calls it as a function and goes on"
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.splitlines()
+
+
+def test_commands_import_nothing_that_most_runs_do_without(found: list[str]) -> None:
+    assert found[0] == "[]"
+
+
+def test_what_a_command_imports_is_never_looked_through_for_garbage_again(found: list[str]) -> None:
+    assert found[1:] == ["True True True"], "but by whoever calls it as a function and goes on"
 
 
 def test_a_process_of_a_command_ends_with_all_of_its_output_and_its_status(tmp_path: Path) -> None:

@@ -152,13 +152,15 @@ def test_arrays_of_simulators_are_split(tmp_path: Path) -> None:
     assert "joint_position: columns 7 to the last of 'qpos'" in said.guessed
 
 
-def test_a_number_called_dt_is_the_step_of_a_recording_without_stamps(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["dt", "step_dt", "sim_time_step"])
+def test_a_number_called_dt_is_the_step_of_a_recording_without_stamps(tmp_path: Path, name: str) -> None:
     q, dq, tau = motion(12)
-    np.savez(tmp_path / "x.npz", dof_pos=q, dof_vel=dq, torques=tau, dt=np.array(0.005), actions=q)
+    arrays = {"dof_pos": q, "dof_vel": dq, "torques": tau, "actions": q, name: np.array(0.005)}
+    np.savez(tmp_path / "x.npz", **arrays)
     said, log, given = started(GO1, tmp_path / "x.npz")
     np.testing.assert_array_equal(log.time, TIME)
     assert given["time"].step == 0.005
-    assert "time: steps of 'dt' [s], as nothing has stamps" in said.guessed
+    assert f"time: steps of '{name}' [s], as nothing has stamps" in said.guessed
     assert not any(text.startswith("time") for text in said.missing)
 
 

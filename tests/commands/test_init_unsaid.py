@@ -7,15 +7,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import yaml
 from dialects import ORDER, in_order, save_csv
 from initiated import URDF, columns_of, initiated, recorded
 from motions import value
+from refusals import refused
+from scipy.spatial.transform import Rotation
 
 from torchid.commands.init import init
 from torchid.config import load_config
-from torchid.logs import read_log, write_log
+from torchid.errors import LogError
+from torchid.logs import Columns, Log, read_log, write_log
 
 
 def test_columns_that_may_be_torques_are_listed_and_take_no_more_than_a_mark_off(tmp_path: Path) -> None:
@@ -167,3 +172,118 @@ def test_headers_in_other_languages_say_what_they_are(tmp_path: Path, language: 
         np.testing.assert_allclose(in_order(found, getattr(found, name)), in_order(log, getattr(log, name)), atol=1e-12)
     for name in ("time", "imu_specific_force", "imu_angular_velocity"):
         np.testing.assert_allclose(getattr(found, name), getattr(log, name), atol=1e-12)
+
+
+def test_the_number_of_a_sample_is_a_stamp_only_where_nothing_else_is(tmp_path: Path) -> None:
+    log = recorded()
+    joints = (("q", log.joint_position), ("dq", log.joint_velocity), ("tau", log.joint_torque))
+    columns = {f"{what}_{name}": value(x)[:, k] for what, x in joints for k, name in enumerate(log.joint_names)}
+    columns = {"time_index": np.arange(len(log))} | columns
+    found, _, _ = initiated(save_csv(tmp_path / "x.csv", columns | {"timestamp": log.time}))
+    np.testing.assert_allclose(found.time, log.time, atol=1e-12)
+    found, said, _ = initiated(save_csv(tmp_path / "y.csv", columns))
+    assert len(found) == len(log)
+    text = next(x for x in said.guessed if x.startswith("joint_velocity: "))
+    assert "times the slope of the positions, as no unit explains: are the stamps right?" in text
+    assert found.joint_velocity is not None
+    np.testing.assert_array_equal(in_order(found, found.joint_velocity), in_order(log, log.joint_velocity))
+
+
+def twist_in_world(log: Log) -> tuple[np.ndarray, np.ndarray]:
+    """Linear and angular velocity of a base, by the slope of its pose."""
+    rotation, step = Rotation.from_quat(value(log.base_quat_xyzw)), np.diff(log.time)[:, None]
+    rate = (rotation[1:] * rotation[:-1].inv()).as_rotvec() / step
+    return np.gradient(value(log.base_position_world), log.time, axis=0), np.vstack([rate, rate[-1:]])
+
+
+@pytest.mark.parametrize("turned", [False, True], ids=["world", "base"])
+def test_twists_and_poses_of_nested_messages_belong_together(tmp_path: Path, turned: bool) -> None:
+    log = recorded()
+    rotation = Rotation.from_quat(value(log.base_quat_xyzw))
+    position, (linear, angular) = value(log.base_position_world), twist_in_world(log)
+    recorded_twist = [rotation.inv().apply(x) if turned else x for x in (linear, angular)]
+    frames = ("position", position), ("linear", recorded_twist[0]), ("angular", recorded_twist[1])
+    columns: dict[str, Any] = {"t": log.time} | columns_of(log, ("q{}", "dq{}", "tau{}"))
+    for name, x in frames:
+        message = "pose/pose" if name == "position" else "twist/twist"
+        columns |= {f"/estimator/robot_state/{message}/{name}/{axis}": x[:, k] for k, axis in enumerate("xyz")}
+    turns = value(log.base_quat_xyzw)
+    columns |= {f"/estimator/robot_state/pose/pose/orientation/{axis}": turns[:, k] for k, axis in enumerate("xyzw")}
+    found, _, _ = initiated(save_csv(tmp_path / "x.csv", columns))
+    np.testing.assert_allclose(value(found.base_linear_velocity_world), linear, atol=1e-9)
+    np.testing.assert_allclose(value(found.base_angular_velocity_base), rotation.inv().apply(angular), atol=1e-9)
+
+
+def test_velocities_of_a_free_joint_are_those_of_the_base(tmp_path: Path) -> None:
+    """MuJoCo's qvel: linear in the world, angular in the base."""
+    log = recorded()
+    linear, angular = twist_in_world(log)
+    angular = Rotation.from_quat(value(log.base_quat_xyzw)).inv().apply(angular)
+    joints = [in_order(log, x) for x in (log.joint_position, log.joint_velocity, log.joint_torque)]
+    arrays = {
+        "time": log.time, "joint_names": np.array(ORDER),
+        "qpos": np.hstack([value(log.base_position_world), np.roll(value(log.base_quat_xyzw), 1, axis=1), joints[0]]),
+        "qvel": np.hstack([linear, angular, joints[1]]), "tau": joints[2],
+    }  # fmt: skip
+    np.savez(tmp_path / "x.npz", **arrays)
+    found, _, _ = initiated(tmp_path / "x.npz")
+    np.testing.assert_array_equal(value(found.base_linear_velocity_world), linear)
+    np.testing.assert_array_equal(value(found.base_angular_velocity_base), angular)
+
+
+def test_a_list_of_names_may_have_more_than_the_robot(tmp_path: Path) -> None:
+    """A gripper's finger that mimics another, in the middle of the arrays."""
+    log = recorded()
+    names = [*ORDER[:5], "r_finger", *ORDER[5:]]
+    fields = {"position": log.joint_position, "velocity": log.joint_velocity, "effort": log.joint_torque}
+    arrays = {name: np.insert(in_order(log, x), 5, 0.1 * log.time, axis=1) for name, x in fields.items()}
+    np.savez(tmp_path / "x.npz", t=log.time, name=np.array(names), **arrays)
+    found, said, _ = initiated(tmp_path / "x.npz")
+    for name in ("joint_position", "joint_velocity", "joint_torque"):
+        np.testing.assert_array_equal(in_order(found, getattr(found, name)), in_order(log, getattr(log, name)))
+    assert any(text.startswith("joint_order: as 'name' of the file lists them") for text in said.guessed)
+
+
+@pytest.mark.parametrize("kind", ["text", "lists"])
+def test_columns_that_are_no_numbers_are_named_with_the_field_that_lacks_them(tmp_path: Path, kind: str) -> None:
+    log, name = recorded(), "tau" if kind == "text" else "q"
+    rows = {what: list(in_order(log, x)) for what, x in (("q", log.joint_position), ("tau", log.joint_torque))}
+    if kind == "text":
+        rows[name] = [[f"{x} Nm" for x in row] for row in rows[name]]
+    else:
+        rows[name] = [[*row, 0.0][: 12 + k % 2] for k, row in enumerate(rows[name])]
+    columns = {what: [list(row) for row in x] for what, x in rows.items()}
+    pq.write_table(pa.table({"t": log.time, **columns}), tmp_path / "x.parquet")
+    said = init(URDF, tmp_path / "x.parquet", tmp_path / "x.yaml")
+    field = "joint_torque" if kind == "text" else "joint_position"
+    assert f"{field}: '{name}' by name, but no numbers: text, or lists of several lengths" in said.missing
+    if kind == "lists":
+        given = Columns(time="t", joint_order=ORDER, joint_position="q[{index}]", joint_torque="tau[{index}]")
+        line = refused(lambda: read_log(tmp_path / "x.parquet", columns=given), "", LogError)
+        assert "joint_position: 'q[0]' of the column 'q', which has no lists, or lists of several lengths" in line
+
+
+def test_a_gyroscope_alone_beside_an_orientation_is_the_rate_of_the_base(tmp_path: Path) -> None:
+    log = recorded()
+    rotation, angular = Rotation.from_quat(value(log.base_quat_xyzw)), twist_in_world(log)[1]
+    columns: dict[str, Any] = {"t": log.time} | columns_of(log, ("q{}", "dq{}", "tau{}"))
+    columns |= {f"base_quat_{axis}": value(log.base_quat_xyzw)[:, k] for k, axis in enumerate("xyzw")}
+    columns |= {f"omega_{axis}": rotation.inv().apply(angular)[:, k] for k, axis in enumerate("xyz")}
+    found, _, _ = initiated(save_csv(tmp_path / "x.csv", columns))
+    np.testing.assert_allclose(value(found.base_angular_velocity_base), rotation.inv().apply(angular), atol=1e-9)
+
+
+@pytest.mark.parametrize("separator", [",", ";"])
+def test_names_in_two_lines_are_joined_where_one_has_some_twice(tmp_path: Path, separator: str) -> None:
+    """Of pandas, whose columns have several levels."""
+    log = recorded()
+    joints = (("position", log.joint_position), ("velocity", log.joint_velocity), ("effort", log.joint_torque))
+    path = tmp_path / "x.csv"
+    columns = {f"{what}.{name}": value(x)[:, k] for what, x in joints for k, name in enumerate(log.joint_names)}
+    save_csv(path, {"time": log.time} | columns, separator)
+    first, _, rows = path.read_text().partition("\n")
+    levels = [name.partition(".")[::2] for name in first.split(separator)]
+    path.write_text("\n".join([*(separator.join(level) for level in zip(*levels, strict=True)), rows]))
+    found, _, _ = initiated(path)
+    np.testing.assert_array_equal(in_order(found, found.joint_torque), in_order(log, log.joint_torque))
+    np.testing.assert_allclose(found.time, log.time, atol=1e-12)

@@ -35,7 +35,7 @@ def _new_files(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The demo with its training log in three files, of which the plates have a clock of their own."""
-    folder = shortened_demo(tmp_path / "demo", 1_000)
+    folder = shortened_demo(tmp_path / "demo", 600)
     with np.load(folder / "sway_train.npz") as log:
         for name, fields in FIELDS.items():
             shift = 3.0 if name == "plates" else 0.0
@@ -62,29 +62,29 @@ def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 
 
 def test_a_fit_of_several_files_is_that_of_the_whole_log(demo: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    whole = identified("runs/whole", ["sway_train.npz[:7]"], ["sway_train.npz[7:]"])
-    joined = identified("runs/joined", [JOINED | {"to": 7}], [JOINED | {"from": 7}])
+    whole = identified("runs/whole", ["sway_train.npz[:4]"], ["sway_train.npz[4:]"])
+    joined = identified("runs/joined", [JOINED | {"to": 4}], [JOINED | {"from": 4}])
     assert Path("runs/joined/parameters.json").read_bytes() == Path("runs/whole/parameters.json").read_bytes()
     for key in ("train", "test", "cross_validation", "samples", "rank"):
         assert joined[key] == whole[key], key
 
-    assert main(["evaluate", "runs/joined", "--log", f"{NAME}[7:]"]) == 0
-    name = "motion + plates + torques[7:]"
+    assert main(["evaluate", "runs/joined", "--log", f"{NAME}[4:]"]) == 0
+    name = "motion + plates + torques[4:]"
     evaluated = json.loads((demo / f"runs/joined/evaluation/{name}/metrics.json").read_text())
     for group, value in evaluated[name]["identified"].items():
         assert value == pytest.approx(joined["test"][group], rel=1e-9), group
-    assert load_config("runs/joined/config.yaml").logs.train == [demo / f"{NAME}[:7]"]
+    assert load_config("runs/joined/config.yaml").logs.train == [demo / f"{NAME}[:4]"]
 
     capsys.readouterr()
-    identified("runs/again", [JOINED | {"to": 7}], [JOINED | {"from": 7}])
+    identified("runs/again", [JOINED | {"to": 4}], [JOINED | {"from": 4}])
     assert "samples of 2 logs" in capsys.readouterr().out  # from the cache
     with np.load("plates.npz") as plates:
         np.savez("new.npz", **dict(plates) | {"contact_wrench_local": 1.01 * plates["contact_wrench_local"]})
     os.replace("new.npz", "plates.npz")
-    identified("runs/changed", [JOINED | {"to": 7}], [JOINED | {"from": 7}])
+    identified("runs/changed", [JOINED | {"to": 4}], [JOINED | {"from": 4}])
     assert "samples of" not in capsys.readouterr().out
     shifted = {"files": ["motion.npz", {"file": "plates.npz", "shift_s": -3.01}, "torques.npz"]}
-    identified("runs/shifted", [shifted | {"to": 7}], [shifted | {"from": 7}])
+    identified("runs/shifted", [shifted | {"to": 4}], [shifted | {"from": 4}])
     assert "samples of" not in capsys.readouterr().out
 
 
@@ -104,13 +104,13 @@ def test_several_files_are_checked_converted_and_compressed(demo: Path) -> None:
 
 def test_no_sample_of_the_first_file_is_used_twice(demo: Path, capsys: pytest.CaptureFixture[str]) -> None:
     other = "motion.npz + torques.npz + plates.npz@-3"
-    error = refusal(capsys, "identify", "quadruped.yaml", f"logs.train={json.dumps([NAME + '[:6]', other + '[5:]'])}")
+    error = refusal(capsys, "identify", "quadruped.yaml", f"logs.train={json.dumps([NAME + '[:4]', other + '[3:]'])}")
     assert "share samples; accepted: every sample once" in error
     error = refusal(capsys, "identify", "quadruped.yaml", f"logs.train={json.dumps([NAME, other])}")
     assert "share samples" in error
-    test = f"logs.test={json.dumps([other + '[5:]'])}"
-    assert main(["identify", "quadruped.yaml", f"logs.train={json.dumps([NAME + '[:6]'])}", test, "output=runs/x"]) == 0
-    assert f"{other}[5:] is fitted on as well" in capsys.readouterr().err
+    test = f"logs.test={json.dumps([other + '[3:]'])}"
+    assert main(["identify", "quadruped.yaml", f"logs.train={json.dumps([NAME + '[:4]'])}", test, "output=runs/x"]) == 0
+    assert f"{other}[3:] is fitted on as well" in capsys.readouterr().err
 
 
 def test_what_several_files_are_not_for_is_refused(demo: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -123,7 +123,7 @@ def test_short_gaps_of_a_recording_hardly_change_the_fit(demo: Path, capsys: pyt
     with np.load("sway_train.npz") as log:
         broken = dict(log)
     rng = np.random.default_rng(2)
-    for start in rng.integers(10, 980, 25):
+    for start in rng.integers(10, 580, 15):
         broken["joint_position"][start : start + 4, rng.integers(12)] = np.nan
         broken["base_quat_wxyz"][start + 5 : start + 8] = np.nan
     np.savez("broken.npz", **broken)

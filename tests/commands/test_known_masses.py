@@ -48,8 +48,9 @@ def scales_of(run: Path) -> dict[str, dict[str, Any]]:
     ("std", "more", "tolerance"),
     [
         (0.0, ("estimator.ridge=auto",), 1e-7),
-        (0.0, ("estimator.ridge=1e-3",), 3e-3),  # 1.4e-3: the ridge holds all other parameters near the URDF
-        (0.05, (), 1e-7),
+        # 1.4e-3: the ridge holds all other parameters near the URDF
+        pytest.param(0.0, ("estimator.ridge=1e-3",), 3e-3, marks=pytest.mark.slow),
+        pytest.param(0.05, (), 1e-7, marks=pytest.mark.slow),
         (0.05, ("estimator.name=consistent", "estimator.ridge=1e-6"), 2e-4),
     ],
 )

@@ -30,7 +30,7 @@ BAG = {"link": "trunk", "mass": 6.0, "center_of_mass": [0.05, 0.0, 0.1]}
 @cache
 def walked() -> Log:
     """A walk of two blocks and a bit, to and fro, with the pose of its base."""
-    log = recorded(MACHINE, truth(MACHINE, 0, seconds=10.0), seed=0, noise=0.1)
+    log = recorded(MACHINE, truth(MACHINE, 0, seconds=8.4), seed=0, noise=0.1)
     count = len(log)
     there_and_back = np.concatenate([np.arange(count), np.arange(count)[::-1]] * 2 + [np.arange(count)])
     arrays: dict[str, Any] = {name: array[there_and_back] for name, array in log.arrays().items()}
@@ -200,7 +200,7 @@ def in_world(log: Log) -> Log:
 
 def with_a_gap(log: Log) -> Log:
     position = log.joint_position.copy()
-    position[9_000, 2] = np.nan
+    position[8_300, 2] = np.nan
     return replace(log, **NO_BASE, joint_position=position)
 
 
@@ -212,7 +212,7 @@ REFUSED: dict[str, tuple[Callable[[Log], Log], dict[str, Any], str]] = {
     "no foot stands": (lifted, {"base_motion": "contacts"}, "contact_active: no contact stands in any sample"),
     "world": (in_world, {"base_motion": "contacts"}, "contact_wrench_world: given, but preprocessing.base_motion"),
     "no flags": (bare, {"base_motion": "contacts"}, "contact_active: missing; accepted"),
-    "a gap": (with_a_gap, {"base_motion": "contacts"}, "joint_position: nan at sample 9000"),
+    "a gap": (with_a_gap, {"base_motion": "contacts"}, "joint_position: nan at sample 8300"),
     "no force": (bare, {"contact_threshold": 5.0}, "contact_wrench: missing; accepted"),
     "no reading": (bare, {"zero_in_air": True}, "contact_wrench_local: missing; accepted"),
     "no foot in the air": (

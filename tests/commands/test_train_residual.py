@@ -20,7 +20,7 @@ DEMO = str(ROOT / "torchid" / "demo" / "quadruped.yaml")
 
 def test_networks_find_the_friction_that_the_model_lacks(tmp_path: Path) -> None:
     status, printed, _ = call(
-        "train_residual", DEMO, "estimator.friction=false", "--epochs", "25", "--curves", str(tmp_path)
+        "train_residual", DEMO, "estimator.friction=false", "--epochs", "12", "--curves", str(tmp_path)
     )
     assert status == 0
     rows = [line for line in printed.splitlines() if "│" in line]
@@ -30,7 +30,7 @@ def test_networks_find_the_friction_that_the_model_lacks(tmp_path: Path) -> None
     for row, run in zip(rows, ("rigid_bodies_alone", "with_networks"), strict=True):
         events = events_in(tmp_path / run)
         unseen = [event.value for event in events.Scalars("loss_unseen/data")]
-        assert len(unseen) == 25
+        assert len(unseen) == 12
         (final,) = events.Scalars("final/unseen_rms")
         assert final.value == pytest.approx(unseen[-1] ** 0.5, rel=1e-6)
         assert f"{final.value:.3f}" in row

@@ -18,7 +18,7 @@ from torchid.fitting.experiment import set_up
 from torchid.logs import read_log, write_log
 from torchid.problem import Samples
 
-SAMPLES = 14_000  # three blocks and a bit
+SAMPLES = 9_000  # two blocks and a bit
 SMALL = "preprocessing.memory_gb=0.0001"
 Fields = dict[str, Any]
 

@@ -23,7 +23,7 @@ import yaml
 ROOT = Path(__file__).resolve().parents[2]
 TORCHRUN = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node")
 TWO = (*TORCHRUN, "2")
-SMALL_CHUNK = 128
+SMALL_CHUNK = 64
 RANDOM = {"noise": {"joint_torque": 0.1, "contact_force": 0.5, "contact_moment": 0.05}}
 
 
@@ -41,14 +41,14 @@ def write_experiments(folder: Path) -> dict[str, Path]:
     feet = [f"{leg}_foot" for leg in ("front_left", "front_right", "rear_left", "rear_right")]
     walks = [[True] * 4, [True, False, False, True], [False, True, True, False]]
     robots: dict[str, Any] = {
-        "quadruped": (demo / "quadruped.urdf", False, [(foot, 3) for foot in feet], walks, [500], "joints"),
-        "arm": (PANDA, True, [], [[]], [700], "joints"),
+        "quadruped": (demo / "quadruped.urdf", False, [(foot, 3) for foot in feet], walks, [250], "joints"),
+        "arm": (PANDA, True, [], [[]], [350], "joints"),
         "biped": (
             ROOT / "configs" / "biped.urdf",
             False,
             [("l_sole", 6), ("r_sole", 6)],
             [[True, True], [True, False], [False, True]],
-            [300, 240],
+            [150, 120],
             {"set": "full", "offsets": {"contact_force": "log", "contact_moment": "log"}},
         ),
     }
@@ -125,11 +125,16 @@ def finish(command: Sequence[str]) -> tuple[int, str, str]:
     return process.returncode, printed, complained
 
 
-def finish_forked(processes: int, run: Callable[[], int], folders: Sequence[Path] = ()) -> tuple[int, str, str]:
+def finish_forked(
+    processes: int,
+    run: Callable[[], int],
+    folders: Sequence[Path] = (),
+    meanwhile: Callable[[Sequence[int]], None] = lambda _: None,
+) -> tuple[int, str, str]:
     """`finish` of what forks of this process run, in which everything is set that torchrun sets.
 
-    They have nothing to import, and nobody ends those that another one leaves behind. Each may have a folder of its
-    own to work in. The status is the largest of theirs.
+    They have nothing to import, and nobody ends those that another one leaves behind, unless `meanwhile` does, which is
+    given the processes. Each may have a folder of its own to work in. The status is the one of theirs farthest from 0.
     """
     with socket() as free:
         free.bind(("localhost", 0))
@@ -141,9 +146,10 @@ def finish_forked(processes: int, run: Callable[[], int], folders: Sequence[Path
             if pid == 0:
                 os.environ.update(common | {"RANK": str(rank), "LOCAL_RANK": str(rank)})
                 os.chdir(folders[rank] if folders else ".")
-                _become(run, printed.fileno(), complained.fileno())
+                become(run, printed.fileno(), complained.fileno())
             pids.append(pid)
         try:
+            meanwhile(pids)
             statuses = [_status_of(pid) for pid in pids]
         finally:
             for pid in pids:
@@ -153,10 +159,10 @@ def finish_forked(processes: int, run: Callable[[], int], folders: Sequence[Path
         for stream in (printed, complained):
             stream.seek(0)
             texts.append(stream.read())
-    return max(statuses), texts[0], texts[1]
+    return max(statuses, key=abs), texts[0], texts[1]
 
 
-def _become(run: Callable[[], int], printed: int, complained: int) -> NoReturn:
+def become(run: Callable[[], int], printed: int, complained: int) -> NoReturn:
     """Run something in this process, whose streams are files, and end with its status."""
     status = 70
     try:

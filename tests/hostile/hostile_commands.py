@@ -2,64 +2,30 @@
 
 from __future__ import annotations
 
-import json
+import gc
 import os
+import resource
 import signal
-import subprocess
-import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from importlib import import_module
 
-from run_figures import FIGURES
+import pytest
+import torch
+from run_figures import EVENTS, PAGE, draw
+from shared_work import become
 
-_SERVER = """
-import gc, json, os, resource, signal, sys
-import h5py, jinja2, scipy.signal, torch._dynamo, torchid.commands.results, torchid.commands.evaluate, torchid.commands.analyze, torchid.commands.check
-import torchid.commands.compress, torchid.commands.identify, torchid.estimators.training, torchid.report.page, torchid.report.tensorboard
-import torchid.terminal.analysis, torchid.terminal.runs, torchid.terminal.identification
-from matplotlib.figure import Figure
 from torchid.cli import main
-for module in (torchid.commands.run_figures, torchid.commands.evaluate, torchid.commands.analyze):
-    for name in FIGURES:
-        if hasattr(module, name):
-            setattr(module, name, lambda *_, **__: Figure(figsize=(1.0, 1.0)))
-torchid.report.page._library()  # compressed once for all children
-gc.freeze()
-signal.signal(signal.SIGINT, signal.default_int_handler)
-said = {}
-"x".encode("cp437")  # which zipfile loads late, when another user may not read it
-print("ready", flush=True)
-for line in sys.stdin:
-    asked = json.loads(line)
-    if "wait" in asked:
-        with os.fdopen(said.pop(asked["wait"]), errors="replace") as pipe:
-            lines = pipe.read().splitlines()
-        status = os.waitstatus_to_exitcode(os.waitpid(asked["wait"], 0)[1])
-        print(json.dumps([status, lines]), flush=True)
-        continue
-    read, write = os.pipe()
-    child = os.fork()
-    if child:
-        os.close(write)
-        said[child] = read
-        print(child, flush=True)
-        continue
-    os.dup2(write, 2)
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-    if asked["uid"]:
-        os.setgid(asked["uid"]), os.setuid(asked["uid"])
-    if asked["largest"] is not None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (asked["largest"],) * 2)
-    try:
-        status = main(asked["arguments"])
-        sys.stderr.flush()
-    except KeyboardInterrupt:  # before the command had begun
-        status = 1
-    os._exit(status)
-"""
+from torchid.report import page
+
+_LATE = [
+    *("h5py", "jinja2", "scipy.signal", "torch._dynamo", "torchid.estimators.training", "torchid.report.tensorboard"),
+    *(f"torchid.commands.{name}" for name in ("check", "compress", "identify")),
+    *(f"torchid.terminal.{name}" for name in ("analysis", "identification", "runs")),
+]
+"""What commands import when they need it, and another user may not read."""
+
+_BEGINS = b"-"  # what a process says from when on it may be stopped
 
 
 @dataclass(frozen=True)
@@ -71,18 +37,49 @@ class Ended:
 
 
 class Commands:
-    """A process that has everything loaded, and runs each command in a child; figures are empty."""
+    """Runs each command in a fork of this process, which has everything loaded; figures are empty."""
 
-    def __init__(self, process: subprocess.Popen[str]) -> None:
-        self._process = process
+    def __init__(self) -> None:
+        for name in _LATE:
+            import_module(name)
+        page._library()  # compressed once for all children
+        "x".encode("cp437")  # which zipfile loads late
+        self._said: dict[int, int] = {}
 
     def start(self, arguments: list[str], largest: int | None = None, uid: int = 0) -> int:
         """Start a command whose files may have `largest` bytes, as another user; its process."""
-        return int(self._ask({"arguments": arguments, "largest": largest, "uid": uid}))
+
+        def run() -> int:
+            gc.freeze()
+            torch.set_num_threads(1)  # the threads of this process are not in its forks
+            draw(pytest.MonkeyPatch(), (PAGE, EVENTS))
+            if uid:
+                os.setgid(uid)
+                os.setuid(uid)
+            if largest is not None:
+                resource.setrlimit(resource.RLIMIT_FSIZE, (largest,) * 2)
+            try:
+                os.write(write, _BEGINS)
+                return main(arguments)
+            except KeyboardInterrupt:  # before the command had begun
+                return 1
+            finally:
+                signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # or it would go on as a run of tests
+
+        read, write = os.pipe()
+        child = os.fork()
+        if not child:
+            become(run, os.open(os.devnull, os.O_WRONLY), write)
+        os.close(write)
+        os.read(read, len(_BEGINS))
+        self._said[child] = read
+        return child
 
     def end(self, child: int) -> Ended:
         """Wait for a command."""
-        status, lines = self._ask({"wait": child})
+        with os.fdopen(self._said.pop(child), errors="replace") as pipe:
+            lines = pipe.read().splitlines()
+        status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
         return Ended(status, [line for line in lines if "Warning: " not in line[:60]])
 
     def run(self, arguments: list[str], largest: int | None = None, uid: int = 0) -> Ended:
@@ -95,22 +92,3 @@ class Commands:
         time.sleep(after)
         os.kill(child, number)  # a child that has ended waits to be waited for
         return self.end(child)
-
-    def _ask(self, asked: dict[str, object]) -> Any:
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        self._process.stdin.write(json.dumps(asked) + "\n")
-        self._process.stdin.flush()
-        return json.loads(self._process.stdout.readline())
-
-
-@contextmanager
-def commands() -> Iterator[Commands]:
-    """The process, until the block ends."""
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
-    program = f"FIGURES = {FIGURES}\n{_SERVER}"
-    with subprocess.Popen([sys.executable, "-c", program], text=True, **pipes) as process:  # type: ignore[call-overload]
-        assert process.stdout is not None
-        assert process.stdout.readline() == "ready\n"
-        yield Commands(process)
-        process.stdin.close()

@@ -12,6 +12,7 @@ import pytest
 from hostile_commands import Commands
 from refusals import files_in
 from run_folders import names_in
+from thinned import slow_but
 
 from torchid.commands.cache import FOLDER
 
@@ -100,7 +101,7 @@ def test_a_command_stopped_at_any_moment_leaves_all_or_nothing(
             assert hidden(out) == [], f"{case}: left by the killed command"
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("number", slow_but([signal.SIGTERM], [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]))
 def test_a_run_that_is_replaced_is_there_at_any_moment(
     place: Path, server: Commands, run: Path, tmp_path: Path, number: signal.Signals
 ) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from synthetic import SOLO12, load
+from thinned import each_once
 
 from torchid.estimators import LeastSquares
 from torchid.identifiability.information import error_directions, expected_errors
@@ -49,8 +50,7 @@ def rms(robot: Robot, logs: list[Samples], phi: np.ndarray) -> dict[str, float]:
     return out | {"joint_torque": float(np.sqrt(np.square(by_joint).mean(0)).mean())}
 
 
-@pytest.mark.parametrize("ridge", [0.0, 0.3])
-@pytest.mark.parametrize("sensors", ["joints", "contacts"])
+@pytest.mark.parametrize(("sensors", "ridge"), each_once(["joints", "contacts"], [0.0, 0.3]))
 def test_repeated_fits_from_wrong_urdfs_and_noisy_sensors_are_as_far_off_as_expected(
     robot: Robot, logs: list[Samples], sensors: str, ridge: float
 ) -> None:

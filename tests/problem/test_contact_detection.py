@@ -83,7 +83,7 @@ def assert_agrees(legged: Legged, seconds: float, seed: int, least: float) -> No
     assert together >= least
 
 
-@pytest.mark.parametrize("legged", WALKERS)
+@pytest.mark.parametrize("legged", [*WALKERS[1:], pytest.param(GO2, id="Go2", marks=[INSTALLED, SLOW])])
 def test_flags_of_a_noisy_recording_are_those_of_the_simulator(legged: Legged) -> None:
     assert_agrees(legged, SECONDS, 0, AGREEING)
 
@@ -124,7 +124,7 @@ def test_masses_that_are_fitted_in_between_leave_no_foot_that_stands_unnoticed(l
     assert missed(DEFAULT) <= 0.25 * missed(ONCE)
 
 
-@pytest.mark.parametrize("legged", WALKERS[:2])
+@pytest.mark.parametrize("legged", [WALKERS[1], pytest.param(GO2, id="Go2", marks=[INSTALLED, SLOW])])
 def test_contacts_that_may_stand_leave_nothing_that_carries_out_of_more_samples(legged: Legged) -> None:
     true, exact = walked(legged)
     found = detect_contacts(exact.log, true.robot, legged.contacts(), DEFAULT)

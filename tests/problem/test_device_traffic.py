@@ -83,7 +83,7 @@ def traffic(builder: RowBuilder, chunks: Chunks) -> dict[str, int]:
     ("name", "sensors", "world", "terms"),
     [
         pytest.param("quadruped", "joints", False, ExtraTerms(), marks=SLOW),
-        ("quadruped", "full", False, TERMS),
+        pytest.param("quadruped", "full", False, TERMS, marks=SLOW),
         pytest.param("quadruped", "mixed", True, ExtraTerms(), marks=SLOW),
         pytest.param("humanoid", "joints", False, TERMS, marks=SLOW),
         ("humanoid", "contacts", True, ExtraTerms()),

@@ -40,7 +40,7 @@ def fit(samples: int) -> dict[str, float]:
 
 
 def test_five_times_the_samples_need_no_more_memory_beside_their_arrays() -> None:
-    short, long = fit(20_000), fit(100_000)
+    short, long = fit(10_000), fit(50_000)
     assert long["all"] - long["arrays"] < short["all"] - short["arrays"] + 80.0  # allocators keep some slack
 
 

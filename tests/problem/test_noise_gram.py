@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from arms import ARMS
+from thinned import slow_but
 from torch import Tensor
 
 import torchid
@@ -251,7 +252,7 @@ def test_combinations_with_more_noise_than_information_keep_to_the_prior() -> No
         assert np.allclose(combinations[1] @ corrected.held[:, :2], combinations[1], rtol=1e-9)
 
 
-@pytest.mark.parametrize("ridge", [0.0, 1e-6])
+@pytest.mark.parametrize("ridge", slow_but([0.0], [0.0, 1e-6]))
 def test_intervals_hold_what_data_that_are_mostly_noise_leave_to_the_prior(robot: Robot, ridge: float) -> None:
     bolted = torchid.load_robot(robot.path, fixed_base=True)
     terms, sensors = ExtraTerms(offsets={"joint_torque": "log"}), named_sensors("joints", 2, 0, SensorNoise(0.1, 1.0))
@@ -275,6 +276,22 @@ def test_intervals_hold_what_data_that_are_mostly_noise_leave_to_the_prior(robot
         scattered.append((off > 1.96 * np.linalg.norm(fit.scatter.deviations[: fit.scatter.blocks], axis=0))[known])
     assert np.mean(missed, axis=0).max() <= 0.1
     assert np.mean(scattered, axis=0).max() > 0.8, "the scatter alone misses one in most cases"
+
+
+@pytest.mark.parametrize("size", [0.0, 0.5, 1.0])
+def test_no_more_noise_is_taken_off_than_the_rows_leave_unexplained(robot: Robot, size: float) -> None:
+    """Of motion with as many times the noise that is taken for there; forces are exact."""
+    bolted = torchid.load_robot(robot.path, fixed_base=True)
+    builder = RowBuilder(bolted, [], named_sensors("joints", bolted.n, 0, SensorNoise(0.1, 1.0, 0.1)))
+    stated, there = (replace(unit_noise(x), base=torch.zeros(12, 12, dtype=torch.float64)) for x in (0.1, 0.1 * size))
+    bare = {"base": BaseMotion(), "active": torch.zeros(4000, 0, dtype=torch.bool)}
+    clean = replace(motion(bolted, 4000, 0.1), **bare, motion_noise=replace(there, turns_force=False))
+    forces = torchid.Regressor(bolted)(*clean.coordinates()) @ torch.from_numpy(bolted.nominal.flatten())
+    noisy = next(draws(replace(clean, torque=forces), 1))
+    factor = compress([replace(noisy, motion_noise=replace(stated, turns_force=False))], builder)
+    R, triangle = corrected_triangle(factor, column_prior(builder, bolted)).R, factor.triangle().numpy()
+    off, of_noise = (triangle.T @ triangle - R.T @ R)[:-1, :-1], factor.whole_noise_gram().numpy()[:-1, :-1]
+    assert off.sum() == pytest.approx(size**2 * of_noise.sum(), rel=0.1, abs=1e-9 * of_noise.sum())
 
 
 def test_without_noise_nothing_changes(robot: Robot, builder: RowBuilder) -> None:

@@ -13,6 +13,7 @@ from torchid.fitting.experiment import Experiment, set_up
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.chunks import chunks_by_state
 from torchid.problem.predict import force_series, null_space_part, projected_forces
+from torchid.sensing.projection import null_space
 
 
 @pytest.fixture(scope="module")
@@ -57,3 +58,13 @@ def test_their_noise_is_that_of_the_readings_through_the_projection(builder: Row
             std = torch.sqrt((P.square() * layout.row_std.square()).sum(-1) / samples.oversampling)
             chosen = where[part if isinstance(part, slice) else part.numpy()]
             np.testing.assert_allclose(found.noise[np.ix_(chosen, coupled)], std.numpy(), atol=1e-12)
+
+
+def test_bases_limb_by_limb_span_what_a_decomposition_of_all_rows_does(builder: RowBuilder, samples: Samples) -> None:
+    for state, index in chunks_by_state(samples):
+        kinematics, layout = builder.kinematics(samples[index]), builder.layout(state)
+        assert layout.has_own_limbs
+        [(_, V)] = builder.null_space_bases(state, kinematics)
+        [(_, expected)] = null_space(builder.contact_rows(layout, kinematics).of_unmeasured(slice(None)))
+        np.testing.assert_allclose(V.mT @ V, np.broadcast_to(np.eye(6), (len(V), 6, 6)), atol=1e-14)
+        np.testing.assert_allclose(V @ V.mT, expected @ expected.mT, atol=1e-13)

@@ -43,8 +43,9 @@ kinds = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 
 @pytest.fixture(autouse=True)
 def combined_columns_of_short_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Chunks of these tests are so short that they would be factorized."""
+    """Chunks of these tests are so short, and combine so many columns, that they would be factorized."""
     monkeypatch.setattr(module, "_LEAST_ROWS", 0)
+    monkeypatch.setattr(module, "_MOST_COMBINED", 1.0)
 
 
 def with_room(rows: Array) -> Tensor:
@@ -144,6 +145,24 @@ def test_rows_that_columns_were_not_combined_for_are_factorized_and_columns_comb
     assert relative_difference(factor.triangle().numpy(), rows) < limit
 
 
+def test_rows_that_most_columns_would_be_combined_for_are_factorized_until_others_come(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(module, "_MOST_COMBINED", 0.5)
+    chunks = [*exact_rows(nearly_dependent, 2), *exact_rows(well_conditioned, 2)]
+    added, combined = list[bool](), module._Sum.add
+
+    def add(self: module._Sum, X: Array) -> bool:
+        added.append(combined(self, X))
+        return added[-1]
+
+    monkeypatch.setattr(module._Sum, "add", add)
+    factor = compressed(chunks)
+    assert added == [True, True], "the last two alone are summed"
+    assert factor.rows == 1200
+    assert relative_difference(factor.triangle().numpy(), np.vstack(chunks)) < 1e-12
+
+
 def test_levels_make_rows_well_conditioned_and_can_be_undone() -> None:
     rows = np.vstack(exact_rows(nearly_dependent, 1, 1e-3))
     levels = ColumnLevels.of(np.linalg.qr(rows, mode="r"))
@@ -152,6 +171,7 @@ def test_levels_make_rows_well_conditioned_and_can_be_undone() -> None:
     unit = X / np.linalg.norm(X, axis=1, keepdims=True)
     assert np.linalg.eigvalsh(unit @ unit.T).min() > module._LEAST_EIGENVALUE
     assert 0 < len(levels.lower) < COLUMNS
+    np.testing.assert_allclose(levels.squares_before(X @ X.T), np.square(rows[:, levels.lower]).sum(0), rtol=1e-12)
     kept = np.setdiff1d(np.arange(COLUMNS + 1), levels.lower)
     np.testing.assert_array_equal(X[kept], rows.T[kept])
     R = levels.undo(np.linalg.qr(X.T, mode="r"))

@@ -32,6 +32,7 @@ WRENCHES = {
     "letters": ("{side}_foot_{part}{axis}", ("left", "right")),
     "couples": ("{Side}FootForceSensor_{part}{axis}", ("Left", "Right")),
     "numbers": ("FT_{side}_foot[{k}]", ("left", "right")),
+    "inside": ("Device/{Side}Foot/Wrench/{part}{axis}/Sensor/Value", ("Left", "Right")),
 }
 
 
@@ -54,6 +55,7 @@ def test_wrenches_named_by_sides_are_those_of_the_feet_on_these(dialect: str) ->
             "letters": ["left_foot_f{axis}", "left_foot_m{axis}"],
             "couples": ["LeftFootForceSensor_f{axis}", "LeftFootForceSensor_c{axis}"],
             "numbers": ["FT_left_foot[{component}]"],
+            "inside": [f"Device/LeftFoot/Wrench/{part}{{axis}}/Sensor/Value" for part in "fm"],
         }[dialect]
     )
 
@@ -131,3 +133,14 @@ def test_thirteen_columns_with_a_pose_are_a_pose_and_a_twist() -> None:
 def test_torques_that_are_wanted_are_not_taken_for_measured_ones(name: str) -> None:
     columns = {f"{x}_{joint}": swinging(k) for k, joint in enumerate(BIPED.joints) for x in (name, "tau")}
     assert proposed(BIPED, columns).columns["joint_torque"] == {"column": "tau_{joint}"}
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("name", ["foot_force_world", "net_forces_w", "foot_force"])
+def test_forces_of_two_feet_are_in_the_world_if_their_name_says_so(name: str, sign: float) -> None:
+    forces = np.stack([swinging(0), swinging(1), WEIGHT * np.ones(N)], axis=1)[:, None].repeat(2, axis=1)
+    entry = proposed(BIPED, {name: sign * forces}).columns
+    if name == "foot_force":
+        assert entry["contact_wrench_local"] == {"force": {"column": name}}
+    else:
+        assert entry["contact_wrench_world"]["force"].get("scale", 1) == sign

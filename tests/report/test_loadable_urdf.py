@@ -14,7 +14,7 @@ from mujoco_oracle import mujoco_forces, mujoco_model
 from regressors import assert_close, without_shapes
 from repository import CONFIGS, DEMO
 from simulated import BIPED, SOLES
-from synthetic import G1, ROBOTS, TALOS_FULL, Array, Oracle, load, make_log, random_states
+from synthetic import G1, ROBOTS, SOLO12, TALOS_FULL, Array, Oracle, load, make_log, random_states
 
 import torchid
 from torchid import parameters
@@ -184,13 +184,12 @@ def test_collisions_of_a_format_that_mujoco_does_not_read_are_kept_as_comments_a
     ("urdf", "file", "feet"),
     [
         pytest.param(BIPED, CONFIGS / "biped_full.yaml", SOLES, id="biped", marks=pytest.mark.slow),
-        pytest.param(TALOS_FULL, None, ("left_sole_link", "right_sole_link"), id="Talos"),
+        pytest.param(TALOS_FULL, None, ("left_sole_link", "right_sole_link"), id="Talos", marks=pytest.mark.slow),
+        pytest.param(SOLO12, None, ("FL_FOOT", "HR_FOOT"), id="Solo12"),
     ],
 )
-def test_a_run_of_a_humanoid_writes_what_loads(
-    urdf: Path, file: Path | None, feet: tuple[str, str], tmp_path: Path
-) -> None:
-    """Random states, exact forces; Talos with its 37 collision meshes."""
+def test_a_run_writes_what_loads(urdf: Path, file: Path | None, feet: tuple[str, str], tmp_path: Path) -> None:
+    """Random states, exact forces; Talos with its 37 collision meshes, Solo12 with 10."""
     oracle = Oracle.of(load(urdf))
     states = [[True, True], [True, False], [False, True]]
     log = make_log(oracle, [(foot, 6) for foot in feet], states, 300, np.random.default_rng(1))

@@ -158,7 +158,9 @@ def solo12() -> SimulationConfig:
     return robot_on(SOLO12, points_at(*(f"{leg}_FOOT" for leg in SOLO_LEGS)), SOLO_POSTURE, sensors=sensors)
 
 
-@pytest.mark.parametrize("config", [g1(), quadruped(), solo12()], ids=["G1", "quadruped", "Solo12"])
+@pytest.mark.parametrize(
+    "config", [g1(), quadruped(), pytest.param(solo12(), marks=pytest.mark.slow)], ids=["G1", "quadruped", "Solo12"]
+)
 def test_other_robots_stand_where_they_are_put_and_squat_as_far_as_they_are_told(config: SimulationConfig) -> None:
     simulation = set_up_simulation(config)
     recording, stood = simulation.run(config.motions[0])

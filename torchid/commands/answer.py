@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from torchid.errors import join_names
-from torchid.estimators import Estimate, SgdEstimate
+from torchid.estimators import ConsistentEstimate, Estimate, SgdEstimate
 from torchid.estimators.posterior import NominalError
 from torchid.fitting.calibration import list_confounded
 from torchid.identifiability.confounding import TotalMass
@@ -88,6 +88,8 @@ def _percent(share: float) -> str:
 
 _LARGER_THAN_MEASURED = 1.05  # errors over the measured, of sensors that any fit of their limb explains better
 _FAR_FROM_LEAST = 3.0  # standard errors by noise, rms; those that are printed count the scatter of blocks, too
+_MUCH_MORE = 1.5  # residuals of bodies that can exist over the least: 1.001 of honest logs, 1.9 to 30 with a unit wrong
+_EXACT = 1e-3  # of what the nominal parameters leave: signals without noise, of which a solver's tolerance is left
 _CLEAR_ERRORS = 4.0  # standard errors of a total mass from which on it is not the URDF's
 
 
@@ -168,6 +170,7 @@ def _attention(run: Identification, judged: Judged) -> Iterator[str]:
     if impossible:
         advice = "estimator.name=consistent finds the best that can be"
         yield f"negative, which nothing is: {join_names(impossible)}; {advice}"
+    yield from _impossible(run)
     if not run.misfit.explained:
         yield f"friction, compliance or contacts that the model lacks, or a wrong sensor (torchid check): {run.misfit}"
     if run.experiment.config.estimator.total_mass is None and _contradicts_nominal(run.mass):
@@ -183,6 +186,15 @@ def _attention(run: Identification, judged: Judged) -> Iterator[str]:
     yield from _far_off(run.posterior.nominal_error)
     if run.noise.suggested:
         yield f"noise: {noise_advice(run.noise.suggested)}"
+
+
+def _impossible(run: Identification) -> Iterator[str]:
+    """That the conditions, under which bodies can exist, leave much more than the fit without them."""
+    increase = run.estimate.relative_increase if isinstance(run.estimate, ConsistentEstimate) else None
+    growth = np.sqrt(1.0 + (increase or 0.0))
+    if growth > _MUCH_MORE and (run.misfit.share or 0.0) > _EXACT:
+        left = f"they leave {growth:.2g} times as much as bodies that cannot"
+        yield f"no bodies that can exist explain these forces: {left}; unit, gear or sign of a torque? (torchid check)"
 
 
 def _unfinished(estimate: SgdEstimate) -> str:

@@ -26,6 +26,7 @@ from torchid.commands.init_proposals import (
     read_sensors,
     split_log,
     stated_contacts,
+    unreadable,
 )
 from torchid.commands.reading import memory_needed
 from torchid.config.preprocessing import PreprocessingConfig
@@ -233,6 +234,7 @@ def _describe(
         out.missing.append("forces: neither joint torques nor contact wrenches")
     if not contacts and not robot.fixed_base and not _is_fixed(contacts, fields):
         out.missing.append(_NO_CONTACT)
+    out.missing += [*unreadable(proposal.not_numbers, fields)]
     out.missing += hints(proposal.left_out, fields, robot.joint_names, what, proposal.like_torques)
     from_feet = _from_feet(contacts, fields)
     if contacts and "contact_active" not in fields:

@@ -247,6 +247,16 @@ def hints(
     return out
 
 
+def unreadable(not_numbers: Sequence[str], fields: Collection[str]) -> list[str]:
+    """Columns that are called like fields that are missing, and are no numbers."""
+    named: dict[str, list[str]] = {}
+    for name in not_numbers:
+        if (field := propose_field(name)) not in ("", *fields):
+            named.setdefault(field, []).append(name)
+    why = "by name, but no numbers: text, or lists of several lengths"
+    return [f"{field}: {_like(names)} {why}" for field, names in named.items()]
+
+
 def _torque_hint(measured: Sequence[str], what: str, like_torques: Sequence[Family]) -> list[str]:
     """What may be torques, or currents of motors, of a log without torques that has columns that are left out."""
     each = join_names([_like(one.columns) for one in like_torques])

@@ -221,7 +221,8 @@ def _torque_findings(robot: Robot, fit: TorqueFit) -> Iterator[Finding | Skipped
 
     is_reversed = fit.implausible & (fit.gain < -1.0 / _SIGN_TOLERANCE_RATIO) & (fit.gain > -_SIGN_TOLERANCE_RATIO)
     if is_reversed.any():
-        yield finding("sign", REJECTED, is_reversed, "reversed; ", "reverse these torques")
+        hangs = "; or robot.base_tilt, if the base is not upright" if robot.fixed_base else ""
+        yield finding("sign", REJECTED, is_reversed, "reversed; ", f"reverse these torques{hangs}")
     scaled = fit.implausible & ~is_reversed
     for factor, unit in TORQUE_UNIT_FACTORS.items():
         low, high = factor / _UNIT_TOLERANCE_RATIO, factor * _UNIT_TOLERANCE_RATIO
@@ -286,7 +287,7 @@ def _gain_and_point_findings(
     relative, blocks = fit.gain / reference, fit.blocks[:, :m] / references
     large = (relative > MIN_GAIN_RATIO) | (relative < 1.0 / MIN_GAIN_RATIO)
     off = large & _is_certain(relative - 1.0, spread / reference, blocks - 1.0)
-    if off.any():
+    if off.any() and m > 1:
         names = [robot.joint_names[joint] for joint in fit.joints[off]]
         gains = join_names([f"{gain:.3g} +- {std:.2g}" for gain, std in zip(relative[off], spread[off], strict=True)])
         text = f"{join_names(names)}: factors that fit the {robot.format} best, relative to the other joints: {gains}"

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torchid.errors import join_names
 from torchid.log_checks.motion import MAX_ANGLE_RAD
 from torchid.logs import Log
-from torchid.logs.log import WRENCHES
+from torchid.logs.log import WRENCHES, FloatArray
 from torchid.logs.quaternion import inverse_rotation, make_sign_continuous
 from torchid.logs.units import advise_units, other_units
 from torchid.parameters import GRAVITY
@@ -111,8 +111,7 @@ def possible_mistakes(log: Log) -> Iterator[Mistake]:
         text = f"{join_names([log.joint_names[joint] for joint in far])} in degrees"
         yield Mistake("joint_position", text, "convert to radians", lambda log: _degrees_to_radians(log, far))
     yield from _order_mistakes(log)
-    if log.base_quat_xyzw is not None:
-        yield from _orientation_mistakes()
+    yield from _orientation_mistakes() if log.base_quat_xyzw is not None else _mountings()
     if log.imu_specific_force is not None:
         reading = "reversed: gravity minus acceleration"
         yield Mistake(
@@ -140,6 +139,15 @@ def _orientation_mistakes() -> Iterator[Mistake]:
     for axis, name in enumerate("xyz"):
         mirrored, turn = f"in a left-handed world, whose {name} axis is reversed", "give a right-handed world's"
         yield Mistake("base_quat_xyzw", mirrored, f"{turn} orientations and vectors", _mirror_world(axis))
+
+
+def _mountings() -> Iterator[Mistake]:
+    """Bases on a ceiling or a wall, and not upright, which a fixed base is taken for whose log has no orientation."""
+    for place, *turns in (("ceiling", (2, 0)), ("wall", (1, 0), (-1, 0), (0, 1), (0, -1))):
+        for x, y in 0.5 * np.pi * np.array(turns):
+            quat = np.array([np.sin(0.5 * x), np.sin(0.5 * y), 0.0, np.cos(0.5 * x) * np.cos(0.5 * y)])
+            advice = f"robot.base_tilt: [{x:.4f}, {y:.4f}] about the base link's x and y axes"
+            yield Mistake("base", f"mounted on a {place}", advice, _constant("base_quat_xyzw", quat))
 
 
 def reversed_joints(log: Log) -> Iterator[Mistake]:
@@ -251,6 +259,10 @@ def _remove(fields: Sequence[str]) -> Callable[[Log], Log]:
 
 def _multiply(field: str, factor: float) -> Callable[[Log], Log]:
     return _change(lambda log: {field: factor * getattr(log, field)})
+
+
+def _constant(field: str, value: FloatArray) -> Callable[[Log], Log]:
+    return _change(lambda log: {field: np.tile(value, (len(log), 1))})
 
 
 def _degrees_to_radians(log: Log, joints: slice | NDArray[np.intp]) -> Log:

@@ -30,8 +30,8 @@ from torchid.sensing import Contact, SensorNoise, SensorSet
 
 #: Errors of a URDF, in units of `parameter_scale`: 0.1 is a mass, or an inertia, that is 15 to 20 % off.
 URDF_ERROR = 0.1
-#: Friction missing in a URDF, over the rms torque of the joint.
-FRICTION_TORQUE_SHARE = 0.2
+#: Friction missing in a URDF, over the rms torque of the joint: strain-wave gears and ball screws have as much.
+FRICTION_TORQUE_SHARE = 1.0
 #: Forces that no parameters explain (flexibility, filters, shape of friction), over the rms of each kind of force.
 UNMODELLED_FORCE_SHARE = 0.05
 #: Successive samples that count as one: of 240 out of ten seconds, errors of friction and flexibility are correlated.

@@ -274,7 +274,7 @@ MAX_DIFFERENCE, MAX_UNEXPLAINED_DIFFERENCE = 0.3, 0.6
 #: is far below the share of it.
 MIN_TURNING = 0.05
 #: Samples that must be left, and time at either end of a stance that does not count.
-_MIN_SAMPLES, _STANCE_END_S = 50, 0.1
+_MIN_SAMPLES, _TURN_END_S = 50, 0.1
 #: Length that makes an axis of a flat foot a vector between points, and the largest radius that counts as none.
 _AXIS_LENGTH_M, _MAX_RADIUS_M = 0.3, 0.03
 _UNIT_TOLERANCE = 0.1
@@ -308,7 +308,7 @@ def _turning(
     """Vectors [m] that keep still in the world, their rates in the base, and the gyroscope's readings, (M, 3) each."""
     poses, feet = recorded_link_poses(log, robot), [c for c in contacts if c.frame in log.contact_names]
     feet = [c for c in feet if c.radius <= _MAX_RADIUS_M and c.frame in poses]
-    ends = max(1, round(_STANCE_END_S / median_step(log)))
+    ends = max(1, round(_TURN_END_S / median_step(log)))
     omega = np.asarray(log.imu_angular_velocity) @ R_base_imu.T
     parts = []
 

@@ -131,6 +131,7 @@ class _Search:
         missing = [column for column in one.columns if column not in self._known]
         if missing:
             self._require_numbers(part, missing[0])
+            self._require_lists(part, missing[0])
             more = f" (nor {len(missing) - 1} more)" if len(missing) > 1 else ""
             unused = self._unused() or self._given
             raise UnknownFieldError.at_field(f"{KEY}.{part.key}", missing[0], unused, f"no such column{more}")
@@ -145,6 +146,13 @@ class _Search:
         if shifted is not None and all(column in self._known for column in shifted.columns):
             found = f"'{missing}', no such column, with first_index: {part.entry.first_index}"
             raise LogError.at_field(f"{KEY}.{part.key}", found, f"first_index: {first}, by the numbers of the columns")
+
+    def _require_lists(self, part: EntryPart, missing: str) -> None:
+        """Refuse an element, such as `q[0]`, of a column that is there and has no lists of one length."""
+        name, bracket, _ = missing.rpartition("[")
+        if bracket and name in self._known:
+            found = f"'{missing}' of the column '{name}', which has no lists, or lists of several lengths"
+            raise LogError.at_field(f"{KEY}.{part.key}", found, "an element of lists of one length")
 
     def _unused(self) -> list[str]:
         taken = {column for one in self._fixed_by_key.values() for column in one.columns}

@@ -73,8 +73,8 @@ def read_header(path: Path) -> TextHeader:
     """The names of the columns of a .csv, .mot or .sto file; the decimal mark is that of the rows.
 
     Names are in the first line with as many cells as the first row that is mostly numbers. Lines above are remarks, a
-    line of units may follow. A column without a name is called `unnamed_0` by its place. In OpenSim's tables all
-    that is below the line `endheader`.
+    line of units may follow, or more names where that line has some twice. A column without a name is called
+    `unnamed_0` by its place. In OpenSim's tables all that is below the line `endheader`.
 
     Raises:
         LogError: no names, or a line that is too long.
@@ -96,6 +96,9 @@ def read_header(path: Path) -> TextHeader:
     if row == first + 1 and _is_units(texts[first], separator, len(cells)):
         units = _cells(_COMMENT.sub("", texts[first]), separator)
         cells = [_with_unit(*pair) for pair in zip(cells, units, strict=True)]
+        first = row
+    elif levels := _levels(cells, texts[first:row], separator):
+        cells = [".".join(filter(None, names)) for names in zip(cells, *levels, strict=True)]
         first = row
     sample = [cell.strip() for cell in _cells(texts[first], separator)] if first < len(texts) else []
     cells += [""] * (len(sample) == len(cells) + 1 and not sample[-1])  # a separator at the end of each row
@@ -157,6 +160,12 @@ def _is_row(text: str) -> bool:
     cells = [cell for cell in _cells(text, _most_used(text)) if cell.strip()]
     numbers = [cell for cell in cells if _NUMBER.fullmatch(cell.strip())]
     return 2 * len(numbers) > len(cells) or (bool(numbers) and _DATE.fullmatch(cells[0].strip()) is not None)
+
+
+def _levels(names: Sequence[str], below: Sequence[str], mark: str) -> list[list[str]]:
+    """Names below a line that has some twice, as pandas writes columns of several levels; none below others."""
+    found = [[cell.strip() for cell in _cells(text, mark)] for text in below]
+    return found if len(set(names)) < len(names) and all(len(cells) == len(names) for cells in found) else []
 
 
 def _is_units(text: str, mark: str, count: int) -> bool:

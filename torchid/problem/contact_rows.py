@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -15,7 +15,7 @@ from torchid.problem.wrench_rows import wrenches_at_ground
 from torchid.regressor.regressor import generalized_forces
 from torchid.regressor.tree import KinematicTree
 from torchid.sensing.limbs import limb_null_space
-from torchid.sensing.projection import any_suspect, whitened_null_space
+from torchid.sensing.projection import any_suspect, null_space, whitened_null_space
 
 
 @dataclass(frozen=True)
@@ -80,6 +80,23 @@ def contact_rows(
         rows[0].append(loop.forces(tree, kinematics))
         columns[0].append(tree.index(tree.base_rows + index for index in loop.joints))
     return ContactRows(*rows, *columns, len(layout.row_std), kinematics.screw_axes)
+
+
+def orthonormal_bases(
+    layout: ContactStateLayout, rows: ContactRows, order: Tensor
+) -> Iterator[tuple[Tensor | slice, Tensor]]:
+    """Orthonormal bases V of the null spaces of the unmeasured rows, grouped by rank; arguments as `whitened_bases`.
+
+    Yields:
+        (index of the samples, V): V is (B', m, r).
+    """
+    if not layout.has_own_limbs:
+        yield from null_space(rows.of_unmeasured(slice(None)))
+        return
+    alike = replace(layout, row_std=torch.ones_like(layout.row_std), wrench_std=layout.wrench_std[:0])
+    nothing = rows.like.new_empty(0, rows.width, rows.like.shape[-1])
+    for index, W in whitened_bases(alike, rows, nothing, None, order):
+        yield index, W.permute(2, 0, 1)
 
 
 def whitened_bases(

@@ -130,18 +130,24 @@ A mass is then between nothing and twice the nominal one.
 """
 
 
+FRICTION_WEIGHT_SHARE = 1e-3
+"""Share of the weight of a robot's moving bodies that friction may easily be: 1 N of 100 kg."""
+
+
 def parameter_scale(nominal: Array) -> Array:
     """Size of a plausible deviation of each parameter, (L, 12): its unit in the prior.
 
     Mass m of the body; first moments m r; inertias m r^2, with r the body's radius of gyration about its link origin;
-    friction 1 N m and 1 N m s/rad.
+    friction 1 N m and 1 N m s/rad, or more of a heavy robot: `FRICTION_WEIGHT_SHARE` of the weight of its moving
+    bodies, or of that times r where this is more than a metre.
     """
     mass = nominal[:, parameters.MASS]
     typical = mass[mass > 0.0].mean()
     mass = np.maximum(mass, 1e-3 * typical)
     gyration = np.trace(parameters.inertia_matrix(nominal), axis1=1, axis2=2) / 2.0 / mass
     radius = np.sqrt(np.maximum(gyration, 1e-4))  # at least a centimetre
-    scale = np.ones_like(nominal)
+    weight = parameters.GRAVITY * (mass * np.maximum(radius, 1.0))[1:].sum()
+    scale = np.full_like(nominal, max(1.0, FRICTION_WEIGHT_SHARE * weight))
     scale[:, parameters.MASS] = mass
     scale[:, parameters.FIRST_MOMENT] = (mass * radius)[:, None]
     scale[:, parameters.INERTIA] = (mass * radius**2)[:, None]
@@ -312,6 +318,14 @@ class TriangularFactor:
         kept = self._blocks.get(support)
         stacked = torch.cat([rows.T] if kept is None else [kept.T, rows.T], dim=1).T
         self._blocks[support] = stacked if len(stacked) < stacked.shape[1] else triangularize(stacked)
+
+
+def gram_matrix(X: Tensor) -> Tensor:
+    """X X^T; on the CPU NumPy's, which does half of the products."""
+    if X.device.type != "cpu":
+        return X @ X.T
+    rows = X.numpy()
+    return torch.from_numpy(rows @ rows.T)
 
 
 def triangularize(stacked: Tensor) -> Tensor:

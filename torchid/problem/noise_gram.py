@@ -26,7 +26,7 @@ from torchid.parameters import Array
 from torchid.problem.chunk_dynamics import Workspace
 from torchid.problem.chunks import ProgressCallback, map_chunks, one_thread
 from torchid.problem.contact_state import ContactState
-from torchid.problem.linear import TriangularFactor
+from torchid.problem.linear import TriangularFactor, gram_matrix
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples, concatenate
 from torchid.rounding import RANK_TOLERANCE, column_scale, is_significant
@@ -161,8 +161,7 @@ def _noise_gram_of_chunks(
                     first, last = (copy * count + x for x in (start, end))
                     if isinstance(index, Tensor):  # of samples whose contacts have one rank
                         first, last = torch.searchsorted(index, torch.tensor([first, last]).to(index)).tolist()
-                    X = rows.values[:, :, first:last].flatten(1)
-                    _add(sums, {rows.block.support: X @ X.T}, weight)
+                    _add(sums, {rows.block.support: gram_matrix(rows.values[:, :, first:last].flatten(1))}, weight)
     return out
 
 
@@ -200,9 +199,10 @@ class CorrectedTriangle:
 def corrected_triangle(factor: TriangularFactor, prior: ColumnPrior) -> CorrectedTriangle:
     """A factor without what noise of the motion adds to its rows.
 
-    Residuals remain those of the rows at the parameters that fit R best. With a share of noise s in the information on
-    a combination, of which 1 - `LEAST_SIGNAL` is taken off at most, the combination follows its data by
-    (1 - s) / `LEAST_SIGNAL` and the prior by the rest, as with a ridge. By chance s may exceed 1; the data then give
+    Residuals remain those of the rows at the parameters that fit R best. Noise that would leave more of the rows
+    unexplained than these is taken to be as much smaller, as total least squares has it. With a share of noise s in
+    the information on a combination, of which 1 - `LEAST_SIGNAL` is taken off at most, the combination follows its data
+    by (1 - s) / `LEAST_SIGNAL` and the prior by the rest, as with a ridge. By chance s may exceed 1; the data then give
     nothing of it.
 
     Args:
@@ -220,15 +220,24 @@ def corrected_triangle(factor: TriangularFactor, prior: ColumnPrior) -> Correcte
     whitening = scale[:, None] * Vh[kept].T / values[kept]  # rows @ whitening has orthonormal columns
     noise = whitening.T @ noise_gram[:-1, :-1] @ whitening
     shares, turn = np.linalg.eigh(0.5 * (noise + noise.T))
+    along, of_forces, rest = (
+        turn.T @ (U[:, kept].T @ rhs),
+        turn.T @ (whitening.T @ noise_gram[:-1, -1]),
+        U[:, other].T @ rhs,
+    )
+    of_noise = np.square(along) @ np.minimum(shares, 1.0) - 2.0 * along @ of_forces + noise_gram[-1, -1]
+    spent = min((len(along) + len(rest)) / max(factor.independent_rows, 1.0), 1.0)
+    residual = np.square(rhs - U[:, kept] @ (turn @ along) - U[:, other] @ rest).sum()
+    possible = min(residual / ((1.0 - spent) * of_noise), 1.0) if spent < 1.0 and of_noise > 0.0 else 1.0
+    shares, of_forces = possible * shares, possible * of_forces
     if np.abs(shares).max(initial=0.0) < _NEGLIGIBLE:
         return CorrectedTriangle(R, NoiseShares.of(shares))
     left = np.clip(1.0 - shares, LEAST_SIGNAL, _MOST_SIGNAL)
     combinations = turn.T @ (values[kept, None] * Vh[kept] * size)
-    target = turn.T @ (U[:, kept].T @ rhs - whitening.T @ noise_gram[:-1, -1])
+    target = along - of_forces
     remaining = np.where(shares > 1.0 - LEAST_SIGNAL, left - np.maximum(1.0 - shares, 0.0), 0.0)
     target += remaining * (combinations[:, : len(prior.nominal)] @ prior.nominal)
     best = whitening @ (turn @ (target / left))
-    rest = U[:, other].T @ rhs
     residual = np.linalg.norm(rhs - rows @ best - U[:, other] @ rest)
     stacked = [
         np.column_stack([np.sqrt(left)[:, None] * combinations, target / np.sqrt(left)]),

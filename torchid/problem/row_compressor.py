@@ -35,6 +35,7 @@ _CERTIFIED = (16.0 * _LEAST_EIGENVALUE, 4.0 * _LEAST_EIGENVALUE, _LEAST_EIGENVAL
 """What the least eigenvalue is shown to be: the larger, the later it is looked at again."""
 
 _ROWS_PER_COLUMN = 3  # of the sample of a chunk that its columns are combined by
+_MOST_COMBINED = 0.5  # of the columns: where more are combined, QR is as fast, and the Gram matrix mostly fails
 _LEAST_ROWS = 2000  # of a chunk that columns are combined for: of fewer, that takes longer than Householder QR of them
 
 
@@ -75,13 +76,21 @@ class ColumnLevels:
             T[np.ix_(order[:start], order[start:end])] = -combination
         return cls(T, size, np.sort(order[bounds[1] :]))
 
-    def apply(self, X: Array) -> Array:
-        """Change columns, (n, M) by column, in place; returns the squares of their lengths before, (k,)."""
-        if not len(self.lower):
-            return np.zeros(0)
-        before = np.square(X[self.lower]).sum(1)
-        X[self.lower] = self.to_lower @ X
-        return before
+    @cached_property
+    def from_all(self) -> Array:
+        """What the lower columns were of all as they are now, (n, k)."""
+        inverse = np.linalg.solve(self.T_unit, np.eye(len(self.size))[:, self.lower])
+        return np.asarray(inverse * self.size[self.lower] / self.size[:, None])
+
+    def apply(self, X: Array) -> None:
+        """Change columns, (n, M) by column, in place."""
+        if len(self.lower):
+            X[self.lower] = self.to_lower @ X
+
+    def squares_before(self, gram: Array) -> Array:
+        """Squares of the lengths that the lower columns had, (k,), from the Gram matrix of changed ones."""
+        with np.errstate(invalid="ignore"):  # what is not finite stays so
+            return np.asarray((self.from_all * (gram @ self.from_all)).sum(0))
 
     def undo(self, R: Array) -> Array:
         """R T^-1, (n, n), of which only the lower columns differ from R's."""
@@ -122,9 +131,10 @@ class _Sum:
 
     def add(self, X: Array) -> bool:
         """Add rows by column, (n, M), which are combined in place, if the sum may be used; returns whether it was."""
-        before = self.levels.apply(X)
-        total = self.gram + X @ X.T  # numpy does half of the products
-        total[self.levels.lower, self.levels.lower] += _FLOOR**2 * before
+        self.levels.apply(X)
+        gram = X @ X.T  # numpy does half of the products
+        total, lower = self.gram + gram, self.levels.lower
+        total[lower, lower] += _FLOOR**2 * self.levels.squares_before(gram)
         if not self._is_certain(total):
             return False
         self.gram = total
@@ -235,12 +245,15 @@ class RowCompressor:
         self._levels.clear()
 
     def _start(self, support: tuple[int, ...], X: Array) -> _Sum | None:
-        """A sum of nothing, with columns combined as for the rows before, or by some of these."""
+        """A sum of nothing, columns combined as for the rows before or by some of these; None if QR is as fast."""
         if support not in self._levels:
             some = X[:, :: max(1, X.shape[1] // (_ROWS_PER_COLUMN * len(X)))].copy()
             if not np.isfinite(some).all():
                 return None
-            self._levels[support] = ColumnLevels.of(triangularize(torch.from_numpy(some).T).numpy())
+            levels = ColumnLevels.of(triangularize(torch.from_numpy(some).T).numpy())
+            if len(levels.lower) > _MOST_COMBINED * len(X):
+                return None
+            self._levels[support] = levels
         return _Sum.of_nothing(self._levels[support])
 
     def _factorize(self, factor: TriangularFactor, support: tuple[int, ...], stacked: Tensor, known: _Sum) -> None:

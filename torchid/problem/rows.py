@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchid.parameters import Array
 from torchid.problem.base_motion import levelled_base_axes
 from torchid.problem.chunk_dynamics import ChunkDynamics, ChunkKinematics, Workspace, Workspaces
-from torchid.problem.contact_rows import ContactRows, contact_rows, whitened_bases
+from torchid.problem.contact_rows import ContactRows, contact_rows, orthonormal_bases, whitened_bases
 from torchid.problem.contact_state import ContactState, ContactStateLayout, ContactStateLayouts, RowColumns
 from torchid.problem.extra_columns import KnownTorques, dof_extra_column, extra_columns
 from torchid.problem.extras import ExtraTerms, NoiseGroups, list_extras
@@ -30,7 +30,6 @@ from torchid.regressor.regressor import (
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
-from torchid.sensing.projection import null_space
 
 
 @dataclass(frozen=True)
@@ -208,7 +207,8 @@ class RowBuilder(nn.Module):
     ) -> Iterator[tuple[Tensor | slice, Tensor]]:
         """Orthonormal V_x, (B', base rows + coupled joints, r), with the samples it belongs to, grouped by rank."""
         layout = self._layouts.layout(state, kinematics.recorded_normals)
-        yield from null_space(self.contact_rows(layout, kinematics).of_unmeasured(slice(None)))
+        rows, order = self.contact_rows(layout, kinematics), self.tree.index(layout.blocks.order)
+        yield from orthonormal_bases(layout, rows, order)
 
     def contact_rows(self, layout: ContactStateLayout, kinematics: ChunkKinematics) -> ContactRows:
         """Rows of J_C, unmeasured and measured, of the bodies that are in contact."""

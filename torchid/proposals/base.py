@@ -24,6 +24,14 @@ _STEPS = 0.1  # of the range of a path: as large no step of one is, in the media
 _CLEAR = 0.05  # of a mean cosine, by which one order of a quaternion is better than the other
 _PLACE = {"p", "pos", "position", "positions", "xyz", "r", "loc", "location", "translation", "trans", "lage"}
 _TURN = {"q", "e", "o", "ori", "orient", "orientation", "quat", "quaternion", "rot", "rotation", "attitude"}
+_LINEAR, _ANGULAR, _SPEED = {"linear", "lin"}, {"angular", "ang", "omega", "w"}, {"vel", "velocity", "v"}
+_MESSAGE = {"pose", "twist"}
+#: Fields of the base beside its orientation: their quantities, and words of which all, and some, are in their names.
+_BESIDE: tuple[tuple[str, str, set[str], set[str]], ...] = (
+    ("base_position_world", "length", _PLACE, set()),
+    ("base_linear_velocity_world", "velocity", _LINEAR | _SPEED, set()),
+    ("base_angular_velocity_base", "angular velocity", _ANGULAR | _SPEED, _ANGULAR),
+)
 _WHOSE = re.compile(
     rf"{BASES}|floating|state|states|data|pose|world|robot|est|"
     r"estimated?|meas|measured|link|vicon|optitrack|ground|truth|gt|global|"
@@ -55,26 +63,28 @@ def field_of_base(family: Family, sample: FileSample) -> str:
     return ""
 
 
-def is_beside(family: Family, quaternion: str, sample: FileSample) -> bool:
-    """Whether three numbers are the position that belongs to a quaternion, by their names and as they are a path.
+def field_beside(family: Family, quaternion: str, sample: FileSample) -> str:
+    """The field of the base that three numbers are which belong to a quaternion by their names; "" for none.
+
+    Positions are a path; in which frame velocities are, and whether they are its slope, is not looked at here.
 
     Args:
         family: of three columns, or of an array.
-        quaternion: columns of a map: `state.quat[{index}]`, beside which `state.p[{index}]` is the position.
+        quaternion: columns of a map: `state.quat[{index}]`, beside which `state.p[{index}]` is the position;
+            `pose/orientation/{axis}`, beside which `twist/linear/{axis}` is a velocity.
         sample: of the file.
     """
-    of_place, of_turn = (words_of(PLACEHOLDER.sub(" ", split_unit(x)[0])) for x in (family.pattern, quaternion))
-    whose = [word for word in of_place if word not in _PLACE]
+    words, of_turn = (words_of(PLACEHOLDER.sub(" ", split_unit(x)[0])) for x in (family.pattern, quaternion))
+    whose = [word for word in of_turn if word not in _TURN | _MESSAGE]
     values = side_by_side(sample, family.columns)
     numbers = values.reshape(len(values), -1) if values.ndim and values.dtype.kind in "fiu" else np.empty((0, 0))
-    return (
-        bool(whose)
-        and whose == [word for word in of_turn if word not in _TURN]
-        and numbers.shape[1:] == (3,)
-        and "".join(sorted(family.axes)).lower() in ("", "xyz")
-        and family.unit_may_be("length")
-        and _is_path(numbers.astype(float))
-    )
+    if numbers.shape[1:] != (3,) or "".join(sorted(family.axes)).lower() not in ("", "xyz"):
+        return ""
+    for field, quantity, own, needed in _BESIDE:
+        rest = [word for word in words if word not in own | _MESSAGE]
+        if rest == whose != [] and (not needed or needed & set(words)) and family.unit_may_be(quantity):
+            return field if field != _BESIDE[0][0] or _is_path(numbers.astype(float)) else ""
+    return ""
 
 
 def _is_path(numbers: FloatArray) -> bool:
@@ -217,7 +227,7 @@ def _angles(values: Mapping[str, NDArray[Any]], unit: str) -> Angles:
 
 
 _AVERAGED = 0.1  # [s]: over which velocities are compared, for the noise of slopes
-_LIKE, _CLEAR = 0.5, 0.8  # error of a velocity that is the slope, and of one frame in the other's, at most
+_LIKE, _BETTER = 0.5, 0.8  # error of a velocity that is the slope, and of one frame in the other's, at most
 
 
 def settle_velocities(proposal: MapProposal, values: Callable[[str], FloatArray | None], seconds: FloatArray) -> None:
@@ -243,7 +253,7 @@ def settle_velocities(proposal: MapProposal, values: Callable[[str], FloatArray 
             if errors[best] > _LIKE:
                 notes[name] = "left out, as it is the slope of the base's pose along no axes"
                 proposal.leave_out(name)
-            elif errors[best] < _CLEAR * errors[other]:
+            elif errors[best] < _BETTER * errors[other]:
                 _rename(columns, notes, name, f"base_{kind}_velocity_{best}", f"along the axes of the {best}")
 
 

@@ -294,7 +294,8 @@ def split_arrays(sample: FileSample, names: Sequence[str], joints: Collection[in
     for name in names if out else ():
         shape, field = np.asarray(sample[name]).shape, propose_field(name)
         if width and shape[1:] == (6 + width,) and field in ("joint_velocity", "joint_torque"):
-            out.append((name, "[6:]", field))
+            of_base = [(name, "[0:3]", _TWIST[0]), (name, "[3:6]", _TWIST[3])] if field == "joint_velocity" else []
+            out += [*of_base, (name, "[6:]", field)]
         elif shape[1:] == (len(_TWIST),) and field == _TWIST[0] and (name, "[7:10]", field) not in out:
             out += [(name, "[0:3]", _TWIST[0]), (name, "[3:6]", _TWIST[3])]
     return out
@@ -320,6 +321,7 @@ class MapProposal:
         columns: the map, as it stands in a file.
         notes: what was guessed, by key.
         left_out: columns that it ignores.
+        not_numbers: of these those that are no numbers, but texts or lists of several lengths.
         key: columns or topics.
         fields: of the log, that a map of topics gives.
         lacking: joints of the robot without columns, if most have some.
@@ -328,6 +330,7 @@ class MapProposal:
     """
 
     columns: dict[str, Any] = field(default_factory=dict)
+    not_numbers: list[str] = field(default_factory=list)
     key: str = "columns"
     fields: set[str] = field(default_factory=set)
     notes: dict[str, str] = field(default_factory=dict)

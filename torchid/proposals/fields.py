@@ -15,7 +15,7 @@ from torchid.logs.name_matching import SUFFIXES, KnownRobot, limb_and_words, wit
 from torchid.logs.unitree import JOINT_ORDERS, MOTORS, numbered_joints, suitable_orders
 from torchid.logs.units import quantities_with, split_unit
 from torchid.proposals.column_groups import Family
-from torchid.proposals.file_samples import FileSample, increases, side_by_side, stated_names
+from torchid.proposals.file_samples import FileSample, increases, listed_order, side_by_side, stated_names
 from torchid.proposals.numbers import point_along_z
 
 FORCE = re.compile(r"force|(?<![a-z])f\{axis", re.IGNORECASE)
@@ -126,6 +126,7 @@ class FieldMatcher:
         else:
             whole = count in (len(self.robot.joints), *slots, *([len(self.named_joints)] if self.names_stated else []))
             whole |= not self.names_stated and len(numbered_joints(self.robot.joints, count)) == count > 2
+            whole |= listed_order(self.sample, "joint", self.robot, count) is not None
         enough = whole or (count >= len(self.robot.joints) and bool(family.numbers))
         return enough and len(self.robot.joints) > 0 and not any(family.axes)
 
@@ -141,7 +142,10 @@ _NO_FOOT = re.compile(
     r"hand|wrist|gripper|palm|finger|tool|tcp|motor|temp|current|limit|cop|pos|vel|acc|(?<![a-z])arm(?![a-z])",
     re.IGNORECASE,
 )
-_AXIS = re.compile(r"(?<![A-Za-z])([fmtcFMTC]?)([xyzXYZ])(?=\W*$)")
+_IN_WORLD = re.compile(r"world|global|inertial|forces?_w(?![a-z])", re.IGNORECASE)
+_LOCAL = re.compile(r"(?<![a-z])local(?![a-z])", re.IGNORECASE)
+_COMPONENT = "(?<![A-Za-z])([fmtcFMTC]?)([xyzXYZ])(?![A-Za-z])"
+_AXIS = re.compile(f"{_COMPONENT}(?!.*{_COMPONENT})")  # the last
 _NUMBER = re.compile(r"(?<=[\[_./' -])(\d)(?=\W*$)")
 _PARTS = {"f": "force", "m": "moment", "t": "moment", "c": "moment"}  # c: of a couple
 _WHOLE = {("",), ("x", "y", "z"), ("0", "1", "2"), ("0", "1", "2", "3", "4", "5")}
@@ -178,19 +182,22 @@ class FootReadings:
         return np.concatenate(arrays, axis=1).reshape(len(arrays[0]), len(self.columns), -1)[..., :3]
 
 
-def frame_of_forces(forces: FloatArray, robot: KnownRobot) -> tuple[str, str, int]:
+def frame_of_forces(forces: FloatArray, robot: KnownRobot, words: str = "") -> tuple[str, str, int]:
     """The field that forces (N, ..., 3) of all feet are, a note on it, and the sign of those that act on the robot.
 
-    In the world, forces of several small feet point along z; all others are taken to be along the contacts' axes.
-    Without any nothing is known.
+    That which `words` in names of columns say; else, as in the world forces of several small feet point along z, the
+    world's if these do, and the contacts' for all others.
     """
-    if len(robot.feet) < 3 or forces.ndim < 2 or not point_along_z(forces):
+    known = forces.ndim > 1
+    named = _IN_WORLD.search(words) is not None
+    is_upright = known and len(robot.feet) > 2 and not _LOCAL.search(words) and point_along_z(forces)
+    if not named and not is_upright:
         return WRENCHES[0], "taken to act on the robot, along the axes of the contact frames", 1
-    upwards = np.nansum(forces.reshape(len(forces), -1, 3)[..., 2], axis=1)
+    upwards = np.nansum(forces.reshape(len(forces), -1, 3)[..., 2], axis=1) if known else np.zeros(1)
     downwards = float(np.nanmean(upwards)) < -_CARRIED * robot.weight
     acting = "reversed, as they pull the robot down" if downwards else "taken to act on the robot"
-    why = "along the axes of the world, as almost all of them points along z"
-    return WRENCHES[1], f"{acting}, {why}", -1 if downwards else 1
+    why = "as its name says" if named else "as almost all of them points along z"
+    return WRENCHES[1], f"{acting}, along the axes of the world, {why}", -1 if downwards else 1
 
 
 def find_foot_readings(sample: FileSample, columns: Sequence[str], robot: KnownRobot) -> list[FootReadings]:
@@ -264,7 +271,7 @@ def _pattern(component: str, column: str) -> str:
     regex = _NUMBER if component.isdigit() else _AXIS
     if not component or (found := regex.search(split_unit(column)[0])) is None:
         return column
-    start, end = found.span(regex.groups)
+    start, end = found.span(1 if component.isdigit() else 2)
     name = "component" if component.isdigit() else "axis" if column[start].islower() else "AXIS"
     return f"{column[:start]}{{{name}}}{column[end:]}"
 

@@ -70,8 +70,12 @@ def texts_in(sample: FileSample) -> list[str]:
     return [*sample, *(text for name in listed for text in stated_names(sample, name))]
 
 
-def listed_order(sample: FileSample, kind: str, robot: KnownRobot, count: int) -> tuple[list[str], str] | None:
+def listed_order(
+    sample: FileSample, kind: str, robot: KnownRobot, count: int
+) -> tuple[Sequence[str | None], str] | None:
     """So many names of joints or feet that some array of a file lists, and which; None where none does.
+
+    What it lists beside all of them, such as joints that mimic others, is None in its place.
 
     Args:
         sample: from `read_sample`.
@@ -89,9 +93,9 @@ def listed_order(sample: FileSample, kind: str, robot: KnownRobot, count: int) -
             numbered[f"{name[: found.start()]}{{index}}{name[found.end() :]}"].append((int(found[0]), one[0]))
     texts |= {name: [text for _, text in sorted(of)] for name, of in numbered.items()}
     for name, listed in texts.items():
-        matched = match_names(listed, known, kind) if len(listed) == count == len(known) else {}
+        matched = match_names(listed, known, kind) if len(listed) == count >= len(known) else {}
         if len(matched) == len(known) > 0:
-            return [matched[text] for text in listed], f"as '{name}' of the file lists them"
+            return [matched.get(text) for text in listed], f"as '{name}' of the file lists them"
     if kind == "contact":
         return _order_of_legs(texts, robot, count)
     return None
@@ -167,6 +171,11 @@ def increases(values: NDArray[Any] | None) -> bool:
     if values is None or values.ndim != 1 or len(values) < 3:
         return False
     return bool((np.diff(values) > 0).mean() > _SORTED)
+
+
+def counts(values: NDArray[Any] | None) -> bool:
+    """Whether numbers (N,) are those of samples: one more with each of them."""
+    return values is not None and values.ndim == 1 and len(values) > 2 and bool((np.diff(values) == 1).all())
 
 
 def side_by_side(sample: FileSample, columns: Sequence[str]) -> NDArray[Any]:

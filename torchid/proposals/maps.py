@@ -18,10 +18,10 @@ from torchid.logs.log import SHAPES, VARIANTS, WRENCHES
 from torchid.logs.name_matching import SUFFIXES, KnownRobot
 from torchid.logs.unitree import JOINT_ORDERS, numbered_joints, usual_order
 from torchid.logs.units import IN_DEGREES, quantities_of, quantities_with, unit_factor
-from torchid.proposals.base import field_of_base, find_angles, is_beside, order_of_quaternion, settle_velocities
+from torchid.proposals.base import field_beside, field_of_base, find_angles, order_of_quaternion, settle_velocities
 from torchid.proposals.column_groups import Family, MapProposal, find_families, split_arrays, split_stamps
 from torchid.proposals.fields import MOMENT, FieldMatcher, find_foot_readings, frame_of_forces
-from torchid.proposals.file_samples import FileSample, increases, listed_order, side_by_side, with_samples_first
+from torchid.proposals.file_samples import FileSample, counts, increases, listed_order, side_by_side, with_samples_first
 from torchid.proposals.numbers import (
     LEAST_GRAVITY,
     UnitProposer,
@@ -103,6 +103,7 @@ class _Proposer:
         taken |= self._place_angles([name for name in numeric if name not in taken])
         self.out.partial = self.match.partial
         self.out.left_out = [name for name in foreign if name not in taken]
+        self.out.not_numbers = [name for name in foreign if name not in numeric]
         families = [one for one in families if one in used or not set(one.columns) <= taken]
         unused = [one for one in families if one not in used or len(one.numbers) > len(self.joints)]
         ignored = {pattern for one in unused for pattern in one.as_ignored}
@@ -115,7 +116,12 @@ class _Proposer:
         return self.out
 
     def _settle_numbers(self) -> None:
-        """Units and frames, as the numbers say."""
+        """Units and frames, as the numbers say; a gyroscope alone is the angular velocity of a base that turns."""
+        entries, turns = self.out.columns, {"base_quat_wxyz", "base_quat_xyzw"}
+        rates = {"base_angular_velocity_base", "base_angular_velocity_world", "imu_specific_force"}
+        known = {*self.given, *entries}
+        if "imu_angular_velocity" in entries and turns & known and not rates & known:
+            entries["base_angular_velocity_base"] = entries.pop("imu_angular_velocity")
         with np.errstate(all="ignore"):  # of numbers that no unit explains
             units = UnitProposer(self.sample, self.out.columns, self.out.notes, self.factors)
             seconds = units.propose(self.robot.weight, not self.files, self.robot.slides)
@@ -170,14 +176,14 @@ class _Proposer:
         self._note(field, f"columns {start} to {stop or 'the last'} of '{name}'")
 
     def _stamps_first(self, families: Sequence[Family]) -> list[Family]:
-        """Families of stamps, those that increase first, of these those beside the positions of joints."""
+        """Families of stamps, those that increase first, numbers of samples last, of others those beside positions."""
         entry = self.out.columns.get("joint_position", {})
         beside = next(iter(entry.get("columns", {}).values()), "") or entry.get("column", "joint_position")
 
-        def rank(family: Family) -> tuple[bool, int]:
+        def rank(family: Family) -> tuple[bool, bool, int]:
             first = family.columns[0]
             forwards = first in self.nanoseconds or increases(self.sample[first])
-            return not forwards, -len(os.path.commonprefix([first, beside]))
+            return not forwards, counts(self.sample[first]), -len(os.path.commonprefix([first, beside]))
 
         return sorted(families, key=rank)
 
@@ -188,8 +194,9 @@ class _Proposer:
         named = [(one, field) for one in families if (field := field_of_base(one, self.sample))]
         placed = [one for one, field in sorted(named, key=lambda pair: not pair[0].stem) if self._place(one, field)]
         turns = [self.out.columns.get(f"base_quat_{order}", {}).get("column", "") for order in ("xyzw", "wxyz")]
-        beside = [one for one in families if any(x and is_beside(one, x, self.sample) for x in turns)]
-        return placed + [one for one in beside if one not in placed and self._place(one, "base_position_world")]
+        others = [(one, turn) for turn in turns if turn for one in families if one not in placed]
+        beside = [(one, field) for one, turn in others if (field := field_beside(one, turn, self.sample))]
+        return placed + [one for one, field in beside if self._place(one, field)]
 
     def _place(self, family: Family, name: str = "") -> bool:
         """Whether a family has become an entry; `name`: of which field, by default the one that it probably is."""
@@ -278,7 +285,7 @@ class _Proposer:
             return False
         entry: dict[str, Any] = family.entry
         if not field:
-            field, note, scale = frame_of_forces(forces if part != "moment" else np.empty(0), self.robot)
+            field, note, scale = frame_of_forces(forces if part != "moment" else np.empty(0), self.robot, family.words)
             entry |= {"scale": scale} if scale < 0 else {}
             self.out.notes[field] = f"{note}{whose}"
         elif any("scale" in of for of in wrench.values()):

@@ -17,8 +17,9 @@ from torchid.proposals.file_samples import FileSample, stated_names
 from torchid.rounding import STD_PER_MAD
 
 _STEP = (2e-4, 0.2)  # [s]: of recordings
-_STEP_NAME = re.compile(r"(sim_?|control_?)?(dt|time_?step)(_s)?", re.IGNORECASE)
+_STEP_NAME = re.compile(r"(\w+_|sim|control)?(dt|time_?step)(_s)?", re.IGNORECASE)
 _TURN_S, _ALIKE = 0.3, 0.5  # over which gravity is seen to turn [s], and correlation with the angular velocity
+_SLOPE = 0.15  # of the logarithm of the ratio of velocities to slopes of positions, that a unit explains
 _TURNED = 7.0  # [rad]: no joint's position is as large throughout
 _MOST_DEGREES = 720.0  # whole numbers up to which may be angles
 _LEVER = 1.0  # [m]: rms of no torque is as large as that of the robot's weight with it
@@ -218,6 +219,10 @@ class UnitProposer:
         ratio = float(np.sqrt(np.nanmean(velocity**2) / max(float(np.nanmean(slope**2)), 1e-12)))
         expected = {unit: 1.0 / UNITS[quantity][unit] for unit in candidates}
         unit = min(expected, key=lambda unit: abs(np.log(max(ratio, 1e-9) / expected[unit])))
+        if abs(np.log(max(ratio, 1e-9) / expected[unit])) > _SLOPE:
+            text = f"{ratio:.3g} times the slope of the positions, as no unit explains: are the stamps right?"
+            self._note("joint_velocity", text)
+            return candidates[0]
         if unit != candidates[0]:
             self._note("joint_velocity", f"{unit}, as they are {ratio:.3g} times the slope of the positions")
         return unit

@@ -7,18 +7,17 @@ import os
 import random
 import re
 import signal
-import subprocess
-import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from hostile_commands import Commands
 from repository import DEMO
-from run_figures import FIGURES
 from run_folders import names_in
 from tensorboard.plugins.custom_scalar import layout_pb2
+from thinned import slow_but
 from trainings import (
     BY_EPOCH,
     EPOCHS,
@@ -177,50 +176,12 @@ def test_custom_charts_show_training_and_unseen_logs_together(run: Path) -> None
 
 # -------------------------------------------------------------------------------------------------------- being stopped
 
-SERVER = """
-import os, sys, time
-from matplotlib.figure import Figure
-import torchid.commands.run_figures as run_figures
-from torchid.cli import main
-from torchid.estimators import Trainer
-for name in {figures}:
-    setattr(run_figures, name, lambda *_: Figure())
-plain = Trainer.run_epoch
-Trainer.run_epoch = lambda trainer: time.sleep(0.03) or plain(trainer)  # or a fast machine is done before it is killed
-print("ready", flush=True)
-for line in sys.stdin:
-    child = os.fork()
-    if not child:
-        os._exit(main(line.rstrip("\\n").split("\\t")))
-    print(child, flush=True)
-    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
-"""
 
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[subprocess.Popen[str]]:
-    """A process that has everything loaded and runs a command in a child for every line it reads."""
-    code = SERVER.format(figures=FIGURES)
-    with subprocess.Popen(
-        [sys.executable, "-c", code],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
-    ) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "ready\n"
-        yield process
-        process.stdin.close()
-
-
-def killed(server: subprocess.Popen[str], arguments: list[str], output: Path, after: float) -> int:
+def killed(server: Commands, arguments: list[str], output: Path, after: float) -> int:
     """The exit status of a command that is killed so many seconds after a checkpoint that is not there yet."""
     checkpoint = training_of(output) / CHECKPOINT
     before = checkpoint.stat().st_mtime_ns if checkpoint.exists() else None
-    server.stdin.write("\t".join(arguments) + "\n")
-    server.stdin.flush()
-    child = int(server.stdout.readline())
+    child = server.start(arguments)
     deadline = time.monotonic() + 60.0
     while not checkpoint.exists() or checkpoint.stat().st_mtime_ns == before:
         assert time.monotonic() < deadline
@@ -228,15 +189,19 @@ def killed(server: subprocess.Popen[str], arguments: list[str], output: Path, af
     time.sleep(after)
     os.kill(child, signal.SIGKILL)
     time.sleep(1.0 - time.time() % 1.0)  # event files of several processes sort by the second they were made in
-    while not (line := server.stdout.readline()).startswith(("-", "0", "1", "2")):  # tables of a run that was done
-        pass
-    return int(line)
+    return server.end(child).status
 
 
 def test_a_run_killed_at_any_moments_ends_as_if_it_had_not_been(
-    experiment: Path, run: Path, server: subprocess.Popen[str], tmp_path: Path
+    experiment: Path, run: Path, server: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    output = tmp_path / "runs" / "run"
+    output, plain = tmp_path / "runs" / "run", Trainer.run_epoch
+
+    def slowly(trainer: Trainer) -> Any:
+        time.sleep(0.03)  # or a fast machine is done before it is killed
+        return plain(trainer)
+
+    monkeypatch.setattr(Trainer, "run_epoch", slowly)
     output.parent.mkdir()
     draw, arguments = random.Random(0), command(experiment, output)
     for _ in range(2):
@@ -247,11 +212,12 @@ def test_a_run_killed_at_any_moments_ends_as_if_it_had_not_been(
         }
         assert load_checkpoint(training_of(output))["trainer"]["epoch"] < EPOCHS
         arguments = command(experiment, output, "--resume")
+    monkeypatch.undo()
     assert main(arguments) == 0
     assert_as_uninterrupted(output, run)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", slow_but([signal.SIGTERM], [signal.SIGINT, signal.SIGTERM]))
 def test_a_signal_ends_a_training_with_a_line_on_how_to_go_on(
     experiment: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], number: int
 ) -> None:

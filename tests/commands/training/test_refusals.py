@@ -276,3 +276,20 @@ def test_overrides_may_come_before_and_after_options_and_strangers_are_refused(
             main(stranger)
         assert raised.value.code == 2
         assert f"unrecognized arguments: {stranger[-1]}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("given", "setting"),
+    [
+        (["--output", "runs/a"], "output"),
+        (["--robot.base-link=trunk"], "robot.base_link"),
+        (["--overwrite"], "overwrite"),
+    ],
+)
+def test_an_option_that_is_a_setting_of_the_file_is_written_as_one(
+    given: list[str], setting: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("identify", "analyze", "simulate"):
+        with pytest.raises(SystemExit):
+            main([name, "a.yaml", *given])
+        assert capsys.readouterr().err.rstrip().endswith(f"; accepted: settings of the file as {setting}=VALUE")
