@@ -95,6 +95,25 @@ def slanting_torque(case: Case, gravity: Array) -> Array:
     return np.asarray(value(case.log.joint_torque) + loads[0] - loads[1])
 
 
+@pytest.mark.parametrize(
+    ("mistake", "name", "text"),
+    [("sign", "sign", "reversed; times -"), ("gain", "scale", "times 0.6"), ("turn", "frame", "turned by [23]")],
+)
+@pytest.mark.parametrize(("machine", "sensors"), [("quadruped", "full"), ("biped", "full"), ("quadruped", "contacts")])
+def test_the_one_contact_sensor_that_is_reversed_scaled_or_turned_is_named(
+    machine: str, sensors: str, mistake: str, name: str, text: str
+) -> None:
+    case = case_of(MACHINES[machine], sensors)
+    change = {"sign": -np.eye(3), "gain": 1.6 * np.eye(3), "turn": Rotation.from_rotvec([0.0, 0.5, 0.0]).as_matrix()}
+    wrench = value(case.log.contact_wrench_local).copy()
+    wrench[:, 1] = wrench[:, 1] @ np.kron(np.eye(2), change[mistake].T)
+    found = checked(case, replace(case.log, contact_wrench_local=wrench))
+    (finding,) = (one for one in found.findings if one.name == name and one.severity == SUSPICIOUS)
+    assert finding.field == "contact_wrench_local"
+    assert finding.channels == (case.log.contact_names[1],)
+    assert re.search(text, finding.found)
+
+
 def test_a_base_that_turns_in_one_place_is_named_unless_nothing_is_derived_from_that() -> None:
     rates: dict[str, Any] = dict.fromkeys(VECTORS[1:])
     log = demo_log()

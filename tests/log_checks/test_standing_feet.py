@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from motions import value
+from scipy.spatial.transform import Rotation, Slerp
 from stances import stance
 from walking import robot_of
 
@@ -54,6 +56,33 @@ def test_an_orientation_that_never_changes_is_not_passed_over_in_silence() -> No
     (finding,) = findings(replace(log, base_quat_xyzw=still))
     assert (finding.name, finding.severity, finding.field) == ("standing feet", SUSPICIOUS, "all")
     assert "no usual mistake explains it" in finding.found
+
+
+@pytest.mark.parametrize(
+    ("at", "turn_deg", "late_s", "found"),
+    [
+        (
+            (0.1, -0.05, 0.15),
+            (0.0, 0.0, 0.0),
+            0.0,
+            r"of a point at \((9\d|10\d), -(4\d|5\d), 1[3-6]\d\) mm of the base link$",
+        ),
+        ((0.0, 0.0, 0.0), (0.0, 10.0, 40.0), 0.0, r"turned about it by \(-?\d, \d+, (39|40|41)\) degrees$"),
+        ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.06, r"is (5[5-9]|6[0-5]) ms late$"),
+    ],
+    ids=["offset", "turn", "lag"],
+)
+def test_a_pose_of_another_frame_or_time_is_named_with_where_and_when(
+    at: tuple[float, ...], turn_deg: tuple[float, ...], late_s: float, found: str
+) -> None:
+    log = STANCE.measured
+    R, t = Rotation.from_quat(value(log.base_quat_xyzw)), np.clip(log.time - late_s, log.time[0], log.time[-1])
+    place = value(log.base_position_world) + R.apply(at)
+    moved = Slerp(log.time, R * Rotation.from_rotvec(np.radians(turn_deg)))(t)
+    late = np.stack([np.interp(t, log.time, axis) for axis in place.T], axis=1)
+    (finding,) = findings(replace(log, base_quat_xyzw=moved.as_quat(), base_position_world=late))
+    assert (finding.name, finding.severity, finding.field) == ("frame", SUSPICIOUS, "base_quat_xyzw")
+    assert re.search(found, finding.found)
 
 
 def test_the_foot_that_moves_most_comes_first() -> None:

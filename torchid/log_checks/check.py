@@ -17,6 +17,7 @@ from torchid.log_checks.contacts import (
     check_contact_flags,
     check_limb_sensors,
     check_scalar_wrenches,
+    check_slip,
     subtract_contact_offsets,
 )
 from torchid.log_checks.findings import (
@@ -39,7 +40,7 @@ from torchid.log_checks.motion import (
 )
 from torchid.log_checks.spikes import check_jumps
 from torchid.log_checks.stamps import check_magnitudes, check_missing_values, check_time_stamps
-from torchid.log_checks.standing_feet import check_gyroscope, check_slip, check_standing_feet
+from torchid.log_checks.standing_feet import check_gyroscope, check_standing_feet
 from torchid.log_checks.weight import check_accelerometer, check_weight
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray

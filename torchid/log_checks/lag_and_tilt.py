@@ -1,4 +1,4 @@
-"""How late torques are, and how far gravity is from the log's vertical, estimated for all URDFs near the given one."""
+"""Lags of torques, tilts of gravity, gains and axes of contact sensors, estimated for all URDFs near the given one."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 
 from torchid.errors import InputError
 from torchid.log_checks.findings import SUSPICIOUS, Finding
@@ -21,7 +22,7 @@ from torchid.log_checks.scales import (
     rows_with_bases,
 )
 from torchid.logs import Log
-from torchid.logs.log import FloatArray
+from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.segments import with_delayed_torques
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.predict import force_series
@@ -38,8 +39,10 @@ _MIN_STANDARD_DEVIATIONS, _MIN_BLOCK_SHARE = 4.0, 0.5
 #: Unexplained forces without the deviation over those with it (1.2 at most in logs without a mistake), and what it may
 #: leave: more, and the forces are another robot's.
 _MIN_UNEXPLAINED_RATIO, _MAX_LEFT = 1.25, 1.5
-#: Prior standard deviations of the lag [s] and of the tilt [rad].
-_LAG_PRIOR_STD_S, _TILT_PRIOR_STD_RAD = 0.2, 0.3
+#: Gain of a contact's sensor relative to the others, and turn of its axes, that are reported.
+_MIN_SENSOR_GAIN, _MIN_TURN_DEG = 0.15, 10.0
+#: Prior standard deviations of the lag [s], of the tilt [rad], and of gains and turns of contact sensors.
+_LAG_PRIOR_STD_S, _TILT_PRIOR_STD_RAD, _SENSOR_PRIOR_STD = 0.2, 0.3, 0.5
 #: Times that torques are shifted by what the slope of their readings says, which is exact for small lags alone.
 _SHIFTS, _LEAST_SHIFT_S = 8, 2e-3
 _SMALL_ANGLE = 1e-4
@@ -66,13 +69,16 @@ class Deviation:
     left: float
 
     @property
-    def is_clear(self) -> bool:
-        """Whether the largest unknown is certain, every block agrees, and forces are explained much better with it."""
-        k = int(np.argmax(np.abs(self.value)))
-        agree = self.blocks[:, k] * np.sign(self.value[k]) > _MIN_BLOCK_SHARE * abs(self.value[k])
-        certain = abs(self.value[k]) > _MIN_STANDARD_DEVIATIONS * self.spread[k]
+    def clear(self) -> BoolArray:
+        """Unknowns (k,) that are certain and that every block agrees on, where all explain the forces much better."""
+        agree = (self.blocks * np.sign(self.value) > _MIN_BLOCK_SHARE * np.abs(self.value)).all(axis=0)
         improves = self.without > _MIN_UNEXPLAINED_RATIO * self.left and self.left < _MAX_LEFT
-        return bool(certain and agree.all() and improves)
+        return np.asarray(agree & (np.abs(self.value) > _MIN_STANDARD_DEVIATIONS * self.spread) & improves)
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the largest unknown is."""
+        return bool(self.clear[np.argmax(np.abs(self.value))])
 
     @property
     def gain(self) -> str:
@@ -83,9 +89,9 @@ class Deviation:
 def check_lag_and_tilt(
     log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: float, derived: tuple[str, ...] = ()
 ) -> tuple[list[Finding], float]:
-    """Findings about torques that are later or earlier than the motion, and about a vertical that gravity is not along.
+    """Findings about torques that lag or lead, a vertical that gravity is not along, and single contact sensors.
 
-    The number is what the best URDF near the given one leaves unexplained without either, in
+    The number is what the best URDF near the given one leaves unexplained without any of these, in
     `UNMODELLED_FORCE_SHARE` of the forces; infinite where nothing could be compared.
 
     Args:
@@ -98,10 +104,12 @@ def check_lag_and_tilt(
     try:
         lag = fit_lag(log, robot, contacts, cutoff_hz)
         tilt = fit_tilt(log, robot, contacts, cutoff_hz) if not "base_quat_xyzw".startswith(derived) else None
+        sensors = fit_contact_sensors(log, robot, contacts, cutoff_hz)
     except InputError:  # reported by `check_forces_against_urdf`
         return [], np.inf
     unexplained = min((x.without for x in (lag, tilt) if x is not None), default=np.inf)
-    return [*_lag_findings(lag), *_tilt_findings(tilt, robot)], unexplained
+    moved = [*_lag_findings(lag), *_tilt_findings(tilt, robot)]
+    return moved or list(_contact_sensor_findings(sensors, log, robot, contacts)), unexplained
 
 
 def _lag_findings(lag: Deviation | None) -> Iterator[Finding]:
@@ -120,6 +128,60 @@ def _tilt_findings(tilt: Deviation | None, robot: Robot) -> Iterator[Finding]:
         field = "base" if robot.fixed_base else "base_quat_xyzw"
         advice = "check the mounting of the base" if robot.fixed_base else "check that the world's z axis points up"
         yield Finding("tilt", SUSPICIOUS, field, f"{text}: {tilt.gain}", f"{advice}, or set robot.base_tilt: auto")
+
+
+def _contact_sensor_findings(
+    found: Deviation | None, log: Log, robot: Robot, contacts: Sequence[Contact]
+) -> Iterator[Finding]:
+    """Findings about single contact sensors; what all have in common is a payload, or the robot's masses."""
+    if found is None:
+        return
+    value, spread, clear = (x.reshape(-1, 4) for x in (found.value, found.spread, found.clear))
+    common = value[np.argmin(np.abs(value[:, 0])), 0]
+    for contact, (gain, *turn), std, is_clear in zip(contacts, value, spread[:, 0], clear, strict=True):
+        size = float(np.linalg.norm(turn))
+        angle = float(np.degrees(np.arctan2(size, 1.0 + gain)))
+        if is_clear[1:].any() and angle > _MIN_TURN_DEG:
+            axis = ", ".join(f"{x:.2g}" for x in np.round(np.array(turn) / size, 2))
+            name, problem = "frame", f"turned by {angle:.2g} degrees about ({axis})"
+            advice = "check how the sensor is mounted, and the frame that its readings are given in"
+        elif is_clear[0] and abs(gain - common) > _MIN_SENSOR_GAIN:
+            name, problem = ("scale", "") if gain > -1.0 else ("sign", "reversed; ")
+            problem += f"times {1.0 + gain:.3g} +- {std:.2g}"
+            advice = "check the sensor's sign, gain and unit, and whether these readings are another foot's"
+        else:
+            continue
+        text = f"{contact.frame}: forces fit the {robot.format} best {problem}: {found.gain}"
+        yield Finding(name, SUSPICIOUS, log.contact_wrench_field, text, advice, (contact.frame,))
+
+
+def fit_contact_sensors(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: float) -> Deviation | None:
+    """By how much each contact's wrench is more than is read, and turned, (4 C,): a share, and three angles' sines.
+
+    The axes are those of the readings. A turn about an axis across the forces takes the share cos - 1 beside it. None
+    where no wrench was measured.
+
+    Raises:
+        InputError: as `fit_lag`.
+    """
+    if log.contact_wrench is None or not contacts:
+        return None
+    pieces = preprocess_pieces(log, cutoff_hz, MAX_TRIAL_DIFFERENTIATED_SAMPLES)
+    samples = bind_some_samples(pieces, robot, contacts, _SAMPLES)
+
+    @torch.no_grad()
+    def columns(builder: RowBuilder, part: Samples, number: int) -> FloatArray:
+        if part.wrench is None:
+            return np.zeros((len(part), builder.tree.n_rows, 4 * len(contacts)))
+        kinematics, J = builder.kinematics(part), builder.contact_jacobian(part)
+        read = torch.nan_to_num(part.wrench * part.active[..., None])
+        force_and_moment, axes = read.reshape(*read.shape[:2], 2, 3), torch.eye(3, dtype=read.dtype)
+        turned = [torch.cross(axis.expand_as(force_and_moment), force_and_moment, dim=-1) for axis in axes]
+        changes = [replace(part, wrench=x.reshape(read.shape)) for x in (read, *turned)]
+        wrenches = [(k, builder.recorded_wrench(x, k, kinematics)) for k in range(len(contacts)) for x in changes]
+        return np.stack([torch.einsum("nwv,nw->nv", J[:, k], w).numpy() for k, w in wrenches], axis=2)
+
+    return _fit(samples, robot, contacts, columns, _SENSOR_PRIOR_STD)
 
 
 def fit_lag(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: float) -> Deviation | None:

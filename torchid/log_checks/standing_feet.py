@@ -1,4 +1,4 @@
-"""Feet that stand by their flags: what their motion shows of orientation, joints, gyroscope, names, radii and slip."""
+"""Feet that stand: what they show of orientation, joints, gyroscope, names, radii and the base's pose."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation, Slerp
 
 from torchid.errors import InputError, join_names
 from torchid.log_checks.findings import REJECTED, SUSPICIOUS, Finding, Skipped, find_spans, median_step, widen_mask
 from torchid.log_checks.mistakes import possible_mistakes, reversed_joints
 from torchid.log_checks.model import (
-    MAX_DIFFERENTIATED_SAMPLES,
     LinkPoses,
     default_cutoff_hz,
     preprocess_pieces,
@@ -22,9 +22,7 @@ from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.quaternion import rotate_to_world
 from torchid.logs.units import advise_units, units_of_ratio
-from torchid.problem import bind_log
 from torchid.problem.base_motion import imu_pose
-from torchid.problem.contact_slip import measure_slip
 from torchid.robot import Robot
 from torchid.robot.rolling import rolled_distance
 from torchid.sensing import Contact
@@ -38,6 +36,9 @@ MAX_UNEXPLAINED_SLIP_SHARE = 0.6
 MIN_SINGLE_SHARE, MAX_OTHERS_SHARE = 0.05, 0.25
 #: Motion of standing feet from which on it is asked whether they roll on other radii, and the radius to begin with.
 MIN_ROLLING_SHARE, _TRIAL_RADIUS_M = 0.02, 0.01
+#: Unknowns of a base's pose that are of one kind, how large they usually are [m, rad, s], and their weight in the fit.
+_POSE_UNKNOWNS = {"offset": slice(0, 3), "lag": slice(6, 7), "turn": slice(3, 6), "all": slice(0, 7)}
+_POSE_SIZE, _POSE_PRIOR_SHARE = np.array([0.3, 0.3, 0.3, 0.5, 0.5, 0.5, 0.1]), 1e-3
 #: Share of this motion, or of the difference from a gyroscope, that a corrected mistake may leave.
 MAX_RESIDUAL_SHARE = 1.0 / 3.0
 #: Time at either end of a stance for heel and toe, and the shortest rest of a stance.
@@ -67,8 +68,9 @@ def check_standing_feet(
         return
     radius = list(_radius_findings(log, robot, contacts, slip, poses))
     yield from radius
+    other_pose = iter(()) if radius or derived or poses is None else _pose_findings(log, contacts, slip, poses)
     if slip < MAX_SLIP_SHARE:
-        yield from () if radius or derived else _single_foot(log, robot, contacts, slip, poses)
+        yield from () if radius or derived else list(_single_foot(log, robot, contacts, slip, poses)) or other_pose
         return
     best, least = None, MAX_RESIDUAL_SHARE * slip
     for mistake in (*possible_mistakes(log), *reversed_joints(log)):
@@ -83,6 +85,8 @@ def check_standing_feet(
         share = f"{100 * slip:.3g} % as much as the base above them, {100 * least:.2g} % once corrected"
         text = f"{best.description}: standing feet move {share}"
         yield Finding("unit, sign or frame", REJECTED, best.field, text, best.advice)
+    elif (found := next(other_pose, None)) is not None:
+        yield found
     elif slip > MAX_UNEXPLAINED_SLIP_SHARE:
         yield _unexplained_motion(log, robot, contacts, slip, poses)
 
@@ -114,6 +118,56 @@ def _single_foot(
     text += f" {100 * left[frame]:.2g} % without it"
     advice = "check zeros, scales and signs of the joint positions in its limb, its flags, and whether it slips"
     yield Finding("standing feet", SUSPICIOUS, "joint_position", text, advice, (frame,))
+
+
+def _pose_findings(log: Log, contacts: Sequence[Contact], slip: float, poses: LinkPoses) -> Iterator[Finding]:
+    """A finding about a pose of the base that is another frame's, or late: with it all standing feet keep still.
+
+    Markers of motion capture are seldom at the base link's origin, and their axes seldom its own.
+    """
+    quat, place = log.base_quat_xyzw, log.base_position_world
+    if slip < MIN_SINGLE_SHARE or quat is None or place is None or log.contact_active is None:
+        return
+    feet = [c for c in contacts if c.frame in log.contact_names and c.frame in poses]
+    stances = [
+        (poses[c.frame].numpy()[stance, :3, 3], _rolled(log, c, poses[c.frame].numpy())[stance], stance)
+        for c in feet
+        for stance in _stances(log, log.contact_active[:, log.contact_names.index(c.frame)])
+    ]
+    recorded = Slerp(log.time, Rotation.from_quat(quat))
+
+    def motion(x: FloatArray) -> FloatArray:
+        """Deviations of standing feet from where they are on average [m], flat, if the pose is corrected by x."""
+        at = np.clip(log.time + x[6], log.time[0], log.time[-1])
+        R = (recorded(at) * Rotation.from_rotvec(x[3:6]).inv()).as_matrix()
+        origin = np.stack([np.interp(at, log.time, axis) for axis in place.T], axis=1) - R @ x[:3]
+        world = [np.einsum("nij,nj->ni", R[s], foot) + origin[s] - rolled for foot, rolled, s in stances]
+        return np.concatenate([one - one.mean(axis=0) for one in world]).ravel()
+
+    as_recorded = float(np.linalg.norm(motion(np.zeros(7)))) if stances else 0.0
+    for unknowns in _POSE_UNKNOWNS.values() if as_recorded else ():
+        x, size = np.zeros(7), _POSE_SIZE[unknowns]
+
+        def cost(y: FloatArray, which: slice = unknowns, size: FloatArray = size) -> FloatArray:
+            correction = np.zeros(7)
+            correction[which] = size * y
+            return np.append(motion(correction), _POSE_PRIOR_SHARE * as_recorded * y)
+
+        x[unknowns] = size * least_squares(cost, np.zeros(len(size)), ftol=1e-3, xtol=1e-3).x
+        if (left := float(np.linalg.norm(motion(x)))) < MAX_RESIDUAL_SHARE * as_recorded:
+            yield _pose_finding(x, slip, left / as_recorded)
+            return
+
+
+def _pose_finding(x: FloatArray, slip: float, left: float) -> Finding:
+    """A finding about a frame at x[:3] [m], turned by x[3:6] [rad], in the base, whose pose is x[6] [s] late."""
+    at, turn = (", ".join(f"{value:.0f}" for value in values) for values in (1e3 * x[:3], np.degrees(x[3:6])))
+    parts = [f"of a point at ({at}) mm of the base link"] if x[:3].any() else []
+    parts += [f"turned about it by ({turn}) degrees"] if x[3:6].any() else []
+    parts += [f"{1e3 * abs(x[6]):.0f} ms {'late' if x[6] > 0.0 else 'early'}"] if x[6] else []
+    text = f"standing feet move {100 * slip:.2g} % as much as the base above them, {100 * left:.2g} % of that if the"
+    advice = "give the pose of the base link itself; shift_s delays files of a log"
+    return Finding("frame", SUSPICIOUS, "base_quat_xyzw", f"{text} base's pose is {join_names(parts)}", advice)
 
 
 def _radius_findings(
@@ -189,6 +243,15 @@ def _rolled(log: Log, contact: Contact, T_base_foot: FloatArray) -> FloatArray:
     return rolled_distance(rotation, contact.radius, normals, contact.rolling_axis)
 
 
+def _stances(log: Log, active: np.ndarray) -> Iterator[slice]:
+    """Samples of each long enough stance, without its ends."""
+    step = median_step(log)
+    ends, shortest = round(_STANCE_END_S / step), max(4, round(_MIN_STANCE_S / step))
+    for span in find_spans(active):
+        if span.last + 1 - span.first - 2 * ends >= shortest:
+            yield slice(span.first + ends, span.last + 1 - ends)
+
+
 def _stance_motion(
     log: Log, vector: FloatArray, active: np.ndarray, unit: float, origin: FloatArray | None = None
 ) -> list[tuple[float, float, int]]:
@@ -196,61 +259,12 @@ def _stance_motion(
     quat = log.base_quat_xyzw
     if quat is None:
         return []
-    step = median_step(log)
-    ends, shortest = round(_STANCE_END_S / step), max(4, round(_MIN_STANCE_S / step))
     sums = []
-    for span in find_spans(active):
-        stance = slice(span.first + ends, span.last + 1 - ends)
-        if stance.stop - stance.start < shortest:
-            continue
+    for stance in _stances(log, active):
         world = rotate_to_world(quat[stance], vector[stance]) + (0.0 if origin is None else origin[stance])
         in_world, in_base = (float(np.square((x - x.mean(axis=0)) / unit).sum()) for x in (world, vector[stance]))
         sums.append((in_world, in_base, stance.stop - stance.start))
     return sums
-
-
-MOST_SLIPPING_SHARE = 0.3
-"""Of a contact's samples: where more of them slip it is no slip, but wrong flags, radii or another motion."""
-
-CLEAR_SLIP = 2.0
-"""Times its limit that a contact that is named moves at its fastest: noise of cameras and encoders has long tails."""
-
-_SLIP_CHECK = "slip of contacts"
-_ADVICE = "preprocessing.max_slip: auto leaves these samples out; look for dust, a soft floor or flags that are late"
-
-
-def check_slip(
-    log: Log, robot: Robot | None, contacts: Sequence[Contact], cutoff_hz: float | None, derived: tuple[str, ...] = ()
-) -> Iterator[Finding | Skipped]:
-    """Findings about contacts that slip; none on flags, or with a base's motion, that torchid made."""
-    if robot is None or not contacts or log.contact_active is None:
-        return
-    if derived:
-        return
-    cutoff_hz = cutoff_hz or default_cutoff_hz(log)
-    slips, checked = np.zeros((len(log), len(contacts)), dtype=bool), False
-    standing, fastest = np.zeros(len(contacts)), np.zeros(len(contacts))
-    for start in range(0, len(log), MAX_DIFFERENTIATED_SAMPLES):
-        part = log.select(slice(start, start + MAX_DIFFERENTIATED_SAMPLES))
-        try:
-            (ready,) = preprocess_pieces(part, cutoff_hz)
-            samples = bind_log(ready, robot, contacts)
-        except InputError as error:
-            yield Skipped(_SLIP_CHECK, f"{error.field}: {error.found}")
-            return
-        slip = measure_slip(ready, samples, part, robot, contacts, cutoff_hz=cutoff_hz)
-        checked |= slip.checked
-        nearest = start + np.searchsorted(part.time, ready.time).clip(0, len(part) - 1)
-        for index in range(len(contacts)):
-            slips[nearest[slip.slips[:, index]], index] = True
-        standing += np.isfinite(slip.speed).sum(axis=0)
-        fastest = np.maximum(fastest, np.nanmax(slip.speed / slip.limits, axis=0, initial=0.0))
-    if not checked:
-        yield Skipped(_SLIP_CHECK, "neither the base's linear velocity nor two contacts that stand at once")
-    for contact, own, stands, peak in zip(contacts, slips.T, standing.tolist(), fastest.tolist(), strict=True):
-        if peak >= CLEAR_SLIP and own.sum() <= MOST_SLIPPING_SHARE * stands:
-            text = f"{contact.frame} moves on the ground in {int(own.sum())} samples"
-            yield Finding("slip", SUSPICIOUS, "contact_active", text, _ADVICE, (contact.frame,), tuple(find_spans(own)))
 
 
 #: Difference between both angular velocities, over the feet's, from which on a mistake is looked for, and where none
