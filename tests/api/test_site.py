@@ -47,7 +47,7 @@ def test_no_page_asks_anybody_for_anything(site: Path) -> None:
             r"<(?:script|link|img)[^>]*(?:src|href)=\"?(?:https?:)?//(?!localhost)[^>]*>", page.read_text()
         )
     chart = text_of(site / "architecture" / "index.html")
-    assert "logs: read, filter, differentiate, resample\n    → problem, log_checks" in chart
+    assert "logs: read, filter, differentiate, resample\n    → proposals, problem, log_checks" in chart
     assert 'class="mermaid"' not in (site / "architecture" / "index.html").read_text()
 
 
