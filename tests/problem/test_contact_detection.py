@@ -8,6 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from faults import CONTACTS, demo_log, demo_robot
 from legged.gait import Reference
 from legged.recording import Noise, record
 from legged.robots import G1, GO2, QUADRUPED, Legged, TrueRobot
@@ -137,6 +138,20 @@ def test_contacts_that_may_stand_leave_nothing_that_carries_out_of_more_samples(
         assert missed.mean() < 0.001
         kept.append(away.mean())
     assert kept[1] > kept[0] + 0.05
+
+
+def test_a_foot_that_the_floor_pulls_is_not_taken_for_one_in_the_air() -> None:
+    """The demo's, which hold on to it: where one is lifted, the one across pulls with up to 40 % of the weight."""
+    log = demo_log()
+    standing = value(log.contact_active)[:, [log.contact_names.index(one.frame) for one in CONTACTS]]
+    found = detect_contacts(log, demo_robot(), CONTACTS, DEFAULT)
+    flags, trusted = found.flags(possible=True)
+    assert trusted.mean() > 0.9
+    assert not (standing & ~flags)[trusted].any()
+    assert (flags == standing)[trusted].mean() > AGREEING - 0.02
+    flags, trusted = found.flags(possible=False)
+    assert trusted.mean() > 0.8
+    assert (standing & ~flags)[trusted].mean() < 1e-3
 
 
 @pytest.mark.slow

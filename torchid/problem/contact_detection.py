@@ -259,8 +259,9 @@ class _Seen:
         if self.velocity is not None:
             loaded |= keep_still(self.velocity, self.in_world, loaded, self.share > settings.light, 2 * shortest)
         flags = np.stack([without_short(one, shortest) for one in loaded.T], axis=1)
-        clear = ~beside_changes(flags)
-        return Detection(flags, clear & ~(loaded & ~flags).any(axis=1), flags | loaded, clear)
+        pulls = np.stack([hysteresis(-one, settings.touch, settings.lift) for one in self.share.T], axis=1)
+        clear, possible = ~beside_changes(flags), flags | loaded | pulls
+        return Detection(flags, clear & ~(possible & ~flags).any(axis=1), possible, clear)
 
     def noise(self, in_the_air: BoolArray) -> float:
         """Standard deviation of the share that contacts seem to carry in the air (K, C); infinite of few samples."""
