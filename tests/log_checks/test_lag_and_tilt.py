@@ -76,6 +76,9 @@ def test_a_world_whose_z_axis_is_level_is_named_with_the_axis_that_points_up(axi
     found = of_demo(tilted(demo_log(), np.array(turn)))
     finding = only(found, "unit, sign or frame", "base_quat_xyzw")
     assert finding.found.startswith(f"in a world whose {axis} axis points up")
+    case = case_of(MACHINES["quadruped"], "joints")
+    finding = only(checked(case, tilted(case.log, np.array(turn))), "gravity", "base_quat_xyzw")
+    assert finding.found.endswith(f"a world whose {axis} axis points up?")
 
 
 def test_an_arm_on_a_table_that_slants_is_told_so() -> None:
