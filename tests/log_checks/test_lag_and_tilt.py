@@ -71,6 +71,16 @@ def test_a_world_that_is_tilted_is_named_with_the_angles(machine: str) -> None:
     assert "base_tilt: auto" in finding.advice
 
 
+@pytest.mark.parametrize(("axis", "turn"), [("y", [-90.0, 0.0, 0.0]), ("x", [0.0, 90.0, 0.0])])
+def test_a_world_whose_z_axis_is_level_is_named_with_the_axis_that_points_up(axis: str, turn: list[float]) -> None:
+    found = of_demo(tilted(demo_log(), np.array(turn)))
+    finding = only(found, "unit, sign or frame", "base_quat_xyzw")
+    assert finding.found.startswith(f"in a world whose {axis} axis points up")
+    case = case_of(MACHINES["quadruped"], "joints")
+    finding = only(checked(case, tilted(case.log, np.array(turn))), "gravity", "base_quat_xyzw")
+    assert finding.found.endswith(f"a world whose {axis} axis points up?")
+
+
 def test_an_arm_on_a_table_that_slants_is_told_so() -> None:
     case = case_of(MACHINES["arm"], "contacts")
     gravity = Rotation.from_rotvec(np.radians([0.0, 12.0, 0.0])).apply([0.0, 0.0, -9.81])

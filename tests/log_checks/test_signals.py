@@ -274,6 +274,15 @@ def test_a_contact_without_a_force_is_suspicious() -> None:
     assert (finding.severity, places(finding)) == (SUSPICIOUS, {(640, 689)})
 
 
+def test_a_sensor_that_reads_nothing_is_not_taken_for_a_foot_in_the_air() -> None:
+    dead = changed(demo_log(), "contact_wrench_local", lambda w: w[:, 1].fill(0.0))
+    finding = only(check(dead), "contact without force")
+    assert "its sensor reads 0" in finding.found
+    assert "sensors.contact_wrenches" in finding.advice
+    in_part = changed(demo_log(), "contact_wrench_local", lambda w: w[:600, 1].fill(0.0))
+    assert "clear the flag" in only(check(in_part), "contact without force").advice
+
+
 def test_a_flag_that_never_changes_though_the_foot_lifts_is_named() -> None:
     always = changed(demo_log(), "contact_active", lambda c: c[:, 2].fill(True))
     finding = only(check(always), "contact without force")

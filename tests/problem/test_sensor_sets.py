@@ -155,6 +155,16 @@ def test_who_asks_to_go_on_is_warned() -> None:
         require_base([lost[2]], "warn")
 
 
+def test_the_axes_of_line_contacts_are_named_where_the_base_is_lost() -> None:
+    lost = [StateReport("l_blade + r_sole", 9, 2, 4, 0.0), StateReport("r_blade + r_sole", 9, 4, 6, 0.1)]
+    contacts = [Contact("l_blade", "line", "x"), Contact("r_blade", "line"), Contact("r_sole", "point")]
+    with pytest.raises(BaseLostError, match="set its line_axis: l_blade along x; accepted: more sensors"):
+        require_base(lost, contacts=contacts)
+    with pytest.raises(BaseLostError) as raised:
+        require_base(lost, contacts=contacts[2:])
+    assert "line_axis" not in str(raised.value)
+
+
 def test_a_bolted_base_cannot_be_lost() -> None:
     robot = load(ANYMAL, fixed_base=True)
     log = make_log(Oracle.of(robot), [(foot.frame, 3) for foot in FEET], [[True] * 4], 5, np.random.default_rng(1))

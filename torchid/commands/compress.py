@@ -97,7 +97,7 @@ def compress(config: ExperimentConfig, output: str | Path) -> Compression:
             logs, excluded = _read(experiment, paths, output, bars)
             states = [state_reports([log], builder) for log in logs]
         together = merge_state_reports(chain.from_iterable(ranks.gather(states, "contact states")))
-        require_base(together, config.sensors.on_base_lost)
+        require_base(together, config.sensors.on_base_lost, experiment.contacts)
         noise = experiment.estimate_noise(_with_those_elsewhere(logs), experiment.sensors)
         factors = _compressed(with_noise(experiment, noise), noise, paths, logs, states, excluded, bars)
         files = _write_all(names, zip(names[share], factors, strict=True), output, config.overwrite)

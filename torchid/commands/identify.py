@@ -146,7 +146,7 @@ def _data_of_logs(experiment: Experiment, clock: _Clock, bars: Progress) -> _Dat
         logs = _read(reader, experiment, bars)
     with clock("noise"):
         states = state_reports(logs["train"], experiment.builder(experiment.sensors))
-        require_base(states, experiment.config.sensors.on_base_lost)
+        require_base(states, experiment.config.sensors.on_base_lost, experiment.contacts)
         noise = ranks.from_first(partial(experiment.estimate_noise, logs["train"], experiment.sensors), "noise")
         experiment = with_noise(experiment, noise)
     reader.let_go()
@@ -163,7 +163,7 @@ def _data_of_factors(experiment: Experiment, clock: _Clock, bars: Progress) -> _
     with clock("read"):
         reading = bars.add_task("reading factors", total=len(experiment.config.logs.train))
         fleet = read_fleet(experiment, lambda _: bars.advance(reading))
-        require_base(fleet.states, experiment.config.sensors.on_base_lost)
+        require_base(fleet.states, experiment.config.sensors.on_base_lost, experiment.contacts)
         reader = open_reader(experiment)
         logs = _read(reader, experiment, bars)
     with clock("compress"):

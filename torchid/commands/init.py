@@ -105,7 +105,7 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> Initiated:
     part = split_range(path)
     files = [file.path for file in part.files]
     check_free_file(target, "--output", False, [urdf, *files])
-    is_bag = existing_log_kind(part.file) is LogKind.BAG
+    is_bag = existing_log_kind(path) is LogKind.BAG
     robot = load_robot(urdf, fixed_base=has_fixed_base(Path(urdf)))
     contacts, fields, proposal = _of_bag(part.file, robot) if is_bag else _of_columns(files, robot)
     out = Initiated(target)

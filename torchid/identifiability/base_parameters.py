@@ -14,12 +14,13 @@ import torch
 from torch import Tensor, nn
 
 from torchid import parameters
-from torchid.errors import BaseLostError, BaseLostWarning, NumericalWarning, warn
+from torchid.errors import BaseLostError, BaseLostWarning, NumericalWarning, join_names, warn
 from torchid.parameters import PARAMETERS, PER_BODY, Array
 from torchid.problem import LinearProblem, RowBuilder, Samples
 from torchid.problem.chunks import chunks_by_state, one_thread, subsample_states
 from torchid.problem.contact_state import ContactState, state_name
 from torchid.rounding import RANK_TOLERANCE, is_significant, numerical_rank
+from torchid.sensing import Contact
 from torchid.sensing.projection import base_rank, base_singular_values
 
 _ROUNDING = 1e-9  # of a coefficient between columns of norm 1; angles rounded to 1.5707963 give 1e-11
@@ -302,12 +303,13 @@ def state_reports(logs: Sequence[Samples], builder: RowBuilder) -> list[StateRep
     ]
 
 
-def require_base(reports: Sequence[StateReport], on_base_lost: str = "error") -> None:
+def require_base(reports: Sequence[StateReport], on_base_lost: str = "error", contacts: Sequence[Contact] = ()) -> None:
     """Refuse logs, or warn, with a contact state in which part of the base does not survive the projection.
 
     Args:
         reports: from `state_reports`.
         on_base_lost: "error" or "warn".
+        contacts: all contacts: the axes of those that are lines are named.
 
     Raises:
         BaseLostError: a floating base of which only part survives the projection.
@@ -320,6 +322,10 @@ def require_base(reports: Sequence[StateReport], on_base_lost: str = "error") ->
         return
     where = "; ".join(f"{r.name} ({r.samples} samples): {_describe_rank(r)}" for r in lost[:4])
     message = f"sensors: the base is lost, rank(S_b V_x) < 6, in contact with {where}"
+    touching = {frame for report in lost for frame in report.name.split(" + ")}
+    lines = [f"{c.frame} along {c.line_axis}" for c in contacts if c.kind == "line" and c.frame in touching]
+    if lines:
+        message += f"; if a line runs along another axis of its frame, set its line_axis: {join_names(lines)}"
     if on_base_lost == "error":
         raise BaseLostError(f"{message}; accepted: more sensors, other contacts, or sensors.on_base_lost: warn")
     warn(f"{message}; parameters of some bodies cannot be determined there", BaseLostWarning)

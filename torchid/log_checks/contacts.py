@@ -51,6 +51,8 @@ _MAX_UNLOADED_S = 0.1
 #: A reading in the air is an offset if it varies by at most this share, has enough samples, and is below this share of
 #: the usual load: above it, the foot stands.
 _MAX_OFFSET_SPREAD_SHARE, _MIN_OFFSET_SAMPLES, _MAX_OFFSET_LOAD_SHARE = 0.2, 10, 0.5
+#: Share of its active samples in which a sensor reads other than 0 up to which it is dead: noise alone is not 0.
+_MOST_READ_OF_DEAD_SHARE = 0.01
 #: Delay of a flag against the force: its resolution, and the longest one.
 MIN_DELAY_SAMPLES, _MAX_DELAY_S = 2, 0.2
 #: Changes of a flag that a delay needs, and the share of them that must agree to `MIN_DELAY_SAMPLES`.
@@ -168,6 +170,9 @@ def _load_findings(log: Log, contact: _Contact, size: FloatArray, weight: float)
         never = " though the flag never changes" if contact.active.all() else ""
         text = f"{contact.name}: active without a force (below {threshold:.2g} N) in {samples}{never}"
         advice = "clear the flag where the foot is in the air: it removes data, but causes no error"
+        if np.mean(contact.force[contact.active].any(axis=1)) < _MOST_READ_OF_DEAD_SHARE:
+            text = f"{contact.name}: its sensor reads 0 in {samples} in which it is active: dead, or of another column"
+            advice = "leave it out: name the others in sensors.contact_wrenches; or mend the column or flags in the air"
         yield Finding("contact without force", SUSPICIOUS, "contact_active", text, advice, (contact.name,), spans)
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from torchid.errors import join_names
 from torchid.log_checks.motion import MAX_ANGLE_RAD
@@ -73,16 +74,19 @@ def _by_first_letter(names: Sequence[str]) -> tuple[str, ...] | None:
 #: Fields that can be derived from positions and orientation.
 _JOINT_RATES = ("joint_velocity", "joint_acceleration")
 _BASE_RATES = ("base_angular_velocity_base", "base_angular_acceleration_base")
-#: Vectors along the world's axes, and their factors under half a turn about x.
+#: Vectors along the world's axes.
 _WORLD_FIELDS = (
     "base_position_world",
     "base_linear_velocity_world",
     "base_linear_acceleration_world",
     "contact_wrench_world",
 )
-_HALF_TURN_SIGNS = np.array([1.0, -1.0, -1.0])
-#: Half a turn about x times a quaternion xyzw is (w, -z, y, -x): reversed components with these signs.
-_HALF_TURN_QUATERNION_SIGNS = np.array([1.0, -1.0, 1.0, -1.0])
+#: Worlds whose z axis does not point up, and what turns it up: rotation vectors in quarter turns.
+_WORLDS = {
+    "z axis points down": (2.0, 0.0, 0.0),
+    "y axis points up": (1.0, 0.0, 0.0),
+    "x axis points up": (0.0, -1.0, 0.0),
+}
 _MILLI_MOMENT_FACTORS = np.array([1.0, 1.0, 1.0, 1e-3, 1e-3, 1e-3])
 
 
@@ -130,8 +134,10 @@ def possible_mistakes(log: Log) -> Iterator[Mistake]:
 
 def _orientation_mistakes() -> Iterator[Mistake]:
     """Other worlds and orders than those of a quaternion xyzw from base to a world whose z axis points up."""
-    down, up = "in a world whose z axis points down", "turn positions, orientations and vectors so that z points up"
-    yield Mistake("base_quat_xyzw", down, up, _flip_world)
+    up = "turn positions, orientations and vectors so that z points up"
+    for axis_points, quarters in _WORLDS.items():
+        turned_up = _turn_world(Rotation.from_rotvec(0.5 * np.pi * np.array(quarters)))
+        yield Mistake("base_quat_xyzw", f"in a world whose {axis_points}", up, turned_up)
     order, rename = "w first against w last is mixed up", "rename base_quat_wxyz and base_quat_xyzw"
     yield Mistake("base_quat_xyzw", order, rename, _with_quaternions(lambda quat: np.roll(quat, -1, axis=1)))
     yield Mistake("base_quat_xyzw", order, rename, _with_quaternions(lambda quat: np.roll(quat, 1, axis=1)))
@@ -219,15 +225,22 @@ def _wrench_mistakes(field: str, other: str) -> Iterator[Mistake]:
             yield Mistake(field, "along axes turned by right angles", turn, _turn_wrench(field, R))
 
 
-def _flip_world(log: Log) -> Log:
-    """The log in a world frame turned by 180 degrees about x."""
-    fields: dict[str, Any] = {}
-    if log.base_quat_xyzw is not None:
-        fields["base_quat_xyzw"] = log.base_quat_xyzw[:, ::-1] * _HALF_TURN_QUATERNION_SIGNS
-    for name in _WORLD_FIELDS:
-        if (vectors := getattr(log, name)) is not None:
-            fields[name] = vectors * (_HALF_TURN_SIGNS if vectors.shape[-1] == 3 else np.tile(_HALF_TURN_SIGNS, 2))
-    return dataclasses.replace(log, **fields)
+def _turn_world(turn: Rotation) -> Callable[[Log], Log]:
+    """A log in a world frame that is turned."""
+    R = turn.as_matrix()
+    x, y, z, w = turn.as_quat()
+    times_quaternion = np.array([[w, -z, y, x], [z, w, -x, y], [-y, x, w, z], [-x, -y, -z, w]])
+
+    def correct(log: Log) -> Log:
+        fields: dict[str, Any] = {}
+        if log.base_quat_xyzw is not None:
+            fields["base_quat_xyzw"] = log.base_quat_xyzw @ times_quaternion.T
+        for name in _WORLD_FIELDS:
+            if (vectors := getattr(log, name)) is not None:
+                fields[name] = vectors @ np.kron(np.eye(vectors.shape[-1] // 3), R).T
+        return dataclasses.replace(log, **fields)
+
+    return correct
 
 
 def _mirror_world(axis: int) -> Callable[[Log], Log]:

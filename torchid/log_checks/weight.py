@@ -173,8 +173,14 @@ def _tilt_findings(log: Log, robot: Robot | None, still: BoolArray, when: str) -
         return
     in_base = log.imu_specific_force[still] @ robot.links[log.imu_frame][1][:3, :3].T
     up = rotate_to_world(log.base_quat_xyzw[still], in_base).mean(axis=0)
-    angle = float(np.degrees(np.arccos(np.clip(up[2] / np.linalg.norm(up), -1.0, 1.0))))
+    angles = np.degrees(np.arccos(np.clip(up / np.linalg.norm(up), -1.0, 1.0)))
+    angle = float(angles[2])
     name, text = "imu_specific_force", f"{angle:.3g} degrees from up {when}, by base_quat"
+    if (level := int(np.argmin(angles))) < 2 and angles[level] < _MAX_TILT_DEG:
+        advice = f"turn the world so that z points up; else check the IMU's frame in the {robot.format}"
+        text = f"imu_specific_force {text}: a world whose {'xy'[level]} axis points up?"
+        yield Finding("gravity", SUSPICIOUS, "base_quat_xyzw", text, advice)
+        return
     if angle <= 90.0:
         if angle > _MAX_TILT_DEG:
             advice = f"check the IMU's frame in the {robot.format} and the order of the quaternion"

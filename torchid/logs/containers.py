@@ -51,16 +51,20 @@ class LogKind(Enum):
     JOINED = "joined"
 
 
-def existing_log_kind(path: Path) -> LogKind:
+def existing_log_kind(path: Path, beside: Path | None = None) -> LogKind:
     """The kind of an existing log, or of the file that it is a part of.
+
+    Args:
+        path: the log.
+        beside: folder of the first file of several, from which this one is looked for.
 
     Raises:
         LogError: the file does not exist, or its extension is unknown; or one of several files is a bag.
     """
     part = split_range(path)
     if part.joins:
-        for file in part.files:
-            if existing_log_kind(file.path) is LogKind.BAG:
+        for number, file in enumerate(part.files):
+            if existing_log_kind(file.path, part.files[0].path.parent if number else None) is LogKind.BAG:
                 accepted = f"{', '.join(WRITABLE)}: the topics of a bag have common stamps already; or convert it"
                 raise LogError(file.path, "file", "a bag, one of several files of a log", accepted)
         return LogKind.JOINED
@@ -72,7 +76,8 @@ def existing_log_kind(path: Path) -> LogKind:
     kind = _kind(path, READABLE)
     if not os.path.isfile(path):
         found = "a pipe, a device or a socket" if os.path.exists(path) else "no such file"
-        raise LogError(path, "file", found, f"an existing log ({', '.join(READABLE)})")
+        where = f"; later files of a log are looked for from the folder of the first, {beside}" if beside else ""
+        raise LogError(path, "file", found, f"an existing log ({', '.join(READABLE)}){where}")
     return kind
 
 
