@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from arms import ARMS
 from currents import HIP_SCALE, HIPS, KNEE_SCALE, KNEES, NOISE, quadruped_files
 from refusals import refusal
 from repository import SHARED
@@ -171,6 +172,29 @@ def test_a_recorded_robot_that_stands_on_all_feet_is_refused_with_the_reason(
     message = refusal(["identify", str(tmp_path / "go2.yaml")], tmp_path, capsys)
     assert "sensors.scales: of all measured forces, which no mass determines here: scale of *_hip_joint" in message
     assert "accepted: a sensor without a scale, or logs in which each contact lifts" in message
+
+
+@pytest.mark.filterwarnings("ignore:identified.urdf")
+def test_scales_of_all_motors_of_a_bolted_robot_are_refused_without_a_word_of_contacts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "arms.urdf").write_text(ARMS)
+    time = np.arange(2000) / 100.0
+    position = np.stack([np.sin(2.0 * time) + 0.3 * np.sin(5.0 * time), np.cos(3.0 * time)], axis=1)
+    torque = np.stack([9.81 * np.cos(position[:, 0]), position[:, 1]], axis=1)
+    log = {"time": time, "joint_names": ["first", "second"], "joint_position": position, "joint_torque": torque}
+    np.savez(tmp_path / "log.npz", **log)
+    experiment = {
+        "robot": {"urdf": "arms.urdf", "fixed_base": True},
+        "logs": {"train": ["log.npz"]},
+        "preprocessing": {"cutoff_hz": 10},
+        "sensors": {"set": "joints", "scales": {"joint_torque": "all"}},
+        "output": str(tmp_path / "run"),
+    }
+    (tmp_path / "arms.yaml").write_text(yaml.safe_dump(experiment))
+    message = refusal(["identify", str(tmp_path / "arms.yaml")], tmp_path, capsys)
+    assert "sensors.scales: of all measured forces, which no mass determines here" in message
+    assert "accepted: a sensor without a scale, or estimator.masses of bodies whose weight acts on it" in message
 
 
 def test_exact_masses_hold_whatever_the_data_say_and_uncertain_ones_are_weighed() -> None:

@@ -14,9 +14,12 @@ from repository import DEMO
 from torchid.cli import main
 from torchid.commands.folder import REPLAY
 from torchid.commands.manifest import read_manifest
-from torchid.commands.replay import _feet, replay
+from torchid.commands.replay import Replay, _feet, replay
 from torchid.errors import ConfigError
+from torchid.fitting.calibration import Comparison
 from torchid.sensing import Contact
+from torchid.simulation.replay import Drift
+from torchid.terminal.runs import replay_lines
 
 UNSEEN = str(DEMO / "sway_test.npz")
 pytestmark = pytest.mark.filterwarnings("ignore:identified.urdf")
@@ -95,6 +98,25 @@ def test_windows_that_no_log_has_are_refused(
     run: Path, more: list[str], found: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert found in refusal(["replay", str(run), "--log", UNSEEN, *more], tmp_path, capsys)
+
+
+@pytest.mark.parametrize(
+    ("units", "shares"), [(("rad", "m"), "joints [rad] 1 %, joints [m] 10 %"), (("rad", "rad"), "joints 4.6 %")]
+)
+def test_drifts_of_hinges_and_slides_are_told_apart(units: tuple[str, ...], shares: str) -> None:
+    time = np.array([0.0, 0.5])
+    drifts = (Drift(time, np.array([[[0.0, 0.0], of_joints]]), None) for of_joints in ([1.0, 0.5], [0.01, 0.05]))
+    found = Replay(
+        source="log",
+        window=0.5,
+        windows=1,
+        drift=Comparison(*drifts),
+        joint_names=("j", "z"),
+        units=units,
+        of="URDF",
+        gains=np.zeros((2, 2)),
+    )
+    assert f"as a share of the URDF's: {shares} (1 windows)" in replay_lines(found, 200)[0]
 
 
 def test_what_a_replay_lacks_is_named(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,7 +9,7 @@ import pytest
 from physical import random_bodies
 
 from torchid.estimators import Conditions
-from torchid.estimators.posterior import Posterior, nominal_error
+from torchid.estimators.posterior import NominalError, Posterior, nominal_error
 from torchid.fitting.posterior import FittedPosterior
 
 BODIES, COMBINATIONS = 8, 30
@@ -42,6 +42,11 @@ def test_error_of_the_file_is_found_whatever_the_friction(width: float) -> None:
     # 14 combinations are left once those of 16 frictions are gone: each value is sure to 1 / sqrt(28)
     assert np.exp(np.log(values).mean()) == pytest.approx(width, rel=0.2)
     assert {one.prior_is_narrow for one in found if one is not None} == {width > 0.3}
+
+
+def test_large_errors_are_said_in_whole_percents() -> None:
+    assert "by 1012 %, 51 times what the prior says" in str(NominalError(10.12, 0.2, 3, 99.0))
+    assert "by 42 %, 2.1 times what the prior says" in str(NominalError(0.42, 0.2, 3, 99.0))
 
 
 def test_prior_of_the_right_width_is_seldom_called_narrow() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +20,15 @@ from torchid.logs.preprocess import preprocess
 from torchid.problem import bind_log
 from torchid.problem.log_joints import with_loop_joints
 from torchid.regressor.loops import LoopClosures
+from torchid.robot import load_robot
+
+FOUR_BAR = """<mujoco><worldbody><body name="frame"><inertial pos="0 0 0" mass="5" diaginertia=".1 .1 .1"/>
+<body name="crank"><joint name="crank" axis="0 1 0"/><inertial pos="0 0 .1" mass="1" diaginertia=".01 .01 .01"/>
+<body name="coupler" pos="0 0 .2"><joint name="coupler" axis="0 1 0"/>
+<inertial pos=".2 0 0" mass="1" diaginertia=".01 .01 .01"/><site name="pin" pos=".4 0 0"/></body></body>
+<body name="rocker" pos=".4 0 0"><joint name="rocker" axis="0 1 0"/>
+<inertial pos="0 0 .1" mass="1" diaginertia=".01 .01 .01"/><site name="top" pos="0 0 .2"/></body></body></worldbody>
+<equality><connect site1="pin" site2="top"/></equality><actuator><motor joint="crank"/></actuator></mujoco>"""
 
 robots = pytest.mark.parametrize("name", MODELS)
 
@@ -101,6 +111,14 @@ def test_joints_that_loops_do_not_determine_are_named() -> None:
         with_loop_joints(short, w.robot)
     with pytest.raises(LogError, match="joint_names: abduction of four-bar leg.xml missing; .*joints of loops follow"):
         bind_log(with_loop_joints(without(w.log, ("abduction",)), w.robot), w.robot, w.contacts)
+
+
+def test_a_log_of_no_joint_of_a_single_loop_is_refused_by_what_is_not_determined(tmp_path: Path) -> None:
+    (tmp_path / "fourbar.xml").write_text(FOUR_BAR)
+    robot = load_robot(tmp_path / "fourbar.xml", fixed_base=True)
+    log = Log("log.npz", np.arange(5.0), (), np.empty((5, 0)))
+    with pytest.raises(LogError, match="crank, coupler, rocker"):
+        with_loop_joints(log, robot)
 
 
 def test_loops_that_do_not_close_are_refused_with_how_far_they_are_open() -> None:

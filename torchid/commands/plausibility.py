@@ -108,7 +108,8 @@ def require_plausible(fit: Fit, logs: TrainingLogs) -> TotalMass:
     tolerance = scene.config.estimator.rank_tolerance
     by_data = LeastSquares(rank_tolerance=tolerance).solve(fit.assembly.problem)
     if fit.assembly.homogeneous:
-        _require_scales(estimate_extras(fit.assembly, by_data, scene.robot.body_names, tolerance))
+        by_data_alone = estimate_extras(fit.assembly, by_data, scene.robot.body_names, tolerance)
+        _require_scales(by_data_alone, bool(scene.contacts))
     mass, mass_by_data = (total_mass(fit.assembly, x, tolerance, block_error) for x in (estimate, by_data))
     reason = implausibility(fit.assembly.data or fit.assembly.problem, estimate.phi, mass_by_data, scene.robot)
     unexplained = None  # a descent that is not finished leaves much that a model explains
@@ -132,11 +133,12 @@ def require_plausible(fit: Fit, logs: TrainingLogs) -> TotalMass:
     return mass
 
 
-def _require_scales(by_data: Sequence[ExtraEstimate]) -> None:
+def _require_scales(by_data: Sequence[ExtraEstimate], has_contacts: bool) -> None:
     """Refuse scales of all measured forces where no forces at all, with mass where it acts on none, fit best.
 
     Args:
         by_data: extra parameters by the data and known masses alone: a ridge would hide where they go.
+        has_contacts: whether the robot has any.
 
     Raises:
         ImplausibleFitError: names them.
@@ -145,8 +147,10 @@ def _require_scales(by_data: Sequence[ExtraEstimate]) -> None:
     beyond = [f"{label} {x:.2g}" for label, x in scales.items() if is_implausible_factor(x)]
     if beyond:
         found = f"of all measured forces, which no mass determines here: {join_names(beyond)}"
-        reason = "mass at a contact that always stands acts on no joint"
-        accepted = f"a sensor without a scale, or logs in which each contact lifts: {reason}"
+        accepted = "a sensor without a scale, or estimator.masses of bodies whose weight acts on it"
+        if has_contacts:
+            reason = "mass at a contact that always stands acts on no joint"
+            accepted = f"a sensor without a scale, or logs in which each contact lifts: {reason}"
         raise ImplausibleFitError.at_field("sensors.scales", found, accepted)
 
 

@@ -196,7 +196,9 @@ class NominalError:
         return self.clear and self.value > _MUCH * self.prior
 
     def __str__(self) -> str:
-        off = f"{100.0 * self.value:.2g} %, {self.value / self.prior:.2g} times what the prior says"
+        times = self.value / self.prior
+        percent, factor = (f"{x:.0f}" if x > 99.0 else f"{x:.2g}" for x in (100.0 * self.value, times))
+        off = f"{percent} %, {factor} times what the prior says"
         return f"where the data tell, in {self.combinations} combinations, bodies are off the robot file by {off}"
 
 

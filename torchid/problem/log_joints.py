@@ -231,7 +231,7 @@ class _Joints:
     def _positions(self, q: Tensor) -> Tensor:
         """Positions (N, n) with the missing joints where the loops close."""
         known = q[:, self.known].numpy()
-        way = np.cumsum(np.abs(np.diff(known, axis=0, prepend=known[:1])).max(axis=1))
+        way = np.cumsum(np.abs(np.diff(known, axis=0, prepend=known[:1])).max(axis=1, initial=0.0))
         at, last = np.unique(way // _FAR, return_index=True, return_inverse=True)[1:]
         nodes = self._from_assembled(q[at])
         self._require_determined(nodes)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict
 
@@ -228,11 +229,14 @@ def replay_lines(replayed: Replay, width: int, verbose: bool = False) -> list[st
 
 def _drift(replayed: Replay) -> str:
     """How much less the identified robot drifts."""
+    drifts = replayed.at(replayed.window)
+    what = Counter(name.partition(" [")[0] for name in drifts)  # with units where joints have two
+    named = {name: bare if what[bare := name.partition(" [")[0]] == 1 else name for name in drifts}
     shares = [
-        f"{name.partition(' [')[0]} {100.0 * after / before:.2g} %" if before else name
-        for name, (before, after) in replayed.at(replayed.window).items()
+        f"{named[name]} {100.0 * after / before:.2g} %" if before else named[name]
+        for name, (before, after) in drifts.items()
     ]
-    worse = any(after > before for before, after in replayed.at(replayed.window).values())
+    worse = any(after > before for before, after in drifts.values())
     head = f"WORSE THAN {replayed.of}: drift" if worse else "Drift"
     driven = "PD targets" if replayed.gains.any() else "torques"
     of = f"of the {driven} of {replayed.source} alone, as a share of the {replayed.of}'s"
