@@ -50,7 +50,8 @@ def test_an_evaluation_replaces_an_evaluation_alone_and_only_on_request(
     output = tmp_path / "evaluated"
     assert main(evaluating(folder, "--output", str(output))) == 0
     capsys.readouterr()
-    assert "not empty" in refusal(evaluating(folder, "--output", str(output)), tmp_path, capsys)
+    message = refusal(evaluating(folder, "--output", str(output)), tmp_path, capsys)
+    assert "not empty; accepted: a new folder, or --overwrite" in message
     assert main(evaluating(folder, "--output", str(output), "--overwrite")) == 0
     capsys.readouterr()
     of_the_run = evaluating(folder, "--output", str(folder / "run"), "--overwrite")

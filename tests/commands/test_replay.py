@@ -81,7 +81,7 @@ def test_pd_targets_keep_both_nearer_to_the_log(run: Path, tmp_path: Path, capsy
 
 def test_a_replay_replaces_nothing_but_a_replay(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     again = ["replay", str(run), "--log", UNSEEN, "--output", str(run)]
-    assert "not empty" in refusal(again, run, capsys)
+    assert "not empty; accepted: a new folder, or --overwrite" in refusal(again, run, capsys)
     assert "a run" in refusal([*again, "--overwrite"], run, capsys)
 
 

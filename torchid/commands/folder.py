@@ -14,14 +14,14 @@ from torchid.errors import ConfigError, current_file, excerpt, join_names
 from torchid.staging import CAN_LOCK, NEW, OLD, interrupts_deferred, leftovers, note_written, staging_folder, try_lock
 
 EVENTS = "events.out.tfevents*"
-EVALUATION = FolderKind("an evaluation")
+EVALUATION = FolderKind("an evaluation", replace="--overwrite")
 RUN = FolderKind("a run", "evaluation", EVALUATION)
 TRAINING = FolderKind("a training", result=False)
 SIMULATION = FolderKind("a simulation")
 ANALYSIS = FolderKind("an analysis")
 STUDY = FolderKind("a study")
-REPLAY = FolderKind("a replay")
-SAMPLES = FolderKind("samples")
+REPLAY = FolderKind("a replay", replace="--overwrite")
+SAMPLES = FolderKind("samples", replace="--overwrite")
 COMPRESSED = FolderKind("compressed logs")
 EXAMPLES = FolderKind("examples")
 
@@ -58,7 +58,7 @@ def check_free(output: Path, overwrite: bool, kind: FolderKind = RUN, inputs: It
     if not (above.is_dir() and os.access(above, os.W_OK | os.X_OK)) or len(os.fsencode(output.name)) > _LONGEST_NAME:
         raise ConfigError(output, "output", f"no folder can be made there, in {above}", "a place that can be written")
     if names and not overwrite:
-        raise ConfigError(output, "output", "not empty", "a new folder, or overwrite=true")
+        raise ConfigError(output, "output", "not empty", f"a new folder, or {kind.replace}")
     if names:
         refuse_inputs(output, inputs)
         require_replaceable(output, kind)

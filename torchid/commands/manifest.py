@@ -32,12 +32,14 @@ class FolderKind:
         inner_folder: name of a folder in it that holds folders of another kind, with manifests of their own.
         inner_kind: their kind.
         result: whether it is what a command answers with, not a state on the way there.
+        replace: what lets its command replace one that exists: a key of the experiment file, or an option.
     """
 
     name: str
     inner_folder: str = ""
     inner_kind: FolderKind | None = None
     result: bool = True
+    replace: str = "overwrite=true"
 
 
 @dataclass(frozen=True)
