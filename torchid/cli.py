@@ -142,6 +142,7 @@ def _add_uses_of_runs(commands: _Commands) -> None:
     for option, what in (("--kp", "of positions"), ("--kd", "of velocities")):
         text = f"gains {what} of the PD law that made the torques: 20, '*_calf=30' (default: 0)"
         replay.add_argument(option, nargs="+", default=[], metavar="GAIN", help=text)
+    replay.add_argument("--samples", type=int, default=10, metavar="N", help="drawn robots to replay too (default: 10)")
     replay.add_argument("--output", metavar="FOLDER", help="folder to write: a figure and all numbers")
     replay.add_argument("--overwrite", action="store_true", help="replace an earlier replay in this folder")
     _add_amount(replay)
@@ -313,10 +314,10 @@ def _replay(options: argparse.Namespace) -> None:
         from torchid.commands.replay import parse_gains, replay
         from torchid.terminal.runs import print_replay
 
-    kp, kd = parse_gains("--kp", options.kp), parse_gains("--kd", options.kd)
-    replayed = replay(options.run, options.log, options.window, options.output, options.overwrite, kp, kd)
+    gains = parse_gains("--kp", options.kp), parse_gains("--kd", options.kd)
+    found = replay(options.run, options.log, options.window, options.output, options.overwrite, *gains, options.samples)
     if not options.quiet:
-        print_replay(replayed, options.verbose)
+        print_replay(found, options.verbose)
 
 
 def _sample(options: argparse.Namespace) -> None:

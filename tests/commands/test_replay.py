@@ -14,7 +14,7 @@ from repository import DEMO
 from torchid.cli import main
 from torchid.commands.folder import REPLAY
 from torchid.commands.manifest import read_manifest
-from torchid.commands.replay import Replay, _feet, replay
+from torchid.commands.replay import SAMPLES, Replay, _feet, replay
 from torchid.errors import ConfigError
 from torchid.fitting.calibration import Comparison
 from torchid.sensing import Contact
@@ -46,6 +46,11 @@ def test_the_identified_robot_stays_nearer_to_a_new_log_than_the_urdf(
         assert (np.diff(nominal, axis=0) >= 0.0).all()
         assert identified[1, -1] < 0.2 * nominal[1, -1]
         assert any(f"{identified[1, -1]:.4g}" in line for line in lines)
+        least, largest = np.array(document["samples"]["least_and_largest_median"][name])
+        assert (least <= largest).all()
+        assert least[-1] < largest[-1] < 0.5 * nominal[1, -1]
+        assert any(f"{least[-1]:.3g} to {largest[-1]:.3g}" in line for line in lines)
+    assert document["samples"]["count"] == SAMPLES
     assert lines[0].startswith("Drift after 0.2 s of the torques of sway_test alone")
     assert len(lines) <= 20
     assert max(map(len, lines)) <= 100
@@ -53,15 +58,20 @@ def test_the_identified_robot_stays_nearer_to_a_new_log_than_the_urdf(
     assert kind is not None
     assert kind.kind == REPLAY.name
     assert {file.name for file in output.iterdir()} == {"replay.json", "drift.png", "manifest.json"}
-    assert main(["replay", str(run), "--log", UNSEEN, "--window", "0.2", "--verbose"]) == 0
-    assert "rear_right_knee" in capsys.readouterr().out
+    assert main(["replay", str(run), "--log", UNSEEN, "--window", "0.2", "--verbose", "--samples", "0"]) == 0
+    said = capsys.readouterr().out
+    assert "rear_right_knee" in said
+    assert "samples" not in said
+    assert main(["replay", str(run), "--log", UNSEEN, "--samples", "-1"]) == 2
+    assert "--samples: -1; accepted: 0 to 1000" in capsys.readouterr().err
 
 
 def test_pd_targets_keep_both_nearer_to_the_log(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     ends = []
     for name, gains in (("free", []), ("held", ["--kp", "20", "*_knee=40", "--kd", "0.5"])):
         output = tmp_path / name
-        assert main(["replay", str(run), "--log", UNSEEN, "--window", "0.2", "--output", str(output), *gains]) == 0
+        shown = ["--window", "0.2", "--samples", "0", "--output", str(output)]
+        assert main(["replay", str(run), "--log", UNSEEN, *shown, *gains]) == 0
         document = json.loads((output / "replay.json").read_text())
         ends.append([document["quartiles"]["joints [rad]"][who][1][-1] for who in ("nominal", "identified")])
     assert "Drift after 0.2 s of the PD targets of sway_test alone" in capsys.readouterr().out

@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import tempfile
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from torchid import parameters
 from torchid.commands.evaluate import FittedRun, read_run, require_run
 from torchid.commands.folder import REPLAY, check_free, new_folder, write_json
 from torchid.commands.reading import LogReader
 from torchid.config import FootConfig
-from torchid.errors import ConfigError, LogError, about_file, during, excerpt
-from torchid.fitting.calibration import Calibration, Comparison
+from torchid.errors import ConfigError, LogError, TorchidWarning, about_file, during, excerpt
+from torchid.estimators.posterior import PRIOR_ERROR
+from torchid.fitting.calibration import Comparison
+from torchid.fitting.posterior import PosteriorSampler, read_posterior
 from torchid.logs.time_range import split_range
 from torchid.parameters import Array
 from torchid.problem import Samples
 from torchid.problem.chunks import one_thread
 from torchid.problem.extras import ACTUATORS
-from torchid.report import identified_name
+from torchid.report import FittedJoints, identified_name, identified_robot
 from torchid.report.figure_style import save_figures
 from torchid.report.figures import drift_figure
 from torchid.report.tables import progress_bars
@@ -35,6 +40,9 @@ from torchid.simulation.ties import Ties
 
 _TIMES = 25  # at which the drift is compared, within a window
 _UNITS = {"revolute": "rad", "prismatic": "m"}
+SAMPLES = 10
+"""Robots that are drawn from what the logs leave open, where nobody says how many."""
+_MOST_SAMPLES = 1000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +58,7 @@ class Replay:
         units: of the joints' positions, "rad" or "m".
         of: what the robot's file is, "URDF" or "MJCF".
         gains: kp and kd of each joint, (2, n), 0 where the log's torques drive it alone.
+        sampled: drift with each of some robots that were drawn from what the logs of the run leave open.
         output: the folder that it was written to, if any.
     """
 
@@ -61,6 +70,7 @@ class Replay:
     units: tuple[str, ...]
     of: str
     gains: Array
+    sampled: tuple[Drift, ...] = ()
     output: Path | None = None
 
     __repr__ = short_repr
@@ -74,19 +84,35 @@ class Replay:
 
         Of joints it is the root mean square over them. A robot that has fallen over is far off, but no farther matters.
         """
+        nominal, identified = (self._quartiles_of(one) for one in self.drift)
+        return {name: Comparison(nominal[name], identified[name]) for name in nominal}
+
+    def _quartiles_of(self, drift: Drift) -> dict[str, Array]:
         out = {}
         for unit in dict.fromkeys(self.units):
-            columns = np.flatnonzero(np.array(self.units) == unit)
-            out[f"joints [{unit}]"] = Comparison(*(_quartiles(one.of_joints(columns)) for one in self.drift))
-        tilts = [one.tilt for one in self.drift]
-        if tilts[0] is not None and tilts[1] is not None:
-            out["base tilt [rad]"] = Comparison(_quartiles(tilts[0]), _quartiles(tilts[1]))
+            out[f"joints [{unit}]"] = _quartiles(drift.of_joints(np.flatnonzero(np.array(self.units) == unit)))
+        if drift.tilt is not None:
+            out["base tilt [rad]"] = _quartiles(drift.tilt)
         return out
+
+    def ranges(self) -> dict[str, Array]:
+        """Least and largest median drift of the robots that were drawn, (2, T), by what drifts; empty without any."""
+        medians = [{name: x[1] for name, x in self._quartiles_of(one).items()} for one in self.sampled]
+        each = {name: np.stack([one[name] for one in medians]) for name in (medians[0] if medians else ())}
+        return {name: np.stack([x.min(axis=0), x.max(axis=0)]) for name, x in each.items()}
 
     def at(self, time: float) -> dict[str, Comparison[float]]:
         """Median drift at the compared time that is nearest to one since the beginning of a window [s]."""
-        k = int(np.abs(self.drift.nominal.time - time).argmin())
+        k = self._nearest(time)
         return {name: Comparison(*(float(x[1, k]) for x in pair)) for name, pair in self.quartiles().items()}
+
+    def ranges_at(self, time: float) -> dict[str, tuple[float, float]]:
+        """As `at`, of `ranges`."""
+        k = self._nearest(time)
+        return {name: (float(low[k]), float(high[k])) for name, (low, high) in self.ranges().items()}
+
+    def _nearest(self, time: float) -> int:
+        return int(np.abs(self.drift.nominal.time - time).argmin())
 
     def by_joint(self) -> dict[str, Comparison[float]]:
         """Median drift at the end of the windows, by joint."""
@@ -107,6 +133,10 @@ class Replay:
                 for name, pair in self.quartiles().items()
             },
             "by_joint": {name: pair._asdict() for name, pair in self.by_joint().items()},
+            "samples": {
+                "count": len(self.sampled),
+                "least_and_largest_median": {name: x.tolist() for name, x in self.ranges().items()},
+            },
         }
 
 
@@ -119,6 +149,7 @@ def replay(
     overwrite: bool = False,
     kp: float | Mapping[str, float] = 0.0,
     kd: float | Mapping[str, float] = 0.0,
+    samples: int = SAMPLES,
 ) -> Replay:
     """Drive the robot in MuJoCo with the torques of a log, and see how far it drifts from the log.
 
@@ -133,12 +164,15 @@ def replay(
         overwrite: whether a replay that stands there may be replaced.
         kp: gain of a PD law whose targets made the log's torques [N m/rad or N/m], of all joints or by name or pattern.
         kd: its gain on the velocity [N m s/rad or N s/m], likewise.
+        samples: robots that are drawn from what the logs of the run leave open, as by `sample`, and replayed as well.
 
     Raises:
         InputError: the folder is no run, MuJoCo is not installed or refuses the robot, or the log lacks fields.
     """
     if not 0.0 < window < np.inf:
         raise ConfigError("command line", "--window", f"{window:g}", "a length of time greater than 0 [s]")
+    if not 0 <= samples <= _MOST_SAMPLES:
+        raise ConfigError("command line", "--samples", f"{samples}", f"0 to {_MOST_SAMPLES}")
     folder, out = Path(run), None if output is None else Path(output)
     require_run(folder)
     if out is not None:
@@ -150,13 +184,14 @@ def replay(
         robot = fitted.experiment.robot
         gains = np.stack([_joint_gains(robot, *x) for x in (("--kp", kp), ("--kd", kd))])
         reading = bars.add_task("reading the log", total=1)
-        (samples,) = LogReader(fitted.experiment, folder).read([Path(log)], None, lambda _: bars.advance(reading))
+        (bound,) = LogReader(fitted.experiment, folder).read([Path(log)], None, lambda _: bars.advance(reading))
         feet = _feet(fitted.experiment.contacts, robot.path) if not robot.fixed_base else ()
-        logs, models = _replayed_pairs(fitted, samples, folder)
+        logs, models = _replayed_pairs(fitted, bound, folder)
         windows = logs.nominal.windows(window)
-        replaying = bars.add_task("replaying", total=2 * len(windows))
+        replaying = bars.add_task("replaying", total=(2 + samples) * len(windows))
         rest = feet, windows, window * np.arange(1, _TIMES + 1) / _TIMES, lambda n: bars.advance(replaying, n), gains
         drift = Comparison(*(replay_log(model, of, *rest) for model, of in zip(models, logs, strict=True)))
+        sampled = tuple(replay_log(model, logs.identified, *rest) for model in _drawn(robot, folder, samples))
     found = Replay(
         source=split_range(log).name,
         window=float(window),
@@ -166,6 +201,7 @@ def replay(
         units=tuple(_UNITS[kind] for kind in _joint_kinds(robot)),
         of=robot.format,
         gains=gains,
+        sampled=sampled,
         output=out,
     )
     if out is not None:
@@ -180,8 +216,30 @@ def _replayed_pairs(
     """What drives the robot of its file and the identified one, and both."""
     robot, calibration = fitted.experiment.robot, fitted.calibrations.identified
     logs = Comparison(*(_replayed(one) for one in (samples, *calibration.calibrate([samples]))))
-    identified = _model(folder / identified_name(robot), robot, calibration)
-    return logs, Comparison(_model(robot.path, robot, None), identified)
+    joints: dict[str, dict[str, float]] = {what: {} for what in ACTUATORS}
+    for extra in calibration.builder.extras:
+        if extra.what in joints:
+            joints[extra.what][extra.name] = calibration.values[("", extra.label)]
+    identified = _model(folder / identified_name(robot), robot, joints, calibration.phi.reshape(robot.nominal.shape))
+    return logs, Comparison(_model(robot.path, robot, {}, None), identified)
+
+
+def _drawn(robot: Robot, run: Path, count: int) -> Iterator[Model]:
+    """Robots drawn from the posterior of a run, always the same ones."""
+    if not count:
+        return
+    posterior = read_posterior(run)
+    sampler = PosteriorSampler(posterior, posterior.prior_error(PRIOR_ERROR))
+    samples = sampler.sample(count, torch.Generator().manual_seed(0))
+    of_joints = {what: samples.of_joints(what) for what in ACTUATORS}
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore", TorchidWarning)  # said of the identified robot, when it was written
+        for number, phi in enumerate(samples.phi.numpy()):
+            joints = {what: {name: float(x[number]) for name, x in of.items()} for what, of in of_joints.items()}
+            file = Path(folder) / identified_name(robot)
+            in_file = FittedJoints(joints["armature"], joints["stiffness"], joints["torque_offset"])
+            file.write_bytes(identified_robot(robot, phi, in_file))
+            yield _model(file, robot, joints, phi)
 
 
 _GAIN = "a number of at least 0, or numbers by joint or pattern: 20 '*_calf=30'"
@@ -218,7 +276,13 @@ def _write(found: Replay, folder: Path, form: str) -> None:
     """Write all numbers and the figure of a replay, in a format."""
     write_json(folder / "replay.json", found.to_dict())
     figure = drift_figure(
-        found.source, found.drift.nominal.time, found.quartiles(), found.by_joint(), found.units, found.of
+        found.source,
+        found.drift.nominal.time,
+        found.quartiles(),
+        found.ranges(),
+        found.by_joint(),
+        found.units,
+        found.of,
     )
     save_figures({"drift": figure}, folder, form)
 
@@ -244,20 +308,26 @@ def _joint_kinds(robot: Robot) -> list[str]:
     return [moving[name] for name in robot.joint_names]
 
 
-def _model(urdf: Path, robot: Robot, calibration: Calibration | None) -> Model:
-    """The robot of a file with identified armatures, springs and offsets of torque, or those of an MJCF file.
+def _model(urdf: Path, robot: Robot, fitted: Mapping[str, Mapping[str, float]], phi: Array | None) -> Model:
+    """The robot of a file with armatures, springs and offsets of torque by joint, and those of the file elsewhere.
 
     Coulomb friction that differs by direction is symmetric friction and an offset, as far as the joint moves.
+
+    Args:
+        urdf: the file.
+        robot: of it.
+        fitted: values of `ACTUATORS`, by joint.
+        phi: (L, 12), identified parameters; None for the robot's file itself.
     """
     values = {what: np.zeros(robot.n) for what in ACTUATORS}
     values |= {"armature": robot.armature.copy(), "stiffness": robot.stiffness.copy()}
-    for extra in calibration.builder.extras if calibration is not None else ():
-        if extra.what in values and calibration is not None:
-            values[extra.what][list(extra.dofs)] = calibration.values[("", extra.label)]
+    for what, by_joint in fitted.items():
+        for name, value in by_joint.items():
+            values[what][robot.joint_names.index(name)] = value
     offset = values["torque_offset"] + values["asymmetric_coulomb"] + robot.spring_torque
     ties = Ties.of(urdf, read_urdf(urdf)[1], robot.loops, robot.welded)
-    if calibration is not None and robot.welded:
-        ties = replace(ties, inertials=_inertials_beyond_welds(robot, calibration.phi.reshape(robot.nominal.shape)))
+    if phi is not None and robot.welded:
+        ties = replace(ties, inertials=_inertials_beyond_welds(robot, phi))
     return Model(urdf, robot.joint_names, values["armature"], offset, values["stiffness"], ties)
 
 

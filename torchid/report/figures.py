@@ -340,6 +340,7 @@ def drift_figure(
     source: str,
     time: Array,
     quartiles: Mapping[str, Comparison[Array]],
+    ranges: Mapping[str, Array],
     by_joint: Mapping[str, Comparison[float]],
     units: Sequence[str],
     of: str,
@@ -352,6 +353,7 @@ def drift_figure(
         source: name of the log.
         time: (T,) [s].
         quartiles: (3, T) each, over windows, by what drifts, with its unit.
+        ranges: least and largest median of robots that were drawn, (2, T), by what drifts; empty without any.
         by_joint: at the end of the windows.
         units: of the joints, "rad" or "m".
         of: what the robot's file is.
@@ -367,6 +369,8 @@ def drift_figure(
         ):
             axis.fill_between(time, low, high, color=color, alpha=0.2, linewidth=0.0)
             axis.plot(time, middle, color=color, label=label)
+        for edge, label in zip(ranges.get(name, ()), ("samples, least and largest", ""), strict=False):
+            axis.plot(time, edge, color=IDENTIFIED_COLOR, linestyle=":", label=label)
         if min(nominal.min(), identified.min()) > 0.0:
             axis.set_yscale("log")
             label_decades(axis.yaxis)

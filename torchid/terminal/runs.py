@@ -207,12 +207,15 @@ def replay_lines(replayed: Replay, width: int, verbose: bool = False) -> list[st
         verbose: with all joints.
     """
     lines = wrap_words(_drift(replayed), width, "  ")
-    rows = [(name, who) for name in replayed.at(replayed.window) for who in (replayed.of, "identified")]
-    columns = [
-        (f"{time:g} s", [f"{replayed.at(time)[name][who == 'identified']:.4g}" for name, who in rows])
-        for time in (share * replayed.window for share in _SHARES)
-    ]
-    lines += column_lines(("median drift after", [f"{name}, {who}" for name, who in rows]), columns, width)
+    names, columns = list[str](), [(f"{share * replayed.window:g} s", list[str]()) for share in _SHARES]
+    for name in replayed.at(replayed.window):
+        drawn = [f"{len(replayed.sampled)} samples"] if replayed.sampled else []
+        names += [f"{name}, {who}" for who in (replayed.of, "identified", *drawn)]
+        for (_, column), share in zip(columns, _SHARES, strict=True):
+            column += [f"{x:.4g}" for x in replayed.at(share * replayed.window)[name]]
+            if drawn:
+                column.append(" to ".join(f"{x:.3g}" for x in replayed.ranges_at(share * replayed.window)[name]))
+    lines += column_lines(("median drift after", names), columns, width)
     joints = sorted(replayed.by_joint().items(), key=lambda x: -x[1].identified)
     few = joints if verbose else joints[:_MOST]
     cells = [
