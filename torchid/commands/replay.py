@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from rich.progress import Progress
 
 from torchid import parameters
 from torchid.commands.evaluate import FittedRun, read_run, require_run
@@ -169,33 +170,23 @@ def replay(
     Raises:
         InputError: the folder is no run, MuJoCo is not installed or refuses the robot, or the log lacks fields.
     """
-    if not 0.0 < window < np.inf:
-        raise ConfigError("command line", "--window", f"{window:g}", "a length of time greater than 0 [s]")
-    if not 0 <= samples <= _MOST_SAMPLES:
-        raise ConfigError("command line", "--samples", f"{samples}", f"0 to {_MOST_SAMPLES}")
+    _require_accepted(window, samples)
     folder, out = Path(run), None if output is None else Path(output)
     require_run(folder)
     if out is not None:
         check_free(out, overwrite, REPLAY, [folder, *(file.path for file in split_range(log).files)])
     with progress_bars() as bars:
         fitted = read_run(folder)
-        with about_file(folder / "config.yaml"):
-            _require_simple(fitted)
+        _require_simple(fitted, folder)
         robot = fitted.experiment.robot
         gains = np.stack([_joint_gains(robot, *x) for x in (("--kp", kp), ("--kd", kd))])
         reading = bars.add_task("reading the log", total=1)
         (bound,) = LogReader(fitted.experiment, folder).read([Path(log)], None, lambda _: bars.advance(reading))
-        feet = _feet(fitted.experiment.contacts, robot.path) if not robot.fixed_base else ()
-        logs, models = _replayed_pairs(fitted, bound, folder)
-        windows = logs.nominal.windows(window)
-        replaying = bars.add_task("replaying", total=(2 + samples) * len(windows))
-        rest = feet, windows, window * np.arange(1, _TIMES + 1) / _TIMES, lambda n: bars.advance(replaying, n), gains
-        drift = Comparison(*(replay_log(model, of, *rest) for model, of in zip(models, logs, strict=True)))
-        sampled = tuple(replay_log(model, logs.identified, *rest) for model in _drawn(robot, folder, samples))
+        windows, drift, sampled = _drifts(fitted, folder, bound, window, gains, samples, bars)
     found = Replay(
         source=split_range(log).name,
         window=float(window),
-        windows=len(windows),
+        windows=windows,
         drift=drift,
         joint_names=robot.joint_names,
         units=tuple(_UNITS[kind] for kind in _joint_kinds(robot)),
@@ -205,9 +196,29 @@ def replay(
         output=out,
     )
     if out is not None:
-        with during("writing", out), new_folder(out, overwrite, REPLAY) as new:
-            _write(found, new, fitted.experiment.config.figures.format)
+        _write(found, out, overwrite, fitted.experiment.config.figures.format)
     return found
+
+
+def _require_accepted(window: float, samples: int) -> None:
+    if not 0.0 < window < np.inf:
+        raise ConfigError("command line", "--window", f"{window:g}", "a length of time greater than 0 [s]")
+    if not 0 <= samples <= _MOST_SAMPLES:
+        raise ConfigError("command line", "--samples", f"{samples}", f"0 to {_MOST_SAMPLES}")
+
+
+def _drifts(
+    fitted: FittedRun, run: Path, bound: Samples, window: float, gains: Array, count: int, bars: Progress
+) -> tuple[int, Comparison[Drift], tuple[Drift, ...]]:
+    """Number of windows [s] of a log, drift of the robot's file and of the identified one, and of some draws."""
+    robot = fitted.experiment.robot
+    logs, models = _replayed_pairs(fitted, bound, run)
+    windows = logs.nominal.windows(window)
+    bar = bars.add_task("replaying", total=(2 + count) * len(windows))
+    feet = _feet(fitted.experiment.contacts, robot.path) if not robot.fixed_base else ()
+    rest = feet, windows, window * np.arange(1, _TIMES + 1) / _TIMES, lambda n: bars.advance(bar, n), gains
+    drift = Comparison(*(replay_log(model, of, *rest) for model, of in zip(models, logs, strict=True)))
+    return len(windows), drift, tuple(replay_log(model, logs.identified, *rest) for model in _drawn(robot, run, count))
 
 
 def _replayed_pairs(
@@ -272,9 +283,8 @@ def _joint_gains(robot: Robot, option: str, stated: float | Mapping[str, float])
     return out
 
 
-def _write(found: Replay, folder: Path, form: str) -> None:
-    """Write all numbers and the figure of a replay, in a format."""
-    write_json(folder / "replay.json", found.to_dict())
+def _write(found: Replay, out: Path, overwrite: bool, form: str) -> None:
+    """Write all numbers and the figure of a replay, in a format, to a folder."""
     figure = drift_figure(
         found.source,
         found.drift.nominal.time,
@@ -284,16 +294,19 @@ def _write(found: Replay, folder: Path, form: str) -> None:
         found.units,
         found.of,
     )
-    save_figures({"drift": figure}, folder, form)
+    with during("writing", out), new_folder(out, overwrite, REPLAY) as folder:
+        write_json(folder / "replay.json", found.to_dict())
+        save_figures({"drift": figure}, folder, form)
 
 
-def _require_simple(fitted: FittedRun) -> None:
+def _require_simple(fitted: FittedRun, run: Path) -> None:
     """Make sure that MuJoCo can move the robot as the run understands it. Raises ConfigError: it cannot."""
     robot = fitted.experiment.robot
     root = next(name for name, (body, pose) in robot.links.items() if body == 0 and np.array_equal(pose, np.eye(4)))
     if not robot.fixed_base and robot.base_link != root:
         accepted = f"the {robot.format}'s root, '{root}', to replay"
-        raise ConfigError.at_field("robot.base_link", f"'{robot.base_link}'", accepted)
+        with about_file(run / "config.yaml"):
+            raise ConfigError.at_field("robot.base_link", f"'{robot.base_link}'", accepted)
 
 
 def _quartiles(drift: Array) -> Array:
