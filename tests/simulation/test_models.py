@@ -16,8 +16,8 @@ from synthetic import ROBOTS, ROMEO, load, random_states
 
 from torchid import Regressor
 from torchid.errors import UrdfError
+from torchid.robot.constraints import weld_positions
 from torchid.robot.urdf import read_urdf
-from torchid.robot.welds import weld_positions
 from torchid.simulation.plant import compile_model
 from torchid.simulation.ties import Ties
 

@@ -32,8 +32,8 @@ from torchid.report.figures import drift_figure
 from torchid.report.tables import progress_bars
 from torchid.reprs import short_repr
 from torchid.robot import Robot
+from torchid.robot.constraints import matching_joints
 from torchid.robot.urdf import read_urdf
-from torchid.robot.welds import matching_joints
 from torchid.sensing import Contact
 from torchid.simulation.feet import Foot, find_feet, point_foot
 from torchid.simulation.replay import Drift, Model, ReplayedLog, replay_log

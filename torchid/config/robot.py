@@ -11,7 +11,7 @@ from pydantic.dataclasses import dataclass
 
 from torchid.config.sensors import as_list
 from torchid.errors import ConfigError
-from torchid.robot.loops import MAX_ANGLE, MAX_GAP, Loop
+from torchid.robot.constraints import MAX_ANGLE, MAX_GAP, Loop
 from torchid.robot.xml_files import is_mjcf
 from torchid.settings import AUTO, STRICT, Number, Positive
 

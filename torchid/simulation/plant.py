@@ -14,11 +14,10 @@ from torchid import parameters
 from torchid.config.robot import TiedRobot
 from torchid.errors import UrdfError
 from torchid.parameters import Array
-from torchid.robot.loops import loops_of_file, passive_joints
+from torchid.robot.constraints import loops_of_file, passive_joints, weld_positions
 from torchid.robot.mjcf_model import mujoco
 from torchid.robot.tree import joint_origin, link_parameters
 from torchid.robot.urdf import TreeJoint, drop_repeated_origins, parse_xml, read_urdf
-from torchid.robot.welds import weld_positions
 from torchid.robot.xml_files import file_kind, is_mjcf, plain_urdf
 from torchid.simulation.feet import Foot
 from torchid.simulation.ties import WORLD, Followers, Ties, body_name, loop_errors, set_inertial

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from torchid import parameters
 from torchid.parameters import Array
-from torchid.robot.loops import Loop
+from torchid.robot.constraints import Loop
 from torchid.robot.mjcf_model import mujoco
 from torchid.robot.tree import Mimic, resolve_mimics
 from torchid.robot.urdf import TreeJoint
