@@ -19,7 +19,7 @@ from torchid.config import FootConfig, load_simulation
 from torchid.config.reading import dump
 from torchid.report.tables import stability_table, table_text
 from torchid.simulation import Stability
-from torchid.simulation.feet import find_feet
+from torchid.simulation.constraints import find_feet
 
 MOTIONS = (*SQUATS, *SWAYS, UNSEEN)
 ALONE = SQUATS[-1]

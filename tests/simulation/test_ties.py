@@ -23,9 +23,9 @@ from torchid.robot import load_robot
 from torchid.robot.urdf import read_urdf
 from torchid.sensing import Contact, named_sensors
 from torchid.simulation import set_up_simulation
+from torchid.simulation.constraints import Ties
 from torchid.simulation.plant import Plant
 from torchid.simulation.replay import Model, ReplayedLog, replay_log
-from torchid.simulation.ties import Ties
 
 TIMES = np.array([0.1, 0.2])
 LINK = """<link name="{name}"><inertial><mass value="{mass}"/><origin xyz="0.1 0.12 0.03" rpy="0.3 0 0.2"/>

@@ -35,9 +35,8 @@ from torchid.robot import Robot
 from torchid.robot.constraints import matching_joints
 from torchid.robot.urdf import read_urdf
 from torchid.sensing import Contact
-from torchid.simulation.feet import Foot, find_feet, point_foot
+from torchid.simulation.constraints import Foot, Ties, find_feet, point_foot
 from torchid.simulation.replay import Drift, Model, ReplayedLog, replay_log
-from torchid.simulation.ties import Ties
 
 _TIMES = 25  # at which the drift is compared, within a window
 _UNITS = {"revolute": "rad", "prismatic": "m"}

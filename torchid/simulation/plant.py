@@ -19,8 +19,7 @@ from torchid.robot.mjcf_model import mujoco
 from torchid.robot.tree import joint_origin, link_parameters
 from torchid.robot.urdf import TreeJoint, drop_repeated_origins, parse_xml, read_urdf
 from torchid.robot.xml_files import file_kind, is_mjcf, plain_urdf
-from torchid.simulation.feet import Foot
-from torchid.simulation.ties import WORLD, Followers, Ties, body_name, loop_errors, set_inertial
+from torchid.simulation.constraints import WORLD, Followers, Foot, Ties, body_name, loop_errors, set_inertial
 
 _SMALLEST = 1e-14  # kg and kg m^2, of links without mass between the axes of a joint of several axes
 _DISCARDED = ("transmission", "gazebo", "material", "mujoco")
