@@ -175,10 +175,10 @@ def loops_of_file(path: Path) -> tuple[Loop, ...]:
         TorchidWarning: some hold the robot to what is no part of it, as a mocap body: contacts, if they are named.
     """
     root = parse_xml(path).getroot()
-    for tie in root.findall(f"{OWN}tie"):
+    for one in root.findall(f"{OWN}attachment"):
         held = "holds the robot to what is no part of it, by a force that is left out"
-        contact = f"{{frame: {tie.get('frame')}, type: {'point' if tie.get('type') == 'point' else 'flat'}}}"
-        warn(f"{path}: {tie.get('where')}: {held}; where it acted in a log: contacts: [{contact}]")
+        contact = f"{{frame: {one.get('frame')}, type: {'point' if one.get('type') == 'point' else 'flat'}}}"
+        warn(f"{path}: {one.get('where')}: {held}; where it acted in a log: contacts: [{contact}]")
     found = root.findall(f"{OWN}loop")
     return tuple(Loop((str(x.get("one")), str(x.get("other"))), str(x.get("type"))) for x in found)
 

@@ -124,7 +124,7 @@ _STIFFEST = 0.9999  # share of a violation's acceleration that MuJoCo's constrai
 
 
 @dataclass(frozen=True)
-class Ties:
+class JointConstraints:
     """What keeps joints of a robot from moving one by one.
 
     Attributes:
@@ -147,14 +147,14 @@ class Ties:
         joints: Sequence[TreeJoint],
         loops: Sequence[Loop] = (),
         held: Mapping[str, float] | None = None,
-    ) -> Ties:
+    ) -> JointConstraints:
         """Those of a robot's file, with its joints, and of loops and held joints that a run has."""
         held = held or {}
         mimics = {name: one for name, one in resolve_mimics(path, joints).items() if one.master and name not in held}
         return cls(held, mimics, loops)
 
     def add_to(self, spec: mujoco.MjSpec, physics_hz: float) -> None:
-        """Tie a robot of a model with constraints as stiff as its steps allow; held joints are no joints any more."""
+        """Constrain joints of a model, as stiffly as its steps allow; held joints are no joints any more."""
         for link, values in self.inertials.items():
             set_inertial(spec.body(body_name(link)), values)
         for name, position in self.held.items():

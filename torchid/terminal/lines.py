@@ -76,7 +76,7 @@ def column_lines(
 
 
 def error_lines(errors: Sequence[tuple[str, float, float, float | None]], width: int, of: str) -> list[str]:
-    """A small table of the errors of a `Judged`, not wider than so many columns; none without errors.
+    """A small table of the errors of a `ErrorComparison`, not wider than so many columns; none without errors.
 
     `of`: what the nominal parameters are those of.
     """
