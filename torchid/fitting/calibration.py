@@ -271,9 +271,9 @@ def warn_of_disagreement(fit: Fit, fitter: LogFitter) -> None:
     if len(on_ground) == len(fit.parts):
         return
     for log in dict.fromkeys(part.source for part in fit.parts):
-        gated = {number for part in fit.parts if part.source == log for number in part.gated}
-        if gated:
-            channels = (builder.extras[number] for number in sorted(gated))
+        masked = {number for part in fit.parts if part.source == log for number in part.masked}
+        if masked:
+            channels = (builder.extras[number] for number in sorted(masked))
             named = _grouped(f"{x.name} {x.component}" for x in channels)
             message = f"{log}: {named} read exactly 0 in the air, as if masked or clamped"
             warn(f"{message}, which says nothing of their offsets")

@@ -207,7 +207,7 @@ class PackedPart:
     samples: Whole
     rows: Whole
     independent_rows: NotNegative
-    gated: list[Whole]
+    masked: Annotated[list[Whole], Field(alias="gated")]  # as files of this format call it
     triangles: list[tuple[Whole, Whole, bool]]
     noise_gram: Annotated[list[Whole], Field(alias="surplus")]  # as files of this format call it
 
@@ -246,7 +246,7 @@ class PartPacker:
                     "samples": part.samples,
                     "rows": part.factor.rows,
                     "independent_rows": part.factor.independent_rows,
-                    "gated": sorted(part.gated),
+                    "gated": sorted(part.masked),
                     "triangles": triangles,
                     "surplus": [self._number(support) for support in part.factor.noise_gram],
                 }
@@ -295,7 +295,7 @@ class PartReader:
             raise ValueError(f"more than {self._most} triangles")
         if len(one.state) != self._contacts or set(one.state) - {"0", "1"}:
             raise ValueError(f"contact state {one.state[:MAX_LETTERS]!r}")
-        if max(one.gated, default=-1) >= self._extras or (unloaded and one.samples):
+        if max(one.masked, default=-1) >= self._extras or (unloaded and one.samples):
             raise ValueError("readings in the air of a sensor that is none")
         if not one.independent_rows <= one.rows or (one.rows and not one.independent_rows):
             raise ValueError(f"{one.independent_rows:g} independent of {one.rows} rows")
@@ -312,7 +312,7 @@ class PartReader:
             raise ValueError("the same columns twice")
         factor = TriangularFactor.from_blocks(self._columns, one.rows, one.independent_rows, triangles, noise_gram)
         state = tuple(digit == "1" for digit in one.state)
-        return Part(source, state, factor, one.samples, unloaded=unloaded, gated=set(one.gated))
+        return Part(source, state, factor, one.samples, unloaded=unloaded, masked=set(one.masked))
 
 
 def _support(columns: Sequence[int], count: int) -> tuple[int, ...]:
