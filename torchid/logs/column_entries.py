@@ -58,6 +58,9 @@ class ColumnEntry:
     scale: Annotated[dict[str, Number], BeforeValidator(for_all)] = dataclasses.field(default_factory=dict)
 
 
+FRACTIONS = {"nanoseconds": "ns", "microseconds": "us"}
+"""Units of what may be added to whole seconds, by key."""
+
 Entry = Annotated[ColumnEntry, BeforeValidator(_column)]
 
 
@@ -66,11 +69,12 @@ class TimeEntry(ColumnEntry):
     """Stamps as a column.
 
     Attributes:
-        nanoseconds: column of what is added to it [ns], of stamps in two columns.
+        nanoseconds, microseconds: column of what is added to it [ns, us], of stamps in two columns.
         step: in place of a column, how much later each sample is than the one before, in the unit.
     """
 
     nanoseconds: Name | None = None
+    microseconds: Name | None = None
     step: Positive | None = None
 
 

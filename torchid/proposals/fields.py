@@ -42,7 +42,7 @@ class FieldMatcher:
     def __init__(self, sample: FileSample, robot: KnownRobot) -> None:
         self.sample, self.robot = sample, robot
         self.stated = stated_names(sample, "joint_names")
-        self.names_stated = bool(self.stated) and set(self.stated) <= set(robot.joints)
+        self.names_stated = bool(self.stated) and set(self.stated) <= {*robot.joints, *robot.moving}
         self.named_joints = set(self.stated) if self.names_stated else set[str]()
         self.partial, self._suffix = dict[str, list[str]](), ""
 
@@ -124,7 +124,8 @@ class FieldMatcher:
             if not whole and 2 * len(named) > len(self.robot.joints):
                 self.partial[field] = [x for x in self.robot.joints if x in self.named_joints - named]
         else:
-            whole = count in (len(self.robot.joints), *slots, *([len(self.named_joints)] if self.names_stated else []))
+            known = {len(self.robot.joints), len(self.robot.moving), *slots}
+            whole = count in known or (self.names_stated and count == len(self.named_joints))
             whole |= not self.names_stated and len(numbered_joints(self.robot.joints, count)) == count > 2
             whole |= listed_order(self.sample, "joint", self.robot, count) is not None
         enough = whole or (count >= len(self.robot.joints) and bool(family.numbers))
@@ -149,6 +150,8 @@ _AXIS = re.compile(f"{_COMPONENT}(?!.*{_COMPONENT})")  # the last
 _NUMBER = re.compile(r"(?<=[\[_./' -])(\d)(?=\W*$)")
 _PARTS = {"f": "force", "m": "moment", "t": "moment", "c": "moment"}  # c: of a couple
 _WHOLE = {("",), ("x", "y", "z"), ("0", "1", "2"), ("0", "1", "2", "3", "4", "5")}
+_BARE = re.compile(r"f[xyz]?|forces?|[xyz]")
+_OTHER_WEIGHT = 0.5  # by which a robot's weight may differ from its file's
 _CARRIED = 0.3  # of the robot's weight, at least, where forces on the robot add up to it
 
 
@@ -223,13 +226,34 @@ def find_foot_readings(sample: FileSample, columns: Sequence[str], robot: KnownR
         components = {tuple(sorted(of)) for of in feet.values()}
         if part and set(feet) == set(robot.feet) and len(components) == 1 and components <= _WHOLE:
             out.append(_readings(part, feet, robot.feet))
-    return [one for one in out if not _is_spelled_alike(one, robot)]
+    apart = [one for one in out if not _is_spelled_alike(one, robot) or _are_vectors(one, sample)]
+    return [one for one in apart if _is_surely_of_feet(one, sample, robot)]
+
+
+def _are_vectors(readings: FootReadings, sample: FileSample) -> bool:
+    """Whether readings are an array of each foot, which no pattern of columns describes."""
+    return (first := sample[readings.all_columns[0]]) is not None and first.shape[1:] in ((3,), (6,))
 
 
 def _is_of_feet(column: str, robot: KnownRobot) -> bool:
     stem = split_unit(column)[0]
     of_joint = any(within(name).search(column) for name in robot.joints)
-    return bool(_OF_FOOT.search(stem)) and not _NO_FOOT.search(stem) and not is_desired(column) and not of_joint
+    named = _OF_FOOT.search(stem) or _is_bare(stem)
+    return bool(named) and not _NO_FOOT.search(stem) and not is_desired(column) and not of_joint
+
+
+def _is_bare(stem: str) -> bool:
+    """Whether a name says that something is a force, and of which side, but not of what."""
+    return all(_BARE.fullmatch(word) for word in limb_and_words(stem)[1])
+
+
+def _is_surely_of_feet(readings: FootReadings, sample: FileSample, robot: KnownRobot) -> bool:
+    """Whether readings say that they are those of feet, or together carry the robot as these do."""
+    if not all(_is_bare(split_unit(column)[0]) for column in readings.all_columns):
+        return True
+    with np.errstate(all="ignore"):
+        carried = np.nanmean(np.linalg.norm(np.nansum(readings.forces(sample), axis=1), axis=1)) / robot.weight
+    return readings.part != "moment" and bool(1.0 - _OTHER_WEIGHT < carried < 1.0 + _OTHER_WEIGHT)
 
 
 def _side(text: str, robot: KnownRobot) -> frozenset[str]:
@@ -256,7 +280,8 @@ def _component(column: str, inner: tuple[int, ...]) -> tuple[str, str, str]:
 
 
 def _part_of(text: str) -> str:
-    return "moment" if _MOMENT.search(text) else "force" if _FORCE.search(text) else ""
+    is_force = _FORCE.search(text) or "f" in limb_and_words(text)[1]
+    return "moment" if _MOMENT.search(text) else "force" if is_force else ""
 
 
 def _readings(part: str, feet: Mapping[str, Mapping[str, str]], order: Sequence[str]) -> FootReadings:

@@ -84,11 +84,12 @@ class _Proposer:
         self.force = next((side_by_side(self.sample, one.columns) for one in of_force), None)
         split = self._place_parts(numeric)
         families = [one for one in families if one.columns[0] not in split]
-        self.nanoseconds = split_stamps(numeric)
-        families = [one for one in families if one.columns[0] not in self.nanoseconds.values()]
-        stamps = [one for one in families if self.match.field(one) == "time"]
+        self.fractions = split_stamps(numeric)
+        of_fractions = {column for _, column in self.fractions.values()}
+        families = [one for one in families if one.columns[0] not in of_fractions]
+        stamps = [one for one in families if one.columns[0] in self.fractions or self.match.field(one) == "time"]
         used = [one for one in families if one not in stamps and self._place(one)]
-        used += [one for one in self._stamps_first(stamps) if self._place(one)]
+        used += [one for one in self._stamps_first(stamps) if self._place(one, "time")]
         used += self._place_of_base([one for one in families if one not in used])
         if "time" in self.out.columns:
             self.out.columns = {"time": self.out.columns["time"], **self.out.columns}
@@ -99,7 +100,7 @@ class _Proposer:
             used += self._place_law([one for one in families if one not in used])
         used = self._settle_contacts(used)
         taken = {column for one in used for column in one.columns} | split | of_feet
-        taken |= {self.out.columns.get("time", {}).get("nanoseconds")} - {None}
+        taken |= of_fractions & set(self.out.columns.get("time", {}).values())
         taken |= self._place_angles([name for name in numeric if name not in taken])
         self.out.partial = self.match.partial
         self.out.left_out = [name for name in foreign if name not in taken]
@@ -107,7 +108,7 @@ class _Proposer:
         families = [one for one in families if one in used or not set(one.columns) <= taken]
         unused = [one for one in families if one not in used or len(one.numbers) > len(self.joints)]
         ignored = {pattern for one in unused for pattern in one.as_ignored}
-        ignored |= {name for name in foreign if name not in numeric or name in self.nanoseconds.values()} - taken
+        ignored |= {name for name in foreign if name not in numeric or name in of_fractions} - taken
         self.out.columns |= {"ignore": sorted(ignored)} if ignored else {}
         if "joint_torque" not in {*self.given, *self.out.columns}:
             alike = [one for one in families if one not in used and self.match.is_like_torques(one)]
@@ -182,7 +183,7 @@ class _Proposer:
 
         def rank(family: Family) -> tuple[bool, bool, int]:
             first = family.columns[0]
-            forwards = first in self.nanoseconds or increases(self.sample[first])
+            forwards = first in self.fractions or increases(self.sample[first])
             return not forwards, counts(self.sample[first]), -len(os.path.commonprefix([first, beside]))
 
         return sorted(families, key=rank)
@@ -216,8 +217,8 @@ class _Proposer:
             name = self._quaternion(family)
             if "imu" in family.words.lower():
                 self._note(name, "of the IMU, taken to be that of the base link")
-        if name == "time" and (more := self.nanoseconds.get(family.columns[0])):
-            entry["nanoseconds"] = more
+        if name == "time" and (more := self.fractions.get(family.columns[0])):
+            entry |= [more]
         if not self._has_readings_of(family, name, entry):
             return False
         self._add_order(family, name)
@@ -350,7 +351,11 @@ class _Proposer:
         if not kind or any(family.names) or key in self.out.columns or (kind == "joint" and self.match.names_stated):
             return
         numbers = len(family.numbers) or int(np.prod(self.match.shape(family)[:1]))
-        order, how = listed_order(self.sample, kind, self.robot, numbers) or usual_order(kind, self.robot, numbers)
+        as_in_file = kind == "contact" and self.out.columns.get("joint_order") == list(self.joints)
+        usual = (list(self.feet), "as in the robot's file, as joints are") if as_in_file else None
+        order, how = (
+            listed_order(self.sample, kind, self.robot, numbers) or usual or usual_order(kind, self.robot, numbers)
+        )
         self.out.columns[key] = order
         listed = [name for name in self._order() if name] if kind == "joint" else order
         if kind == "joint" and not self.out.lacking:
