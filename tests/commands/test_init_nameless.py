@@ -159,3 +159,39 @@ def test_joints_that_mimic_others_may_be_among_those_that_a_file_lists(tmp_path:
         found, _, _ = initiated(path, panda)
         of = found.joint_names.index("panda_joint3")
         np.testing.assert_array_equal(found.joint_position[:, of], arrays["joint_pos"][:, 2])
+
+
+def test_arrays_of_one_limb_each_are_its_joints_in_the_order_of_the_robots_file(tmp_path: Path) -> None:
+    log, arrays = recorded(), dict[str, Any]()
+    for limb, side in (("RR", "rear_right"), ("FL", "front_left"), ("RL", "rear_left"), ("FR", "front_right")):
+        columns = [log.joint_names.index(f"{side}_{joint}") for joint in ("hip", "thigh", "knee")]
+        arrays |= {
+            f"{limb}/state/q": log.joint_position[:, columns],
+            f"{limb}/state/time": log.time + 1e-3 * len(arrays),
+        }
+    np.savez(tmp_path / "x.npz", **arrays)
+    found, said, _ = initiated(tmp_path / "x.npz")
+    of = [found.joint_names.index(name) for name in log.joint_names]
+    np.testing.assert_array_equal(found.joint_position[:, of], log.joint_position)
+    assert any(
+        line.startswith("time: of 'RR/state/time', from which others differ by up to 0.00") for line in said.guessed
+    )
+    np.savez(tmp_path / "y.npz", **{name: x for name, x in arrays.items() if "FR" not in name})
+    said = init(URDF, tmp_path / "y.npz", tmp_path / "y.yaml")
+    assert any(line.startswith("joint_position: ") for line in said.missing), "limbs alone are not the robot"
+
+
+def test_files_with_the_same_columns_are_told_by_their_names(tmp_path: Path) -> None:
+    log, files = recorded(), []
+    for name, values in (
+        ("positions", log.joint_position),
+        ("torques", value(log.joint_torque)),
+        ("kelvin", log.joint_position),
+    ):
+        columns = {"time": log.time} | dict(zip(log.joint_names, values.T, strict=True))
+        files.append(str(save_csv(tmp_path / f"{name}.csv", columns)))
+    init(URDF, " + ".join(files), tmp_path / "x.yaml")
+    columns = load_config(tmp_path / "x.yaml").logs.columns
+    found = read_log(" + ".join(files), columns=columns)
+    np.testing.assert_array_equal(found.joint_position, log.joint_position)
+    np.testing.assert_array_equal(value(found.joint_torque), value(log.joint_torque))

@@ -192,3 +192,19 @@ Angle = Annotated[AngleEntry, BeforeValidator(_column)]
 Torque = Annotated[TorqueEntry, BeforeValidator(_column)]
 Flags = Annotated[FlagEntry, BeforeValidator(_column)]
 Wrench = Annotated[WrenchEntry, BeforeValidator(_column)]
+
+
+OF_FILE = "::"
+"""Between the name of a file and that of a column that others have, too."""
+
+
+def as_in_file(value: Any, file: str) -> Any:
+    """A map, or a part of one, with the names of a file's columns without that of the file before them."""
+    if isinstance(value, str):
+        return value.removeprefix(f"{file}{OF_FILE}")
+    if isinstance(value, list):
+        return [as_in_file(one, file) for one in value]
+    if isinstance(value, dict):
+        return {key: as_in_file(one, file) for key, one in value.items()}
+    is_entry = dataclasses.is_dataclass(value) and not isinstance(value, type)
+    return dataclasses.replace(value, **as_in_file(dict(vars(value)), file)) if is_entry else value

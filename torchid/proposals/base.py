@@ -102,6 +102,17 @@ def _is_unit(numbers: FloatArray) -> bool:
     return bool(len(known)) and float(np.abs(known - 1.0).max()) < _UNIT
 
 
+def field_of_quaternion(family: Family, sample: FileSample, force: NDArray[Any] | None, notes: dict[str, str]) -> str:
+    """The field of a quaternion in the order that it has, with a note where its numbers say so; `force` as below."""
+    stated = re.search("xyzw|wxyz", family.words.lower())
+    order = stated[0] if stated else "xyzw" if family.axes[0] in ("x", "X") else "wxyz"
+    if not stated and not any(family.axes):
+        arrays = [x for column in family.columns if (x := sample[column]) is not None]
+        order, why = order_of_quaternion(arrays, force)
+        notes[f"base_quat_{order}"] = f"order of components, {why}"
+    return f"base_quat_{order}"
+
+
 def order_of_quaternion(arrays: Sequence[NDArray[Any]], force: NDArray[Any] | None = None) -> tuple[str, str]:
     """Order of a quaternion's components, as columns or as an array, and why.
 

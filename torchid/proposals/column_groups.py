@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchid.errors import excerpt
 from torchid.logs.arrays import TRANSPOSED
 from torchid.logs.column_map import PLACEHOLDER
 from torchid.logs.column_proposals import is_current, propose_field
 from torchid.logs.name_matching import SUFFIXES, KnownRobot, joints_by_place, spelled, within
 from torchid.logs.units import OF_JOINTS, quantities_with, split_unit
-from torchid.proposals.file_samples import FileSample
+from torchid.proposals.file_samples import FileSample, side_by_side
 
 _NUMBER = re.compile(r"\d+")
 _AXIS = re.compile(
@@ -115,6 +116,17 @@ class Family:
         """Likewise, with the number that counting begins with."""
         first = min(self.numbers, default=0)
         return self.entry | ({"first_index": first} if first > 0 else {})
+
+
+def first_of_stamps(families: Sequence[Family], sample: FileSample, notes: dict[str, str]) -> list[Family]:
+    """The first of stamps of several limbs, with a note where others differ; else the families as they are."""
+    columns = [column for one in families for column in one.columns]
+    values = side_by_side(sample, columns) if len(columns) > 1 else np.empty(0)
+    if values.ndim != 2:
+        return list(families)
+    if apart := float(np.ptp(values, axis=1).max()):
+        notes["time"] = f"of '{excerpt(columns[0])}', from which others differ by up to {apart:.2g}"
+    return [Family(columns[0], columns[:1], ("",), (), ("",))]
 
 
 @dataclass(frozen=True)

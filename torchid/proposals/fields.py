@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from torchid.logs.column_proposals import OF_BASE, OF_PLATES, is_desired, is_no_torque
+from torchid.logs.column_proposals import OF_BASE, OF_PLATES, is_desired, is_no_torque, propose_field, words_of
 from torchid.logs.log import WRENCHES, FloatArray
-from torchid.logs.name_matching import SUFFIXES, KnownRobot, limb_and_words, within
+from torchid.logs.name_matching import SUFFIXES, KnownRobot, limb_and_words, limb_of, within
 from torchid.logs.unitree import JOINT_ORDERS, MOTORS, numbered_joints, suitable_orders
 from torchid.logs.units import quantities_with, split_unit
 from torchid.proposals.column_groups import Family
@@ -39,7 +41,7 @@ class FieldMatcher:
         partial: by field that is left out for it, joints that have columns of other fields alone.
     """
 
-    def __init__(self, sample: FileSample, robot: KnownRobot) -> None:
+    def __init__(self, sample: dict[str, NDArray[Any] | None], robot: KnownRobot) -> None:
         self.sample, self.robot = sample, robot
         self.stated = stated_names(sample, "joint_names")
         self.names_stated = bool(self.stated) and set(self.stated) <= {*robot.joints, *robot.moving}
@@ -50,6 +52,29 @@ class FieldMatcher:
         """Learn which joints the columns of a file name; `more` as from `find_families`."""
         self._suffix = more.get("joint", "").removeprefix("{joint}")
         self.named_joints = self.named_joints or self._all_named(families)
+
+    def of_limbs(self, names: Sequence[str]) -> list[tuple[Family, Collection[str]]]:
+        """Arrays that hold the joints of one limb each, in the order of the robot's file, and together all joints.
+
+        Args:
+            names: of arrays that may be; of these the columns become a part of the sample.
+        """
+        by_field = defaultdict[str, dict[str, Sequence[str]]](dict)
+        for name in names:
+            array, field = self.sample[name], propose_field(name)
+            if array is not None and array.ndim == 2 and field.startswith("joint_"):
+                by_field[field][name] = limb_of(name, array.shape[1], self.robot)
+        out = list[tuple[Family, Collection[str]]]()
+        for arrays in by_field.values():
+            places = {joint: (name, k) for name, of in arrays.items() for k, joint in enumerate(of)}
+            if len(arrays) > 1 and len(places) == sum(map(len, arrays.values())) == len(self.robot.joints):
+                columns = {joint: f"{name}[{k}:{k + 1}]" for joint, (name, k) in places.items()}
+                self.sample |= {
+                    columns[joint]: np.asarray(self.sample[name])[:, k] for joint, (name, k) in places.items()
+                }
+                family = Family(next(iter(arrays)), list(columns.values()), tuple(columns), (), ("",), columns)
+                out.append((family, arrays))
+        return out
 
     def is_like_torques(self, family: Family) -> bool:
         """Whether a family that nothing says what it is has changing numbers of each joint."""
@@ -126,10 +151,17 @@ class FieldMatcher:
         else:
             known = {len(self.robot.joints), len(self.robot.moving), *slots}
             whole = count in known or (self.names_stated and count == len(self.named_joints))
-            whole |= not self.names_stated and len(numbered_joints(self.robot.joints, count)) == count > 2
+            numbered = not self.names_stated and len(numbered_joints(self.robot.joints, count)) == count > 2
+            whole |= numbered and not self._has_rival(family)
             whole |= listed_order(self.sample, "joint", self.robot, count) is not None
         enough = whole or (count >= len(self.robot.joints) and bool(family.numbers))
         return enough and len(self.robot.joints) > 0 and not any(family.axes)
+
+    def _has_rival(self, family: Family) -> bool:
+        """Whether another array has as many columns and the same last word, such as the `q` of another limb."""
+        named = {name: x for name, x in self.sample.items() if words_of(name)[-1:] == words_of(family.pattern)[-1:]}
+        alike = [x for x in named.values() if x is not None and x.shape[1:] == self.shape(family)]
+        return len(family.columns) == 1 and len(alike) > 1
 
 
 _OF_FOOT = re.compile(

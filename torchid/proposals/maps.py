@@ -18,8 +18,15 @@ from torchid.logs.log import SHAPES, VARIANTS, WRENCHES
 from torchid.logs.name_matching import SUFFIXES, KnownRobot
 from torchid.logs.unitree import JOINT_ORDERS, numbered_joints, usual_order
 from torchid.logs.units import IN_DEGREES, quantities_of, quantities_with, unit_factor
-from torchid.proposals.base import field_beside, field_of_base, find_angles, order_of_quaternion, settle_velocities
-from torchid.proposals.column_groups import Family, MapProposal, find_families, split_arrays, split_stamps
+from torchid.proposals.base import field_beside, field_of_base, field_of_quaternion, find_angles, settle_velocities
+from torchid.proposals.column_groups import (
+    Family,
+    MapProposal,
+    find_families,
+    first_of_stamps,
+    split_arrays,
+    split_stamps,
+)
 from torchid.proposals.fields import MOMENT, FieldMatcher, find_foot_readings, frame_of_forces
 from torchid.proposals.file_samples import FileSample, counts, increases, listed_order, side_by_side, with_samples_first
 from torchid.proposals.numbers import (
@@ -82,13 +89,14 @@ class _Proposer:
         families = sorted(families, key=self._lacks_gravity)
         of_force = (one for one in families if self._lacks_gravity(one) < 0.0)
         self.force = next((side_by_side(self.sample, one.columns) for one in of_force), None)
-        split = self._place_parts(numeric)
-        families = [one for one in families if one.columns[0] not in split]
+        split, of_limbs = self._place_parts(numeric), self._place_limbs(numeric)
+        split |= of_limbs
         self.fractions = split_stamps(numeric)
         of_fractions = {column for _, column in self.fractions.values()}
-        families = [one for one in families if one.columns[0] not in of_fractions]
+        families = [one for one in families if one.columns[0] not in split | of_fractions]
         stamps = [one for one in families if one.columns[0] in self.fractions or self.match.field(one) == "time"]
         used = [one for one in families if one not in stamps and self._place(one)]
+        stamps = first_of_stamps(stamps, self.sample, self.out.notes) if of_limbs else stamps
         used += [one for one in self._stamps_first(stamps) if self._place(one, "time")]
         used += self._place_of_base([one for one in families if one not in used])
         if "time" in self.out.columns:
@@ -161,6 +169,13 @@ class _Proposer:
             self._place_part(*part)
         return {name for name, *_ in parts}
 
+    def _place_limbs(self, numeric: Sequence[str]) -> set[str]:
+        """Arrays of the joints of a limb each, which have become entries."""
+        placed = [(family, of) for family, of in self.match.of_limbs(numeric) if self._place(family)]
+        for family, _ in placed:
+            self._note(family.proposed, "joints of each limb in the order of the robot's file")
+        return {name for _, arrays in placed for name in arrays}
+
     def _place_part(self, name: str, columns: str, field: str) -> None:
         """Make some columns of an array an entry."""
         (start, _, stop), text = columns.strip("[]").partition(":"), f"{name}{columns}"
@@ -168,7 +183,7 @@ class _Proposer:
         self.sample[text] = part
         family = Family(text, [text], ("",), (), ("",))
         if field == "base_quat_wxyz":
-            field = self._quaternion(family)
+            field = field_of_quaternion(family, self.sample, self.force, self.out.notes)
         if field.startswith("joint_") and "joint_order" not in self.out.columns and len(part.T) == len(self.joints):
             self.out.columns["joint_order"] = list(self.joints)
             self.out.notes["joint_order"] = "as in the robot's file, as of libraries for dynamics"
@@ -214,7 +229,7 @@ class _Proposer:
             return False
         entry: dict[str, Any] = family.counted_entry
         if name == "base_quat_wxyz":
-            name = self._quaternion(family)
+            name = field_of_quaternion(family, self.sample, self.force, self.out.notes)
             if "imu" in family.words.lower():
                 self._note(name, "of the IMU, taken to be that of the base link")
         if name == "time" and (more := self.fractions.get(family.columns[0])):
@@ -232,8 +247,7 @@ class _Proposer:
         """Whether the numbers of a family may be those of a field; flags get a threshold."""
         if name == "contact_active":
             return self._add_threshold(family, entry)
-        is_free = name == "imu_specific_force" and not family.unit and -self._lacks_gravity(family) < LEAST_GRAVITY
-        if is_free:
+        if is_free := name == "imu_specific_force" and not family.unit and -self._lacks_gravity(family) < LEAST_GRAVITY:
             self._note(name, f"not '{excerpt(family.columns[0])}', which is without gravity")
         return not is_free
 
@@ -313,24 +327,15 @@ class _Proposer:
         self.out.notes["joint_torque"] = "of the PD law that the columns belong to, as no torque was recorded"
         return used
 
-    def _quaternion(self, family: Family) -> str:
-        """The field of a quaternion in the order that it has."""
-        stated = re.search("xyzw|wxyz", family.words.lower())
-        order = stated[0] if stated else "xyzw" if family.axes[0] in ("x", "X") else "wxyz"
-        if not stated and not any(family.axes):
-            arrays = [x for column in family.columns if (x := self.sample[column]) is not None]
-            order, why = order_of_quaternion(arrays, self.force)
-            self.out.notes[f"base_quat_{order}"] = f"order of components, {why}"
-        return f"base_quat_{order}"
-
     def _place_angles(self, columns: Sequence[str]) -> set[str]:
         """Columns that are angles of the base, where nothing else says how it is turned."""
         if any(name.startswith("base_quat") for name in (*self.given, *self.out.columns)):
             return set()
-        if found := find_angles(self.sample, columns):
-            self.out.columns["base_quat_wxyz"] = {"rpy": found.entry}
-            self._note("base_quat_wxyz", found.note)
-        return set(found.columns if found else ())
+        if (found := find_angles(self.sample, columns)) is None:
+            return set()
+        self.out.columns["base_quat_wxyz"] = {"rpy": found.entry}
+        self._note("base_quat_wxyz", found.note)
+        return set(found.columns)
 
     def _add_threshold(self, family: Family, entry: dict[str, Any]) -> bool:
         """Whether flags can be made of a family, with a threshold unless it has flags; not of numbers of states."""
