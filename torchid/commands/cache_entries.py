@@ -79,6 +79,7 @@ def content_of_scene(scene: Scene) -> dict[str, Any]:
         "motion_noise": config.sensors.noise.motion,
         "sign_width": config.actuators.sign_width,
         "delay": config.actuators.known_delay,
+        **({} if config.actuators.stribeck is None else {"stribeck": config.actuators.stribeck}),
         "topics": topics,
         "columns": json.dumps(columns),  # as text: the order of names in it is that of the log
     }

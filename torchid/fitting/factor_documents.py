@@ -84,6 +84,8 @@ class RowModel:
             settings["robot.loops"] = [f"{loop.kind} of {loop.label}" for loop in robot.loops]
         if robot.passive:
             settings["robot.passive"] = list(robot.passive)
+        if tree.stribeck is not None:
+            settings["actuators.stribeck"] = tree.stribeck
         if any(robot.base_tilt):
             settings["robot.base_tilt"] = ", ".join(map(repr, robot.base_tilt))
         for name in ("armature", "stiffness", "spring_torque"):

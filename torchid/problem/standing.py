@@ -73,6 +73,7 @@ def preprocess_standing(
     cutoff_hz: float | None,
     sample_rate_hz: float | None,
     sign_width: float | None = None,
+    stribeck: float | None = None,
 ) -> Log:
     """As `preprocess`, with the motion of the base from the feet that stand; samples with too few of them are left out.
 
@@ -83,6 +84,7 @@ def preprocess_standing(
         cutoff_hz: as of `preprocess`.
         sample_rate_hz: likewise.
         sign_width: likewise.
+        stribeck: likewise.
 
     Raises:
         InputError: as `stand_on_feet` and `preprocess`, or no segment is long enough for the filter.
@@ -91,7 +93,8 @@ def preprocess_standing(
         TorchidWarning: as `preprocess`; number of samples left out, with the reasons; feet that are not on one floor.
     """
     standing = stand_on_feet(log, robot, contacts)
-    out, too_short = preprocess_segments(standing.log, standing.segments, cutoff_hz, sample_rate_hz, sign_width)
+    dry = sign_width, stribeck
+    out, too_short = preprocess_segments(standing.log, standing.segments, cutoff_hz, sample_rate_hz, *dry)
     warn_of_standing(log.source, len(log), standing, too_short)
     return out
 
