@@ -57,14 +57,11 @@ class Copy(Generic[T]):
 
     def __enter__(self) -> Copy[T]:
         if can_copy():
-            context = multiprocessing.get_context("fork")
-            with interrupts_deferred(), suppress(OSError):  # no memory, or too many processes
-                self._results, sender = context.Pipe(duplex=False)
-                with sender, warnings.catch_warnings():
-                    warnings.simplefilter("ignore", DeprecationWarning)  # Python 3.12: of threads that a copy lacks
-                    ends = self._results, sender
-                    self._process = context.Process(target=_call, args=(self._work, *ends), daemon=True)
-                    self._process.start()
+            try:
+                self._start()
+            except BaseException:  # Ctrl-C meanwhile: the copy would go on writing files
+                self.__exit__()
+                raise
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -73,6 +70,15 @@ class Copy(Generic[T]):
             self._process.join()
         if self._results is not None:
             self._results.close()
+
+    def _start(self) -> None:
+        context = multiprocessing.get_context("fork")
+        with interrupts_deferred(), suppress(OSError):  # no memory, or too many processes
+            self._results, sender = context.Pipe(duplex=False)
+            with sender, warnings.catch_warnings():
+                warnings.simplefilter("ignore", DeprecationWarning)  # Python 3.12: of threads that a copy lacks
+                self._process = context.Process(target=_call, args=(self._work, self._results, sender), daemon=True)
+                self._process.start()
 
     def result(self) -> T:
         """What the function returns, or raises."""

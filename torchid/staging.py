@@ -102,14 +102,20 @@ def staging_folder(target: Path) -> Iterator[Path]:
     Raises:
         OSError: the folder cannot be made.
     """
-    folder, lock = target, -1
+    folder, lock, there = target, -1, False
     try:
         with interrupts_deferred():
             folder, lock = _make_staging_folder(target)
+            there = True
         yield folder
     finally:
-        with interrupts_deferred():
-            if folder != target:
+        try:
+            with interrupts_deferred():
+                if there:
+                    there = False
+                    _discard(folder, lock)
+        finally:
+            if there:  # Ctrl-C before it was deferred
                 _discard(folder, lock)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -106,6 +107,22 @@ def test_none_is_left_when_the_block_ends_before_its_copy() -> None:
     with copies_allowed(), Copy(lambda: time.sleep(60.0)):
         (process,) = multiprocessing.active_children()
     assert not process.is_alive()
+
+
+def test_none_is_left_when_ctrl_c_comes_while_it_is_started(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It would fill a folder that is being removed, of which something is then left."""
+
+    def fork() -> int:
+        child = forked()
+        if child:
+            signal.raise_signal(signal.SIGINT)
+        return child
+
+    forked = os.fork
+    monkeypatch.setattr(os, "fork", fork)
+    with copies_allowed(), pytest.raises(KeyboardInterrupt), Copy(lambda: time.sleep(600.0)):
+        pass
+    assert not multiprocessing.active_children()
 
 
 def test_copies_make_no_copies() -> None:

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from mistaken import MISTAKES, NAMED, SENSORS, Cell, case_of, cells, checked, judged
+from mistaken import CUTOFF, MISTAKES, NAMED, SENSORS, Cell, case_of, cells, checked, judged
 from motions import value
 from walking import MACHINES, robot_of, truth
 
 from torchid.log_checks import NOTE
-from torchid.log_checks.mistakes import exchanged_names
+from torchid.log_checks.mistakes import exchanged_names, possible_mistakes
 from torchid.log_checks.model import bind_some_samples, preprocess_pieces
 from torchid.log_checks.scales import fit_time_scale, fit_torque_gains, motion_cutoff_hz
 from torchid.log_checks.standing_feet import measure_foot_slip
@@ -53,6 +53,20 @@ def test_a_mistake_in_the_log_of_an_arm_is_named(name: str) -> None:
 def test_a_robot_unlike_its_urdf_gives_no_alarm(machine: str, sensors: str) -> None:
     case = case_of(MACHINES[machine], sensors, heading=0.0 if machine == "biped" else None)
     assert not [one for one in checked(case, case.log).findings if one.severity != NOTE]
+
+
+@pytest.mark.parametrize(("machine", "sensors"), [("quadruped", "full"), ("biped", "joints")])
+def test_what_passes_the_filter_may_be_corrected_after_it(machine: str, sensors: str) -> None:
+    log = case_of(MACHINES[machine], sensors).log.select(slice(0, 200))
+    chosen = [mistake for mistake in possible_mistakes(log) if mistake.after_filter]
+    (filtered,) = preprocess_pieces(log, CUTOFF)
+    for mistake in chosen:
+        (expected,), found = preprocess_pieces(mistake.correct(log), CUTOFF), mistake.correct(filtered)
+        assert (found.joint_names, found.contact_names) == (expected.joint_names, expected.contact_names)
+        for name, x in expected.arrays().items():
+            size = max(1.0, float(np.nanmax(np.abs(x), initial=0.0)))
+            np.testing.assert_allclose(found.arrays()[name], x, rtol=0.0, atol=1e-12 * size, err_msg=f"{mistake}")
+    assert {"joint_names", "contact_names", "joint_torque"} <= {mistake.field for mistake in chosen}
 
 
 def test_an_accelerometer_is_told_from_the_world_by_where_the_feet_are() -> None:

@@ -24,7 +24,7 @@ from torchid.commands.reading import fits_contact_offsets
 from torchid.config.robot import RobotConfig
 from torchid.errors import TorchidWarning
 from torchid.fitting.experiment import Experiment, Scene
-from torchid.fitting.packed_parts import PackedPart, PartPacker, PartReader
+from torchid.fitting.factor_documents import PackedPart, PartPacker, PartReader
 from torchid.logs.spill import MappedPages
 from torchid.logs.time_range import log_title
 from torchid.problem import RowBuilder, Samples, TriangularFactor

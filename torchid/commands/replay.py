@@ -32,12 +32,11 @@ from torchid.report.figures import drift_figure
 from torchid.report.tables import progress_bars
 from torchid.reprs import short_repr
 from torchid.robot import Robot
+from torchid.robot.constraints import matching_joints
 from torchid.robot.urdf import read_urdf
-from torchid.robot.welds import matching_joints
 from torchid.sensing import Contact
-from torchid.simulation.feet import Foot, find_feet, point_foot
+from torchid.simulation.constraints import Foot, JointConstraints, find_feet, point_foot
 from torchid.simulation.replay import Drift, Model, ReplayedLog, replay_log
-from torchid.simulation.ties import Ties
 
 _TIMES = 25  # at which the drift is compared, within a window
 _UNITS = {"revolute": "rad", "prismatic": "m"}
@@ -338,10 +337,10 @@ def _model(urdf: Path, robot: Robot, fitted: Mapping[str, Mapping[str, float]], 
         for name, value in by_joint.items():
             values[what][robot.joint_names.index(name)] = value
     offset = values["torque_offset"] + values["asymmetric_coulomb"] + robot.spring_torque
-    ties = Ties.of(urdf, read_urdf(urdf)[1], robot.loops, robot.welded)
+    constraints = JointConstraints.of(urdf, read_urdf(urdf)[1], robot.loops, robot.welded)
     if phi is not None and robot.welded:
-        ties = replace(ties, inertials=_inertials_beyond_welds(robot, phi))
-    return Model(urdf, robot.joint_names, values["armature"], offset, values["stiffness"], ties)
+        constraints = replace(constraints, inertials=_inertials_beyond_welds(robot, phi))
+    return Model(urdf, robot.joint_names, values["armature"], offset, values["stiffness"], constraints)
 
 
 def _inertials_beyond_welds(robot: Robot, phi: Array) -> dict[str, Array]:

@@ -15,7 +15,7 @@ from torchid.config.estimator import MASS_ACCEPTED, ROBUST_ACCEPTED, EstimatorCo
 from torchid.config.logs import SETS, LogsConfig, entries_spelled_out, resolve_logs
 from torchid.config.maps import MAPS_ACCEPTED
 from torchid.config.preprocessing import PreprocessingConfig
-from torchid.config.reading import FileKind, Settings, dump, load, plain_sections
+from torchid.config.reading import FileKind, Settings, load, plain_sections
 from torchid.config.robot import LOOPS_ACCEPTED, MJCF_SUFFIXES, WELDS_ACCEPTED, RobotConfig, require_one_file
 from torchid.config.sensors import (
     CHOICE_ACCEPTED,
@@ -259,11 +259,6 @@ def inputs_of(config: ExperimentConfig | AnalyzeConfig) -> list[Path]:
     """The robot's file and logs; a bag may be a folder."""
     logs = config.logs
     return [config.robot.path, *(logs.files if logs else [])]
-
-
-def dump_config(config: ExperimentConfig | AnalyzeConfig) -> str:
-    """The resolved configuration as YAML; `load_config` reads it back."""
-    return dump(config)
 
 
 def _check_threshold(settings: PreprocessingConfig) -> None:

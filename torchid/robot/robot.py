@@ -24,7 +24,15 @@ from torchid.errors import (
 )
 from torchid.parameters import WRENCH_COMPONENTS, Array
 from torchid.reprs import short_repr
-from torchid.robot.loops import Loop, loops_of_file, passive_joints, validate_loops
+from torchid.robot.constraints import (
+    Loop,
+    links_beyond,
+    loops_of_file,
+    passive_joints,
+    validate_loops,
+    weld_joints,
+    weld_positions,
+)
 from torchid.robot.tree import (
     BodyJoint,
     BodyTree,
@@ -37,7 +45,6 @@ from torchid.robot.tree import (
     nominal_parameters,
 )
 from torchid.robot.urdf import has_fixed_base, read_urdf
-from torchid.robot.welds import links_beyond, weld_joints, weld_positions
 from torchid.robot.xml_files import file_kind
 
 if TYPE_CHECKING:
