@@ -193,9 +193,9 @@ def _best_mistake(
         except InputError:  # the filter does not accept the corrected log
             continue
         trial = model.compare(samples, least)
-        if trial.compared != fit.compared or trial.implausible > fit.implausible:  # compare the same forces only
+        if mistake.field == "joint_torque" and trial.implausible > fit.implausible:
             continue
-        if trial.misfit < least:
+        if trial.compared == fit.compared and trial.misfit < least:  # compare the same forces only
             best, least = mistake, trial.misfit
     if best is None:
         return None
