@@ -86,6 +86,13 @@ def test_factors_of_torques_and_of_time_are_recovered() -> None:
     assert factors.gain[1] / np.median(factors.gain) == pytest.approx(1.0 / 1.3, abs=3.0 * factors.spread[1])
 
 
+def test_a_log_that_ends_elsewhere_than_it_began_moves_no_faster() -> None:
+    log, time = case_of(MACHINES["arm"], "contacts").log, np.arange(500) / 200.0
+    q = np.outer(np.sin(2.0 * np.pi * 0.9 * time), np.ones(len(log.joint_names)))
+    short = replace(log.select(np.arange(500)), time=time, joint_position=q)
+    assert value(motion_cutoff_hz(short)) < 10.0  # six times 0.9 Hz, and what a log of 2.5 s resolves
+
+
 def test_a_tool_that_the_urdf_lacks_is_not_taken_for_another_unit_of_time() -> None:
     machine = MACHINES["arm"]
     case, robot, mass, height = case_of(machine, "contacts"), robot_of(machine), 6.0, 0.1

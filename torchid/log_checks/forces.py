@@ -146,6 +146,8 @@ def _misfit_findings(
         )
         advice = f"check units, frames, the order of joints and contacts, friction, the {robot.format}'s base link and"
         advice += f" masses, and whether the {robot.format} is that of this robot"
+        if not contacts and not robot.fixed_base:
+            advice = f"name under contacts what touches the ground, or holds the base in the air; or {advice}"
         yield Finding("forces", SUSPICIOUS, "all", text, advice)
         return
     torques = [] if fit.torque is None else list(_torque_findings(robot, fit.torque))

@@ -245,8 +245,8 @@ class Robot:
         Raises:
             UnknownNameError: the URDF has no such link.
         """
-        if name not in self.links:
-            raise UnknownNameError(current_file() or self.path, field, name, self.links)
+        if not isinstance(name, str) or name not in self.links:
+            raise UnknownNameError(current_file() or self.path, field, str(name), self.links)
         return self.links[name]
 
 

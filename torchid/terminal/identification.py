@@ -120,6 +120,8 @@ def _columns(robot: Robot, estimate: Estimate, bodies: Sequence[int]) -> list[tu
     verdict, nominal = estimate.verdict.reshape(-1, PER_BODY), robot.nominal
 
     def cells(parameter: int) -> list[str]:
+        if parameter != _MASS and set(verdict[:, parameter]) <= {FIXED, UNOBSERVABLE}:
+            return [""] * len(bodies)  # friction, of which sensors outside of the joints tell nothing
         return [_cell(*(x[k, parameter] for x in (phi, error, verdict))) for k in bodies]
 
     masses = [
