@@ -215,6 +215,32 @@ def test_one_standard_error_takes_the_largest_ridge_that_held_out_blocks_cannot_
     assert yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())["estimator"]["ridge"] == found["ridge"]
 
 
+@pytest.mark.parametrize(
+    ("ridge", "error", "spread", "end"),
+    [
+        (0.1, (3.0, 2.0, 1.0), (0.1, 0.2, 0.0), "largest"),
+        (0.1, (3.0, 1.1, 1.0), (0.1, 0.2, 0.0), ""),
+        (0.01, (3.0, 1.0, 2.0), (0.1, 0.0, 0.2), ""),
+        (0.001, (1.0, 2.0, 3.0), (0.0, 0.2, 0.1), "smallest"),
+        (0.1, (2.0, 1.0, 1.1), (0.1, 0.0, 0.2), ""),
+    ],
+)
+def test_an_end_of_the_grid_matters_where_errors_fall_towards_it(
+    ridge: float, error: tuple[float, ...], spread: tuple[float, ...], end: str
+) -> None:
+    assert RidgeChoice(ridge, (0.001, 0.01, 0.1), error, spread).end == end
+
+
+def test_a_ridge_at_the_end_of_the_grid_is_said_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said = "estimator.ridge: auto takes 1, the smallest tried, and left-out errors fall towards it; accepted: 0"
+    monkeypatch.setattr("torchid.fitting.experiment.RIDGES", (1.0, 10.0))
+    file, auto = str(DEMO / "quadruped.yaml"), "estimator={name: least_squares, ridge: auto}"
+    assert main(["identify", file, auto, f"output={tmp_path / 'run'}"]) == 0
+    assert said in " ".join(capsys.readouterr().err.split())
+
+
 def test_tensorboard_and_a_figure_have_the_error_of_every_ridge(run: Path) -> None:
     found = json.loads((run / "metrics.json").read_text())["ridge_selection"]
     events = EventAccumulator(str(run))

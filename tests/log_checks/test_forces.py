@@ -340,3 +340,14 @@ def test_a_long_log_is_compared_in_pieces() -> None:
     long = replace(log.select(index), time=np.arange(len(index)) / 200.0)
     flipped = rescaled(long, [1], -1.0)
     assert only(check(flipped, robot, (), 5.0), "sign").channels == (robot.joint_names[1],)
+
+
+def test_torques_of_motors_of_one_type_that_are_an_eighth_are_named_with_the_key_of_their_scale() -> None:
+    """Three of seven joints: a unit for all torques would be wrong for the other four."""
+    case = case_of(MACHINES["arm"], "contacts")
+    torque = value(case.log.joint_torque).copy()
+    torque[:, 1:4] /= 8.0
+    result = check(replace(case.log, joint_torque=torque), robot_of(case.machine), case.machine.contacts, CUTOFF)
+    finding = only(result, "scale", "joint_torque")
+    assert {case.log.joint_names[1], case.log.joint_names[3]} <= set(finding.channels)
+    assert "or set sensors.scales: {joint_torque: [[" in finding.advice

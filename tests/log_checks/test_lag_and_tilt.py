@@ -1,4 +1,4 @@
-"""Torques that are late, gravity that is not along the log's vertical, and a base that turns in one place."""
+"""Torques that are late or off by a constant, gravity that is not vertical, and a base that turns in one place."""
 
 from __future__ import annotations
 
@@ -55,6 +55,21 @@ def test_torques_that_are_late_or_early_are_named_with_the_time(robot: tuple[str
     shift = re.search(r"actuators.delay: (-?[\d.]+)$", finding.advice)
     assert shift is not None
     assert float(shift[1]) == pytest.approx(-1e-3 * late, rel=0.06)
+
+
+@pytest.mark.parametrize(("robot", "share"), each_once([("arm", "contacts"), ("quadruped", "full")], [0.5, -0.8]))
+def test_a_torque_that_is_off_by_a_constant_is_named_with_its_size(robot: tuple[str, str], share: float) -> None:
+    case = case_of(MACHINES[robot[0]], robot[1])
+    torque = value(case.log.joint_torque).copy()
+    offset = share * float(np.sqrt(np.square(torque).mean()))
+    torque[:, 1] += offset
+    finding = only(checked(case, replace(case.log, joint_torque=torque)), "offset", "joint_torque")
+    found = re.match(r"(\S+): torques read ([\d.]+) \+- ([\d.]+) N m too (much|little)", finding.found)
+    assert found is not None
+    assert found[1] == case.log.joint_names[1]
+    assert found[4] == ("much" if share > 0.0 else "little")
+    assert float(found[2]) == pytest.approx(abs(offset), abs=max(3.0 * float(found[3]), 0.1 * abs(offset)))
+    assert "sensors.offsets: {joint_torque: log}" in finding.advice
 
 
 @pytest.mark.parametrize("machine", ["quadruped", "biped", "demo"])

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from motions import value
+from scipy.ndimage import uniform_filter1d
 from scipy.signal import butter, sosfilt
 from scipy.spatial.transform import Rotation
 
@@ -123,6 +124,25 @@ def test_more_noise_asks_for_a_lower_cutoff_and_none_for_the_usual_one() -> None
     assert "usual" in str(none)
     assert choose_cutoff([noisy], {"joint_position": 0.0}) == none
     assert choose_cutoff([clean], sample_rate_hz=25.0).cutoff_hz == 5.0
+
+
+@pytest.mark.parametrize("lost", ["", "repeated", "missing"])
+@pytest.mark.parametrize("step", [1e-4, 1e-3])
+@pytest.mark.parametrize("rate", [1000.0, 4000.0])
+def test_neither_coarse_encoders_nor_lost_samples_are_taken_for_motion(rate: float, step: float, lost: str) -> None:
+    """Joints that go from point to point: at even speed, readings are stairs, whose lines are far above the motion."""
+    rng, time = np.random.default_rng(17), np.arange(8 * int(rate)) / rate
+    corners = [np.r_[0.0, np.cumsum(rng.uniform(0.3, 1.2, 40))] for _ in range(3)]
+    angle = np.stack([np.interp(time, x, rng.uniform(-1.0, 1.0, 41)) for x in corners], axis=1)
+    for width in (0.1, 0.05, 0.02):
+        angle = uniform_filter1d(angle, int(width * rate), axis=0)
+    read, gone = step * np.round(angle / step), (rng.uniform(size=len(time)) < 0.05) & (time > 0.0)
+    kept = ~gone if lost == "missing" else np.ones(len(time), dtype=bool)
+    if lost == "repeated":
+        read = read[np.maximum.accumulate(np.where(gone, 0, np.arange(len(time))))]
+    choice = choose_cutoff([Log("moves.npz", time[kept], (*"abc",), read[kept])])
+    assert choice.cutoff_hz is not None
+    assert 5.0 < choice.cutoff_hz < 60.0
 
 
 def test_logs_count_together_by_their_length() -> None:

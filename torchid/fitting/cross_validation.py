@@ -31,10 +31,9 @@ RIDGES = tuple(float(f"1e{power}") for power in range(-7, 2))
 """Ridges that are tried, in decades: finer steps change predictions by less than their spread over the folds."""
 
 MOST_SCORED = 100_000
-"""Samples of training logs that errors of forces are computed of at most: of more, every k-th.
+"""Samples of training logs that errors of forces are computed of at most, evenly spread.
 
-Successive samples of a filtered log are alike: every 11th of a million gives errors within 0.1 % of those of all.
-"""
+Those of a filtered log are alike: every 11th of a million gives errors within 0.1 % of those of all."""
 
 
 @dataclass(frozen=True)
@@ -51,10 +50,9 @@ class CrossValidation:
 
 @dataclass(frozen=True)
 class RidgeChoice:
-    """A ridge, and the mean square of whitened residuals on held-out folds by ridge tried, with standard errors.
+    """A ridge, and mean squares of whitened residuals on held-out folds by ridge; errors of differences from the best.
 
-    The errors are those of the difference from the best. `rule`: what was taken, the ridge with the least error or the
-    largest within one standard error of it.
+    `rule`: what was taken, the ridge with the least mean square or the largest within one standard error of it.
     """
 
     ridge: float
@@ -62,6 +60,13 @@ class RidgeChoice:
     mean_square: tuple[float, ...]
     standard_error: tuple[float, ...]
     rule: RidgeRule = "least"
+
+    @property
+    def end(self) -> str:
+        """The "largest" or "smallest", if it is that and errors fall towards it by more than their standard error."""
+        at = self.tried.index(self.ridge)
+        name, beside = {0: ("smallest", 1), len(self.tried) - 1: ("largest", at - 1)}.get(at, ("", at))
+        return name if self.mean_square[beside] - self.mean_square[at] > self.standard_error[beside] else ""
 
     def __str__(self) -> str:
         within = "" if self.rule == "least" else ", the largest within one standard error of the best"

@@ -13,7 +13,7 @@ from torchid.config import AnalyzeConfig, ExperimentConfig
 from torchid.config.estimator import EstimatorConfig
 from torchid.config.robot import require_kind
 from torchid.config.sensors import ChoiceConfig
-from torchid.errors import ConfigError, LogError, UnknownNameError
+from torchid.errors import ConfigError, LogError, UnknownNameError, warn_about_file
 from torchid.estimators import Conditions, Consistent, LeastSquares
 from torchid.fitting.calibration import Calibration, Comparison, calibrations
 from torchid.fitting.checked_settings import (
@@ -184,10 +184,17 @@ class Scene:
         settings = self.config.estimator
         estimators = [batch_estimator(replace(settings, ridge=ridge), conditions) for ridge in RIDGES]
         try:
-            return choose_ridge(parts, blocks, fitter, estimators, self.loss, rule=settings.ridge_rule)
+            choice = choose_ridge(parts, blocks, fitter, estimators, self.loss, rule=settings.ridge_rule)
         except LogError as error:
             accepted = "a number, 0.001 say, or longer logs"
             raise ConfigError.at_field("estimator.ridge", f"{settings.ridge}, but {error.found}", accepted) from error
+        if choice.end:
+            found = (
+                f"{settings.ridge} takes {choice.ridge:g}, the {choice.end} tried, and left-out errors fall towards it"
+            )
+            better = "a larger number, or logs that say more than the URDF" if choice.end == "largest" else "0"
+            warn_about_file(f"estimator.ridge: {found}; accepted: {better}")
+        return choice
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)

@@ -41,6 +41,8 @@ MAX_RESIDUAL_SHARE = 0.5
 #: Misfit that a corrected mistake leaves, above which it may be another robot that the forces are of: 0.05 to 0.1 is a
 #: URDF that is 20 % off, 0.33 was a robot of four times the weight whose torques were taken for kg m.
 MAX_CLEAR_MISFIT = 0.2
+#: The same, above which it may be another factor than that of a unit: those of currents are anything.
+_MAX_UNIT_MISFIT = 0.1
 #: Factors of single torques in another unit, and the tolerance of such a factor (see `model.MAX_GAIN_RATIO`).
 TORQUE_UNIT_FACTORS = {1e-3: "in mN m", 1e3: "in kN m"}
 _UNIT_TOLERANCE_RATIO = 3.0
@@ -134,9 +136,9 @@ def _misfit_findings(
         return
     unexplained = unexplained if scale is None else min(unexplained, scale.recorded)
     if fit.misfit > MAX_MISFIT and unexplained > MAX_UNEXPLAINED_RATIO:
-        alike = list(_common_gain_findings(fit_torque_gains(samples, robot, contacts)))
-        yield from alike
-        if alike:
+        scaled = list(_gain_and_point_findings(log, samples, robot, contacts))
+        yield from scaled
+        if scaled:
             return
         text = (
             f"measured forces differ from the {robot.format}'s by {_percent(fit.misfit)}, "
@@ -193,6 +195,8 @@ def _best_mistake(
         except InputError:  # the filter does not accept the corrected log
             continue
         trial = model.compare(samples, least)
+        if mistake.field == "joint_torque" and trial.implausible > fit.implausible:
+            continue
         if trial.compared == fit.compared and trial.misfit < least:  # compare the same forces only
             best, least = mistake, trial.misfit
     if best is None:
@@ -201,7 +205,9 @@ def _best_mistake(
         f"measured forces differ from the {robot.format}'s by {_percent(fit.misfit)}, "
         f"by {_percent(least)} once corrected"
     )
-    advice = best.advice + f"; or is {robot.path.name} another robot's?" * (least > MAX_CLEAR_MISFIT)
+    of_currents = best.field == "joint_torque" and best.description.startswith("in ") and least > _MAX_UNIT_MISFIT
+    advice = best.advice + "; of currents, set sensors.scales: {joint_torque: all}" * of_currents
+    advice += f"; or is {robot.path.name} another robot's?" * (least > MAX_CLEAR_MISFIT)
     return Finding("unit, sign or frame", REJECTED, best.field, f"{best.description}: {text}", advice)
 
 
@@ -299,6 +305,7 @@ def _gain_and_point_findings(
         gains = join_names([f"{gain:.3g} +- {std:.2g}" for gain, std in zip(relative[off], spread[off], strict=True)])
         text = f"{join_names(names)}: factors that fit the {robot.format} best, relative to the other joints: {gains}"
         advice = f"check gear ratios, torque constants and units, and the {robot.format}'s friction and inertias there"
+        advice += f", or set sensors.scales: {{joint_torque: [[{', '.join(names)}]]}}"
         yield Finding("scale", SUSPICIOUS, "joint_torque", text, advice, tuple(names))
     shifted = _is_certain(fit.point, fit.spread[m:], fit.blocks[:, m:]) & (np.abs(fit.point) > MIN_POINT_SHIFT_M)
     if shifted.any():
@@ -320,7 +327,8 @@ def _common_gain_findings(fit: TorqueGains | None) -> Iterator[Finding]:
     if off and _is_certain(value, np.array([spread]), agreeing, MIN_COMMON_BLOCK_SHARE).all():
         text = f"all torques: the factor that fits the URDF best is {gain:.3g} +- {spread:.2g}"
         advice = (
-            "check units, gear ratios and torque constants, and whether the URDF's masses and contact forces are right"
+            "check units, gear ratios and torque constants, whether the URDF's masses and contact forces are right, or "
+            "set sensors.scales: {joint_torque: all}"
         )
         yield Finding("scale", SUSPICIOUS, "joint_torque", text, advice)
 

@@ -1,4 +1,4 @@
-"""Lags of torques, tilts of gravity, gains and axes of contact sensors, estimated for all URDFs near the given one."""
+"""Lags and offsets of torques, tilts of gravity, contact sensors turned or off, for all URDFs near the given one."""
 
 from __future__ import annotations
 
@@ -41,8 +41,11 @@ _MIN_STANDARD_DEVIATIONS, _MIN_BLOCK_SHARE = 4.0, 0.5
 _MIN_UNEXPLAINED_RATIO, _MAX_LEFT = 1.25, 1.5
 #: Gain of a contact's sensor relative to the others, and turn of its axes, that are reported.
 _MIN_SENSOR_GAIN, _MIN_TURN_DEG = 0.15, 10.0
-#: Prior standard deviations of the lag [s], of the tilt [rad], and of gains and turns of contact sensors.
-_LAG_PRIOR_STD_S, _TILT_PRIOR_STD_RAD, _SENSOR_PRIOR_STD = 0.2, 0.3, 0.5
+#: Offset of a torque, over the rms of all torques, that is reported: those of good sensors are 0.08 of it.
+_MIN_OFFSET_SHARE = 0.1
+#: Prior standard deviations of the lag [s], of the tilt [rad], and of gains and turns of contact sensors; of offsets,
+#: over the rms of all torques.
+_LAG_PRIOR_STD_S, _TILT_PRIOR_STD_RAD, _SENSOR_PRIOR_STD, _OFFSET_PRIOR_SHARE = 0.2, 0.3, 0.5, 0.5
 #: Times that torques are shifted by what the slope of their readings says, which is exact for small lags alone.
 _SHIFTS, _LEAST_SHIFT_S = 8, 2e-3
 _SMALL_ANGLE = 1e-4
@@ -105,11 +108,13 @@ def check_lag_and_tilt(
         lag = fit_lag(log, robot, contacts, cutoff_hz)
         tilt = fit_tilt(log, robot, contacts, cutoff_hz) if not "base_quat_xyzw".startswith(derived) else None
         sensors = fit_contact_sensors(log, robot, contacts, cutoff_hz)
+        offsets = fit_torque_offsets(log, robot, contacts, cutoff_hz)
     except InputError:  # reported by `check_forces_against_urdf`
         return [], np.inf
     unexplained = min((x.without for x in (lag, tilt) if x is not None), default=np.inf)
     moved = [*_lag_findings(lag), *_tilt_findings(tilt, robot)]
-    return moved or list(_contact_sensor_findings(sensors, log, robot, contacts)), unexplained
+    moved = moved or list(_contact_sensor_findings(sensors, log, robot, contacts))
+    return moved or list(_offset_findings(offsets, log, robot)), unexplained
 
 
 def _lag_findings(lag: Deviation | None) -> Iterator[Finding]:
@@ -128,6 +133,18 @@ def _tilt_findings(tilt: Deviation | None, robot: Robot) -> Iterator[Finding]:
         field = "base" if robot.fixed_base else "base_quat_xyzw"
         advice = "check the mounting of the base" if robot.fixed_base else "check that the world's z axis points up"
         yield Finding("tilt", SUSPICIOUS, field, f"{text}: {tilt.gain}", f"{advice}, or set robot.base_tilt: auto")
+
+
+def _offset_findings(found: Deviation | None, log: Log, robot: Robot) -> Iterator[Finding]:
+    """Findings about single joints whose torque reads too much by a constant."""
+    if found is None:
+        return
+    for joint in np.flatnonzero(found.clear & (np.abs(found.value) > _MIN_OFFSET_SHARE * _torque_rms(log))):
+        name, offset, std = robot.joint_names[joint], found.value[joint], found.spread[joint]
+        unit = "N" if name in robot.sliding else "N m"
+        text = f"{name}: torques read {abs(offset):.3g} +- {std:.2g} {unit} too {'much' if offset > 0.0 else 'little'}"
+        advice = "check the zero of the sensor, or set sensors.offsets: {joint_torque: log}"
+        yield Finding("offset", SUSPICIOUS, "joint_torque", f"{text}: {found.gain}", advice, (name,))
 
 
 def _contact_sensor_findings(
@@ -216,6 +233,30 @@ def fit_lag(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: floa
     return out
 
 
+def fit_torque_offsets(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: float) -> Deviation | None:
+    """By how much each joint's torque is less than is read, (n,) [N m or N]; None where no torque was measured.
+
+    Raises:
+        InputError: as `fit_lag`.
+    """
+    if log.joint_torque is None:
+        return None
+    pieces = preprocess_pieces(log, cutoff_hz, MAX_TRIAL_DIFFERENTIATED_SAMPLES)
+    samples = bind_some_samples(pieces, robot, contacts, _SAMPLES)
+
+    def columns(builder: RowBuilder, part: Samples, number: int) -> FloatArray:
+        constant = np.zeros((builder.tree.n_rows, robot.n))
+        constant[builder.tree.base_rows + np.arange(robot.n), np.arange(robot.n)] = -1.0
+        return np.broadcast_to(constant, (len(part), *constant.shape))
+
+    return _fit(samples, robot, contacts, columns, _OFFSET_PRIOR_SHARE * _torque_rms(log) or 1.0, offsets=False)
+
+
+def _torque_rms(log: Log) -> float:
+    """Of all joints' torques [N m or N]."""
+    return 0.0 if log.joint_torque is None else float(np.sqrt(np.nanmean(np.square(log.joint_torque))))
+
+
 def _slope(log: Log) -> FloatArray | None:
     return None if log.joint_torque is None else np.gradient(log.joint_torque, log.time, axis=0)
 
@@ -252,9 +293,14 @@ def _turned(samples: Samples, axis: int) -> Samples:
 
 
 def _fit(
-    samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact], columns: UnknownColumns, prior_std: float
+    samples: Sequence[Samples],
+    robot: Robot,
+    contacts: Sequence[Contact],
+    columns: UnknownColumns,
+    prior_std: float,
+    offsets: bool = True,
 ) -> Deviation | None:
-    """Unknowns by their columns, beside parameters, friction, armature and offsets of torques."""
+    """Unknowns by their columns, beside parameters, friction, armature and, if not left out, offsets of torques."""
     sensors = measured_sensors(samples, robot, contacts)
     if not measures_force(sensors, robot):
         return None
@@ -266,7 +312,7 @@ def _fit(
         rows, W, equations = rows_with_bases(builder, part)
         target = rows[..., :-1] @ nominal - rows[..., -1]
         projected = np.einsum("nvr,nvk->nrk", W, columns(builder, part, number))
-        K = deviation_columns(builder, rows, W, part, prior)
+        K = deviation_columns(builder, rows, W, part, prior, offsets=offsets)
         parts.append((K, np.concatenate([target[..., None], projected], axis=2), equations))
     normal = accumulate_blocks(parts)
 

@@ -88,6 +88,11 @@ class ModelFit:
         return fit.misfit if fit.implausible.sum() >= fit.determined.sum() else fit.misfit_corrected
 
     @property
+    def implausible(self) -> int:
+        """Number of torques that no model error explains."""
+        return 0 if self.torque is None else int(self.torque.implausible.sum())
+
+    @property
     def wrench_misfit(self) -> float | None:
         """The larger misfit of base force and base moment."""
         return max((part for part in (self.base_force, self.base_moment) if part is not None), default=None)

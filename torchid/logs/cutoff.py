@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,7 @@ from torchid.errors import LogError
 from torchid.logs.log import FloatArray, Log
 from torchid.logs.preprocess import lacks_derivatives
 from torchid.logs.quaternion import make_sign_continuous
-from torchid.logs.signal_noise import SignalNoise, signal_noise
+from torchid.logs.signal_noise import STATED_FIELDS, SignalNoise, signal_noise
 from torchid.logs.timeline import LONGEST_MEDIAN_STEP, spline_derivatives
 from torchid.parameters import GRAVITY
 
@@ -29,6 +29,9 @@ _KEPT_SHARE, _MOTION_SHARE = 0.95, 0.99
 _WEIGHT_SHARE = 0.01
 #: Forces of a motion have its harmonics: gravity and Coriolis terms are not linear in wide angles.
 _HARMONICS = 6.0
+#: Bins of a spectrum per decade, up to a share of the sample rate that splines leave as it is, and how many times the
+#: noise a bin may have.
+_BINS_PER_DECADE, _TOP_SHARE, _ABOVE_NOISE = 20, 0.25, 3.0
 #: What an acceleration is worked out of, the first that was recorded, with the number of derivatives.
 _SOURCES = (
     (("joint_acceleration", 0), ("joint_velocity", 1), ("joint_position", 2)),
@@ -114,7 +117,10 @@ def choose_cutoff(
     motion, noise, of_base = np.zeros((3, len(candidates)))  # of_base: noise of its derived linear acceleration
     gravity = 0.0
     for log in derived:
-        for of_motion, of_noise, name in _powers(log, signal_noise(log, None, stated), candidates, base_is_derived):
+        known = {name for key in stated or {} for name in STATED_FIELDS[key]}
+        for of_motion, of_noise, name in _powers(
+            log, signal_noise(log, None, stated), candidates, base_is_derived, known
+        ):
             motion, noise = motion + of_motion, noise + of_noise
             if name in _OF_WEIGHT:
                 of_base += of_noise
@@ -131,11 +137,11 @@ def choose_cutoff(
 
 
 def _powers(
-    log: Log, noise: SignalNoise, candidates: FloatArray, base_is_derived: bool
+    log: Log, noise: SignalNoise, candidates: FloatArray, base_is_derived: bool, known: Collection[str]
 ) -> Iterator[tuple[FloatArray, FloatArray, str]]:
     """Power of accelerations up to each cutoff (n,) [Hz], of the motion and of its noise, times the log's length.
 
-    With each the field that they are worked out of.
+    With each the field that they are worked out of. `known`: those whose noise is stated.
     """
     from scipy.signal import welch  # as in `LowPass`
 
@@ -144,10 +150,39 @@ def _powers(
         even = spline_derivatives(log.time, values, np.linspace(log.time[0], log.time[-1], len(log)), (0,))[0]
         length = min(len(log), int(np.ceil(_SEGMENT_S * rate)))
         frequency, power = welch(even, fs=rate, nperseg=length, axis=0, detrend="linear")
+        total = power.sum(axis=1)
         of_noise = np.full(len(frequency), 2.0 * float(np.square(std).sum()) / rate)
-        densities = np.stack([power.sum(axis=1) - of_noise, of_noise])
+        if name not in known:
+            steps = np.abs(np.diff(values, axis=0))
+            step = np.min(steps, axis=0, where=steps > 0.0, initial=np.inf)
+            of_quantization = float(np.square(step[step < np.inf]).sum()) / 12.0
+            of_noise = _with_coloured_noise(frequency, total, of_noise, of_quantization)
+        densities = np.stack([total - of_noise, of_noise])
         upto = np.cumsum(densities * (2.0 * np.pi * frequency) ** (2 * order), axis=1) * frequency[1] * len(log) / rate
         yield np.interp(candidates, frequency, upto[0]), np.interp(candidates, frequency, upto[1]), name
+
+
+def _with_coloured_noise(
+    frequency: FloatArray, power: FloatArray, white: FloatArray, of_quantization: float
+) -> FloatArray:
+    """The density of noise (F,) where there is more than white noise, which differences of neighbours do not show.
+
+    Encoders with coarse steps, and samples that were lost, repeat readings: most differences of a high order are then
+    0. But the spectrum beyond the motion shows the noise: it falls with the inverse of the frequency at most, but for
+    lines of no more power than quantization has. Where it falls faster there is motion, whose noise is that of the
+    octave above twice this frequency.
+    """
+    edges = _LOWEST_HZ * 10.0 ** np.arange(0.0, np.log10(_TOP_SHARE * 2.0 * frequency[-1]), 1.0 / _BINS_PER_DECADE)
+    starts = np.unique(np.searchsorted(frequency, edges))
+    lines, at = np.diff(starts), frequency[starts[:-1]]
+    density = np.add.reduceat(power[: starts[-1]], starts[:-1]) / lines
+    floor = _ABOVE_NOISE * np.minimum.accumulate((density * at)[::-1])[::-1] / at
+    more = np.cumsum((np.maximum(density - floor, 0.0) * lines)[::-1])[::-1] * frequency[1]
+    motion = np.flatnonzero((density > floor) & (more > of_quantization))
+    first = starts[motion[-1] + 1] if len(motion) else starts[0]
+    noise = np.full_like(power, power[2 * first : 4 * first].mean())
+    noise[2 * first :] = power[2 * first :]
+    return np.asarray(np.maximum(noise, white))
 
 
 def _noisy_sources(
