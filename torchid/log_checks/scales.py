@@ -314,36 +314,18 @@ def fit_torque_gains(samples: Sequence[Samples], robot: Robot, contacts: Sequenc
     columns = prior_columns(builder, robot, samples)
     nominal = builder.columns.parameter_map @ robot.nominal.flatten()
     parts = []
-    readings = [builder.recorded_torque(part)[:, joints].numpy() for part in samples]
-    explained = _explained_torques(builder, samples, robot, joints, readings) if robot.fixed_base else readings
-    for part, read, noiseless in zip(samples, readings, explained, strict=True):
+    for part in samples:
         rows, W, equations = rows_with_bases(builder, part)
         torque = np.zeros((len(part), builder.tree.base_rows + robot.n_dofs, len(joints)))
-        torque[:, builder.tree.base_rows + joints, range(len(joints))] = noiseless
+        for index, joint in enumerate(joints):
+            torque[:, builder.tree.base_rows + joint, index] = builder.recorded_torque(part)[:, joint].numpy()
         terms = np.concatenate([torque, _point_shift_forces(builder, part, sensors.wrench)], axis=2)
         projected = np.einsum("nvr,nvk->nrk", W, terms)
-        noise = np.einsum("nvr,nv->nr", W[:, builder.tree.base_rows + joints], read - noiseless)
-        contact_part = rows[..., -1] - projected[..., : len(joints)].sum(axis=2) - noise
-        target = rows[..., :-1] @ nominal - contact_part - noise
+        contact_part = rows[..., -1] - projected[..., : len(joints)].sum(axis=2)
+        target = rows[..., :-1] @ nominal - contact_part
         K = deviation_columns(builder, rows, W, part, columns, armature=False)
         parts.append((K, np.concatenate([target[..., None], projected], axis=2), equations))
     return _solve_gains(accumulate_blocks(parts), joints)
-
-
-def _explained_torques(
-    builder: RowBuilder, samples: Sequence[Samples], robot: Robot, joints: np.ndarray, readings: Sequence[FloatArray]
-) -> list[FloatArray]:
-    """Readings (N, m) of a robot on a fixed base as far as its file, friction and an offset explain them.
-
-    A factor of readings with noise comes out too small; one of what explains them does not (two-stage least squares).
-    """
-    model = np.concatenate([force_series(builder, part, robot.nominal.flatten()[None])[1][0] for part in samples])
-    rate, read = np.concatenate([part.joint_velocity.numpy() for part in samples]), np.concatenate(readings)
-    explained = np.empty_like(read)
-    for index, joint in enumerate(joints):
-        terms = np.column_stack([model[:, joint], np.sign(rate[:, joint]), rate[:, joint], np.ones(len(read))])
-        explained[:, index] = terms @ np.linalg.lstsq(terms, read[:, index], rcond=None)[0]
-    return np.split(explained, np.cumsum([len(part) for part in samples])[:-1])
 
 
 def _point_shift_forces(builder: RowBuilder, samples: Samples, measured: np.ndarray) -> FloatArray:
