@@ -154,6 +154,7 @@ _UNITS = {
     **dict.fromkeys((f"preprocessing.detect_contacts.{x}" for x in ("touch", "lift", "light")), "robot's weight"),
     **dict.fromkeys((f"preprocessing.contact_threshold.{x}" for x in ("above", "below")), "N"),
     "actuators.sign_width": "rad/s or m/s",
+    "actuators.stribeck": "rad/s or m/s",
     "estimator.bounds": f"kg, kg m, kg m²; {_FRICTION}",
     "estimator.robust.tuning": "standard deviations",
     **dict.fromkeys((f"estimator.total_mass.{x}" for x in ("value", "std")), "kg"),

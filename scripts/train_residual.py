@@ -26,8 +26,8 @@ from torch import Tensor, nn
 import torchid
 from torchid.boundary import run_guarded
 from torchid.commands.chosen_settings import with_chosen_settings
-from torchid.commands.events import hyperparameters
 from torchid.commands.reading import LogReader
+from torchid.commands.run_figures import hyperparameters
 from torchid.config import load_config
 from torchid.errors import ConfigError, about_file
 from torchid.estimators import ResidualEffect, Sgd, Trainer

@@ -44,6 +44,11 @@ from .fitting.cross_validation import (
     choose_ridge,
     cross_validate,
 )
+from .fitting.factor_documents import (
+    RowModel,
+    require_same_noise,
+    require_same_rows,
+)
 from .fitting.factor_files import (
     FactorFile,
     read_factors,
@@ -64,11 +69,6 @@ from .fitting.posterior import (
 from .fitting.robust import (
     RobustLoss,
     fit_robustly,
-)
-from .fitting.row_model import (
-    RowModel,
-    require_same_noise,
-    require_same_rows,
 )
 from .identifiability.base_parameters import (
     BaseParameters,

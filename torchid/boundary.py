@@ -17,6 +17,7 @@ from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_st
 from torchid import ranks
 from torchid.errors import (
     BaseLostError,
+    ConfoundedWarning,
     EscapedStream,
     InputError,
     TorchidError,
@@ -45,8 +46,8 @@ def run_guarded(
         program: its name.
         command: what to run; returns an exit status, None for 0.
         debug: whether to show tracebacks and all warnings.
-        fold_warnings: whether a terminal gets the first of alike warnings alone, and at last how many there were; a
-            file or pipe gets all.
+        fold_warnings: whether a terminal gets the first of alike warnings alone, of what is confounded none, as the
+            answer says it, and at last how many there were; a file or pipe gets all.
 
     Returns:
         The exit status: the command's own or 0 on success, 2 on bad input, 1 on anything else, silently if the
@@ -128,7 +129,7 @@ def _describe_failure(error: Exception) -> tuple[int, str]:
 
 
 class _Warnings:
-    """Prints warnings as lines; repeated warnings of libraries once, and alike ones of torchid if `fold`."""
+    """Prints warnings as lines: of libraries once, and if `fold` alike ones once, and none that the answer repeats."""
 
     def __init__(self, program: str, debug: bool, fold: bool) -> None:
         self._program, self._debug, self._fold = program, debug, fold
@@ -138,6 +139,8 @@ class _Warnings:
         text = kind = f"{category.__name__}: {message}"
         if issubclass(category, TorchidWarning):
             kind = _without_names(text)
+            if self._fold and issubclass(category, ConfoundedWarning):
+                return
             if self._fold and kind in self._printed:
                 self._folded += 1
                 return

@@ -48,19 +48,19 @@ def run() -> NoReturn:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; 0 on success, 2 on bad input, 1 on anything else."""
-    is_function = arguments is not None
     try:
-        with nullcontext() if is_function else copies_allowed():
+        with copies_allowed() if arguments is None else nullcontext():
             return run_in_ranks("torchid", lambda: _main(arguments))
     finally:
-        if is_function:  # whoever calls it goes on
+        if arguments is not None:  # whoever calls it goes on
             gc.unfreeze()
 
 
 def _main(arguments: Sequence[str] | None) -> int:
     with plain_streams():  # argparse repeats unknown arguments in its errors
         options = _options(arguments)
-    return run_guarded("torchid", lambda: _command(options), options.debug, not getattr(options, "verbose", True))
+    answers = not (getattr(options, "verbose", True) or options.quiet)
+    return run_guarded("torchid", lambda: _command(options), options.debug, answers)
 
 
 def _command(options: argparse.Namespace) -> int | None:

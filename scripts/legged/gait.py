@@ -190,8 +190,9 @@ class _Legs:
         centre = self._centre(index, place)
         J = np.zeros((6, self._model.nv))
         mujoco.mj_jac(self._model, self._data, J[:3], J[3:], centre, index)
-        R = self._data.xmat[index].reshape(3, 3)
-        error = np.concatenate([target - centre, -Rotation.from_matrix(R).as_rotvec()])[: self._size]
+        error = target - centre
+        if self._size > 3:
+            error = np.append(error, -Rotation.from_matrix(self._data.xmat[index].reshape(3, 3)).as_rotvec())
         A = J[: self._size, leg + 6]
         joints[leg] += A.T @ np.linalg.solve(A @ A.T + 1e-9 * np.eye(len(A)), error)
         return float(np.abs(error).max())

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from demo import shortened_demo
 from repository import DEMO
 
 import torchid
@@ -19,8 +20,9 @@ FILE = DEMO / "quadruped.yaml"
 
 
 @pytest.fixture(scope="module")
-def things() -> Mapping[str, object]:
-    """One of each public building block, of the demo."""
+def things(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, object]:
+    """One of each public building block, of the demo; what is checked and analyzed is short."""
+    short = shortened_demo(tmp_path_factory.mktemp("short") / "demo", 400) / "quadruped.yaml"
     log, robot = torchid.read_log(DEMO / "sway_train.npz"), torchid.load_robot(DEMO / "quadruped.urdf")
     contacts = [torchid.Contact(name, "point") for name in log.contact_names]
     noise = torchid.SensorNoise(joint_torque=0.1)
@@ -34,8 +36,8 @@ def things() -> Mapping[str, object]:
     fit = fitter.fit(parts)
     batches = torchid.MiniBatches([samples], builder)
     result = torchid.identify(FILE, output=None, estimator={"ridge": 0.01})
-    analysis = torchid.analyze(FILE, output=None, estimator={"ridge": 0.01})
-    checked = torchid.check(FILE)
+    analysis = torchid.analyze(short, output=None, estimator={"ridge": 0.01})
+    checked = torchid.check(short)
     return {
         "log": log,
         "filtered log": torchid.preprocess(log, 8.0),

@@ -21,7 +21,7 @@ from rich.text import Text
 from torchid.boundary import run_guarded
 from torchid.cli import main
 from torchid.config.reading import check_yaml
-from torchid.errors import ConfigError, TorchidWarning, during, is_plain
+from torchid.errors import ConfigError, ConfoundedWarning, TorchidWarning, during, is_plain
 from torchid.guards import read_bytes
 from torchid.report.tables import print_tables, table_text, terminal_console
 
@@ -235,12 +235,19 @@ class _Terminal(io.StringIO):
         return True
 
 
-def _warn_of_logs(told: list[str], monkeypatch: pytest.MonkeyPatch, *, terminal: bool, fold: bool) -> list[str]:
+def _warn_of_logs(
+    told: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    terminal: bool,
+    fold: bool,
+    category: type[TorchidWarning] = TorchidWarning,
+) -> list[str]:
     """Lines on standard error of a command that warns."""
 
     def command() -> None:
         for text in told:
-            warnings.warn(text, TorchidWarning, stacklevel=1)
+            warnings.warn(text, category, stacklevel=1)
 
     screen = _Terminal() if terminal else io.StringIO()
     monkeypatch.setattr(sys, "stderr", screen)
@@ -260,3 +267,10 @@ def test_a_terminal_gets_the_first_of_alike_warnings_and_their_number_and_a_file
     first = [f"torchid: TorchidWarning: {text}" for text in (told[0], told[-3], told[-2])]
     assert lines == [*first, "torchid: and 9 warnings like these: --verbose"]
     assert _warn_of_logs(told[-3:-1], monkeypatch, terminal=True, fold=True) == first[1:]
+
+
+def test_a_terminal_gets_no_warning_of_what_its_answer_says_is_confounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    told = ["walk.yaml: offset of l_hip: confounded with m of pelvis; do not trust either; add motion"]
+    for terminal, fold in ((False, True), (True, False), (True, True)):
+        lines = _warn_of_logs(told, monkeypatch, terminal=terminal, fold=fold, category=ConfoundedWarning)
+        assert bool(lines) is not (terminal and fold)

@@ -215,7 +215,7 @@ def test_noise_sensors_extras_and_folds_change_the_name_of_factors(demo: Path, t
     assert values.keys() | STATED_FIELDS.keys() == {x.name for x in fields(NoiseConfig)}
     values = {name: x for name, x in values.items() if name not in STATED_FIELDS}  # change samples
     terms = {"armature": True, "torque_offset": True, "asymmetric_coulomb": True, "stiffness": True}
-    terms["sign_width"] = 0.01
+    terms |= {"sign_width": 0.01, "stribeck": 0.1}
     assert terms.keys() | {"delay"} == {x.name for x in fields(ActuatorsConfig)}, "a delay changes samples"
     others = [f"sensors.noise.{name}={json.dumps(x)}" for name, x in values.items()]
     others += [f"actuators.{name}={json.dumps(x)}" for name, x in terms.items()]

@@ -212,6 +212,10 @@ FILES: dict[str, tuple[Edit, tuple[str, ...]]] = {
         edit_config(sensors="contacts", actuators={"sign_width": 0.1}),
         ("actuators.sign_width: set, but no joint torque is measured",),
     ),
+    "friction at rest without joint torques": (
+        edit_config(sensors="contacts", actuators={"stribeck": "auto"}),
+        ("actuators.stribeck: set, but no joint torque is measured",),
+    ),
     "limb sensor at a moving joint": (
         edit_config(sensors={"set": "joints", "ft_sensors": ["front_left_hip"]}),
         ("sensors.ft_sensors: 'front_left_hip', a revolute joint, not a fixed joint; accepted: front_left_sole",),

@@ -238,13 +238,14 @@ def test_outliers_do_not_move_the_offsets_of_a_new_log_where_fits_are_robust(run
     ["preprocessing.cutoff_hz=null"], ["preprocessing.contact_margin_s=0.05", "preprocessing.sample_rate_hz=150"],
     ["preprocessing.base_motion=contacts"], ["preprocessing.memory_gb=1e-6"],
 ])  # fmt: skip
-def test_logs_that_are_read_once_are_those_that_would_be_read_with_each_width(settings: list[str]) -> None:
+def test_logs_that_are_read_once_are_those_that_would_be_read_with_each_friction(settings: list[str]) -> None:
     scene = set_up(load_config(DEMO / "quadruped.yaml", [*settings, "actuators.sign_width=auto"]))
     reader = WidthReader(scene)
-    for width in (0.1, 0.003, None, 0.1):
-        stated = load_config(DEMO / "quadruped.yaml", [*settings, f"actuators.sign_width={width or 'null'}"])
+    for width, stribeck in ((0.1, None), (0.003, 0.2), (None, 0.05), (0.1, None)):
+        own = f"actuators.sign_width={width or 'null'}", f"actuators.stribeck={stribeck or 'null'}"
+        stated = load_config(DEMO / "quadruped.yaml", [*settings, *own])
         (expected,) = LogReader(set_up(stated)).read(stated.logs.train, scene.sensors)
-        (samples,) = reader.logs(width, scene.sensors)
+        (samples,) = reader.logs(set_up(stated).terms, scene.sensors)
         for name, there in vars(expected).items():
             found = getattr(samples, name)
             if isinstance(there, torch.Tensor):

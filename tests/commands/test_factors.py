@@ -92,7 +92,7 @@ def test_the_demo_from_its_factor_is_the_demo_from_its_log(tmp_path: Path, overr
     [
         pytest.param("arm", (6.0,), {}, marks=pytest.mark.slow),
         ("arm", (3.0, 4.0, 3.0), {"actuators": {"armature": True, "torque_offset": True}}),
-        ("biped", (2.0, 2.0, 3.0), {"sensors": OFFSETS}),
+        ("biped", (2.0, 2.0), {"sensors": OFFSETS}),
         pytest.param(
             *("biped", (8.0, 2.0, 2.0), {"sensors": OFFSETS, "estimator": {"name": "consistent", "ridge": 1e-3}}),
             marks=pytest.mark.slow,

@@ -279,12 +279,6 @@ def test_names_are_shown_as_they_are_and_never_as_markup(capsys: pytest.CaptureF
     assert "[red]x[/blue]" in capsys.readouterr().out
 
 
-def test_the_same_experiment_gives_the_same_parameters_again(run: Path, tmp_path: Path) -> None:
-    output = tmp_path / "again"
-    assert main(["identify", str(DEMO / "quadruped.yaml"), f"output={output}", "overwrite=true"]) == 0
-    assert json.loads((output / "parameters.json").read_text()) == json.loads((run / "parameters.json").read_text())
-
-
 def test_identified_urdf_moves_as_its_parameters_say(tmp_path: Path) -> None:
     robot = torchid.load_robot(DEMO / "quadruped.urdf")
     rng = np.random.default_rng(0)

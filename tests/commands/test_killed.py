@@ -1,19 +1,24 @@
-"""Commands whose process is killed while they write: what is there before or after, whole."""
+"""Commands of which a process is killed, while it writes or shares the work: what is there before or after, whole."""
 
 from __future__ import annotations
 
 import os
+import random
 import shutil
 import signal
 import sys
+import time
 import warnings
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from run_folders import a_run, everything, write
+import pytest
+from demo import shortened_demo
+from run_folders import a_run, everything, names_in, write
+from shared_work import SMALL_CHUNK, TWO, children, finish_forked, is_running, started
 
-from torchid.commands.folder import (
-    check_free,
-)
+from torchid.cli import main
+from torchid.commands.folder import check_free
 from torchid.commands.manifest import MANIFEST
 from torchid.staging import staging_folder
 
@@ -81,3 +86,82 @@ def test_what_a_living_process_makes_and_what_only_looks_like_it_stay(tmp_path: 
         assert (living / "new").exists()
     shutil.rmtree(output)
     assert everything(tmp_path) == before
+
+
+# ------------------------------------------------------------------------------------------ processes that share work
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[list[str], bytes, float]]:
+    """A command without its output, the parameters that two processes find, and how long they work on them [s].
+
+    Its logs have some chunks.
+    """
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr("torchid.problem.chunks._LEAST", SMALL_CHUNK)
+        folder = shortened_demo(tmp_path_factory.mktemp("killed") / "demo", 500)
+        command = ["identify", str(folder / "quadruped.yaml")]
+        begin = time.monotonic()
+        status, _, complained = finish_forked(2, lambda: main([*command, f"output={folder / 'run'}"]))
+        assert status == 0, complained
+        yield command, (folder / "run/parameters.json").read_bytes(), time.monotonic() - begin
+
+
+def killed_after(seconds: float, command: list[str], output: Path, victim: int) -> int:
+    """Exit status of a command of which one process was killed, so long after it had begun, all others having ended.
+
+    A command begins with the folder that its cache is kept in, once it has imported what it needs; before that where
+    the time is negative.
+    """
+    with started([*TWO, "-m", "torchid", *command, f"output={output}"]) as process:
+        while process.poll() is None and len(children(process)) < 2:
+            time.sleep(0.01)
+        while process.poll() is None and seconds >= 0.0 and not output.parent.exists():
+            time.sleep(0.01)
+        time.sleep(max(0.0, seconds))
+        workers = children(process)
+        if victim < len(workers):
+            os.kill(workers[victim], signal.SIGKILL)
+        process.communicate(timeout=60)
+    assert not any(is_running(pid) for pid in workers)
+    return process.returncode
+
+
+def killed_fork_after(seconds: float, command: list[str], output: Path, victim: int) -> int:
+    """As `killed_after`, of forks of this process, of which the other is then ended as torchrun does."""
+
+    def kill(processes: Sequence[int]) -> None:
+        until = time.monotonic() + 60.0
+        while not output.parent.exists() and time.monotonic() < until:
+            time.sleep(0.01)
+        time.sleep(seconds)
+        os.kill(processes[victim], signal.SIGKILL)
+        os.kill(processes[1 - victim], signal.SIGTERM)
+
+    return finish_forked(2, lambda: main([*command, f"output={output}"]), meanwhile=kill)[0]
+
+
+def assert_nothing_or_whole(output: Path, parameters: bytes, status: int) -> None:
+    assert not output.exists() or (output / "parameters.json").read_bytes() == parameters
+    assert output.exists() or status != 0
+
+
+@pytest.mark.parametrize(
+    ("seed", "kill", "least"),
+    [
+        (0, killed_fork_after, 0.2),
+        *(pytest.param(seed, killed_after, -0.2, marks=pytest.mark.slow) for seed in range(20)),
+    ],
+)
+def test_a_killed_process_ends_all_and_leaves_nothing_or_all(
+    whole: tuple[list[str], bytes, float], tmp_path: Path, seed: int, kill: Callable[..., int], least: float
+) -> None:
+    command, parameters, seconds = whole
+    drawn, output = random.Random(seed), tmp_path / "runs" / "run"
+    status = kill(seconds * drawn.uniform(least, 1.0), command, output, drawn.randrange(2))
+    assert_nothing_or_whole(output, parameters, status)
+    again = [*command, f"output={output}", "overwrite=true"]
+    status, _, complained = finish_forked(2, lambda: main(again))
+    assert status == 0, complained
+    assert (output / "parameters.json").read_bytes() == parameters
+    assert names_in(output.parent) == ["run"]

@@ -28,13 +28,14 @@ from torchid.problem import LinearProblem
 
 SCALES = dict.fromkeys(HIPS, HIP_SCALE) | dict.fromkeys(KNEES, KNEE_SCALE)
 SENSORS = {"set": "joints", "noise": NOISE, "scales": {"joint_torque": [HIPS, KNEES]}}
+EXACT = {"name": "least_squares", "ridge": 0.0}
 LABELS = ("scale of *_hip,*_thigh", "scale of *_knee")
 
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, float]:
     """An experiment file of a robot of which each type of motor has an unknown constant, and its mass [kg]."""
-    return quadruped_files(tmp_path_factory.mktemp("currents"), SCALES, sensors=SENSORS, estimator={"ridge": 0.0})
+    return quadruped_files(tmp_path_factory.mktemp("currents"), SCALES, sensors=SENSORS, estimator=EXACT)
 
 
 def document(run: Path, name: str) -> dict[str, Any]:

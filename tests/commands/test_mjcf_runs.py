@@ -14,7 +14,7 @@ import yaml
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed")
 
-from demo import DEMO
+from demo import DEMO, shortened_demo
 from pages import figures_of
 
 import torchid
@@ -37,7 +37,13 @@ LOG = DEMO / "sway_train.npz"
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The demo with short logs."""
+    return shortened_demo(tmp_path_factory.mktemp("short") / "demo", 400)
+
+
+@pytest.fixture(scope="module")
+def runs(short: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Runs on the demo's quadruped as a URDF and as MJCF."""
     folder = tmp_path_factory.mktemp("runs")
     robot = load_robot(DEMO / "quadruped.urdf")
@@ -47,7 +53,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     for key, file in (("urdf", DEMO / "quadruped.urdf"), ("mjcf", folder / "quadruped.xml")):
         out[key] = folder / key
         own = settings | {"robot": {"urdf": None, key: file}, "output": out[key]}
-        torchid.identify(DEMO / "quadruped.yaml", **own)
+        torchid.identify(short / "quadruped.yaml", **own)
     return out
 
 
@@ -65,17 +71,17 @@ def test_the_page_of_a_run_names_the_robot_s_file(runs: dict[str, Path], key: st
 
 
 def test_what_an_mjcf_robot_is_compared_with_is_called_mjcf(
-    runs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    runs: dict[str, Path], short: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """In sentences, tables and the page, the same words as of a URDF otherwise."""
     said = {}
     for key, run in runs.items():
         for words in (["evaluate", str(run)], ["evaluate", str(run), "--verbose"], ["replay", str(run)]):
-            assert main([*words, "--log", str(DEMO / "sway_test.npz")]) == 0
+            assert main([*words, "--log", str(short / "sway_test.npz")]) == 0
         said[key] = re.sub(r"written to.*|[\d.]+(e[+-]\d+)?", "", capsys.readouterr().out).split()
         answer = json.loads((run / "report.json").read_text())["answer"]
         said[key] += [word for text in (answer["headline"], answer["total_mass"]) for word in text.split()[:5]]
-        said[key] += repr(torchid.evaluate(run, DEMO / "sway_test.npz")).split()[:6]
+        said[key] += repr(torchid.evaluate(run, short / "sway_test.npz")).split()[:6]
     assert "URDF" in " ".join(said["urdf"])
     assert "URDF" not in " ".join(said["mjcf"])
     words = [re.sub("[^A-Za-z]", "", word.replace("URDF", "MJCF")) for word in said["urdf"]]
@@ -206,7 +212,7 @@ def test_the_log_is_replayed_on_the_mjcf_robot_as_on_the_urdf(runs: dict[str, Pa
     from torchid.commands.replay import replay
 
     log = tmp_path / "log.npz"
-    torchid.write_log(torchid.read_log(LOG).select(slice(0, 300)), log)
+    torchid.write_log(torchid.read_log(LOG).select(slice(0, 150)), log)
     drifts = [replay(runs[key], log, 0.1).drift for key in ("urdf", "mjcf")]
     for one, other in zip(*drifts, strict=True):
         np.testing.assert_allclose(one.joints, other.joints, atol=1e-4)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 import os
-import random
 import shutil
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +24,6 @@ from shared_work import (
     differences,
     finish,
     finish_forked,
-    is_running,
     lines_of_torchid,
     run_all,
     started,
@@ -313,80 +311,6 @@ def test_an_item_that_fails_ends_what_a_process_does_apart(monkeypatch: pytest.M
         ranks.share_out([0, 0], lambda item: 1 / item, "items", sizes=[1, 1])
     assert ranks._sharing is together
     assert not together.about
-
-
-# ------------------------------------------------------------------------------------------------ processes that end
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[str], bytes, float]:
-    """A command without its output, the parameters that two processes find, and how long they work on them [s]."""
-    folder = shortened_demo(tmp_path_factory.mktemp("killed") / "demo", 500)
-    command = ["identify", str(folder / "quadruped.yaml")]
-    begin = time.monotonic()
-    status, _, complained = finish_forked(2, lambda: main([*command, f"output={folder / 'run'}"]))
-    assert status == 0, complained
-    return command, (folder / "run/parameters.json").read_bytes(), time.monotonic() - begin
-
-
-def killed_after(seconds: float, command: list[str], output: Path, victim: int) -> int:
-    """Exit status of a command of which one process was killed, so long after it had begun, all others having ended.
-
-    A command begins with the folder that its cache is kept in, once it has imported what it needs; before that where
-    the time is negative.
-    """
-    with started([*TWO, "-m", "torchid", *command, f"output={output}"]) as process:
-        while process.poll() is None and len(children(process)) < 2:
-            time.sleep(0.01)
-        while process.poll() is None and seconds >= 0.0 and not output.parent.exists():
-            time.sleep(0.01)
-        time.sleep(max(0.0, seconds))
-        workers = children(process)
-        if victim < len(workers):
-            os.kill(workers[victim], signal.SIGKILL)
-        process.communicate(timeout=60)
-    assert not any(is_running(pid) for pid in workers)
-    return process.returncode
-
-
-def killed_fork_after(seconds: float, command: list[str], output: Path, victim: int) -> int:
-    """As `killed_after`, of forks of this process, of which the other is then ended as torchrun does."""
-
-    def kill(processes: Sequence[int]) -> None:
-        until = time.monotonic() + 60.0
-        while not output.parent.exists() and time.monotonic() < until:
-            time.sleep(0.01)
-        time.sleep(seconds)
-        os.kill(processes[victim], signal.SIGKILL)
-        os.kill(processes[1 - victim], signal.SIGTERM)
-
-    return finish_forked(2, lambda: main([*command, f"output={output}"]), meanwhile=kill)[0]
-
-
-def assert_nothing_or_whole(output: Path, parameters: bytes, status: int) -> None:
-    assert not output.exists() or (output / "parameters.json").read_bytes() == parameters
-    assert output.exists() or status != 0
-
-
-@pytest.mark.parametrize(
-    ("seed", "kill", "least"),
-    [
-        (0, killed_fork_after, 0.2),
-        *(pytest.param(seed, killed_after, -0.2, marks=pytest.mark.slow) for seed in range(20)),
-    ],
-)
-def test_a_killed_process_ends_all_and_leaves_nothing_or_all(
-    whole: tuple[list[str], bytes, float], tmp_path: Path, seed: int, kill: Callable[..., int], least: float
-) -> None:
-    command, parameters, seconds = whole
-    drawn, output = random.Random(seed), tmp_path / "runs" / "run"
-    status = kill(seconds * drawn.uniform(least, 1.0), command, output, drawn.randrange(2))
-    assert_nothing_or_whole(output, parameters, status)
-    again = [*command, f"output={output}", "overwrite=true"]
-    status, _, complained = finish_forked(2, lambda: main(again))
-    assert status == 0, complained
-    assert (output / "parameters.json").read_bytes() == parameters
-    assert names_in(output.parent) == ["run"]
 
 
 @pytest.mark.slow

@@ -19,7 +19,8 @@ GROUPED = {"set": "joints", "noise": NOISE, "scales": {"joint_torque": [HIPS]}}
 def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Hips and thighs have motors whose constant is off, knees others that are right."""
     scales = dict.fromkeys(HIPS, HIP_SCALE)
-    return quadruped_files(tmp_path_factory.mktemp("currents"), scales, sensors=GROUPED, estimator={"ridge": 0.0})[0]
+    exact = {"name": "least_squares", "ridge": 0.0}
+    return quadruped_files(tmp_path_factory.mktemp("currents"), scales, sensors=GROUPED, estimator=exact)[0]
 
 
 def document(run: Path, name: str) -> dict[str, Any]:

@@ -42,6 +42,7 @@ ALL: dict[str, Any] = {
         "armature": True,
         "torque_offset": False,
         "asymmetric_coulomb": True,
+        "stribeck": None,
         "stiffness": False,
         "sign_width": 0.01,
         "delay": -0.002,

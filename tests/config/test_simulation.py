@@ -10,8 +10,7 @@ import pytest
 import yaml
 from refusals import assert_unknown_key, assert_wrong_value
 
-from torchid.config import SimulationConfig, load_simulation
-from torchid.config.reading import dump
+from torchid.config import SimulationConfig, dump_config, load_simulation
 from torchid.errors import ConfigError
 
 WAVE = {"what": "com_z", "hz": 0.5, "amplitude": 0.08}
@@ -90,7 +89,7 @@ def test_every_key_of_the_file_arrives(file: Path) -> None:
 def test_what_a_simulation_writes_down_reads_back_as_itself_anywhere(file: Path, tmp_path: Path, settings: Any) -> None:
     config = load(file, settings)
     elsewhere = tmp_path / "elsewhere.yaml"
-    elsewhere.write_text(dump(config))
+    elsewhere.write_text(dump_config(config))
     assert load_simulation(elsewhere) == config
 
 

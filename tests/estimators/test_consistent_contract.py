@@ -78,10 +78,10 @@ def test_conditions_that_exclude_each_other_are_refused_soon(method: Method, nam
     if name.startswith("mirror"):
         nominal[1, 4] = 9.0 * nominal[1, [4, 7, 9]].sum()  # breaks the triangle inequality
         problem = replace(problem, nominal=nominal.ravel())
-    started = time.perf_counter()
+    started = time.process_time()
     with pytest.raises(InputError, match=named):
         Consistent(1e-3, conditions=conditions, method=method).solve(problem)
-    assert time.perf_counter() - started < 5.0
+    assert time.process_time() - started < 5.0
 
 
 def test_a_start_far_from_what_the_conditions_allow_finds_it() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from synthetic import UR5, Array, load
 from thinned import slow_but
 
 from torchid import parameters
-from torchid.estimators import LeastSquares
+from torchid.estimators import Consistent, LeastSquares
 from torchid.problem import LinearProblem, RowBuilder, TriangularFactor, compress, linear_problem
 from torchid.problem.linear import PRIOR_DEVIATION
 from torchid.sensing import SensorNoise, named_sensors
@@ -271,3 +272,25 @@ def test_friction_of_an_excavator_is_not_held_back_by_a_prior_of_light_robots() 
     estimate = LeastSquares(ridge=1e-5).solve(linear_problem(compress([log], builder), builder, nominal))
     found = estimate.phi.reshape(truth.shape)[1:, parameters.FRICTION] / tons
     np.testing.assert_allclose(found, truth[1:, parameters.FRICTION], atol=0.1)  # 0.7 off if all have 1 N m
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"free": np.ones(12, dtype=np.int64)}, "free: found ndarray of int64; accepted: a NumPy array of bool"),
+        ({"A": torch.ones(20, 12)}, "A: found Tensor of torch.float32; accepted: a NumPy array of floats"),
+        ({"nominal": [0.0] * 12}, "nominal: found list of no dtype; accepted: a NumPy array of floats"),
+    ],
+)
+def test_a_problem_of_other_types_is_refused_by_name(wrong: dict[str, Any], said: str) -> None:
+    parts: dict[str, Any] = {"A": np.ones((20, 12)), "b": np.ones(20), "nominal": np.ones(12), "scale": np.ones(12)}
+    parts |= {"free": np.ones(12, dtype=bool), "residual": 0.0, "rows": 20} | wrong
+    with pytest.raises(TypeError, match=said):
+        LinearProblem(**parts)
+
+
+def test_columns_that_are_of_no_bodies_are_refused_by_the_estimator_of_bodies() -> None:
+    ones = np.ones(13)
+    problem = LinearProblem(np.ones((20, 13)), np.ones(20), 0.0, 20, ones, ones, ones > 0.0)
+    with pytest.raises(ValueError, match="A: found 13 columns; accepted: 12 for each body"):
+        Consistent().solve(problem)

@@ -36,7 +36,7 @@ def test_a_model_explains_what_noise_would_leave_and_no_more() -> None:
     assert replace(more, expected=None).explained, "estimated noise is what the residuals show"
     alike = replace(good, expected=None, lack_of_fit=4.0)
     assert not alike.explained
-    assert str(alike) == "neighbouring residuals agree 4 times as much as those of noise"
+    assert str(alike) == "residuals are correlated in time, between blocks 4 times noise's variance"
     assert replace(alike, lack_of_fit=None).explained
     assert replace(alike, share=1e-7).explained, "what rounding leaves of exact signals"
     assert not replace(alike, share=1e-5).explained

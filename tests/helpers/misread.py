@@ -80,7 +80,7 @@ def with_actuators(w: World, terms: ExtraTerms) -> tuple[list[Log], dict[tuple[s
     """The logs of calibrated sensors on a robot with smooth friction and the terms, and their values."""
     rng, n = np.random.default_rng(5), w.robot.n
     armature, offset, half = rng.uniform(0.1, 0.5, n), rng.uniform(-5, 5, n), rng.uniform(-0.5, 0.5, n)
-    stiffness = rng.uniform(-2, 2, n)
+    stiffness, at_rest = rng.uniform(-2, 2, n), rng.uniform(0.5, 2, n)
     logs = []
     for log, sensors in zip(w.logs, w.sensors, strict=True):
         v = value(log.joint_velocity)
@@ -90,6 +90,8 @@ def with_actuators(w: World, terms: ExtraTerms) -> tuple[list[Log], dict[tuple[s
         torque = torque + terms.armature * armature * value(log.joint_acceleration) + terms.torque_offset * offset
         torque = torque + terms.asymmetric_coulomb * half * np.abs(np.tanh(v / WIDTH))
         torque = torque + terms.stiffness * stiffness * value(log.joint_position)
+        if terms.stribeck:
+            torque = torque + at_rest * np.tanh(v / WIDTH) * np.exp(-np.square(v / terms.stribeck))
         ft, wrench = value(log.ft_wrench) - sensors.ft, value(log.contact_wrench_local) - sensors.wrench
         logs.append(replace(log, joint_torque=torque, ft_wrench=ft, contact_wrench_local=wrench))
     labels = {
@@ -97,9 +99,11 @@ def with_actuators(w: World, terms: ExtraTerms) -> tuple[list[Log], dict[tuple[s
         "torque offset": offset,
         "asymmetric Coulomb friction": half,
         "stiffness": stiffness,
+        "Stribeck friction": at_rest,
     }
     wanted = {"armature": terms.armature, "torque offset": terms.torque_offset, "stiffness": terms.stiffness}
     wanted["asymmetric Coulomb friction"] = terms.asymmetric_coulomb
+    wanted["Stribeck friction"] = bool(terms.stribeck)
     true = {("", f"{what} of {j}"): float(x[k]) for what, x in labels.items() if wanted[what]
             for k, j in enumerate(w.robot.joint_names)}  # fmt: skip
     return logs, true

@@ -103,6 +103,8 @@ class _Watch:
             return True  # a descriptor: opened before
         above = os.readlink(f"/proc/self/fd/{folder}") if isinstance(folder, int) and folder >= 0 else ""
         full = os.path.abspath(os.path.join(above, os.fsdecode(path)))
+        if "__pycache__" in full.split(os.sep)[-2:]:
+            return True  # the interpreter's own, of a module that nobody has imported before
         return any(full.startswith(start) for start in (*self.allowed, os.devnull))
 
 

@@ -17,9 +17,11 @@ from torchid.fitting.fit import LogFitter
 from torchid.identifiability import block_scatter
 from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log, compress_parts
 from torchid.problem.compression import compress_in_blocks, split_into_folds
+from torchid.problem.motion_noise import MotionNoise
 from torchid.sensing import SensorNoise, named_sensors
 
 NOISE = 0.3
+NOISE_RAD_S2 = 3.0
 
 
 def scene(seconds: int, terms: ExtraTerms | None = None) -> tuple[Samples, LogFitter, Array, np.random.Generator]:
@@ -121,6 +123,30 @@ def test_noise_alone_is_no_lack_of_fit() -> None:
         fit = fitter.fit(compress_in_blocks(split_into_folds([log], fitter.builder), fitter.builder))
         assert fit.scatter is not None
         assert 0.8 < fit.scatter.lack_of_fit < 1.25
+
+
+def test_noise_of_the_motion_that_is_known_is_no_lack_of_fit() -> None:
+    samples, fitter, _, rng = scene(200)
+    base = samples.base
+    assert base.specific_force is not None
+    joints, bases = torch.zeros(12, 3, 3, dtype=torch.float64), torch.zeros(12, 12, dtype=torch.float64)
+    joints[:, 2, 2], bases[6:, 6:] = NOISE_RAD_S2, NOISE_RAD_S2 * torch.eye(6, dtype=torch.float64)
+
+    def drawn(width: int) -> torch.Tensor:
+        return NOISE_RAD_S2 * torch.from_numpy(rng.normal(size=(len(samples), width)))
+
+    moved = replace(base, specific_force=base.specific_force + drawn(3))
+    if base.angular_acceleration is not None:
+        moved = replace(moved, angular_acceleration=base.angular_acceleration + drawn(3))
+    log = replace(
+        noisy(samples, NOISE * rng.normal(size=(len(samples), 12))),
+        joint_acceleration=samples.joint_acceleration + drawn(12),
+        base=moved,
+        motion_noise=MotionNoise(joints, bases),
+    )
+    fit = fitter.fit(compress_in_blocks(split_into_folds([log], fitter.builder), fitter.builder))
+    assert fit.scatter is not None
+    assert fit.scatter.lack_of_fit < 2.0
 
 
 def test_neighbours_of_very_many_blocks_count_as_one(monkeypatch: pytest.MonkeyPatch) -> None:

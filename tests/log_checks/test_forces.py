@@ -307,6 +307,12 @@ def test_a_bolted_robot_is_not_asked_for_its_base_nor_for_contacts() -> None:
     }
 
 
+def test_a_floating_base_that_nothing_holds_is_asked_for_its_contacts() -> None:
+    log = demo_log()
+    bare = replace(log, contact_names=(), contact_active=None, contact_wrench_local=None)
+    assert "name under contacts" in only(check(bare, demo_robot(), (), CUTOFF), "forces").advice
+
+
 def test_what_no_usual_mistake_explains_is_only_suspicious() -> None:
     shuffled = of_arm(lambda log: replace(log, joint_torque=np.roll(value(log.joint_torque), 400, axis=0)))
     finding = only(shuffled, "forces")

@@ -71,14 +71,20 @@ def test_a_world_that_is_tilted_is_named_with_the_angles(machine: str) -> None:
     assert "base_tilt: auto" in finding.advice
 
 
-@pytest.mark.parametrize(("axis", "turn"), [("y", [-90.0, 0.0, 0.0]), ("x", [0.0, 90.0, 0.0])])
-def test_a_world_whose_z_axis_is_level_is_named_with_the_axis_that_points_up(axis: str, turn: list[float]) -> None:
-    found = of_demo(tilted(demo_log(), np.array(turn)))
-    finding = only(found, "unit, sign or frame", "base_quat_xyzw")
-    assert finding.found.startswith(f"in a world whose {axis} axis points up")
-    case = case_of(MACHINES["quadruped"], "joints")
-    finding = only(checked(case, tilted(case.log, np.array(turn))), "gravity", "base_quat_xyzw")
-    assert finding.found.endswith(f"a world whose {axis} axis points up?")
+@pytest.mark.parametrize(
+    ("world", "by"), each_once([("y", [-90.0, 0.0, 0.0]), ("x", [0.0, 90.0, 0.0])], ["feet", "IMU"])
+)
+def test_a_world_whose_z_axis_is_level_is_named_with_the_axis_that_points_up(
+    world: tuple[str, list[float]], by: str
+) -> None:
+    axis, turn = world
+    if by == "feet":
+        finding = only(of_demo(tilted(demo_log(), np.array(turn))), "unit, sign or frame", "base_quat_xyzw")
+        assert finding.found.startswith(f"in a world whose {axis} axis points up")
+    else:
+        case = case_of(MACHINES["quadruped"], "joints")
+        finding = only(checked(case, tilted(case.log, np.array(turn))), "gravity", "base_quat_xyzw")
+        assert finding.found.endswith(f"a world whose {axis} axis points up?")
 
 
 def test_an_arm_on_a_table_that_slants_is_told_so() -> None:
@@ -106,13 +112,16 @@ def slanting_torque(case: Case, gravity: Array) -> Array:
 
 
 @pytest.mark.parametrize(
-    ("mistake", "name", "text"),
-    [("sign", "sign", "reversed; times -"), ("gain", "scale", "times 0.6"), ("turn", "frame", "turned by [23]")],
+    ("recorded", "mistaken"),
+    each_once(
+        [("quadruped", "full"), ("biped", "full"), ("quadruped", "contacts")],
+        [("sign", "sign", "reversed; times -"), ("gain", "scale", "times 0.6"), ("turn", "frame", "turned by [23]")],
+    ),
 )
-@pytest.mark.parametrize(("machine", "sensors"), [("quadruped", "full"), ("biped", "full"), ("quadruped", "contacts")])
 def test_the_one_contact_sensor_that_is_reversed_scaled_or_turned_is_named(
-    machine: str, sensors: str, mistake: str, name: str, text: str
+    recorded: tuple[str, str], mistaken: tuple[str, str, str]
 ) -> None:
+    (machine, sensors), (mistake, name, text) = recorded, mistaken
     case = case_of(MACHINES[machine], sensors)
     change = {"sign": -np.eye(3), "gain": 1.6 * np.eye(3), "turn": Rotation.from_rotvec([0.0, 0.5, 0.0]).as_matrix()}
     wrench = value(case.log.contact_wrench_local).copy()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from welded import machine
 
 from torchid.log_checks import NOTE, REJECTED, SUSPICIOUS, Checked
 from torchid.log_checks.check import check
+from torchid.log_checks.contacts import _limb_sensor_findings
 from torchid.logs import Log
 from torchid.regressor import Regressor
 from torchid.robot import load_robot
@@ -61,6 +63,16 @@ def test_an_offset_is_named_with_its_size(seen: Seen) -> None:
     assert (offset.severity, offset.field, offset.channels) == (NOTE, "ft_wrench", ("ankle_ft",))
     assert "a steady 5 N" in offset.found.replace("4.99", "5").replace("5.01", "5")
     assert "ft_force: log" in offset.advice
+
+
+def test_a_mass_beside_noise_of_accelerations_is_no_offset(tmp_path: Path) -> None:
+    robot, rng = load_robot(machine(tmp_path), fixed_base=True, ft_joints=NAMES), np.random.default_rng(1)
+    angle = 0.15 * np.sin(np.linspace(0.0, 9.0, 100))
+    hangs = 45.0 * np.stack([np.sin(angle), 0.0 * angle, -np.cos(angle)], axis=1)
+    model, measured = hangs + 1.2 * rng.normal(size=hangs.shape), 1.1 * hangs
+    assert not list(_limb_sensor_findings("thigh_ft", measured, model, robot))
+    shifted = list(_limb_sensor_findings("thigh_ft", measured + [5.0, 0.0, 5.0], hangs, robot))
+    assert [one.name for one in shifted] == ["offset"]
 
 
 def test_a_reversed_sensor_and_one_of_another_gain_are_named_whatever_their_offset(seen: Seen) -> None:

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from mistaken import MISTAKES, NAMED, SENSORS, Cell, case_of, cells, checked, judged
+from mistaken import CUTOFF, MISTAKES, NAMED, SENSORS, Cell, case_of, cells, checked, judged
 from motions import value
 from walking import MACHINES, robot_of, truth
 
 from torchid.log_checks import NOTE
-from torchid.log_checks.mistakes import exchanged_names
+from torchid.log_checks.mistakes import exchanged_names, possible_mistakes
 from torchid.log_checks.model import bind_some_samples, preprocess_pieces
 from torchid.log_checks.scales import fit_time_scale, fit_torque_gains, motion_cutoff_hz
 from torchid.log_checks.standing_feet import measure_foot_slip
@@ -55,6 +55,20 @@ def test_a_robot_unlike_its_urdf_gives_no_alarm(machine: str, sensors: str) -> N
     assert not [one for one in checked(case, case.log).findings if one.severity != NOTE]
 
 
+@pytest.mark.parametrize(("machine", "sensors"), [("quadruped", "full"), ("biped", "joints")])
+def test_what_passes_the_filter_may_be_corrected_after_it(machine: str, sensors: str) -> None:
+    log = case_of(MACHINES[machine], sensors).log.select(slice(0, 200))
+    chosen = [mistake for mistake in possible_mistakes(log) if mistake.after_filter]
+    (filtered,) = preprocess_pieces(log, CUTOFF)
+    for mistake in chosen:
+        (expected,), found = preprocess_pieces(mistake.correct(log), CUTOFF), mistake.correct(filtered)
+        assert (found.joint_names, found.contact_names) == (expected.joint_names, expected.contact_names)
+        for name, x in expected.arrays().items():
+            size = max(1.0, float(np.nanmax(np.abs(x), initial=0.0)))
+            np.testing.assert_allclose(found.arrays()[name], x, rtol=0.0, atol=1e-12 * size, err_msg=f"{mistake}")
+    assert {"joint_names", "contact_names", "joint_torque"} <= {mistake.field for mistake in chosen}
+
+
 def test_an_accelerometer_is_told_from_the_world_by_where_the_feet_are() -> None:
     case = case_of(MACHINES["quadruped"], "joints")
     for name in ("accelerometer reversed", "world downward"):
@@ -70,6 +84,13 @@ def test_factors_of_torques_and_of_time_are_recovered() -> None:
     log = value(BY_NAME["one torque x 1.3"].make(case))
     factors = value(fit_torque_gains(bind_some_samples(preprocess_pieces(log, 10.0), robot, (), 240), robot, ()))
     assert factors.gain[1] / np.median(factors.gain) == pytest.approx(1.0 / 1.3, abs=3.0 * factors.spread[1])
+
+
+def test_a_log_that_ends_elsewhere_than_it_began_moves_no_faster() -> None:
+    log, time = case_of(MACHINES["arm"], "contacts").log, np.arange(500) / 200.0
+    q = np.outer(np.sin(2.0 * np.pi * 0.9 * time), np.ones(len(log.joint_names)))
+    short = replace(log.select(np.arange(500)), time=time, joint_position=q)
+    assert value(motion_cutoff_hz(short)) < 10.0  # six times 0.9 Hz, and what a log of 2.5 s resolves
 
 
 def test_a_tool_that_the_urdf_lacks_is_not_taken_for_another_unit_of_time() -> None:

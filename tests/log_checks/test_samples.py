@@ -93,6 +93,14 @@ def test_a_torque_may_step_which_is_only_worth_a_look() -> None:
     assert not checked.rejected.any()
 
 
+def test_friction_that_reverses_at_the_end_of_a_log_is_no_step() -> None:
+    time = np.arange(120) / 100.0 - 0.004
+    noise = 0.01 * np.random.default_rng(0).normal(size=120)
+    torque = np.where(time < 0.0, 0.3, -0.3) + noise  # of a joint that turns back after its first sample
+    log = Log("short.npz", time + 0.004, ("j",), np.cos(4.0 * time)[:, None], joint_torque=torque[:, None])
+    assert not found(check(log), "step")
+
+
 @pytest.mark.parametrize("peak", [0.0, 900.0])
 @pytest.mark.parametrize("reset", [0.0, 500.0])
 def test_a_heel_strike_without_a_contact_flag_is_no_step_but_a_reset_is(peak: float, reset: float) -> None:

@@ -313,3 +313,9 @@ def test_a_map_of_another_robot_says_so_and_a_misspelt_name_the_nearest() -> Non
         require_names(columns, {"joint": ["FL_hip", "FL_thigh"]})
     with pytest.raises(UnknownNameError, match="unknown name 'FL_hpi'"):
         require_names(Columns(joint_order=["FL_hpi", "FL_thigh"]), {"joint": ["FL_hip", "FL_thigh"]})  # type: ignore[arg-type]
+
+
+def test_a_map_of_another_type_is_refused_with_the_one_to_make(tmp_path: Path) -> None:
+    columns: Any = {"time": "t"}
+    with pytest.raises(TypeError, match=r"columns: found dict; accepted: torchid.Columns\("):
+        read_log(tmp_path / "x.npz", columns=columns)

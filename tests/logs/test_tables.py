@@ -18,6 +18,7 @@ from torchid.guards import MAX_COLUMNS
 from torchid.logs import Log, read_log, write_log
 from torchid.logs import tables as table
 from torchid.logs.log import LARGEST
+from torchid.logs.table_headers import read_header
 
 Columns = dict[str, Sequence[Any]]
 SUFFIXES = (".csv", ".parquet")
@@ -166,6 +167,11 @@ def test_semicolons_tabs_and_decimal_commas_are_recognised(tmp_path: Path, separ
     assert other.names == plain.names
     for field, values in plain.arrays().items():
         np.testing.assert_array_equal(other.arrays()[field], values)
+
+
+def test_a_line_of_units_is_found_above_a_row_with_as_many_decimal_commas_as_semicolons(tmp_path: Path) -> None:
+    (tmp_path / "x.csv").write_text("Time;q_a;q_b\ns;deg;deg\n0;1,5;2,5\n1;1,6;2,6\n")
+    assert read_header(tmp_path / "x.csv").texts == ["Time [s]", "q_a [deg]", "q_b [deg]"]
 
 
 def test_two_decimal_marks_in_a_file_are_refused_by_row(tmp_path: Path) -> None:

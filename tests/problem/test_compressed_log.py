@@ -50,7 +50,7 @@ def assert_same(found: Sequence[Part], expected: Sequence[Part]) -> None:
         assert one.keys() == other.keys()
         for key, part in one.items():
             same, G = other[key], gram(other[key].factor)
-            assert (part.samples, part.factor.rows, part.gated) == (same.samples, same.factor.rows, same.gated)
+            assert (part.samples, part.factor.rows, part.masked) == (same.samples, same.factor.rows, same.masked)
             assert part.factor.independent_rows == pytest.approx(same.factor.independent_rows, rel=1e-12)
             assert (gram(part.factor) - G).abs().max() <= 1e-12 * G.abs().max()
 

@@ -136,7 +136,7 @@ def test_a_contact_and_a_limb_sensor_of_one_name_have_unknowns_of_their_own() ->
     assert len(set(labels)) == len(labels) == robot.n + 6 * len(SENSORS) + 6
 
 
-@pytest.mark.parametrize("kinds", ["asymmetric_coulomb", "stiffness", "all"])
+@pytest.mark.parametrize("kinds", ["asymmetric_coulomb", "stribeck", "stiffness", "all"])
 def test_terms_of_actuators_are_found_with_friction_that_turns_over_smoothly(kinds: str) -> None:
     every = tuple(ACTUATORS)
     terms = ExtraTerms(sign_width=WIDTH, **dict.fromkeys(every if kinds == "all" else (kinds,), True))

@@ -115,7 +115,7 @@ def test_readings_in_the_air_give_the_offset_an_equation_of_its_own() -> None:
         assert np.isnan(air[:, :, [0, 1, 3, 4, 5]]).all()
         equations = list(unloaded_offset_equations(builder, samples))
         assert [builder.extras[x.offset].label for x in equations] == [f"offset of {name} fn" for name in NAMES]
-        assert {(x.mean, x.gated) for x in equations} == {(7.0, False)}
+        assert {(x.mean, x.masked) for x in equations} == {(7.0, False)}
 
 
 @pytest.mark.parametrize(

@@ -191,7 +191,7 @@ def test_parts_of_readings_in_the_air_are_beside_those_of_samples_which_stay_as_
 def test_readings_that_something_has_set_to_0_are_no_offset_of_0() -> None:
     (part,) = of_air(written(0.0))
     contacts = {number for number, extra in enumerate(builder_of().extras) if extra.contact is not None}
-    assert part.gated == contacts
+    assert part.masked == contacts
     assert not part.factor.rows
 
 
@@ -204,10 +204,10 @@ def test_a_clamp_at_0_is_recognized_and_a_coarse_sensor_about_0_is_not_taken_for
     log, _ = swinging()
     wrench = value(log.contact_wrench_local).copy()
     noise = rng.normal(size=wrench.shape)
-    for readings, gated in ((np.maximum(noise, 0.0), True), (np.round(noise), False), (noise, False)):
+    for readings, masked in ((np.maximum(noise, 0.0), True), (np.round(noise), False), (noise, False)):
         free = ~value(log.contact_active)[..., None]
         (part,) = of_air(replace(log, contact_wrench_local=np.where(free, readings, wrench)))
-        assert bool(part.gated) == gated
+        assert bool(part.masked) == masked
 
 
 def test_a_sensor_that_is_off_in_another_way_in_the_air_is_named_with_both_numbers() -> None:

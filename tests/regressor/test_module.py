@@ -167,6 +167,14 @@ def test_one_part_of_a_motion_of_another_precision_is_refused_by_name(small: Rob
         Regressor(small)(*state)
 
 
+def test_tensors_of_another_device_are_refused_by_its_name(small: Robot) -> None:
+    q, v, a = tensors(*random_states(np.random.default_rng(23), small.n, 2))
+    with pytest.raises(TypeError, match="found devices meta, cpu; accepted: one device"):
+        Regressor(small)(q.to("meta"), v, a)
+    with pytest.raises(TypeError, match=r"q: found meta; accepted: cpu, the module's, which .to\(device\) changes"):
+        FrameJacobian(small, "c")(q.to("meta"))
+
+
 def test_jacobians_refuse_coordinates_that_are_none(small: Robot) -> None:
     q, _, _ = tensors(*random_states(np.random.default_rng(20), small.n, 3))
     for jacobian in (FrameJacobian(small, "c"), LoopJacobian(small)):

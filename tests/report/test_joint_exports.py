@@ -8,6 +8,7 @@ import torch
 from synthetic import random_states
 
 from torchid import Regressor, parameters
+from torchid.report import FittedJoints
 from torchid.report.joint_exports import isaaclab_text, joint_parameters, parameters_export
 from torchid.robot import Robot
 
@@ -18,13 +19,13 @@ def test_joints_have_the_friction_of_those_that_mimic_them(small: Robot) -> None
     phi[1:, parameters.FRICTION] = rng.uniform(0.1, 1.0, (len(phi) - 1, 2))
     q, v, a = random_states(rng, small.n, 20)
     rows = (Regressor(small)(*map(torch.tensor, (q, v, a))).numpy() @ phi.flatten())[:, small.base_rows :]
-    of_joints = zip(joint_parameters(small, phi, {}), v[:, small.base_rows :].T, strict=True)
+    of_joints = zip(joint_parameters(small, phi, FittedJoints()), v[:, small.base_rows :].T, strict=True)
     torque = [joint.coulomb * np.sign(speed) + joint.viscous * speed for joint, speed in of_joints]
     np.testing.assert_allclose(np.column_stack(torque), rows, rtol=0.0, atol=1e-14)
 
 
 def test_a_joint_that_mimics_another_is_no_actuator(small: Robot) -> None:
-    joints = joint_parameters(small, small.nominal, {"slide": 0.3})
+    joints = joint_parameters(small, small.nominal, FittedJoints({"slide": 0.3}))
     assert [joint.name for joint in joints] == ["hinge", "slide", "branch"]
     assert [joint.kind for joint in joints] == ["revolute", "prismatic", "revolute"]
     assert "follower" not in isaaclab_text(joints, "a run")

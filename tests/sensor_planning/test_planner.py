@@ -96,10 +96,10 @@ def test_a_quadruped_on_points_or_balls_needs_three_readings_per_leg_whatever_it
 def test_walking_with_a_hand_on_a_rail_is_planned_in_seconds(per: str) -> None:
     contacts = (*SOLES, HAND)
     states = states_of("110", "101", "011", "111")
-    start = time.perf_counter()
+    start = time.process_time()
     choice = candidates(g1(), contacts, per=per)
     least = cheapest_set(demands(g1(), contacts, states, choice), choice)
-    seconds = time.perf_counter() - start
+    seconds = time.process_time() - start
     assert (least.cost, least.lower_bound, least.proven) == (15.0, 15.0, True)
     assert seconds < 8.0, "0.2 s measured"
     assert sees_the_base(g1(), contacts, states, [sensor_set(g1(), contacts, least.chosen)]).all()

@@ -13,7 +13,7 @@ from synthetic import Array, load
 from torchid import parameters
 from torchid.config import FootConfig
 from torchid.robot import Robot
-from torchid.simulation.feet import find_feet
+from torchid.simulation.constraints import find_feet
 from torchid.simulation.plant import Plant
 
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])

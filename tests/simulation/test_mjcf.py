@@ -11,8 +11,7 @@ from forked import forked_simulations
 from simulated import QUADRUPED, quadruped, squat
 
 from torchid.cli import main
-from torchid.config import SimulationConfig
-from torchid.config.reading import dump
+from torchid.config import SimulationConfig, dump_config
 from torchid.config.simulation import SimulatedRobotConfig
 from torchid.errors import InputError
 from torchid.logs import read_log
@@ -53,7 +52,7 @@ def test_armatures_are_in_the_torques_and_the_nominal_robot_keeps_them(tmp_path:
     light = set_up_simulation(quadruped(MOTION)).plant
     np.testing.assert_allclose(plant.model.dof_armature[6:], 0.05)
     np.testing.assert_allclose(light.model.dof_armature[6:], 0.0)
-    (tmp_path / "sim.yaml").write_text(dump(config))
+    (tmp_path / "sim.yaml").write_text(dump_config(config))
     with forked_simulations():
         assert main(["simulate", str(tmp_path / "sim.yaml"), f"output={tmp_path / 'out'}"]) == 0
     nominal = load_robot(tmp_path / "out" / "nominal.xml")
@@ -75,7 +74,7 @@ def test_springs_are_refused(tmp_path: Path) -> None:
 
 def test_the_wrong_key_and_two_files_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = of_mjcf(tmp_path)
-    (tmp_path / "sim.yaml").write_text(dump(config))
+    (tmp_path / "sim.yaml").write_text(dump_config(config))
     for change, message in (
         ([f"robot.mjcf={QUADRUPED}"], "robot.mjcf: '"),
         ([f"robot.urdf={QUADRUPED}"], "robot.urdf: set together with robot.mjcf"),

@@ -16,10 +16,10 @@ from synthetic import ROBOTS, ROMEO, load, random_states
 
 from torchid import Regressor
 from torchid.errors import UrdfError
+from torchid.robot.constraints import weld_positions
 from torchid.robot.urdf import read_urdf
-from torchid.robot.welds import weld_positions
+from torchid.simulation.constraints import JointConstraints
 from torchid.simulation.plant import compile_model
-from torchid.simulation.ties import Ties
 
 LINKWISE_REFUSED = (
     "go1_description/urdf/go1.urdf",
@@ -41,7 +41,7 @@ def linkwise(urdf: Path) -> mujoco.MjSpec:
 
 def compiled(urdf: Path) -> mujoco.MjModel:
     """Bolted, with its mimic joints."""
-    return compile_model(urdf, (), 1000.0, floating=False, ties=Ties.of(urdf, read_urdf(urdf)[1]))
+    return compile_model(urdf, (), 1000.0, floating=False, constraints=JointConstraints.of(urdf, read_urdf(urdf)[1]))
 
 
 @pytest.mark.parametrize("urdf", [ROBOTS / name for name in LINKWISE_REFUSED], ids=lambda urdf: urdf.stem)
@@ -62,7 +62,9 @@ def test_a_link_that_moves_without_mass_is_named_with_what_helps() -> None:
         compiled(ROMEO)
     joints = read_urdf(ROMEO)[1]
     hands = weld_positions(ROMEO, joints, {"LHand": 0.0, "RHand": 0.0})
-    assert compile_model(ROMEO, (), 1000.0, floating=False, ties=Ties.of(ROMEO, joints, held=hands)).nv
+    assert compile_model(
+        ROMEO, (), 1000.0, floating=False, constraints=JointConstraints.of(ROMEO, joints, held=hands)
+    ).nv
 
 
 def test_an_inertia_that_no_body_has_is_named(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from repository import DEMO
 from scipy.spatial.transform import Rotation
 
 from torchid.errors import InputError, LogError
-from torchid.simulation.feet import point_foot
+from torchid.simulation.constraints import point_foot
 from torchid.simulation.replay import Drift, Model, ReplayedLog, replay_log
 
 RATE, SECONDS = 1000.0, 1.2
@@ -183,3 +183,15 @@ def test_what_cannot_be_replayed_is_named(tmp_path: Path) -> None:
 def test_the_joints_of_a_drift_have_their_root_mean_square() -> None:
     found = Drift(TIMES, np.array([[[3.0, 4.0, 100.0]]]), None)
     assert found.of_joints(np.array([0, 1]))[0, 0] == pytest.approx(np.sqrt(12.5))
+
+
+def test_friction_that_drops_with_speed_is_that_of_the_log(tmp_path: Path) -> None:
+    """For a joint that swings, but for what MuJoCo's soft constraint creeps where it turns."""
+    true = arm(tmp_path)
+    log = swinging(true)
+    at_rest, velocity = np.array([0.5, 0.2]), 2.0
+    dry = np.sign(log.velocity) * at_rest * np.exp(-np.square(log.velocity / velocity))
+    log = replace(log, torque=log.torque + dry)
+    with_it, without = replace(model_of(true), stribeck=at_rest, stribeck_velocity=velocity), model_of(true)
+    assert drift(with_it, log) < 2.5e-3
+    assert drift(without, log) > 3e-2

@@ -15,11 +15,10 @@ from synthetic import load
 
 from torchid import parameters
 from torchid.cli import main
-from torchid.config import FootConfig, load_simulation
-from torchid.config.reading import dump
+from torchid.config import FootConfig, dump_config, load_simulation
 from torchid.report.tables import stability_table, table_text
 from torchid.simulation import Stability
-from torchid.simulation.feet import find_feet
+from torchid.simulation.constraints import find_feet
 
 MOTIONS = (*SQUATS, *SWAYS, UNSEEN)
 ALONE = SQUATS[-1]
@@ -29,7 +28,7 @@ ALONE = SQUATS[-1]
 def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A simulation file of one motion of the short set, that has not run."""
     folder = tmp_path_factory.mktemp("alone")
-    (folder / "sim.yaml").write_text(dump(only(short(folder / "out"), ALONE)))
+    (folder / "sim.yaml").write_text(dump_config(only(short(folder / "out"), ALONE)))
     return folder / "sim.yaml"
 
 

@@ -17,8 +17,7 @@ from synthetic import Array, load
 
 from torchid import parameters
 from torchid.cli import main
-from torchid.config import MotionConfig, SensorImperfectionsConfig, SimulationConfig, load_simulation
-from torchid.config.reading import dump
+from torchid.config import MotionConfig, SensorImperfectionsConfig, SimulationConfig, dump_config, load_simulation
 from torchid.config.simulation import WaveConfig, WhiteNoiseConfig
 from torchid.estimators import LeastSquares
 from torchid.logs import Log, read_log
@@ -58,7 +57,7 @@ def walked(tmp_path_factory: pytest.TempPathFactory) -> Walked:
     config = quadruped(*motions, sensors=SensorImperfectionsConfig(noise=NOISE, contact_threshold=3.0))
     feet = [replace(foot, sensor="fn" if foot.frame in SCALAR else "wrench") for foot in config.feet]
     config = replace(config, feet=feet, output=folder / "simulation")
-    (folder / "simulation.yaml").write_text(dump(config))
+    (folder / "simulation.yaml").write_text(dump_config(config))
     with forked_simulations():
         assert main(["simulate", str(folder / "simulation.yaml")]) == 0
     return Walked(config)
@@ -141,6 +140,6 @@ def test_what_is_simulated_is_identified(walked: Walked, capsys: pytest.CaptureF
 
 def test_a_foot_has_one_of_two_sensors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = quadruped()
-    (tmp_path / "sim.yaml").write_text(dump(config).replace("sensor: wrench", "sensor: fz", 1))
+    (tmp_path / "sim.yaml").write_text(dump_config(config).replace("sensor: wrench", "sensor: fz", 1))
     message = refusal(["simulate", str(tmp_path / "sim.yaml"), f"output={tmp_path / 'out'}"], tmp_path, capsys)
     assert "feet.0.sensor: found 'fz'; accepted: 'wrench' or 'fn'" in message

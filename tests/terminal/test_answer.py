@@ -17,7 +17,7 @@ from torchid.commands.results import Identification
 from torchid.config import load_config
 from torchid.estimators import SgdEstimate
 from torchid.estimators.least_squares import COMBINED, IDENTIFIED, ConstrainedEstimate
-from torchid.parameters import INERTIAL, PER_BODY
+from torchid.parameters import FRICTION, INERTIAL, PER_BODY
 from torchid.problem import Metrics
 from torchid.problem.metrics import DECISIVE_GROUPS, LIMB_GROUPS, WHITENED, WorseThanNominal
 from torchid.terminal.identification import answer_lines
@@ -194,6 +194,14 @@ def test_the_bodies_that_changed_most_are_listed_in_the_robots_order(consistent:
             assert error == pytest.approx(errors[body, k], rel=0.1)
     assert f"and {13 - len(rows)} bodies that changed less" in "\n".join(lines)
     assert "+ known only in sums with other bodies" in lines
+
+
+def test_friction_that_no_joint_shows_has_no_columns(consistent: Identification) -> None:
+    observable = consistent.estimate.observable.reshape(-1, PER_BODY).copy()
+    observable[:, FRICTION] = False
+    unseen = replace(consistent, estimate=replace(consistent.estimate, observable=observable.ravel()))
+    for run, shown in ((consistent, True), (unseen, False)):
+        assert any("Coulomb" in line for line in answer_lines(run, 120)) == shown
 
 
 def test_names_are_never_broken_however_narrow_the_terminal(consistent: Identification) -> None:

@@ -37,7 +37,7 @@ _AT_THE_FLOOR = 1.3  # times the error that noise of the readings leaves
 
 
 @dataclass(frozen=True)
-class Judged:
+class ErrorComparison:
     """Errors of nominal and of identified parameters.
 
     Attributes:
@@ -125,19 +125,21 @@ def answer(run: Identification) -> Answer:
     )
 
 
-def _judge(run: Identification) -> Judged:
+def _judge(run: Identification) -> ErrorComparison:
     of = run.experiment.robot.format
     if "test" in run.metrics:
         names = [log_title(path) for path in run.experiment.config.logs.test]
         text = f"unseen motion ({join_names(names, 2)})"
-        return Judged(text, run.metrics["test"].nominal, run.metrics["test"].identified, of)
+        return ErrorComparison(text, run.metrics["test"].nominal, run.metrics["test"].identified, of)
     if run.validation is not None:
         text = f"blocks of the training logs, each left out of the fit ({run.validation.folds})"
-        return Judged(text, run.validation.nominal, run.validation.identified, of)
-    return Judged("the training logs themselves", run.metrics["train"].nominal, run.metrics["train"].identified, of)
+        return ErrorComparison(text, run.validation.nominal, run.validation.identified, of)
+    return ErrorComparison(
+        "the training logs themselves", run.metrics["train"].nominal, run.metrics["train"].identified, of
+    )
 
 
-def _headline(run: Identification, judged: Judged) -> str:
+def _headline(run: Identification, judged: ErrorComparison) -> str:
     if run.worse:
         return f"WORSE THAN {judged.of}: {describe_worse(run.worse, judged.of)}"
     return judged.headline(explained=run.misfit.explained)
@@ -159,7 +161,7 @@ def _bodies_text(run: Identification) -> str:
     return f"{which} cannot exist, and simulators refuse them{advice}"
 
 
-def _attention(run: Identification, judged: Judged) -> Iterator[str]:
+def _attention(run: Identification, judged: ErrorComparison) -> Iterator[str]:
     """What the user should look at, the most urgent first."""
     if run.worse:
         yield ADVICE

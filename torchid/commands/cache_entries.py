@@ -24,7 +24,7 @@ from torchid.commands.reading import fits_contact_offsets
 from torchid.config.robot import RobotConfig
 from torchid.errors import TorchidWarning
 from torchid.fitting.experiment import Experiment, Scene
-from torchid.fitting.packed_parts import PackedPart, PartPacker, PartReader
+from torchid.fitting.factor_documents import PackedPart, PartPacker, PartReader
 from torchid.logs.spill import MappedPages
 from torchid.logs.time_range import log_title
 from torchid.problem import RowBuilder, Samples, TriangularFactor
@@ -79,6 +79,7 @@ def content_of_scene(scene: Scene) -> dict[str, Any]:
         "motion_noise": config.sensors.noise.motion,
         "sign_width": config.actuators.sign_width,
         "delay": config.actuators.known_delay,
+        **({} if config.actuators.stribeck is None else {"stribeck": config.actuators.stribeck}),
         "topics": topics,
         "columns": json.dumps(columns),  # as text: the order of names in it is that of the log
     }

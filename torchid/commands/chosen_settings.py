@@ -11,7 +11,6 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 from rich.progress import Progress
-from torch import Tensor
 
 from torchid import ranks
 from torchid.commands.check import recorded_segments
@@ -23,13 +22,20 @@ from torchid.fitting.delay import DelayChoice, choose_delay
 from torchid.fitting.experiment import Experiment, S, Scene
 from torchid.fitting.fit import LogFitter
 from torchid.fitting.noise import recorded_sensors
-from torchid.fitting.separable import SignWidthChoice, TiltChoice, choose_base_tilt, choose_sign_width
+from torchid.fitting.separable import (
+    SignWidthChoice,
+    StribeckChoice,
+    TiltChoice,
+    choose_base_tilt,
+    choose_sign_width,
+    choose_stribeck,
+)
 from torchid.logs import Log
 from torchid.logs.cutoff import CutoffChoice, choose_cutoff
 from torchid.logs.log import FloatArray
-from torchid.logs.preprocess import directions, lacks_derivatives, make_timeline
+from torchid.logs.preprocess import dry_friction, lacks_derivatives, make_timeline
 from torchid.logs.sign_filter import with_sign_filter
-from torchid.problem import RowBuilder, Samples
+from torchid.problem import ExtraTerms, RowBuilder, Samples
 from torchid.problem.compressed_log import Block
 from torchid.problem.compression import Part
 from torchid.problem.log_joints import columns_in_order
@@ -52,8 +58,9 @@ class Choices:
     base_tilt: TiltChoice | None = None
     sign_width: SignWidthChoice | None = None
     delay: DelayChoice | None = None
+    stribeck: StribeckChoice | None = None
 
-    def by_name(self) -> dict[str, CutoffChoice | TiltChoice | SignWidthChoice | DelayChoice | None]:
+    def by_name(self) -> dict[str, CutoffChoice | TiltChoice | SignWidthChoice | DelayChoice | StribeckChoice | None]:
         """The same by name, in words."""
         return {name.replace("_", " "): choice for name, choice in vars(self).items()}
 
@@ -73,7 +80,7 @@ def with_chosen_settings(scene: S, bars: Progress) -> tuple[S, Choices]:
     """
     if scene.config.logs is None:
         return scene, Choices()
-    cutoff = tilt = width = delay = None
+    cutoff = tilt = width = delay = stribeck = None
     if scene.config.preprocessing.cutoff_hz == AUTO:
         cutoff = _chosen("cutoff", partial(_cutoff, scene), bars)
         settings = replace(scene.config.preprocessing, cutoff_hz=cutoff.cutoff_hz)
@@ -85,14 +92,18 @@ def with_chosen_settings(scene: S, bars: Progress) -> tuple[S, Choices]:
         scene = replace(scene, robot=robot, config=replace(scene.config, robot=stated))
     reader = WidthReader(scene)
     if scene.config.actuators.sign_width == AUTO:
-        width = _chosen("sign width", partial(choose_sign_width, partial(_logs_and_fitter, scene, reader)), bars)
-        scene = _with_sign_width(scene, width.width)
+        width = _chosen("sign width", partial(choose_sign_width, partial(_logs_of, scene, reader, "sign_width")), bars)
+        scene = _with_actuators(scene, sign_width=width.width)
     if scene.config.actuators.delay == AUTO:
         if cutoff is None and scene.config.preprocessing.cutoff_hz is None:
             warn_about_file(_UNFILTERED)
         delay = _chosen("delay of torques", partial(_delay, scene, reader), bars)
         scene = _with_actuators(scene, delay=delay.delay)
-    return scene, Choices(cutoff, tilt, width, delay)
+    if scene.config.actuators.stribeck == AUTO:
+        reader = WidthReader(scene) if scene.config.actuators.known_delay and delay else reader
+        stribeck = _chosen("Stribeck velocity", partial(_stribeck, scene, reader), bars)
+        scene = _with_actuators(scene, stribeck=stribeck.velocity)
+    return scene, Choices(cutoff, tilt, width, delay, stribeck)
 
 
 def _chosen(name: str, choose: Callable[[], Chosen], bars: Progress) -> Chosen:
@@ -114,25 +125,29 @@ def _cutoff(scene: Scene) -> CutoffChoice:
 
 
 def _base_tilt(scene: Scene) -> TiltChoice:
-    return choose_base_tilt(*_logs_and_fitter(scene, WidthReader(scene), scene.terms.sign_width))
+    return choose_base_tilt(*_logs_and_fitter(scene, WidthReader(scene)))
 
 
 def _delay(scene: Scene, reader: WidthReader) -> DelayChoice:
-    return choose_delay(*_logs_and_fitter(scene, reader, scene.terms.sign_width), scene.terms)
+    return choose_delay(*_logs_and_fitter(scene, reader), scene.terms)
 
 
-def _logs_and_fitter(scene: Scene, reader: WidthReader, width: float | None) -> tuple[Sequence[Samples], LogFitter]:
-    """The training logs, and a fitter of their rows, with a width of friction's sign."""
-    scene = _with_sign_width(scene, width)
+def _stribeck(scene: Scene, reader: WidthReader) -> StribeckChoice:
+    return choose_stribeck(partial(_logs_of, scene, reader, "stribeck"), scene.terms)
+
+
+def _logs_of(scene: Scene, reader: WidthReader, name: str, value: float | None) -> tuple[Sequence[Samples], LogFitter]:
+    """As `_logs_and_fitter`, with a value of one of the settings of actuators."""
+    return _logs_and_fitter(_with_actuators(scene, **{name: value}), reader)
+
+
+def _logs_and_fitter(scene: Scene, reader: WidthReader) -> tuple[Sequence[Samples], LogFitter]:
+    """The training logs, and a fitter of their rows."""
     sensors = scene.sensors if isinstance(scene, Experiment) else None
-    logs = reader.logs(width, sensors)
+    logs = reader.logs(scene.terms, sensors)
     if sensors is None:
         sensors = recorded_sensors(scene.robot, scene.contacts, logs, scene.noise)
     return logs, scene.fitter(scene.builder(sensors), Conditions(names=scene.robot.body_names))
-
-
-def _with_sign_width(scene: S, width: float | None) -> S:
-    return _with_actuators(scene, sign_width=width)
 
 
 def _with_actuators(scene: S, **stated: Any) -> S:
@@ -162,25 +177,28 @@ def with_ridge(
 
 @dataclass(frozen=True)
 class _Directions:
-    """What the filter makes of the sign of a log's joint velocities, by the width of the sign.
+    """What the filter makes of a log's dry friction, by the width of its sign and the Stribeck velocity.
 
     `stamps`: (K,) of the preprocessed log [s]; `order`: columns of the robot's joints.
     """
 
     stamps: FloatArray
     order: list[int]
-    by_width: Callable[[float | None], FloatArray | None]
+    by_setting: Callable[[float | None, float | None], dict[str, FloatArray]]
 
-    def of(self, samples: Samples, width: float | None) -> Tensor | None:
-        """Those of some of the samples."""
-        found = self.by_width(width)
-        if found is None:
-            return None
-        return torch.from_numpy(columns_in_order(found[np.searchsorted(self.stamps, samples.time.numpy())], self.order))
+    def applied(self, samples: Samples, terms: ExtraTerms) -> Samples:
+        """Some of the samples, with those of the terms."""
+        at = np.searchsorted(self.stamps, samples.time.numpy())
+        fields: dict[str, Any] = {"direction": None, "stribeck": None}
+        for name, found in self.by_setting(terms.sign_width, terms.stribeck).items():
+            fields[name.removeprefix("joint_")] = torch.from_numpy(columns_in_order(found[at], self.order))
+        return replace(samples, **fields)
 
 
 class WidthReader(LogReader):
-    """Reads logs that fit into memory once for all widths; others anew for each, since the filter comes after friction.
+    """Reads logs that fit into memory once for all widths and Stribeck velocities.
+
+    Others are read anew for each, since the filter comes after friction.
 
     So are logs whose base moves as the feet say: they are filtered in segments.
     """
@@ -190,15 +208,16 @@ class WidthReader(LogReader):
         self._directions: dict[str, _Directions] = {}
         self._logs: list[Samples] | None = None
 
-    def logs(self, width: float | None, required: SensorSet | None) -> list[Samples]:
-        """The training logs as `read` gives them with a width; with the same `required` at each call."""
+    def logs(self, terms: ExtraTerms, required: SensorSet | None) -> list[Samples]:
+        """The training logs as `read` gives them with the dry friction of terms; with the same `required` each time."""
         files, actuators = self.scene.config.logs, self.scene.config.actuators
         if self._logs is None or len(self._directions) < len(self._logs):
-            config = replace(self.scene.config, actuators=replace(actuators, sign_width=width))
+            own: dict[str, Any] = {"sign_width": terms.sign_width, "stribeck": terms.stribeck}
+            config = replace(self.scene.config, actuators=replace(actuators, **own))
             self.scene, self._directions = replace(self.scene, config=config), {}
             self._logs = self.read(files.train if files else [], required)
             return self._logs
-        return [replace(log, direction=self._directions[log.source].of(log, width)) for log in self._logs]
+        return [self._directions[log.source].applied(log, terms) for log in self._logs]
 
     def _preprocessed(self, clean: Log) -> Log:
         log, settings = super()._preprocessed(clean), self.scene.config.preprocessing
@@ -209,6 +228,6 @@ class WidthReader(LogReader):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", TorchidWarning)  # said where the log was read
                 filtered = timeline and with_sign_filter(timeline, clean)
-            by_width = (lambda _: None) if filtered is None else directions(clean, filtered)
-            self._directions[log.source] = _Directions(log.time, joint_order(log, self.scene.robot), by_width)
+            by_setting = dry_friction(clean, filtered) if filtered else (lambda *_: {})
+            self._directions[log.source] = _Directions(log.time, joint_order(log, self.scene.robot), by_setting)
         return log

@@ -57,7 +57,8 @@ def export(run: str | Path, form: str, output: str | Path | None = None, overwri
 def _fitted_joints(fitted: FittedRun) -> FittedJoints:
     calibration = fitted.calibrations.identified
     of_joints = (extra for extra in calibration.builder.extras if extra.what in ACTUATORS)
-    return FittedJoints.of((extra, calibration.values[("", extra.label)]) for extra in of_joints)
+    found = ((extra, calibration.values[("", extra.label)]) for extra in of_joints)
+    return FittedJoints.of(found, calibration.builder.tree.stribeck)
 
 
 def robot_text(form: str, robot: Robot, phi: Array, fitted: FittedJoints, folder: Path) -> str:
@@ -69,11 +70,15 @@ def robot_text(form: str, robot: Robot, phi: Array, fitted: FittedJoints, folder
     Warns:
         TorchidWarning: as `export`.
     """
-    joints = joint_parameters(robot, phi, fitted.armature)
+    joints = joint_parameters(robot, phi, fitted)
     if form == "isaaclab":
         return isaaclab_text(joints, f"{folder.resolve().name} of {robot.path.name}")
     if form == "json":
         return json.dumps(parameters_export(robot, phi, joints), indent=1, allow_nan=False) + "\n"
+    if at_rest := [joint.name for joint in joints if joint.stribeck]:
+        most = max(joint.stribeck for joint in joints)
+        warn(f"{form.upper()}: has no Stribeck friction, which {join_names(at_rest)} have, up to {most:.3g} N m (N): "
+             "its friction at rest is Coulomb's alone; --format isaaclab or json says it")  # fmt: skip
     if form == "mjcf":
         return _mjcf(robot, phi, fitted).decode()
     lost = [joint.name for joint in joints if joint.armature]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -33,13 +34,16 @@ from torchid.config.preprocessing import PreprocessingConfig
 from torchid.errors import ConfigError, InputError, LogError, about_file, excerpt, format_count, join_names
 from torchid.fitting.checked_settings import is_along_base
 from torchid.logs import Columns, Log, Topics, read_log
+from torchid.logs.column_entries import OF_FILE
+from torchid.logs.column_proposals import propose_field
+from torchid.logs.columns import is_column
 from torchid.logs.containers import LogKind, atomic_output, existing_log_kind
 from torchid.logs.log import VARIANTS
 from torchid.logs.name_matching import KnownRobot
 from torchid.logs.time_range import split_range
 from torchid.parameters import GRAVITY
 from torchid.proposals.column_groups import MapProposal
-from torchid.proposals.file_samples import read_bag_sample, read_sample, states_degrees, texts_in
+from torchid.proposals.file_samples import FileSample, read_bag_sample, read_sample, states_degrees, texts_in
 from torchid.proposals.maps import propose_map
 from torchid.proposals.topics import USED_TYPES, frame_of, propose_topics
 from torchid.robot import Robot, load_robot
@@ -136,6 +140,7 @@ def _of_columns(files: Sequence[Path], robot: Robot) -> tuple[list[GuessedContac
         with about_file(file):
             samples.append(read_sample(file))
             in_degrees |= set(samples[-1]) if states_degrees(file) else set()
+    samples = _named_apart(samples, [file.name for file in files])
     sample = {name: values for of_file in reversed(samples) for name, values in of_file.items()}
     contacts = guess_contacts(robot, stated_contacts(sample, robot), texts_in(sample))
     proposal = propose_map(sample, _known(robot, contacts), samples if len(files) > 1 else (), in_degrees)
@@ -144,6 +149,20 @@ def _of_columns(files: Sequence[Path], robot: Robot) -> tuple[list[GuessedContac
         proposal.notes |= notes_on_arrays(sample, len(robot.joint_names))
     _add_imu_frame(robot, fields, proposal)
     return contacts, fields, proposal
+
+
+def _named_apart(samples: Sequence[FileSample], files: Sequence[str]) -> list[FileSample]:
+    """Columns of several files, those that others have too with the name of the file before them, but for stamps."""
+    often = Counter(name for sample in samples for name in sample)
+    again = {
+        name for name, count in often.items() if count > 1 and not is_column(name) and propose_field(name) != "time"
+    }
+    if len(set(files)) < len(files):
+        return list(samples)
+    return [
+        {f"{file}{OF_FILE}{name}" if name in again else name: x for name, x in sample.items()}
+        for file, sample in zip(files, samples, strict=True)
+    ]
 
 
 def _of_bag(file: Path, robot: Robot) -> tuple[list[GuessedContact], set[str], MapProposal]:
@@ -161,7 +180,18 @@ def _known(robot: Robot, contacts: Sequence[GuessedContact]) -> KnownRobot:
     feet, weight = [contact.frame for contact in contacts], GRAVITY * float(robot.nominal[:, 0].sum())
     known = robot.joint_names, feet, robot.path.stem, weight, robot.base_link, on_base, elsewhere, limb_sensors(robot)
     moving = [body.joint.name for body in robot.bodies if body.joint is not None and body.joint.kind != "fixed"]
-    return KnownRobot(*known, [link for link in on_base if is_along_base(robot, link)], robot.sliding, moving)
+    along = [link for link in on_base if is_along_base(robot, link)]
+    return KnownRobot(*known, along, robot.sliding, moving, _limbs(robot))
+
+
+def _limbs(robot: Robot) -> list[list[str]]:
+    """Independent joints along each part of the tree without branches."""
+    children, limb_of = Counter(body.parent for body in robot.bodies), dict[int, list[str]]()
+    for number, body in enumerate(robot.bodies):
+        own = limb_of.get(body.parent) if body.parent and children[body.parent] == 1 else None
+        limb_of[number] = [] if own is None else own
+        limb_of[number] += [body.joint.name] if body.joint and body.joint.name in robot.joint_names else []
+    return list({id(limb): limb for limb in limb_of.values() if limb}.values())
 
 
 def _add_imu_frame(robot: Robot, fields: set[str], proposal: MapProposal) -> None:

@@ -94,7 +94,7 @@ class LargeLog:
         required: sensors whose every value must be there, None if gaps are allowed.
         folder: where there is room for the samples; None: in memory.
         motion_noise: of the recorded motion, as far as it is stated, as `preprocess` takes it.
-        sign_width: as `preprocess` takes it.
+        sign_width, stribeck: as `preprocess` takes them.
         columns: as of `read_log`.
         loaded: the robot with what it carried in the log, if it carried something.
     """
@@ -107,6 +107,7 @@ class LargeLog:
     folder: Path | None
     motion_noise: Mapping[str, float] = field(default_factory=dict)
     sign_width: float | None = None
+    stribeck: float | None = None
     columns: Columns | None = None
     loaded: Robot | None = None
 
@@ -197,7 +198,7 @@ class LargeLog:
         longest = max(chosen, key=lambda segment: segment.stop - segment.start)
         start = blocks if standing is None else blocks.part(longest)
         first = start.read(slice(0, min(len(start), MOST_SAMPLES)))
-        rates = settings.filter_hz, settings.sample_rate_hz, self.sign_width
+        rates = settings.filter_hz, settings.sample_rate_hz, self.sign_width, self.stribeck
         whole = make_timeline(blocks.time, lacks_derivatives(first), *rates)
         whole = whole and with_sign_filter(whole, first)
         coverage = {} if whole is None else self._coverage(blocks, first, whole)
@@ -221,7 +222,8 @@ class LargeLog:
         usable = long_segments(blocks.time, standing.segments, whole)
         for segment in usable:
             part = blocks.part(segment)
-            timeline = make_timeline(part.time, True, settings.filter_hz, settings.sample_rate_hz, self.sign_width)
+            rates = settings.filter_hz, settings.sample_rate_hz, self.sign_width, self.stribeck
+            timeline = make_timeline(part.time, True, *rates)
             if timeline is not None:
                 timeline = replace(timeline, sign_low_pass=whole.sign_low_pass)
             out.append(Segment(part, timeline, first, None if air is None else air[segment]))

@@ -145,10 +145,11 @@ class LogReader:
     def _preprocessed(self, clean: Log) -> Log:
         """A log as recorded, filtered, differentiated and resampled."""
         settings = self.scene.config.preprocessing
-        rates, sign_width = (settings.filter_hz, settings.sample_rate_hz), self.scene.terms.sign_width
+        rates, terms = (settings.filter_hz, settings.sample_rate_hz), self.scene.terms
+        dry = terms.sign_width, terms.stribeck
         if settings.base_motion is None:
-            return preprocess(clean, *rates, self._stated, sign_width)
-        return preprocess_standing(clean, self.scene.robot, self.scene.contacts, *rates, sign_width)
+            return preprocess(clean, *rates, self._stated, *dry)
+        return preprocess_standing(clean, self.scene.robot, self.scene.contacts, *rates, *dry)
 
     def _slipping(self, log: Log, samples: Samples, recorded: Log) -> FloatArray | None:
         """Stamps of samples in which a contact slips; None where all are kept.
@@ -205,6 +206,7 @@ class LogReader:
             folder,
             motion_noise=self._stated,
             sign_width=scene.terms.sign_width,
+            stribeck=scene.terms.stribeck,
             columns=None if scene.config.logs is None else scene.config.logs.columns,
             loaded=scene_of_log(scene, path).robot,
         )

@@ -32,15 +32,14 @@ from torchid.report.figures import drift_figure
 from torchid.report.tables import progress_bars
 from torchid.reprs import short_repr
 from torchid.robot import Robot
+from torchid.robot.constraints import matching_joints
 from torchid.robot.urdf import read_urdf
-from torchid.robot.welds import matching_joints
 from torchid.sensing import Contact
-from torchid.simulation.feet import Foot, find_feet, point_foot
+from torchid.simulation.constraints import Foot, JointConstraints, find_feet, point_foot
 from torchid.simulation.replay import Drift, Model, ReplayedLog, replay_log
-from torchid.simulation.ties import Ties
 
+_ByJoint = Mapping[str, Mapping[str, float]]
 _TIMES = 25  # at which the drift is compared, within a window
-_UNITS = {"revolute": "rad", "prismatic": "m"}
 SAMPLES = 10
 """Robots that are drawn from what the logs leave open, where nobody says how many."""
 _MOST_SAMPLES = 1000
@@ -189,7 +188,7 @@ def replay(
         windows=windows,
         drift=drift,
         joint_names=robot.joint_names,
-        units=tuple(_UNITS[kind] for kind in _joint_kinds(robot)),
+        units=tuple("m" if name in robot.sliding else "rad" for name in robot.joint_names),
         of=robot.format,
         gains=gains,
         sampled=sampled,
@@ -218,7 +217,7 @@ def _drifts(
     feet = _feet(fitted.experiment.contacts, robot.path) if not robot.fixed_base else ()
     rest = feet, windows, window * np.arange(1, _TIMES + 1) / _TIMES, lambda n: bars.advance(bar, n), gains
     drift = Comparison(*(replay_log(model, of, *rest) for model, of in zip(models, logs, strict=True)))
-    return len(windows), drift, tuple(replay_log(model, logs.identified, *rest) for model in _drawn(robot, run, count))
+    return len(windows), drift, tuple(replay_log(model, logs.identified, *rest) for model in _drawn(fitted, run, count))
 
 
 def _replayed_pairs(
@@ -231,14 +230,16 @@ def _replayed_pairs(
     for extra in calibration.builder.extras:
         if extra.what in joints:
             joints[extra.what][extra.name] = calibration.values[("", extra.label)]
-    identified = _model(folder / identified_name(robot), robot, joints, calibration.phi.reshape(robot.nominal.shape))
+    own = joints, calibration.phi.reshape(robot.nominal.shape), calibration.builder.tree.stribeck
+    identified = _model(folder / identified_name(robot), robot, *own)
     return logs, Comparison(_model(robot.path, robot, {}, None), identified)
 
 
-def _drawn(robot: Robot, run: Path, count: int) -> Iterator[Model]:
+def _drawn(fitted: FittedRun, run: Path, count: int) -> Iterator[Model]:
     """Robots drawn from the posterior of a run, always the same ones."""
     if not count:
         return
+    robot, stribeck = fitted.experiment.robot, fitted.experiment.terms.stribeck
     posterior = read_posterior(run)
     sampler = PosteriorSampler(posterior, posterior.prior_error(PRIOR_ERROR))
     samples = sampler.sample(count, torch.Generator().manual_seed(0))
@@ -250,7 +251,7 @@ def _drawn(robot: Robot, run: Path, count: int) -> Iterator[Model]:
             file = Path(folder) / identified_name(robot)
             in_file = FittedJoints(joints["armature"], joints["stiffness"], joints["torque_offset"])
             file.write_bytes(identified_robot(robot, phi, in_file))
-            yield _model(file, robot, joints, phi)
+            yield _model(file, robot, joints, phi, stribeck)
 
 
 _GAIN = "a number of at least 0, or numbers by joint or pattern: 20 '*_calf=30'"
@@ -315,13 +316,7 @@ def _quartiles(drift: Array) -> Array:
         return np.asarray(np.quantile(np.nan_to_num(drift, nan=np.inf), (0.25, 0.5, 0.75), axis=0, method="nearest"))
 
 
-def _joint_kinds(robot: Robot) -> list[str]:
-    """Of the independent joints: revolute or prismatic."""
-    moving = {body.joint.name: body.joint.kind for body in robot.bodies if body.joint is not None}
-    return [moving[name] for name in robot.joint_names]
-
-
-def _model(urdf: Path, robot: Robot, fitted: Mapping[str, Mapping[str, float]], phi: Array | None) -> Model:
+def _model(urdf: Path, robot: Robot, fitted: _ByJoint, phi: Array | None, stribeck: float | None = None) -> Model:
     """The robot of a file with armatures, springs and offsets of torque by joint, and those of the file elsewhere.
 
     Coulomb friction that differs by direction is symmetric friction and an offset, as far as the joint moves.
@@ -331,6 +326,7 @@ def _model(urdf: Path, robot: Robot, fitted: Mapping[str, Mapping[str, float]], 
         robot: of it.
         fitted: values of `ACTUATORS`, by joint.
         phi: (L, 12), identified parameters; None for the robot's file itself.
+        stribeck: velocity of Stribeck friction [rad/s or m/s], None without.
     """
     values = {what: np.zeros(robot.n) for what in ACTUATORS}
     values |= {"armature": robot.armature.copy(), "stiffness": robot.stiffness.copy()}
@@ -338,10 +334,11 @@ def _model(urdf: Path, robot: Robot, fitted: Mapping[str, Mapping[str, float]], 
         for name, value in by_joint.items():
             values[what][robot.joint_names.index(name)] = value
     offset = values["torque_offset"] + values["asymmetric_coulomb"] + robot.spring_torque
-    ties = Ties.of(urdf, read_urdf(urdf)[1], robot.loops, robot.welded)
+    constraints = JointConstraints.of(urdf, read_urdf(urdf)[1], robot.loops, robot.welded)
     if phi is not None and robot.welded:
-        ties = replace(ties, inertials=_inertials_beyond_welds(robot, phi))
-    return Model(urdf, robot.joint_names, values["armature"], offset, values["stiffness"], ties)
+        constraints = replace(constraints, inertials=_inertials_beyond_welds(robot, phi))
+    at_rest = values["stribeck"], stribeck or np.inf
+    return Model(urdf, robot.joint_names, values["armature"], offset, values["stiffness"], constraints, *at_rest)
 
 
 def _inertials_beyond_welds(robot: Robot, phi: Array) -> dict[str, Array]:

@@ -12,11 +12,10 @@ import numpy as np
 import yaml
 
 from torchid.commands.chosen_settings import Choices
-from torchid.commands.events import write_events
 from torchid.commands.folder import RUN, check_free, check_free_file, new_folder, write_json
 from torchid.commands.named_results import BodyEstimate, ParameterTable, body_estimate, parameter_table, run_lines
 from torchid.commands.report import DATA, report_document, write_page
-from torchid.commands.run_figures import Drawing, all_figures, drawing, write_figures
+from torchid.commands.run_figures import Drawing, all_figures, drawing, write_events, write_figures
 from torchid.commands.training import Training, body_eigenvalues
 from torchid.config import dump_config, inputs_of
 from torchid.errors import during

@@ -21,6 +21,7 @@ from torchid.fitting.posterior import FittedPosterior, ParameterSamples, Posteri
 from torchid.logs.containers import save_arrays
 from torchid.report import FittedJoints
 from torchid.report.parameter_files import ranges_document, sample_arrays
+from torchid.report.robot_files import IN_FILES
 from torchid.reprs import short_repr
 from torchid.staging import atomic_file
 
@@ -154,12 +155,13 @@ def _write(drawn: DrawnSamples, form: str, run: Path, out: Path, overwrite: bool
 def _robots(samples: ParameterSamples, form: str, run: Path) -> Iterable[tuple[str, str]]:
     """Names and texts of files of robots; what a format cannot say is warned of once."""
     robot = read_run(run).experiment.robot
-    drawn = {what: samples.of_joints(what) for what in ("armature", "stiffness", "torque_offset")}
+    drawn = {what: samples.of_joints(what) for what in IN_FILES}
     digits, suffix = len(str(len(samples) - 1)), {"urdf": ".urdf", "mjcf": ".xml"}[form]
     for number, phi in enumerate(samples.phi.cpu().numpy()):
         joints = {what: {name: float(x[number]) for name, x in of.items()} for what, of in drawn.items()}
+        fitted = FittedJoints(**joints)  # type: ignore[arg-type]
         with warnings.catch_warnings():
             if number:
                 warnings.simplefilter("ignore", TorchidWarning)
-            text = robot_text(form, robot, phi, FittedJoints(**joints), run)
+            text = robot_text(form, robot, phi, fitted, run)
         yield f"{robot.path.stem}_{number:0{digits}d}{suffix}", text

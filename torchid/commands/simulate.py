@@ -16,8 +16,7 @@ import numpy as np
 
 from torchid import parameters
 from torchid.commands.folder import SIMULATION, check_free, new_folder, write_json
-from torchid.config import MotionConfig, NominalConfig, SimulationConfig
-from torchid.config.reading import dump
+from torchid.config import MotionConfig, NominalConfig, SimulationConfig, dump_config
 from torchid.errors import about_file, current_file
 from torchid.logs import write_log
 from torchid.parameters import Array
@@ -25,7 +24,7 @@ from torchid.report import FittedJoints, identified_robot
 from torchid.report.tables import progress_bars
 from torchid.robot import Robot, load_robot
 from torchid.simulation import LEAD_S, Stability, sensor_log, set_up_simulation
-from torchid.simulation.feet import find_feet
+from torchid.simulation.constraints import find_feet
 
 _POLL_S = 0.2
 START = "spawn"
@@ -55,7 +54,7 @@ def simulate(config: SimulationConfig) -> dict[str, Stability]:
         (folder / "exact").mkdir()
         bar = bars.add_task("simulating [s]", total=sum(LEAD_S + motion.duration_s for motion in config.motions))
         stabilities = _in_processes(config, folder, lambda seconds: bars.update(bar, completed=seconds))
-        (folder / "simulation.yaml").write_text(dump(config))
+        (folder / "simulation.yaml").write_text(dump_config(config))
         write_json(folder / "stability.json", {name: asdict(stability) for name, stability in stabilities.items()})
         nominal = identified_robot(robot, perturbed_parameters(robot, config.nominal), FittedJoints())
         (folder / nominal_name(config)).write_bytes(nominal)

@@ -3,11 +3,11 @@
 from torchid.config.experiment import (
     AnalyzeConfig,
     ExperimentConfig,
-    dump_config,
     inputs_of,
     load_analysis,
     load_config,
 )
+from torchid.config.reading import dump_config
 from torchid.config.simulation import (
     BoundsConfig,
     FootConfig,

@@ -15,7 +15,7 @@ from torchid.config.estimator import MASS_ACCEPTED, ROBUST_ACCEPTED, EstimatorCo
 from torchid.config.logs import SETS, LogsConfig, entries_spelled_out, resolve_logs
 from torchid.config.maps import MAPS_ACCEPTED
 from torchid.config.preprocessing import PreprocessingConfig
-from torchid.config.reading import FileKind, Settings, dump, load, plain_sections
+from torchid.config.reading import FileKind, Settings, load, plain_sections
 from torchid.config.robot import LOOPS_ACCEPTED, MJCF_SUFFIXES, WELDS_ACCEPTED, RobotConfig, require_one_file
 from torchid.config.sensors import (
     CHOICE_ACCEPTED,
@@ -86,12 +86,15 @@ class ActuatorsConfig:
     `armature`: reflected rotor inertia; `torque_offset`; `asymmetric_coulomb`: Coulomb friction that differs by
     direction; `stiffness` of springs, or of cables that act as such; `sign_width` [rad/s or m/s]: Coulomb friction goes
     with tanh(velocity / width) instead of the sign; auto, with the width that leaves least of the training logs.
+    `stribeck` [rad/s or m/s]: friction at rest beyond Coulomb friction, which drops with exp(-(velocity / stribeck)^2);
+    auto, with the velocity that leaves least, or without such friction where the logs do not determine it.
     `delay` [s]: joint torques act so much later than recorded or commanded; auto, the delay that leaves least.
     """
 
     armature: bool = False
     torque_offset: bool = False
     asymmetric_coulomb: bool = False
+    stribeck: PositiveOrAuto = None
     stiffness: bool = False
     sign_width: PositiveOrAuto = None
     delay: NumberOrAuto = None
@@ -261,11 +264,6 @@ def inputs_of(config: ExperimentConfig | AnalyzeConfig) -> list[Path]:
     return [config.robot.path, *(logs.files if logs else [])]
 
 
-def dump_config(config: ExperimentConfig | AnalyzeConfig) -> str:
-    """The resolved configuration as YAML; `load_config` reads it back."""
-    return dump(config)
-
-
 def _check_threshold(settings: PreprocessingConfig) -> None:
     """Refuse two sources of contact flags, and a threshold below that is above."""
     threshold, key = settings.contact_threshold, "preprocessing.contact_threshold"
@@ -285,6 +283,9 @@ def _check_extras(config: _Common) -> None:
     if actuators.torque_offset and "joint_torque" in sensors.offsets:
         found = "set together with sensors.offsets.joint_torque, which is the same"
         raise ConfigError.at_field("actuators.torque_offset", found, "one of the two")
+    if actuators.stribeck is not None and not config.estimator.friction:
+        found = "set, but estimator.friction: false leaves the Coulomb friction that it drops to at the URDF's"
+        raise ConfigError.at_field("actuators.stribeck", found, "estimator.friction: true, or no such key")
     if config.robot.base_tilt is not None and config.preprocessing.base_motion is not None:
         found = "set together with preprocessing.base_motion, which finds how the base itself is turned"
         raise ConfigError.at_field("robot.base_tilt", found, "one of the two")
@@ -293,6 +294,7 @@ def _check_extras(config: _Common) -> None:
         found = "set together with preprocessing.zero_in_air, which subtracts the same"
         raise ConfigError.at_field(f"sensors.offsets.{twice[0]}", found, "one of the two")
     unknowns = {f"actuators.{name}": x is True for name, x in vars(actuators).items()}
+    unknowns["actuators.stribeck"] = actuators.stribeck is not None
     unknowns |= {f"sensors.{name}": bool(getattr(sensors, name)) for name in ("offsets", "scales")}
     for field, is_set in unknowns.items():
         if is_set and config.estimator.name == "sgd":
@@ -334,6 +336,7 @@ def _check_factors(config: _Common, logs: LogsConfig) -> None:
             "what compress printed",
         ),
         ("actuators.sign_width", "auto", config.actuators.sign_width == "auto", "the width that compress printed"),
+        ("actuators.stribeck", "auto", config.actuators.stribeck == "auto", "the velocity that compress printed"),
         ("actuators.delay", "auto", config.actuators.delay == "auto", "the delay that compress printed"),
         ("robot.base_tilt", "auto", config.robot.base_tilt == "auto", "the tilt that compress printed"),
         (

@@ -134,7 +134,7 @@ def _merged(kind: FileKind[T], settings: Settings, given: Settings) -> Settings:
     return out
 
 
-def dump(settings: object) -> str:
+def dump_config(settings: object) -> str:
     """The resolved settings, a dataclass of any kind, as YAML; `load` reads it back."""
     return yaml.safe_dump(TypeAdapter(type(settings)).dump_python(settings, mode="json"), sort_keys=False)
 

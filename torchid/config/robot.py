@@ -11,7 +11,7 @@ from pydantic.dataclasses import dataclass
 
 from torchid.config.sensors import as_list
 from torchid.errors import ConfigError
-from torchid.robot.loops import MAX_ANGLE, MAX_GAP, Loop
+from torchid.robot.constraints import MAX_ANGLE, MAX_GAP, Loop
 from torchid.robot.xml_files import is_mjcf
 from torchid.settings import AUTO, STRICT, Number, Positive
 
@@ -111,8 +111,8 @@ def require_kind(robot: RobotFile) -> None:
 
 
 @dataclass(config=STRICT, frozen=True)
-class TiedRobot(RobotFile):
-    """A robot's file, and what its joints are tied by or lack that the file may not say.
+class ConstrainedRobot(RobotFile):
+    """A robot's file, and constraints and missing motors of its joints that the file may not state.
 
     `weld`: names or patterns of joints that are held still, at 0 or at the position [rad or m] that a mapping gives.
     `loops`: closed loops beside those of an MJCF file. `passive`: names or patterns of joints without a motor, whose
@@ -125,7 +125,7 @@ class TiedRobot(RobotFile):
 
 
 @dataclass(config=STRICT, frozen=True)
-class RobotConfig(TiedRobot):
+class RobotConfig(ConstrainedRobot):
     """The robot, `urdf` or `mjcf`; `base_link` defaults to the URDF's root.
 
     `mjcf`: a MuJoCo model, read by MuJoCo (the extra [sim]); its tree of most degrees of freedom is the robot.

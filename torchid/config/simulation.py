@@ -11,7 +11,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from torchid.config.reading import FileKind, load
-from torchid.config.robot import TiedRobot, require_one_file
+from torchid.config.robot import ConstrainedRobot, require_one_file
 from torchid.config.sensors import FileName
 from torchid.errors import ConfigError, about_file
 from torchid.settings import STRICT, BelowOne, NotNegative, Number, Positive, Seed
@@ -20,7 +20,7 @@ Point = Annotated[list[Number], Field(min_length=3, max_length=3)]
 
 
 @dataclass(config=STRICT, frozen=True)
-class SimulatedRobotConfig(TiedRobot):
+class SimulatedRobotConfig(ConstrainedRobot):
     """The true robot, `urdf` or `mjcf`: its base is the URDF's root, or the body with the free joint."""
 
 

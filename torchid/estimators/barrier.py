@@ -1,25 +1,205 @@
-"""The primal-dual barrier method for the conic problem, its Newton steps batched over bodies in torch."""
+"""The interior-point method for the conic problem, phases I and II, its Newton steps batched over bodies in torch."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy.optimize import brentq
 from torch import Tensor
 
-from torchid.errors import NumericalWarning, warn
-from torchid.estimators.conic_problem import ConicProblem, Solution
-from torchid.estimators.strict_feasibility import ConicTensors, damped_inverse, find_strictly_feasible
+from torchid.errors import InputError, NumericalWarning, warn
+from torchid.estimators.conic_problem import EQUAL_WITHIN, ConicProblem, Solution
+from torchid.parameters import Array
 from torchid.problem.chunks import one_thread
 
-_STEPS = 200
+_SHRINK = 0.02  # of the barrier's weight from stage to stage
+_STAGE_CENTRED = 0.25  # squared Newton decrement at which a full step ends a stage
+_STEPS, _STAGES = 200, 40
+_GOOD_SLACK = 1e-6  # of a starting point, at which phase I stops
+_LEAST_SLACK = 1e-9  # of a starting point that is accepted if phase I finds no better one
+_MOST_SLACK = 0.01  # bound of the slack in phase I
+_ROOM, _MOVES = 0.1, 3  # at rows of a starting point, and moves to get there
+_SHORTEST = 1e-6  # least share of a step: below, rounding decides about feasibility
+
+
+@one_thread()
+def find_strictly_feasible(problem: ConicProblem, patience: int = _STEPS * _STAGES) -> tuple[Array, int]:
+    """A strictly feasible x, (n,), near 0 where possible, and the Newton steps it took to find (phase I).
+
+    Args:
+        problem: with the conditions to meet.
+        patience: largest number of Newton steps.
+
+    Raises:
+        InputError: there is none; names the condition that is violated most.
+    """
+    x = problem.E.T @ problem.e if problem.start is None else problem.start
+    worst = float(problem.slack(x).min(initial=np.inf))
+    if worst > _GOOD_SLACK:
+        return x, 0
+    inside = _with_room(problem, x)
+    if problem.slack(inside).min() > _GOOD_SLACK:
+        return inside, 0
+    z, kappa, steps = np.append(x, 1.0 - worst), 1.0, 0
+    while kappa * (problem.degree + 1) > 0.1 * _LEAST_SLACK and steps < patience:
+        z, taken = _CentralPath(_phase_one(problem, kappa)).centre(z, kappa, patience - steps)
+        steps += taken
+        if problem.slack(z[:-1]).min() > _GOOD_SLACK:
+            return z[:-1], steps
+        kappa *= _SHRINK
+    slack = problem.slack(z[:-1])
+    if slack.min() > _LEAST_SLACK:
+        return z[:-1], steps
+    which = int(slack.argmin())
+    name = problem.names[which // 4 if which < 4 * len(problem.F0) else which - 3 * len(problem.F0)]
+    raise InputError("estimator", name, "excluded by the other conditions", "conditions that some robot can meet")
+
+
+def _with_room(problem: ConicProblem, x: Array) -> Array:
+    """Near x, a point that is well inside the linear conditions: nominal friction of 0 stands on the border of its own.
+
+    Each move, of least length, makes room at the rows that lack it, and may take some from others.
+    """
+    for _ in range(_MOVES):
+        slack = problem.G @ x - problem.h
+        tight = slack < _ROOM
+        if not tight.any():
+            break
+        rows = problem.G[tight] @ problem.null_space
+        x = x + problem.null_space @ np.linalg.lstsq(rows, _ROOM - slack[tight], rcond=EQUAL_WITHIN)[0]
+    return x
+
+
+def _phase_one(problem: ConicProblem, kappa: float) -> ConicProblem:
+    """Min s, with s added to every eigenvalue and slack: a point with negative s is strictly feasible.
+
+    Boyd, Vandenberghe, section 11.4, with two additions. A quadratic that fades with the barrier bounds directions
+    without a minimum. A lower bound on s saves steps: 122 instead of 211 for the worst of 600 random problems.
+    """
+    n, blocks, rows = len(problem.linear), len(problem.F0), len(problem.h)
+    return replace(
+        problem,
+        start=None,
+        root=np.sqrt(0.5 * kappa) * np.hstack([problem.deviations, np.zeros((n, 1))]),
+        target=np.zeros(n),
+        linear=np.eye(n + 1)[n],
+        F=np.concatenate([problem.F, np.broadcast_to(np.eye(4), (blocks, 1, 4, 4))], axis=1),
+        variables=np.concatenate([problem.variables, np.full((blocks, 1), n)], axis=1),
+        weights=np.zeros(blocks),
+        G=np.vstack([np.hstack([problem.G, np.ones((rows, 1))]), np.eye(n + 1)[n:]]),
+        h=np.append(problem.h, -_MOST_SLACK),
+        E=np.hstack([problem.E, np.zeros((len(problem.e), 1))]),
+    )
+
+
+class ConicTensors:
+    """A conic problem with its arrays as tensors, for Newton steps in torch."""
+
+    def __init__(self, problem: ConicProblem) -> None:
+        """They share memory with the arrays."""
+        self.problem = problem
+        self.F0, self.F = torch.from_numpy(problem.F0), torch.from_numpy(problem.F)
+        self.variables = torch.from_numpy(problem.variables)
+        self.G, self.h = torch.from_numpy(problem.G), torch.from_numpy(problem.h)
+        self.H = torch.from_numpy(problem.hessian)
+
+    def factors(self, x: Tensor) -> tuple[Tensor, Tensor] | None:
+        """Cholesky factors (K, 4, 4) of the blocks and slacks (M,) of the rows at x, (n,); None if it is infeasible."""
+        root, failed = torch.linalg.cholesky_ex(self.F0 + (x[self.variables, None, None] * self.F).sum(1))
+        slack = self.G @ x - self.h
+        return None if failed.any() or not (slack > 0.0).all() else (root, slack)
+
+    def feasible_factors(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """The same of a point that is strictly feasible; LinAlgError where rounding says that it is not."""
+        factors = self.factors(x)
+        if factors is None:
+            raise np.linalg.LinAlgError("by rounding, the starting point is not strictly feasible")
+        return factors
+
+
+class _CentralPath(ConicTensors):
+    """The central path of a problem."""
+
+    def __init__(self, problem: ConicProblem) -> None:
+        super().__init__(problem)
+        self.null_space = torch.from_numpy(problem.null_space)
+
+    def centre(self, start: Array, kappa: float, patience: int) -> tuple[Array, int]:
+        """The path at barrier weight `kappa` from a strictly feasible `start`, (n,): its point, and the steps."""
+        x, N = torch.from_numpy(start), self.null_space
+        factors = self.feasible_factors(x)
+        most = min(_STEPS, patience)
+        for steps in range(1, most + 1):
+            root, slack = factors
+            quadratic_gradient = torch.from_numpy(self.problem.gradient(x.numpy()))
+            half_whitened = torch.linalg.solve_triangular(root[:, None], self.F, upper=False)
+            whitened = torch.linalg.solve_triangular(
+                root[:, None], half_whitened.mT, upper=False
+            )  # (K, V, 4, 4), C^-1 F C^-T
+            gradient, hessian = self._derivatives(quadratic_gradient, whitened, slack, kappa)
+            move = -(N @ damped_inverse(N.T @ hessian @ N)(N.T @ gradient))
+            decrement = float(-gradient @ move) / kappa
+            if decrement <= _STAGE_CENTRED or steps == most:
+                break
+            change = (move[self.variables, None, None] * whitened).sum(1)  # of the blocks, relative
+            rates = torch.cat([torch.linalg.eigvalsh(change).ravel(), self.G @ move / slack]).numpy()
+            length = _step_length(float(quadratic_gradient @ move), float(move @ self.H @ move), rates, kappa)
+            while (after := self.factors(x + length * move)) is None and length > _SHORTEST:
+                length *= 0.5  # infeasible by rounding alone
+            if after is None:
+                break
+            x, factors = x + length * move, after
+        if decrement <= _STAGE_CENTRED and self.factors(x + move) is not None:
+            x = x + move
+        return x.numpy(), steps
+
+    def _derivatives(
+        self, quadratic_gradient: Tensor, whitened: Tensor, slack: Tensor, kappa: float
+    ) -> tuple[Tensor, Tensor]:
+        """Gradient (n,) and Hessian (n, n) of the quadratic and the barrier."""
+        flat = whitened.flatten(2)  # (K, V, 16)
+        gradient = quadratic_gradient - kappa * (self.G.T @ (1.0 / slack))
+        gradient.index_put_((self.variables,), -kappa * flat[..., ::5].sum(-1), accumulate=True)
+        scaled = self.G / slack[:, None]
+        hessian = self.H + kappa * scaled.T @ scaled
+        rows, columns = self.variables[:, :, None], self.variables[:, None, :]
+        curvature = kappa * (flat @ flat.mT)
+        hessian.index_put_((rows.expand_as(curvature), columns.expand_as(curvature)), curvature, accumulate=True)
+        return gradient, hessian
+
+
+def _step_length(slope: float, curvature: float, rates: Array, kappa: float) -> float:
+    """Exact line search on a quadratic, slope and curvature, minus `kappa` times the sum of log(1 + length `rates`).
+
+    It finds the root of the derivative: differences of the objective are lost in rounding near the end of the path.
+    """
+
+    def slope_at(length: float) -> float:
+        return slope + length * curvature - kappa * float((rates / (1.0 + length * rates)).sum())
+
+    longest = min(10.0, 0.99 / max(-float(rates.min(initial=0.0)), 1e-9))
+    return longest if slope_at(longest) <= 0.0 else float(brentq(slope_at, 0.0, longest, xtol=1e-3 * longest))
+
+
+def damped_inverse(A: Tensor) -> Callable[[Tensor], Tensor]:
+    """B -> A^-1 b for A positive semidefinite, (n, n), with the least damping that works (Levenberg)."""
+    scale = A.diagonal().abs().clamp_min(torch.finfo(A.dtype).tiny).rsqrt()
+    scaled = scale[:, None] * A * scale
+    damping = 0.0
+    while True:
+        root, failed = torch.linalg.cholesky_ex(scaled + damping * torch.eye(len(A), dtype=A.dtype))
+        if not failed:
+            return lambda b: scale * torch.cholesky_solve((scale * b)[:, None], root)[:, 0]
+        damping = max(1e-15, 10.0 * damping)
+
+
 _LOOSE = 1e-6  # relative gap above which there is a warning
 _PATIENCE = 2  # steps in a row without a smaller gap: rounding makes small gaps uneven
 _SHARE = 0.98  # of the longest step that stays inside
 _SHORT = 0.2  # length of a corrected step below which a plain one is taken
-_SHORTEST = 1e-6  # least share of a step: below, rounding decides about feasibility
 _ACCURATE, _CENTRED = 1e-9, 0.5  # complementarity, relative to the objective, from which on the gap itself is computed
 
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
+from torchid.estimators.barrier import find_strictly_feasible
 from torchid.estimators.conic_problem import ConicProblem
-from torchid.estimators.strict_feasibility import find_strictly_feasible
 from torchid.parameters import Array
 from torchid.problem.chunks import one_thread
 

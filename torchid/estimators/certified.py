@@ -10,8 +10,8 @@ import numpy as np
 from scipy import sparse
 
 from torchid.errors import InputError, NumericalWarning, warn
+from torchid.estimators.barrier import find_strictly_feasible
 from torchid.estimators.conic_problem import ConicProblem, Solution
-from torchid.estimators.strict_feasibility import find_strictly_feasible
 from torchid.parameters import Array
 from torchid.problem.chunks import one_thread
 

@@ -95,7 +95,9 @@ class Consistent(Regularized):
         Raises:
             InputError: the conditions exclude each other, or a prior other than the Euclidean one has nominal bodies
                 that are not physically consistent.
+            ValueError: columns that are not twelve for each body.
         """
+        problem.require_bodies()
         plain, found = self.least_squares.solve(problem), self._minimum(problem, self.certify)
         phi, psi = found.minimizer
         return ConsistentEstimate(

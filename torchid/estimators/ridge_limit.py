@@ -8,12 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from torchid.errors import InputError, NumericalWarning, warn
-from torchid.estimators.barrier import solve_barrier
+from torchid.estimators.barrier import find_strictly_feasible, solve_barrier
 from torchid.estimators.conditions import Conditions
 from torchid.estimators.conic_formulation import Prior, build_conic_problem
 from torchid.estimators.conic_problem import SEARCH_RADIUS, ConicProblem, Solution
 from torchid.estimators.least_squares import residual_std
-from torchid.estimators.strict_feasibility import find_strictly_feasible
 from torchid.parameters import Array
 from torchid.problem import LinearProblem
 from torchid.problem.chunks import one_thread

@@ -184,7 +184,7 @@ def calibration_at(
     return Calibration(robot=robot, builder=builder, phi=minimizer.phi, values=values, loss=loss)
 
 
-_NAMED = 6  # sensors or bodies that a warning names
+_NAMED, _NAMED_IN_SHORT = 6, 2  # sensors or bodies that a warning names, and the answer of a run
 
 
 def warn_of_confounded(extras: Sequence[ExtraEstimate]) -> None:
@@ -221,7 +221,7 @@ class Confounded:
     @property
     def in_short(self) -> str:
         """What to do, before what it is good for, without what they are confounded with."""
-        return f"{self.advice}; until then do not trust {_grouped(self.extras)}"
+        return f"{self.advice}; until then do not trust {_grouped(self.extras, _NAMED_IN_SHORT)}"
 
 
 _TOTAL_MASS = "total mass"
@@ -271,9 +271,9 @@ def warn_of_disagreement(fit: Fit, fitter: LogFitter) -> None:
     if len(on_ground) == len(fit.parts):
         return
     for log in dict.fromkeys(part.source for part in fit.parts):
-        gated = {number for part in fit.parts if part.source == log for number in part.gated}
-        if gated:
-            channels = (builder.extras[number] for number in sorted(gated))
+        masked = {number for part in fit.parts if part.source == log for number in part.masked}
+        if masked:
+            channels = (builder.extras[number] for number in sorted(masked))
             named = _grouped(f"{x.name} {x.component}" for x in channels)
             message = f"{log}: {named} read exactly 0 in the air, as if masked or clamped"
             warn(f"{message}, which says nothing of their offsets")
@@ -294,13 +294,13 @@ def warn_of_disagreement(fit: Fit, fitter: LogFitter) -> None:
         warn(f"{log}: {named}{more}; {advice}")
 
 
-def _grouped(labels: Iterable[str]) -> str:
-    """Labels by sensor or body, the most frequent first: "scale of l_hip, r_hip; m, mcx of pelvis"."""
+def _grouped(labels: Iterable[str], most: int = _NAMED) -> str:
+    """So many labels by sensor or body, the most frequent first: "scale of l_hip, r_hip; m, mcx of pelvis"."""
     groups: dict[str, dict[str, None]] = {}
     for label in labels:
         first, _, last = label.rpartition(" ")
         groups.setdefault(first, {})[last] = None
     order = sorted(groups, key=lambda first: -len(groups[first]))
-    more = f"; and {len(order) - _NAMED} more" if len(order) > _NAMED else ""
-    named = ((first, join_names(list(groups[first]), _NAMED)) for first in order[:_NAMED])
+    more = f"; and {len(order) - most} more" if len(order) > most else ""
+    named = ((first, join_names(list(groups[first]), most)) for first in order[:most])
     return "; ".join(f"{first} {names}" if " of" in first else f"{names} of {first}" for first, names in named) + more

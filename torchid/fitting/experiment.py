@@ -38,6 +38,7 @@ from torchid.reprs import short_repr
 from torchid.robot import Robot, load_robot
 from torchid.robot.tree import FT_FIELD
 from torchid.sensing import Contact, SensorNoise, SensorSet, chosen_sensors, named_sensors, with_ft_sensors
+from torchid.settings import AUTO
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,8 +90,8 @@ class Scene:
         offsets = {str(channel): scope for channel, scope in sensors.offsets.items()}
         scales = {str(channel): scope for channel, scope in sensors.scales.items()}
         actuators = vars(self.config.actuators)
-        width = actuators["sign_width"]
-        known = {"sign_width": None if width == "auto" else width, "delay": False}  # logs are read with the delay
+        known = {name: None if actuators[name] == AUTO else actuators[name] for name in ("sign_width", "stribeck")}
+        known["delay"] = False  # logs are read with the delay
         return ExtraTerms(offsets, scales, **actuators | known)
 
     @property

@@ -18,9 +18,18 @@ from pydantic.dataclasses import dataclass
 from torchid import __version__
 from torchid.errors import ConfigError, LogError, about_file, during, excerpt
 from torchid.fitting.experiment import Experiment, with_noise
+from torchid.fitting.factor_documents import (
+    NOISE,
+    PackedPart,
+    PartPacker,
+    PartReader,
+    RowModel,
+    Value,
+    Whole,
+    require_same_noise,
+    require_same_rows,
+)
 from torchid.fitting.noise import GroupNoise, NoiseSummary
-from torchid.fitting.packed_parts import PackedPart, PartPacker, PartReader, Whole
-from torchid.fitting.row_model import NOISE, RowModel, Value, require_same_noise, require_same_rows
 from torchid.guards import MAX_ARRAYS, MAX_DESCRIPTION, MAX_LETTERS, MAX_TRIANGLES, check_unpacked_size
 from torchid.identifiability.base_parameters import StateReport, merge_state_reports
 from torchid.logs.containers import FACTORS, Container, open_npz, reader_errors_explained

@@ -55,7 +55,7 @@ class Misfit:
 
     @property
     def alike(self) -> bool:
-        """Whether neighbouring residuals agree more than those of noise do, and are more than rounding."""
+        """Whether residuals are correlated in time more than noise is, and are more than rounding."""
         rounding = self.share is not None and self.share < _EXACT
         return self.lack_of_fit is not None and self.lack_of_fit > _ALIKE and not rounding
 
@@ -78,7 +78,9 @@ class Misfit:
         if self.expected is not None and self.residual > _MUCH * self.expected:
             reasons.append(f"residuals are {self.residual / self.expected:.2g} times what the stated noise leaves")
         if self.alike:
-            reasons.append(f"neighbouring residuals agree {self.lack_of_fit:.2g} times as much as those of noise")
+            reasons.append(
+                f"residuals are correlated in time, between blocks {self.lack_of_fit:.2g} times noise's variance"
+            )
         if self.friction is not None and self.friction.significant:
             reasons.append(str(self.friction))
         share = self.expected or 1.0

@@ -23,7 +23,8 @@ from torchid.fitting.fit import Fit
 from torchid.identifiability.confounding import mass_weights
 from torchid.logs.containers import open_container
 from torchid.parameters import PARAMETERS, PER_BODY, Array
-from torchid.problem.extras import ACTUATORS
+from torchid.problem.elimination import NEVER_NEGATIVE
+from torchid.problem.extras import ACTUATORS, in_words
 from torchid.reprs import short_repr
 from torchid.robot import Robot
 
@@ -108,7 +109,7 @@ def fitted_posterior(fit: Fit, robot: Robot, conditions: Conditions) -> FittedPo
             free=problem.free,
             conditions=conditions,
             extra_size=np.array([max(extra.size, abs(found.get(extra.label, 0.0))) for extra in extras]),
-            extra_lower=np.array([0.0 if extra.what == "armature" else -np.inf for extra in extras]),
+            extra_lower=np.array([0.0 if extra.what in NEVER_NEGATIVE else -np.inf for extra in extras]),
         ),
         body_names=tuple(robot.body_names),
         joint_names=tuple("" if joint is None else joint.name for joint in joints),
@@ -286,14 +287,14 @@ class ParameterSamples:
         return self.phi[..., parameters.VISCOUS]
 
     def of_joints(self, what: str) -> dict[str, Tensor]:
-        """Actuator terms by joint, each (N,): "armature", "torque_offset", "asymmetric_coulomb" or "stiffness".
+        """Actuator terms by joint, each (N,), of one of `ACTUATORS`.
 
         Raises:
             ValueError: `what` is none of these.
         """
         if what not in ACTUATORS:
             raise ValueError(f"what: found '{what}'; accepted: {', '.join(ACTUATORS)}")
-        start = f"{what.replace('_', ' ').replace('coulomb', 'Coulomb friction')} of "
+        start = f"{in_words(what)} of "
         return {
             name.removeprefix(start): self.extras[:, number]
             for number, name in enumerate(self.extra_names)

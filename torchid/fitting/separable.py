@@ -7,18 +7,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
 from scipy.optimize import minimize, minimize_scalar
+from scipy.stats import norm
 
 from torchid.copies import share_between_copies
 from torchid.errors import warn
 from torchid.estimators import LeastSquares
 from torchid.fitting.fit import LogFitter
+from torchid.identifiability.confounding import ExtraEstimate
 from torchid.parameters import Array
-from torchid.problem import RowBuilder, Samples, compress_parts
+from torchid.problem import ExtraTerms, RowBuilder, Samples, compress_parts
 from torchid.problem.chunks import thread_count
+from torchid.problem.compression import compress_in_blocks
+from torchid.problem.extra_columns import dof_extra_column
+from torchid.problem.extras import DELAYED
 from torchid.problem.sampled_rows import SampledRows
 
 LARGEST_TILT = 0.3
@@ -26,7 +32,13 @@ LARGEST_TILT = 0.3
 
 _GAIN = 1e-3  # of the residual, by which a value has to beat none
 _WIDTHS = tuple(10.0 ** np.arange(-3.0, 0.25, 0.5))
-_WIDTH_SETTLED = 1e-3  # of the logarithm of the width, to base 10
+_STRIBECK = tuple(10.0 ** np.arange(-2.0, 1.25, 0.25))  # [rad/s or m/s]
+_STRIBECK_SAMPLES = 5000  # of all logs, evenly spaced
+_RIDGE = 1e-6  # the residual is smooth in the velocity where the data determine some parameters badly
+_STEP = 1e-3  # of the logarithm of the velocity, of differences
+_CHANCE = 0.025  # that friction at rest of any joint seems to be beyond Coulomb friction
+_QUANTILE = 1.96  # standard errors from the middle to the end of a 95 % interval
+_WIDTH_SETTLED, _STRIBECK_SETTLED = 1e-3, 1e-4  # of the logarithm, to base 10
 _WIDTH_DIGITS = 4
 _AT_ONCE = 1024  # samples: fewer lose to dispatch
 _TILT_RIDGE = 1e-6  # the residual is smooth in the tilt where the data determine some parameters badly
@@ -67,11 +79,10 @@ def choose_sign_width(
         logs_and_fitter: bound training logs, preprocessed with a width, and a fitter with rows of that width; None for
             the sign.
     """
-    found: dict[float | None, float] = {}
     of_one: list[SampledRows] = []  # rows of the logs with a direction of 1, from which those of any others follow
 
     def sampled(logs: Sequence[Samples], builder: RowBuilder) -> SampledRows:
-        if any(extra.what == "asymmetric_coulomb" for extra in builder.extras):  # its columns depend on the width, too
+        if any(extra.what in ("asymmetric_coulomb", "stribeck") for extra in builder.extras):  # of the width, too
             return SampledRows(logs, builder, _AT_ONCE)
         if not of_one:
             ones = [replace(log, direction=torch.ones_like(log.joint_velocity)) for log in logs]
@@ -85,22 +96,139 @@ def choose_sign_width(
         problem = fitter.build_problem(rows.compress(np.ones(len(rows.groups)))).assembly.problem
         return estimator.solve(problem).residual_std
 
-    def tried(width: float) -> float:
-        found[width] = left(width)
-        return found[width]
-
-    first, *others = _WIDTHS
-    tried(first)  # reads the logs, which copies of this process then have
-    *rest, sign = share_between_copies([*others, None], left, thread_count())
-    found |= dict(zip(others, rest, strict=True))
-    best = int(np.argmin(list(found.values())))
-    between = [np.log10(_WIDTHS[max(best - 1, 0)]), np.log10(_WIDTHS[min(best + 1, len(_WIDTHS) - 1)])]
-    minimize_scalar(lambda x: tried(10.0**x), bounds=between, method="bounded", options={"xatol": _WIDTH_SETTLED})
-    found[None] = sign
-    width = min(found, key=lambda one: found[one])
+    found = _search(left, _WIDTHS, _WIDTH_SETTLED)
+    width, sign = min(found, key=lambda one: found[one]), found[None]
     gains = found[width] < (1.0 - _GAIN) * sign
     chosen = float(f"{width:.{_WIDTH_DIGITS}g}") if gains and width is not None else None
     return SignWidthChoice(chosen, tuple(found), tuple(found.values()))
+
+
+def _search(left: Callable[[float | None], float], first: Sequence[float], settled: float) -> dict[float | None, float]:
+    """What is left with some values, with those between the neighbours of the best of them, and with none, the last."""
+    found: dict[float | None, float] = {first[0]: left(first[0])}  # reads the logs, which copies then have
+    *rest, none = share_between_copies([*first[1:], None], left, thread_count())
+    found |= dict(zip(first[1:], rest, strict=True))
+    best = int(np.argmin(list(found.values())))
+    between = np.log10([first[max(best - 1, 0)], first[min(best + 1, len(first) - 1)]])
+
+    def tried(logarithm: float) -> float:
+        value = 10.0**logarithm
+        found[value] = left(value)
+        return found[value]
+
+    minimize_scalar(tried, bounds=between, method="bounded", options={"xatol": settled})
+    return {**found, None: none}
+
+
+@dataclass(frozen=True)
+class StribeckChoice:
+    """A Stribeck velocity, and what fits with it and without such friction leave.
+
+    Attributes:
+        velocity: [rad/s or m/s]; None for no such friction: it is not significant, or the data do not determine it.
+        found: the best of those that were tried, which it is otherwise.
+        significance: standard errors by which friction at rest is beyond Coulomb friction, of the joint with most.
+        required: what it must be, of the largest of so many joints, to be chance in one of 40 cases.
+        interval: of 95 % of it, from the standard error of its logarithm; None where no data depend on it.
+        inflation: of this standard error by not knowing all other parameters, None likewise.
+        confounded_with: names of other parameters that it is confounded with, empty if with none.
+        residual, coulomb_residual: standard deviation of whitened residuals with the best and without [1].
+    """
+
+    velocity: float | None
+    found: float
+    significance: float
+    required: float
+    interval: tuple[float, float] | None
+    inflation: float | None
+    confounded_with: tuple[str, ...]
+    residual: float
+    coulomb_residual: float
+
+    def __str__(self) -> str:
+        """The velocity with its interval, and what it is for."""
+        left = f"residual {self.residual:.4g}, {self.coulomb_residual:.4g} without"
+        if not self.significance > self.required:
+            return f"none: friction at rest is not significantly beyond Coulomb friction ({left})"
+        if self.confounded_with:
+            others = ", ".join(self.confounded_with)
+            return f"none: any, such as {self.found:.3g} rad/s (m/s), is confounded with {others} ({left})"
+        if self.interval is None:
+            return f"none: the data do not determine it ({left})"
+        span = "{:.3g} to {:.3g}".format(*self.interval)
+        if self.velocity is None:
+            return f"none: the data do not determine it, 95 %: {span} rad/s (m/s) ({left})"
+        return f"{self.velocity:.3g} rad/s (m/s) (95 %: {span}), chosen by the residual: {left}"
+
+
+def choose_stribeck(
+    logs_and_fitter: Callable[[float | None], tuple[Sequence[Samples], LogFitter]], terms: ExtraTerms
+) -> StribeckChoice:
+    """The Stribeck velocity whose fit of the logs leaves least, one for all joints.
+
+    All other parameters, friction at rest of each joint among them, are linear and fitted anew for each velocity,
+    within the conditions of the estimator: separable least squares (Golub and Pereyra, 1973). The standard error is
+    that of the logarithm of the velocity as one more unknown, to first order, in a fit with all others (Kaufman, 1975).
+
+    Args:
+        logs_and_fitter: bound training logs, preprocessed with a velocity, and a fitter of their rows; None for no such
+            friction.
+        terms: extra parameters of these.
+    """
+
+    def some(velocity: float | None) -> tuple[list[Samples], LogFitter]:
+        logs, fitter = logs_and_fitter(velocity)
+        step = max(1, sum(map(len, logs)) // _STRIBECK_SAMPLES)
+        own: dict[str, Any] = {"folder": None, "motion_noise": None}
+        thin = [replace(x.every(step), oversampling=max(1.0, x.oversampling / step), **own) for x in logs]
+        estimator = replace(fitter.estimator, ridge=max(fitter.estimator.ridge, _RIDGE))  # type: ignore[type-var]
+        return thin, replace(fitter, estimator=estimator)
+
+    def left(velocity: float | None) -> float:
+        logs, fitter = some(velocity)
+        problem = fitter.build_problem(compress_parts(logs, fitter.builder)).assembly.problem
+        return fitter.estimator.solve(problem).residual_std
+
+    found = _search(left, _STRIBECK, _STRIBECK_SETTLED)
+    best = min((value for value in found if value is not None), key=lambda one: found[one])
+    unknown = _with_logarithm(some, best, terms)
+    term, at_rest = unknown[DELAYED][0], unknown["stribeck"]
+    reach = _QUANTILE * term.standard_error
+    interval = (best * np.exp(-reach), best * np.exp(reach)) if np.isfinite(reach) else None
+    choice = StribeckChoice(
+        velocity=float(f"{best:.{_WIDTH_DIGITS}g}"),
+        significance=max((one.value / one.standard_error for one in at_rest if one.standard_error > 0.0), default=0.0),
+        required=float(norm.isf(_CHANCE / max(len(at_rest), 1))),
+        found=best,
+        interval=interval,
+        inflation=term.inflation if np.isfinite(term.inflation) else None,
+        confounded_with=() if term.separable else term.confounded_with or ("other parameters",),
+        residual=found[best],
+        coulomb_residual=found[None],
+    )
+    known = interval is not None and interval[0] > _STRIBECK[0] and interval[1] < _STRIBECK[-1]
+    return (
+        choice if choice.significance > choice.required and term.separable and known else replace(choice, velocity=None)
+    )
+
+
+def _with_logarithm(
+    some: Callable[[float], tuple[list[Samples], LogFitter]], velocity: float, terms: ExtraTerms
+) -> dict[str, list[ExtraEstimate]]:
+    """Friction at rest, and `DELAYED`, how far the logarithm of a Stribeck velocity is off, beside all parameters."""
+    (before, low), (logs, fitter), (after, high) = (some(velocity * np.exp(x)) for x in (-_STEP, 0.0, _STEP))
+    of, slopes = fitter.builder, [log.joint_velocity.new_zeros(len(log), 1, fitter.robot.n) for log in logs]
+    for extra, value in ((x.extra, x.value) for x in fitter.fit(compress_parts(logs, of)).extras):
+        if extra.what == "stribeck" and extra.dof is not None:
+            for slope, *ends in zip(slopes, before, after, strict=True):
+                trees = low.builder.tree, high.builder.tree
+                less, more = (dof_extra_column(extra, extra.dof, *one) for one in zip(ends, trees, strict=True))
+                slope[:, 0, extra.dof] = value * (more - less) / (2.0 * _STEP)
+    further = replace(terms, stribeck=velocity, delays=1)  # whose column is a given torque
+    fitter = replace(fitter, builder=RowBuilder(fitter.robot, of.contacts, of.sensors, further).to(of.device))
+    sloped = [replace(log, delayed_torque=slope) for log, slope in zip(logs, slopes, strict=True)]
+    found = fitter.fit(compress_in_blocks(sloped, fitter.builder)).extras
+    return {what: [x for x in found if x.extra.what == what] for what in ("stribeck", DELAYED)}
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,9 @@ MOST_BLOCKS = 100
 """Of more, neighbours count as one: the factors of a fleet's logs are more than memory has room for matrices."""
 
 _LEVERAGE = 0.95  # of the information that a block has on a combination, at most: it alone cannot say how it scatters
+#: Noise of the motion in the information on a combination, as a share of what is left without it, up to which scatter
+#: tells of a lack of fit: beyond, noise times noise does not average out in a block, and scatters 3 to 9 times as much.
+_LITTLE_NOISE = 0.1
 _NORMAL = float(ndtri(0.975))
 
 
@@ -45,7 +48,8 @@ class BlockScatter:
         without_ridge: (G, 12 L), the same of the estimate without regularization.
         extras: the same of the extra parameters, (G, M) for each elimination, without regularization.
         lack_of_fit: variance of the blocks' part of the residuals over what it is if residuals are independent noise: 1
-            if the model explains the forces, more if residuals are alike within a block.
+            if the model explains the forces, more if residuals are alike within a block. Of combinations of parameters
+            on which little of the information is noise of the motion.
     """
 
     blocks: int
@@ -97,7 +101,9 @@ def block_scatter(
     noise = (
         problem.oversampling * residual_std(problem.cost(best), problem.rows, basis.shape[1], problem.oversampling) ** 2
     )
-    expected = noise * (np.trace(of_rows, axis1=1, axis2=2) - (of_rows * shares).sum((1, 2))).sum()
+    of_motion, axes = np.linalg.eigh(of_noise.sum(axis=0))
+    known = axes[:, of_motion < _LITTLE_NOISE]
+    expected = noise * np.trace(known.T @ (of_rows - of_rows @ shares).sum(axis=0) @ known)
     factor = np.sqrt((count - 1) / count) * stdtrit(count - 1, 0.975) / _NORMAL
     held = np.zeros((0, basis.shape[1])) if problem.held is None else problem.held.T @ problem.A @ basis
     without_ridge = np.concatenate([factor * _left_out(scores, shares), held]) @ basis.T
@@ -112,7 +118,7 @@ def block_scatter(
         deviations=with_ridge,
         without_ridge=without_ridge,
         extras=_of_extras(gradients, without_ridge, assembly, factor),
-        lack_of_fit=float(np.square(scores).sum() / expected) if expected > 0.0 else 1.0,
+        lack_of_fit=float(np.square(scores @ known).sum() / expected) if expected > 0.0 else 1.0,
     )
 
 

@@ -206,7 +206,7 @@ def triangular_factor(X: Array) -> Array:
 def _unloaded_information(builder: RowBuilder, samples: Samples, count: int) -> Iterator[tuple[int, Tensor]]:
     """Contacts, and the information (count, count) of their readings in the air about offsets."""
     for channel in unloaded_offset_equations(builder, samples):
-        if not channel.gated and (index := builder.extras[channel.offset].contact):
+        if not channel.masked and (index := builder.extras[channel.offset].contact):
             columns, row = channel.row(builder)
             wide = row.new_zeros(count)
             wide[list(columns)] = row[0, :-1]

@@ -28,7 +28,7 @@ from torchid.regressor.loops import LoopClosures, LoopJacobian
 from torchid.regressor.regressor import contact_arms
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
-from torchid.robot.loops import LOOPS_FIELD
+from torchid.robot.constraints import LOOPS_FIELD
 from torchid.rounding import KINEMATIC_TOLERANCE
 from torchid.sensing import Contact, SensorSet
 

@@ -276,6 +276,9 @@ def check_slip(
 _MIN_AIR_SAMPLES = 20
 #: Correlation of reading and model that separates the weight beyond a sensor from its offset: the limb must turn.
 _MIN_CORRELATION = 0.9
+#: Share of the squared residual of another mass beyond a sensor that mass and offset may leave, for the offset to be
+#: told from a mass: noise of accelerations makes the mass too small and an offset of the rest, which leave 0.85 of it.
+_MAX_OFFSET_RESIDUAL = 0.5
 #: Misfit of a sensor's forces that loads and offsets do not make, and the share of it that another frame may leave.
 _MIN_FRAME_MISFIT, _MAX_TURNED_SHARE = 0.7, 0.35
 _LIMB_SENSOR_CHECK = "limb sensors in the air"
@@ -355,11 +358,13 @@ def _limb_sensor_findings(name: str, measured: FloatArray, model: FloatArray, ro
     offset = np.median(residual, axis=0)
     size, spread = float(np.linalg.norm(offset)), _spread(residual - offset)
     threshold = MIN_ACTIVE_WEIGHT_SHARE * GRAVITY * float(robot.nominal[:, 0].sum())
-    if not correlated:
+    mass_alone = measured - (measured.mean(axis=0) @ model.mean(axis=0)) / max(weight, 1e-9) ** 2 * model
+    separate = correlated and np.square(residual - offset).sum() < _MAX_OFFSET_RESIDUAL * np.square(mass_alone).sum()
+    if not separate:
         threshold += MAX_MASS_ERROR * weight
     if size > max(threshold, spread):
         hanging = f"the {weight:.3g} N that hang on it by the {robot.format}"
         text = f"{name}: reads a steady {size:.3g} N in the air beside {hanging}"
-        ambiguity = "" if correlated else "; a load of that weight would look the same"
+        ambiguity = "" if separate else "; a load of that weight would look the same"
         advice = f"identify it, sensors.offsets: {{ft_force: log}}, or subtract it{ambiguity}"
         yield Finding("offset", NOTE, "ft_wrench", text, advice, (name,))

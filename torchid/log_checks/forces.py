@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
@@ -143,6 +144,8 @@ def _misfit_findings(
         )
         advice = f"check units, frames, the order of joints and contacts, friction, the {robot.format}'s base link and"
         advice += f" masses, and whether the {robot.format} is that of this robot"
+        if not contacts and not robot.fixed_base:
+            advice = f"name under contacts what touches the ground, or holds the base in the air; or {advice}"
         yield Finding("forces", SUSPICIOUS, "all", text, advice)
         return
     torques = [] if fit.torque is None else list(_torque_findings(robot, fit.torque))
@@ -177,15 +180,19 @@ def _best_mistake(
 ) -> Finding | None:
     """The mistake whose correction leaves the least misfit, if that is small enough."""
     robot, best, least = model.robot, None, MAX_RESIDUAL_SHARE * min(fit.misfit, 1.0)
+    filtered = cache(lambda: preprocess_pieces(log, cutoff, MAX_TRIAL_DIFFERENTIATED_SAMPLES))
     for mistake in possible_mistakes(log):
         if not _may_explain(mistake.field, fit) or mistake.field.startswith(derived):
             continue
         try:
-            pieces = preprocess_pieces(mistake.correct(log), cutoff, MAX_TRIAL_DIFFERENTIATED_SAMPLES)
+            if mistake.after_filter:
+                pieces = [mistake.correct(piece) for piece in filtered()]
+            else:
+                pieces = preprocess_pieces(mistake.correct(log), cutoff, MAX_TRIAL_DIFFERENTIATED_SAMPLES)
             samples = bind_some_samples(pieces, robot, model.contacts, TRIAL_SAMPLES)
         except InputError:  # the filter does not accept the corrected log
             continue
-        trial = model.compare(samples)
+        trial = model.compare(samples, least)
         if trial.compared == fit.compared and trial.misfit < least:  # compare the same forces only
             best, least = mistake, trial.misfit
     if best is None:

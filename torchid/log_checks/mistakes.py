@@ -92,12 +92,16 @@ _MILLI_MOMENT_FACTORS = np.array([1.0, 1.0, 1.0, 1e-3, 1e-3, 1e-3])
 
 @dataclass(frozen=True)
 class Mistake:
-    """A common mistake: its field, a description, advice, and the function that corrects a log."""
+    """A common mistake: its field, a description, advice, and the function that corrects a log.
+
+    `after_filter`: a filtered log is corrected alike, by other names or by a constant linear map of what was filtered.
+    """
 
     field: str
     description: str
     advice: str
     correct: Callable[[Log], Log]
+    after_filter: bool = False
 
 
 def possible_mistakes(log: Log) -> Iterator[Mistake]:
@@ -119,12 +123,16 @@ def possible_mistakes(log: Log) -> Iterator[Mistake]:
     if log.imu_specific_force is not None:
         reading = "reversed: gravity minus acceleration"
         yield Mistake(
-            "imu_specific_force", reading, "reverse it: it points up at rest", _multiply("imu_specific_force", -1.0)
+            "imu_specific_force",
+            reading,
+            "reverse it: it points up at rest",
+            _multiply("imu_specific_force", -1.0),
+            True,
         )
     if log.joint_torque is not None:
         reverse = "reverse them; a base that hangs upside down looks the same (give base_quat)"
-        yield Mistake("joint_torque", "all reversed", reverse, _multiply("joint_torque", -1.0))
-        yield from _unit_mistakes("joint_torque", "torque")
+        yield Mistake("joint_torque", "all reversed", reverse, _multiply("joint_torque", -1.0), True)
+        yield from _unit_mistakes("joint_torque", "torque", after_filter=True)
     if log.base_position_world is not None:
         yield from _unit_mistakes("base_position_world", "length")
     for field, other in (WRENCHES, WRENCHES[::-1]):
@@ -176,20 +184,20 @@ def _order_mistakes(log: Log) -> Iterator[Mistake]:
     """Exchanged names of joints and contacts, and flags assigned to the wrong contacts."""
     for description, permuted in (*exchanged_names(log.joint_names), *_exchanged_neighbours(log.joint_names)):
         text, advice = f"{description} exchanged", "give joint_names in the order of the columns"
-        yield Mistake("joint_names", text, advice, _rename("joint_names", permuted))
+        yield Mistake("joint_names", text, advice, _rename("joint_names", permuted), True)
     for description, permuted in exchanged_names(log.contact_names):
         order = [log.contact_names.index(name) for name in permuted]
         text = f"{description} exchanged"
         advice = "give contact_names in the order of the columns"
-        yield Mistake("contact_names", text, advice, _rename("contact_names", permuted))
+        yield Mistake("contact_names", text, advice, _rename("contact_names", permuted), True)
         flags = _reorder(("contact_active",), order)
         yield Mistake("contact_active", text, "give the flags in the order of contact_names", flags)
 
 
-def _unit_mistakes(field: str, quantity: str) -> Iterator[Mistake]:
+def _unit_mistakes(field: str, quantity: str, after_filter: bool = False) -> Iterator[Mistake]:
     for units, factor in other_units(quantity).items():
         advice = f"{advise_units({field: tuple(units.split(' or '))})}; without a map multiply by {factor:.4g}"
-        yield Mistake(field, f"in {units}", advice, _multiply(field, factor))
+        yield Mistake(field, f"in {units}", advice, _multiply(field, factor), after_filter)
 
 
 def quarter_turns() -> Iterator[tuple[str, NDArray[np.float64]]]:
@@ -209,20 +217,20 @@ def _turn_wrench(field: str, R: NDArray[np.float64]) -> Callable[[Log], Log]:
 
 def _wrench_mistakes(field: str, other: str) -> Iterator[Mistake]:
     reverse = "reverse it: wrenches are what the ground exerts on the robot"
-    yield Mistake(field, "all reversed", reverse, _multiply(field, -1.0))
+    yield Mistake(field, "all reversed", reverse, _multiply(field, -1.0), True)
     for unit, factor in (("kN and kN m", 1e3), ("kg", GRAVITY), ("mN and mN m", 1e-3)):
-        yield Mistake(field, f"in {unit}", f"multiply by {factor:g}", _multiply(field, factor))
+        yield Mistake(field, f"in {unit}", f"multiply by {factor:g}", _multiply(field, factor), True)
     moments = _change(lambda log: {field: getattr(log, field) * _MILLI_MOMENT_FACTORS})
-    yield Mistake(field, "moments in N mm", "multiply moments by 0.001", moments)
+    yield Mistake(field, "moments in N mm", "multiply moments by 0.001", moments, True)
     first = _change(lambda log: {field: np.roll(getattr(log, field), 3, axis=2)})
-    yield Mistake(field, "with the moment first", "give the force first, then the moment", first)
+    yield Mistake(field, "with the moment first", "give the force first, then the moment", first, True)
     axes = "along the world's axes" if other == WRENCHES[1] else "along the contact frames' axes"
     moved = _change(lambda log: {other: getattr(log, field), field: None, "moments_about_world_origin": False})
-    yield Mistake(field, axes, f"call it {other}", moved)
+    yield Mistake(field, axes, f"call it {other}", moved, True)
     if field == WRENCHES[0]:
         for axes, R in quarter_turns():
             turn = f"turn forces and moments into the contact frames, whose {axes}"
-            yield Mistake(field, "along axes turned by right angles", turn, _turn_wrench(field, R))
+            yield Mistake(field, "along axes turned by right angles", turn, _turn_wrench(field, R), True)
 
 
 def _turn_world(turn: Rotation) -> Callable[[Log], Log]:

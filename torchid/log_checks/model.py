@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from torchid.logs import Log
 from torchid.logs.cutoff import usual_cutoff_hz
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import preprocess
+from torchid.logs.signal_noise import SignalNoise
 from torchid.problem import RowBuilder, Samples, bind_log
 from torchid.problem.predict import force_series, null_space_part
 from torchid.robot import Robot
@@ -116,6 +117,8 @@ def default_cutoff_hz(log: Log) -> float:
 def preprocess_pieces(log: Log, cutoff_hz: float, max_samples: int = MAX_DIFFERENTIATED_SAMPLES) -> list[Log]:
     """The log with velocities and accelerations; of one longer than `max_samples`, evenly spread runs of samples.
 
+    The noise of the motion, of which no finding speaks, is not estimated.
+
     Raises:
         InputError: the log cannot be filtered.
     """
@@ -124,7 +127,8 @@ def preprocess_pieces(log: Log, cutoff_hz: float, max_samples: int = MAX_DIFFERE
     starts = np.linspace(0, len(log) - length, count).astype(int)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", TorchidWarning)  # other findings report these
-        return [preprocess(log.select(slice(start, start + length)), cutoff_hz) for start in starts]
+        pieces = [replace(log.select(slice(start, start + length)), motion_noise=SignalNoise({})) for start in starts]
+        return [preprocess(piece, cutoff_hz) for piece in pieces]
 
 
 def bind_some_samples(
@@ -153,8 +157,11 @@ class NominalModel:
     contacts: Sequence[Contact]
     _builders: dict[bytes, RowBuilder] = dataclasses.field(default_factory=dict, init=False, repr=False)
 
-    def compare(self, samples: Sequence[Samples]) -> ModelFit:
-        """Compare the forces of some samples with those of the robot's file."""
+    def compare(self, samples: Sequence[Samples], least: float = np.inf) -> ModelFit:
+        """Compare the forces of some samples with those of the robot's file.
+
+        Torques are left out where the misfit is more than the `least`, whatever they say.
+        """
         robot, base = self.robot, self.robot.base_rows
         measured = np.zeros(robot.n, dtype=bool)
         if all(part.torque is not None for part in samples):
@@ -166,13 +173,14 @@ class NominalModel:
         parts = (slice(0, min(3, base)), slice(3, base))
         force, moment = (_misfit(acting[:, rows], required[:, rows]) for rows in parts)
         fit = None
-        if measured.any():
+        known = [x for x in (force, moment) if x is not None]
+        if measured.any() and np.square(known).sum() <= least**2 * (1 + len(known)):
             fit = _fit_projected(builder, samples, required, torque, np.flatnonzero(measured))
             contact_part = acting[:, base : base + robot.n] - torque
             consistent = force is not None and force < _MAX_WRENCH_MISFIT and np.isfinite(contact_part).all()
             if (consistent or not self.contacts) and not fit.determined.all() and not robot.loops:
                 fit = _fit_single_rows(fit, required[:, base : base + robot.n] - contact_part, torque)
-            fit = dataclasses.replace(fit, determined=fit.determined & ~_held_by_friction(samples, torque)[fit.joints])
+            fit = replace(fit, determined=fit.determined & ~_held_by_friction(samples, torque)[fit.joints])
         return ModelFit(fit, force, moment)
 
     def _builder(self, measured: BoolArray) -> RowBuilder:
@@ -182,7 +190,7 @@ class NominalModel:
             robot, contacts = self.robot, self.contacts
             sensors = named_sensors("joints", robot.n, len(contacts), ft=len(robot.ft_names))
             known = np.append(measured, sensors.torque[robot.n :]) | robot.is_passive
-            self._builders[key] = RowBuilder(robot, contacts, dataclasses.replace(sensors, torque=known))
+            self._builders[key] = RowBuilder(robot, contacts, replace(sensors, torque=known))
         return self._builders[key]
 
 
@@ -239,4 +247,4 @@ def _fit_single_rows(fit: TorqueFit, required: FloatArray, torque: FloatArray) -
         gain[index] = y @ x / (x @ x)
         residual = np.linalg.norm(y - gain[index] * x)
         determined[index] = abs(gain[index]) * np.linalg.norm(x) > MIN_ROW_SIGNAL_RATIO * residual
-    return dataclasses.replace(fit, gain=gain, determined=determined)
+    return replace(fit, gain=gain, determined=determined)

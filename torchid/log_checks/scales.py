@@ -185,7 +185,8 @@ def _scale_time(log: Log, factor: float) -> Log:
 def motion_cutoff_hz(log: Log) -> float | None:
     """A cutoff [Hz] from the spectrum of the joint positions, for any unit of time; None where no joint moves."""
     position = log.joint_position[: 2 * (len(log) // 2)]
-    power = np.square(np.abs(np.fft.rfft(position - position.mean(axis=0), axis=0))).sum(axis=1)
+    window = np.hanning(len(position))[:, None]  # a log that ends elsewhere than it began has no jump between
+    power = np.square(np.abs(np.fft.rfft(window * (position - position.mean(axis=0)), axis=0))).sum(axis=1)
     power[0] = 0.0
     if not power.sum() > 0.0:
         return None

@@ -128,7 +128,7 @@ def _near_load_changes(log: Log, candidates: Iterable[tuple[ChannelGroup, list[l
 
 
 def _unexplained(log: Log, group: ChannelGroup, column: int, jumps: list[Jump], impacts: BoolArray) -> list[Jump]:
-    """Jumps of a channel that neither motion nor contact explains."""
+    """Jumps of a channel that neither motion nor contact explains; a step beyond the range has no samples on a side."""
     values = group.values[:, column]
     if group.field in POSITION_FIELDS:
         return [jump for jump in jumps if abs(jump.size) > MIN_POSITION_JUMP]
@@ -148,7 +148,7 @@ def _unexplained(log: Log, group: ChannelGroup, column: int, jumps: list[Jump], 
         for jump in jumps
         if abs(jump.size) > (MIN_STEP_RANGE_SHARE if jump.lasting else MIN_SPIKE_RANGE_SHARE) * extent
         and not (jump.lasting and group.field in _FORCE_FIELDS and not _is_reset(values, jump))
-        and (abs(jump.size) > extent or not explained[jump.first : jump.last + 1].any())
+        and ((abs(jump.size) > extent and not jump.lasting) or not explained[jump.first : jump.last + 1].any())
     ]
 
 

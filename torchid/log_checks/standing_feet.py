@@ -259,10 +259,11 @@ def _stance_motion(
     quat = log.base_quat_xyzw
     if quat is None:
         return []
-    sums = []
+    world, sums = rotate_to_world(quat, vector) + (0.0 if origin is None else origin), []
     for stance in _stances(log, active):
-        world = rotate_to_world(quat[stance], vector[stance]) + (0.0 if origin is None else origin[stance])
-        in_world, in_base = (float(np.square((x - x.mean(axis=0)) / unit).sum()) for x in (world, vector[stance]))
+        in_world, in_base = (
+            float(np.square((x - x.mean(axis=0)) / unit).sum()) for x in (world[stance], vector[stance])
+        )
         sums.append((in_world, in_base, stance.stop - stance.start))
     return sums
 

@@ -58,6 +58,9 @@ class ColumnEntry:
     scale: Annotated[dict[str, Number], BeforeValidator(for_all)] = dataclasses.field(default_factory=dict)
 
 
+FRACTIONS = {"nanoseconds": "ns", "microseconds": "us"}
+"""Units of what may be added to whole seconds, by key."""
+
 Entry = Annotated[ColumnEntry, BeforeValidator(_column)]
 
 
@@ -66,11 +69,12 @@ class TimeEntry(ColumnEntry):
     """Stamps as a column.
 
     Attributes:
-        nanoseconds: column of what is added to it [ns], of stamps in two columns.
+        nanoseconds, microseconds: column of what is added to it [ns, us], of stamps in two columns.
         step: in place of a column, how much later each sample is than the one before, in the unit.
     """
 
     nanoseconds: Name | None = None
+    microseconds: Name | None = None
     step: Positive | None = None
 
 
@@ -188,3 +192,19 @@ Angle = Annotated[AngleEntry, BeforeValidator(_column)]
 Torque = Annotated[TorqueEntry, BeforeValidator(_column)]
 Flags = Annotated[FlagEntry, BeforeValidator(_column)]
 Wrench = Annotated[WrenchEntry, BeforeValidator(_column)]
+
+
+OF_FILE = "::"
+"""Between the name of a file and that of a column that others have, too."""
+
+
+def as_in_file(value: Any, file: str) -> Any:
+    """A map, or a part of one, with the names of a file's columns without that of the file before them."""
+    if isinstance(value, str):
+        return value.removeprefix(f"{file}{OF_FILE}")
+    if isinstance(value, list):
+        return [as_in_file(one, file) for one in value]
+    if isinstance(value, dict):
+        return {key: as_in_file(one, file) for key, one in value.items()}
+    is_entry = dataclasses.is_dataclass(value) and not isinstance(value, type)
+    return dataclasses.replace(value, **as_in_file(dict(vars(value)), file)) if is_entry else value

@@ -14,6 +14,7 @@ from pydantic.dataclasses import dataclass
 
 from torchid.errors import ConfigError, UnknownNameError, excerpt, join_names
 from torchid.logs.column_entries import (
+    FRACTIONS,
     KEY,
     Angle,
     ColumnEntry,
@@ -190,9 +191,8 @@ def list_parts(columns: Columns) -> dict[str, EntryPart]:
         entry = getattr(columns, field)
         if entry.column or entry.columns:
             parts[field] = _part(field, field, entry)
-        if isinstance(entry, TimeEntry) and entry.nanoseconds is not None:
-            more = ColumnEntry(column=entry.nanoseconds, unit={"*": "ns"})
-            parts[f"{field}.nanoseconds"] = EntryPart(f"{field}.nanoseconds", more, "", (), {"": ("time",)})
+        if isinstance(entry, TimeEntry):
+            parts |= _fraction_parts(field, entry)
         if isinstance(entry, WrenchEntry):
             for name, quantity in (("force", "force"), ("moment", "torque")):
                 if (inner := getattr(entry, name)) is not None:
@@ -208,6 +208,13 @@ def list_parts(columns: Columns) -> dict[str, EntryPart]:
             key = f"{field}.current"
             parts[key] = EntryPart(key, entry.current, names_field(field), (), {"": ("current",)})
     return parts
+
+
+def _fraction_parts(field: str, entry: TimeEntry) -> dict[str, EntryPart]:
+    """What is added to whole seconds."""
+    given = {f"{field}.{name}": (column, unit) for name, unit in FRACTIONS.items() if (column := getattr(entry, name))}
+    entries = {key: ColumnEntry(column=column, unit={"*": unit}) for key, (column, unit) in given.items()}
+    return {key: EntryPart(key, more, "", (), {"": ("time",)}) for key, more in entries.items()}
 
 
 def _part(key: str, field: str, entry: ColumnEntry) -> EntryPart:
@@ -283,8 +290,7 @@ def _check_given(field: str, entry: ColumnEntry) -> None:
         found = f"{' and '.join(given)} together" if given else "nothing that says where it is"
         raise ConfigError.at_field(f"{KEY}.{field}", found, f"one of {', '.join(own)}")
     if given[0] not in ("column", "columns"):
-        if getattr(entry, "nanoseconds", None):
-            _check_unscaled(field, ["nanoseconds"], given[0])
+        _check_unscaled(field, [name for name in FRACTIONS if getattr(entry, name, None)], given[0])
         unsaid = ("scale", "order") if given[0] == "step" else ("unit", "scale", "order")
         _check_unscaled(field, [x for x in unsaid if getattr(entry, x)], given[0])
     if isinstance(entry, WrenchEntry) and entry.moment is not None and entry.force is None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from torchid.errors import ConfigError, LogError, excerpt, join_names
-from torchid.logs.column_entries import KEY, TimeEntry
+from torchid.logs.column_entries import KEY, TimeEntry, as_in_file
 from torchid.logs.column_map import AXES, PLACEHOLDER, Columns, EntryPart, fits, letters_of, list_parts
 from torchid.logs.column_proposals import name_unknown
 from torchid.logs.columns import KINDS
@@ -229,6 +229,8 @@ class _Search:
             most = max(letters.values())
             if any(letters_of(one) > most and fits(text, one) for one in self._columns.ignore):
                 continue
+            if text == "time" and not most:  # stamps of the file, beside {joint}
+                continue
             best = [key for key in named if letters[key] == most]
             if len(best) > 1:
                 both = f"the patterns of {KEY}.{best[0]} and {KEY}.{best[1]}"
@@ -305,7 +307,8 @@ def columns_of_file(columns: Columns, given: Sequence[str]) -> Columns:
 def columns_by_file(columns: Columns, given: Sequence[Sequence[str]], files: Sequence[str]) -> list[Columns | None]:
     """The map without the entries that are for others of several files, for each.
 
-    Entries without columns are for the file with the field that they belong to.
+    Entries without columns are for the file with the field that they belong to. Of columns that several files have, a
+    name says before `::` of which file they are: `torques.csv::{joint}`.
 
     Args:
         columns: the map.
@@ -315,7 +318,8 @@ def columns_by_file(columns: Columns, given: Sequence[Sequence[str]], files: Seq
     Raises:
         LogError: an entry of which no file has a column.
     """
-    maps = [columns_of_file(columns, of_file) for of_file in given]
+    of_files = [as_in_file(columns, file) for file in files]
+    maps = [columns_of_file(own, of_file) for own, of_file in zip(of_files, given, strict=True)]
     found = [_entries_in(own, of_file) for own, of_file in zip(maps, given, strict=True)]
     for name in columns.fields:
         if not any(name in of_file for of_file in found):

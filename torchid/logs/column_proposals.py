@@ -18,35 +18,39 @@ OF_PLATES = (WRENCHES[1], POINTS)
 #: Words for the base in recordings, and how names of columns begin with one.
 BASES = "base|root|trunk|torso|pelvis|body|mocap|odom|odometry"
 OF_BASE = rf"\b({BASES}|floating base)"
-_STAMPS = r"(time|timestamps?|stamps?|tstamps?)"
+_STAMPS = r"(time|datetime|timestamps?|stamps?|tstamps?)"
 #: Words that recordings have for a field, by what the name of a column contains; the first that fits counts.
 _WORDS = (
     ("time", rf"\b{_STAMPS}$"),  # of positions/timestamps
     (POINTS, r"\b(cop[xyz]?|ground force p[xyz])\b"),
     (WRENCHES[1], r"\b(ground (force|torque|moment)s?|force ?plates?|fp)\b"),
-    ("base_position_world", rf"{OF_BASE} (pos|position|xyz)\b"),
+    ("base_position_world", rf"{OF_BASE} (pose )*(pos|position|xyz)\b"),
+    ("base_linear_velocity_base", r"\b(v|vel|velocity) (body|base)$|\bodom\w* twist (twist )?linear\b"),
     (
         "base_linear_velocity_world",
-        rf"{OF_BASE} (twist )?(lin ?vel|linear|lin|vel|velocity)\b",
+        rf"{OF_BASE} (twist )*(lin ?vel|linear|lin|vel|velocity)\b",
     ),
-    ("base_angular_velocity_base", rf"{OF_BASE} (twist )?(ang ?vel|angular|ang|omega)\b"),
+    ("base_angular_velocity_base", rf"{OF_BASE} (twist )*(ang ?vel|angular|ang|omega)\b"),
     ("base_quat_wxyz", rf"{OF_BASE} (q|rot|rotation)\b"),
     ("joint_acceleration", r"\b(ddqj?|qdd|qpp|thdd|qacc|joints? acc|joints? accelerations?)\b"),
     ("imu_angular_velocity", r"\b(gyr|gyro\w*|omega|ang vel|angular velocity|drehraten?|imu g)\b"),
-    ("imu_specific_force", r"\b(acc|accel\w*|linear acceleration|specific force|beschleunigung|imu a)\b"),
+    ("imu_specific_force", r"\b(acc|accel\w*|linear acceleration|specific force|beschleunigung|imu a|a body)\b"),
     ("base_quat_wxyz", r"\b(quat\w*|orientation)\b"),
     ("contact_wrench_local", r"\b(wrench|wrenches)\b"),
     ("contact_force_normal", r"\b(foot forces?|feet forces?|contact forces?|grf|fsr)\b"),
     ("contact_active", r"\b(contacts?|touch|touches|stance)\b"),
-    ("joint_torque", r"\b(taus?|torques?|efforts?|eff|trq|load|qfrc|drehmoment|couples?|par|pares)\b"),
+    (
+        "joint_torque",
+        r"\b(taus?|torques?|efforts?|eff|trq|load|qfrc|gf|generalized forces?|drehmoment|couples?|par|pares)\b",
+    ),
     (
         "joint_velocity",
-        r"\b(dqs?|dqj|d q|qd|qp|qdot|thd|v|qvel|vels?|velocity|velocities|speeds?|rates?|vitesses?|geschw)\b"
+        r"\b(dqs?|dqj|d q|qd|qp|qdot|thd|gv|v|qvel|vels?|velocity|velocities|speeds?|rates?|vitesses?|geschw)\b"
         r"|\b(velocidad|velocidades)\b|geschwindigkeit\b",
     ),
     (
         "joint_position",
-        r"\b(observation state|qs?|qj|th|theta|qpos|pos|positions?|angles?|winkel|angulos?|posicion|gelenkwinkel)\b",
+        r"\b(observation state|gc|qs?|qj|th|theta|qpos|pos|positions?|angles?|winkel|angulos?|posicion|gelenkwinkel)\b",
     ),
     ("time", rf"\b(t|ts|{_STAMPS}|ticks?|clock|millis|sec|secs|seconds|zeit|temps|tiempo)\b"),
 )
@@ -59,12 +63,14 @@ _APART = (("linear", "angular"), ("position", "velocity", "acceleration", "torqu
 _DESIRED = re.compile(
     r"\b(des|desired|cmd|command(ed)?|ref|target|goal|setpoint|ff|cons|consigne|soll)\b"
     r"|\b(taus?|torques?|j|q|dq|qd|pos) d\b"  # tau_d, tau_J_d
+    r"|\b(taus?|torques?) (ext|external|gravity|grav|friction|fric|coriolis|residual)\b"
+    r"|\b(ext|external|gravity|friction|coriolis|residual) (joint )?(taus?|torques?)\b"  # that a model gave
 )
 _ANGLES = re.compile(r"\b(rpy|euler)\b")  # of the base, three: see `orientation_proposals`
 _OF_MOTOR = re.compile(r"\b(kp|kd)\b|temp|volt|err|status|state|mode|flag|count|fault|limit", re.IGNORECASE)
 _CURRENT = re.compile(r"(?i:current(?!.*limit)|(?<![a-z])(amps?|iq|i|cur)(?![a-z]))|[_ ]m?A$")
 _OTHER_UNITS = ("V", "°C", "C", "K", "%")
-_SPLIT = re.compile(r"[^A-Za-z]+|(?<=[a-z])(?=[A-Z])")
+_SPLIT = re.compile(r"[^A-Za-z]+|(?<=[a-z])(?=[A-Z])|(?<=(?<![A-Z])[A-Z])(?=[A-Z][a-z])")  # also axisQMsr
 #: What headers without letters of ours say, the longest first.
 _WRITTEN = {
     "関節角速度": "joint velocity", "関節角度": "joint position", "角速度": "gyro", "加速度": "acc", "トルク": "torque",
@@ -74,7 +80,7 @@ _WRITTEN = {
 
 
 def is_desired(column: str) -> bool:
-    """Whether a column holds what a controller wants, not what was measured."""
+    """Whether a column holds what a controller wants or a model gives, not what was measured."""
     return bool(_DESIRED.search(" ".join(words_of(column))))
 
 

@@ -129,6 +129,8 @@ class Log:
         imu_angular_acceleration: (N, 3) [rad/s^2], in that frame.
         joint_direction: (N, n), what the filter makes of the sign of the joint velocities; None in a log that was not
             filtered, where it is that sign. No part of a file.
+        joint_stribeck: (N, n), what the filter makes of sign(v) exp(-(v / v_s)^2) of the joint velocities v with a
+            Stribeck velocity v_s; None without one, and in a log that was not filtered. No part of a file.
         contact_share: (N, C), what the filter makes of a reading that is 1 while the contact is active and 0 else; None
             in a log that was not filtered, where it is `contact_active`. No part of a file.
         contact_unloaded: (N, C, 6), or (N, C, 7) with `contact_force_normal`, as recorded even in a filtered log: what
@@ -174,6 +176,7 @@ class Log:
     contact_unloaded: FloatArray | None = None
     noise_bandwidth_hz: float | None = None
     motion_noise: SignalNoise | None = None
+    joint_stribeck: FloatArray | None = None
 
     __repr__ = short_repr
 
@@ -225,7 +228,7 @@ class Log:
     def select(self, index: slice | NDArray[np.intp] | BoolArray) -> Log:
         """The log of the chosen samples: a slice (no data is copied), sample numbers (M,) or a mask (N,)."""
         chosen: dict[str, Any] = {name: array[index] for name, array in self.arrays().items()}
-        for name in ("joint_direction", "contact_share", "contact_unloaded"):
+        for name in ("joint_direction", "joint_stribeck", "contact_share", "contact_unloaded"):
             if (array := getattr(self, name)) is not None:
                 chosen[name] = array[index]
         return dataclasses.replace(self, **chosen)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -35,6 +35,7 @@ class LowPass:
     padding: int
 
     @classmethod
+    @cache  # takes 1 ms, and a log is filtered by the same ones over and over
     def butterworth(cls, cutoff_hz: float, step: float) -> LowPass:
         """A Butterworth filter of that cutoff [Hz], for samples at steps of so many seconds."""
         from scipy import signal  # takes 0.4 s, which runs that find their samples in a cache need not
@@ -54,7 +55,7 @@ class LowPass:
             out[:, first : first + together] = signal.sosfiltfilt(self.sections, channels, padlen=self.padding).T
         return out.reshape(values.shape)
 
-    @property
+    @cached_property
     def settling(self) -> int:
         """Samples after which earlier ones have no effect: the slowest mode has decayed to rounding."""
         slowest = max(float(np.max(np.abs(np.roots(section[3:])))) for section in self.sections)

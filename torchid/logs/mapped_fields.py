@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from torchid.errors import LogError
 from torchid.logs.arrays import fields_of_records, parse_names, with_parts
-from torchid.logs.column_entries import KEY, Gains, PdLaw
+from torchid.logs.column_entries import FRACTIONS, KEY, Gains, PdLaw
 from torchid.logs.column_map import PLACEHOLDER, Columns, check_columns, list_parts, values_by_name, values_of_all
 from torchid.logs.column_matching import columns_of_file, match_columns
 from torchid.logs.columns import TEXT_COLUMN, TableLayout, is_column, parse_header
@@ -163,7 +163,7 @@ class MappedFields:
     def _mapped(self, name: str, take: Take) -> NDArray[Any]:
         if name in self._values:
             out = self._values[name].read(take)
-            if name == "time" and (more := self._values.get("time.nanoseconds")) is not None:
+            for more in (x for part in FRACTIONS if (x := self._values.get(f"{name}.{part}")) is not None):
                 out = out + more.read(take)
             return _flagged(out, self._threshold) if name == "contact_active" else out
         if name == "joint_torque":

@@ -38,6 +38,7 @@ class KnownRobot:
         elsewhere: all others.
         slides: joints that are prismatic.
         moving: all joints that move, those too that mimic others.
+        limbs: its joints along each part of the tree without branches, from the base outwards.
         limb_sensors: children of the fixed joints in limbs that are called force or torque sensors, by joint.
     """
 
@@ -52,6 +53,7 @@ class KnownRobot:
     along_base: Sequence[str] = ()
     slides: Sequence[str] = ()
     moving: Sequence[str] = ()
+    limbs: Sequence[Sequence[str]] = ()
 
 
 def within(stem: str) -> re.Pattern[str]:
@@ -101,6 +103,22 @@ def limb_and_words(text: str) -> tuple[frozenset[str], tuple[str, ...]]:
     """The limb that a name of a joint means, and its other words."""
     words = [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", text)]
     return limbs(text), tuple(word for word in words if word not in _LIMBS and word != "joint")
+
+
+_KINDS = {
+    "leg": "hip|thigh|calf|knee|ankle|leg", "arm": "shoulder|elbow|wrist|arm", "torso": "torso|waist|spine|chest",
+    "waist": "torso|waist|spine|chest", "head": "head|neck", "neck": "head|neck",
+}  # fmt: skip
+
+
+def limb_of(text: str, count: int, robot: KnownRobot) -> Sequence[str]:
+    """The joints of the limb with so many that a text means, by its side or by what it is; none if none or several."""
+    side, words = limb_and_words(text)
+    found = [of for of in robot.limbs if len(of) == count and frozenset.intersection(*map(limbs, of)) == side]
+    kinds = [_KINDS[word] for word in words if word in _KINDS]
+    if kinds:
+        found = [of for of in found if all(any(re.search(kind, name.lower()) for name in of) for kind in kinds)]
+    return found[0] if len(found) == 1 and (side or kinds) else ()
 
 
 def _contains(words: tuple[str, ...], others: tuple[str, ...]) -> bool:

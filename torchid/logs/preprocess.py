@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from itertools import takewhile
 from typing import Any
 
@@ -22,7 +23,7 @@ from torchid.logs.log import (
     column_labels,
 )
 from torchid.logs.quaternion import angular_acceleration_base, angular_velocity_base, make_sign_continuous
-from torchid.logs.sign_filter import mean_sign, mean_tanh, with_sign_filter
+from torchid.logs.sign_filter import mean_dry, mean_stribeck, with_sign_filter
 from torchid.logs.signal_noise import signal_noise, warn_of_noisy_accelerations
 from torchid.logs.timeline import JITTER, Timeline, lay_out_timeline, nearest_known
 
@@ -45,6 +46,7 @@ def preprocess(
     sample_rate_hz: float | None = None,
     motion_noise: Mapping[str, float] | None = None,
     sign_width: float | None = None,
+    stribeck: float | None = None,
 ) -> Log:
     """Fill in velocities and accelerations, after a zero-phase low-pass filter and before resampling, both optional.
 
@@ -63,8 +65,9 @@ def preprocess(
     In a filtered log a contact is active from 1/cutoff_hz before its recorded start until 1/cutoff_hz after its end, as
     the filter spreads its force over that time: an ignored force would bias the fit, a projected force of 0 would not.
     Readings of contact sensors without contact, their offsets, are kept as recorded (`contact_unloaded`). The sign of
-    the joint velocities, which dry friction goes with, is filtered as its torque is (`joint_direction`). The noise of
-    the recorded motion, which makes parameters too small, comes with the log (`motion_noise`).
+    the joint velocities, which dry friction goes with, is filtered as its torque is (`joint_direction`), and what
+    Stribeck friction goes with alike (`joint_stribeck`). The noise of the recorded motion, which makes parameters too
+    small, comes with the log (`motion_noise`).
 
     Args:
         log: the log.
@@ -74,6 +77,8 @@ def preprocess(
             known; others are estimated, see `signal_noise`.
         sign_width: over which the sign of a joint's velocity changes, as tanh(velocity / width) [rad/s or m/s]; None
             for at once.
+        stribeck: velocity over which friction at rest drops to Coulomb friction [rad/s or m/s]; None: there is no such
+            friction.
 
     Returns:
         The preprocessed log, which shares the memory of unchanged fields; `log` itself where nothing has to be done.
@@ -87,7 +92,7 @@ def preprocess(
             faster than the filter lets through, or accelerations are noise to a large part.
     """
     with about_file(log.source):
-        timeline = make_timeline(log.time, lacks_derivatives(log), cutoff_hz, sample_rate_hz, sign_width)
+        timeline = make_timeline(log.time, lacks_derivatives(log), cutoff_hz, sample_rate_hz, sign_width, stribeck)
     noise = log.motion_noise or signal_noise(log, timeline, motion_noise)
     if timeline is None:
         return replace(log, motion_noise=noise) if noise.found else log
@@ -108,11 +113,13 @@ def make_timeline(
     cutoff_hz: float | None,
     sample_rate_hz: float | None,
     sign_width: float | None = None,
+    stribeck: float | None = None,
 ) -> Timeline | None:
     """The timeline of `preprocess`; None where nothing has to be done. Raises and warns as `lay_out_timeline`."""
     if cutoff_hz is None and sample_rate_hz is None and not differentiates:
         return None
-    return replace(lay_out_timeline(time, cutoff_hz, sample_rate_hz, differentiates), sign_width=sign_width)
+    timeline = lay_out_timeline(time, cutoff_hz, sample_rate_hz, differentiates)
+    return replace(timeline, sign_width=sign_width, stribeck=stribeck)
 
 
 def gapless_fields(log: Log, timeline: Timeline) -> list[str]:
@@ -194,13 +201,11 @@ def _motion(log: Log, timeline: Timeline) -> dict[str, FloatArray]:
             is_turned = names[0] == "base_quat_xyzw"
             out |= _orientation(log, derivatives, timeline) if is_turned else dict(zip(names, derivatives, strict=True))
         joints |= {names[0]: x for names, x in zip(same, smoothed, strict=True) if names[0] in DERIVATIVE_CHAINS[0]}
-    if (direction := _direction(log, joints, timeline)) is not None:
-        out["joint_direction"] = direction
-    return out
+    return out | _dry_friction(log, joints, timeline)
 
 
-def _direction(log: Log, smoothed: Mapping[str, FloatArray], timeline: Timeline) -> FloatArray | None:
-    """What the filter makes of the sign of the joint velocities, (K, n); None where nothing is filtered.
+def _dry_friction(log: Log, smoothed: Mapping[str, FloatArray], timeline: Timeline) -> dict[str, FloatArray]:
+    """`joint_direction` and, with a Stribeck velocity, `joint_stribeck`, (K, n); none where nothing is filtered.
 
     Dry friction reverses at once, or over the width of the timeline, and the filter smears its torque as it smears all
     others. The velocities are filtered less, where they have reversals that the filter would take off.
@@ -211,31 +216,37 @@ def _direction(log: Log, smoothed: Mapping[str, FloatArray], timeline: Timeline)
         timeline: with the grid.
     """
     if log.joint_direction is not None:
-        return timeline.evaluate(timeline.smooth(log.joint_direction), (0,))[0]
+        given = {"joint_direction": log.joint_direction, "joint_stribeck": log.joint_stribeck}
+        return {key: timeline.evaluate(timeline.smooth(x), (0,))[0] for key, x in given.items() if x is not None}
     if timeline.low_pass is None:
-        return None
+        return {}
     name = "joint_position" if log.joint_velocity is None else "joint_velocity"
     known, wider = smoothed[name], timeline.sign_low_pass
     if wider is not None:
         known = replace(timeline, low_pass=wider).smooth(getattr(log, name))
-    steps, width = np.diff(timeline.grid), timeline.sign_width
-    out = np.empty((len(timeline.output_stamps), known.shape[1]))
+    steps, width, stribeck = np.diff(timeline.grid), timeline.sign_width, timeline.stribeck
+    means = {"joint_direction": partial(mean_dry, width=width)}
+    if stribeck is not None:
+        means["joint_stribeck"] = partial(mean_stribeck, width=width, stribeck=stribeck)
+    out = {key: np.empty((len(timeline.output_stamps), known.shape[1])) for key in means}
     together = _channels_together(len(known))
     for start in range(0, known.shape[1], together):
         x = known[:, start : start + together]
         halfway = np.diff(x, axis=0) / steps[:, None] if name == "joint_position" else 0.5 * (x[1:] + x[:-1])
         before, after = np.concatenate([halfway[:1], halfway]), np.concatenate([halfway, halfway[-1:]])
-        sign = mean_sign(before, after) if width is None else mean_tanh(before / width, after / width)
-        out[:, start : start + together] = timeline.evaluate(timeline.low_pass(sign), (0,))[0]
+        for key, mean in means.items():
+            filtered = timeline.low_pass(mean(before, after))
+            out[key][:, start : start + together] = timeline.evaluate(filtered, (0,))[0]
     return out
 
 
-def directions(log: Log, timeline: Timeline) -> Callable[[float | None], FloatArray | None]:
-    """`joint_direction` of the preprocessed log by the width of the sign, as `preprocess` takes it."""
+def dry_friction(log: Log, timeline: Timeline) -> Callable[[float | None, float | None], dict[str, FloatArray]]:
+    """`joint_direction` and `joint_stribeck` of the preprocessed log by `sign_width` and `stribeck` of `preprocess`."""
     name = "joint_position" if log.joint_velocity is None else "joint_velocity"
     signs = timeline if timeline.sign_low_pass is None else replace(timeline, low_pass=timeline.sign_low_pass)
     smoothed = {name: signs.smooth(getattr(log, name))}
-    return lambda width: _direction(log, smoothed, replace(timeline, sign_width=width, sign_low_pass=None))
+    own = replace(timeline, sign_low_pass=None)
+    return lambda width, stribeck: _dry_friction(log, smoothed, replace(own, sign_width=width, stribeck=stribeck))
 
 
 def _continuous(log: Log, name: str) -> FloatArray:

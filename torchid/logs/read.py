@@ -89,11 +89,14 @@ def read_log(
     Raises:
         LogError: one line with the file, the field, its value and the accepted values.
         ConfigError: a map of columns that does not fit itself.
+        TypeError: `columns` is no `Columns`.
 
     Warns:
         TorchidWarning: messages of a bag without time stamps, duplicate messages, channels that are NaN in some, or
             gaps that are filled.
     """
+    if columns is not None and not isinstance(columns, Columns):
+        raise TypeError(f"columns: found {type(columns).__name__}; accepted: torchid.Columns(joint_position=...)")
     with during("reading", os.fspath(path)):
         part, check = split_range(path), partial(check_fields_given, needs_flags=needs_flags)
         kind = existing_log_kind(part.file)

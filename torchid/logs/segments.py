@@ -31,6 +31,7 @@ def preprocess_segments(
     cutoff_hz: float | None,
     sample_rate_hz: float | None,
     sign_width: float | None = None,
+    stribeck: float | None = None,
 ) -> tuple[Log, int]:
     """As `preprocess`, of segments of a log without what is between them.
 
@@ -40,6 +41,7 @@ def preprocess_segments(
         cutoff_hz: as of `preprocess`.
         sample_rate_hz: likewise.
         sign_width: likewise.
+        stribeck: likewise.
 
     Returns:
         One log of all segments, and how many samples were in segments too short for the filter or for derivatives.
@@ -51,7 +53,7 @@ def preprocess_segments(
         TorchidWarning: as `preprocess`.
     """
     with about_file(log.source):
-        whole = make_timeline(log.time, lacks_derivatives(log), cutoff_hz, sample_rate_hz, sign_width)
+        whole = make_timeline(log.time, lacks_derivatives(log), cutoff_hz, sample_rate_hz, sign_width, stribeck)
         if whole is None:
             return _joined([log.select(segment) for segment in segments]), 0
         usable = long_segments(log.time, segments, whole)
@@ -65,7 +67,7 @@ def preprocess_segments(
     for segment in usable:
         part = log.select(segment)
         with about_file(log.source):
-            timeline = make_timeline(part.time, True, cutoff_hz, sample_rate_hz, sign_width)
+            timeline = make_timeline(part.time, True, cutoff_hz, sample_rate_hz, sign_width, stribeck)
         if timeline is None:
             raise ValueError("nothing to derive")
         timeline = dataclasses.replace(timeline, sign_low_pass=whole.sign_low_pass)

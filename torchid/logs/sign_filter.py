@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.polynomial.legendre import leggauss
 
 from torchid.errors import about_file, warn_about_file
 from torchid.logs.log import FloatArray, Log
@@ -20,6 +21,7 @@ _FEWEST = 100  # samples
 _DOUBLINGS = 8  # of the cutoff
 _MUCH = 0.05  # share of the velocities' power that is worth a warning
 _LEAST_CHANGE = 1e-4  # of a tanh's argument over a step, across which its mean is its middle
+_NODES = 9  # within a step, of what Stribeck friction loses with speed
 _WIDEST = 0.4  # largest cutoff over the sample rate
 _EVIDENT = 0.01  # share of the velocities' power by which the error must fall: less is a few per cent of the reversals
 
@@ -123,3 +125,25 @@ def mean_tanh(before: FloatArray, after: FloatArray) -> FloatArray:
     change, tanh = after - before, np.tanh(0.5 * (before + after))
     integral = np.logaddexp(after, -after) - np.logaddexp(before, -before)
     return np.divide(integral, change, out=tanh, where=np.abs(change) > _LEAST_CHANGE)
+
+
+def mean_dry(before: FloatArray, after: FloatArray, width: float | None) -> FloatArray:
+    """Mean of the sign as Coulomb friction has it: over a width [rad/s or m/s], None for at once."""
+    return mean_sign(before, after) if width is None else mean_tanh(before / width, after / width)
+
+
+def mean_stribeck(before: FloatArray, after: FloatArray, width: float | None, stribeck: float) -> FloatArray:
+    """Mean of this sign times exp(-(v / v_s)^2), by that of the sign less what is lost with speed, smooth where v is 0.
+
+    Args:
+        before: (M,), velocity at the beginning [rad/s or m/s].
+        after: (M,), at the end.
+        width: as of `mean_dry`.
+        stribeck: v_s [rad/s or m/s].
+    """
+    mean = mean_dry(before, after, width)
+    for node, weight in zip(*leggauss(_NODES), strict=True):
+        v = 0.5 * (before + after) + 0.5 * node * (after - before)
+        sign = np.sign(v) if width is None else np.tanh(v / width)
+        mean = mean + 0.5 * weight * sign * np.expm1(-((v / stribeck) ** 2))
+    return np.asarray(mean)

@@ -188,10 +188,14 @@ def _with_unit(name: str, unit: str) -> str:
 
 
 def _most_used(text: str) -> str:
-    """The mark that separates most cells of a line, a space if no other does."""
-    counts = {mark: len(_cells(text, mark)) for mark in _SEPARATORS}
+    """The mark between which most cells are numbers, of several that with most cells; a space if none separates any.
+
+    Of `0;1,5;2,5` it is the semicolon, though there are as many commas.
+    """
+    cells = {mark: _cells(text, mark) for mark in _SEPARATORS}
+    counts = {mark: (sum(map(bool, map(_NUMBER.fullmatch, of))), len(of)) for mark, of in cells.items()}
     mark = max(counts, key=lambda mark: counts[mark])
-    return mark if counts[mark] > 1 else " "
+    return mark if counts[mark][1] > 1 else " "
 
 
 def _cells(text: str, mark: str) -> list[str]:

@@ -93,6 +93,7 @@ class Timeline:
         origin: stamp of the log's first sample [s].
         bandwidth_hz: [Hz], up to where the filter leaves white noise white, None without one.
         sign_width: of Coulomb friction's sign [rad/s or m/s], as in `KinematicTree`, None for the sign itself.
+        stribeck: Stribeck velocity [rad/s or m/s], as in `KinematicTree`, None without one.
         sign_low_pass: wider filter of the velocities that this sign is of, None for `low_pass`.
     """
 
@@ -105,6 +106,7 @@ class Timeline:
     origin: float = 0.0
     bandwidth_hz: float | None = None
     sign_width: float | None = None
+    stribeck: float | None = None
     sign_low_pass: LowPass | None = None
 
     @property

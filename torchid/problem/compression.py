@@ -41,7 +41,7 @@ PartKey = tuple[str, ContactState, int, int, bool]  # source, state, fold, block
 class Part:
     """Compressed rows of one log (named by `source`) in one contact state, one fold and one block of it.
 
-    Equations of unloaded contact sensors are in parts of their own, `unloaded`, which count no samples. `gated`:
+    Equations of unloaded contact sensors are in parts of their own, `unloaded`, which count no samples. `masked`:
     indices of extras that are offsets without such an equation, because their readings in the air are masked.
     """
 
@@ -52,7 +52,7 @@ class Part:
     fold: int = 0
     block: int = 0
     unloaded: bool = False
-    gated: set[int] = field(default_factory=set)
+    masked: set[int] = field(default_factory=set)
 
     __repr__ = short_repr
 
@@ -185,8 +185,8 @@ def _compress_chunks(
                 compressor.add(own.factor, support, stacked, samples.oversampling)
         for channel in unloaded_offset_equations(builder, samples):
             in_the_air = part(samples, state, True)
-            if channel.gated:
-                in_the_air.gated.add(channel.offset)
+            if channel.masked:
+                in_the_air.masked.add(channel.offset)
             else:
                 in_the_air.factor.add(*channel.row(builder), samples.oversampling)
     compressor.finish()
@@ -230,7 +230,7 @@ def _merge_parts(of_workers: Iterable[list[Part]]) -> list[Part]:
         same = total.setdefault(part.key, part)
         if same is not part:
             same.samples += part.samples
-            same.gated |= part.gated
+            same.masked |= part.masked
             same.factor.merge(part.factor)
     return list(total.values())
 
@@ -393,8 +393,8 @@ def merge_by_key(parts: Sequence[Part], keys: Sequence[tuple[object, ...]], buil
     out: dict[tuple[object, ...], Part] = {}
     for part, key in zip(parts, keys, strict=True):
         if key not in out:
-            out[key] = replace(part, factor=TriangularFactor(builder.width), samples=0, gated=set())
+            out[key] = replace(part, factor=TriangularFactor(builder.width), samples=0, masked=set())
         out[key].factor.merge(part.factor)
-        out[key].gated |= part.gated
+        out[key].masked |= part.masked
         out[key].samples += part.samples
     return list(out.values())

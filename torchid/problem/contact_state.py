@@ -14,7 +14,7 @@ from torchid import parameters
 from torchid.parameters import Array
 from torchid.problem.extras import Extra
 from torchid.problem.row_blocks import RowBlock, RowBlocks, row_block
-from torchid.problem.wrench_rows import Acting, LoopLayouts, LoopRows, WrenchRows
+from torchid.problem.wrench_rows import LineOfAction, LoopLayouts, LoopRows, WrenchRows
 from torchid.regressor.columns import reduced_layout, reduction_matrix
 from torchid.regressor.kinematics import BodyStates
 from torchid.regressor.regressor import (
@@ -304,47 +304,48 @@ class ContactStateLayouts:
         for contact in contacts:
             at_body = wrench_transform(self.frames[contact][1]).T
             for k in self.contacts[contact].components:
-                acting = self._acting(contact, k)
-                row = at_body[k] if acting.ground is None else np.eye(3)[k]
+                line = self._line_of_action(contact, k)
+                row = at_body[k] if line.ground is None else np.eye(3)[k]
                 if self._measured[contact, k]:
-                    measured.setdefault(acting, []).append(row)
+                    measured.setdefault(line, []).append(row)
                     components.append((contact, k))
                 else:
-                    alike = self._rolling_alike(acting, unmeasured, recorded_normals)
+                    alike = self._rolling_alike(line, unmeasured, recorded_normals)
                     unmeasured.setdefault(alike, []).append(row)
-        components.sort(key=lambda component: list(measured).index(self._acting(*component)))
-        spans = {acting: _span(np.array(rows)) for acting, rows in unmeasured.items()}
+        components.sort(key=lambda component: list(measured).index(self._line_of_action(*component)))
+        spans = {line: _span(np.array(rows)) for line, rows in unmeasured.items()}
         count = sum(map(len, spans.values()))
-        if len(spans) > 1 and not any(acting.ground is not None for acting in spans):
+        if len(spans) > 1 and not any(line.ground is not None for line in spans):
             count = self._generic_rank(spans)
             if count == _WRENCH:
-                spans = {Acting(): np.eye(_WRENCH)}
+                spans = {LineOfAction(): np.eye(_WRENCH)}
         above = set(self.columns.joints_above(body))
         joints = tuple(index for index, joint in enumerate(coupled) if joint in above)
         rows = [
-            tuple(WrenchRows(self._tensor(np.array(x)), acting) for acting, x in part.items())
-            for part in (spans, measured)
+            tuple(WrenchRows(self._tensor(np.array(x)), line) for line, x in part.items()) for part in (spans, measured)
         ]
         return ContactBody(body, rows[0], count, rows[1], tuple(components), joints)
 
-    def _acting(self, contact: int, k: int) -> Acting:
+    def _line_of_action(self, contact: int, k: int) -> LineOfAction:
         """How a component of a contact acts; moments of one that is read along the normal act as they do of others.
 
         Forces of several such contacts on a body may span less by chance, as those of cells in a flat sole do: their
         rank is that of each sample, by its null space.
         """
         if contact not in self.along_normal:
-            return Acting(contact if contact in self.rolling else None)
-        return Acting(contact if contact in self.rolling else None, contact) if k < 3 else Acting()
+            return LineOfAction(contact if contact in self.rolling else None)
+        return LineOfAction(contact if contact in self.rolling else None, contact) if k < 3 else LineOfAction()
 
-    def _rolling_alike(self, acting: Acting, others: Iterable[Acting], recorded_normals: bool) -> Acting:
+    def _rolling_alike(
+        self, line: LineOfAction, others: Iterable[LineOfAction], recorded_normals: bool
+    ) -> LineOfAction:
         """The first of other contacts of the body that touches the ground by the same arm from its origin, or itself.
 
         Forces of contacts with the same arm span a space that is moved as a whole by it.
         """
-        rolling = acting.rolling
-        if rolling is None or acting.ground is not None or recorded_normals:
-            return acting
+        rolling = line.rolling
+        if rolling is None or line.ground is not None or recorded_normals:
+            return line
         own = self.contacts[rolling]
         for other in others:
             if other.rolling is not None and other.ground is None:
@@ -354,13 +355,13 @@ class ContactStateLayouts:
                     own.kind == "point" or np.allclose(self._axis(other.rolling), self._axis(rolling), atol=1e-12)
                 ):
                     return other
-        return acting
+        return line
 
     def _axis(self, contact: int) -> Array:
         """Axis of a cylinder in its node's joint frame, (3,)."""
         return self.frames[contact][1][:3, "xyz".index(self.contacts[contact].line_axis)]
 
-    def _generic_rank(self, spans: Mapping[Acting, Array]) -> int:
+    def _generic_rank(self, spans: Mapping[LineOfAction, Array]) -> int:
         """Dimension of the space that wrenches span with normals in any directions; it is never larger."""
         rng, moved = np.random.default_rng(0), []
         for (rolling, _), rows in spans.items():
@@ -378,7 +379,7 @@ class ContactStateLayouts:
 
 
 _WRENCH = 6
-_Grouped = dict[Acting, list[Array]]
+_Grouped = dict[LineOfAction, list[Array]]
 
 
 def _span(rows: Array) -> Array:

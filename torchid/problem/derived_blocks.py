@@ -36,7 +36,7 @@ from torchid.problem.detection_motion import (
     quiet,
     require_torque,
 )
-from torchid.problem.floor_pose import Footing, StanceFoot, ways_up
+from torchid.problem.floor_pose import Footholds, StanceFoot, foot_to_base
 from torchid.problem.standing import (
     StandingSegments,
     feet_poses,
@@ -166,10 +166,10 @@ def stand_in_blocks(
 
     axes = _sole_axes(joints, active, robot, contacts, parts)
 
-    def footing(samples: slice) -> Footing:
+    def footholds(samples: slice) -> Footholds:
         poses = feet_poses(joints(samples), robot, contacts)
         feet = [StanceFoot.of(x, poses[x.frame], axis) for x, axis in zip(contacts, axes, strict=True)]
-        return Footing.of(feet, points_that_stand(active[samples], contacts))
+        return Footholds.of(feet, points_that_stand(active[samples], contacts))
 
     quats, positions = (growing_array(blocks.source, folder, len(blocks)) for _ in range(2))
     length = 0
@@ -181,7 +181,7 @@ def stand_in_blocks(
             grows.append(rows)
         length = samples.stop
 
-    found = stand_in_parts(blocks.source, contacts, active, footing, parts, add)
+    found = stand_in_parts(blocks.source, contacts, active, footholds, parts, add)
     _skip(quats, len(blocks) - length, 4)
     _skip(positions, len(blocks) - length, 3)
     fields: dict[str, Any] = {name: None for name in (*motion_fields(blocks), NORMALS) if not name.startswith("joint_")}
@@ -218,7 +218,7 @@ def _sole_axes(
     for part in parts if flat else ():
         poses = feet_poses(joints(part), robot, contacts)
         for index in flat:
-            ways = ways_up(poses[contacts[index].frame])[active[part, index]]
+            ways = foot_to_base(poses[contacts[index].frame])[active[part, index]]
             if len(ways):
                 before = sums[index]
                 sums[index] = ways.sum(axis=0) if before is None else before + ways.sum(axis=0)

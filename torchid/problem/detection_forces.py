@@ -137,7 +137,6 @@ class _Balance:
         n = 6 + self.robot.n
         _, predicted = force_series(self.builder, samples, self.robot.nominal.flatten()[None])
         q, _, _ = samples.coordinates()
-        poses = self.robot.link_poses(samples.joint_position)
         missing = predicted[0, :, :n].copy()
         missing[:, 6:] -= np.zeros(1) if samples.torque is None else samples.torque[:, : self.robot.n].numpy()
         maps, normals = [], []
@@ -145,8 +144,8 @@ class _Balance:
             normal = torch.tensor(contact.normal, dtype=torch.float64)
             J = FrameJacobian(self.robot, contact.frame, contact.radius, contact.rolling_axis)(q, normal).numpy()
             maps.append(J[:, list(contact.components), :n][:, :, self.rows])
-            to_frame = (rotation @ poses[contact.frame][:, :3, :3].numpy()).swapaxes(1, 2)
-            normals.append(to_frame @ np.array(contact.normal))
+            in_base = rotation.swapaxes(1, 2) @ np.array(contact.normal)
+            normals.append((J[:, :3, :3] @ in_base[..., None])[..., 0])  # which turns the base's axes into the frame's
         A = np.asarray(np.concatenate(maps, axis=1).swapaxes(1, 2) / self.error[:, None], dtype=np.float64)
         free = np.concatenate([_free(contact) for contact in self.contacts]) / (_FREE * self.weight)
         solver = np.linalg.solve(A.swapaxes(1, 2) @ A + np.diag(free**2), A.swapaxes(1, 2))

@@ -30,6 +30,9 @@ def dof_extra_column(extra: Extra, dof: int, samples: Samples, tree: KinematicTr
         return samples.joint_position[:, dof]
     if extra.what == "asymmetric_coulomb":
         return tree.coulomb_sign(samples.joint_velocity[:, dof]).abs()
+    if extra.what == "stribeck":
+        filtered = samples.stribeck
+        return tree.stribeck_share(samples.joint_velocity[:, dof]) if filtered is None else filtered[:, dof]
     return torch.ones_like(samples.time)
 
 

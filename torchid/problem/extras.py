@@ -21,6 +21,7 @@ ACTUATORS = {
     "armature": ("kg m^2", 0.1),
     "torque_offset": ("N m", 5.0),
     "asymmetric_coulomb": ("N m", 1.0),
+    "stribeck": ("N m", 1.0),
     "stiffness": ("N m/rad", 1.0),
 }
 """Extra parameters of joints rather than sensors: their unit, and the size of a plausible value in it."""
@@ -49,7 +50,10 @@ class ExtraTerms:
     `torque_offset`, `asymmetric_coulomb`, half the difference of Coulomb friction forwards and backwards, and
     `stiffness` of a spring, or of cables and hoses that act as one, times the joint's position; where it is at rest
     follows with an offset of the torque.
-    `sign_width` [rad/s or m/s] replaces the sign of a velocity v in Coulomb friction by tanh(v / width).
+    `sign_width` [rad/s or m/s] replaces the sign of a velocity v in dry friction by tanh(v / width).
+    `stribeck`, a velocity v_s [rad/s or m/s]: what friction at rest is beyond Coulomb friction, which goes with
+    sign(v) exp(-(v / v_s)^2) (Armstrong-Hélouvry, Dupont and Canudas de Wit, "A survey of models, analysis tools and
+    compensation methods for the control of machines with friction", 1994, with an exponent of 2).
 
     `delay` and `delays` are those of a search, see `torchid.fitting.delay`: how much later than recorded all joint
     torques act, to first order, and the number of `delayed_torque` that samples have.
@@ -60,6 +64,7 @@ class ExtraTerms:
     armature: bool = False
     torque_offset: bool = False
     asymmetric_coulomb: bool = False
+    stribeck: float | None = None
     stiffness: bool = False
     sign_width: float | None = None
     delay: bool = False
@@ -113,7 +118,13 @@ class Extra:
         """A unique name: "offset of l_sole fz", "offset of limb sensor l_ankle fz", "scale of *_hip,*_knee"."""
         limb = "limb sensor " if self.component and self.dofs else ""  # a link may have its joint's name
         channel = f"{limb}{self.name} {self.component}".strip()
-        return f"{self.what.replace('_', ' ').replace('coulomb', 'Coulomb friction')} of {channel}"
+        return f"{in_words(self.what)} of {channel}"
+
+
+def in_words(what: str) -> str:
+    """A kind of extra parameters as labels have it: "asymmetric Coulomb friction"."""
+    words = what.replace("_", " ").replace("coulomb", "Coulomb friction")
+    return words.replace("stribeck", "Stribeck friction")
 
 
 def list_extras(robot: Robot, contacts: Sequence[Contact], sensors: SensorSet, terms: ExtraTerms) -> tuple[Extra, ...]:

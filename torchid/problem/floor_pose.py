@@ -50,8 +50,8 @@ class StanceFoot:
         return cls(contact, rotation, origin[:, None] + (_HALF_FOOT_M * local) @ rotation.swapaxes(1, 2))
 
 
-def ways_up(pose: FloatArray) -> FloatArray:
-    """Ways (N, 3) [m] from a foot with poses (N, 4, 4) in the base up to the base's origin, along the foot's axes."""
+def foot_to_base(pose: FloatArray) -> FloatArray:
+    """Vectors (N, 3) [m] from a foot with poses (N, 4, 4) in the base to the base's origin, along the foot's axes."""
     return np.asarray(-np.einsum("nji,nj->ni", pose[:, :3, :3], pose[:, :3, 3]))
 
 
@@ -117,7 +117,7 @@ def _fit_planes(points: FloatArray, radius: FloatArray) -> tuple[FloatArray, Flo
 
 
 @dataclass(frozen=True)
-class Footing:
+class Footholds:
     """Feet of N successive samples above their floor, in the base frame; `points`: of all feet, (N, P, 3) [m]."""
 
     feet: Sequence[StanceFoot]
@@ -125,16 +125,16 @@ class Footing:
     floor: Floor
 
     @classmethod
-    def of(cls, feet: Sequence[StanceFoot], stands: BoolArray) -> Footing:
+    def of(cls, feet: Sequence[StanceFoot], stands: BoolArray) -> Footholds:
         """Of feet of whose P points these stand, (N, P)."""
         points = np.concatenate([foot.points for foot in feet], axis=1)
         radius = np.concatenate([np.full(foot.points.shape[1], foot.contact.radius) for foot in feet])
         return cls(feet, points, fit_floors(points, radius, stands))
 
-    def __getitem__(self, samples: slice) -> Footing:
+    def __getitem__(self, samples: slice) -> Footholds:
         feet = [StanceFoot(foot.contact, foot.rotation[samples], foot.points[samples]) for foot in self.feet]
         floor = Floor(self.floor.up[samples], self.floor.height[samples], self.floor.uneven[samples])
-        return Footing(feet, self.points[samples], floor)
+        return Footholds(feet, self.points[samples], floor)
 
 
 def split_at_lost_feet(stands: BoolArray, known: BoolArray) -> Iterator[list[slice]]:
@@ -168,30 +168,30 @@ class Walk:
         self._places[~stayed] = np.nan
         return bool(np.isfinite(self._places).all(axis=1).sum() >= 2)
 
-    def along(self, runs: Sequence[slice], footing: Footing) -> tuple[FloatArray, FloatArray]:
+    def along(self, runs: Sequence[slice], footholds: Footholds) -> tuple[FloatArray, FloatArray]:
         """Rotations (M, 3, 3) to the world and positions (M, 3) [m] in it, along the runs of a segment.
 
         A segment may be walked in parts, of which each begins with the last sample of the part before.
 
         Args:
             runs: of samples on the same feet, without a gap.
-            footing: of their M samples.
+            footholds: of their M samples.
         """
-        levelled_base = levelled(footing.floor.up)  # base to floor but for the heading
-        flat = np.einsum("nij,npj->npi", levelled_base, footing.points)[..., :2]
+        levelled_base = levelled(footholds.floor.up)  # base to floor but for the heading
+        flat = np.einsum("nij,npj->npi", levelled_base, footholds.points)[..., :2]
         rolled = np.zeros_like(flat)
-        rolling = [foot.contact.radius > 0.0 for foot in footing.feet]
+        rolling = [foot.contact.radius > 0.0 for foot in footholds.feet]
         for _ in range(_PASSES):
             yaw, place, places = self._follow(runs, levelled_base, flat, rolled)
             rotation = _about_z(yaw) @ levelled_base
             if not any(rolling):
                 break
-            before, rolled = rolled, _rolled(footing.feet, rotation)
+            before, rolled = rolled, _rolled(footholds.feet, rotation)
             if np.abs(rolled - before).max() < _SETTLED_M:
                 break
         self._places, self._last = places, runs[-1].stop
         to_world = _rotation_between(np.array(UP), self._normal)
-        position = np.concatenate([place, footing.floor.height[:, None]], axis=1)
+        position = np.concatenate([place, footholds.floor.height[:, None]], axis=1)
         return to_world @ rotation, position @ to_world.T
 
     def _follow(

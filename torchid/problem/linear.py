@@ -55,7 +55,13 @@ class LinearProblem:
         return f"{self.rows} whitened equations for {self.A.shape[1]} parameters, {int(self.free.sum())} of them free"
 
     def __post_init__(self) -> None:
-        """Check shapes, and that all numbers are finite."""
+        """Check types and shapes, and that all numbers are finite."""
+        for name, kind in (("A", "f"), ("b", "f"), ("nominal", "f"), ("scale", "f"), ("free", "b")):
+            if not isinstance(x := getattr(self, name), np.ndarray) or x.dtype.kind != kind:
+                found = f"{type(x).__name__} of {getattr(x, 'dtype', 'no dtype')}"
+                raise TypeError(
+                    f"{name}: found {found}; accepted: a NumPy array of {'bool' if kind == 'b' else 'floats'}"
+                )
         rows, columns = self.A.shape
         shapes = (self.b.shape, self.nominal.shape, self.scale.shape, self.free.shape)
         if shapes != ((rows,), (columns,), (columns,), (columns,)):
@@ -72,12 +78,18 @@ class LinearProblem:
         if not 1.0 <= self.oversampling < np.inf:
             raise ValueError(f"oversampling: found {self.oversampling}; accepted: a finite number of at least 1")
 
+    def require_bodies(self) -> None:
+        """Raise ValueError unless the columns may be those of bodies."""
+        if len(self.free) % parameters.PER_BODY:
+            raise ValueError(f"A: found {len(self.free)} columns; accepted: {parameters.PER_BODY} for each body")
+
     def free_bodies(self) -> np.ndarray:
         """Bodies whose inertial parameters are free, (L',) int, where the parameters are those of bodies.
 
         Raises:
-            ValueError: a body has both free and fixed inertial parameters.
+            ValueError: the columns are not those of bodies, or a body has both free and fixed inertial parameters.
         """
+        self.require_bodies()
         inertial = self.free.reshape(-1, parameters.PER_BODY)[:, parameters.INERTIAL]
         if (inertial.any(axis=1) != inertial.all(axis=1)).any():
             raise ValueError("free: found a body of which part is free; accepted: inertial parameters body by body")

@@ -92,7 +92,7 @@ class RowBuilder(nn.Module):
         self.extras = list_extras(robot, contacts, sensors, terms)
         self.known_torques = KnownTorques(robot, self.extras)
         self.motors = MotorForces(robot)
-        self.tree = KinematicTree(robot, terms.sign_width)
+        self.tree = KinematicTree(robot, terms.sign_width, terms.stribeck)
         self.columns = RowColumns(self.tree)
         self.contacts = tuple(contacts)
         self.sensors = sensors

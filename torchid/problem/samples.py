@@ -53,11 +53,10 @@ class Samples:
             rate over the noise bandwidth of the filter.
         contact_normal: (N, C, 3), unit vectors in the world that point away from the ground; None for those that the
             contacts state.
-        share: (N, C), share of a constant contact reading that the filter leaves, as `Log.contact_share`; None if it is
-            `active`.
+        share: (N, C), of a constant contact reading that the filter leaves, as `Log.contact_share`; None for `active`.
         unloaded: (N, C, 6), readings of contact sensors while the contact is in the air, NaN elsewhere, as
             `Log.contact_unloaded`, on the CPU; None without such readings.
-        direction: (N, n), what Coulomb friction goes with, as `Log.joint_direction`; None for the sign of the velocity.
+        direction, stribeck: (N, n), what Coulomb and Stribeck friction go with, as in `Log`; None for the velocity's.
         folder: where the tensors of a log larger than memory are stored; None for one in memory.
         fold: number of the cross-validation fold of these samples, see `split_into_folds`.
         block: number of the block in which they are compressed, see `compress_in_blocks`.
@@ -91,6 +90,7 @@ class Samples:
     payload: Array | None = None
     pages: MappedPages | None = field(default=None, repr=False, compare=False)
     delayed_torque: Tensor | None = None
+    stribeck: Tensor | None = None
 
     __repr__ = short_repr
 
@@ -156,8 +156,7 @@ class Samples:
             force = torch.stack([zero[:, 0] - g for g in GRAVITY_WORLD], dim=1)
             if (rotation := base.rotation) is not None:
                 force = (rotation.mT @ force[..., None])[..., 0]
-        omega = zero if base.angular_velocity is None else base.angular_velocity
-        alpha = zero if base.angular_acceleration is None else base.angular_acceleration
+        omega, alpha = (zero if x is None else x for x in (base.angular_velocity, base.angular_acceleration))
         joints = self.joint_position, self.joint_velocity, self.joint_acceleration
         return Motion(*joints, omega, alpha, force, self.direction)
 
@@ -247,6 +246,7 @@ def bind_log(log: Log, robot: Robot, contacts: Sequence[Contact], required: Sens
         None if unloaded is None else torch.from_numpy(_unloaded(columns_in_order(unloaded, chosen), contacts)),
         None if log.joint_direction is None else torch.from_numpy(columns_in_order(log.joint_direction, order)),
         has_force_normal=log.contact_force_normal is not None,
+        stribeck=None if log.joint_stribeck is None else torch.from_numpy(columns_in_order(log.joint_stribeck, order)),
         motion_noise=bind_motion_noise(log, order, robot.fixed_base, imu),
     )
     if required is not None:

@@ -18,13 +18,13 @@ from torchid.logs.quaternion import make_sign_continuous
 from torchid.logs.segments import preprocess_segments
 from torchid.problem.floor_pose import (
     FEWEST_POINTS,
-    Footing,
+    Footholds,
     StanceFoot,
     Walk,
     find_sole_axis,
+    foot_to_base,
     points_of,
     split_at_lost_feet,
-    ways_up,
 )
 from torchid.problem.samples import joint_order
 from torchid.robot import Robot
@@ -73,6 +73,7 @@ def preprocess_standing(
     cutoff_hz: float | None,
     sample_rate_hz: float | None,
     sign_width: float | None = None,
+    stribeck: float | None = None,
 ) -> Log:
     """As `preprocess`, with the motion of the base from the feet that stand; samples with too few of them are left out.
 
@@ -83,6 +84,7 @@ def preprocess_standing(
         cutoff_hz: as of `preprocess`.
         sample_rate_hz: likewise.
         sign_width: likewise.
+        stribeck: likewise.
 
     Raises:
         InputError: as `stand_on_feet` and `preprocess`, or no segment is long enough for the filter.
@@ -91,7 +93,8 @@ def preprocess_standing(
         TorchidWarning: as `preprocess`; number of samples left out, with the reasons; feet that are not on one floor.
     """
     standing = stand_on_feet(log, robot, contacts)
-    out, too_short = preprocess_segments(standing.log, standing.segments, cutoff_hz, sample_rate_hz, sign_width)
+    dry = sign_width, stribeck
+    out, too_short = preprocess_segments(standing.log, standing.segments, cutoff_hz, sample_rate_hz, *dry)
     warn_of_standing(log.source, len(log), standing, too_short)
     return out
 
@@ -141,10 +144,10 @@ def stand_on_feet(log: Log, robot: Robot, contacts: Sequence[Contact]) -> Standi
     require_floor_normals(log.source, log.contact_names, normals, active, contacts)
     with about_file(log.source):
         poses = feet_poses(log, robot, contacts)
-        soles = [ways_up(poses[x.frame])[active[:, i]] for i, x in enumerate(contacts)]
+        soles = [foot_to_base(poses[x.frame])[active[:, i]] for i, x in enumerate(contacts)]
         axes = sole_axes(contacts, [way.mean(axis=0) if len(way) else None for way in soles])
         feet = [StanceFoot.of(x, poses[x.frame], axis) for x, axis in zip(contacts, axes, strict=True)]
-    whole = Footing.of(feet, points_that_stand(active, contacts))
+    whole = Footholds.of(feet, points_that_stand(active, contacts))
     quat, position = np.full((len(log), 4), np.nan), np.full((len(log), 3), np.nan)
 
     def add(samples: slice, turned: FloatArray, placed: FloatArray) -> None:
@@ -162,7 +165,7 @@ def stand_in_parts(
     source: str,
     contacts: Sequence[Contact],
     active: BoolArray,
-    footing: Callable[[slice], Footing],
+    footholds: Callable[[slice], Footholds],
     parts: Sequence[slice],
     add: Callable[[slice, FloatArray, FloatArray], None],
 ) -> StandingSegments:
@@ -172,14 +175,14 @@ def stand_in_parts(
         source: name of the log.
         contacts: its feet, C of them.
         active: which stand, (N, C).
-        footing: of successive samples.
+        footholds: of successive samples.
         parts: all samples; nothing but flags and heights above the floor is kept from one to the next.
         add: called with successive samples, their quaternions (M, 4) and positions (M, 3) [m].
     """
     stands = points_that_stand(active, contacts)
     known, uneven, counted = np.zeros(len(active), dtype=bool), 0.0, 0
     for part in parts:
-        floor = footing(part).floor
+        floor = footholds(part).floor
         known[part] = np.isfinite(floor.height)
         uneven += float(np.square(floor.uneven[known[part]]).sum())
         counted += int(known[part].sum())
@@ -192,7 +195,7 @@ def stand_in_parts(
     for runs in split_at_lost_feet(stands, known):
         samples = slice(runs[0].start, runs[-1].stop)
         if walk.begin(samples.start) or normal == UP or not segments:
-            _walk_along(walk, runs, footing, [part.start for part in parts], add)
+            _walk_along(walk, runs, footholds, [part.start for part in parts], add)
             segments.append(samples)
         else:
             lost = "heading on a floor that is not level"
@@ -204,7 +207,7 @@ def stand_in_parts(
 def _walk_along(
     walk: Walk,
     runs: Sequence[slice],
-    footing: Callable[[slice], Footing],
+    footholds: Callable[[slice], Footholds],
     starts: Sequence[int],
     add: Callable[[slice, FloatArray, FloatArray], None],
 ) -> None:
@@ -215,7 +218,7 @@ def _walk_along(
     for start, stop in zip(borders, borders[1:], strict=False):
         begin = start if before is None else start - 1  # where the part before has ended
         own = [slice(max(run.start, begin), min(run.stop, stop)) for run in runs if run.stop > begin < stop > run.start]
-        rotation, position = walk.along(own, footing(slice(begin, stop)))
+        rotation, position = walk.along(own, footholds(slice(begin, stop)))
         quat = make_sign_continuous(Rotation.from_matrix(rotation).as_quat())
         if before is not None and float(quat[0] @ before) < 0.0:
             quat = -quat

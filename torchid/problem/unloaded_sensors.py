@@ -39,7 +39,7 @@ class UnloadedOffsetEquation:
     Attributes:
         offset: its number among the extras.
         scale: number of the channel's unknown scale, None if that is known.
-        gated: whether the readings are masked, clamped or missing (exactly 0), so that there is no equation.
+        masked: whether the readings are masked, clamped or missing (exactly 0), so that there is no equation.
         mean: of the readings, without outliers [N, N m].
         deviation: standard deviation of the mean [N, N m]: that of independent readings with the stated noise, or more
             if they or their means over longer spans of time scatter more.
@@ -47,7 +47,7 @@ class UnloadedOffsetEquation:
 
     offset: int
     scale: int | None
-    gated: bool = False
+    masked: bool = False
     mean: float = 0.0
     deviation: float = 1.0
 
@@ -79,7 +79,7 @@ def unloaded_offset_equations(builder: RowBuilder, samples: Samples) -> Iterator
         if len(y) < LEAST_READINGS:
             continue
         if _is_masked(y):
-            yield UnloadedOffsetEquation(number, None, gated=True)
+            yield UnloadedOffsetEquation(number, None, masked=True)
         else:
             mean, deviation = _robust_mean(y, noise[axis], samples.oversampling)
             yield UnloadedOffsetEquation(number, scales.get(extra.contact), False, mean, deviation)

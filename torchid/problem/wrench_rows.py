@@ -20,7 +20,7 @@ from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 
 
-class Acting(NamedTuple):
+class LineOfAction(NamedTuple):
     """What of forces on a body changes from sample to sample.
 
     `rolling`: contact whose `rolling_arms` they have, so that they act where it touches the ground. `ground`: contact
@@ -35,11 +35,11 @@ class Acting(NamedTuple):
 class WrenchRows:
     """Wrenches, (k, 6), at a body's joint frame, in its axes.
 
-    `acting`: where and along which axes their forces act, if that is not fixed to the body.
+    `line_of_action`: where and along which axes their forces act, if that is not fixed to the body.
     """
 
     rows: Tensor
-    acting: Acting
+    line_of_action: LineOfAction
 
 
 def wrenches_at_ground(
@@ -59,7 +59,7 @@ def wrenches_at_ground(
     """
     rows, states = [], kinematics.states
     for part in parts:
-        rolling, ground = part.acting
+        rolling, ground = part.line_of_action
         arms = None if rolling is None else kinematics.arms[rolling]
         if ground is None:
             rows.append(wrenches_at_base(states, body, part.rows, arms))

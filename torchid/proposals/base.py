@@ -102,6 +102,17 @@ def _is_unit(numbers: FloatArray) -> bool:
     return bool(len(known)) and float(np.abs(known - 1.0).max()) < _UNIT
 
 
+def field_of_quaternion(family: Family, sample: FileSample, force: NDArray[Any] | None, notes: dict[str, str]) -> str:
+    """The field of a quaternion in the order that it has, with a note where its numbers say so; `force` as below."""
+    stated = re.search("xyzw|wxyz", family.words.lower())
+    order = stated[0] if stated else "xyzw" if family.axes[0] in ("x", "X") else "wxyz"
+    if not stated and not any(family.axes):
+        arrays = [x for column in family.columns if (x := sample[column]) is not None]
+        order, why = order_of_quaternion(arrays, force)
+        notes[f"base_quat_{order}"] = f"order of components, {why}"
+    return f"base_quat_{order}"
+
+
 def order_of_quaternion(arrays: Sequence[NDArray[Any]], force: NDArray[Any] | None = None) -> tuple[str, str]:
     """Order of a quaternion's components, as columns or as an array, and why.
 
@@ -248,7 +259,10 @@ def settle_velocities(proposal: MapProposal, values: Callable[[str], FloatArray 
             recorded = _in_si(name, columns, values)
             if recorded is None or recorded.shape != slopes["world"].shape:
                 continue
-            errors = {frame: _error(recorded, slope, width) for frame, slope in slopes.items()}
+            known = np.isfinite(np.hstack([recorded, slopes["world"]])).all(axis=1)
+            if known.sum() <= width:
+                continue
+            errors = {frame: _error(recorded[known], slope[known], width) for frame, slope in slopes.items()}
             best, other = sorted(errors, key=lambda frame: errors[frame])
             if errors[best] > _LIKE:
                 notes[name] = "left out, as it is the slope of the base's pose along no axes"
@@ -276,19 +290,27 @@ def _in_si(name: str, columns: dict[str, Any], values: Callable[[str], FloatArra
 def _slopes(
     columns: dict[str, Any], values: Callable[[str], FloatArray | None], seconds: FloatArray
 ) -> dict[str, dict[str, FloatArray]]:
-    """Linear and angular velocity (N, 3) [m/s, rad/s] along each axes, as far as a pose gives them."""
+    """Linear and angular velocity (N, 3) [m/s, rad/s] along each axes, NaN in samples without the pose for them."""
     quat = values("base_quat_xyzw")
     if quat is None and (wxyz := values("base_quat_wxyz")) is not None and wxyz.shape[1] == 4:
         quat = np.roll(wxyz, -1, axis=1)
     if quat is None or quat.shape != (len(seconds), 4) or len(seconds) < 3 or not (np.diff(seconds) > 0.0).all():
         return {}
     quat = make_sign_continuous(quat)
-    rate = angular_velocity_base(quat, np.gradient(quat, seconds, axis=0))
+    rate = angular_velocity_base(quat, _slope(quat, seconds))
     out = {"angular": {"world": rotate_to_world(quat, rate), "base": rate}}
     position = _in_si("base_position_world", columns, values)
     if position is not None and position.shape == (len(seconds), 3):
-        slope = np.gradient(position, seconds, axis=0)
+        slope = _slope(position, seconds)
         out["linear"] = {"world": slope, "base": rotate_to_base(quat, slope)}
+    return out
+
+
+def _slope(values: FloatArray, seconds: FloatArray) -> FloatArray:
+    """Derivatives (N, k) across gaps, which stay NaN."""
+    known, out = np.isfinite(values).all(axis=1), np.full_like(values, np.nan)
+    if known.sum() > 1:
+        out[known] = np.gradient(values[known], seconds[known], axis=0)
     return out
 
 

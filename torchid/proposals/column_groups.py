@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchid.errors import excerpt
 from torchid.logs.arrays import TRANSPOSED
 from torchid.logs.column_map import PLACEHOLDER
 from torchid.logs.column_proposals import is_current, propose_field
 from torchid.logs.name_matching import SUFFIXES, KnownRobot, joints_by_place, spelled, within
 from torchid.logs.units import OF_JOINTS, quantities_with, split_unit
-from torchid.proposals.file_samples import FileSample
+from torchid.proposals.file_samples import FileSample, side_by_side
 
 _NUMBER = re.compile(r"\d+")
 _AXIS = re.compile(
@@ -27,16 +28,22 @@ _BEHIND = re.compile(r"[_./ \[-]*\{[^{}]*\}\]?$")  # a unit: the axis in `acc_g.
 
 
 _OF_A_JOINT = {"imu_angular_velocity": "joint_velocity", "imu_specific_force": "joint_acceleration"}
-_SECONDS, _NANOSECONDS = r"secs?|seconds", r"nano_?secs?|nsecs?|nano_?seconds|nanos|ns"
+_SECONDS = r"secs?|seconds"
+_FRACTIONS = {
+    "nanoseconds": r"nano_?secs?|nsecs?|nano_?seconds|nanos|ns",
+    "microseconds": r"micro_?secs?|usecs?|micro_?seconds|micros|us",
+}
 
 
-def split_stamps(columns: Sequence[str]) -> dict[str, str]:
-    """Columns of whole seconds, with those of the nanoseconds beside them: `stamp.sec` and `stamp.nanosec`."""
-    seconds, rest = (
-        {found[1]: x for x in columns if (found := re.fullmatch(rf"(.*?)(?<![a-z])(?:{words})", x, re.IGNORECASE))}
-        for words in (_SECONDS, _NANOSECONDS)
+def split_stamps(columns: Sequence[str]) -> dict[str, tuple[str, str]]:
+    """Columns of whole seconds, with key and column of the rest beside them: `stamp.sec` and `stamp.nanosec`."""
+    before = r"(.*?)(?:(?<![A-Za-z])|(?<=[a-z])(?=[A-Z]))"
+    seconds, *rest = (
+        {found[1]: x for x in columns if (found := re.fullmatch(f"{before}(?i:{words})", x))}
+        for words in (_SECONDS, *_FRACTIONS.values())
     )
-    return {column: rest[stem] for stem, column in seconds.items() if stem in rest}
+    pairs = ((key, of) for key, of in zip(_FRACTIONS, rest, strict=True))
+    return {seconds[stem]: (key, column) for key, of in pairs for stem, column in of.items() if stem in seconds}
 
 
 @dataclass(frozen=True)
@@ -111,6 +118,17 @@ class Family:
         return self.entry | ({"first_index": first} if first > 0 else {})
 
 
+def first_of_stamps(families: Sequence[Family], sample: FileSample, notes: dict[str, str]) -> list[Family]:
+    """The first of stamps of several limbs, with a note where others differ; else the families as they are."""
+    columns = [column for one in families for column in one.columns]
+    values = side_by_side(sample, columns) if len(columns) > 1 else np.empty(0)
+    if values.ndim != 2:
+        return list(families)
+    if apart := float(np.ptp(values, axis=1).max()):
+        notes["time"] = f"of '{excerpt(columns[0])}', from which others differ by up to {apart:.2g}"
+    return [Family(columns[0], columns[:1], ("",), (), ("",))]
+
+
 @dataclass(frozen=True)
 class _Stems:
     """What the file calls joints or contacts, with their names in the URDF.
@@ -140,17 +158,18 @@ def find_families(columns: Sequence[str], robot: KnownRobot) -> tuple[list[Famil
         robot: whose joints and contacts they may name.
     """
     joints = _stems("joint", columns, robot.joints, _Stems("joint"))
+    alike = Counter(hole for column in columns for hole, _ in _numbers(split_unit(column)[0]))
     if 2 * len(joints.names) <= len(robot.joints) and (places := joints_by_place(columns, robot.joints)):
         joints = _Stems("joint", places, exact=False, by_place=True)
     kinds = (joints, _stems("contact", columns, robot.feet, joints))
-    with_axes = [_pattern(column, kinds) for column in columns]
+    with_axes = [_pattern(column, kinds, alike) for column in columns]
     axes = defaultdict[str, set[str]](set)
     for pattern, _, _, axis in with_axes:
         axes[pattern].add(axis)
     found = defaultdict[str, list[tuple[str, str, str, str]]](list)
     for column, split in zip(columns, with_axes, strict=True):
         alone = len(axes[split[0]]) == 1  # the y of velocity, the z of the one component that was recorded
-        pattern, name, number, axis = _pattern(column, kinds, False) if alone else split
+        pattern, name, number, axis = _pattern(column, kinds, alike, False) if alone else split
         found[pattern].append((column, name, number, axis))
     out = []
     for patterns in _apart_from_units(found):
@@ -246,8 +265,15 @@ def _stems(kind: str, columns: Sequence[str], names: Sequence[str], others: _Ste
     return best
 
 
-def _pattern(column: str, kinds: Sequence[_Stems], split_axes: bool = True) -> tuple[str, str, str, str]:
-    """A column with placeholders, and the name, number and axis in their places."""
+def _numbers(stem: str) -> list[tuple[str, re.Match[str]]]:
+    """The numbers in a name, with what is around each."""
+    return [(f"{stem[: found.start()]}#{stem[found.end() :]}", found) for found in _NUMBER.finditer(stem)]
+
+
+def _pattern(
+    column: str, kinds: Sequence[_Stems], alike: Mapping[str, int], split_axes: bool = True
+) -> tuple[str, str, str, str]:
+    """A column with placeholders, and the name, number and axis in their places; of numbers that of most columns."""
     number = axis = ""
     fitting = [(name, one) for one in kinds for name in one.names if one.find(name).search(column)]
     name, of = max(fitting, key=lambda pair: len(pair[0]), default=("", _Stems("")))
@@ -255,8 +281,9 @@ def _pattern(column: str, kinds: Sequence[_Stems], split_axes: bool = True) -> t
         column = of.find(name).sub(f"{{{of.kind}}}", column, count=1)
     stem, _ = split_unit(column)
     column, behind = stem, column[len(stem) :]
-    if not name and (found := _NUMBER.search(column)):
-        column, number = f"{column[: found.start()]}{{index}}{column[found.end() :]}", found[0]
+    if not name and (numbers := _numbers(column)):
+        _, match = max(numbers, key=lambda pair: alike.get(pair[0], 0))
+        column, number = f"{column[: match.start()]}{{index}}{column[match.end() :]}", match[0]
     if split_axes and (found := _AXIS.search(column)):
         axis = found[0]
         column = f"{column[: found.start()]}{{{'axis' if axis.islower() else 'AXIS'}}}{column[found.end() :]}"

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from torchid.logs.column_proposals import OF_BASE, OF_PLATES, is_desired, is_no_torque
+from torchid.logs.column_proposals import OF_BASE, OF_PLATES, is_desired, is_no_torque, propose_field, words_of
 from torchid.logs.log import WRENCHES, FloatArray
-from torchid.logs.name_matching import SUFFIXES, KnownRobot, limb_and_words, within
+from torchid.logs.name_matching import SUFFIXES, KnownRobot, limb_and_words, limb_of, within
 from torchid.logs.unitree import JOINT_ORDERS, MOTORS, numbered_joints, suitable_orders
 from torchid.logs.units import quantities_with, split_unit
 from torchid.proposals.column_groups import Family
@@ -39,10 +41,10 @@ class FieldMatcher:
         partial: by field that is left out for it, joints that have columns of other fields alone.
     """
 
-    def __init__(self, sample: FileSample, robot: KnownRobot) -> None:
+    def __init__(self, sample: dict[str, NDArray[Any] | None], robot: KnownRobot) -> None:
         self.sample, self.robot = sample, robot
         self.stated = stated_names(sample, "joint_names")
-        self.names_stated = bool(self.stated) and set(self.stated) <= set(robot.joints)
+        self.names_stated = bool(self.stated) and set(self.stated) <= {*robot.joints, *robot.moving}
         self.named_joints = set(self.stated) if self.names_stated else set[str]()
         self.partial, self._suffix = dict[str, list[str]](), ""
 
@@ -50,6 +52,29 @@ class FieldMatcher:
         """Learn which joints the columns of a file name; `more` as from `find_families`."""
         self._suffix = more.get("joint", "").removeprefix("{joint}")
         self.named_joints = self.named_joints or self._all_named(families)
+
+    def of_limbs(self, names: Sequence[str]) -> list[tuple[Family, Collection[str]]]:
+        """Arrays that hold the joints of one limb each, in the order of the robot's file, and together all joints.
+
+        Args:
+            names: of arrays that may be; of these the columns become a part of the sample.
+        """
+        by_field = defaultdict[str, dict[str, Sequence[str]]](dict)
+        for name in names:
+            array, field = self.sample[name], propose_field(name)
+            if array is not None and array.ndim == 2 and field.startswith("joint_"):
+                by_field[field][name] = limb_of(name, array.shape[1], self.robot)
+        out = list[tuple[Family, Collection[str]]]()
+        for arrays in by_field.values():
+            places = {joint: (name, k) for name, of in arrays.items() for k, joint in enumerate(of)}
+            if len(arrays) > 1 and len(places) == sum(map(len, arrays.values())) == len(self.robot.joints):
+                columns = {joint: f"{name}[{k}:{k + 1}]" for joint, (name, k) in places.items()}
+                self.sample |= {
+                    columns[joint]: np.asarray(self.sample[name])[:, k] for joint, (name, k) in places.items()
+                }
+                family = Family(next(iter(arrays)), list(columns.values()), tuple(columns), (), ("",), columns)
+                out.append((family, arrays))
+        return out
 
     def is_like_torques(self, family: Family) -> bool:
         """Whether a family that nothing says what it is has changing numbers of each joint."""
@@ -124,11 +149,19 @@ class FieldMatcher:
             if not whole and 2 * len(named) > len(self.robot.joints):
                 self.partial[field] = [x for x in self.robot.joints if x in self.named_joints - named]
         else:
-            whole = count in (len(self.robot.joints), *slots, *([len(self.named_joints)] if self.names_stated else []))
-            whole |= not self.names_stated and len(numbered_joints(self.robot.joints, count)) == count > 2
+            known = {len(self.robot.joints), len(self.robot.moving), *slots}
+            whole = count in known or (self.names_stated and count == len(self.named_joints))
+            numbered = not self.names_stated and len(numbered_joints(self.robot.joints, count)) == count > 2
+            whole |= numbered and not self._has_rival(family)
             whole |= listed_order(self.sample, "joint", self.robot, count) is not None
         enough = whole or (count >= len(self.robot.joints) and bool(family.numbers))
         return enough and len(self.robot.joints) > 0 and not any(family.axes)
+
+    def _has_rival(self, family: Family) -> bool:
+        """Whether another array has as many columns and the same last word, such as the `q` of another limb."""
+        named = {name: x for name, x in self.sample.items() if words_of(name)[-1:] == words_of(family.pattern)[-1:]}
+        alike = [x for x in named.values() if x is not None and x.shape[1:] == self.shape(family)]
+        return len(family.columns) == 1 and len(alike) > 1
 
 
 _OF_FOOT = re.compile(
@@ -149,6 +182,8 @@ _AXIS = re.compile(f"{_COMPONENT}(?!.*{_COMPONENT})")  # the last
 _NUMBER = re.compile(r"(?<=[\[_./' -])(\d)(?=\W*$)")
 _PARTS = {"f": "force", "m": "moment", "t": "moment", "c": "moment"}  # c: of a couple
 _WHOLE = {("",), ("x", "y", "z"), ("0", "1", "2"), ("0", "1", "2", "3", "4", "5")}
+_BARE = re.compile(r"f[xyz]?|forces?|[xyz]")
+_OTHER_WEIGHT = 0.5  # by which a robot's weight may differ from its file's
 _CARRIED = 0.3  # of the robot's weight, at least, where forces on the robot add up to it
 
 
@@ -223,13 +258,34 @@ def find_foot_readings(sample: FileSample, columns: Sequence[str], robot: KnownR
         components = {tuple(sorted(of)) for of in feet.values()}
         if part and set(feet) == set(robot.feet) and len(components) == 1 and components <= _WHOLE:
             out.append(_readings(part, feet, robot.feet))
-    return [one for one in out if not _is_spelled_alike(one, robot)]
+    apart = [one for one in out if not _is_spelled_alike(one, robot) or _are_vectors(one, sample)]
+    return [one for one in apart if _is_surely_of_feet(one, sample, robot)]
+
+
+def _are_vectors(readings: FootReadings, sample: FileSample) -> bool:
+    """Whether readings are an array of each foot, which no pattern of columns describes."""
+    return (first := sample[readings.all_columns[0]]) is not None and first.shape[1:] in ((3,), (6,))
 
 
 def _is_of_feet(column: str, robot: KnownRobot) -> bool:
     stem = split_unit(column)[0]
     of_joint = any(within(name).search(column) for name in robot.joints)
-    return bool(_OF_FOOT.search(stem)) and not _NO_FOOT.search(stem) and not is_desired(column) and not of_joint
+    named = _OF_FOOT.search(stem) or _is_bare(stem)
+    return bool(named) and not _NO_FOOT.search(stem) and not is_desired(column) and not of_joint
+
+
+def _is_bare(stem: str) -> bool:
+    """Whether a name says that something is a force, and of which side, but not of what."""
+    return all(_BARE.fullmatch(word) for word in limb_and_words(stem)[1])
+
+
+def _is_surely_of_feet(readings: FootReadings, sample: FileSample, robot: KnownRobot) -> bool:
+    """Whether readings say that they are those of feet, or together carry the robot as these do."""
+    if not all(_is_bare(split_unit(column)[0]) for column in readings.all_columns):
+        return True
+    with np.errstate(all="ignore"):
+        carried = np.nanmean(np.linalg.norm(np.nansum(readings.forces(sample), axis=1), axis=1)) / robot.weight
+    return readings.part != "moment" and bool(1.0 - _OTHER_WEIGHT < carried < 1.0 + _OTHER_WEIGHT)
 
 
 def _side(text: str, robot: KnownRobot) -> frozenset[str]:
@@ -256,7 +312,8 @@ def _component(column: str, inner: tuple[int, ...]) -> tuple[str, str, str]:
 
 
 def _part_of(text: str) -> str:
-    return "moment" if _MOMENT.search(text) else "force" if _FORCE.search(text) else ""
+    is_force = _FORCE.search(text) or "f" in limb_and_words(text)[1]
+    return "moment" if _MOMENT.search(text) else "force" if is_force else ""
 
 
 def _readings(part: str, feet: Mapping[str, Mapping[str, str]], order: Sequence[str]) -> FootReadings:

@@ -18,8 +18,15 @@ from torchid.logs.log import SHAPES, VARIANTS, WRENCHES
 from torchid.logs.name_matching import SUFFIXES, KnownRobot
 from torchid.logs.unitree import JOINT_ORDERS, numbered_joints, usual_order
 from torchid.logs.units import IN_DEGREES, quantities_of, quantities_with, unit_factor
-from torchid.proposals.base import field_beside, field_of_base, find_angles, order_of_quaternion, settle_velocities
-from torchid.proposals.column_groups import Family, MapProposal, find_families, split_arrays, split_stamps
+from torchid.proposals.base import field_beside, field_of_base, field_of_quaternion, find_angles, settle_velocities
+from torchid.proposals.column_groups import (
+    Family,
+    MapProposal,
+    find_families,
+    first_of_stamps,
+    split_arrays,
+    split_stamps,
+)
 from torchid.proposals.fields import MOMENT, FieldMatcher, find_foot_readings, frame_of_forces
 from torchid.proposals.file_samples import FileSample, counts, increases, listed_order, side_by_side, with_samples_first
 from torchid.proposals.numbers import (
@@ -82,13 +89,15 @@ class _Proposer:
         families = sorted(families, key=self._lacks_gravity)
         of_force = (one for one in families if self._lacks_gravity(one) < 0.0)
         self.force = next((side_by_side(self.sample, one.columns) for one in of_force), None)
-        split = self._place_parts(numeric)
-        families = [one for one in families if one.columns[0] not in split]
-        self.nanoseconds = split_stamps(numeric)
-        families = [one for one in families if one.columns[0] not in self.nanoseconds.values()]
-        stamps = [one for one in families if self.match.field(one) == "time"]
+        split, of_limbs = self._place_parts(numeric), self._place_limbs(numeric)
+        split |= of_limbs
+        self.fractions = split_stamps(numeric)
+        of_fractions = {column for _, column in self.fractions.values()}
+        families = [one for one in families if one.columns[0] not in split | of_fractions]
+        stamps = [one for one in families if one.columns[0] in self.fractions or self.match.field(one) == "time"]
         used = [one for one in families if one not in stamps and self._place(one)]
-        used += [one for one in self._stamps_first(stamps) if self._place(one)]
+        stamps = first_of_stamps(stamps, self.sample, self.out.notes) if of_limbs else stamps
+        used += [one for one in self._stamps_first(stamps) if self._place(one, "time")]
         used += self._place_of_base([one for one in families if one not in used])
         if "time" in self.out.columns:
             self.out.columns = {"time": self.out.columns["time"], **self.out.columns}
@@ -99,7 +108,7 @@ class _Proposer:
             used += self._place_law([one for one in families if one not in used])
         used = self._settle_contacts(used)
         taken = {column for one in used for column in one.columns} | split | of_feet
-        taken |= {self.out.columns.get("time", {}).get("nanoseconds")} - {None}
+        taken |= of_fractions & set(self.out.columns.get("time", {}).values())
         taken |= self._place_angles([name for name in numeric if name not in taken])
         self.out.partial = self.match.partial
         self.out.left_out = [name for name in foreign if name not in taken]
@@ -107,7 +116,7 @@ class _Proposer:
         families = [one for one in families if one in used or not set(one.columns) <= taken]
         unused = [one for one in families if one not in used or len(one.numbers) > len(self.joints)]
         ignored = {pattern for one in unused for pattern in one.as_ignored}
-        ignored |= {name for name in foreign if name not in numeric or name in self.nanoseconds.values()} - taken
+        ignored |= {name for name in foreign if name not in numeric or name in of_fractions} - taken
         self.out.columns |= {"ignore": sorted(ignored)} if ignored else {}
         if "joint_torque" not in {*self.given, *self.out.columns}:
             alike = [one for one in families if one not in used and self.match.is_like_torques(one)]
@@ -160,6 +169,13 @@ class _Proposer:
             self._place_part(*part)
         return {name for name, *_ in parts}
 
+    def _place_limbs(self, numeric: Sequence[str]) -> set[str]:
+        """Arrays of the joints of a limb each, which have become entries."""
+        placed = [(family, of) for family, of in self.match.of_limbs(numeric) if self._place(family)]
+        for family, _ in placed:
+            self._note(family.proposed, "joints of each limb in the order of the robot's file")
+        return {name for _, arrays in placed for name in arrays}
+
     def _place_part(self, name: str, columns: str, field: str) -> None:
         """Make some columns of an array an entry."""
         (start, _, stop), text = columns.strip("[]").partition(":"), f"{name}{columns}"
@@ -167,7 +183,7 @@ class _Proposer:
         self.sample[text] = part
         family = Family(text, [text], ("",), (), ("",))
         if field == "base_quat_wxyz":
-            field = self._quaternion(family)
+            field = field_of_quaternion(family, self.sample, self.force, self.out.notes)
         if field.startswith("joint_") and "joint_order" not in self.out.columns and len(part.T) == len(self.joints):
             self.out.columns["joint_order"] = list(self.joints)
             self.out.notes["joint_order"] = "as in the robot's file, as of libraries for dynamics"
@@ -182,7 +198,7 @@ class _Proposer:
 
         def rank(family: Family) -> tuple[bool, bool, int]:
             first = family.columns[0]
-            forwards = first in self.nanoseconds or increases(self.sample[first])
+            forwards = first in self.fractions or increases(self.sample[first])
             return not forwards, counts(self.sample[first]), -len(os.path.commonprefix([first, beside]))
 
         return sorted(families, key=rank)
@@ -213,11 +229,11 @@ class _Proposer:
             return False
         entry: dict[str, Any] = family.counted_entry
         if name == "base_quat_wxyz":
-            name = self._quaternion(family)
+            name = field_of_quaternion(family, self.sample, self.force, self.out.notes)
             if "imu" in family.words.lower():
                 self._note(name, "of the IMU, taken to be that of the base link")
-        if name == "time" and (more := self.nanoseconds.get(family.columns[0])):
-            entry["nanoseconds"] = more
+        if name == "time" and (more := self.fractions.get(family.columns[0])):
+            entry |= [more]
         if not self._has_readings_of(family, name, entry):
             return False
         self._add_order(family, name)
@@ -231,8 +247,7 @@ class _Proposer:
         """Whether the numbers of a family may be those of a field; flags get a threshold."""
         if name == "contact_active":
             return self._add_threshold(family, entry)
-        is_free = name == "imu_specific_force" and not family.unit and -self._lacks_gravity(family) < LEAST_GRAVITY
-        if is_free:
+        if is_free := name == "imu_specific_force" and not family.unit and -self._lacks_gravity(family) < LEAST_GRAVITY:
             self._note(name, f"not '{excerpt(family.columns[0])}', which is without gravity")
         return not is_free
 
@@ -312,24 +327,15 @@ class _Proposer:
         self.out.notes["joint_torque"] = "of the PD law that the columns belong to, as no torque was recorded"
         return used
 
-    def _quaternion(self, family: Family) -> str:
-        """The field of a quaternion in the order that it has."""
-        stated = re.search("xyzw|wxyz", family.words.lower())
-        order = stated[0] if stated else "xyzw" if family.axes[0] in ("x", "X") else "wxyz"
-        if not stated and not any(family.axes):
-            arrays = [x for column in family.columns if (x := self.sample[column]) is not None]
-            order, why = order_of_quaternion(arrays, self.force)
-            self.out.notes[f"base_quat_{order}"] = f"order of components, {why}"
-        return f"base_quat_{order}"
-
     def _place_angles(self, columns: Sequence[str]) -> set[str]:
         """Columns that are angles of the base, where nothing else says how it is turned."""
         if any(name.startswith("base_quat") for name in (*self.given, *self.out.columns)):
             return set()
-        if found := find_angles(self.sample, columns):
-            self.out.columns["base_quat_wxyz"] = {"rpy": found.entry}
-            self._note("base_quat_wxyz", found.note)
-        return set(found.columns if found else ())
+        if (found := find_angles(self.sample, columns)) is None:
+            return set()
+        self.out.columns["base_quat_wxyz"] = {"rpy": found.entry}
+        self._note("base_quat_wxyz", found.note)
+        return set(found.columns)
 
     def _add_threshold(self, family: Family, entry: dict[str, Any]) -> bool:
         """Whether flags can be made of a family, with a threshold unless it has flags; not of numbers of states."""
@@ -350,7 +356,11 @@ class _Proposer:
         if not kind or any(family.names) or key in self.out.columns or (kind == "joint" and self.match.names_stated):
             return
         numbers = len(family.numbers) or int(np.prod(self.match.shape(family)[:1]))
-        order, how = listed_order(self.sample, kind, self.robot, numbers) or usual_order(kind, self.robot, numbers)
+        as_in_file = kind == "contact" and self.out.columns.get("joint_order") == list(self.joints)
+        usual = (list(self.feet), "as in the robot's file, as joints are") if as_in_file else None
+        order, how = (
+            listed_order(self.sample, kind, self.robot, numbers) or usual or usual_order(kind, self.robot, numbers)
+        )
         self.out.columns[key] = order
         listed = [name for name in self._order() if name] if kind == "joint" else order
         if kind == "joint" and not self.out.lacking:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchid.logs.column_entries import FRACTIONS
 from torchid.logs.gaps import turn_jumps
 from torchid.logs.unitree import names_by_number
 from torchid.logs.units import OF_JOINTS, UNITS, unit_factor
@@ -152,10 +153,13 @@ class UnitProposer:
         time = self._flat([self._sample["time"]]) if native else self.values("time")  # type: ignore[list-item]
         if time is None or len(time) < 3:
             return None
-        if (column := self._columns.get("time", {}).get("nanoseconds")) is not None:
-            more = self._flat([self._sample[column]])  # type: ignore[list-item]
-            time = time if more is None else time + 1e-9 * more
+        for key, unit in FRACTIONS.items():
+            if (column := self._columns.get("time", {}).get(key)) is not None:
+                more = self._flat([self._sample[column]])  # type: ignore[list-item]
+                time = time if more is None else time + UNITS["time"][unit] * more
         step = float(np.median(np.diff(time[:, 0])))
+        if not step > 0.0:  # which nothing of what follows can be compared with
+            return None
         unit = next((u for u in ("s", "ms", "us", "ns") if _STEP[0] <= step * UNITS["time"][u] <= _STEP[1]), "s")
         if native and unit != "s" and self._columns:
             self._columns["time"] = {"column": "time"}

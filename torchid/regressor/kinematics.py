@@ -69,7 +69,7 @@ def motion_from_state(
         gravity: (3,), in the world [m/s^2].
 
     Raises:
-        TypeError: one of `q`, `v` and `a` is not a tensor.
+        TypeError: one of `q`, `v` and `a` is not a tensor, or on another device.
         ValueError: wrong shapes of these.
     """
     if wrong := [type(x).__name__ for x in (q, v, a) if not isinstance(x, Tensor)]:
@@ -78,6 +78,8 @@ def motion_from_state(
     if q.ndim != 2 or q.shape[1] != width_q or v.shape != (q.shape[0], width_v) or a.shape != v.shape:
         shapes = ", ".join(str(tuple(x.shape)) for x in (q, v, a))
         raise ValueError(f"q, v, a: found shapes {shapes}; accepted: (B, {width_q}), (B, {width_v}), (B, {width_v})")
+    if len(devices := {x.device: None for x in (q, v, a)}) > 1:
+        raise TypeError(f"q, v, a: found devices {', '.join(map(str, devices))}; accepted: one device")
     g_world = q.new_tensor(gravity)
     if fixed_base:
         zero = q.new_zeros(q.shape[0], 3)
@@ -169,10 +171,11 @@ def body_states(tree: KinematicTree, motion: Motion, joints: JointMotion) -> Bod
 
 
 def _require_precision(tree: KinematicTree, tensors: Mapping[str, Tensor | None]) -> None:
-    expected = tree.joint_map.dtype
     for name, x in tensors.items():
-        if x is not None and x.dtype != expected:
-            raise TypeError(f"{name}: found {x.dtype}; accepted: {expected}, the module's, which .to(dtype) changes")
+        for what in ("dtype", "device"):
+            expected = getattr(tree.joint_map, what)
+            if x is not None and (found := getattr(x, what)) != expected:
+                raise TypeError(f"{name}: found {found}; accepted: {expected}, the module's, which .to({what}) changes")
 
 
 def independent_positions(tree: KinematicTree, q: Tensor) -> Tensor:

@@ -85,8 +85,9 @@ class KinematicTree(nn.Module):
             of freedom, of which the first n move.
 
     `n_nodes`: one for each body, and five more for every force/torque sensor in a limb. `sign_width`: as in
-    `Regressor`. `node_of`: node of each of the robot's bodies. `body_of`: body of each node; for a
-    massless node the body beyond the weld. `has_link_offsets`: whether any `link_offset` is not 0.
+    `Regressor`. `stribeck`: Stribeck velocity [rad/s or m/s], None without such friction. `node_of`: node of each of
+    the robot's bodies. `body_of`: body of each node; for a massless node the body beyond the weld. `has_link_offsets`:
+    whether any `link_offset` is not 0.
     """
 
     pose: Tensor
@@ -102,9 +103,9 @@ class KinematicTree(nn.Module):
     joint_constant: Tensor
     parent_in_level: Tensor
 
-    def __init__(self, robot: Robot, sign_width: float | None = None) -> None:
+    def __init__(self, robot: Robot, sign_width: float | None = None, stribeck: float | None = None) -> None:
         super().__init__()
-        self.sign_width = sign_width
+        self.sign_width, self.stribeck = sign_width, stribeck
         self._indices: dict[tuple[int, ...], Tensor] = {}
         self._path_maps: dict[tuple[int, ...], tuple[slice | Tensor, Tensor | None]] = {}
         nodes = tree_nodes(robot)
@@ -198,6 +199,10 @@ class KinematicTree(nn.Module):
     def coulomb_sign(self, velocity: Tensor) -> Tensor:
         """Sign (...) of velocities (...) [rad/s or m/s] as Coulomb friction has it, smooth if a width is given."""
         return torch.sign(velocity) if self.sign_width is None else torch.tanh(velocity / self.sign_width)
+
+    def stribeck_share(self, velocity: Tensor) -> Tensor:
+        """Share (...) of its friction at rest that Stribeck friction has at velocities (...) [rad/s or m/s]."""
+        return self.coulomb_sign(velocity) * torch.exp(-((velocity / (self.stribeck or torch.inf)) ** 2))
 
     def frame(self, robot: Robot, link: str) -> tuple[int, Array]:
         """Node that carries a URDF link of the robot, and the link's pose, (4, 4) [m], in the node's joint frame.

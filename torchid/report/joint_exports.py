@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -11,9 +11,13 @@ import numpy as np
 
 from torchid import parameters
 from torchid.parameters import Array
+from torchid.report.robot_files import FittedJoints
 from torchid.robot import Robot
 
-_UNITS = {"revolute": ("kg m^2", "N m", "N m s/rad"), "prismatic": ("kg", "N", "N s/m")}
+_UNITS = {
+    "revolute": ("kg m^2", "N m", "N m s/rad", "N m", "rad/s"),
+    "prismatic": ("kg", "N", "N s/m", "N", "m/s"),
+}
 
 
 @dataclass(frozen=True)
@@ -26,6 +30,8 @@ class JointParameters:
         armature: reflected rotor inertia [kg m^2 or kg].
         coulomb: torque or force of dry friction, at any velocity [N m or N].
         viscous: friction over velocity [N m s/rad or N s/m].
+        stribeck: what dry friction at rest is beyond that [N m or N].
+        stribeck_velocity: v_s, where exp(-(velocity / v_s)^2) of it is left [rad/s or m/s]; None without it.
     """
 
     name: str
@@ -33,9 +39,11 @@ class JointParameters:
     armature: float
     coulomb: float
     viscous: float
+    stribeck: float
+    stribeck_velocity: float | None
 
 
-def joint_parameters(robot: Robot, phi: Array, armature: Mapping[str, float]) -> list[JointParameters]:
+def joint_parameters(robot: Robot, phi: Array, fitted: FittedJoints) -> list[JointParameters]:
     """Of the independent joints: one that mimics another has no actuator, its armature and friction are the other's.
 
     By the ratio k of their positions, armature and viscous friction count k^2 times, Coulomb friction |k| times.
@@ -43,7 +51,7 @@ def joint_parameters(robot: Robot, phi: Array, armature: Mapping[str, float]) ->
     Args:
         robot: the robot.
         phi: identified parameters, (L, 12).
-        armature: by joint [kg m^2 or kg], of those whose armature was fitted; others have that of the robot's file.
+        fitted: what else was found of joints; those whose armature was not fitted have that of the robot's file.
     """
     ratio = np.abs(robot.joint_map[0])
     coulomb, viscous = ratio.T @ phi[1:, parameters.COULOMB], (ratio**2).T @ phi[1:, parameters.VISCOUS]
@@ -51,9 +59,11 @@ def joint_parameters(robot: Robot, phi: Array, armature: Mapping[str, float]) ->
         JointParameters(
             name=name,
             kind="prismatic" if name in robot.sliding else "revolute",
-            armature=float(armature.get(name, robot.armature[k])),
+            armature=float(fitted.armature.get(name, robot.armature[k])),
             coulomb=float(coulomb[k]),
             viscous=float(viscous[k]),
+            stribeck=float(fitted.stribeck.get(name, 0.0)),
+            stribeck_velocity=fitted.stribeck_velocity if name in fitted.stribeck else None,
         )
         for k, name in enumerate(robot.joint_names)
     ]
@@ -70,13 +80,11 @@ def isaaclab_text(joints: Sequence[JointParameters], source: str) -> str:
     def entries(value: Callable[[JointParameters], float]) -> str:
         return "".join(f"        {_pattern(joint)}: {value(joint)!r},\n" for joint in joints)
 
-    def friction(joint: JointParameters) -> float:
-        return joint.coulomb
-
     names = "".join(f"        {_pattern(joint)},\n" for joint in joints)
     return (
         f'"""Actuators identified by torchid: {_plain(source)}.\n\n'
-        "friction: Coulomb friction [N m or N]: an effort from Isaac Sim 5.0 on, a coefficient without unit before.\n"
+        "friction: of joints at rest [N m or N]: an effort from Isaac Sim 5.0 on, a coefficient without unit before.\n"
+        "dynamic_friction: Coulomb friction, that of joints that move [N m or N], from Isaac Sim 5.0 on.\n"
         "viscous_friction: [N m s/rad or N s/m], from Isaac Sim 5.0 on; before, leave it out and add its numbers to\n"
         "damping. stiffness, damping: the gains of your controller; with 0 and 0 the joints take efforts.\n"
         '"""\n\n'
@@ -86,8 +94,8 @@ def isaaclab_text(joints: Sequence[JointParameters], source: str) -> str:
         "    stiffness=0.0,\n"
         "    damping=0.0,\n"
         f"    armature={{\n{entries(lambda joint: joint.armature)}    }},\n"
-        f"    friction={{\n{entries(friction)}    }},\n"
-        f"    dynamic_friction={{\n{entries(friction)}    }},\n"
+        f"    friction={{\n{entries(lambda joint: joint.coulomb + joint.stribeck)}    }},\n"
+        f"    dynamic_friction={{\n{entries(lambda joint: joint.coulomb)}    }},\n"
         f"    viscous_friction={{\n{entries(lambda joint: joint.viscous)}    }},\n"
         ")\n"
     )

@@ -14,7 +14,7 @@ from torchid.errors import InputError, join_names, warn
 from torchid.parameters import Array
 from torchid.report.urdf_files import mass_bounds, warn_if_inconsistent, without_links_beyond_welds
 from torchid.robot import Robot
-from torchid.robot.mjcf_model import MjcfModel, body_elements, complaint, parse_model
+from torchid.robot.mjcf_model import MjcfModel, body_elements, mujoco_error, parse_model
 from torchid.robot.tree import Mimic, joint_origin, link_parameters, resolve_mimics
 from torchid.robot.urdf import MOVING_TYPES, MeshError, TreeJoint, mesh_path, parse_xml, position_limits, read_urdf
 
@@ -155,7 +155,7 @@ def _armature_of_mimics(robot: Robot) -> dict[str, float]:
 
 def require_loadable(text: bytes, source: Path) -> None:
     """Make sure that MuJoCo takes a model. Raises InputError: it does not."""
-    if found := complaint(text):
+    if found := mujoco_error(text):
         raise InputError(source, "MJCF", f"MuJoCo refuses it: {found}", "a robot that MuJoCo can simulate")
 
 

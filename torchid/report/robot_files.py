@@ -12,6 +12,9 @@ from torchid.report.urdf_files import identified_urdf
 from torchid.robot import Robot
 from torchid.robot.xml_files import is_mjcf
 
+IN_FILES = ("armature", "stiffness", "torque_offset", "stribeck")
+"""Kinds of extra parameters that some file of a robot, or of its actuators, has a place for."""
+
 
 @dataclass(frozen=True)
 class FittedJoints:
@@ -21,20 +24,24 @@ class FittedJoints:
         armature: [kg m^2 or kg].
         stiffness: of springs [N m/rad or N/m].
         torque_offset: [N m or N].
+        stribeck: friction at rest beyond Coulomb friction [N m or N].
+        stribeck_velocity: over which that drops [rad/s or m/s]; None without it.
     """
 
     armature: Mapping[str, float] = field(default_factory=dict)
     stiffness: Mapping[str, float] = field(default_factory=dict)
     torque_offset: Mapping[str, float] = field(default_factory=dict)
+    stribeck: Mapping[str, float] = field(default_factory=dict)
+    stribeck_velocity: float | None = None
 
     @classmethod
-    def of(cls, found: Iterable[tuple[Extra, float]]) -> FittedJoints:
+    def of(cls, found: Iterable[tuple[Extra, float]], stribeck_velocity: float | None = None) -> FittedJoints:
         """From extra parameters with their values."""
-        values: dict[str, dict[str, float]] = {name: {} for name in ("armature", "stiffness", "torque_offset")}
+        values: dict[str, dict[str, float]] = {name: {} for name in IN_FILES}
         for extra, value in found:
             if extra.what in values:
                 values[extra.what][extra.name] = value
-        return cls(**values)
+        return cls(**values, stribeck_velocity=stribeck_velocity)
 
     def springs(self, robot: Robot, file: str) -> dict[str, tuple[float, float]]:
         """Stiffness and position at rest [rad or m] of springs that say what was fitted, with offsets of their torque.

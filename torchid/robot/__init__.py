@@ -1,6 +1,6 @@
 """From a URDF to a tree of bodies with nominal parameters."""
 
-from torchid.robot.loops import Loop
+from torchid.robot.constraints import Loop
 from torchid.robot.payloads import Payload, payload_parameters, require_payloads, with_payload
 from torchid.robot.robot import Body, Robot, load_robot
 from torchid.robot.rolling import CollisionShapes, RollingShape

@@ -165,7 +165,7 @@ class _Document:
             kind = equality_kind(held)
             if len(links) == 1:  # to a mocap body, or to scenery
                 where = model.label(held, kind, held.name)
-                etree.SubElement(self.root, f"{OWN}tie", frame=links[0], type=LOOPS[kind], where=where)
+                etree.SubElement(self.root, f"{OWN}attachment", frame=links[0], type=LOOPS[kind], where=where)
             else:
                 etree.SubElement(self.root, f"{OWN}loop", one=links[0], other=links[1], type=LOOPS[kind])
         driven = driven_joints(model) if self.root.find(f"{OWN}loop") is not None else None

@@ -41,7 +41,7 @@ def check_model(model: MjcfModel) -> None:
 
 
 def _check_equality(model: MjcfModel, equality: Any) -> None:
-    """Refuse all but a loop or a tie of the robot."""
+    """Refuse all but closed loops, and what attaches the robot to something else."""
     kind = equality_kind(equality)
     if kind not in LOOPS:
         linear = {"joint": "joint1 = c0 + c1 joint2 alone", "tendon": "one fixed tendon of two joints"}

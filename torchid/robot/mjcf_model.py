@@ -29,7 +29,7 @@ except ImportError as error:
 
 mujoco.set_mju_user_warning(lambda _: None)  # MuJoCo would write a log file where it runs
 
-__all__ = ["MeshShape", "MjcfModel", "MjcfText", "body_elements", "complaint", "mujoco", "parse_model", "pose"]
+__all__ = ["MeshShape", "MjcfModel", "MjcfText", "body_elements", "mujoco_error", "mujoco", "parse_model", "pose"]
 
 _MOST_FILES = 100
 _LONGEST_TAG = 20  # lines
@@ -337,7 +337,7 @@ def pose(position: Array, quat_wxyz: Array) -> Array:
     return T
 
 
-def complaint(text: bytes) -> str:
+def mujoco_error(text: bytes) -> str:
     """What MuJoCo says against a model, "" if it takes it."""
     try:
         mujoco.MjModel.from_xml_string(text.decode())

@@ -24,7 +24,15 @@ from torchid.errors import (
 )
 from torchid.parameters import WRENCH_COMPONENTS, Array
 from torchid.reprs import short_repr
-from torchid.robot.loops import Loop, loops_of_file, passive_joints, validate_loops
+from torchid.robot.constraints import (
+    Loop,
+    links_beyond,
+    loops_of_file,
+    passive_joints,
+    validate_loops,
+    weld_joints,
+    weld_positions,
+)
 from torchid.robot.tree import (
     BodyJoint,
     BodyTree,
@@ -37,7 +45,6 @@ from torchid.robot.tree import (
     nominal_parameters,
 )
 from torchid.robot.urdf import has_fixed_base, read_urdf
-from torchid.robot.welds import links_beyond, weld_joints, weld_positions
 from torchid.robot.xml_files import file_kind
 
 if TYPE_CHECKING:
@@ -238,8 +245,8 @@ class Robot:
         Raises:
             UnknownNameError: the URDF has no such link.
         """
-        if name not in self.links:
-            raise UnknownNameError(current_file() or self.path, field, name, self.links)
+        if not isinstance(name, str) or name not in self.links:
+            raise UnknownNameError(current_file() or self.path, field, str(name), self.links)
         return self.links[name]
 
 

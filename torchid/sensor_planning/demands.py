@@ -15,7 +15,7 @@ from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.contact_state import ContactState
 from torchid.robot import Robot
-from torchid.robot.loops import LOOPS_FIELD
+from torchid.robot.constraints import LOOPS_FIELD
 from torchid.rounding import BASE_RANK_TOLERANCE
 from torchid.sensing import Contact, SensorNoise, SensorSet
 from torchid.sensing.sensors import NORMAL_FORCE, NORMAL_INDEX, measured_components

@@ -12,13 +12,20 @@ from torchid.config import MotionConfig, StepsConfig
 from torchid.errors import InputError, UnknownNameError
 from torchid.logs.log import BoolArray
 from torchid.parameters import Array
-from torchid.simulation.feet import Foot
+from torchid.simulation.constraints import Foot, rotation_error
 from torchid.simulation.plant import FootMotion, Plant
-from torchid.simulation.ties import rotation_error
 
 _STIFFNESS, _DAMPING = 100.0, 20.0  # 1/s^2, 1/s: errors decay within half a second, without overshoot
 _CREEP, _FOOT_DAMPING = 100.0, 20.0  # 1/s^2, 1/s, of a foot that stands: friction holds it, but lets it creep
-_TIED, _STANDING, _CENTRE, _TURN, _SWING, _JOINT, _POSTURE = 1000.0, 100.0, 10.0, 10.0, 10.0, 3.0, 0.05  # weights
+_CONSTRAINED, _STANDING, _CENTRE, _TURN, _SWING, _JOINT, _POSTURE = (
+    1000.0,
+    100.0,
+    10.0,
+    10.0,
+    10.0,
+    3.0,
+    0.05,
+)  # weights
 ALOFT = 1e-3  # a foot that carries a smaller share than this is off the floor
 _PREVIEW, _SMOOTH = 0.02, 0.05  # s, rad/s: friction is that of the velocity to come, and smooth where it turns
 _TRIES, _LEAST_POINTS = 3, 3
@@ -95,8 +102,8 @@ def _tasks(plant: Plant, feet: Sequence[Foot], targets: Array, rotations: Array)
         off.append(np.concatenate([target - now.position, rotation_error(now.rotation, R)])[: foot.constrained])
     level = np.zeros((3, plant.nv))
     level[:, 3:6] = np.eye(3)
-    tie, open_by, _ = plant.ties
-    A = np.vstack([*jacobians, tie, plant.inertia[:2] / plant.mass, level])
+    J_constraints, open_by, _ = plant.constraints
+    A = np.vstack([*jacobians, J_constraints, plant.inertia[:2] / plant.mass, level])
     above = (targets.mean(axis=0) - plant.com)[:2]
     return A, np.concatenate([*off, -open_by, above, rotation_error(plant.base_rotation, np.eye(3))])
 
@@ -164,9 +171,9 @@ class Controller:
         return joints if plant.has_motor.all() else self._of_motors(joints)
 
     def _of_motors(self, needed: Array) -> Array:
-        """Torques (n,) that do what others would, (n,), where some joints have no motor: ties exert the rest."""
+        """Torques (n,) that do what others would, (n,), where some joints have no motor: constraints exert the rest."""
         motors = np.flatnonzero(self._plant.has_motor)
-        J, _, _ = self._plant.ties
+        J, _, _ = self._plant.constraints
         exerted = np.concatenate([np.eye(len(needed))[:, motors], J[:, 6:].T], axis=1)
         out = np.zeros(len(needed))
         out[motors] = np.linalg.lstsq(exerted, needed, rcond=_SINGULAR)[0][: len(motors)]
@@ -204,8 +211,8 @@ class Controller:
             rows = slice(self._feet[i].constrained)
             tasks.append((weight, foot.J[rows], (target - foot.bias)[rows]))
 
-        tie, off, bias_of_ties = plant.ties
-        tasks.append((_TIED, tie, _servo(-off, -tie @ velocity, -bias_of_ties)))
+        J_constraints, off, constraint_bias = plant.constraints
+        tasks.append((_CONSTRAINED, J_constraints, _servo(-off, -J_constraints @ velocity, -constraint_bias)))
 
         joints = np.zeros((plant.n, nv))
         joints[:, 6:] = np.diag(np.where(goal.driven, _JOINT, _POSTURE))

@@ -11,17 +11,23 @@ import numpy as np
 from lxml import etree
 
 from torchid import parameters
-from torchid.config.robot import TiedRobot
+from torchid.config.robot import ConstrainedRobot
 from torchid.errors import UrdfError
 from torchid.parameters import Array
-from torchid.robot.loops import loops_of_file, passive_joints
+from torchid.robot.constraints import loops_of_file, passive_joints, weld_positions
 from torchid.robot.mjcf_model import mujoco
 from torchid.robot.tree import joint_origin, link_parameters
 from torchid.robot.urdf import TreeJoint, drop_repeated_origins, parse_xml, read_urdf
-from torchid.robot.welds import weld_positions
 from torchid.robot.xml_files import file_kind, is_mjcf, plain_urdf
-from torchid.simulation.feet import Foot
-from torchid.simulation.ties import WORLD, Followers, Ties, body_name, loop_errors, set_inertial
+from torchid.simulation.constraints import (
+    WORLD,
+    Followers,
+    Foot,
+    JointConstraints,
+    body_name,
+    loop_errors,
+    set_inertial,
+)
 
 _SMALLEST = 1e-14  # kg and kg m^2, of links without mass between the axes of a joint of several axes
 _DISCARDED = ("transmission", "gazebo", "material", "mujoco")
@@ -72,7 +78,7 @@ class Plant:
         feet: Sequence[Foot],
         physics_hz: float,
         friction: tuple[float, float] | None = None,
-        stated: TiedRobot | None = None,
+        stated: ConstrainedRobot | None = None,
     ) -> None:
         """Compile the model.
 
@@ -87,10 +93,10 @@ class Plant:
             UrdfError: MuJoCo does not take it, or it has springs.
             ConfigError: see `weld_positions` and `passive_joints`.
         """
-        stated, joints = stated or TiedRobot(), read_urdf(urdf)[1]
+        stated, joints = stated or ConstrainedRobot(), read_urdf(urdf)[1]
         loops = (*(loop.loop for loop in stated.loops), *loops_of_file(urdf))
-        self._ties = Ties.of(urdf, joints, loops, weld_positions(urdf, joints, stated.weld))
-        self.model = compile_model(urdf, feet, physics_hz, ties=self._ties)
+        self._constraints = JointConstraints.of(urdf, joints, loops, weld_positions(urdf, joints, stated.weld))
+        self.model = compile_model(urdf, feet, physics_hz, constraints=self._constraints)
         self.data = mujoco.MjData(self.model)
         model = self.model
         if is_mjcf(urdf):
@@ -110,8 +116,8 @@ class Plant:
         self._middles = [model.site(_middle(foot)).id for foot in feet]
         self._bodies = [int(model.site_bodyid[site]) for site in self._middles]
         self._M = np.zeros((self.nv, self.nv))
-        self._followers = Followers(model, self._ties.mimics)
-        moving = [name for name in self.joint_names if name not in self._ties.mimics]
+        self._followers = Followers(model, self._constraints.mimics)
+        moving = [name for name in self.joint_names if name not in self._constraints.mimics]
         driven = set(moving).difference(passive_joints(joints, stated.passive, moving))
         self.has_motor = np.array([name in driven for name in self.joint_names])
 
@@ -177,10 +183,10 @@ class Plant:
         return self.data.qfrc_bias
 
     @property
-    def ties(self) -> tuple[Array, Array, Array]:
+    def constraints(self) -> tuple[Array, Array, Array]:
         """Joints that follow others, and closed loops: Jacobian (k, nv), errors (k,), bias accelerations (k,)."""
         follow = self._followers.errors(self.model, self.data)
-        loops = loop_errors(self.model, self.data, self._ties.loops)
+        loops = loop_errors(self.model, self.data, self._constraints.loops)
         J, off, bias = (np.concatenate(pair) for pair in zip(follow, loops, strict=True))
         return J, off, bias
 
@@ -225,7 +231,11 @@ def _add_armatures(model: mujoco.MjModel, path: Path, joints: Sequence[TreeJoint
 
 
 def compile_model(
-    urdf: Path, feet: Sequence[Foot], physics_hz: float, floating: bool = True, ties: Ties | None = None
+    urdf: Path,
+    feet: Sequence[Foot],
+    physics_hz: float,
+    floating: bool = True,
+    constraints: JointConstraints | None = None,
 ) -> mujoco.MjModel:
     """MuJoCo's model of a URDF robot without shapes, on a soft floor that its feet alone touch, without joint stops.
 
@@ -233,8 +243,8 @@ def compile_model(
         UrdfError: MuJoCo does not take it.
     """
     spec = _spec(urdf)
-    if ties is not None:
-        ties.add_to(spec, physics_hz)
+    if constraints is not None:
+        constraints.add_to(spec, physics_hz)
     if floating:
         spec.worldbody.first_body().add_freejoint()
     spec.option.timestep = 1.0 / physics_hz
@@ -258,7 +268,7 @@ def _spec(urdf: Path) -> mujoco.MjSpec:
     root = parse_xml(urdf).getroot()
     if is_mjcf(urdf):
         plain_urdf(root)
-    of_shapes = ("link/visual", "link/collision", "joint/mimic")  # `Ties` has the last
+    of_shapes = ("link/visual", "link/collision", "joint/mimic")  # `JointConstraints` has the last
     for element in [element for tag in (*_DISCARDED, *of_shapes) for element in root.findall(tag)]:
         element.getparent().remove(element)
     drop_repeated_origins(root)

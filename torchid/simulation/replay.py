@@ -14,9 +14,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from torchid.errors import InputError, LogError
 from torchid.parameters import Array
 from torchid.regressor.kinematics import GRAVITY_WORLD
-from torchid.simulation.feet import Foot
+from torchid.simulation.constraints import Followers, Foot, JointConstraints
 from torchid.simulation.plant import compile_model, foot_site
-from torchid.simulation.ties import Followers, Ties
 
 _PHYSICS_HZ = 1000.0
 # Rates of decay by damping [1/s] from _PHYSICS_HZ on are for an implicit integrator: Runge and Kutta's would diverge.
@@ -92,7 +91,9 @@ class Model:
         armature: (n,), reflected rotor inertia [kg m^2 or kg].
         offset: (n,), subtracted from the joints' torques [N m or N].
         stiffness: (n,), of springs that are at rest at position 0 [N m/rad or N/m].
-        ties: what keeps joints of the file from moving one by one.
+        stribeck: (n,), friction at rest beyond the file's [N m or N]; empty without any.
+        stribeck_velocity: over which that drops [rad/s or m/s].
+        constraints: what keeps joints of the file from moving one by one.
     """
 
     urdf: Path
@@ -100,7 +101,9 @@ class Model:
     armature: Array
     offset: Array
     stiffness: Array
-    ties: Ties = field(default_factory=Ties)
+    constraints: JointConstraints = field(default_factory=JointConstraints)
+    stribeck: Array = field(default_factory=lambda: np.zeros(0))
+    stribeck_velocity: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -183,7 +186,7 @@ class _Simulated:
                 raise InputError(model.urdf.parent, f"armature of {name}", found, "estimator.name=consistent")
         self.log, self.floating = log, log.angular_velocity is not None
         self.feet = feet if self.floating else ()
-        self.model = compile_model(model.urdf, self.feet, _PHYSICS_HZ, self.floating, model.ties)
+        self.model = compile_model(model.urdf, self.feet, _PHYSICS_HZ, self.floating, model.constraints)
         self.model.opt.gravity = GRAVITY_WORLD
         if not self.floating and log.quat_xyzw is not None:
             self.model.opt.gravity = Rotation.from_quat(log.quat_xyzw[0]).inv().apply(GRAVITY_WORLD)
@@ -193,7 +196,9 @@ class _Simulated:
         self.model.dof_armature[self.rate] += model.armature
         self.model.jnt_stiffness[[joint.id for joint in joints]] = model.stiffness
         self.model.qpos_spring[self.at] = 0.0
-        self.followers = Followers(self.model, model.ties.mimics)
+        self.dry, self.stribeck = self.model.dof_frictionloss[self.rate].copy(), model.stribeck
+        self.stribeck_velocity = model.stribeck_velocity
+        self.followers = Followers(self.model, model.constraints.mimics)
 
     def add_gains(self, kp: Array, kd: Array) -> None:
         """Let joints be pulled to position 0 and velocity 0, (n,) each, as by springs and dampers."""
@@ -212,6 +217,9 @@ class _Simulated:
         """
         model, data = self.model, self.data
         self._place(begin)
+        if self.stribeck.any():
+            path = np.array([data.qpos, *(self._step(forces) for forces in torque)])
+            return path[:, self.at], path[:, 3:7] if self.floating else None
         force = np.zeros((1, len(torque), model.nv))
         force[0][:, self.rate] = torque
         kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -221,6 +229,15 @@ class _Simulated:
         states, _ = rollout.rollout(model, data, state[None], force, control_spec=spec)
         position = np.vstack([state, states[0]])[:, 1 : 1 + model.nq]  # after the time
         return position[:, self.at], position[:, 3:7] if self.floating else None
+
+    def _step(self, torque: Array) -> Array:
+        """Positions (nq,) after a step with torques of the joints (n,), dry friction being that of their velocities."""
+        data = self.data
+        share = np.exp(-((data.qvel[self.rate] / self.stribeck_velocity) ** 2))
+        self.model.dof_frictionloss[self.rate] = np.maximum(self.dry + self.stribeck * share, 0.0)
+        data.qfrc_applied[self.rate] = torque
+        mujoco.mj_step(self.model, data)
+        return np.array(data.qpos)
 
     def _place(self, begin: int) -> None:
         """Put the robot into the state of a sample."""

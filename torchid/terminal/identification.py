@@ -76,8 +76,9 @@ def answer_lines(run: Identification, width: int, last: Sequence[tuple[str, str]
     lines = [*wrap_words(said.headline, width), *error_lines(said.errors, width, run.experiment.robot.format), ""]
     lines += labelled("total mass", said.total_mass, width, _TEXT_LINES)
     lines += labelled("bodies", said.bodies, width, _TEXT_LINES)
+    most = _TEXT_LINES if len(said.attention) > 1 else _ATTENTION_LINES
     for one in said.attention[:_MOST_ATTENTION]:
-        lines += labelled("attention", one, width, _ATTENTION_LINES)
+        lines += labelled("attention", one, width, most)
     if len(said.attention) > _MOST_ATTENTION:
         lines += labelled("", f"and {len(said.attention) - _MOST_ATTENTION} more: --verbose", width, _TEXT_LINES)
     output = run.experiment.config.output
@@ -119,6 +120,8 @@ def _columns(robot: Robot, estimate: Estimate, bodies: Sequence[int]) -> list[tu
     verdict, nominal = estimate.verdict.reshape(-1, PER_BODY), robot.nominal
 
     def cells(parameter: int) -> list[str]:
+        if parameter != _MASS and set(verdict[:, parameter]) <= {FIXED, UNOBSERVABLE}:
+            return [""] * len(bodies)  # friction, of which sensors outside of the joints tell nothing
         return [_cell(*(x[k, parameter] for x in (phi, error, verdict))) for k in bodies]
 
     masses = [

@@ -76,14 +76,14 @@ def column_lines(
 
 
 def error_lines(errors: Sequence[tuple[str, float, float, float | None]], width: int, of: str) -> list[str]:
-    """A small table of the errors of a `Judged`, not wider than so many columns; none without errors.
+    """A small table of the errors of an `ErrorComparison`, not wider than so many columns; none without errors.
 
     `of`: what the nominal parameters are those of.
     """
     columns = [
         (of, [f"{before:.4g}" for _, before, _, _ in errors]),
         ("identified", [f"{after:.4g}" for _, _, after, _ in errors]),
-        ("noise alone", ["-" if floor is None else f"{floor:.4g}" for *_, floor in errors]),
+        ("noise alone", ["" if floor is None else f"{floor:.4g}" for *_, floor in errors]),
     ]
     return column_lines(("rms error of", [group for group, *_ in errors]), columns, width) if errors else []
 

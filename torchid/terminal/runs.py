@@ -8,7 +8,7 @@ from dataclasses import asdict
 
 import numpy as np
 
-from torchid.commands.answer import Judged
+from torchid.commands.answer import ErrorComparison
 from torchid.commands.evaluate import EvaluatedRun
 from torchid.commands.replay import Replay
 from torchid.commands.sample import DrawnSamples
@@ -41,7 +41,7 @@ def evaluation_lines(evaluated: EvaluatedRun, width: int) -> list[str]:
         width: of the terminal.
     """
     of = evaluated.robot.format
-    judged = [Judged(name, pair.nominal, pair.identified, of) for name, pair in evaluated.metrics.items()]
+    judged = [ErrorComparison(name, pair.nominal, pair.identified, of) for name, pair in evaluated.metrics.items()]
     judged.sort(key=_worst, reverse=True)
     lines = [line for one in judged[:MOST_LOGS] for line in wrap_words(_sentence(one), width, "  ")]
     if len(judged) > MOST_LOGS:
@@ -62,12 +62,12 @@ def print_all_errors(evaluated: EvaluatedRun) -> None:
     print(f"{'written to':{LABEL}}{evaluated.output}")
 
 
-def _sentence(one: Judged) -> str:
+def _sentence(one: ErrorComparison) -> str:
     worse = worse_than_nominal({one.text: (one.nominal, one.identified)})
     return f"WORSE THAN {one.of}: {describe_worse(worse, one.of)}" if worse else one.headline()
 
 
-def _worst(one: Judged) -> float:
+def _worst(one: ErrorComparison) -> float:
     """The largest error of a group as a share of the URDF's."""
     return max((after / before if before else 1.0 for _, before, after, _ in one.errors()), default=0.0)
 

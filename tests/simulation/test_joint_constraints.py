@@ -1,4 +1,4 @@
-"""Robots in MuJoCo whose joints are tied: held, following others, or closing loops."""
+"""Robots in MuJoCo whose joints are constrained: held, following others, or closing loops."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from motions import value
 from simulated import BIPED, SOLES, forces, only, robot_on, short
 
 from torchid.config import FootConfig, MotionConfig
-from torchid.config.robot import LoopConfig, TiedRobot
+from torchid.config.robot import ConstrainedRobot, LoopConfig
 from torchid.config.simulation import SimulatedRobotConfig, WaveConfig
 from torchid.errors import UnknownNameError
 from torchid.problem import RowBuilder, bind_log, compress, linear_problem
@@ -23,9 +23,9 @@ from torchid.robot import load_robot
 from torchid.robot.urdf import read_urdf
 from torchid.sensing import Contact, named_sensors
 from torchid.simulation import set_up_simulation
+from torchid.simulation.constraints import JointConstraints
 from torchid.simulation.plant import Plant
 from torchid.simulation.replay import Model, ReplayedLog, replay_log
-from torchid.simulation.ties import Ties
 
 TIMES = np.array([0.1, 0.2])
 LINK = """<link name="{name}"><inertial><mass value="{mass}"/><origin xyz="0.1 0.12 0.03" rpy="0.3 0 0.2"/>
@@ -65,31 +65,31 @@ def swinging(urdf: Path, second: tuple[float, float]) -> ReplayedLog:
     return ReplayedLog("swing", time, *motion[:2], at_two, None, None, np.zeros((len(time), 0), dtype=bool))
 
 
-def drift(urdf: Path, ties: Ties, log: ReplayedLog) -> float:
+def drift(urdf: Path, constraints: JointConstraints, log: ReplayedLog) -> float:
     """The largest of both joints with motors after `TIMES` [rad]."""
-    model = Model(urdf, ("first", "third"), np.zeros(2), np.zeros(2), np.zeros(2), ties)
+    model = Model(urdf, ("first", "third"), np.zeros(2), np.zeros(2), np.zeros(2), constraints)
     return float(np.abs(replay_log(model, log, (), log.windows(TIMES[-1]), TIMES).joints).max())
 
 
 def test_a_joint_that_mimics_another_follows_it_and_loads_its_motor(tmp_path: Path) -> None:
     urdf = arm(tmp_path, more='<mimic joint="first" multiplier="-0.7" offset="0.2"/>')
-    ties = Ties.of(urdf, read_urdf(urdf)[1])
+    constraints = JointConstraints.of(urdf, read_urdf(urdf)[1])
     log = swinging(urdf, (-0.7, 0.2))
-    assert drift(urdf, ties, log) < 2e-5
-    assert drift(urdf, ties, replace(log, torque=1.02 * log.torque)) > 1e-3
+    assert drift(urdf, constraints, log) < 2e-5
+    assert drift(urdf, constraints, replace(log, torque=1.02 * log.torque)) > 1e-3
 
 
 @pytest.mark.parametrize(("kind", "position"), [("revolute", 0.7), ("prismatic", -0.15)])
 def test_a_held_joint_stays_where_it_is_held(tmp_path: Path, kind: str, position: float) -> None:
     urdf = arm(tmp_path, kind)
     log, joints = swinging(urdf, (0.0, position)), read_urdf(urdf)[1]
-    assert drift(urdf, Ties.of(urdf, joints, held={"second": position}), log) < 2e-5
-    assert drift(urdf, Ties.of(urdf, joints, held={"second": 0.0}), log) > 1e-3
+    assert drift(urdf, JointConstraints.of(urdf, joints, held={"second": position}), log) < 2e-5
+    assert drift(urdf, JointConstraints.of(urdf, joints, held={"second": 0.0}), log) > 1e-3
 
 
 def test_damping_that_is_faster_than_the_steps_does_not_make_a_joint_jump(tmp_path: Path) -> None:
     urdf = arm(tmp_path)
-    log, held = swinging(urdf, (0.0, 0.0)), Ties.of(urdf, read_urdf(urdf)[1], held={"second": 0.0})
+    log, held = swinging(urdf, (0.0, 0.0)), JointConstraints.of(urdf, read_urdf(urdf)[1], held={"second": 0.0})
     urdf.write_text(urdf.read_text().replace('damping="0.2"', 'damping="200"'))
     assert drift(urdf, held, replace(log, torque=log.torque + 199.8 * log.velocity)) < 2e-4
     assert drift(urdf, held, log) > 1e-2
@@ -145,12 +145,12 @@ def test_a_simulated_robot_can_have_held_joints_loops_and_joints_without_motors(
     loop = LoopConfig(["base", "c"])  # type: ignore[arg-type]
     urdf = arm(tmp_path)
     urdf.write_text(urdf.read_text().replace('<link name="base"/>', LINK.format(name="base", mass=2.0)))
-    plant = Plant(urdf, (), 1000.0, stated=TiedRobot(weld={"second": 0.2}, loops=[loop], passive=["thi*"]))
+    plant = Plant(urdf, (), 1000.0, stated=ConstrainedRobot(weld={"second": 0.2}, loops=[loop], passive=["thi*"]))
     assert plant.joint_names == ("first", "third")
     np.testing.assert_array_equal(plant.has_motor, [True, False])
-    assert plant.ties[0].shape == (3, plant.nv)
+    assert plant.constraints[0].shape == (3, plant.nv)
     with pytest.raises(UnknownNameError, match=r"robot\.weld"):
-        Plant(urdf, (), 1000.0, stated=TiedRobot(weld={"fourth": 0.0}))
+        Plant(urdf, (), 1000.0, stated=ConstrainedRobot(weld={"fourth": 0.0}))
 
 
 def test_the_log_of_a_robot_with_a_held_joint_is_that_of_the_robot_with_a_weld(tmp_path: Path) -> None:

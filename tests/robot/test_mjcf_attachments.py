@@ -30,7 +30,7 @@ ARM = """<mujoco><option timestep="1e-3"/><default><joint damping=".3" armature=
      <site name="grip" pos=".06 0 .01"/></body></body></body></body></worldbody>
  <equality>
 {}</equality></mujoco>"""
-TIES = {
+ATTACHMENTS = {
     '<weld body1="target" body2="four"/>': ("<weld>, line 13", "loop1 of four", "flat"),
     '<weld name="held" body1="four" body2="target"/>': ("<weld> 'held', line 13", "held of four", "flat"),
     '<connect body1="four" body2="target" anchor=".06 0 .01"/>': ("<connect>, line 13", "loop1 of four", "point"),
@@ -38,12 +38,12 @@ TIES = {
 }
 
 
-@pytest.mark.parametrize("tie", TIES)
-def test_what_holds_the_robot_drops_out_as_a_contact_that_is_not_measured(tie: str, tmp_path: Path) -> None:
-    """Random torques against the tie, in MuJoCo: its equations without the tie's force, within rounding."""
-    where, frame, kind = TIES[tie]
+@pytest.mark.parametrize("attachment", ATTACHMENTS)
+def test_what_holds_the_robot_drops_out_as_a_contact_that_is_not_measured(attachment: str, tmp_path: Path) -> None:
+    """Random torques against it, in MuJoCo: the arm's equations without the attachment's force, within rounding."""
+    where, frame, kind = ATTACHMENTS[attachment]
     path = tmp_path / "arm.xml"
-    path.write_text(ARM.format(tie))
+    path.write_text(ARM.format(attachment))
     contact = f"contacts: [{{frame: {frame}, type: {kind}}}]"
     with pytest.warns(TorchidWarning, match=f"{re.escape(where)}: holds the robot to .*{re.escape(contact)}"):
         robot = load_robot(path, fixed_base=True)
@@ -67,7 +67,7 @@ def test_what_holds_the_robot_drops_out_as_a_contact_that_is_not_measured(tie: s
     groups = project(J, active, needed[..., None], applied, torch.zeros(50, rows, dtype=torch.float64))
     size = (needed - applied).abs().max()
     missed = [float((x.K[..., 0] - x.f).abs().max()) for x in groups if x.f.numel()]
-    assert size > 1.0, "the tie's force"
+    assert size > 1.0, "the attachment's force"
     assert len(missed) == 1, "rows are left in all samples"
     assert missed[0] < 1e-12 * size
 
