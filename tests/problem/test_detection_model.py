@@ -7,14 +7,18 @@ from dataclasses import replace
 import numpy as np
 import torch
 from legged.gait import Reference
-from legged.robots import QUADRUPED, TrueRobot
+from legged.robots import FRICTION_WIDTH, QUADRUPED, TrueRobot
 from legged.simulate import simulated
 from motions import value
 
 from torchid.logs.preprocess import away_from_changes
+from torchid.parameters import COULOMB, PER_BODY
 from torchid.problem import LinearProblem
 from torchid.problem.detection_forces import fitted_parameters, most_probable
 from torchid.problem.detection_motion import prepare
+from torchid.problem.extras import ExtraTerms
+from torchid.problem.rows import RowBuilder
+from torchid.sensing import named_sensors
 
 
 def problem(A: np.ndarray, b: np.ndarray, free: np.ndarray) -> LinearProblem:
@@ -42,10 +46,14 @@ def test_the_mass_of_a_walker_follows_from_its_torques_and_the_contacts_that_sta
     true = TrueRobot.unlike_its_urdf(QUADRUPED, 0)
     exact = simulated(true, Reference(true, 5.0, seed=0), 5.0)
     contacts = QUADRUPED.contacts()
-    found = prepare(exact.log, true.robot, contacts, 40.0)
+    found = prepare(exact.log, true.robot, contacts, np.inf)
     at = np.searchsorted(exact.log.time, found.log.time - 1e-9)
     samples = replace(found.samples, active=torch.from_numpy(value(exact.log.contact_active)[at]))
     away = value(away_from_changes(exact.log, found.log.time, 0.05))
-    phi = fitted_parameters(samples[torch.from_numpy(np.flatnonzero(away))], true.robot, contacts)
+    sensors = named_sensors("joints", true.robot.n, len(contacts))
+    builder = RowBuilder(true.robot, contacts, sensors, ExtraTerms(armature=True, sign_width=FRICTION_WIDTH))
+    phi, armature = fitted_parameters(samples[torch.from_numpy(np.flatnonzero(away))], builder, true.robot)
+    np.testing.assert_allclose(armature, true.armature, rtol=0.02)
+    np.testing.assert_allclose(phi[1:, COULOMB], true.phi.reshape(-1, PER_BODY)[1:, COULOMB], rtol=0.02)
     masses = [float(x[:, 0].sum()) for x in (phi, true.phi, true.robot.nominal)]
     assert abs(masses[0] - masses[1]) < 0.05 * abs(masses[2] - masses[1])

@@ -184,7 +184,7 @@ class LargeLog:
         settings, rest = self.settings, (partial(self._pieces, blocks), self.folder)
         if settings.detect_contacts is not None and self.contacts:
             robot = self.robot if self.loaded is None else self.loaded
-            found = detect_in_blocks(blocks, robot, self.contacts, settings.detect_contacts, *rest)
+            found = detect_in_blocks(blocks, robot, self.contacts, settings.detect_contacts, *rest, self.sign_width)
             active, certain = found.flags(settings.takes_possible_contacts)
             return _Settled(with_flags(blocks, self.contacts, active), certain)
         if settings.contact_threshold is not None:

@@ -238,7 +238,7 @@ def _with_flags(log: Log, scene: Scene) -> tuple[Log, BoolArray]:
     """A log with contact flags as recorded, from joint torques or from forces, and where they are certain."""
     settings = scene.config.preprocessing
     if settings.detect_contacts is not None:
-        rest = settings.detect_contacts, settings.takes_possible_contacts
+        rest = settings.detect_contacts, settings.takes_possible_contacts, scene.terms.sign_width
         return with_detected_contacts(log, scene.robot, scene.contacts, *rest)
     if settings.contact_threshold is not None:
         return with_flags_by_force(log, settings.contact_threshold)

@@ -20,7 +20,7 @@ from torchid.logs.preprocess import find_unloaded
 from torchid.logs.spill import growing_array
 from torchid.problem.contact_slip import base_velocity, contact_velocities, keep_still
 from torchid.problem.detection_forces import ForcesAlongNormals, fitted_parameters
-from torchid.problem.detection_motion import Prepared, detection_cutoff_hz, prepare
+from torchid.problem.detection_motion import Prepared, detection_cutoff_hz, nyquist_hz, prepare
 from torchid.robot import Robot
 from torchid.rounding import STD_PER_MAD
 from torchid.sensing import Contact
@@ -46,7 +46,8 @@ class DetectionConfig:
 
     With `refit`, where the base's acceleration is known, parameters are then fitted to each log with the contacts that
     were found, and contacts detected again with these: by thresholds that are lower in the same ratio, three standard
-    deviations of what feet seem to carry in the air, and with a wider filter as long as these leave `touch` as it is.
+    deviations of what feet seem to carry in the air, and with a wider filter, at last none, as long as these leave
+    `touch` as it is; then samples about touches by `touch` that are too short for a stance are dropped as well.
     Of what that filter leaves, parameters are fitted again as long as feet seem to carry less in the air for it.
     A contact that stands by either counts as standing, and samples about changes by the stated ones are dropped.
     """
@@ -66,6 +67,7 @@ def with_detected_contacts(
     contacts: Sequence[Contact],
     settings: DetectionConfig | None = None,
     possible: bool = False,
+    sign_width: float | None = None,
 ) -> tuple[Log, BoolArray]:
     """The log with flags of all contacts by `detect_contacts` in the place of what it has, and where they are certain.
 
@@ -75,11 +77,12 @@ def with_detected_contacts(
         contacts: that may stand.
         settings: thresholds.
         possible: as of `Detection.flags`.
+        sign_width: as of `detect_contacts`.
 
     Raises:
         LogError: as `detect_contacts`; wrenches without the name of a contact.
     """
-    active, certain = detect_contacts(log, robot, contacts, settings or DetectionConfig()).flags(possible)
+    active, certain = detect_contacts(log, robot, contacts, settings or DetectionConfig(), sign_width).flags(possible)
     bare = log.contact_wrench is None and log.contact_force_normal is None and log.contact_normal_world is None
     names, flags = name_flags(log.source, () if bare else log.contact_names, contacts, active)
     return dataclasses.replace(log, contact_names=names, contact_active=flags), certain
@@ -134,7 +137,9 @@ class Detection(NamedTuple):
         return (self.possible, self.clear) if possible else (self.active, self.certain)
 
 
-def detect_contacts(log: Log, robot: Robot, contacts: Sequence[Contact], settings: DetectionConfig) -> Detection:
+def detect_contacts(
+    log: Log, robot: Robot, contacts: Sequence[Contact], settings: DetectionConfig, sign_width: float | None = None
+) -> Detection:
     """Which contacts stand when.
 
     Args:
@@ -142,6 +147,7 @@ def detect_contacts(log: Log, robot: Robot, contacts: Sequence[Contact], setting
         robot: the robot, whose base floats.
         contacts: that may stand.
         settings: thresholds.
+        sign_width: over which the sign of friction changes, as of `KinematicTree` [rad/s or m/s]; narrow by default.
 
     Raises:
         LogError: no torques, fewer than three of joints above a contact, or joints that are missing.
@@ -155,7 +161,7 @@ def detect_contacts(log: Log, robot: Robot, contacts: Sequence[Contact], setting
         whole = prepare(log, robot, contacts, cutoff_hz)
         return Filtered(whole.log.time, cutoff_hz, lambda: [whole])
 
-    return detect_in_parts(filtered, log.time, robot, contacts, settings)
+    return detect_in_parts(filtered, log.time, robot, contacts, settings, sign_width)
 
 
 class Filtered(NamedTuple):
@@ -163,7 +169,7 @@ class Filtered(NamedTuple):
 
     Attributes:
         time: (K,) [s] of its samples.
-        cutoff_hz: of the filter.
+        cutoff_hz: of the filter, half the sample rate without one.
         parts: makes its successive parts, once more each time.
     """
 
@@ -178,6 +184,7 @@ def detect_in_parts(
     robot: Robot,
     contacts: Sequence[Contact],
     settings: DetectionConfig,
+    sign_width: float | None = None,
     folder: Path | None = None,
 ) -> Detection:
     """As `detect_contacts`, of a log that is prepared in successive parts.
@@ -188,10 +195,11 @@ def detect_in_parts(
         robot: the robot.
         contacts: one or more.
         settings: thresholds.
+        sign_width: as of `detect_contacts`.
         folder: with room for forces and velocities; None: in memory.
     """
     known = filtered(detection_cutoff_hz(settings.cutoff_hz, stamps))
-    forces = ForcesAlongNormals.of(known.parts(), len(known.time), robot, contacts)
+    forces = ForcesAlongNormals.of(known.parts(), len(known.time), robot, contacts, sign_width)
     seen = _Seen.of(known, forces, settings, folder)
     found, time = seen.judged(), seen.time
     if settings.refit and seen.accelerates:
@@ -252,15 +260,15 @@ class _Seen:
         """How far [s] from a change of contact its filtered force is seen."""
         return 1.0 / self.known.cutoff_hz
 
-    def judged(self) -> Detection:
-        """Which contacts stand."""
+    def judged(self, bounces: bool = False) -> Detection:
+        """Which contacts stand; with bounces, no stance is too short to have impacts."""
         settings, shortest = self.settings, samples_of(self.settings.shortest_s, self.time)
         loaded = np.stack([hysteresis(one, settings.touch, settings.lift) for one in self.share.T], axis=1)
         if self.velocity is not None:
             loaded |= keep_still(self.velocity, self.in_world, loaded, self.share > settings.light, 2 * shortest)
         flags = np.stack([without_short(one, shortest) for one in loaded.T], axis=1)
         pulls = np.stack([hysteresis(-one, settings.touch, settings.lift) for one in self.share.T], axis=1)
-        clear, possible = ~beside_changes(flags), flags | loaded | pulls
+        clear, possible = ~beside_changes(loaded if bounces else flags), flags | loaded | pulls
         return Detection(flags, clear & ~(possible & ~flags).any(axis=1), possible, clear)
 
     def noise(self, in_the_air: BoolArray) -> float:
@@ -273,11 +281,12 @@ class _Seen:
         """As `judged`, with thresholds as low as the shares of contacts in the air (K, C) allow.
 
         Certain is what the settings' own thresholds say too: they differ from before a foot touches until it carries
-        something, with an impact between. Of sharp signals feet that scuff the floor are not certain either; elsewhere
-        noise would pass for them. In the air is what stands by neither, twice as far away as the filter lets a scuff be
-        seen: once around, a touch that is too light to be seen at its beginning is left in the air.
+        something, with an impact between. Of sharp signals feet that scuff the floor are not certain either, and have
+        impacts where they carry enough; elsewhere noise would pass for them. In the air is what stands by neither,
+        twice as far away as the filter lets a scuff be seen: once around, a touch that is too light to be seen at its
+        beginning is left in the air.
         """
-        found = self.judged()
+        found = self.judged(bounces=is_sharp)
         factor = float(np.clip(_DEVIATIONS * self.noise(in_the_air) / self.settings.touch, _LOWEST, 1.0))
         lower = {name: factor * getattr(self.settings, name) for name in ("touch", "lift", "light")}
         finer = dataclasses.replace(self, settings=dataclasses.replace(self.settings, **lower)).judged()
@@ -325,7 +334,8 @@ def _detect_again(
         found = best.finer(in_the_air, is_sharp)
         if not is_sharp or not more:
             break
-        by_urdf = ForcesAlongNormals.of(sharp.parts(), len(time), forces.balance.robot, forces.balance.contacts)
+        of_robot = forces.balance.robot, forces.balance.contacts, forces.balance.builder.tree.sign_width
+        by_urdf = ForcesAlongNormals.of(sharp.parts(), len(time), *of_robot)
         away = find_unloaded(time, ~found.clear[:, None], 2.0 * best.smear_s)[:, 0]
         again = _fitted(by_urdf, found.possible, away)
     return found, time
@@ -339,7 +349,7 @@ def _sharpest(
     in_the_air: BoolArray,
     folder: Path | None,
 ) -> _Seen:
-    """What the widest filter shows whose noise leaves the thresholds as they are.
+    """What the widest filter shows whose noise leaves the thresholds as they are, or signals without one.
 
     A filter of 20 Hz shows an impact 25 ms early, and a foot that scuffs the floor for 5 ms not at all.
 
@@ -352,7 +362,7 @@ def _sharpest(
         folder: with room, or None.
     """
     best = _Seen.of(known, forces, seen.settings, folder)
-    highest = detection_cutoff_hz(np.inf, known.time)
+    highest = nyquist_hz(known.time)
     while best.known.cutoff_hz < highest:
         wider = _Seen.of(filtered(min(2.0 * best.known.cutoff_hz, highest)), forces, seen.settings, folder)
         if _DEVIATIONS * wider.noise(in_the_air[_nearest(seen.time, wider.time)]) > seen.settings.touch:
@@ -376,4 +386,4 @@ def _fitted(forces: ForcesAlongNormals, active: BoolArray, sure: BoolArray) -> F
         return None
     flags = torch.from_numpy(active[forces.chosen[kept]])
     samples = dataclasses.replace(forces.samples[torch.from_numpy(kept)], active=flags)
-    return forces.with_parameters(fitted_parameters(samples, forces.balance.robot, forces.balance.contacts))
+    return forces.with_parameters(*fitted_parameters(samples, forces.balance.builder, forces.balance.robot))

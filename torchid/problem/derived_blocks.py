@@ -21,17 +21,17 @@ from torchid.logs.preprocess import (
     find_unloaded,
     gapless_fields,
     lacks_derivatives,
-    make_timeline,
     move_to_timeline,
     unloaded_readings,
 )
 from torchid.logs.spill import Filled, Spill, growing_array
-from torchid.logs.timeline import SPLINE_BLOCK
+from torchid.logs.timeline import SPLINE_BLOCK, lay_out_timeline
 from torchid.problem.contact_detection import Detection, DetectionConfig, Filtered, detect_in_parts, name_flags
 from torchid.problem.detection_motion import (
     MAX_GAPS,
     Prepared,
     bind_for_detection,
+    filter_hz,
     for_detection,
     quiet,
     require_torque,
@@ -79,6 +79,7 @@ def detect_in_blocks(
     settings: DetectionConfig,
     pieces: Pieces,
     folder: Path | None,
+    sign_width: float | None = None,
 ) -> Detection:
     """As `detect_contacts`; a pass over the torques, and two or more that filter them and the motion.
 
@@ -89,6 +90,7 @@ def detect_in_blocks(
         settings: thresholds.
         pieces: in which it is read.
         folder: with room for forces and velocities of the contacts; None: in memory.
+        sign_width: as of `detect_contacts`.
 
     Raises:
         InputError: as `detect_contacts`; a tilted floor below a base whose tilt nobody measured.
@@ -103,9 +105,8 @@ def detect_in_blocks(
 
     def filtered(cutoff_hz: float) -> Filtered:
         with quiet():
-            timeline = make_timeline(blocks.time, lacks_derivatives(first), cutoff_hz, None)
-        if timeline is None:
-            raise ValueError("nothing is filtered")
+            cutoff = filter_hz(cutoff_hz, blocks.time)
+            timeline = lay_out_timeline(blocks.time, cutoff, None, lacks_derivatives(first))
         coverage = {name: Coverage.empty(torque.shape[1:]) for name in gapless_fields(first, timeline)}
         for one in coverage.values():
             one.add(np.where(torque.broken, np.nan, 0.0)[None], None)
@@ -119,7 +120,7 @@ def detect_in_blocks(
 
         return Filtered(timeline.stamps_of(blocks.time), cutoff_hz, parts)
 
-    return detect_in_parts(filtered, blocks.time, robot, contacts, settings, folder)
+    return detect_in_parts(filtered, blocks.time, robot, contacts, settings, sign_width, folder)
 
 
 def _require_level_or_measured(blocks: LogBlocks, contacts: Sequence[Contact]) -> None:

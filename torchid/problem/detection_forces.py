@@ -26,7 +26,7 @@ from torchid.sensing import Contact, named_sensors
 
 _DAMPING = 1e-3  # of actuators' terms, against the share that samples have of them
 _LARGEST = 1.0, 100.0, 100.0  # armature [kg m^2] and friction [N m, N m s/rad] that nothing determines
-_SIGN_WIDTH = 0.001  # rad/s, below which friction is not sure of its sign
+_SIGN_WIDTH = 0.001  # rad/s, of friction's sign where none is stated: what rests has none
 _FITTED = 4000  # samples, at least half of them, from which actuators' terms are worked out
 _TOGETHER = 2048  # samples whose forces are solved for at once
 _JOINT_SHARE, _BASE_SHARE = 0.1, 1.0  # errors of the URDF and of friction, of the largest torque's rms and the weight
@@ -59,8 +59,15 @@ class ForcesAlongNormals:
     unexplained: FloatArray
 
     @classmethod
-    def of(cls, parts: Iterable[Prepared], count: int, robot: Robot, contacts: Sequence[Contact]) -> ForcesAlongNormals:
-        """Of the parts of a log of so many samples."""
+    def of(
+        cls,
+        parts: Iterable[Prepared],
+        count: int,
+        robot: Robot,
+        contacts: Sequence[Contact],
+        sign_width: float | None = None,
+    ) -> ForcesAlongNormals:
+        """Of the parts of a log of so many samples, with friction whose sign is so wide [rad/s or m/s]."""
         every, start, power, chosen = -(-count // _FITTED), 0, np.zeros(robot.n), list[tuple[Samples, FloatArray]]()
         for part in parts:
             measured = np.full((len(part.log), robot.n), np.nan)
@@ -70,7 +77,7 @@ class ForcesAlongNormals:
             some = slice(-start % every, None, every)
             chosen.append((part.samples[some], part.rotation[some]))
             start += len(part.log)
-        balance = _Balance.of(robot, contacts, np.sqrt(power / count))
+        balance = _Balance.of(robot, contacts, np.sqrt(power / count), sign_width)
         samples = concatenate([samples for samples, _ in chosen])
         rotation = np.concatenate([rotation for _, rotation in chosen])
         found = balance.equations(samples, rotation)
@@ -84,11 +91,10 @@ class ForcesAlongNormals:
             balance.unexplained_force(found, actuators),
         )
 
-    def with_parameters(self, nominal: FloatArray) -> ForcesAlongNormals:
-        """Those of the robot with other parameters (L, 12)."""
+    def with_parameters(self, nominal: FloatArray, armature: FloatArray) -> ForcesAlongNormals:
+        """Those of the robot with other parameters (L, 12), and armatures (m,) of joints whose torque was measured."""
         balance = dataclasses.replace(self.balance, robot=dataclasses.replace(self.balance.robot, nominal=nominal))
-        actuators = _fit_actuators(balance.equations(self.samples, self.rotation))
-        return dataclasses.replace(self, balance=balance, actuators=actuators)
+        return dataclasses.replace(self, balance=balance, actuators=np.outer(armature, [1.0, 0.0, 0.0]))
 
     def of_part(self, part: Prepared) -> FloatArray:
         """Forces (K, C) [N] of some samples."""
@@ -109,7 +115,9 @@ class _Balance:
     weight: float
 
     @classmethod
-    def of(cls, robot: Robot, contacts: Sequence[Contact], torque_rms: FloatArray) -> _Balance:
+    def of(
+        cls, robot: Robot, contacts: Sequence[Contact], torque_rms: FloatArray, sign_width: float | None
+    ) -> _Balance:
         """Of the base, and the joints whose torques were measured throughout: those with an rms (n,) [N m]."""
         measured = np.isfinite(torque_rms)
         rows = np.concatenate([np.ones(6, dtype=bool), measured])
@@ -118,7 +126,10 @@ class _Balance:
         of_base = _BASE_SHARE * weight * np.array([1.0, 1.0, 1.0, _LEVER_M, _LEVER_M, _LEVER_M])
         error = np.concatenate([of_base, np.full(int(rows[6:].sum()), of_joints)])
         plain = [dataclasses.replace(contact, along_normal=False) for contact in contacts]
-        builder = RowBuilder(robot, plain, named_sensors("joints", robot.n, len(contacts), ft=len(robot.ft_names)))
+        sensors = named_sensors("joints", robot.n, len(contacts), ft=len(robot.ft_names))
+        sensors = dataclasses.replace(sensors, torque=np.append(measured, sensors.torque[robot.n :]))
+        width = _SIGN_WIDTH if sign_width is None else sign_width
+        builder = RowBuilder(robot, plain, sensors, ExtraTerms(armature=True, sign_width=width))
         return cls(robot, plain, builder, rows, error, weight)
 
     def equations(self, samples: Samples, rotation: FloatArray) -> _Equations:
@@ -138,8 +149,9 @@ class _Balance:
         A = np.asarray(np.concatenate(maps, axis=1).swapaxes(1, 2) / self.error[:, None], dtype=np.float64)
         free = np.concatenate([_free(contact) for contact in self.contacts]) / (_FREE * self.weight)
         solver = np.linalg.solve(A.swapaxes(1, 2) @ A + np.diag(free**2), A.swapaxes(1, 2))
-        velocity, acceleration = samples.joint_velocity.numpy(), samples.joint_acceleration.numpy()
-        terms = np.stack([acceleration, np.tanh(velocity / _SIGN_WIDTH), velocity], axis=2)[:, self.rows[6:]]
+        velocity, acceleration = samples.joint_velocity, samples.joint_acceleration
+        of_joints = [acceleration, self.builder.tree.coulomb_sign(velocity), velocity]
+        terms = torch.stack(of_joints, dim=2).numpy()[:, self.rows[6:]]
         return _Equations(
             A,
             missing[:, self.rows] / self.error,
@@ -209,23 +221,21 @@ def _free(contact: Contact) -> FloatArray:
 _PASSES = 3  # over the variance of what the parameters leave, which settles at once
 
 
-def fitted_parameters(samples: Samples, robot: Robot, contacts: Sequence[Contact]) -> FloatArray:
-    """Parameters (L, 12) of a robot without friction, which was fitted with them, as armatures were.
+def fitted_parameters(samples: Samples, builder: RowBuilder, robot: Robot) -> tuple[FloatArray, FloatArray]:
+    """Parameters (L, 12) of a robot, and armatures (m,) of its joints, neither friction nor armatures below zero.
 
     Args:
-        samples: with joint torques and the contacts that stand; torques without a value count as not measured.
+        samples: with joint torques and the contacts that stand.
+        builder: of rows, whose extra parameters are armatures.
         robot: for the prior.
-        contacts: none of which is measured.
     """
-    sensors = named_sensors("joints", robot.n, len(contacts), ft=len(robot.ft_names))
-    if samples.torque is not None:
-        sensors = dataclasses.replace(sensors, torque=sensors.torque & samples.torque.isfinite().all(dim=0).numpy())
-    builder = RowBuilder(robot, contacts, sensors, ExtraTerms(armature=True))
     with ranks.apart():  # each process has logs of its own
-        problem = assemble(compress_parts([samples], builder), builder, robot).problem
-    phi = most_probable(problem).reshape(-1, PER_BODY)
-    phi[:, FRICTION] = robot.nominal[:, FRICTION]
-    return phi
+        assembly = assemble(compress_parts([samples], builder), builder, robot)
+    phi = most_probable(assembly.problem)
+    armature = np.maximum(np.concatenate(assembly.extras_at(phi)), 0.0)
+    phi = phi.reshape(-1, PER_BODY)
+    phi[:, FRICTION] = np.maximum(phi[:, FRICTION], 0.0)
+    return phi, armature
 
 
 def most_probable(problem: LinearProblem) -> FloatArray:

@@ -16,6 +16,7 @@ from torchid.errors import InputError, LogError, TorchidWarning
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import preprocess
+from torchid.logs.timeline import JITTER
 from torchid.problem.base_motion import BaseMotion, base_motion
 from torchid.problem.floor_pose import levelled
 from torchid.problem.samples import Samples, joint_order
@@ -65,14 +66,14 @@ def prepare(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: floa
         log: as recorded; gaps are interpolated.
         robot: the robot, whose base floats.
         contacts: that may stand.
-        cutoff_hz: of the filter [Hz], lower where the log is slow.
+        cutoff_hz: of the filter [Hz]; there is none from half the log's sample rate on.
 
     Raises:
         InputError: no torques, fewer than three of joints above a contact, joints that are missing, or as `preprocess`.
     """
     require_torque(log.source, log.joint_torque is not None)
     with quiet():
-        known = preprocess(for_detection(log), detection_cutoff_hz(cutoff_hz, log.time))
+        known = preprocess(for_detection(log), filter_hz(cutoff_hz, log.time))
     return bind_for_detection(known, robot, contacts)
 
 
@@ -101,7 +102,17 @@ def bind_for_detection(known: Log, robot: Robot, contacts: Sequence[Contact]) ->
 
 def detection_cutoff_hz(cutoff_hz: float, time: FloatArray) -> float:
     """The cutoff [Hz] of a log with stamps (N,) [s]."""
-    return min(cutoff_hz, _RATE_SHARE / float(np.median(np.diff(time))) if len(time) > 1 else _RATE_SHARE)
+    return min(cutoff_hz, 2.0 * _RATE_SHARE * nyquist_hz(time))
+
+
+def nyquist_hz(time: FloatArray) -> float:
+    """Half the sample rate [Hz] of a log with stamps (N,) [s]."""
+    return 0.5 / float(np.median(np.diff(time))) if len(time) > 1 else 0.5
+
+
+def filter_hz(cutoff_hz: float, time: FloatArray) -> float | None:
+    """The cutoff [Hz] of the filter of a log with stamps (N,) [s]; None, no filter, from half its sample rate on."""
+    return cutoff_hz if cutoff_hz < (1.0 - JITTER) * nyquist_hz(time) else None
 
 
 @contextmanager
