@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
 import torch
 from scipy.optimize import minimize, minimize_scalar
-from scipy.stats import norm
 
 from torchid.copies import share_between_copies
 from torchid.errors import warn
@@ -198,7 +198,7 @@ def choose_stribeck(
     choice = StribeckChoice(
         velocity=float(f"{best:.{_WIDTH_DIGITS}g}"),
         significance=max((one.value / one.standard_error for one in at_rest if one.standard_error > 0.0), default=0.0),
-        required=float(norm.isf(_CHANCE / max(len(at_rest), 1))),
+        required=-NormalDist().inv_cdf(_CHANCE / max(len(at_rest), 1)),
         found=best,
         interval=interval,
         inflation=term.inflation if np.isfinite(term.inflation) else None,

@@ -10,7 +10,7 @@ import numpy as np
 
 from torchid.errors import InputError, join_names
 from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, Finding, Skipped
-from torchid.log_checks.lag_and_tilt import check_lag_and_tilt
+from torchid.log_checks.lag_and_tilt import check_lag_and_tilt, check_torque_offsets
 from torchid.log_checks.mistakes import possible_mistakes
 from torchid.log_checks.model import (
     MAX_TRIAL_DIFFERENTIATED_SAMPLES,
@@ -136,7 +136,8 @@ def _misfit_findings(
         return
     unexplained = unexplained if scale is None else min(unexplained, scale.recorded)
     if fit.misfit > MAX_MISFIT and unexplained > MAX_UNEXPLAINED_RATIO:
-        scaled = list(_gain_and_point_findings(log, samples, robot, contacts))
+        held = bool(contacts) or robot.fixed_base
+        scaled = list(_gain_and_point_findings(log, samples, robot, contacts)) if held else []
         yield from scaled
         if scaled:
             return
@@ -146,14 +147,15 @@ def _misfit_findings(
         )
         advice = f"check units, frames, the order of joints and contacts, friction, the {robot.format}'s base link and"
         advice += f" masses, and whether the {robot.format} is that of this robot"
-        if not contacts and not robot.fixed_base:
+        if not held:
             advice = f"name under contacts what touches the ground, or holds the base in the air; or {advice}"
         yield Finding("forces", SUSPICIOUS, "all", text, advice)
         return
     torques = [] if fit.torque is None else list(_torque_findings(robot, fit.torque))
     yield from torques
     if not any(isinstance(item, Finding) for item in torques):
-        yield from _gain_and_point_findings(log, samples, robot, contacts)
+        scaled = list(_gain_and_point_findings(log, samples, robot, contacts))
+        yield from scaled or check_torque_offsets(log, robot, contacts, cutoff)
 
 
 def _without_friction(robot: Robot) -> Robot | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -108,13 +109,20 @@ def check_lag_and_tilt(
         lag = fit_lag(log, robot, contacts, cutoff_hz)
         tilt = fit_tilt(log, robot, contacts, cutoff_hz) if not "base_quat_xyzw".startswith(derived) else None
         sensors = fit_contact_sensors(log, robot, contacts, cutoff_hz)
-        offsets = fit_torque_offsets(log, robot, contacts, cutoff_hz)
     except InputError:  # reported by `check_forces_against_urdf`
         return [], np.inf
     unexplained = min((x.without for x in (lag, tilt) if x is not None), default=np.inf)
     moved = [*_lag_findings(lag), *_tilt_findings(tilt, robot)]
-    moved = moved or list(_contact_sensor_findings(sensors, log, robot, contacts))
-    return moved or list(_offset_findings(offsets, log, robot)), unexplained
+    return moved or list(_contact_sensor_findings(sensors, log, robot, contacts)), unexplained
+
+
+def check_torque_offsets(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: float) -> Iterator[Finding]:
+    """Findings about single joints whose torque reads too much by a constant, for logs that nothing else is wrong with.
+
+    Args: as `check_lag_and_tilt`.
+    """
+    with suppress(InputError):  # reported by `check_forces_against_urdf`
+        yield from _offset_findings(fit_torque_offsets(log, robot, contacts, cutoff_hz), log, robot)
 
 
 def _lag_findings(lag: Deviation | None) -> Iterator[Finding]:
@@ -136,7 +144,6 @@ def _tilt_findings(tilt: Deviation | None, robot: Robot) -> Iterator[Finding]:
 
 
 def _offset_findings(found: Deviation | None, log: Log, robot: Robot) -> Iterator[Finding]:
-    """Findings about single joints whose torque reads too much by a constant."""
     if found is None:
         return
     for joint in np.flatnonzero(found.clear & (np.abs(found.value) > _MIN_OFFSET_SHARE * _torque_rms(log))):
