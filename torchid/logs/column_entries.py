@@ -30,7 +30,7 @@ def _column(value: object) -> object:
 def _gains(value: object) -> object:
     if isinstance(value, str):
         return {"column": value}
-    if isinstance(value, Mapping) and set(value) & set(_GAINS):
+    if isinstance(value, Gains) or (isinstance(value, Mapping) and set(value) & set(_GAINS)):
         return value
     return {"value": value}
 
