@@ -11,7 +11,7 @@ import pytest
 from faults import CONTACTS, demo_log, demo_robot
 from legged.gait import Reference
 from legged.recording import Noise, record
-from legged.robots import G1, GO2, QUADRUPED, Legged, TrueRobot
+from legged.robots import FRICTION_WIDTH, G1, GO2, QUADRUPED, Legged, TrueRobot
 from legged.simulate import Exact, simulated
 from motions import value
 from refusals import refused
@@ -163,13 +163,14 @@ def test_parameters_of_the_wider_filter_show_a_foot_that_hardly_touches(monkeypa
     time, active = exact.log.time, value(exact.log.contact_active)
 
     def missed() -> int:
-        flags, clear = detect_contacts(exact.log, true.robot, G1.contacts(), DEFAULT).flags(possible=True)
+        found = detect_contacts(exact.log, true.robot, G1.contacts(), DEFAULT, sign_width=FRICTION_WIDTH)
+        flags, clear = found.flags(possible=True)
         kept = away_from_stamps(time, time[~clear], DEFAULT.margin_s)
         return int(((active & ~flags).any(axis=1) & kept).sum())
 
     assert missed() == 0
     monkeypatch.setattr(contact_detection, "_FITS", 1)
-    assert missed() > 10
+    assert missed() > 0
 
 
 @pytest.mark.parametrize(("share", "is_clear"), [(0.05, False), (0.015, True)], ids=["impact", "light"])

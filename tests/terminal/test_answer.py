@@ -107,14 +107,18 @@ def test_a_total_mass_that_contradicts_the_urdf_needs_attention(consistent: Iden
     assert "times the URDF's" not in text(vague)
 
 
-def test_bodies_far_off_their_file_need_a_wider_prior_and_a_line_says_which(consistent: Identification) -> None:
+@pytest.mark.parametrize(("share", "unlike"), [(0.3, True), (0.6, False)])
+def test_bodies_far_off_their_file_need_a_wider_prior_and_a_line_says_which(
+    consistent: Identification, share: float, unlike: bool
+) -> None:
     fitted = consistent.posterior
     light = fitted.posterior.nominal.copy()
-    light.reshape(-1, PER_BODY)[:, INERTIAL] *= 0.3
+    light.reshape(-1, PER_BODY)[:, INERTIAL] *= share
     wrong = replace(fitted, posterior=replace(fitted.posterior, nominal=light))
     said = text(replace(consistent, posterior=wrong), 400)
     assert "torchid sample --prior-error auto" in said
     assert str(wrong.nominal_error) in said
+    assert ("does not explain these forces, or the file is another robot's" in said) is unlike
     assert "--prior-error" not in text(consistent, 400)
 
 

@@ -91,6 +91,7 @@ _FAR_FROM_LEAST = 3.0  # standard errors by noise, rms; those that are printed c
 _MUCH_MORE = 1.5  # residuals of bodies that can exist over the least: 1.001 of honest logs, 1.9 to 30 with a unit wrong
 _EXACT = 1e-3  # of what the nominal parameters leave: signals without noise, of which a solver's tolerance is left
 _CLEAR_ERRORS = 4.0  # standard errors of a total mass from which on it is not the URDF's
+_ANOTHER_ROBOT = 1.0  # of each body that data determine: no file of the same robot is off by so much
 
 
 @dataclass(frozen=True)
@@ -221,7 +222,9 @@ def _unlike_sensors(identified: Metrics) -> Iterator[str]:
 def _far_off(nominal: NominalError | None) -> Iterator[str]:
     """That bodies are further off their file than samples of what data leave open take them to be."""
     if nominal is not None and nominal.prior_is_narrow:
-        yield f"{nominal}, and so may be what they do not determine: torchid sample --prior-error auto"
+        unlike = nominal.value > _ANOTHER_ROBOT
+        why = ": the model does not explain these forces, or the file is another robot's" if unlike else ""
+        yield f"{nominal}{why}; so may be what they do not determine: torchid sample --prior-error auto"
 
 
 def _contradicts_nominal(mass: TotalMass) -> bool:
