@@ -192,7 +192,8 @@ class Scene:
             found = (
                 f"{settings.ridge} takes {choice.ridge:g}, the {choice.end} tried, and left-out errors fall towards it"
             )
-            better = "a larger number, or logs that say more than the URDF" if choice.end == "largest" else "0"
+            larger = "a larger number, or logs that say more than the URDF"
+            better = larger if choice.end == "largest" else "a smaller number"
             warn_about_file(f"estimator.ridge: {found}; accepted: {better}")
         return choice
 
