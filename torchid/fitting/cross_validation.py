@@ -36,6 +36,9 @@ MOST_SCORED = 100_000
 Those of a filtered log are alike: every 11th of a million gives errors within 0.1 % of those of all."""
 
 
+_MATTERS = 0.01  # of a left-out error
+
+
 @dataclass(frozen=True)
 class CrossValidation:
     """Errors on every block of the training logs of what was fitted without it: `folds` fits, blocks pooled.
@@ -63,10 +66,11 @@ class RidgeChoice:
 
     @property
     def end(self) -> str:
-        """The "largest" or "smallest", if it is that and errors fall towards it by more than their standard error."""
+        """The "largest" or "smallest", if it is that and errors fall towards it beyond chance, by over a percent."""
         at = self.tried.index(self.ridge)
         name, beside = {0: ("smallest", 1), len(self.tried) - 1: ("largest", at - 1)}.get(at, ("", at))
-        return name if self.mean_square[beside] - self.mean_square[at] > self.standard_error[beside] else ""
+        gain = self.mean_square[beside] - self.mean_square[at]
+        return name if gain > max(self.standard_error[beside], _MATTERS * self.mean_square[at]) else ""
 
     def __str__(self) -> str:
         within = "" if self.rule == "least" else ", the largest within one standard error of the best"
