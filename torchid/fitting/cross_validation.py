@@ -32,11 +32,7 @@ RIDGES = tuple(float(f"1e{power}") for power in range(-7, 2))
 
 MOST_SCORED = 100_000
 """Samples of training logs that errors of forces are computed of at most, evenly spread.
-
 Those of a filtered log are alike: every 11th of a million gives errors within 0.1 % of those of all."""
-
-
-_MATTERS = 0.01  # of a left-out error
 
 
 @dataclass(frozen=True)
@@ -70,7 +66,7 @@ class RidgeChoice:
         at = self.tried.index(self.ridge)
         name, beside = {0: ("smallest", 1), len(self.tried) - 1: ("largest", at - 1)}.get(at, ("", at))
         gain = self.mean_square[beside] - self.mean_square[at]
-        return name if gain > max(self.standard_error[beside], _MATTERS * self.mean_square[at]) else ""
+        return name if gain > max(self.standard_error[beside], 0.01 * self.mean_square[at]) else ""
 
     def __str__(self) -> str:
         within = "" if self.rule == "least" else ", the largest within one standard error of the best"
