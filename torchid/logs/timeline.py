@@ -6,6 +6,7 @@ import math
 import numbers
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
@@ -73,6 +74,9 @@ def joint_spline_derivatives(
     ]
 
 
+SampleRate = float | Literal["auto"] | None
+"""Of a preprocessed log [Hz], "auto" for the lowest that holds what the filter lets through, None for the log's own."""
+
 # ------------------------------------------------------------------------- stamps of a log, and the filter between them
 
 #: Steps that differ by less than this share of the median step count as uniform.
@@ -86,7 +90,7 @@ class Timeline:
     Attributes:
         native: (N,) the log's own stamps.
         grid: (M,) the stamps at which channels are filtered: `native`, or a uniform grid where that is jittered.
-        kept: the samples of `grid` that neither filter nor spline spoils.
+        kept: the samples of `grid` that neither filter nor spline spoils, or every k-th of them.
         output: (K,) stamps of the preprocessed log, None for those of `kept`.
         low_pass: the filter, None without one.
         reach: how far the filter smears what it filters [s], 0 without one.
@@ -140,12 +144,12 @@ class Timeline:
         grid = _around(self.grid, at, beyond)
         samples = grid if self.grid is self.native else _around(self.native, self.grid[grid][[0, -1]], SPLINE_OVERLAP)
         native = self.native[samples]
-        start = self.kept.start - grid.start
+        start, each = self.kept.start - grid.start, self.kept.step or 1
         return samples, replace(
             self,
             native=native,
             grid=native if self.grid is self.native else self.grid[grid],
-            kept=slice(start + first, start + last) if self.output is None else slice(0),
+            kept=slice(start + each * first, start + each * last, each) if self.output is None else slice(0),
             output=None if self.output is None else at,
         )
 
@@ -229,19 +233,22 @@ LONGEST_STEP = 10.0
 SHORTEST_STEP = 0.1
 #: Longest median step [s], as the checks of logs have it: longer ones are of another unit.
 LONGEST_MEDIAN_STEP = 0.5
+#: Sample rate that holds what the filter lets through, in cutoffs: at 5, fits of a quadruped and an arm lose no
+#: information and move by at most 0.06 standard errors (at 3 by 0.12, at 2.5 by 0.6).
+LEAST_RATE = 5.0
 #: Highest sample rate to resample to, in median sample rates.
 FASTEST = 10.0
 
 
 def lay_out_timeline(
-    time: FloatArray, cutoff_hz: float | None, sample_rate_hz: float | None, differentiates: bool
+    time: FloatArray, cutoff_hz: float | None, sample_rate_hz: SampleRate, differentiates: bool
 ) -> Timeline:
     """Lay out the stamps of a log that is filtered, resampled or differentiated.
 
     Args:
         time: (N,) [s].
         cutoff_hz: low-pass cutoff [Hz], None for no filter.
-        sample_rate_hz: output's sample rate [Hz], None for the log's own.
+        sample_rate_hz: as of `preprocess`.
         differentiates: whether a derivative is missing in the log.
 
     Raises:
@@ -266,7 +273,9 @@ def lay_out_timeline(
         low_pass = LowPass.butterworth(cutoff_hz, step)
         kept = _unspoiled(grid, step, cutoff_hz, low_pass.padding)
     output = None
-    if sample_rate_hz is not None:
+    if isinstance(sample_rate_hz, str):
+        kept = slice(kept.start, kept.stop, _as_few_as_hold_the_band(kept.stop - kept.start, step, cutoff_hz))
+    elif sample_rate_hz is not None:
         accepted = f"{FASTEST:g} times the log's median sample rate"
         _check_rate("sample_rate_hz", sample_rate_hz, FASTEST / step, accepted)
         if cutoff_hz is not None and cutoff_hz >= 0.5 * sample_rate_hz:
@@ -277,6 +286,8 @@ def lay_out_timeline(
             found = f"{sample_rate_hz:g}, which leaves one sample"
             accepted = f"more than {1.0 / (grid[kept][-1] - grid[kept][0]):.3g} Hz for this log"
             raise InputError.at_field("preprocessing.sample_rate_hz", found, accepted)
+        if (each := _share_kept(grid, 1.0 / sample_rate_hz)) is not None:  # no spline has to find what is there
+            kept, output = slice(kept.start, kept.stop, each), None
     if low_pass is None or cutoff_hz is None:
         return Timeline(native, grid, kept, output, None, 0.0, float(time[0]))
     passed = low_pass.noise_share * 0.5 / float(np.median(np.diff(grid)))
@@ -315,6 +326,21 @@ def _unspoiled(grid: FloatArray, step: float, cutoff_hz: float, padding: int) ->
         accepted = f"more than {shortest:.6g} s for a cutoff of {cutoff_hz:g} Hz, which spoils both ends of a log"
         raise LogError.at_field("time", f"{grid[-1]:.6g} s ({len(grid)} samples)", accepted)
     return slice(int(inside[0]), int(inside[-1]) + 1)
+
+
+def _as_few_as_hold_the_band(count: int, step: float, cutoff_hz: float | None) -> int:
+    """Every how many-th of some samples says what all of them do, two at least; each without a filter."""
+    if cutoff_hz is None:
+        return 1
+    return max(min(int((1.0 + JITTER) / (LEAST_RATE * cutoff_hz * step)), count - 1), 1)
+
+
+def _share_kept(grid: FloatArray, step: float) -> int | None:
+    """Every how many-th stamp of a uniform grid makes one of another step [s]; None where none does."""
+    own = float(grid[-1] - grid[0]) / (len(grid) - 1)
+    each = max(round(step / own), 1)
+    uniform = np.abs(np.diff(grid) - own).max() <= JITTER * own
+    return each if uniform and abs(step / (each * own) - 1.0) <= JITTER else None
 
 
 def _uniform(kept: FloatArray, rate_hz: float) -> FloatArray:
