@@ -35,11 +35,10 @@ from torchid.errors import ConfigError, InputError, LogError, about_file, excerp
 from torchid.fitting.checked_settings import is_along_base
 from torchid.logs import Columns, Log, Topics, read_log
 from torchid.logs.column_entries import OF_FILE
-from torchid.logs.column_proposals import propose_field
 from torchid.logs.columns import is_column
 from torchid.logs.containers import LogKind, atomic_output, existing_log_kind
 from torchid.logs.log import VARIANTS
-from torchid.logs.name_matching import KnownRobot
+from torchid.logs.name_matching import KnownRobot, propose_field
 from torchid.logs.time_range import split_range
 from torchid.parameters import GRAVITY
 from torchid.proposals.column_groups import MapProposal
