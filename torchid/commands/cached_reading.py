@@ -20,7 +20,7 @@ from torchid.fitting.experiment import Scene
 from torchid.fitting.noise import recorded_sensors
 from torchid.logs.blocks import GIGABYTE, log_bytes
 from torchid.logs.containers import LogKind, existing_log_kind, log_files
-from torchid.logs.spill import MappedPages
+from torchid.logs.lazy_arrays import MappedPages
 from torchid.logs.tables import is_text_table
 from torchid.logs.time_range import split_range
 from torchid.problem import Samples

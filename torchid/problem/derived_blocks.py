@@ -15,7 +15,7 @@ from torchid.logs.arrays import parse_names
 from torchid.logs.blocks import LogBlocks
 from torchid.logs.flags import ContactThreshold, MeasuredForces, flags_by_force
 from torchid.logs.gaps import Coverage
-from torchid.logs.lazy_arrays import Computed, GapsFilled
+from torchid.logs.lazy_arrays import Computed, Filled, GapsFilled, Spill, growing_array
 from torchid.logs.log import CONTACT_READINGS, FLAGS, FORCE_NORMAL, NORMALS, WRENCHES, BoolArray, FloatArray
 from torchid.logs.preprocess import (
     find_unloaded,
@@ -24,7 +24,6 @@ from torchid.logs.preprocess import (
     move_to_timeline,
     unloaded_readings,
 )
-from torchid.logs.spill import Filled, Spill, growing_array
 from torchid.logs.timeline import SPLINE_BLOCK, lay_out_timeline
 from torchid.problem.contact_detection import Detection, DetectionConfig, Filtered, detect_in_parts, name_flags
 from torchid.problem.detection_motion import (

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchid.logs.spill import Spill
+from torchid.logs.lazy_arrays import Spill
 from torchid.parameters import Array
 from torchid.problem.chunk_dynamics import ChunkKinematics
 from torchid.problem.chunks import chunks_by_state, one_thread
