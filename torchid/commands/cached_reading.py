@@ -189,7 +189,7 @@ class CachedReader(LogReader):
         """The name of the samples of a log, None if it cannot be read.
 
         Reading block by block rounds otherwise than reading a log as a whole, and with the size of the blocks. Where
-        samples are dropped, what was required of them before cannot be told from what is left.
+        samples are dropped, what was required of them before does not follow from what is left.
         """
         content = self._content(path)
         if content is None:

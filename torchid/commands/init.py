@@ -69,7 +69,7 @@ class Initiated:
         output: the experiment file.
         found: what log and robot have, in words.
         guessed: what should be compared with the robot and its manual.
-        missing: what a fit needs and nobody found.
+        missing: what a fit needs and was not found.
     """
 
     output: Path
@@ -224,7 +224,7 @@ def _lacks_base_motion(contacts: Sequence[GuessedContact], fields: set[str]) -> 
 
 
 def _from_feet(contacts: Sequence[GuessedContact], fields: set[str]) -> dict[str, object]:
-    """Keys of preprocessing that take what nobody recorded from joints and feet, if there are enough of these."""
+    """Keys of preprocessing that take what was not recorded from joints and feet, if there are enough of these."""
     out: dict[str, object] = {}
     kinds = [contact.type for contact in contacts]
     if _lacks_base_motion(contacts, fields) and ("flat" in kinds or len(kinds) > 2):
@@ -351,7 +351,7 @@ def _text(
         lines += [
             f"    # {line}" for line in [remark, *(x for one in entries for x in _entry("joint_torque", one))] if line
         ]
-    lines += [f"# {' and '.join(from_feet)}: nobody recorded them"] if from_feet else []
+    lines += [f"# {' and '.join(from_feet)}: not recorded"] if from_feet else []
     lines += [f"# {key}: {why}" for key, (_, why) in gaps.items()]
     stated = {key: value for key, (value, _) in gaps.items()}
     lines += _entry("preprocessing", {"cutoff_hz": "auto"} | from_feet | stated)

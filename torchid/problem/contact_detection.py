@@ -222,7 +222,7 @@ class _Seen:
     Attributes:
         known: the signals.
         share: of the weight that contacts carry, (K, C).
-        velocity: (K, C, 3) [m/s], in the world or not; None where nobody knows.
+        velocity: (K, C, 3) [m/s], in the world or not; None where it is unknown.
         in_world: whether it is.
         accelerates: whether the acceleration of the base is known.
         settings: thresholds.

@@ -92,7 +92,7 @@ def detect_in_blocks(
         sign_width: as of `detect_contacts`.
 
     Raises:
-        InputError: as `detect_contacts`; a tilted floor below a base whose tilt nobody measured.
+        InputError: as `detect_contacts`; a tilted floor below a base whose tilt was not measured.
     """
     require_torque(blocks.source, "joint_torque" in blocks.fields)
     _require_level_or_measured(blocks, contacts)
@@ -123,7 +123,7 @@ def detect_in_blocks(
 
 
 def _require_level_or_measured(blocks: LogBlocks, contacts: Sequence[Contact]) -> None:
-    """Refuse a tilted floor where nobody measured the base's tilt: its heading there follows from the whole log."""
+    """Refuse a tilted floor where the base's tilt was not measured: its heading there follows from the whole log."""
     measured = "imu_frame" in blocks.names or any(name.startswith("base_quat") for name in blocks.fields)
     if not measured and any(contact.normal != UP for contact in contacts):
         found = "missing, with detect_contacts on a tilted floor in a log that is not in memory at once"
