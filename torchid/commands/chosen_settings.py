@@ -121,7 +121,7 @@ def _cutoff(scene: Scene) -> CutoffChoice:
         return CutoffChoice(None, by_noise=False)
     logs = [next(recorded_segments(path, files, settings))[0] for path in files.train]
     stated, from_feet = scene.config.sensors.noise.motion, settings.base_motion is not None
-    return choose_cutoff(logs, stated, settings.stated_rate_hz, base_is_derived=from_feet)
+    return choose_cutoff(logs, stated, settings.sample_rate_hz, base_is_derived=from_feet)
 
 
 def _base_tilt(scene: Scene) -> TiltChoice:

@@ -29,7 +29,6 @@ class PreprocessingConfig:
     """Zero-phase low-pass [Hz] and resampling [Hz]; None leaves the signals as they are.
 
     `cutoff_hz`: auto, one that the motion of the training logs and its noise ask for, see `choose_cutoff`.
-    `sample_rate_hz`: auto, the lowest that holds what the filter lets through.
     `bridge_gaps_s`: gaps (NaN) of at most so long [s] are filled before anything else is done; None leaves them.
     `contact_margin_s`: samples that are dropped before and after each change of contact [s], None for none.
     `detect_contacts`: true, or its settings, for contact flags from joint torques (`DetectionConfig`) in the place of
@@ -45,7 +44,7 @@ class PreprocessingConfig:
     """
 
     cutoff_hz: PositiveOrAuto = None
-    sample_rate_hz: PositiveOrAuto = None
+    sample_rate_hz: Positive | None = None
     bridge_gaps_s: Positive | None = None
     contact_margin_s: NotNegative | None = None
     detect_contacts: Annotated[DetectionConfig | None, BeforeValidator(_switch)] = None
@@ -61,11 +60,6 @@ class PreprocessingConfig:
     def filter_hz(self) -> float | None:
         """The cutoff as a number [Hz], None where there is no filter, or it has not been chosen."""
         return None if isinstance(self.cutoff_hz, str) else self.cutoff_hz
-
-    @property
-    def stated_rate_hz(self) -> float | None:
-        """The sample rate [Hz] that logs are brought to, None for their own or one that follows from the filter."""
-        return None if isinstance(self.sample_rate_hz, str) else self.sample_rate_hz
 
     @property
     def slip_limit(self) -> float | None:

@@ -25,7 +25,7 @@ from torchid.logs.log import (
 from torchid.logs.quaternion import angular_acceleration_base, angular_velocity_base, make_sign_continuous
 from torchid.logs.sign_filter import mean_dry, mean_stribeck, with_sign_filter
 from torchid.logs.signal_noise import signal_noise, warn_of_noisy_accelerations
-from torchid.logs.timeline import JITTER, SampleRate, Timeline, lay_out_timeline, nearest_known
+from torchid.logs.timeline import JITTER, Timeline, lay_out_timeline, nearest_known
 
 #: Quantities of which each is the derivative of the one before. The first angular one would be the orientation.
 DERIVATIVE_CHAINS = (
@@ -43,7 +43,7 @@ _MIN_QUATERNION_NORM = 0.5
 def preprocess(
     log: Log,
     cutoff_hz: float | None = None,
-    sample_rate_hz: SampleRate = None,
+    sample_rate_hz: float | None = None,
     motion_noise: Mapping[str, float] | None = None,
     sign_width: float | None = None,
     stribeck: float | None = None,
@@ -72,8 +72,7 @@ def preprocess(
     Args:
         log: the log.
         cutoff_hz: cutoff [Hz] of the filter, below half the median sample rate; None for no filter.
-        sample_rate_hz: of the result [Hz], at most ten times the log's; "auto": every k-th sample of a filtered log, as
-            few as hold what the filter lets through, at five times the cutoff or more; None for the log's own.
+        sample_rate_hz: sample rate [Hz] of the result, at most ten times the median one; None for the log's own.
         motion_noise: standard deviations of the recorded motion by the keys of `STATED_FIELDS`, as far as they are
             known; others are estimated, see `signal_noise`.
         sign_width: over which the sign of a joint's velocity changes, as tanh(velocity / width) [rad/s or m/s]; None
@@ -112,7 +111,7 @@ def make_timeline(
     time: FloatArray,
     differentiates: bool,
     cutoff_hz: float | None,
-    sample_rate_hz: SampleRate,
+    sample_rate_hz: float | None,
     sign_width: float | None = None,
     stribeck: float | None = None,
 ) -> Timeline | None:

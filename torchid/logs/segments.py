@@ -22,14 +22,14 @@ from torchid.logs.preprocess import (
 )
 from torchid.logs.sign_filter import with_sign_filter
 from torchid.logs.signal_noise import signal_noise, warn_of_noisy_accelerations
-from torchid.logs.timeline import FEWEST_DIFFERENTIATED, LONGEST_STEP, SampleRate, Timeline, spline_derivatives
+from torchid.logs.timeline import FEWEST_DIFFERENTIATED, LONGEST_STEP, Timeline, spline_derivatives
 
 
 def preprocess_segments(
     log: Log,
     segments: Sequence[slice],
     cutoff_hz: float | None,
-    sample_rate_hz: SampleRate,
+    sample_rate_hz: float | None,
     sign_width: float | None = None,
     stribeck: float | None = None,
 ) -> tuple[Log, int]:
@@ -110,8 +110,8 @@ def _is_long_enough(time: FloatArray, segment: slice, whole: Timeline) -> bool:
         return True
     step = float(np.median(np.diff(time)))
     left = time[segment.stop - 1] - time[segment.start] - 2.0 * DROPPED_PERIODS / whole.cutoff_hz
-    rate = max(step, float(np.median(np.diff(whole.output_stamps))))
-    return bool(left > 2.0 * rate and count > 2 * whole.low_pass.padding)
+    wanted = step * (whole.kept.step or 1) if whole.output is None else float(np.median(np.diff(whole.output)))
+    return bool(left > 2.0 * max(step, wanted) and count > 2 * whole.low_pass.padding)
 
 
 def _joined(logs: Sequence[Log]) -> Log:

@@ -6,7 +6,6 @@ import math
 import numbers
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
@@ -73,9 +72,6 @@ def joint_spline_derivatives(
         for derivatives, values in zip(out, fields, strict=True)
     ]
 
-
-SampleRate = float | Literal["auto"] | None
-"""Of a preprocessed log [Hz], "auto" for the lowest that holds what the filter lets through, None for the log's own."""
 
 # ------------------------------------------------------------------------- stamps of a log, and the filter between them
 
@@ -233,22 +229,19 @@ LONGEST_STEP = 10.0
 SHORTEST_STEP = 0.1
 #: Longest median step [s], as the checks of logs have it: longer ones are of another unit.
 LONGEST_MEDIAN_STEP = 0.5
-#: Sample rate that holds what the filter lets through, in cutoffs: at 5, fits of a quadruped and an arm lose no
-#: information and move by at most 0.06 standard errors (at 3 by 0.12, at 2.5 by 0.6).
-LEAST_RATE = 5.0
 #: Highest sample rate to resample to, in median sample rates.
 FASTEST = 10.0
 
 
 def lay_out_timeline(
-    time: FloatArray, cutoff_hz: float | None, sample_rate_hz: SampleRate, differentiates: bool
+    time: FloatArray, cutoff_hz: float | None, sample_rate_hz: float | None, differentiates: bool
 ) -> Timeline:
     """Lay out the stamps of a log that is filtered, resampled or differentiated.
 
     Args:
         time: (N,) [s].
         cutoff_hz: low-pass cutoff [Hz], None for no filter.
-        sample_rate_hz: as of `preprocess`.
+        sample_rate_hz: output's sample rate [Hz], None for the log's own.
         differentiates: whether a derivative is missing in the log.
 
     Raises:
@@ -273,9 +266,7 @@ def lay_out_timeline(
         low_pass = LowPass.butterworth(cutoff_hz, step)
         kept = _unspoiled(grid, step, cutoff_hz, low_pass.padding)
     output = None
-    if isinstance(sample_rate_hz, str):
-        kept = slice(kept.start, kept.stop, _as_few_as_hold_the_band(kept.stop - kept.start, step, cutoff_hz))
-    elif sample_rate_hz is not None:
+    if sample_rate_hz is not None:
         accepted = f"{FASTEST:g} times the log's median sample rate"
         _check_rate("sample_rate_hz", sample_rate_hz, FASTEST / step, accepted)
         if cutoff_hz is not None and cutoff_hz >= 0.5 * sample_rate_hz:
@@ -326,13 +317,6 @@ def _unspoiled(grid: FloatArray, step: float, cutoff_hz: float, padding: int) ->
         accepted = f"more than {shortest:.6g} s for a cutoff of {cutoff_hz:g} Hz, which spoils both ends of a log"
         raise LogError.at_field("time", f"{grid[-1]:.6g} s ({len(grid)} samples)", accepted)
     return slice(int(inside[0]), int(inside[-1]) + 1)
-
-
-def _as_few_as_hold_the_band(count: int, step: float, cutoff_hz: float | None) -> int:
-    """Every how many-th of some samples says what all of them do, two at least; each without a filter."""
-    if cutoff_hz is None:
-        return 1
-    return max(min(int((1.0 + JITTER) / (LEAST_RATE * cutoff_hz * step)), count - 1), 1)
 
 
 def _share_kept(grid: FloatArray, step: float) -> int | None:
