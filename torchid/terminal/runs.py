@@ -75,6 +75,7 @@ def _worst(one: ErrorComparison) -> float:
 _ENDS = (0.025, 0.5, 0.975)
 _MOST_PARAMETERS = 5  # bodies and joints in the answer
 
+_FEWEST_FOR_TAILS = 40  # draws of which one is beyond each end of a 95 % range
 
 def print_samples(drawn: DrawnSamples, verbose: bool = False) -> None:
     """Print the answer for the terminal's width; `verbose`: with all parameters."""
@@ -84,9 +85,12 @@ def print_samples(drawn: DrawnSamples, verbose: bool = False) -> None:
 def sample_lines(drawn: DrawnSamples, width: int, verbose: bool = False) -> list[str]:
     """A sentence, and the ranges that are widest; lines of at most so many columns."""
     fitted, table = drawn.fitted, table_of_draws(drawn.samples)
-    total = np.quantile(table[:, MASS : len(fitted.posterior.nominal) : PER_BODY].sum(axis=1), _ENDS)
+    few = len(table) < _FEWEST_FOR_TAILS
+    ends, titles = ((0.0, 0.5, 1.0), ("least", "median", "largest")) if few else (_ENDS, ("2.5 %", "median", "97.5 %"))
+    total = np.quantile(table[:, MASS : len(fitted.posterior.nominal) : PER_BODY].sum(axis=1), ends)
     lines = wrap_words(
-        f"{format_count(len(table), 'robot')} that can exist; 95 % of them weigh {total[0]:.4g} to {total[2]:.4g} kg. "
+        f"{format_count(len(table), 'robot')} that can exist; {'all' if few else '95 % of them'} weigh {total[0]:.4g} "
+        f"to {total[2]:.4g} kg. "
         f"Prior: nominal bodies may be off by {100.0 * drawn.prior_error:.3g} % (--prior-error).",
         width,
         "  ",
@@ -95,11 +99,9 @@ def sample_lines(drawn: DrawnSamples, width: int, verbose: bool = False) -> list
     if found is not None and found.prior_is_narrow and drawn.prior_error < found.value:
         lines += wrap_words(f"  {found}: ranges are too narrow; --prior-error auto takes that.", width, "  ")
     numbers = _shown(drawn, table, verbose)
-    ranges = np.quantile(table[:, numbers], _ENDS, axis=0)
+    ranges = np.quantile(table[:, numbers], ends, axis=0)
     names = [fitted.parameter_names[number] for number in numbers]
-    columns = [
-        (title, [f"{x:.4g}" for x in row]) for title, row in zip(("2.5 %", "median", "97.5 %"), ranges, strict=True)
-    ]
+    columns = [(title, [f"{x:.4g}" for x in row]) for title, row in zip(titles, ranges, strict=True)]
     lines += column_lines(("widest, in SI units" if not verbose else "parameter", names), columns, width)
     where = "no file: --output samples.npz, ranges.json or, with --format urdf, a folder"
     return [*lines, f"{'written to':{LABEL}}{where if drawn.output is None else drawn.output}"]
@@ -224,7 +226,7 @@ def replay_lines(replayed: Replay, width: int, verbose: bool = False) -> list[st
     ]
     lines += ["", *column_lines((f"joint, after {replayed.window:g} s", [name for name, _ in few]), cells, width)]
     if len(few) < len(joints):
-        lines.append(f"and {len(joints) - len(few)} joints that drift less: --verbose")
+        lines.append(f"and {format_count(len(joints) - len(few), 'joint')} drifting less: --verbose")
     if replayed.output is not None:
         lines.append(f"{'written to':{LABEL}}{replayed.output}")
     return lines
@@ -241,6 +243,5 @@ def _drift(replayed: Replay) -> str:
     ]
     worse = any(after > before for before, after in drifts.values())
     head = f"WORSE THAN {replayed.of}: drift" if worse else "Drift"
-    driven = "PD targets" if replayed.gains.any() else "torques"
-    of = f"of the {driven} of {replayed.source} alone, as a share of the {replayed.of}'s"
-    return f"{head} after {replayed.window:g} s {of}: {', '.join(shares)} ({replayed.windows} windows)"
+    of = f"of {replayed.driven} alone, as a share of the {replayed.of}'s"
+    return f"{head} after {replayed.window:g} s {of}: {', '.join(shares)} ({format_count(replayed.windows, 'window')})"
