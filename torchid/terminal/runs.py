@@ -43,7 +43,8 @@ def evaluation_lines(evaluated: EvaluatedRun, width: int) -> list[str]:
     of = evaluated.robot.format
     judged = [ErrorComparison(name, pair.nominal, pair.identified, of) for name, pair in evaluated.metrics.items()]
     judged.sort(key=_worst, reverse=True)
-    lines = [line for one in judged[:MOST_LOGS] for line in wrap_words(_sentence(one), width, "  ")]
+    shown = [_sentence(one, evaluated.explained) for one in judged[:MOST_LOGS]]
+    lines = [line for sentence in shown for line in wrap_words(sentence, width, "  ")]
     if len(judged) > MOST_LOGS:
         lines.append(f"and {len(judged) - MOST_LOGS} logs that are predicted better than these: --verbose")
     if len(judged) == 1:
@@ -62,9 +63,10 @@ def print_all_errors(evaluated: EvaluatedRun) -> None:
     print(f"{'written to':{LABEL}}{evaluated.output}")
 
 
-def _sentence(one: ErrorComparison) -> str:
+def _sentence(one: ErrorComparison, explained: bool) -> str:
     worse = worse_than_nominal({one.text: (one.nominal, one.identified)})
-    return f"WORSE THAN {one.of}: {describe_worse(worse, one.of)}" if worse else one.headline()
+    unexplained = "" if explained else "the run's own logs"
+    return f"WORSE THAN {one.of}: {describe_worse(worse, one.of)}" if worse else one.headline(unexplained)
 
 
 def _worst(one: ErrorComparison) -> float:
@@ -73,9 +75,9 @@ def _worst(one: ErrorComparison) -> float:
 
 
 _ENDS = (0.025, 0.5, 0.975)
+_FEWEST_FOR_TAILS = 40  # draws of which one is beyond each end of a 95 % range
 _MOST_PARAMETERS = 5  # bodies and joints in the answer
 
-_FEWEST_FOR_TAILS = 40  # draws of which one is beyond each end of a 95 % range
 
 def print_samples(drawn: DrawnSamples, verbose: bool = False) -> None:
     """Print the answer for the terminal's width; `verbose`: with all parameters."""
