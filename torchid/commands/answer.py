@@ -175,7 +175,8 @@ def _attention(run: Identification, judged: ErrorComparison) -> Iterator[str]:
         yield f"negative, which nothing is: {join_names(impossible)}; {advice}"
     yield from _impossible(run)
     if not run.misfit.explained:
-        yield f"friction, compliance or contacts that the model lacks, or a wrong sensor (torchid check): {run.misfit}"
+        why = run.misfit.in_short
+        yield f"friction, compliance or contacts are missing, or a sensor is wrong (torchid check): {why}"
     if run.experiment.config.estimator.total_mass is None and _contradicts_nominal(run.mass):
         ratio = f"{run.mass.value / run.mass.nominal:.3g} times the {run.experiment.robot.format}'s"
         yield f"the total mass is {ratio}: weigh the robot, or mend units and gains of forces: torchid check"
@@ -224,7 +225,7 @@ def _far_off(nominal: NominalError | None) -> Iterator[str]:
     if nominal is not None and nominal.prior_is_narrow:
         unlike = nominal.value > _ANOTHER_ROBOT
         why = ": the model does not explain these forces, or the file is another robot's" if unlike else ""
-        yield f"{nominal}{why}; so may be what they do not determine: torchid sample --prior-error auto"
+        yield f"{nominal}{why}; other bodies may be as far off: torchid sample --prior-error auto"
 
 
 def _contradicts_nominal(mass: TotalMass) -> bool:
