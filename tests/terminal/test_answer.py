@@ -201,7 +201,7 @@ def test_the_bodies_that_changed_most_are_listed_in_the_robots_order(consistent:
             )
             assert value == pytest.approx(phi[body, k], abs=0.5 * errors[body, k])
             assert error == pytest.approx(errors[body, k], rel=0.1)
-    assert f"and {13 - len(rows)} bodies that changed less" in "\n".join(lines)
+    assert f"and {13 - len(rows)} bodies whose mass changed less" in "\n".join(lines)
     assert "+ known only in sums with other bodies" in lines
 
 

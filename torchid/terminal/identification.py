@@ -101,13 +101,14 @@ def _body_lines(robot: Robot, estimate: Estimate, room: int, width: int) -> list
     lines = column_lines(("body", names), columns, width)
     marks = {word for line in lines[1:] for word in line.split()[1:]}
     if len(free) > len(shown):
-        lines.append(f"and {len(free) - len(shown)} bodies that changed less: parameters.json, --verbose")
+        what = "mass" if (estimate.phi.reshape(-1, PER_BODY) != robot.nominal)[free, _MASS].any() else "friction"
+        lines.append(f"and {len(free) - len(shown)} bodies whose {what} changed less: --verbose")
     legend = "; ".join(text.format(of=robot.format) for verdict, text in _LEGEND.items() if _MARKS[verdict] in marks)
     return [*lines, *([shorten(legend, width, placeholder=CUT)] if legend else [])]
 
 
 def _most_changed(robot: Robot, estimate: Estimate, bodies: Sequence[int]) -> list[int]:
-    """The bodies whose mass moved by the largest share of the robot's, or else friction by that of its own."""
+    """The bodies whose mass moved most, or else whose Coulomb friction did."""
     phi, nominal = estimate.phi.reshape(-1, PER_BODY), robot.nominal
     moved = np.abs(phi - nominal)
     return sorted(bodies, key=lambda k: (-moved[k, _MASS], -moved[k, _COULOMB], k))
