@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from torchid.commands.manifest import read_manifest
 from torchid.commands.replay import SAMPLES, Replay, _feet, replay
 from torchid.errors import ConfigError
 from torchid.fitting.calibration import Comparison
+from torchid.report.figures import drift_figure
 from torchid.sensing import Contact
 from torchid.simulation.replay import Drift
 from torchid.terminal.runs import replay_lines
@@ -126,7 +128,11 @@ def test_drifts_of_hinges_and_slides_are_told_apart(units: tuple[str, ...], shar
         of="URDF",
         gains=np.zeros((2, 2)),
     )
-    assert f"as a share of the URDF's: {shares} (1 windows)" in replay_lines(found, 200)[0]
+    assert f"as a share of the URDF's: {shares} (1 window)" in replay_lines(found, 200)[0]
+    driven = replace(found, gains=np.ones((2, 2)))
+    for one, by in ((found, "the torques of log"), (driven, "the PD targets of log")):
+        figure = drift_figure(one.driven, time, one.quartiles(), {}, one.by_joint(), units, "URDF")
+        assert figure.get_suptitle().startswith(f"Drift of a robot driven by {by}: median")
 
 
 def test_what_a_replay_lacks_is_named(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -72,10 +72,8 @@ class Misfit:
         much = self.expected is not None and self.residual > _MUCH * self.expected
         return not (much or self.alike or (self.friction is not None and self.friction.significant))
 
-    def __str__(self) -> str:
-        """In words, "" where the model explains the forces."""
-        if self.explained:
-            return ""
+    def _reasons(self) -> list[str]:
+        """Why noise cannot be all that the model leaves, none where it may be."""
         reasons = []
         if self.expected is not None and self.residual > _MUCH * self.expected:
             reasons.append(f"residuals are {self.residual / self.expected:.2g} times what the stated noise leaves")
@@ -85,6 +83,19 @@ class Misfit:
             )
         if self.friction is not None and self.friction.significant:
             reasons.append(str(self.friction))
+        return reasons
+
+    @property
+    def in_short(self) -> str:
+        """The first reason and the readings that show it most, "" where the model explains the forces."""
+        where = f", most in {self.groups[0].group}" if self.groups else ""
+        return "".join(f"{reason}{where}" for reason in self._reasons()[:1])
+
+    def __str__(self) -> str:
+        """In words, "" where the model explains the forces."""
+        reasons = self._reasons()
+        if not reasons:
+            return ""
         share = self.expected or 1.0
         shown = [
             f"{one.group} {one.residual:.2g} {one.unit} where {share * one.used:.2g} are expected"
