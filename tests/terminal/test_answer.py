@@ -126,6 +126,14 @@ def test_a_base_force_that_a_constant_would_predict_as_well_is_not_explained(
     assert ("but the model does not explain these forces" in said.split("rms error")[0]) is told
 
 
+def test_projected_forces_that_no_bodies_would_predict_as_well_are_not_explained(consistent: Identification) -> None:
+    pair = consistent.metrics["test"]
+    found = replace(pair.identified, relative={**pair.identified.relative, "nullspace": 1.31})
+    said = text(replace(consistent, metrics=consistent.metrics | {"test": pair._replace(identified=found)}), 400)
+    assert "errors of 1.3 times what was measured; check signs, units and order of joints: torchid check" in said
+    assert "what was measured" not in text(consistent, 400)
+
+
 @pytest.mark.parametrize(("share", "unlike"), [(0.3, True), (0.6, False)])
 def test_bodies_far_off_their_file_need_a_wider_prior_and_a_line_says_which(
     consistent: Identification, share: float, unlike: bool

@@ -223,12 +223,14 @@ def _unfinished(estimate: SgdEstimate) -> str:
 
 
 def _unlike_sensors(identified: Metrics) -> Iterator[str]:
-    """Readings that the identified parameters explain worse than no limb, or a constant base force, would."""
-    for group in LIMB_GROUPS:
+    """Readings that the identified parameters explain worse than no bodies, or a constant base force, would."""
+    for group in (*LIMB_GROUPS, "nullspace"):
         share = identified.relative_of(group)
         if share is not None and share > _LARGER_THAN_MEASURED:
-            ratio = f"{group_name(group)}: errors of {share:.2g} times what was measured"
-            yield f"{ratio}; check the sensor's sign, unit and frame: torchid check"
+            in_limb = group in LIMB_GROUPS
+            name = group_name(group) if in_limb else "forces without those of the contacts"
+            whose = "the sensor's sign, unit and frame" if in_limb else "signs, units and order of joints"
+            yield f"{name}: errors of {share:.2g} times what was measured; check {whose}: torchid check"
     share, of_weight = identified.base_force_of_variation, identified.relative_of("base_force")
     if share is not None and share > _LARGER_THAN_MEASURED and (of_weight or 0.0) > MAX_MASS_ERROR:
         ratio = f"base force: errors of {share:.2g} times what its measurements vary by"
