@@ -1,4 +1,4 @@
-"""Pose of a base that nobody measured, from the feet that stand on a floor."""
+"""Unmeasured pose of the base, from the feet that stand on a floor."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from torchid.problem.floor_pose import (
     points_of,
     split_at_lost_feet,
 )
-from torchid.problem.samples import joint_order
+from torchid.problem.log_joints import joint_order
 from torchid.robot import Robot
 from torchid.sensing import Contact
 from torchid.sensing.sensors import UP
@@ -136,7 +136,7 @@ def stand_on_feet(log: Log, robot: Robot, contacts: Sequence[Contact]) -> Standi
 
     Raises:
         LogError: joints or contacts that are missing, no sample with enough feet, a foot without an axis along the
-            normal, or readings along axes of a world whose heading nobody knows.
+            normal, or readings along axes of a world whose heading is unknown.
     """
     active = standing_flags(log.source, log.contact_names, log.contact_active, contacts)
     normals = None if log.contact_active is None else log.contact_normal_world
