@@ -120,6 +120,22 @@ def test_friction_that_the_model_lacks_is_said_before_all_else(
     assert "unexplained residuals are 11 times" in said
 
 
+def test_stated_noise_explains_logs_that_are_resampled_after_the_filter(tmp_path: Path) -> None:
+    command = [
+        "identify",
+        "--quiet",
+        str(DEMO / "quadruped.yaml"),
+        f"output={tmp_path / 'run'}",
+        "estimator.ridge=0.001",
+    ]
+    assert main([*command, "preprocessing.cache_gb=0", "preprocessing.sample_rate_hz=40"]) == 0
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert metrics["residual_std"] == pytest.approx(metrics["misfit"]["expected_residual_std"], rel=0.05)
+    for logs in ("train", "test"):
+        floor, error = metrics["noise_floor"][logs]["projected_residual"], metrics[logs]["projected_residual"]
+        assert error == pytest.approx(floor, rel=0.15), logs
+
+
 def test_only_noise_that_was_stated_makes_a_large_residual_unlike_any_model() -> None:
     rng = np.random.default_rng(0)
     A, forces = rng.normal(size=(200, 4)), np.full(4, 100.0)

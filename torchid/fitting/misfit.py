@@ -5,6 +5,7 @@ Friction that was not fitted is what it lacks most often: `unfitted_friction` te
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,7 @@ from torchid.identifiability.block_scatter import BlockScatter
 from torchid.parameters import FRICTION, INERTIAL, PER_BODY, Array
 from torchid.problem import LinearProblem
 from torchid.problem.chunks import one_thread
+from torchid.problem.compressed_log import Block
 from torchid.robot import Robot
 from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, is_significant
 
@@ -105,19 +107,24 @@ class Misfit:
 
 
 def misfit(
-    estimate: Estimate, noise: NoiseSummary, scatter: BlockScatter | None, friction: UnfittedFriction | None
+    estimate: Estimate,
+    noise: NoiseSummary,
+    logs: Sequence[Block],
+    scatter: BlockScatter | None,
+    friction: UnfittedFriction | None,
 ) -> Misfit:
     """What a fit leaves of the forces.
 
     Args:
         estimate: of the training logs.
         noise: that rows were weighted with.
-        scatter: of the estimate between blocks of these logs.
+        logs: these logs.
+        scatter: of the estimate between blocks of them.
         friction: that was not fitted.
     """
-    share = float(1.0 / np.sqrt(estimate.oversampling))
+    left = np.average([log.noise_left for log in logs], weights=[len(log) for log in logs])
     stated = any(one.origin == "stated" for one in noise.groups)
-    expected = share if stated else None
+    expected = float(np.sqrt(left)) if stated else None
     excess = {one.group: (one.residual or 0.0) / ((expected or 1.0) * one.used) for one in noise.groups}
     beyond = [one for one in noise.groups if excess[one.group] > _MUCH and (one.origin == "stated" or not stated)]
     growth = None
