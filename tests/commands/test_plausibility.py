@@ -85,7 +85,7 @@ def changed(folder: Path, change: Callable[[dict[str, Any]], None]) -> list[str]
             ["sensors.set=joints"],
             ("total mass is -21.38", "opposite sign", "joint_torque: all reversed"),
         ),
-        (silent_torques, ["sensors.set=joints", RIDGE], ("all measured forces are 0", "NaN where nobody measured")),
+        (silent_torques, ["sensors.set=joints", RIDGE], ("all measured forces are 0", "NaN where none was measured")),
         pytest.param(reversed_torques, [RIDGE], ("total mass is -21.38", "all reversed"), marks=pytest.mark.slow),
         (
             reversed_torques,

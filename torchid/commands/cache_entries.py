@@ -25,7 +25,7 @@ from torchid.config.robot import RobotConfig
 from torchid.errors import TorchidWarning
 from torchid.fitting.experiment import Experiment, Scene
 from torchid.fitting.factor_documents import PackedPart, PartPacker, PartReader
-from torchid.logs.spill import MappedPages
+from torchid.logs.lazy_arrays import MappedPages
 from torchid.logs.time_range import log_title
 from torchid.problem import RowBuilder, Samples, TriangularFactor
 from torchid.problem.base_motion import BaseMotion

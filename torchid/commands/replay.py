@@ -41,7 +41,7 @@ from torchid.simulation.replay import Drift, Model, ReplayedLog, replay_log
 _ByJoint = Mapping[str, Mapping[str, float]]
 _TIMES = 25  # at which the drift is compared, within a window
 SAMPLES = 10
-"""Robots that are drawn from what the logs leave open, where nobody says how many."""
+"""Robots that are drawn from what the logs leave open, where no number is given."""
 _MOST_SAMPLES = 1000
 
 

@@ -12,13 +12,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchid.logs.spill import Spill
+from torchid.logs.lazy_arrays import Spill
 from torchid.parameters import Array
 from torchid.problem.chunk_dynamics import ChunkKinematics
 from torchid.problem.chunks import chunks_by_state, one_thread
 from torchid.problem.contact_state import ContactState
-from torchid.problem.extra_columns import contact_extra_column, dof_extra_column
-from torchid.problem.extras import ACTUATORS, Extra
+from torchid.problem.extras import ACTUATORS, Extra, contact_extra_column, dof_extra_column
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.regressor.columns import body_wrenches

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from torchid.errors import LogError, UnknownNameError, about_file, join_names
 from torchid.logs import Log
+from torchid.logs.lazy_arrays import MappedPages
 from torchid.logs.log import FORCE_NORMAL, FloatArray, normalize_normals
 from torchid.logs.preprocess import unloaded_readings
-from torchid.logs.spill import MappedPages
 from torchid.parameters import WRENCH_COMPONENTS, Array
 from torchid.problem import log_joints
 from torchid.problem.base_motion import BaseMotion, base_motion, imu_pose, position_for_moments
