@@ -42,7 +42,7 @@ NOT_IN_SAMPLES = ("memory_gb", "cache_gb")
 Said = tuple[type[Warning], str]
 """Class and text of a warning."""
 
-_SAMPLES_FORMAT = 2  # of entries
+_SAMPLES_FORMAT = 3  # of entries
 _BASE = "base."  # before the names of tensors of the base's motion
 
 
