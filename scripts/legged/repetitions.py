@@ -161,7 +161,7 @@ class Repetitions:
         for number in range(count):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", TorchidWarning)
-                self._add(tally, self._fit(self._samples(np.random.default_rng([number, self.seed]))))
+                self._add(tally, self._samples(np.random.default_rng([number, self.seed])))
             done()
         return tally
 
@@ -187,7 +187,8 @@ class Repetitions:
             return fit_robustly(logs, self.fitter, RobustLoss.named("huber")).fit
         return self.fitter.fit(compress_in_blocks(logs, self.fitter.builder))
 
-    def _add(self, tally: Tally, fit: Fit) -> None:
+    def _add(self, tally: Tally, samples: Samples) -> None:
+        fit = self._fit(samples)
         base, estimate = structural_base(self.true.legged), fit.estimate
         mass = total_mass(fit.assembly, estimate, block_error=fit.scatter.mass_error if fit.scatter else 0.0)
         known = estimate.verdict == IDENTIFIED
@@ -201,7 +202,7 @@ class Repetitions:
         tally.parameters.append(np.where(known, off <= NORMAL, np.nan))
         tally.residual.append(estimate.residual_std)
         friction = unfitted_friction(fit.assembly.problem, self.true.robot)
-        tally.misfit.append(not misfit(estimate, self.weights, fit.scatter, friction).explained)
+        tally.misfit.append(not misfit(estimate, self.weights, [samples], fit.scatter, friction).explained)
 
 
 def combination_errors(fit: Fit, combinations: Array) -> Array:

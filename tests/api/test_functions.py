@@ -40,7 +40,7 @@ def sections(demo: Path = DEMO) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The demo with less of its logs, and with its own estimator."""
-    folder = shortened_demo(tmp_path_factory.mktemp("short") / "demo", 600)
+    folder = shortened_demo(tmp_path_factory.mktemp("short") / "demo", 400)
     file = folder / "quadruped.yaml"
     file.write_text(
         file.read_text().replace(f"estimator: {FAST_ESTIMATOR}", "estimator: {name: consistent, ridge: auto}")

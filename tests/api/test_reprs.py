@@ -22,7 +22,7 @@ FILE = DEMO / "quadruped.yaml"
 @pytest.fixture(scope="module")
 def things(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, object]:
     """One of each public building block, of the demo; what is checked and analyzed is short."""
-    short = shortened_demo(tmp_path_factory.mktemp("short") / "demo", 400) / "quadruped.yaml"
+    short = shortened_demo(tmp_path_factory.mktemp("short") / "demo", 200) / "quadruped.yaml"
     log, robot = torchid.read_log(DEMO / "sway_train.npz"), torchid.load_robot(DEMO / "quadruped.urdf")
     contacts = [torchid.Contact(name, "point") for name in log.contact_names]
     noise = torchid.SensorNoise(joint_torque=0.1)

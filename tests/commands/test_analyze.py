@@ -275,6 +275,9 @@ def test_an_axis_of_less_than_a_decade_has_plain_numbers() -> None:
     labels = [text.get_text() for axes in figure.axes for text in axes.yaxis.get_ticklabels(which="both")]
     assert any(labels)
     assert not any("$" in label for label in labels)
+    arm = ExpectedErrors(*[rms | dict.fromkeys(("base_force", "base_moment"))] * 2)
+    titles = [axes.get_title(loc="left") for axes in accuracy_figure({"full": SetAccuracy(1, 1, arm, None)}).axes]
+    assert titles == ["joint torque", "projected"]
 
 
 def test_a_key_of_another_estimator_is_refused_without_logs_too(

@@ -56,7 +56,7 @@ def _new_files(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Experiment file of the demo, shortened."""
-    return shortened_demo(tmp_path_factory.mktemp("cache") / "demo", 300) / "quadruped.yaml"
+    return shortened_demo(tmp_path_factory.mktemp("cache") / "demo", 150) / "quadruped.yaml"
 
 
 @pytest.fixture(scope="module")

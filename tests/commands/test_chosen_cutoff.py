@@ -16,6 +16,7 @@ from torchid.errors import ConfigError
 from torchid.fitting.experiment import set_up
 
 AUTO = ["preprocessing={cutoff_hz: auto, cache_gb: 0}", "sensors.noise={joint_position: 1e-4}", "estimator.ridge=0.01"]
+AUTO += [f"logs.train=[{json.dumps(str(DEMO / 'sway_train.npz[:6]'))}]"]
 FILE = str(DEMO / "quadruped.yaml")
 
 

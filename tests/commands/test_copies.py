@@ -136,7 +136,7 @@ def test_copies_make_no_copies() -> None:
 def test_a_command_in_its_own_process_writes_the_files_that_it_writes_without_copies(
     tmp_path: Path, figures: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    settings, override = str(shortened_demo(tmp_path / "demo", 500) / "quadruped.yaml"), "estimator.ridge=auto"
+    settings, override = str(shortened_demo(tmp_path / "demo", 400) / "quadruped.yaml"), "estimator.ridge=auto"
     assert main(["identify", settings, override, f"output={tmp_path / 'alone'}", "--quiet"]) == 0
     command = [sys.executable, "-m", "torchid", "identify", settings, override, f"output={tmp_path / 'copies'}", "-q"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)

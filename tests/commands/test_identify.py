@@ -328,15 +328,3 @@ def test_force_plates_alone_identify_a_person_who_then_squats_differently(tmp_pa
     assert_loads(tmp_path / "run" / "identified.urdf", metrics["total_mass"])
     assert metrics["test"]["joint_torque_rms"] is None
     assert metrics["test"]["nullspace_rms"] is None
-
-
-@pytest.mark.skipif(not SHARED.is_dir(), reason="the recorded arm motion (../shared/data) is not here")
-@pytest.mark.filterwarnings(UNPHYSICAL)
-def test_a_bolted_arm_is_identified_from_its_joint_torques(tmp_path: Path) -> None:
-    config = CONFIGS / "kuka_lwr4.yaml"
-    assert main(["identify", str(config), f"output={tmp_path / 'run'}"]) == 0
-    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    assert metrics["test"]["joint_torque_rms"] < 0.5 * metrics["test_nominal"]["joint_torque_rms"]
-    assert metrics["test"]["base_force_rms"] is None
-    bodies = json.loads((tmp_path / "run" / "parameters.json").read_text())["bodies"]
-    assert_loads(tmp_path / "run" / "identified.urdf", sum(body["identified"]["m"] for body in bodies))

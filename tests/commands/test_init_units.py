@@ -17,7 +17,7 @@ from torchid.config import load_config
 from torchid.errors import LogError
 from torchid.fitting.experiment import set_up
 from torchid.logs import Log, read_log
-from torchid.logs.column_proposals import propose_field
+from torchid.logs.name_matching import propose_field
 from torchid.logs.units import split_unit
 
 URDF = DEMO / "quadruped.urdf"

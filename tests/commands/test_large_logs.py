@@ -34,6 +34,7 @@ SETTINGS = {
     "filtered": ({"cutoff_hz": 8}, 1e-10),
     "resampled": ({"sample_rate_hz": 137}, 0.0),
     "filtered and resampled": ({"sample_rate_hz": 301.5, "cutoff_hz": 25}, 1e-10),
+    "every fifth sample": ({"sample_rate_hz": 100, "cutoff_hz": 25}, 1e-10),
     "away from contact changes": ({"contact_margin_s": 0.05, "cutoff_hz": 20}, 1e-10),
 }
 

@@ -150,7 +150,7 @@ SETTINGS: dict[str, tuple[Callable[[Log], Log], float, dict[str, Any]]] = {
 
 
 #: Of which others hold all that they are made of.
-PARTS = ("base", "base, unfiltered", "flags by force", "zeros", "zeros, then flags", "gaps", "gaps, flags")
+PARTS = ("base", "flags", "base, unfiltered", "flags by force", "zeros", "zeros, then flags", "gaps", "gaps, flags")
 
 
 @pytest.mark.parametrize("name", slow_but(SETTINGS.keys() - PARTS, SETTINGS))

@@ -37,7 +37,7 @@ from torchid.estimators import LeastSquares
 from torchid.fitting.experiment import set_up
 from torchid.logs import read_log
 from torchid.logs.blocks import log_bytes, open_log_blocks
-from torchid.logs.spill import Spill, SpillError
+from torchid.logs.lazy_arrays import Spill, SpillError
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
 from torchid.problem.predict import calibrate_readings
 

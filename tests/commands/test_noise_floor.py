@@ -57,6 +57,12 @@ def series(noise: Array | None) -> ForceSeries:
     return ForceSeries("walk.npz[0:5]", time, measured, measured + 1.0, measured + 0.1, noise)
 
 
+def test_forces_are_known_where_any_row_was_measured_in_full() -> None:
+    some = series(None)
+    assert some.known
+    assert not replace(some, measured=np.full((50, 2), np.nan)).known
+
+
 def test_the_figure_shows_errors_in_a_band_of_two_standard_deviations() -> None:
     figure = force_figure(series(np.full((50, 2), 0.2)), ["knee", "hip"], 0)
     assert len(figure.axes) == 4

@@ -67,11 +67,12 @@ def in_degrees(log: dict[str, Any]) -> None:
     log["joint_position"] = np.rad2deg(log["joint_position"])
 
 
-def changed(folder: Path, change: Callable[[dict[str, Any]], None]) -> list[str]:
-    """Overrides for the demo with changed logs."""
+def changed(folder: Path, change: Callable[[dict[str, Any]], None], samples: int = 600) -> list[str]:
+    """Overrides for the demo with shortened and changed logs."""
     for name in ("train", "test"):
         with np.load(DEMO / f"sway_{name}.npz") as file:
             log = dict(file)
+        log = {key: x if key.endswith("names") else x[:samples] for key, x in log.items()}
         change(log)
         np.savez(folder / f"{name}.npz", **log)
     return [f"logs.train=[{folder}/train.npz]", f"logs.test=[{folder}/test.npz]", f"output={folder}/run"]
@@ -83,10 +84,10 @@ def changed(folder: Path, change: Callable[[dict[str, Any]], None]) -> list[str]
         (
             reversed_torques,
             ["sensors.set=joints"],
-            ("total mass is -21.38", "opposite sign", "joint_torque: all reversed"),
+            ("total mass is -21.", "opposite sign", "joint_torque: all reversed"),
         ),
-        (silent_torques, ["sensors.set=joints", RIDGE], ("all measured forces are 0", "NaN where nobody measured")),
-        pytest.param(reversed_torques, [RIDGE], ("total mass is -21.38", "all reversed"), marks=pytest.mark.slow),
+        (silent_torques, ["sensors.set=joints", RIDGE], ("all measured forces are 0", "NaN where none was measured")),
+        pytest.param(reversed_torques, [RIDGE], ("total mass is -21.", "all reversed"), marks=pytest.mark.slow),
         (
             reversed_torques,
             ["sensors.set=full", RIDGE],
@@ -132,7 +133,7 @@ def test_a_long_log_is_looked_at_in_segments(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("torchid.commands.check.MOST_CHECKED", 500)
-    assert main(["identify", str(DEMO / "quadruped.yaml"), *changed(tmp_path, change), RIDGE]) == 2
+    assert main(["identify", str(DEMO / "quadruped.yaml"), *changed(tmp_path, change, 1_300), RIDGE]) == 2
     assert f"torchid check finds in train.npz (samples {segment} of 1300, counted from there): joint_position: " in (
         capsys.readouterr().err
     )

@@ -16,7 +16,7 @@ from torchid.cli import main
 @pytest.fixture
 def tampered(tmp_path: Path) -> Path:
     """The demo's experiment file; one torque sensor of its training log has spikes."""
-    folder = shortened_demo(tmp_path / "demo", 500)
+    folder = shortened_demo(tmp_path / "demo", 250)
     with np.load(folder / "sway_train.npz") as log:
         fields = dict(log.items())
     fields["joint_torque"][::25, 3] += 50.0

@@ -20,7 +20,7 @@ _RUN = ("forces", "errors", "parameters", "identifiability", "contributions")
 @pytest.mark.usefixtures("figures")
 @pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
 def test_each_figure_of_a_run_and_of_an_evaluation_is_drawn(tmp_path: Path) -> None:
-    demo, run = shortened_demo(tmp_path / "demo", 300), tmp_path / "run"
+    demo, run = shortened_demo(tmp_path / "demo", 120), tmp_path / "run"
     assert main(["identify", str(demo / "quadruped.yaml"), f"output={run}"]) == 0
     assert main(["evaluate", str(run), "--log", str(demo / "sway_test.npz")]) == 0
     (evaluation,) = (folder for folder in (run / "evaluation").iterdir() if folder.is_dir())
@@ -36,7 +36,7 @@ _BEGINS = {"pdf": b"%PDF-1.", "svg": b"<?xml"}
 @pytest.mark.usefixtures("figures")
 @pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
 def test_figures_for_print_come_from_all_commands_and_tensorboard_keeps_its_pictures(tmp_path: Path) -> None:
-    demo, run = shortened_demo(tmp_path / "demo", 300), tmp_path / "run"
+    demo, run = shortened_demo(tmp_path / "demo", 120), tmp_path / "run"
     log, experiment = demo / "sway_test.npz", str(demo / "quadruped.yaml")
     given = ["figures.format=pdf", "estimator.name=consistent"]
     assert main(["identify", experiment, f"output={run}", *given]) == 0

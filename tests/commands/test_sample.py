@@ -106,6 +106,12 @@ def test_the_answer_fits_on_a_screen(run: Path, capsys: pytest.CaptureFixture[st
     assert len(short) <= 20
     assert main(["sample", str(run), "--count", "50", "--verbose"]) == 0
     assert len(capsys.readouterr().out.splitlines()) > 150
+    assert "95 % of them weigh" in short[0]
+    assert main(["sample", str(run), "--count", "2"]) == 0
+    two = capsys.readouterr().out
+    assert two.startswith("2 robots that can exist; all weigh ")
+    assert "least" in two
+    assert "2.5 %" not in two
     assert main(["sample", str(run), "--count", "50", "--quiet"]) == 0
     assert capsys.readouterr().out == ""
 

@@ -27,7 +27,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::torchid.errors.NumericalWarning"),
     pytest.mark.filterwarnings("ignore::torchid.errors.ConfoundedWarning"),
 ]
-SAMPLES = 700
+SAMPLES = 400
 EVERY_FOOT = ", ".join(f"{foot}: [fn]" for foot in FEET)
 
 
@@ -170,7 +170,7 @@ def test_analyze_plans_with_scalar_sensors_and_measures_the_plan(
 def test_a_plan_with_scalar_sensors_is_not_measured_on_logs_that_are_read_as_wrenches(
     experiment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    answers = analyzed(shortened_demo(tmp_path / "demo", 300) / "quadruped.yaml", "planned")
+    answers = analyzed(shortened_demo(tmp_path / "demo", 150) / "quadruped.yaml", "planned")
     (plan,) = answers["scenarios"].values()
     assert plan["cost"] == 10.0
     assert set(answers["accuracy"]) == {"proposed"}

@@ -20,7 +20,7 @@ from torchid.problem import Samples
 @pytest.fixture(scope="module")
 def dragged(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The demo, where one leg was turned by hand for 0.4 s while its foot counts as standing."""
-    file = shortened_demo(tmp_path_factory.mktemp("slip") / "demo", 500) / "quadruped.yaml"
+    file = shortened_demo(tmp_path_factory.mktemp("slip") / "demo", 300) / "quadruped.yaml"
     path = file.parent / "sway_train.npz"
     with np.load(path) as archive:
         log = dict(archive)

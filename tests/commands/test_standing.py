@@ -37,7 +37,7 @@ NO_BASE: dict[str, Any] = {"base_quat_xyzw": None, "base_position_world": None}
 @pytest.fixture(scope="module")
 def logs() -> tuple[Log, Log]:
     """A walk and another of a quadruped, recorded with the pose of its base."""
-    one, other = (recorded(MACHINE, truth(MACHINE, 0, seconds=4.0), seed=seed, noise=0.1) for seed in (0, 1))
+    one, other = (recorded(MACHINE, truth(MACHINE, 0, seconds=3.0), seed=seed, noise=0.1) for seed in (0, 1))
     return replace(one, contact_wrench_local=None), replace(other, contact_wrench_local=None)
 
 

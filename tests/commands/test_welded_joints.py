@@ -56,7 +56,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     np.testing.assert_allclose(again.links["rear_right_shank_link"][1], pose, rtol=0.0, atol=1e-12)
     np.testing.assert_allclose(again.nominal, robot.nominal, rtol=0.0, atol=1e-12)
     for name in (_TRAIN, _TEST):
-        log = _held(read_log(DEMO / name).select(slice(0, 400)))
+        log = _held(read_log(DEMO / name).select(slice(0, 250)))
         write_log(log, folder / name)
         write_log(_without(log), folder / f"fixed_{name}")
     settings = yaml.safe_load((DEMO / "quadruped.yaml").read_text())

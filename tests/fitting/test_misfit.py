@@ -110,12 +110,30 @@ def test_friction_that_the_model_lacks_is_said_before_all_else(
     assert good["unfitted_friction"] is None
     assert told["true"][0]["residual_std"] == pytest.approx(good["expected_residual_std"], rel=0.05)
     assert 0.7 < good["lack_of_fit"] < 1.3
-    assert "NOT EXPLAINED" not in told["true"][1]
+    assert "does not explain" not in told["true"][1]
     assert not lacking["explained"]
     assert "most in joint_torque" in lacking["message"]
     assert lacking["unfitted_friction"] > 100.0
     assert "friction, which is not fitted, explains" in lacking["message"]
-    assert told["false"][1].startswith("NOT EXPLAINED: the model does not explain these forces: residuals are 11 times")
+    said = " ".join(told["false"][1].split())
+    assert "the model does not explain these forces attention friction, compliance or contacts are missing" in said
+    assert "unexplained residuals are 11 times" in said
+
+
+def test_stated_noise_explains_logs_that_are_resampled_after_the_filter(tmp_path: Path) -> None:
+    command = [
+        "identify",
+        "--quiet",
+        str(DEMO / "quadruped.yaml"),
+        f"output={tmp_path / 'run'}",
+        "estimator.ridge=0.001",
+    ]
+    assert main([*command, "preprocessing.cache_gb=0", "preprocessing.sample_rate_hz=40"]) == 0
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert metrics["residual_std"] == pytest.approx(metrics["misfit"]["expected_residual_std"], rel=0.05)
+    for logs in ("train", "test"):
+        floor, error = metrics["noise_floor"][logs]["projected_residual"], metrics[logs]["projected_residual"]
+        assert error == pytest.approx(floor, rel=0.15), logs
 
 
 def test_only_noise_that_was_stated_makes_a_large_residual_unlike_any_model() -> None:

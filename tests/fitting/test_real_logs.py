@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from loadable import assert_loads
 from repository import CONFIGS, SHARED
 from synthetic import ROBOTS
 
@@ -28,7 +29,9 @@ def identified(output: Path, config: str, *overrides: str) -> tuple[dict[str, An
 def test_an_arm_that_can_exist_is_predicted_to_two_percent_on_a_run_that_no_fit_has_seen(tmp_path: Path) -> None:
     metrics, parameters = identified(tmp_path / "kuka", "kuka_lwr4.yaml")
     assert metrics["test"]["nullspace_rms_relative"] <= 0.0214  # rms over all joints; 0.0210 measured
+    assert metrics["test"]["base_force_rms"] is None
     assert metrics["violations"] == []
+    assert_loads(tmp_path / "kuka" / "identified.urdf", sum(one["identified"]["m"] for one in parameters["bodies"]))
     x, y = np.rad2deg(metrics["base_tilt_selection"]["tilt"])
     assert -2.5 < x < -1.3, "the table is not level, whatever else is fitted"
     assert abs(y) < 0.8

@@ -32,7 +32,7 @@ STATES = [[True] * 4, [True, False, False, True], [False, True, True, True], [Tr
 def quadruped_files(
     folder: Path,
     scales: Mapping[str, float],
-    samples: int = 240,
+    samples: int = 160,
     states: Sequence[Sequence[bool]] = STATES,
     noise: float = 0.0,
     loads: Mapping[str, Payload] | None = None,

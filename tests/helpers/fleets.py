@@ -20,7 +20,7 @@ from torchid.config import load_config
 from torchid.logs import write_log
 
 WALKS = ("left.npz", "right.npz", "long.npz")
-SECONDS = (4.0, 3.0, 6.0)
+SECONDS = (2.5, 2.0, 3.5)
 
 
 def walks(folder: Path, machine: str, seconds: Sequence[float] = SECONDS, **settings: Any) -> Path:

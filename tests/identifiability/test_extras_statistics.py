@@ -1,4 +1,4 @@
-"""What is said of unknowns beside the bodies' parameters: standard errors, and which cannot be told apart."""
+"""What is said of unknowns beside the bodies' parameters: standard errors, and which are confounded."""
 
 from __future__ import annotations
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
@@ -247,3 +248,13 @@ def test_to_torque_sensors_a_point_that_stands_hides_a_mass_at_that_point() -> N
             rank, gap = structural_rank(problem)
             assert rank == 10 + 7 * robot.n - lost * sum(state)
             assert gap > 1e12
+
+
+def test_a_tilted_table_shows_what_a_level_one_hides_of_the_first_link() -> None:
+    """Gravity turns an arm about a vertical axis not at all, and one that is askew by its first moments."""
+    level = load(PANDA, fixed_base=True)
+    ranks = [
+        base_parameters(structural_problem(robot, [], named_sensors("joints", robot.n, 0), [()], False)).rank
+        for robot in (level, replace(level, base_tilt=(0.03, -0.01)))
+    ]
+    assert ranks[1] == ranks[0] + 2

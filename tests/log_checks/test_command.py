@@ -84,7 +84,7 @@ def test_a_log_that_is_not_usable_ends_with_status_one(folder: Path, capsys: pyt
     write_log(replace(log, joint_position=np.degrees(log.joint_position)), folder / "sway_train.npz")
     assert main(["check", str(folder / "quadruped.yaml")]) == 1
     printed = capsys.readouterr().out
-    assert printed.startswith("0 of 2 logs are free of usual mistakes; 1 is not usable; 1 is usable")
+    assert printed.startswith("1 of 2 logs is usable")
     assert "rejected      joint_position, unit in sway_train.npz: " in printed
 
 

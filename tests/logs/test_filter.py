@@ -30,6 +30,18 @@ def test_a_sine_keeps_its_phase_and_loses_the_butterworth_share(time: FloatArray
     np.testing.assert_allclose(value(middle.joint_velocity)[:, 0] / rate, gain * np.cos(angle), rtol=0.0, atol=accuracy)
 
 
+@pytest.mark.parametrize("rate", [None, 100.0, 137.0])
+def test_the_share_of_noise_that_is_left_does_not_depend_on_the_rate_afterwards(rate: float | None) -> None:
+    t = uniform(400.0)
+    noise = np.random.default_rng(7).standard_normal((len(t), 4))
+    log = Log("noise.npz", t, ("a", "b", "c", "d"), np.zeros((len(t), 4)), joint_torque=noise)
+    out = preprocess(log, 12.0, rate)
+    share = value(out.noise_share)
+    assert share == pytest.approx(out.noise_bandwidth_hz / (RATE / 2), rel=1e-9)
+    # 400 s hold some 40,000 independent values
+    assert np.mean(value(out.joint_torque) ** 2) == pytest.approx(share, rel=0.03)
+
+
 def test_every_channel_passes_the_same_filter() -> None:
     rng = np.random.default_rng(2)
     t = jittered(2.0)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from torchid.logs.column_proposals import propose_field
-from torchid.logs.name_matching import limbs, match_joints, match_names, spelled
+from torchid.logs.name_matching import limbs, match_joints, match_names, propose_field, spelled
 
 FEET = ("LF_FOOT", "RF_FOOT", "LH_FOOT", "RH_FOOT")
 

@@ -207,6 +207,17 @@ def test_a_cutoff_that_no_stamps_in_ms_allow_is_answered_with_the_unit() -> None
         preprocess(sine_log(1.0, uniform()), cutoff_hz=300.0)
 
 
+@pytest.mark.parametrize("time", [uniform(), jittered()], ids=["uniform", "jittered"])
+@pytest.mark.parametrize("each", [1, 4, 5])
+def test_a_rate_that_divides_the_logs_keeps_every_kth_of_its_samples(time: FloatArray, each: int) -> None:
+    log = moving_log(time, base_position_world=position(time), joint_torque=np.cos(9.0 * position(time)))
+    rate = 1.0 / np.median(np.diff(log.time))  # of the grid that jittered stamps are filtered on
+    every, some = preprocess(log, 20.0), preprocess(log, 20.0, rate / each)
+    for name in ("time", "joint_acceleration", "base_angular_acceleration_base", "joint_torque", "joint_direction"):
+        np.testing.assert_array_equal(value(getattr(some, name)), value(getattr(every, name))[::each], err_msg=name)
+    assert some.noise_bandwidth_hz == every.noise_bandwidth_hz
+
+
 @pytest.mark.parametrize("wrong", [0.0, -3.0, 5000.1, float("nan"), float("inf")])
 def test_sample_rates_that_only_invent_samples_are_refused(wrong: float) -> None:
     with pytest.raises(InputError, match=r"preprocessing.sample_rate_hz: .*below 5000 Hz"):

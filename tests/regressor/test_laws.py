@@ -74,6 +74,15 @@ def test_neither_place_nor_heading_matters(small: Robot, seed: int) -> None:
     assert_close(regressor(small, elsewhere, v, a), K)
 
 
+def test_a_quaternion_is_normalized_and_one_that_is_no_rotation_gives_nan(small: Robot) -> None:
+    q, v, a = random_states(np.random.default_rng(0), small.n, 3)
+    K, longer = regressor(small, q, v, a), q.copy()
+    longer[:, 3:7] *= [[2.0], [-0.3], [0.0]]
+    found = regressor(small, longer, v, a)
+    assert_close(found[:2], K[:2])
+    assert np.isnan(found[2]).any()
+
+
 @few
 @given(seed=seeds)
 def test_a_robot_on_a_train_needs_the_same_forces(small: Robot, seed: int) -> None:

@@ -70,7 +70,7 @@ def test_compiled_and_exported_they_are_the_same(small: Robot) -> None:
     state, more = (tensors(*random_states(np.random.default_rng(15), small.n, samples)) for samples in (3, 7))
     K, J = Regressor(small), FrameJacobian(small, "c")
     for module, inputs in ((K, state), (J, state[:1])):
-        whole_graph = torch.compile(module, backend="aot_eager", fullgraph=True)
+        whole_graph = torch.compile(module, backend="eager", fullgraph=True)  # `export` traces what comes after
         assert_close(whole_graph(*inputs).numpy(), module(*inputs).numpy(), 1e-14)
     batch = torch.export.Dim("batch")
     exported = torch.export.export(K, tuple(state), dynamic_shapes=({0: batch},) * 3)

@@ -9,7 +9,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 import pytest
-from matplotlib.collections import PathCollection
+from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.colors import to_rgba
 from matplotlib.image import imread
 from rich.console import Console
@@ -138,3 +138,16 @@ def test_confounded_values_leave_room_for_those_that_are_known() -> None:
     assert [text.get_text() for text in cut.texts] == ["◂ -70"]
     assert cut.get_xlabel() == "stiffness [N m/rad]"
     assert not cut.figure.legends, "all logs alone need no key"
+
+
+def test_an_interval_that_is_cut_leaves_the_panel() -> None:
+    """None ends within it short of its end."""
+    errors = (0.1, 30.0, np.inf)
+    extras = [replace(found("offset", f"j{k}", ""), noise_error=error) for k, error in enumerate(errors)]
+    (axis,) = extra_figure(extras).axes
+    (bars,) = (lines for lines in axis.collections if isinstance(lines, LineCollection))
+    ends = [sorted(bar[:, 0]) for bar in bars.get_segments()]
+    low, high = axis.get_xlim()
+    assert ends[0] == pytest.approx([1.5 - 0.196, 1.5 + 0.196])
+    assert low < ends[0][0] < ends[0][1] < high
+    assert all(first < low < high < last for first, last in ends[1:])

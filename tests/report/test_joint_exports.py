@@ -9,7 +9,7 @@ from synthetic import random_states
 
 from torchid import Regressor, parameters
 from torchid.report import FittedJoints
-from torchid.report.joint_exports import isaaclab_text, joint_parameters, parameters_export
+from torchid.report.robot_files import isaaclab_text, joint_parameters, parameters_export
 from torchid.robot import Robot
 
 

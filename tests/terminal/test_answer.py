@@ -163,7 +163,12 @@ def test_errors_of_a_sensor_in_a_limb_are_shown_and_need_attention_where_they_ex
 
 def test_what_needs_attention_is_named_with_what_to_do(free: Identification) -> None:
     (line,) = [line for line in text(free, 400).splitlines() if line.startswith("attention     friction, ")]
-    assert "most in joint_torque" in line
+    assert line.count("most in joint_torque") == 1
+    misfit = free.misfit
+    several = replace(misfit, expected=0.4 * misfit.residual, lack_of_fit=3.0, share=0.1)
+    for width in (80, 100):  # the reason and where it shows are within the lines that there are
+        said = " ".join(text(replace(free, misfit=several), width).split())
+        assert f"most in {misfit.groups[0].group} " in said
     worse = replace(free)
     worse.__dict__["worse"] = [WorseThanNominal("test logs", "joint_torque", 1.0, 2.0)]
     said = text(worse, 400)
@@ -196,7 +201,7 @@ def test_the_bodies_that_changed_most_are_listed_in_the_robots_order(consistent:
             )
             assert value == pytest.approx(phi[body, k], abs=0.5 * errors[body, k])
             assert error == pytest.approx(errors[body, k], rel=0.1)
-    assert f"and {13 - len(rows)} bodies that changed less" in "\n".join(lines)
+    assert f"and {13 - len(rows)} bodies whose mass changed less" in "\n".join(lines)
     assert "+ known only in sums with other bodies" in lines
 
 
@@ -232,5 +237,6 @@ def test_all_tables_are_printed_when_asked_for_and_nothing_when_asked_to_be_quie
         assert title in printed["--verbose"]
         assert title in printed["-v"]
         assert title not in printed[None]
+    assert printed["--verbose"].splitlines()[0] == printed[None].splitlines()[0]
     with pytest.raises(SystemExit):
         main(["identify", file, "-q", "-v"])

@@ -59,7 +59,7 @@ def test_a_terminal_of_a_few_columns_gets_all_the_same() -> None:
 def test_the_verdict_comes_first_and_the_worst_finding_next_with_what_to_do() -> None:
     logs = [checked("clean", WEIGHT), checked("spiked", SPIKE, SIGN), checked("degrees", DEGREES)]
     assert text(logs).startswith(
-        "1 of 3 logs is free of usual mistakes; 1 is not usable; 1 is usable without some samples "
+        "2 of 3 logs are usable, 1 of them without some samples; 1 is free of usual mistakes "
         "rejected joint_position, unit in degrees.npz: more than two turns: degrees do: convert to radians "
         "rejected joint_torque, spike in spiked.npz: excursions of 200 N m"
     )
@@ -92,8 +92,8 @@ def test_every_finding_is_shown_or_counted(width: int) -> None:
     lines = check_lines(logs, (), width)
     shown = sum(line.startswith((*severities,)) for line in lines)
     (rest,) = (line for line in lines if line.endswith("--verbose"))
-    counted = {s: int(n) for s, n in re.findall(rf"({'|'.join(severities)}) (\d+)", rest)}
-    assert rest.startswith(f"{sum(counted.values())} more: ")
+    counted = {s: int(n) for n, s in re.findall(rf"(\d+) ({'|'.join(severities)})", rest)}
+    assert rest.startswith("and ")
     assert shown + sum(counted.values()) == 36
     assert counted == {REJECTED: 12 - shown, SUSPICIOUS: 12, NOTE: 12}, "the most severe are shown"
 

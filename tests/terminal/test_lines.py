@@ -62,7 +62,7 @@ def test_no_line_of_a_command_is_wider_than_that(
     width: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The answers have 20 lines at most, and `--verbose` keeps to the width likewise."""
-    demo = shortened_demo(tmp_path / "demo", 300)
+    demo = shortened_demo(tmp_path / "demo", 150)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", str(width))
     (file, log), run = (str(demo / name) for name in ("quadruped.yaml", "sway_test.npz")), "output=run"

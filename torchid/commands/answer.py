@@ -59,8 +59,8 @@ class ErrorComparison:
             if before is not None and after is not None:
                 yield group, before, after, self.identified.noise.get(group)
 
-    def headline(self, *, explained: bool = True) -> str:
-        """The verdict in a sentence; `explained`: whether the model explains the forces that it was fitted to."""
+    def headline(self, unexplained: str = "") -> str:
+        """The verdict in a sentence; `unexplained`: forces of the fit that the model does not explain, in words."""
         ratios = [after / before if before else 1.0 for _, before, after, _ in self.errors()]
         if not ratios:
             return f"Nothing to compare with the {self.of} on {self.text}"
@@ -70,8 +70,8 @@ class ErrorComparison:
         verdict = next(within, _NO_BETTER)
         known = [after / floor for _, _, after, floor in self.errors() if floor]
         floor = ", as near as the sensors' noise allows" if known and max(known) < _AT_THE_FLOOR else ""
-        if not explained:
-            floor = f", {'and' if verdict == _NO_BETTER else 'but'} the model does not explain these forces"
+        if unexplained:
+            floor = f", {'and' if verdict == _NO_BETTER else 'but'} the model does not explain {unexplained}"
         words, part = verdict.removesuffix(_IN_PART), _IN_PART * verdict.endswith(_IN_PART)
         return f"{words} than the {self.of}{part} on {self.text}: errors of {shares} of the {self.of}'s{floor}"
 
@@ -143,7 +143,7 @@ def _judge(run: Identification) -> ErrorComparison:
 def _headline(run: Identification, judged: ErrorComparison) -> str:
     if run.worse:
         return f"WORSE THAN {judged.of}: {describe_worse(run.worse, judged.of)}"
-    return judged.headline(explained=run.misfit.explained)
+    return judged.headline("" if run.misfit.explained else "these forces")
 
 
 def _bodies_text(run: Identification) -> str:
@@ -175,7 +175,8 @@ def _attention(run: Identification, judged: ErrorComparison) -> Iterator[str]:
         yield f"negative, which nothing is: {join_names(impossible)}; {advice}"
     yield from _impossible(run)
     if not run.misfit.explained:
-        yield f"friction, compliance or contacts that the model lacks, or a wrong sensor (torchid check): {run.misfit}"
+        why = run.misfit.in_short
+        yield f"friction, compliance or contacts are missing, or a sensor is wrong (torchid check): {why}"
     if run.experiment.config.estimator.total_mass is None and _contradicts_nominal(run.mass):
         ratio = f"{run.mass.value / run.mass.nominal:.3g} times the {run.experiment.robot.format}'s"
         yield f"the total mass is {ratio}: weigh the robot, or mend units and gains of forces: torchid check"
@@ -224,7 +225,7 @@ def _far_off(nominal: NominalError | None) -> Iterator[str]:
     if nominal is not None and nominal.prior_is_narrow:
         unlike = nominal.value > _ANOTHER_ROBOT
         why = ": the model does not explain these forces, or the file is another robot's" if unlike else ""
-        yield f"{nominal}{why}; so may be what they do not determine: torchid sample --prior-error auto"
+        yield f"{nominal}{why}; other bodies may be as far off: torchid sample --prior-error auto"
 
 
 def _contradicts_nominal(mass: TotalMass) -> bool:

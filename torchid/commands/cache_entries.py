@@ -25,7 +25,7 @@ from torchid.config.robot import RobotConfig
 from torchid.errors import TorchidWarning
 from torchid.fitting.experiment import Experiment, Scene
 from torchid.fitting.factor_documents import PackedPart, PartPacker, PartReader
-from torchid.logs.spill import MappedPages
+from torchid.logs.lazy_arrays import MappedPages
 from torchid.logs.time_range import log_title
 from torchid.problem import RowBuilder, Samples, TriangularFactor
 from torchid.problem.base_motion import BaseMotion
@@ -42,7 +42,7 @@ NOT_IN_SAMPLES = ("memory_gb", "cache_gb")
 Said = tuple[type[Warning], str]
 """Class and text of a warning."""
 
-_SAMPLES_FORMAT = 2  # of entries
+_SAMPLES_FORMAT = 3  # of entries
 _BASE = "base."  # before the names of tensors of the base's motion
 
 

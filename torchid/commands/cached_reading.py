@@ -20,7 +20,7 @@ from torchid.fitting.experiment import Scene
 from torchid.fitting.noise import recorded_sensors
 from torchid.logs.blocks import GIGABYTE, log_bytes
 from torchid.logs.containers import LogKind, existing_log_kind, log_files
-from torchid.logs.spill import MappedPages
+from torchid.logs.lazy_arrays import MappedPages
 from torchid.logs.tables import is_text_table
 from torchid.logs.time_range import split_range
 from torchid.problem import Samples
@@ -189,7 +189,7 @@ class CachedReader(LogReader):
         """The name of the samples of a log, None if it cannot be read.
 
         Reading block by block rounds otherwise than reading a log as a whole, and with the size of the blocks. Where
-        samples are dropped, what was required of them before cannot be told from what is left.
+        samples are dropped, what was required of them before does not follow from what is left.
         """
         content = self._content(path)
         if content is None:

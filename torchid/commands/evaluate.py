@@ -60,6 +60,7 @@ class EvaluatedRun:
         forces: of the first samples of the first log, as measured and as predicted.
         robot: whose they are.
         usual: errors on the own logs of the run, by group of rows, the larger of train and test.
+        explained: whether the model explains the forces that the run was fitted to.
         output: the folder that they were written to, if any.
     """
 
@@ -68,6 +69,7 @@ class EvaluatedRun:
     forces: ForceSeries
     robot: Robot
     usual: Mapping[str, float] = field(default_factory=dict)
+    explained: bool = True
     output: Path | None = None
 
     __repr__ = short_repr
@@ -116,12 +118,13 @@ class EvaluatedRun:
 class FittedRun:
     """What a run has found, from its folder or from memory.
 
-    `experiment`: with the noise that it estimated. `usual`: errors on its own logs, as `EvaluatedRun` has them.
+    `experiment`: with the noise that it estimated. `usual` and `explained` are as `EvaluatedRun` has them.
     """
 
     experiment: Experiment
     calibrations: Comparison[Calibration]
     usual: Mapping[str, float] = field(default_factory=dict)
+    explained: bool = True
 
 
 @one_thread()
@@ -185,10 +188,10 @@ def read_run(folder: Path, device: str | None = None) -> FittedRun:
     settings, found = folder / _SETTINGS, folder / "parameters.json"
     config = load_config(settings, [f"device={device}"] if device else [])
     with about_file(settings):
-        experiment, usual = _with_own_metrics(set_up(config), folder / _METRICS)
+        experiment, usual, explained = _with_own_metrics(set_up(config), folder / _METRICS)
     shared = Comparison(read_shared_extras(found, "nominal_value"), read_shared_extras(found, "value"))
     calibrations = _calibrations(experiment, read_parameters(found, experiment.robot), shared)
-    return FittedRun(experiment=experiment, calibrations=calibrations, usual=usual)
+    return FittedRun(experiment=experiment, calibrations=calibrations, usual=usual, explained=explained)
 
 
 @one_thread()
@@ -204,6 +207,7 @@ def evaluate_identification(run: Identification, logs: Sequence[str | Path], dev
         experiment=experiment,
         calibrations=_calibrations(experiment, run.phi, values),
         usual=_usual([pair.identified.as_dict() for pair in run.metrics.values()]),
+        explained=run.misfit.explained,
     )
     with progress_bars() as bars:
         return _evaluate(fitted, logs, None, bars)
@@ -227,7 +231,14 @@ def _evaluate(fitted: FittedRun, logs: Sequence[str | Path], folder: Path | None
             warn(f"{log.source}: neither joint torques nor contact wrenches to compare predictions with")
     excluded = {split_range(path).name: count for path, count in reader.excluded.items()}
     forces = ranks.from_first(partial(compare_forces, evaluation, samples[0], compared), "forces")
-    return EvaluatedRun(metrics=metrics, excluded=excluded, forces=forces, robot=experiment.robot, usual=fitted.usual)
+    return EvaluatedRun(
+        metrics=metrics,
+        excluded=excluded,
+        forces=forces,
+        robot=experiment.robot,
+        usual=fitted.usual,
+        explained=fitted.explained,
+    )
 
 
 def _calibrations(experiment: Experiment, phi: Array, shared: Comparison[dict[str, float]]) -> Comparison[Calibration]:
@@ -252,7 +263,7 @@ def _write(evaluated: EvaluatedRun, output: Path, config: Path, form: str, overw
         (new / "config.yaml").write_bytes(read_bytes(config, MAX_YAML))
         write_json(new / "metrics.json", evaluated.to_dict())
         figures = {
-            "forces": draw_forces(evaluated.forces, evaluated.robot),
+            **({"forces": draw_forces(evaluated.forces, evaluated.robot)} if evaluated.forces.known else {}),
             "errors": error_figure(evaluated.metrics, evaluated.robot.format),
         }
         save_figures(figures, new, form)
@@ -290,16 +301,20 @@ def _output(run: Path, logs: Sequence[str | Path], given: Path | None, overwrite
     return output
 
 
-def _with_own_metrics(experiment: Experiment, path: Path) -> tuple[Experiment, dict[str, float]]:
-    """A run's experiment with the noise that it estimated, and its errors; nothing of figures that cannot be read."""
+def _with_own_metrics(experiment: Experiment, path: Path) -> tuple[Experiment, dict[str, float], bool]:
+    """A run's experiment with the noise that it estimated, its errors, and whether the model explains its forces.
+
+    Nothing of figures that cannot be read.
+    """
     try:
         document = json.loads(read_bytes(path, MAX_JSON))
         any_stated = any(group["origin"] == "stated" for group in document["noise"]["groups"])
         used = stated_noise(_NOISE.validate_python(document["noise"]["used"]), experiment.robot)
         usual = _usual([document.get(name) or {} for name in ("train", "test")])
+        explained = bool((document.get("misfit") or {}).get("explained", True))
     except (OSError, ValueError, LookupError, TypeError, AttributeError):
-        return experiment, {}
-    return with_estimated_noise(experiment, used, any_stated), usual
+        return experiment, {}, True
+    return with_estimated_noise(experiment, used, any_stated), usual, explained
 
 
 def _usual(documents: Sequence[Mapping[str, object]]) -> dict[str, float]:

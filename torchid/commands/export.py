@@ -14,7 +14,7 @@ from torchid.errors import ConfigError, InputError, TorchidWarning, during, join
 from torchid.parameters import PER_BODY, Array
 from torchid.problem.extras import ACTUATORS
 from torchid.report import FittedJoints, identified_robot, identified_urdf
-from torchid.report.joint_exports import isaaclab_text, joint_parameters, parameters_export
+from torchid.report.robot_files import isaaclab_text, joint_parameters, parameters_export
 from torchid.robot import Robot
 from torchid.robot.xml_files import is_mjcf
 from torchid.staging import atomic_file

@@ -240,7 +240,7 @@ def _identify(
         extras=fit.extras,
         noise=ready.noise,
         motion_noise=fit.assembly.noise,
-        misfit=misfit(estimate, ready.noise, fit.scatter, unfitted_friction(problem, experiment.robot)),
+        misfit=misfit(estimate, ready.noise, blocks, fit.scatter, unfitted_friction(problem, experiment.robot)),
         robust=solved.robust,
         states=ready.states,
         by_state=alone,

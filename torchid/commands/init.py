@@ -35,11 +35,10 @@ from torchid.errors import ConfigError, InputError, LogError, about_file, excerp
 from torchid.fitting.checked_settings import is_along_base
 from torchid.logs import Columns, Log, Topics, read_log
 from torchid.logs.column_entries import OF_FILE
-from torchid.logs.column_proposals import propose_field
 from torchid.logs.columns import is_column
 from torchid.logs.containers import LogKind, atomic_output, existing_log_kind
 from torchid.logs.log import VARIANTS
-from torchid.logs.name_matching import KnownRobot
+from torchid.logs.name_matching import KnownRobot, propose_field
 from torchid.logs.time_range import split_range
 from torchid.parameters import GRAVITY
 from torchid.proposals.column_groups import MapProposal
@@ -70,7 +69,7 @@ class Initiated:
         output: the experiment file.
         found: what log and robot have, in words.
         guessed: what should be compared with the robot and its manual.
-        missing: what a fit needs and nobody found.
+        missing: what a fit needs and was not found.
     """
 
     output: Path
@@ -225,7 +224,7 @@ def _lacks_base_motion(contacts: Sequence[GuessedContact], fields: set[str]) -> 
 
 
 def _from_feet(contacts: Sequence[GuessedContact], fields: set[str]) -> dict[str, object]:
-    """Keys of preprocessing that take what nobody recorded from joints and feet, if there are enough of these."""
+    """Keys of preprocessing that take what was not recorded from joints and feet, if there are enough of these."""
     out: dict[str, object] = {}
     kinds = [contact.type for contact in contacts]
     if _lacks_base_motion(contacts, fields) and ("flat" in kinds or len(kinds) > 2):
@@ -352,7 +351,7 @@ def _text(
         lines += [
             f"    # {line}" for line in [remark, *(x for one in entries for x in _entry("joint_torque", one))] if line
         ]
-    lines += [f"# {' and '.join(from_feet)}: nobody recorded them"] if from_feet else []
+    lines += [f"# {' and '.join(from_feet)}: not recorded"] if from_feet else []
     lines += [f"# {key}: {why}" for key, (_, why) in gaps.items()]
     stated = {key: value for key, (value, _) in gaps.items()}
     lines += _entry("preprocessing", {"cutoff_hz": "auto"} | from_feet | stated)

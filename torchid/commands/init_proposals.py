@@ -12,11 +12,10 @@ import numpy as np
 
 from torchid.errors import InputError, TorchidWarning, excerpt, format_count, join_names
 from torchid.logs import Log
-from torchid.logs.column_proposals import OF_PLATES, is_current, is_desired, propose_field
 from torchid.logs.cutoff import choose_cutoff
 from torchid.logs.log import FORCE_NORMAL, WRENCHES
 from torchid.logs.low_pass import DROPPED_PERIODS
-from torchid.logs.name_matching import within
+from torchid.logs.name_matching import OF_PLATES, is_current, is_desired, propose_field, within
 from torchid.problem.compression import LEAST_PER_FOLD
 from torchid.proposals.column_groups import Family
 from torchid.proposals.file_samples import FileSample, stated_names

@@ -22,6 +22,7 @@ from torchid.errors import LogError, about_file
 from torchid.logs import Columns, Log
 from torchid.logs.blocks import GIGABYTE, LogBlocks, bridge_in_blocks, count_samples_from, open_log_blocks
 from torchid.logs.gaps import Coverage, warn_of_gaps
+from torchid.logs.lazy_arrays import Filled, MappedPages, Spill, growing_array
 from torchid.logs.log import CONTACT_READINGS, NORMALS, BoolArray
 from torchid.logs.preprocess import (
     away_from_changes,
@@ -33,7 +34,6 @@ from torchid.logs.preprocess import (
 from torchid.logs.segments import count_samples, long_segments
 from torchid.logs.sign_filter import with_sign_filter
 from torchid.logs.signal_noise import MOST_SAMPLES, signal_noise, warn_of_noisy_accelerations
-from torchid.logs.spill import Filled, MappedPages, Spill, growing_array
 from torchid.logs.timeline import SPLINE_BLOCK, Timeline
 from torchid.problem import Samples, bind_log
 from torchid.problem.base_motion import BaseMotion

@@ -54,7 +54,7 @@ class LogReader:
         """Nothing is read yet; without a `folder` it is the one that the output of the scene goes to, or a temporary.
 
         Raises:
-            ConfigError: settings that leave the cutoff to the logs, and nobody has chosen it.
+            ConfigError: settings that leave the cutoff to the logs, where it has not been chosen.
         """
         if scene.config.preprocessing.cutoff_hz == "auto":
             raise ConfigError.at_field("preprocessing.cutoff_hz", "auto, not yet chosen", "a number [Hz] or null")

@@ -41,7 +41,7 @@ from torchid.simulation.replay import Drift, Model, ReplayedLog, replay_log
 _ByJoint = Mapping[str, Mapping[str, float]]
 _TIMES = 25  # at which the drift is compared, within a window
 SAMPLES = 10
-"""Robots that are drawn from what the logs leave open, where nobody says how many."""
+"""Robots that are drawn from what the logs leave open, where no number is given."""
 _MOST_SAMPLES = 1000
 
 
@@ -78,6 +78,11 @@ class Replay:
     def _headline(self) -> str:
         texts = [f"{name} {before:.3g} and {after:.3g}" for name, (before, after) in self.at(self.window).items()]
         return f"{self.source}, drift after {self.window:g} s, {self.of} against identified: {'; '.join(texts)}"
+
+    @property
+    def driven(self) -> str:
+        """By what the robots are driven, in words."""
+        return f"the {'PD targets' if self.gains.any() else 'torques'} of {self.source}"
 
     def quartiles(self) -> dict[str, Comparison[Array]]:
         """Quartiles over windows of the drift, (3, T), by what drifts and its unit.
@@ -287,7 +292,7 @@ def _joint_gains(robot: Robot, option: str, stated: float | Mapping[str, float])
 def _write(found: Replay, out: Path, overwrite: bool, form: str) -> None:
     """Write all numbers and the figure of a replay, in a format, to a folder."""
     figure = drift_figure(
-        found.source,
+        found.driven,
         found.drift.nominal.time,
         found.quartiles(),
         found.ranges(),

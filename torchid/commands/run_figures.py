@@ -58,7 +58,7 @@ def fit_figures(
 def all_figures(run: Identification) -> Figures:
     """Those of a run, in the order in which they are to be seen."""
     robot, figures = run.experiment.robot, Figures()
-    if run.forces is not None:
+    if run.forces is not None and run.forces.known:
         figures["forces"] = partial(draw_forces, run.forces, robot)
     figures["errors"] = partial(error_figure, run.metrics, robot.format)
     of_fit = fit_figures(robot, run.estimate, run.extras, run.ridge)

@@ -219,7 +219,7 @@ def _solve(conic: ConicProblem, method: Method, tolerance: float = 1e-9) -> Solu
 
 
 def _with_decoupled_fixed(problem: LinearProblem, conditions: Conditions) -> LinearProblem:
-    """The problem with bodies and friction fixed that no row sees and whose nominal values are allowed.
+    """The problem with unobservable bodies and friction fixed whose nominal values are allowed.
 
     A solver ends within a tolerance of the least objective, which parameters that only a small ridge holds hardly
     change: a KUKA's fixed base drifts by 8e-3 of its scale with a ridge of 1e-7. It also keeps away from conditions
@@ -229,20 +229,20 @@ def _with_decoupled_fixed(problem: LinearProblem, conditions: Conditions) -> Lin
         problem: its parameters are those of bodies.
         conditions: on the parameters. Bodies that one ties to others (the total mass, mirror images) stay as they are.
     """
-    unseen = (problem.free & ~_seen(problem)).reshape(-1, PER_BODY)
+    unobservable = (problem.free & ~_observable(problem)).reshape(-1, PER_BODY)
     nominal, scale = (x.reshape(-1, PER_BODY) for x in (problem.nominal, problem.scale))
     apart = replace(conditions, total_mass=None, mirrors=())
     for violation in violations(nominal, scale, apart, tolerance=0.0):
         if violation.body is not None:
-            unseen[violation.body] = False
+            unobservable[violation.body] = False
     for mirror in conditions.mirrors:
-        unseen[[mirror.body, mirror.image]] = False
-    inertial = unseen[:, parameters.INERTIAL]
+        unobservable[[mirror.body, mirror.image]] = False
+    inertial = unobservable[:, parameters.INERTIAL]
     inertial[:] = inertial.all(axis=1, keepdims=True) & (conditions.total_mass is None)
-    return replace(problem, free=problem.free & ~unseen.ravel()) if unseen.any() else problem
+    return replace(problem, free=problem.free & ~unobservable.ravel()) if unobservable.any() else problem
 
 
-def _seen(problem: LinearProblem) -> np.ndarray:
+def _observable(problem: LinearProblem) -> np.ndarray:
     """Parameters that rows, or terms that conditions bound, depend on, (P,) bool."""
     size = np.linalg.norm(problem.A, axis=0) * problem.scale
     seen = size > relative_tolerance(0.0, problem.A.shape) * size.max(initial=0.0)

@@ -198,8 +198,8 @@ class NominalError:
     def __str__(self) -> str:
         times = self.value / self.prior
         percent, factor = (f"{x:.0f}" if x > 99.0 else f"{x:.2g}" for x in (100.0 * self.value, times))
-        off = f"{percent} %, {factor} times what the prior says"
-        return f"where the data tell, in {self.combinations} combinations, bodies are off the robot file by {off}"
+        prior = f"{factor} times the {100.0 * self.prior:.3g} % of the prior"
+        return f"bodies are off the robot file by {percent} % where the data determine them, {prior}"
 
 
 @one_thread()

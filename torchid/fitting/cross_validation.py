@@ -363,7 +363,7 @@ def sum_residuals(
         for one, squares in zip(calibrations, out, strict=True):
             residual = R[:, :-1] @ one.columns(builder, by_source[part.source]).cpu() - R[:, -1]
             sums = float(residual @ residual), float(R[:, -1] @ R[:, -1])
-            squares.add(ResidualSquares(*sums, factor.independent_rows, factor.rows))
+            squares.add(ResidualSquares(*sums, factor.rows * by_source[part.source].noise_left, factor.rows))
     return out
 
 
@@ -396,5 +396,5 @@ def _sum_chunks(
             residual = rows[:, :-1] @ phi[samples.source][builder.tree.index(support)] - rows[:, -1:]
             error += residual.square().sum(0)
             measured += rows[:, -1].square().sum()
-            noise, count = noise + len(rows) / samples.oversampling, count + len(rows)
+            noise, count = noise + len(rows) * samples.noise_left, count + len(rows)
     return error.tolist(), float(measured), noise, count

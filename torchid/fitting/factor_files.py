@@ -44,7 +44,7 @@ from torchid.robot.payloads import Payload
 from torchid.settings import STRICT, NotNegative, Number
 from torchid.staging import atomic_file
 
-FORMAT = 2
+FORMAT = 3
 """Version of the format, a whole number that grows whenever a reader of an older version would be wrong."""
 
 _ACCEPTED = f"a whole {FACTORS} file, as torchid compress writes it"
@@ -111,6 +111,7 @@ class _Description:
     sha256: Annotated[str, Field(pattern=r"^([0-9a-f]{64})?$")]
     samples: Annotated[int, Field(ge=1, le=2**53)]
     oversampling: Annotated[Number, Field(ge=1.0)]
+    noise_left: Annotated[Number, Field(gt=0.0, le=1.0)]
     duration_s: NotNegative
     excluded: Whole
     blocks: Annotated[int, Field(ge=1, le=FOLDS)]
@@ -209,6 +210,7 @@ def _packed(factors: FactorFile) -> tuple[dict[str, object], Array]:
         "sha256": factors.sha256,
         "samples": log.samples,
         "oversampling": log.oversampling,
+        "noise_left": log.noise_left,
         "duration_s": factors.duration,
         "excluded": factors.excluded,
         "blocks": log.blocks,
@@ -283,7 +285,8 @@ def _log(source: str, description: _Description, values: Array) -> CompressedLog
         raise ValueError("contact states of other samples than those of the log")
     if parts.numbers_left:
         raise ValueError("more numbers than are described")
-    return CompressedLog(source, samples, description.oversampling, blocks, pieces, by_state, unloaded)
+    noise = description.oversampling, description.noise_left
+    return CompressedLog(source, samples, *noise, blocks, pieces, by_state, unloaded)
 
 
 def _sizes(settings: Mapping[str, Value]) -> tuple[int, int, int]:

@@ -5,6 +5,7 @@ Friction that was not fitted is what it lacks most often: `unfitted_friction` te
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,7 @@ from torchid.identifiability.block_scatter import BlockScatter
 from torchid.parameters import FRICTION, INERTIAL, PER_BODY, Array
 from torchid.problem import LinearProblem
 from torchid.problem.chunks import one_thread
+from torchid.problem.compressed_log import Block
 from torchid.robot import Robot
 from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, is_significant
 
@@ -70,10 +72,8 @@ class Misfit:
         much = self.expected is not None and self.residual > _MUCH * self.expected
         return not (much or self.alike or (self.friction is not None and self.friction.significant))
 
-    def __str__(self) -> str:
-        """In words, "" where the model explains the forces."""
-        if self.explained:
-            return ""
+    def _reasons(self) -> list[str]:
+        """Why noise cannot be all that the model leaves, none where it may be."""
         reasons = []
         if self.expected is not None and self.residual > _MUCH * self.expected:
             reasons.append(f"residuals are {self.residual / self.expected:.2g} times what the stated noise leaves")
@@ -83,6 +83,19 @@ class Misfit:
             )
         if self.friction is not None and self.friction.significant:
             reasons.append(str(self.friction))
+        return reasons
+
+    @property
+    def in_short(self) -> str:
+        """The first reason and the readings that show it most, "" where the model explains the forces."""
+        where = f", most in {self.groups[0].group}" if self.groups else ""
+        return "".join(f"{reason}{where}" for reason in self._reasons()[:1])
+
+    def __str__(self) -> str:
+        """In words, "" where the model explains the forces."""
+        reasons = self._reasons()
+        if not reasons:
+            return ""
         share = self.expected or 1.0
         shown = [
             f"{one.group} {one.residual:.2g} {one.unit} where {share * one.used:.2g} are expected"
@@ -94,19 +107,24 @@ class Misfit:
 
 
 def misfit(
-    estimate: Estimate, noise: NoiseSummary, scatter: BlockScatter | None, friction: UnfittedFriction | None
+    estimate: Estimate,
+    noise: NoiseSummary,
+    logs: Sequence[Block],
+    scatter: BlockScatter | None,
+    friction: UnfittedFriction | None,
 ) -> Misfit:
     """What a fit leaves of the forces.
 
     Args:
         estimate: of the training logs.
         noise: that rows were weighted with.
-        scatter: of the estimate between blocks of these logs.
+        logs: these logs.
+        scatter: of the estimate between blocks of them.
         friction: that was not fitted.
     """
-    share = float(1.0 / np.sqrt(estimate.oversampling))
+    left = np.average([log.noise_left for log in logs], weights=[len(log) for log in logs])
     stated = any(one.origin == "stated" for one in noise.groups)
-    expected = share if stated else None
+    expected = float(np.sqrt(left)) if stated else None
     excess = {one.group: (one.residual or 0.0) / ((expected or 1.0) * one.used) for one in noise.groups}
     beyond = [one for one in noise.groups if excess[one.group] > _MUCH and (one.origin == "stated" or not stated)]
     growth = None

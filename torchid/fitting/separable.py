@@ -23,8 +23,7 @@ from torchid.parameters import Array
 from torchid.problem import ExtraTerms, RowBuilder, Samples, compress_parts
 from torchid.problem.chunks import thread_count
 from torchid.problem.compression import compress_in_blocks
-from torchid.problem.extra_columns import dof_extra_column
-from torchid.problem.extras import DELAYED
+from torchid.problem.extras import DELAYED, dof_extra_column
 from torchid.problem.sampled_rows import SampledRows
 
 LARGEST_TILT = 0.3

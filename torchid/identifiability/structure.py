@@ -90,7 +90,7 @@ def standing_samples(
     """Random samples that satisfy the constraints of a contact state; forces are zeros.
 
     Positions are unconstrained: the ground differs between samples, with any slope under every foot. The rank is an
-    upper bound of that on one ground.
+    upper bound of that on one ground. A fixed base stands as the robot's.
 
     Args:
         robot: the robot.
@@ -100,14 +100,14 @@ def standing_samples(
         rng: draws them.
     """
     q, v, a = standing_states(robot, contacts, state, count, rng)
-    rows = robot.base_rows
+    rows, base = robot.base_rows, BaseMotion.from_coordinates(q, v, a, robot.fixed_base)
     return Samples(
         source="standing samples",
         time=torch.arange(count, dtype=torch.float64),
         joint_position=q[:, q.shape[1] - robot.n :],
         joint_velocity=v[:, rows:],
         joint_acceleration=a[:, rows:],
-        base=BaseMotion.from_coordinates(q, v, a, robot.fixed_base),
+        base=base.tilted(robot.base_tilt, count) if robot.fixed_base else base,
         torque=q.new_zeros(count, robot.n_dofs),
         wrench=q.new_zeros(count, len(contacts), 6),
         wrench_in_world=False,

@@ -129,7 +129,7 @@ def check(
         robot: the robot; without one, checks against its URDF are skipped.
         contacts: of the robot.
         cutoff_hz: cutoff [Hz] of the filter that the log will be preprocessed with; None for the default.
-        derived: how names of fields begin that nobody recorded, which are not to blame for anything. contact_active:
+        derived: how names of fields begin that were not recorded, which are not to blame for anything. contact_active:
             of a log that has got flags from its torques. base_: motion of the base will follow from the feet that
             stand; forces are compared with the URDF in the longest segment in which enough of them do.
     """

@@ -85,7 +85,7 @@ def check_forces_against_urdf(
         robot: the robot.
         contacts: of it.
         cutoff_hz: of the fit, None for a usual one.
-        derived: how names of fields begin that nobody recorded, so that nobody mistook them.
+        derived: how names of fields begin that were not recorded and hold no mistake of a recording.
     """
     if robot is None:
         yield Skipped(_FORCE_CHECK, "no robot (--urdf)")

@@ -334,7 +334,7 @@ def _smallest_difference(sides: list[FloatArray], rounding: FloatArray) -> Float
 
 
 def check_still_base(log: Log) -> Iterator[Finding]:
-    """A finding about a position of the base that never changes although the base turns: nobody measured it.
+    """A finding about a position of the base that never changes although the base turns: it was not measured.
 
     A base that is held neither turns nor moves, and one that turns about its origin for good is none.
     """

@@ -103,7 +103,7 @@ def check_lag_and_tilt(
         robot: the robot.
         contacts: of it.
         cutoff_hz: of the filter.
-        derived: how names of fields begin that nobody recorded.
+        derived: how names of fields begin that were not recorded.
     """
     try:
         lag = fit_lag(log, robot, contacts, cutoff_hz)

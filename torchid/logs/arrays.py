@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from torchid.errors import LogError, excerpt, is_plain
 from torchid.guards import MAX_LETTERS
+from torchid.logs.lazy_arrays import LazyArray
 from torchid.logs.log import SHAPES, check_shape
-from torchid.logs.spill import LazyArray
 
 
 def parse_names(name: str, array: NDArray[Any]) -> tuple[str, ...]:

@@ -20,7 +20,7 @@ from torchid.logs.column_map import Columns
 from torchid.logs.containers import Container, LogKind, existing_log_kind, open_container, reader_errors_explained
 from torchid.logs.force_plates import about_world_origin
 from torchid.logs.gaps import fill_short_gaps, warn_of_filled
-from torchid.logs.lazy_arrays import Computed, MappedArray
+from torchid.logs.lazy_arrays import Computed, LazyArray, MappedArray, Spill
 from torchid.logs.log import (
     CONTACT_READINGS,
     FLAGS,
@@ -37,7 +37,6 @@ from torchid.logs.log import (
 )
 from torchid.logs.mapped_fields import map_arrays
 from torchid.logs.read import build_log, check_fields_given
-from torchid.logs.spill import LazyArray, Spill
 from torchid.logs.tables import is_text_table, read_table, table_blocks, table_size
 from torchid.logs.time_range import split_range
 

@@ -11,9 +11,9 @@ from typing import Any
 from torchid.errors import ConfigError, LogError, excerpt, join_names
 from torchid.logs.column_entries import KEY, TimeEntry, as_in_file
 from torchid.logs.column_map import AXES, PLACEHOLDER, Columns, EntryPart, fits, letters_of, list_parts
-from torchid.logs.column_proposals import name_unknown
 from torchid.logs.columns import KINDS
 from torchid.logs.log import CONTACT_READINGS, IMU_FIELDS, WRENCHES, UnknownFieldError
+from torchid.logs.name_matching import name_unknown
 
 _LISTED = 8
 

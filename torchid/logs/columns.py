@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from torchid.errors import LogError, excerpt, is_plain
 from torchid.guards import MAX_COLUMNS
 from torchid.guards import MAX_LETTERS as MAX_NAME
-from torchid.logs.column_proposals import is_foreign, unknown_columns
 from torchid.logs.log import NAME_FIELDS, SHAPES, VARIANTS, UnknownFieldError, field_shape, is_quaternion
+from torchid.logs.name_matching import is_foreign, unknown_columns
 from torchid.parameters import WRENCH_COMPONENTS
 
 #: The one column of text: the same in every row.

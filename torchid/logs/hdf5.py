@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from torchid.errors import LogError, how_to_install
 from torchid.guards import CHUNK_BYTES, MAX_CHUNKS, MAX_SMALL, check_fields, check_names
-from torchid.logs.spill import LazyArray
+from torchid.logs.lazy_arrays import LazyArray
 
 #: Filters by their HDF5 number.
 _DEFLATE, _SHUFFLE, _FLETCHER32, _LZF = 1, 2, 3, 32000

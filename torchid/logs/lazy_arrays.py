@@ -1,19 +1,139 @@
-"""Fields of a log that are worked out where they are sliced: of other fields, foreign arrays, neighbours of gaps."""
+"""Arrays of a log that are not in memory: on the disk, or worked out where they are sliced.
+
+On the disk they are in temporary files that vanish with the process, or mapped to files. Worked out are fields of other
+fields or foreign arrays, and what fills gaps.
+"""
 
 from __future__ import annotations
 
+import mmap
+import tempfile
+import weakref
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import LogError
+from torchid.errors import InputError, LogError
 from torchid.logs.flags import runs
 from torchid.logs.log import FloatArray
-from torchid.logs.mapped_fields import MappedFields
-from torchid.logs.spill import LazyArray
+
+if TYPE_CHECKING:
+    from torchid.logs.mapped_fields import MappedFields
+
+
+class LazyArray(Protocol):
+    """An array that is in memory only where it is sliced."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the array."""
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of its elements."""
+
+    def __getitem__(self, rows: slice) -> NDArray[Any]:
+        """Some rows."""
+
+
+class SpillError(InputError):
+    """The disk has no room for arrays that exceed the memory."""
+
+
+class Filled:
+    """An array in memory that is filled row by row, without a second copy at the end."""
+
+    def __init__(self, rows: int) -> None:
+        """Start empty, with room for so many rows as soon as there is a first."""
+        self._length, self._filled, self._array = rows, 0, np.zeros(0)
+
+    def append(self, rows: NDArray[Any]) -> None:
+        """Add rows, all of one shape and type."""
+        if not self._filled:
+            self._array = np.empty((self._length, *rows.shape[1:]), rows.dtype)
+        self._array[self._filled : self._filled + len(rows)] = rows
+        self._filled += len(rows)
+
+    def array(self) -> NDArray[Any]:
+        """All rows, (N, ...)."""
+        return self._array
+
+
+class Spill:
+    """An array that grows by rows on a disk.
+
+    Its file has no name: it vanishes with the last reference to the array, or with the process, however that ends.
+    """
+
+    def __init__(self, source: object, folder: Path) -> None:
+        """Start empty; `source` is named in errors."""
+        self.source, self.folder = source, folder
+        self._rows, self._like = 0, np.zeros(0)
+        try:  # closed when this object is deleted
+            self._file = tempfile.TemporaryFile(dir=folder, buffering=0)  # noqa: SIM115
+        except OSError as error:
+            raise self._failure(error) from error
+        weakref.finalize(self, self._file.close)
+
+    def append(self, rows: NDArray[Any]) -> None:
+        """Add rows, all of one shape and type. Raises SpillError: the disk is full."""
+        self.write(np.ascontiguousarray(rows).reshape(-1).view(np.uint8).data)
+        self._rows, self._like = self._rows + len(rows), rows[:0]
+
+    def write(self, data: Any) -> None:
+        """Add bytes. Raises SpillError: the disk is full."""
+        rest = memoryview(data)
+        try:
+            while rest:
+                rest = rest[self._file.write(rest) :]
+        except OSError as error:
+            raise self._failure(error) from error
+
+    def array(self) -> NDArray[Any]:
+        """All rows, (N, ...), mapped to the file."""
+        return self.mapped((self._rows, *self._like.shape[1:]), self._like.dtype)
+
+    def mapped(self, shape: tuple[int, ...], dtype: np.dtype[Any], fortran_order: bool = False) -> NDArray[Any]:
+        """The bytes as an array, mapped to the file: the system may drop its pages from memory."""
+        if not np.prod(shape):
+            return np.empty(shape, dtype)
+        # shared, as private pages count as memory of the process; writable, as torch warns of read-only arrays
+        return np.memmap(self._file, dtype, "r+", shape=shape, order="F" if fortran_order else "C")
+
+    def _failure(self, error: OSError) -> SpillError:
+        accepted = "a folder with room for the log, or a preprocessing.memory_gb that takes it"
+        return SpillError(self.source, f"temporary file in {self.folder}", f"cannot be written ({error})", accepted)
+
+
+def growing_array(source: object, folder: Path | None, rows: int) -> Filled | Spill:
+    """An array that so many rows will be added to: on the disk of a folder, or in memory without one."""
+    return Filled(rows) if folder is None else Spill(source, folder)
+
+
+_DONTNEED = getattr(mmap, "MADV_DONTNEED", None)  # not on Windows
+
+
+class MappedPages:
+    """The pages of some arrays that are mapped to files."""
+
+    def __init__(self, arrays: Iterable[NDArray[Any]]) -> None:
+        """Those of the arrays that are mapped, of all given ones."""
+        bases: list[object] = [array.base for array in arrays]
+        self._maps = [one for one in bases if isinstance(one, mmap.mmap)]
+
+    def let_go(self) -> None:
+        """Take them out of memory; they come back where they are used."""
+        if _DONTNEED is not None:
+            for one in self._maps:
+                one.madvise(_DONTNEED)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Tensors that another process gets are in its memory."""
+        return MappedPages, ((),)
 
 
 @dataclass(frozen=True)

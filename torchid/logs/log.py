@@ -138,6 +138,8 @@ class Log:
             sample. No part of a file.
         noise_bandwidth_hz: [Hz], up to where `preprocess` has left the sensors' noise white; None if it did not filter.
             No part of a file.
+        noise_share: of the variance of white noise in the readings, which `preprocess` has left; None if it did not
+            filter. No part of a file.
         motion_noise: noise of the recorded motion, as `preprocess` found it; None if there was nothing to preprocess
             and none. No part of a file.
 
@@ -177,6 +179,7 @@ class Log:
     noise_bandwidth_hz: float | None = None
     motion_noise: SignalNoise | None = None
     joint_stribeck: FloatArray | None = None
+    noise_share: float | None = None
 
     __repr__ = short_repr
 

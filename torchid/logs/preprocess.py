@@ -165,6 +165,7 @@ def _fields_on_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Cov
         fields[NORMALS] = np.where(fields["contact_active"][..., None], normals, np.nan)
     if timeline.bandwidth_hz is not None:
         fields["noise_bandwidth_hz"] = min(timeline.bandwidth_hz, log.noise_bandwidth_hz or np.inf)
+        fields["noise_share"] = 2.0 * fields["noise_bandwidth_hz"] * float(np.median(np.diff(timeline.grid)))
     return fields
 
 

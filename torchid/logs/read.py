@@ -15,7 +15,6 @@ from torchid.errors import LogError, about_file, current_file, during
 from torchid.logs.alignment import read_joined
 from torchid.logs.arrays import load_part, parse_frame, parse_names, require_plain
 from torchid.logs.column_map import Columns
-from torchid.logs.column_proposals import is_foreign, unknown_columns
 from torchid.logs.containers import (
     LogKind,
     existing_log_kind,
@@ -53,6 +52,7 @@ from torchid.logs.log import (
     to_float64,
 )
 from torchid.logs.mapped_fields import map_arrays
+from torchid.logs.name_matching import is_foreign, unknown_columns
 from torchid.logs.quaternion import make_sign_continuous, rotate_to_base, rotate_to_world
 from torchid.logs.ros_read import read_bag
 from torchid.logs.ros_topics import Topics

@@ -110,8 +110,8 @@ def _is_long_enough(time: FloatArray, segment: slice, whole: Timeline) -> bool:
         return True
     step = float(np.median(np.diff(time)))
     left = time[segment.stop - 1] - time[segment.start] - 2.0 * DROPPED_PERIODS / whole.cutoff_hz
-    rate = step if whole.output is None else max(step, float(np.median(np.diff(whole.output))))
-    return bool(left > 2.0 * rate and count > 2 * whole.low_pass.padding)
+    wanted = step * (whole.kept.step or 1) if whole.output is None else float(np.median(np.diff(whole.output)))
+    return bool(left > 2.0 * max(step, wanted) and count > 2 * whole.low_pass.padding)
 
 
 def _joined(logs: Sequence[Log]) -> Log:

@@ -58,9 +58,8 @@ class WiderLowPass:
     def __str__(self) -> str:
         """What is lost, what follows and what helps."""
         return (
-            f"{100.0 * self.lost:.0f} % of the power of their velocities is taken off, with whose squares forces go;"
-            " parameters may be off by more than their standard errors; accepted: preprocessing.cutoff_hz of"
-            f" {self.cutoff_hz:.3g} or more"
+            f"{100.0 * self.lost:.0f} % of the power of their velocities is taken off, with whose squares forces go,"
+            f" measured and fitted ones; accepted: preprocessing.cutoff_hz of {self.cutoff_hz:.3g} or more"
         )
 
 

@@ -181,14 +181,14 @@ def warn_of_noisy_accelerations(log: Log, preprocessed: Log, timeline: Timeline,
     if not noisy:
         return
     names = [f"{name} ({100.0 * share:.0f} %)" for name, share, _ in noisy]
-    found = f"accelerations of {join_names(names, _NAMED)} are that much noise of the signals they are derived from"
+    found = f"a large part of these accelerations is noise: {join_names(names, _NAMED)}"
     cutoff = timeline.cutoff_hz
     if cutoff is None:
         advice = "a low-pass filter, preprocessing.cutoff_hz"
     else:
         lower = cutoff * float(np.median([_slower(share, order) for _, share, order in noisy]))  # some hardly move
         advice = f"a cutoff of {lower:.2g} Hz, if the motion is that slow, or faster motion"
-    warn_about_file(f"{found}: parameters that rest on them are uncertain; accepted: {advice}")
+    warn_about_file(f"{found}; what rests on them is uncertain; accepted: {advice}")
 
 
 def _slower(share: float, order: int) -> float:

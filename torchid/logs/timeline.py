@@ -86,7 +86,7 @@ class Timeline:
     Attributes:
         native: (N,) the log's own stamps.
         grid: (M,) the stamps at which channels are filtered: `native`, or a uniform grid where that is jittered.
-        kept: the samples of `grid` that neither filter nor spline spoils.
+        kept: the samples of `grid` that neither filter nor spline spoils, or every k-th of them.
         output: (K,) stamps of the preprocessed log, None for those of `kept`.
         low_pass: the filter, None without one.
         reach: how far the filter smears what it filters [s], 0 without one.
@@ -140,12 +140,12 @@ class Timeline:
         grid = _around(self.grid, at, beyond)
         samples = grid if self.grid is self.native else _around(self.native, self.grid[grid][[0, -1]], SPLINE_OVERLAP)
         native = self.native[samples]
-        start = self.kept.start - grid.start
+        start, each = self.kept.start - grid.start, self.kept.step or 1
         return samples, replace(
             self,
             native=native,
             grid=native if self.grid is self.native else self.grid[grid],
-            kept=slice(start + first, start + last) if self.output is None else slice(0),
+            kept=slice(start + each * first, start + each * last, each) if self.output is None else slice(0),
             output=None if self.output is None else at,
         )
 
@@ -277,6 +277,8 @@ def lay_out_timeline(
             found = f"{sample_rate_hz:g}, which leaves one sample"
             accepted = f"more than {1.0 / (grid[kept][-1] - grid[kept][0]):.3g} Hz for this log"
             raise InputError.at_field("preprocessing.sample_rate_hz", found, accepted)
+        if (each := _share_kept(grid, 1.0 / sample_rate_hz)) is not None:  # no spline has to find what is there
+            kept, output = slice(kept.start, kept.stop, each), None
     if low_pass is None or cutoff_hz is None:
         return Timeline(native, grid, kept, output, None, 0.0, float(time[0]))
     passed = low_pass.noise_share * 0.5 / float(np.median(np.diff(grid)))
@@ -315,6 +317,14 @@ def _unspoiled(grid: FloatArray, step: float, cutoff_hz: float, padding: int) ->
         accepted = f"more than {shortest:.6g} s for a cutoff of {cutoff_hz:g} Hz, which spoils both ends of a log"
         raise LogError.at_field("time", f"{grid[-1]:.6g} s ({len(grid)} samples)", accepted)
     return slice(int(inside[0]), int(inside[-1]) + 1)
+
+
+def _share_kept(grid: FloatArray, step: float) -> int | None:
+    """Every how many-th stamp of a uniform grid makes one of another step [s]; None where none does."""
+    own = float(grid[-1] - grid[0]) / (len(grid) - 1)
+    each = max(round(step / own), 1)
+    uniform = np.abs(np.diff(grid) - own).max() <= JITTER * own
+    return each if uniform and abs(step / (each * own) - 1.0) <= JITTER else None
 
 
 def _uniform(kept: FloatArray, rate_hz: float) -> FloatArray:

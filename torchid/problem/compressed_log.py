@@ -39,6 +39,7 @@ class CompressedLog:
         source: name of the log.
         samples: their number.
         oversampling: of the samples, as `Samples` has it.
+        noise_left: likewise.
         blocks: their largest number.
         pieces: a factor of each of `piece_spans`, all contact states together, in time.
         by_state: a factor of each contact state of the whole log.
@@ -48,6 +49,7 @@ class CompressedLog:
     source: str
     samples: int
     oversampling: float
+    noise_left: float
     blocks: int
     pieces: list[Part]
     by_state: list[Part]
@@ -75,7 +77,7 @@ class CompressedLog:
             [replace(part, fold=fold) for part in parts] for parts in (loaded, self.unloaded.get((start, stop), []))
         )
         loaded = [replace(part, block=number) for number, part in enumerate(loaded)]
-        return CompressedBlock(self.source, fold, stop - start, [*loaded, *unloaded])
+        return CompressedBlock(self.source, fold, stop - start, self.noise_left, [*loaded, *unloaded])
 
 
 @dataclass(frozen=True)
@@ -86,12 +88,14 @@ class CompressedBlock:
         source: name of the log.
         fold: number of the fold.
         samples: their number.
+        noise_left: as `Samples` has it.
         parts: one with all contact states, whose own state means nothing, and equations of readings in the air.
     """
 
     source: str
     fold: int
     samples: int
+    noise_left: float
     parts: list[Part]
 
     def __len__(self) -> int:
@@ -136,9 +140,8 @@ def compress_log(log: Samples, builder: RowBuilder, progress: ProgressCallback |
         for part in _compact(compress_unloaded(_cut(log, spans), builder)):
             unloaded.setdefault(spans[part.fold], []).append(part)
     pieces = sorted(_compact(merge_states(parts, builder)), key=lambda part: part.fold)
-    return CompressedLog(
-        log.source, len(log), log.oversampling, blocks, pieces, _compact(merge_folds(parts, builder)), unloaded
-    )
+    by_state = _compact(merge_folds(parts, builder))
+    return CompressedLog(log.source, len(log), log.oversampling, log.noise_left, blocks, pieces, by_state, unloaded)
 
 
 def fold_compressed(logs: Sequence[CompressedLog], builder: RowBuilder) -> list[CompressedBlock]:

@@ -15,9 +15,9 @@ from pydantic.dataclasses import dataclass
 from torchid.errors import LogError
 from torchid.logs import Log
 from torchid.logs.flags import beside_changes, hysteresis, samples_of, without_short
+from torchid.logs.lazy_arrays import growing_array
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import find_unloaded
-from torchid.logs.spill import growing_array
 from torchid.problem.contact_slip import base_velocity, contact_velocities, keep_still
 from torchid.problem.detection_forces import ForcesAlongNormals, fitted_parameters
 from torchid.problem.detection_motion import Prepared, detection_cutoff_hz, nyquist_hz, prepare
@@ -222,7 +222,7 @@ class _Seen:
     Attributes:
         known: the signals.
         share: of the weight that contacts carry, (K, C).
-        velocity: (K, C, 3) [m/s], in the world or not; None where nobody knows.
+        velocity: (K, C, 3) [m/s], in the world or not; None where it is unknown.
         in_world: whether it is.
         accelerates: whether the acceleration of the base is known.
         settings: thresholds.

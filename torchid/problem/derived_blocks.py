@@ -15,7 +15,7 @@ from torchid.logs.arrays import parse_names
 from torchid.logs.blocks import LogBlocks
 from torchid.logs.flags import ContactThreshold, MeasuredForces, flags_by_force
 from torchid.logs.gaps import Coverage
-from torchid.logs.lazy_arrays import Computed, GapsFilled
+from torchid.logs.lazy_arrays import Computed, Filled, GapsFilled, Spill, growing_array
 from torchid.logs.log import CONTACT_READINGS, FLAGS, FORCE_NORMAL, NORMALS, WRENCHES, BoolArray, FloatArray
 from torchid.logs.preprocess import (
     find_unloaded,
@@ -24,7 +24,6 @@ from torchid.logs.preprocess import (
     move_to_timeline,
     unloaded_readings,
 )
-from torchid.logs.spill import Filled, Spill, growing_array
 from torchid.logs.timeline import SPLINE_BLOCK, lay_out_timeline
 from torchid.problem.contact_detection import Detection, DetectionConfig, Filtered, detect_in_parts, name_flags
 from torchid.problem.detection_motion import (
@@ -93,7 +92,7 @@ def detect_in_blocks(
         sign_width: as of `detect_contacts`.
 
     Raises:
-        InputError: as `detect_contacts`; a tilted floor below a base whose tilt nobody measured.
+        InputError: as `detect_contacts`; a tilted floor below a base whose tilt was not measured.
     """
     require_torque(blocks.source, "joint_torque" in blocks.fields)
     _require_level_or_measured(blocks, contacts)
@@ -124,7 +123,7 @@ def detect_in_blocks(
 
 
 def _require_level_or_measured(blocks: LogBlocks, contacts: Sequence[Contact]) -> None:
-    """Refuse a tilted floor where nobody measured the base's tilt: its heading there follows from the whole log."""
+    """Refuse a tilted floor where the base's tilt was not measured: its heading there follows from the whole log."""
     measured = "imu_frame" in blocks.names or any(name.startswith("base_quat") for name in blocks.fields)
     if not measured and any(contact.normal != UP for contact in contacts):
         found = "missing, with detect_contacts on a tilted floor in a log that is not in memory at once"

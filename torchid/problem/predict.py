@@ -12,13 +12,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchid.logs.spill import Spill
+from torchid.logs.lazy_arrays import Spill
 from torchid.parameters import Array
 from torchid.problem.chunk_dynamics import ChunkKinematics
 from torchid.problem.chunks import chunks_by_state, one_thread
 from torchid.problem.contact_state import ContactState
-from torchid.problem.extra_columns import contact_extra_column, dof_extra_column
-from torchid.problem.extras import ACTUATORS, Extra
+from torchid.problem.extras import ACTUATORS, Extra, contact_extra_column, dof_extra_column
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.regressor.columns import body_wrenches
@@ -129,7 +128,7 @@ def reading_variance(
 ) -> Tensor:
     """Variance of S^T tau + J_C^T lambda by the noise of the readings, (B, n_rows) [N^2, (N m)^2].
 
-    A filter leaves a share of it, one over the `oversampling` of the samples. NaN where a reading that enters, or its
+    A filter leaves a share of it, `noise_left` of the samples. NaN where a reading that enters, or its
     noise, is not known.
 
     Args:
@@ -157,7 +156,7 @@ def reading_variance(
             forces[:, rows] = generalized_forces(tree, kinematics.screw_axes, body, wrenches, joints)
             total += builder.motors.of(tree, kinematics, forces.mT).mT.square().sum(0)
             total[rows] += recorded
-    return total.T / samples.oversampling
+    return total.T * samples.noise_left
 
 
 def measured_and_predicted_forces(
@@ -292,5 +291,5 @@ def projected_forces(builder: RowBuilder, samples: Samples, phi: torch.Tensor) -
             where = index if isinstance(index, slice) else index.numpy()
             measured[where] = forces[..., 0].cpu().numpy()
             predicted[:, where] = forces[..., 1:].permute(2, 0, 1).cpu().numpy()
-            noise[where] = (back.square().sum(2) / chunk.oversampling).sqrt().cpu().numpy()
+            noise[where] = (back.square().sum(2) * chunk.noise_left).sqrt().cpu().numpy()
     return ProjectedForces(measured, predicted, noise)

@@ -14,8 +14,7 @@ from torchid.problem.base_motion import levelled_base_axes
 from torchid.problem.chunk_dynamics import ChunkDynamics, ChunkKinematics, Workspace, Workspaces
 from torchid.problem.contact_rows import ContactRows, contact_rows, orthonormal_bases, whitened_bases
 from torchid.problem.contact_state import ContactState, ContactStateLayout, ContactStateLayouts, RowColumns
-from torchid.problem.extra_columns import KnownTorques, dof_extra_column, extra_columns
-from torchid.problem.extras import ExtraTerms, NoiseGroups, list_extras
+from torchid.problem.extras import ExtraTerms, KnownTorques, NoiseGroups, dof_extra_column, extra_columns, list_extras
 from torchid.problem.row_blocks import RowBlock, moved_rows, multiply_wrenches, subtract_payload
 from torchid.problem.samples import Samples
 from torchid.problem.wrench_rows import FramePoses, MotorForces

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from torchid.errors import LogError, UnknownNameError, about_file, join_names
 from torchid.logs import Log
+from torchid.logs.lazy_arrays import MappedPages
 from torchid.logs.log import FORCE_NORMAL, FloatArray, normalize_normals
 from torchid.logs.preprocess import unloaded_readings
-from torchid.logs.spill import MappedPages
 from torchid.parameters import WRENCH_COMPONENTS, Array
 from torchid.problem import log_joints
 from torchid.problem.base_motion import BaseMotion, base_motion, imu_pose, position_for_moments
@@ -51,6 +51,8 @@ class Samples:
         active: (N, C) bool.
         oversampling: samples per independent sample of the sensors' noise, above 1 in a filtered log: half the sample
             rate over the noise bandwidth of the filter.
+        noise_share: of the variance of that noise, which a filter has left; None for 1 / `oversampling`, which it is
+            unless samples were dropped after the filter.
         contact_normal: (N, C, 3), unit vectors in the world that point away from the ground; None for those that the
             contacts state.
         share: (N, C), of a constant contact reading that the filter leaves, as `Log.contact_share`; None for `active`.
@@ -90,6 +92,7 @@ class Samples:
     payload: Array | None = None
     pages: MappedPages | None = field(default=None, repr=False, compare=False)
     delayed_torque: Tensor | None = None
+    noise_share: float | None = None
     stribeck: Tensor | None = None
 
     __repr__ = short_repr
@@ -123,6 +126,11 @@ class Samples:
             return rows
 
         return replace(self._each(chosen), pages=None)
+
+    @property
+    def noise_left(self) -> float:
+        """Share of the variance of the recorded noise that is in the samples."""
+        return 1.0 / self.oversampling if self.noise_share is None else min(self.noise_share, 1.0)
 
     def every(self, step: int) -> Samples:
         """Every `step`-th sample from the first on; all of them, without a copy, for a step of 1."""
@@ -248,6 +256,7 @@ def bind_log(log: Log, robot: Robot, contacts: Sequence[Contact], required: Sens
         has_force_normal=log.contact_force_normal is not None,
         stribeck=None if log.joint_stribeck is None else torch.from_numpy(columns_in_order(log.joint_stribeck, order)),
         motion_noise=bind_motion_noise(log, order, robot.fixed_base, imu),
+        noise_share=log.noise_share,
     )
     if required is not None:
         log_joints.require_limb_sensors(log, robot, required)

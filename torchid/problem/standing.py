@@ -1,4 +1,4 @@
-"""Pose of a base that nobody measured, from the feet that stand on a floor."""
+"""Unmeasured pose of the base, from the feet that stand on a floor."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ def stand_on_feet(log: Log, robot: Robot, contacts: Sequence[Contact]) -> Standi
 
     Raises:
         LogError: joints or contacts that are missing, no sample with enough feet, a foot without an axis along the
-            normal, or readings along axes of a world whose heading nobody knows.
+            normal, or readings along axes of a world whose heading is unknown.
     """
     active = standing_flags(log.source, log.contact_names, log.contact_active, contacts)
     normals = None if log.contact_active is None else log.contact_normal_world

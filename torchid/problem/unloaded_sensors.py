@@ -116,7 +116,7 @@ def zero_in_air(log: Log, contacts: Sequence[Contact]) -> Log:
 
     Args:
         log: as recorded, with flags.
-        contacts: whose sensors are zeroed; one that nobody measured is left out.
+        contacts: whose sensors are zeroed; an unmeasured one is left out.
 
     Raises:
         LogError: no readings of contacts, or along the world's axes of sensors that move; fewer than `LEAST_READINGS`

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.logs.column_map import PLACEHOLDER
-from torchid.logs.column_proposals import BASES, is_desired, words_of
 from torchid.logs.log import FloatArray
+from torchid.logs.name_matching import BASES, is_desired, words_of
 from torchid.logs.quaternion import angular_velocity_base, make_sign_continuous, rotate_to_base, rotate_to_world
 from torchid.logs.units import quantities_of, quantities_with, split_unit, unit_factor
 from torchid.proposals.column_groups import Family, MapProposal

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from torchid.errors import excerpt
 from torchid.logs.arrays import TRANSPOSED
 from torchid.logs.column_map import PLACEHOLDER
-from torchid.logs.column_proposals import is_current, propose_field
-from torchid.logs.name_matching import SUFFIXES, KnownRobot, joints_by_place, spelled, within
+from torchid.logs.name_matching import SUFFIXES, KnownRobot, is_current, joints_by_place, propose_field, spelled, within
 from torchid.logs.units import OF_JOINTS, quantities_with, split_unit
 from torchid.proposals.file_samples import FileSample, side_by_side
 

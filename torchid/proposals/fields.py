@@ -11,9 +11,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.logs.column_proposals import OF_BASE, OF_PLATES, is_desired, is_no_torque, propose_field, words_of
 from torchid.logs.log import WRENCHES, FloatArray
-from torchid.logs.name_matching import SUFFIXES, KnownRobot, limb_and_words, limb_of, within
+from torchid.logs.name_matching import (
+    OF_BASE,
+    OF_PLATES,
+    SUFFIXES,
+    KnownRobot,
+    is_desired,
+    is_no_torque,
+    limb_and_words,
+    limb_of,
+    propose_field,
+    within,
+    words_of,
+)
 from torchid.logs.unitree import JOINT_ORDERS, MOTORS, numbered_joints, suitable_orders
 from torchid.logs.units import quantities_with, split_unit
 from torchid.proposals.column_groups import Family

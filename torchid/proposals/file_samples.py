@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from torchid.errors import TorchidError, excerpt
 from torchid.logs.arrays import fields_of_records, require_plain
-from torchid.logs.column_proposals import propose_field
 from torchid.logs.containers import LogKind, existing_log_kind, list_bag_files, open_container, reader_errors_explained
-from torchid.logs.name_matching import KnownRobot, limb_and_words, match_names
+from torchid.logs.name_matching import KnownRobot, limb_and_words, match_names, propose_field
 from torchid.logs.ros_messages import make_deserializer
 from torchid.logs.ros_read import list_channels, open_bag_file
 from torchid.logs.table_headers import read_header

@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from torchid.errors import excerpt
 from torchid.logs.column_map import fits
-from torchid.logs.column_proposals import is_desired, propose_field
 from torchid.logs.columns import is_column
 from torchid.logs.log import SHAPES, VARIANTS, WRENCHES
-from torchid.logs.name_matching import SUFFIXES, KnownRobot
+from torchid.logs.name_matching import SUFFIXES, KnownRobot, is_desired, propose_field
 from torchid.logs.unitree import JOINT_ORDERS, numbered_joints, usual_order
 from torchid.logs.units import IN_DEGREES, quantities_of, quantities_with, unit_factor
 from torchid.proposals.base import field_beside, field_of_base, field_of_quaternion, find_angles, settle_velocities

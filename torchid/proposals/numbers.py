@@ -1,4 +1,4 @@
-"""What numbers of foreign columns say of themselves, where nobody stated it: units, turns, axes of forces, contacts."""
+"""What numbers of foreign columns say of themselves, where it is not stated: units, turns, axes of forces, contacts."""
 
 from __future__ import annotations
 

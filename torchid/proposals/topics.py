@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 
 from torchid.errors import format_count
-from torchid.logs.column_proposals import is_desired
 from torchid.logs.log import NORM_TOLERANCE
-from torchid.logs.name_matching import KnownRobot, match_joints, match_names, spelled
+from torchid.logs.name_matching import KnownRobot, is_desired, match_joints, match_names, spelled
 from torchid.logs.ros_messages import ContactFlag, Imu, JointStates, NormalForce, Odometry, Wrench
 from torchid.logs.unitree import JOINT_ORDERS, LowState, suitable_orders, usual_order
 from torchid.proposals.column_groups import MapProposal

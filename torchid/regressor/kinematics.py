@@ -60,8 +60,8 @@ def motion_from_state(
     """Motion from generalized coordinates in Pinocchio's free-flyer layout.
 
     Args:
-        q: (B, 7 + n): base position in the world (3) [m], orientation as a unit quaternion x, y, z, w, joints;
-            (B, n) for a fixed base.
+        q: (B, 7 + n): base position in the world (3) [m], orientation as a quaternion x, y, z, w, which is
+            normalized (norm 0 gives NaN), joints; (B, n) for a fixed base.
         v: (B, nv): base linear and angular velocity in the base frame, then joints.
         a: (B, nv): d/dt of `v`.
         n: number of independent joints.
@@ -244,13 +244,17 @@ def joint_screw_axes(tree: KinematicTree, states: BodyStates) -> Tensor:
 
 
 def rotation_matrix(quat_xyzw: Tensor) -> Tensor:
-    """Rotation matrices (..., 3, 3) of unit quaternions (..., 4), scalar last."""
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4) of any norm, scalar last; NaN of norm 0.
+
+    No value is looked at, for which a GPU would have to wait.
+    """
     x, y, z, w = quat_xyzw.unbind(-1)
+    s = 2 / (x * x + y * y + z * z + w * w)
     return torch.stack(
         [
-            *(1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
-            *(2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
-            *(2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+            *(1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)),
+            *(s * (x * y + z * w), 1 - s * (x * x + z * z), s * (y * z - x * w)),
+            *(s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y)),
         ],
         dim=-1,
     ).unflatten(-1, (3, 3))

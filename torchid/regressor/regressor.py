@@ -65,7 +65,8 @@ class Regressor(nn.Module):
         """Regressor at generalized coordinates.
 
         Args:
-            q: (B, n + 7), base position [m], orientation x y z w, joints [rad or m]; (B, n) for a fixed base.
+            q: (B, n + 7), base position [m], orientation x y z w, which is normalized (norm 0 gives NaN), joints
+                [rad or m]; (B, n) for a fixed base.
             v: (B, nv), base linear and angular velocity in the base frame, joints.
             a: (B, nv), d/dt of `v`.
 

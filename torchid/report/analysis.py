@@ -308,11 +308,12 @@ def _number(x: float | None) -> str:
 
 @matplotlib.rc_context(STYLE)
 def accuracy_figure(sets: Mapping[str, SetAccuracy]) -> Figure:
-    """One panel per group of rows, with the sensor sets side by side on a logarithmic scale."""
-    figure = Figure(figsize=(2.6 * len(ROW_GROUPS) + 0.6, 3.8), layout="constrained")
-    axes = figure.subplots(1, len(ROW_GROUPS))
+    """One panel per group of rows that the logs give, with the sensor sets side by side on a logarithmic scale."""
+    groups = [group for group in ROW_GROUPS if any(found.expected.model[group] is not None for found in sets.values())]
+    figure = Figure(figsize=(2.6 * max(len(groups), 2) + 0.6, 3.8), layout="constrained")
+    axes = figure.subplots(1, len(groups), squeeze=False)[0]
     index = np.arange(len(sets))
-    for axis, (group, label) in zip(axes, ROW_GROUPS.items(), strict=True):
+    for axis, group in zip(axes, groups, strict=True):
         measured = [None if found.measured is None else found.measured.rms[group] for found in sets.values()]
         for shift, name, (marker, color), heights in (
             (-0.15, "expected model error", _MODEL, [found.expected.model[group] for found in sets.values()]),
@@ -326,6 +327,6 @@ def accuracy_figure(sets: Mapping[str, SetAccuracy]) -> Figure:
         label_decades(axis.yaxis)
         axis.set_xticks(index, list(sets), rotation=40, ha="right")
         axis.set_title(group_name(group), loc="left", fontsize=9)
-        axis.set_ylabel(f"rms error {label[label.index('[') :]}")
+        axis.set_ylabel(f"rms error {ROW_GROUPS[group][ROW_GROUPS[group].index('[') :]}")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=3)
     return figure

@@ -337,7 +337,7 @@ def ridge_figure(choice: RidgeChoice, of: str = "URDF") -> Figure:
 
 @matplotlib.rc_context(STYLE)
 def drift_figure(
-    source: str,
+    driven: str,
     time: Array,
     quartiles: Mapping[str, Comparison[Array]],
     ranges: Mapping[str, Array],
@@ -350,7 +350,7 @@ def drift_figure(
     On logarithmic axes, as robots that spin and those that hardly drift are compared.
 
     Args:
-        source: name of the log.
+        driven: by what, "the torques of walk".
         time: (T,) [s].
         quartiles: (3, T) each, over windows, by what drifts, with its unit.
         ranges: least and largest median of robots that were drawn, (2, T), by what drifts; empty without any.
@@ -390,8 +390,6 @@ def drift_figure(
     joints.set_yticks(rows, list(by_joint))
     joints.invert_yaxis()
     joints.set_xlabel(f"median drift after {time[-1]:g} s [{', '.join(dict.fromkeys(units))}]")
-    figure.suptitle(
-        f"Drift of a robot driven by the torques of {source}: median of windows, and quartiles", x=0.01, ha="left"
-    )
+    figure.suptitle(f"Drift of a robot driven by {driven}: median of windows, and quartiles", x=0.01, ha="left")
     figure.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return figure

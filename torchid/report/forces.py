@@ -42,6 +42,11 @@ class ForceSeries:
     identified: Array
     noise: Array | None = None
 
+    @property
+    def known(self) -> bool:
+        """Whether any force was measured in full; of legs that all stand on feet without sensors none is."""
+        return bool(np.isfinite(self.measured).any())
+
 
 @matplotlib.rc_context(STYLE)
 def force_figure(

@@ -111,9 +111,9 @@ def _legend(axis: Axes, of: str, impossible: bool) -> list[matplotlib.artist.Art
     ]
 
 
-#: Rows of a panel (`parameters.json` has all), longest error bar over the largest value, and vertical
-#: offsets for logs in one row.
-_MAX_PANEL_ROWS, _MAX_ERROR_RATIO, _LANES = 40, 4, 5
+#: Rows of a panel (`parameters.json` has all), longest error bar that is whole over the largest value, the longest of
+#: all over this, its margin beside these as a share of the panel, and vertical offsets for logs in one row.
+_MAX_PANEL_ROWS, _MAX_ERROR_RATIO, _ENDLESS, _MARGIN, _LANES = 40, 4, 1e3, 0.05, 5
 
 
 @matplotlib.rc_context(STYLE)
@@ -150,21 +150,26 @@ def extra_figure(extras: Sequence[ExtraEstimate]) -> Figure:
 
 
 def _draw_panel(axis: Axes, extras: Sequence[ExtraEstimate], rows: Sequence[str], colors: Mapping[str, str]) -> None:
-    """Values with their intervals; the logs of a row have vertical offsets around its middle."""
+    """Values with their intervals; the logs of a row have vertical offsets around its middle.
+
+    Long intervals leave the panel: a bar that ends within it ends where the interval does.
+    """
     longest = _MAX_ERROR_RATIO * max(abs(x.value) for x in extras) or 1.0
+    bars = [(x.value, INTERVAL * x.standard_error) for x in extras]
+    ends = [end for value, error in bars for end in (value - min(error, longest), value + min(error, longest))]
     for number, log in enumerate(logs := [log for log in colors if any(x.log == log for x in extras)]):
         points = [x for x in extras if x.log == log]
         offset = 0.15 * (number % _LANES - (min(len(logs), _LANES) - 1) / 2)
         values, index = [x.value for x in points], [rows.index(x.extra.label) + offset for x in points]
-        error = [
-            min(INTERVAL * x.standard_error, longest) if math.isfinite(x.standard_error) else longest for x in points
-        ]
+        error = [min(INTERVAL * x.standard_error, _ENDLESS * longest) for x in points]
         axis.errorbar(values, index, xerr=error, fmt="none", ecolor=colors[log], elinewidth=1.0)
         faces = [colors[log] if x.separable else "white" for x in points]
         axis.scatter(values, index, c=faces, edgecolors=colors[log], s=22, zorder=3)
     axis.axvline(0.0, color="0.7", linewidth=0.8, zorder=0)
     axis.set_yticks(range(len(rows)), rows, fontsize=8)
     axis.set_ylim(len(rows) - 0.5, -0.5)
+    margin = _MARGIN * (max(*ends, 0.0) - min(*ends, 0.0))
+    axis.set_xlim(min(*ends, 0.0) - margin, max(*ends, 0.0) + margin)
     _leave_room(axis, extras, rows)
 
 

@@ -1,10 +1,15 @@
-"""The robot's file with identified parameters, of the kind that it was."""
+"""The robot's file with identified parameters, of the kind that it was, and its joints for simulators."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
 
+import numpy as np
+
+from torchid import parameters
 from torchid.errors import join_names, warn
 from torchid.parameters import Array
 from torchid.problem.extras import Extra
@@ -86,3 +91,116 @@ def identified_robot(robot: Robot, phi: Array, fitted: FittedJoints) -> bytes:
     from torchid.report.mjcf_files import identified_mjcf  # needs an extra
 
     return identified_mjcf(robot, phi, fitted.armature, fitted.springs(robot, identified_name(robot)))
+
+
+_UNITS = {
+    "revolute": ("kg m^2", "N m", "N m s/rad", "N m", "rad/s"),
+    "prismatic": ("kg", "N", "N s/m", "N", "m/s"),
+}
+
+
+@dataclass(frozen=True)
+class JointParameters:
+    """What an actuator model needs of a joint.
+
+    Attributes:
+        name: of the joint.
+        kind: "revolute" or "prismatic".
+        armature: reflected rotor inertia [kg m^2 or kg].
+        coulomb: torque or force of dry friction, at any velocity [N m or N].
+        viscous: friction over velocity [N m s/rad or N s/m].
+        stribeck: what dry friction at rest is beyond that [N m or N].
+        stribeck_velocity: v_s, where exp(-(velocity / v_s)^2) of it is left [rad/s or m/s]; None without it.
+    """
+
+    name: str
+    kind: str
+    armature: float
+    coulomb: float
+    viscous: float
+    stribeck: float
+    stribeck_velocity: float | None
+
+
+def joint_parameters(robot: Robot, phi: Array, fitted: FittedJoints) -> list[JointParameters]:
+    """Of the independent joints: one that mimics another has no actuator, its armature and friction are the other's.
+
+    By the ratio k of their positions, armature and viscous friction count k^2 times, Coulomb friction |k| times.
+
+    Args:
+        robot: the robot.
+        phi: identified parameters, (L, 12).
+        fitted: what else was found of joints; those whose armature was not fitted have that of the robot's file.
+    """
+    ratio = np.abs(robot.joint_map[0])
+    coulomb, viscous = ratio.T @ phi[1:, parameters.COULOMB], (ratio**2).T @ phi[1:, parameters.VISCOUS]
+    return [
+        JointParameters(
+            name=name,
+            kind="prismatic" if name in robot.sliding else "revolute",
+            armature=float(fitted.armature.get(name, robot.armature[k])),
+            coulomb=float(coulomb[k]),
+            viscous=float(viscous[k]),
+            stribeck=float(fitted.stribeck.get(name, 0.0)),
+            stribeck_velocity=fitted.stribeck_velocity if name in fitted.stribeck else None,
+        )
+        for k, name in enumerate(robot.joint_names)
+    ]
+
+
+def isaaclab_text(joints: Sequence[JointParameters], source: str) -> str:
+    """Python text of an `ImplicitActuatorCfg` with all independent joints by name.
+
+    Args:
+        joints: from `joint_parameters`.
+        source: what they come from, for the first line.
+    """
+
+    def entries(value: Callable[[JointParameters], float]) -> str:
+        return "".join(f"        {_pattern(joint)}: {value(joint)!r},\n" for joint in joints)
+
+    names = "".join(f"        {_pattern(joint)},\n" for joint in joints)
+    return (
+        f'"""Actuators identified by torchid: {_plain(source)}.\n\n'
+        "friction: of joints at rest [N m or N]: an effort from Isaac Sim 5.0 on, a coefficient without unit before.\n"
+        "dynamic_friction: Coulomb friction, that of joints that move [N m or N], from Isaac Sim 5.0 on.\n"
+        "viscous_friction: [N m s/rad or N s/m], from Isaac Sim 5.0 on; before, leave it out and add its numbers to\n"
+        "damping. stiffness, damping: the gains of your controller; with 0 and 0 the joints take efforts.\n"
+        '"""\n\n'
+        "from isaaclab.actuators import ImplicitActuatorCfg\n\n"
+        "IDENTIFIED_ACTUATORS = ImplicitActuatorCfg(\n"
+        f"    joint_names_expr=[\n{names}    ],\n"
+        "    stiffness=0.0,\n"
+        "    damping=0.0,\n"
+        f"    armature={{\n{entries(lambda joint: joint.armature)}    }},\n"
+        f"    friction={{\n{entries(lambda joint: joint.coulomb + joint.stribeck)}    }},\n"
+        f"    dynamic_friction={{\n{entries(lambda joint: joint.coulomb)}    }},\n"
+        f"    viscous_friction={{\n{entries(lambda joint: joint.viscous)}    }},\n"
+        ")\n"
+    )
+
+
+def parameters_export(robot: Robot, phi: Array, joints: Sequence[JointParameters]) -> dict[str, Any]:
+    """Bodies by mass, centre of mass and inertia about it, in their link frames, and joints, with units."""
+    bodies = {}
+    for body, values in zip(robot.bodies, phi, strict=True):
+        if values[parameters.MASS]:
+            mass, com, inertia = parameters.mass_com_inertia(values)
+            bodies[body.name] = {"mass": mass, "center_of_mass": com.tolist(), "inertia": inertia.tolist()}
+    entries = {joint.name: asdict(joint) | {"units": list(_UNITS[joint.kind])} for joint in joints}
+    return {
+        "robot": robot.path.name,
+        "units": {"mass": "kg", "center_of_mass": "m", "inertia": "kg m^2"},
+        "frame": "each body's link frame; inertia about the centre of mass, along the link's axes",
+        "bodies": bodies,
+        "joints": {name: {k: x for k, x in entry.items() if k != "name"} for name, entry in entries.items()},
+    }
+
+
+def _pattern(joint: JointParameters) -> str:
+    """A joint's name as a regular expression that fits it alone, in Python."""
+    return repr(re.escape(joint.name))
+
+
+def _plain(text: str) -> str:
+    return text.replace("\\", "/").replace('"', "'")

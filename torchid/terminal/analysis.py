@@ -41,7 +41,7 @@ def analysis_lines(analysis: Analysis, width: int) -> list[str]:
     lines = [*wrap_words(_headline(scenarios), width), ""]
     if len(scenarios) == 1:
         lines += labelled("determined", _determined_text(scenarios[0]), width, _TEXT_LINES + 1)
-        lines += labelled("smallest set", _smallest_text(scenarios[0]), width, _TEXT_LINES)
+        lines += labelled("smallest set", _smallest_text(scenarios[0]), width, _TEXT_LINES + 1)
     else:
         lines += _scenario_lines(scenarios, width)
     if analysis.scene.rolling:
@@ -134,7 +134,8 @@ def _smallest_text(scenario: ScenarioAnalysis) -> str:
     proof = "no cheaper set exists" if plan.proven else "not proven to be the cheapest"
     own = bool(scenario.proposed) and scenario.proposed is plan.observability
     names = "that of the file" if own else candidate_names(plan.chosen)
-    return f"{format_count(len(plan.chosen), 'sensor')}, cost {plan.cost:g}, {proof}: {names}"
+    aim = " for the inertia, friction aside" if plan.problem.criterion == "stack" else ""
+    return f"{format_count(len(plan.chosen), 'sensor')}{aim}, cost {plan.cost:g}, {proof}: {names}"
 
 
 def _scenario_lines(scenarios: Sequence[ScenarioAnalysis], width: int) -> list[str]:

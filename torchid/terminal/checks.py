@@ -100,15 +100,13 @@ def _headline(checked: Sequence[Checked]) -> str:
     if len(checked) == 1:
         usual = "; free of usual mistakes" if _is_clean(checked[0]) else ""
         return f"{log_heading(checked[0])}: {checked[0].verdict}{usual}"
-    clean = sum(map(_is_clean, checked))
-    counts = {
-        "not usable": sum(not log.usable for log in checked),
-        "usable without some samples": sum(log.usable and bool(log.rejected.any()) for log in checked),
-    }
-    rest = "".join(f"; {count} {'is' if count == 1 else 'are'} {what}" for what, count in counts.items() if count)
-    return (
-        f"{clean} of {format_count(len(checked), 'log')} {'is' if clean == 1 else 'are'} free of usual mistakes{rest}"
-    )
+    clean, usable = (sum(map(of, checked)) for of in (_is_clean, lambda log: log.usable))
+    if clean == len(checked):
+        return f"{clean} of {format_count(clean, 'log')} are free of usual mistakes"
+    shortened = sum(log.usable and bool(log.rejected.any()) for log in checked)
+    some = f", {shortened} of them without some samples" if shortened else ""
+    free = f"{clean or 'none'} {'is' if clean < 2 else 'are'} free of usual mistakes"
+    return f"{usable} of {format_count(len(checked), 'log')} {'is' if usable == 1 else 'are'} usable{some}; {free}"
 
 
 def _finding_lines(found: Sequence[_Alike], room: int, width: int, logs: int) -> list[str]:
@@ -140,8 +138,8 @@ def _finding_text(one: _Alike, width: int, logs: int, most: int | None) -> list[
 
 def _hidden_text(found: Sequence[_Alike]) -> str:
     counts = sum((one.severities for one in found), Counter[str]())
-    named = ", ".join(f"{severity} {counts[severity]}" for severity in SEVERITIES if counts[severity])
-    return f"{counts.total()} more: {named}; --verbose"
+    named = (f"{count} {kind}{'s' * (kind == NOTE and count > 1)}" for kind in SEVERITIES if (count := counts[kind]))
+    return f"and {', '.join(named)} more: --verbose"
 
 
 def _log_lines(checked: Sequence[Checked], room: int, width: int) -> list[str]:

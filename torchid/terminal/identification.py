@@ -18,7 +18,7 @@ from torchid.estimators.least_squares import COMBINED, FIXED, IDENTIFIED, PRIOR,
 from torchid.fitting.cross_validation import CrossValidation
 from torchid.fitting.misfit import Misfit
 from torchid.parameters import PARAMETERS, PER_BODY, Array
-from torchid.problem.metrics import ADVICE, DECISIVE_GROUPS, WorseThanNominal, describe_errors, describe_worse
+from torchid.problem.metrics import DECISIVE_GROUPS, describe_errors
 from torchid.report.tables import (
     compression_table,
     contribution_table,
@@ -76,8 +76,7 @@ def answer_lines(run: Identification, width: int, last: Sequence[tuple[str, str]
     lines = [*wrap_words(said.headline, width), *error_lines(said.errors, width, run.experiment.robot.format), ""]
     lines += labelled("total mass", said.total_mass, width, _TEXT_LINES)
     lines += labelled("bodies", said.bodies, width, _TEXT_LINES)
-    most = _TEXT_LINES if len(said.attention) > 1 else _ATTENTION_LINES
-    for one in said.attention[:_MOST_ATTENTION]:
+    for one, most in zip(said.attention, (_ATTENTION_LINES, *[_TEXT_LINES] * (_MOST_ATTENTION - 1)), strict=False):
         lines += labelled("attention", one, width, most)
     if len(said.attention) > _MOST_ATTENTION:
         lines += labelled("", f"and {len(said.attention) - _MOST_ATTENTION} more: --verbose", width, _TEXT_LINES)
@@ -102,13 +101,14 @@ def _body_lines(robot: Robot, estimate: Estimate, room: int, width: int) -> list
     lines = column_lines(("body", names), columns, width)
     marks = {word for line in lines[1:] for word in line.split()[1:]}
     if len(free) > len(shown):
-        lines.append(f"and {len(free) - len(shown)} bodies that changed less: parameters.json, --verbose")
+        what = "mass" if (estimate.phi.reshape(-1, PER_BODY) != robot.nominal)[free, _MASS].any() else "friction"
+        lines.append(f"and {len(free) - len(shown)} bodies whose {what} changed less: --verbose")
     legend = "; ".join(text.format(of=robot.format) for verdict, text in _LEGEND.items() if _MARKS[verdict] in marks)
     return [*lines, *([shorten(legend, width, placeholder=CUT)] if legend else [])]
 
 
 def _most_changed(robot: Robot, estimate: Estimate, bodies: Sequence[int]) -> list[int]:
-    """The bodies whose mass moved by the largest share of the robot's, or else friction by that of its own."""
+    """The bodies whose mass moved most, or else whose Coulomb friction did."""
     phi, nominal = estimate.phi.reshape(-1, PER_BODY), robot.nominal
     moved = np.abs(phi - nominal)
     return sorted(bodies, key=lambda k: (-moved[k, _MASS], -moved[k, _COULOMB], k))
@@ -171,10 +171,11 @@ _NAMED = 6  # conditions
 
 
 def print_details(run: Identification) -> None:
-    """Print all tables, and the key figures one per line."""
-    estimate, robot = run.estimate, run.experiment.robot
-    if run.worse:
-        _print_worse(run.worse, robot.format)
+    """Print the verdict, all that needs attention, all tables, and the key figures one per line."""
+    estimate, robot, said = run.estimate, run.experiment.robot, answer(run)
+    print("\n".join(wrap_words(said.headline, terminal_width())))
+    for one in said.attention:
+        print_labelled("attention", one)
     if not run.misfit.explained:
         _print_misfit(run.misfit)
     print_tables(state_table([asdict(state) for state in run.states]), *error_tables(run.metrics, robot.format))
@@ -201,24 +202,11 @@ def print_details(run: Identification) -> None:
     print(f"written to    {run.experiment.config.output}")
 
 
-def _print_wrapped(text: str, indent: str = "") -> None:
-    print(indent + "\n".join(wrap_words(text, terminal_width() - len(indent), "  ")))
-
-
-def _print_worse(worse: list[WorseThanNominal], of: str) -> None:
-    for line in (
-        f"WORSE THAN {of}: {describe_worse(worse, of)}",
-        f"{ADVICE}; the results are written all the same, status 0",
-    ):
-        _print_wrapped(line)
-
-
 def _print_misfit(misfit: Misfit) -> None:
-    _print_wrapped(f"NOT EXPLAINED: the model does not explain these forces: {misfit}")
+    growth = ""
     if misfit.error_growth is not None and misfit.error_growth > 1.0:
-        advice = "look for friction, compliance or contacts that the model lacks, and for wrong sensors (torchid check)"
-        growth = f"standard errors are {misfit.error_growth:.2g} times (median) what noise alone would make of them"
-        _print_wrapped(f"{growth}; {advice}", "  ")
+        growth = f"; standard errors are {misfit.error_growth:.2g} times (median) what noise alone would make of them"
+    print_labelled("unexplained", f"{misfit}{growth}")
 
 
 def _print_fit(run: Identification) -> None:

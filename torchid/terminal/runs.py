@@ -43,7 +43,8 @@ def evaluation_lines(evaluated: EvaluatedRun, width: int) -> list[str]:
     of = evaluated.robot.format
     judged = [ErrorComparison(name, pair.nominal, pair.identified, of) for name, pair in evaluated.metrics.items()]
     judged.sort(key=_worst, reverse=True)
-    lines = [line for one in judged[:MOST_LOGS] for line in wrap_words(_sentence(one), width, "  ")]
+    shown = [_sentence(one, evaluated.explained) for one in judged[:MOST_LOGS]]
+    lines = [line for sentence in shown for line in wrap_words(sentence, width, "  ")]
     if len(judged) > MOST_LOGS:
         lines.append(f"and {len(judged) - MOST_LOGS} logs that are predicted better than these: --verbose")
     if len(judged) == 1:
@@ -62,9 +63,10 @@ def print_all_errors(evaluated: EvaluatedRun) -> None:
     print(f"{'written to':{LABEL}}{evaluated.output}")
 
 
-def _sentence(one: ErrorComparison) -> str:
+def _sentence(one: ErrorComparison, explained: bool) -> str:
     worse = worse_than_nominal({one.text: (one.nominal, one.identified)})
-    return f"WORSE THAN {one.of}: {describe_worse(worse, one.of)}" if worse else one.headline()
+    unexplained = "" if explained else "the run's own logs"
+    return f"WORSE THAN {one.of}: {describe_worse(worse, one.of)}" if worse else one.headline(unexplained)
 
 
 def _worst(one: ErrorComparison) -> float:
@@ -73,6 +75,7 @@ def _worst(one: ErrorComparison) -> float:
 
 
 _ENDS = (0.025, 0.5, 0.975)
+_FEWEST_FOR_TAILS = 40  # draws of which one is beyond each end of a 95 % range
 _MOST_PARAMETERS = 5  # bodies and joints in the answer
 
 
@@ -84,9 +87,12 @@ def print_samples(drawn: DrawnSamples, verbose: bool = False) -> None:
 def sample_lines(drawn: DrawnSamples, width: int, verbose: bool = False) -> list[str]:
     """A sentence, and the ranges that are widest; lines of at most so many columns."""
     fitted, table = drawn.fitted, table_of_draws(drawn.samples)
-    total = np.quantile(table[:, MASS : len(fitted.posterior.nominal) : PER_BODY].sum(axis=1), _ENDS)
+    few = len(table) < _FEWEST_FOR_TAILS
+    ends, titles = ((0.0, 0.5, 1.0), ("least", "median", "largest")) if few else (_ENDS, ("2.5 %", "median", "97.5 %"))
+    total = np.quantile(table[:, MASS : len(fitted.posterior.nominal) : PER_BODY].sum(axis=1), ends)
     lines = wrap_words(
-        f"{format_count(len(table), 'robot')} that can exist; 95 % of them weigh {total[0]:.4g} to {total[2]:.4g} kg. "
+        f"{format_count(len(table), 'robot')} that can exist; {'all' if few else '95 % of them'} weigh {total[0]:.4g} "
+        f"to {total[2]:.4g} kg. "
         f"Prior: nominal bodies may be off by {100.0 * drawn.prior_error:.3g} % (--prior-error).",
         width,
         "  ",
@@ -95,11 +101,9 @@ def sample_lines(drawn: DrawnSamples, width: int, verbose: bool = False) -> list
     if found is not None and found.prior_is_narrow and drawn.prior_error < found.value:
         lines += wrap_words(f"  {found}: ranges are too narrow; --prior-error auto takes that.", width, "  ")
     numbers = _shown(drawn, table, verbose)
-    ranges = np.quantile(table[:, numbers], _ENDS, axis=0)
+    ranges = np.quantile(table[:, numbers], ends, axis=0)
     names = [fitted.parameter_names[number] for number in numbers]
-    columns = [
-        (title, [f"{x:.4g}" for x in row]) for title, row in zip(("2.5 %", "median", "97.5 %"), ranges, strict=True)
-    ]
+    columns = [(title, [f"{x:.4g}" for x in row]) for title, row in zip(titles, ranges, strict=True)]
     lines += column_lines(("widest, in SI units" if not verbose else "parameter", names), columns, width)
     where = "no file: --output samples.npz, ranges.json or, with --format urdf, a folder"
     return [*lines, f"{'written to':{LABEL}}{where if drawn.output is None else drawn.output}"]
@@ -224,7 +228,7 @@ def replay_lines(replayed: Replay, width: int, verbose: bool = False) -> list[st
     ]
     lines += ["", *column_lines((f"joint, after {replayed.window:g} s", [name for name, _ in few]), cells, width)]
     if len(few) < len(joints):
-        lines.append(f"and {len(joints) - len(few)} joints that drift less: --verbose")
+        lines.append(f"and {format_count(len(joints) - len(few), 'joint')} drifting less: --verbose")
     if replayed.output is not None:
         lines.append(f"{'written to':{LABEL}}{replayed.output}")
     return lines
@@ -241,6 +245,5 @@ def _drift(replayed: Replay) -> str:
     ]
     worse = any(after > before for before, after in drifts.values())
     head = f"WORSE THAN {replayed.of}: drift" if worse else "Drift"
-    driven = "PD targets" if replayed.gains.any() else "torques"
-    of = f"of the {driven} of {replayed.source} alone, as a share of the {replayed.of}'s"
-    return f"{head} after {replayed.window:g} s {of}: {', '.join(shares)} ({replayed.windows} windows)"
+    of = f"of {replayed.driven} alone, as a share of the {replayed.of}'s"
+    return f"{head} after {replayed.window:g} s {of}: {', '.join(shares)} ({format_count(replayed.windows, 'window')})"
