@@ -18,9 +18,11 @@ from refusals import refused
 from scipy.spatial.transform import Rotation
 
 from torchid.commands.init import init
+from torchid.commands.init_proposals import guess_contacts
 from torchid.config import load_config
 from torchid.errors import LogError
 from torchid.logs import Columns, Log, read_log, write_log
+from torchid.robot import load_robot
 
 
 def test_columns_that_may_be_torques_are_listed_and_take_no_more_than_a_mark_off(tmp_path: Path) -> None:
@@ -287,3 +289,40 @@ def test_names_in_two_lines_are_joined_where_one_has_some_twice(tmp_path: Path, 
     found, _, _ = initiated(path)
     np.testing.assert_array_equal(in_order(found, found.joint_torque), in_order(log, log.joint_torque))
     np.testing.assert_allclose(found.time, log.time, atol=1e-12)
+
+
+def _star(path: Path, tips: str) -> Path:
+    """A robot of three limbs, of one hinge each, that end in balls."""
+    inertial = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+    ball = '<collision><geometry><sphere radius="0.02"/></geometry></collision>'
+    limbs = "".join(
+        f'<link name="{k} {tips}">{inertial}{ball}</link><joint name="j{k}" type="revolute"><parent link="body"/>'
+        f'<child link="{k} {tips}"/><axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="9" velocity="9"/></joint>'
+        for k in range(3)
+    )
+    path.write_text(f'<robot name="star"><link name="body">{inertial}</link>{limbs}</robot>')
+    return path
+
+
+@pytest.mark.parametrize(("tips", "found"), [("tip", 3), ("fingertip", 0)])
+def test_balls_at_the_ends_of_limbs_are_feet_where_no_link_is_called_so_but_for_fingers(
+    tmp_path: Path, tips: str, found: int
+) -> None:
+    contacts = guess_contacts(load_robot(_star(tmp_path / "star.urdf", tips)), [], [])
+    assert [(one.frame, one.type) for one in contacts] == [(f"{k} {tips}", "point") for k in range(found)]
+
+
+def test_a_gyroscope_called_g_and_forces_called_kraft_are_found_with_bare_names_of_the_pose(tmp_path: Path) -> None:
+    time = np.linspace(0.0, 4.0, 400)
+    turn, still = 0.3 * np.sin(time), np.zeros_like(time)
+    columns = {"t": time} | {f"j{k} pos": 0.2 * np.sin(time + k) for k in range(3)}
+    columns |= {"qx": still, "qy": np.sin(turn / 2), "qz": still, "qw": np.cos(turn / 2)}
+    columns |= {"x": 0.1 * np.sin(time), "y": still, "z": 1.0 + still}
+    columns |= {"imu.ax": 9.81 * np.sin(turn), "imu.ay": still, "imu.az": 9.81 * np.cos(turn)}
+    columns |= {"imu.gx": still, "imu.gy": 0.3 * np.cos(time), "imu.gz": still}
+    columns |= {f"{k} tip Kraft {axis} [N]": 13.0 * (axis == "z") + turn for k in range(3) for axis in "xyz"}
+    pq.write_table(pa.table(columns), tmp_path / "log.parquet")
+    init(_star(tmp_path / "star.urdf", "tip"), tmp_path / "log.parquet", tmp_path / "new.yaml")
+    entries = yaml.safe_load((tmp_path / "new.yaml").read_text(encoding="utf-8"))["logs"]["columns"]
+    assert {"imu_specific_force", "imu_angular_velocity", "base_quat_xyzw", "base_position_world"} <= set(entries)
+    assert any(name.startswith("contact_wrench") for name in entries)

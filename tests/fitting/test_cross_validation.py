@@ -137,7 +137,7 @@ def test_of_long_training_logs_every_kth_sample_is_scored(run: Path, demo: tuple
     builder, evaluation = experiment.builder(experiment.sensors), experiment.evaluation()
     fitter, blocks = experiment.fitter(builder, experiment.conditions()), split_into_folds([log], builder)
     fit = fitter.fit(compress_in_blocks(blocks, builder))
-    compared, *without = (experiment.calibrations(one, builder) for one in (fit, *fitter.fit_without_folds(fit.parts)))
+    compared, *without = (experiment.calibrations(one, builder) for one in (fit, *fitter.fit_without_folds(fit)))
     parts = merge_states(fit.parts, builder)
 
     def score(most: int) -> TrainingScore:

@@ -161,6 +161,10 @@ def test_information_on_some_variances_is_less_where_others_are_unknown() -> Non
     whole = np.linalg.inv(information)
     np.testing.assert_allclose(np.linalg.inv(own), whole[np.ix_(index, index)], rtol=1e-4)
     np.testing.assert_allclose(np.linalg.solve(own, pull), (whole @ score)[index], rtol=1e-4)
+    lost = np.zeros((6, 6))  # with a base row that no sample has
+    lost[:5, :5] = information
+    for found, expected in zip(information_about(index, lost, np.append(score, 0.0)), (own, pull), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
 # ------------------------------------------------------------------------------------------------------------- stated

@@ -16,13 +16,14 @@ from faults import CONTACTS, CUTOFF, changed, demo_log, demo_robot, found, of_de
 from mistaken import case_of
 from motions import value
 from recordings import in_world
-from repository import SHARED
+from repository import CONFIGS, SHARED
 from scipy.spatial.transform import Rotation
-from synthetic import PANDA, Oracle, load
-from thinned import SLOW, slow_but
+from synthetic import PANDA, ROBOTS, Oracle, load
+from thinned import SLOW, each_once, slow_but
 from urdfs import joint, link, write
 from walking import MACHINES, robot_of
 
+from torchid.commands.check import check_experiment
 from torchid.log_checks import NOTE, REJECTED, SUSPICIOUS, Checked, scales
 from torchid.log_checks.check import check
 from torchid.log_checks.model import NominalModel, bind_some_samples, preprocess_pieces
@@ -71,7 +72,10 @@ def test_forces_of_a_robot_that_differs_from_its_urdf_by_a_fifth_are_not_complai
         assert {one.name for one in checked.findings} <= {"weight"}
 
 
-def test_friction_as_large_as_a_load_is_not_taken_for_another_scale_of_the_force(tmp_path: Path) -> None:
+@pytest.mark.parametrize("armature", [0.0, 20.0])
+def test_neither_friction_nor_armature_larger_than_a_load_is_taken_for_another_scale_of_the_force(
+    tmp_path: Path, armature: float
+) -> None:
     slides = [
         joint(name, parent, child, "prismatic", f'<axis xyz="{axis}"/><limit lower="-1" upper="1" effort="9"/>')
         for name, parent, child, axis in (("x", "base", "arm", "1 0 0"), ("quill", "arm", "tool", "0 0 1"))
@@ -81,11 +85,47 @@ def test_friction_as_large_as_a_load_is_not_taken_for_another_scale_of_the_force
     rate, size = 2.0 * np.pi * np.array([0.5, 0.3]), np.array([0.5, 0.1])
     phase = rate * time[:, None]
     v, a = size * rate * np.cos(phase), -size * rate**2 * np.sin(phase)
-    force = a * [2.0, 1.1] + [0.0, 1.1 * GRAVITY] + [0.0, 15.0] * np.sign(v) + 0.1 * rng.normal(size=v.shape)
+    force = a * [2.0 + armature, 1.1] + [0.0, 1.1 * GRAVITY] + [0.0, 15.0] * np.sign(v) + 0.1 * rng.normal(size=v.shape)
     log = Log("stage.npz", time, robot.joint_names, size * np.sin(phase), joint_torque=force)
     samples = bind_some_samples(preprocess_pieces(log, 10.0), robot, (), 240)
     gains = value(scales.fit_torque_gains(samples, robot, ()))
     assert abs(gains.gain[1] - 1.0 / 1.1) < gains.spread[1]  # 2.3 times that, if friction is taken for small
+    if armature:
+        assert gains.gain[0] < 1.0 / 1.3 < 1.3 < gains.reverse[0]  # mass or armature: any factor
+
+
+@pytest.mark.parametrize(
+    ("recorded", "factor"),
+    each_once([("arm", "contacts"), ("quadruped", "joints"), ("biped", "full")], [-1.0, 0.5, 2.0, 8.0]),
+)
+def test_of_joints_half_of_which_have_another_factor_none_that_is_right_is_named(
+    recorded: tuple[str, str], factor: float
+) -> None:
+    case = case_of(MACHINES[recorded[0]], recorded[1])
+    names = case.log.joint_names
+    wrong = np.random.default_rng(5).choice(len(names), len(names) // 2, replace=False).tolist()
+    checked = check(rescaled(case.log, wrong, factor), robot_of(case.machine), case.machine.contacts, CUTOFF)
+    named = {joint for one in checked.findings if one.field == "joint_torque" for joint in one.channels}
+    assert named <= {names[joint] for joint in wrong}
+    assert len(named) >= len(wrong) // 2
+
+
+@ELSEWHERE
+def test_torques_that_armature_and_friction_make_up_have_no_factor() -> None:
+    """Chirps by a PD law of a quadruped that hangs with its base held: rotors outweigh its legs."""
+    urdf = ROBOTS / "go2_description" / "urdf" / "go2.urdf"
+    for one in check_experiment(CONFIGS / "go2_in_air.yaml", [f"robot.urdf={urdf}"]):
+        assert not found(one, "scale")
+
+
+def test_halved_torques_are_not_taken_for_slow_time() -> None:
+    case = case_of(MACHINES["quadruped"], "joints")
+    halved = rescaled(case.log, range(len(case.log.joint_names)), 0.5)
+    checked = check(halved, robot_of(case.machine), case.machine.contacts, CUTOFF)
+    assert not found(checked, "unit", "time")
+    assert only(checked, "scale", "joint_torque").found.startswith(
+        "all torques: the factor that fits the URDF best is 1."
+    )
 
 
 @pytest.mark.parametrize(
@@ -181,9 +221,8 @@ def test_factors_that_one_block_of_time_makes_up_are_compared_within_blocks(
     shape = (scales.TIME_BLOCKS, 5 + 3)
     blocks = np.where(np.arange(8) < 5, 1.1, 0.0) * np.ones(shape)
     blocks[0, :3] = 0.02
-    gains = scales.TorqueGains(
-        np.arange(5), np.array([0.02, 0.02, 0.02, 0.7, 0.75]), np.zeros(3), np.full(8, 0.05), blocks, None
-    )
+    gain = np.array([0.02, 0.02, 0.02, 0.7, 0.75])
+    gains = scales.TorqueGains(np.arange(5), gain, gain, np.zeros(3), np.full(8, 0.05), blocks, None)
     monkeypatch.setattr("torchid.log_checks.forces.fit_torque_gains", lambda *_: gains)
     assert not found(check(log, robot, (), 5.0), "scale")
 

@@ -76,6 +76,8 @@ MACHINES: dict[str, tuple[Path | None, bool, Sequence[Contact]]] = {
         None, False, [Contact("sole", "line", "x", 0.3), Contact("fin", "line", "z", 0.07)]),
     "welded, two equal balls on a foot": (None, False, rolling(("foot", 0.05), ("sole", 0.05), ("hand", 0.02))),
     "welded, two balls on a foot": (None, False, rolling(("foot", 0.05), ("sole", 0.02))),
+    "welded, two equal balls on two slopes": (
+        None, False, [*rolling(("foot", 0.05)), Contact("sole", "point", radius=0.05, normal=(0.1, 0.4, 1.0))]),
     "welded, two equal balls on recorded ground": (None, False, rolling(("foot", 0.05), ("sole", 0.05))),
     "welded, a ball and a point on a foot": (None, False, rolling(("foot", 0.05), ("sole", 0.0))),
     "welded, a ball and a plate on a foot": (None, False, [*rolling(("foot", 0.05)), Contact("sole", "flat")]),

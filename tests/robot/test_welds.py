@@ -14,8 +14,7 @@ from urdfs import joint, link, write
 
 from torchid.errors import InputError, TorchidWarning
 from torchid.logs import Log
-from torchid.problem.log_joints import without_welded_joints
-from torchid.problem.samples import joint_order
+from torchid.problem.log_joints import joint_order, without_welded_joints
 from torchid.report.urdf_files import identified_urdf
 from torchid.robot import Robot, load_robot
 

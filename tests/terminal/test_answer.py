@@ -107,6 +107,33 @@ def test_a_total_mass_that_contradicts_the_urdf_needs_attention(consistent: Iden
     assert "times the URDF's" not in text(vague)
 
 
+def test_bodies_that_a_weak_prior_lets_go_far_from_the_urdf_are_said_to_weigh_so(consistent: Identification) -> None:
+    unknown, nominal = replace(consistent.mass, standard_error=np.inf), consistent.mass.nominal
+    near, far = (text(replace(consistent, mass=replace(unknown, value=x * nominal)), 400) for x in (1.1, 5.0))
+    assert "attention     these data do not determine the total mass; weigh the robot: estimator.total_mass" in near
+    assert "and the fit lets it be 104.000 kg (20.800 kg by the URDF): estimator.ridge=one_standard_error" in far
+
+
+@pytest.mark.parametrize(("variation", "of_weight", "told"), [(1.4, 0.5, True), (1.4, 0.01, False), (0.5, 0.5, False)])
+def test_a_base_force_that_a_constant_would_predict_as_well_is_not_explained(
+    consistent: Identification, variation: float, of_weight: float, told: bool
+) -> None:
+    pair = consistent.metrics["test"]
+    relative = {**pair.identified.relative, "base_force": of_weight}
+    found = replace(pair.identified, base_force_of_variation=variation, relative=relative)
+    said = text(replace(consistent, metrics=consistent.metrics | {"test": pair._replace(identified=found)}), 400)
+    assert ("attention     base force: errors of 1.4 times what its measurements vary by; check frames" in said) is told
+    assert ("but the model does not explain these forces" in said.split("rms error")[0]) is told
+
+
+def test_projected_forces_that_no_bodies_would_predict_as_well_are_not_explained(consistent: Identification) -> None:
+    pair = consistent.metrics["test"]
+    found = replace(pair.identified, relative={**pair.identified.relative, "nullspace": 1.31})
+    said = text(replace(consistent, metrics=consistent.metrics | {"test": pair._replace(identified=found)}), 400)
+    assert "errors of 1.3 times what was measured; check signs, units and order of joints: torchid check" in said
+    assert "what was measured" not in text(consistent, 400)
+
+
 @pytest.mark.parametrize(("share", "unlike"), [(0.3, True), (0.6, False)])
 def test_bodies_far_off_their_file_need_a_wider_prior_and_a_line_says_which(
     consistent: Identification, share: float, unlike: bool

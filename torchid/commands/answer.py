@@ -143,7 +143,8 @@ def _judge(run: Identification) -> ErrorComparison:
 def _headline(run: Identification, judged: ErrorComparison) -> str:
     if run.worse:
         return f"WORSE THAN {judged.of}: {describe_worse(run.worse, judged.of)}"
-    return judged.headline("" if run.misfit.explained else "these forces")
+    explained = run.misfit.explained and not any(_unlike_sensors(judged.identified))
+    return judged.headline("" if explained else "these forces")
 
 
 def _bodies_text(run: Identification) -> str:
@@ -183,13 +184,25 @@ def _attention(run: Identification, judged: ErrorComparison) -> Iterator[str]:
     if not run.misfit.judged:
         reason = "no noise is stated, and the logs are too short to tell it from errors of the model"
         yield f"whether the model explains these forces is not known: {reason}; state sensors.noise, or record more"
-    if not run.mass.determined and not run.experiment.robot.fixed_base:
-        yield "these data do not determine the total mass; weigh the robot: estimator.total_mass"
+    yield from _undetermined(run)
     for one in list_confounded(run.extras):
         yield one.in_short
     yield from _far_off(run.posterior.nominal_error)
     if run.noise.suggested:
         yield f"noise: {noise_advice(run.noise.suggested)}"
+
+
+def _undetermined(run: Identification) -> Iterator[str]:
+    """That data do not determine the total mass of a robot, which a weak prior may have let go far from the nominal."""
+    ratio = run.mass.value / run.mass.nominal
+    away = abs(ratio - 1.0) > MAX_MASS_ERROR
+    if run.mass.determined or not (away or not run.experiment.robot.fixed_base):
+        return
+    what = "these data do not determine the total mass"
+    if away:
+        nominal = f"{decimal(run.mass.nominal)} kg by the {run.experiment.robot.format}"
+        what += f", and the fit lets it be {decimal(run.mass.value)} kg ({nominal}): estimator.ridge=one_standard_error"
+    yield f"{what}; weigh the robot: estimator.total_mass"
 
 
 def _impossible(run: Identification) -> Iterator[str]:
@@ -212,12 +225,18 @@ def _unfinished(estimate: SgdEstimate) -> str:
 
 
 def _unlike_sensors(identified: Metrics) -> Iterator[str]:
-    """Readings in limbs that the identified parameters explain worse than no limb at all would."""
-    for group in LIMB_GROUPS:
+    """Readings that the identified parameters explain worse than no bodies, or a constant base force, would."""
+    for group in (*LIMB_GROUPS, "nullspace"):
         share = identified.relative_of(group)
         if share is not None and share > _LARGER_THAN_MEASURED:
-            ratio = f"{group_name(group)}: errors of {share:.2g} times what was measured"
-            yield f"{ratio}; check the sensor's sign, unit and frame: torchid check"
+            in_limb = group in LIMB_GROUPS
+            name = group_name(group) if in_limb else "forces without those of the contacts"
+            whose = "the sensor's sign, unit and frame" if in_limb else "signs, units and order of joints"
+            yield f"{name}: errors of {share:.2g} times what was measured; check {whose}: torchid check"
+    share, of_weight = identified.base_force_of_variation, identified.relative_of("base_force")
+    if share is not None and share > _LARGER_THAN_MEASURED and (of_weight or 0.0) > MAX_MASS_ERROR:
+        ratio = f"base force: errors of {share:.2g} times what its measurements vary by"
+        yield f"{ratio}; check frames, signs and units of contact forces and of the base's pose: torchid check"
 
 
 def _far_off(nominal: NominalError | None) -> Iterator[str]:

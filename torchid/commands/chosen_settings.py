@@ -38,8 +38,7 @@ from torchid.logs.sign_filter import with_sign_filter
 from torchid.problem import ExtraTerms, RowBuilder, Samples
 from torchid.problem.compressed_log import Block
 from torchid.problem.compression import Part
-from torchid.problem.log_joints import columns_in_order
-from torchid.problem.samples import joint_order
+from torchid.problem.log_joints import columns_in_order, joint_order
 from torchid.sensing import SensorSet
 from torchid.settings import AUTO
 

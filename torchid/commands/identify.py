@@ -227,7 +227,7 @@ def _identify(
             lambda: _contributions(experiment, builder, whole, logs["train"], problem, bars), "contributions"
         )
     with clock("evaluate"):
-        fits = (fit, *fitter.fit_without_folds(fit.parts))
+        fits = (fit, *fitter.fit_without_folds(fit))
         compared, *without_folds = (experiment.calibrations(one, builder) for one in fits)
         scorer, of_blocks = Scorer(evaluation, builder), merge_states(fit.parts, builder)
         scores = _scores(scorer, logs["test"], blocks, of_blocks, compared, without_folds, bars)

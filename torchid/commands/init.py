@@ -251,7 +251,7 @@ def _describe(
     _describe_found(out, robot, contacts, fields, proposal)
     out.guessed += [f"{key}: {note}" for key, note in proposal.notes.items()]
     if contacts:
-        out.guessed.append("contacts: from names of links; point where there is a ball or more than two of them")
+        out.guessed.append("contacts: from names or balls of links; point where there is a ball or more than two")
     if _is_fixed(contacts, fields) and not robot.fixed_base:
         out.guessed.append("robot.fixed_base: true, as there is neither a foot nor a motion of the base")
     if held := _held(robot, proposal):

@@ -95,7 +95,7 @@ def cross_validate(
     """
     blocks = split_into_folds(logs, fitter.builder)
     fit = fitter.fit(compress_in_blocks(blocks, fitter.builder))
-    without_folds = fitter.fit_without_folds(fit.parts)
+    without_folds = fitter.fit_without_folds(fit)
 
     def compared(one: Fit) -> Comparison[Calibration]:
         return calibrations(one, fitter.robot, fitter.builder, loss)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -21,9 +21,14 @@ from torchid.problem import LinearProblem, RowBuilder, assemble
 from torchid.problem.chunks import one_thread
 from torchid.problem.compression import Part, merge_blocks_of_folds, merge_states
 from torchid.problem.elimination import Assembly
+from torchid.problem.noise_gram import scale_columns
 from torchid.reprs import short_repr
 from torchid.robot import Robot
 from torchid.rounding import RANK_TOLERANCE
+
+_TURNS = 10  # of fit and noise of readings; they settle in three or four
+_SETTLED = 0.02
+_LEAST_SCALE = 0.1
 
 Solve = Callable[[LinearProblem], Estimate]
 """An estimator's `solve`."""
@@ -127,13 +132,13 @@ class LogFitter:
         scatter = block_scatter(parts, self.builder, fit.assembly, estimator.ridge, estimator.rank_tolerance)
         return fit if scatter is None else with_block_errors(fit, scatter)
 
-    def assemble(self, parts: Sequence[Part]) -> Assembly:
+    def assemble(self, parts: Sequence[Part], reading_noise: Mapping[int, float] | None = None) -> Assembly:
         """The problem of compressed logs as they are, with extra parameters eliminated and frozen ones not free.
 
         Masses that are known are further rows of it. Where scales make up all of the forces and no mass is known, the
-        nominal total mass stands in for one: the best fit were no forces at all.
+        nominal total mass stands in for one: the best fit were no forces at all. `reading_noise`: as `Assembly` has it.
         """
-        assembly = assemble(parts, self.builder, self.robot, self.friction)
+        assembly = assemble(parts, self.builder, self.robot, self.friction, reading_noise)
         problem, known, data = assembly.problem, assembly.if_known, None
         if self.frozen is not None:
             problem, known = (replace(x, free=x.free & ~self.frozen) for x in (problem, known))
@@ -155,14 +160,41 @@ class LogFitter:
     def build_problem(self, parts: Sequence[Part]) -> LogProblem:
         """The problem of compressed logs, readings of contact sensors in the air weighted by their own noise.
 
-        A first least-squares fit shows by how much all other rows miss the stated noise.
+        A first least-squares fit shows by how much all other rows miss the stated noise, and so how large the noise of
+        readings with unknown scales is: fit and noise take turns.
         """
-        assembly = self.assemble(parts)
-        if not any(part.unloaded for part in parts):
-            return LogProblem(list(parts), assembly)
-        first = self.least_squares.solve(assembly.problem)
-        weighted = [_with_own_noise(part, first.residual_std) for part in parts]
-        return LogProblem(weighted, self.assemble(weighted))
+        problem = LogProblem(list(parts), self.assemble(parts))
+        if any(part.unloaded for part in parts):
+            first = self.least_squares.solve(problem.assembly.problem)
+            weighted = [_with_own_noise(part, first.residual_std) for part in parts]
+            problem = LogProblem(weighted, self.assemble(weighted))
+        if not scale_columns(self.builder) or problem.assembly.homogeneous:
+            return problem
+        noise: Mapping[int, float] = {}
+        for _ in range(_TURNS):
+            found = self._reading_noise(problem)
+            if all(abs(found[at] - noise.get(at, 0.0)) <= _SETTLED * found[at] for at in found):
+                break
+            noise = {at: float(np.sqrt(x * noise.get(at, x))) for at, x in found.items()}  # x alone overshoots
+            problem = LogProblem(problem.parts, self.assemble(problem.parts, noise))
+        return problem
+
+    def _reading_noise(self, problem: LogProblem) -> dict[int, float]:
+        """What `Assembly` has under this name: the mean square residual but for noise of the motion, per squared scale.
+
+        Rows are weighted with the noise of forces, which is that of readings times their scales.
+        """
+        fit, left = self.solve_problem(problem, self.least_squares.solve), 0.0
+        no_readings = dict.fromkeys(scale_columns(self.builder), 0.0)
+        for log in {part.source: None for part in problem.parts}:
+            at = np.append(fit.columns(self.builder, log).cpu().double().numpy(), -1.0)
+            for part in problem.parts:
+                if part.source == log:
+                    left += float(at @ part.factor.whole_noise_gram(no_readings).numpy() @ at)
+        left = max(fit.estimate.residual_std**2 - left / max(fit.assembly.problem.rows, 1), 0.0)
+        values = {x.extra.label: 1.0 + x.value for x in fit.extras}
+        of_column = zip(no_readings, (x.label for x in self.builder.extras if x.what == "scale"), strict=True)
+        return {column: left / max(abs(values[label]), _LEAST_SCALE) ** 2 for column, label in of_column}
 
     def solve_problem(self, problem: LogProblem, solve: Solve | None = None) -> Fit:
         """Solve what `build_problem` has built; `solve` instead of the estimator's."""
@@ -172,20 +204,16 @@ class LogFitter:
         return Fit(problem.parts, assembly, estimate, extras)
 
     @one_thread()
-    def fit_without_folds(self, parts: Sequence[Part]) -> list[Fit]:
-        """For every fold, in order, the fit of all others; none where there is only one fold.
-
-        Args:
-            parts: of a `Fit`, with the weights that they have in it.
-        """
-        folds = sorted({part.fold for part in parts})
+    def fit_without_folds(self, fit: Fit) -> list[Fit]:
+        """For every fold of a fit, in order, that of all others, weighted as it is; none where there is only one."""
+        folds, noise = sorted({part.fold for part in fit.parts}), fit.assembly.reading_noise
         if len(folds) < 2:
             return []
-        blocks = merge_states(parts, self.builder)
+        blocks = merge_states(fit.parts, self.builder)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", TorchidWarning)  # the fit of all of them says the same
             rests = ([block for block in blocks if block.fold != fold] for fold in folds)
-            return [self.solve_problem(LogProblem(rest, self.assemble(rest))) for rest in rests]
+            return [self.solve_problem(LogProblem(rest, self.assemble(rest, noise))) for rest in rests]
 
 
 def _is_homogeneous(problem: LinearProblem, forces: float) -> bool:

@@ -174,7 +174,7 @@ def _by_block(
             columns.add_gradient(gradients, number, at, rows[:, :-1].T @ residual)
             projected = rows[:, :-1] @ along[at]
             shares[number] += projected.T @ projected
-        for support, tensor in part.factor.noise_gram.items():
+        for support, tensor in part.factor.noise_gram_of(assembly.reading_noise).items():
             more, at = np.ascontiguousarray(tensor.cpu().double().numpy()), list(support)
             columns.add_gradient(gradients, number, at, more[:-1, :-1] @ columns.values[at] - more[:-1, -1])
             of_noise[number] += along[at].T @ more[:-1, :-1] @ along[at]

@@ -132,12 +132,14 @@ def _misfit_findings(
     moved, unexplained = check_lag_and_tilt(log, robot, contacts, cutoff, derived)
     scale = None if moved else _fit_time_scale(log, robot, contacts)
     if found := moved or [one for one in [_time_scale_finding(scale)] if one is not None]:
-        yield from found
+        alike = None if moved else fit_torque_gains(samples, robot, contacts)
+        yield from (alike and list(_common_gain_findings(alike))) or found
         return
     unexplained = unexplained if scale is None else min(unexplained, scale.recorded)
     if fit.misfit > MAX_MISFIT and unexplained > MAX_UNEXPLAINED_RATIO:
         held = bool(contacts) or robot.fixed_base
-        scaled = list(_gain_and_point_findings(log, samples, robot, contacts)) if held else []
+        gains = fit_torque_gains(samples, robot, contacts) if held else None
+        scaled = list(_gain_and_point_findings(log, gains, robot))
         yield from scaled
         if scaled:
             return
@@ -154,7 +156,7 @@ def _misfit_findings(
     torques = [] if fit.torque is None else list(_torque_findings(robot, fit.torque))
     yield from torques
     if not any(isinstance(item, Finding) for item in torques):
-        scaled = list(_gain_and_point_findings(log, samples, robot, contacts))
+        scaled = list(_gain_and_point_findings(log, fit_torque_gains(samples, robot, contacts), robot))
         yield from scaled or check_torque_offsets(log, robot, contacts, cutoff)
 
 
@@ -284,24 +286,20 @@ def _time_scale_finding(scale: TimeScale | None) -> Finding | None:
     return Finding("unit", REJECTED, "time", text, advice)
 
 
-def _gain_and_point_findings(
-    log: Log, samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact]
-) -> Iterator[Finding]:
+def _gain_and_point_findings(log: Log, fit: TorqueGains | None, robot: Robot) -> Iterator[Finding]:
     """Findings about torques with another gain and wrenches about another point."""
-    fit = fit_torque_gains(samples, robot, contacts)
     if fit is None:
         return
     m = len(fit.joints)
-    spread = fit.spread[:m]
-    known = spread < _MAX_REFERENCE_SPREAD
-    reference, references = 1.0, np.ones((len(fit.blocks), 1))
-    if known.sum() >= _MIN_REFERENCE_JOINTS:
-        reference = float(np.median(fit.gain[known]))
-        references = np.median(fit.blocks[:, :m][:, known], axis=1, keepdims=True)
+    spread, blocks = fit.spread[:m], fit.blocks[:, :m]
     yield from _common_gain_findings(fit)
-    relative, blocks = fit.gain / reference, fit.blocks[:, :m] / references
-    large = (relative > MIN_GAIN_RATIO) | (relative < 1.0 / MIN_GAIN_RATIO)
-    off = large & _is_certain(relative - 1.0, spread / reference, blocks - 1.0)
+    of = _reference_joints(fit)
+    reference, of_reverse = (float(np.median(x[of])) if of.any() else 1.0 for x in (fit.gain, fit.reverse))
+    relative = fit.gain / reference
+    off = np.abs(fit.gain) > MIN_STANDARD_DEVIATIONS * spread  # readings of nothing have no factor
+    off &= _is_beyond(relative, fit.reverse / of_reverse, MIN_GAIN_RATIO)
+    references = np.median(blocks[:, of], axis=1, keepdims=True) if of.any() else 1.0
+    off &= _is_certain(relative - 1.0, spread / reference, blocks / references - 1.0)
     if off.any() and m > 1:
         names = [robot.joint_names[joint] for joint in fit.joints[off]]
         gains = join_names([f"{gain:.3g} +- {std:.2g}" for gain, std in zip(relative[off], spread[off], strict=True)])
@@ -319,20 +317,50 @@ def _gain_and_point_findings(
         yield Finding("point", SUSPICIOUS, log.contact_wrench_field, text, advice)
 
 
-def _common_gain_findings(fit: TorqueGains | None) -> Iterator[Finding]:
+def _reference_joints(fit: TorqueGains) -> BoolArray:
+    """Joints (m,) whose factors are the reference for all others, none if too few are known.
+
+    Those that the URDF's masses agree with, if there are any, however many have another factor: motors of one type are
+    wrong alike. Else all of them, as the URDF may weigh too much or too little.
+    """
+    known, right = _known_and_right_joints(fit)
+    return right if right.any() else known & (known.sum() >= _MIN_REFERENCE_JOINTS)
+
+
+def _known_and_right_joints(fit: TorqueGains) -> tuple[BoolArray, BoolArray]:
+    """Joints (m,) whose factors are known, and those of them whose factors are 1 within what a URDF is off by."""
+    known = fit.spread[: len(fit.gain)] < _MAX_REFERENCE_SPREAD * np.maximum(np.abs(fit.gain), 1.0)
+    known &= _agree(fit.gain, fit.reverse)
+    is_off = _is_beyond(fit.gain, fit.gain, MIN_COMMON_GAIN_RATIO)
+    return known, known & ~is_off & ~_is_beyond(fit.reverse, fit.reverse, MIN_COMMON_GAIN_RATIO)
+
+
+def _common_gain_findings(of_joints: TorqueGains) -> Iterator[Finding]:
     """A finding about all torques times a common factor."""
-    if fit is None or fit.common is None:
+    fit = of_joints.common
+    if fit is None or _known_and_right_joints(of_joints)[1].any() or not _agree(fit.gain, fit.reverse):
         return
-    gain, spread, blocks = fit.common
-    off = max(gain, 1.0 / max(gain, _TINY)) > MIN_COMMON_GAIN_RATIO
-    value, agreeing = np.array([gain - 1.0]), blocks[:, None] - 1.0
-    if off and _is_certain(value, np.array([spread]), agreeing, MIN_COMMON_BLOCK_SHARE).all():
-        text = f"all torques: the factor that fits the URDF best is {gain:.3g} +- {spread:.2g}"
+    if not _is_beyond(fit.gain, fit.reverse, MIN_COMMON_GAIN_RATIO):
+        return
+    value, agreeing = np.array([fit.gain - 1.0]), fit.blocks[:, None] - 1.0
+    if _is_certain(value, np.array([fit.spread]), agreeing, MIN_COMMON_BLOCK_SHARE).all():
+        text = f"all torques: the factor that fits the URDF best is {fit.gain:.3g} +- {fit.spread:.2g}"
         advice = (
             "check units, gear ratios and torque constants, whether the URDF's masses and contact forces are right, or "
             "set sensors.scales: {joint_torque: all}"
         )
         yield Finding("scale", SUSPICIOUS, "joint_torque", text, advice)
+
+
+def _agree(one: FloatArray | float, other: FloatArray | float) -> BoolArray:
+    """Whether factors by either regression are the same, within what is reported of a factor."""
+    return np.asarray(np.abs(other) < MIN_COMMON_GAIN_RATIO * np.abs(one))
+
+
+def _is_beyond(one: FloatArray | float, other: FloatArray | float, ratio: float) -> BoolArray:
+    """Whether factors by either regression are both larger than a ratio, or both smaller than its inverse."""
+    low, high = np.minimum(one, other), np.maximum(one, other)
+    return np.asarray((low > ratio) | (high < 1.0 / ratio))
 
 
 def _is_certain(value: FloatArray, spread: FloatArray, blocks: FloatArray, share: float = MIN_BLOCK_SHARE) -> BoolArray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -153,13 +153,11 @@ _REST_FACTOR = 1e4
 _MOTION_POWER_SHARE, _CUTOFF_BANDWIDTHS, _MIN_CUTOFF_PERIODS, _MAX_CUTOFF_RATE_SHARE = 0.99, 6.0, 20.0, 0.2
 #: Factors of time that are tried.
 _TIME_FACTORS = np.geomspace(1e-4, 1e4, 1601)
-#: Prior of torque terms that the URDF lacks, over the unmodelled force.
-_JOINT_TERM_SCALE = 3.0
+#: Prior of torque terms that the URDF lacks, over the unmodelled force; of armatures beside factors of torques, which
+#: would else be what a geared motor's inertia is: all of the torque in light limbs.
+_JOINT_TERM_SCALE, ARMATURE_SCALE = 3.0, FRICTION_TORQUE_SHARE / UNMODELLED_FORCE_SHARE
 #: Prior standard deviations of a torque's factor about 1, and of the point of wrenches about the contact frame.
-_GAIN_PRIOR_STD, _POINT_PRIOR_STD_M = 0.5, 0.3
-#: Squared residual, in `UNMODELLED_FORCE_SHARE` of the forces, that a common factor of all torques may leave: noise of
-#: accelerations, which takes any factor for too large, leaves more.
-MAX_COMMON_RESIDUAL = 0.25
+_GAIN_PRIOR_STD, _POINT_PRIOR_STD_M = 1.0, 0.3
 
 
 @dataclass(frozen=True)
@@ -236,7 +234,7 @@ def deviation_columns(
     W: FloatArray,
     samples: Samples,
     prior: FloatArray,
-    armature: bool = True,
+    armature: float = _JOINT_TERM_SCALE,
     offsets: bool = True,
 ) -> FloatArray:
     """Columns (N, n_rows, P) of what may differ from the URDF: parameters, friction, armature, offsets of torques.
@@ -247,24 +245,22 @@ def deviation_columns(
         W: their bases.
         samples: whose motion friction and armature follow.
         prior: from `prior_columns`.
-        armature: whether it is among them.
-        offsets: whether they are.
+        armature: its prior, over the unmodelled force.
+        offsets: whether they are among them.
     """
     rate = samples.joint_velocity
-    further = [samples.joint_acceleration] * armature + [torch.ones_like(rate)] * offsets
-    terms = _joint_terms(builder, W, torch.sign(rate), rate, *further)
-    return np.concatenate([rows[..., :-1] @ prior, *terms], axis=2)
+    terms = [(torch.sign(rate), _JOINT_TERM_SCALE), (rate, _JOINT_TERM_SCALE), (samples.joint_acceleration, armature)]
+    terms += [(torch.ones_like(rate), _JOINT_TERM_SCALE)] * offsets
+    of_joints = (_joint_term(builder, W, value, scale) for value, scale in terms)
+    return np.concatenate([rows[..., :-1] @ prior, *of_joints], axis=2)
 
 
-def _joint_terms(builder: RowBuilder, W: FloatArray, *values: torch.Tensor) -> list[FloatArray]:
+def _joint_term(builder: RowBuilder, W: FloatArray, value: torch.Tensor, scale: float) -> FloatArray:
     """Columns of joint torques in proportion to values (N, n), scaled by the prior whatever the size of the values."""
     base = builder.tree.base_rows
-    out = []
-    for value in values:
-        columns = W[:, base : base + value.shape[1]].transpose(0, 2, 1) * value.numpy()[:, None]
-        size = np.sqrt(np.square(columns).mean(axis=(0, 1)))
-        out.append(_JOINT_TERM_SCALE * columns / np.where(size > 0.0, size, 1.0))
-    return out
+    columns = W[:, base : base + value.shape[1]].transpose(0, 2, 1) * value.numpy()[:, None]
+    size = np.sqrt(np.square(columns).mean(axis=(0, 1)))
+    return np.asarray(scale * columns / np.where(size > 0.0, size, 1.0))
 
 
 def _best_factor(equations: NormalEquations) -> TimeScale:
@@ -284,24 +280,37 @@ def _best_factor(equations: NormalEquations) -> TimeScale:
 
 
 @dataclass(frozen=True, eq=False)
+class CommonGain:
+    """A factor of all torques alike, by either regression, its standard deviation, and by block, (TIME_BLOCKS,)."""
+
+    gain: float
+    reverse: float
+    spread: float
+    blocks: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
 class TorqueGains:
     """Factors of torques and the reference point of wrenches, by the best URDF near the given one.
 
     Attributes:
         joints: numbers of the m joints whose torque was measured.
-        gain: (m,) factors.
+        gain: (m,) factors, if what no parameters explain were no error of this torque's readings.
+        reverse: (m,) the same if all of it were: the truth is between both (Frisch, "Statistical confluence
+            analysis", 1934). Far apart where friction, armature or inertias that the URDF lacks explain the readings.
         point: (3,) [m] in the contact frames.
-        spread: (m + 3,) standard deviations of both.
+        spread: (m + 3,) standard deviations of gain and point.
         blocks: (TIME_BLOCKS, m + 3), both by block of time.
-        common: factor of all torques alike, its standard deviation, and by block, (TIME_BLOCKS,); None without torques.
+        common: of all torques alike; None without torques.
     """
 
     joints: np.ndarray
     gain: FloatArray
+    reverse: FloatArray
     point: FloatArray
     spread: FloatArray
     blocks: FloatArray
-    common: tuple[float, float, FloatArray] | None
+    common: CommonGain | None
 
 
 def fit_torque_gains(samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact]) -> TorqueGains | None:
@@ -323,7 +332,7 @@ def fit_torque_gains(samples: Sequence[Samples], robot: Robot, contacts: Sequenc
         projected = np.einsum("nvr,nvk->nrk", W, terms)
         contact_part = rows[..., -1] - projected[..., : len(joints)].sum(axis=2)
         target = rows[..., :-1] @ nominal - contact_part
-        K = deviation_columns(builder, rows, W, part, columns, armature=False)
+        K = deviation_columns(builder, rows, W, part, columns, ARMATURE_SCALE)
         parts.append((K, np.concatenate([target[..., None], projected], axis=2), equations))
     return _solve_gains(accumulate_blocks(parts), joints)
 
@@ -351,33 +360,38 @@ def _has_moments(measured: np.ndarray) -> bool:
 
 def _solve_gains(equations: NormalEquations, joints: np.ndarray) -> TorqueGains:
     m = len(joints)
-    prior_mean = np.append(np.ones(m), np.zeros(3))
-    precision = np.append(np.full(m, _GAIN_PRIOR_STD), np.full(3, _POINT_PRIOR_STD_M)) ** -2.0
-
-    def solve(block: int | None, unknowns: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-        """Unknowns, of which the columns make gains and shifts, their variances, and the squared residual."""
-        map_ = np.zeros((len(unknowns) + 1, unknowns.shape[1] + 1))
-        map_[0, 0], map_[1:, 1:] = 1.0, unknowns
-        G = map_.T @ equations.unexplained(block) @ map_
-        H = G[1:, 1:] + CORRELATED_SAMPLES * unknowns.T @ np.diag(precision) @ unknowns
-        x = np.linalg.solve(H, G[1:, 0] + CORRELATED_SAMPLES * unknowns.T @ (precision * prior_mean))
-        residual = G[0, 0] - 2.0 * G[0, 1:] @ x + x @ G[1:, 1:] @ x
-        return np.asarray(x), np.asarray(np.diag(np.linalg.inv(H))), float(residual)
-
-    each = np.eye(m + 3)
-    x, spread, blocks = _with_blocks(lambda block: solve(block, each), equations.rows)
+    each, alike = np.eye(m + 3), np.column_stack([np.repeat([1.0, 0.0], [m, 3]), np.eye(m + 3)[:, m:]])
+    x, reverse, spread, blocks = _fit_gains(equations, each, m)
     common = None
-    alike = np.column_stack([prior_mean, each[:, m:]])
-    if m and solve(None, alike)[2] < MAX_COMMON_RESIDUAL * equations.rows:
-        factor, certainty, by_block = _with_blocks(lambda block: solve(block, alike), equations.rows)
-        common = (float(factor[0]), float(certainty[0]), by_block[:, 0])
-    return TorqueGains(joints, x[:m], x[m:], spread, blocks, common)
+    if m:
+        factor, bound, certainty, by_block = _fit_gains(equations, alike, m)
+        common = CommonGain(float(factor[0]), float(bound[0]), float(certainty[0]), by_block[:, 0])
+    return TorqueGains(joints, x[:m], reverse[:m], x[m:], spread, blocks, common)
 
 
-def _with_blocks(
-    solve: Callable[[int | None], tuple[FloatArray, FloatArray, float]], rows: int
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Unknowns (k,) of all samples, their standard deviations, and those of each block, (TIME_BLOCKS, k)."""
-    x, variance, residual = solve(None)
-    size = max(1.0, residual / max(rows, 1))
-    return x, np.sqrt(CORRELATED_SAMPLES * size * variance), np.array([solve(block)[0] for block in range(TIME_BLOCKS)])
+def _fit_gains(
+    equations: NormalEquations, unknowns: FloatArray, m: int
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Unknowns (k,) by either regression (see `TorqueGains`), standard deviations, and by block, (TIME_BLOCKS, k).
+
+    `unknowns`, (m + 3, k): which of m gains and of the point's shifts each of them is.
+    """
+    precision = CORRELATED_SAMPLES * np.repeat([_GAIN_PRIOR_STD, _POINT_PRIOR_STD_M], [m, 3]) ** -2.0
+    to_prior = np.column_stack([np.repeat([1.0, 0.0], [m, 3]), unknowns])
+    prior = (to_prior.T * precision) @ to_prior
+    map_ = np.zeros((len(unknowns) + 1, unknowns.shape[1] + 1))
+    map_[0, 0], map_[1:, 1:] = 1.0, unknowns
+
+    def solve(block: int | None) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+        G = map_.T @ equations.unexplained(block) @ map_
+        H = G + prior
+        x, variance = np.linalg.solve(H[1:, 1:], H[1:, 0]), np.diag(np.linalg.inv(H[1:, 1:]))
+        inverse = np.linalg.inv(G + _TINY * prior)  # which is for what no reading says
+        with np.errstate(divide="ignore"):
+            reverse = np.where(inverse[0, 1:] * x < 0.0, -np.diag(inverse)[1:] / inverse[0, 1:], np.copysign(np.inf, x))
+        fit = np.append(1.0, -x)
+        return np.asarray(x), reverse, np.asarray(variance), float(fit @ G @ fit)
+
+    x, reverse, variance, residual = solve(None)
+    spread = np.sqrt(CORRELATED_SAMPLES * max(1.0, residual / max(equations.rows, 1)) * variance)
+    return x, reverse, spread, np.array([solve(block)[0] for block in range(TIME_BLOCKS)])

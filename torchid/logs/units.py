@@ -114,7 +114,8 @@ def split_unit(column: str) -> tuple[str, str]:
     for start in (found.start() for found in re.finditer(r"[_ .](?=[^_ .])", column)):
         text = column[start + 1 :].replace("_per_", "/")
         for unit in (text.replace("_", "/"), text.replace("_", "")):
-            if quantities_with(unit) and unit != "A":  # which is a letter as well
+            of_gyro = unit.strip() == "g" and column[:start].lower().endswith("imu")
+            if quantities_with(unit) and unit != "A" and not of_gyro:  # which are letters as well
                 return column[:start].rstrip("_ ."), unit
     return column, ""
 

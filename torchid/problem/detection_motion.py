@@ -19,7 +19,8 @@ from torchid.logs.preprocess import preprocess
 from torchid.logs.timeline import JITTER
 from torchid.problem.base_motion import BaseMotion, base_motion
 from torchid.problem.floor_pose import levelled
-from torchid.problem.samples import Samples, joint_order
+from torchid.problem.log_joints import joint_order
+from torchid.problem.samples import Samples
 from torchid.problem.standing import stand_on_feet
 from torchid.regressor.kinematics import GRAVITY_WORLD
 from torchid.robot import Robot

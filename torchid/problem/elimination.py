@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -14,7 +14,7 @@ from torchid.problem.compression import Part, column_prior, merge_factors, probl
 from torchid.problem.eliminated_terms import EliminatedTerms, SignCondition
 from torchid.problem.extras import Extra
 from torchid.problem.linear import LinearProblem
-from torchid.problem.noise_gram import NoiseShares, corrected_triangle
+from torchid.problem.noise_gram import NoiseShares, corrected_triangle, scale_columns
 from torchid.problem.rows import RowBuilder
 from torchid.robot import Robot
 from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, column_scale, is_significant
@@ -64,7 +64,8 @@ class Assembly:
     added to it. `forces`: squared norm of all measured forces, weighted. `stated`: how many of the last rows of
     both problems are no data but what is known of the parameters; `data`: the problem without them. `homogeneous`:
     whether unknown scales make up all of the measured forces, so that nothing says how large these are; `scaled_by` is
-    then the total mass [kg] that stands in for a known one, None if one is known.
+    then the total mass [kg] that stands in for a known one, None if one is known. `reading_noise`: variance of the
+    noise of readings with unknown scales, by their columns, over the one that rows were weighted with.
     """
 
     problem: LinearProblem
@@ -76,6 +77,7 @@ class Assembly:
     data: LinearProblem | None = None
     scaled_by: float | None = None
     homogeneous: bool = False
+    reading_noise: Mapping[int, float] = field(default_factory=dict)
 
     def extras_at(self, phi: Array, psi: Array | None = None) -> list[Array]:
         """Values of the eliminated unknowns, for each elimination, that fit the rows best at parameters (12 L,).
@@ -95,7 +97,13 @@ class Assembly:
 
 
 @one_thread()
-def assemble(parts: Sequence[Part], builder: RowBuilder, robot: Robot, friction: bool = True) -> Assembly:
+def assemble(
+    parts: Sequence[Part],
+    builder: RowBuilder,
+    robot: Robot,
+    friction: bool = True,
+    reading_noise: Mapping[int, float] | None = None,
+) -> Assembly:
     """Pose the linear problem in the bodies' parameters (12 L,), with all extra parameters eliminated.
 
     Orthogonal projection eliminates first the unknowns of each log, then those of all logs. It changes neither the
@@ -106,16 +114,16 @@ def assemble(parts: Sequence[Part], builder: RowBuilder, robot: Robot, friction:
         builder: of their rows, with their extra parameters.
         robot: with the nominal parameters.
         friction: whether friction is free.
+        reading_noise: as `Assembly` has it; None to leave it in the rows.
     """
     everything = merge_factors((part.factor for part in parts), builder)
-    prior = column_prior(builder, robot, friction)
+    reading_noise = reading_noise or dict.fromkeys(scale_columns(builder), 0.0)
+    prior = replace(column_prior(builder, robot, friction), reading_noise=reading_noise)
     corrected = corrected_triangle(everything, prior)
     of_all_logs, noise, held = corrected.R, corrected.noise, corrected.held
-    forces = float(np.square(of_all_logs[:, -1]).sum())
+    forces, oversampling = float(np.square(of_all_logs[:, -1]).sum()), everything.oversampling
     if not builder.extras:
-        problem = problem_from_triangle(
-            of_all_logs, everything.rows, everything.oversampling, builder, robot, friction, held
-        )
+        problem = problem_from_triangle(of_all_logs, everything.rows, oversampling, builder, robot, friction, held)
         return Assembly(problem, (), problem, noise, forces)
     count = builder.columns.count
     per_log, of_all = ([n for n, extra in enumerate(builder.extras) if extra.per_log is own] for own in (True, False))
@@ -139,15 +147,15 @@ def assemble(parts: Sequence[Part], builder: RowBuilder, robot: Robot, friction:
         elimination, rows = _eliminate("", extras, rows[:, count:-1], rest, builder, sizes)
         eliminations.append(elimination)
         rows = np.asarray(np.linalg.qr(rows, mode="r"))
-    spent = everything.oversampling * sum(elimination.inverse.shape[1] for elimination in eliminations)
+    spent = oversampling * sum(elimination.inverse.shape[1] for elimination in eliminations)
     rows_left = max(everything.rows - round(spent), 1)
     held = None if held is None else held[:count]
-    problem = problem_from_triangle(rows, rows_left, everything.oversampling, builder, robot, friction, held)
+    problem = problem_from_triangle(rows, rows_left, oversampling, builder, robot, friction, held)
     if of_all:
         problem = replace(problem, terms=_bounded_terms(eliminations[-1], robot))
     known = np.asarray(np.linalg.qr(np.delete(of_all_logs, np.s_[count:-1], axis=1), mode="r"))
-    if_known = problem_from_triangle(known, everything.rows, everything.oversampling, builder, robot, friction, None)
-    return Assembly(problem, tuple(eliminations), if_known, noise, forces)
+    if_known = problem_from_triangle(known, everything.rows, oversampling, builder, robot, friction, None)
+    return Assembly(problem, tuple(eliminations), if_known, noise, forces, reading_noise=reading_noise)
 
 
 def _bounded_terms(of_all: Elimination, robot: Robot) -> EliminatedTerms | None:

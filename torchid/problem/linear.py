@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -298,7 +299,9 @@ class TriangularFactor:
         else:
             every = tuple(range(self.columns))
             blocks = {every: self.triangle().triu()}
-            noise_gram = {every: self.whole_noise_gram()} if self.noise_gram else {}
+            noise_gram = {support: x for support, x in self.noise_gram.items() if len(support) == 1}
+            if len(noise_gram) < len(self.noise_gram):
+                noise_gram[every] = self.whole_noise_gram(dict.fromkeys(every, 0.0))
         return TriangularFactor.from_blocks(self.columns, self.rows, self.independent_rows, blocks, noise_gram)
 
     def triangle(self) -> Tensor:
@@ -311,10 +314,17 @@ class TriangularFactor:
             scattered.append(wide)
         return triangularize(torch.cat([rows.T for rows in scattered], dim=1).T)
 
-    def whole_noise_gram(self) -> Tensor:
-        """What noise adds to X^T X, (columns + 1, columns + 1), float64 on the CPU."""
+    def noise_gram_of(self, reading_noise: Mapping[int, float]) -> Mapping[tuple[int, ...], Tensor]:
+        """The noise Gram matrix with noise of readings, which have a column alone, times numbers by column."""
+        sizes = {
+            support: reading_noise.get(support[0], 1.0) if len(support) == 1 else 1.0 for support in self.noise_gram
+        }
+        return {support: sizes[support] * x for support, x in self.noise_gram.items() if sizes[support]}
+
+    def whole_noise_gram(self, reading_noise: Mapping[int, float] = MappingProxyType({})) -> Tensor:
+        """What noise adds to X^T X, (columns + 1, columns + 1), float64 on the CPU; `noise_gram_of` these numbers."""
         total = torch.zeros(self.columns + 1, self.columns + 1, dtype=torch.float64)
-        for support, x in self.noise_gram.items():
+        for support, x in self.noise_gram_of(reading_noise).items():
             at = torch.tensor([*support, self.columns])
             total[at[:, None], at] += x.to("cpu", torch.float64)
         return total

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchid.errors import LogError, join_names, warn
+from torchid.errors import LogError, UnknownNameError, join_names, warn
 from torchid.logs import Log
 from torchid.logs.log import SHAPES, FloatArray
 from torchid.logs.time_range import log_title
@@ -20,7 +20,23 @@ from torchid.robot import Loop, Robot
 from torchid.robot.constraints import LOOPS_FIELD
 from torchid.sensing import SensorSet
 
+_LISTED = 6
 _NO_TORQUE = 1e-9  # N m or N: what a simulator's log may have of a joint without a motor
+
+
+def joint_order(log: Log, robot: Robot) -> list[int]:
+    """Columns of a log's joints in the robot's order; InputError unless it has them all and else welded ones only."""
+    known = {body.joint.name for body in robot.bodies if body.joint is not None} | robot.welded.keys()
+    for name in log.joint_names:
+        if name not in known:
+            raise UnknownNameError(log.source, "joint_names", name, robot.joint_names)
+    lacking = [name for name in robot.joint_names if name not in log.joint_names]
+    if lacking:
+        found = f"{join_names(lacking, _LISTED)} of {robot.path.name} missing"
+        listed = ", ".join(lacking) if len(lacking) <= _LISTED else f"{lacking[0]}, ..."
+        accepted = f"every joint that moves, or robot.weld: [{listed}] for those that are held"
+        raise LogError(log.source, "joint_names", found, accepted + FOLLOW * bool(robot.loops))
+    return [log.joint_names.index(name) for name in robot.joint_names]
 
 
 def recorded_torques(log: Log, robot: Robot, order: list[int]) -> Tensor | None:

@@ -18,6 +18,7 @@ from torchid.parameters import Array
 
 if TYPE_CHECKING:
     from torchid.problem.samples import Samples
+    from torchid.sensing import SensorNoise
 
 _JOINTS = ("joint_position", "joint_velocity", "joint_acceleration")
 _TURNING = ("base_quat_xyzw", "base_angular_velocity_base", "base_angular_acceleration_base")
@@ -77,6 +78,23 @@ class MotionNoise:
             joint_acceleration=samples.joint_acceleration + a,
             base=moved,
         )
+
+
+def with_noise_alone(samples: Samples, noise: SensorNoise) -> Samples:
+    """Samples whose readings are noise alone, one standard deviation to one side or the other, drawn as above.
+
+    Args:
+        samples: B of one log.
+        noise: of the forces.
+    """
+    torque, wrench, time = samples.torque, samples.wrench, samples.time
+    if torque is not None:
+        std = torque.new_tensor(noise.dof_std(samples.joint_position.shape[1], torque.shape[1]))
+        torque = 0.0 * torque + std * _sides(time, len(std))
+    if wrench is not None:
+        sides = _sides(time, wrench.shape[1] * 6).unflatten(1, (-1, 6))
+        wrench = 0.0 * wrench + wrench.new_tensor(noise.wrench_std) * sides
+    return replace(samples, torque=torque, wrench=wrench)
 
 
 def bind_motion_noise(

@@ -45,8 +45,9 @@ def information_about(index: np.ndarray, information: Array, score: Array) -> tu
     """
     others = np.setdiff1d(np.arange(len(score)), index)
     known = information[np.ix_(others, others)]
-    known = known + np.diag(_HELD_OTHERS * np.diag(known) + np.finfo(float).tiny)
-    across = scipy.linalg.solve(known, information[np.ix_(others, index)], assume_a="pos").T
+    size = 1.0 / np.sqrt(np.where(np.diag(known) > 0.0, np.diag(known), 1.0))  # of base rows that are lost: 0
+    known = known * size * size[:, None] + _HELD_OTHERS * np.eye(len(others))
+    across = size * scipy.linalg.solve(known, size[:, None] * information[np.ix_(others, index)], assume_a="pos").T
     own = information[np.ix_(index, index)] - across @ information[np.ix_(others, index)]
     return own, score[index] - across @ score[others]
 

@@ -1,4 +1,4 @@
-"""What noise of the motion adds to the normal equations, and factors without it.
+"""What noise of the motion, and of readings with unknown scales, adds to the normal equations; factors without it.
 
 Noise of positions, velocities and accelerations makes a regressor larger on average: X^T X grows by the covariance of
 the noise in X, and parameters that rest on noisy columns come out too small. Samples with as much noise again show by
@@ -27,6 +27,7 @@ from torchid.problem.chunk_dynamics import Workspace
 from torchid.problem.chunks import ProgressCallback, map_chunks, one_thread
 from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import TriangularFactor, gram_matrix
+from torchid.problem.motion_noise import with_noise_alone
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples, concatenate
 from torchid.rounding import RANK_TOLERANCE, column_scale, is_significant
@@ -75,6 +76,20 @@ class NoiseShares:
         return text
 
 
+def scale_columns(builder: RowBuilder) -> list[int]:
+    """Columns of unknown scales of sensors."""
+    return [number for number, extra in enumerate(builder.extras, builder.columns.count) if extra.what == "scale"]
+
+
+def noise_of_reading(column: int, size: Tensor) -> NoiseGram:
+    """What noise of readings with an unknown scale adds, of which this is the sum of squares in the rows.
+
+    A reading is a force, and minus the column of its scale. No rows have this column alone: its size, unlike that of
+    noise of the motion, follows from a fit.
+    """
+    return {(column,): size * size.new_tensor([[1.0, -1.0], [-1.0, 1.0]])}
+
+
 def estimate_noise_gram(
     pieces: Sequence[Samples],
     builder: RowBuilder,
@@ -89,10 +104,11 @@ def estimate_noise_gram(
         key: which rows belong together.
         progress: called with 0 where some of the samples of a piece have been taken.
     """
+    scaled = bool(scale_columns(builder))
     step = ranks.as_first(max(1, sum(map(len, pieces)) // _PERTURBED), "samples with noise")
     by_log: dict[str, list[Samples]] = {}
     for piece in pieces:
-        if piece.motion_noise is not None and len(piece):
+        if (scaled or piece.motion_noise is not None) and len(piece):
             by_log.setdefault(piece.source, []).append(piece)
     logs = [concatenate([_spread(piece, step, progress) for piece in of_log]) for of_log in by_log.values()]
     total: dict[Key, NoiseGram] = {}
@@ -143,26 +159,39 @@ def _noise_gram_of_chunks(
 ) -> dict[_Place, NoiseGram]:
     """By log, number of the piece and contact state: half of what pairs of samples with noise have more."""
     out: dict[_Place, NoiseGram] = {}
-    workspace = Workspace()
+    workspace, scales = Workspace(), scale_columns(builder)
     for samples, state in chunks:
         noise, count, own = samples.motion_noise, len(samples), pieces[samples.source]
-        if noise is None:
-            continue
         starts = torch.stack([piece.time[0] for piece in own]).to(samples.time)
         of_piece = torch.searchsorted(starts, samples.time.contiguous(), right=True)
         ends = torch.bincount(of_piece - 1, minlength=len(own)).cumsum(0).tolist()
         spans = [(number, start, end) for number, (start, end) in enumerate(pairwise([0, *ends])) if end > start]
+        for rows, index in (
+            builder.blocks(with_noise_alone(samples, builder.sensors.noise), state, workspace) if scales else ()
+        ):
+            for number, start, end in spans:
+                sums, (first, last) = out.setdefault((samples.source, number, state), {}), _span(index, start, end)
+                for column in set(scales) & set(rows.block.support):
+                    of_column = rows.values[rows.block.support.index(column), :, first:last]
+                    _add(sums, noise_of_reading(column, of_column.square().sum()), 1.0)
+        if noise is None:
+            continue
         side = torch.tensor([0.0, 1.0, -1.0]).to(samples.time).repeat_interleave(count)
         perturbed = noise.perturbed(samples[torch.arange(count, device=samples.time.device).repeat(3)], side[:, None])
         for rows, index in builder.blocks(perturbed, state, workspace):
             for number, start, end in spans:
                 sums = out.setdefault((samples.source, number, state), {})
                 for copy, weight in enumerate((-1.0, 0.5, 0.5)):
-                    first, last = (copy * count + x for x in (start, end))
-                    if isinstance(index, Tensor):  # of samples whose contacts have one rank
-                        first, last = torch.searchsorted(index, torch.tensor([first, last]).to(index)).tolist()
+                    first, last = _span(index, copy * count + start, copy * count + end)
                     _add(sums, {rows.block.support: gram_matrix(rows.values[:, :, first:last].flatten(1))}, weight)
     return out
+
+
+def _span(index: Tensor | slice, start: int, end: int) -> tuple[int, int]:
+    """Which of the samples of a block, all or some of those of a chunk, lie between two of the chunk."""
+    if isinstance(index, Tensor):  # of samples whose contacts have one rank
+        start, end = torch.searchsorted(index, torch.tensor([start, end]).to(index)).tolist()
+    return start, end
 
 
 @dataclass(frozen=True)
@@ -172,10 +201,12 @@ class ColumnPrior:
     Attributes:
         nominal: (count,).
         spread: (count, P), deviations from them for each of P independent ones of unit variance.
+        reading_noise: as `Assembly` has it.
     """
 
     nominal: Array
     spread: Array
+    reading_noise: Mapping[int, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -209,10 +240,10 @@ def corrected_triangle(factor: TriangularFactor, prior: ColumnPrior) -> Correcte
         factor: of some rows.
         prior: of the parameters in its columns.
     """
-    R = factor.triangle().numpy()
-    if not factor.noise_gram:
+    R, noise_gram = factor.triangle().numpy(), factor.whole_noise_gram(prior.reading_noise).numpy()
+    if not noise_gram.any():
         return CorrectedTriangle(R)
-    rows, rhs, noise_gram = R[:, :-1], R[:, -1], factor.whole_noise_gram().numpy()
+    rows, rhs = R[:, :-1], R[:, -1]
     size, scale = np.linalg.norm(rows, axis=0), column_scale(rows)
     U, values, Vh = np.linalg.svd(rows * scale, full_matrices=False)
     kept = is_significant(values, _RESOLVED)
@@ -230,12 +261,16 @@ def corrected_triangle(factor: TriangularFactor, prior: ColumnPrior) -> Correcte
     residual = np.square(rhs - U[:, kept] @ (turn @ along) - U[:, other] @ rest).sum()
     possible = min(residual / ((1.0 - spent) * of_noise), 1.0) if spent < 1.0 and of_noise > 0.0 else 1.0
     shares, of_forces = possible * shares, possible * of_forces
+    scales = [column for column, size in prior.reading_noise.items() if size > 0.0]
+    of_readings = noise_gram[scales, scales] @ np.square((whitening @ turn)[scales])
+    bound, lacking = _bound_of_readings(shares, possible * of_readings)
+    shares, of_forces = bound * shares, bound * of_forces
     if np.abs(shares).max(initial=0.0) < _NEGLIGIBLE:
         return CorrectedTriangle(R, NoiseShares.of(shares))
     left = np.clip(1.0 - shares, LEAST_SIGNAL, _MOST_SIGNAL)
     combinations = turn.T @ (values[kept, None] * Vh[kept] * size)
     target = along - of_forces
-    remaining = np.where(shares > 1.0 - LEAST_SIGNAL, left - np.maximum(1.0 - shares, 0.0), 0.0)
+    remaining = ((shares > 1.0 - LEAST_SIGNAL) & (bound == 1.0)) * (left - np.maximum(1.0 - shares, 0.0))
     target += remaining * (combinations[:, : len(prior.nominal)] @ prior.nominal)
     best = whitening @ (turn @ (target / left))
     residual = np.linalg.norm(rhs - rows @ best - U[:, other] @ rest)
@@ -245,9 +280,20 @@ def corrected_triangle(factor: TriangularFactor, prior: ColumnPrior) -> Correcte
         np.append(np.zeros_like(size), residual)[None],
         np.zeros((len(R) - 1 - len(target) - len(rest), R.shape[1])),
     ]
-    noise, triangle = NoiseShares.of(shares), np.asarray(np.linalg.qr(np.concatenate(stacked), mode="r"))
+    noise, triangle = NoiseShares.of(shares + lacking), np.asarray(np.linalg.qr(np.concatenate(stacked), mode="r"))
     if not noise.lost:
         return CorrectedTriangle(triangle, noise)
-    held, count = (remaining / left)[:, None] * combinations, len(prior.nominal)
-    units = np.hstack([held[:, :count] @ prior.spread, held[:, count:] * best[count:]])
+    deviations = np.where(np.isin(range(len(best)), scales), np.maximum(np.abs(1.0 + best), 1.0), best)
+    held, count = ((remaining + lacking) / left)[:, None] * combinations, len(prior.nominal)
+    units = np.hstack([held[:, :count] @ prior.spread, held[:, count:] * deviations[count:]])
     return CorrectedTriangle(triangle, noise, whitening @ turn @ units)
+
+
+def _bound_of_readings(shares: Array, of_readings: Array) -> tuple[Array, Array]:
+    """Factors of shares of noise, mostly that of readings, beyond what is taken off, and how much is left in for that.
+
+    Noise of readings draws their scales towards 0, not to the nominal 1 that makes up for other noise.
+    """
+    most = np.minimum((1.0 - LEAST_SIGNAL) / np.maximum(shares, 0.5), 1.0)
+    bound = np.where(of_readings > 0.5 * shares, most, 1.0)
+    return bound, np.minimum(shares, 1.0) - np.minimum(bound * shares, 1.0)

@@ -18,6 +18,7 @@ from torchid.problem.chunks import chunks_by_state, one_thread
 from torchid.problem.compression import Part
 from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import TriangularFactor
+from torchid.problem.noise_gram import noise_of_reading
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.regressor.kinematics import joint_motion
@@ -90,6 +91,7 @@ class SampledRows:
         self._std = torch.from_numpy(self.reference_std[self.group_of])
         n_rows = builder.tree.n_rows
         most = min(_SAMPLES, _BYTES // (8 * max(n_rows, 1) * (builder.width + 1 + len(names))))
+        self._scaled = _sources_of_scales(builder)
         self._drawn = max(most, 1), chunk
         self.chunks = [self._chunk(part, state) for part, state in _random_chunks(logs, *self._drawn)]
         elsewhere = any(isinstance(log, LogElsewhere) for log in logs)
@@ -177,14 +179,30 @@ class SampledRows:
             part = parts.setdefault(key, Part(*key, TriangularFactor(self.builder.width), 0))
             part.samples += len(chunk.rows)
             rows, present = chunk.rows, chunk.sources.abs().sum(1) > 0.0
+            readings = chunk.sources.square().sum(2)
             if columns is not None:
                 size = torch.linalg.vector_norm(rows[..., :-1] @ columns[chunk.log] - rows[..., -1], dim=1)
                 limit = _radius(present.sum(1))
-                rows = rows * (limit / size).clamp_max(1.0).sqrt()[:, None, None]
+                weight = (limit / size).clamp_max(1.0)
+                rows, readings = rows * weight.sqrt()[:, None, None], readings * weight[:, None]
             for support, slots in _supports(rows).items():
                 own = rows[:, torch.tensor(slots)[:, None], torch.tensor([*support, self.builder.width])]
                 part.factor.add(support, own[present[:, slots]], chunk.oversampling)
+            for column, sources in self._scaled.items():
+                part.factor.add_noise_gram(noise_of_reading(column, readings[:, sources].sum()))
         return list(parts.values())
+
+
+def _sources_of_scales(builder: RowBuilder) -> dict[int, list[int]]:
+    """Numbers of the sources of noise of readings with an unknown scale, by its column."""
+    base, torque = builder.tree.base_rows, np.asarray(builder.sensors.torque)
+    components = measured_components(builder.contacts, builder.sensors)
+    dofs, places = base + np.cumsum(torque) - 1, base + torque.sum() + np.cumsum(components).reshape(-1, 6) - 1
+    return {
+        column: [*(int(dofs[dof]) for dof in extra.dofs), *(int(places[at]) for at in extra.contacts if components[at])]
+        for column, extra in enumerate(builder.extras, builder.columns.count)
+        if extra.what == "scale"
+    }
 
 
 def _supports(rows: Tensor) -> dict[tuple[int, ...], list[int]]:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchid.errors import LogError, UnknownNameError, about_file, join_names
+from torchid.errors import LogError, about_file
 from torchid.logs import Log
 from torchid.logs.lazy_arrays import MappedPages
 from torchid.logs.log import FORCE_NORMAL, FloatArray, normalize_normals
@@ -19,7 +19,7 @@ from torchid.logs.preprocess import unloaded_readings
 from torchid.parameters import WRENCH_COMPONENTS, Array
 from torchid.problem import log_joints
 from torchid.problem.base_motion import BaseMotion, base_motion, imu_pose, position_for_moments
-from torchid.problem.log_joints import FOLLOW, columns_in_order, recorded_torques
+from torchid.problem.log_joints import columns_in_order, joint_order, recorded_torques
 from torchid.problem.motion_noise import MotionNoise, bind_motion_noise
 from torchid.regressor import Motion
 from torchid.regressor.kinematics import GRAVITY_WORLD, rotation_matrix
@@ -28,7 +28,6 @@ from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
 from torchid.sensing.sensors import NORMAL_FORCE, NORMAL_INDEX, recorded_components
 
-_LISTED = 6
 _AS_MEASURED = "numbers throughout, as of a sensor that is there, or sensors without it"
 _FAR_APART = 8  # samples per chosen one, beyond which a page holds few of these
 _JOINT_FIELDS = ("joint_position", "joint_velocity", "joint_acceleration")
@@ -323,21 +322,6 @@ def _joints(log: Log, name: str, order: list[int]) -> Tensor:
     if values is None:
         raise LogError(log.source, name, "missing", "the field, or a log passed through preprocess()")
     return torch.from_numpy(columns_in_order(values, order))
-
-
-def joint_order(log: Log, robot: Robot) -> list[int]:
-    """Columns of a log's joints in the robot's order; InputError unless it has them all and else welded ones only."""
-    known = {body.joint.name for body in robot.bodies if body.joint is not None} | robot.welded.keys()
-    for name in log.joint_names:
-        if name not in known:
-            raise UnknownNameError(log.source, "joint_names", name, robot.joint_names)
-    lacking = [name for name in robot.joint_names if name not in log.joint_names]
-    if lacking:
-        found = f"{join_names(lacking, _LISTED)} of {robot.path.name} missing"
-        listed = ", ".join(lacking) if len(lacking) <= _LISTED else f"{lacking[0]}, ..."
-        accepted = f"every joint that moves, or robot.weld: [{listed}] for those that are held"
-        raise LogError(log.source, "joint_names", found, accepted + FOLLOW * bool(robot.loops))
-    return [log.joint_names.index(name) for name in robot.joint_names]
 
 
 def _contacts(log: Log, robot: Robot, contacts: Sequence[Contact]) -> tuple[list[int], np.ndarray]:

@@ -26,7 +26,7 @@ from torchid.problem.floor_pose import (
     points_of,
     split_at_lost_feet,
 )
-from torchid.problem.samples import joint_order
+from torchid.problem.log_joints import joint_order
 from torchid.robot import Robot
 from torchid.sensing import Contact
 from torchid.sensing.sensors import UP

@@ -31,7 +31,7 @@ from torchid.proposals.column_groups import Family
 from torchid.proposals.file_samples import FileSample, increases, listed_order, side_by_side, stated_names
 from torchid.proposals.numbers import point_along_z
 
-FORCE = re.compile(r"force|(?<![a-z])f\{axis", re.IGNORECASE)
+FORCE = re.compile(r"force|kraft|fuerza|(?<![a-z])f\{axis", re.IGNORECASE)
 MOMENT = re.compile(r"moment|torque|(?<![a-z])[mt]\{axis", re.IGNORECASE)
 """In patterns of columns."""
 
