@@ -3,9 +3,9 @@
     python scripts/make_demo.py
 
 Needs the package pin (extra `[oracle]`). The true robot is not the URDF's: mass, centre of mass and inertia of every
-body are off by up to 30 %, joints have friction, and the recorded signals are noisy. Feet hold on to the ground: in
-7 to 8 % of the samples the trunk is outside of the feet that stand, so that no forces that only push would do; they
-pull by up to 86 N.
+body are off by up to 30 %, joints have friction, and the recorded signals are noisy. The trunk leans away from each
+foot before it lifts, so that in all samples every foot that is loaded pushes, within a friction cone of coefficient
+0.6; a motion in which one would pull or slip is refused.
 """
 
 from __future__ import annotations
@@ -23,6 +23,10 @@ RATE_HZ = 100.0
 TORQUE_NOISE, FORCE_NOISE, ANGLE_NOISE, POSITION_NOISE = 0.1, 0.5, 2e-5, 1e-5  # N m, N, rad, m
 STEP_S, LIFT_M, UNLOADED = 1.6, 0.06, 0.3  # a foot is unloaded at 30 % of its lift
 COULOMB, VISCOUS = 0.3, 0.05  # N m, N m s/rad
+GROUND_FRICTION = 0.6  # tangential over normal force of a foot, at most
+HEADING = Rotation.from_euler("z", 0.4)
+STANCE = np.array([[x, y, 0.0] for x in (0.25, -0.25) for y in (0.18, -0.18)])  # feet, from below the trunk [m]
+LEAN_M = np.array([0.065, 0.06, 0.0])  # of the trunk, away from the foot that lifts
 
 
 def _link(name: str, mass: float, com: tuple[float, ...], box: tuple[float, ...]) -> str:
@@ -66,25 +70,26 @@ def quadruped_urdf() -> str:
 
 
 def base_motion(time: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, Rotation]:
-    """Smooth sway of the trunk: position (N, 3) and orientation."""
+    """Smooth sway of the trunk, and its lean away from the foot that lifts: position (N, 3) and orientation."""
 
     def sway(size: float) -> np.ndarray:
         rates, phases = rng.uniform(0.3, 1.6, 3), rng.uniform(0.0, 2.0 * np.pi, 3)
         return size * np.sin(2.0 * np.pi * time[:, None] * rates + phases).sum(1)
 
-    position = np.stack([sway(0.012), sway(0.012), 0.36 + sway(0.015)], axis=1)
+    position = np.stack([sway(0.01), sway(0.01), 0.32 + sway(0.018)], axis=1)
+    position -= turns(time, share=1.0) @ HEADING.apply(LEAN_M * np.sign(STANCE))
     return position, Rotation.from_rotvec(np.stack([sway(0.05), sway(0.07), 0.4 + sway(0.07)], axis=1))
 
 
-def lift(time: np.ndarray) -> np.ndarray:
-    """Height of each foot above the ground, (N, 4) from 0 to 1; one foot at a time, with pauses."""
+def turns(time: np.ndarray, share: float) -> np.ndarray:
+    """Each foot's turn, one after the other, (N, 4): from 0 to 1 and back in the middle share of its step."""
     phase = time / STEP_S
-    height = np.zeros((len(time), len(LEGS)))
+    turn = np.zeros((len(time), len(LEGS)))
     for leg in range(len(LEGS)):
         local = np.where(np.floor(phase).astype(int) % len(LEGS) == leg, phase % 1.0, 0.0)
-        swing = np.clip((local - 0.25) / 0.5, 0.0, 1.0)
-        height[:, leg] = (np.sin(np.pi * swing) ** 4) * (swing > 0.0)
-    return height
+        swing = np.clip((local - 0.5) / share + 0.5, 0.0, 1.0)
+        turn[:, leg] = (np.sin(np.pi * swing) ** 4) * (swing > 0.0)
+    return turn
 
 
 def leg_angles(model: pin.Model, base: np.ndarray, feet: np.ndarray) -> np.ndarray:
@@ -120,7 +125,11 @@ def perturbed(model: pin.Model, rng: np.random.Generator) -> pin.Model:
 def forces(
     model: pin.Model, q: np.ndarray, v: np.ndarray, a: np.ndarray, load: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Joint torques (12,) and foot forces in the feet's axes (4, 3); feet share the load in proportion to `load`."""
+    """Joint torques (12,) and foot forces in the feet's axes (4, 3); feet share the load in proportion to `load`.
+
+    Raises:
+        ValueError: a foot would pull or slip.
+    """
     data = model.createData()
     generalized = pin.rnea(model, data, q, v, a)
     frames = [model.getFrameId(f"{leg}_foot", pin.FrameType.BODY) for leg in LEGS]
@@ -128,6 +137,11 @@ def forces(
     share = np.repeat(load, 3)
     J_base = J[:, :6].T
     force = share * (J_base.T @ np.linalg.solve((J_base * share) @ J_base.T, generalized[:6]))
+    pin.framesForwardKinematics(model, data, q)
+    for leg, frame, local in zip(LEGS, frames, force.reshape(-1, 3), strict=True):
+        *along, normal = data.oMf[frame].rotation @ local
+        if np.hypot(*along) > GROUND_FRICTION * normal:
+            raise ValueError(f"{leg}: {normal:.3g} N on the ground, {np.hypot(*along):.3g} N along it")
     friction = COULOMB * np.sign(v[6:]) + VISCOUS * v[6:]
     return generalized[6:] + friction - J[:, 6:].T @ force, force.reshape(-1, 3)
 
@@ -136,9 +150,8 @@ def record(model: pin.Model, true: pin.Model, seconds: float, rng: np.random.Gen
     """Simulate one log and save it."""
     time = np.arange(0.0, seconds, 1.0 / RATE_HZ)
     position, rotation = base_motion(time, rng)
-    height = lift(time)
-    stance = np.array([[x, y, 0.0] for x in (0.24, -0.2) for y in (0.17, -0.17)])
-    feet = Rotation.from_euler("z", 0.4).apply(stance)[None] + LIFT_M * height[..., None] * np.array([0.0, 0.0, 1.0])
+    height = turns(time, share=0.5)
+    feet = HEADING.apply(STANCE)[None] + LIFT_M * height[..., None] * np.array([0.0, 0.0, 1.0])
     angles = leg_angles(model, np.hstack([position, rotation.as_quat()]), feet)
 
     spline = make_interp_spline(time, np.hstack([position, rotation.as_rotvec(), angles]), k=5)

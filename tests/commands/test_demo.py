@@ -8,10 +8,15 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 from refusals import refusal
 from repository import CONFIGS, DEMO, ROOT
+from scipy.spatial.transform import Rotation
+from script_calls import script
 
+import torchid
 from torchid.cli import main
 from torchid.config import inputs_of, load_analysis, load_config, load_simulation
 
@@ -78,3 +83,31 @@ def test_copied_examples_find_their_robots_and_logs_and_replace_nothing(
     assert {run.robot.urdf for run in runs} == {simulation.output / "nominal.urdf"}
     assert "--copy: exists" in refusal(["demo", "--copy", "examples"], tmp_path, capsys)
     assert "--copy FOLDER alone" in refusal(["demo", "--copy", "more", "estimator.ridge=1"], tmp_path, capsys)
+
+
+@pytest.mark.parametrize("name", ["sway_train", "sway_test"])
+def test_every_foot_pushes_within_its_friction_cone_in_all_samples(name: str) -> None:
+    """As recorded: with up to four standard deviations of the noise of the force that counts."""
+    maker, robot = script("make_demo"), torchid.load_robot(DEMO / "quadruped.urdf")
+    log = torchid.read_log(DEMO / f"{name}.npz")
+    orientation = Rotation.from_quat(log.base_quat_xyzw)
+    q = torch.from_numpy(np.hstack([log.base_position_world, log.base_quat_xyzw, log.joint_position]))
+    assert log.joint_names == robot.joint_names
+    for k, foot in enumerate(log.contact_names):
+        J = torchid.FrameJacobian(robot, foot)(q)[:, :3, :3].numpy()  # its transpose turns to the base's axes
+        force = orientation.apply(np.einsum("bij,bi->bj", J, log.contact_wrench_local[:, k, :3]))
+        normal, along = force[:, 2], np.hypot(*force[:, :2].T)
+        noise = maker.FORCE_NOISE * np.hypot(1.0, maker.GROUND_FRICTION)
+        assert np.all(along - maker.GROUND_FRICTION * normal < 4.0 * noise)
+        assert np.all(normal > -4.0 * maker.FORCE_NOISE)
+        assert not force[~log.contact_active[:, k]].any()
+        assert np.median(normal) > 40.0
+
+
+def test_a_motion_in_which_a_foot_would_pull_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    maker = script("make_demo")
+    monkeypatch.setattr(maker, "FOLDER", tmp_path)
+    monkeypatch.setattr(maker, "LEAN_M", np.zeros(3))
+    with pytest.raises(ValueError, match=r": .* N on the ground, .* N along it"):
+        maker.main()
+    assert not list(tmp_path.glob("*.npz"))

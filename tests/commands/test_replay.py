@@ -155,7 +155,7 @@ def test_a_run_with_welds_is_replayed_with_the_joint_held(tmp_path: Path) -> Non
         of_joints = {name: log[name][:, kept] for name in ("joint_position", "joint_torque")}
         np.savez(path, **(log | of_joints | {"joint_names": log["joint_names"][kept]}))
     weld = [
-        "robot.weld={rear_right_knee: -1.4}",
+        "robot.weld={rear_right_knee: -1.65}",  # its mean angle in these samples
         "estimator={name: consistent, ridge: 0.001}",
         "sensors.on_base_lost=warn",
         f"output={tmp_path / 'run'}",

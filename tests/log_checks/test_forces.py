@@ -296,7 +296,7 @@ def test_rows_are_laid_out_anew_where_other_torques_are_known() -> None:
 
 
 def test_a_unit_that_leaves_a_third_of_the_misfit_may_be_another_robot() -> None:
-    checked = of_demo(scaled(demo_log().select(slice(0, 600)), "joint_torque", 1.25 / 9.81))
+    checked = of_demo(scaled(demo_log().select(slice(0, 600)), "joint_torque", 1.3 / 9.81))
     explained = only(checked, EXPLAINED)
     assert explained.found.startswith("in kgm")
     assert explained.advice.endswith("; or is quadruped.urdf another robot's?")

@@ -39,7 +39,7 @@ def consistent(tmp_path_factory: pytest.TempPathFactory) -> Identification:
 
 @pytest.fixture(scope="module")
 def free(tmp_path_factory: pytest.TempPathFactory) -> Identification:
-    closest = "estimator={name: least_squares, ridge: 0.001, friction: false}"
+    closest = "estimator={name: least_squares, ridge: 0.01, friction: false}"
     with pytest.warns(match="identified.urdf"):
         return run_demo(tmp_path_factory.mktemp("free"), "logs.test=[]", closest)
 

@@ -39,7 +39,7 @@ def experiment(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder.mkdir()
     shutil.copy(DEMO / "quadruped.urdf", folder)
     for name, log, part in (
-        ("train", "sway_train", slice(0, 240)),
+        ("train", "sway_train", slice(0, 296)),
         ("held_out", "sway_train", slice(700, 800)),
         ("test", "sway_test", slice(0, 100)),
     ):
