@@ -45,8 +45,9 @@ def test_error_of_the_file_is_found_whatever_the_friction(width: float) -> None:
 
 
 def test_large_errors_are_said_in_whole_percents() -> None:
-    assert "by 1012 %, 51 times what the prior says" in str(NominalError(10.12, 0.2, 3, 99.0))
-    assert "by 42 %, 2.1 times what the prior says" in str(NominalError(0.42, 0.2, 3, 99.0))
+    far, near = NominalError(10.12, 0.2, 3, 99.0), NominalError(0.42, 0.2, 3, 99.0)
+    assert "by 1012 % where the data determine them, 51 times the 20 % of the prior" in str(far)
+    assert "by 42 % where the data determine them, 2.1 times the 20 % of the prior" in str(near)
 
 
 def test_prior_of_the_right_width_is_seldom_called_narrow() -> None:

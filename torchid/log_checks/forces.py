@@ -133,7 +133,7 @@ def _misfit_findings(
     scale = None if moved else _fit_time_scale(log, robot, contacts)
     if found := moved or [one for one in [_time_scale_finding(scale)] if one is not None]:
         alike = None if moved else fit_torque_gains(samples, robot, contacts)
-        yield from (alike and list(_common_gain_findings(alike))) or found
+        yield from (alike and list(_common_gain_findings(alike, robot))) or found
         return
     unexplained = unexplained if scale is None else min(unexplained, scale.recorded)
     if fit.misfit > MAX_MISFIT and unexplained > MAX_UNEXPLAINED_RATIO:
@@ -292,7 +292,7 @@ def _gain_and_point_findings(log: Log, fit: TorqueGains | None, robot: Robot) ->
         return
     m = len(fit.joints)
     spread, blocks = fit.spread[:m], fit.blocks[:, :m]
-    yield from _common_gain_findings(fit)
+    yield from _common_gain_findings(fit, robot)
     of = _reference_joints(fit)
     reference, of_reverse = (float(np.median(x[of])) if of.any() else 1.0 for x in (fit.gain, fit.reverse))
     relative = fit.gain / reference
@@ -335,7 +335,7 @@ def _known_and_right_joints(fit: TorqueGains) -> tuple[BoolArray, BoolArray]:
     return known, known & ~is_off & ~_is_beyond(fit.reverse, fit.reverse, MIN_COMMON_GAIN_RATIO)
 
 
-def _common_gain_findings(of_joints: TorqueGains) -> Iterator[Finding]:
+def _common_gain_findings(of_joints: TorqueGains, robot: Robot) -> Iterator[Finding]:
     """A finding about all torques times a common factor."""
     fit = of_joints.common
     if fit is None or _known_and_right_joints(of_joints)[1].any() or not _agree(fit.gain, fit.reverse):
@@ -344,10 +344,10 @@ def _common_gain_findings(of_joints: TorqueGains) -> Iterator[Finding]:
         return
     value, agreeing = np.array([fit.gain - 1.0]), fit.blocks[:, None] - 1.0
     if _is_certain(value, np.array([fit.spread]), agreeing, MIN_COMMON_BLOCK_SHARE).all():
-        text = f"all torques: the factor that fits the URDF best is {fit.gain:.3g} +- {fit.spread:.2g}"
+        text = f"all torques: the factor that fits the {robot.format} best is {fit.gain:.3g} +- {fit.spread:.2g}"
         advice = (
-            "check units, gear ratios and torque constants, whether the URDF's masses and contact forces are right, or "
-            "set sensors.scales: {joint_torque: all}"
+            f"check units, gear ratios and torque constants, whether the {robot.format}'s masses and contact forces "
+            "are right, or set sensors.scales: {joint_torque: all}"
         )
         yield Finding("scale", SUSPICIOUS, "joint_torque", text, advice)
 
