@@ -109,8 +109,8 @@ def test_the_figures_of_an_estimate_are_those_of_its_parameters(
 
 
 def test_penalties_pull_nearly_as_near_and_nearly_into_what_can_exist() -> None:
-    """1.0049 was found, and eigenvalues down to -1e-5."""
-    estimate, _ = trained(demo(), consistency="penalties", epochs=30, optimizer={"name": "Adam", "lr": 0.1})
+    """1.015 was found (1.021 after 30 epochs, 1.011 after 60), and eigenvalues down to 2e-5."""
+    estimate, _ = trained(demo(), consistency="penalties", epochs=45, optimizer={"name": "Adam", "lr": 0.1})
     assert ratio(estimate) <= 1.02
     assert np.nanmin(estimate.eigenvalues) > -1e-3
     assert estimate.phi.reshape(-1, 12)[1:, 10:].min() > -1e-3
