@@ -88,7 +88,7 @@ def test_neither_friction_nor_armature_larger_than_a_load_is_taken_for_another_s
     force = a * [2.0 + armature, 1.1] + [0.0, 1.1 * GRAVITY] + [0.0, 15.0] * np.sign(v) + 0.1 * rng.normal(size=v.shape)
     log = Log("stage.npz", time, robot.joint_names, size * np.sin(phase), joint_torque=force)
     samples = bind_some_samples(preprocess_pieces(log, 10.0), robot, (), 240)
-    gains = value(scales.fit_torque_gains(samples, robot, ()))
+    gains = value(scales.fit_torque_gains(samples, NominalModel(robot, ())))
     assert abs(gains.gain[1] - 1.0 / 1.1) < gains.spread[1]  # 2.3 times that, if friction is taken for small
     if armature:
         assert gains.gain[0] < 1.0 / 1.3 < 1.3 < gains.reverse[0]  # mass or armature: any factor

@@ -77,7 +77,8 @@ class TrainingLogs:
             with suppress(InputError):  # larger than memory
                 for log, name in segments_to_check(path, files, settings):
                     flagged, _ = settle_contacts(log, own)
-                    checked = check(flagged, own.robot, scene.contacts, settings.filter_hz, settings.derived)
+                    rest = scene.contacts, settings.filter_hz, settings.derived, scene.declared
+                    checked = check(flagged, own.robot, *rest)
                     severe = [one for one in checked.findings if one.severity in SEVERITIES[:2]]
                     large = [one for one in severe if one.mask(len(checked.log)).mean() > _PART]
                     yield from ((name, one) for one in large)
