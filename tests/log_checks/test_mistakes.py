@@ -32,6 +32,7 @@ UPRIGHT = (
     "time x 2",
     "time in minutes",
     "one torque x 1.3",
+    "torques of limbs exchanged",
 )
 
 

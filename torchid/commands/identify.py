@@ -263,7 +263,7 @@ def _identify(
     )
     logs.clear()  # checks of a log and figures need room, too
     ready.blocks = blocks = []
-    require_not_worse(run.worse, checked)
+    require_not_worse(run.worse, run.metrics["train"].identified, checked)
     return run, solved.training, begun
 
 

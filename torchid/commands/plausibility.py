@@ -24,7 +24,7 @@ from torchid.errors import (
 from torchid.estimators import LeastSquares, SgdEstimate
 from torchid.fitting.experiment import Scene
 from torchid.fitting.fit import Fit
-from torchid.fitting.misfit import beyond_models
+from torchid.fitting.misfit import beyond_models, unexplained_torques
 from torchid.identifiability.confounding import ExtraEstimate, TotalMass, estimate_extras, total_mass
 from torchid.log_checks import Finding
 from torchid.log_checks.check import check
@@ -32,7 +32,7 @@ from torchid.log_checks.findings import SEVERITIES
 from torchid.parameters import GRAVITY, PARAMETERS, PER_BODY, Array
 from torchid.problem import LinearProblem
 from torchid.problem.chunks import one_thread
-from torchid.problem.metrics import ADVICE, WorseThanNominal, describe_worse
+from torchid.problem.metrics import ADVICE, Metrics, WorseThanNominal, describe_worse
 from torchid.robot import Robot
 from torchid.rounding import is_significant
 
@@ -155,8 +155,13 @@ def _require_scales(by_data: Sequence[ExtraEstimate], has_contacts: bool) -> Non
         raise ImplausibleFitError.at_field("sensors.scales", found, accepted)
 
 
-def require_not_worse(worse: list[WorseThanNominal], logs: TrainingLogs) -> None:
-    """Refuse a fit that predicts worse than the URDF if the checks reject a training log; else warn.
+def require_not_worse(worse: list[WorseThanNominal], fitted: Metrics, logs: TrainingLogs) -> None:
+    """Refuse a fit that predicts worse than the URDF, or leaves most of the torques, if the checks reject a log.
+
+    Args:
+        worse: groups of rows that the URDF predicts better.
+        fitted: errors of the fit on the training logs.
+        logs: these.
 
     Raises:
         ImplausibleFitError: the parameters of a log that is not usable.
@@ -164,15 +169,18 @@ def require_not_worse(worse: list[WorseThanNominal], logs: TrainingLogs) -> None
     Warns:
         NumericalWarning: the URDF's parameters predict better, for whatever reason.
     """
-    if not worse:
+    message, unexplained = describe_worse(worse, logs.scene.robot.format), unexplained_torques(fitted)
+    if message is None and not unexplained:
         return
-    message, advice = describe_worse(worse, logs.scene.robot.format), ADVICE
     log, finding = logs.finding or (None, None)
-    if finding is not None:
-        message, advice = f"{message}; torchid check finds in {log}: {finding.field}: {finding.found}", finding.advice
-        if finding.rejects_all:
-            raise ImplausibleFitError.at_field("logs", message, advice)
-    warn_about_file(f"{message}; {advice}", NumericalWarning)
+    if finding is not None and finding.rejects_all:
+        found = f"{message or unexplained}; torchid check finds in {log}: {finding.field}"
+        raise ImplausibleFitError.at_field("logs", f"{found}: {finding.found}", finding.advice)
+    if message is not None and finding is not None:
+        found = f"{message}; torchid check finds in {log}: {finding.field}: {finding.found}"
+        warn_about_file(f"{found}; {finding.advice}", NumericalWarning)
+    elif message is not None:
+        warn_about_file(f"{message}; {ADVICE}", NumericalWarning)
 
 
 def implausibility(problem: LinearProblem, phi: Array, mass: TotalMass, robot: Robot) -> str | None:

@@ -124,12 +124,12 @@ def _misfit_findings(
 ) -> Iterator[Finding | Skipped]:
     """The mistake that explains forces unlike the URDF's, or single deviations of forces that are like them."""
     fit, explanation, robot = model.compare(samples), None, model.robot
-    if fit.misfit > MAX_MISFIT and (bare := _without_friction(robot)) is not None:
+    if fit.largest_misfit > MAX_MISFIT and (bare := _without_friction(robot)) is not None:
         without = replace(model, robot=bare)
-        if (better := without.compare(samples)).misfit <= MAX_MISFIT:
+        if (better := without.compare(samples)).largest_misfit <= MAX_MISFIT:
             yield _friction_finding(robot, fit, better)
             robot, model, fit = bare, without, better
-    if fit.misfit > MAX_MISFIT:
+    if fit.largest_misfit > MAX_MISFIT:
         explanation = _best_mistake(log, model, cutoff, fit, derived)
     if explanation is not None:
         yield explanation
@@ -144,7 +144,7 @@ def _misfit_findings(
         yield from (alike and list(_common_gain_findings(alike, robot))) or found
         return
     unexplained = unexplained if scale is None else min(unexplained, scale.recorded)
-    if fit.misfit > MAX_MISFIT and unexplained > MAX_UNEXPLAINED_RATIO:
+    if fit.largest_misfit > MAX_MISFIT and unexplained > MAX_UNEXPLAINED_RATIO:
         held = bool(model.contacts) or robot.fixed_base
         gains = fit_torque_gains(samples, model) if held else None
         yield from list(_gain_and_point_findings(log, gains, robot)) or [_contradiction(fit, robot, held)]
@@ -158,7 +158,7 @@ def _misfit_findings(
 
 def _contradiction(fit: ModelFit, robot: Robot, held: bool) -> Finding:
     """A finding about forces that no usual mistake explains; `held`: whether anything is known to hold the robot."""
-    text = f"measured forces differ from the {robot.format}'s by {_percent(fit.misfit)}"
+    text = f"measured forces differ from the {robot.format}'s by {_percent(fit.largest_misfit)}"
     text += ", and no usual mistake explains it"
     advice = f"check units, frames, the order of joints and contacts, friction, the {robot.format}'s base link and"
     advice += f" masses, and whether the {robot.format} is that of this robot"
@@ -193,8 +193,8 @@ def _friction_finding(robot: Robot, stated: ModelFit, without: ModelFit) -> Find
         if (value := robot.nominal[robot.bodies.index(body), number]) and body.joint is not None:
             largest.append(f"{kind} up to {value:g} in {body.joint.name}")
     text = (
-        f"measured forces differ from the {robot.format}'s by {_percent(stated.misfit)}, "
-        f"by {_percent(without.misfit)} without the friction that it states: {', '.join(largest)}"
+        f"measured forces differ from the {robot.format}'s by {_percent(stated.largest_misfit)}, "
+        f"by {_percent(without.largest_misfit)} without the friction that it states: {', '.join(largest)}"
     )
     return Finding("friction", NOTE, "all", text, f"nothing, as a fit finds friction; or 0 in the {robot.format}")
 
@@ -202,8 +202,8 @@ def _friction_finding(robot: Robot, stated: ModelFit, without: ModelFit) -> Find
 def _best_mistake(
     log: Log, model: NominalModel, cutoff: float, fit: ModelFit, derived: tuple[str, ...]
 ) -> Finding | None:
-    """The mistake whose correction leaves the least misfit, if that is small enough."""
-    robot, best, least = model.robot, None, MAX_RESIDUAL_SHARE * min(fit.misfit, 1.0)
+    """The mistake whose correction leaves the least misfit, if that is small enough: one of torques, by the torques."""
+    robot, best, least, shares = model.robot, None, min(fit.misfit, 1.0), (0.0, 0.0)
     filtered = cache(lambda: preprocess_pieces(log, cutoff, MAX_TRIAL_DIFFERENTIATED_SAMPLES))
     for mistake in possible_mistakes(log):
         if not _may_explain(mistake.field, fit) or mistake.field.startswith(derived):
@@ -216,20 +216,22 @@ def _best_mistake(
             samples = bind_some_samples(pieces, robot, model.contacts, TRIAL_SAMPLES)
         except InputError:  # the filter does not accept the corrected log
             continue
-        trial = model.compare(samples, least)
-        if mistake.field == "joint_torque" and trial.implausible > fit.implausible:
-            continue
-        if trial.compared == fit.compared and trial.misfit < least:  # compare the same forces only
-            best, least = mistake, trial.misfit
+        of_torques = mistake.field == "joint_torque"
+        trial = model.compare(samples, least if of_torques else min(least, MAX_RESIDUAL_SHARE * min(fit.misfit, 1.0)))
+        if trial.compared != fit.compared or (of_torques and trial.implausible > fit.implausible):
+            continue  # compare the same forces only
+        before, after = (x.torque_misfit or 0.0 if of_torques else x.misfit for x in (fit, trial))
+        if after < MAX_RESIDUAL_SHARE * min(before, 1.0) and trial.misfit < least:
+            best, least, shares = mistake, trial.misfit, (before, after)
     if best is None:
         return None
-    text = (
-        f"measured forces differ from the {robot.format}'s by {_percent(fit.misfit)}, "
-        f"by {_percent(least)} once corrected"
-    )
-    of_currents = best.field == "joint_torque" and best.description.startswith("in ") and least > _MAX_UNIT_MISFIT
+    before, after = shares
+    measured = "torques" if best.field == "joint_torque" else "forces"
+    text = f"measured {measured} differ from the {robot.format}'s by {_percent(before)}"
+    text += f", by {_percent(after)} once corrected"
+    of_currents = best.field == "joint_torque" and best.description.startswith("in ") and after > _MAX_UNIT_MISFIT
     advice = best.advice + "; of currents, set sensors.scales: {joint_torque: all}" * of_currents
-    advice += f"; or is {robot.path.name} another robot's?" * (least > MAX_CLEAR_MISFIT)
+    advice += f"; or is {robot.path.name} another robot's?" * (after > MAX_CLEAR_MISFIT)
     return Finding("unit, sign or frame", REJECTED, best.field, f"{best.description}: {text}", advice)
 
 

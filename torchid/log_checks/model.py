@@ -137,6 +137,11 @@ class ModelFit:
         parts = [x for x in (self.torque_misfit, self.base_force, self.base_moment) if x is not None]
         return float(np.sqrt(np.mean(np.square(parts)))) if parts else 0.0
 
+    @property
+    def largest_misfit(self) -> float:
+        """That of all forces, or of the torques alone: forces that fit do not make up for torques that do not."""
+        return max(self.misfit, self.torque_misfit or 0.0)
+
 
 def _implausible_gains(gain: FloatArray, determined: BoolArray) -> BoolArray:
     """Which determined gains (m,) no model error explains."""
