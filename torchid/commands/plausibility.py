@@ -29,8 +29,10 @@ from torchid.identifiability.confounding import ExtraEstimate, TotalMass, estima
 from torchid.log_checks import Finding
 from torchid.log_checks.check import check
 from torchid.log_checks.findings import SEVERITIES
+from torchid.log_checks.lag_and_tilt import check_tilt
+from torchid.log_checks.model import NominalModel
 from torchid.parameters import GRAVITY, PARAMETERS, PER_BODY, Array
-from torchid.problem import LinearProblem
+from torchid.problem import LinearProblem, Samples
 from torchid.problem.chunks import one_thread
 from torchid.problem.metrics import ADVICE, Metrics, WorseThanNominal, describe_worse
 from torchid.robot import Robot
@@ -86,8 +88,13 @@ class TrainingLogs:
                         return
 
 
-def require_plausible(fit: Fit, logs: TrainingLogs) -> TotalMass:
+def require_plausible(fit: Fit, logs: TrainingLogs, samples: Sequence[Samples] = ()) -> TotalMass:
     """Refuse a fit that no robot can have produced, and warn of residuals far above the stated noise.
+
+    Args:
+        fit: the fit.
+        logs: that it is of.
+        samples: of these, to look for the tilt of a bolted base in.
 
     Returns:
         How well the total mass is known.
@@ -99,6 +106,7 @@ def require_plausible(fit: Fit, logs: TrainingLogs) -> TotalMass:
 
     Warns:
         NumericalWarning: forces that no parameters explain, for whatever reason.
+        TorchidWarning: a bolted base that is tilted, which masses make up for in part.
     """
     estimate, scene = fit.estimate, logs.scene
     if not estimate.rank:
@@ -117,6 +125,7 @@ def require_plausible(fit: Fit, logs: TrainingLogs) -> TotalMass:
     if not isinstance(estimate, SgdEstimate):
         unexplained = beyond_models(estimate, fit.assembly.problem, fit.assembly.forces, scene.noise_stated)
     if reason is None and unexplained is None:
+        _warn_of_tilt(samples, scene)
         return mass
     log, finding = logs.finding or (None, None)
     if finding is not None and (reason is not None or finding.rejects_all):
@@ -132,6 +141,13 @@ def require_plausible(fit: Fit, logs: TrainingLogs) -> TotalMass:
     advice = "check units, frames, quaternion order and contact_active, or state the noise that there is"
     warn_about_file(f"{unexplained}{named}; {advice}", NumericalWarning)
     return mass
+
+
+def _warn_of_tilt(samples: Sequence[Samples], scene: Scene) -> None:
+    """Say that a bolted base which counts as upright is tilted."""
+    if samples and scene.robot.fixed_base and scene.config.robot.base_tilt is None:
+        for one in check_tilt(samples, NominalModel(scene.robot, scene.contacts, scene.declared)):
+            warn_about_file(f"robot.base_tilt: {one.found}; {one.advice}")
 
 
 def _require_scales(by_data: Sequence[ExtraEstimate], has_contacts: bool) -> None:

@@ -18,6 +18,7 @@ from torchid.log_checks.model import (
     bind_some_samples,
     deviation_builder,
     preprocess_pieces,
+    some_samples,
 )
 from torchid.log_checks.scales import (
     CORRELATED_SAMPLES,
@@ -116,6 +117,11 @@ def check_lag_and_tilt(
     unexplained = min((x.without for x in (lag, tilt) if x is not None), default=np.inf)
     moved = [*_lag_findings(lag, model.declared), *_tilt_findings(tilt, model)]
     return moved or list(_contact_sensor_findings(sensors, log, model)), unexplained
+
+
+def check_tilt(samples: Sequence[Samples], model: NominalModel) -> Iterator[Finding]:
+    """A finding about a vertical that gravity is not along, in filtered logs of a robot."""
+    yield from _tilt_findings(_tilt_of(some_samples(samples, _SAMPLES), model), model)
 
 
 def check_torque_offsets(log: Log, model: NominalModel, cutoff_hz: float) -> Iterator[Finding]:
@@ -291,14 +297,15 @@ def fit_tilt(log: Log, model: NominalModel, cutoff_hz: float) -> Deviation | Non
     Raises:
         InputError: as `fit_lag`.
     """
-    robot = model.robot
-    if log.imu_specific_force is not None and not robot.fixed_base:
+    if log.imu_specific_force is not None and not model.robot.fixed_base:
         return None
     pieces = preprocess_pieces(log, cutoff_hz, MAX_TRIAL_DIFFERENTIATED_SAMPLES)
-    samples = bind_some_samples(pieces, robot, model.contacts, _SAMPLES)
+    return _tilt_of(bind_some_samples(pieces, model.robot, model.contacts, _SAMPLES), model)
 
+
+def _tilt_of(samples: Sequence[Samples], model: NominalModel) -> Deviation | None:
     def columns(builder: RowBuilder, part: Samples, number: int) -> FloatArray:
-        phi = robot.nominal.flatten()[None]
+        phi = model.robot.nominal.flatten()[None]
         level = force_series(builder, part, phi)[1][0]
         turned = [force_series(builder, _turned(part, axis), phi)[1][0] for axis in range(2)]
         return np.stack([level - one for one in turned], axis=2) / _SMALL_ANGLE

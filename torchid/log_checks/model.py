@@ -174,8 +174,13 @@ def bind_some_samples(
     logs: Sequence[Log], robot: Robot, contacts: Sequence[Contact], count: int = COMPARED_SAMPLES
 ) -> list[Samples]:
     """About `count` evenly spread samples of filtered logs. Raises InputError: they do not match the robot."""
-    bound = [bind_log(log, robot, contacts) for log in logs]
-    return [part[torch.linspace(0, len(part) - 1, min(count // len(logs), len(part))).long()] for part in bound]
+    return some_samples([bind_log(log, robot, contacts) for log in logs], count)
+
+
+def some_samples(logs: Sequence[Samples], count: int) -> list[Samples]:
+    """About `count` evenly spread samples of logs, at least one of each."""
+    most = max(1, count // max(1, len(logs)))
+    return [part[torch.linspace(0, len(part) - 1, min(most, len(part))).long()] for part in logs]
 
 
 LinkPoses = dict[str, torch.Tensor]
