@@ -29,7 +29,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
         monkeypatch.setenv("NO_MKDOCS_2_WARNING", "1")
         warnings.simplefilter("ignore")  # of Python, about libraries of MkDocs
         mkdocs = pytest.importorskip("mkdocs.__main__")
-        mkdocs.cli(["build", "--strict", "--quiet", "--site-dir", str(folder)], standalone_mode=False)
+        mkdocs.cli(["build", "--strict", "--site-dir", str(folder)], standalone_mode=False)
     assert "WARNING" not in said.getvalue()
     return folder
 
