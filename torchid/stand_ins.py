@@ -10,10 +10,12 @@ from importlib import import_module
 from types import ModuleType
 from typing import Any
 
-#: Modules, and the functions that libraries take from them while they are imported themselves.
+#: Modules, and what libraries take from them while they are imported themselves.
 _UNUSED = {
     "torch._meta_registrations": (),  # what torch.compile has to know of operators: 0.3 s
     "scipy.stats": ("scoreatpercentile",),  # scipy.signal finds peaks of wavelets with it: 0.25 s
+    "scipy.ndimage": ("convolve1d",),  # of scipy.signal and trimesh: 0.04 s
+    "networkx": ("Graph",),  # graphs of meshes in trimesh: 0.07 s
     "pytorch_kinematics.mjcf": ("build_chain_from_mjcf", "build_serial_chain_from_mjcf"),  # MuJoCo, if any: 0.1 s
 }
 
