@@ -221,7 +221,7 @@ def _identify(
         shown = [*logs["test"], *logs["train"]][:1]
         forces = ranks.from_first(lambda: [compare_forces(evaluation, log, compared) for log in shown], "forces")
         figures = fit_figures(experiment.robot, estimate, fit.extras, ready.ridge, *forces)
-        begun = stack.enter_context(drawing(figures, experiment.config, spared=1)) if config.output else None
+        begun = stack.enter_context(drawing(figures, experiment.config)) if config.output else None
     with clock("identifiability"):
         whole = merge_folds(_with_states(fit.parts, ready.factors), builder)
         alone = _by_state(fitter, whole)

@@ -96,17 +96,16 @@ class Drawing:
 
 
 @contextmanager
-def drawing(figures: Figures, config: ExperimentConfig, spared: int = 0) -> Iterator[Drawing]:
-    """Copies of this process that draw figures of the run of an experiment within the block.
+def drawing(figures: Figures, config: ExperimentConfig) -> Iterator[Drawing]:
+    """Copies of this process that draw figures of the run of an experiment within the block, on all cores but one.
 
     Args:
         figures: to draw.
         config: of the experiment, with an output.
-        spared: cores that are left to what this process does meanwhile.
     """
     folder, form = config.output or Path(), config.figures.format
     files = [(folder / f"{name}.{form}", make) for name, make in figures.items()]
-    with in_copies(files, lambda file: draw_for(*file), max(thread_count() - spared, 1)) as drawn:
+    with in_copies(files, lambda file: draw_for(*file), max(thread_count() - 1, 1)) as drawn:
         yield Drawing(tuple(figures), drawn)
 
 
