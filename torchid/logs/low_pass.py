@@ -29,6 +29,7 @@ _SETTLED = 1e-18
 _FILTERED_AT_ONCE = 2**16
 
 
+@cache
 def import_signal() -> ModuleType:
     """`scipy.signal`: it takes 0.1 s, which runs that find their samples in a cache, or draw nothing, need not."""
     with unused_modules_apart():
