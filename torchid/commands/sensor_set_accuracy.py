@@ -6,8 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
-from rich.progress import Progress
-
 from torchid import ranks
 from torchid.commands.plausibility import TrainingLogs, require_plausible
 from torchid.copies import share_between_copies
@@ -31,7 +29,6 @@ def accuracies(
     sets: Mapping[str, SensorSet],
     train: Sequence[Samples],
     test: Sequence[Samples],
-    bars: Progress,
 ) -> dict[str, SetAccuracy]:
     """Fit with every sensor set that the training logs recorded, by least squares instead of a descent.
 
@@ -41,7 +38,6 @@ def accuracies(
     Warns:
         TorchidWarning: the training logs lack a sensor of a set, or no robot can have left its fit; it is left out.
     """
-    bars.add_task("comparing sensor sets", total=None)
     evaluation = scene.evaluation()
     reference = _reference(scene, train)
 
