@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchid import ranks
 from torchid.parameters import Array
-from torchid.problem.chunks import chunks_by_state, map_in_workers, one_thread
+from torchid.problem.chunks import chunks_by_state, map_in_workers, one_thread, worker_count
 from torchid.problem.compression import Part
 from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import TriangularFactor
@@ -100,7 +100,7 @@ class SampledRows:
         drawn = list(_random_chunks(logs, *self._drawn))
         for samples, state in drawn:
             builder.layout(state, samples.contact_normal is not None)
-        self.chunks = map_in_workers(drawn, lambda one: self._chunk(*one))
+        self.chunks = map_in_workers(drawn, lambda one: self._chunk(*one), worker_count(builder.device))
         elsewhere = any(isinstance(log, LogElsewhere) for log in logs)
         if any(ranks.gather(elsewhere, "logs that others have")):
             self.chunks = list(chain.from_iterable(ranks.gather(self.chunks, "samples for the noise")))
