@@ -185,15 +185,19 @@ def _step_length(slope: float, curvature: float, rates: Array, kappa: float) -> 
 
 
 def damped_inverse(A: Tensor) -> Callable[[Tensor], Tensor]:
-    """B -> A^-1 b for A positive semidefinite, (n, n), with the least damping that works (Levenberg)."""
+    """B -> A^-1 b for A positive semidefinite, (n, n), with the least damping that works (Levenberg).
+
+    Of A, which it overwrites, the lower triangle counts.
+    """
     scale = A.diagonal().abs().clamp_min(torch.finfo(A.dtype).tiny).rsqrt()
-    scaled = scale[:, None] * A * scale
-    root, failed = torch.linalg.cholesky_ex(scaled)
-    damping = 1e-15
-    while failed:
-        root, failed = torch.linalg.cholesky_ex(scaled + damping * torch.eye(len(A), dtype=A.dtype))
-        damping *= 10.0
-    return lambda b: scale * torch.cholesky_solve((scale * b)[:, None], root)[:, 0]
+    scaled, damping = A.mul_(scale).mul_(scale[:, None]), 0.0
+    while True:
+        root, failed = torch.linalg.cholesky_ex(scaled)
+        if not failed:
+            return lambda b: scale * torch.cholesky_solve((scale * b)[:, None], root)[:, 0]
+        more = max(1e-15, 10.0 * damping)
+        scaled.diagonal().add_(more - damping)
+        damping = more
 
 
 _LOOSE = 1e-6  # relative gap above which there is a warning
@@ -345,7 +349,7 @@ class _PrimalDual(ConicTensors):
 
         curvature = flat @ (whitened @ point.Z[:, None]).flatten(2).mT
         stiffness = point.y / point.slack
-        hessian = self.H + self.G.T @ (stiffness[:, None] * self.G)
+        hessian = torch.addmm(self.H, self.G.T, stiffness[:, None] * self.G)
         rows, columns = self.variables[:, :, None], self.variables[:, None, :]
         hessian.index_put_((rows.expand_as(curvature), columns.expand_as(curvature)), curvature, accumulate=True)
         N = self.null_space
