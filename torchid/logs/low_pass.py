@@ -27,6 +27,11 @@ _SETTLED = 1e-18
 _FILTERED_AT_ONCE = 2**16
 
 
+def import_filters() -> None:
+    """Import what filters need: 0.4 s, which runs that find their samples in a cache need not."""
+    import scipy.signal  # noqa: F401
+
+
 @dataclass(frozen=True, eq=False)
 class LowPass:
     """A zero-phase filter: the second-order sections of one pass, and how many samples each end is extended by."""
@@ -38,7 +43,7 @@ class LowPass:
     @cache  # takes 1 ms, and a log is filtered by the same ones over and over
     def butterworth(cls, cutoff_hz: float, step: float) -> LowPass:
         """A Butterworth filter of that cutoff [Hz], for samples at steps of so many seconds."""
-        from scipy import signal  # takes 0.4 s, which runs that find their samples in a cache need not
+        from scipy import signal  # see `import_filters`
 
         sections = signal.butter(FILTER_ORDER, cutoff_hz, fs=1.0 / step, output="sos")
         return cls(sections, padding=max(15, math.ceil(1.0 / (cutoff_hz * step))))
