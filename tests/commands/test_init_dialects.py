@@ -218,6 +218,17 @@ def test_short_gaps_in_the_motion_are_bridged_and_long_ones_excluded(tmp_path: P
         assert any(text.startswith("preprocessing.") and "gaps of joint_position" in text for text in said.guessed)
 
 
+def test_of_a_long_log_a_fit_takes_as_few_samples_as_the_filter_allows(tmp_path: Path) -> None:
+    for count in (100_000, 100_001):
+        time = np.arange(count) / 500.0
+        swing = 0.3 * np.sin(time[:, None] + np.arange(12))
+        np.savez(tmp_path / f"{count}.npz", t=time, q=swing, tau=swing)
+        said, *_ = started(SOLO12, tmp_path / f"{count}.npz")
+        is_long = count > 100_000
+        assert ("sample_rate_hz: auto" in (tmp_path / f"{count}.yaml").read_text()) == is_long
+        assert any("preprocessing.sample_rate_hz: auto, as 100001 samples" in text for text in said.guessed) == is_long
+
+
 RPY = np.stack([0.2 * np.sin(TIME), 0.1 - 0.3 * TIME, 3.0 + 0.4 * TIME], axis=1)  # yaw passes half a turn
 
 

@@ -14,7 +14,7 @@ from rich.progress import Progress
 from torchid import ranks
 from torchid.commands.cache_entries import cached_parts, factors_key
 from torchid.commands.cached_reading import CachedReader, open_reader
-from torchid.commands.chosen_settings import Choices, with_chosen_settings, with_ridge
+from torchid.commands.chosen_settings import Choices, with_chosen_settings, with_ridge, with_sample_rates
 from torchid.commands.evaluate import compare_forces, trace_forces
 from torchid.commands.folder import RUN, check_free, claim_folder
 from torchid.commands.plausibility import TrainingLogs, require_not_worse, require_plausible
@@ -255,7 +255,7 @@ def _identify(
         posterior=fitted_posterior(fit, experiment.robot, ready.conditions),
         validation=scores.validation,
         ridge=ready.ridge,
-        choices=ready.choices,
+        choices=with_sample_rates(ready.choices, experiment, logs["train"]),
         forces=next(iter(forces), None),
         traces=next(iter(traces), None),
         reused=ready.reused,

@@ -207,6 +207,8 @@ _STEP = re.compile(r"(dt|time_?step|sample_?rate|fps|rate_?hz|freq\w*)", re.IGNO
 _MOTION = ("joint_position", "base_quat_xyzw", "base_position_world", *("imu_specific_force", "imu_angular_velocity"))
 _BRIDGED_S = 0.05
 """Gaps that `init` has bridged [s]."""
+_MANY = 100_000
+"""Samples that a fit works on for about a second; of more, no more are kept than a filter leaves information in."""
 
 
 def missing_columns(joints: int, fields: Collection[str], partial: Mapping[str, Sequence[str]], what: str) -> list[str]:
@@ -343,3 +345,10 @@ def keys_for_gaps(read: Log | InputError) -> dict[str, tuple[object, str]]:
         )
         out["exclude_rejected"] = (True, reason)
     return out
+
+
+def keys_for_length(read: Log | InputError) -> dict[str, tuple[object, str]]:
+    """The keys of preprocessing that a long log should have, with the reason."""
+    if isinstance(read, InputError) or len(read) <= _MANY:
+        return {}
+    return {"sample_rate_hz": ("auto", f"as {len(read)} samples are many: five for each period of the cutoff are kept")}
