@@ -199,7 +199,7 @@ def _solved(ready: _Prepared, evaluation: Evaluation, checked: TrainingLogs, bar
         solve = partial(training.run, builder=fitter.builder, logs=logs, evaluate=evaluate, bars=bars, resume=resume)
     fit = fitter.fit(ready.parts, solve)
     fit, robust = _robust(fit, ready, bars)
-    mass = require_plausible(fit, checked)
+    mass = require_plausible(fit, checked, logs["train"])
     warn_of_confounded(fit.extras)
     warn_of_disagreement(fit, fitter)
     return _Solved(fit, robust, training, mass)
@@ -262,7 +262,7 @@ def _identify(
     )
     logs.clear()  # checks of a log and figures need room, too
     ready.blocks = blocks = []
-    require_not_worse(run.worse, checked)
+    require_not_worse(run.worse, run.metrics["train"].identified, checked)
     return run, solved.training, begun
 
 

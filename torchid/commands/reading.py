@@ -220,7 +220,8 @@ class LogReader:
         settings = self.scene.config.preprocessing
         if not settings.exclude_rejected:
             return None
-        return check(log, robot, self.scene.contacts, settings.filter_hz, settings.derived)
+        declared = replace(self.scene.declared, delay=0.0)  # the log has been read with it
+        return check(log, robot, self.scene.contacts, settings.filter_hz, settings.derived, declared)
 
 
 def settle_contacts(log: Log, scene: Scene) -> tuple[Log, BoolArray]:

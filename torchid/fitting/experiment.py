@@ -30,6 +30,7 @@ from torchid.fitting.fit import Fit, LogFitter, frozen_parameters
 from torchid.fitting.noise import NoiseSummary, estimate_noise, recorded_sensors
 from torchid.fitting.prior_knowledge import conditions_from, known_masses
 from torchid.fitting.robust import RobustLoss
+from torchid.log_checks.model import Declared
 from torchid.problem import Evaluation, ExtraTerms, RowBuilder, Samples
 from torchid.problem.compressed_log import Block
 from torchid.problem.compression import Part
@@ -93,6 +94,17 @@ class Scene:
         known = {name: None if actuators[name] == AUTO else actuators[name] for name in ("sign_width", "stribeck")}
         known["delay"] = False  # logs are read with the delay
         return ExtraTerms(offsets, scales, **actuators | known)
+
+    @property
+    def declared(self) -> Declared:
+        """What the settings say of sensors and actuators, for checks of the logs.
+
+        Raises:
+            InputError: as `stated_noise`.
+        """
+        stated = stated_noise(self.config.sensors.noise, self.robot)
+        delay, finds_tilt = self.config.actuators.delay or 0.0, self.config.robot.base_tilt == AUTO
+        return Declared(SensorNoise.of_known(stated) if stated else None, self.terms, delay, finds_tilt)
 
     @property
     def loss(self) -> RobustLoss | None:
