@@ -304,8 +304,8 @@ def _star(path: Path, tips: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize(("tips", "found"), [("tip", 3), ("fingertip", 0)])
-def test_balls_at_the_ends_of_limbs_are_feet_where_no_link_is_called_so_but_for_fingers(
+@pytest.mark.parametrize(("tips", "found"), [("tip", 3), ("fingertip", 0), ("wheel_link", 0)])
+def test_balls_at_the_ends_of_limbs_are_feet_where_no_link_is_called_so_but_for_fingers_and_wheels(
     tmp_path: Path, tips: str, found: int
 ) -> None:
     contacts = guess_contacts(load_robot(_star(tmp_path / "star.urdf", tips)), [], [])
