@@ -152,10 +152,11 @@ def test_arrays_of_simulators_are_split(tmp_path: Path) -> None:
     assert "joint_position: columns 7 to the last of 'qpos'" in said.guessed
 
 
-@pytest.mark.parametrize("name", ["dt", "step_dt", "sim_time_step"])
-def test_a_number_called_dt_is_the_step_of_a_recording_without_stamps(tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize("name", ["dt", "step_dt", "sim_time_step", "duration"])
+@pytest.mark.parametrize("each", [False, True], ids=["once", "of each sample"])
+def test_a_number_called_dt_is_the_step_of_a_recording_without_stamps(tmp_path: Path, name: str, each: bool) -> None:
     q, dq, tau = motion(12)
-    arrays = {"dof_pos": q, "dof_vel": dq, "torques": tau, "actions": q, name: np.array(0.005)}
+    arrays = {"dof_pos": q, "dof_vel": dq, "torques": tau, "actions": q, name: np.full(len(q) if each else (), 0.005)}
     np.savez(tmp_path / "x.npz", **arrays)
     said, log, given = started(GO1, tmp_path / "x.npz")
     np.testing.assert_array_equal(log.time, TIME)

@@ -156,6 +156,10 @@ HEADERS = {
     "Japanese": ("時刻[s]", "関節角度{}[deg]", "関節角速度{}[deg/s]", "トルク{}[Nm]", "加速度{}[m/s2]",
                  "角速度{}[deg/s]"),
     "Chinese": ("时间", "关节角度_{}[deg]", "关节速度_{}[deg/s]", "力矩_{}", "加速度_{}", "角速度_{}[deg/s]"),
+    "Italian": ("tempo_s", "posizione_{}_gradi", "velocità_{}_gradi_s", "coppia_{}_Nm", "accelerometro_{}_m_s2",
+                "giroscopio_{}_gradi_s"),
+    "Portuguese": ("tempo", "posição {} [graus]", "velocidade {} [graus/s]", "torque {} [N.m]", "aceleração {}",
+                   "giroscópio {} [graus/s]"),
     "short": ("t", "Q_{}[deg]", "dQ_{}[deg/s]", "Tau_{}", "Acc{}(m/s2)", "Gyr{}(dps)"),
 }  # fmt: skip
 

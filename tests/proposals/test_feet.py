@@ -28,9 +28,11 @@ def swinging(seed: int) -> np.ndarray:
     return WEIGHT * np.maximum(np.sin(3.0 * TIME + seed), 0.0)
 
 
+PARTS = ("Force", "Moment")
 WRENCHES = {
     "letters": ("{side}_foot_{part}{axis}", ("left", "right")),
     "couples": ("{Side}FootForceSensor_{part}{axis}", ("Left", "Right")),
+    "camels": ("{side}Foot{Part}{Axis}", ("left", "right")),
     "numbers": ("FT_{side}_foot[{k}]", ("left", "right")),
     "inside": ("Device/{Side}Foot/Wrench/{part}{axis}/Sensor/Value", ("Left", "Right")),
 }
@@ -41,7 +43,15 @@ def test_wrenches_named_by_sides_are_those_of_the_feet_on_these(dialect: str) ->
     text, sides = WRENCHES[dialect]
     letters = "fc" if dialect == "couples" else "fm"
     columns = {
-        text.format(side=side, Side=side, part=letters[k // 3], axis="xyz"[k % 3], k=k): swinging(k)
+        text.format(
+            side=side,
+            Side=side,
+            part=letters[k // 3],
+            Part=PARTS[k // 3],
+            axis="xyz"[k % 3],
+            Axis="XYZ"[k % 3],
+            k=k,
+        ): swinging(k)
         for side in sides
         for k in range(6)
     }
@@ -53,6 +63,7 @@ def test_wrenches_named_by_sides_are_those_of_the_feet_on_these(dialect: str) ->
         of_left
         == {
             "letters": ["left_foot_f{axis}", "left_foot_m{axis}"],
+            "camels": ["leftFootForce{AXIS}", "leftFootMoment{AXIS}"],
             "couples": ["LeftFootForceSensor_f{axis}", "LeftFootForceSensor_c{axis}"],
             "numbers": ["FT_left_foot[{component}]"],
             "inside": [f"Device/LeftFoot/Wrench/{part}{{axis}}/Sensor/Value" for part in "fm"],

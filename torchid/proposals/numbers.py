@@ -18,7 +18,7 @@ from torchid.proposals.file_samples import FileSample, stated_names
 from torchid.rounding import STD_PER_MAD
 
 _STEP = (2e-4, 0.2)  # [s]: of recordings
-_STEP_NAME = re.compile(r"(\w+_|sim|control)?(dt|time_?step)(_s)?", re.IGNORECASE)
+_STEP_NAME = re.compile(r"(\w+_|sim|control)?(dt|time_?step|duration|period)(_s)?", re.IGNORECASE)
 _TURN_S, _ALIKE = 0.3, 0.5  # over which gravity is seen to turn [s], and correlation with the angular velocity
 _SLOPE = 0.15  # of the logarithm of the ratio of velocities to slopes of positions, that a unit explains
 _TURNED = 7.0  # [rad]: no joint's position is as large throughout
