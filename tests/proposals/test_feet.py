@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -155,3 +156,31 @@ def test_forces_of_two_feet_are_in_the_world_if_their_name_says_so(name: str, si
         assert entry["contact_wrench_local"] == {"force": {"column": name}}
     else:
         assert entry["contact_wrench_world"]["force"].get("scale", 1) == sign
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "in_newtons"),
+    [
+        ("{foot}_fn", "", 1.0),
+        ("normal_force_{side}", "", 1.0),
+        ("Force verticale pied {side} (kN)", "kN", 1e-3),
+    ],
+)
+@pytest.mark.parametrize("carried", [1.0, 0.1], ids=["of the weight", "of less, or counts"])
+def test_forces_along_the_normal_are_those_that_say_so_and_carry_the_robot(
+    name: str, unit: str, in_newtons: float, carried: float
+) -> None:
+    loads = np.stack([swinging(k) for k in range(4)], axis=1)
+    loads[loads < 60.0] = 0.0
+    loads *= carried * WEIGHT / np.maximum(loads.sum(axis=1, keepdims=True), 1.0)
+    columns = {name.format(foot=f"{side}_foot", side=side): in_newtons * loads[:, k] for k, side in enumerate(LEGS)}
+    turn = np.tile([0.0, 0.0, 0.0, 1.0], (N, 1))
+    found = proposed(QUADRUPED, columns | {"base_quat_xyzw": turn}).columns
+    assert ("contact_force_normal" in found) == (carried == 1.0)
+    assert "contact_force_normal" not in proposed(QUADRUPED, columns).columns, "of no known orientation"
+    if carried == 1.0:
+        assert found["contact_force_normal"].get("unit", "") == unit
+        assert 5.0 < found["contact_active"]["above"] < 60.0
+    unsaid = {"fn": "fz", "normal": "foot", "verticale": ""}
+    others = {re.sub("|".join(unsaid), lambda word: unsaid[word[0]], name): x for name, x in columns.items()}
+    assert "contact_force_normal" not in proposed(QUADRUPED, others | {"base_quat_xyzw": turn}).columns

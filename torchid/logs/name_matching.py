@@ -192,16 +192,17 @@ OF_PLATES = (WRENCHES[1], POINTS)
 BASES = "base|root|trunk|torso|pelvis|body|mocap|odom|odometry"
 OF_BASE = rf"\b({BASES}|floating base)"
 _STAMPS = r"(times?|datetime|timestamps?|stamps?|tstamps?|duration)"
+_NOT_ANGULAR = r"(?<!ang )(?<!angular )"
 #: Words that recordings have for a field, by what the name of a column contains; the first that fits counts.
 _FIELD_WORDS = (
     ("time", rf"\b{_STAMPS}$"),  # of positions/timestamps
     (POINTS, r"\b(cop[xyz]?|ground force p[xyz])\b"),
     (WRENCHES[1], r"\b(ground (force|torque|moment)s?|force ?plates?|fp)\b"),
     ("base_position_world", rf"{OF_BASE} (pose )*(pos|position|xyz)\b"),
-    ("base_linear_velocity_base", r"\b(v|vel|velocity) (body|base)$|\bodom\w* twist (twist )?linear\b"),
+    ("base_linear_velocity_base", rf"{_NOT_ANGULAR}\b(v|vel|velocity) (body|base)$|\bodom\w* twist (twist )?linear\b"),
     (
         "base_linear_velocity_world",
-        rf"{OF_BASE} (twist )*(lin ?vel|linear|lin|vel|velocity)\b",
+        rf"{OF_BASE} (twist )*(lin ?vel|linear|lin|vel|velocity|v)\b",
     ),
     ("base_angular_velocity_base", rf"{OF_BASE} (twist )*(ang ?vel|angular|ang|omega)\b"),
     ("base_quat_wxyz", rf"{OF_BASE} (q|rot|rotation)\b"),

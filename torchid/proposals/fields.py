@@ -219,7 +219,7 @@ _AXIS = re.compile(f"{_COMPONENT}(?!.*{_COMPONENT})")  # the last
 _NUMBER = re.compile(r"(?<=[\[_./' -])(\d)(?=\W*$)")
 _PARTS = {"f": "force", "m": "moment", "t": "moment", "c": "moment"}  # c: of a couple
 _WHOLE = {("",), ("x", "y", "z"), ("0", "1", "2"), ("0", "1", "2", "3", "4", "5")}
-_BARE = re.compile(r"f[xyz]?|forces?|[xyz]")
+_BARE = re.compile(r"f[nxyz]?|forces?|normal|[xyz]")
 _OTHER_WEIGHT = 0.5  # by which a robot's weight may differ from its file's
 _CARRIED = 0.3  # of the robot's weight, at least, where forces on the robot add up to it
 
