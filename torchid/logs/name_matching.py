@@ -215,7 +215,8 @@ _FIELD_WORDS = (
     ("contact_active", r"\b(contacts?|touch|touches|stance)\b"),
     (
         "joint_torque",
-        r"\b(taus?|torques?|efforts?|eff|trq|load|qfrc|gf|generalized forces?|drehmoment|couples?|par|pares|copp\w+)\b",
+        r"\b(taus?|torques?|efforts?|eff|trq|load|qfrc|gf|generalized forces?|drehmoment|couples?|par|pares|copp\w+)\b"
+        r"|^us$",  # of optimal control, beside states called xs
     ),
     (
         "joint_velocity",
