@@ -36,7 +36,7 @@ from torchid.problem.unloaded_sensors import zero_in_air
 from torchid.robot import Robot, payload_parameters, with_payload
 from torchid.sensing import SensorSet
 
-_WHOLE_GB = 4.0 * BLOCK_GB  # recorded arrays that are taken whole: no block is worth its neighbourhood
+_WHOLE_GB = 2.0 * BLOCK_GB  # recorded arrays that are taken whole: no block is worth its neighbourhood
 
 
 class LogReader:

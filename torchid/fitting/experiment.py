@@ -37,6 +37,7 @@ from torchid.problem.compression import Part
 from torchid.problem.sampled_rows import LogElsewhere
 from torchid.reprs import short_repr
 from torchid.robot import Robot, load_robot
+from torchid.robot.constraints import matching_joints
 from torchid.robot.tree import FT_FIELD
 from torchid.sensing import Contact, SensorNoise, SensorSet, chosen_sensors, named_sensors, with_ft_sensors
 from torchid.settings import AUTO
@@ -118,8 +119,9 @@ class Scene:
         if choice.set is not None:
             sensors = named_sensors(choice.set, robot.n, len(contacts), noise, ft)
         else:
-            by_name = choice.joint_torques, choice.contact_wrenches
-            sensors = chosen_sensors(robot.joint_names, contacts, *by_name, noise, ft)
+            field, joints = "sensors.joint_torques", robot.joint_names
+            torques = [name for key in choice.joint_torques for name in matching_joints(field, key, joints)]
+            sensors = chosen_sensors(joints, contacts, torques, choice.contact_wrenches, noise, ft)
         measured = with_ft_sensors(sensors, robot, choice.ft_sensors)
         return replace(measured, torque=measured.torque | robot.is_passive)  # known: 0
 
