@@ -158,8 +158,10 @@ def _misfit_findings(
 
 def _contradiction(fit: ModelFit, robot: Robot, held: bool) -> Finding:
     """A finding about forces that no usual mistake explains; `held`: whether anything is known to hold the robot."""
-    text = f"measured forces differ from the {robot.format}'s by {_percent(fit.largest_misfit)}"
-    text += ", and no usual mistake explains it"
+    text = (
+        f"measured forces differ from the {robot.format}'s by {_percent(fit.largest_misfit)}, "
+        "and no usual mistake explains it"
+    )
     advice = f"check units, frames, the order of joints and contacts, friction, the {robot.format}'s base link and"
     advice += f" masses, and whether the {robot.format} is that of this robot"
     if not held:
