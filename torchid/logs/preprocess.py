@@ -23,7 +23,7 @@ from torchid.logs.log import (
     column_labels,
 )
 from torchid.logs.quaternion import angular_acceleration_base, angular_velocity_base, make_sign_continuous
-from torchid.logs.sign_filter import mean_dry, mean_stribeck, with_sign_filter
+from torchid.logs.sign_filter import mean_dry, mean_stribeck, noisy_width, with_sign_filter
 from torchid.logs.signal_noise import signal_noise, warn_of_noisy_accelerations
 from torchid.logs.timeline import JITTER, Timeline, lay_out_timeline, nearest_known
 
@@ -97,7 +97,7 @@ def preprocess(
     if timeline is None:
         return replace(log, motion_noise=noise) if noise.found else log
     require_no_turns(log)  # which would pass for fast motion
-    timeline = with_sign_filter(timeline, log)
+    timeline = with_sign_filter(timeline, log, noise)
     coverage = {name: measure_coverage(log, name) for name in gapless_fields(log, timeline)}
     for name, found in coverage.items():
         warn_of_gaps(log, name, found)
@@ -208,8 +208,8 @@ def _motion(log: Log, timeline: Timeline) -> dict[str, FloatArray]:
 def _dry_friction(log: Log, smoothed: Mapping[str, FloatArray], timeline: Timeline) -> dict[str, FloatArray]:
     """`joint_direction` and, with a Stribeck velocity, `joint_stribeck`, (K, n); none where nothing is filtered.
 
-    Dry friction reverses at once, or over the width of the timeline, and the filter smears its torque as it smears all
-    others. The velocities are filtered less, where they have reversals that the filter would take off.
+    The filter smears the torque of dry friction (`noisy_width`) as it smears all others. Velocities are filtered less
+    where they have reversals that it would take off.
 
     Args:
         log: the log.
@@ -225,19 +225,20 @@ def _dry_friction(log: Log, smoothed: Mapping[str, FloatArray], timeline: Timeli
     known, wider = smoothed[name], timeline.sign_low_pass
     if wider is not None:
         known = replace(timeline, low_pass=wider).smooth(getattr(log, name))
-    steps, width, stribeck = np.diff(timeline.grid), timeline.sign_width, timeline.stribeck
-    means = {"joint_direction": partial(mean_dry, width=width)}
+    steps, stribeck = np.diff(timeline.grid), timeline.stribeck
+    means: dict[str, Callable[..., FloatArray]] = {"joint_direction": mean_dry}
     if stribeck is not None:
-        means["joint_stribeck"] = partial(mean_stribeck, width=width, stribeck=stribeck)
+        means["joint_stribeck"] = partial(mean_stribeck, stribeck=stribeck)
     out = {key: np.empty((len(timeline.output_stamps), known.shape[1])) for key in means}
     together = _channels_together(len(known))
     for start in range(0, known.shape[1], together):
-        x = known[:, start : start + together]
+        columns = slice(start, start + together)
+        width, x = noisy_width(timeline, columns), known[:, columns]
         halfway = np.diff(x, axis=0) / steps[:, None] if name == "joint_position" else 0.5 * (x[1:] + x[:-1])
         before, after = np.concatenate([halfway[:1], halfway]), np.concatenate([halfway, halfway[-1:]])
         for key, mean in means.items():
-            filtered = timeline.low_pass(mean(before, after))
-            out[key][:, start : start + together] = timeline.evaluate(filtered, (0,))[0]
+            filtered = timeline.low_pass(mean(before, after, width=width))
+            out[key][:, columns] = timeline.evaluate(filtered, (0,))[0]
     return out
 
 
