@@ -210,13 +210,12 @@ def _motion(log: Log, timeline: Timeline) -> dict[str, FloatArray]:
 def _dry_friction(log: Log, smoothed: Mapping[str, FloatArray], timeline: Timeline) -> dict[str, FloatArray]:
     """`joint_direction` and, with a Stribeck velocity, `joint_stribeck`, (K, n); none where nothing is filtered.
 
-    The filter smears the torque of dry friction (`noisy_width`) as it smears all others. Velocities are filtered less
-    where they have reversals that it would take off.
+    The filter smears its torque as all others; velocities with reversals that it would take off are filtered less.
 
     Args:
         log: the log.
-        smoothed: its joint positions and, if it has them, velocities on the grid.
-        timeline: with the grid.
+        smoothed: its joint positions and, if it has them, velocities.
+        timeline: with the width of the sign (`noisy_width`).
     """
     if log.joint_direction is not None:
         given = {"joint_direction": log.joint_direction, "joint_stribeck": log.joint_stribeck}
@@ -227,10 +226,9 @@ def _dry_friction(log: Log, smoothed: Mapping[str, FloatArray], timeline: Timeli
     known, wider = smoothed[name], timeline.sign_low_pass
     if wider is not None:
         known = replace(timeline, low_pass=wider).smooth(getattr(log, name))
-    steps, stribeck = np.diff(timeline.grid), timeline.stribeck
-    means: dict[str, Callable[..., FloatArray]] = {"joint_direction": mean_dry}
-    if stribeck is not None:
-        means["joint_stribeck"] = partial(mean_stribeck, stribeck=stribeck)
+    steps, means = np.diff(timeline.grid), dict[str, Callable[..., FloatArray]](joint_direction=mean_dry)
+    if timeline.stribeck is not None:
+        means["joint_stribeck"] = partial(mean_stribeck, stribeck=timeline.stribeck)
     out = {key: np.empty((len(timeline.output_stamps), known.shape[1])) for key in means}
     together = _channels_together(len(known))
     for start in range(0, known.shape[1], together):
