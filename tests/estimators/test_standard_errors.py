@@ -16,6 +16,7 @@ from torchid.estimators import Estimate, LeastSquares
 from torchid.logs import Log, read_log, write_log
 from torchid.logs.low_pass import FILTER_ORDER
 from torchid.logs.preprocess import preprocess
+from torchid.parameters import FRICTION, PER_BODY
 from torchid.problem import LinearProblem, RowBuilder, Samples, bind_log, compress, linear_problem
 from torchid.robot import Robot
 from torchid.sensing import SensorNoise, named_sensors
@@ -48,6 +49,26 @@ def test_intervals_from_white_rows_hold_the_truth() -> None:
     holds = covered(estimates, true)
     assert holds.shape[1] == 4
     assert_honest(holds)
+
+
+@pytest.mark.parametrize("ridge", [1e-2, 1e-1, 1.0])
+def test_intervals_of_a_ridge_hold_the_truth_whatever_it_keeps_of_the_nominal_parameters(ridge: float) -> None:
+    rng, bodies, rows, others = np.random.default_rng(5), 5, 200, 3800  # rows that tell of noise alone
+    is_friction = np.arange(PER_BODY * bodies) % PER_BODY >= FRICTION.start
+    scale, off = 10.0 ** rng.uniform(-1.0, 1.0, is_friction.size), np.where(is_friction, 2.0, 0.15)
+    A = rng.normal(size=(rows, is_friction.size)) * 10.0 ** rng.uniform(-1.0, 1.5, is_friction.size)
+    holds, of_noise = [], []
+    for _ in range(100):
+        nominal = scale * rng.normal(size=scale.size)
+        true = nominal + scale * off * rng.normal(size=scale.size)
+        b = A / scale @ true + rng.normal(size=rows)
+        problem = LinearProblem(A / scale, b, rng.chisquare(others), rows + others, nominal, scale, scale > 0.0)
+        estimate = LeastSquares(ridge).solve(problem)
+        error = np.abs(estimate.phi - true)
+        holds.append(error <= 1.959964 * estimate.standard_error)
+        of_noise.append(error <= 1.959964 * estimate.noise_error)
+    assert 0.92 < np.mean(holds) < 0.98
+    assert np.mean(of_noise) < 0.75, "noise alone is not what such an estimate is off by"
 
 
 def test_intervals_from_noisy_joint_torques_of_a_robot_on_its_feet_hold_the_truth() -> None:

@@ -71,7 +71,9 @@ def test_deviations_are_those_of_leaving_each_block_out(monkeypatch: pytest.Monk
         assert 0.7 < np.median(ratio) < 1.1
     assert fit.estimate.block_error is not None
     larger = np.maximum(fit.estimate.noise_error, fit.estimate.block_error)
-    np.testing.assert_array_equal(fit.estimate.standard_error, larger)
+    kept_error = np.zeros_like(larger) if fit.estimate.kept_error is None else fit.estimate.kept_error
+    assert bool(np.nanmax(kept_error) > 0.0) == bool(ridge)
+    np.testing.assert_array_equal(fit.estimate.standard_error, np.hypot(larger, kept_error))
 
 
 def test_extra_parameters_scatter_with_the_blocks_of_their_log() -> None:

@@ -12,6 +12,7 @@ from torchid.logs import Log
 from torchid.logs.log import FloatArray
 from torchid.logs.preprocess import lacks_derivatives, make_timeline, move_to_timeline, preprocess
 from torchid.logs.sign_filter import wider_low_pass, with_sign_filter
+from torchid.logs.signal_noise import signal_noise
 from torchid.logs.timeline import Timeline
 
 CUTOFF, RATE = 20.0, 500.0  # Hz
@@ -80,10 +81,56 @@ def test_steps_of_an_encoder_are_no_vibration() -> None:
 def test_parts_of_a_log_have_the_directions_of_the_whole() -> None:
     log, _ = recorded(0.8, velocity_noise=0.02)
     with pytest.warns(TorchidWarning, match="joints move faster"):
-        timeline = with_sign_filter(timeline_of(log), log)
+        timeline = with_sign_filter(timeline_of(log), log, signal_noise(log, timeline_of(log)))
     assert timeline.sign_low_pass is not None
+    assert timeline.sign_noise is not None
     whole = move_to_timeline(log, timeline, {}).joint_direction
     samples, part = timeline.part(2000, 2600)
     of_part = move_to_timeline(log.select(samples), part, {}).joint_direction
     assert whole is not None
     np.testing.assert_allclose(of_part, whole[2000:2600], atol=1e-12)
+
+
+def noisy(seed: int, velocity_noise: float, position_noise: float) -> tuple[Log, FloatArray]:
+    """Four joints that swing with 0.18 rad/s, and their true velocities; with noise of one or the other."""
+    rng, time = np.random.default_rng(seed), np.arange(6000) / RATE
+    w, phase = 2.0 * np.pi * rng.uniform(0.1, 0.8, (2, 3, 4))
+    sines = w * time[:, None, None] + phase
+    position, velocity = (0.15 * x.sum(axis=1) for x in (np.sin(sines) / w, np.cos(sines)))
+    log = Log(
+        "noisy",
+        time=time,
+        joint_names=tuple("abcd"),
+        joint_position=position + position_noise * rng.normal(size=position.shape),
+        joint_velocity=velocity + velocity_noise * rng.normal(size=velocity.shape) if velocity_noise else None,
+    )
+    return log, velocity
+
+
+@pytest.mark.parametrize("width", [None, 0.02])
+@pytest.mark.parametrize(("velocity_noise", "position_noise"), [(0.05, 0.0), (0.1, 0.0), (0.0, 1e-3)])
+def test_coulomb_friction_is_no_smaller_for_noise_of_velocities(
+    velocity_noise: float, position_noise: float, width: float | None
+) -> None:
+    found: dict[str, list[FloatArray]] = {"noise known": [], "noise ignored": []}
+    for seed in range(8):
+        log, velocity = noisy(seed, velocity_noise, position_noise)
+        timeline = replace(timeline_of(log), sign_width=width)
+        assert timeline.low_pass is not None
+        torque = np.sign(velocity) if width is None else np.tanh(velocity / width)
+        torque, speed = (timeline.low_pass(x)[timeline.kept] for x in (torque, velocity))
+        knows = with_sign_filter(timeline, log, signal_noise(log, timeline))
+        for name, one in zip(found, (knows, timeline), strict=True):
+            direction = move_to_timeline(log, one, {}).joint_direction
+            assert direction is not None
+            both = np.stack([direction, speed])
+            found[name].append(np.array([np.linalg.lstsq(both[..., j].T, torque[:, j])[0][0] for j in range(4)]))
+    off = {name: abs(float(np.mean(x)) - 1.0) for name, x in found.items()}
+    assert off["noise known"] < 0.4 * off["noise ignored"]
+    assert off["noise ignored"] > 0.02
+
+
+def test_where_signals_are_exact_friction_reverses_at_once() -> None:
+    log, _ = recorded(0.0)
+    timeline = timeline_of(log)
+    assert with_sign_filter(timeline, log, signal_noise(log, timeline)) is timeline

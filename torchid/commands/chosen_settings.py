@@ -35,6 +35,7 @@ from torchid.logs.cutoff import CutoffChoice, choose_cutoff
 from torchid.logs.log import FloatArray
 from torchid.logs.preprocess import dry_friction, lacks_derivatives, make_timeline
 from torchid.logs.sign_filter import with_sign_filter
+from torchid.logs.signal_noise import SignalNoise
 from torchid.logs.timeline import LOSSLESS_RATE
 from torchid.problem import ExtraTerms, RowBuilder, Samples
 from torchid.problem.compressed_log import Block
@@ -248,7 +249,7 @@ class WidthReader(LogReader):
                 timeline = make_timeline(clean.time, lacks_derivatives(clean), *rates)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", TorchidWarning)  # said where the log was read
-                filtered = timeline and with_sign_filter(timeline, clean)
+                filtered = timeline and with_sign_filter(timeline, clean, log.motion_noise or SignalNoise({}))
             by_setting = dry_friction(clean, filtered) if filtered else (lambda *_: {})
             self._directions[log.source] = _Directions(log.time, joint_order(log, self.scene.robot), by_setting)
         return log

@@ -200,7 +200,8 @@ class LargeLog:
         first = start.read(slice(0, min(len(start), MOST_SAMPLES)))
         rates = settings.filter_hz, settings.sample_rate_hz, self.sign_width, self.stribeck
         whole = make_timeline(blocks.time, lacks_derivatives(first), *rates)
-        whole = whole and with_sign_filter(whole, first)
+        noise = signal_noise(first, whole, self.motion_noise if standing is None else {})
+        whole = whole and with_sign_filter(whole, first, noise)
         coverage = {} if whole is None else self._coverage(blocks, first, whole)
         contacts = None if first.contact_active is None else contacts_alone(blocks, partial(self._pieces, blocks))
         air = None if contacts is None or not with_unloaded else in_the_air(contacts)
@@ -209,9 +210,7 @@ class LargeLog:
         else:
             segments = self._segments(blocks, standing, whole, air)
         time = np.concatenate([segment.time for segment in segments])
-        stated = self.motion_noise if standing is None else {}
-        course = Course(segments, coverage, time)
-        course = replace(course, noise=signal_noise(first, course.longest.timeline, stated))
+        course = Course(segments, coverage, time, noise=noise)
         return course if contacts is None else replace(course, kept=self._kept(course, contacts, settled.certain))
 
     def _segments(
@@ -225,7 +224,7 @@ class LargeLog:
             rates = settings.filter_hz, settings.sample_rate_hz, self.sign_width, self.stribeck
             timeline = make_timeline(part.time, True, *rates)
             if timeline is not None:
-                timeline = replace(timeline, sign_low_pass=whole.sign_low_pass)
+                timeline = replace(timeline, sign_low_pass=whole.sign_low_pass, sign_noise=whole.sign_noise)
             out.append(Segment(part, timeline, first, None if air is None else air[segment]))
             first += len(out[-1].time)
         too_short = count_samples(standing.segments) - count_samples(usable)

@@ -12,11 +12,12 @@ from torchid import parameters
 from torchid.estimators.conditions import Conditions
 from torchid.estimators.conic_formulation import build_conic_problem
 from torchid.estimators.conic_problem import ConicProblem
+from torchid.estimators.nominal_spread import WIDTHS, likelihood_of_widths, without
 from torchid.parameters import INERTIAL, PER_BODY, Array
 from torchid.problem import LinearProblem
 from torchid.problem.chunks import one_thread
 from torchid.reprs import short_repr
-from torchid.rounding import RANK_TOLERANCE, is_significant
+from torchid.rounding import RANK_TOLERANCE
 
 PRIOR_ERROR = 0.2
 """Default standard deviation of the nominal parameters, as a share of each body; that of `analysis.prior_error`."""
@@ -158,10 +159,6 @@ def _widen(covariance: Array, weights: Array, least: float) -> None:
         covariance += (least - variance) / variance**2 * np.outer(along, along)
 
 
-NARROWEST, WIDEST = 0.01, 10.0
-"""Errors of nominal bodies, as shares of them, that are considered."""
-
-_STEPS = 300  # between these: 2.3 % each
 _LEVEL = 1e-3  # share of robots whose files are as wrong as the prior says, and that are called otherwise
 _MUCH = 1.5  # times the prior's width: less changes ranges little
 
@@ -209,7 +206,7 @@ def nominal_error(posterior: Posterior) -> NominalError | None:
     Bodies that data do not determine are taken to be as wrong as those that they do. Friction and extra parameters may
     have any value, as files seldom state them; conditions on the parameters are left out.
 
-    Source: type-II maximum likelihood (MacKay, Neural Computation 4, 1992).
+    Source: as `likelihood_of_widths` has it.
     """
     inertial = np.zeros(len(posterior.nominal), dtype=bool).reshape(-1, PER_BODY)
     inertial[:, INERTIAL] = True
@@ -220,26 +217,15 @@ def nominal_error(posterior: Posterior) -> NominalError | None:
     columns = posterior.A[:, posterior.free] * posterior.scale[posterior.free]
     nuisance = np.hstack([columns[:, ~inertial], posterior.D * posterior.extra_size])
     rows = np.column_stack([columns @ units[:, inertial], posterior.b - posterior.A @ posterior.nominal])
-    rows -= _projected(nuisance, rows)
-    U, values, _ = np.linalg.svd(rows[:, :-1], full_matrices=False)
-    kept = is_significant(values, RANK_TOLERANCE)
-    if not kept.any():
+    widths = np.append(WIDTHS, PRIOR_ERROR)
+    rows = without(nuisance, rows)
+    likelihood = likelihood_of_widths(rows, widths)
+    if likelihood is None:
         return None
-    found, variance = np.square(U[:, kept].T @ rows[:, -1]), np.square(values[kept])
-    widths = np.append(np.geomspace(NARROWEST, WIDEST, _STEPS), PRIOR_ERROR)
-    of_data = 1.0 + np.square(widths)[:, None] * variance
-    likelihood = -(np.log(of_data) + found / of_data).sum(axis=1)  # twice its logarithm
     best = int(likelihood.argmax())
     return NominalError(
         value=float(widths[best]),
         prior=PRIOR_ERROR,
         evidence=float(likelihood[best] - likelihood[-1]),
-        combinations=int((widths[best] ** 2 * variance > 1.0).sum()),
+        combinations=int((widths[best] * np.linalg.svd(rows[:, :-1], compute_uv=False) > 1.0).sum()),
     )
-
-
-def _projected(columns: Array, rows: Array) -> Array:
-    """Of rows (R, c), what columns (R, k) of unknowns take up."""
-    U, values, _ = np.linalg.svd(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), full_matrices=False)
-    U = U[:, is_significant(values, RANK_TOLERANCE)]
-    return np.asarray(U @ (U.T @ rows))

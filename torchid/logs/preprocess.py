@@ -23,7 +23,7 @@ from torchid.logs.log import (
     column_labels,
 )
 from torchid.logs.quaternion import angular_acceleration_base, angular_velocity_base, make_sign_continuous
-from torchid.logs.sign_filter import mean_dry, mean_stribeck, with_sign_filter
+from torchid.logs.sign_filter import mean_dry, mean_stribeck, noisy_width, with_sign_filter
 from torchid.logs.signal_noise import signal_noise, warn_of_noisy_accelerations
 from torchid.logs.timeline import JITTER, SampleRate, Timeline, lay_out_timeline, nearest_known
 from torchid.settings import AUTO
@@ -99,7 +99,7 @@ def preprocess(
     if timeline is None:
         return replace(log, motion_noise=noise) if noise.found else log
     require_no_turns(log)  # which would pass for fast motion
-    timeline = with_sign_filter(timeline, log)
+    timeline = with_sign_filter(timeline, log, noise)
     coverage = {name: measure_coverage(log, name) for name in gapless_fields(log, timeline)}
     for name, found in coverage.items():
         warn_of_gaps(log, name, found)
@@ -210,13 +210,12 @@ def _motion(log: Log, timeline: Timeline) -> dict[str, FloatArray]:
 def _dry_friction(log: Log, smoothed: Mapping[str, FloatArray], timeline: Timeline) -> dict[str, FloatArray]:
     """`joint_direction` and, with a Stribeck velocity, `joint_stribeck`, (K, n); none where nothing is filtered.
 
-    Dry friction reverses at once, or over the width of the timeline, and the filter smears its torque as it smears all
-    others. The velocities are filtered less, where they have reversals that the filter would take off.
+    The filter smears its torque as all others; velocities with reversals that it would take off are filtered less.
 
     Args:
         log: the log.
-        smoothed: its joint positions and, if it has them, velocities on the grid.
-        timeline: with the grid.
+        smoothed: its joint positions and, if it has them, velocities.
+        timeline: with the width of the sign (`noisy_width`).
     """
     if log.joint_direction is not None:
         given = {"joint_direction": log.joint_direction, "joint_stribeck": log.joint_stribeck}
@@ -227,19 +226,19 @@ def _dry_friction(log: Log, smoothed: Mapping[str, FloatArray], timeline: Timeli
     known, wider = smoothed[name], timeline.sign_low_pass
     if wider is not None:
         known = replace(timeline, low_pass=wider).smooth(getattr(log, name))
-    steps, width, stribeck = np.diff(timeline.grid), timeline.sign_width, timeline.stribeck
-    means = {"joint_direction": partial(mean_dry, width=width)}
-    if stribeck is not None:
-        means["joint_stribeck"] = partial(mean_stribeck, width=width, stribeck=stribeck)
+    steps, means = np.diff(timeline.grid), dict[str, Callable[..., FloatArray]](joint_direction=mean_dry)
+    if timeline.stribeck is not None:
+        means["joint_stribeck"] = partial(mean_stribeck, stribeck=timeline.stribeck)
     out = {key: np.empty((len(timeline.output_stamps), known.shape[1])) for key in means}
     together = _channels_together(len(known))
     for start in range(0, known.shape[1], together):
-        x = known[:, start : start + together]
+        columns = slice(start, start + together)
+        width, x = noisy_width(timeline, columns), known[:, columns]
         halfway = np.diff(x, axis=0) / steps[:, None] if name == "joint_position" else 0.5 * (x[1:] + x[:-1])
         before, after = np.concatenate([halfway[:1], halfway]), np.concatenate([halfway, halfway[-1:]])
         for key, mean in means.items():
-            filtered = timeline.low_pass(mean(before, after))
-            out[key][:, start : start + together] = timeline.evaluate(filtered, (0,))[0]
+            filtered = timeline.low_pass(mean(before, after, width=width))
+            out[key][:, columns] = timeline.evaluate(filtered, (0,))[0]
     return out
 
 

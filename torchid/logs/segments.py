@@ -63,18 +63,20 @@ def preprocess_segments(
     log = dataclasses.replace(log, contact_unloaded=unloaded_readings(log))
     parts = []
     longest_of = max(usable, key=lambda segment: segment.stop - segment.start)
-    whole = with_sign_filter(whole, log.select(longest_of))
+    longest = log.select(longest_of)
+    noise = signal_noise(longest, whole)
+    whole = with_sign_filter(whole, longest, noise)
     for segment in usable:
         part = log.select(segment)
         with about_file(log.source):
             timeline = make_timeline(part.time, True, cutoff_hz, sample_rate_hz, sign_width, stribeck)
         if timeline is None:
             raise ValueError("nothing to derive")
-        timeline = dataclasses.replace(timeline, sign_low_pass=whole.sign_low_pass)
+        timeline = dataclasses.replace(timeline, sign_low_pass=whole.sign_low_pass, sign_noise=whole.sign_noise)
         parts.append(move_to_timeline(part, timeline, coverage))
         if segment is longest_of:
             with about_file(log.source):
-                warn_of_noisy_accelerations(part, parts[-1], timeline, signal_noise(part, timeline))
+                warn_of_noisy_accelerations(part, parts[-1], timeline, noise)
     return _joined(parts), count_samples(segments) - count_samples(usable)
 
 

@@ -14,31 +14,44 @@ from numpy.polynomial.legendre import leggauss
 from torchid.errors import about_file, warn_about_file
 from torchid.logs.log import FloatArray, Log
 from torchid.logs.low_pass import LowPass
-from torchid.logs.signal_noise import MOST_SAMPLES, rough_noise
+from torchid.logs.signal_noise import MOST_SAMPLES, SignalNoise, noise_of_derivatives, rough_noise
 from torchid.logs.timeline import JITTER, Timeline, spline_derivatives
 
 _FEWEST = 100  # samples
 _DOUBLINGS = 8  # of the cutoff
 _MUCH = 0.05  # share of the velocities' power that is worth a warning
+_REVERSAL = float(np.sqrt(2.0 / np.pi) / np.log(2.0))  # width of tanh over deviation of erf
+_LEAST_WIDTH = 1e-9  # [rad/s or m/s] of a joint without noise among others: at once
 _LEAST_CHANGE = 1e-4  # of a tanh's argument over a step, across which its mean is its middle
 _NODES = 9  # within a step, of what Stribeck friction loses with speed
 _WIDEST = 0.4  # largest cutoff over the sample rate
 _EVIDENT = 0.01  # share of the velocities' power by which the error must fall: less is a few per cent of the reversals
 
 
-def with_sign_filter(timeline: Timeline, log: Log) -> Timeline:
-    """A timeline of a log, or of one whose start this is, with the filter of `wider_low_pass`.
+def with_sign_filter(timeline: Timeline, log: Log, noise: SignalNoise) -> Timeline:
+    """A timeline of a log, or of one whose start this is, with the filter of `wider_low_pass` and the noise behind it.
+
+    Args:
+        timeline: of the log.
+        log: as recorded, or its start.
+        noise: of its motion, by this timeline.
 
     Warns:
         TorchidWarning: the timeline's own filter takes off much of the joints' motion.
     """
-    wider = wider_low_pass(log, timeline)
-    if wider is None:
+    wider, derivatives = wider_low_pass(log, timeline), noise.derivatives
+    if wider is not None:
+        if wider.lost > _MUCH:
+            with about_file(log.source):
+                warn_about_file(f"joints move faster than the filter lets through: {wider}")
+        timeline = replace(timeline, sign_low_pass=wider.low_pass)
+        step = float(np.median(np.diff(log.time)))
+        derivatives = noise_of_derivatives(step, replace(timeline, low_pass=wider.low_pass))
+    name, order = ("joint_position", 1) if log.joint_velocity is None else ("joint_velocity", 0)
+    std = noise.std.get(name)
+    if std is None or not std.any():
         return timeline
-    if wider.lost > _MUCH:
-        with about_file(log.source):
-            warn_about_file(f"joints move faster than the filter lets through: {wider}")
-    return replace(timeline, sign_low_pass=wider.low_pass)
+    return replace(timeline, sign_noise=std * np.sqrt(derivatives[order, order]))
 
 
 @dataclass(frozen=True)
@@ -126,12 +139,31 @@ def mean_tanh(before: FloatArray, after: FloatArray) -> FloatArray:
     return np.divide(integral, change, out=tanh, where=np.abs(change) > _LEAST_CHANGE)
 
 
-def mean_dry(before: FloatArray, after: FloatArray, width: float | None) -> FloatArray:
+def noisy_width(timeline: Timeline, columns: slice) -> float | FloatArray | None:
+    """Width over which the sign of some joints' velocities reverses on average where noisy ones pass through 0.
+
+    None for at once: a timeline without a width and without noise.
+
+    With Gaussian noise s a velocity that is read as u has the mean sign erf(u / (sqrt(2) s)), as all velocities within
+    so little are as probable. With this width w, tanh(u / w) lacks as much of a sign during a reversal. A fit on
+    sign(u), wrong where noise is the larger, finds too little Coulomb friction, and viscous friction in its place.
+
+    Source: regression calibration (Carroll, Ruppert, Stefanski, Crainiceanu, "Measurement Error in Nonlinear Models",
+    2006, chapter 4); squares of widths add up as in MacKay's moderated output (Neural Computation 4, 1992).
+    """
+    if timeline.sign_noise is None:
+        return timeline.sign_width
+    return np.maximum(np.hypot(timeline.sign_width or 0.0, _REVERSAL * timeline.sign_noise[columns]), _LEAST_WIDTH)
+
+
+def mean_dry(before: FloatArray, after: FloatArray, width: float | FloatArray | None) -> FloatArray:
     """Mean of the sign as Coulomb friction has it: over a width [rad/s or m/s], None for at once."""
     return mean_sign(before, after) if width is None else mean_tanh(before / width, after / width)
 
 
-def mean_stribeck(before: FloatArray, after: FloatArray, width: float | None, stribeck: float) -> FloatArray:
+def mean_stribeck(
+    before: FloatArray, after: FloatArray, width: float | FloatArray | None, stribeck: float
+) -> FloatArray:
     """Mean of this sign times exp(-(v / v_s)^2), by that of the sign less what is lost with speed, smooth where v is 0.
 
     Args:

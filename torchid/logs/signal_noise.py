@@ -92,7 +92,7 @@ def signal_noise(log: Log, timeline: Timeline | None, stated: Mapping[str, float
     noise = SignalNoise(std)
     if timeline is None or not noise.found:
         return noise
-    return SignalNoise(std, _derivatives(float(np.median(np.diff(log.time))), timeline))
+    return SignalNoise(std, noise_of_derivatives(float(np.median(np.diff(log.time))), timeline))
 
 
 def _width(name: str, values: FloatArray) -> int:
@@ -139,7 +139,7 @@ def _left_by_differences(values: FloatArray, order: int) -> FloatArray:
     return np.asarray(np.minimum(np.median(off, axis=0) / MAD_PER_STD, differences.std(axis=0)))
 
 
-def _derivatives(step: float, timeline: Timeline) -> FloatArray:
+def noise_of_derivatives(step: float, timeline: Timeline) -> FloatArray:
     """Covariance of what becomes of unit white noise, recorded every so many seconds, and of its derivatives."""
     around = SPLINE_OVERLAP
     if timeline.low_pass is not None:

@@ -97,6 +97,7 @@ class Timeline:
         sign_width: of Coulomb friction's sign [rad/s or m/s], as in `KinematicTree`, None for the sign itself.
         stribeck: Stribeck velocity [rad/s or m/s], as in `KinematicTree`, None without one.
         sign_low_pass: wider filter of the velocities that this sign is of, None for `low_pass`.
+        sign_noise: (n,), of these velocities behind their filter [rad/s or m/s], None for none.
     """
 
     native: FloatArray
@@ -110,6 +111,7 @@ class Timeline:
     sign_width: float | None = None
     stribeck: float | None = None
     sign_low_pass: LowPass | None = None
+    sign_noise: FloatArray | None = None
 
     @property
     def output_stamps(self) -> FloatArray:

@@ -58,8 +58,10 @@ def parameters_document(
 def _by_body(robot: Robot, estimate: Estimate, **columns: np.ndarray) -> list[dict[str, Any]]:
     """Columns (12 L,) and the statistics of the estimate, by body and parameter."""
     columns |= {name: getattr(estimate, name) for name in ("standard_error", "identifiable", "data_share", "verdict")}
-    if estimate.block_error is not None:  # else the standard error is that by noise
-        columns |= {"noise_error": estimate.noise_error, "block_error": estimate.block_error}
+    parts = {"block_error": estimate.block_error, "kept_error": estimate.kept_error}
+    known = {name: x for name, x in parts.items() if x is not None}
+    if known:  # else the standard error is that by noise
+        columns |= {"noise_error": estimate.noise_error} | known
     per_body = {name: x.reshape(-1, PER_BODY) for name, x in columns.items()}
     return [
         {"name": name} | {column: _by_name(values[body]) for column, values in per_body.items()}
