@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from dialects import save_csv, with_velocity
+from motions import value
 from repository import DEMO
 
 from torchid.cli import main
@@ -148,6 +149,19 @@ def test_a_joint_with_a_torque_but_without_a_position_is_named_and_not_welded(tm
     named = f"joint_position: no column of numbers of {log.joint_names[4]}, but of all others"
     assert named in written.missing
     assert "weld" not in yaml.safe_load((tmp_path / "new.yaml").read_text())["robot"]
+
+
+def test_the_first_letter_of_a_component_is_no_unit(tmp_path: Path) -> None:
+    log = recorded()
+    columns = {"t": log.time, **with_units(log, log.joint_names, ("{} [deg]", "{} [mrad/s]", "{} [Ncm]"))}
+    for foot in log.contact_names:
+        columns |= {
+            f"{foot}_{axis}": np.full(len(log), 50.0 + k) for k, axis in enumerate(("fx", "fy", "fz", "mx", "my", "mz"))
+        }
+    written = init(URDF, save_csv(tmp_path / "x.csv", columns), tmp_path / "new.yaml")
+    entry = value(load_config(tmp_path / "new.yaml").logs.columns).contact_wrench_local
+    assert (entry.force.column, entry.moment.column) == ("{contact}_f{axis}", "{contact}_m{axis}")
+    assert not [text for text in written.guessed if "unit" in text]
 
 
 def test_joints_that_a_log_lacks_are_named_with_the_key_that_holds_them(
