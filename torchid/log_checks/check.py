@@ -52,7 +52,7 @@ from torchid.problem.log_joints import without_welded_joints
 from torchid.problem.standing import longest_standing
 from torchid.reprs import short_repr
 from torchid.robot import Robot
-from torchid.sensing import Contact
+from torchid.sensing import Contact, SensorSet
 
 #: Share of rejected samples above which a log is not usable.
 MAX_REJECTED_SHARE = 0.5
@@ -122,6 +122,7 @@ def check(
     contacts: Sequence[Contact] = (),
     cutoff_hz: float | None = None,
     derived: tuple[str, ...] = (),
+    required: SensorSet | None = None,
 ) -> Checked:
     """Check a log as it was read.
 
@@ -133,9 +134,14 @@ def check(
         derived: how names of fields begin that were not recorded, which are not to blame for anything. contact_active:
             of a log that has got flags from its torques. base_: motion of the base will follow from the feet that
             stand; forces are compared with the URDF in the longest segment in which enough of them do.
+        required: sensors of a fit, which must be in the log; None for any.
     """
     log, unclosed = completed(without_welded_joints(log, robot), robot)
-    contacts = [replace(contact, along_normal=False) for contact in contacts]  # wrenches are what is checked
+    if any(contact.along_normal for contact in contacts):
+        contacts, required = (
+            [replace(contact, along_normal=False) for contact in contacts],
+            None,
+        )  # wrenches are checked
     results: list[Finding | Skipped] = list(check_magnitudes(log))
     if (blocking := _blocking_finding(results)) is not None:
         return _collect(log, log, [*results, _skip_dependent(blocking)])
@@ -170,7 +176,7 @@ def check(
         results += unfit
     if _blocking_finding(results) is None:
         unbiased = subtract_contact_offsets(compared)
-        results += check_forces_against_urdf(unbiased, robot, contacts, cutoff_hz, derived)
+        results += check_forces_against_urdf(unbiased, robot, contacts, cutoff_hz, derived, required)
         results += check_limb_sensors(compared, robot, contacts, cutoff_hz)
     blocking = _blocking_finding(results)
     if blocking is None or blocking.name == "sign":
