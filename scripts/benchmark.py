@@ -34,12 +34,12 @@ from torchid.estimators import Consistent, LeastSquares
 from torchid.parameters import FRICTION, Array, perturb_parameters
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
 from torchid.problem.base_motion import BaseMotion
-from torchid.problem.chunks import chunk_size
 from torchid.regressor import FrameJacobian, Regressor
 from torchid.robot import Robot, load_robot
 from torchid.sensing import Contact, SensorNoise, named_sensors
 
 _CPU = torch.device("cpu")
+_DENSE = 16384  # samples whose whole regressor a GPU has at a time: 1.7 GB of G1
 
 
 @dataclass(frozen=True)
@@ -244,7 +244,7 @@ def measure(
     robot, builder, samples = bench.robot, bench.builder, bench.samples
     per_sample = PerSample(robots_folder() / case.urdf, robot, case)
     regressor = Regressor(robot).to(device)
-    there, step = samples.to(device), 1024 if device.type == "cpu" else chunk_size(device)
+    there, step = samples.to(device), 1024 if device.type == "cpu" else _DENSE
     few = samples[torch.arange(0, count, 32)]
 
     def in_chunks(work: Callable[[Samples], object]) -> Callable[[], None]:

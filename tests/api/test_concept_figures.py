@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from repository import ROOT
+from repository import DEMO, ROOT
 from script_calls import script
 
 import torchid
@@ -17,7 +17,7 @@ from torchid.report.parameter_figures import INTERVAL
 
 @pytest.fixture(scope="module")
 def run() -> Identification:
-    return torchid.identify(ROOT / "torchid" / "demo" / "quadruped.yaml", output=None)
+    return torchid.identify(DEMO / "quadruped.yaml", output=None)
 
 
 def test_the_projection_leaves_noise_of_forces_that_nobody_measured(run: Identification) -> None:
@@ -45,8 +45,13 @@ def test_as_many_intervals_hold_the_truth_as_the_page_says(run: Identification) 
     assert "24 of the 24 intervals hold it" in " ".join((ROOT / "docs" / "concepts.md").read_text().split())
 
 
-def test_every_figure_of_the_page_is_there_and_is_drawn(tmp_path: Path) -> None:
+def test_every_figure_of_the_page_is_there_and_is_drawn(
+    run: Identification, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = []
+    monkeypatch.setattr(torchid, "identify", lambda file, output: files.append((file, output)) or run)
     script("concept_figures").draw(tmp_path)
+    assert files == [(DEMO / "quadruped.yaml", None)]
     drawn = {path.name for path in tmp_path.iterdir()}
     assert len(drawn) == 4
     page = (ROOT / "docs" / "concepts.md").read_text()

@@ -88,7 +88,7 @@ def test_without_an_output_nothing_is_written(
     demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, result: torchid.Identification
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    torchid.identify(demo / "quadruped.yaml", output=None)
+    torchid.identify(demo / "quadruped.yaml", output=None, estimator=FAST_ESTIMATOR)
     torchid.evaluate(result, demo / "sway_test.npz")
     torchid.check(demo / "quadruped.yaml")
     assert names_in(tmp_path) == []
@@ -197,7 +197,9 @@ def test_a_result_and_its_folder_are_evaluated_alike(demo: Path, result: torchid
 @pytest.mark.filterwarnings(UNPHYSICAL, "ignore::torchid.errors.ConfoundedWarning")
 def test_offsets_of_a_result_are_those_of_its_folder(demo: Path, tmp_path: Path) -> None:
     offsets = {"set": "joints", "offsets": {"joint_torque": "all"}, "noise": {"joint_torque": 0.1}}
-    result = torchid.identify(demo / "quadruped.yaml", sensors=offsets, output=tmp_path / "run")
+    result = torchid.identify(
+        demo / "quadruped.yaml", sensors=offsets, estimator=FAST_ESTIMATOR, output=tmp_path / "run"
+    )
     of_result = torchid.evaluate(result, demo / "sway_test.npz")
     assert of_result.to_dict() == torchid.evaluate(tmp_path / "run", demo / "sway_test.npz").to_dict()
     written = torchid.evaluate(result, demo / "sway_test.npz", write=True)
@@ -215,7 +217,7 @@ def test_logs_are_checked_from_files_and_from_memory(demo: Path, capsys: pytest.
 
 
 def test_an_analysis_has_what_the_command_writes(demo: Path, tmp_path: Path) -> None:
-    analysis = torchid.analyze(demo / "quadruped.yaml", output=tmp_path / "run")
+    analysis = torchid.analyze(demo / "quadruped.yaml", output=tmp_path / "run", estimator=FAST_ESTIMATOR)
     written = json.loads((tmp_path / "run.analysis" / "analysis.json").read_text())
     assert json.loads(json.dumps(analysis.to_dict())) == written
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import html
-import os
+import io
 import re
-import subprocess
-import sys
+import warnings
+from contextlib import redirect_stderr
 from pathlib import Path
 
 import pytest
@@ -23,11 +23,14 @@ site_pages = pytest.importorskip("site_pages")
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("site")
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(folder)]
-    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1", "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "WARNING" not in done.stderr
+    said = io.StringIO()
+    with pytest.MonkeyPatch.context() as monkeypatch, warnings.catch_warnings(), redirect_stderr(said):
+        monkeypatch.chdir(ROOT)
+        monkeypatch.setenv("NO_MKDOCS_2_WARNING", "1")
+        warnings.simplefilter("ignore")  # of Python, about libraries of MkDocs
+        mkdocs = pytest.importorskip("mkdocs.__main__")
+        mkdocs.cli(["build", "--strict", "--site-dir", str(folder)], standalone_mode=False)
+    assert "WARNING" not in said.getvalue()
     return folder
 
 

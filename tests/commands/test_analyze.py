@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from demo import shortened_demo
+from demo import FAST_ESTIMATOR, shortened_demo
 from refusals import files_in, refusal
 from synthetic import Oracle
 
@@ -42,6 +42,7 @@ def asked(folder: Path, **settings: Any) -> Path:
     content: dict[str, Any] = {
         "robot": {"urdf": str(folder / "quadruped.urdf")},
         "contacts": [{"frame": foot, "type": "point"} for foot in FEET],
+        "estimator": FAST_ESTIMATOR,
         "output": str(folder / "out"),
     }
     path = folder / "asked.yaml"
@@ -57,7 +58,6 @@ def with_logs(experiment: Path) -> tuple[Path, dict[str, Any]]:
         logs={"train": ["sway_train.npz"], "test": ["sway_test.npz"]},
         preprocessing={"cutoff_hz": 8},
         sensors={"joint_torques": [*TORQUES[:-1]], "noise": {"joint_torque": 0.1, "contact_force": 0.5}},
-        estimator={"name": "least_squares", "ridge": 0.001},
         analysis={"compare": {"full": "full", "feet": "contacts"}},
         output=str(experiment / "with_logs"),
     )

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
 
 import pytest
 from matplotlib.figure import Figure
 
+from torchid.report import figure_style
+
 FIGURES = (
     *("draw_forces", "error_figure", "parameter_figure", "identifiability_figure", "contribution_figure"),
     *("extra_figure", "ridge_figure", "tree_figure", "accuracy_figure"),
 )
 PAGE, EVENTS = "write_page", "write_events"
+_WHITE = Figure(figsize=(1.0, 1.0))
+_figure_bytes = figure_style.figure_bytes
+_white_bytes = cache(partial(_figure_bytes, _WHITE))
 _MODULES = [import_module(f"torchid.commands.{name}") for name in ("results", "run_figures", "evaluate", "analyze")]
 _DRAWN = [
     (module, name, vars(module)[name])
@@ -24,11 +30,14 @@ _DRAWN = [
 
 
 def draw_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Commands in this process write small white figures, no page of a run and no events."""
+    """Commands in this process write one small white figure for all, no page of a run and no events."""
     for module, name, _ in _DRAWN:
-        monkeypatch.setattr(
-            module, name, _write_nothing if name == EVENTS else lambda *_, **__: Figure(figsize=(1.0, 1.0))
-        )
+        monkeypatch.setattr(module, name, _write_nothing if name == EVENTS else lambda *_, **__: _WHITE)
+    monkeypatch.setattr(
+        figure_style,
+        "figure_bytes",
+        lambda figure, form: _white_bytes(form) if figure is _WHITE else _figure_bytes(figure, form),
+    )
 
 
 def _write_nothing(_: object, folder: Path, figures: Callable[[], Mapping[str, bytes]]) -> None:

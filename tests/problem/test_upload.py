@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -57,15 +59,30 @@ class Copies:
         return arrived
 
 
-def test_the_copy_of_the_next_chunk_starts_before_the_work_on_one_and_no_other(samples: Samples) -> None:
+def test_the_next_chunk_and_no_other_is_made_and_copied_while_one_is_worked_on(samples: Samples) -> None:
     events: list[str] = []
     for chunk, number in _one_ahead(chunks_of(samples, events), Copies(events)):
         assert torch.equal(chunk.time, samples.time[10 * number : 10 * number + 10])
+        until = time.monotonic() + 60.0
+        while number < 5 and f"start {number + 1}" not in events:
+            assert time.monotonic() < until, "the next chunk waits for the work on this one"
+            time.sleep(0.001)
+        assert f"cut {number + 2}" not in events
         events.append(f"work {number}")
-    expected = ["cut 0", "start 0"]
-    for number in range(5):
-        expected += [f"cut {number + 1}", f"start {number + 1}", f"wait {number}", f"work {number}"]
-    assert events == [*expected, "wait 5", "work 5"]
+    assert [event for event in events if "work" in event] == [f"work {number}" for number in range(6)]
+    for number in range(6):
+        assert events.index(f"cut {number}") < events.index(f"start {number}") < events.index(f"wait {number}")
+
+
+def test_a_chunk_that_cannot_be_made_ends_the_work(samples: Samples) -> None:
+    def failing() -> Iterator[tuple[Samples, int]]:
+        yield samples, 0
+        raise OSError("gone")
+
+    chunks = _one_ahead(failing(), Copies([]))
+    next(chunks)
+    with pytest.raises(OSError, match="gone"):
+        next(chunks)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
@@ -141,7 +158,11 @@ def test_a_log_is_the_same_whether_its_chunks_are_one_ahead_or_not(
 def test_a_gpu_gets_larger_chunks_unless_a_call_says_how_large(
     samples: Samples, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert chunk_size(CPU) == CHUNK < chunk_size(CUDA)
+    for memory, expected in ((2**30, CHUNK), (2**33, 21845), (2**37, 64 * CHUNK)):
+        properties = SimpleNamespace(total_memory=memory)
+        monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device, found=properties: found)
+        assert chunk_size(CUDA) == expected
+    assert chunk_size(CPU) == CHUNK
     robot, contacts = load(SOLO12), [Contact("FL_FOOT", "point")]
     builder = RowBuilder(robot, contacts, sensor_set("full", robot, contacts))
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import run_figures
 import yaml
 from demo import shortened_demo
 from pages import browser_programs, figures_of, opened
@@ -183,11 +184,11 @@ def test_a_damaged_run_is_refused_in_one_line(
     assert len(said.splitlines()) == 1
 
 
-@pytest.mark.usefixtures("figures")
 def test_a_run_writes_its_page_or_says_why_not(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     settings = str(run.parent / "quadruped.yaml")
+    run_figures.draw(monkeypatch, (run_figures.PAGE,))
     assert main(["identify", "-q", settings, f"output={tmp_path / 'with'}"]) == 0
     written = (tmp_path / "with" / PAGE).read_text()
     assert figures_of(written).keys() >= FIGURES

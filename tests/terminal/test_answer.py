@@ -11,7 +11,7 @@ import pytest
 from demo import shortened_demo
 from repository import DEMO
 
-from torchid.cli import main
+from torchid.cli import _options, main
 from torchid.commands.identify import identify
 from torchid.commands.results import Identification
 from torchid.config import load_config
@@ -253,17 +253,19 @@ def test_all_tables_are_printed_when_asked_for_and_nothing_when_asked_to_be_quie
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     printed, file = {}, str(shortened_demo(tmp_path / "demo", 300) / "quadruped.yaml")
-    for option in ("--quiet", "--verbose", "-q", "-v", None):
+    for option in ("--quiet", "--verbose", None):
         command = ["identify", file, f"output={tmp_path / str(option)}", "logs.test=[]"]
         assert main([*command, *([] if option is None else [option])]) == 0
         printed[option] = capsys.readouterr().out
-    assert printed["--quiet"] == printed["-q"] == ""
+    assert printed["--quiet"] == ""
     assert len(printed[None].splitlines()) <= LINES
     assert printed[None].splitlines()[-1] == f"written to    {tmp_path / 'None'}"
     for title in ("Contact states", "What each log", "Parameters:", "Noise that weights the rows", "condition     "):
         assert title in printed["--verbose"]
-        assert title in printed["-v"]
         assert title not in printed[None]
     assert printed["--verbose"].splitlines()[0] == printed[None].splitlines()[0]
+    for names in (("--quiet", "-q"), ("--verbose", "-v")):
+        one, other = (vars(_options(["identify", file, option])) for option in names)
+        assert one == other != vars(_options(["identify", file]))
     with pytest.raises(SystemExit):
         main(["identify", file, "-q", "-v"])

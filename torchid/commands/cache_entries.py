@@ -27,7 +27,7 @@ from torchid.fitting.experiment import Experiment, Scene
 from torchid.fitting.factor_documents import PackedPart, PartPacker, PartReader
 from torchid.logs.lazy_arrays import MappedPages
 from torchid.logs.time_range import log_title
-from torchid.problem import RowBuilder, Samples, TriangularFactor
+from torchid.problem import RowBuilder, Samples
 from torchid.problem.base_motion import BaseMotion
 from torchid.problem.chunks import worker_count
 from torchid.problem.compression import Part
@@ -258,13 +258,7 @@ def _unpacked(entry: CacheEntry, builder: RowBuilder, sources: Sequence[str]) ->
     for packed, (source, fold, block, unloaded) in zip(
         _PARTS.validate_python(document["parts"]), document["of"], strict=True
     ):
-        part = reader.read(sources[source], packed, unloaded)
-        factor = part.factor
-        blocks, noise_gram = (
-            {support: x.to(builder.device) for support, x in by.items()} for by in (factor.blocks, factor.noise_gram)
-        )
-        moved = TriangularFactor.from_blocks(columns, factor.rows, factor.independent_rows, blocks, noise_gram)
-        parts.append(replace(part, factor=moved, fold=fold, block=block))
+        parts.append(replace(reader.read(sources[source], packed, unloaded), fold=fold, block=block))
     if reader.numbers_left:
         raise ValueError("more numbers than are described")
     return parts

@@ -223,11 +223,10 @@ def with_estimated_noise(scene: S, estimated: Mapping[str, Any], any_stated: boo
 
 
 def require_device(device: str) -> None:
-    """Refuse a device that this machine has not."""
-    try:
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:
-        raise ConfigError.at_field("device", f"'{device}' is not available here", "cpu, cuda, cuda:0, ...") from error
+    """Refuse a device that this machine has not; it is not connected to: copies, which read logs, could not be made."""
+    chosen = torch.device(device)
+    if chosen.type == "cuda" and not (torch.cuda.is_available() and (chosen.index or 0) < torch.cuda.device_count()):
+        raise ConfigError.at_field("device", f"'{device}' is not available here", "cpu, cuda, cuda:0, ...")
 
 
 def set_up_scene(config: ExperimentConfig | AnalyzeConfig) -> Scene:

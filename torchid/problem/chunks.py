@@ -35,7 +35,8 @@ CHUNK = 4096
 _LEAST, _EACH = 2048, 4  # samples per chunk where there are fewer chunks than so many for each worker
 _LET_GO = 4  # chunks of a worker, after which pages that samples are mapped to leave the memory of the process
 _WORTH_COPYING = 50_000  # samples of a pass: copies save 0.8 us of each on two cores, and take 15 to 30 ms to make
-_CHUNK_OF_GPU = 4 * CHUNK  # hides launches of some microseconds behind the work of each; not measured
+_MOST_ON_GPU = 64 * CHUNK  # samples per chunk: launching the work on one takes the host 12 ms, whatever its size
+_SHARE_OF_GPU, _ON_GPU = 8, 48 * 2**10  # a chunk takes one of so many parts of a GPU's memory; bytes of a sample
 
 
 def map_chunks(
@@ -219,8 +220,11 @@ def _run_in_copies(tasks: Sequence[Task], run: Callable[[Iterator[Task], bool], 
 
 
 def chunk_size(device: torch.device) -> int:
-    """Default number of samples per chunk."""
-    return _CHUNK_OF_GPU if device.type == "cuda" else CHUNK
+    """Default number of samples per chunk: on a GPU as many as its memory allows."""
+    if device.type != "cuda":
+        return CHUNK
+    memory = torch.cuda.get_device_properties(device).total_memory
+    return min(max(memory // (_SHARE_OF_GPU * _ON_GPU), CHUNK), _MOST_ON_GPU)
 
 
 def worker_count(device: torch.device) -> int:
@@ -267,8 +271,9 @@ def _pools() -> ThreadpoolController:
 def upload(chunks: Iterable[tuple[Samples, Label]], device: torch.device) -> Iterator[tuple[Samples, Label]]:
     """The chunks, in order, on a device; on a CPU the chunks themselves.
 
-    For a GPU they go through page-locked memory on a stream of their own, at most one ahead of the chunk that is worked
-    on: the host does not wait for copies, and the memory is that of three chunks, page-locked, copied and worked on.
+    For a GPU a thread of its own makes them and copies them through page-locked memory on a stream of their own, at
+    most one ahead of the chunk that is worked on: the work waits neither for the host nor for copies, and the memory is
+    that of three chunks, page-locked, copied and worked on.
 
     Args:
         chunks: with whatever goes with each.
@@ -280,15 +285,19 @@ def upload(chunks: Iterable[tuple[Samples, Label]], device: torch.device) -> Ite
 
 
 def _one_ahead(chunks: Iterable[tuple[Samples, Label]], copies: _SideStream) -> Iterator[tuple[Samples, Label]]:
-    """The chunks as they arrive; the copy of the next one starts before one is handed over."""
-    moving: tuple[Callable[[], Samples], Label] | None = None
-    for samples, label in chunks:
-        following = (copies.start(samples), label)
-        if moving is not None:
-            yield moving[0](), moving[1]
-        moving = following
-    if moving is not None:
-        yield moving[0](), moving[1]
+    """The chunks as they arrive; the next one is made, and its copy starts, while one is worked on."""
+    following = iter(chunks)
+
+    def start() -> tuple[Callable[[], Samples], Label] | None:
+        for samples, label in following:
+            return copies.start(samples), label
+        return None
+
+    with ThreadPoolExecutor(1, initializer=torch.set_num_threads, initargs=(thread_count(),)) as beside:
+        moving = beside.submit(start)
+        while (chunk := moving.result()) is not None:
+            moving = beside.submit(start)
+            yield chunk[0](), chunk[1]
 
 
 class _SideStream:

@@ -224,9 +224,10 @@ def compress_unloaded(logs: Sequence[Samples], builder: RowBuilder) -> list[Part
 
 @one_thread()
 def _merge_parts(of_workers: Iterable[list[Part]]) -> list[Part]:
-    """The parts of all workers, those of one log, contact state and fold merged."""
+    """The parts of all workers, those of one log, contact state and fold merged, on the CPU."""
     total: dict[PartKey, Part] = {}
     for part in chain.from_iterable(of_workers):
+        part.factor = part.factor.to_cpu()
         same = total.setdefault(part.key, part)
         if same is not part:
             same.samples += part.samples
@@ -392,9 +393,8 @@ def merge_by_key(parts: Sequence[Part], keys: Sequence[tuple[object, ...]], buil
     """One part for each key, with whatever else of the first; the factors of the parts stay as they are."""
     out: dict[tuple[object, ...], Part] = {}
     for part, key in zip(parts, keys, strict=True):
-        if key not in out:
-            out[key] = replace(part, factor=TriangularFactor(builder.width), samples=0, masked=set())
-        out[key].factor.merge(part.factor)
-        out[key].masked |= part.masked
-        out[key].samples += part.samples
+        merged = out.setdefault(key, replace(part, factor=TriangularFactor(builder.width), samples=0, masked=set()))
+        merged.factor.merge(part.factor)
+        merged.masked |= part.masked
+        merged.samples += part.samples
     return list(out.values())

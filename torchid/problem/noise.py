@@ -290,13 +290,12 @@ class VarianceComponentEstimator:
     ) -> _Residuals:
         rows, group_of = self.rows, self.rows.group_of
         leverages, size, readings = (np.zeros(len(variance)) for _ in range(3))
-        for chunk in rows.whitened(variance):
+        for chunk in rows.whitened(variance, _THINNED):
             own = chunk.sources.square().sum(2)
-            thinned = slice(None, None, _THINNED)
-            fitted = chunk.rows[thinned, :, :-1] @ directions[chunk.log]
-            leverage = (chunk.sources[thinned] @ fitted).square().sum((0, 2))
+            fitted = chunk.rows[..., :-1] @ directions[chunk.log]
+            leverage = (chunk.sources[::_THINNED] @ fitted).square().sum((0, 2))
             np.add.at(leverages, group_of, chunk.oversampling * leverage.numpy())
-            np.add.at(size, group_of, own[thinned].sum(0).numpy())
+            np.add.at(size, group_of, own[::_THINNED].sum(0).numpy())
             np.add.at(readings, group_of, (own > _NEGLIGIBLE).sum(0).numpy() / chunk.oversampling)
         remaining = 1.0 - np.divide(leverages, size, out=np.zeros_like(size), where=size > 0.0)
         r = [chunk.rows[..., :-1] @ columns[chunk.log] - chunk.rows[..., -1] for chunk in rows.chunks]

@@ -116,7 +116,7 @@ def estimate_noise_gram(
         return total
     for of_worker in map_chunks(logs, builder, partial(_noise_gram_of_chunks, builder, by_log)):
         for (source, number, state), noise_gram in of_worker.items():
-            halves = {support: x.triu() for support, x in noise_gram.items()}
+            halves = {support: x.cpu().triu() for support, x in noise_gram.items()}
             both = {support: x + x.triu(1).T for support, x in halves.items()}  # to the last bit, as files have one
             _add(total.setdefault(key(by_log[source][number], state), {}), both, float(step))
     return total

@@ -150,10 +150,13 @@ class SampledRows:
             forces.append(J[:, torch.from_numpy(components)])
         return torch.cat(forces, dim=1)
 
-    def whitened(self, variance: Array) -> Iterator[_Chunk]:
-        """The chunks, whitened with variances of the groups relative to the stated ones, (G,)."""
+    def whitened(self, variance: Array, thinned: int = 1) -> Iterator[_Chunk]:
+        """The chunks, whitened with variances of the groups relative to the stated ones, (G,).
+
+        They have the sources of all samples, and the rows of one in so many.
+        """
         if (variance == 1.0).all():
-            yield from self.chunks
+            yield from (replace(chunk, rows=chunk.rows[::thinned]) for chunk in self.chunks)
             return
         scale = torch.from_numpy(np.sqrt(variance)[self.group_of])[:, None]
         for chunk in self.chunks:
@@ -161,7 +164,7 @@ class SampledRows:
             S = sources.mT @ sources
             empty = S.diagonal(dim1=1, dim2=2) == 0.0  # rows of zeros
             L = torch.linalg.cholesky(S + torch.diag_embed(empty.to(S)))
-            rows = torch.linalg.solve_triangular(L, chunk.rows, upper=False)
+            rows = torch.linalg.solve_triangular(L[::thinned], chunk.rows[::thinned], upper=False)
             sources = torch.linalg.solve_triangular(L, sources.mT, upper=False).mT
             yield replace(chunk, rows=rows, sources=sources)
 
