@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +16,7 @@ import numpy as np
 import pytest
 
 from torchid.commands.cache import Cache, content_key
+from torchid.copies import copies_allowed
 from torchid.errors import TorchidWarning
 
 
@@ -150,3 +154,24 @@ def test_a_young_checksum_is_not_trusted(tmp_path: Path, monkeypatch: pytest.Mon
     cache.write_index()
     assert len(found) == 2
     assert not (tmp_path / "cache").exists()
+
+
+@pytest.mark.parametrize("allowed", [copies_allowed, nullcontext], ids=["by a copy", "alone"])
+def test_long_files_are_summed_up_while_something_else_is_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, allowed: Callable[[], AbstractContextManager[None]]
+) -> None:
+    log, done, content = tmp_path / "log", list[Path](), bytes(range(100))
+    log.write_bytes(content)
+
+    def meanwhile() -> None:
+        done.append(log)
+
+    with allowed():
+        sums = [Cache(tmp_path / "cache", 1.0).checksum(log, [log], meanwhile)]
+        assert not done, "a short file is summed up at once"
+        monkeypatch.setattr("torchid.commands.cache._LONG", 100)
+        monkeypatch.setattr("torchid.commands.cache._YOUNG", -1.0)
+        cache = Cache(tmp_path / "cache", 1.0)
+        sums += [cache.checksum(log, [log], meanwhile) for _ in range(2)]
+    assert sums == [hashlib.sha256(content).hexdigest()] * 3
+    assert done == [log], "the second time nothing is read"

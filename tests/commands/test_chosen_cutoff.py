@@ -15,6 +15,7 @@ from torchid.config import load_config
 from torchid.errors import ConfigError
 from torchid.fitting.experiment import set_up
 
+FEW = "preprocessing.sample_rate_hz=auto"
 AUTO = ["preprocessing={cutoff_hz: auto, cache_gb: 0}", "sensors.noise={joint_position: 1e-4}", "estimator.ridge=0.01"]
 AUTO += [f"logs.train=[{json.dumps(str(DEMO / 'sway_train.npz[:6]'))}]"]
 FILE = str(DEMO / "quadruped.yaml")
@@ -48,6 +49,18 @@ def test_a_log_larger_than_memory_gives_the_same_cutoff(run: Path, tmp_path: Pat
     assert main(["identify", FILE, *settings]) == 0
     chosen = [load_config(folder / "config.yaml").preprocessing.cutoff_hz for folder in (run, tmp_path / "run")]
     assert chosen[0] == chosen[1]
+
+
+def test_a_run_of_as_few_samples_as_the_filter_allows_is_that_of_every_k_th(tmp_path: Path) -> None:
+    rates = {"auto": FEW, "number": "preprocessing.sample_rate_hz=50"}  # of 100 Hz, for a cutoff of 8 Hz
+    for name, rate in rates.items():
+        assert main(["identify", FILE, *AUTO, "preprocessing.cutoff_hz=8", rate, f"output={tmp_path / name}"]) == 0
+    found = [json.loads((tmp_path / name / "parameters.json").read_text()) for name in rates]
+    assert found[0] == found[1]
+    chosen = [json.loads((tmp_path / name / "metrics.json").read_text())["sample_rate_selection"] for name in rates]
+    assert chosen[1] is None
+    assert list(chosen[0]["rates_hz"].values()) == pytest.approx([50.0])
+    assert main(["evaluate", str(tmp_path / "auto"), "--log", str(DEMO / "sway_test.npz")]) == 0
 
 
 def test_factors_are_made_with_a_number_and_fitted_without_auto(

@@ -14,6 +14,7 @@ from synthetic import ANYMAL, PANDA, ROBOTS, SOLO12
 
 from torchid.commands.init import Initiated, init
 from torchid.config import load_config
+from torchid.errors import TorchidWarning
 from torchid.logs import Log, read_log
 from torchid.proposals.numbers import point_along_z, threshold
 
@@ -152,10 +153,32 @@ def test_arrays_of_simulators_are_split(tmp_path: Path) -> None:
     assert "joint_position: columns 7 to the last of 'qpos'" in said.guessed
 
 
-@pytest.mark.parametrize("name", ["dt", "step_dt", "sim_time_step"])
-def test_a_number_called_dt_is_the_step_of_a_recording_without_stamps(tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize("has_base", [True, False])
+def test_states_of_optimal_control_are_positions_then_velocities_and_one_more_than_controls(
+    tmp_path: Path, has_base: bool
+) -> None:
+    q, dq, tau = motion(12 if has_base else 6)
+    turn = Rotation.from_rotvec(np.outer(np.sin(TIME), [0.1, 0.2, 0.3]))
+    rate = turn.apply(np.outer(np.cos(TIME), [0.1, 0.2, 0.3]), inverse=True)
+    place, speed = np.outer(np.sin(2.0 * TIME), [0.1, 0.2, 0.0]), np.outer(2.0 * np.cos(2.0 * TIME), [0.1, 0.2, 0.0])
+    xs = [q, dq]
+    if has_base:
+        xs = [place, turn.as_quat(), q, turn.apply(speed, inverse=True), rate, dq]
+    np.savez(tmp_path / "x.npz", xs=np.hstack(xs), us=tau[:-1], dt=TIME[1] - TIME[0])
+    with pytest.warns(TorchidWarning, match="joint_torque has one sample less than all else, as controls have"):
+        _, log, _ = started(GO1 if has_base else UR5, tmp_path / "x.npz")
+    for name, values in (("joint_position", q[:-1]), ("joint_velocity", dq[:-1]), ("joint_torque", tau[:-1])):
+        np.testing.assert_array_equal(getattr(log, name), values)
+    if has_base:
+        np.testing.assert_allclose(log.base_angular_velocity_base, rate[:-1])
+        np.testing.assert_allclose(log.base_linear_velocity_world, speed[:-1], atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["dt", "step_dt", "sim_time_step", "duration"])
+@pytest.mark.parametrize("each", [False, True], ids=["once", "of each sample"])
+def test_a_number_called_dt_is_the_step_of_a_recording_without_stamps(tmp_path: Path, name: str, each: bool) -> None:
     q, dq, tau = motion(12)
-    arrays = {"dof_pos": q, "dof_vel": dq, "torques": tau, "actions": q, name: np.array(0.005)}
+    arrays = {"dof_pos": q, "dof_vel": dq, "torques": tau, "actions": q, name: np.full(len(q) if each else (), 0.005)}
     np.savez(tmp_path / "x.npz", **arrays)
     said, log, given = started(GO1, tmp_path / "x.npz")
     np.testing.assert_array_equal(log.time, TIME)
@@ -216,6 +239,17 @@ def test_short_gaps_in_the_motion_are_bridged_and_long_ones_excluded(tmp_path: P
         said, *_ = started(SOLO12, tmp_path / f"{last}.npz")
         assert key in (tmp_path / f"{last}.yaml").read_text()
         assert any(text.startswith("preprocessing.") and "gaps of joint_position" in text for text in said.guessed)
+
+
+def test_of_a_long_log_a_fit_takes_as_few_samples_as_the_filter_allows(tmp_path: Path) -> None:
+    for count in (100_000, 100_001):
+        time = np.arange(count) / 500.0
+        swing = 0.3 * np.sin(time[:, None] + np.arange(12))
+        np.savez(tmp_path / f"{count}.npz", t=time, q=swing, tau=swing)
+        said, *_ = started(SOLO12, tmp_path / f"{count}.npz")
+        is_long = count > 100_000
+        assert ("sample_rate_hz: auto" in (tmp_path / f"{count}.yaml").read_text()) == is_long
+        assert any("preprocessing.sample_rate_hz: auto, as 100001 samples" in text for text in said.guessed) == is_long
 
 
 RPY = np.stack([0.2 * np.sin(TIME), 0.1 - 0.3 * TIME, 3.0 + 0.4 * TIME], axis=1)  # yaw passes half a turn

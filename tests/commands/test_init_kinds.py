@@ -341,10 +341,21 @@ def test_python_objects_are_refused_in_a_line_and_left_out_where_nobody_needs_th
     assert_recorded(initiated(tmp_path / "y.npz")[0], log)
 
 
-def test_matlabs_files_of_before_7_3_are_refused_with_what_to_do(tmp_path: Path) -> None:
-    scipy.io.savemat(tmp_path / "x.mat", {"q": np.zeros((5, 12))})
+@pytest.mark.parametrize("do_compression", [False, True])
+def test_matlabs_files_of_before_7_3_are_read_with_what_is_in_structures(tmp_path: Path, do_compression: bool) -> None:
+    log = recorded()
+    arrays = arrays_of(log)
+    arrays["joint_names"] = np.array(arrays["joint_names"], dtype=object)  # a cell array
+    scipy.io.savemat(tmp_path / "x.mat", {"log": arrays, "note": "a walk"}, do_compression=do_compression)
+    found, _, text = initiated(tmp_path / "x.mat")
+    assert yaml.safe_load(text)["logs"]["columns"]["joint_position"] == "log/q"
+    assert_recorded(found, log)
+
+
+def test_what_matlab_4_wrote_is_refused(tmp_path: Path) -> None:
+    scipy.io.savemat(tmp_path / "x.mat", {"q": np.zeros((5, 12))}, format="4")
     line = refused(lambda: init(URDF, tmp_path / "x.mat", tmp_path / "x.yaml"), str(tmp_path / "x.mat"), LogError)
-    assert "no HDF5, as Matlab's files of before 7.3; accepted: one that Matlab saved with -v7.3" in line
+    assert "accepted: a complete file of Matlab 5 or later" in line
 
 
 @pytest.mark.parametrize(("suffix", "separator"), [("txt", " "), ("tsv", "\t"), ("dat", ";")])

@@ -20,6 +20,7 @@ from torchid.errors import UnphysicalInertiaWarning
 from torchid.logs import read_log
 from torchid.robot import load_robot
 
+SIDES = ("front_left", "front_right", "rear_left", "rear_right")
 TIAGO = ROBOTS / "tiago_description/robots/tiago_no_hand.urdf"
 
 
@@ -179,6 +180,24 @@ def test_arrays_of_one_limb_each_are_its_joints_in_the_order_of_the_robots_file(
     np.savez(tmp_path / "y.npz", **{name: x for name, x in arrays.items() if "FR" not in name})
     said = init(URDF, tmp_path / "y.npz", tmp_path / "y.yaml")
     assert any(line.startswith("joint_position: ") for line in said.missing), "limbs alone are not the robot"
+
+
+@pytest.mark.parametrize("kind", ["arrays with lists of names", "numbered columns", "one limb without a name"])
+def test_parts_of_a_robot_are_told_by_lists_of_names_by_limbs_and_by_what_is_left(tmp_path: Path, kind: str) -> None:
+    log, columns = recorded(), dict[str, Any]()
+    limbs = {side: [f"{side}_{joint}" for joint in ("knee", "hip", "thigh")] for side in SIDES}
+    for limb, joints in limbs.items():
+        ordered = joints if kind.startswith("arrays") else [f"{limb}_{x}" for x in ("hip", "thigh", "knee")]
+        values = np.stack([log.joint_position[:, log.joint_names.index(name)] for name in ordered], axis=1)
+        if kind == "numbered columns":
+            columns |= {f"{limb}.position.{k}": x for k, x in enumerate(values.T)}
+            continue
+        called = "spine" if limb == SIDES[-1] and kind.startswith("one") else limb
+        columns |= {f"{called}MotorPos": values} | ({f"{limb}JointNames": ordered} if ordered is joints else {})
+    save = save_csv if kind == "numbered columns" else lambda path, given: (np.savez(path, **given), path)[1]
+    found, _, _ = initiated(save(tmp_path / ("x.csv" if save is save_csv else "x.npz"), {"t": log.time} | columns))
+    of = [found.joint_names.index(name) for name in log.joint_names]
+    np.testing.assert_array_equal(found.joint_position[:, of], log.joint_position)
 
 
 def test_files_with_the_same_columns_are_told_by_their_names(tmp_path: Path) -> None:

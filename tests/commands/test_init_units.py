@@ -19,7 +19,7 @@ from torchid.errors import LogError
 from torchid.fitting.experiment import set_up
 from torchid.logs import Log, read_log
 from torchid.logs.name_matching import propose_field
-from torchid.logs.units import split_unit
+from torchid.logs.units import quantities_with, split_unit, unit_factor
 
 URDF = DEMO / "quadruped.urdf"
 TURN = 180.0 / np.pi
@@ -48,15 +48,22 @@ def stem(joint: str) -> str:
         ("acc_g", "acc", "g"),
         ("w [rad s^-1]", "w", "rad s^-1"),
         ("quat_w [-]", "quat_w", "-"),
-        ("angle [Grad]", "angle", "Grad"),
+        ("angle [gon]", "angle", "gon"),
         ("motor_state[3]", "motor_state[3]", ""),
         ("acc[x]", "acc[x]", ""),
         ("left_hip_pitch", "left_hip_pitch", ""),
-        ("angle_Grad", "angle_Grad", ""),
+        ("angle_Grad", "angle", "Grad"),
+        ("angle_gon", "angle_gon", ""),
     ],
 )
 def test_a_unit_is_what_brackets_hold_or_a_suffix_that_is_known(column: str, name: str, unit: str) -> None:
     assert split_unit(column) == (name, unit)
+
+
+@pytest.mark.parametrize("unit", ["U/min", "tr/min", "1/min", "giri/min", "r / min"])
+def test_turns_per_minute_are_spelled_in_many_ways(unit: str) -> None:
+    assert unit_factor("x", unit, ("angular velocity",)) == unit_factor("x", "rpm", ("angular velocity",))
+    assert quantities_with("Nm/min") == ()
 
 
 def test_a_unit_tells_the_field_where_the_name_says_nothing() -> None:
@@ -111,10 +118,10 @@ def test_units_of_headers_give_the_log_that_was_recorded(
 
 def test_a_unit_that_nobody_knows_is_named(tmp_path: Path) -> None:
     log = recorded()
-    path = save_csv(tmp_path / "x.csv", {"t": log.time, **with_units(log, log.joint_names, ("q_{} [Grad]",) * 3)})
-    said = [note for note in init(URDF, path, tmp_path / "new.yaml").guessed if "Grad" in note]
+    path = save_csv(tmp_path / "x.csv", {"t": log.time, **with_units(log, log.joint_names, ("q_{} [gon]",) * 3)})
+    said = [note for note in init(URDF, path, tmp_path / "new.yaml").guessed if "gon" in note]
     assert len(said) == 1
-    assert "unit 'Grad' of its columns is none of angle or length" in said[0]
+    assert "unit 'gon' of its columns is none of angle or length" in said[0]
 
 
 def without(log: Log, joints: tuple[str, ...], folder: Path) -> Initiated:

@@ -156,6 +156,10 @@ HEADERS = {
     "Japanese": ("時刻[s]", "関節角度{}[deg]", "関節角速度{}[deg/s]", "トルク{}[Nm]", "加速度{}[m/s2]",
                  "角速度{}[deg/s]"),
     "Chinese": ("时间", "关节角度_{}[deg]", "关节速度_{}[deg/s]", "力矩_{}", "加速度_{}", "角速度_{}[deg/s]"),
+    "Italian": ("tempo_s", "posizione_{}_gradi", "velocità_{}_gradi_s", "coppia_{}_Nm", "accelerometro_{}_m_s2",
+                "giroscopio_{}_gradi_s"),
+    "Portuguese": ("tempo", "posição {} [graus]", "velocidade {} [graus/s]", "torque {} [N.m]", "aceleração {}",
+                   "giroscópio {} [graus/s]"),
     "short": ("t", "Q_{}[deg]", "dQ_{}[deg/s]", "Tau_{}", "Acc{}(m/s2)", "Gyr{}(dps)"),
 }  # fmt: skip
 
@@ -304,8 +308,8 @@ def _star(path: Path, tips: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize(("tips", "found"), [("tip", 3), ("fingertip", 0)])
-def test_balls_at_the_ends_of_limbs_are_feet_where_no_link_is_called_so_but_for_fingers(
+@pytest.mark.parametrize(("tips", "found"), [("tip", 3), ("fingertip", 0), ("wheel_link", 0)])
+def test_balls_at_the_ends_of_limbs_are_feet_where_no_link_is_called_so_but_for_fingers_and_wheels(
     tmp_path: Path, tips: str, found: int
 ) -> None:
     contacts = guess_contacts(load_robot(_star(tmp_path / "star.urdf", tips)), [], [])

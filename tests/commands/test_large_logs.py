@@ -35,6 +35,7 @@ SETTINGS = {
     "resampled": ({"sample_rate_hz": 137}, 0.0),
     "filtered and resampled": ({"sample_rate_hz": 301.5, "cutoff_hz": 25}, 1e-10),
     "every fifth sample": ({"sample_rate_hz": 100, "cutoff_hz": 25}, 1e-10),
+    "as few samples as the filter allows": ({"sample_rate_hz": "auto", "cutoff_hz": 18}, 1e-10),
     "away from contact changes": ({"contact_margin_s": 0.05, "cutoff_hz": 20}, 1e-10),
 }
 

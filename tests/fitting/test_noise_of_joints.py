@@ -75,6 +75,14 @@ def arm(tmp_path_factory: pytest.TempPathFactory) -> Arm:
     )
 
 
+def test_patterns_name_the_joints_whose_torques_are_measured(arm: Arm) -> None:
+    sensors = arm.experiment("sensors.set=null", "sensors.joint_torques=['wrist_?_joint', elbow_joint]").sensors
+    names = arm.experiment().robot.joint_names
+    assert [name for name, measured in zip(names, sensors.torque, strict=True) if measured] == [*names[2:]]
+    with pytest.raises(InputError, match=r"sensors\.joint_torques: '\*_knee' matches no joint that moves"):
+        arm.experiment("sensors.set=null", "sensors.joint_torques=['*_knee']")
+
+
 def estimated(arm: Arm, samples: Samples, *overrides: str) -> NoiseSummary:
     experiment = arm.experiment(*overrides)
     return experiment.estimate_noise([samples], experiment.sensors)

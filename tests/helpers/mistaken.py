@@ -144,6 +144,17 @@ def _joints(case: Case) -> Log | None:
     return replace(case.log, joint_names=tuple(names[place] for place in order))
 
 
+def _limbs(case: Case) -> Log | None:
+    """Torques of limbs exchanged, of positions that are right: front for rear, or left for right of two legs."""
+    torque, names = case.log.joint_torque, list(case.log.joint_names)
+    if torque is None or case.machine.bolted:
+        return None
+    ends = {"front": "rear", "rear": "front"}
+    other = [re.sub("^(front|rear)", lambda end: ends[end[0]], name) for name in names]
+    order = _swapped(names) if other == names else [names.index(name) for name in other]
+    return replace(case.log, joint_torque=torque[:, order])
+
+
 def _rates(case: Case) -> Log | None:
     velocity = case.happened.v[:, 0 if case.machine.bolted else 6 :]
     noise = 1e-2 * np.random.default_rng(3).normal(size=velocity.shape)
@@ -211,6 +222,7 @@ MISTAKES = (
     Mistake("torques reversed", _scaled("joint_torque", -1.0), "joint_torque", "reversed"),
     Mistake("one torque reversed", _one_torque(-1.0), "joint_torque", "reversed"),
     Mistake("one torque x 1.3", _one_torque(1.3), "joint_torque", "scale"),
+    Mistake("torques of limbs exchanged", _limbs, "joint_torque", "exchanged"),
     Mistake("torques in N mm", _scaled("joint_torque", 1e3), "joint_torque", "mNm"),
     Mistake("wrenches reversed", _scaled("contact_wrench_local", -1.0), "contact_wrench", "revers"),
     Mistake("wrenches in kg", _scaled("contact_wrench_local", 1.0 / 9.81), "contact_wrench", "kg"),

@@ -215,6 +215,24 @@ def _interleaved(path: Path) -> None:
 
 
 _SKIPPED = (b"\x80" + bytes(8)) * (6 * MEBIBYTE // 9)
+
+
+def _mat(content: bytes) -> Callable[[Path], None]:
+    """A file of Matlab 5 with one pressed element."""
+    header = b"MATLAB 5.0".ljust(124) + b"\x00\x01IM" + struct.pack("<II", 15, len(content))
+
+    def make(path: Path) -> None:
+        path.write_bytes(header + content)
+
+    return make
+
+
+def _cells(depth: int) -> bytes:
+    """So many cells, one in the other."""
+    inside = struct.pack("<IIIIIIiiII", 6, 8, 1, 0, 5, 8, 1, 1, 1, 0)
+    return b"".join(struct.pack("<II", 14, 48 * k - 8) + inside for k in range(depth, 0, -1))
+
+
 CASES: dict[str, Callable[[Path], None]] = {
     "h5 of chunks of one number": _tiny_chunks,
     "h5 of a chunk that holds 2 GB": _chunk(pressed(2000)),
@@ -225,6 +243,8 @@ CASES: dict[str, Callable[[Path], None]] = {
     "h5 of a chunk that holds too much, by LZF": _chunk((b"\x00\x00" + b"\xe0\xff\x00" * 10**6), compression="lzf"),
     "h5 of a chunk that was pressed twice": _twice_pressed,
     "h5 of names in one large chunk": _chunks_of_text,
+    "mat of 2 GB": _mat(pressed(2000)),
+    "mat of cells in 50000 cells": _mat(zlib.compress(_cells(50_000))),
     "urdf of a mesh of 60000 solids in capitals": _solids,
     "urdf of a mesh that 24 visuals name": _named(24, 1),
     "urdf of a mesh of many materials in capitals": _materials,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,9 +17,11 @@ from synthetic import Array
 from thinned import each_once
 from walking import MACHINES
 
+from torchid.commands.identify import identify
+from torchid.config import load_config
 from torchid.log_checks import NOTE, SUSPICIOUS, Checked
 from torchid.log_checks.frozen import check_excitation, check_still_base
-from torchid.logs import Log
+from torchid.logs import Log, write_log
 from torchid.logs.segments import with_delayed_torques
 
 VECTORS = ("base_position_world", "base_linear_velocity_world", "base_linear_acceleration_world")
@@ -109,6 +112,28 @@ def test_an_arm_on_a_table_that_slants_is_told_so() -> None:
     finding = only(checked(case, replace(case.log, joint_torque=torque)), "tilt", "base")
     assert "about the base's own x and y axes" in finding.found
     assert re.match(r"gravity is 1[0-4]", finding.found)
+
+
+@pytest.mark.filterwarnings("ignore:.*large part of these accelerations is noise")
+@pytest.mark.parametrize(
+    ("degrees", "stated", "told"), [(12.0, "", True), (12.0, ", base_tilt: auto", False), (0.0, "", False)]
+)
+def test_identify_says_that_the_table_of_an_arm_slants(
+    tmp_path: Path, degrees: float, stated: str, told: bool, recwarn: pytest.WarningsRecorder
+) -> None:
+    """Masses make up for most of it: errors are a tenth of the URDF's."""
+    case = case_of(MACHINES["arm"], "contacts")
+    gravity = Rotation.from_rotvec(np.radians([0.0, degrees, 0.0])).apply([0.0, 0.0, -9.81])
+    write_log(replace(case.log, joint_torque=slanting_torque(case, gravity)), tmp_path / "arm.npz")
+    (tmp_path / "arm.yaml").write_text(
+        f"robot: {{urdf: {case.machine.urdf}, fixed_base: true{stated}}}\nlogs: [arm.npz]\n"
+        "preprocessing: {cutoff_hz: 10}\nsensors: joints\nestimator: {name: least_squares, ridge: 1e-4}\n"
+        f"output: {tmp_path / 'run'}\n"
+    )
+    identify(load_config(tmp_path / "arm.yaml"))
+    said = [str(one.message) for one in recwarn if "robot.base_tilt" in str(one.message)]
+    assert bool(said) is told
+    assert all(re.search(r"gravity is 1[0-4] degrees from down .*base_tilt: auto", one) for one in said)
 
 
 def slanting_torque(case: Case, gravity: Array) -> Array:

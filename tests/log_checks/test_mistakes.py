@@ -13,7 +13,7 @@ from walking import MACHINES, robot_of, truth
 
 from torchid.log_checks import NOTE
 from torchid.log_checks.mistakes import exchanged_names, possible_mistakes
-from torchid.log_checks.model import bind_some_samples, preprocess_pieces
+from torchid.log_checks.model import NominalModel, bind_some_samples, preprocess_pieces
 from torchid.log_checks.scales import fit_time_scale, fit_torque_gains, motion_cutoff_hz
 from torchid.log_checks.standing_feet import measure_foot_slip
 from torchid.regressor import Regressor
@@ -32,6 +32,7 @@ UPRIGHT = (
     "time x 2",
     "time in minutes",
     "one torque x 1.3",
+    "torques of limbs exchanged",
 )
 
 
@@ -79,10 +80,11 @@ def test_factors_of_torques_and_of_time_are_recovered() -> None:
     machine = MACHINES["arm"]
     case, robot = case_of(machine, "contacts"), robot_of(machine)
     slow = replace(case.log, time=3.0 * case.log.time)
-    found = fit_time_scale(slow, robot, (), value(motion_cutoff_hz(slow)))
+    found = fit_time_scale(slow, NominalModel(robot, ()), value(motion_cutoff_hz(slow)))
     assert found.factor == pytest.approx(1.0 / 3.0, rel=0.1)
     log = value(BY_NAME["one torque x 1.3"].make(case))
-    factors = value(fit_torque_gains(bind_some_samples(preprocess_pieces(log, 10.0), robot, (), 240), robot, ()))
+    samples = bind_some_samples(preprocess_pieces(log, 10.0), robot, (), 240)
+    factors = value(fit_torque_gains(samples, NominalModel(robot, ())))
     assert factors.gain[1] / np.median(factors.gain) == pytest.approx(1.0 / 1.3, abs=3.0 * factors.spread[1])
 
 
@@ -101,7 +103,7 @@ def test_a_tool_that_the_urdf_lacks_is_not_taken_for_another_unit_of_time() -> N
     motion = (torch.from_numpy(x) for x in (case.happened.q, case.happened.v, case.happened.a))
     carried = (Regressor(robot)(*motion) @ torch.from_numpy(tool.flatten())).numpy()
     log = replace(case.log, joint_torque=value(case.log.joint_torque) + carried)
-    scale = value(fit_time_scale(log, robot, (), value(motion_cutoff_hz(log))))
+    scale = value(fit_time_scale(log, NominalModel(robot, ()), value(motion_cutoff_hz(log))))
     assert abs(np.log(scale.factor)) > np.log(1.5)  # less time makes up a part of what the tool needs
     assert not [one for one in checked(case, log).findings if one.field == "time"]
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from demo import DEMO
 from faults import HERE, changed, demo_log, found, moving, only, places, with_rates
 from motions import position, value
 from repository import SHARED
@@ -15,7 +16,7 @@ from repository import SHARED
 from torchid.log_checks import NOTE, REJECTED, SUSPICIOUS
 from torchid.log_checks.check import check, repair_log
 from torchid.log_checks.spikes import find_jumps
-from torchid.logs import Log
+from torchid.logs import Log, read_log
 
 Array = np.ndarray[Any, Any]
 
@@ -244,6 +245,24 @@ def test_a_driver_that_reads_nothing_below_some_size_is_not_frozen(field: str, b
     assert (finding.severity, finding.field) == (SUSPICIOUS, field)
     assert f"below {band}" in finding.found
     assert not check(dead).rejected.any()
+
+
+@pytest.mark.parametrize("band", [0.2, 0.5])
+def test_torques_that_cross_a_dead_band_faster_than_their_noise_are_not_frozen(band: float) -> None:
+    """With steps of 0.2 N m some first readings beyond the band are more than twice as large as its edge."""
+    log = read_log(DEMO / "sway_test.npz")
+    dead = changed(log, "joint_torque", lambda x: x.__setitem__(np.abs(x) < band, 0.0))
+    assert found(check(dead), "dead band")
+    assert not found(check(dead), "frozen")
+
+
+def test_a_sensor_with_a_dead_band_that_is_lost_is_frozen_there_alone() -> None:
+    lost = slice(300, 360)
+    assert np.abs(value(demo_log().joint_torque)[lost, 2]).min() > 5.0
+    dead = changed(demo_log(), "joint_torque", lambda x: x.__setitem__(np.abs(x) < 0.5, 0.0))
+    checked = check(changed(dead, "joint_torque", lambda x: x.__setitem__((lost, 2), 0.0)))
+    assert found(checked, "dead band")
+    assert places(only(checked, "frozen")) == {(lost.start + 1, lost.stop - 1)}
 
 
 def test_a_torque_that_was_recorded_at_a_lower_rate_and_held_is_named_but_not_rejected() -> None:

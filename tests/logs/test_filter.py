@@ -13,6 +13,7 @@ from torchid.logs import Log
 from torchid.logs.log import FloatArray
 from torchid.logs.preprocess import preprocess
 from torchid.logs.timeline import lay_out_timeline, spline_derivatives
+from torchid.settings import AUTO
 
 
 @pytest.mark.parametrize("hertz", [3.0, 10.0, 20.0, 40.0, 100.0])
@@ -155,6 +156,25 @@ def test_one_spline_and_a_chain_of_short_ones_are_the_same() -> None:
     whole = spline_derivatives(t, values, at, (0, 1, 2), block=10**6)
     for one, other in zip(whole, spline_derivatives(t, values, at, (0, 1, 2), block=100), strict=True):
         np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-12 * np.max(np.abs(one)))
+
+
+@pytest.mark.parametrize("time", [uniform(), jittered()], ids=["uniform", "jittered"])
+@pytest.mark.parametrize(("cutoff", "each"), [(10.0, 10), (11.0, 9), (9.99, 10), (60.0, 1), (150.0, 1)])
+def test_of_a_filtered_log_as_few_samples_are_kept_as_are_five_times_the_cutoff(
+    time: FloatArray, cutoff: float, each: int
+) -> None:
+    log = sine_log(1.0, time)
+    every, few = preprocess(log, cutoff), preprocess(log, cutoff, AUTO)
+    assert RATE / each >= 5.0 * cutoff or each == 1
+    np.testing.assert_array_equal(few.time, every.time[::each])
+    for name in ("joint_position", "joint_velocity", "joint_acceleration"):
+        np.testing.assert_array_equal(value(getattr(few, name)), value(getattr(every, name))[::each])
+
+
+def test_without_a_filter_all_samples_are_kept() -> None:
+    derived = preprocess(sine_log(1.0, uniform()))
+    np.testing.assert_array_equal(preprocess(sine_log(1.0, uniform()), sample_rate_hz=AUTO).time, derived.time)
+    assert preprocess(derived, sample_rate_hz=AUTO) is derived
 
 
 @pytest.mark.parametrize("time", [uniform(), jittered()], ids=["uniform", "jittered"])

@@ -74,3 +74,9 @@ def test_joints_are_told_by_their_words_and_limbs_and_doubtful_ones_by_none(
     joints: list[str], texts: list[str], expected: list[str]
 ) -> None:
     assert match_joints(texts, joints) == dict(zip(texts, expected, strict=False))
+
+
+def test_an_angular_velocity_of_the_body_is_no_linear_one() -> None:
+    assert propose_field("base_ang_vel_body").startswith("base_angular_velocity")
+    assert propose_field("base/v_world").startswith("base_linear_velocity")
+    assert propose_field("velBody").startswith("base_linear_velocity")

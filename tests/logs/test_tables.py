@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 from raw_logs import log_refusal, without_package
 
-from torchid.errors import LogError, UnknownNameError
+from torchid.errors import LogError, TorchidWarning, UnknownNameError
 from torchid.guards import MAX_COLUMNS
 from torchid.logs import Log, read_log, write_log
 from torchid.logs import tables as table
@@ -293,3 +293,25 @@ def test_without_pyarrow_the_message_says_what_to_install(tmp_path: Path, monkey
     assert "pip install '.[tables]'" in log_refusal(path)
     with pytest.raises(LogError, match="pyarrow is not installed"):
         write_log(Log("x", np.zeros(1), (), np.zeros((1, 0))), tmp_path / "y.parquet")
+
+
+@both
+@pytest.mark.parametrize("rows", [2**16, 2], ids=["whole", "in blocks"])
+def test_rows_that_repeat_the_one_before_count_once(
+    tmp_path: Path, suffix: str, rows: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(table, "_ROWS", rows)
+    again = [0, 0, 1, 1, 1, 2]
+    once, twice = columns(), {name: [x[k] for k in again] for name, x in columns().items()}
+    path = save(tmp_path / f"x{suffix}", twice)
+    with pytest.warns(TorchidWarning, match="3 rows like the one before, stamp and all: counted once"):
+        log = read_log(path)
+    expected = read_log(save(tmp_path / f"once{suffix}", once)).arrays()
+    for name, values in log.arrays().items():
+        np.testing.assert_array_equal(values, expected[name])
+    with pytest.warns(TorchidWarning, match="3 rows "):
+        blocks = [block["time"] for block in table.table_blocks(path)]
+    assert np.concatenate(blocks).tolist() == once["time"]
+    save(path, twice | {"joint_torque.knee": [7.0, 7.0, 8.0, 8.5, 8.0, 9.0]})
+    with pytest.warns(TorchidWarning, match="1 row "), pytest.raises(LogError, match="strictly increasing"):
+        read_log(path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -28,9 +29,11 @@ def swinging(seed: int) -> np.ndarray:
     return WEIGHT * np.maximum(np.sin(3.0 * TIME + seed), 0.0)
 
 
+PARTS = ("Force", "Moment")
 WRENCHES = {
     "letters": ("{side}_foot_{part}{axis}", ("left", "right")),
     "couples": ("{Side}FootForceSensor_{part}{axis}", ("Left", "Right")),
+    "camels": ("{side}Foot{Part}{Axis}", ("left", "right")),
     "numbers": ("FT_{side}_foot[{k}]", ("left", "right")),
     "inside": ("Device/{Side}Foot/Wrench/{part}{axis}/Sensor/Value", ("Left", "Right")),
 }
@@ -41,7 +44,15 @@ def test_wrenches_named_by_sides_are_those_of_the_feet_on_these(dialect: str) ->
     text, sides = WRENCHES[dialect]
     letters = "fc" if dialect == "couples" else "fm"
     columns = {
-        text.format(side=side, Side=side, part=letters[k // 3], axis="xyz"[k % 3], k=k): swinging(k)
+        text.format(
+            side=side,
+            Side=side,
+            part=letters[k // 3],
+            Part=PARTS[k // 3],
+            axis="xyz"[k % 3],
+            Axis="XYZ"[k % 3],
+            k=k,
+        ): swinging(k)
         for side in sides
         for k in range(6)
     }
@@ -53,6 +64,7 @@ def test_wrenches_named_by_sides_are_those_of_the_feet_on_these(dialect: str) ->
         of_left
         == {
             "letters": ["left_foot_f{axis}", "left_foot_m{axis}"],
+            "camels": ["leftFootForce{AXIS}", "leftFootMoment{AXIS}"],
             "couples": ["LeftFootForceSensor_f{axis}", "LeftFootForceSensor_c{axis}"],
             "numbers": ["FT_left_foot[{component}]"],
             "inside": [f"Device/LeftFoot/Wrench/{part}{{axis}}/Sensor/Value" for part in "fm"],
@@ -144,3 +156,31 @@ def test_forces_of_two_feet_are_in_the_world_if_their_name_says_so(name: str, si
         assert entry["contact_wrench_local"] == {"force": {"column": name}}
     else:
         assert entry["contact_wrench_world"]["force"].get("scale", 1) == sign
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "in_newtons"),
+    [
+        ("{foot}_fn", "", 1.0),
+        ("normal_force_{side}", "", 1.0),
+        ("Force verticale pied {side} (kN)", "kN", 1e-3),
+    ],
+)
+@pytest.mark.parametrize("carried", [1.0, 0.1], ids=["of the weight", "of less, or counts"])
+def test_forces_along_the_normal_are_those_that_say_so_and_carry_the_robot(
+    name: str, unit: str, in_newtons: float, carried: float
+) -> None:
+    loads = np.stack([swinging(k) for k in range(4)], axis=1)
+    loads[loads < 60.0] = 0.0
+    loads *= carried * WEIGHT / np.maximum(loads.sum(axis=1, keepdims=True), 1.0)
+    columns = {name.format(foot=f"{side}_foot", side=side): in_newtons * loads[:, k] for k, side in enumerate(LEGS)}
+    turn = np.tile([0.0, 0.0, 0.0, 1.0], (N, 1))
+    found = proposed(QUADRUPED, columns | {"base_quat_xyzw": turn}).columns
+    assert ("contact_force_normal" in found) == (carried == 1.0)
+    assert "contact_force_normal" not in proposed(QUADRUPED, columns).columns, "of no known orientation"
+    if carried == 1.0:
+        assert found["contact_force_normal"].get("unit", "") == unit
+        assert 5.0 < found["contact_active"]["above"] < 60.0
+    unsaid = {"fn": "fz", "normal": "foot", "verticale": ""}
+    others = {re.sub("|".join(unsaid), lambda word: unsaid[word[0]], name): x for name, x in columns.items()}
+    assert "contact_force_normal" not in proposed(QUADRUPED, others | {"base_quat_xyzw": turn}).columns

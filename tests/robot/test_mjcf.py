@@ -128,6 +128,13 @@ def test_included_files_are_read_and_stand_in_what_is_written(tmp_path: Path) ->
     assert "<include" not in (tmp_path / "out" / "scene.xml").read_text()
 
 
+def test_a_file_that_is_missing_is_named_with_the_one_that_includes_it(tmp_path: Path) -> None:
+    (tmp_path / "part.xml").write_text('<mujoco><include file="arm.xml"/></mujoco>')
+    (tmp_path / "scene.xml").write_text('<mujoco><include file="part.xml"/></mujoco>')
+    with pytest.raises(UrdfError, match=r"part\.xml: <include>: 'arm\.xml', which is not there"):
+        load_robot(tmp_path / "scene.xml")
+
+
 def test_a_missing_mesh_matters_only_where_it_gives_a_body_its_inertia(tmp_path: Path) -> None:
     text = """<mujoco><asset><mesh name="m" file="none.stl"/></asset><worldbody><body name="b"><joint name="j"/>{}
     <geom type="mesh" mesh="m"/></body></worldbody></mujoco>"""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -132,6 +133,30 @@ def test_projected_forces_that_no_bodies_would_predict_as_well_are_not_explained
     said = text(replace(consistent, metrics=consistent.metrics | {"test": pair._replace(identified=found)}), 400)
     assert "errors of 1.3 times what was measured; check signs, units and order of joints: torchid check" in said
     assert "what was measured" not in text(consistent, 400)
+
+
+@pytest.mark.parametrize(
+    ("group", "share", "noise", "in_air", "told"),
+    [
+        ("joint_torque", 0.7, None, False, True),
+        ("nullspace", 0.7, None, True, True),
+        ("joint_torque", 0.7, None, True, False),
+        ("joint_torque", 0.4, None, False, False),
+        ("joint_torque", 0.7, 1.9, False, False),
+        ("base_moment", 0.7, None, False, False),
+    ],
+)
+def test_a_fit_that_leaves_most_of_the_torques_is_not_explained_by_other_forces(
+    consistent: Identification, group: str, share: float, noise: float | None, in_air: bool, told: bool
+) -> None:
+    """By `noise` of the readings that is about as large it may be; limbs in the air are no measure of all torques."""
+    pair = consistent.metrics["train"]
+    fitted = pair.identified
+    errors: dict[str, Any] = {"rms": {**fitted.rms, group: 2.0}, "relative": {**fitted.relative, group: share}}
+    found = replace(fitted, **errors, noise={**fitted.noise, group: noise}, limbs_in_air=in_air)
+    said = text(replace(consistent, metrics=consistent.metrics | {"train": pair._replace(identified=found)}), 400)
+    assert ("attention     the fit leaves 70 % of the joint torques; check signs, units" in said) is told
+    assert ("but the model does not explain these forces" in said.split("rms error")[0]) is told
 
 
 @pytest.mark.parametrize(("share", "unlike"), [(0.3, True), (0.6, False)])

@@ -98,6 +98,16 @@ def test_every_finding_is_shown_or_counted(width: int) -> None:
     assert counted == {REJECTED: 12 - shown, SUSPICIOUS: 12, NOTE: 12}, "the most severe are shown"
 
 
+def test_notes_give_way_to_the_whole_text_of_what_has_to_be_done() -> None:
+    parts = [f"channel_{k} reads {k} N m more than all of the others do at rest" for k in range(5)]
+    severe = [replace(SPIKE, name=name, found="; ".join(parts)) for name in ("spike", "step")]
+    lines = check_lines([checked("walk", *severe, *(replace(WEIGHT, field=f"field_{k}") for k in range(6)))], (), 100)
+    said = " ".join(" ".join(lines).split())
+    assert said.count("; ".join(parts)) == 2
+    assert re.search(r"and \d notes more: --verbose", said)
+    assert len(lines) <= LINES
+
+
 def test_what_several_logs_share_is_said_once_and_where_all_of_it_is() -> None:
     logs = [checked(f"walk_{k}", SPIKE) for k in range(4)]
     said = text(logs)

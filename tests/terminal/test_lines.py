@@ -33,6 +33,22 @@ def test_what_has_no_room_is_cut_between_words_and_marked(width: int, most: int)
     assert said == text or (said.endswith(CUT) and f"{text} ".startswith(f"{said.removesuffix(CUT)} "))
 
 
+@pytest.mark.parametrize(
+    ("width", "most", "said"),
+    [
+        (60, 1, "one jump in hip, knee and ankle; ..."),
+        (30, 1, "one jump in hip, ..."),
+        (50, 2, "one jump in hip, knee and ankle; the clearest: hip by 0.26 rad from 1335 to 1336, ..."),
+        (44, 2, "one jump in hip, knee and ankle; the clearest: hip by 0.26 rad from 1335 to ..."),
+    ],
+)
+def test_what_has_no_room_is_cut_where_a_clause_begins_unless_half_would_be_lost(
+    width: int, most: int, said: str
+) -> None:
+    text = "one jump in hip, knee and ankle; the clearest: hip by 0.26 rad from 1335 to 1336, 342 times the noise there"
+    assert " ".join(wrap_words(text, width, most=most)) == said
+
+
 def test_a_label_stands_before_the_first_line_alone() -> None:
     assert labelled("bodies", "all can exist", 25) == ["bodies        all can", "              exist"]
 

@@ -19,12 +19,13 @@ from torchid.commands.folder import ANALYSIS, check_free, new_folder, write_json
 from torchid.commands.reading import LogReader, check_parts
 from torchid.commands.sensor_set_accuracy import accuracies
 from torchid.config import AnalyzeConfig, dump_config, inputs_of
+from torchid.copies import can_copy, in_copies
 from torchid.errors import ConfigError, SensorError, UnknownNameError, during, join_names, warn
 from torchid.fitting.experiment import Scene, set_up_scene, with_noise
 from torchid.identifiability.base_parameters import BaseParameters, base_parameters
 from torchid.parameters import WRENCH_COMPONENTS
 from torchid.problem import Samples
-from torchid.problem.chunks import chunks_by_state, one_thread
+from torchid.problem.chunks import chunks_by_state, one_thread, thread_count
 from torchid.problem.compression import free_parameters
 from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import parameter_scale
@@ -180,8 +181,15 @@ def analyze(config: AnalyzeConfig) -> Analysis:
                 results.append(_analyze_scenario(request, name, states, train, bars))
             return _sets_to_compare(request, results, train)
 
-        sets = ranks.from_first(plan, "sensor sets")
-        compared = accuracies(scene, sets, train, test, bars) if train else {}
+        def compare(sets: Mapping[str, SensorSet]) -> dict[str, SetAccuracy]:
+            return accuracies(scene, sets, train, test) if train else {}
+
+        early = [{name: one} for name, one in request.compared.items()][: thread_count() - 1 if can_copy() else 0]
+        with in_copies(early, compare, len(early)) as compared_early:
+            sets = ranks.from_first(plan, "sensor sets")
+            bars.add_task("comparing sensor sets", total=None)
+            later = compare({name: one for name, one in sets.items() if not any(name in part for part in early)})
+            compared = {name: one for part in (*compared_early(), later) for name, one in part.items()}
         analysis = Analysis(scene, tuple(results), compared, output)
         if output is not None:
             bars.add_task("writing", total=None)

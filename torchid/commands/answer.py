@@ -12,6 +12,7 @@ from torchid.errors import join_names
 from torchid.estimators import ConsistentEstimate, Estimate, SgdEstimate
 from torchid.estimators.posterior import NominalError
 from torchid.fitting.calibration import list_confounded
+from torchid.fitting.misfit import AT_THE_FLOOR, unexplained_torques
 from torchid.identifiability.confounding import TotalMass
 from torchid.log_checks.weight import MAX_MASS_ERROR
 from torchid.logs.time_range import log_title
@@ -33,7 +34,6 @@ _VERDICTS = {
     (0.95, np.inf): f"Better{_IN_PART}",
 }
 _NO_BETTER = "No better"
-_AT_THE_FLOOR = 1.3  # times the error that noise of the readings leaves
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class ErrorComparison:
         within = (text for limits, text in _VERDICTS.items() if least < limits[0] and most < limits[1])
         verdict = next(within, _NO_BETTER)
         known = [after / floor for _, _, after, floor in self.errors() if floor]
-        floor = ", as near as the sensors' noise allows" if known and max(known) < _AT_THE_FLOOR else ""
+        floor = ", as near as the sensors' noise allows" if known and max(known) < AT_THE_FLOOR else ""
         if unexplained:
             floor = f", {'and' if verdict == _NO_BETTER else 'but'} the model does not explain {unexplained}"
         words, part = verdict.removesuffix(_IN_PART), _IN_PART * verdict.endswith(_IN_PART)
@@ -143,7 +143,7 @@ def _judge(run: Identification) -> ErrorComparison:
 def _headline(run: Identification, judged: ErrorComparison) -> str:
     if run.worse:
         return f"WORSE THAN {judged.of}: {describe_worse(run.worse, judged.of)}"
-    explained = run.misfit.explained and not any(_unlike_sensors(judged.identified))
+    explained = run.misfit.explained and not any((*_unlike_sensors(judged.identified), *_unlike_torques(run)))
     return judged.headline("" if explained else "these forces")
 
 
@@ -169,7 +169,7 @@ def _attention(run: Identification, judged: ErrorComparison) -> Iterator[str]:
         yield ADVICE
     if isinstance(run.estimate, SgdEstimate) and run.estimate.deviation > _FAR_FROM_LEAST:
         yield _unfinished(run.estimate)
-    yield from _unlike_sensors(judged.identified)
+    yield from list(_unlike_sensors(judged.identified)) or _unlike_torques(run)
     impossible = [one.term for one in run.violations if one.term is not None]
     if impossible:
         advice = "estimator.name=consistent finds the best that can be"
@@ -236,6 +236,12 @@ def _unlike_sensors(identified: Metrics) -> Iterator[str]:
     if share is not None and share > _LARGER_THAN_MEASURED and (of_weight or 0.0) > MAX_MASS_ERROR:
         ratio = f"base force: errors of {share:.2g} times what its measurements vary by"
         yield f"{ratio}; check frames, signs and units of contact forces and of the base's pose: torchid check"
+
+
+def _unlike_torques(run: Identification) -> Iterator[str]:
+    """That the fit itself leaves most of the joint torques."""
+    if found := unexplained_torques(run.metrics["train"].identified):
+        yield f"{found}; check signs, units and order of torques and joints: torchid check"
 
 
 def _far_off(nominal: NominalError | None) -> Iterator[str]:

@@ -17,7 +17,7 @@ import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 import torchid
 from torchid.commands.manifest import file_checksum
+from torchid.copies import Copy
 from torchid.errors import excerpt, warn
 from torchid.logs.blocks import GIGABYTE
 from torchid.staging import NEW, atomic_file, is_leftover, remove_leftover, staging_folder
@@ -45,6 +46,7 @@ _BLOCK = 2**22  # bytes that are written at a time
 _MOST_FILES = 10_000  # in the index of checksums
 _FORGOTTEN = 3600.0  # [s]: age of a token whose process was killed
 _THERE = (errno.ENOTEMPTY, errno.EEXIST)  # of a rename
+_LONG = 2**27  # bytes that take longer to sum up than a copy of the process to make
 _YOUNG = 2.0  # [s]: a file that is no older may change again within one tick of its time stamp
 
 
@@ -201,12 +203,13 @@ class Cache:
 
     # ------------------------------------------------------------------------------------------- checksums of logs
 
-    def checksum(self, path: Path, files: Sequence[Path]) -> str:
+    def checksum(self, path: Path, files: Sequence[Path], meanwhile: Callable[[], None] = lambda: None) -> str:
         """SHA-256 of the content of a log; that of the index, where no file has changed since.
 
         Args:
             path: of the log.
             files: that it consists of.
+            meanwhile: called while a copy of this process sums up long files.
 
         Raises:
             OSError: one cannot be read.
@@ -214,7 +217,12 @@ class Cache:
         states, known = file_states(files), self._known(path)
         if known.get("files") == states and _NAME.fullmatch(str(known.get("sha256"))):
             return str(known["sha256"])
-        found = file_checksum(*files)
+        if sum(state[0] for state in states) < _LONG:
+            found = file_checksum(*files)
+        else:
+            with Copy(partial(file_checksum, *files)) as summing:
+                meanwhile()
+                found = summing.result()
         youngest = max(max(state[1:3]) for state in states) / 1e9
         if states == file_states(files) and abs(time.time() - youngest) > _YOUNG:
             self._noted[_place(path)] = {"files": states, "sha256": found}

@@ -21,6 +21,7 @@ from torchid.fitting.noise import recorded_sensors
 from torchid.logs.blocks import GIGABYTE, log_bytes
 from torchid.logs.containers import LogKind, existing_log_kind, log_files
 from torchid.logs.lazy_arrays import MappedPages
+from torchid.logs.low_pass import import_signal
 from torchid.logs.tables import is_text_table
 from torchid.logs.time_range import split_range
 from torchid.problem import Samples
@@ -179,11 +180,16 @@ class CachedReader(LogReader):
             files = log_files(path)
             try:
                 states = file_states(files)
-                checksum = self.cache.checksum(split_range(path).file, files)
+                checksum = self.cache.checksum(split_range(path).file, files, self._import_filters)
                 self._contents[path] = _Content(checksum, files, states)
             except OSError:
                 return None
         return self._contents[path]
+
+    def _import_filters(self) -> None:
+        """Import what reads a log that is not in the cache, as one of unknown content hardly is."""
+        if self.scene.config.preprocessing.filter_hz is not None:
+            import_signal()
 
     def _key(self, path: Path, required: SensorSet | None, together: float | None) -> str | None:
         """The name of the samples of a log, None if it cannot be read.

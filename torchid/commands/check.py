@@ -109,7 +109,8 @@ def check_experiment(
         for file in bars.track(files, description="checking"):
             settings, own = config.preprocessing, scene_of_log(scene, file)
             log, _ = settle_contacts(_read_log_to_check(file, config.logs, settings), own)
-            found = check(log, own.robot, scene.contacts, settings.filter_hz, settings.derived, required)
+            rest = scene.contacts, settings.filter_hz, settings.derived, scene.declared, required
+            found = check(log, own.robot, *rest)
             checked.append(replace(found, rolling=scene.rolling))
     return checked
 

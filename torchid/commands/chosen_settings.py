@@ -15,7 +15,7 @@ from rich.progress import Progress
 from torchid import ranks
 from torchid.commands.check import recorded_segments
 from torchid.commands.reading import LogReader
-from torchid.errors import TorchidWarning, about_file, warn_about_file
+from torchid.errors import TorchidWarning, about_file, join_names, warn_about_file
 from torchid.estimators import Conditions
 from torchid.fitting.cross_validation import RidgeChoice
 from torchid.fitting.delay import DelayChoice, choose_delay
@@ -35,6 +35,7 @@ from torchid.logs.cutoff import CutoffChoice, choose_cutoff
 from torchid.logs.log import FloatArray
 from torchid.logs.preprocess import dry_friction, lacks_derivatives, make_timeline
 from torchid.logs.sign_filter import with_sign_filter
+from torchid.logs.timeline import LOSSLESS_RATE
 from torchid.problem import ExtraTerms, RowBuilder, Samples
 from torchid.problem.compressed_log import Block
 from torchid.problem.compression import Part
@@ -50,6 +51,17 @@ _UNFILTERED = (
 
 
 @dataclass(frozen=True)
+class SampleRates:
+    """Sample rates of preprocessed logs [Hz], by file."""
+
+    rates_hz: dict[str, float]
+
+    def __str__(self) -> str:
+        rates = dict.fromkeys(f"{rate:.4g} Hz" for rate in self.rates_hz.values())
+        return f"{join_names(list(rates))}: every k-th sample at {LOSSLESS_RATE:g} cutoffs or more"
+
+
+@dataclass(frozen=True)
 class Choices:
     """How settings were chosen, in the order in which they are; None for what the experiment states."""
 
@@ -58,8 +70,9 @@ class Choices:
     sign_width: SignWidthChoice | None = None
     delay: DelayChoice | None = None
     stribeck: StribeckChoice | None = None
+    sample_rate: SampleRates | None = None
 
-    def by_name(self) -> dict[str, CutoffChoice | TiltChoice | SignWidthChoice | DelayChoice | StribeckChoice | None]:
+    def by_name(self) -> dict[str, object]:
         """The same by name, in words."""
         return {name.replace("_", " "): choice for name, choice in vars(self).items()}
 
@@ -105,6 +118,14 @@ def with_chosen_settings(scene: S, bars: Progress) -> tuple[S, Choices]:
     return scene, Choices(cutoff, tilt, width, delay, stribeck)
 
 
+def with_sample_rates(choices: Choices, scene: Scene, logs: Sequence[Samples]) -> Choices:
+    """The choices with what `preprocessing.sample_rate_hz: auto` has made of logs, if they were read so."""
+    if scene.config.preprocessing.sample_rate_hz != AUTO:
+        return choices
+    rates = {log.source: 1.0 / float(np.median(np.diff(log.time.numpy()))) for log in logs if len(log) > 1}
+    return replace(choices, sample_rate=SampleRates(rates))
+
+
 def _chosen(name: str, choose: Callable[[], Chosen], bars: Progress) -> Chosen:
     """What the first process chooses."""
     bar = bars.add_task(f"choosing the {name}", total=None)
@@ -120,7 +141,8 @@ def _cutoff(scene: Scene) -> CutoffChoice:
         return CutoffChoice(None, by_noise=False)
     logs = [next(recorded_segments(path, files, settings))[0] for path in files.train]
     stated, from_feet = scene.config.sensors.noise.motion, settings.base_motion is not None
-    return choose_cutoff(logs, stated, settings.sample_rate_hz, base_is_derived=from_feet)
+    rate = None if settings.sample_rate_hz == AUTO else settings.sample_rate_hz
+    return choose_cutoff(logs, stated, rate, base_is_derived=from_feet)
 
 
 def _base_tilt(scene: Scene) -> TiltChoice:

@@ -14,7 +14,7 @@ from rich.progress import Progress
 from torchid import ranks
 from torchid.commands.cache_entries import cached_parts, factors_key
 from torchid.commands.cached_reading import CachedReader, open_reader
-from torchid.commands.chosen_settings import Choices, with_chosen_settings, with_ridge
+from torchid.commands.chosen_settings import Choices, with_chosen_settings, with_ridge, with_sample_rates
 from torchid.commands.evaluate import compare_forces, trace_forces
 from torchid.commands.folder import RUN, check_free, claim_folder
 from torchid.commands.plausibility import TrainingLogs, require_not_worse, require_plausible
@@ -199,7 +199,7 @@ def _solved(ready: _Prepared, evaluation: Evaluation, checked: TrainingLogs, bar
         solve = partial(training.run, builder=fitter.builder, logs=logs, evaluate=evaluate, bars=bars, resume=resume)
     fit = fitter.fit(ready.parts, solve)
     fit, robust = _robust(fit, ready, bars)
-    mass = require_plausible(fit, checked)
+    mass = require_plausible(fit, checked, logs["train"])
     warn_of_confounded(fit.extras)
     warn_of_disagreement(fit, fitter)
     return _Solved(fit, robust, training, mass)
@@ -217,9 +217,11 @@ def _identify(
     with clock("solve"):
         solved = _solved(ready, evaluation, checked, bars, resume)
         fit, ready.parts = solved.fit, []
-        estimate, problem = fit.estimate, fit.assembly.problem
-        figures = fit_figures(experiment.robot, estimate, fit.extras, ready.ridge)
-        begun = stack.enter_context(drawing(figures, experiment.config, spared=1)) if config.output else None
+        estimate, problem, compared = fit.estimate, fit.assembly.problem, experiment.calibrations(fit, builder)
+        shown = [*logs["test"], *logs["train"]][:1]
+        forces = ranks.from_first(lambda: [compare_forces(evaluation, log, compared) for log in shown], "forces")
+        figures = fit_figures(experiment.robot, estimate, fit.extras, ready.ridge, *forces)
+        begun = stack.enter_context(drawing(figures, experiment.config)) if config.output else None
     with clock("identifiability"):
         whole = merge_folds(_with_states(fit.parts, ready.factors), builder)
         alone = _by_state(fitter, whole)
@@ -227,12 +229,9 @@ def _identify(
             lambda: _contributions(experiment, builder, whole, logs["train"], problem, bars), "contributions"
         )
     with clock("evaluate"):
-        fits = (fit, *fitter.fit_without_folds(fit))
-        compared, *without_folds = (experiment.calibrations(one, builder) for one in fits)
+        without_folds = [experiment.calibrations(one, builder) for one in fitter.fit_without_folds(fit)]
         scorer, of_blocks = Scorer(evaluation, builder), merge_states(fit.parts, builder)
         scores = _scores(scorer, logs["test"], blocks, of_blocks, compared, without_folds, bars)
-        shown = [*logs["test"], *logs["train"]][:1]
-        forces = ranks.from_first(lambda: [compare_forces(evaluation, log, compared) for log in shown], "forces")
         traces = ranks.from_first(lambda: [trace_forces(evaluation, log, compared) for log in shown], "traces")
     run = Identification(
         experiment=experiment,
@@ -256,14 +255,14 @@ def _identify(
         posterior=fitted_posterior(fit, experiment.robot, ready.conditions),
         validation=scores.validation,
         ridge=ready.ridge,
-        choices=ready.choices,
+        choices=with_sample_rates(ready.choices, experiment, logs["train"]),
         forces=next(iter(forces), None),
         traces=next(iter(traces), None),
         reused=ready.reused,
     )
     logs.clear()  # checks of a log and figures need room, too
     ready.blocks = blocks = []
-    require_not_worse(run.worse, checked)
+    require_not_worse(run.worse, run.metrics["train"].identified, checked)
     return run, solved.training, begun
 
 

@@ -19,6 +19,7 @@ from torchid.commands.init_proposals import (
     guess_contacts,
     hints,
     keys_for_gaps,
+    keys_for_length,
     like_torques,
     limb_sensors,
     measured_torques,
@@ -115,7 +116,7 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> Initiated:
     out = Initiated(target)
     _state_flags(contacts, fields, proposal)
     read = _try(path, proposal)
-    gaps = keys_for_gaps(read)
+    gaps = keys_for_gaps(read) | keys_for_length(read)
     split = split_log(read, "base_motion" in _from_feet(contacts, fields))
     limbs = list(proposal.columns.get("ft_wrenches", ())) or read_sensors(robot, read)
     torques = measured_torques(robot, read)

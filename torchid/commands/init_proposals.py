@@ -29,7 +29,7 @@ _FEET = (r"foot|feet", r"sole", r"ankle_roll|ankle_flexion", r"toe|ankle|paw|hoo
 _ON_FEET = r"sensor|imu|camera|bumper|laser"
 _IN_LIMBS = r"(?<![a-z])ft(?![a-z])"
 _NAMED = r"foot|feet|sole"
-_OF_HANDS = r"finger|thumb|hand|palm|grip"
+_NO_FEET = r"finger|thumb|hand|palm|grip|wheel|caster"
 
 
 @dataclass(frozen=True)
@@ -76,14 +76,14 @@ def guess_contacts(robot: Robot, stated: Sequence[str], texts: Sequence[str]) ->
 
 
 def _balls_of_limbs(robot: Robot, shapes: CollisionShapes) -> list[str]:
-    """Balls at the ends of limbs: of more than two that begin at the base, or called feet; no fingers."""
+    """Balls at the ends of limbs: of more than two that begin at the base, or called feet; no fingers or wheels."""
     parents, limbs = [body.parent for body in robot.bodies], dict[int, str]()
     for name in robot.links:
         body = root = robot.links[name][0]
         while root and parents[root]:
             root = parents[root]
         is_end = body and body not in parents and shapes.about(name) is not None
-        if is_end and not re.search(_OF_HANDS, name, re.IGNORECASE):
+        if is_end and not re.search(_NO_FEET, name, re.IGNORECASE):
             limbs.setdefault(root, name)
     called = [name for name in limbs.values() if re.search("|".join(_FEET), name, re.IGNORECASE)]
     return list(limbs.values()) if len(limbs) > 2 else called
@@ -228,6 +228,8 @@ _STEP = re.compile(r"(dt|time_?step|sample_?rate|fps|rate_?hz|freq\w*)", re.IGNO
 _MOTION = ("joint_position", "base_quat_xyzw", "base_position_world", *("imu_specific_force", "imu_angular_velocity"))
 _BRIDGED_S = 0.05
 """Gaps that `init` has bridged [s]."""
+_MANY = 100_000
+"""Samples that a fit works on for about a second; of more, no more are kept than a filter leaves information in."""
 
 
 def missing_columns(joints: int, fields: Collection[str], partial: Mapping[str, Sequence[str]], what: str) -> list[str]:
@@ -364,3 +366,10 @@ def keys_for_gaps(read: Log | InputError) -> dict[str, tuple[object, str]]:
         )
         out["exclude_rejected"] = (True, reason)
     return out
+
+
+def keys_for_length(read: Log | InputError) -> dict[str, tuple[object, str]]:
+    """The keys of preprocessing that a long log should have, with the reason."""
+    if isinstance(read, InputError) or len(read) <= _MANY:
+        return {}
+    return {"sample_rate_hz": ("auto", f"as {len(read)} samples are many: five for each period of the cutoff are kept")}

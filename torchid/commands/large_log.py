@@ -61,7 +61,7 @@ from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
 
 _COPIES = 16  # a block takes so many times the memory of its recorded arrays: derivatives, splines, bound tensors
-BLOCK_GB = 0.01
+BLOCK_GB = 0.02
 """Recorded arrays of a block in memory; smaller ones spend more on the neighbourhood that a filter needs."""
 
 

@@ -24,15 +24,17 @@ from torchid.errors import (
 from torchid.estimators import LeastSquares, SgdEstimate
 from torchid.fitting.experiment import Scene
 from torchid.fitting.fit import Fit
-from torchid.fitting.misfit import beyond_models
+from torchid.fitting.misfit import beyond_models, unexplained_torques
 from torchid.identifiability.confounding import ExtraEstimate, TotalMass, estimate_extras, total_mass
 from torchid.log_checks import Finding
 from torchid.log_checks.check import check
 from torchid.log_checks.findings import SEVERITIES
+from torchid.log_checks.lag_and_tilt import check_tilt
+from torchid.log_checks.model import NominalModel
 from torchid.parameters import GRAVITY, PARAMETERS, PER_BODY, Array
-from torchid.problem import LinearProblem
+from torchid.problem import LinearProblem, Samples
 from torchid.problem.chunks import one_thread
-from torchid.problem.metrics import ADVICE, WorseThanNominal, describe_worse
+from torchid.problem.metrics import ADVICE, Metrics, WorseThanNominal, describe_worse
 from torchid.robot import Robot
 from torchid.rounding import is_significant
 
@@ -77,7 +79,8 @@ class TrainingLogs:
             with suppress(InputError):  # larger than memory
                 for log, name in segments_to_check(path, files, settings):
                     flagged, _ = settle_contacts(log, own)
-                    checked = check(flagged, own.robot, scene.contacts, settings.filter_hz, settings.derived)
+                    rest = scene.contacts, settings.filter_hz, settings.derived, scene.declared
+                    checked = check(flagged, own.robot, *rest)
                     severe = [one for one in checked.findings if one.severity in SEVERITIES[:2]]
                     large = [one for one in severe if one.mask(len(checked.log)).mean() > _PART]
                     yield from ((name, one) for one in large)
@@ -85,8 +88,13 @@ class TrainingLogs:
                         return
 
 
-def require_plausible(fit: Fit, logs: TrainingLogs) -> TotalMass:
+def require_plausible(fit: Fit, logs: TrainingLogs, samples: Sequence[Samples] = ()) -> TotalMass:
     """Refuse a fit that no robot can have produced, and warn of residuals far above the stated noise.
+
+    Args:
+        fit: the fit.
+        logs: that it is of.
+        samples: of these, to look for the tilt of a bolted base in.
 
     Returns:
         How well the total mass is known.
@@ -98,6 +106,7 @@ def require_plausible(fit: Fit, logs: TrainingLogs) -> TotalMass:
 
     Warns:
         NumericalWarning: forces that no parameters explain, for whatever reason.
+        TorchidWarning: a bolted base that is tilted, which masses make up for in part.
     """
     estimate, scene = fit.estimate, logs.scene
     if not estimate.rank:
@@ -116,6 +125,7 @@ def require_plausible(fit: Fit, logs: TrainingLogs) -> TotalMass:
     if not isinstance(estimate, SgdEstimate):
         unexplained = beyond_models(estimate, fit.assembly.problem, fit.assembly.forces, scene.noise_stated)
     if reason is None and unexplained is None:
+        _warn_of_tilt(samples, scene)
         return mass
     log, finding = logs.finding or (None, None)
     if finding is not None and (reason is not None or finding.rejects_all):
@@ -131,6 +141,13 @@ def require_plausible(fit: Fit, logs: TrainingLogs) -> TotalMass:
     advice = "check units, frames, quaternion order and contact_active, or state the noise that there is"
     warn_about_file(f"{unexplained}{named}; {advice}", NumericalWarning)
     return mass
+
+
+def _warn_of_tilt(samples: Sequence[Samples], scene: Scene) -> None:
+    """Say that a bolted base which counts as upright is tilted."""
+    if samples and scene.robot.fixed_base and scene.config.robot.base_tilt is None:
+        for one in check_tilt(samples, NominalModel(scene.robot, scene.contacts, scene.declared)):
+            warn_about_file(f"robot.base_tilt: {one.found}; {one.advice}")
 
 
 def _require_scales(by_data: Sequence[ExtraEstimate], has_contacts: bool) -> None:
@@ -154,8 +171,13 @@ def _require_scales(by_data: Sequence[ExtraEstimate], has_contacts: bool) -> Non
         raise ImplausibleFitError.at_field("sensors.scales", found, accepted)
 
 
-def require_not_worse(worse: list[WorseThanNominal], logs: TrainingLogs) -> None:
-    """Refuse a fit that predicts worse than the URDF if the checks reject a training log; else warn.
+def require_not_worse(worse: list[WorseThanNominal], fitted: Metrics, logs: TrainingLogs) -> None:
+    """Refuse a fit that predicts worse than the URDF, or leaves most of the torques, if the checks reject a log.
+
+    Args:
+        worse: groups of rows that the URDF predicts better.
+        fitted: errors of the fit on the training logs.
+        logs: these.
 
     Raises:
         ImplausibleFitError: the parameters of a log that is not usable.
@@ -163,15 +185,18 @@ def require_not_worse(worse: list[WorseThanNominal], logs: TrainingLogs) -> None
     Warns:
         NumericalWarning: the URDF's parameters predict better, for whatever reason.
     """
-    if not worse:
+    message, unexplained = describe_worse(worse, logs.scene.robot.format), unexplained_torques(fitted)
+    if message is None and not unexplained:
         return
-    message, advice = describe_worse(worse, logs.scene.robot.format), ADVICE
     log, finding = logs.finding or (None, None)
-    if finding is not None:
-        message, advice = f"{message}; torchid check finds in {log}: {finding.field}: {finding.found}", finding.advice
-        if finding.rejects_all:
-            raise ImplausibleFitError.at_field("logs", message, advice)
-    warn_about_file(f"{message}; {advice}", NumericalWarning)
+    if finding is not None and finding.rejects_all:
+        found = f"{message or unexplained}; torchid check finds in {log}: {finding.field}"
+        raise ImplausibleFitError.at_field("logs", f"{found}: {finding.found}", finding.advice)
+    if message is not None and finding is not None:
+        found = f"{message}; torchid check finds in {log}: {finding.field}: {finding.found}"
+        warn_about_file(f"{found}; {finding.advice}", NumericalWarning)
+    elif message is not None:
+        warn_about_file(f"{message}; {ADVICE}", NumericalWarning)
 
 
 def implausibility(problem: LinearProblem, phi: Array, mass: TotalMass, robot: Robot) -> str | None:

@@ -36,7 +36,7 @@ from torchid.problem.unloaded_sensors import zero_in_air
 from torchid.robot import Robot, payload_parameters, with_payload
 from torchid.sensing import SensorSet
 
-_WHOLE_GB = 4.0 * BLOCK_GB  # recorded arrays that are taken whole: no block is worth its neighbourhood
+_WHOLE_GB = 2.0 * BLOCK_GB  # recorded arrays that are taken whole: no block is worth its neighbourhood
 
 
 class LogReader:
@@ -220,7 +220,8 @@ class LogReader:
         settings = self.scene.config.preprocessing
         if not settings.exclude_rejected:
             return None
-        return check(log, robot, self.scene.contacts, settings.filter_hz, settings.derived)
+        declared = replace(self.scene.declared, delay=0.0)  # the log has been read with it
+        return check(log, robot, self.scene.contacts, settings.filter_hz, settings.derived, declared)
 
 
 def settle_contacts(log: Log, scene: Scene) -> tuple[Log, BoolArray]:

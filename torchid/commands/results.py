@@ -208,9 +208,7 @@ def write_run(
     config, robot = replace(run.experiment.config, output=output), run.experiment.robot
     run = replace(run, experiment=replace(run.experiment, config=config))
     figures, begun = all_figures(run), begun or Drawing()
-    left = [name for name in figures if name not in begun.names]
-    left.sort(key=lambda name: name != "errors")  # of two copies one draws forces, which take longest, alone
-    rest = {name: figures[name] for name in left}
+    rest = {name: figure for name, figure in figures.items() if name not in begun.names}
     with during("writing", output), new_folder(output, overwrite) as folder, drawing(rest, config) as others:
         (folder / "config.yaml").write_text(dump_config(config))
         write_json(folder / "parameters.json", parameters_document(robot, run.estimate, run.by_state, run.extras))

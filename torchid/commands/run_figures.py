@@ -40,11 +40,18 @@ Figures = dict[str, Callable[[], "Figure"]]
 
 
 def fit_figures(
-    robot: Robot, estimate: Estimate, extras: Sequence[ExtraEstimate], ridge: RidgeChoice | None
+    robot: Robot,
+    estimate: Estimate,
+    extras: Sequence[ExtraEstimate],
+    ridge: RidgeChoice | None,
+    forces: ForceSeries | None = None,
 ) -> Figures:
     """Those that a fit alone gives, in the order in which they are to be seen."""
     kinds = {body.joint.kind for body in robot.bodies if body.joint is not None}
-    figures: Figures = {
+    figures = Figures()
+    if forces is not None and forces.known:
+        figures["forces"] = partial(draw_forces, forces, robot)
+    figures |= {
         "parameters": partial(parameter_figure, robot.body_names, robot.nominal, estimate, kinds, robot.format),
         "identifiability": partial(identifiability_figure, robot.body_names, estimate),
     }
@@ -57,11 +64,10 @@ def fit_figures(
 
 def all_figures(run: Identification) -> Figures:
     """Those of a run, in the order in which they are to be seen."""
-    robot, figures = run.experiment.robot, Figures()
-    if run.forces is not None and run.forces.known:
-        figures["forces"] = partial(draw_forces, run.forces, robot)
+    robot = run.experiment.robot
+    of_fit = fit_figures(robot, run.estimate, run.extras, run.ridge, run.forces)
+    figures = {name: of_fit.pop(name) for name in ("forces",) if name in of_fit}
     figures["errors"] = partial(error_figure, run.metrics, robot.format)
-    of_fit = fit_figures(robot, run.estimate, run.extras, run.ridge)
     figures |= {name: of_fit.pop(name) for name in ("parameters", "identifiability")}
     figures["contributions"] = partial(contribution_figure, _bits(run.contributions))
     return figures | of_fit
@@ -90,17 +96,16 @@ class Drawing:
 
 
 @contextmanager
-def drawing(figures: Figures, config: ExperimentConfig, spared: int = 0) -> Iterator[Drawing]:
-    """Copies of this process that draw figures of the run of an experiment within the block.
+def drawing(figures: Figures, config: ExperimentConfig) -> Iterator[Drawing]:
+    """Copies of this process that draw figures of the run of an experiment within the block, on all cores but one.
 
     Args:
         figures: to draw.
         config: of the experiment, with an output.
-        spared: cores that are left to what this process does meanwhile.
     """
     folder, form = config.output or Path(), config.figures.format
     files = [(folder / f"{name}.{form}", make) for name, make in figures.items()]
-    with in_copies(files, lambda file: draw_for(*file), max(thread_count() - spared, 1)) as drawn:
+    with in_copies(files, lambda file: draw_for(*file), max(thread_count() - 1, 1)) as drawn:
         yield Drawing(tuple(figures), drawn)
 
 

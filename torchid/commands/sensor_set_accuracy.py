@@ -6,16 +6,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
-from rich.progress import Progress
-
 from torchid import ranks
 from torchid.commands.plausibility import TrainingLogs, require_plausible
+from torchid.copies import share_between_copies
 from torchid.errors import ImplausibleFitError, LogError, warn
 from torchid.fitting.calibration import Calibration, list_confounded
 from torchid.fitting.experiment import Scene, batch_estimator
 from torchid.identifiability.information import error_directions, expected_errors
 from torchid.parameters import Array
 from torchid.problem import Evaluation, ExtraTerms, RowBuilder, Samples, assemble, compress_parts
+from torchid.problem.chunks import thread_count
 from torchid.problem.compression import split_into_folds
 from torchid.problem.elimination import Assembly
 from torchid.problem.samples import require_forces
@@ -29,7 +29,6 @@ def accuracies(
     sets: Mapping[str, SensorSet],
     train: Sequence[Samples],
     test: Sequence[Samples],
-    bars: Progress,
 ) -> dict[str, SetAccuracy]:
     """Fit with every sensor set that the training logs recorded, by least squares instead of a descent.
 
@@ -39,21 +38,22 @@ def accuracies(
     Warns:
         TorchidWarning: the training logs lack a sensor of a set, or no robot can have left its fit; it is left out.
     """
-    bar = bars.add_task("comparing sensor sets", total=len(sets))
     evaluation = scene.evaluation()
-    reference, out = _reference(scene, train), {}
-    for name, sensors in sets.items():
+    reference = _reference(scene, train)
+
+    def accuracy(name: str) -> SetAccuracy | None:
         try:
             for samples in train:
-                require_forces(samples, scene.robot, scene.contacts, sensors)
-            out[name] = _accuracy(scene, sensors, train, test, evaluation, reference)
+                require_forces(samples, scene.robot, scene.contacts, sets[name])
+            return _accuracy(scene, sets[name], train, test, evaluation, reference)
         except LogError as error:
-            message = f"{error.source}: {error.field}: {error.found}; no accuracy of the sensors '{name}'"
-            warn(message)
+            warn(f"{error.source}: {error.field}: {error.found}; no accuracy of the sensors '{name}'")
         except ImplausibleFitError as error:
             warn(f"{error}; no accuracy of the sensors '{name}'")
-        bars.advance(bar)
-    return out
+        return None
+
+    found = zip(sets, share_between_copies(list(sets), accuracy, thread_count()), strict=True)
+    return {name: one for name, one in found if one is not None}
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ class PreprocessingConfig:
     """Zero-phase low-pass [Hz] and resampling [Hz]; None leaves the signals as they are.
 
     `cutoff_hz`: auto, one that the motion of the training logs and its noise ask for, see `choose_cutoff`.
+    `sample_rate_hz`: auto, every k-th sample of a log that is filtered, see `lay_out_timeline`.
     `bridge_gaps_s`: gaps (NaN) of at most so long [s] are filled before anything else is done; None leaves them.
     `contact_margin_s`: samples that are dropped before and after each change of contact [s], None for none.
     `detect_contacts`: true, or its settings, for contact flags from joint torques (`DetectionConfig`) in the place of
@@ -44,7 +45,7 @@ class PreprocessingConfig:
     """
 
     cutoff_hz: PositiveOrAuto = None
-    sample_rate_hz: Positive | None = None
+    sample_rate_hz: PositiveOrAuto = None
     bridge_gaps_s: Positive | None = None
     contact_margin_s: NotNegative | None = None
     detect_contacts: Annotated[DetectionConfig | None, BeforeValidator(_switch)] = None

@@ -185,15 +185,19 @@ def _step_length(slope: float, curvature: float, rates: Array, kappa: float) -> 
 
 
 def damped_inverse(A: Tensor) -> Callable[[Tensor], Tensor]:
-    """B -> A^-1 b for A positive semidefinite, (n, n), with the least damping that works (Levenberg)."""
+    """B -> A^-1 b for A positive semidefinite, (n, n), with the least damping that works (Levenberg).
+
+    Of A, which it overwrites, the lower triangle counts.
+    """
     scale = A.diagonal().abs().clamp_min(torch.finfo(A.dtype).tiny).rsqrt()
-    scaled = scale[:, None] * A * scale
-    damping = 0.0
+    scaled, damping = A.mul_(scale).mul_(scale[:, None]), 0.0
     while True:
-        root, failed = torch.linalg.cholesky_ex(scaled + damping * torch.eye(len(A), dtype=A.dtype))
+        root, failed = torch.linalg.cholesky_ex(scaled)
         if not failed:
             return lambda b: scale * torch.cholesky_solve((scale * b)[:, None], root)[:, 0]
-        damping = max(1e-15, 10.0 * damping)
+        more = max(1e-15, 10.0 * damping)
+        scaled.diagonal().add_(more - damping)
+        damping = more
 
 
 _LOOSE = 1e-6  # relative gap above which there is a warning
@@ -204,6 +208,7 @@ _ACCURATE, _CENTRED = 1e-9, 0.5  # complementarity, relative to the objective, f
 
 
 @one_thread()
+@torch.inference_mode()
 def solve_barrier(problem: ConicProblem, tolerance: float = 1e-9) -> Solution:
     """Follow the central path until the duality gap is below `tolerance` times the objective.
 
@@ -342,13 +347,13 @@ class _PrimalDual(ConicTensors):
             out = torch.zeros_like(point.x)
             return out.index_put_((self.variables,), (flat @ blocks.flatten(1)[..., None])[..., 0], accumulate=True)
 
-        curvature = flat @ (whitened @ point.Z[:, None]).mT.flatten(2).mT
+        curvature = flat @ (whitened @ point.Z[:, None]).flatten(2).mT
         stiffness = point.y / point.slack
-        hessian = self.H + self.G.T @ (stiffness[:, None] * self.G)
+        hessian = torch.addmm(self.H, self.G.T, stiffness[:, None] * self.G)
         rows, columns = self.variables[:, :, None], self.variables[:, None, :]
         hessian.index_put_((rows.expand_as(curvature), columns.expand_as(curvature)), curvature, accumulate=True)
         N = self.null_space
-        invert = damped_inverse(_symmetric(hessian if N is None else N.T @ hessian @ N))
+        invert = damped_inverse(hessian if N is None else N.T @ hessian @ N)
         gradient = torch.from_numpy(self.problem.gradient(point.x.numpy())) - self.G.T @ point.y - gathered(point.Z)
 
         def solve(kappa: float, block_correction: Tensor, row_correction: Tensor) -> _Direction:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import scipy.linalg
 
 from torchid.errors import InputError
 from torchid.parameters import Array
@@ -152,11 +153,13 @@ class ConicProblem:
         multiplier_slopes[weighted] = self.weights[weighted, None, None, None] * inverse @ self.F[weighted] @ inverse
         residual = self.gradient(x) - self.G.T @ y - self._gathered(Z)
         # A Newton step balances the part of it in directions in which quadratic and log-determinants are stiff enough.
-        values, vectors = self._stiffness_modes(multiplier_slopes) if weighted.any() else self._quadratic_modes
-        modes = vectors.T @ (self.null_space.T @ residual)
-        balanced = np.abs(modes) <= 2.0 * SEARCH_RADIUS * values
-        lengths = modes[balanced] / np.maximum(values[balanced], np.finfo(float).tiny)
-        step = -self.null_space @ (vectors[:, balanced] @ lengths)
+        step = None if weighted.any() else self._balancing_step(residual)
+        if step is None:
+            values, vectors = self._stiffness_modes(multiplier_slopes)
+            modes = vectors.T @ (self.null_space.T @ residual)
+            balanced = np.abs(modes) <= 2.0 * SEARCH_RADIUS * values
+            lengths = modes[balanced] / np.maximum(values[balanced], np.finfo(float).tiny)
+            step = -self.null_space @ (vectors[:, balanced] @ lengths)
         multiplier_change = np.einsum("kv,kvij->kij", step[self.variables], multiplier_slopes)
         unbalanced = self.null_space.T @ (residual + self.hessian @ step + self._gathered(multiplier_change))
         gap = 0.5 * step @ self.hessian @ step + y @ (self.G @ x - self.h) + SEARCH_RADIUS * np.abs(unbalanced).sum()
@@ -168,11 +171,21 @@ class ConicProblem:
             return np.inf
         return float(gap + (weights * (relative - 1.0 - np.log(relative))).sum())
 
+    def _balancing_step(self, residual: Array) -> Array | None:
+        """The Newton step of the quadratic; None where it is not stiff enough in all directions."""
+        if self._stiffness_root is None:
+            return None
+        lengths = scipy.linalg.cho_solve((self._stiffness_root, True), self.null_space.T @ residual)
+        return -self.null_space @ lengths if np.linalg.norm(lengths) <= 2.0 * SEARCH_RADIUS else None
+
     @cached_property
-    def _quadratic_modes(self) -> tuple[Array, Array]:
-        """Eigenvalues and eigenvectors of the quadratic in the null space of the equalities."""
-        values, vectors = np.linalg.eigh(self.null_space.T @ self.hessian @ self.null_space)
-        return values, vectors
+    def _stiffness_root(self) -> Array | None:
+        """Lower triangular factor of the quadratic in the null space of the equalities; None by rounding."""
+        reduced = self.null_space.T @ self.hessian @ self.null_space if len(self.e) else self.hessian
+        try:
+            return np.asarray(np.linalg.cholesky(reduced))
+        except np.linalg.LinAlgError:
+            return None
 
     def _stiffness_modes(self, multiplier_slopes: Array) -> tuple[Array, Array]:
         """Those of quadratic and log-determinants, whose multipliers change by these slopes, (K, 10, 4, 4)."""

@@ -230,6 +230,8 @@ def _with_decoupled_fixed(problem: LinearProblem, conditions: Conditions) -> Lin
         conditions: on the parameters. Bodies that one ties to others (the total mass, mirror images) stay as they are.
     """
     unobservable = (problem.free & ~_observable(problem)).reshape(-1, PER_BODY)
+    if not unobservable.any():
+        return problem
     nominal, scale = (x.reshape(-1, PER_BODY) for x in (problem.nominal, problem.scale))
     apart = replace(conditions, total_mass=None, mirrors=())
     for violation in violations(nominal, scale, apart, tolerance=0.0):

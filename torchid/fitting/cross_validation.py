@@ -146,13 +146,17 @@ def choose_ridge(
     if len(folds) < 2:
         raise _too_few(blocks)
     together = merge_states(parts, fitter.builder)
+    count, squares = min(thread_count(), len(estimators)), np.empty((len(folds), len(estimators)))
+    shares = [(fold, first) for first in range(count) for fold in folds]  # five folds are no two equal halves
 
-    def held_out(fold: int) -> Array:
-        return _held_out_squares(fold, together, blocks, fitter, estimators, loss, done)
+    def held_out(share: tuple[int, int]) -> Array:
+        fold, first = share
+        return _held_out_squares(fold, together, blocks, fitter, estimators[first::count], loss, done)
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", TorchidWarning)  # the fit says the same
-        squares = np.array(share_between_copies(folds, held_out, thread_count()))
+        for (fold, first), found in zip(shares, share_between_copies(shares, held_out, thread_count()), strict=True):
+            squares[folds.index(fold), first::count] = found
     means = squares.mean(axis=0)
     apart = squares - squares[:, [int(means.argmin())]]
     error = apart.std(axis=0, ddof=1) / np.sqrt(len(folds))

@@ -11,6 +11,7 @@ from numpy.polynomial import chebyshev
 from scipy.interpolate import BSpline, make_interp_spline
 from torch import Tensor
 
+from torchid.copies import in_copies, share_between_copies
 from torchid.errors import LogError, warn
 from torchid.estimators import LeastSquares
 from torchid.fitting.fit import Fit, LogFitter
@@ -19,6 +20,7 @@ from torchid.logs.segments import recorded_at_delays, unbroken_segments
 from torchid.logs.timeline import spline_degree
 from torchid.parameters import Array
 from torchid.problem import ExtraTerms, RowBuilder, Samples
+from torchid.problem.chunks import thread_count
 from torchid.problem.compression import Part, compress_in_blocks, compress_parts, merge_blocks_of_folds, merge_states
 from torchid.problem.extras import DELAY
 from torchid.problem.linear import TriangularFactor
@@ -98,7 +100,7 @@ def choose_delay(logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms) 
     plain = replace(fitter, estimator=LeastSquares(ridge, rank_tolerance=fitter.estimator.rank_tolerance))
     wide = _Delays(_torques(logs, fitter, _FEW), plain, terms, (EARLIEST, LATEST), 0.0, _WIDE)
     tried = np.linspace(EARLIEST, LATEST, _TRIED)
-    best = float(tried[int(np.argmin([wide.residual(delay) for delay in tried]))])
+    best = float(tried[int(np.argmin(share_between_copies(tried.tolist(), wide.residual, thread_count())))])
     many = _torques(logs, fitter, _MANY)
     for _ in range(_PASSES):
         ends = max(EARLIEST, min(best, 0.0) - _AROUND), min(LATEST, max(best, 0.0) + _AROUND)
@@ -107,10 +109,11 @@ def choose_delay(logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms) 
         is_scaled = any(extra.what == "scale" for extra in fitter.builder.extras)
         if (best not in ends or best in (EARLIEST, LATEST)) and not (is_scaled and abs(best - before) > _SAME):
             break
-    term = near.term(near.fit_in_blocks(best))
+    with in_copies([best, 0.0], near.residual, max(thread_count() - 1, 1)) as residuals:
+        term = near.term(near.fit_in_blocks(best))
+        left, without = residuals()
     if term.separable and best in (EARLIEST, LATEST):
         warn(f"actuators.delay: {best:g} s or beyond; are torques and positions stamped by the same clock?")
-    left, without = near.residual(best), near.residual(0.0)
     return _choice(best, term, left, without)
 
 

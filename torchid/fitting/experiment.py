@@ -30,12 +30,14 @@ from torchid.fitting.fit import Fit, LogFitter, frozen_parameters
 from torchid.fitting.noise import NoiseSummary, estimate_noise, recorded_sensors
 from torchid.fitting.prior_knowledge import conditions_from, known_masses
 from torchid.fitting.robust import RobustLoss
+from torchid.log_checks.model import Declared
 from torchid.problem import Evaluation, ExtraTerms, RowBuilder, Samples
 from torchid.problem.compressed_log import Block
 from torchid.problem.compression import Part
 from torchid.problem.sampled_rows import LogElsewhere
 from torchid.reprs import short_repr
 from torchid.robot import Robot, load_robot
+from torchid.robot.constraints import matching_joints
 from torchid.robot.tree import FT_FIELD
 from torchid.sensing import Contact, SensorNoise, SensorSet, chosen_sensors, named_sensors, with_ft_sensors
 from torchid.settings import AUTO
@@ -95,6 +97,17 @@ class Scene:
         return ExtraTerms(offsets, scales, **actuators | known)
 
     @property
+    def declared(self) -> Declared:
+        """What the settings say of sensors and actuators, for checks of the logs.
+
+        Raises:
+            InputError: as `stated_noise`.
+        """
+        stated = stated_noise(self.config.sensors.noise, self.robot)
+        delay, finds_tilt = self.config.actuators.delay or 0.0, self.config.robot.base_tilt == AUTO
+        return Declared(SensorNoise.of_known(stated) if stated else None, self.terms, delay, finds_tilt)
+
+    @property
     def loss(self) -> RobustLoss | None:
         """Loss of a robust fit, None for least squares."""
         robust = self.config.estimator.robust
@@ -106,8 +119,9 @@ class Scene:
         if choice.set is not None:
             sensors = named_sensors(choice.set, robot.n, len(contacts), noise, ft)
         else:
-            by_name = choice.joint_torques, choice.contact_wrenches
-            sensors = chosen_sensors(robot.joint_names, contacts, *by_name, noise, ft)
+            field, joints = "sensors.joint_torques", robot.joint_names
+            torques = [name for key in choice.joint_torques for name in matching_joints(field, key, joints)]
+            sensors = chosen_sensors(joints, contacts, torques, choice.contact_wrenches, noise, ft)
         measured = with_ft_sensors(sensors, robot, choice.ft_sensors)
         return replace(measured, torque=measured.torque | robot.is_passive)  # known: 0
 

@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 from torch import Tensor
 
+from torchid.copies import share_between_copies
 from torchid.errors import TorchidWarning, UnknownNameError
 from torchid.estimators import Estimate, LeastSquares
 from torchid.estimators.least_squares import Minimizer
@@ -18,7 +19,7 @@ from torchid.identifiability.block_scatter import BlockScatter, block_scatter
 from torchid.identifiability.confounding import ExtraEstimate, estimate_extras, mass_weights
 from torchid.parameters import PER_BODY
 from torchid.problem import LinearProblem, RowBuilder, assemble
-from torchid.problem.chunks import one_thread
+from torchid.problem.chunks import one_thread, thread_count
 from torchid.problem.compression import Part, merge_blocks_of_folds, merge_states
 from torchid.problem.elimination import Assembly
 from torchid.problem.noise_gram import scale_columns
@@ -210,10 +211,14 @@ class LogFitter:
         if len(folds) < 2:
             return []
         blocks = merge_states(fit.parts, self.builder)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", TorchidWarning)  # the fit of all of them says the same
-            rests = ([block for block in blocks if block.fold != fold] for fold in folds)
-            return [self.solve_problem(LogProblem(rest, self.assemble(rest, noise))) for rest in rests]
+
+        def without(fold: int) -> Fit:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", TorchidWarning)  # the fit of all of them says the same
+                rest = [block for block in blocks if block.fold != fold]
+                return self.solve_problem(LogProblem(rest, self.assemble(rest, noise)))
+
+        return share_between_copies(folds, without, thread_count())
 
 
 def _is_homogeneous(problem: LinearProblem, forces: float) -> bool:

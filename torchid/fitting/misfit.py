@@ -19,6 +19,7 @@ from torchid.parameters import FRICTION, INERTIAL, PER_BODY, Array
 from torchid.problem import LinearProblem
 from torchid.problem.chunks import one_thread
 from torchid.problem.compressed_log import Block
+from torchid.problem.metrics import Metrics
 from torchid.robot import Robot
 from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, is_significant
 
@@ -29,6 +30,8 @@ _NAMED = 3
 
 _UNEXPLAINED = 5.0  # residual in units of the stated noise; recorded logs with honest noise figures stay below 2
 _SHARE = 0.5  # and of the weighted forces, where the noise was estimated to be as large; recorded logs stay below 0.35
+AT_THE_FLOOR = 1.3
+"""Errors up to which noise of the readings may be all that is left, over what it leaves."""
 
 
 @dataclass(frozen=True)
@@ -161,6 +164,17 @@ def beyond_models(
     if share > _SHARE:
         return f"no rigid-body model explains {100.0 * share:.3g} % of the weighted forces"
     return None
+
+
+def unexplained_torques(fitted: Metrics) -> str:
+    """That a fit leaves most of the joint torques, however well it explains other forces; "" where it does not.
+
+    Of all torques, or of what no contact has a part in. Noise of the readings, where it is known, explains what it may.
+    """
+    groups = ("nullspace",) if fitted.limbs_in_air else ("joint_torque", "nullspace")
+    beyond = (one for one in groups if (fitted.rms_of(one) or 0.0) > AT_THE_FLOOR * (fitted.noise.get(one) or 0.0))
+    share = max((fitted.relative_of(one) or 0.0 for one in beyond), default=0.0)
+    return f"the fit leaves {100.0 * share:.3g} % of the joint torques" if share > _SHARE else ""
 
 
 _LEVEL = 1e-3  # share of fits without such friction that show some

@@ -211,13 +211,12 @@ def total_mass(
         block_error: standard error by the scatter between blocks of the logs, which counts if it is the larger.
     """
     weights = mass_weights(len(estimate.phi) // parameters.PER_BODY)
-    error, by_rows, if_known = (
-        combination_standard_error(problem, estimate, weights, rank_tolerance)
-        for problem in (assembly.problem, replace(assembly.problem, held=None), assembly.if_known)
-    )
+    known = assembly.problem, assembly.if_known
+    error, if_known = (combination_standard_error(x, estimate, weights, rank_tolerance) for x in known)
     noise = float(np.sqrt(assembly.problem.oversampling) * estimate.residual_std)
     covariance = ParameterCovariance.of(assembly.problem, rank_tolerance, assembly.stated)
     along = covariance.scale_sensitivity(weights[None])[0]
+    by_rows = noise * float(np.linalg.norm(along @ covariance.root)) if np.isfinite(error) else error
     by_data = noise * covariance.without_stated(by_rows / noise, along) if assembly.stated and noise else by_rows
     separable = not np.isfinite(if_known) or by_data <= INFLATION_LIMIT * if_known
     value, nominal = (float(weights @ phi) for phi in (estimate.phi, assembly.problem.nominal))
@@ -275,6 +274,10 @@ class ParameterCovariance:
     @classmethod
     def of(cls, problem: LinearProblem, rank_tolerance: float, stated: int = 0) -> ParameterCovariance:
         """Of the rows of a problem, the last `stated` of which are no data; `rank_tolerance` as in `LeastSquares`."""
+        return problem.shared(("covariance", rank_tolerance, stated), lambda: cls._of(problem, rank_tolerance, stated))
+
+    @classmethod
+    def _of(cls, problem: LinearProblem, rank_tolerance: float, stated: int) -> ParameterCovariance:
         scale = problem.scale[problem.free]
         _, values, Vt = np.linalg.svd(problem.A[:, problem.free] * scale, full_matrices=True)
         least = max(rank_tolerance, np.finfo(float).eps * max(problem.A.shape)) * values.max(initial=0.0)
@@ -283,14 +286,7 @@ class ParameterCovariance:
         values[rank:] = 0.0
         root = Vt[:rank].T / values[:rank]
         known = problem.A[len(problem.A) - stated :, problem.free] * scale
-        return cls(
-            by_stated=root @ (root.T @ known.T),
-            root=root,
-            null_space=Vt[rank:].T,
-            values=values,
-            scale=scale,
-            free=problem.free,
-        )
+        return cls(root, Vt[rank:].T, values, scale, problem.free, by_stated=root @ (root.T @ known.T))
 
     def variance_shares(self, sensitivity: Array, noise: float) -> Array:
         """Part (P',) of the variance along sensitivities (P',) due to each parameter, as a share of the largest.

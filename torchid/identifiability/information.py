@@ -15,7 +15,7 @@ from torchid.problem import LinearProblem, RowBuilder, Samples
 from torchid.problem.chunks import ProgressCallback, chunks_by_state, one_thread, subsample_states
 from torchid.problem.contact_state import ContactState
 from torchid.problem.metrics import ROW_GROUPS, ForceSums, finite_or_none
-from torchid.problem.predict import null_space_components, predict_forces
+from torchid.problem.predict import null_space_components, predict_by_columns
 from torchid.problem.unloaded_sensors import unloaded_offset_equations
 from torchid.rounding import KINEMATIC_TOLERANCE, RANK_TOLERANCE
 from torchid.sensing import SensorNoise
@@ -264,8 +264,8 @@ def expected_errors(
     model, sensors = ForceSums(nv), ForceSums(nv)
     for samples, state, weight in subsample_states(logs, _ERROR_SAMPLES):
         samples = samples.to(builder.device)
-        kinematics = builder.kinematics(samples)
-        predicted = predict_forces(builder, kinematics, columns).mT
+        kinematics = builder.dynamics(samples)
+        predicted = predict_by_columns(builder, kinematics, columns).mT
         rows = _row_noise(builder, samples, noise)
         through_contacts = _wrench_noise(builder, samples, state, noise)
         for sums, errors, without_contacts in (

@@ -31,6 +31,7 @@ from torchid.log_checks.findings import (
 )
 from torchid.log_checks.forces import check_forces_against_urdf
 from torchid.log_checks.frozen import check_excitation, check_repeats, check_still_base
+from torchid.log_checks.model import Declared
 from torchid.log_checks.motion import (
     check_angle_unit,
     check_angular_velocity,
@@ -122,6 +123,7 @@ def check(
     contacts: Sequence[Contact] = (),
     cutoff_hz: float | None = None,
     derived: tuple[str, ...] = (),
+    declared: Declared | None = None,
     required: SensorSet | None = None,
 ) -> Checked:
     """Check a log as it was read.
@@ -134,14 +136,12 @@ def check(
         derived: how names of fields begin that were not recorded, which are not to blame for anything. contact_active:
             of a log that has got flags from its torques. base_: motion of the base will follow from the feet that
             stand; forces are compared with the URDF in the longest segment in which enough of them do.
+        declared: what an experiment says of noise, delay and unknown scales and offsets; None: nothing.
         required: sensors of a fit, which must be in the log; None for any.
     """
     log, unclosed = completed(without_welded_joints(log, robot), robot)
-    if any(contact.along_normal for contact in contacts):
-        contacts, required = (
-            [replace(contact, along_normal=False) for contact in contacts],
-            None,
-        )  # wrenches are checked
+    if any(contact.along_normal for contact in contacts):  # wrenches are what is checked
+        contacts, required = [replace(contact, along_normal=False) for contact in contacts], None
     results: list[Finding | Skipped] = list(check_magnitudes(log))
     if (blocking := _blocking_finding(results)) is not None:
         return _collect(log, log, [*results, _skip_dependent(blocking)])
@@ -176,11 +176,12 @@ def check(
         results += unfit
     if _blocking_finding(results) is None:
         unbiased = subtract_contact_offsets(compared)
-        results += check_forces_against_urdf(unbiased, robot, contacts, cutoff_hz, derived, required)
+        results += check_forces_against_urdf(unbiased, robot, contacts, cutoff_hz, derived, declared, required)
         results += check_limb_sensors(compared, robot, contacts, cutoff_hz)
     blocking = _blocking_finding(results)
     if blocking is None or blocking.name == "sign":
-        results += check_weight(subtract_contact_offsets(compared), robot)
+        scaled = declared is not None and "contact_force" in declared.terms.scales
+        results += check_weight(subtract_contact_offsets(compared), robot, scaled)
     else:
         results.append(_skip_dependent(blocking))
     return _collect(log, repaired, results)

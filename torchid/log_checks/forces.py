@@ -7,14 +7,16 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import torch
 
 from torchid.errors import InputError, join_names
 from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, Finding, Skipped
-from torchid.log_checks.lag_and_tilt import check_lag_and_tilt, check_torque_offsets
+from torchid.log_checks.lag_and_tilt import check_lag_and_tilt, check_torque_offsets, without_lag
 from torchid.log_checks.mistakes import possible_mistakes
 from torchid.log_checks.model import (
     MAX_TRIAL_DIFFERENTIATED_SAMPLES,
     TRIAL_SAMPLES,
+    Declared,
     ModelFit,
     NominalModel,
     TorqueFit,
@@ -25,11 +27,13 @@ from torchid.log_checks.model import (
 from torchid.log_checks.scales import TimeScale, TorqueGains, fit_time_scale, fit_torque_gains, motion_cutoff_hz
 from torchid.logs import Log
 from torchid.logs.log import WRENCHES, BoolArray, FloatArray
+from torchid.logs.segments import with_delayed_torques
 from torchid.parameters import COULOMB, FRICTION, VISCOUS
 from torchid.problem import Samples
 from torchid.problem.samples import require_forces
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
+from torchid.settings import AUTO
 
 #: Misfit above which common mistakes are tried. A URDF that is 20 % off leaves 0.05 to 0.1, one with links missing 0.3.
 MAX_MISFIT = 0.4
@@ -82,6 +86,7 @@ def check_forces_against_urdf(
     contacts: Sequence[Contact],
     cutoff_hz: float | None,
     derived: tuple[str, ...] = (),
+    declared: Declared | None = None,
     required: SensorSet | None = None,
 ) -> Iterator[Finding | Skipped]:
     """Findings about joint torques and contact wrenches.
@@ -92,18 +97,20 @@ def check_forces_against_urdf(
         contacts: of it.
         cutoff_hz: of the fit, None for a usual one.
         derived: how names of fields begin that were not recorded and hold no mistake of a recording.
+        declared: what is known of the sensors.
         required: sensors of a fit, which must be in the log.
     """
     if robot is None:
         yield Skipped(_FORCE_CHECK, "no robot (--urdf)")
         return
-    cutoff = cutoff_hz or default_cutoff_hz(log)
+    cutoff, model = cutoff_hz or default_cutoff_hz(log), NominalModel(robot, contacts, declared or Declared())
     try:
+        log = with_delayed_torques(log, model.declared.known_delay)
         logs = preprocess_pieces(log, cutoff)
     except InputError as error:  # too short, or sampled too slowly by its time stamps
         refused = Finding("does not fit", REJECTED, error.field, error.found, f"give {error.accepted}")
         skipped = Skipped(_FORCE_CHECK, f"{error.field}: {error.found}") if required is None else refused
-        yield _time_scale_finding(_fit_time_scale(log, robot, contacts)) or skipped
+        yield _time_scale_finding(_fit_time_scale(log, model)) or skipped
         return
     try:
         samples = bind_some_samples(logs, robot, contacts)
@@ -119,59 +126,66 @@ def check_forces_against_urdf(
     if log.joint_torque is None and log.contact_wrench is None:
         yield Skipped(_FORCE_CHECK, "neither joint torques nor contact wrenches")
         return
-    yield from _misfit_findings(log, samples, robot, contacts, cutoff, derived)
+    yield from _misfit_findings(log, samples, model, cutoff, derived)
 
 
 def _misfit_findings(
-    log: Log,
-    samples: Sequence[Samples],
-    robot: Robot,
-    contacts: Sequence[Contact],
-    cutoff: float,
-    derived: tuple[str, ...],
+    log: Log, samples: Sequence[Samples], model: NominalModel, cutoff: float, derived: tuple[str, ...]
 ) -> Iterator[Finding | Skipped]:
     """The mistake that explains forces unlike the URDF's, or single deviations of forces that are like them."""
-    model = NominalModel(robot, contacts)
-    fit, explanation = model.compare(samples), None
-    if fit.misfit > MAX_MISFIT and (bare := _without_friction(robot)) is not None:
-        without = NominalModel(bare, contacts)
-        if (better := without.compare(samples)).misfit <= MAX_MISFIT:
+    fit, explanation, robot = model.compare(samples), None, model.robot
+    if fit.largest_misfit > MAX_MISFIT and (bare := _without_friction(robot)) is not None:
+        without = replace(model, robot=bare)
+        if (better := without.compare(samples)).largest_misfit <= MAX_MISFIT:
             yield _friction_finding(robot, fit, better)
             robot, model, fit = bare, without, better
-    if fit.misfit > MAX_MISFIT:
+    if fit.largest_misfit > MAX_MISFIT:
         explanation = _best_mistake(log, model, cutoff, fit, derived)
     if explanation is not None:
         yield explanation
         return
-    moved, unexplained = check_lag_and_tilt(log, robot, contacts, cutoff, derived)
-    scale = None if moved else _fit_time_scale(log, robot, contacts)
+    log, samples = _scaled(log, samples, robot, fit.torque)
+    if model.declared.delay == AUTO:
+        log = without_lag(log, model, cutoff)
+    moved, unexplained = check_lag_and_tilt(log, model, cutoff, derived)
+    scale = None if moved else _fit_time_scale(log, model)
     if found := moved or [one for one in [_time_scale_finding(scale)] if one is not None]:
-        alike = None if moved else fit_torque_gains(samples, robot, contacts)
+        alike = None if moved else fit_torque_gains(samples, model)
         yield from (alike and list(_common_gain_findings(alike, robot))) or found
         return
     unexplained = unexplained if scale is None else min(unexplained, scale.recorded)
-    if fit.misfit > MAX_MISFIT and unexplained > MAX_UNEXPLAINED_RATIO:
-        held = bool(contacts) or robot.fixed_base
-        gains = fit_torque_gains(samples, robot, contacts) if held else None
-        scaled = list(_gain_and_point_findings(log, gains, robot))
-        yield from scaled
-        if scaled:
-            return
-        text = (
-            f"measured forces differ from the {robot.format}'s by {_percent(fit.misfit)}, "
-            "and no usual mistake explains it"
-        )
-        advice = f"check units, frames, the order of joints and contacts, friction, the {robot.format}'s base link and"
-        advice += f" masses, and whether the {robot.format} is that of this robot"
-        if not held:
-            advice = f"name under contacts what touches the ground, or holds the base in the air; or {advice}"
-        yield Finding("forces", SUSPICIOUS, "all", text, advice)
+    if fit.largest_misfit > MAX_MISFIT and unexplained > MAX_UNEXPLAINED_RATIO:
+        held = bool(model.contacts) or robot.fixed_base
+        gains = fit_torque_gains(samples, model) if held else None
+        yield from list(_gain_and_point_findings(log, gains, robot)) or [_contradiction(fit, robot, held)]
         return
     torques = [] if fit.torque is None else list(_torque_findings(robot, fit.torque))
     yield from torques
     if not any(isinstance(item, Finding) for item in torques):
-        scaled = list(_gain_and_point_findings(log, fit_torque_gains(samples, robot, contacts), robot))
-        yield from scaled or check_torque_offsets(log, robot, contacts, cutoff)
+        scaled = list(_gain_and_point_findings(log, fit_torque_gains(samples, model), robot))
+        yield from scaled or check_torque_offsets(log, model, cutoff)
+
+
+def _contradiction(fit: ModelFit, robot: Robot, held: bool) -> Finding:
+    """A finding about forces that no usual mistake explains; `held`: whether anything is known to hold the robot."""
+    text = f"measured forces differ from the {robot.format}'s by {_percent(fit.largest_misfit)}"
+    text += ", and no usual mistake explains it"
+    advice = f"check units, frames, the order of joints and contacts, friction, the {robot.format}'s base link and"
+    advice += f" masses, and whether the {robot.format} is that of this robot"
+    if not held:
+        advice = f"name under contacts what touches the ground, or holds the base in the air; or {advice}"
+    return Finding("forces", SUSPICIOUS, "all", text, advice)
+
+
+def _scaled(log: Log, samples: Sequence[Samples], robot: Robot, fit: TorqueFit | None) -> tuple[Log, Sequence[Samples]]:
+    """A log and samples of it, of torques times the declared unknown scales that fit best."""
+    if fit is None or log.joint_torque is None or (fit.scale == 1.0).all():
+        return log, samples
+    by_name = dict(zip((robot.joint_names[joint] for joint in fit.joints), fit.scale, strict=True))
+    factor = np.array([by_name.get(name, 1.0) for name in log.joint_names])
+    of_dofs = torch.tensor([by_name.get(name, 1.0) for name in robot.dof_names])
+    scaled = [replace(x, torque=None if x.torque is None else x.torque * of_dofs) for x in samples]
+    return replace(log, joint_torque=log.joint_torque * factor), scaled
 
 
 def _without_friction(robot: Robot) -> Robot | None:
@@ -189,8 +203,8 @@ def _friction_finding(robot: Robot, stated: ModelFit, without: ModelFit) -> Find
         if (value := robot.nominal[robot.bodies.index(body), number]) and body.joint is not None:
             largest.append(f"{kind} up to {value:g} in {body.joint.name}")
     text = (
-        f"measured forces differ from the {robot.format}'s by {_percent(stated.misfit)}, "
-        f"by {_percent(without.misfit)} without the friction that it states: {', '.join(largest)}"
+        f"measured forces differ from the {robot.format}'s by {_percent(stated.largest_misfit)}, "
+        f"by {_percent(without.largest_misfit)} without the friction that it states: {', '.join(largest)}"
     )
     return Finding("friction", NOTE, "all", text, f"nothing, as a fit finds friction; or 0 in the {robot.format}")
 
@@ -198,8 +212,8 @@ def _friction_finding(robot: Robot, stated: ModelFit, without: ModelFit) -> Find
 def _best_mistake(
     log: Log, model: NominalModel, cutoff: float, fit: ModelFit, derived: tuple[str, ...]
 ) -> Finding | None:
-    """The mistake whose correction leaves the least misfit, if that is small enough."""
-    robot, best, least = model.robot, None, MAX_RESIDUAL_SHARE * min(fit.misfit, 1.0)
+    """The mistake whose correction leaves the least misfit, if that is small enough: one of torques, by the torques."""
+    robot, best, least, shares = model.robot, None, min(fit.misfit, 1.0), (0.0, 0.0)
     filtered = cache(lambda: preprocess_pieces(log, cutoff, MAX_TRIAL_DIFFERENTIATED_SAMPLES))
     for mistake in possible_mistakes(log):
         if not _may_explain(mistake.field, fit) or mistake.field.startswith(derived):
@@ -212,20 +226,22 @@ def _best_mistake(
             samples = bind_some_samples(pieces, robot, model.contacts, TRIAL_SAMPLES)
         except InputError:  # the filter does not accept the corrected log
             continue
-        trial = model.compare(samples, least)
-        if mistake.field == "joint_torque" and trial.implausible > fit.implausible:
-            continue
-        if trial.compared == fit.compared and trial.misfit < least:  # compare the same forces only
-            best, least = mistake, trial.misfit
+        of_torques = mistake.field == "joint_torque"
+        trial = model.compare(samples, least if of_torques else min(least, MAX_RESIDUAL_SHARE * min(fit.misfit, 1.0)))
+        if trial.compared != fit.compared or (of_torques and trial.implausible > fit.implausible):
+            continue  # compare the same forces only
+        before, after = (x.torque_misfit or 0.0 if of_torques else x.misfit for x in (fit, trial))
+        if after < MAX_RESIDUAL_SHARE * min(before, 1.0) and trial.misfit < least:
+            best, least, shares = mistake, trial.misfit, (before, after)
     if best is None:
         return None
-    text = (
-        f"measured forces differ from the {robot.format}'s by {_percent(fit.misfit)}, "
-        f"by {_percent(least)} once corrected"
-    )
-    of_currents = best.field == "joint_torque" and best.description.startswith("in ") and least > _MAX_UNIT_MISFIT
+    before, after = shares
+    measured = "torques" if best.field == "joint_torque" else "forces"
+    text = f"measured {measured} differ from the {robot.format}'s by {_percent(before)}"
+    text += f", by {_percent(after)} once corrected"
+    of_currents = best.field == "joint_torque" and best.description.startswith("in ") and after > _MAX_UNIT_MISFIT
     advice = best.advice + "; of currents, set sensors.scales: {joint_torque: all}" * of_currents
-    advice += f"; or is {robot.path.name} another robot's?" * (least > MAX_CLEAR_MISFIT)
+    advice += f"; or is {robot.path.name} another robot's?" * (after > MAX_CLEAR_MISFIT)
     return Finding("unit, sign or frame", REJECTED, best.field, f"{best.description}: {text}", advice)
 
 
@@ -268,11 +284,11 @@ def _torque_findings(robot: Robot, fit: TorqueFit) -> Iterator[Finding | Skipped
         yield Skipped("sign of torques", f"too little in this motion but friction and noise: {names}")
 
 
-def _fit_time_scale(log: Log, robot: Robot, contacts: Sequence[Contact]) -> TimeScale | None:
+def _fit_time_scale(log: Log, model: NominalModel) -> TimeScale | None:
     """The scale of time by the forces; None where nothing moves, or the log is too short."""
     cutoff = motion_cutoff_hz(log)
     try:
-        return None if cutoff is None else fit_time_scale(log, robot, contacts, cutoff)
+        return None if cutoff is None else fit_time_scale(log, model, cutoff)
     except InputError:
         return None
 

@@ -40,6 +40,8 @@ _MIN_STEP_QUANTA = 4.0
 #: Speed next to a run over that on the same side of it; a robot that stops smoothly is slower. Noisy channels are
 #: averaged over this number of steps.
 _MIN_SPEED_SHARE, _AVERAGED_STEPS = 0.5, 4
+#: Median steps beside a run of zeros within which they begin and end at a dead band: 4 standard deviations of noise.
+_MAX_STEPS_TO_DEAD_BAND = 6.0
 #: Share of repeats above which a channel may be held at a lower rate...
 MIN_REPEATED_SHARE = 0.2
 #: ... and the share of runs that have the typical length within one sample, if the rate is regular.
@@ -142,11 +144,10 @@ def _channel_findings(group: ChannelGroup, all_repeated: BoolArray, columns: np.
         repeated = all_repeated[:, column]
         name, values = group.names[column], group.values[:, column]
         runs = _implausible_runs(values[:, None], repeated)
-        zeros = values[runs.first] == 0.0
         small = _in_dead_band(values[:, None], runs)
-        if group.field in DEAD_BAND_FIELDS and small.any() and 2 * small.sum() >= zeros.sum():
+        if group.field in DEAD_BAND_FIELDS and small.any():
             dead.append((name, float(np.abs(values[values != 0.0]).min()), 100.0 * float(np.mean(values == 0.0))))
-            runs = runs.select(~zeros)
+            runs = runs.select(~small)
         for extreme in (values.min(), values.max()):
             at_limit = Runs.of_repeats(repeated & (values[1:] == extreme))
             if (values[runs.first] == extreme).any() and at_limit.lengths.sum() >= MIN_SAMPLES_AT_LIMIT:
@@ -303,16 +304,18 @@ def _implausible_runs(values: FloatArray, repeated: BoolArray) -> Runs:
 
 
 def _in_dead_band(values: FloatArray, runs: Runs) -> BoolArray:
-    """Which runs (R,) of values (M, c) are zeros next to the smallest readings of the channel.
+    """Which runs (R,) of values (M, c) are zeros that begin and end next to the smallest readings of the channel.
 
-    A driver with a dead band starts and ends its zeros at small readings, a lost sensor at any reading.
+    A signal enters a dead band and leaves it within a step of its edge; a lost sensor reads 0 from any reading on.
     """
-    size = np.abs(values)
+    size, steps = np.abs(values), np.abs(np.diff(values, axis=0))
     least = np.where(size > 0.0, size, np.inf).min(axis=0)
     inside = (size[runs.first] == 0.0).all(axis=1)
-    for neighbour in (runs.first - 1, runs.last + 2):
+    for neighbour, jump, direction in ((runs.first - 1, runs.first - 1, -1), (runs.last + 2, runs.last + 1, 1)):
         at_end = (neighbour < 0) | (neighbour >= len(size))
-        inside &= at_end | (size[np.clip(neighbour, 0, len(size) - 1)] <= 2.0 * least).all(axis=1)
+        usual = finite_median(neighbours_of(steps, jump, direction, NEIGHBOUR_STEPS))
+        reach = least + np.maximum(least, _MAX_STEPS_TO_DEAD_BAND * usual)
+        inside &= at_end | (size[np.clip(neighbour, 0, len(size) - 1)] <= reach).all(axis=1)
     return np.asarray(inside)
 
 

@@ -10,15 +10,21 @@ import numpy as np
 import torch
 
 from torchid.errors import InputError
-from torchid.log_checks.findings import SUSPICIOUS, Finding
-from torchid.log_checks.model import MAX_TRIAL_DIFFERENTIATED_SAMPLES, bind_some_samples, preprocess_pieces
+from torchid.log_checks.findings import NOTE, SUSPICIOUS, Finding
+from torchid.log_checks.model import (
+    MAX_TRIAL_DIFFERENTIATED_SAMPLES,
+    Declared,
+    NominalModel,
+    bind_some_samples,
+    deviation_builder,
+    preprocess_pieces,
+    some_samples,
+)
 from torchid.log_checks.scales import (
     CORRELATED_SAMPLES,
     TIME_BLOCKS,
     accumulate_blocks,
     deviation_columns,
-    measured_sensors,
-    measures_force,
     prior_columns,
     rows_with_bases,
 )
@@ -28,8 +34,6 @@ from torchid.logs.segments import with_delayed_torques
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.predict import force_series
 from torchid.regressor.kinematics import GRAVITY_WORLD
-from torchid.robot import Robot
-from torchid.sensing import Contact
 
 #: Samples that are compared.
 _SAMPLES = 240
@@ -91,7 +95,7 @@ class Deviation:
 
 
 def check_lag_and_tilt(
-    log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: float, derived: tuple[str, ...] = ()
+    log: Log, model: NominalModel, cutoff_hz: float, derived: tuple[str, ...] = ()
 ) -> tuple[list[Finding], float]:
     """Findings about torques that lag or lead, a vertical that gravity is not along, and single contact sensors.
 
@@ -100,52 +104,60 @@ def check_lag_and_tilt(
 
     Args:
         log: the log.
-        robot: the robot.
-        contacts: of it.
+        model: robot, contacts, and what is declared.
         cutoff_hz: of the filter.
         derived: how names of fields begin that were not recorded.
     """
     try:
-        lag = fit_lag(log, robot, contacts, cutoff_hz)
-        tilt = fit_tilt(log, robot, contacts, cutoff_hz) if not "base_quat_xyzw".startswith(derived) else None
-        sensors = fit_contact_sensors(log, robot, contacts, cutoff_hz)
+        lag = fit_lag(log, model, cutoff_hz)
+        tilt = fit_tilt(log, model, cutoff_hz) if not "base_quat_xyzw".startswith(derived) else None
+        sensors = fit_contact_sensors(log, model, cutoff_hz)
     except InputError:  # reported by `check_forces_against_urdf`
         return [], np.inf
     unexplained = min((x.without for x in (lag, tilt) if x is not None), default=np.inf)
-    moved = [*_lag_findings(lag), *_tilt_findings(tilt, robot)]
-    return moved or list(_contact_sensor_findings(sensors, log, robot, contacts)), unexplained
+    moved = [*_lag_findings(lag, model.declared), *_tilt_findings(tilt, model)]
+    return moved or list(_contact_sensor_findings(sensors, log, model)), unexplained
 
 
-def check_torque_offsets(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: float) -> Iterator[Finding]:
+def check_tilt(samples: Sequence[Samples], model: NominalModel) -> Iterator[Finding]:
+    """A finding about a vertical that gravity is not along, in filtered logs of a robot."""
+    yield from _tilt_findings(_tilt_of(some_samples(samples, _SAMPLES), model), model)
+
+
+def check_torque_offsets(log: Log, model: NominalModel, cutoff_hz: float) -> Iterator[Finding]:
     """Findings about single joints whose torque reads too much by a constant, for logs that nothing else is wrong with.
 
     Args: as `check_lag_and_tilt`.
     """
     with suppress(InputError):  # reported by `check_forces_against_urdf`
-        yield from _offset_findings(fit_torque_offsets(log, robot, contacts, cutoff_hz), log, robot)
+        yield from _offset_findings(fit_torque_offsets(log, model, cutoff_hz), log, model)
 
 
-def _lag_findings(lag: Deviation | None) -> Iterator[Finding]:
+def _lag_findings(lag: Deviation | None, declared: Declared) -> Iterator[Finding]:
     if lag is not None and abs(lag.value[0]) > MIN_LAG_S and lag.is_clear:
         seconds, late = float(lag.value[0]), "later" if lag.value[0] > 0.0 else "earlier"
         text = f"torques are {1e3 * abs(seconds):.3g} +- {1e3 * lag.spread[0]:.2g} ms {late} than the motion"
-        advice = f"check their stamps and filters, or set actuators.delay: {-seconds:.2g}"
+        advice = f"check their stamps and filters, or set actuators.delay: {declared.known_delay - seconds:.2g}"
         yield Finding("delay", SUSPICIOUS, "joint_torque", f"{text}: {lag.gain}", advice)
 
 
-def _tilt_findings(tilt: Deviation | None, robot: Robot) -> Iterator[Finding]:
+def _tilt_findings(tilt: Deviation | None, model: NominalModel) -> Iterator[Finding]:
     if tilt is not None and np.linalg.norm(tilt.value) > np.radians(MIN_TILT_DEG) and tilt.is_clear:
-        x, y = np.degrees(tilt.value)
+        robot, (x, y) = model.robot, np.degrees(tilt.value)
         of = "the base's own" if robot.fixed_base else "the world's"
         text = f"gravity is {np.hypot(x, y):.2g} degrees from down ({x:.2g} and {y:.2g} about {of} x and y axes)"
         field = "base" if robot.fixed_base else "base_quat_xyzw"
         advice = "check the mounting of the base" if robot.fixed_base else "check that the world's z axis points up"
-        yield Finding("tilt", SUSPICIOUS, field, f"{text}: {tilt.gain}", f"{advice}, or set robot.base_tilt: auto")
+        severity, advice = SUSPICIOUS, f"{advice}, or set robot.base_tilt: auto"
+        if model.declared.finds_tilt:
+            severity, advice = NOTE, "nothing: robot.base_tilt: auto finds it"
+        yield Finding("tilt", severity, field, f"{text}: {tilt.gain}", advice)
 
 
-def _offset_findings(found: Deviation | None, log: Log, robot: Robot) -> Iterator[Finding]:
+def _offset_findings(found: Deviation | None, log: Log, model: NominalModel) -> Iterator[Finding]:
     if found is None:
         return
+    robot = model.robot
     for joint in np.flatnonzero(found.clear & (np.abs(found.value) > _MIN_OFFSET_SHARE * _torque_rms(log))):
         name, offset, std = robot.joint_names[joint], found.value[joint], found.spread[joint]
         unit = "N" if name in robot.sliding else "N m"
@@ -154,15 +166,13 @@ def _offset_findings(found: Deviation | None, log: Log, robot: Robot) -> Iterato
         yield Finding("offset", SUSPICIOUS, "joint_torque", f"{text}: {found.gain}", advice, (name,))
 
 
-def _contact_sensor_findings(
-    found: Deviation | None, log: Log, robot: Robot, contacts: Sequence[Contact]
-) -> Iterator[Finding]:
+def _contact_sensor_findings(found: Deviation | None, log: Log, model: NominalModel) -> Iterator[Finding]:
     """Findings about single contact sensors; what all have in common is a payload, or the robot's masses."""
     if found is None:
         return
     value, spread, clear = (x.reshape(-1, 4) for x in (found.value, found.spread, found.clear))
     common = value[np.argmin(np.abs(value[:, 0])), 0]
-    for contact, (gain, *turn), std, is_clear in zip(contacts, value, spread[:, 0], clear, strict=True):
+    for contact, (gain, *turn), std, is_clear in zip(model.contacts, value, spread[:, 0], clear, strict=True):
         size = float(np.linalg.norm(turn))
         angle = float(np.degrees(np.arctan2(size, 1.0 + gain)))
         if is_clear[1:].any() and angle > _MIN_TURN_DEG:
@@ -175,11 +185,11 @@ def _contact_sensor_findings(
             advice = "check the sensor's sign, gain and unit, and whether these readings are another foot's"
         else:
             continue
-        text = f"{contact.frame}: forces fit the {robot.format} best {problem}: {found.gain}"
+        text = f"{contact.frame}: forces fit the {model.robot.format} best {problem}: {found.gain}"
         yield Finding(name, SUSPICIOUS, log.contact_wrench_field, text, advice, (contact.frame,))
 
 
-def fit_contact_sensors(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: float) -> Deviation | None:
+def fit_contact_sensors(log: Log, model: NominalModel, cutoff_hz: float) -> Deviation | None:
     """By how much each contact's wrench is more than is read, and turned, (4 C,): a share, and three angles' sines.
 
     The axes are those of the readings. A turn about an axis across the forces takes the share cos - 1 beside it. None
@@ -188,10 +198,11 @@ def fit_contact_sensors(log: Log, robot: Robot, contacts: Sequence[Contact], cut
     Raises:
         InputError: as `fit_lag`.
     """
+    contacts = model.contacts
     if log.contact_wrench is None or not contacts:
         return None
     pieces = preprocess_pieces(log, cutoff_hz, MAX_TRIAL_DIFFERENTIATED_SAMPLES)
-    samples = bind_some_samples(pieces, robot, contacts, _SAMPLES)
+    samples = bind_some_samples(pieces, model.robot, model.contacts, _SAMPLES)
 
     @torch.no_grad()
     def columns(builder: RowBuilder, part: Samples, number: int) -> FloatArray:
@@ -205,10 +216,10 @@ def fit_contact_sensors(log: Log, robot: Robot, contacts: Sequence[Contact], cut
         wrenches = [(k, builder.recorded_wrench(x, k, kinematics)) for k in range(len(contacts)) for x in changes]
         return np.stack([torch.einsum("nwv,nw->nv", J[:, k], w).numpy() for k, w in wrenches], axis=2)
 
-    return _fit(samples, robot, contacts, columns, _SENSOR_PRIOR_STD)
+    return _fit(samples, model, columns, _SENSOR_PRIOR_STD)
 
 
-def fit_lag(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: float) -> Deviation | None:
+def fit_lag(log: Log, model: NominalModel, cutoff_hz: float) -> Deviation | None:
     """By how much joint torques are later than the motion, (1,) [s]; None where no torque was measured.
 
     Raises:
@@ -216,12 +227,12 @@ def fit_lag(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: floa
     """
     if log.joint_torque is None:
         return None
-    out, shift = None, 0.0
+    robot, out, shift = model.robot, None, 0.0
     for _ in range(_SHIFTS):
         moved = with_delayed_torques(log, -shift)
         pieces = preprocess_pieces(moved, cutoff_hz, MAX_TRIAL_DIFFERENTIATED_SAMPLES)
         slopes = [replace(one, joint_torque=_slope(one)) for one in pieces]
-        rates = bind_some_samples(slopes, robot, contacts, _SAMPLES)
+        rates = bind_some_samples(slopes, robot, model.contacts, _SAMPLES)
 
         def columns(builder: RowBuilder, part: Samples, number: int, rates: Sequence[Samples] = rates) -> FloatArray:
             torque = np.zeros((len(part), builder.tree.n_rows, 1))
@@ -229,7 +240,7 @@ def fit_lag(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: floa
             torque[:, base : base + robot.n, 0] = builder.recorded_torque(rates[number])[:, : robot.n].numpy()
             return np.nan_to_num(torque)
 
-        found = _fit(bind_some_samples(pieces, robot, contacts, _SAMPLES), robot, contacts, columns, _LAG_PRIOR_STD_S)
+        found = _fit(bind_some_samples(pieces, robot, model.contacts, _SAMPLES), model, columns, _LAG_PRIOR_STD_S)
         if found is None:
             return None
         without = found.without if out is None else out.without
@@ -240,7 +251,7 @@ def fit_lag(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: floa
     return out
 
 
-def fit_torque_offsets(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: float) -> Deviation | None:
+def fit_torque_offsets(log: Log, model: NominalModel, cutoff_hz: float) -> Deviation | None:
     """By how much each joint's torque is less than is read, (n,) [N m or N]; None where no torque was measured.
 
     Raises:
@@ -248,15 +259,15 @@ def fit_torque_offsets(log: Log, robot: Robot, contacts: Sequence[Contact], cuto
     """
     if log.joint_torque is None:
         return None
-    pieces = preprocess_pieces(log, cutoff_hz, MAX_TRIAL_DIFFERENTIATED_SAMPLES)
-    samples = bind_some_samples(pieces, robot, contacts, _SAMPLES)
+    robot, pieces = model.robot, preprocess_pieces(log, cutoff_hz, MAX_TRIAL_DIFFERENTIATED_SAMPLES)
+    samples = bind_some_samples(pieces, robot, model.contacts, _SAMPLES)
 
     def columns(builder: RowBuilder, part: Samples, number: int) -> FloatArray:
         constant = np.zeros((builder.tree.n_rows, robot.n))
         constant[builder.tree.base_rows + np.arange(robot.n), np.arange(robot.n)] = -1.0
         return np.broadcast_to(constant, (len(part), *constant.shape))
 
-    return _fit(samples, robot, contacts, columns, _OFFSET_PRIOR_SHARE * _torque_rms(log) or 1.0, offsets=False)
+    return _fit(samples, model, columns, _OFFSET_PRIOR_SHARE * _torque_rms(log) or 1.0, offsets=False)
 
 
 def _torque_rms(log: Log) -> float:
@@ -264,11 +275,21 @@ def _torque_rms(log: Log) -> float:
     return 0.0 if log.joint_torque is None else float(np.sqrt(np.nanmean(np.square(log.joint_torque))))
 
 
+def without_lag(log: Log, model: NominalModel, cutoff_hz: float) -> Log:
+    """The log with joint torques as late as the motion, where it is clear by how much they are not.
+
+    Raises:
+        InputError: as `fit_lag`.
+    """
+    lag = fit_lag(log, model, cutoff_hz)
+    return log if lag is None or not lag.is_clear else with_delayed_torques(log, -float(lag.value[0]))
+
+
 def _slope(log: Log) -> FloatArray | None:
     return None if log.joint_torque is None else np.gradient(log.joint_torque, log.time, axis=0)
 
 
-def fit_tilt(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: float) -> Deviation | None:
+def fit_tilt(log: Log, model: NominalModel, cutoff_hz: float) -> Deviation | None:
     """By how much gravity is turned about x and y from where the log says it is, (2,) [rad].
 
     The axes are the world's, of a fixed base its own. None where no force was measured, or an IMU felt gravity.
@@ -276,18 +297,20 @@ def fit_tilt(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: flo
     Raises:
         InputError: as `fit_lag`.
     """
-    if log.imu_specific_force is not None and not robot.fixed_base:
+    if log.imu_specific_force is not None and not model.robot.fixed_base:
         return None
     pieces = preprocess_pieces(log, cutoff_hz, MAX_TRIAL_DIFFERENTIATED_SAMPLES)
-    samples = bind_some_samples(pieces, robot, contacts, _SAMPLES)
+    return _tilt_of(bind_some_samples(pieces, model.robot, model.contacts, _SAMPLES), model)
 
+
+def _tilt_of(samples: Sequence[Samples], model: NominalModel) -> Deviation | None:
     def columns(builder: RowBuilder, part: Samples, number: int) -> FloatArray:
-        phi = robot.nominal.flatten()[None]
+        phi = model.robot.nominal.flatten()[None]
         level = force_series(builder, part, phi)[1][0]
         turned = [force_series(builder, _turned(part, axis), phi)[1][0] for axis in range(2)]
         return np.stack([level - one for one in turned], axis=2) / _SMALL_ANGLE
 
-    return _fit(samples, robot, contacts, columns, _TILT_PRIOR_STD_RAD)
+    return _fit(samples, model, columns, _TILT_PRIOR_STD_RAD)
 
 
 def _turned(samples: Samples, axis: int) -> Samples:
@@ -301,19 +324,17 @@ def _turned(samples: Samples, axis: int) -> Samples:
 
 def _fit(
     samples: Sequence[Samples],
-    robot: Robot,
-    contacts: Sequence[Contact],
+    model: NominalModel,
     columns: UnknownColumns,
     prior_std: float,
     offsets: bool = True,
 ) -> Deviation | None:
     """Unknowns by their columns, beside parameters, friction, armature and, if not left out, offsets of torques."""
-    sensors = measured_sensors(samples, robot, contacts)
-    if not measures_force(sensors, robot):
+    builder = deviation_builder(samples, model)
+    if builder is None:
         return None
-    builder = RowBuilder(robot, contacts, sensors)
-    prior = prior_columns(builder, robot, samples)
-    nominal = builder.columns.parameter_map @ robot.nominal.flatten()
+    prior = prior_columns(builder, model.robot, samples)
+    nominal = builder.to_columns(model.robot.nominal.flatten()[None])[0].numpy()
     parts = []
     for number, part in enumerate(samples):
         rows, W, equations = rows_with_bases(builder, part)

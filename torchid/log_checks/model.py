@@ -9,7 +9,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy.optimize import nnls
 
+from torchid import parameters
 from torchid.errors import TorchidWarning
 from torchid.log_checks.findings import median_step
 from torchid.logs import Log
@@ -17,10 +19,11 @@ from torchid.logs.cutoff import usual_cutoff_hz
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import preprocess
 from torchid.logs.signal_noise import SignalNoise
-from torchid.problem import RowBuilder, Samples, bind_log
+from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log
+from torchid.problem.extras import list_extras
 from torchid.problem.predict import force_series, null_space_part
 from torchid.robot import Robot
-from torchid.sensing import Contact, named_sensors
+from torchid.sensing import Contact, SensorNoise, SensorSet, named_sensors
 
 #: Samples that are differentiated: all of a short log, `PIECES` evenly spread runs of a long one.
 MAX_DIFFERENTIATED_SAMPLES, PIECES = 40000, 4
@@ -40,8 +43,32 @@ _MAX_WRENCH_MISFIT = 0.3
 MIN_MOTION, MAX_FRICTION_SHARE = 0.01, 0.2
 #: Torque below the resolution of any sensor.
 MIN_TORQUE_NM = 1e-9
+#: Forces that no parameters explain (flexibility, filters, shape of friction), over the rms of each kind of force.
+UNMODELLED_FORCE_SHARE = 0.05
 #: Smaller singular values, over the largest, are raised to this share: the data do not determine such combinations.
 _MIN_SINGULAR_VALUE_SHARE, _TINY = 1e-12, 1e-100
+
+
+@dataclass(frozen=True, eq=False)
+class Declared:
+    """What an experiment says of its sensors and actuators, for which no log is to blame.
+
+    Attributes:
+        noise: standard deviations of the readings, NaN where none is stated; None: nowhere.
+        terms: extra parameters that are fitted, as offsets and scales of sensors.
+        delay: how much later than recorded joint torques act [s]; `AUTO`: to be found.
+        finds_tilt: whether the tilt of the base is to be found.
+    """
+
+    noise: SensorNoise | None = None
+    terms: ExtraTerms = dataclasses.field(default_factory=ExtraTerms)
+    delay: float | str = 0.0
+    finds_tilt: bool = False
+
+    @property
+    def known_delay(self) -> float:
+        """The delay [s], 0 where it is to be found."""
+        return 0.0 if isinstance(self.delay, str) else self.delay
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +79,7 @@ class TorqueFit:
         joints: numbers of the m joints whose torque was measured.
         gain: (m,) factor that each measured torque should be multiplied by.
         determined: (m,) bool, whether the data determine the gain.
+        scale: (m,) factor of torques that have an unknown one by the experiment; all else here is of torques with it.
         misfit: norm of the difference between measured and model torques, over the norm of the model's.
         misfit_corrected: as `misfit`, with torques multiplied by their gain where that is determined and implausible.
     """
@@ -59,6 +87,7 @@ class TorqueFit:
     joints: np.ndarray
     gain: FloatArray
     determined: BoolArray
+    scale: FloatArray
     misfit: float
     misfit_corrected: float
 
@@ -108,6 +137,11 @@ class ModelFit:
         parts = [x for x in (self.torque_misfit, self.base_force, self.base_moment) if x is not None]
         return float(np.sqrt(np.mean(np.square(parts)))) if parts else 0.0
 
+    @property
+    def largest_misfit(self) -> float:
+        """That of all forces, or of the torques alone: forces that fit do not make up for torques that do not."""
+        return max(self.misfit, self.torque_misfit or 0.0)
+
 
 def _implausible_gains(gain: FloatArray, determined: BoolArray) -> BoolArray:
     """Which determined gains (m,) no model error explains."""
@@ -140,8 +174,13 @@ def bind_some_samples(
     logs: Sequence[Log], robot: Robot, contacts: Sequence[Contact], count: int = COMPARED_SAMPLES
 ) -> list[Samples]:
     """About `count` evenly spread samples of filtered logs. Raises InputError: they do not match the robot."""
-    bound = [bind_log(log, robot, contacts) for log in logs]
-    return [part[torch.linspace(0, len(part) - 1, min(count // len(logs), len(part))).long()] for part in bound]
+    return some_samples([bind_log(log, robot, contacts) for log in logs], count)
+
+
+def some_samples(logs: Sequence[Samples], count: int) -> list[Samples]:
+    """About `count` evenly spread samples of logs, at least one of each."""
+    most = max(1, count // max(1, len(logs)))
+    return [part[torch.linspace(0, len(part) - 1, min(most, len(part))).long()] for part in logs]
 
 
 LinkPoses = dict[str, torch.Tensor]
@@ -156,10 +195,14 @@ def recorded_link_poses(log: Log, robot: Robot) -> LinkPoses:
 
 @dataclass(frozen=True)
 class NominalModel:
-    """A robot as its file has it, whose rows are laid out once for all samples in which the same torques are known."""
+    """A robot as its file has it, whose rows are laid out once for all samples in which the same torques are known.
+
+    `declared`: what is known of the sensors; forces are compared with the unknown scales that fit best.
+    """
 
     robot: Robot
     contacts: Sequence[Contact]
+    declared: Declared = dataclasses.field(default_factory=Declared)
     _builders: dict[bytes, RowBuilder] = dataclasses.field(default_factory=dict, init=False, repr=False)
 
     def compare(self, samples: Sequence[Samples], least: float = np.inf) -> ModelFit:
@@ -176,12 +219,17 @@ class NominalModel:
         forces = [force_series(builder, part, robot.nominal.flatten()[None]) for part in samples]
         acting, required = np.concatenate([f[0] for f in forces]), np.concatenate([f[1][0] for f in forces])
         parts = (slice(0, min(3, base)), slice(3, base))
-        force, moment = (_misfit(acting[:, rows], required[:, rows]) for rows in parts)
+        scales = self.declared.terms.scales
+        free = "contact_force" in scales, "contact_moment" in scales
+        force, moment = (_misfit(acting[:, at], required[:, at], x) for at, x in zip(parts, free, strict=True))
         fit = None
         known = [x for x in (force, moment) if x is not None]
         if measured.any() and np.square(known).sum() <= least**2 * (1 + len(known)):
-            fit = _fit_projected(builder, samples, required, torque, np.flatnonzero(measured))
+            extras = list_extras(robot, self.contacts, builder.sensors, ExtraTerms(scales=scales))
+            alike = [extra.dofs for extra in extras if extra.dofs and max(extra.dofs) < robot.n]
+            fit = _fit_projected(builder, samples, required, torque, np.flatnonzero(measured), alike)
             contact_part = acting[:, base : base + robot.n] - torque
+            torque[:, fit.joints] *= fit.scale
             consistent = force is not None and force < _MAX_WRENCH_MISFIT and np.isfinite(contact_part).all()
             if (consistent or not self.contacts) and not fit.determined.all() and not robot.loops:
                 fit = _fit_single_rows(fit, required[:, base : base + robot.n] - contact_part, torque)
@@ -206,19 +254,31 @@ def _held_by_friction(samples: Sequence[Samples], torque: FloatArray) -> BoolArr
     return np.asarray((np.ptp(position, axis=0) < MIN_MOTION) & (load < MAX_FRICTION_SHARE * load.max(initial=0.0)))
 
 
-def _misfit(measured: FloatArray, model: FloatArray) -> float | None:
-    """Norm of the difference over that of the model, over samples (N, k) that were measured; None without any."""
+def _misfit(measured: FloatArray, model: FloatArray, scaled: bool) -> float | None:
+    """Norm of the difference over that of the model, over samples (N, k) that were measured; None without any.
+
+    `scaled`: of what was measured times the factor that fits best, unless that is negative.
+    """
     known = np.isfinite(measured).all(axis=1)
     size = np.linalg.norm(model[known])
     if not measured.shape[1] or not known.any() or not size > 0.0 or not measured[known].any():
         return None
-    return float(np.linalg.norm(measured[known] - model[known]) / size)
+    factor = float((measured[known] * model[known]).sum() / np.square(measured[known]).sum()) if scaled else 1.0
+    return float(np.linalg.norm((factor if factor > 0.0 else 1.0) * measured[known] - model[known]) / size)
 
 
 def _fit_projected(
-    builder: RowBuilder, samples: Sequence[Samples], required: FloatArray, torque: FloatArray, joints: np.ndarray
+    builder: RowBuilder,
+    samples: Sequence[Samples],
+    required: FloatArray,
+    torque: FloatArray,
+    joints: np.ndarray,
+    alike: Sequence[Sequence[int]],
 ) -> TorqueFit:
-    """Gains by least squares in the null space of the contacts, where contact forces vanish."""
+    """Gains by least squares in the null space of the contacts, where contact forces vanish.
+
+    `alike`: joints that share an unknown scale.
+    """
     base = builder.tree.base_rows
     passive = [row for row in builder.motors.passive if row not in joints]
     rows = [*range(base), *(base + joints), *(base + row for row in passive)]
@@ -231,6 +291,8 @@ def _fit_projected(
     projected = np.concatenate([null_space_part(builder, s, v) for s, v in zip(samples, parts, strict=True)], axis=1)
     projected = projected[..., rows].reshape(1 + len(joints), -1)
     y, A = projected[0], projected[1:].T
+    scale = _fit_scales(y, A, [np.isin(joints, group) for group in alike])
+    A = A * scale
     norms = np.linalg.norm(A, axis=0)
     norms[norms == 0.0] = 1.0
     U, values, Vh = np.linalg.svd(A / norms, full_matrices=False)
@@ -241,7 +303,17 @@ def _fit_projected(
     corrected = np.where(_implausible_gains(gain, determined), gain, 1.0)
     size = max(float(np.linalg.norm(y)), _TINY)
     misfits = (float(np.linalg.norm(y - A @ factor)) / size for factor in (np.ones(len(joints)), corrected))
-    return TorqueFit(joints, gain, determined, *misfits)
+    return TorqueFit(joints, gain, determined, scale, *misfits)
+
+
+def _fit_scales(y: FloatArray, A: FloatArray, groups: Sequence[BoolArray]) -> FloatArray:
+    """Factors (m,) of the columns of A (M, m) whose sum is nearest to y, positive, one for each group (m,), else 1."""
+    scale = np.ones(A.shape[1])
+    if groups:
+        free = np.array(groups, float)
+        best, _ = nnls(A @ free.T, y - A[:, ~np.any(groups, axis=0)].sum(axis=1))
+        scale[np.any(groups, axis=0)] = (best @ free)[np.any(groups, axis=0)]
+    return np.where(scale > 0.0, scale, 1.0)
 
 
 def _fit_single_rows(fit: TorqueFit, required: FloatArray, torque: FloatArray) -> TorqueFit:
@@ -253,3 +325,43 @@ def _fit_single_rows(fit: TorqueFit, required: FloatArray, torque: FloatArray) -
         residual = np.linalg.norm(y - gain[index] * x)
         determined[index] = abs(gain[index]) * np.linalg.norm(x) > MIN_ROW_SIGNAL_RATIO * residual
     return replace(fit, gain=gain, determined=determined)
+
+
+def deviation_builder(samples: Sequence[Samples], model: NominalModel) -> RowBuilder | None:
+    """Rows of the forces that are measured in all samples, with declared terms; None without any force."""
+    sensors = _measured_sensors(samples, model.robot, model.contacts, model.declared.noise)
+    motors = (sensors.torque & ~model.robot.is_passive)[: model.robot.n]
+    if not motors.any() and not sensors.wrench.any():
+        return None
+    return RowBuilder(model.robot, model.contacts, sensors, model.declared.terms)
+
+
+def _measured_sensors(
+    samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact], stated: SensorNoise | None
+) -> SensorSet:
+    """The sensors that are read in all samples; their noise is the unmodelled force of each kind, or more if stated."""
+    torque = np.zeros(robot.n_dofs, bool)
+    wrench = np.zeros((len(contacts), 6), bool)
+    size = 0.0
+    if all(part.torque is not None for part in samples):
+        values = np.concatenate([part.torque.numpy() for part in samples if part.torque is not None])[:, : robot.n]
+        torque[: robot.n] = np.isfinite(values).all(axis=0) & (np.abs(values) > MIN_TORQUE_NM).any(axis=0)
+        size = float(np.sqrt(np.square(values[:, torque[: robot.n]]).mean())) if torque.any() else 0.0
+    if contacts and all(part.wrench is not None for part in samples):
+        for k, contact in enumerate(contacts):
+            known = [
+                part.wrench[:, k][part.active[:, k]].numpy()[:, list(contact.components)]
+                for part in samples
+                if part.wrench is not None
+            ]
+            wrench[k, list(contact.components)] = np.isfinite(np.concatenate(known)).all()
+    weight = parameters.GRAVITY * float(robot.nominal[:, parameters.MASS].sum())
+    size = size or 0.1 * weight
+    stated = stated or SensorNoise.of_known({})
+    torque_noise, force, moment = (max(UNMODELLED_FORCE_SHARE * x, MIN_TORQUE_NM) for x in (size, 0.5 * weight, size))
+    noise = SensorNoise(
+        tuple(np.fmax(torque_noise, np.broadcast_to(stated.joint_torque, robot.n)).tolist()),
+        float(np.fmax(force, stated.contact_force)),
+        float(np.fmax(moment, stated.contact_moment)),
+    )
+    return SensorSet(torque | robot.is_passive, wrench, noise)

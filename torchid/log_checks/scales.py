@@ -7,24 +7,25 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy.linalg import block_diag
 
 from torchid import parameters
 from torchid.log_checks.findings import median_step
 from torchid.log_checks.model import (
     MAX_TRIAL_DIFFERENTIATED_SAMPLES,
-    MIN_TORQUE_NM,
+    UNMODELLED_FORCE_SHARE,
+    NominalModel,
     bind_some_samples,
+    deviation_builder,
     preprocess_pieces,
 )
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
-from torchid.parameters import GRAVITY
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.chunks import chunks_by_state, one_thread
 from torchid.problem.linear import parameter_scale
 from torchid.problem.predict import force_series
 from torchid.robot import Robot
-from torchid.sensing import Contact, SensorNoise, SensorSet
 
 # ---------------------------------------------------------------------- equations with a prior on the URDF's parameters
 
@@ -32,8 +33,6 @@ from torchid.sensing import Contact, SensorNoise, SensorSet
 URDF_ERROR = 0.1
 #: Friction missing in a URDF, over the rms torque of the joint: strain-wave gears and ball screws have as much.
 FRICTION_TORQUE_SHARE = 1.0
-#: Forces that no parameters explain (flexibility, filters, shape of friction), over the rms of each kind of force.
-UNMODELLED_FORCE_SHARE = 0.05
 #: Successive samples that count as one: of 240 out of ten seconds, errors of friction and flexibility are correlated.
 CORRELATED_SAMPLES = 10.0
 #: Blocks of time whose estimates are compared.
@@ -65,34 +64,6 @@ class NormalEquations:
         return np.asarray(G - C.T @ np.linalg.solve(H, C))
 
 
-def measured_sensors(samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact]) -> SensorSet:
-    """The sensors that are read in all samples; their noise is the unmodelled force of each kind."""
-    torque = np.zeros(robot.n_dofs, bool)
-    wrench = np.zeros((len(contacts), 6), bool)
-    size = 0.0
-    if all(part.torque is not None for part in samples):
-        values = np.concatenate([part.torque.numpy() for part in samples if part.torque is not None])[:, : robot.n]
-        torque[: robot.n] = np.isfinite(values).all(axis=0) & (np.abs(values) > MIN_TORQUE_NM).any(axis=0)
-        size = float(np.sqrt(np.square(values[:, torque[: robot.n]]).mean())) if torque.any() else 0.0
-    if contacts and all(part.wrench is not None for part in samples):
-        for k, contact in enumerate(contacts):
-            known = [
-                part.wrench[:, k][part.active[:, k]].numpy()[:, list(contact.components)]
-                for part in samples
-                if part.wrench is not None
-            ]
-            wrench[k, list(contact.components)] = np.isfinite(np.concatenate(known)).all()
-    weight = GRAVITY * float(robot.nominal[:, parameters.MASS].sum())
-    moment = size or 0.1 * weight
-    noise = SensorNoise(*(max(UNMODELLED_FORCE_SHARE * x, _TINY) for x in (moment, 0.5 * weight, moment)))
-    return SensorSet(torque | robot.is_passive, wrench, noise)
-
-
-def measures_force(sensors: SensorSet, robot: Robot) -> bool:
-    """Whether a motor's torque or a contact's wrench is measured."""
-    return bool((sensors.torque & ~robot.is_passive)[: robot.n].any() or sensors.wrench.any())
-
-
 def _missing_friction_scale(samples: Sequence[Samples], robot: Robot) -> FloatArray:
     """Coulomb [N m] and viscous [N m s/rad] friction of joints without friction in the URDF, (n, 2)."""
     out = np.full((robot.n, 2), _TINY)
@@ -106,7 +77,10 @@ def _missing_friction_scale(samples: Sequence[Samples], robot: Robot) -> FloatAr
 
 
 def prior_columns(builder: RowBuilder, robot: Robot, samples: Sequence[Samples]) -> FloatArray:
-    """Matrix (columns, P) from parameters in standard deviations of the prior to the builder's columns."""
+    """Matrix (columns, P) from unknowns in standard deviations of the prior to the builder's columns.
+
+    Declared terms are free: a scale has that of a gain, others 10 times their usual size.
+    """
     scale = URDF_ERROR * parameter_scale(robot.nominal)
     scale[:, parameters.FRICTION] = 0.0
     friction = _missing_friction_scale(samples, robot)
@@ -116,7 +90,8 @@ def prior_columns(builder: RowBuilder, robot: Robot, samples: Sequence[Samples])
     massless = [body.massless for body in robot.bodies]
     scale[massless, parameters.INERTIAL] = 0.0
     kept = scale.flatten() > 0.0
-    return np.asarray((builder.columns.parameter_map * scale.flatten())[:, kept])
+    extras = [_GAIN_PRIOR_STD if extra.what == "scale" else 10.0 * extra.size for extra in builder.extras]
+    return block_diag((builder.columns.parameter_map * scale.flatten())[:, kept], np.diag(extras))
 
 
 @torch.no_grad()
@@ -195,7 +170,7 @@ def motion_cutoff_hz(log: Log) -> float | None:
     )
 
 
-def fit_time_scale(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: float) -> TimeScale | None:
+def fit_time_scale(log: Log, model: NominalModel, cutoff_hz: float) -> TimeScale | None:
     """The factor of time at which gravity and inertia explain the forces best; None where no force was measured.
 
     Velocities and accelerations scale with the inverse of time and its square, gravity is constant: three factors
@@ -207,16 +182,15 @@ def fit_time_scale(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_h
 
     def samples_at(factor: float) -> list[Samples]:
         logs = preprocess_pieces(_scale_time(log, factor), cutoff_hz / factor, MAX_TRIAL_DIFFERENTIATED_SAMPLES)
-        return bind_some_samples(logs, robot, contacts, TIME_SCALE_SAMPLES)
+        return bind_some_samples(logs, model.robot, model.contacts, TIME_SCALE_SAMPLES)
 
     recorded, doubled, at_rest = samples_at(1.0), samples_at(2.0), samples_at(_REST_FACTOR)
-    sensors = measured_sensors(recorded, robot, contacts)
-    if not measures_force(sensors, robot):
+    builder = deviation_builder(recorded, model)
+    if builder is None:
         return None  # any factor explains none
-    builder = RowBuilder(robot, contacts, sensors)
     parts = []
-    columns = prior_columns(builder, robot, recorded)
-    phi = robot.nominal.flatten()[None]
+    columns = prior_columns(builder, model.robot, recorded)
+    phi = model.robot.nominal.flatten()[None]
     for one, two, rest in zip(recorded, doubled, at_rest, strict=True):
         rows, W, equations = rows_with_bases(builder, rest)
         total, slower, gravity = (force_series(builder, part, phi)[1][0] for part in (one, two, rest))
@@ -313,15 +287,17 @@ class TorqueGains:
     common: CommonGain | None
 
 
-def fit_torque_gains(samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact]) -> TorqueGains | None:
+def fit_torque_gains(samples: Sequence[Samples], model: NominalModel) -> TorqueGains | None:
     """Factors of single torques and the point of wrenches; None where neither was measured."""
-    sensors = measured_sensors(samples, robot, contacts)
+    robot, builder = model.robot, deviation_builder(samples, model)
+    if builder is None:
+        return None
+    sensors = builder.sensors
     joints = np.flatnonzero((sensors.torque & ~robot.is_passive)[: robot.n])
     if not len(joints) and not _has_moments(sensors.wrench):
         return None
-    builder = RowBuilder(robot, contacts, sensors)
     columns = prior_columns(builder, robot, samples)
-    nominal = builder.columns.parameter_map @ robot.nominal.flatten()
+    nominal = builder.to_columns(robot.nominal.flatten()[None])[0].numpy()
     parts = []
     for part in samples:
         rows, W, equations = rows_with_bases(builder, part)

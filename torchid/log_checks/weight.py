@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -31,8 +32,8 @@ _MAX_TILT_DEG = 5.0
 _WEIGHT_CHECK, _ACCELEROMETER_CHECK = "weight at rest", "accelerometer at rest"
 
 
-def check_weight(log: Log, robot: Robot | None) -> Iterator[Finding | Skipped]:
-    """Findings about the sum of the contact forces."""
+def check_weight(log: Log, robot: Robot | None, scaled: bool = False) -> Iterator[Finding | Skipped]:
+    """Findings about the sum of the contact forces; notes where these have an unknown scale by the experiment."""
     if robot is not None and robot.fixed_base and not log.contact_names:
         return  # the mounting carries the weight
     still = _find_rest(log)
@@ -49,7 +50,8 @@ def check_weight(log: Log, robot: Robot | None) -> Iterator[Finding | Skipped]:
         return
     when = f"at rest ({still.sum() * step:.3g} s)" if rests else f"on average over {log.time[-1] - log.time[0]:.4g} s"
     field = log.contact_wrench_field
-    yield from _weight_findings(float(vertical.mean()), when, field, robot)
+    for finding in _weight_findings(float(vertical.mean()), when, field, robot):
+        yield replace(finding, severity=NOTE) if scaled and finding.name != "sign" else finding
 
 
 def _weight_findings(carried: float, when: str, field: str, robot: Robot | None) -> Iterator[Finding]:

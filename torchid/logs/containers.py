@@ -20,12 +20,13 @@ from torchid.errors import LogError, TorchidError, during, excerpt
 from torchid.guards import MAX_ARRAYS, check_fields, check_names, check_unpacked_size
 from torchid.logs.hdf5 import Hdf5, import_h5py, save_hdf5
 from torchid.logs.lazy_arrays import LazyArray, Spill
+from torchid.logs.matlab import MatFile, byte_order
 from torchid.logs.time_range import split_range
 from torchid.staging import atomic_file
 
 # --------------------------------------------------------------------------------------------------- kinds of log files
 
-#: Containers of named arrays; Matlab's (`save -v7.3`) are HDF5.
+#: Containers of named arrays; Matlab's are HDF5 (`save -v7.3`) or of its own format before.
 _WRITTEN = (".npz", ".h5", ".hdf5")
 ARRAYS = (*_WRITTEN, ".mat")
 #: Tables of OpenSim, motions and storages: text with lines before the names of the columns.
@@ -148,7 +149,7 @@ def reader_errors_explained(field: str, accepted: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def open_container(path: Path, whole: bool = True) -> Iterator[Container]:
-    """Open a .npz, .h5 or .hdf5 file; LogError where it is missing, of another kind, damaged or too large.
+    """Open a .npz, .h5, .hdf5 or .mat file; LogError where it is missing, of another kind, damaged or too large.
 
     Args:
         path: the file.
@@ -158,28 +159,22 @@ def open_container(path: Path, whole: bool = True) -> Iterator[Container]:
     if not path.is_file():
         found = "a folder" if path.is_dir() else "no such file"
         raise LogError(path, "file", found, f"an existing log ({', '.join(ARRAYS)})")
-    kind = "a complete .npz (zip) archive" if suffix == ".npz" else "a complete HDF5 file"
+    kind = {".npz": "a complete .npz (zip) archive", ".mat": "a complete file of Matlab 5 or later"}
     with contextlib.ExitStack() as stack:
-        with reader_errors_explained("file", kind):
+        with reader_errors_explained("file", kind.get(suffix, "a complete HDF5 file")):
             container: Container
             if suffix == ".npz":
                 container = stack.enter_context(open_npz(path))
+            elif suffix == ".mat" and byte_order(path):
+                container = MatFile(path)
             else:
                 h5py = import_h5py(path)
-                _require_hdf5(path, suffix, h5py)
                 container = Hdf5(stack.enter_context(h5py.File(path, "r")), h5py, path.stat().st_size)
             total = sum(container.declared_bytes().values())
         if whole and total > MAX_ARRAYS:
             raise LogError(path, "file", f"arrays of {total} bytes", f"at most {MAX_ARRAYS} bytes in all")
         check_unpacked_size(path, total)
         yield container
-
-
-def _require_hdf5(path: Path, suffix: str, h5py: Any) -> None:
-    """Refuse a file of Matlab that is no HDF5 file."""
-    if suffix == ".mat" and not h5py.is_hdf5(path):
-        accepted = "one that Matlab saved with -v7.3, or a .npz (scipy.io.loadmat, numpy.savez)"
-        raise LogError(path, "file", "no HDF5, as Matlab's files of before 7.3", accepted)
 
 
 @contextlib.contextmanager

@@ -9,6 +9,7 @@ import numpy as np
 
 from torchid.errors import LogError
 from torchid.logs.log import FloatArray, Log
+from torchid.logs.low_pass import import_signal
 from torchid.logs.preprocess import lacks_derivatives
 from torchid.logs.quaternion import make_sign_continuous
 from torchid.logs.signal_noise import STATED_FIELDS, SignalNoise, signal_noise
@@ -143,13 +144,11 @@ def _powers(
 
     With each the field that they are worked out of. `known`: those whose noise is stated.
     """
-    from scipy.signal import welch  # as in `LowPass`
-
     rate = (len(log) - 1) / float(log.time[-1] - log.time[0])
     for name, values, std, order in _noisy_sources(log, noise, base_is_derived):
         even = spline_derivatives(log.time, values, np.linspace(log.time[0], log.time[-1], len(log)), (0,))[0]
         length = min(len(log), int(np.ceil(_SEGMENT_S * rate)))
-        frequency, power = welch(even, fs=rate, nperseg=length, axis=0, detrend="linear")
+        frequency, power = import_signal().welch(even, fs=rate, nperseg=length, axis=0, detrend="linear")
         total = power.sum(axis=1)
         of_noise = np.full(len(frequency), 2.0 * float(np.square(std).sum()) / rate)
         if name not in known:

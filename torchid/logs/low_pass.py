@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache, cached_property
+from types import ModuleType
 
 import numpy as np
 
 from torchid.logs.log import FloatArray
+from torchid.stand_ins import unused_modules_apart
 
 #: Order of the Butterworth filter, which runs forward and backward: the gain at the cutoff is 1/2.
 FILTER_ORDER = 4
@@ -27,6 +29,14 @@ _SETTLED = 1e-18
 _FILTERED_AT_ONCE = 2**16
 
 
+@cache
+def import_signal() -> ModuleType:
+    """`scipy.signal`: it takes 0.1 s, which runs that find their samples in a cache, or draw nothing, need not."""
+    with unused_modules_apart():
+        from scipy import signal
+    return signal
+
+
 @dataclass(frozen=True, eq=False)
 class LowPass:
     """A zero-phase filter: the second-order sections of one pass, and how many samples each end is extended by."""
@@ -38,21 +48,18 @@ class LowPass:
     @cache  # takes 1 ms, and a log is filtered by the same ones over and over
     def butterworth(cls, cutoff_hz: float, step: float) -> LowPass:
         """A Butterworth filter of that cutoff [Hz], for samples at steps of so many seconds."""
-        from scipy import signal  # takes 0.4 s, which runs that find their samples in a cache need not
-
-        sections = signal.butter(FILTER_ORDER, cutoff_hz, fs=1.0 / step, output="sos")
+        sections = import_signal().butter(FILTER_ORDER, cutoff_hz, fs=1.0 / step, output="sos")
         return cls(sections, padding=max(15, math.ceil(1.0 / (cutoff_hz * step))))
 
     def __call__(self, values: FloatArray) -> FloatArray:
         """Filter every channel of uniformly sampled values (M, ...) forward and backward, M above the padding."""
-        from scipy import signal
-
         flat = values.reshape(len(values), -1)
         out = np.empty(flat.shape)
+        filtered = import_signal().sosfiltfilt
         together = max(1, _FILTERED_AT_ONCE // max(len(flat), 1))
         for first in range(0, flat.shape[1], together):
             channels = np.ascontiguousarray(flat[:, first : first + together].T)
-            out[:, first : first + together] = signal.sosfiltfilt(self.sections, channels, padlen=self.padding).T
+            out[:, first : first + together] = filtered(self.sections, channels, padlen=self.padding).T
         return out.reshape(values.shape)
 
     @cached_property
@@ -68,16 +75,12 @@ class LowPass:
 
     def gain(self, cycles: FloatArray) -> FloatArray:
         """By how much amplitudes change at frequencies (K,) [1/samples], in both passes together."""
-        from scipy import signal
-
-        _, response = signal.sosfreqz(self.sections, worN=2.0 * np.pi * cycles)
+        _, response = import_signal().sosfreqz(self.sections, worN=2.0 * np.pi * cycles)
         return np.asarray(np.square(np.abs(response)))
 
 
 @cache  # takes 20 ms, and logs, or segments of one, mostly have one filter
 def _noise_share(sections: bytes) -> float:
     """Of a filter, from its second-order sections."""
-    from scipy import signal
-
-    _, response = signal.sosfreqz(np.frombuffer(sections).reshape(-1, 6), worN=_FREQUENCIES, whole=True)
+    _, response = import_signal().sosfreqz(np.frombuffer(sections).reshape(-1, 6), worN=_FREQUENCIES, whole=True)
     return float(np.mean(np.abs(response) ** 4))  # two passes, and power goes with the amplitude squared

@@ -6,6 +6,7 @@ import difflib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from unicodedata import combining, normalize
 
 from torchid.errors import LogError, excerpt
 from torchid.logs.arrays import TRANSPOSED
@@ -190,41 +191,42 @@ OF_PLATES = (WRENCHES[1], POINTS)
 #: Words for the base in recordings, and how names of columns begin with one.
 BASES = "base|root|trunk|torso|pelvis|body|mocap|odom|odometry"
 OF_BASE = rf"\b({BASES}|floating base)"
-_STAMPS = r"(time|datetime|timestamps?|stamps?|tstamps?)"
+_STAMPS = r"(times?|datetime|timestamps?|stamps?|tstamps?|duration)"
+_NOT_ANGULAR = r"(?<!ang )(?<!angular )"
 #: Words that recordings have for a field, by what the name of a column contains; the first that fits counts.
 _FIELD_WORDS = (
     ("time", rf"\b{_STAMPS}$"),  # of positions/timestamps
     (POINTS, r"\b(cop[xyz]?|ground force p[xyz])\b"),
     (WRENCHES[1], r"\b(ground (force|torque|moment)s?|force ?plates?|fp)\b"),
     ("base_position_world", rf"{OF_BASE} (pose )*(pos|position|xyz)\b"),
-    ("base_linear_velocity_base", r"\b(v|vel|velocity) (body|base)$|\bodom\w* twist (twist )?linear\b"),
+    ("base_linear_velocity_base", rf"{_NOT_ANGULAR}\b(v|vel|velocity) (body|base)$|\bodom\w* twist (twist )?linear\b"),
     (
         "base_linear_velocity_world",
-        rf"{OF_BASE} (twist )*(lin ?vel|linear|lin|vel|velocity)\b",
+        rf"{OF_BASE} (twist )*(lin ?vel|linear|lin|vel|velocity|v)\b",
     ),
     ("base_angular_velocity_base", rf"{OF_BASE} (twist )*(ang ?vel|angular|ang|omega)\b"),
     ("base_quat_wxyz", rf"{OF_BASE} (q|rot|rotation)\b"),
     ("joint_acceleration", r"\b(ddqj?|qdd|qpp|thdd|qacc|joints? acc|joints? accelerations?)\b"),
-    ("imu_angular_velocity", r"\b(gyr|gyro\w*|omega|ang vel|angular velocity|drehraten?|imu g)\b"),
-    ("imu_specific_force", r"\b(acc|accel\w*|linear acceleration|specific force|beschleunigung|imu a|a body)\b"),
-    ("base_quat_wxyz", r"\b(quat\w*|orientation)\b"),
+    ("imu_angular_velocity", r"\b(gyr|gyro\w*|giroscop\w*|omega|ang vel|angular velocity|drehraten?|imu g)\b"),
+    ("imu_specific_force", r"\b(acc|acc?el\w*|linear acceleration|specific force|beschleunigung|imu a|a body)\b"),
+    ("base_quat_wxyz", r"\b(quat\w*|orienta\w*)\b"),
     ("contact_wrench_local", r"\b(wrench|wrenches)\b"),
     ("contact_force_normal", r"\b(foot forces?|feet forces?|contact forces?|grf|fsr)\b"),
     ("contact_active", r"\b(contacts?|touch|touches|stance)\b"),
     (
         "joint_torque",
-        r"\b(taus?|torques?|efforts?|eff|trq|load|qfrc|gf|generalized forces?|drehmoment|couples?|par|pares)\b",
+        r"\b(taus?|torques?|efforts?|eff|trq|load|qfrc|gf|generalized forces?|drehmoment|couples?|par|pares|copp\w+)\b"
+        r"|^us$",  # of optimal control, beside states called xs
     ),
     (
         "joint_velocity",
-        r"\b(dqs?|dqj|d q|qd|qp|qdot|thd|gv|v|qvel|vels?|velocity|velocities|speeds?|rates?|vitesses?|geschw)\b"
-        r"|\b(velocidad|velocidades)\b|geschwindigkeit\b",
+        r"\b(dqs?|dqj|d q|qd|qp|qdot|thd|gv|v|qvel|vels?|veloc\w+|speeds?|rates?|vitesses?|geschw)\b|geschwindigkeit\b",
     ),
     (
         "joint_position",
-        r"\b(observation state|gc|qs?|qj|th|theta|qpos|pos|positions?|angles?|winkel|angulos?|posicion|gelenkwinkel)\b",
+        r"\b(observation state|gc|qs?|qj|th|theta|qpos|pos|posi[ctz]\w+|angles?|winkel|gelenkwinkel|ang[ou]l[io]s?)\b",
     ),
-    ("time", rf"\b(t|ts|{_STAMPS}|ticks?|clock|millis|sec|secs|seconds|zeit|temps|tiempo)\b"),
+    ("time", rf"\b(t|ts|{_STAMPS}|ticks?|clock|millis|sec|secs|seconds|zeit|temp[os]|tiempo)\b"),
 )
 #: Fields that a unit alone tells: of `LF_HAA [deg]`, `LF_HAA [deg/s]`.
 _BY_QUANTITY = {
@@ -233,7 +235,7 @@ _BY_QUANTITY = {
 }  # fmt: skip
 _APART = (("linear", "angular"), ("position", "velocity", "acceleration", "torque"), ("world", "base", "local"))
 _DESIRED = re.compile(
-    r"\b(des|desired|cmd|command(ed)?|ref|target|goal|setpoint|ff|cons|consigne|soll)\b"
+    r"\b(des|desired|cmd|command(ed)?|ref|target|goal|setpoint|ff|cons|consigne|soll\w*)\b"
     r"|\b(taus?|torques?|j|q|dq|qd|pos) d\b"  # tau_d, tau_J_d
     r"|\b(taus?|torques?) (ext|external|gravity|grav|friction|fric|coriolis|residual)\b"
     r"|\b(ext|external|gravity|friction|coriolis|residual) (joint )?(taus?|torques?)\b"  # that a model gave
@@ -297,6 +299,7 @@ def words_of(column: str) -> list[str]:
     """Words of a column's name, in lower case, what its letters say in other scripts among them."""
     for written, words in _WRITTEN.items():
         column = column.replace(written, f" {words} ")
+    column = "".join(letter for letter in normalize("NFKD", column) if not combining(letter))  # posicao for posição
     return [word.lower() for word in _SPLIT.split(column) if word]
 
 

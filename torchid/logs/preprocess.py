@@ -25,7 +25,8 @@ from torchid.logs.log import (
 from torchid.logs.quaternion import angular_acceleration_base, angular_velocity_base, make_sign_continuous
 from torchid.logs.sign_filter import mean_dry, mean_stribeck, with_sign_filter
 from torchid.logs.signal_noise import signal_noise, warn_of_noisy_accelerations
-from torchid.logs.timeline import JITTER, Timeline, lay_out_timeline, nearest_known
+from torchid.logs.timeline import JITTER, SampleRate, Timeline, lay_out_timeline, nearest_known
+from torchid.settings import AUTO
 
 #: Quantities of which each is the derivative of the one before. The first angular one would be the orientation.
 DERIVATIVE_CHAINS = (
@@ -43,7 +44,7 @@ _MIN_QUATERNION_NORM = 0.5
 def preprocess(
     log: Log,
     cutoff_hz: float | None = None,
-    sample_rate_hz: float | None = None,
+    sample_rate_hz: SampleRate = None,
     motion_noise: Mapping[str, float] | None = None,
     sign_width: float | None = None,
     stribeck: float | None = None,
@@ -72,7 +73,8 @@ def preprocess(
     Args:
         log: the log.
         cutoff_hz: cutoff [Hz] of the filter, below half the median sample rate; None for no filter.
-        sample_rate_hz: sample rate [Hz] of the result, at most ten times the median one; None for the log's own.
+        sample_rate_hz: sample rate [Hz] of the result, at most ten times the median one; auto, every k-th sample, see
+            `lay_out_timeline`; None for the log's own.
         motion_noise: standard deviations of the recorded motion by the keys of `STATED_FIELDS`, as far as they are
             known; others are estimated, see `signal_noise`.
         sign_width: over which the sign of a joint's velocity changes, as tanh(velocity / width) [rad/s or m/s]; None
@@ -111,12 +113,12 @@ def make_timeline(
     time: FloatArray,
     differentiates: bool,
     cutoff_hz: float | None,
-    sample_rate_hz: float | None,
+    sample_rate_hz: SampleRate,
     sign_width: float | None = None,
     stribeck: float | None = None,
 ) -> Timeline | None:
     """The timeline of `preprocess`; None where nothing has to be done. Raises and warns as `lay_out_timeline`."""
-    if cutoff_hz is None and sample_rate_hz is None and not differentiates:
+    if cutoff_hz is None and sample_rate_hz in (None, AUTO) and not differentiates:
         return None
     timeline = lay_out_timeline(time, cutoff_hz, sample_rate_hz, differentiates)
     return replace(timeline, sign_width=sign_width, stribeck=stribeck)

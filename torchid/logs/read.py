@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import LogError, about_file, current_file, during
+from torchid.errors import LogError, about_file, current_file, during, warn_about_file
 from torchid.logs.alignment import read_joined
 from torchid.logs.arrays import load_part, parse_frame, parse_names, require_plain
 from torchid.logs.column_map import Columns
@@ -165,7 +165,17 @@ def _read_arrays(
         names = list(container.declared_bytes())
         mapped = None if columns is None else map_arrays(columns, names, load)
         check(names if mapped is None else mapped.given)
-        return {name: load(name) for name in names} if mapped is None else mapped.read(take)
+        return {name: load(name) for name in names} if mapped is None else _as_many_as_controls(mapped.read(take))
+
+
+def _as_many_as_controls(raw: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Mapped fields without the last state, of which optimal control has one more than torques."""
+    count = len(raw.get("joint_torque", ()))
+    sampled = {name: x for name, x in raw.items() if field_shape(name)[:1] == ("N",) and name != "joint_torque"}
+    if not count or any(len(x) != count + 1 for x in sampled.values()):
+        return raw
+    warn_about_file("joint_torque has one sample less than all else, as controls have: the last state is left out")
+    return raw | {name: x[:-1] for name, x in sampled.items()}
 
 
 def _check_known(names: Collection[str]) -> None:

@@ -22,14 +22,14 @@ from torchid.logs.preprocess import (
 )
 from torchid.logs.sign_filter import with_sign_filter
 from torchid.logs.signal_noise import signal_noise, warn_of_noisy_accelerations
-from torchid.logs.timeline import FEWEST_DIFFERENTIATED, LONGEST_STEP, Timeline, spline_derivatives
+from torchid.logs.timeline import FEWEST_DIFFERENTIATED, LONGEST_STEP, SampleRate, Timeline, spline_derivatives
 
 
 def preprocess_segments(
     log: Log,
     segments: Sequence[slice],
     cutoff_hz: float | None,
-    sample_rate_hz: float | None,
+    sample_rate_hz: SampleRate,
     sign_width: float | None = None,
     stribeck: float | None = None,
 ) -> tuple[Log, int]:

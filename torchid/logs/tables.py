@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import LogError, excerpt, how_to_install
+from torchid.errors import LogError, excerpt, format_count, how_to_install, warn_about_file
 from torchid.guards import MAX_ARRAYS, MAX_SCHEMA, check_names, check_unpacked_size
 from torchid.logs.column_map import Columns
 from torchid.logs.columns import TEXT_COLUMN, TableLayout, check_header, parse_header, to_columns
 from torchid.logs.containers import TEXT_TABLES, atomic_output, reader_errors_explained
+from torchid.logs.log import field_shape
 from torchid.logs.mapped_fields import MappedFields, map_table
 from torchid.logs.table_headers import BLOCK, NestedColumns, TextHeader, read_header
 from torchid.logs.units import IN_DEGREES, quantities_of
@@ -57,7 +58,8 @@ def read_table(path: Path, columns: Columns | None = None) -> dict[str, NDArray[
         (layout, _), *rest = _batches(pa, path, columns)
         batches = [batch for _, batch in rest]
         del rest
-        return _fields(pa, layout, batches)
+        (fields,) = _without_repeats([_fields(pa, layout, batches)])
+        return fields
 
 
 def sample_table(path: Path) -> dict[str, NDArray[Any] | None]:
@@ -143,6 +145,28 @@ def _sample_parquet(pa: Any, path: Path) -> tuple[list[str], Any]:
 
 def table_blocks(path: Path, columns: Columns | None = None) -> Iterator[dict[str, NDArray[Any]]]:
     """As `read_table`, some rows at a time, after a block without rows."""
+    return _without_repeats(_every_block(path, columns))
+
+
+def _without_repeats(blocks: Iterable[dict[str, NDArray[Any]]]) -> Iterator[dict[str, NDArray[Any]]]:
+    """Fields of successive rows without those that repeat the one before, stamp and all, whose number is warned of."""
+    count, last = 0, dict[str, NDArray[Any]]()
+    for block in blocks:
+        fields = {name: x for name, x in block.items() if field_shape(name)[:1] == ("N",)}
+        stamps = fields.get("time", np.zeros(0))
+        again = np.flatnonzero(np.diff(stamps, prepend=last.get("time", [np.nan])) == 0.0)
+        for name, x in fields.items() if len(again) else ():
+            before = np.concatenate([last.get(name, x[:1]), x[:-1]])[again]
+            equal = (x[again] == before) | ((x[again] != x[again]) & (before != before))  # NaN, too
+            again = again[equal.all(axis=tuple(range(1, x.ndim)))]
+        last = {name: x[-1:].copy() for name, x in fields.items()} if len(stamps) else last
+        count += len(again)
+        yield block | {name: np.delete(x, again, axis=0) for name, x in fields.items()} if len(again) else block
+    if count:
+        warn_about_file(f"{format_count(count, 'row')} like the one before, stamp and all: counted once")
+
+
+def _every_block(path: Path, columns: Columns | None) -> Iterator[dict[str, NDArray[Any]]]:
     pa = _pyarrow(path)
     with _complete(path):
         rows = 0

@@ -6,6 +6,7 @@ import math
 import numbers
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
@@ -13,6 +14,7 @@ from scipy.interpolate import make_interp_spline
 from torchid.errors import InputError, LogError, format_count, warn_about_file
 from torchid.logs.log import BoolArray, FloatArray, check_time
 from torchid.logs.low_pass import DROPPED_PERIODS, REACH_PERIODS, LowPass
+from torchid.settings import AUTO
 
 # -------------------------------------------------------------------------------------------------------------- splines
 
@@ -231,17 +233,23 @@ SHORTEST_STEP = 0.1
 LONGEST_MEDIAN_STEP = 0.5
 #: Highest sample rate to resample to, in median sample rates.
 FASTEST = 10.0
+#: Lowest rate that samples of a filtered log may have without loss, in cutoffs: rows are products of filtered signals.
+LOSSLESS_RATE = 5.0
+
+SampleRate: TypeAlias = float | Literal["auto"] | None
+"""Sample rate of a preprocessed log [Hz]: a number, every k-th sample at `LOSSLESS_RATE`, or the log's own."""
 
 
 def lay_out_timeline(
-    time: FloatArray, cutoff_hz: float | None, sample_rate_hz: float | None, differentiates: bool
+    time: FloatArray, cutoff_hz: float | None, sample_rate_hz: SampleRate, differentiates: bool
 ) -> Timeline:
     """Lay out the stamps of a log that is filtered, resampled or differentiated.
 
     Args:
         time: (N,) [s].
         cutoff_hz: low-pass cutoff [Hz], None for no filter.
-        sample_rate_hz: output's sample rate [Hz], None for the log's own.
+        sample_rate_hz: output's sample rate [Hz]; auto, the least that is `LOSSLESS_RATE` cutoffs and keeps every k-th
+            sample, all without a filter; None for the log's own.
         differentiates: whether a derivative is missing in the log.
 
     Raises:
@@ -266,23 +274,34 @@ def lay_out_timeline(
         low_pass = LowPass.butterworth(cutoff_hz, step)
         kept = _unspoiled(grid, step, cutoff_hz, low_pass.padding)
     output = None
-    if sample_rate_hz is not None:
-        accepted = f"{FASTEST:g} times the log's median sample rate"
-        _check_rate("sample_rate_hz", sample_rate_hz, FASTEST / step, accepted)
-        if cutoff_hz is not None and cutoff_hz >= 0.5 * sample_rate_hz:
-            accepted = f"a rate above {2.0 * cutoff_hz:g} Hz, twice the cutoff, so that nothing aliases"
-            raise InputError.at_field("preprocessing.sample_rate_hz", f"{sample_rate_hz:g}", accepted)
-        output = _uniform(grid[kept], sample_rate_hz)
-        if len(output) < 2:
-            found = f"{sample_rate_hz:g}, which leaves one sample"
-            accepted = f"more than {1.0 / (grid[kept][-1] - grid[kept][0]):.3g} Hz for this log"
-            raise InputError.at_field("preprocessing.sample_rate_hz", found, accepted)
-        if (each := _share_kept(grid, 1.0 / sample_rate_hz)) is not None:  # no spline has to find what is there
-            kept, output = slice(kept.start, kept.stop, each), None
+    if sample_rate_hz == AUTO:
+        each = 1 if cutoff_hz is None else int(1.0 / (step * LOSSLESS_RATE * cutoff_hz) + JITTER)
+        kept = slice(kept.start, kept.stop, max(min(each, kept.stop - kept.start - 1), 1))
+    elif sample_rate_hz is not None:
+        kept, output = _resampled(grid, step, kept, cutoff_hz, sample_rate_hz)
     if low_pass is None or cutoff_hz is None:
         return Timeline(native, grid, kept, output, None, 0.0, float(time[0]))
     passed = low_pass.noise_share * 0.5 / float(np.median(np.diff(grid)))
     return Timeline(native, grid, kept, output, low_pass, REACH_PERIODS / cutoff_hz, float(time[0]), passed)
+
+
+def _resampled(
+    grid: FloatArray, step: float, kept: slice, cutoff_hz: float | None, sample_rate_hz: float
+) -> tuple[slice, FloatArray | None]:
+    """The samples of the grid that are kept, and the stamps at a sample rate where these are no every k-th of them."""
+    accepted = f"{FASTEST:g} times the log's median sample rate"
+    _check_rate("sample_rate_hz", sample_rate_hz, FASTEST / step, accepted)
+    if cutoff_hz is not None and cutoff_hz >= 0.5 * sample_rate_hz:
+        accepted = f"a rate above {2.0 * cutoff_hz:g} Hz, twice the cutoff, so that nothing aliases"
+        raise InputError.at_field("preprocessing.sample_rate_hz", f"{sample_rate_hz:g}", accepted)
+    output = _uniform(grid[kept], sample_rate_hz)
+    if len(output) < 2:
+        found = f"{sample_rate_hz:g}, which leaves one sample"
+        accepted = f"more than {1.0 / (grid[kept][-1] - grid[kept][0]):.3g} Hz for this log"
+        raise InputError.at_field("preprocessing.sample_rate_hz", found, accepted)
+    if (each := _share_kept(grid, 1.0 / sample_rate_hz)) is not None:  # no spline has to find what is there
+        return slice(kept.start, kept.stop, each), None
+    return kept, output
 
 
 def _median_step(native: FloatArray) -> float:

@@ -41,10 +41,11 @@ OF_JOINTS = {
     "joint_torque": ("torque", "force"),
 }
 _SPELLINGS = {
-    "°": "deg", "µ": "u", "μ": "u", "²": "2", "⁻": "-", "kgf": "kg", "degrees": "deg", "degree": "deg",
-    "radians": "rad", "milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns", "seconds": "s", "sec": "s",
-    "dps": "deg/s", "grados": "deg", "degrés": "deg",
+    "°": "deg", "µ": "u", "μ": "u", "²": "2", "⁻": "-", "kgf": "kg", "radians": "rad", "milliseconds": "ms",
+    "microseconds": "us", "nanoseconds": "ns", "seconds": "s", "sec": "s", "dps": "deg/s",
 }  # fmt: skip
+_DEGREES = re.compile(r"(?<![A-Za-z])(degrees?|degrés|gra(d|dos|di|us))(?![A-Za-z])", re.IGNORECASE)
+_PER_MINUTE = re.compile(r"(U|r|tr|giri|1) ?/ ?min", re.IGNORECASE)
 _MARKS = re.compile(r"[ ·.*^]")
 _POWERS = {"s-1": "/s", "s-2": "/s2", "/s/s": "/s2", "N-m": "Nm", "nm": "Nm"}
 _BRACKETS = re.compile(r"(.*?)\s*(?:\[([^\[\]{}]*)\]|\(([^(){}]*)\))\s*")
@@ -123,6 +124,7 @@ def split_unit(column: str) -> tuple[str, str]:
 def _plain(unit: str) -> str:
     """The unit as the table spells it: without spaces, dots, powers, capitals of long ones, and words in full."""
     unit = "g" if unit == "G" else unit
+    unit = _PER_MINUTE.sub("rpm", _DEGREES.sub("deg", unit))
     for spelling, plain in _SPELLINGS.items():
         unit = unit.replace(spelling, plain)
     unit = _MARKS.sub("", unit)

@@ -99,11 +99,11 @@ def levelled_base_axes(rotation_world_base: Tensor) -> Tensor:
     up = rotation_world_base[:, 2]  # vertical, in the base frame
     index = up.abs().argmax(dim=1, keepdim=True)
     nearest = torch.zeros_like(up).scatter(1, index, up.gather(1, index).sign())
-    x, y, z = torch.linalg.cross(nearest, up).unbind(1)
-    zero = torch.zeros_like(x)
+    v = torch.linalg.cross(nearest, up)
+    (x, y, z), cosine = v.unbind(1), (nearest * up).sum(1)
+    diagonal, zero = cosine[:, None, None] * torch.eye(3, dtype=up.dtype, device=up.device), torch.zeros_like(x)
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=1).unflatten(1, (3, 3))
-    cosine = (nearest * up).sum(1)[:, None, None]
-    return torch.eye(3, dtype=up.dtype, device=up.device) + cross + cross @ cross / (1.0 + cosine)
+    return diagonal + cross + v[:, :, None] * (v / (1.0 + cosine[:, None]))[:, None]
 
 
 def base_motion(log: Log, robot: Robot) -> BaseMotion:

@@ -205,6 +205,12 @@ def run_in_workers(tasks: Sequence[Task], run: Callable[[Iterator[Task]], Result
             return list(pool.map(work, range(workers)))
 
 
+def map_in_workers(tasks: Sequence[Task], work: Callable[[Task], Result], workers: int | None = None) -> list[Result]:
+    """What a function makes of each task, in their order, by threads: by default as many as `thread_count`."""
+    parts = run_in_workers(tasks, lambda own: [work(task) for task in own], workers or thread_count())
+    return [parts[number % len(parts)][number // len(parts)] for number in range(len(tasks))]
+
+
 def _run_in_copies(tasks: Sequence[Task], run: Callable[[Iterator[Task], bool], Result], workers: int) -> list[Result]:
     """As `run_in_workers`, to the last bit, by this process, whose chunks are reported, and copies of it.
 

@@ -24,10 +24,10 @@ import torch
 from torch import Tensor
 
 from torchid.parameters import Array
-from torchid.problem.chunks import one_thread
+from torchid.problem.chunks import map_in_workers, one_thread
 from torchid.problem.elimination import Assembly
 from torchid.problem.rows import RowBuilder
-from torchid.problem.sampled_rows import CLIP, SampledRows
+from torchid.problem.sampled_rows import CLIP, SampledChunk, SampledRows, noise_root
 from torchid.rounding import MAD_PER_STD, RANK_TOLERANCE, is_significant
 
 _LEAST, _MOST = 1e-4, 1e3  # variance of the logarithms: deviations are 0.5 % apart, or anything
@@ -135,14 +135,13 @@ class GroupVariances:
 
 @dataclass(frozen=True)
 class _Residuals:
-    """Residuals and noise sources of the rows, by chunk, and the degrees of freedom that the fit leaves.
+    """Residuals of the rows, by chunk, and the degrees of freedom that the fit leaves.
 
-    `r`: (B, n_rows), residuals; `U`: (B, E, n_rows), sources of the stated noise; `left`, (G,), share of each group's
-    degrees of freedom that remain after the fit; `independent`, (G,), number of independent readings.
+    `r`: (B, n_rows), residuals; `left`, (G,), share of each group's degrees of freedom that remain after the fit;
+    `independent`, (G,), number of independent readings.
     """
 
     r: list[Tensor]
-    U: list[Tensor]
     left: Array
     independent: Array
 
@@ -261,21 +260,25 @@ class VarianceComponentEstimator:
     def _moments(self, residuals: _Residuals, variance: Array) -> tuple[Array, Array, Array, Array]:
         """M (G, G), q (G,) of the equations M x = q; variance in the rows and number of readings by group, (G,)."""
         group_of, count = self.rows.group_of, len(variance)
-        member = torch.zeros(len(group_of), count, dtype=torch.float64)
-        member[torch.arange(len(group_of)), torch.from_numpy(group_of)] = 1.0
-        scale = torch.from_numpy(np.sqrt(variance)[group_of])[:, None]
-        M, z, sizes = torch.zeros(count, count, dtype=torch.float64), [], []
-        for r, U in zip(residuals.r, residuals.U, strict=True):
-            sources = U * scale
-            S = sources.mT @ sources
-            S = S + torch.diag_embed((S.diagonal(dim1=1, dim2=2) == 0.0).to(S))
-            L = torch.linalg.cholesky(S)
-            white = torch.linalg.solve_triangular(L, sources.mT, upper=False)  # (B, n_rows, E)
-            y = torch.linalg.solve_triangular(L, r[..., None], upper=False)
-            M += member.T @ (white.mT @ white).square().sum(0) @ member
-            sizes.append(white.square().sum(1))
-            z.append((white.mT @ y)[..., 0])
-        size, score = torch.cat(sizes).numpy(), torch.cat(z).numpy()
+        index, scale = torch.from_numpy(group_of), torch.from_numpy(np.sqrt(variance)[group_of])
+
+        def of_chunk(number: int) -> tuple[Tensor, Tensor, Tensor]:
+            chunk, r = self.rows.chunks[number], residuals.r[number]
+            M, size = torch.zeros(count, count, dtype=torch.float64), r.new_zeros(len(r), len(group_of))
+            score = torch.zeros_like(size)
+            for own, slots in chunk.blocks:
+                sources = scale[own[..., None]] * chunk.sources[:, own[..., None], slots[:, None]]
+                both = torch.cat([sources.mT, r[:, slots, None]], dim=3)
+                solved = torch.linalg.solve_triangular(noise_root(sources), both, upper=False)
+                white, y = solved[..., :-1], solved[..., -1:]  # (B, k, r, e), (B, k, r, 1)
+                pairs = index[own[..., None]], index[own[:, None]]
+                M.index_put_(pairs, (white.mT @ white).square().sum(0), accumulate=True)
+                size[:, own], score[:, own] = white.square().sum(2), (white.mT @ y)[..., 0]
+            return M, size, score
+
+        parts = map_in_workers(range(len(residuals.r)), of_chunk)
+        M = torch.stack([x for x, *_ in parts]).sum(0)
+        size, score = (torch.cat([part[k] for part in parts]).numpy() for k in (1, 2))
         q, t, n = (np.zeros(count) for _ in range(3))
         for group in range(count):
             own, scores = size[:, group_of == group], score[:, group_of == group]
@@ -290,17 +293,22 @@ class VarianceComponentEstimator:
     ) -> _Residuals:
         rows, group_of = self.rows, self.rows.group_of
         leverages, size, readings = (np.zeros(len(variance)) for _ in range(3))
-        for chunk in rows.whitened(variance, _THINNED):
-            own = chunk.sources.square().sum(2)
-            fitted = chunk.rows[..., :-1] @ directions[chunk.log]
-            leverage = (chunk.sources[::_THINNED] @ fitted).square().sum((0, 2))
-            np.add.at(leverages, group_of, chunk.oversampling * leverage.numpy())
-            np.add.at(size, group_of, own[::_THINNED].sum(0).numpy())
-            np.add.at(readings, group_of, (own > _NEGLIGIBLE).sum(0).numpy() / chunk.oversampling)
+
+        def of_chunk(chunk: SampledChunk) -> tuple[Tensor, Tensor, Tensor]:
+            white = rows.whiten(chunk, variance, _THINNED)
+            own = white.sources.square().sum(2)
+            fitted = white.rows[..., :-1] @ directions[chunk.log]
+            leverage = (white.sources[::_THINNED] @ fitted).square().sum((0, 2))
+            return leverage, own[::_THINNED].sum(0), (own > _NEGLIGIBLE).sum(0)
+
+        for chunk, found in zip(rows.chunks, map_in_workers(rows.chunks, of_chunk), strict=True):
+            leverage, own, count = (x.numpy() for x in found)
+            np.add.at(leverages, group_of, chunk.oversampling * leverage)
+            np.add.at(size, group_of, own)
+            np.add.at(readings, group_of, count / chunk.oversampling)
         remaining = 1.0 - np.divide(leverages, size, out=np.zeros_like(size), where=size > 0.0)
-        r = [chunk.rows[..., :-1] @ columns[chunk.log] - chunk.rows[..., -1] for chunk in rows.chunks]
-        U = [chunk.sources for chunk in rows.chunks]
-        return _Residuals(r, U, np.maximum(remaining, _LEFT), readings * np.maximum(remaining, 0.0))
+        r = map_in_workers(rows.chunks, lambda chunk: chunk.rows[..., :-1] @ columns[chunk.log] - chunk.rows[..., -1])
+        return _Residuals(r, np.maximum(remaining, _LEFT), readings * np.maximum(remaining, 0.0))
 
 
 def _forces(rows: SampledRows) -> Array:

@@ -9,12 +9,14 @@ from itertools import chain
 
 import numpy as np
 import torch
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.special import chdtri, ndtr
 from torch import Tensor
 
 from torchid import ranks
 from torchid.parameters import Array
-from torchid.problem.chunks import chunks_by_state, one_thread
+from torchid.problem.chunks import chunks_by_state, map_in_workers, one_thread, worker_count
 from torchid.problem.compression import Part
 from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import TriangularFactor
@@ -36,11 +38,12 @@ def noise_of_sensors(builder: RowBuilder) -> dict[str, float]:
 
 
 @dataclass(frozen=True)
-class _Chunk:
+class SampledChunk:
     """Samples of one log in one contact state.
 
     `rows`, (B, n_rows, width + 1), whitened with the noise of the builder; `sources`, (B, E, n_rows), one standard
-    deviation of each source of noise in these rows.
+    deviation of each source of noise in these rows. `blocks`: numbers of sources, (k, e), and of rows, (k, r), that
+    have nothing to do with others, for all k that have as many.
     """
 
     log: str
@@ -48,6 +51,7 @@ class _Chunk:
     oversampling: float
     rows: Tensor
     sources: Tensor
+    blocks: tuple[tuple[Tensor, Tensor], ...]
 
 
 @dataclass(frozen=True)
@@ -93,7 +97,10 @@ class SampledRows:
         most = min(_SAMPLES, _BYTES // (8 * max(n_rows, 1) * (builder.width + 1 + len(names))))
         self._scaled = _sources_of_scales(builder)
         self._drawn = max(most, 1), chunk
-        self.chunks = [self._chunk(part, state) for part, state in _random_chunks(logs, *self._drawn)]
+        drawn = list(_random_chunks(logs, *self._drawn))
+        for samples, state in drawn:
+            builder.layout(state, samples.contact_normal is not None)
+        self.chunks = map_in_workers(drawn, lambda one: self._chunk(*one), worker_count(builder.device))
         elsewhere = any(isinstance(log, LogElsewhere) for log in logs)
         if any(ranks.gather(elsewhere, "logs that others have")):
             self.chunks = list(chain.from_iterable(ranks.gather(self.chunks, "samples for the noise")))
@@ -127,10 +134,11 @@ class SampledRows:
         counts = np.array([[len(chunk.rows), len(chunk.rows) / chunk.oversampling] for chunk in self.chunks]).sum(0)
         return float(counts[0] / counts[1])
 
-    def _chunk(self, samples: Samples, state: ContactState) -> _Chunk:
+    def _chunk(self, samples: Samples, state: ContactState) -> SampledChunk:
         rows, W = self.builder.rows_by_sample(samples.to(self.builder.device), state)
         sources = (self._unit_forces(samples.to(self.builder.device)) @ W).cpu() * self._std[:, None]
-        return _Chunk(samples.source, state, samples.oversampling, rows.cpu().double(), sources.double())
+        blocks = _blocks((sources != 0.0).any(0).numpy())
+        return SampledChunk(samples.source, state, samples.oversampling, rows.cpu().double(), sources.double(), blocks)
 
     def _unit_forces(self, samples: Samples) -> Tensor:
         """Generalized force of a unit of each noise source, (B, E, n_rows)."""
@@ -150,23 +158,22 @@ class SampledRows:
             forces.append(J[:, torch.from_numpy(components)])
         return torch.cat(forces, dim=1)
 
-    def whitened(self, variance: Array, thinned: int = 1) -> Iterator[_Chunk]:
-        """The chunks, whitened with variances of the groups relative to the stated ones, (G,).
+    def whiten(self, chunk: SampledChunk, variance: Array, step: int = 1) -> SampledChunk:
+        """A chunk whitened with variances of the groups relative to the stated ones, (G,).
 
-        They have the sources of all samples, and the rows of one in so many.
+        Of its `rows` those of every `step`-th sample.
         """
         if (variance == 1.0).all():
-            yield from (replace(chunk, rows=chunk.rows[::thinned]) for chunk in self.chunks)
-            return
-        scale = torch.from_numpy(np.sqrt(variance)[self.group_of])[:, None]
-        for chunk in self.chunks:
-            sources = chunk.sources * scale
-            S = sources.mT @ sources
-            empty = S.diagonal(dim1=1, dim2=2) == 0.0  # rows of zeros
-            L = torch.linalg.cholesky(S + torch.diag_embed(empty.to(S)))
-            rows = torch.linalg.solve_triangular(L[::thinned], chunk.rows[::thinned], upper=False)
-            sources = torch.linalg.solve_triangular(L, sources.mT, upper=False).mT
-            yield replace(chunk, rows=rows, sources=sources)
+            return replace(chunk, rows=chunk.rows[::step])
+        scale = torch.from_numpy(np.sqrt(variance)[self.group_of])
+        rows, sources = chunk.rows[::step].clone(), torch.zeros_like(chunk.sources)
+        for own, slots in chunk.blocks:
+            of = slice(None), own[..., None], slots[:, None]
+            U = scale[of[1]] * chunk.sources[of]
+            L = noise_root(U)
+            rows[:, slots] = torch.linalg.solve_triangular(L[::step], rows[:, slots], upper=False)
+            sources[of] = torch.linalg.solve_triangular(L, U.mT, upper=False).mT
+        return replace(chunk, rows=rows, sources=sources)
 
     @one_thread()
     def compress(self, variance: Array, columns: Mapping[str, Tensor] | None = None) -> list[Part]:
@@ -176,11 +183,9 @@ class SampledRows:
         in Huber's loss: otherwise the effect of impacts on the parameters would look like noise of all rows. A sample's
         rows are taken together, as another basis of their span must not make a difference.
         """
-        parts: dict[tuple[str, ContactState], Part] = {}
-        for chunk in self.whitened(variance):
-            key = chunk.log, chunk.state
-            part = parts.setdefault(key, Part(*key, TriangularFactor(self.builder.width), 0))
-            part.samples += len(chunk.rows)
+
+        def factor_of(chunk: SampledChunk) -> TriangularFactor:
+            chunk = self.whiten(chunk, variance)
             rows, present = chunk.rows, chunk.sources.abs().sum(1) > 0.0
             readings = chunk.sources.square().sum(2)
             if columns is not None:
@@ -188,12 +193,44 @@ class SampledRows:
                 limit = _radius(present.sum(1))
                 weight = (limit / size).clamp_max(1.0)
                 rows, readings = rows * weight.sqrt()[:, None, None], readings * weight[:, None]
+            factor = TriangularFactor(self.builder.width)
             for support, slots in _supports(rows).items():
                 own = rows[:, torch.tensor(slots)[:, None], torch.tensor([*support, self.builder.width])]
-                part.factor.add(support, own[present[:, slots]], chunk.oversampling)
+                factor.add(support, own[present[:, slots]], chunk.oversampling)
             for column, sources in self._scaled.items():
-                part.factor.add_noise_gram(noise_of_reading(column, readings[:, sources].sum()))
+                factor.add_noise_gram(noise_of_reading(column, readings[:, sources].sum()))
+            return factor
+
+        parts: dict[tuple[str, ContactState], Part] = {}
+        for chunk, factor in zip(self.chunks, map_in_workers(self.chunks, factor_of), strict=True):
+            key = chunk.log, chunk.state
+            part = parts.setdefault(key, Part(*key, TriangularFactor(self.builder.width), 0))
+            part.samples += len(chunk.rows)
+            part.factor.merge(factor)
         return list(parts.values())
+
+
+def noise_root(sources: Tensor) -> Tensor:
+    """L (..., r, r) with `L L^T` the covariance of rows that have these sources (..., e, r); 1 of rows of zeros."""
+    S = sources.mT @ sources
+    return torch.linalg.cholesky(S + torch.diag_embed((S.diagonal(dim1=-2, dim2=-1) == 0.0).to(S)))
+
+
+def _blocks(present: np.ndarray) -> tuple[tuple[Tensor, Tensor], ...]:
+    """`SampledChunk.blocks` by which source is in which row, (E, n_rows)."""
+    sources, rows = np.nonzero(present)
+    count, size = len(present), sum(present.shape)
+    linked = coo_array((np.ones(len(rows)), (sources, count + rows)), (size, size))
+    label = connected_components(linked, directed=False)[1]
+    alike: dict[tuple[int, int], list[tuple[np.ndarray, np.ndarray]]] = {}
+    for number in np.unique(label[sources]):
+        of = np.flatnonzero(label == number)
+        block = of[of < count], of[of >= count] - count
+        alike.setdefault((len(block[0]), len(block[1])), []).append(block)
+    return tuple(
+        (torch.from_numpy(np.stack([own for own, _ in blocks])), torch.from_numpy(np.stack([own for _, own in blocks])))
+        for blocks in alike.values()
+    )
 
 
 def _sources_of_scales(builder: RowBuilder) -> dict[int, list[int]]:

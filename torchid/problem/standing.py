@@ -16,6 +16,7 @@ from torchid.logs import Log
 from torchid.logs.log import NORMALS, BoolArray, FloatArray
 from torchid.logs.quaternion import make_sign_continuous
 from torchid.logs.segments import preprocess_segments
+from torchid.logs.timeline import SampleRate
 from torchid.problem.floor_pose import (
     FEWEST_POINTS,
     Footholds,
@@ -71,7 +72,7 @@ def preprocess_standing(
     robot: Robot,
     contacts: Sequence[Contact],
     cutoff_hz: float | None,
-    sample_rate_hz: float | None,
+    sample_rate_hz: SampleRate,
     sign_width: float | None = None,
     stribeck: float | None = None,
 ) -> Log:

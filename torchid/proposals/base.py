@@ -82,7 +82,8 @@ def field_beside(family: Family, quaternion: str, sample: FileSample) -> str:
         return ""
     for field, quantity, own, needed in _BESIDE:
         rest = [word for word in words if word not in own | _MESSAGE]
-        if rest == whose != [] and (not needed or needed & set(words)) and family.unit_may_be(quantity):
+        is_beside = rest == whose and (bool(rest) or any(family.axes))
+        if is_beside and (not needed or needed & set(words)) and family.unit_may_be(quantity):
             return field if field != _BESIDE[0][0] or _is_path(numbers.astype(float)) else ""
     return ""
 

@@ -291,6 +291,7 @@ def _pattern(
     return column + behind, name, number, axis
 
 
+_FEWEST, _ALIKE = 20, 0.9  # samples of which slopes are compared, and their correlation with velocities
 _UNIT = 1e-3  # of the length of quaternions from 1
 _TWIST = (*["base_linear_velocity_world"] * 3, *["base_angular_velocity_world"] * 3)  # columns of it
 
@@ -316,9 +317,12 @@ def split_arrays(sample: FileSample, names: Sequence[str], joints: Collection[in
         if array.shape[1] - 7 in joints:
             out.append((name, "[7:]", "joint_position"))
             width = array.shape[1] - 7
-        elif array.shape[1] == 7 + len(_TWIST):
-            out += [(name, "[7:10]", _TWIST[0]), (name, "[10:13]", _TWIST[3])]
+        elif (n := (array.shape[1] - 7 - len(_TWIST)) // 2) in {0, *joints} and array.shape[1] == 13 + 2 * n:  # a state
+            out += [(name, f"[{7 + n}:{10 + n}]", _TWIST[0]), (name, f"[{10 + n}:{13 + n}]", _TWIST[3])]
+            out += [(name, f"[7:{7 + n}]", "joint_position"), (name, f"[{13 + n}:]", "joint_velocity")] if n else []
         break
+    if not out:
+        return _fixed_states(sample, names, joints)
     for name in names if out else ():
         shape, field = np.asarray(sample[name]).shape, propose_field(name)
         if width and shape[1:] == (6 + width,) and field in ("joint_velocity", "joint_torque"):
@@ -327,6 +331,26 @@ def split_arrays(sample: FileSample, names: Sequence[str], joints: Collection[in
         elif shape[1:] == (len(_TWIST),) and field == _TWIST[0] and (name, "[7:10]", field) not in out:
             out += [(name, "[0:3]", _TWIST[0]), (name, "[3:6]", _TWIST[3])]
     return out
+
+
+def _fixed_states(sample: FileSample, names: Sequence[str], joints: Collection[int]) -> list[tuple[str, str, str]]:
+    """Positions and velocities of joints in the first array that is a state of a robot with a fixed base."""
+    for name in names:
+        if _is_state(array := np.asarray(sample[name]), joints):
+            n = array.shape[1] // 2
+            return [(name, f"[0:{n}]", "joint_position"), (name, f"[{n}:]", "joint_velocity")]
+    return []
+
+
+def _is_state(array: NDArray[Any], joints: Collection[int]) -> bool:
+    """Whether the first half of the columns of an array (N, 2 n) are positions, and the rest their slopes."""
+    if array.ndim != 2 or array.shape[1] // 2 not in joints or array.shape[1] % 2 or len(array) < _FEWEST:
+        return False
+    position, velocity = np.hsplit(array.astype(float), 2)
+    slope = np.gradient(position, axis=0)
+    with np.errstate(all="ignore"):
+        alike = np.nansum(slope * velocity) / np.sqrt(np.nansum(slope**2) * np.nansum(velocity**2))
+    return bool(alike > _ALIKE)
 
 
 def _has_pose(array: NDArray[Any]) -> bool:

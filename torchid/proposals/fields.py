@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -28,10 +28,17 @@ from torchid.logs.name_matching import (
 from torchid.logs.unitree import JOINT_ORDERS, MOTORS, numbered_joints, suitable_orders
 from torchid.logs.units import quantities_with, split_unit
 from torchid.proposals.column_groups import Family
-from torchid.proposals.file_samples import FileSample, increases, listed_order, side_by_side, stated_names
+from torchid.proposals.file_samples import (
+    FileSample,
+    increases,
+    listed_joints,
+    listed_order,
+    side_by_side,
+    stated_names,
+)
 from torchid.proposals.numbers import point_along_z
 
-FORCE = re.compile(r"force|kraft|fuerza|(?<![a-z])f\{axis", re.IGNORECASE)
+FORCE = re.compile(r"force|kraft|f(ue|o)r[cçz]a|(?<![a-z])f\{axis", re.IGNORECASE)
 MOMENT = re.compile(r"moment|torque|(?<![a-z])[mt]\{axis", re.IGNORECASE)
 """In patterns of columns."""
 
@@ -64,28 +71,47 @@ class FieldMatcher:
         self._suffix = more.get("joint", "").removeprefix("{joint}")
         self.named_joints = self.named_joints or self._all_named(families)
 
-    def of_limbs(self, names: Sequence[str]) -> list[tuple[Family, Collection[str]]]:
-        """Arrays that hold the joints of one limb each, in the order of the robot's file, and together all joints.
+    def of_limbs(self, names: Sequence[str]) -> list[tuple[Family, set[str]]]:
+        """Arrays, or numbered columns, of the joints of one limb each, together all, and which of `names` these are.
+
+        Joints are those that a list in the file names, else a limb's in the order of the robot's file.
 
         Args:
-            names: of arrays that may be; of these the columns become a part of the sample.
+            names: that may be; of arrays the columns become a part of the sample.
         """
-        by_field = defaultdict[str, dict[str, Sequence[str]]](dict)
-        for name in names:
-            array, field = self.sample[name], propose_field(name)
-            if array is not None and array.ndim == 2 and field.startswith("joint_"):
-                by_field[field][name] = limb_of(name, array.shape[1], self.robot)
-        out = list[tuple[Family, Collection[str]]]()
-        for arrays in by_field.values():
-            places = {joint: (name, k) for name, of in arrays.items() for k, joint in enumerate(of)}
-            if len(arrays) > 1 and len(places) == sum(map(len, arrays.values())) == len(self.robot.joints):
-                columns = {joint: f"{name}[{k}:{k + 1}]" for joint, (name, k) in places.items()}
-                self.sample |= {
-                    columns[joint]: np.asarray(self.sample[name])[:, k] for joint, (name, k) in places.items()
-                }
-                family = Family(next(iter(arrays)), list(columns.values()), tuple(columns), (), ("",), columns)
-                out.append((family, arrays))
+        by_field, out = defaultdict[str, dict[str, list[str]]](dict), list[tuple[Family, set[str]]]()
+        for name, columns in self._side_by_side(names).items():
+            if (field := propose_field(name)).startswith("joint_") and len(columns) < len(self.robot.joints):
+                by_field[field][name] = columns
+        for lists in by_field.values():
+            limbs = self._limbs_of({name: len(columns) for name, columns in lists.items()})
+            entry = {joint: column for name, of in limbs.items() for joint, column in zip(of, lists[name], strict=True)}
+            if len(limbs) > 1 and len(entry) == sum(map(len, limbs.values())) == len(self.robot.joints):
+                arrays = {name: np.asarray(self.sample[name]) for name in limbs if name in self.sample}
+                self.sample |= {column: x[:, k] for name, x in arrays.items() for k, column in enumerate(lists[name])}
+                family = Family(next(iter(limbs)), list(entry.values()), tuple(entry), (), ("",), entry)
+                out.append((family, {*arrays, *entry.values()} & set(names)))
         return out
+
+    def _side_by_side(self, names: Sequence[str]) -> dict[str, list[str]]:
+        """The columns of each array, and columns that differ in a number at their end, by what they have in common."""
+        out, numbered = dict[str, list[str]](), defaultdict[str, list[tuple[int, str]]](list)
+        for name in names:
+            if np.ndim(array := np.asarray(self.sample[name])) == 2:
+                out[name] = [f"{name}[{k}:{k + 1}]" for k in range(array.shape[1])]
+            elif found := re.fullmatch(r"(.*\D)(\d+)\]?", name):
+                numbered[found[1]].append((int(found[2]), name))
+        return out | {name: [column for _, column in sorted(of)] for name, of in numbered.items()}
+
+    def _limbs_of(self, counts: Mapping[str, int]) -> dict[str, Sequence[str]]:
+        """The joints of lists of so many, by their names; the one limb that is left is that of the one list without."""
+        names = self.robot.joints
+        out = {x: listed_joints(self.sample, x, n, names) or limb_of(x, n, self.robot) for x, n in counts.items()}
+        nameless, taken = [x for x, of in out.items() if not of], {joint for of in out.values() for joint in of}
+        left = [of for of in self.robot.limbs if not taken & set(of)]
+        if len(nameless) == len(left) == 1 and counts[nameless[0]] == len(left[0]):
+            out[nameless[0]] = left[0]
+        return {x: of for x, of in out.items() if of}
 
     def is_like_torques(self, family: Family) -> bool:
         """Whether a family that nothing says what it is has changing numbers of each joint."""
@@ -139,7 +165,7 @@ class FieldMatcher:
         inner = int(np.prod(self.shape(family)))
         count = max(inner, len(family.columns)) if inner == 1 or len(family.columns) == 1 else 0
         if name == "time":
-            return count == 1
+            return count == 1 and (len(first) < 2 or bool(np.ptp(first)))  # all the same: steps
         if ("{contact}" if name.startswith("joint_") else "{joint}") in family.pattern:
             return False
         if name.startswith("joint_"):
@@ -181,7 +207,7 @@ _OF_FOOT = re.compile(
     r"foot|feet|sole|ankle|pied|patte|fu(ss|ß)|(?<![a-z])pie(?![a-z])|contact|touch|stance|wrench|grf|(?<![a-z])fts?(?![a-z])",
     re.IGNORECASE,
 )
-_FORCE = re.compile(r"force|wrench|grf|kraft|fuerza|(?<![a-z])fts?(?![a-z])", re.IGNORECASE)
+_FORCE = re.compile(r"force|wrench|grf|kraft|f(ue|o)r[cçz]a|(?<![a-z])fts?(?![a-z])", re.IGNORECASE)
 _MOMENT = re.compile(r"torque|moment|couple", re.IGNORECASE)
 _TOUCH = re.compile(r"contact|touch|stance|pressure", re.IGNORECASE)
 _NO_FOOT = re.compile(
@@ -190,12 +216,12 @@ _NO_FOOT = re.compile(
 )
 _IN_WORLD = re.compile(r"world|global|inertial|forces?_w(?![a-z])", re.IGNORECASE)
 _LOCAL = re.compile(r"(?<![a-z])local(?![a-z])", re.IGNORECASE)
-_COMPONENT = "(?<![A-Za-z])([fmtcFMTC]?)([xyzXYZ])(?![A-Za-z])"
+_COMPONENT = "(?:(?<![A-Za-z])|(?<=[a-z])(?=[FMTCXYZ]))([fmtcFMTC]?)([xyzXYZ])(?![A-Za-z])"
 _AXIS = re.compile(f"{_COMPONENT}(?!.*{_COMPONENT})")  # the last
 _NUMBER = re.compile(r"(?<=[\[_./' -])(\d)(?=\W*$)")
 _PARTS = {"f": "force", "m": "moment", "t": "moment", "c": "moment"}  # c: of a couple
 _WHOLE = {("",), ("x", "y", "z"), ("0", "1", "2"), ("0", "1", "2", "3", "4", "5")}
-_BARE = re.compile(r"f[xyz]?|forces?|[xyz]")
+_BARE = re.compile(r"f[nxyz]?|forces?|normal|[xyz]")
 _OTHER_WEIGHT = 0.5  # by which a robot's weight may differ from its file's
 _CARRIED = 0.3  # of the robot's weight, at least, where forces on the robot add up to it
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping, Sequence
@@ -98,6 +99,15 @@ def listed_order(
     if kind == "contact":
         return _order_of_legs(texts, robot, count)
     return None
+
+
+def listed_joints(sample: FileSample, name: str, count: int, joints: Sequence[str]) -> list[str]:
+    """Joints of an array, as the list of so many that is called most like it says; none where there is none."""
+    lists = [other for other, x in sample.items() if x is not None and x.dtype.kind in "SU" and x.shape == (count,)]
+    closest = max(lists, key=lambda other: len(os.path.commonprefix([name, other])), default="")
+    texts = stated_names(sample, closest)
+    matched = match_names(texts, joints, "joint")
+    return [matched[text] for text in texts] if len(matched) == count else []
 
 
 def _order_of_legs(texts: Mapping[str, Sequence[str]], robot: KnownRobot, count: int) -> tuple[list[str], str] | None:

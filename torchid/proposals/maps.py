@@ -172,7 +172,7 @@ class _Proposer:
         """Arrays of the joints of a limb each, which have become entries."""
         placed = [(family, of) for family, of in self.match.of_limbs(numeric) if self._place(family)]
         for family, _ in placed:
-            self._note(family.proposed, "joints of each limb in the order of the robot's file")
+            self._note(family.proposed, "joints of each limb as the file lists them, else as the robot's file does")
         return {name for _, arrays in placed for name in arrays}
 
     def _place_part(self, name: str, columns: str, field: str) -> None:

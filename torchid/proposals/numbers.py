@@ -11,19 +11,22 @@ from numpy.typing import NDArray
 
 from torchid.logs.column_entries import FRACTIONS
 from torchid.logs.gaps import turn_jumps
+from torchid.logs.log import FLAGS, FORCE_NORMAL
+from torchid.logs.name_matching import words_of
 from torchid.logs.unitree import names_by_number
-from torchid.logs.units import OF_JOINTS, UNITS, unit_factor
+from torchid.logs.units import OF_JOINTS, UNITS, split_unit, unit_factor
 from torchid.proposals.base import vertical_in_base
 from torchid.proposals.file_samples import FileSample, stated_names
 from torchid.rounding import STD_PER_MAD
 
 _STEP = (2e-4, 0.2)  # [s]: of recordings
-_STEP_NAME = re.compile(r"(\w+_|sim|control)?(dt|time_?step)(_s)?", re.IGNORECASE)
+_STEP_NAME = re.compile(r"(\w+_|sim|control)?(dt|time_?step|duration|period)(_s)?", re.IGNORECASE)
 _TURN_S, _ALIKE = 0.3, 0.5  # over which gravity is seen to turn [s], and correlation with the angular velocity
 _SLOPE = 0.15  # of the logarithm of the ratio of velocities to slopes of positions, that a unit explains
 _TURNED = 7.0  # [rad]: no joint's position is as large throughout
 _MOST_DEGREES = 720.0  # whole numbers up to which may be angles
 _LEVER = 1.0  # [m]: rms of no torque is as large as that of the robot's weight with it
+_OTHER_WEIGHT = 0.3  # by which a robot's weight may differ from its file's, of forces in N
 _FAR = 60.0  # [m]: no base is recorded as far away
 _FREE = 0.02  # of a turn, to either side of where it begins
 _STARTS = (-0.5, -0.25, -0.75, 0.25)  # of a turn, where it may begin
@@ -90,7 +93,23 @@ class UnitProposer:
             values = self.values(name)
             if values is not None and is_it(values):
                 self._set(name, unit, why)
+        self._add_normal_forces(weight)
         return seconds
+
+    def _add_normal_forces(self, weight: float) -> None:
+        """Forces along the ground's normal, of readings with a threshold that say so and together carry the robot."""
+        entry, readings = self._columns.get(FLAGS, {}), self.values(FLAGS)
+        names = list(entry.get("columns", {}).values() or [entry.get("column", "")])
+        is_turned = any(name.startswith("base_quat") for name in (*self._columns, *self._sample))
+        if not ("above" in entry and readings is not None and is_turned and _all_say_normal(names)):
+            return
+        unit = split_unit(names[0])[1]
+        factor = UNITS["force"].get(unit or "N", np.nan)
+        if abs(factor * np.nanmedian(np.nansum(readings, axis=1)) / weight - 1.0) < _OTHER_WEIGHT:
+            self._columns[FORCE_NORMAL] = entry | ({"unit": unit} if unit not in ("", "N") else {})
+            self._columns[FLAGS] = {"above": float(f"{factor * self._columns[FORCE_NORMAL].pop('above'):.2g}")}
+            how = "sensors: {joint_torques: ['*'], contact_wrenches: {FOOT: [fn]}}"
+            self._note(FORCE_NORMAL, f"as its name says, and it carries the robot; to fit it, too, {how}")
 
     def _joints(self, name: str, count: int) -> list[str]:
         """Joints by column of an entry, as many as there are columns; "" for each where the map does not say."""
@@ -290,6 +309,11 @@ class UnitProposer:
         flat = [np.asarray(x, dtype=float).reshape(len(x), -1) for x in found]
         values = np.concatenate(flat, axis=1) if flat and len({len(x) for x in flat}) == 1 else np.zeros((0, 1))
         return values if np.isfinite(values).any() else None
+
+
+def _all_say_normal(names: Sequence[str]) -> bool:
+    """Whether all names of columns say that forces are those along the ground's normal."""
+    return all({"fn", "normal", "vertical", "verticale"} & set(words_of(name)) for name in names)
 
 
 def _turn_start(position: Numbers, turn: float) -> float | None:

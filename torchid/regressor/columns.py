@@ -126,18 +126,21 @@ def wrench_columns(states: BodyStates, columns: tuple[int, ...], out: Tensor, is
     Source: the Newton-Euler equations of a body about its frame's origin, sorted by parameter.
     """
     forces_of, moments_of = _unit_wrenches(states, columns)
-    n_with_force, rotation = len(forces_of), states.rotation.unsqueeze(3)
-    local = torch.stack([vector[axis] for axis in range(3) for vector in (*moments_of, *forces_of)])
-    local = local.unflatten(0, (3, -1)).transpose(1, 2)  # (3, k, vectors, B)
-    moments, forces, arm = local[:, :, : len(columns)], local[:, :, len(columns) :], states.position.unsqueeze(2)
+    n_with_force, rotation = len(forces_of), states.rotation
     if not is_reused:
-        forces = rotate_vectors(rotation, forces)
+        local = torch.stack([vector[axis] for axis in range(3) for vector in (*moments_of, *forces_of)])
+        local = local.unflatten(0, (3, -1)).transpose(1, 2)  # (3, k, vectors, B)
+        moments, forces = local[:, :, : len(columns)], local[:, :, len(columns) :]
+        forces = rotate_vectors(rotation.unsqueeze(3), forces)
         out[:3, :, :n_with_force] = forces
-        out[3:] = rotate_vectors(rotation, moments)
-        out[3:, :, :n_with_force] += cross_product(arm, forces)
+        out[3:] = rotate_vectors(rotation.unsqueeze(3), moments)
+        out[3:, :, :n_with_force] += cross_product(states.position.unsqueeze(2), forces)
         return
-    rotate_vectors(rotation, moments, out[3:])
-    (x, y, z), (fx, fy, fz) = arm.unbind(), rotate_vectors(rotation, forces, out[:3, :, :n_with_force]).unbind()
+    for column, moment in enumerate(moments_of):  # to stack them takes as long as to turn them
+        rotate_vectors(rotation, moment, out[3:, :, column])
+    for column, force in enumerate(forces_of):
+        rotate_vectors(rotation, force, out[:3, :, column])
+    (x, y, z), (fx, fy, fz) = states.position.unsqueeze(2).unbind(), out[:3, :, :n_with_force].unbind()
     for row, (a, f), (b, g) in ((3, (y, fz), (z, fy)), (4, (z, fx), (x, fz)), (5, (x, fy), (y, fx))):
         out[row, :, :n_with_force].addcmul_(a, f).addcmul_(b, g, value=-1)
 

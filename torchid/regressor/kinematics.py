@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -232,7 +232,8 @@ def joint_frame_poses(tree: KinematicTree, position: Tensor) -> tuple[Tensor, Te
         parent_poses = torch.stack([torch.addcmul(c * x, s, y), torch.addcmul(c * y, s, x, value=-1), z, origin], dim=1)
         levels.append(parent_poses)
         start += size
-    pose = torch.cat(levels, 2).index_select(2, tree.depth_first)
+    nodes = [node for level in levels for node in level.split(1, dim=2)]
+    pose = torch.cat([nodes[number] for number in tree.depth_first], 2)
     return pose[:, :3], pose[:, 3]
 
 
@@ -267,7 +268,7 @@ def cross_product(a: Tensor, b: Tensor) -> Tensor:
     return torch.stack(products)  # 1.6 times as fast as three differences: half as many temporaries
 
 
-def rotate_vectors(rotation: Tensor, x: Tensor, out: Tensor | None = None) -> Tensor:
+def rotate_vectors(rotation: Tensor, x: Tensor | Sequence[Tensor], out: Tensor | None = None) -> Tensor:
     """Rotation (3, 3, ...) times vectors (3, ...), to `out`, if given, which no gradient flows through."""
     return torch.mul(rotation[:, 0], x[0], out=out).addcmul_(rotation[:, 1], x[1]).addcmul_(rotation[:, 2], x[2])
 

@@ -76,7 +76,7 @@ class KinematicTree(nn.Module):
 
     Attributes (buffers, so `.to()` moves and casts them):
         pose: (3, 4, L, 1), rotation and offset [m] of every joint frame at position 0 in its parent's joint frame,
-            nodes sorted by depth (`by_depth`; `depth_first` sorts back). L counts nodes here.
+            nodes sorted by depth (`by_depth`). L counts nodes here.
         link_rotation, (3, 3, L, 1), and link_offset, (3, L, 1): the node's link frame in its joint frame.
         revolute, prismatic: (L, 1) of 0 and 1.
         parent: (L,), index of the parent node, 0 for the base.
@@ -86,13 +86,12 @@ class KinematicTree(nn.Module):
 
     `n_nodes`: one for each body, and five more for every force/torque sensor in a limb. `sign_width`: as in
     `Regressor`. `stribeck`: Stribeck velocity [rad/s or m/s], None without such friction. `node_of`: node of each of
-    the robot's bodies. `body_of`: body of each node; for a massless node the body beyond the weld. `has_link_offsets`:
-    whether any `link_offset` is not 0.
+    the robot's bodies. `body_of`: body of each node; for a massless node the body beyond the weld. `depth_first`: place
+    of each node among those sorted by depth. `has_link_offsets`: whether any `link_offset` is not 0.
     """
 
     pose: Tensor
     by_depth: Tensor
-    depth_first: Tensor
     link_rotation: Tensor
     link_offset: Tensor
     revolute: Tensor
@@ -137,6 +136,7 @@ class KinematicTree(nn.Module):
         by_depth = np.argsort(depth, kind="stable")
         position = np.argsort(by_depth)
         self.level_sizes = np.bincount(depth).tolist()
+        self.depth_first = position.tolist()
 
         moving = np.arange(count) > 0
         self._register("pose", in_parent[by_depth, :3].transpose(1, 2, 0)[..., None])
@@ -152,7 +152,6 @@ class KinematicTree(nn.Module):
         level_start = np.repeat(np.cumsum([0, 0, *self.level_sizes[:-1]])[:-1], self.level_sizes)
         self._register("parent", parent)
         self._register("by_depth", by_depth)
-        self._register("depth_first", position)
         self._register("parent_in_level", position[parent[by_depth]] - level_start)
 
     def extra_repr(self) -> str:

@@ -16,7 +16,9 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+from torchid.copies import share_between_copies
 from torchid.errors import during, escape
+from torchid.problem.chunks import thread_count
 
 # the palette of Okabe and Ito, which the colour-blind tell apart
 MEASURED_COLOR, NOMINAL_COLOR, IDENTIFIED_COLOR, NOISE_COLOR = "#111111", "#d55e00", "#0072b2", "#8c8c8c"
@@ -74,8 +76,11 @@ def figure_bytes(figure: Figure, form: str) -> bytes:
 
 def save_figures(figures: Mapping[str, Figure], folder: Path, form: str) -> None:
     """Write figures by name, in the format of that extension."""
-    for name, figure in figures.items():
-        save_figure(figure, folder / f"{name}.{form}")
+
+    def save(name: str) -> None:
+        save_figure(figures[name], folder / f"{name}.{form}")
+
+    share_between_copies(list(figures), save, thread_count())
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from torchid.logs.low_pass import import_signal
 from torchid.parameters import Array
 from torchid.problem.metrics import BASE_ROWS
 from torchid.report.figure_style import IDENTIFIED_COLOR, MEASURED_COLOR, NOMINAL_COLOR, STYLE
@@ -251,10 +252,8 @@ def _spectrum(series: ForceSeries, row: int, time: Array, bandwidth: float) -> d
     if count < _SHORTEST or not bandwidth > 0.0:
         return None
     rate = (count - 1) / (time[segment.stop - 1] - time[segment.start])
-    from scipy.signal import welch  # takes 0.1 s, which commands that draw nothing need not
-
     window = int(np.clip(count // 4, _SHORTEST, _LONGEST))
-    frequency, density = welch(errors[:, segment], rate, nperseg=window)
+    frequency, density = import_signal().welch(errors[:, segment], rate, nperseg=window)
     shown = (frequency > 0.0) & (frequency <= _BEYOND * bandwidth)
     noise = None if series.noise is None else _rms(series.noise[segment, row])
     return {

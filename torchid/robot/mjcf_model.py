@@ -102,9 +102,12 @@ class MjcfText:
         return out
 
     def _included(self, by: Path, file: str) -> Path:
-        """The file that another includes: beside it, or else beside the main one."""
-        beside = by.parent / file
-        return beside if beside.is_file() else self.path.parent / file
+        """The file that another includes: beside it, or else beside the main one; UrdfError where there is none."""
+        found = next((path for path in (by.parent / file, self.path.parent / file) if path.is_file()), None)
+        if found is None:
+            accepted = f"a file beside {' or '.join(dict.fromkeys((by.name, self.path.name)))}"
+            raise UrdfError(by, "<include>", f"'{excerpt(file)}', which is not there", accepted)
+        return found
 
 
 def body_elements(root: etree._Element) -> list[tuple[etree._Element, list[etree._Element]]]:

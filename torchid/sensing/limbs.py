@@ -62,14 +62,17 @@ def limb_null_space(
     if axes is None:
         base.diagonal().copy_(row_std[:BASE])
     else:
-        base[:3, :3], base[3:, 3:] = ((axes * row_std[rows]).permute(2, 1, 0) for rows in _OF_BASE)
+        axes = axes.permute(1, 2, 0).contiguous()
+        for rows in _OF_BASE:
+            base[rows, rows] = axes.transpose(0, 1) * row_std[rows, None, None]
     _orthonormalize(white, suspect)
     own /= row_std[BASE:, None, None]
     if axes is None:
         base /= row_std[:BASE, None, None]
     else:
         for rows in _OF_BASE:
-            base[rows] = ((axes / row_std[rows]) @ base[rows].permute(2, 0, 1)).permute(1, 2, 0)
+            turn = axes / row_std[rows, None]
+            base[rows] = _sum_of_products(turn[:, :, None].unbind(1), base[rows].unbind())
     return white[:m], suspect
 
 
@@ -99,7 +102,7 @@ def _solve(limbs: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
         v, rest = X[:, done:, column].clone(), X[:, done:, :column]
         length = torch.copysign((v * v).sum(1).sqrt_(), v[:, 0])
         v[:, 0] += length
-        along = (v[:, :, None] * rest).sum(1)
+        along = _sum_of_products(v[:, :, None].unbind(1), rest.unbind(1))
         along /= (length * v[:, 0])[:, None]
         rest.addcmul_(v[:, :, None], along[:, None], value=-1)
         X[:, done, column] = -length
@@ -109,3 +112,11 @@ def _solve(limbs: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
         X[:, :row, :BASE].addcmul_(X[:, :row, column, None], X[:, row, None, :BASE], value=-1)
     motion = X[:, :, :BASE].flip(1).neg_()
     return motion.flatten(0, 1), (motion.square().sum((1, 2)) * size).amax(0)
+
+
+def _sum_of_products(factors: Sequence[Tensor], others: Sequence[Tensor]) -> Tensor:
+    """Sum of the products of each of some tensors with its other; no array holds all products."""
+    out = factors[0] * others[0]
+    for factor, other in zip(factors[1:], others[1:], strict=True):
+        out.addcmul_(factor, other)
+    return out

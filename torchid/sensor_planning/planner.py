@@ -9,11 +9,12 @@ from itertools import count
 
 import numpy as np
 
+from torchid.copies import share_between_copies
 from torchid.errors import SensorError
 from torchid.identifiability.structure import random_postures
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples
-from torchid.problem.chunks import subsample_states
+from torchid.problem.chunks import subsample_states, thread_count
 from torchid.problem.contact_state import ContactState
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
@@ -226,7 +227,7 @@ def plan_sensors(problem: PlanningProblem, progress: StepCallback | None = None)
         observability=tuple(problem.assess(sensors)),
         stack_rank=stack.rank(chosen),
         stack_full=stack.full,
-        removals=tuple(_removals(problem, chosen, report)),
+        removals=_removals(problem, chosen, report),
     )
 
 
@@ -311,12 +312,14 @@ def _best_parts(
     return tuple(out), tuple(c for c in problem.candidates if c in chosen)
 
 
-def _removals(problem: PlanningProblem, chosen: Sequence[Candidate], report: StepCallback) -> Iterable[Removal]:
-    step = _counted(report, "leaving sensors out", len(chosen))
-    for candidate in chosen:
+def _removals(problem: PlanningProblem, chosen: Sequence[Candidate], report: StepCallback) -> tuple[Removal, ...]:
+    report("leaving sensors out", 0, 1)
+
+    def without(candidate: Candidate) -> Removal:
         fewer = [c for c in chosen if c is not candidate]
-        yield Removal(candidate, _base_rank(problem, fewer), problem.stack.rank(fewer))
-        step()
+        return Removal(candidate, _base_rank(problem, fewer), problem.stack.rank(fewer))
+
+    return tuple(share_between_copies(chosen, without, thread_count()))
 
 
 def _base_rank(problem: PlanningProblem, chosen: Sequence[Candidate]) -> int | None:

@@ -16,6 +16,8 @@ from torchid.report.tables import print_tables, terminal_width
 from torchid.terminal.lines import CUT, LABEL, LINES, column_lines, labelled, print_labelled, print_rolling, wrap_words
 
 _TEXT_LINES = 2
+#: Lines of a finding and of a note, the first in which all have room.
+_LEVELS = ((None, None), (None, _TEXT_LINES), (_TEXT_LINES + 1, _TEXT_LINES), (_TEXT_LINES, _TEXT_LINES))
 _NAMED = 2  # logs of a finding
 _FEWEST_ROWS = 4  # of the table of logs: empty line, heading, a log, how many others there are
 
@@ -110,19 +112,24 @@ def _headline(checked: Sequence[Checked]) -> str:
 
 
 def _finding_lines(found: Sequence[_Alike], room: int, width: int, logs: int) -> list[str]:
-    """The findings in at most so many lines, whole if they fit; else the last line counts what is not shown."""
-    if not found:
-        return []
-    for most in (None, _TEXT_LINES + 1, _TEXT_LINES):
-        texts = [_finding_text(one, width, logs, most) for one in found]
+    """The findings in at most so many lines, whole if they fit; else the last line counts what is not shown.
+
+    Notes are shortened first, and those that have no room are left out before other findings are shortened.
+    """
+    severe = sum(one.first.severity != NOTE for one in found)
+    texts, shown = [], 0
+    for most, of_note in _LEVELS if found else ():
+        limits = (of_note if one.first.severity == NOTE else most for one in found)
+        texts = [_finding_text(one, width, logs, limit) for one, limit in zip(found, limits, strict=True)]
         lines = [line for text in texts for line in text]
         whole = not any(line.endswith(CUT) for line in lines) and all(len(one.by_log) == 1 for one in found)
         end = [] if whole else ["all in full: --verbose"]
         if len(lines) + len(end) <= room:
             return lines + end
-    *ends, _ = accumulate(map(len, texts))
-    shown = sum(end < room for end in ends)
-    return [*(line for text in texts[:shown] for line in text), _hidden_text(found[shown:])]
+        shown = sum(last < room for last in accumulate(map(len, texts[:-1])))
+        if of_note and shown >= max(severe, 1):
+            break
+    return [*(line for text in texts[:shown] for line in text), _hidden_text(found[shown:])] if found else []
 
 
 def _finding_text(one: _Alike, width: int, logs: int, most: int | None) -> list[str]:

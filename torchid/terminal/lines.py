@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict
 from textwrap import wrap
+from typing import Any
 
 from rich.table import Table
 from rich.text import Text
@@ -28,15 +29,23 @@ def wrap_words(text: str, width: int, indent: str = "", most: int | None = None)
         text: to be broken.
         width: of the lines.
         indent: of all lines but the first.
-        most: lines; the last of them ends in `CUT` if there are words beyond.
+        most: lines; the last of them ends in `CUT` if there are words beyond, which begin a clause where one does in
+            the second half of what there is room for.
     """
     room = max(width, 1)
-    lines = wrap(text, room, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False) or [""]
+    options: dict[str, Any] = {"subsequent_indent": indent, "break_long_words": False, "break_on_hyphens": False}
+    lines = wrap(text, room, **options) or [""]
     if most is None or len(lines) <= most:
         return lines
     *before, last = lines[:most]
     while " " in last.strip() and len(last) > width - len(CUT):
         last = last[: last.rindex(" ")]
+    kept = " ".join(line.strip() for line in (*before, last))
+    for end in "; ", ", ":
+        clause = kept.rfind(end)
+        if clause >= len(kept) / 2:
+            *before, last = wrap(kept[: clause + 1], room, **options)
+            break
     return [*before, last + CUT]
 
 
