@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from dialects import save_csv, with_velocity
+from motions import value
 from repository import DEMO
 
 from torchid.cli import main
@@ -155,6 +156,34 @@ def test_a_joint_with_a_torque_but_without_a_position_is_named_and_not_welded(tm
     named = f"joint_position: no column of numbers of {log.joint_names[4]}, but of all others"
     assert named in written.missing
     assert "weld" not in yaml.safe_load((tmp_path / "new.yaml").read_text())["robot"]
+
+
+def test_torques_of_some_joints_are_the_sensors_of_the_fit(tmp_path: Path) -> None:
+    log = recorded()
+    columns = with_units(log, log.joint_names, ("{} [deg]", "{} [mrad/s]", "{} [Ncm]"))
+    del columns[f"{stem(log.joint_names[4])} [Ncm]"]
+    written = init(URDF, save_csv(tmp_path / "x.csv", {"t": log.time, **columns}), tmp_path / "new.yaml")
+    config = load_config(tmp_path / "new.yaml")
+    assert not [text for text in written.missing if text.startswith("joint_torque")]
+    assert any(text.startswith("sensors.joint_torques: ") for text in written.guessed)
+    assert set(config.sensors.joint_torques) == set(log.joint_names) - {log.joint_names[4]}
+    again = read_log(tmp_path / "x.csv", columns=config.logs.columns)
+    np.testing.assert_array_equal(
+        np.isnan(again.joint_torque).any(axis=0), ~np.isin(again.joint_names, config.sensors.joint_torques)
+    )
+
+
+def test_the_first_letter_of_a_component_is_no_unit(tmp_path: Path) -> None:
+    log = recorded()
+    columns = {"t": log.time, **with_units(log, log.joint_names, ("{} [deg]", "{} [mrad/s]", "{} [Ncm]"))}
+    for foot in log.contact_names:
+        columns |= {
+            f"{foot}_{axis}": np.full(len(log), 50.0 + k) for k, axis in enumerate(("fx", "fy", "fz", "mx", "my", "mz"))
+        }
+    written = init(URDF, save_csv(tmp_path / "x.csv", columns), tmp_path / "new.yaml")
+    entry = value(load_config(tmp_path / "new.yaml").logs.columns).contact_wrench_local
+    assert (entry.force.column, entry.moment.column) == ("{contact}_f{axis}", "{contact}_m{axis}")
+    assert not [text for text in written.guessed if "unit" in text]
 
 
 def test_joints_that_a_log_lacks_are_named_with_the_key_that_holds_them(

@@ -94,3 +94,12 @@ def test_stamps_of_a_clock_are_shown_as_seconds_since_the_first_sample() -> None
     for figure, label in ((as_recorded, "time [s]"), (since_1970, "time since the first sample [s]")):
         np.testing.assert_allclose(figure.axes[0].get_lines()[0].get_xdata(), series(None).time, atol=1e-6)
         assert {axis.get_xlabel() for axis in figure.axes} == {"", label}
+
+
+def test_the_figure_says_how_many_rows_it_leaves_out() -> None:
+    measured = np.tile(np.arange(8.0), (50, 1))
+    measured[:, 7] = np.nan
+    many = ForceSeries("walk.npz", np.linspace(0.0, 1.0, 50), measured, measured, measured)
+    names = [f"joint_{k}" for k in range(8)]
+    assert force_figure(many, names, 0).get_suptitle().startswith("Generalized forces (6 of 7 rows, the largest), walk")
+    assert force_figure(series(None), names, 0).get_suptitle().startswith("Generalized forces, walk")

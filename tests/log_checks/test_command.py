@@ -50,6 +50,28 @@ def test_the_logs_of_an_experiment_file_are_checked_one_by_one(
     assert max(map(len, printed.splitlines())) <= 100
 
 
+@pytest.mark.parametrize(
+    ("sensors", "settings", "said"),
+    [
+        ("joints", [], "joint_torque '{joint}', does not fit"),
+        ("contacts", [], ""),
+        ("contacts", ["preprocessing.cutoff_hz=60"], "preprocessing.cutoff_hz, does not fit"),
+    ],
+)
+def test_a_log_that_identify_would_refuse_is_not_usable(
+    folder: Path, capsys: pytest.CaptureFixture[str], sensors: str, settings: list[str], said: str
+) -> None:
+    log = read_log(folder / "sway_train.npz")
+    torque = value(log.joint_torque).copy()
+    torque[:, 3] = np.nan
+    write_log(replace(log, joint_torque=torque), folder / "sway_train.npz")
+    status = main(["check", str(folder / "quadruped.yaml"), f"sensors={sensors}", "estimator.robust=null", *settings])
+    printed = capsys.readouterr().out
+    assert status == (1 if said else 0)
+    assert ("does not fit" in printed) == bool(said)
+    assert said.format(joint=log.joint_names[3]) in printed
+
+
 def test_frames_that_are_sent_again_are_one_row_of_the_table(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log = read_log(folder / "sway_train.npz")
     again = np.arange(400)

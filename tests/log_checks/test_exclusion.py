@@ -17,7 +17,7 @@ from motions import value
 from torchid.cli import main
 from torchid.errors import LogError, TorchidWarning
 from torchid.estimators import Estimate, LeastSquares
-from torchid.log_checks import drop_rejected
+from torchid.log_checks import NOTE, drop_rejected
 from torchid.log_checks.check import check, excluded_stamps
 from torchid.logs import Log, read_log, write_log
 from torchid.logs.preprocess import preprocess
@@ -84,6 +84,20 @@ def test_holes_in_poses_are_found_and_left_out_where_that_is_asked_for(tmp_path:
     assert len(kept) == len(same) > 0.9 * len(clean)
     error = np.abs(fitted(kept).phi - fitted(same).phi) / fitted(same).standard_error
     assert np.nanmax(error) < 0.15, "of ten samples interpolated by a line; a residual twice as large hid half of it"
+
+
+def test_what_was_interpolated_in_a_long_hole_is_not_compared_with_the_model() -> None:
+    hole = slice(400, 600)
+    log = changed(demo_log(), "joint_torque", lambda t: t.__setitem__((hole, slice(0, 6)), np.nan))
+    checked = check(log, demo_robot(), CONTACTS, CUTOFF)
+    assert [(x.name, x.field) for x in checked.findings if x.severity != NOTE] == [("not measured", "joint_torque")]
+    np.testing.assert_array_equal(np.flatnonzero(checked.rejected), np.arange(hole.start, hole.stop))
+
+
+def test_a_joint_that_is_recorded_late_is_not_called_frozen_too() -> None:
+    log = changed(demo_log(), "joint_position", lambda q: q.__setitem__((slice(0, 150), 2), np.nan))
+    findings = check(log, demo_robot(), CONTACTS, CUTOFF).findings
+    assert [(x.name, x.field) for x in findings if x.severity != NOTE] == [("not measured", "joint_position")]
 
 
 def test_a_pose_that_was_mostly_not_measured_makes_a_log_useless(tmp_path: Path) -> None:

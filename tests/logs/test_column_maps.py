@@ -51,6 +51,20 @@ def test_an_order_names_the_columns_by_number_and_null_leaves_one_out(tmp_path: 
     np.testing.assert_array_equal(log.joint_position, arrays["q"][:, [0, 2]])
 
 
+def test_a_joint_without_a_column_of_torques_was_not_measured_and_one_without_a_position_is_refused(
+    tmp_path: Path,
+) -> None:
+    text = 'joint_torque: "tau_{joint}"\njoint_position: "q_{joint}"'
+    columns = {"q_0": None, "q_1": None, "q_hip": [1, 2, 3], "q_knee": [4, 5, 6]}
+    log = mapped(tmp_path, text, **columns, tau_knee=[7, 8, 9])
+    assert log.joint_names == ("hip", "knee")
+    np.testing.assert_array_equal(log.joint_torque, [[np.nan, 7], [np.nan, 8], [np.nan, 9]])
+    with pytest.raises(LogError, match="joint_torque: joint 'toe' missing in other fields"):
+        mapped(tmp_path, text, **columns, tau_toe=[7, 8, 9])
+    with pytest.raises(LogError, match="joint_velocity: joint 'hip' missing here"):
+        mapped(tmp_path, text + '\njoint_velocity: "dq_{joint}"', **columns, tau_knee=TIME, dq_knee=[7, 8, 9])
+
+
 def test_every_field_may_have_an_order_of_its_own(tmp_path: Path) -> None:
     text = POSITION + 'joint_torque: {column: "tau{index}", order: [knee, hip], first_index: 1}'
     log = mapped(tmp_path, text, tau1=[1.5, 2.5, 3.5], tau2=[0.5, 0.25, 0.0])

@@ -102,13 +102,14 @@ def check_experiment(
             raise ConfigError.at_field("logs", "missing", "logs to check")
         config.logs.require_samples("check")
         scene = set_up_scene(config)
+        required = None if config.sensors.empty else scene.sensors_of(config.sensors)
     files = [*config.logs.train, *config.logs.validation, *config.logs.test]
     checked = []
     with progress_bars() as bars:
         for file in bars.track(files, description="checking"):
             settings, own = config.preprocessing, scene_of_log(scene, file)
             log, _ = settle_contacts(_read_log_to_check(file, config.logs, settings), own)
-            rest = scene.contacts, settings.filter_hz, settings.derived, scene.declared
+            rest = scene.contacts, settings.filter_hz, settings.derived, scene.declared, required
             found = check(log, own.robot, *rest)
             checked.append(replace(found, rolling=scene.rolling))
     return checked

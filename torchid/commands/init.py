@@ -22,6 +22,7 @@ from torchid.commands.init_proposals import (
     keys_for_length,
     like_torques,
     limb_sensors,
+    measured_torques,
     missing_columns,
     notes_on_arrays,
     proposed_sensors,
@@ -117,12 +118,15 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> Initiated:
     read = _try(path, proposal)
     gaps = keys_for_gaps(read) | keys_for_length(read)
     split = split_log(read, "base_motion" in _from_feet(contacts, fields))
-    sensors = proposed_sensors(fields, list(proposal.columns.get("ft_wrenches", ())) or read_sensors(robot, read))
+    limbs = list(proposal.columns.get("ft_wrenches", ())) or read_sensors(robot, read)
+    torques = measured_torques(robot, read)
+    sensors = proposed_sensors(fields, limbs, contacts, torques)
     text = _text(robot, urdf, path, target, contacts, fields, proposal, gaps, split, sensors)
     _describe(out, robot, contacts, fields, proposal)
     _describe_log(out, read, fields)
     out.guessed += [f"preprocessing.{key}: {value}, {why}" for key, (value, why) in gaps.items()]
     out.guessed += [split.guessed] * bool(split.guessed)
+    out.guessed += ["sensors.joint_torques: those that the log has, not of all joints"] * bool(torques)
     out.missing += [split.missing] * bool(split.missing)
     with atomic_output(target) as new:
         new.write_text(text, encoding="utf-8")

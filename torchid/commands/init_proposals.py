@@ -16,6 +16,7 @@ from torchid.logs.cutoff import choose_cutoff
 from torchid.logs.log import FORCE_NORMAL, WRENCHES
 from torchid.logs.low_pass import DROPPED_PERIODS
 from torchid.logs.name_matching import OF_PLATES, is_current, is_desired, propose_field, within
+from torchid.parameters import WRENCH_COMPONENTS
 from torchid.problem.compression import LEAST_PER_FOLD
 from torchid.proposals.column_groups import Family
 from torchid.proposals.file_samples import FileSample, stated_names
@@ -118,14 +119,34 @@ def _can_be_split(robot: Robot, joint: str) -> bool:
     return True
 
 
-def proposed_sensors(fields: Collection[str], limbs: Sequence[str]) -> str | dict[str, object]:
-    """The set of sensors of a run, with those in limbs at fixed joints."""
+def measured_torques(robot: Robot, log: Log | InputError) -> list[str]:
+    """Joints whose torque a log has, if it has that of some driven ones alone; none otherwise."""
+    if isinstance(log, InputError) or log.joint_torque is None:
+        return []
+    of_joints = zip(log.joint_names, log.joint_torque.T, strict=True)
+    known = {name: bool(np.isfinite(torque).any()) for name, torque in of_joints}
+    driven = [name for name in robot.joint_names if name in known and name not in robot.passive]
+    measured = [name for name in driven if known[name]]
+    return measured if len(measured) < len(driven) else []
+
+
+def proposed_sensors(
+    fields: Collection[str],
+    limbs: Sequence[str],
+    contacts: Sequence[GuessedContact] = (),
+    torques: Sequence[str] = (),
+) -> str | dict[str, object]:
+    """The set of sensors of a run, with those in limbs at fixed joints; `torques`: joints, if only some have one."""
     wrench, torque = bool(set(WRENCHES) & set(fields)), "joint_torque" in fields
     of_contacts = wrench or FORCE_NORMAL in fields
     named = ("full" if wrench else "joints") if torque or not of_contacts else "contacts"
+    of_limbs: dict[str, object] = {"ft_sensors": list(limbs)} if limbs else {}
+    if torques:
+        components = {x.frame: list(WRENCH_COMPONENTS[: 6 if x.type == "flat" else 3]) for x in contacts}
+        return of_limbs | {"joint_torques": list(torques)} | ({"contact_wrenches": components} if wrench else {})
     if not limbs:
         return named
-    return ({"set": named} if wrench or torque else {}) | {"ft_sensors": list(limbs)}
+    return of_limbs | ({"set": named} if wrench or torque else {})
 
 
 _LIKE_TORQUES = "of these no name says what they are; uncomment one of torques [N m]"

@@ -53,12 +53,13 @@ from torchid.problem.log_joints import without_welded_joints
 from torchid.problem.standing import longest_standing
 from torchid.reprs import short_repr
 from torchid.robot import Robot
-from torchid.sensing import Contact
+from torchid.sensing import Contact, SensorSet
 
 #: Share of rejected samples above which a log is not usable.
 MAX_REJECTED_SHARE = 0.5
 #: Descriptions and spans that one line of text lists.
 _MAX_LISTED_TEXTS, _MAX_LISTED_SPANS = 3, 4
+_LONGEST_BRIDGED_S = 0.1  # half of the shortest period of a robot's motion, 5 Hz
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +124,7 @@ def check(
     cutoff_hz: float | None = None,
     derived: tuple[str, ...] = (),
     declared: Declared | None = None,
+    required: SensorSet | None = None,
 ) -> Checked:
     """Check a log as it was read.
 
@@ -135,9 +137,11 @@ def check(
             of a log that has got flags from its torques. base_: motion of the base will follow from the feet that
             stand; forces are compared with the URDF in the longest segment in which enough of them do.
         declared: what an experiment says of noise, delay and unknown scales and offsets; None: nothing.
+        required: sensors of a fit, which must be in the log; None for any.
     """
     log, unclosed = completed(without_welded_joints(log, robot), robot)
-    contacts = [replace(contact, along_normal=False) for contact in contacts]  # wrenches are what is checked
+    if any(contact.along_normal for contact in contacts):  # wrenches are what is checked
+        contacts, required = [replace(contact, along_normal=False) for contact in contacts], None
     results: list[Finding | Skipped] = list(check_magnitudes(log))
     if (blocking := _blocking_finding(results)) is not None:
         return _collect(log, log, [*results, _skip_dependent(blocking)])
@@ -146,7 +150,7 @@ def check(
     if (blocking := _blocking_finding(missing)) is not None:
         return _collect(log, log, [*results, _skip_dependent(blocking)])
     repaired = repair_log(log, _findings(results))
-    results += check_repeats(channel_groups(repaired))
+    results += (x for x in check_repeats(channel_groups(repaired)) if not _was_interpolated(x, missing))
     repaired = repair_log(log, _findings(results))
     results += check_jumps(repaired, channel_groups(repaired))
     repaired = repair_log(log, _findings(results))
@@ -159,18 +163,20 @@ def check(
     if blocking is None or blocking.field != "time":
         results += [*check_derivatives(repaired), *check_angular_velocity(repaired, robot)]
         results += check_accelerometer(repaired, robot)
-    if _blocking_finding(results) is None:
-        results += unclosed or check_loops(repaired, robot)
-        results += check_standing_feet(repaired, robot, contacts, derived)
-        results += check_slip(repaired, robot, contacts, cutoff_hz, derived)
-        results += [] if derived else check_gyroscope(repaired, robot, contacts, cutoff_hz)
     compared = repaired
+    if _blocking_finding(results) is None:
+        filled = rejected_samples((x for x in _findings(results) if x.field != "contact_active"), len(log))
+        compared = _between_holes(repaired, filled)
+        results += unclosed or check_loops(compared, robot)
+        results += check_standing_feet(compared, robot, contacts, derived)
+        results += check_slip(_in_the_air(repaired, filled), robot, contacts, cutoff_hz, derived)
+        results += [] if derived else check_gyroscope(compared, robot, contacts, cutoff_hz)
     if "base_" in derived and robot is not None and _blocking_finding(results) is None:
-        compared, unfit = _longest_standing(repaired, robot, contacts)
+        compared, unfit = _longest_standing(compared, robot, contacts)
         results += unfit
     if _blocking_finding(results) is None:
         unbiased = subtract_contact_offsets(compared)
-        results += check_forces_against_urdf(unbiased, robot, contacts, cutoff_hz, derived, declared)
+        results += check_forces_against_urdf(unbiased, robot, contacts, cutoff_hz, derived, declared, required)
         results += check_limb_sensors(compared, robot, contacts, cutoff_hz)
     blocking = _blocking_finding(results)
     if blocking is None or blocking.name == "sign":
@@ -187,6 +193,35 @@ def _longest_standing(log: Log, robot: Robot, contacts: Sequence[Contact]) -> tu
         return longest_standing(log, robot, contacts), []
     except InputError as error:
         return log, [Finding("does not fit", REJECTED, error.field, error.found, f"give {error.accepted}")]
+
+
+def _was_interpolated(finding: Finding | Skipped, missing: Sequence[Finding]) -> bool:
+    """Whether all values of a finding stand where none was recorded: what was filled in at the ends repeats."""
+    if isinstance(finding, Skipped):
+        return False
+    holes = [span for x in missing if x.field == finding.field for span in x.spans]
+    spans = [
+        [x for x in holes if x.channel == one.channel and x.first <= one.first <= one.last <= x.last + 1]
+        for one in finding.spans
+    ]
+    return bool(spans) and all(spans)
+
+
+def _between_holes(log: Log, filled: BoolArray) -> Log:
+    """The longest part of a repaired log without holes so long that what was `filled` in (N,) is no motion."""
+    edges = np.flatnonzero(np.diff(filled, prepend=False, append=False))
+    first, last = edges[::2], edges[1::2]
+    long = log.time[last - 1] - log.time[first] > _LONGEST_BRIDGED_S
+    starts, ends = np.append(0, last[long]), np.append(first[long], len(log))
+    best = int(np.argmax(ends - starts))
+    return log.select(slice(starts[best], ends[best])) if starts[best] < ends[best] else log
+
+
+def _in_the_air(log: Log, samples: BoolArray) -> Log:
+    """The log without contacts in some samples (N,)."""
+    if log.contact_active is None or not samples.any():
+        return log
+    return replace(log, contact_active=log.contact_active & ~samples[:, None])
 
 
 def _findings(results: Iterable[Finding | Skipped]) -> Iterator[Finding]:

@@ -30,8 +30,9 @@ from torchid.logs.log import WRENCHES, BoolArray, FloatArray
 from torchid.logs.segments import with_delayed_torques
 from torchid.parameters import COULOMB, FRICTION, VISCOUS
 from torchid.problem import Samples
+from torchid.problem.samples import require_forces
 from torchid.robot import Robot
-from torchid.sensing import Contact
+from torchid.sensing import Contact, SensorSet
 from torchid.settings import AUTO
 
 #: Misfit above which common mistakes are tried. A URDF that is 20 % off leaves 0.05 to 0.1, one with links missing 0.3.
@@ -86,6 +87,7 @@ def check_forces_against_urdf(
     cutoff_hz: float | None,
     derived: tuple[str, ...] = (),
     declared: Declared | None = None,
+    required: SensorSet | None = None,
 ) -> Iterator[Finding | Skipped]:
     """Findings about joint torques and contact wrenches.
 
@@ -96,6 +98,7 @@ def check_forces_against_urdf(
         cutoff_hz: of the fit, None for a usual one.
         derived: how names of fields begin that were not recorded and hold no mistake of a recording.
         declared: what is known of the sensors.
+        required: sensors of a fit, which must be in the log.
     """
     if robot is None:
         yield Skipped(_FORCE_CHECK, "no robot (--urdf)")
@@ -105,7 +108,8 @@ def check_forces_against_urdf(
         log = with_delayed_torques(log, model.declared.known_delay)
         logs = preprocess_pieces(log, cutoff)
     except InputError as error:  # too short, or sampled too slowly by its time stamps
-        skipped = Skipped(_FORCE_CHECK, f"{error.field}: {error.found}")
+        refused = Finding("does not fit", REJECTED, error.field, error.found, f"give {error.accepted}")
+        skipped = Skipped(_FORCE_CHECK, f"{error.field}: {error.found}") if required is None else refused
         yield _time_scale_finding(_fit_time_scale(log, model)) or skipped
         return
     try:
@@ -113,6 +117,12 @@ def check_forces_against_urdf(
     except InputError as error:
         yield Finding("does not fit", REJECTED, error.field, error.found, f"give {error.accepted}")
         return
+    if required is not None:
+        try:
+            for part in samples:
+                require_forces(part, robot, contacts, required)
+        except InputError as error:
+            yield Finding("does not fit", REJECTED, error.field, error.found, f"give {error.accepted}")
     if log.joint_torque is None and log.contact_wrench is None:
         yield Skipped(_FORCE_CHECK, "neither joint torques nor contact wrenches")
         return

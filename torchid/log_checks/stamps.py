@@ -84,7 +84,7 @@ def _missing_findings(log: Log, field: str) -> Iterator[Finding]:
         shares = ", ".join(f"{name} {100 * share:.2g} %" for name, (_, share) in list(holes.items())[:4])
         text = f"NaN in {format_count(len(holes), 'channel')}, {format_count(len(spans), 'time')}: {shares}"
         if field in NAN_ALLOWED:
-            advice = "leave these samples out; a filter would lose the channels throughout"
+            advice = "leave these samples out (exclude_rejected); a filter would lose the channels throughout"
         else:
             advice = "leave these samples out (exclude_rejected): motion must be known throughout"
         yield Finding("not measured", REJECTED, field, text, advice, tuple(holes), spans)

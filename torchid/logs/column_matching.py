@@ -382,15 +382,16 @@ def _require_once(matched: Mapping[str, Matched]) -> None:
 def _common_names(
     columns: Columns, matched: Mapping[str, Matched], named: Mapping[str, tuple[str, ...]]
 ) -> dict[str, tuple[str, ...]]:
-    """Names of joints, contacts and sensors: those that the file states, else in the order of the first entry."""
+    """Names of joints, contacts and sensors: those that the file states, else of the first entry, of torques last."""
     listed = [(f"{KEY}.{key}", one.part.names_field, one.names) for key, one in matched.items() if one.part.kind]
     if columns.contact_active is not None and columns.contact_active.always:
         listed.append((f"{KEY}.contact_active.always", "contact_names", tuple(columns.contact_active.always)))
-    names = dict(named)
-    for key, field, of_part in listed:
+    names, torque = dict(named), f"{KEY}.joint_torque"
+    for key, field, of_part in sorted(listed, key=lambda one: one[0].startswith(torque)):
         common = names.setdefault(field, of_part)
         again = [name for name in of_part if of_part.count(name) > 1]
-        differing = again or sorted(set(common) ^ set(of_part))
+        lacking = set() if key.startswith(torque) else set(common) - set(of_part)  # a torque may be unmeasured
+        differing = again or sorted(lacking | set(of_part) - set(common))
         if differing:
             where = "twice" if again else "missing here" if differing[0] in common else "missing in other fields"
             found = f"{KINDS[field]} '{excerpt(differing[0])}' {where}"

@@ -26,7 +26,7 @@ class EntryValues:
 
     Attributes:
         of: the columns.
-        order: which names of these, in the order of the log; None for all as they are.
+        order: which names of these, in the order of the log, -1 for one without a column; None for all as they are.
         factors: of a sample's elements, units and signs; None for 1.
         turns: in the unit of the columns where the turn of each joint begins that its angle is counted in, and how much
             a turn is, each (n,); None for angles as they are.
@@ -58,6 +58,7 @@ class EntryValues:
                 out = out.reshape(len(out), len(self.of.labels), len(self.of.part.components))
         if self.order is not None:
             out = out[:, self.order]
+            out[:, np.less(self.order, 0)] = np.nan
         if self.turns is not None:
             start, turn = self.turns
             out = np.where(np.isfinite(start), start + np.mod(out - np.nan_to_num(start), turn), out)
@@ -92,11 +93,14 @@ class EntryValues:
 def entry_values(
     matched: Mapping[str, Matched], names: Mapping[str, tuple[str, ...]], in_degrees: bool = False
 ) -> dict[str, EntryValues]:
-    """How the numbers of all entries come from their columns, with names by field in the order of the log."""
+    """How the numbers of all entries come from their columns, with names by field in the order of the log.
+
+    A joint without a torque is NaN there.
+    """
     out = {}
     for key, one in matched.items():
         common = names.get(one.part.names_field, ())
-        order = [one.labels.index(name) for name in common]
+        order = [one.labels.index(name) if name in one.labels else -1 for name in common]
         kept = None if order == list(range(len(one.labels))) else order
         turning = _names_in_degrees(one) if in_degrees else set[str]()
         factors, turns = _element_factors(one.part, common, turning), _joint_turns(one.part, common, turning)

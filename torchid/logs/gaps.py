@@ -262,7 +262,7 @@ def warn_of_gaps(log: Log, name: str, coverage: Coverage) -> None:
     ]
     if broken:
         message = f"{log.source}: {name}: NaN in part of {', '.join(broken)}: NaN throughout after preprocessing"
-        message += f", unless {KEY} bridges these gaps"
+        message += f", unless {KEY} bridges these gaps or preprocessing.exclude_rejected leaves them out"
         warn(message)
 
 

@@ -11,7 +11,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 from scipy.interpolate import make_interp_spline
 
-from torchid.errors import InputError, LogError, warn_about_file
+from torchid.errors import InputError, LogError, format_count, warn_about_file
 from torchid.logs.log import BoolArray, FloatArray, check_time
 from torchid.logs.low_pass import DROPPED_PERIODS, REACH_PERIODS, LowPass
 from torchid.settings import AUTO
@@ -262,7 +262,7 @@ def lay_out_timeline(
     fewest = FEWEST_DIFFERENTIATED if differentiates else FEWEST_FILTERED
     if len(time) < fewest:
         accepted = f"at least {fewest} to filter, resample or differentiate"
-        raise LogError.at_field("time", f"{len(time)} samples", accepted)
+        raise LogError.at_field("time", format_count(len(time), "sample"), accepted)
     native = time - time[0]
     step = _median_step(native)
     grid, low_pass = native, None

@@ -58,10 +58,12 @@ def _with_passive(torque: FloatArray, log: Log, robot: Robot) -> FloatArray:
     """Joint torques (N, n) with zeros for joints without a motor; LogError if one of these was recorded as another."""
     passive = robot.is_passive[: robot.n]
     size = np.nanmax(np.abs(torque), axis=0, initial=0.0, where=np.isfinite(torque))
-    for joint in np.flatnonzero(passive & (size > _NO_TORQUE)):
-        name = robot.joint_names[joint]
-        found = f"up to {size[joint]:.3g} N m of a joint without a motor"
-        raise LogError(log.source, f"joint_torque '{name}'", found, f"0, NaN or none, or robot.passive without {name}")
+    driven = passive & (size > _NO_TORQUE)
+    if driven.any():
+        names = [robot.joint_names[joint] for joint in np.flatnonzero(driven)]
+        found = f"{join_names(names, _LISTED)}: up to {size[driven].max():.3g} N m, without a motor"
+        rest = ", ".join(name for name in robot.passive if name not in names)
+        raise LogError(log.source, "joint_torque", found, f"0, NaN or none, or robot.passive: [{rest}]")
     return np.where(passive, 0.0, torque)
 
 

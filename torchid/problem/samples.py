@@ -362,6 +362,7 @@ def require_forces(samples: Samples, robot: Robot, contacts: Sequence[Contact], 
         if bad.any():
             sample, dof = torch.nonzero(bad)[0].tolist()
             found = f"not a finite number at sample {sample} ({int(bad[:, dof].sum())} in all)"
+            found = "NaN in all samples of the fit" if bad[:, dof].all() else found
             field = "ft_wrench" if dof >= robot.n else "joint_torque"
             raise LogError(samples.source, f"{field} '{robot.dof_names[dof]}'", found, _AS_MEASURED)
     needed = recorded_components(contacts, required, samples.wrench_in_world)

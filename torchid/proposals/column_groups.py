@@ -23,7 +23,9 @@ _AXIS = re.compile(
     r"(?<=[._\-/\[ '])([wxyz])(?=$|\]|'\)?$)|(?<=[a-zFM_.\-/\[ \u0080-\uffff])([WXYZ])(?=$|[\]])|(?<=[a-zFM])([wxyz])$"
     r"|(?<=[a-z])([XYZ])(?=[/_.])|^([wxyzWXYZ])$|(?<=(?<![A-Za-z])[PQ])([WXYZwxyz])$",
 )
-_BEHIND = re.compile(r"[_./ \[-]*\{[^{}]*\}\]?$")  # a unit: the axis in `acc_g.{axis}`
+_BEHIND = re.compile(
+    r"([_./ \[-]+\{axis\}|[_./ \[-]*\{(?!axis\})[^{}]*\})\]?$"
+)  # a unit, as in `acc_g.{axis}`, not `l_m{axis}`
 
 
 _OF_A_JOINT = {"imu_angular_velocity": "joint_velocity", "imu_specific_force": "joint_acceleration"}

@@ -182,8 +182,10 @@ class FieldMatcher:
         named = self.joints_of(family)
         slots = {MOTORS[JOINT_ORDERS[name].message] for name in suitable_orders(self.robot.joints)}
         if named:
+            most = 2 * len(named) > len(self.robot.joints)
             whole = named == (self.named_joints or set(self.robot.joints))
-            if not whole and 2 * len(named) > len(self.robot.joints):
+            whole |= most and field == "joint_torque" and named <= self.named_joints  # of others it is not measured
+            if not whole and most:
                 self.partial[field] = [x for x in self.robot.joints if x in self.named_joints - named]
         else:
             known = {len(self.robot.joints), len(self.robot.moving), *slots}

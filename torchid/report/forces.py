@@ -77,7 +77,9 @@ def force_figure(
         axis.set_xlabel(f"time{since} [s]")
     if len(series.time) and 0.0 <= series.time[0] < _NEAR_0 * series.time[-1]:
         axes[0, 0].set_xlim(left=0.0)
-    figure.suptitle(f"Generalized forces, {series.source}, and errors: predicted - measured", x=0.01, ha="left")
+    known = int(np.isfinite(series.measured).any(axis=0).sum())
+    shown = f" ({len(rows)} of {known} rows, the largest)" if len(rows) < known else ""
+    figure.suptitle(f"Generalized forces{shown}, {series.source}, and errors: predicted - measured", x=0.01, ha="left")
     return figure
 
 
