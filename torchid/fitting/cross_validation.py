@@ -122,8 +122,7 @@ def choose_ridge(
     """The ridge with the least error on held-out folds, or the largest within one standard error of it.
 
     The second (Hastie, Tibshirani, Friedman, "The Elements of Statistical Learning", 7.10; here with the standard error
-    of the difference, fold by fold) was worse on some logs, as nearer to the URDF is not simpler, and better on one
-    whose unseen motion was three times as fast::
+    of the difference, fold by fold) was worse on some logs, better on one whose unseen motion was faster::
 
         blocks = torchid.split_into_folds(logs, builder)
         parts = torchid.compress_parts(blocks, builder)
@@ -150,18 +149,16 @@ def choose_ridge(
     shares = [(fold, first) for first in range(count) for fold in folds]  # five folds are no two equal halves
 
     def held_out(share: tuple[int, int]) -> Array:
-        fold, first = share
-        return _held_out_squares(fold, together, blocks, fitter, estimators[first::count], loss, done)
+        return _held_out_squares(share[0], together, blocks, fitter, estimators[share[1] :: count], loss, done)
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", TorchidWarning)  # the fit says the same
         for (fold, first), found in zip(shares, share_between_copies(shares, held_out, thread_count()), strict=True):
             squares[folds.index(fold), first::count] = found
     means = squares.mean(axis=0)
-    apart = squares - squares[:, [int(means.argmin())]]
-    error = apart.std(axis=0, ddof=1) / np.sqrt(len(folds))
-    ridges = tuple(float(estimator.ridge) for estimator in estimators)
-    taken = int(means.argmin()) if rule == "least" else int(np.flatnonzero(means - means.min() <= error)[-1])
+    best, ridges = int(means.argmin()), tuple(float(estimator.ridge) for estimator in estimators)
+    error = (squares - squares[:, [best]]).std(axis=0, ddof=1) / np.sqrt(len(folds))
+    taken = best if rule == "least" else int(np.flatnonzero(means - means.min() <= error)[-1])
     return RidgeChoice(ridges[taken], ridges, tuple(means.tolist()), tuple(error.tolist()), rule)
 
 
@@ -179,9 +176,8 @@ def _held_out_squares(
     logs, own = [x for x in blocks if x.fold == fold], [x for x in parts if x.fold == fold]
     fitted = []
     for estimator in estimators:
-        fitted.append(
-            calibration_at(assembly, estimator.minimize(assembly.problem), fitter.robot, fitter.builder, loss)
-        )
+        found = estimator.minimize(assembly.problem)
+        fitted.append(calibration_at(assembly, found, fitter.robot, fitter.builder, loss))
         if done is not None:
             done(1)
     return np.array([left.error / max(left.rows, 1) for left in sum_residuals(fitter.builder, logs, own, fitted)])

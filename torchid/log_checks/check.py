@@ -28,6 +28,7 @@ from torchid.log_checks.findings import (
     channel_groups,
     channel_names,
     median_step,
+    refused,
 )
 from torchid.log_checks.forces import check_forces_against_urdf
 from torchid.log_checks.frozen import check_excitation, check_repeats, check_still_base
@@ -192,7 +193,7 @@ def _longest_standing(log: Log, robot: Robot, contacts: Sequence[Contact]) -> tu
     try:
         return longest_standing(log, robot, contacts), []
     except InputError as error:
-        return log, [Finding("does not fit", REJECTED, error.field, error.found, f"give {error.accepted}")]
+        return log, [refused(error)]
 
 
 def _was_interpolated(finding: Finding | Skipped, missing: Sequence[Finding]) -> bool:

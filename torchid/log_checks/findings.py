@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from torchid.errors import InputError
 from torchid.logs import Log
 from torchid.logs.log import CONTACT_READINGS, NORMALS, BoolArray, FloatArray, column_labels
 from torchid.parameters import WRENCH_COMPONENTS
@@ -84,6 +85,11 @@ class Finding:
         for span in self.spans:
             mask[span.first : span.last + 1] = True
         return mask
+
+
+def refused(error: InputError) -> Finding:
+    """A finding about a log that a fit would refuse with this error."""
+    return Finding("does not fit", REJECTED, error.field, error.found, f"give {error.accepted}")
 
 
 @dataclass(frozen=True)

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache
+from itertools import product
 
 import numpy as np
 import torch
 
 from torchid.errors import InputError, join_names
-from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, Finding, Skipped
+from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, Finding, Skipped, refused
 from torchid.log_checks.lag_and_tilt import check_lag_and_tilt, check_torque_offsets, without_lag
 from torchid.log_checks.mistakes import possible_mistakes
 from torchid.log_checks.model import (
@@ -108,25 +109,23 @@ def check_forces_against_urdf(
         log = with_delayed_torques(log, model.declared.known_delay)
         logs = preprocess_pieces(log, cutoff)
     except InputError as error:  # too short, or sampled too slowly by its time stamps
-        refused = Finding("does not fit", REJECTED, error.field, error.found, f"give {error.accepted}")
-        skipped = Skipped(_FORCE_CHECK, f"{error.field}: {error.found}") if required is None else refused
+        skipped = Skipped(_FORCE_CHECK, f"{error.field}: {error.found}") if required is None else refused(error)
         yield _time_scale_finding(_fit_time_scale(log, model)) or skipped
         return
     try:
         samples = bind_some_samples(logs, robot, contacts)
     except InputError as error:
-        yield Finding("does not fit", REJECTED, error.field, error.found, f"give {error.accepted}")
+        yield refused(error)
         return
-    if required is not None:
-        try:
-            for part in samples:
-                require_forces(part, robot, contacts, required)
-        except InputError as error:
-            yield Finding("does not fit", REJECTED, error.field, error.found, f"give {error.accepted}")
+    try:
+        for part, sensors in product(samples, [] if required is None else [required]):
+            require_forces(part, robot, contacts, sensors)
+    except InputError as error:
+        yield refused(error)
     if log.joint_torque is None and log.contact_wrench is None:
         yield Skipped(_FORCE_CHECK, "neither joint torques nor contact wrenches")
-        return
-    yield from _misfit_findings(log, samples, model, cutoff, derived)
+    else:
+        yield from _misfit_findings(log, samples, model, cutoff, derived)
 
 
 def _misfit_findings(

@@ -20,8 +20,11 @@ _ORDERS = {b"\x00\x01IM": "<", b"\x01\x00MI": ">"}  # of bytes, by version and m
 _FLAGS, _MATRIX, _COMPRESSED, _OBJECT = 6, 14, 15, 17
 _NUMBERS, _WHOLE = {*range(1, 8), 9, 12, 13}, {5, 6}
 #: Kinds of elements in an array, by its class: cells and structures hold arrays, characters texts, the rest numbers.
-_INSIDE = dict.fromkeys(range(6, 16), _NUMBERS) | dict.fromkeys((1, 2, 3, _OBJECT), {*_NUMBERS, _MATRIX})
-_INSIDE[4] = {*_NUMBERS, 16, 17, 18}
+_INSIDE = (
+    dict.fromkeys(range(6, 16), _NUMBERS)
+    | dict.fromkeys((1, 2, 3, _OBJECT), {*_NUMBERS, _MATRIX})
+    | {4: {*_NUMBERS, 16, 17, 18}}
+)
 _OF_NUMBERS = 4  # elements: flags, shape, name, numbers
 _MOST_AXES, _COMPLEX = 8, 0x800
 #: Elements in a file, arrays and their parts, those in structures too: some four for each array.
