@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import pytest
 from foreign_robots import DIALECTS, Motion, compared, moved, recorded_fields
 from synthetic import G1, ROBOTS
@@ -62,3 +63,20 @@ def test_all_that_was_recorded_is_found_with_its_numbers(tmp_path: Path, robot: 
     assert {bodies[one.frame][0] for one in config.contacts} == {bodies[foot][0] for foot in feet}
     assert config.robot.fixed_base == (not feet)
     assert not any("joint" in text or "forces" in text for text in said.missing if "detected" not in text)
+
+
+@pytest.mark.parametrize("oriented", [True, False])
+def test_balls_roll_where_the_log_says_where_the_ground_is(tmp_path: Path, oriented: bool) -> None:
+    """Without an orientation of the base, a fit refuses balls that roll, so that the file has none."""
+    log = motion_of("hyq").log
+    arrays = {name: getattr(log, name) for name in ("time", "joint_position", "joint_velocity", "joint_torque")}
+    arrays |= {"imu_specific_force": np.tile([0.0, 0.0, 9.81], (len(log), 1)), "contact_active": log.contact_active}
+    arrays |= {"imu_angular_velocity": np.zeros((len(log), 3))} | (
+        {"base_quat_xyzw": log.base_quat_xyzw} if oriented else {}
+    )
+    names = {"joint_names": np.array(log.joint_names), "contact_names": np.array(log.contact_names)}
+    np.savez(tmp_path / "log.npz", **arrays, **names)
+    said = init(ROBOTS / MACHINES["hyq"][0], tmp_path / "log.npz", tmp_path / "new.yaml")
+    scene = set_up(load_config(tmp_path / "new.yaml"))
+    assert {bool(contact.radius) for contact in scene.contacts} == {oriented}
+    assert ("radius 0, as no orientation" in str(said).replace("\n" + " " * 14, " ")) is not oriented

@@ -10,8 +10,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from textwrap import fill
 
-import yaml
-
 from torchid.commands.folder import check_free_file
 from torchid.commands.init_proposals import (
     GuessedContact,
@@ -30,9 +28,11 @@ from torchid.commands.init_proposals import (
     split_log,
     stated_contacts,
     unreadable,
+    without_rolling,
 )
 from torchid.commands.reading import memory_needed
 from torchid.config.preprocessing import PreprocessingConfig
+from torchid.config.yaml_text import inline_yaml, yaml_lines
 from torchid.errors import ConfigError, InputError, LogError, about_file, excerpt, format_count, join_names
 from torchid.fitting.checked_settings import is_along_base
 from torchid.logs import Columns, Log, Topics, read_log
@@ -60,7 +60,6 @@ _WHAT = {
     "topics": "what the messages of the bag hold: docs/bags.md",
 }
 _WELDED = "joints that the log lacks, held still; one that moves needs readings"
-_LINE = 118
 
 
 @dataclass
@@ -115,6 +114,7 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> Initiated:
     contacts, fields, proposal = _of_bag(part.file, robot) if is_bag else _of_columns(files, robot)
     out = Initiated(target)
     _state_flags(contacts, fields, proposal)
+    contacts = contacts if _knows_ground(robot, contacts, fields) else without_rolling(contacts, robot)
     read = _try(path, proposal)
     gaps = keys_for_gaps(read) | keys_for_length(read)
     split = split_log(read, "base_motion" in _from_feet(contacts, fields))
@@ -223,6 +223,10 @@ def _is_fixed(contacts: Sequence[GuessedContact], fields: set[str]) -> bool:
     return not contacts and not {*_POSE, *_IMU} & fields
 
 
+def _knows_ground(robot: Robot, contacts: Sequence[GuessedContact], fields: set[str]) -> bool:
+    return robot.fixed_base or bool(set(_POSE) & fields) or "base_motion" in _from_feet(contacts, fields)
+
+
 def _lacks_base_motion(contacts: Sequence[GuessedContact], fields: set[str]) -> bool:
     pose = set(_POSE) & fields and "base_position_world" in fields
     return not _is_fixed(contacts, fields) and not pose and not set(_IMU) <= fields
@@ -256,7 +260,11 @@ def _describe(
     _describe_found(out, robot, contacts, fields, proposal)
     out.guessed += [f"{key}: {note}" for key, note in proposal.notes.items()]
     if contacts:
-        out.guessed.append("contacts: from names or balls of links; point where there is a ball or more than two")
+        balls = "; radius 0, as no orientation says where the ground is that balls roll on"
+        out.guessed.append(
+            "contacts: from names or balls of links; point where there is a ball or more than two"
+            + balls * any(contact.radius == 0.0 for contact in contacts)
+        )
     if _is_fixed(contacts, fields) and not robot.fixed_base:
         out.guessed.append("robot.fixed_base: true, as there is neither a foot nor a motion of the base")
     if held := _held(robot, proposal):
@@ -286,11 +294,9 @@ def _describe_found(
     """The robot, and what of a map there is."""
     frames = join_names([contact.frame for contact in contacts])
     out.found.append(f"{len(robot.joint_names)} joints" + f", contacts {frames}" * bool(contacts))
-    if proposal.key == "topics":
-        known = list(proposal.columns)
-    else:
-        names = [name for name in proposal.columns if name in fields]
-        known = [name for name in names if not name.endswith(("_order", "_name", "ignore"))]
+    no_fields = ("_order", "_name", "ignore")
+    of_map = [name for name in proposal.columns if name in fields and not name.endswith(no_fields)]
+    known = list(proposal.columns) if proposal.key == "topics" else of_map
     if known:
         out.found.append(f"{proposal.key} of {', '.join(known)}")
 
@@ -337,32 +343,34 @@ def _text(
     own |= {"weld": weld} if (weld := _weld(robot, proposal)) else {}
     names = f"{excerpt(log.name)} and {excerpt(robot.path.name)}"
     lines = [f"# {names}, by torchid init; what is marked as guessed should be checked"]
-    lines += _entry("robot", own)
+    lines += yaml_lines("robot", own)
     lines += [f"  # guessed: weld: {_WELDED}"] * bool(weld)
     if contacts:
         lines.append("contacts:  # guessed: from names of links")
-        lines += [f"  - {_flow({'frame': contact.frame, 'type': contact.type})}" for contact in contacts]
+        lines += [f"  - {inline_yaml(contact.entry)}" for contact in contacts]
     name = _relative(log, output)
     whole = split_range(log).range is not None or not split.has_test
-    lines += ["logs:", f"  train: {_flow([name if whole else f'{name}[:80%]'])}"]
-    lines += [] if whole else [f"  test: {_flow([f'{name}[80%:]'])}"]
+    lines += ["logs:", f"  train: {inline_yaml([name if whole else f'{name}[:80%]'])}"]
+    lines += [] if whole else [f"  test: {inline_yaml([f'{name}[80%:]'])}"]
     if proposal.columns:
         lines.append(f"  {proposal.key}:  # {_WHAT[proposal.key]}")
         for key, value in proposal.columns.items():
             note = proposal.notes.get(key, "")
             lines += [f"    # guessed: {note}"] if note else []
-            lines += [f"    {line}" for line in _entry(key, value)]
+            lines += [f"    {line}" for line in yaml_lines(key, value)]
         remark, entries = like_torques(proposal.like_torques)
         lines += [
-            f"    # {line}" for line in [remark, *(x for one in entries for x in _entry("joint_torque", one))] if line
+            f"    # {line}"
+            for line in [remark, *(x for one in entries for x in yaml_lines("joint_torque", one))]
+            if line
         ]
     lines += [f"# {' and '.join(from_feet)}: not recorded"] if from_feet else []
     lines += [f"# {key}: {why}" for key, (_, why) in gaps.items()]
     stated = {key: value for key, (value, _) in gaps.items()}
-    lines += _entry("preprocessing", {"cutoff_hz": "auto"} | from_feet | stated)
-    lines += _entry("sensors", sensors)
-    lines += _entry("estimator", {"name": "consistent", "ridge": split.ridge})
-    lines += _entry("output", f"runs/{output.stem}")
+    lines += yaml_lines("preprocessing", {"cutoff_hz": "auto"} | from_feet | stated)
+    lines += yaml_lines("sensors", sensors)
+    lines += yaml_lines("estimator", {"name": "consistent", "ridge": split.ridge})
+    lines += yaml_lines("output", f"runs/{output.stem}")
     return "\n".join(lines) + "\n"
 
 
@@ -381,20 +389,3 @@ def _weld(robot: Robot, proposal: MapProposal) -> list[str] | dict[str, float]:
 
 def _relative(path: Path, output: Path) -> str:
     return os.path.relpath(os.path.abspath(path), os.path.abspath(output.parent))
-
-
-def _flow(value: object) -> str:
-    """A value on one line, as YAML."""
-    text = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=10**6, allow_unicode=True)
-    return text.removesuffix("\n").removesuffix("\n...")
-
-
-def _entry(key: str, value: object) -> list[str]:
-    """A key with its value, short ones on one line; a column alone is its name."""
-    if isinstance(value, dict) and set(value) == {"column"}:
-        value = value["column"]
-    line = f"{key}: {_flow(value)}"
-    if len(line) <= _LINE - 4 or not isinstance(value, (dict, list)):
-        return [line]
-    block = yaml.safe_dump({key: value}, default_flow_style=None, sort_keys=False, width=_LINE - 4, allow_unicode=True)
-    return block.splitlines()

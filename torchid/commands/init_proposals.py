@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,12 @@ class GuessedContact:
 
     frame: str
     type: str
+    radius: float | None = None
+
+    @property
+    def entry(self) -> dict[str, object]:
+        """As in the file."""
+        return {key: value for key, value in vars(self).items() if value is not None}
 
 
 def stated_contacts(sample: Any, robot: Robot) -> list[str]:
@@ -73,6 +79,13 @@ def guess_contacts(robot: Robot, stated: Sequence[str], texts: Sequence[str]) ->
     frames = frames or _balls_of_limbs(robot, shapes)
     flat = len(frames) < 3
     return [GuessedContact(x, "flat" if flat and shapes.about(x) is None else "point") for x in frames]
+
+
+def without_rolling(contacts: Sequence[GuessedContact], robot: Robot) -> list[GuessedContact]:
+    """The same with balls that do not roll, as of a log without the orientation that says where the ground is."""
+    shapes = CollisionShapes(robot)
+    rolling = [contact.type == "point" and shapes.about(contact.frame) is not None for contact in contacts]
+    return [replace(x, radius=0.0) if rolls else x for x, rolls in zip(contacts, rolling, strict=True)]
 
 
 def _balls_of_limbs(robot: Robot, shapes: CollisionShapes) -> list[str]:

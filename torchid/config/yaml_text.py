@@ -1,4 +1,4 @@
-"""The text of a settings file: bounds on what YAML may unfold to, and where it is no YAML."""
+"""The text of a settings file: bounds on what YAML may unfold to, where it is no YAML, and how values are written."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ _NUMBERS = ("int", "float", "bool", "null")
 
 #: Characters that YAML keeps for itself, and what its reader says of them.
 _RESERVED, _CANNOT_BEGIN = "%@`", "cannot start any token"
+_WIDTH = 114  # of a line that is written, without its indent
 _BRACKETS = '; names with brackets take quotes in a list: ["walk.npz[0:30]"]'
 
 
@@ -114,3 +115,20 @@ def explain_syntax(error: yaml.MarkedYAMLError, text: str, wanted: str) -> tuple
         why += f" from line {error.context_mark.line + 1} on"
     found = f"{where}, column {mark.column + 1}: {why}" + f", in '{shown}'" * bool(shown)
     return found, wanted + _BRACKETS * ("flow sequence" in why)
+
+
+def inline_yaml(value: object) -> str:
+    """A value on one line, as YAML."""
+    text = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=10**6, allow_unicode=True)
+    return text.removesuffix("\n").removesuffix("\n...")
+
+
+def yaml_lines(key: str, value: object) -> list[str]:
+    """A key with its value, short ones on one line; a column alone is its name."""
+    if isinstance(value, dict) and set(value) == {"column"}:
+        value = value["column"]
+    line = f"{key}: {inline_yaml(value)}"
+    if len(line) <= _WIDTH or not isinstance(value, (dict, list)):
+        return [line]
+    block = yaml.safe_dump({key: value}, default_flow_style=None, sort_keys=False, width=_WIDTH, allow_unicode=True)
+    return block.splitlines()
