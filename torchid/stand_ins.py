@@ -27,6 +27,8 @@ def unused_modules_apart() -> Iterator[None]:
     sys.modules.update(absent)
     try:
         yield
+        if "torch" in sys.modules:
+            import_module("torch._prims.rng_prims")  # torch's registrations do; without it no torch.Generator is made
     finally:
         for module in absent.values():
             module.leave()
