@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from torchid.errors import join_names
+from torchid.errors import format_percent, join_names
 from torchid.estimators import ConsistentEstimate, Estimate, SgdEstimate
 from torchid.estimators.posterior import NominalError
 from torchid.fitting.calibration import list_confounded
@@ -65,7 +65,7 @@ class ErrorComparison:
         if not ratios:
             return f"Nothing to compare with the {self.of} on {self.text}"
         least, most = min(ratios), max(ratios)
-        shares = f"{_percent(least)} to {_percent(most)} %" if most > 1.1 * least else f"{_percent(most)} %"
+        shares = f"{format_percent(least)} to " * (most > 1.1 * least) + f"{format_percent(most)} %"
         within = (text for limits, text in _VERDICTS.items() if least < limits[0] and most < limits[1])
         verdict = next(within, _NO_BETTER)
         known = [after / floor for _, _, after, floor in self.errors() if floor]
@@ -80,10 +80,6 @@ class ErrorComparison:
         few = len(list(self.errors())) < _FEW_GROUPS  # no joint of its own, as all legs stand: their projection
         errors = self.errors(tuple(ERROR_GROUPS) if few else DECISIVE_GROUPS)
         return [(self.identified.label(group), before, after, floor) for group, before, after, floor in errors]
-
-
-def _percent(share: float) -> str:
-    return f"{100.0 * share:.0f}" if share >= 0.1 else f"{100.0 * share:.2g}"
 
 
 _LARGER_THAN_MEASURED = 1.05  # errors over the measured, of sensors that any fit of their limb explains better

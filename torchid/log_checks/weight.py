@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from torchid.errors import format_percent
 from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, Finding, Skipped, median_step, widen_mask
 from torchid.log_checks.model import recorded_link_poses
 from torchid.logs import Log
@@ -66,9 +67,8 @@ def _weight_findings(carried: float, when: str, field: str, robot: Robot | None)
         return
     nominal = float(robot.nominal[:, 0].sum())
     ratio = mass / nominal
-    text = (
-        f"contacts carry {mass:.4g} kg {when}, the {robot.format} weighs {nominal:.4g} kg ({100 * (ratio - 1):+.2g} %)"
-    )
+    more = format_percent(ratio - 1.0, "+")
+    text = f"contacts carry {mass:.4g} kg {when}, the {robot.format} weighs {nominal:.4g} kg ({more} %)"
     if units := units_of_ratio(ratio, ("force",)):
         text = f"contacts carry {ratio:.3g} of the weight {when}: forces in {' or '.join(units)}?"
         yield Finding("unit", REJECTED, field, text, "convert forces to N and moments to N m")
