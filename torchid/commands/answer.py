@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from torchid.config.logs import tests_on_seen_samples
 from torchid.errors import format_percent, join_names
 from torchid.estimators import ConsistentEstimate, Estimate, SgdEstimate
 from torchid.estimators.posterior import NominalError
@@ -125,8 +126,10 @@ def answer(run: Identification) -> Answer:
 def _judge(run: Identification) -> ErrorComparison:
     of = run.experiment.robot.format
     if "test" in run.metrics:
-        names = [log_title(path) for path in run.experiment.config.logs.test]
-        text = f"unseen motion ({join_names(names, 2)})"
+        files = run.experiment.config.logs
+        names = [log_title(path) for path in files.test]
+        motion = "motion that the fit has seen" if tests_on_seen_samples(files) else "unseen motion"
+        text = f"{motion} ({join_names(names, 2)})"
         return ErrorComparison(text, run.metrics["test"].nominal, run.metrics["test"].identified, of)
     if run.validation is not None:
         text = f"blocks of the training logs, each left out of the fit ({run.validation.folds})"
