@@ -46,7 +46,7 @@ _SPELLINGS = {
 }  # fmt: skip
 _DEGREES = re.compile(
     r"(?<![A-Za-z])([Dd]egrees?|[Dd]egrés|[Gg]ra(dos|di|us)|Grad)(?![A-Za-z])"
-)  # a grad is 0.9 of one
+)  # 1 grad is 0.9
 _PER_MINUTE = re.compile(r"(U|r|tr|giri|1) ?/ ?min", re.IGNORECASE)
 _MARKS = re.compile(r"[ ·.*^]")
 _POWERS = {"s-1": "/s", "s-2": "/s2", "/s/s": "/s2", "N-m": "Nm", "nm": "Nm"}
