@@ -27,7 +27,6 @@ from torchid.errors import (
     one_line,
 )
 from torchid.staging import interrupts_deferred, list_written, reset_written, termination_as_interrupt
-from torchid.stand_ins import unused_modules_apart
 
 #: Errors of the system, not of the user's files or the program: no room, no memory, no permission.
 _MACHINE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.EMFILE)
@@ -213,7 +212,7 @@ def importing() -> Iterator[None]:
     collects = gc.isenabled()
     gc.disable()  # a seventh of the time of all imports
     try:
-        with interrupts_deferred(), unused_modules_apart():
+        with interrupts_deferred():
             yield
     finally:
         gc.freeze()  # later looks, and those when Python ends, are a sixth of the processor time of the demo

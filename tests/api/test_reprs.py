@@ -113,7 +113,7 @@ def test_no_repr_is_longer_than_ten_lines(things: Mapping[str, object]) -> None:
         ("identification", "data        1250 samples of 1 log"),
         ("identification", "total mass  21.431 ± 0.054 kg (URDF: 20.800 kg)"),
         ("identification", "written to  no folder"),
-        ("body estimate", "± 0.0068 kg m, identified"),
+        ("body estimate", "± 0.007 kg m, identified"),
         ("metrics", "Metrics: joint torque 0.0721 N m (6.8 %), base force 0.596 N (0.49 %), base moment 0.145 N m"),
         ("evaluation", "sway_test: joint torque 0.0721 against 0.362 N m"),
         ("analysis", "cost 12"),

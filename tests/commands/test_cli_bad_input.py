@@ -249,8 +249,8 @@ FILES: dict[str, tuple[Edit, tuple[str, ...]]] = {
     "no training log": (edit_config(logs={"train": []}), ("logs.train", "at least one")),
     "log missing": (edit_config(logs={"train": ["nowhere.npz"]}), ("nowhere.npz",)),
     "unknown log type": (
-        both(write("log.mat", b"x"), edit_config(logs={"train": ["log.mat"]})),
-        ("log.mat", ".npz"),
+        both(write("log.wav", b"x"), edit_config(logs={"train": ["log.wav"]})),
+        ("log.wav", ".npz"),
     ),
     "base lost": (
         edit_config(sensors={"joint_torques": ["front_left_hip", "front_left_thigh"]}),

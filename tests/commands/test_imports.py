@@ -39,29 +39,6 @@ def test_what_a_command_imports_is_never_looked_through_for_garbage_again(
     assert found.stdout.splitlines()[1:] == ["True True True"], "but by whoever calls it as a function and goes on"
 
 
-def test_what_commands_leave_out_of_libraries_is_there_for_whoever_uses_it() -> None:
-    code = """
-import sys
-from torchid.boundary import importing
-unused = ("torch._meta_registrations", "scipy.stats", "scipy.ndimage", "networkx", "mujoco")
-with importing():
-    import torchid.commands.identify
-import torch
-from torchid.logs.low_pass import import_signal
-signal = import_signal()
-print([name for name in unused if name in sys.modules], torch.Generator().manual_seed(3).initial_seed())
-import numpy as np, pytorch_kinematics, torch._meta_registrations, trimesh
-print(len(trimesh.graph.vertex_adjacency_graph(trimesh.creation.box())))
-print(signal.savgol_filter(np.arange(9.0), 5, 1)[4].round(9))
-print(np.diff(signal.find_peaks_cwt(np.sin(np.arange(0.0, 10.0 * np.pi, 0.1)), np.arange(5, 20))))
-robot = "<mujoco><worldbody><body name='arm'><geom size='1'/></body></worldbody></mujoco>"
-print(pytorch_kinematics.build_chain_from_mjcf(robot).n_joints, torch._meta_registrations.meta_index_Tensor.__name__)
-print([name for name in unused if name not in sys.modules])
-"""
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.splitlines()
-    assert out == ["[] 3", "8", "4.0", "[62 63 63 63]", "0 meta_index_Tensor", "[]"]
-
-
 def test_a_process_of_a_command_ends_with_all_of_its_output_and_its_status(
     found: subprocess.CompletedProcess[str], tmp_path: Path
 ) -> None:

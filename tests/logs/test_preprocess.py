@@ -179,7 +179,7 @@ def test_very_short_logs_are_differentiated_as_well_as_they_can_be(samples: int)
     ("time", "arguments", "found"),
     [
         (uniform(4 / RATE), {}, "4 samples; accepted: at least 5"),
-        (uniform(1 / RATE), {"sample_rate_hz": 10.0}, "1 samples"),
+        (uniform(1 / RATE), {"sample_rate_hz": 10.0}, "1 sample;"),
         (uniform(0.1), {"cutoff_hz": 20.0}, "0.098 s (50 samples); accepted: more than 0.2 s"),
         (uniform(10 / RATE), {"cutoff_hz": 200.0}, "10 samples"),
         (np.append(uniform(), 5.0), {}, "a step of 1.002 s after sample 1999"),

@@ -12,7 +12,7 @@ NARROWEST, WIDEST = 0.01, 10.0
 """Errors of nominal bodies, as shares of them, that are considered."""
 
 WIDTHS = np.geomspace(NARROWEST, WIDEST, 300)  # 2.3 % each
-_LEAST_NOISE = 1e-8  # of rows without any, as a share of the rms of the right-hand side
+_LEAST_NOISE = 1e-8  # of rows without any, as a share of the rms of the forces
 
 
 def nominal_spread(problem: LinearProblem, noise: float) -> Array:
@@ -28,8 +28,11 @@ def nominal_spread(problem: LinearProblem, noise: float) -> Array:
     """
     columns = problem.A[:, problem.free] * problem.scale[problem.free]
     target = problem.b - problem.A @ problem.nominal
-    noise = max(noise, _LEAST_NOISE * float(np.linalg.norm(problem.b)) / max(problem.rows, 1) ** 0.5, 1e-300)
     place, spread = np.flatnonzero(problem.free) % PER_BODY, np.zeros(columns.shape[1])
+    size = max(float(np.linalg.norm(problem.b)), float(np.linalg.norm(columns)))
+    if size == 0.0:
+        return spread
+    noise = max(noise, _LEAST_NOISE * size / max(problem.rows, 1) ** 0.5)
     of_friction = (place >= FRICTION.start) & (place < FRICTION.stop)
     for group in (~of_friction, of_friction):
         rows = without(columns[:, ~group], np.column_stack([columns[:, group], target])) / noise

@@ -238,8 +238,9 @@ def with_estimated_noise(scene: S, estimated: Mapping[str, Any], any_stated: boo
 
 def require_device(device: str) -> None:
     """Refuse a device that this machine has not; it is not connected to: copies, which read logs, could not be made."""
-    chosen = torch.device(device)
-    if chosen.type == "cuda" and not (torch.cuda.is_available() and (chosen.index or 0) < torch.cuda.device_count()):
+    kind, _, index = device.partition(":")
+    gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if device != "cpu" and not (kind == "cuda" and int(index or 0) < gpus):
         raise ConfigError.at_field("device", f"'{device}' is not available here", "cpu, cuda, cuda:0, ...")
 
 

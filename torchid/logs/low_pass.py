@@ -10,7 +10,6 @@ from types import ModuleType
 import numpy as np
 
 from torchid.logs.log import FloatArray
-from torchid.stand_ins import unused_modules_apart
 
 #: Order of the Butterworth filter, which runs forward and backward: the gain at the cutoff is 1/2.
 FILTER_ORDER = 4
@@ -32,8 +31,8 @@ _FILTERED_AT_ONCE = 2**16
 @cache
 def import_signal() -> ModuleType:
     """`scipy.signal`: it takes 0.1 s, which runs that find their samples in a cache, or draw nothing, need not."""
-    with unused_modules_apart():
-        from scipy import signal
+    from scipy import signal
+
     return signal
 
 

@@ -43,9 +43,9 @@ def wrap_words(text: str, width: int, indent: str = "", most: int | None = None)
     kept = " ".join(line.strip() for line in (*before, last))
     for end in "; ", ", ":
         clause = kept.rfind(end)
-        if clause >= len(kept) / 2:
-            *before, last = wrap(kept[: clause + 1], room, **options)
-            break
+        shorter = wrap(kept[: clause + 1] + CUT, room, **options)
+        if clause >= len(kept) / 2 and len(shorter) <= most:
+            return shorter
     return [*before, last + CUT]
 
 
