@@ -237,3 +237,9 @@ def join_names(names: Sequence[str], most: int = 4) -> str:
 def format_count(count: int, what: str) -> str:
     """A number with its noun, as in "1 gap" and "3 gaps"."""
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
+
+
+def format_percent(share: float, sign: str = "") -> str:
+    """A share in percent, to two digits or whole, as in "8.3", "83" and "830"; `sign`: "+" for that of gains, too."""
+    percent = 100.0 * share
+    return f"{percent:{sign}.2g}" if abs(percent) < 99.5 else f"{percent:{sign}.0f}"

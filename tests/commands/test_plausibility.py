@@ -20,7 +20,7 @@ from torchid.cli import main
 from torchid.commands.plausibility import force_gain, implausibility, is_implausible_factor
 from torchid.estimators import LeastSquares
 from torchid.identifiability.confounding import TotalMass
-from torchid.log_checks import Checked
+from torchid.log_checks import REJECTED, SUSPICIOUS, Checked, Finding, Span
 from torchid.log_checks.check import check
 from torchid.logs import Log
 from torchid.problem import (
@@ -195,7 +195,9 @@ def test_logs_are_checked_once_for_all_doubts_of_a_fit(
 
     def counted(log: Log, *settings: Any) -> Checked:
         checked.append(len(log))
-        return replace(check(log, *settings), findings=())
+        zero = Finding("offset", SUSPICIOUS, "joint_torque", "reads 1 N m too much", "check its zero")
+        untouched = Finding("force without contact", REJECTED, "contact_active", "never set", "set it")
+        return replace(check(log, *settings), findings=(zero, replace(untouched, spans=(Span(0, 299, "foot"),))))
 
     monkeypatch.setattr("torchid.commands.plausibility.check", counted)
     overrides = [*changed(tmp_path, late_torques_of_a_knee), "estimator.ridge=0.001"]
@@ -204,6 +206,7 @@ def test_logs_are_checked_once_for_all_doubts_of_a_fit(
     assert "forces differ from any rigid-body model" in told
     assert "predict worse than the URDF's" in told
     assert len(checked) == 1
+    assert told.count("torchid check finds in train.npz: contact_active: never set") == 2, "the most severe"
 
 
 @pytest.mark.parametrize(("factor", "stops"), [(1.0, False), (3.0, False), (-1.0, True), (1e3, True), (1e-3, True)])

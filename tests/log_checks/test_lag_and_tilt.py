@@ -105,6 +105,13 @@ def test_a_world_whose_z_axis_is_level_is_named_with_the_axis_that_points_up(
         assert finding.found.endswith(f"a world whose {axis} axis points up?")
 
 
+def test_forces_that_nobody_measured_have_no_offset_and_no_warning() -> None:
+    log = demo_log()
+    torque, wrench = (np.full_like(value(x), np.nan) for x in (log.joint_torque, log.contact_wrench_local))
+    unmeasured = of_demo(replace(log, joint_torque=torque, contact_wrench_local=wrench))
+    assert not [one for one in unmeasured.findings if one.name == "offset"]
+
+
 def test_an_arm_on_a_table_that_slants_is_told_so() -> None:
     case = case_of(MACHINES["arm"], "contacts")
     gravity = Rotation.from_rotvec(np.radians([0.0, 12.0, 0.0])).apply([0.0, 0.0, -9.81])

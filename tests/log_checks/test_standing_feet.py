@@ -29,6 +29,16 @@ def test_feet_that_stand_give_no_finding() -> None:
     assert findings(STANCE.measured) == []
 
 
+def test_feet_that_move_as_much_as_the_base_have_shares_without_an_exponent() -> None:
+    """One of 99.5 % and more has three digits."""
+    log = STANCE.measured
+    position = value(log.base_position_world) * 3.0
+    (finding,) = findings(replace(log, base_position_world=position))
+    shares = re.findall(r"_foot (\S+) %", finding.found)
+    assert max(map(float, shares)) >= 100.0
+    assert all(share.isdigit() for share in shares), finding.found
+
+
 @pytest.mark.parametrize("axis", range(3))
 def test_the_pose_in_a_left_handed_world_is_named_with_its_axis(axis: int) -> None:
     signs = np.where(np.arange(3) == axis, -1.0, 1.0)

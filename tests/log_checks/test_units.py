@@ -87,6 +87,12 @@ def test_an_accelerometer_in_si_units_is_in_none_other(gravity: float) -> None:
     assert not found(check(shaken(1.0, gravity)), "unit")
 
 
+def test_gravity_that_was_taken_out_is_missed_without_rest() -> None:
+    assert not found(check(shaken(1.0)), "gravity")
+    finding = only(check(shaken(1.0, 0.0)), "gravity", "imu_specific_force")
+    assert (finding.severity, "gravity has been taken out" in finding.found) == (REJECTED, True)
+
+
 @pytest.mark.parametrize("unit", slow_but(["Ncm", "kgm"], ["Ncm", "kgcm", "kgm", "kNm"]))
 def test_joint_torques_in_another_unit_are_named(unit: str) -> None:
     checked = of_demo(scaled(demo_log().select(slice(0, 600)), "joint_torque", 1.0 / UNITS["torque"][unit]))

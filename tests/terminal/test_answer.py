@@ -72,6 +72,13 @@ def test_the_errors_on_unseen_motion_come_first_with_the_noise(consistent: Ident
     assert str(consistent.experiment.config.output) in " ".join(said.split("\n")[-1:])
 
 
+def test_errors_on_motion_that_was_fitted_are_not_those_of_unseen_motion(consistent: Identification) -> None:
+    config = consistent.experiment.config
+    fitted = replace(config, logs=replace(config.logs, test=config.logs.train))
+    said = text(replace(consistent, experiment=replace(consistent.experiment, config=fitted)))
+    assert said.startswith("Much better than the URDF on motion that the fit has seen (sway_train.npz)")
+
+
 def test_without_test_logs_blocks_left_out_are_judged_and_the_text_says_so(free: Identification) -> None:
     first = text(free).split("rms error of")[0].replace("\n", " ")
     assert "blocks of the training logs, each left out of the fit (5)" in first

@@ -84,6 +84,13 @@ def test_a_check_that_logs_lack_for_several_reasons_is_named_once() -> None:
     assert f"not checked 1 check: forces against the model ({reasons})" in text([checked("a"), still, checked("b")])
 
 
+def test_a_check_that_logs_lack_for_reasons_that_differ_in_a_number_is_named_with_one() -> None:
+    logs = [replace(checked("a"), skipped=(Skipped("noise", f"of l_foot1: {x} samples"),)) for x in ("12", "3.4e+05")]
+    assert "not checked 1 check: noise (of l_foot1: 12 samples or alike)" in text(logs)
+    others = [replace(log, skipped=(Skipped("noise", f"of l_foot{k}"),)) for k, log in enumerate(logs)]
+    assert "(of l_foot0, 1 of 2 logs; of l_foot1, 1 of 2 logs)" in text(others), "which are names"
+
+
 @pytest.mark.parametrize("width", [60, 100])
 def test_every_finding_is_shown_or_counted(width: int) -> None:
     names = [f"kind_{k}" for k in range(12)]

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from torchid.errors import join_names
+from torchid.config.logs import tests_on_seen_samples
+from torchid.errors import format_percent, join_names
 from torchid.estimators import ConsistentEstimate, Estimate, SgdEstimate
 from torchid.estimators.posterior import NominalError
 from torchid.fitting.calibration import list_confounded
@@ -65,7 +66,7 @@ class ErrorComparison:
         if not ratios:
             return f"Nothing to compare with the {self.of} on {self.text}"
         least, most = min(ratios), max(ratios)
-        shares = f"{_percent(least)} to {_percent(most)} %" if most > 1.1 * least else f"{_percent(most)} %"
+        shares = f"{format_percent(least)} to " * (most > 1.1 * least) + f"{format_percent(most)} %"
         within = (text for limits, text in _VERDICTS.items() if least < limits[0] and most < limits[1])
         verdict = next(within, _NO_BETTER)
         known = [after / floor for _, _, after, floor in self.errors() if floor]
@@ -80,10 +81,6 @@ class ErrorComparison:
         few = len(list(self.errors())) < _FEW_GROUPS  # no joint of its own, as all legs stand: their projection
         errors = self.errors(tuple(ERROR_GROUPS) if few else DECISIVE_GROUPS)
         return [(self.identified.label(group), before, after, floor) for group, before, after, floor in errors]
-
-
-def _percent(share: float) -> str:
-    return f"{100.0 * share:.0f}" if share >= 0.1 else f"{100.0 * share:.2g}"
 
 
 _LARGER_THAN_MEASURED = 1.05  # errors over the measured, of sensors that any fit of their limb explains better
@@ -129,8 +126,10 @@ def answer(run: Identification) -> Answer:
 def _judge(run: Identification) -> ErrorComparison:
     of = run.experiment.robot.format
     if "test" in run.metrics:
-        names = [log_title(path) for path in run.experiment.config.logs.test]
-        text = f"unseen motion ({join_names(names, 2)})"
+        files = run.experiment.config.logs
+        names = [log_title(path) for path in files.test]
+        motion = "motion that the fit has seen" if tests_on_seen_samples(files) else "unseen motion"
+        text = f"{motion} ({join_names(names, 2)})"
         return ErrorComparison(text, run.metrics["test"].nominal, run.metrics["test"].identified, of)
     if run.validation is not None:
         text = f"blocks of the training logs, each left out of the fit ({run.validation.folds})"

@@ -274,5 +274,5 @@ def _reach(robot: Robot) -> float:
     return float((away + radius).max())
 
 
-def _order(finding: Finding) -> tuple[bool, int, bool]:
-    return not finding.whole, SEVERITIES.index(finding.severity), finding.name in _GENERAL
+def _order(finding: Finding) -> tuple[int, bool, bool]:
+    return SEVERITIES.index(finding.severity), not finding.whole, finding.name in _GENERAL

@@ -232,9 +232,22 @@ def resolve_logs(logs: LogsConfig) -> LogsConfig:
         TorchidWarning: samples are tested on that had another use.
     """
     files = {key: _matching(f"logs.{key}", getattr(logs, key)) for key in SETS}
-    parts = {key: [_part(f"logs.{key}", path) for path in files[key]] for key in SETS}
-    require_apart(parts, lambda one, other: one.shares_samples(other) is True)
+    require_apart(_parts(files), _surely_share)
     return LogsConfig(**files, topics=logs.topics, columns=logs.columns, payloads=_resolved_payloads(logs))
+
+
+def tests_on_seen_samples(logs: LogsConfig) -> bool:
+    """Whether samples are tested on that are fitted on, or decide when to stop, as far as ranges alone say."""
+    parts = _parts({key: getattr(logs, key) for key in SETS})
+    return any(any(_sharing(parts, key, "test", _surely_share)) for key in ("train", "validation"))
+
+
+def _parts(files: Mapping[str, Sequence[Path]]) -> Parts:
+    return {key: [_part(f"logs.{key}", path) for path in files[key]] for key in SETS}
+
+
+def _surely_share(one: LogPart, other: LogPart) -> bool:
+    return one.shares_samples(other) is True
 
 
 def _resolved_payloads(logs: LogsConfig) -> dict[str, list[Payload]]:

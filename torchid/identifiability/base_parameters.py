@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from torchid import parameters
-from torchid.errors import BaseLostError, BaseLostWarning, NumericalWarning, join_names, warn
+from torchid.errors import BaseLostError, BaseLostWarning, NumericalWarning, format_percent, join_names, warn
 from torchid.parameters import PARAMETERS, PER_BODY, Array
 from torchid.problem import LinearProblem, RowBuilder, Samples
 from torchid.problem.chunks import chunks_by_state, one_thread, subsample_states
@@ -375,5 +375,5 @@ def _common_rank(shares: Mapping[int, float]) -> int:
 
 def _describe_rank(report: StateReport) -> str:
     """Rank of most samples, and the share of samples with rank 6."""
-    share = f", 6 in {100 * report.base_full_share:.2g} % of them" if report.base_full_share else ""
+    share = f", 6 in {format_percent(report.base_full_share)} % of them" if report.base_full_share else ""
     return f"rank {report.base_rank} of 6{share}"

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import format_count, join_names
+from torchid.errors import format_count, format_percent, join_names
 from torchid.log_checks.findings import (
     NEIGHBOUR_STEPS,
     NOTE,
@@ -146,7 +146,7 @@ def _channel_findings(group: ChannelGroup, all_repeated: BoolArray, columns: np.
         runs = _implausible_runs(values[:, None], repeated)
         small = _in_dead_band(values[:, None], runs)
         if group.field in DEAD_BAND_FIELDS and small.any():
-            dead.append((name, float(np.abs(values[values != 0.0]).min()), 100.0 * float(np.mean(values == 0.0))))
+            dead.append((name, float(np.abs(values[values != 0.0]).min()), float(np.mean(values == 0.0))))
             runs = runs.select(~small)
         for extreme in (values.min(), values.max()):
             at_limit = Runs.of_repeats(repeated & (values[1:] == extreme))
@@ -160,7 +160,7 @@ def _channel_findings(group: ChannelGroup, all_repeated: BoolArray, columns: np.
         yield _frozen_finding(group, channels, frozen, count)
     if dead:
         texts = [
-            f"{name} below {least:.3g} {channel_unit(group.field, name)} ({share:.2g} % of it)"
+            f"{name} below {least:.3g} {channel_unit(group.field, name)} ({format_percent(share)} % of it)"
             for name, least, share in dead
         ]
         advice = "switch the dead band off; a velocity may be left out, and is derived then"
@@ -193,12 +193,12 @@ def _frozen_finding(group: ChannelGroup, channels: str, frozen: _RunsByChannel, 
 def _saturated_finding(group: ChannelGroup, limits: list[tuple[str, Runs, float]]) -> Finding:
     spans = tuple(span for name, runs, _ in limits for span in _spans(group, name, runs, 0))
     names = tuple(dict.fromkeys(name for name, _, _ in limits))
-    shares = [(name, extreme, 100.0 * np.mean(group.values == extreme, axis=0)) for name, _, extreme in limits]
+    shares = [
+        (name, extreme, format_percent(float(np.mean(group.values[:, group.names.index(name)] == extreme))))
+        for name, _, extreme in limits
+    ]
     text = "stays at an extreme value: " + join_names(
-        [
-            f"{name} at {extreme:.4g} {channel_unit(group.field, name)} in {share[group.names.index(name)]:.2g} %"
-            for name, extreme, share in shares
-        ]
+        [f"{name} at {extreme:.4g} {channel_unit(group.field, name)} in {share} %" for name, extreme, share in shares]
     )
     if group.field == "joint_position":  # an end stop, or a limit of inverse kinematics
         advice = "none if these are the joints' stops; else widen the bounds of the encoder or inverse kinematics"

@@ -271,8 +271,9 @@ def fit_torque_offsets(log: Log, model: NominalModel, cutoff_hz: float) -> Devia
 
 
 def _torque_rms(log: Log) -> float:
-    """Of all joints' torques [N m or N]."""
-    return 0.0 if log.joint_torque is None else float(np.sqrt(np.nanmean(np.square(log.joint_torque))))
+    """Of all joints' torques [N m or N]; 0 where none was measured."""
+    torque = np.zeros(0) if log.joint_torque is None else log.joint_torque
+    return float(np.sqrt(np.nanmean(np.square(torque)))) if np.isfinite(torque).any() else 0.0
 
 
 def without_lag(log: Log, model: NominalModel, cutoff_hz: float) -> Log:

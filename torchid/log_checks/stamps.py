@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from torchid.errors import format_count, join_names
+from torchid.errors import format_count, format_percent, join_names
 from torchid.log_checks.findings import (
     MIN_GAP_STEPS,
     NON_SIGNAL_FIELDS,
@@ -81,7 +81,7 @@ def _missing_findings(log: Log, field: str) -> Iterator[Finding]:
         spans: tuple[Span, ...] = tuple(
             span for name, (column, _) in holes.items() for span in find_spans(nan[:, column], name)
         )
-        shares = ", ".join(f"{name} {100 * share:.2g} %" for name, (_, share) in list(holes.items())[:4])
+        shares = ", ".join(f"{name} {format_percent(share)} %" for name, (_, share) in list(holes.items())[:4])
         text = f"NaN in {format_count(len(holes), 'channel')}, {format_count(len(spans), 'time')}: {shares}"
         if field in NAN_ALLOWED:
             advice = "leave these samples out (exclude_rejected); a filter would lose the channels throughout"
@@ -149,7 +149,7 @@ def _unit_finding(median: float) -> Finding:
 
 
 def _jitter_finding(log: Log, steps: FloatArray, rms: float, largest: float, long: BoolArray) -> Finding:
-    text = f"rms {100 * rms:.2g} % of the median step, at most {100 * largest:.2g} %"
+    text = f"rms {format_percent(rms)} % of the median step, at most {format_percent(largest)} %"
     advice = "none: a filter (preprocessing.cutoff_hz) interpolates to a uniform grid"
     if _is_uniformly_sampled(log, steps, _MIN_DEVIATION_RMS * rms, long):
         text += "; the positions do not follow: the stamps jitter, not the sampling"

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation, Slerp
 
-from torchid.errors import InputError, join_names
+from torchid.errors import InputError, format_percent, join_names
 from torchid.log_checks.findings import REJECTED, SUSPICIOUS, Finding, Skipped, find_spans, median_step, widen_mask
 from torchid.log_checks.mistakes import possible_mistakes, reversed_joints
 from torchid.log_checks.model import (
@@ -82,7 +82,7 @@ def check_standing_feet(
         if trial is not None and trial < least:
             best, least = mistake, trial
     if best is not None:
-        share = f"{100 * slip:.3g} % as much as the base above them, {100 * least:.2g} % once corrected"
+        share = f"{100 * slip:.3g} % as much as the base above them, {format_percent(least)} % once corrected"
         text = f"{best.description}: standing feet move {share}"
         yield Finding("unit, sign or frame", REJECTED, best.field, text, best.advice)
     elif (found := next(other_pose, None)) is not None:
@@ -97,7 +97,7 @@ def _unexplained_motion(
     """A finding about feet that move though they stand, which no usual mistake explains, with those that move most."""
     alone = {c.frame: measure_foot_slip(log, robot, [c], poses) for c in contacts}
     moving = sorted((name for name, own in alone.items() if own), key=lambda name: -(alone[name] or 0.0))
-    most = join_names([f"{name} {100 * (alone[name] or 0.0):.2g} %" for name in moving])
+    most = join_names([f"{name} {format_percent(alone[name] or 0.0)} %" for name in moving])
     text = f"standing feet move {100 * slip:.3g} % as much as the base above them, and no usual mistake explains it"
     advice = "check signs, scales and zeros of joint positions, the base's orientation and position, and the flags"
     return Finding("standing feet", SUSPICIOUS, "all", f"{text}: {most}" if most else text, advice, tuple(moving))
@@ -114,8 +114,8 @@ def _single_foot(
     frame = min(left, key=lambda name: left[name], default="")
     if not frame or left[frame] > MAX_OTHERS_SHARE * slip:
         return
-    text = f"{frame} moves though it stands: standing feet move {100 * slip:.2g} % as much as the base above them,"
-    text += f" {100 * left[frame]:.2g} % without it"
+    text = f"{frame} moves though it stands: standing feet move {format_percent(slip)} % as much as the base above"
+    text += f" them, {format_percent(left[frame])} % without it"
     advice = "check zeros, scales and signs of the joint positions in its limb, its flags, and whether it slips"
     yield Finding("standing feet", SUSPICIOUS, "joint_position", text, advice, (frame,))
 
@@ -165,9 +165,10 @@ def _pose_finding(x: FloatArray, slip: float, left: float) -> Finding:
     parts = [f"of a point at ({at}) mm of the base link"] if x[:3].any() else []
     parts += [f"turned about it by ({turn}) degrees"] if x[3:6].any() else []
     parts += [f"{1e3 * abs(x[6]):.0f} ms {'late' if x[6] > 0.0 else 'early'}"] if x[6] else []
-    text = f"standing feet move {100 * slip:.2g} % as much as the base above them, {100 * left:.2g} % of that if the"
+    text = f"standing feet move {format_percent(slip)} % as much as the base above them, {format_percent(left)} %"
+    text += f" of that if the base's pose is {join_names(parts)}"
     advice = "give the pose of the base link itself; shift_s delays files of a log"
-    return Finding("frame", SUSPICIOUS, "base_quat_xyzw", f"{text} base's pose is {join_names(parts)}", advice)
+    return Finding("frame", SUSPICIOUS, "base_quat_xyzw", text, advice)
 
 
 def _radius_findings(
@@ -191,8 +192,8 @@ def _radius_findings(
     if least < MAX_RESIDUAL_SHARE * slip:
         found = ", ".join(f"{factor * radius:.3g}" for radius in sorted(set(unit.values())))
         stated = ", ".join(f"{radius:.3g}" for radius in sorted({c.radius for c in points}))
-        text = f"standing feet move {100 * slip:.2g} % as much as the base above them if they roll on a radius of"
-        text += f" {stated} m, {100 * least:.2g} % on {found} m"
+        text = f"standing feet move {format_percent(slip)} % as much as the base above them if they roll on a radius of"
+        text += f" {stated} m, {format_percent(least)} % on {found} m"
         advice = f"contacts: [{{frame: {points[0].frame}, type: point, radius: {found}}}, ...], if the feet are balls"
         yield Finding("radius", SUSPICIOUS, "contact_names", text, advice, tuple(c.frame for c in points))
 
@@ -352,17 +353,17 @@ def _compare(vectors: FloatArray, rates: FloatArray, omega: FloatArray) -> Itera
     offset = _least_squares(vectors, rates - np.cross(vectors, omega), np.ones((len(omega), 1)))[:, 0]
     if (rest := left(omega + offset)) < limit:
         values = ", ".join(f"{-x:.3g}" for x in offset)
-        found = f"{text}, {100 * rest:.2g} % without a steady ({values}) rad/s"
+        found = f"{text}, {format_percent(rest)} % without a steady ({values}) rad/s"
         yield Finding("offset", SUSPICIOUS, _FIELD, found, "subtract it: a gyroscope at rest reads its offset")
         return
     turned = np.cross(vectors, omega)
     factor = float((rates * turned).sum() / max(float(np.square(turned).sum()), np.finfo(float).tiny))
     if (rest := left(factor * omega)) < limit:
-        yield _factor_finding(factor, f"{text}, {100 * rest:.2g} % times {factor:.3g}")
+        yield _factor_finding(factor, f"{text}, {format_percent(rest)} % times {factor:.3g}")
         return
     matrix = _least_squares(vectors, rates, omega)
     if (rest := left(omega @ matrix.T)) < limit:
-        found = f"{text}, {100 * rest:.2g} % along other axes"
+        found = f"{text}, {format_percent(rest)} % along other axes"
         yield Finding("frame", REJECTED, _FIELD, found, "imu_frame is the frame along whose axes the IMU reads")
     elif difference > MAX_UNEXPLAINED_DIFFERENCE:
         advice = "check unit, axes and imu_frame, signs and zeros of joint positions, and the flags"

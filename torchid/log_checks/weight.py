@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from torchid.errors import format_percent
 from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, Finding, Skipped, median_step, widen_mask
 from torchid.log_checks.model import recorded_link_poses
 from torchid.logs import Log
@@ -66,9 +67,8 @@ def _weight_findings(carried: float, when: str, field: str, robot: Robot | None)
         return
     nominal = float(robot.nominal[:, 0].sum())
     ratio = mass / nominal
-    text = (
-        f"contacts carry {mass:.4g} kg {when}, the {robot.format} weighs {nominal:.4g} kg ({100 * (ratio - 1):+.2g} %)"
-    )
+    more = format_percent(ratio - 1.0, "+")
+    text = f"contacts carry {mass:.4g} kg {when}, the {robot.format} weighs {nominal:.4g} kg ({more} %)"
     if units := units_of_ratio(ratio, ("force",)):
         text = f"contacts carry {ratio:.3g} of the weight {when}: forces in {' or '.join(units)}?"
         yield Finding("unit", REJECTED, field, text, "convert forces to N and moments to N m")
@@ -121,10 +121,10 @@ def check_accelerometer(log: Log, robot: Robot | None) -> Iterator[Finding | Ski
     still = _find_rest(log)
     rests = still.sum() >= 10
     if not rests:
-        yield _accelerometer_unit_in_motion(log) or Skipped(
-            _ACCELEROMETER_CHECK, f"the robot never rests for {_MIN_REST_S:g} s"
-        )
-        if log.base_quat_xyzw is None or log.time[-1] - log.time[0] < _MIN_AVERAGING_S:
+        found = _accelerometer_in_motion(log)
+        yield found or Skipped(_ACCELEROMETER_CHECK, f"the robot never rests for {_MIN_REST_S:g} s")
+        gone = found is not None and found.name == "gravity"
+        if gone or log.base_quat_xyzw is None or log.time[-1] - log.time[0] < _MIN_AVERAGING_S:
             return
         yield from _tilt_findings(log, robot, np.ones(len(log), bool), "on average")
         return
@@ -134,16 +134,15 @@ def check_accelerometer(log: Log, robot: Robot | None) -> Iterator[Finding | Ski
     if units := units_of_ratio(size / GRAVITY, ("acceleration",), _ACCELEROMETER_UNIT_TOLERANCE):
         yield _accelerometer_unit_finding(f"{size:.4g} at rest", units)
     elif size < 0.1 * GRAVITY:
-        advice = "give the reading of the accelerometer: acceleration minus gravity, upward at rest"
-        yield Finding("gravity", REJECTED, name, f"{text}: gravity has been taken out", advice)
+        yield _no_gravity_finding(text)
     elif abs(size / GRAVITY - 1.0) > _MAX_ACCELEROMETER_ERROR:
         yield Finding("gravity", SUSPICIOUS, name, f"{text}, gravity is {GRAVITY}", "calibrate the accelerometer")
     if units or size > 0.5 * GRAVITY:
         yield from _tilt_findings(log, robot, still, "at rest")
 
 
-def _accelerometer_unit_in_motion(log: Log) -> Finding | None:
-    """Finding about the unit of an accelerometer that never rests, by its mean and by its median size, over a long log.
+def _accelerometer_in_motion(log: Log) -> Finding | None:
+    """Finding about unit or gravity of an accelerometer that never rests, by mean and median size, over a long log.
 
     Both are gravity's for a base that hardly turns and falls; of one without gravity, the mean is nearly zero.
     """
@@ -157,7 +156,15 @@ def _accelerometer_unit_in_motion(log: Log) -> Finding | None:
         units_of_ratio(size / GRAVITY, ("acceleration",), _ACCELEROMETER_UNIT_TOLERANCE) for size in sizes
     )
     units = tuple(unit for unit in by_size if unit in by_mean)
-    return _accelerometer_unit_finding(f"{sizes[1]:.4g} in the median", units) if units else None
+    if units:
+        return _accelerometer_unit_finding(f"{sizes[1]:.4g} in the median", units)
+    gone = sizes[0] < 0.1 * GRAVITY and sizes[1] < 0.5 * GRAVITY
+    return _no_gravity_finding(f"{sizes[1]:.3g} m/s^2 in the median") if gone else None
+
+
+def _no_gravity_finding(text: str) -> Finding:
+    advice = "give the reading of the accelerometer: acceleration minus gravity, upward at rest"
+    return Finding("gravity", REJECTED, "imu_specific_force", f"{text}: gravity has been taken out", advice)
 
 
 def _accelerometer_unit_finding(text: str, units: tuple[str, ...]) -> Finding:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 
-from torchid.errors import join_names
+from torchid.errors import format_percent, join_names
 from torchid.parameters import Array
 from torchid.problem.chunk_dynamics import ChunkKinematics
 from torchid.problem.chunks import ProgressCallback, map_chunks
@@ -159,7 +159,7 @@ class Metrics:
             rms, share = self.rms.get(group), self.relative.get(group)
             if rms is not None:
                 name, _, unit = self.label(group).rstrip("]").partition(" [")
-                said.append(f"{name} {rms:.3g} {unit}" + ("" if share is None else f" ({100.0 * share:.2g} %)"))
+                said.append(f"{name} {rms:.3g} {unit}" + ("" if share is None else f" ({format_percent(share)} %)"))
         return f"Metrics: {', '.join(said) or 'none'}"
 
     def as_dict(self) -> dict[str, object]:

@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from torchid import ranks
+from torchid.errors import format_percent
 from torchid.parameters import Array
 from torchid.problem.chunk_dynamics import Workspace
 from torchid.problem.chunks import ProgressCallback, map_chunks, one_thread
@@ -70,7 +71,7 @@ class NoiseShares:
         return cls(len(shares), max(float(shares.max(initial=0.0)), 0.0), int((shares > 1.0 - LEAST_SIGNAL).sum()))
 
     def __str__(self) -> str:
-        text = f"up to {100.0 * self.largest:.2g} % of the information on a combination was noise, taken off"
+        text = f"up to {format_percent(self.largest)} % of the information on a combination was noise, taken off"
         if self.lost:
             text += f" but for {self.lost} of {self.combinations}, mostly noise, which remain near the nominal ones"
         return text

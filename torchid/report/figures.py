@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from torchid.errors import format_percent
 from torchid.estimators import Estimate
 from torchid.estimators.least_squares import FIXED
 from torchid.fitting.calibration import Comparison
@@ -59,7 +60,7 @@ def error_figure(sets: Mapping[str, Comparison[Metrics]], of: str = "URDF") -> F
         for shift, metrics, color, label in pairs:
             heights = [100.0 * (metrics.relative.get(group) or 0.0) for group in groups]
             bars = axis.bar(index + shift, heights, 0.38, color=color, label=label)
-            axis.bar_label(bars, fmt=_percent, fontsize=8)
+            axis.bar_label(bars, fmt=lambda height: format_percent(height / 100.0), fontsize=8)
         _draw_noise(axis, identified, groups)
         axis.margins(y=0.1)
         axis.set_xticks(index, [group_name(group).replace(" ", "\n") for group in groups])
@@ -69,10 +70,6 @@ def error_figure(sets: Mapping[str, Comparison[Metrics]], of: str = "URDF") -> F
     labels = sorted(by_label, key=lambda label: label == _FLOOR)
     figure.legend([by_label[label] for label in labels], labels, loc="outside upper right", ncols=3)
     return figure
-
-
-def _percent(value: float) -> str:
-    return f"{value:.2g}" if value < 99.5 else f"{value:.0f}"
 
 
 def _draw_noise(axis: Axes, metrics: Metrics, groups: Sequence[str]) -> None:

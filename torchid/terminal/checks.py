@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from torchid.terminal.lines import CUT, LABEL, LINES, column_lines, labelled, pr
 _TEXT_LINES = 2
 #: Lines of a finding and of a note, the first in which all have room.
 _LEVELS = ((None, None), (None, _TEXT_LINES), (_TEXT_LINES + 1, _TEXT_LINES), (_TEXT_LINES, _TEXT_LINES))
+_NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\w.+-]*")
 _NAMED = 2  # logs of a finding
 _FEWEST_ROWS = 4  # of the table of logs: empty line, heading, a log, how many others there are
 
@@ -179,11 +181,15 @@ def _usable_text(log: Checked) -> str:
 
 def _skipped_lines(checked: Sequence[Checked], most: int, width: int) -> list[str]:
     """Checks that could not be made, with the reasons, and the number of logs if it is not all."""
-    logs = Counter(skip for log in checked for skip in dict.fromkeys(log.skipped))
+    alike: dict[tuple[str, str], list[str]] = {}  # but for numbers, one of each log
+    for log in checked:
+        for key, reason in {(skip.name, _NUMBER.sub("", skip.reason)): skip.reason for skip in log.skipped}.items():
+            alike.setdefault(key, []).append(reason)
     reasons: dict[str, list[str]] = {}
-    for skip, count in logs.items():
-        of_some = "" if count == len(checked) else f", {count} of {len(checked)} logs"
-        reasons.setdefault(skip.name, []).append(f"{skip.reason}{of_some}")
+    for (name, _), of_logs in alike.items():
+        or_alike = " or alike" if len(set(of_logs)) > 1 else ""
+        of_some = "" if len(of_logs) == len(checked) else f", {len(of_logs)} of {len(checked)} logs"
+        reasons.setdefault(name, []).append(f"{of_logs[0]}{or_alike}{of_some}")
     texts = [f"{name} ({'; '.join(of_name)})" for name, of_name in reasons.items()]
     text = f"{format_count(len(texts), 'check')}: {'; '.join(texts)}"
     return labelled("not checked", text, width, most) if texts else []

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from torchid.commands.replay import Replay
 from torchid.commands.simulate import nominal_name, simulated_balls
 from torchid.config import SimulationConfig
-from torchid.errors import format_count
+from torchid.errors import format_count, format_percent
 from torchid.report.tables import print_tables, stability_table, terminal_width
 from torchid.simulation import Stability
 from torchid.terminal.lines import LABEL, LINES, column_lines, labelled, print_rolling, wrap_words
@@ -130,7 +130,7 @@ def _drift(replayed: Replay) -> str:
     what = Counter(name.partition(" [")[0] for name in drifts)  # with units where joints have two
     named = {name: bare if what[bare := name.partition(" [")[0]] == 1 else name for name in drifts}
     shares = [
-        f"{named[name]} {100.0 * after / before:.2g} %" if before else named[name]
+        f"{named[name]} {format_percent(after / before)} %" if before else named[name]
         for name, (before, after) in drifts.items()
     ]
     worse = any(after > before for before, after in drifts.values())
