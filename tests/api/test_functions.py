@@ -267,8 +267,11 @@ def test_a_missing_keyword_is_named(result: torchid.Identification) -> None:
         torchid.check(robot=DEMO / "quadruped.urdf")
     with pytest.raises(ConfigError, match="^torchid.evaluate: logs: none; accepted: logs to evaluate"):
         torchid.evaluate(result, [])
-    with pytest.raises(ConfigError, match="^torchid.evaluate: device: 'tpu' is not available here; accepted: cpu, "):
-        torchid.evaluate(result, DEMO / "sway_test.npz", device="tpu")
+    for device in ("tpu", "cuda:x", "cuda:99"):
+        with pytest.raises(
+            ConfigError, match=f"^torchid.evaluate: device: '{device}' is not available here; accepted: c"
+        ):
+            torchid.evaluate(result, DEMO / "sway_test.npz", device=device)
     with pytest.raises(ConfigError, match="^torchid.evaluate: write: True, of a run without a folder; accepted: run.w"):
         torchid.evaluate(result, DEMO / "sway_test.npz", write=True)
     with pytest.raises(UnknownNameError, match="sway_test.npz: key: 'logs', which goes with an experiment"):

@@ -240,7 +240,8 @@ def require_device(device: str) -> None:
     """Refuse a device that this machine has not; it is not connected to: copies, which read logs, could not be made."""
     kind, _, index = device.partition(":")
     gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    if device != "cpu" and not (kind == "cuda" and int(index or 0) < gpus):
+    is_there = kind == "cuda" and (index or "0").isdecimal() and int(index or "0") < gpus
+    if device != "cpu" and not is_there:
         raise ConfigError.at_field("device", f"'{device}' is not available here", "cpu, cuda, cuda:0, ...")
 
 
