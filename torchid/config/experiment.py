@@ -16,19 +16,23 @@ from torchid.config.logs import SETS, LogsConfig, entries_spelled_out, resolve_l
 from torchid.config.maps import MAPS_ACCEPTED
 from torchid.config.preprocessing import PreprocessingConfig
 from torchid.config.reading import FileKind, Settings, load, plain_sections
-from torchid.config.robot import LOOPS_ACCEPTED, MJCF_SUFFIXES, WELDS_ACCEPTED, RobotConfig, require_one_file
-from torchid.config.sensors import (
+from torchid.config.robot import (
     CHOICE_ACCEPTED,
     COMPONENTS_ACCEPTED,
     GROUPS_ACCEPTED,
+    LOOPS_ACCEPTED,
+    MJCF_SUFFIXES,
     SCOPES_ACCEPTED,
+    WELDS_ACCEPTED,
     WRENCHES_ACCEPTED,
     Choice,
     ContactConfig,
     Device,
     FileName,
+    RobotConfig,
     Sensors,
     SensorsConfig,
+    require_one_file,
     spelled_out,
     validate_choice,
 )

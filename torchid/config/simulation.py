@@ -11,8 +11,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from torchid.config.reading import FileKind, load
-from torchid.config.robot import ConstrainedRobot, require_one_file
-from torchid.config.sensors import FileName
+from torchid.config.robot import ConstrainedRobot, FileName, require_one_file
 from torchid.errors import ConfigError, about_file
 from torchid.settings import STRICT, BelowOne, NotNegative, Number, Positive, Seed
 
