@@ -67,6 +67,11 @@ class ScenarioAnalysis:
 
     __repr__ = short_repr
 
+    @property
+    def plan_label(self) -> str:
+        """Name of the planned sensors among the sets that are compared."""
+        return f"sensor plan for {self.name}"
+
     def _headline(self) -> str:
         plan = self.plan
         proof = "no cheaper set exists" if plan.proven else "not proven to be the cheapest"
@@ -109,7 +114,7 @@ class Analysis:
 
 @dataclass(frozen=True, kw_only=True)
 class AnalysisRequest:
-    """What an experiment file wants to know, its names looked up.
+    """What an experiment file requests, its names looked up.
 
     Attributes:
         scene: robot, contacts and settings.
@@ -301,9 +306,9 @@ def _sets_to_compare(
         if scalar := _planned_along_normals(plan, scene.contacts):
             needed = f"sensors.contact_wrenches: {{{scalar[0]}: [{NORMAL_FORCE}]}}"
             bound = f"the file's sensors do not read {', '.join(scalar)} along the normal ({needed})"
-            warn(f"{bound}; no accuracy of the sensors planned for {scenario.name}")
+            warn(f"{bound}; no accuracy of the {scenario.plan_label}")
             continue
-        sets[f"planned for {scenario.name}"] = planned
+        sets[scenario.plan_label] = planned
     return sets
 
 

@@ -167,7 +167,7 @@ def _attention(analysis: Analysis, scenarios: Sequence[ScenarioAnalysis]) -> Ite
         yield from named(one, describe_losses(_judged_states(one)))
     if analysis.scene.config.analysis.scenarios is None:
         for one in scenarios:
-            found = analysis.accuracies.get("proposed" if one.proposed is not None else f"planned for {one.name}")
+            found = analysis.accuracies.get("proposed" if one.proposed is not None else one.plan_label)
             if found is not None and found.rank < one.base.rank:
                 what = f"the logs determine {found.rank} of {one.base.rank} combinations"
                 yield f"{what}: record motion that differs more, of all joints and of the base"
