@@ -12,7 +12,7 @@ import torch
 
 from torchid import ranks
 from torchid.commands.large_log import BLOCK_GB, LargeLog
-from torchid.commands.log_course import require_kept
+from torchid.commands.segmented_log import require_kept
 from torchid.config.logs import require_apart
 from torchid.errors import ConfigError, LogError
 from torchid.fitting.experiment import S, Scene
@@ -90,7 +90,7 @@ class LogReader:
         added = [payload_of(self.scene, path) for path in paths]
         return [replace(log, source=name, payload=x) for log, name, x in zip(logs, names, added, strict=True)]
 
-    def let_go(self) -> None:
+    def release(self) -> None:
         """Take pages of files that samples are mapped to out of memory; they come back where they are used."""
 
     def _together(self, path: Path) -> float:
