@@ -149,7 +149,7 @@ def _data_of_logs(experiment: Experiment, clock: _Clock, bars: Progress) -> _Dat
         require_base(states, experiment.config.sensors.on_base_lost, experiment.contacts)
         noise = ranks.from_first(partial(experiment.estimate_noise, logs["train"], experiment.sensors), "noise")
         experiment = with_noise(experiment, noise)
-    reader.let_go()
+    reader.release()
     with clock("compress"):
         builder = experiment.builder(experiment.sensors)
         blocks = split_into_folds(logs["train"], builder)

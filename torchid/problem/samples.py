@@ -121,7 +121,7 @@ class Samples:
 
         def chosen(x: Tensor) -> Tensor:
             rows = x[index].clone() if isinstance(index, slice) else x[index]
-            pages.let_go()
+            pages.release()
             return rows
 
         return replace(self._each(chosen), pages=None)
