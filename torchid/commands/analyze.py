@@ -74,9 +74,8 @@ class ScenarioAnalysis:
 
     def _headline(self) -> str:
         plan = self.plan
-        proof = "no cheaper set exists" if plan.proven else "not proven to be the cheapest"
         names = join_names([one.name for one in plan.chosen])
-        what = f"{len(plan.chosen)} sensors at a cost of {plan.cost:g} ({proof}): {names}"
+        what = f"{len(plan.chosen)} sensors at a cost of {plan.cost:g} ({plan.proof}): {names}"
         return f"{self.name}, {len(self.states)} contact states, {what}"
 
 
