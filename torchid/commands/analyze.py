@@ -133,7 +133,7 @@ class AnalysisRequest:
 
     @classmethod
     def of(cls, scene: Scene) -> AnalysisRequest:
-        """The request of an experiment file. Raises InputError: a name that nothing answers to, or that is taken."""
+        """The request of an experiment file. Raises InputError: a name that nothing has, or that is taken."""
         settings, config = scene.config.analysis, scene.config
         choice = settings.candidates
         with _errors_at("analysis"):

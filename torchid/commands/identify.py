@@ -117,7 +117,7 @@ class _Data:
 
 @dataclass
 class _Prepared(_Data):
-    """Data with the ridge settled."""
+    """Data with the ridge chosen."""
 
     conditions: Conditions
     fitter: LogFitter
@@ -325,7 +325,7 @@ def _robust(fit: Fit, ready: _Prepared, bars: Progress) -> tuple[Fit, RobustSumm
     robust = fit_robustly(train, ready.fitter, loss, first=fit, parts=ready.parts, progress=done)
     bars.update(bar, total=1, completed=1)
     if not robust.summary.converged:
-        message = f"estimator.robust: not settled after {robust.summary.passes} passes; accepted: more passes"
+        message = f"estimator.robust: not converged after {robust.summary.passes} passes; accepted: more passes"
         warn_about_file(message, NumericalWarning)
     return robust.fit, robust.summary
 

@@ -66,7 +66,7 @@ BLOCK_GB = 0.02
 
 
 @dataclass(frozen=True)
-class _Settled:
+class _Derived:
     """A log with the contact flags and the motion of its base that the settings want.
 
     Attributes:
@@ -148,7 +148,7 @@ class LargeLog:
             parts = self._pieces(recorded, len(recorded))
             recorded = bridge_in_blocks(recorded, self.settings.bridge_gaps_s, parts)
             self._check_welds(recorded)
-            segmented = self._in_segments(self._settled(recorded), with_unloaded)
+            segmented = self._in_segments(self._derived(recorded), with_unloaded)
             pieces, kept = list(segmented.pieces(self._step(recorded, len(segmented.time)))), segmented.kept
             mine = pieces[own([piece.stop - piece.start for _, piece in pieces])]
             row, total = row_numbers(kept, mine[0][1].start if mine else 0, len(segmented.time))
@@ -166,7 +166,7 @@ class LargeLog:
                     add(replace(samples, oversampling=segmented.oversampling, folder=self.folder), row, total)
                     row += len(samples)
 
-    def _settled(self, recorded: LogBlocks) -> _Settled:
+    def _derived(self, recorded: LogBlocks) -> _Derived:
         """The log with what is worked out of its other fields, each of which takes passes over it."""
         settings = self.settings
         out = self._flagged(recorded)
@@ -179,21 +179,21 @@ class LargeLog:
         blocks, standing = stand_in_blocks(out.blocks, self.robot, self.contacts, *rest)
         return replace(out, blocks=blocks, standing=standing)
 
-    def _flagged(self, blocks: LogBlocks) -> _Settled:
+    def _flagged(self, blocks: LogBlocks) -> _Derived:
         """The log with flags as recorded, from joint torques or from forces."""
         settings, rest = self.settings, (partial(self._pieces, blocks), self.folder)
         if settings.detect_contacts is not None and self.contacts:
             robot = self.robot if self.loaded is None else self.loaded
             found = detect_in_blocks(blocks, robot, self.contacts, settings.detect_contacts, *rest, self.sign_width)
             active, certain = found.flags(settings.takes_possible_contacts)
-            return _Settled(with_flags(blocks, self.contacts, active), certain)
+            return _Derived(with_flags(blocks, self.contacts, active), certain)
         if settings.contact_threshold is not None:
-            return _Settled(*flag_by_force_in_blocks(blocks, settings.contact_threshold, *rest))
-        return _Settled(blocks)
+            return _Derived(*flag_by_force_in_blocks(blocks, settings.contact_threshold, *rest))
+        return _Derived(blocks)
 
-    def _in_segments(self, settled: _Settled, with_unloaded: bool) -> SegmentedLog:
+    def _in_segments(self, derived: _Derived, with_unloaded: bool) -> SegmentedLog:
         """What of a log must be known before its blocks can be worked on, which takes a pass or two over it."""
-        blocks, settings, standing = settled.blocks, self.settings, settled.standing
+        blocks, settings, standing = derived.blocks, self.settings, derived.standing
         chosen = [slice(0, len(blocks))] if standing is None else standing.segments
         longest = max(chosen, key=lambda segment: segment.stop - segment.start)
         start = blocks if standing is None else blocks.part(longest)
@@ -212,7 +212,7 @@ class LargeLog:
         time = np.concatenate([segment.time for segment in segments])
         segmented = SegmentedLog(segments, coverage, time, noise=noise)
         return (
-            segmented if contacts is None else replace(segmented, kept=self._kept(segmented, contacts, settled.certain))
+            segmented if contacts is None else replace(segmented, kept=self._kept(segmented, contacts, derived.certain))
         )
 
     def _segments(
