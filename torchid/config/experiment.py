@@ -27,8 +27,6 @@ from torchid.config.robot import (
     WRENCHES_ACCEPTED,
     Choice,
     ContactConfig,
-    Device,
-    FileName,
     RobotConfig,
     Sensors,
     SensorsConfig,
@@ -40,7 +38,7 @@ from torchid.errors import ConfigError, about_file
 from torchid.logs.column_map import check_columns
 from torchid.logs.containers import FACTORS
 from torchid.logs.ros_topics import check_topics
-from torchid.settings import STRICT, Name, NumberOrAuto, Positive, PositiveOrAuto, Seed
+from torchid.settings import STRICT, Device, FileName, Name, NumberOrAuto, Positive, PositiveOrAuto, Seed
 
 Scenarios = dict[FileName, Annotated[list[list[str]], Field(min_length=1)]]
 

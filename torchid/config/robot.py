@@ -1,14 +1,13 @@
-"""The robot of an experiment file, its contacts and its sensors with their noise; values that settings files share."""
+"""The robot of an experiment file, its contacts and its sensors with their noise."""
 
 from __future__ import annotations
 
 import dataclasses
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import AfterValidator, BeforeValidator, Field, FiniteFloat, PlainSerializer, PlainValidator, TypeAdapter
+from pydantic import BeforeValidator, Field, FiniteFloat, PlainSerializer, PlainValidator, TypeAdapter
 from pydantic.dataclasses import dataclass
 
 from torchid.errors import ConfigError
@@ -17,22 +16,6 @@ from torchid.problem.extras import CHANNELS
 from torchid.robot.constraints import MAX_ANGLE, MAX_GAP, Loop
 from torchid.robot.xml_files import is_mjcf
 from torchid.settings import AUTO, STRICT, Name, NotNegative, NotNegativeOrAuto, Number, Positive
-
-
-def _torch_device(value: str) -> str:
-    if not re.fullmatch(r"cpu|cuda(:\d+)?", value):
-        raise ValueError("cpu, cuda, cuda:0, ...")
-    return value
-
-
-def _file_name(value: str) -> str:
-    if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}", value):
-        raise ValueError("a name of letters, digits, _, - and ., at most 100")
-    return value
-
-
-FileName = Annotated[str, AfterValidator(_file_name)]
-Device = Annotated[str, AfterValidator(_torch_device)]
 
 
 def as_list(value: object) -> object:
