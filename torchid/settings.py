@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from functools import cache
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
@@ -20,6 +21,18 @@ def _not_bool(value: object) -> object:
 def _has_name(value: dict[str, Any]) -> dict[str, Any]:
     if not isinstance(value.get("name"), str):
         raise ValueError("a mapping with the name of a class, and its options")
+    return value
+
+
+def _torch_device(value: str) -> str:
+    if not re.fullmatch(r"cpu|cuda(:\d+)?", value):
+        raise ValueError("cpu, cuda, cuda:0, ...")
+    return value
+
+
+def _file_name(value: str) -> str:
+    if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}", value):
+        raise ValueError("a name of letters, digits, _, - and ., at most 100")
     return value
 
 
@@ -59,6 +72,8 @@ Ridge = Annotated[
     _number_or((AUTO, "one_standard_error"), NotNegative, "auto, one_standard_error, or a number of at least 0"),
 ]
 """A ridge, or how cross-validation chooses one."""
+FileName = Annotated[str, AfterValidator(_file_name)]
+Device = Annotated[str, AfterValidator(_torch_device)]
 RidgeRule = Literal["least", "one_standard_error"]
 """Which ridge is chosen: that of the least error, or the largest whose error is within one standard error of it."""
 BelowOne = Annotated[Number, Field(ge=0.0, lt=1.0)]

@@ -118,7 +118,7 @@ def test_the_plan_is_the_smallest_and_says_what_each_sensor_is_for(with_logs: tu
 
 def test_expected_errors_are_of_the_size_of_the_measured_ones(with_logs: tuple[Path, dict[str, Any]]) -> None:
     accuracy = with_logs[1]["accuracy"]
-    assert set(accuracy) == {"proposed", "full", "feet", "planned for logs"}
+    assert set(accuracy) == {"proposed", "full", "feet", "sensor plan for logs"}
     for found in accuracy.values():
         for group, expected in found["expected"].items():
             assert expected / 3.0 < found["measured"][group] < 3.0 * expected, group
@@ -343,7 +343,7 @@ def test_a_bolted_arm_without_contacts_is_asked_what_the_stack_of_its_log_needs(
     assert scenario.plan.problem.criterion == "stack"
     assert scenario.plan.stack_rank == scenario.plan.stack_full == scenario.base.rank - 2 * len(TORQUES)
     assert scenario.plan.cost < len(TORQUES)
-    assert set(analysis.accuracies) == {"proposed", "planned for logs"}
+    assert set(analysis.accuracies) == {"proposed", "sensor plan for logs"}
     assert {removal.base_rank for removal in scenario.plan.removals} == {None}
 
 

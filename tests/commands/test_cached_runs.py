@@ -27,8 +27,7 @@ from torchid.commands.reading import LogReader
 from torchid.config import load_config
 from torchid.config.experiment import ActuatorsConfig
 from torchid.config.preprocessing import PreprocessingConfig
-from torchid.config.robot import RobotConfig
-from torchid.config.sensors import ContactConfig, NoiseConfig
+from torchid.config.robot import ContactConfig, NoiseConfig, RobotConfig
 from torchid.errors import TorchidWarning
 from torchid.fitting.experiment import set_up, with_noise
 from torchid.fitting.noise import NoiseSummary

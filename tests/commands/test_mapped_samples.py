@@ -65,7 +65,7 @@ def test_samples_far_apart_are_taken_from_files_without_their_pages_staying_in_m
     near, far = torch.arange(0, len(log), 2), torch.arange(0, len(log), 30)
     expected = {name: x[far].nan_to_num() for name, x in tensors(log).items()}
     assert log[near].pages is log.pages
-    reader.let_go()
+    reader.release()
     for chosen in (log[far], log.every(30)):
         assert mapped_kilobytes(tmp_path / FOLDER) == 0
         assert chosen.pages is None
@@ -80,6 +80,6 @@ def test_mapped_samples_that_are_sent_to_another_process_are_in_its_memory(tmp_p
     scene = set_up(config)
     [log] = open_reader(scene).read(config.logs.train, scene.sensors)
     there = pickle.loads(pickle.dumps(log))  # noqa: S301 - what was just written
-    there.pages.let_go()
+    there.pages.release()
     for name, x in tensors(there).items():
         assert torch.equal(x.nan_to_num(), tensors(log)[name].nan_to_num()), name

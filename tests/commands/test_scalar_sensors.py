@@ -154,8 +154,8 @@ def test_analyze_plans_with_scalar_sensors_and_measures_the_plan(
         assert len(part["cheapest"]) == 3
     assert {check["random_postures"]["rank"] for check in plan["checks"]} == {6}
     found = answers["accuracy"]
-    assert set(found) == {"proposed", "planned for logs"}
-    assert (found["proposed"]["channels"], found["planned for logs"]["channels"]) == (16, 12)
+    assert set(found) == {"proposed", "sensor plan for logs"}
+    assert (found["proposed"]["channels"], found["sensor plan for logs"]["channels"]) == (16, 12)
     assert found["proposed"]["rank"] == 118
     for one in found.values():
         assert one["expected"]["nullspace"] / 3.0 < one["measured"]["nullspace"] < 3.0 * one["expected"]["nullspace"]
@@ -175,4 +175,4 @@ def test_a_plan_with_scalar_sensors_is_not_measured_on_logs_that_are_read_as_wre
     assert plan["cost"] == 10.0
     assert set(answers["accuracy"]) == {"proposed"}
     warned = f"do not read {', '.join(FEET)} along the normal (sensors.contact_wrenches: {{{FEET[0]}: [fn]}})"
-    assert f"{warned}; no accuracy of the sensors planned for logs" in capsys.readouterr().err
+    assert f"{warned}; no accuracy of the sensor plan for logs" in capsys.readouterr().err

@@ -165,7 +165,7 @@ def test_a_contact_that_never_touches_in_a_log_has_no_offset_there(recorded: Rec
         assert found.values[key] == pytest.approx(complete.values[key], abs=1e-6)
 
 
-# ------------------------------------------------------------------------------------------- what cannot be told
+# ------------------------------------------------------------------------------------------- what is confounded
 
 
 @pytest.mark.parametrize("acceleration", [0.0, 0.3, 0.9, 1.1, 3.0])

@@ -96,7 +96,7 @@ def test_without_a_step_joints_alone_lose_the_feet(study: tuple[Path, str], erro
     for sensors in SETS:
         assert together["all runs", sensors] == 122  # 10 + 7 * 16
     assert together["squats alone", "full"] == together["squats alone", "contacts"] == 122
-    assert together["squats alone", "joints"] == 98  # a standing foot's inertia cannot be told from the floor's wrench
+    assert together["squats alone", "joints"] == 98  # a standing foot's inertia is confounded with the floor's wrench
     assert error("white noise", "squats alone", "joints", "base_force") > 5.0 * error(
         "white noise", "all runs", "joints", "base_force"
     )

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from synthetic import ANYMAL, ROBOTS, SOLO12, load
 from urdfs import joint, link, write
 
-from torchid.config.sensors import ContactConfig
+from torchid.config.robot import ContactConfig
 from torchid.errors import ConfigError, UrdfError
 from torchid.fitting.checked_settings import resolve_contacts
 from torchid.robot.rolling import rolled_distance

@@ -175,7 +175,7 @@ def arms(folder: Path, *bodies: str) -> Robot:
     "equal": (["l_arm", "r_arm"], ("l_", "l_"), "'l_' on both sides"),
     "alone": (["l_arm", "r_arm", "l_leg"], ("l_", "r_"), "l_leg has no counterpart; accepted: a body named r_leg"),
     "alone, right": (["l_arm", "r_arm", "r_leg"], ("l_", "r_"), "r_leg has no counterpart"),
-    "two": (["l_l", "r_l", "l_r"], ("l", "r"), "l_l answers to r_l and to l_r"),
+    "two": (["l_l", "r_l", "l_r"], ("l", "r"), "l_l corresponds to r_l and to l_r"),
 })  # fmt: skip
 def test_names_that_do_not_answer_to_each_other_are_refused(case: tuple, tmp_path: Path) -> None:
     bodies, tokens, found = case

@@ -16,7 +16,7 @@ from synthetic import Array, load
 from torchid import parameters
 from torchid.cli import main
 from torchid.config import FootConfig, MotionConfig, load_config
-from torchid.config.sensors import ContactConfig
+from torchid.config.robot import ContactConfig
 from torchid.config.simulation import SimulatedRobotConfig, WaveConfig
 from torchid.estimators import LeastSquares
 from torchid.fitting.checked_settings import resolve_contacts

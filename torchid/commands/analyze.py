@@ -67,11 +67,15 @@ class ScenarioAnalysis:
 
     __repr__ = short_repr
 
+    @property
+    def plan_label(self) -> str:
+        """Name of the planned sensors among the sets that are compared."""
+        return f"sensor plan for {self.name}"
+
     def _headline(self) -> str:
         plan = self.plan
-        proof = "no cheaper set exists" if plan.proven else "not proven to be the cheapest"
         names = join_names([one.name for one in plan.chosen])
-        what = f"{len(plan.chosen)} sensors at a cost of {plan.cost:g} ({proof}): {names}"
+        what = f"{len(plan.chosen)} sensors at a cost of {plan.cost:g} ({plan.proof}): {names}"
         return f"{self.name}, {len(self.states)} contact states, {what}"
 
 
@@ -109,7 +113,7 @@ class Analysis:
 
 @dataclass(frozen=True, kw_only=True)
 class AnalysisRequest:
-    """What an experiment file wants to know, its names looked up.
+    """What an experiment file requests, its names looked up.
 
     Attributes:
         scene: robot, contacts and settings.
@@ -129,7 +133,7 @@ class AnalysisRequest:
 
     @classmethod
     def of(cls, scene: Scene) -> AnalysisRequest:
-        """The request of an experiment file. Raises InputError: a name that nothing answers to, or that is taken."""
+        """The request of an experiment file. Raises InputError: a name that nothing has, or that is taken."""
         settings, config = scene.config.analysis, scene.config
         choice = settings.candidates
         with _errors_at("analysis"):
@@ -301,9 +305,9 @@ def _sets_to_compare(
         if scalar := _planned_along_normals(plan, scene.contacts):
             needed = f"sensors.contact_wrenches: {{{scalar[0]}: [{NORMAL_FORCE}]}}"
             bound = f"the file's sensors do not read {', '.join(scalar)} along the normal ({needed})"
-            warn(f"{bound}; no accuracy of the sensors planned for {scenario.name}")
+            warn(f"{bound}; no accuracy of the {scenario.plan_label}")
             continue
-        sets[f"planned for {scenario.name}"] = planned
+        sets[scenario.plan_label] = planned
     return sets
 
 

@@ -192,7 +192,7 @@ def _attention(run: Identification, judged: ErrorComparison) -> Iterator[str]:
 
 
 def _undetermined(run: Identification) -> Iterator[str]:
-    """That data do not determine the total mass of a robot, which a weak prior may have let go far from the nominal."""
+    """That data do not determine the total mass of a robot, which a weak prior may leave far from the nominal."""
     away = abs(run.mass.value - run.mass.nominal) > MAX_MASS_ERROR * run.mass.nominal
     if run.mass.determined or not (away or not run.experiment.robot.fixed_base):
         return

@@ -318,7 +318,7 @@ def _rename(folder: Path, entry: Path) -> None:
 
 
 def _remove(folder: Path) -> None:
-    """Remove an entry at once for others, by a rename; what the system does not let go stays."""
+    """Remove an entry at once for others, by a rename; what the system refuses to remove stays."""
     with suppress(OSError), staging_folder(folder) as staging:
         folder.rename(staging / NEW)
 

@@ -1,4 +1,4 @@
-"""What a cache holds: samples of one log with what reading had said, and factors of training logs."""
+"""What a cache holds: samples of one log with the warnings of reading them, and factors of training logs."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from torchid.sensing import SensorSet
 NOT_IN_SAMPLES = ("memory_gb", "cache_gb")
 """Keys of preprocessing that do not change what the samples of a log are that is read whole."""
 
-Said = tuple[type[Warning], str]
+RecordedWarning = tuple[type[Warning], str]
 """Class and text of a warning."""
 
 _SAMPLES_FORMAT = 3  # of entries
@@ -48,7 +48,7 @@ _BASE = "base."  # before the names of tensors of the base's motion
 
 @dataclass(frozen=True)
 class ReadLog:
-    """Samples of a log, the sensors whose every value is in them, how many were left out, and what reading said.
+    """Samples of a log, the sensors whose every value is in them, how many were left out, and the warnings of reading.
 
     `excluded`: None where the settings leave nothing out.
     """
@@ -56,7 +56,7 @@ class ReadLog:
     samples: Samples
     recorded: SensorSet
     excluded: int | None
-    said: list[Said]
+    warned: list[RecordedWarning]
 
 
 def content_of_scene(scene: Scene) -> dict[str, Any]:
@@ -118,7 +118,9 @@ def samples_entry(read: ReadLog) -> tuple[dict[str, Any], dict[str, NDArray[Any]
         "motion_noise": _noise_document(samples.motion_noise),
         "recorded": [read.recorded.torque.tolist(), read.recorded.wrench.tolist()],
         "excluded": read.excluded,
-        "said": [[category.__name__, message] for category, message in read.said if category in _said_again()],
+        "warnings": [
+            [category.__name__, message] for category, message in read.warned if category in _stored_categories()
+        ],
     }
     return document, arrays
 
@@ -146,9 +148,9 @@ def samples_of_entry(entry: CacheEntry, source: str, folder: Path | None) -> Rea
     )
     torque, wrench = (np.array(mask, dtype=bool) for mask in document["recorded"])
     recorded = SensorSet(torque, wrench.reshape(-1, 6))
-    categories = {category.__name__: category for category in _said_again()}
-    said = [(categories[name], _about(source, document["source"], text)) for name, text in document["said"]]
-    return ReadLog(samples, recorded, document["excluded"], said)
+    categories = {category.__name__: category for category in _stored_categories()}
+    warned = [(categories[name], _about(source, document["source"], text)) for name, text in document["warnings"]]
+    return ReadLog(samples, recorded, document["excluded"], warned)
 
 
 def _noise_document(noise: MotionNoise | None) -> dict[str, Any] | None:
@@ -165,12 +167,12 @@ def _noise_of_document(document: dict[str, Any] | None) -> MotionNoise | None:
 
 
 def _about(source: str, before: str, text: str) -> str:
-    """What was said of a log, said of one with the same content."""
+    """A warning about a log, about one with the same content."""
     names = {before: source, log_title(before): log_title(source)}
     return re.sub("|".join(map(re.escape, names)), lambda found: names[found[0]], text)
 
 
-def _said_again() -> list[type[Warning]]:
+def _stored_categories() -> list[type[Warning]]:
     """Warnings that are for users: torchid's, and those of libraries about numbers."""
     out: list[type[Warning]] = [TorchidWarning, RuntimeWarning]
     for category in out:

@@ -12,7 +12,7 @@ from typing import Any
 
 from torchid import ranks
 from torchid.commands.cache import FOLDER, TOKEN, Cache, Files, content_key, file_states, missing_folders, remove_empty
-from torchid.commands.cache_entries import ReadLog, Said, content_of_scene, samples_entry, samples_of_entry
+from torchid.commands.cache_entries import ReadLog, RecordedWarning, content_of_scene, samples_entry, samples_of_entry
 from torchid.commands.reading import LogReader, fits_contact_offsets, payload_of
 from torchid.commands.shared_log import on_one_machine, read_together
 from torchid.errors import TorchidWarning, warn
@@ -78,7 +78,7 @@ class _Content:
 
 
 @dataclass(frozen=True)
-class _Planned:
+class _LogToRead:
     """A log that will be read, the name of its samples, what it takes with others if that is too much, its bytes.
 
     `in_place`: it is read in blocks, which lie in its file as they are: neither a table nor compressed.
@@ -109,10 +109,10 @@ class CachedReader(LogReader):
         self._scene_content = content_of_scene(scene)
         self._mapped: list[MappedPages] = []
 
-    def let_go(self) -> None:
-        """As `LogReader.let_go`."""
+    def release(self) -> None:
+        """As `LogReader.release`."""
         for one in self._mapped:
-            one.let_go()
+            one.release()
 
     def read(
         self, paths: Sequence[Path], required: SensorSet | None, on_read: Callable[[Path], None] | None = None
@@ -144,19 +144,22 @@ class CachedReader(LogReader):
             return super()._samples(path, required, together)
         if not self.cache.has(key):
             self._new.add(key)
-            if ranks.world_size() == 1 and (one := self._planned(path, key, together, self._together(path))).in_place:
+            if (
+                ranks.world_size() == 1
+                and (one := self._log_to_read(path, key, together, self._together(path))).in_place
+            ):
                 self._store_together([one], 0, required)
         found = self._load(key, path, required, together)
         if found is None:
-            said: list[Said] = []
+            warned: list[RecordedWarning] = []
             try:
-                found = self._read(path, required, together, said)
+                found = self._read(path, required, together, warned)
             finally:
-                _say(said)
+                _reissue(warned)
             if ranks.world_size() == 1 and self._store(key, path, found):
                 found = self._load(key, path, required, together) or found
         else:
-            _say(found.said)
+            _reissue(found.warned)
             if key not in self._new:
                 self.reused.add(str(path))
         self.keys[str(path)] = key
@@ -164,12 +167,14 @@ class CachedReader(LogReader):
             self.excluded[str(path)] = found.excluded
         return found.samples
 
-    def _read(self, path: Path, required: SensorSet | None, together: float | None, said: list[Said]) -> ReadLog:
-        """A log as it is read without a cache; what is said on the way goes to a list."""
-        with _listening(said):
+    def _read(
+        self, path: Path, required: SensorSet | None, together: float | None, warned: list[RecordedWarning]
+    ) -> ReadLog:
+        """A log as it is read without a cache; warnings go to a list."""
+        with _collecting_warnings(warned):
             samples = super()._samples(path, required, together)
         recorded = recorded_sensors(self.scene.robot, self.scene.contacts, [samples])
-        return ReadLog(samples, recorded, self.excluded.get(str(path)), said)
+        return ReadLog(samples, recorded, self.excluded.get(str(path)), warned)
 
     # ---------------------------------------------------------------------------------------------- keys and entries
 
@@ -244,51 +249,53 @@ class CachedReader(LogReader):
         All processes then find the same entries, and read what is not there themselves: what cannot be read fails in
         all of them, as without a cache.
         """
-        plan = self._plan(paths, required)
-        self.cache.keep([one.key for one in plan])
-        missing = {one.key: number for number, one in enumerate(plan) if not self.cache.has(one.key)}
+        to_read = self._logs_to_read(paths, required)
+        self.cache.keep([one.key for one in to_read])
+        missing = {one.key: number for number, one in enumerate(to_read) if not self.cache.has(one.key)}
         self._new.update(missing)
-        whole, in_pieces = {number: plan[number].size for number in missing.values()}, list[int]()
+        whole, in_pieces = {number: to_read[number].size for number in missing.values()}, list[int]()
         if on_one_machine():
-            in_pieces = [x for x in whole if plan[x].in_place and whole[x] * ranks.world_size() > sum(whole.values())]
+            in_pieces = [
+                x for x in whole if to_read[x].in_place and whole[x] * ranks.world_size() > sum(whole.values())
+            ]
         in_pieces = ranks.as_first(in_pieces, "logs to read in pieces")
         for number in in_pieces:
-            self._store_together(plan, number, required)
+            self._store_together(to_read, number, required)
         own = _shares({number: size for number, size in whole.items() if number not in in_pieces})
         shares = ranks.as_first(own, "logs to read")
         for number in shares[ranks.rank()]:
             try:
-                one = plan[number]
+                one = to_read[number]
                 self._store(one.key, one.path, self._read(one.path, required, one.together, []))
-            except Exception:  # noqa: B902 - all processes meet it, and say it, when they read the log
+            except Exception:  # noqa: B902 - all processes meet it when they read the log
                 break
         ranks.gather(None, "logs read")
 
-    def _store_together(self, plan: Sequence[_Planned], number: int, required: SensorSet | None) -> None:
+    def _store_together(self, to_read: Sequence[_LogToRead], number: int, required: SensorSet | None) -> None:
         """Store the samples of a log block by block, of which each process reads some; or not, if one of them fails."""
 
         def fill(folder: str) -> tuple[dict[str, Any], Files] | None:
-            if not all(ranks.gather(number < len(plan), "plans")):
+            if not all(ranks.gather(number < len(to_read), "logs to read together")):
                 return None
-            one = plan[number]
+            one = to_read[number]
             log = self._large_log(one.path, required, None if one.together is None else self.folder)
             return read_together(log, fits_contact_offsets(self.scene), Path(folder), self.cache.limit)
 
         def fill_for_all(folder: Path) -> tuple[dict[str, Any], Files] | None:
-            told.append(ranks.as_first(str(folder), "a folder for a log"))
-            written, content = fill(str(folder)), self._contents[plan[number].path]
+            begun.append(ranks.as_first(str(folder), "a folder for a log"))
+            written, content = fill(str(folder)), self._contents[to_read[number].path]
             return written if file_states(content.files) == content.states else None
 
-        told: list[str] = []
+        begun: list[str] = []
         if ranks.is_first():
-            self.cache.save_files(plan[number].key, plan[number].size, fill_for_all)
-        folder = "" if told else ranks.as_first("", "a folder for a log")
+            self.cache.save_files(to_read[number].key, to_read[number].size, fill_for_all)
+        folder = "" if begun else ranks.as_first("", "a folder for a log")
         if folder:
             fill(folder)
 
-    def _plan(self, paths: Sequence[Path], required: SensorSet | None) -> list[_Planned]:
+    def _logs_to_read(self, paths: Sequence[Path], required: SensorSet | None) -> list[_LogToRead]:
         """What will be read, up to the first log that cannot be; bags that are not in the cache count as nothing."""
-        plan, held, limit = [], self._held, self.scene.config.preprocessing.memory_gb
+        to_read, held, limit = [], self._held, self.scene.config.preprocessing.memory_gb
         try:
             for path in paths:
                 together = self._together(path)
@@ -296,19 +303,19 @@ class CachedReader(LogReader):
                 key = self._key(path, required, together if large else None)
                 if key is None:
                     break
-                plan.append(self._planned(path, key, together if large else None, together))
+                to_read.append(self._log_to_read(path, key, together if large else None, together))
                 self._held = self._held if large else together
-        except Exception:  # noqa: B902 - said when the log is read
-            return plan
+        except Exception:  # noqa: B902 - raised again when the log is read
+            return to_read
         finally:
             self._held = held
-        return plan
+        return to_read
 
-    def _planned(self, path: Path, key: str, too_much: float | None, together: float) -> _Planned:
+    def _log_to_read(self, path: Path, key: str, too_much: float | None, together: float) -> _LogToRead:
         size = sum(state[0] for state in self._contents[path].states)
         gigabytes = together - self._held
         in_place = existing_log_kind(path) is LogKind.ARRAYS and size >= GIGABYTE * gigabytes
-        return _Planned(path, key, too_much, size, in_place and self._takes_blocks(path, gigabytes))
+        return _LogToRead(path, key, too_much, size, in_place and self._takes_blocks(path, gigabytes))
 
 
 def _shares(sizes: Mapping[int, int]) -> list[list[int]]:
@@ -323,18 +330,18 @@ def _shares(sizes: Mapping[int, int]) -> list[list[int]]:
 
 
 @contextmanager
-def _listening(said: list[Said]) -> Iterator[None]:
+def _collecting_warnings(warned: list[RecordedWarning]) -> Iterator[None]:
     """Gather all warnings instead of giving them."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")  # which of them are shown is decided where they are given
         try:
             yield
         finally:
-            said += [(one.category, str(one.message)) for one in caught]
+            warned += [(one.category, str(one.message)) for one in caught]
 
 
-def _say(said: Iterable[Said]) -> None:
-    for category, message in said:
+def _reissue(warned: Iterable[RecordedWarning]) -> None:
+    for category, message in warned:
         if issubclass(category, TorchidWarning):
             warn(message, category)
         else:

@@ -17,7 +17,7 @@ from torchid.config import load_analysis
 from torchid.config.logs import LogsConfig
 from torchid.config.maps import load_columns, load_topics
 from torchid.config.preprocessing import PreprocessingConfig
-from torchid.config.sensors import ContactConfig
+from torchid.config.robot import ContactConfig
 from torchid.errors import ConfigError, LogError, about_file, current_file, format_count
 from torchid.fitting.checked_settings import resolve_contacts
 from torchid.fitting.experiment import set_up_scene

@@ -93,7 +93,7 @@ def compress(config: ExperimentConfig, output: str | Path) -> Compression:
     with progress_bars() as bars:
         experiment, choices = with_chosen_settings(set_up(config), bars)
         builder = experiment.builder(experiment.sensors)
-        with _told_by_first(), ranks.apart():
+        with _warning_in_first_process(), ranks.apart():
             logs, excluded = _read(experiment, paths, output, bars)
             states = [state_reports([log], builder) for log in logs]
         together = merge_state_reports(chain.from_iterable(ranks.gather(states, "contact states")))
@@ -123,7 +123,7 @@ def _size(path: Path) -> int:
 
 
 @contextmanager
-def _told_by_first() -> Iterator[None]:
+def _warning_in_first_process() -> Iterator[None]:
     """Let the first process warn of what any of them warns of within the block."""
     with nullcontext() if ranks.is_first() else warnings.catch_warnings(record=True) as caught:
         yield

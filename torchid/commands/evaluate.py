@@ -19,7 +19,7 @@ from torchid.commands.reading import LogReader
 from torchid.commands.results import Identification
 from torchid.commands.run_figures import draw_forces
 from torchid.config import load_config
-from torchid.config.sensors import NoiseConfig
+from torchid.config.robot import NoiseConfig
 from torchid.errors import ConfigError, about_file, during, warn
 from torchid.fitting.calibration import Calibration, Comparison
 from torchid.fitting.checked_settings import stated_noise

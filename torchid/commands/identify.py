@@ -117,7 +117,7 @@ class _Data:
 
 @dataclass
 class _Prepared(_Data):
-    """Data with the ridge settled."""
+    """Data with the ridge chosen."""
 
     conditions: Conditions
     fitter: LogFitter
@@ -149,7 +149,7 @@ def _data_of_logs(experiment: Experiment, clock: _Clock, bars: Progress) -> _Dat
         require_base(states, experiment.config.sensors.on_base_lost, experiment.contacts)
         noise = ranks.from_first(partial(experiment.estimate_noise, logs["train"], experiment.sensors), "noise")
         experiment = with_noise(experiment, noise)
-    reader.let_go()
+    reader.release()
     with clock("compress"):
         builder = experiment.builder(experiment.sensors)
         blocks = split_into_folds(logs["train"], builder)
@@ -325,7 +325,7 @@ def _robust(fit: Fit, ready: _Prepared, bars: Progress) -> tuple[Fit, RobustSumm
     robust = fit_robustly(train, ready.fitter, loss, first=fit, parts=ready.parts, progress=done)
     bars.update(bar, total=1, completed=1)
     if not robust.summary.converged:
-        message = f"estimator.robust: not settled after {robust.summary.passes} passes; accepted: more passes"
+        message = f"estimator.robust: not converged after {robust.summary.passes} passes; accepted: more passes"
         warn_about_file(message, NumericalWarning)
     return robust.fit, robust.summary
 

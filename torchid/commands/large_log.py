@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchid.commands.log_course import Course, RecordedBlock, Segment, in_the_air, require_kept, row_numbers
+from torchid.commands.segmented_log import RecordedBlock, Segment, SegmentedLog, in_the_air, require_kept, row_numbers
 from torchid.config.preprocessing import PreprocessingConfig
 from torchid.errors import LogError, about_file
 from torchid.logs import Columns, Log
@@ -66,7 +66,7 @@ BLOCK_GB = 0.02
 
 
 @dataclass(frozen=True)
-class _Settled:
+class _Derived:
     """A log with the contact flags and the motion of its base that the settings want.
 
     Attributes:
@@ -148,25 +148,25 @@ class LargeLog:
             parts = self._pieces(recorded, len(recorded))
             recorded = bridge_in_blocks(recorded, self.settings.bridge_gaps_s, parts)
             self._check_welds(recorded)
-            course = self._course(self._settled(recorded), with_unloaded)
-            pieces, kept = list(course.pieces(self._step(recorded, len(course.time)))), course.kept
+            segmented = self._in_segments(self._derived(recorded), with_unloaded)
+            pieces, kept = list(segmented.pieces(self._step(recorded, len(segmented.time)))), segmented.kept
             mine = pieces[own([piece.stop - piece.start for _, piece in pieces])]
-            row, total = row_numbers(kept, mine[0][1].start if mine else 0, len(course.time))
+            row, total = row_numbers(kept, mine[0][1].start if mine else 0, len(segmented.time))
             if mine:
                 mine[0][0].follow_signs(mine[0][1].start, max(SPLINE_BLOCK, int(BLOCK_GB * GIGABYTE / 32)))
             threads = thread_count() if threads is None else threads
             threads = 0 if self.folder is not None else threads  # on a disk because memory is short
             read = (segment.read(piece) for segment, piece in mine)
-            with closing(_in_threads(partial(self._bound, course), read, threads)) as bound:
+            with closing(_in_threads(partial(self._bound, segmented), read, threads)) as bound:
                 for piece, samples in bound:
-                    if course.longest.in_the_air is None:
+                    if segmented.longest.in_the_air is None:
                         samples = replace(samples, unloaded=None)
                     if kept is not None:
                         samples = samples[torch.from_numpy(np.flatnonzero(kept[piece]))]
-                    add(replace(samples, oversampling=course.oversampling, folder=self.folder), row, total)
+                    add(replace(samples, oversampling=segmented.oversampling, folder=self.folder), row, total)
                     row += len(samples)
 
-    def _settled(self, recorded: LogBlocks) -> _Settled:
+    def _derived(self, recorded: LogBlocks) -> _Derived:
         """The log with what is worked out of its other fields, each of which takes passes over it."""
         settings = self.settings
         out = self._flagged(recorded)
@@ -179,21 +179,21 @@ class LargeLog:
         blocks, standing = stand_in_blocks(out.blocks, self.robot, self.contacts, *rest)
         return replace(out, blocks=blocks, standing=standing)
 
-    def _flagged(self, blocks: LogBlocks) -> _Settled:
+    def _flagged(self, blocks: LogBlocks) -> _Derived:
         """The log with flags as recorded, from joint torques or from forces."""
         settings, rest = self.settings, (partial(self._pieces, blocks), self.folder)
         if settings.detect_contacts is not None and self.contacts:
             robot = self.robot if self.loaded is None else self.loaded
             found = detect_in_blocks(blocks, robot, self.contacts, settings.detect_contacts, *rest, self.sign_width)
             active, certain = found.flags(settings.takes_possible_contacts)
-            return _Settled(with_flags(blocks, self.contacts, active), certain)
+            return _Derived(with_flags(blocks, self.contacts, active), certain)
         if settings.contact_threshold is not None:
-            return _Settled(*flag_by_force_in_blocks(blocks, settings.contact_threshold, *rest))
-        return _Settled(blocks)
+            return _Derived(*flag_by_force_in_blocks(blocks, settings.contact_threshold, *rest))
+        return _Derived(blocks)
 
-    def _course(self, settled: _Settled, with_unloaded: bool) -> Course:
+    def _in_segments(self, derived: _Derived, with_unloaded: bool) -> SegmentedLog:
         """What of a log must be known before its blocks can be worked on, which takes a pass or two over it."""
-        blocks, settings, standing = settled.blocks, self.settings, settled.standing
+        blocks, settings, standing = derived.blocks, self.settings, derived.standing
         chosen = [slice(0, len(blocks))] if standing is None else standing.segments
         longest = max(chosen, key=lambda segment: segment.stop - segment.start)
         start = blocks if standing is None else blocks.part(longest)
@@ -210,8 +210,10 @@ class LargeLog:
         else:
             segments = self._segments(blocks, standing, whole, air)
         time = np.concatenate([segment.time for segment in segments])
-        course = Course(segments, coverage, time, noise=noise)
-        return course if contacts is None else replace(course, kept=self._kept(course, contacts, settled.certain))
+        segmented = SegmentedLog(segments, coverage, time, noise=noise)
+        return (
+            segmented if contacts is None else replace(segmented, kept=self._kept(segmented, contacts, derived.certain))
+        )
 
     def _segments(
         self, blocks: LogBlocks, standing: StandingSegments, whole: Timeline, air: BoolArray | None
@@ -231,34 +233,34 @@ class LargeLog:
         warn_of_standing(blocks.source, len(blocks), standing, too_short)
         return tuple(out)
 
-    def _kept(self, course: Course, contacts: Log, certain: BoolArray | None) -> BoolArray | None:
+    def _kept(self, segmented: SegmentedLog, contacts: Log, certain: BoolArray | None) -> BoolArray | None:
         """Which samples are kept, None for all: away from changes of contact, with flags that are certain, no slip."""
         settings, parts = self.settings, list[BoolArray]()
         checked = settings.max_slip is not None and bool(self.contacts)
         if checked:
-            parts.append(self._standing_firmly(course, contacts))
+            parts.append(self._standing_firmly(segmented, contacts))
         if settings.margin_s is not None and settings.detect_contacts is None:
-            away = away_from_changes(contacts, course.time, settings.margin_s)
+            away = away_from_changes(contacts, segmented.time, settings.margin_s)
             parts += [] if away is None else [away]
         if certain is not None and not certain.all():
-            parts.append(away_from_stamps(course.time, contacts.time[~certain], settings.margin_s or 0.0))
+            parts.append(away_from_stamps(segmented.time, contacts.time[~certain], settings.margin_s or 0.0))
         kept = np.all(parts, axis=0) if parts else np.ones(1, dtype=bool)
         require_kept(kept, self.path, checked)
         return None if kept.all() else kept
 
-    def _standing_firmly(self, course: Course, contacts: Log) -> BoolArray:
+    def _standing_firmly(self, segmented: SegmentedLog, contacts: Log) -> BoolArray:
         """In which samples no contact slips, (N,), which takes a pass over the motion.
 
         Warns:
             TorchidWarning: as `warn_of_slip`.
         """
-        settings, blocks = self.settings, course.longest.blocks
+        settings, blocks = self.settings, segmented.longest.blocks
         motion = motion_fields(blocks, "contact_active", NORMALS)
-        away = away_from_own_changes(contacts, course.time, self.contacts, settings.filter_hz)
-        speeds = growing_array(self.path, self.folder, len(course.time))
+        away = away_from_own_changes(contacts, segmented.time, self.contacts, settings.filter_hz)
+        speeds = growing_array(self.path, self.folder, len(segmented.time))
         known = settings.base_motion is None
-        for segment, piece in course.pieces(self._step(blocks, len(course.time))):
-            log = segment.read(piece, motion).preprocessed(course.coverage)
+        for segment, piece in segmented.pieces(self._step(blocks, len(segmented.time))):
+            log = segment.read(piece, motion).preprocessed(segmented.coverage)
             samples = bind_log(log, self.robot, self.contacts)
             base = base_velocity(log, samples) if known else None
             known = base is not None
@@ -296,13 +298,13 @@ class LargeLog:
             warn_of_gaps(first, name, coverage)
         return coverages
 
-    def _bound(self, course: Course, block: RecordedBlock) -> tuple[slice, Samples]:
+    def _bound(self, segmented: SegmentedLog, block: RecordedBlock) -> tuple[slice, Samples]:
         """The numbers of a block's samples, and these; errors count from the beginning."""
-        log = block.preprocessed(course.coverage)
-        if block.timeline is not None and block.piece.start == course.longest.first:  # this block stands for all
-            warn_of_noisy_accelerations(block.log, log, block.timeline, course.noise)
+        log = block.preprocessed(segmented.coverage)
+        if block.timeline is not None and block.piece.start == segmented.longest.first:  # this block stands for all
+            warn_of_noisy_accelerations(block.log, log, block.timeline, segmented.noise)
         if self.settings.base_motion is None:
-            log = replace(log, motion_noise=course.noise)
+            log = replace(log, motion_noise=segmented.noise)
         samples = bind_log(log, self.robot, self.contacts)
         if self.required is not None:
             try:

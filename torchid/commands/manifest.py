@@ -90,7 +90,7 @@ class FolderContents:
     leftovers: list[Path] = field(default_factory=list)
 
     def remove(self) -> None:
-        """Remove the own files, and the folders that are empty then; what the system does not let go stays."""
+        """Remove the own files, and the folders that are empty then; what the system refuses to remove stays."""
         for path in self.leftovers:
             remove_leftover(path)
         for path in self.own:

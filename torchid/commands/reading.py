@@ -12,7 +12,7 @@ import torch
 
 from torchid import ranks
 from torchid.commands.large_log import BLOCK_GB, LargeLog
-from torchid.commands.log_course import require_kept
+from torchid.commands.segmented_log import require_kept
 from torchid.config.logs import require_apart
 from torchid.errors import ConfigError, LogError
 from torchid.fitting.experiment import S, Scene
@@ -90,7 +90,7 @@ class LogReader:
         added = [payload_of(self.scene, path) for path in paths]
         return [replace(log, source=name, payload=x) for log, name, x in zip(logs, names, added, strict=True)]
 
-    def let_go(self) -> None:
+    def release(self) -> None:
         """Take pages of files that samples are mapped to out of memory; they come back where they are used."""
 
     def _together(self, path: Path) -> float:
@@ -170,16 +170,15 @@ class LogReader:
         """A log that does not, with those before it [GB]."""
         settings = self.scene.config.preprocessing
         needed = f"a preprocessing.memory_gb above {together:.2g}"
+        arrays = f"arrays of {together:.2g} GB, which are not in memory at once"
         if split_range(path).joins:
-            found = f"several files with arrays of {together:.2g} GB, which are not in memory at once"
+            found = f"several files with {arrays}"
             raise LogError(path, "file", found, f"{needed}, or the one file that torchid convert makes of them")
         if self.scene.config.actuators.known_delay:
-            found = f"set for arrays of {together:.2g} GB, which are not in memory at once"
-            raise LogError(path, "actuators.delay", found, f"{needed}, or parts of the log")
+            raise LogError(path, "actuators.delay", f"set for {arrays}", f"{needed}, or parts of the log")
         if settings.exclude_rejected:
-            found = f"set for arrays of {together:.2g} GB, which are not in memory at once"
             accepted = f"{needed}, or parts of the logs that torchid check passes"
-            raise LogError(path, "preprocessing.exclude_rejected", found, accepted)
+            raise LogError(path, "preprocessing.exclude_rejected", f"set for {arrays}", accepted)
         return self._large_log(path, required, self.folder).samples(fits_contact_offsets(self.scene))
 
     def _takes_blocks(self, path: Path, gigabytes: float) -> bool:

@@ -18,7 +18,7 @@ import numpy as np
 
 from torchid import ranks
 from torchid.commands.cache import Files, written_file
-from torchid.commands.cache_entries import ReadLog, Said, named_tensors, samples_entry
+from torchid.commands.cache_entries import ReadLog, RecordedWarning, named_tensors, samples_entry
 from torchid.commands.large_log import LargeLog
 from torchid.commands.manifest import file_checksum
 from torchid.copies import can_copy, share_between_copies
@@ -36,16 +36,16 @@ def on_one_machine() -> bool:
 
 @dataclass(frozen=True)
 class _Share:
-    """What a process tells of its blocks.
+    """What a process reports of its blocks.
 
     `like`: samples without any, for whatever is no tensor, and the shapes of these; None if it had no block.
-    `recorded`: sensors whose every value is in its blocks. `said`: warnings, the first `common` of which are about the
+    `recorded`: sensors whose every value is in its blocks. `warned`: the first `common` of these warnings are about the
     log as a whole. `failed`: it could not go on.
     """
 
     like: Samples | None
     recorded: SensorSet | None
-    said: Sequence[Said]
+    warned: Sequence[RecordedWarning]
     common: int
     failed: bool
 
@@ -90,8 +90,8 @@ def read_together(log: LargeLog, with_unloaded: bool, folder: Path, most: float)
     sensors = SensorSet(
         np.all([one.torque for one in recorded], axis=0), np.all([one.wrench for one in recorded], axis=0)
     )
-    said = [*shares[0].said, *(x for one in shares[1:] for x in one.said[one.common :])]
-    document, _ = samples_entry(ReadLog(likes[0], sensors, None, said))
+    warned = [*shares[0].warned, *(x for one in shares[1:] for x in one.warned[one.common :])]
+    document, _ = samples_entry(ReadLog(likes[0], sensors, None, warned))
     document["axes"] = {name: list(range(x.ndim)) for name, x in named_tensors(likes[0]).items()}
     files = {name: written_file(path, found) for name, path, found in zip(names, paths, sums, strict=True)}
     return document, files
@@ -114,8 +114,8 @@ def _fill(
             log.each_block(rows.add, with_unloaded, own, threads)
         except Exception:  # noqa: B902 - all processes meet it, and say it, when they read the log
             failed = True
-    said = [(one.category, str(one.message)) for one in caught]
-    return _Share(rows.like, rows.recorded, said, common, failed)
+    warned = [(one.category, str(one.message)) for one in caught]
+    return _Share(rows.like, rows.recorded, warned, common, failed)
 
 
 def _checksum(path: Path) -> str:

@@ -16,19 +16,21 @@ from torchid.config.logs import SETS, LogsConfig, entries_spelled_out, resolve_l
 from torchid.config.maps import MAPS_ACCEPTED
 from torchid.config.preprocessing import PreprocessingConfig
 from torchid.config.reading import FileKind, Settings, load, plain_sections
-from torchid.config.robot import LOOPS_ACCEPTED, MJCF_SUFFIXES, WELDS_ACCEPTED, RobotConfig, require_one_file
-from torchid.config.sensors import (
+from torchid.config.robot import (
     CHOICE_ACCEPTED,
     COMPONENTS_ACCEPTED,
     GROUPS_ACCEPTED,
+    LOOPS_ACCEPTED,
+    MJCF_SUFFIXES,
     SCOPES_ACCEPTED,
+    WELDS_ACCEPTED,
     WRENCHES_ACCEPTED,
     Choice,
     ContactConfig,
-    Device,
-    FileName,
+    RobotConfig,
     Sensors,
     SensorsConfig,
+    require_one_file,
     spelled_out,
     validate_choice,
 )
@@ -36,7 +38,7 @@ from torchid.errors import ConfigError, about_file
 from torchid.logs.column_map import check_columns
 from torchid.logs.containers import FACTORS
 from torchid.logs.ros_topics import check_topics
-from torchid.settings import STRICT, Name, NumberOrAuto, Positive, PositiveOrAuto, Seed
+from torchid.settings import STRICT, Device, FileName, Name, NumberOrAuto, Positive, PositiveOrAuto, Seed
 
 Scenarios = dict[FileName, Annotated[list[list[str]], Field(min_length=1)]]
 

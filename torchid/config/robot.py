@@ -1,19 +1,26 @@
-"""The robot of an experiment file."""
+"""The robot of an experiment file, its contacts and its sensors with their noise."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BeforeValidator, Field, FiniteFloat, PlainSerializer, PlainValidator, TypeAdapter
 from pydantic.dataclasses import dataclass
 
-from torchid.config.sensors import as_list
 from torchid.errors import ConfigError
+from torchid.logs.signal_noise import STATED_FIELDS
+from torchid.problem.extras import CHANNELS
 from torchid.robot.constraints import MAX_ANGLE, MAX_GAP, Loop
 from torchid.robot.xml_files import is_mjcf
-from torchid.settings import AUTO, STRICT, Number, Positive
+from torchid.settings import AUTO, STRICT, Name, NotNegative, NotNegativeOrAuto, Number, Positive
+
+
+def as_list(value: object) -> object:
+    """A tuple as a list, as YAML has it."""
+    return list(value) if isinstance(value, tuple) else value
 
 
 def _at_zero(value: object) -> object:
@@ -141,3 +148,195 @@ class RobotConfig(ConstrainedRobot):
     def tilt(self) -> tuple[float, float]:
         """The angles, 0 where there are none, or they have not been chosen."""
         return (0.0, 0.0) if self.base_tilt is None or isinstance(self.base_tilt, str) else self.base_tilt
+
+
+Component = Literal["fx", "fy", "fz", "mx", "my", "mz", "fn"]
+COMPONENTS_ACCEPTED = "a list of components: [fx, fy, fz], or [fn] for a force along the ground's normal"
+WRENCHES_ACCEPTED = "a mapping from frames of contacts to components: {l_sole: [fx, fy, fz]}"
+"""Accepted for measured components of a contact, and of all contacts, in messages."""
+
+
+def _per_axis(value: object) -> float | tuple[float, float, float]:
+    """A positive number, or three."""
+    try:
+        if not isinstance(value, (list, tuple)):
+            return _POSITIVE.validate_python(value)
+        x, y, z = (_POSITIVE.validate_python(one) for one in value)
+    except ValueError as error:
+        raise ValueError("a number greater than 0, or three for the axes: [x, y, z]") from error
+    return x, y, z
+
+
+def _normal(value: object) -> list[float] | None:
+    """Three numbers, not all 0, or none."""
+    try:
+        normal = None if value is None else _VECTOR.validate_python(value)
+    except ValueError:
+        normal = []
+    if normal is not None and not any(normal):
+        raise ValueError("three numbers [x, y, z] in the world, not all 0")
+    return normal
+
+
+_VECTOR: TypeAdapter[list[float]] = TypeAdapter(Annotated[list[Number], Field(min_length=3, max_length=3)])
+_POSITIVE: TypeAdapter[float] = TypeAdapter(Positive)
+PER_JOINT_ACCEPTED = "a number greater than 0, or one by name or pattern of the joints: {'*': 0.5, '*_wrist': 0.02}"
+
+
+def _per_joint(value: object) -> float | dict[str, float] | None:
+    """A positive number, or some by name or pattern of the joints."""
+    try:
+        return None if value is None else _POSITIVE_BY_NAME.validate_python(value)
+    except ValueError as error:
+        raise ValueError(PER_JOINT_ACCEPTED) from error
+
+
+_POSITIVE_BY_NAME: TypeAdapter[float | dict[str, float]] = TypeAdapter(Positive | dict[Name, Positive])
+PerJoint = Annotated[float | dict[str, float], PlainValidator(_per_joint)]
+PerAxis = Annotated[float | tuple[float, float, float], PlainValidator(_per_axis), PlainSerializer(as_list)]
+
+
+@dataclass(config=STRICT, frozen=True)
+class ContactConfig:
+    """A contact at a URDF frame: `line_axis` is the frame's axis that a line contact runs along.
+
+    `radius` [m]: a point is a sphere, a line a cylinder about the frame's origin, which rolls; auto: that of the
+    collision sphere (of a line: cylinder) about this origin in the URDF, 0 without one. `normal`: of the ground, in the
+    world, where the logs do not record it (`contact_normal_world`); None for upwards.
+    """
+
+    frame: str
+    type: Literal["point", "line", "flat"]
+    line_axis: Literal["x", "y", "z"] = "y"
+    radius: NotNegativeOrAuto = AUTO
+    normal: Annotated[list[float] | None, PlainValidator(_normal)] = None
+
+
+@dataclass(config=STRICT, frozen=True)
+class NoiseConfig:
+    """Standard deviations of the sensors [N m, N, N m], floors of the base rows [N, N m], and noise of the motion.
+
+    None: estimated from the training logs (`torchid.fitting.noise`), or those of `SensorNoise` where there are none;
+    that of joint torques for all joints, or by pattern of their names; that of the motion, in every recorded sample
+    [rad or m, rad/s or m/s, rad, rad/s, m/s^2], from the high frequencies of each log (`torchid.logs.signal_noise`), 0
+    for none.
+    """
+
+    joint_torque: PerJoint | None = None
+    contact_force: Positive | None = None
+    contact_moment: Positive | None = None
+    base_force: PerAxis | None = None
+    base_moment: PerAxis | None = None
+    ft_force: Positive | None = None
+    ft_moment: Positive | None = None
+    joint_position: NotNegative | None = None
+    joint_velocity: NotNegative | None = None
+    base_orientation: NotNegative | None = None
+    angular_velocity: NotNegative | None = None
+    specific_force: NotNegative | None = None
+
+    @property
+    def forces(self) -> dict[str, Any]:
+        """What is stated of sensors and base rows, by key."""
+        return {name: x for name, x in vars(self).items() if x is not None and name not in STATED_FIELDS}
+
+    @property
+    def motion(self) -> dict[str, float]:
+        """What is stated of the motion, by key."""
+        return {name: x for name, x in vars(self).items() if x is not None and name in STATED_FIELDS}
+
+
+@dataclass(config=STRICT, frozen=True)
+class ChoiceConfig:
+    """A named set, or sensors by name; `full` is short for `{set: full}`.
+
+    `ft_sensors`, the fixed joints that carry a force/torque sensor, may be given with a named set too. `fn`, alone
+    among the components of a contact, is the force along the ground's normal, `contact_force_normal` of the logs.
+    """
+
+    set: Literal["full", "contacts", "joints"] | None = None
+    joint_torques: list[str] = dataclasses.field(default_factory=list)
+    contact_wrenches: dict[str, list[Component]] = dataclasses.field(default_factory=dict)
+    ft_sensors: list[str] = dataclasses.field(default_factory=list)
+
+    @property
+    def empty(self) -> bool:
+        """Whether nothing is chosen."""
+        return self.set is None and not (self.joint_torques or any(self.contact_wrenches.values()) or self.ft_sensors)
+
+
+def _every_channel(value: object) -> object:
+    """A scope for every kind of channel, where it is a name alone."""
+    return dict.fromkeys(CHANNELS, value) if value in get_args(Scope) else value
+
+
+def _scope_or_groups(value: object) -> str | list[list[str]]:
+    """A scope, or groups of patterns, of which one alone needs no list."""
+    if isinstance(value, str) and value in get_args(Scope):
+        return value
+    groups = [[group] if isinstance(group, str) else group for group in value] if isinstance(value, list) else []
+    named = all(
+        isinstance(group, list) and group and all(isinstance(name, str) and name for name in group) for group in groups
+    )
+    if not (groups and named):
+        raise ValueError(GROUPS_ACCEPTED)
+    return groups
+
+
+ChannelKind = Literal["joint_torque", "contact_force", "contact_moment", "ft_force", "ft_moment"]
+Scope = Literal["log", "all"]
+Scopes = Annotated[dict[ChannelKind, Scope], BeforeValidator(_every_channel)]
+Scales = Annotated[
+    dict[ChannelKind, Annotated[Scope | list[list[str]], PlainValidator(_scope_or_groups)]],
+    BeforeValidator(_every_channel),
+]
+SCOPES_ACCEPTED = f"log, all, or a mapping from kinds of channels ({', '.join(CHANNELS)}) to log or all"
+"""Accepted for `Scopes`, in messages."""
+
+GROUPS_ACCEPTED = "log, all, or a list of groups of joints or frames: [[l_hip, r_hip], '*_knee']"
+"""Accepted for the scales of a kind of channels, in messages."""
+
+
+@dataclass(config=STRICT, frozen=True)
+class SensorsConfig(ChoiceConfig):
+    """The sensors of a run, their noise and calibration, and whether to stop where they lose the base.
+
+    `offsets` and `scales` say which channels have an unknown one, constant over a `log` or over `all`; a scope alone is
+    short for every kind of channel. `scales` may have groups of joints or frames, by names or patterns, that share one.
+    """
+
+    noise: NoiseConfig = dataclasses.field(default_factory=NoiseConfig)
+    offsets: Scopes = dataclasses.field(default_factory=dict)
+    scales: Scales = dataclasses.field(default_factory=dict)
+    on_base_lost: Literal["error", "warn"] = "error"
+
+
+def spelled_out(value: object) -> object:
+    """A choice as a mapping, where it may be a name alone."""
+    return {"set": value} if isinstance(value, str) else value
+
+
+CHOICE_ACCEPTED = "full, contacts, joints, or a mapping with sensors by name"
+"""Accepted for a choice of sensors, in messages."""
+
+Choice = Annotated[ChoiceConfig, BeforeValidator(spelled_out)]
+Sensors = Annotated[SensorsConfig, BeforeValidator(spelled_out)]
+
+
+def validate_choice(field: str, sensors: ChoiceConfig, may_be_empty: bool = False) -> None:
+    """Refuse a named set together with sensors by name, a sensor named twice, and a choice without any.
+
+    Raises:
+        ConfigError: one of these.
+    """
+    if sensors.set is not None and (sensors.joint_torques or sensors.contact_wrenches):
+        raise ConfigError.at_field(field, f"set: {sensors.set} together with sensors by name", "one of the two")
+    named: dict[str, Sequence[str]] = {"joint_torques": sensors.joint_torques, "ft_sensors": sensors.ft_sensors}
+    named |= {f"contact_wrenches.{frame}": components for frame, components in sensors.contact_wrenches.items()}
+    for key, names in named.items():
+        twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
+        if twice is not None:
+            raise ConfigError.at_field(f"{field}.{key}", f"'{twice}' named twice", "each once")
+    if sensors.empty and not may_be_empty:
+        accepted = "full, contacts, joints, or joint_torques, contact_wrenches and ft_sensors by name"
+        raise ConfigError.at_field(field, "no sensor", accepted)

@@ -12,9 +12,8 @@ from pydantic.dataclasses import dataclass
 
 from torchid.config.reading import FileKind, load
 from torchid.config.robot import ConstrainedRobot, require_one_file
-from torchid.config.sensors import FileName
 from torchid.errors import ConfigError, about_file
-from torchid.settings import STRICT, BelowOne, NotNegative, Number, Positive, Seed
+from torchid.settings import STRICT, BelowOne, FileName, NotNegative, Number, Positive, Seed
 
 Point = Annotated[list[Number], Field(min_length=3, max_length=3)]
 

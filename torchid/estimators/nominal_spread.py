@@ -6,6 +6,7 @@ import numpy as np
 
 from torchid.parameters import FRICTION, PER_BODY, Array
 from torchid.problem import LinearProblem
+from torchid.problem.elimination import eliminate_columns
 from torchid.rounding import RANK_TOLERANCE, is_significant
 
 NARROWEST, WIDEST = 0.01, 10.0
@@ -35,7 +36,8 @@ def nominal_spread(problem: LinearProblem, noise: float) -> Array:
     noise = max(noise, _LEAST_NOISE * size / max(problem.rows, 1) ** 0.5)
     of_friction = (place >= FRICTION.start) & (place < FRICTION.stop)
     for group in (~of_friction, of_friction):
-        rows = without(columns[:, ~group], np.column_stack([columns[:, group], target])) / noise
+        whole = np.column_stack([columns[:, ~group], columns[:, group], target])
+        rows = eliminate_columns(whole, range(np.count_nonzero(~group))) / noise
         likelihood = likelihood_of_widths(rows, WIDTHS)
         if likelihood is not None:
             weight = np.exp(0.5 * (likelihood - likelihood.max()))
@@ -59,10 +61,3 @@ def likelihood_of_widths(rows: Array, widths: Array) -> Array | None:
         return None
     found, of_data = np.square(U[:, kept].T @ rows[:, -1]), 1.0 + np.outer(np.square(widths), np.square(values[kept]))
     return np.asarray(-(np.log(of_data) + found / of_data).sum(axis=1))
-
-
-def without(columns: Array, rows: Array) -> Array:
-    """Rows (R, c) without what columns (R, k) of unknowns take up."""
-    U, values, _ = np.linalg.svd(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), full_matrices=False)
-    U = U[:, is_significant(values, RANK_TOLERANCE)]
-    return np.asarray(rows - U @ (U.T @ rows))

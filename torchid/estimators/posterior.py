@@ -12,10 +12,11 @@ from torchid import parameters
 from torchid.estimators.conditions import Conditions
 from torchid.estimators.conic_formulation import build_conic_problem
 from torchid.estimators.conic_problem import ConicProblem
-from torchid.estimators.nominal_spread import WIDTHS, likelihood_of_widths, without
+from torchid.estimators.nominal_spread import WIDTHS, likelihood_of_widths
 from torchid.parameters import INERTIAL, PER_BODY, Array
 from torchid.problem import LinearProblem
 from torchid.problem.chunks import one_thread
+from torchid.problem.elimination import eliminate_columns
 from torchid.reprs import short_repr
 from torchid.rounding import RANK_TOLERANCE
 
@@ -218,7 +219,7 @@ def nominal_error(posterior: Posterior) -> NominalError | None:
     nuisance = np.hstack([columns[:, ~inertial], posterior.D * posterior.extra_size])
     rows = np.column_stack([columns @ units[:, inertial], posterior.b - posterior.A @ posterior.nominal])
     widths = np.append(WIDTHS, PRIOR_ERROR)
-    rows = without(nuisance, rows)
+    rows = eliminate_columns(np.hstack([nuisance, rows]), range(nuisance.shape[1]))
     likelihood = likelihood_of_widths(rows, widths)
     if likelihood is None:
         return None

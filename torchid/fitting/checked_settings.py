@@ -10,7 +10,7 @@ import numpy as np
 
 from torchid.config import AnalyzeConfig, ExperimentConfig
 from torchid.config.logs import LogsConfig
-from torchid.config.sensors import ChoiceConfig, ContactConfig, NoiseConfig
+from torchid.config.robot import ChoiceConfig, ContactConfig, NoiseConfig
 from torchid.errors import ConfigError, SensorError, UnknownNameError, format_count
 from torchid.logs.column_entries import for_all
 from torchid.logs.column_map import fits, require_names, values_of_all

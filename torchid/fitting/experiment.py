@@ -11,8 +11,7 @@ import torch
 
 from torchid.config import AnalyzeConfig, ExperimentConfig
 from torchid.config.estimator import EstimatorConfig
-from torchid.config.robot import require_kind
-from torchid.config.sensors import ChoiceConfig
+from torchid.config.robot import ChoiceConfig, require_kind
 from torchid.errors import ConfigError, LogError, UnknownNameError, warn_about_file
 from torchid.estimators import Conditions, Consistent, LeastSquares
 from torchid.fitting.calibration import Calibration, Comparison, calibrations

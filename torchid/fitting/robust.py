@@ -93,7 +93,7 @@ class RobustLoss:
 
 @dataclass(frozen=True)
 class RobustSummary:
-    """How a robust fit went: `scale` of good residuals in stated noise, `mean_weight` of rows, whether it settled."""
+    """How a robust fit went: `scale` of good residuals in stated noise, `mean_weight` of rows, whether it converged."""
 
     loss: str
     tuning: float
@@ -233,8 +233,8 @@ def _passes(rows: _Rows, loss: RobustLoss, start: _Point, first_pass: int = 0, s
         parts, done = rows.compress(reweighting), done + 1
         add_noise_gram(parts, rows.noise_gram, reweighting.mean_weight)
         fit, scale = fitter.fit(parts, solve), reweighting.median_scale
-        settled = current == loss and _settled(fit, at.fit, at.scale, scale)
-        converged = ranks.as_first(settled, "convergence")
+        same = current == loss and _has_converged(fit, at.fit, at.scale, scale)
+        converged = ranks.as_first(same, "convergence")
         at = at.beyond(fit, scale, reweighting.newton_ratio)
     return _Passes(fit, at, reweighting, done, converged)
 
@@ -266,8 +266,8 @@ def fit_extras_robustly(
         before, values = values, solve(compress_parts([log], builder, weight_rows=reweighting))
         steady = abs(reweighting.median_scale - scale) <= _STEADY * scale
         scale = reweighting.median_scale
-        settled = current == loss and steady and np.allclose(values, before, rtol=_SAME, atol=_SAME)
-        if ranks.as_first(settled, "convergence"):
+        same = current == loss and steady and np.allclose(values, before, rtol=_SAME, atol=_SAME)
+        if ranks.as_first(same, "convergence"):
             break
     return values
 
@@ -361,7 +361,7 @@ def _loss_of_pass(loss: RobustLoss, done: int) -> RobustLoss:
     return loss if loss.kind == "huber" or done >= _START else replace(loss, kind="huber", tuning=TUNING["huber"])
 
 
-def _settled(fit: Fit, before: Fit, scale: float, new_scale: float) -> bool:
+def _has_converged(fit: Fit, before: Fit, scale: float, new_scale: float) -> bool:
     """Whether a pass has moved predicted rows, extra parameters and the scale far less than their errors.
 
     So it has where nothing but rounding remains to be fitted.

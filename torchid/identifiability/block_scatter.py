@@ -24,7 +24,7 @@ MOST_BLOCKS = 100
 
 _LEVERAGE = 0.95  # of the information that a block has on a combination, at most: it alone cannot say how it scatters
 #: Noise of the motion in the information on a combination, as a share of what is left without it, up to which scatter
-#: tells of a lack of fit: beyond, noise times noise does not average out in a block, and scatters 3 to 9 times as much.
+#: shows a lack of fit: beyond, noise times noise does not average out in a block, and scatters 3 to 9 times as much.
 _LITTLE_NOISE = 0.1
 _NORMAL = float(ndtri(0.975))
 
@@ -44,7 +44,7 @@ class BlockScatter:
         blocks: their number G.
         deviations: (G, 12 L), whose norm over the blocks is the standard error of the parameters; 1.96 times it is half
             of a 95 % interval. Where rows are mostly noise of the motion, rows of what they lack follow (`held` of
-            `LinearProblem`): no scatter tells of that.
+            `LinearProblem`): no scatter shows that.
         without_ridge: (G, 12 L), the same of the estimate without regularization.
         extras: the same of the extra parameters, (G, M) for each elimination, without regularization.
         lack_of_fit: variance of the blocks' part of the residuals over what it is if residuals are independent noise: 1

@@ -125,7 +125,7 @@ class MappedPages:
         bases: list[object] = [array.base for array in arrays]
         self._maps = [one for one in bases if isinstance(one, mmap.mmap)]
 
-    def let_go(self) -> None:
+    def release(self) -> None:
         """Take them out of memory; they come back where they are used."""
         if _DONTNEED is not None:
             for one in self._maps:

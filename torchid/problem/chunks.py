@@ -94,7 +94,7 @@ def _pieces(
         for number, (samples, state, index) in enumerate(tasks, start=1):
             yield samples[index], state
             if samples.pages is not None and number % _LET_GO == 0:
-                samples.pages.let_go()
+                samples.pages.release()
 
     for piece, state in upload(chosen(), device):
         yield piece, state

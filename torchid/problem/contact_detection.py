@@ -12,7 +12,6 @@ import torch
 from numpy.typing import NDArray
 from pydantic.dataclasses import dataclass
 
-from torchid.errors import LogError
 from torchid.logs import Log
 from torchid.logs.flags import beside_changes, hysteresis, samples_of, without_short
 from torchid.logs.lazy_arrays import growing_array
@@ -21,6 +20,7 @@ from torchid.logs.preprocess import find_unloaded
 from torchid.problem.contact_slip import base_velocity, contact_velocities, keep_still
 from torchid.problem.detection_forces import ForcesAlongNormals, fitted_parameters
 from torchid.problem.detection_motion import Prepared, detection_cutoff_hz, nyquist_hz, prepare
+from torchid.problem.samples import require_contacts
 from torchid.robot import Robot
 from torchid.rounding import STD_PER_MAD
 from torchid.sensing import Contact
@@ -105,8 +105,7 @@ def name_flags(
     frames = tuple(contact.frame for contact in contacts)
     if not names:
         return frames, active
-    if missing := [frame for frame in frames if frame not in names]:
-        raise LogError(source, "contact_names", f"contact '{missing[0]}' missing", "every contact of the experiment")
+    require_contacts(source, names, contacts)
     flags = np.zeros((len(active), len(names)), dtype=bool)
     flags[:, [names.index(frame) for frame in frames]] = active
     return names, flags

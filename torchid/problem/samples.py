@@ -121,7 +121,7 @@ class Samples:
 
         def chosen(x: Tensor) -> Tensor:
             rows = x[index].clone() if isinstance(index, slice) else x[index]
-            pages.let_go()
+            pages.release()
             return rows
 
         return replace(self._each(chosen), pages=None)
@@ -324,6 +324,13 @@ def _joints(log: Log, name: str, order: list[int]) -> Tensor:
     return torch.from_numpy(columns_in_order(values, order))
 
 
+def require_contacts(source: str, names: Sequence[str], contacts: Sequence[Contact]) -> None:
+    """Refuse a log without some of these contacts. Raises LogError: names the first one missing."""
+    missing = next((contact.frame for contact in contacts if contact.frame not in names), None)
+    if missing is not None:
+        raise LogError(source, "contact_names", f"contact '{missing}' missing", "every contact of the experiment")
+
+
 def _contacts(log: Log, robot: Robot, contacts: Sequence[Contact]) -> tuple[list[int], np.ndarray]:
     """Columns of the log's contacts in the experiment's order, and their activity (N, C)."""
     frames = [contact.frame for contact in contacts]
@@ -333,9 +340,7 @@ def _contacts(log: Log, robot: Robot, contacts: Sequence[Contact]) -> tuple[list
         if name not in frames and log.contact_active is not None and log.contact_active[:, column].any():
             raise LogError(log.source, f"contact_names '{name}'", "active, but not among the experiment's contacts",
                            f"contacts: [{{frame: {name}, type: ...}}, ...]")  # fmt: skip
-    for frame in frames:
-        if frame not in log.contact_names:
-            raise LogError(log.source, "contact_names", f"contact '{frame}' missing", "every contact of the experiment")
+    require_contacts(log.source, log.contact_names, contacts)
     order = [log.contact_names.index(frame) for frame in frames]
     if frames and log.contact_active is None:
         raise LogError(log.source, "contact_active", "missing", "(N, C) bool: which contact touches the ground when")

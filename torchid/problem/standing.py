@@ -28,6 +28,7 @@ from torchid.problem.floor_pose import (
     split_at_lost_feet,
 )
 from torchid.problem.log_joints import joint_order
+from torchid.problem.samples import require_contacts
 from torchid.robot import Robot
 from torchid.sensing import Contact
 from torchid.sensing.sensors import UP
@@ -237,10 +238,7 @@ def standing_flags(
     if flags is None:
         accepted = "(N, C) bool: which contact stands when; base_motion: contacts follows from it"
         raise LogError(source, "contact_active", "missing", accepted)
-    for contact in contacts:
-        if contact.frame not in names:
-            accepted = "every contact of the experiment"
-            raise LogError(source, "contact_names", f"contact '{contact.frame}' missing", accepted)
+    require_contacts(source, names, contacts)
     return flags[:, [list(names).index(contact.frame) for contact in contacts]]
 
 

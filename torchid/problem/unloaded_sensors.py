@@ -167,7 +167,7 @@ def offsets_in_the_air(
             offsets[column, component] = air.total[column, component] / count
             if _are_masked(count, above, below) and contact.frame not in masked:
                 masked.append(contact.frame)
-    _say(log, offsets, masked)
+    _warn_of_offsets(log, offsets, masked)
     return offsets
 
 
@@ -215,7 +215,7 @@ def _require_readings(log: Log, frame: str, component: int, count: int) -> None:
         raise LogError(log.source, FORCE_NORMAL if component == 6 else log.contact_wrench_field, found, accepted)
 
 
-def _say(log: Log, offsets: FloatArray, masked: Sequence[str]) -> None:
+def _warn_of_offsets(log: Log, offsets: FloatArray, masked: Sequence[str]) -> None:
     """Warn of offsets (C, 7) that were subtracted, and of contacts whose readings are masked."""
     units = ((slice(0, 3), "N"), (slice(3, 6), "N m"), (slice(6, 7), "N along the normal"))
     texts = [

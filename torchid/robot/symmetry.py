@@ -89,7 +89,7 @@ def _by_name(
             raise ConfigError.at_field(field, f"{name} has no counterpart", f"a body named {expected}")
         if len(found) > 1 or any(images[image] != [name] for image in found):
             others = [other for other in names if other in found or name in images[other]]
-            raise ConfigError.at_field(field, f"{name} answers to {' and to '.join(others)}", "one counterpart")
+            raise ConfigError.at_field(field, f"{name} corresponds to {' and to '.join(others)}", "one counterpart")
     pairs = [(i, names.index(images[name][0])) for i, name in enumerate(names) if images[name]]
     if not pairs:
         raise ConfigError.at_field(

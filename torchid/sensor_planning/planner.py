@@ -190,6 +190,11 @@ class SensorPlan:
     stack_full: int
     removals: tuple[Removal, ...]
 
+    @property
+    def proof(self) -> str:
+        """Whether a cheaper set may exist, in words."""
+        return "no cheaper set exists" if self.proven else "not proven to be the cheapest"
+
 
 def plan_sensors(problem: PlanningProblem, progress: StepCallback | None = None) -> SensorPlan:
     """The cheapest sensor set for a scenario, and of these the most informative one.

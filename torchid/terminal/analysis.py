@@ -131,11 +131,10 @@ def _determined_text(scenario: ScenarioAnalysis) -> str:
 
 def _smallest_text(scenario: ScenarioAnalysis) -> str:
     plan = scenario.plan
-    proof = "no cheaper set exists" if plan.proven else "not proven to be the cheapest"
     own = bool(scenario.proposed) and scenario.proposed is plan.observability
     names = "that of the file" if own else candidate_names(plan.chosen)
     aim = " for the inertia, friction aside" if plan.problem.criterion == "stack" else ""
-    return f"{format_count(len(plan.chosen), 'sensor')}{aim}, cost {plan.cost:g}, {proof}: {names}"
+    return f"{format_count(len(plan.chosen), 'sensor')}{aim}, cost {plan.cost:g}, {plan.proof}: {names}"
 
 
 def _scenario_lines(scenarios: Sequence[ScenarioAnalysis], width: int) -> list[str]:
@@ -167,7 +166,7 @@ def _attention(analysis: Analysis, scenarios: Sequence[ScenarioAnalysis]) -> Ite
         yield from named(one, describe_losses(_judged_states(one)))
     if analysis.scene.config.analysis.scenarios is None:
         for one in scenarios:
-            found = analysis.accuracies.get("proposed" if one.proposed is not None else f"planned for {one.name}")
+            found = analysis.accuracies.get("proposed" if one.proposed is not None else one.plan_label)
             if found is not None and found.rank < one.base.rank:
                 what = f"the logs determine {found.rank} of {one.base.rank} combinations"
                 yield f"{what}: record motion that differs more, of all joints and of the base"

@@ -153,7 +153,7 @@ def _hidden_text(found: Sequence[_Alike]) -> str:
 
 def _log_lines(checked: Sequence[Checked], room: int, width: int) -> list[str]:
     """A table of the logs, the worst first, in at most so many lines."""
-    order = sorted(checked, key=_badness, reverse=True)
+    order = sorted(checked, key=_severity, reverse=True)
     most = room - 2 if len(checked) <= room - 2 else room - 3  # an empty line, a heading, how many others there are
     shown = order[: max(most, 1)]
     counts = [Counter(finding.severity for finding in log.findings) for log in shown]
@@ -169,7 +169,7 @@ def _log_lines(checked: Sequence[Checked], room: int, width: int) -> list[str]:
     return ["", *lines]
 
 
-def _badness(log: Checked) -> tuple[float, ...]:
+def _severity(log: Checked) -> tuple[float, ...]:
     counts = Counter(finding.severity for finding in log.findings)
     return (not log.usable, float(log.rejected.mean()), *(counts[severity] for severity in SEVERITIES))
 

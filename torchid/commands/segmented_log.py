@@ -1,4 +1,4 @@
-"""What of a log must be known before its blocks can be worked on."""
+"""A log in segments that are read in blocks, with what must be known of all of it before."""
 
 from __future__ import annotations
 
@@ -76,8 +76,8 @@ class Segment:
 
 
 @dataclass(frozen=True)
-class Course:
-    """What is known of a whole log before its blocks are worked on.
+class SegmentedLog:
+    """A log in segments, with what must be known of all of it before its blocks are worked on.
 
     Attributes:
         segments: of it, in their order.
