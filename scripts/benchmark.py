@@ -39,6 +39,7 @@ from torchid.robot import Robot, load_robot
 from torchid.sensing import Contact, SensorNoise, named_sensors
 
 _CPU = torch.device("cpu")
+_PAUSE = 0.1  # seconds before each time that is taken: OpenBLAS' threads spin for some 30 ms after their last product
 _DENSE = 16384  # samples whose whole regressor a GPU has at a time: 1.7 GB of G1
 
 
@@ -217,12 +218,16 @@ def measure_consistent(count: int, repeats: int, device: torch.device) -> dict[s
 def medians(
     pipelines: Mapping[str, tuple[Callable[[], object], int]], repeats: int, device: torch.device = _CPU
 ) -> dict[str, float]:
-    """Median microseconds per sample; the pipelines take turns, so that other load affects all alike."""
+    """Median microseconds per sample; the pipelines take turns, so that other load affects all alike.
+
+    Each waits until the threads of the one before sleep, which would take a core from it.
+    """
     times: dict[str, list[float]] = {name: [] for name in pipelines}
     for work, _ in pipelines.values():
         work()
     for _ in range(repeats):
         for name, (work, size) in pipelines.items():
+            time.sleep(_PAUSE)
             times[name].append(microseconds(work, size, device))
     return {name: statistics.median(values) for name, values in times.items()}
 
