@@ -18,6 +18,7 @@ from urdfs import inertial, joint, link, write
 import torchid
 from torchid.cli import main
 from torchid.commands.plausibility import force_gain, implausibility, is_implausible_factor
+from torchid.copies import copies_allowed
 from torchid.estimators import LeastSquares
 from torchid.identifiability.confounding import TotalMass
 from torchid.log_checks import REJECTED, SUSPICIOUS, Checked, Finding, Span
@@ -133,17 +134,22 @@ def in_degrees_at_the_end(log: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "segment"), [(in_degrees, "433 to 866"), (in_degrees_at_the_end, "867 to 1299")], ids=["middle", "end"]
+    ("change", "segment", "together"),
+    [(in_degrees, "433 to 866", 1), (in_degrees_at_the_end, "867 to 1299", 3)],
+    ids=["middle", "end, three at a time"],
 )
 def test_a_long_log_is_looked_at_in_segments(
     tmp_path: Path,
     change: Callable[[dict[str, Any]], None],
     segment: str,
+    together: int,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("torchid.commands.check.MOST_CHECKED", 500)
-    assert main(["identify", str(DEMO / "quadruped.yaml"), *changed(tmp_path, change, 1_300), RIDGE]) == 2
+    monkeypatch.setattr("torchid.commands.plausibility.thread_count", lambda: together)
+    with copies_allowed():
+        assert main(["identify", str(DEMO / "quadruped.yaml"), *changed(tmp_path, change, 1_300), RIDGE]) == 2
     assert f"torchid check finds in train.npz (samples {segment} of 1300, counted from there): joint_position: " in (
         capsys.readouterr().err
     )

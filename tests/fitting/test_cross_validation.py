@@ -32,7 +32,14 @@ from torchid.problem import (
     compress_parts,
     linear_problem,
 )
-from torchid.problem.compression import FOLDS, compress_in_blocks, merge_folds, merge_states, split_into_folds
+from torchid.problem.compression import (
+    FOLDS,
+    compress_in_blocks,
+    cut_into_blocks,
+    merge_folds,
+    merge_states,
+    split_into_folds,
+)
 from torchid.problem.metrics import ROW_GROUPS, WHITENED, describe_worse, worse_than_nominal
 from torchid.report.figures import ridge_figure
 from torchid.sensing import Contact, SensorNoise, named_sensors
@@ -90,6 +97,16 @@ def test_parts_of_folds_together_are_those_of_the_logs(demo: tuple[RowBuilder, S
         assert (part.samples, part.factor.rows) == (by_state[part.state].samples, by_state[part.state].factor.rows)
         assert torch.allclose(R.T @ R, expected.T @ expected, rtol=0.0, atol=1e-12 * float(expected.norm() ** 2))
     assert [part.fold for part in merge_states(parts, builder)] == list(range(FOLDS))
+    folds = split_into_folds([log], builder)
+    cut = {part.key: part for part in compress_parts(cut_into_blocks(folds, builder), builder)}
+    blocks = compress_in_blocks(folds, builder)
+    assert {part.key for part in blocks} == set(cut)
+    assert len({(part.fold, part.block) for part in blocks}) > FOLDS, "rows of several blocks are made at once"
+    for part in blocks:
+        R, expected = (x.factor.triangle() for x in (part, cut[part.key]))
+        assert (part.samples, part.factor.rows) == (cut[part.key].samples, cut[part.key].factor.rows)
+        assert part.factor.independent_rows == pytest.approx(cut[part.key].factor.independent_rows)
+        assert torch.allclose(R.T @ R, expected.T @ expected, rtol=0.0, atol=1e-12 * float(expected.norm() ** 2))
 
 
 # ------------------------------------------------------------------------------------------------------- whole runs

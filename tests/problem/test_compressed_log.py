@@ -14,8 +14,9 @@ from walking import MACHINES, recorded, robot_of, truth
 
 from torchid.logs.preprocess import preprocess
 from torchid.problem import ExtraTerms, RowBuilder, Samples, TriangularFactor, bind_log, compress_parts
+from torchid.problem.blocks import block_spans
 from torchid.problem.compressed_log import compress_log, fold_compressed, merge_blocks, piece_spans
-from torchid.problem.compression import FOLDS, Part, block_spans, merge_folds, merge_states, split_into_folds
+from torchid.problem.compression import FOLDS, Part, merge_folds, merge_states, split_into_folds
 from torchid.sensing import named_sensors
 
 

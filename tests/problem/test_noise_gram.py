@@ -19,15 +19,14 @@ from torchid.fitting.fit import LogFitter
 from torchid.problem import ExtraTerms, RowBuilder, Samples, TriangularFactor, assemble, compress, compress_parts
 from torchid.problem.base_motion import BaseMotion
 from torchid.problem.compression import (
-    column_prior,
     compress_in_blocks,
-    free_parameters,
     merge_factors,
     split_into_folds,
 )
 from torchid.problem.linear import parameter_scale
 from torchid.problem.motion_noise import MotionNoise
 from torchid.problem.noise_gram import LEAST_SIGNAL, ColumnPrior, NoiseShares, corrected_triangle
+from torchid.problem.posing import column_prior, free_parameters
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, named_sensors
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,15 @@ _FEW_LOGS = 8
 _WRENCH = (slice(0, 3), slice(3, 6))
 MOST_CHECKED = 100_000
 """Samples of a log that are checked at once for the reason of a bad fit."""
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Successive samples of a log, with a name that says which, and how many the log has."""
+
+    log: Log
+    name: str
+    of: int
 
 
 class CheckedLogs(list[Checked]):
@@ -163,10 +172,8 @@ def _read_log_to_check(path: Path, logs: LogsConfig, settings: PreprocessingConf
     return _read_with_gaps(path, logs, settings)
 
 
-def segments_to_check(path: Path, logs: LogsConfig, settings: PreprocessingConfig) -> Iterator[tuple[Log, str]]:
+def segments_to_check(path: Path, logs: LogsConfig, settings: PreprocessingConfig) -> Iterator[Segment]:
     """One of the logs of an experiment in equal segments of at most `MOST_CHECKED` samples, the middle first.
-
-    Each has a name that says which.
 
     Raises:
         LogError: as `_read_log_to_check`.
@@ -175,16 +182,17 @@ def segments_to_check(path: Path, logs: LogsConfig, settings: PreprocessingConfi
     yield from recorded_segments(path, logs, settings)
 
 
-def recorded_segments(path: Path, logs: LogsConfig, settings: PreprocessingConfig) -> Iterator[tuple[Log, str]]:
+def recorded_segments(path: Path, logs: LogsConfig, settings: PreprocessingConfig) -> Iterator[Segment]:
     """As `segments_to_check`, of a log of any size."""
     if settings.bridge_gaps_s is not None or existing_log_kind(path) in (LogKind.BAG, LogKind.JOINED):
         log = _read_with_gaps(path, logs, settings)
         for segment in _segments(len(log)):
-            yield log.select(segment), _segment_name(path, segment, len(log))
+            yield Segment(log.select(segment), _segment_name(path, segment, len(log)), len(log))
         return
     with open_log_blocks(path, None, logs.columns, settings.needs_flags) as blocks:
         for segment in _segments(len(blocks)):
-            yield blocks.read(segment, allow_gaps=True), _segment_name(path, segment, len(blocks))
+            log = blocks.read(segment, allow_gaps=True)
+            yield Segment(log, _segment_name(path, segment, len(blocks)), len(blocks))
 
 
 def _read_with_gaps(path: Path, logs: LogsConfig, settings: PreprocessingConfig) -> Log:

@@ -140,7 +140,7 @@ def _cutoff(scene: Scene) -> CutoffChoice:
     settings, files = scene.config.preprocessing, scene.config.logs
     if files is None:
         return CutoffChoice(None, by_noise=False)
-    logs = [next(recorded_segments(path, files, settings))[0] for path in files.train]
+    logs = [next(recorded_segments(path, files, settings)).log for path in files.train]
     stated, from_feet = scene.config.sensors.noise.motion, settings.base_motion is not None
     rate = None if settings.sample_rate_hz == AUTO else settings.sample_rate_hz
     return choose_cutoff(logs, stated, rate, base_is_derived=from_feet)

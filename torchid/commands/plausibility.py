@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from functools import cached_property
+from functools import cached_property, partial
+from itertools import islice
 
 import numpy as np
 from rich.progress import Progress
 
 from torchid import parameters
-from torchid.commands.check import segments_to_check
+from torchid.commands.check import Segment, segments_to_check
 from torchid.commands.reading import scene_of_log, settle_contacts
 from torchid.config.logs import LogsConfig
+from torchid.copies import can_copy, share_between_copies
 from torchid.errors import (
     ImplausibleFitError,
     InputError,
@@ -33,7 +35,7 @@ from torchid.log_checks.lag_and_tilt import check_tilt
 from torchid.log_checks.model import NominalModel
 from torchid.parameters import GRAVITY, PARAMETERS, PER_BODY, Array
 from torchid.problem import LinearProblem, Samples
-from torchid.problem.chunks import one_thread
+from torchid.problem.chunks import one_thread, thread_count
 from torchid.problem.metrics import ADVICE, Metrics, WorseThanNominal, describe_worse
 from torchid.robot import Robot
 from torchid.rounding import is_significant
@@ -55,7 +57,7 @@ class TrainingLogs:
 
     def __init__(self, scene: Scene, bars: Progress | None = None) -> None:
         """Nothing is checked yet; `bars`: gets one for the checks, which take a while for long logs."""
-        self.scene, self._bars = scene, bars
+        self.scene, self._bars = scene, bars or Progress(disable=True)
 
     @cached_property
     def finding(self) -> tuple[str, Finding] | None:
@@ -66,26 +68,41 @@ class TrainingLogs:
         files = self.scene.config.logs
         if files is None or files.compressed:
             return None
-        task = None if self._bars is None else self._bars.add_task("checking the logs", total=None)
-        found = list(self._findings(files))
-        if self._bars is not None and task is not None:
-            self._bars.update(task, completed=1, total=1)
+        total = 100.0 * len(files.train)
+        task = self._bars.add_task("checking the logs", total=total)
+        found = list(self._findings(files, partial(self._bars.advance, task)))
+        self._bars.update(task, completed=total)
         return min(found, key=lambda pair: _order(pair[1]), default=None)
 
-    def _findings(self, files: LogsConfig) -> Iterator[tuple[str, Finding]]:
-        scene, settings = self.scene, self.scene.config.preprocessing
+    def _findings(self, files: LogsConfig, done: Callable[[float], None]) -> Iterator[tuple[str, Finding]]:
+        """Findings on large parts of segments; `done` is called with the share of each in its log in percent."""
+        segments, count = self._segments(files), thread_count() if can_copy() else 1
+        while together := list(islice(segments, count)):  # as many as are in memory at a time
+            findings = share_between_copies(together, _large_findings, count)
+            for (_, segment), found in zip(together, findings, strict=True):
+                yield from ((segment.name, one) for one in found)
+                if any(one.rejects_all for one in found):
+                    return
+                done(100.0 * len(segment.log) / segment.of)
+
+    def _segments(self, files: LogsConfig) -> Iterator[tuple[Scene, Segment]]:
         for path in files.train:
-            own = scene_of_log(scene, path)
             with suppress(InputError):  # larger than memory
-                for log, name in segments_to_check(path, files, settings):
-                    flagged, _ = settle_contacts(log, own)
-                    rest = scene.contacts, settings.filter_hz, settings.derived, scene.declared
-                    checked = check(flagged, own.robot, *rest)
-                    severe = [one for one in checked.findings if one.severity in SEVERITIES[:2]]
-                    large = [one for one in severe if one.mask(len(checked.log)).mean() > _PART]
-                    yield from ((name, one) for one in large)
-                    if any(one.rejects_all for one in large):
-                        return
+                own = scene_of_log(self.scene, path)
+                yield from ((own, one) for one in segments_to_check(path, files, own.config.preprocessing))
+
+
+def _large_findings(of: tuple[Scene, Segment]) -> list[Finding]:
+    """Findings on a large part of a segment of a log, none where its contacts cannot be settled."""
+    scene, segment = of
+    settings = scene.config.preprocessing
+    try:
+        flagged, _ = settle_contacts(segment.log, scene)
+    except InputError:
+        return []
+    checked = check(flagged, scene.robot, scene.contacts, settings.filter_hz, settings.derived, scene.declared)
+    severe = [one for one in checked.findings if one.severity in SEVERITIES[:2]]
+    return [one for one in severe if one.mask(len(checked.log)).mean() > _PART]
 
 
 def require_plausible(fit: Fit, logs: TrainingLogs, samples: Sequence[Samples] = ()) -> TotalMass:

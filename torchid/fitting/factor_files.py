@@ -36,8 +36,9 @@ from torchid.logs.containers import FACTORS, Container, open_npz, reader_errors_
 from torchid.logs.remote import RemoteFile, is_url, local_copy
 from torchid.parameters import Array
 from torchid.problem import RowBuilder
+from torchid.problem.blocks import block_spans
 from torchid.problem.compressed_log import CompressedLog, piece_spans
-from torchid.problem.compression import FOLDS, block_spans
+from torchid.problem.compression import FOLDS
 from torchid.problem.extras import NoiseGroups, noise_key
 from torchid.reprs import short_repr
 from torchid.robot.payloads import Payload

@@ -12,7 +12,7 @@ import torch
 
 from torchid.errors import InputError, join_names
 from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, Finding, Skipped, refused
-from torchid.log_checks.lag_and_tilt import check_lag_and_tilt, check_torque_offsets, without_lag
+from torchid.log_checks.lag_and_tilt import Trial, check_lag_and_tilt, check_torque_offsets, without_lag
 from torchid.log_checks.mistakes import possible_mistakes
 from torchid.log_checks.model import (
     MAX_TRIAL_DIFFERENTIATED_SAMPLES,
@@ -144,9 +144,11 @@ def _misfit_findings(
         yield explanation
         return
     log, samples = _scaled(log, samples, robot, fit.torque)
+    trial = Trial(log, model, cutoff)
     if model.declared.delay == AUTO:
-        log = without_lag(log, model, cutoff)
-    moved, unexplained = check_lag_and_tilt(log, model, cutoff, derived)
+        trial = without_lag(trial)
+        log = trial.log
+    moved, unexplained = check_lag_and_tilt(trial, derived)
     scale = None if moved else _fit_time_scale(log, model)
     if found := moved or [one for one in [_time_scale_finding(scale)] if one is not None]:
         alike = None if moved else fit_torque_gains(samples, model)
@@ -162,7 +164,7 @@ def _misfit_findings(
     yield from torques
     if not any(isinstance(item, Finding) for item in torques):
         scaled = list(_gain_and_point_findings(log, fit_torque_gains(samples, model), robot))
-        yield from scaled or check_torque_offsets(log, model, cutoff)
+        yield from scaled or check_torque_offsets(trial)
 
 
 def _contradiction(fit: ModelFit, robot: Robot, held: bool) -> Finding:

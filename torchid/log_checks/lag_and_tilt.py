@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -60,6 +61,66 @@ UnknownColumns = Callable[[RowBuilder, Samples, int], FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
+class Trial:
+    """Some filtered samples of a log, with their rows, for all that may be wrong with it.
+
+    Attributes:
+        log: the log.
+        model: robot, contacts, and what is declared.
+        cutoff_hz: of the filter.
+    """
+
+    log: Log
+    model: NominalModel
+    cutoff_hz: float
+
+    @cached_property
+    def pieces(self) -> list[Log]:
+        """Runs of the log, filtered. Raises InputError: it cannot be filtered."""
+        return preprocess_pieces(self.log, self.cutoff_hz, MAX_TRIAL_DIFFERENTIATED_SAMPLES)
+
+    @cached_property
+    def samples(self) -> list[Samples]:
+        """Samples of them. Raises InputError: as `pieces`, or the log does not match the robot."""
+        return bind_some_samples(self.pieces, self.model.robot, self.model.contacts, _SAMPLES)
+
+    @cached_property
+    def rows(self) -> _Rows | None:
+        """Rows of the samples, None where no force was measured. Raises InputError: as `samples`."""
+        return _Rows.of(self.samples, self.model)
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Whitened rows of some samples, and columns of what may differ from the URDF in them.
+
+    Attributes:
+        builder: of the rows.
+        samples: that they are of.
+        parts: of each of the samples, bases W (N, n_rows, n_rows), which rows are not zero, columns (N, n_rows, P),
+            those of offsets of torques last, and what the nominal parameters leave (N, n_rows).
+    """
+
+    builder: RowBuilder
+    samples: Sequence[Samples]
+    parts: list[tuple[FloatArray, BoolArray, FloatArray, FloatArray]]
+
+    @classmethod
+    def of(cls, samples: Sequence[Samples], model: NominalModel) -> _Rows | None:
+        """The rows of the forces that are measured, None without any."""
+        builder = deviation_builder(samples, model)
+        if builder is None:
+            return None
+        prior, parts = prior_columns(builder, model.robot, samples), []
+        nominal = builder.to_columns(model.robot.nominal.flatten()[None])[0].numpy()
+        for part in samples:
+            rows, W, equations = rows_with_bases(builder, part)
+            columns = deviation_columns(builder, rows, W, part, prior)
+            parts.append((W, equations, columns, rows[..., :-1] @ nominal - rows[..., -1]))
+        return cls(builder, samples, parts)
+
+
+@dataclass(frozen=True, eq=False)
 class Deviation:
     """Unknowns beside the parameters, estimated with these.
 
@@ -94,24 +155,21 @@ class Deviation:
         return f"{self.without / max(self.left, 1e-9):.2g} times as much is unexplained otherwise"
 
 
-def check_lag_and_tilt(
-    log: Log, model: NominalModel, cutoff_hz: float, derived: tuple[str, ...] = ()
-) -> tuple[list[Finding], float]:
+def check_lag_and_tilt(trial: Trial, derived: tuple[str, ...] = ()) -> tuple[list[Finding], float]:
     """Findings about torques that lag or lead, a vertical that gravity is not along, and single contact sensors.
 
     The number is what the best URDF near the given one leaves unexplained without any of these, in
     `UNMODELLED_FORCE_SHARE` of the forces; infinite where nothing could be compared.
 
     Args:
-        log: the log.
-        model: robot, contacts, and what is declared.
-        cutoff_hz: of the filter.
+        trial: of the log.
         derived: how names of fields begin that were not recorded.
     """
+    log, model = trial.log, trial.model
     try:
-        lag = fit_lag(log, model, cutoff_hz)
-        tilt = fit_tilt(log, model, cutoff_hz) if not "base_quat_xyzw".startswith(derived) else None
-        sensors = fit_contact_sensors(log, model, cutoff_hz)
+        lag = fit_lag(trial)
+        tilt = fit_tilt(trial) if not "base_quat_xyzw".startswith(derived) else None
+        sensors = fit_contact_sensors(trial)
     except InputError:  # reported by `check_forces_against_urdf`
         return [], np.inf
     unexplained = min((x.without for x in (lag, tilt) if x is not None), default=np.inf)
@@ -121,16 +179,16 @@ def check_lag_and_tilt(
 
 def check_tilt(samples: Sequence[Samples], model: NominalModel) -> Iterator[Finding]:
     """A finding about a vertical that gravity is not along, in filtered logs of a robot."""
-    yield from _tilt_findings(_tilt_of(some_samples(samples, _SAMPLES), model), model)
+    yield from _tilt_findings(_tilt_of(_Rows.of(some_samples(samples, _SAMPLES), model), model), model)
 
 
-def check_torque_offsets(log: Log, model: NominalModel, cutoff_hz: float) -> Iterator[Finding]:
+def check_torque_offsets(trial: Trial) -> Iterator[Finding]:
     """Findings about single joints whose torque reads too much by a constant, for logs that nothing else is wrong with.
 
     Args: as `check_lag_and_tilt`.
     """
     with suppress(InputError):  # reported by `check_forces_against_urdf`
-        yield from _offset_findings(fit_torque_offsets(log, model, cutoff_hz), log, model)
+        yield from _offset_findings(fit_torque_offsets(trial), trial.log, trial.model)
 
 
 def _lag_findings(lag: Deviation | None, declared: Declared) -> Iterator[Finding]:
@@ -189,7 +247,7 @@ def _contact_sensor_findings(found: Deviation | None, log: Log, model: NominalMo
         yield Finding(name, SUSPICIOUS, log.contact_wrench_field, text, advice, (contact.frame,))
 
 
-def fit_contact_sensors(log: Log, model: NominalModel, cutoff_hz: float) -> Deviation | None:
+def fit_contact_sensors(trial: Trial) -> Deviation | None:
     """By how much each contact's wrench is more than is read, and turned, (4 C,): a share, and three angles' sines.
 
     The axes are those of the readings. A turn about an axis across the forces takes the share cos - 1 beside it. None
@@ -198,11 +256,9 @@ def fit_contact_sensors(log: Log, model: NominalModel, cutoff_hz: float) -> Devi
     Raises:
         InputError: as `fit_lag`.
     """
-    contacts = model.contacts
-    if log.contact_wrench is None or not contacts:
+    contacts = trial.model.contacts
+    if trial.log.contact_wrench is None or not contacts:
         return None
-    pieces = preprocess_pieces(log, cutoff_hz, MAX_TRIAL_DIFFERENTIATED_SAMPLES)
-    samples = bind_some_samples(pieces, model.robot, model.contacts, _SAMPLES)
 
     @torch.no_grad()
     def columns(builder: RowBuilder, part: Samples, number: int) -> FloatArray:
@@ -216,23 +272,21 @@ def fit_contact_sensors(log: Log, model: NominalModel, cutoff_hz: float) -> Devi
         wrenches = [(k, builder.recorded_wrench(x, k, kinematics)) for k in range(len(contacts)) for x in changes]
         return np.stack([torch.einsum("nwv,nw->nv", J[:, k], w).numpy() for k, w in wrenches], axis=2)
 
-    return _fit(samples, model, columns, _SENSOR_PRIOR_STD)
+    return _fit(trial.rows, columns, _SENSOR_PRIOR_STD)
 
 
-def fit_lag(log: Log, model: NominalModel, cutoff_hz: float) -> Deviation | None:
+def fit_lag(trial: Trial) -> Deviation | None:
     """By how much joint torques are later than the motion, (1,) [s]; None where no torque was measured.
 
     Raises:
         InputError: the log cannot be filtered, or does not match the robot.
     """
-    if log.joint_torque is None:
+    if trial.log.joint_torque is None:
         return None
-    robot, out, shift = model.robot, None, 0.0
+    robot, contacts, out, shift, moved = trial.model.robot, trial.model.contacts, None, 0.0, trial
     for _ in range(_SHIFTS):
-        moved = with_delayed_torques(log, -shift)
-        pieces = preprocess_pieces(moved, cutoff_hz, MAX_TRIAL_DIFFERENTIATED_SAMPLES)
-        slopes = [replace(one, joint_torque=_slope(one)) for one in pieces]
-        rates = bind_some_samples(slopes, robot, model.contacts, _SAMPLES)
+        slopes = [replace(one, joint_torque=_slope(one)) for one in moved.pieces]
+        rates = bind_some_samples(slopes, robot, contacts, _SAMPLES)
 
         def columns(builder: RowBuilder, part: Samples, number: int, rates: Sequence[Samples] = rates) -> FloatArray:
             torque = np.zeros((len(part), builder.tree.n_rows, 1))
@@ -240,7 +294,7 @@ def fit_lag(log: Log, model: NominalModel, cutoff_hz: float) -> Deviation | None
             torque[:, base : base + robot.n, 0] = builder.recorded_torque(rates[number])[:, : robot.n].numpy()
             return np.nan_to_num(torque)
 
-        found = _fit(bind_some_samples(pieces, robot, model.contacts, _SAMPLES), model, columns, _LAG_PRIOR_STD_S)
+        found = _fit(moved.rows, columns, _LAG_PRIOR_STD_S)
         if found is None:
             return None
         without = found.without if out is None else out.without
@@ -248,26 +302,26 @@ def fit_lag(log: Log, model: NominalModel, cutoff_hz: float) -> Deviation | None
         shift = float(out.value[0])
         if abs(found.value[0]) < _LEAST_SHIFT_S or abs(shift) > 2.0 * _LAG_PRIOR_STD_S:
             break
+        moved = replace(trial, log=with_delayed_torques(trial.log, -shift))
     return out
 
 
-def fit_torque_offsets(log: Log, model: NominalModel, cutoff_hz: float) -> Deviation | None:
+def fit_torque_offsets(trial: Trial) -> Deviation | None:
     """By how much each joint's torque is less than is read, (n,) [N m or N]; None where no torque was measured.
 
     Raises:
         InputError: as `fit_lag`.
     """
+    log, robot = trial.log, trial.model.robot
     if log.joint_torque is None:
         return None
-    robot, pieces = model.robot, preprocess_pieces(log, cutoff_hz, MAX_TRIAL_DIFFERENTIATED_SAMPLES)
-    samples = bind_some_samples(pieces, robot, model.contacts, _SAMPLES)
 
     def columns(builder: RowBuilder, part: Samples, number: int) -> FloatArray:
         constant = np.zeros((builder.tree.n_rows, robot.n))
         constant[builder.tree.base_rows + np.arange(robot.n), np.arange(robot.n)] = -1.0
         return np.broadcast_to(constant, (len(part), *constant.shape))
 
-    return _fit(samples, model, columns, _OFFSET_PRIOR_SHARE * _torque_rms(log) or 1.0, offsets=False)
+    return _fit(trial.rows, columns, _OFFSET_PRIOR_SHARE * _torque_rms(log) or 1.0, offsets=robot.n)
 
 
 def _torque_rms(log: Log) -> float:
@@ -276,21 +330,23 @@ def _torque_rms(log: Log) -> float:
     return float(np.sqrt(np.nanmean(np.square(torque)))) if np.isfinite(torque).any() else 0.0
 
 
-def without_lag(log: Log, model: NominalModel, cutoff_hz: float) -> Log:
-    """The log with joint torques as late as the motion, where it is clear by how much they are not.
+def without_lag(trial: Trial) -> Trial:
+    """The trial of a log with joint torques as late as the motion, where it is clear by how much they are not.
 
     Raises:
         InputError: as `fit_lag`.
     """
-    lag = fit_lag(log, model, cutoff_hz)
-    return log if lag is None or not lag.is_clear else with_delayed_torques(log, -float(lag.value[0]))
+    lag = fit_lag(trial)
+    if lag is None or not lag.is_clear:
+        return trial
+    return replace(trial, log=with_delayed_torques(trial.log, -float(lag.value[0])))
 
 
 def _slope(log: Log) -> FloatArray | None:
     return None if log.joint_torque is None else np.gradient(log.joint_torque, log.time, axis=0)
 
 
-def fit_tilt(log: Log, model: NominalModel, cutoff_hz: float) -> Deviation | None:
+def fit_tilt(trial: Trial) -> Deviation | None:
     """By how much gravity is turned about x and y from where the log says it is, (2,) [rad].
 
     The axes are the world's, of a fixed base its own. None where no force was measured, or an IMU felt gravity.
@@ -298,20 +354,19 @@ def fit_tilt(log: Log, model: NominalModel, cutoff_hz: float) -> Deviation | Non
     Raises:
         InputError: as `fit_lag`.
     """
-    if log.imu_specific_force is not None and not model.robot.fixed_base:
+    if trial.log.imu_specific_force is not None and not trial.model.robot.fixed_base:
         return None
-    pieces = preprocess_pieces(log, cutoff_hz, MAX_TRIAL_DIFFERENTIATED_SAMPLES)
-    return _tilt_of(bind_some_samples(pieces, model.robot, model.contacts, _SAMPLES), model)
+    return _tilt_of(trial.rows, trial.model)
 
 
-def _tilt_of(samples: Sequence[Samples], model: NominalModel) -> Deviation | None:
+def _tilt_of(rows: _Rows | None, model: NominalModel) -> Deviation | None:
     def columns(builder: RowBuilder, part: Samples, number: int) -> FloatArray:
         phi = model.robot.nominal.flatten()[None]
         level = force_series(builder, part, phi)[1][0]
         turned = [force_series(builder, _turned(part, axis), phi)[1][0] for axis in range(2)]
         return np.stack([level - one for one in turned], axis=2) / _SMALL_ANGLE
 
-    return _fit(samples, model, columns, _TILT_PRIOR_STD_RAD)
+    return _fit(rows, columns, _TILT_PRIOR_STD_RAD)
 
 
 def _turned(samples: Samples, axis: int) -> Samples:
@@ -323,26 +378,15 @@ def _turned(samples: Samples, axis: int) -> Samples:
     return replace(samples, base=replace(base, specific_force=base.specific_force - change @ base.rotation))
 
 
-def _fit(
-    samples: Sequence[Samples],
-    model: NominalModel,
-    columns: UnknownColumns,
-    prior_std: float,
-    offsets: bool = True,
-) -> Deviation | None:
-    """Unknowns by their columns, beside parameters, friction, armature and, if not left out, offsets of torques."""
-    builder = deviation_builder(samples, model)
-    if builder is None:
+def _fit(rows: _Rows | None, columns: UnknownColumns, prior_std: float, offsets: int = 0) -> Deviation | None:
+    """Unknowns by their columns, beside parameters, friction, armature and all but so many `offsets` of torques."""
+    if rows is None:
         return None
-    prior = prior_columns(builder, model.robot, samples)
-    nominal = builder.to_columns(model.robot.nominal.flatten()[None])[0].numpy()
     parts = []
-    for number, part in enumerate(samples):
-        rows, W, equations = rows_with_bases(builder, part)
-        target = rows[..., :-1] @ nominal - rows[..., -1]
-        projected = np.einsum("nvr,nvk->nrk", W, columns(builder, part, number))
-        K = deviation_columns(builder, rows, W, part, prior, offsets=offsets)
-        parts.append((K, np.concatenate([target[..., None], projected], axis=2), equations))
+    for number, (part, (W, equations, K, target)) in enumerate(zip(rows.samples, rows.parts, strict=True)):
+        projected = np.einsum("nvr,nvk->nrk", W, columns(rows.builder, part, number))
+        Y = np.concatenate([target[..., None], projected], axis=2)
+        parts.append((K[..., : K.shape[2] - offsets], Y, equations))
     normal = accumulate_blocks(parts)
 
     def solve(block: int | None) -> tuple[FloatArray, FloatArray, float, float]:

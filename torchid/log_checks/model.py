@@ -22,6 +22,7 @@ from torchid.logs.signal_noise import SignalNoise
 from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log
 from torchid.problem.extras import list_extras
 from torchid.problem.predict import force_series, null_space_part
+from torchid.problem.samples import concatenate
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet, named_sensors
 
@@ -173,8 +174,13 @@ def preprocess_pieces(log: Log, cutoff_hz: float, max_samples: int = MAX_DIFFERE
 def bind_some_samples(
     logs: Sequence[Log], robot: Robot, contacts: Sequence[Contact], count: int = COMPARED_SAMPLES
 ) -> list[Samples]:
-    """About `count` evenly spread samples of filtered logs. Raises InputError: they do not match the robot."""
-    return some_samples([bind_log(log, robot, contacts) for log in logs], count)
+    """About `count` evenly spread samples of filtered runs of a log, in one piece, whose rows are made at once.
+
+    Raises:
+        InputError: the log does not match the robot.
+    """
+    pieces = some_samples([bind_log(log, robot, contacts) for log in logs], count)
+    return [concatenate([replace(piece, unloaded=None) for piece in pieces])]
 
 
 def some_samples(logs: Sequence[Samples], count: int) -> list[Samples]:

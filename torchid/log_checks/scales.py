@@ -209,9 +209,8 @@ def deviation_columns(
     samples: Samples,
     prior: FloatArray,
     armature: float = _JOINT_TERM_SCALE,
-    offsets: bool = True,
 ) -> FloatArray:
-    """Columns (N, n_rows, P) of what may differ from the URDF: parameters, friction, armature, offsets of torques.
+    """Columns (N, n_rows, P) of what may differ from the URDF: parameters, friction, armature, last offsets of torques.
 
     Args:
         builder: of the rows.
@@ -220,11 +219,10 @@ def deviation_columns(
         samples: whose motion friction and armature follow.
         prior: from `prior_columns`.
         armature: its prior, over the unmodelled force.
-        offsets: whether they are among them.
     """
     rate = samples.joint_velocity
     terms = [(torch.sign(rate), _JOINT_TERM_SCALE), (rate, _JOINT_TERM_SCALE), (samples.joint_acceleration, armature)]
-    terms += [(torch.ones_like(rate), _JOINT_TERM_SCALE)] * offsets
+    terms.append((torch.ones_like(rate), _JOINT_TERM_SCALE))
     of_joints = (_joint_term(builder, W, value, scale) for value, scale in terms)
     return np.concatenate([rows[..., :-1] @ prior, *of_joints], axis=2)
 

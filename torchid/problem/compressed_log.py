@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from torchid.problem.blocks import block_spans, lay_out_folds
 from torchid.problem.chunks import ProgressCallback, chunks_by_state, one_thread
 from torchid.problem.compression import (
     LEAST_PER_FOLD,
     Part,
-    block_spans,
     compress_parts,
     compress_unloaded,
     fold_count,
-    lay_out_folds,
     merge_by_key,
     merge_folds,
     merge_states,

@@ -8,19 +8,20 @@ from functools import partial
 from itertools import chain
 
 import numpy as np
+import torch
 
-from torchid import parameters, ranks
-from torchid.parameters import Array
+from torchid import ranks
+from torchid.problem.blocks import block_spans, blocks_in, cut_logs, lay_out_folds, rows_of_samples, span_of_samples
+from torchid.problem.chunk_dynamics import Workspace
 from torchid.problem.chunks import ProgressCallback, chunks_by_state, map_chunks, one_thread, worker_count
 from torchid.problem.contact_state import ContactState
-from torchid.problem.linear import PRIOR_DEVIATION, LinearProblem, TriangularFactor, parameter_scale
-from torchid.problem.noise_gram import ColumnPrior, NoiseGram, corrected_triangle, estimate_noise_gram
+from torchid.problem.linear import TriangularFactor
+from torchid.problem.noise_gram import NoiseGram, estimate_noise_gram
 from torchid.problem.row_compressor import RowCompressor, RowWeighting
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.problem.unloaded_sensors import unloaded_offset_equations
 from torchid.reprs import short_repr
-from torchid.robot import Robot
 
 FOLDS = 5
 """Number of cross-validation folds of the training samples."""
@@ -104,6 +105,19 @@ def compress_parts(
     `weight_rows` weights all other rows before they are added; their factors then have no noise Gram matrix, see
     `add_noise_gram`.
     """
+    return _compress_parts(logs, logs, builder, chunk, threads, progress, weight_rows)
+
+
+def _compress_parts(
+    logs: Sequence[Samples],
+    pieces: Sequence[Samples],
+    builder: RowBuilder,
+    chunk: int | None,
+    threads: int | None,
+    progress: ProgressCallback | None,
+    weight_rows: RowWeighting | None,
+) -> list[Part]:
+    """As `compress_parts`; `pieces`: the logs, cut where parts are."""
 
     def reduce(chunks: Iterator[tuple[Samples, ContactState]]) -> tuple[list[Part], RowWeighting | None]:
         weighting = None if weight_rows is None else weight_rows.for_worker()
@@ -112,7 +126,7 @@ def compress_parts(
     done = map_chunks(logs, builder, reduce, chunk, threads, progress)
     parts = _merge_parts(of_worker for of_worker, _ in done)
     if weight_rows is None:
-        add_noise_gram(parts, noise_gram_by_part(logs, builder, progress))
+        add_noise_gram(parts, noise_gram_by_part(pieces, builder, progress))
     else:
         for _, weighting in done:
             weight_rows.add(weighting)
@@ -134,8 +148,12 @@ def compress_in_blocks(
         progress: called with the number of samples done.
         weight_rows: as in `compress_parts`.
     """
-    pieces = [replace(piece, unloaded=None) for piece in cut_into_blocks(logs, builder)]
-    parts = compress_parts(pieces, builder, progress=progress, weight_rows=weight_rows)
+    spans = _spans_of_blocks(logs, builder)
+    numbers = [np.repeat(range(len(own)), np.diff(own)[:, 0]) for own in spans]
+    numbered = [
+        replace(log, unloaded=None, blocks=torch.from_numpy(own)) for log, own in zip(logs, numbers, strict=True)
+    ]
+    parts = _compress_parts(numbered, cut_logs(numbered, spans), builder, None, None, progress, weight_rows)
     if not any(extra.what == "offset" and extra.contact is not None for extra in builder.extras):
         return parts
     return [*parts, *compress_unloaded(logs, builder)]
@@ -143,16 +161,16 @@ def compress_in_blocks(
 
 def cut_into_blocks(logs: Sequence[Samples], builder: RowBuilder) -> list[Samples]:
     """The logs in blocks of about equal length, some `BLOCKS` in all; fewer where samples or memory are short."""
+    return cut_logs(logs, _spans_of_blocks(logs, builder))
+
+
+def _spans_of_blocks(logs: Sequence[Samples], builder: RowBuilder) -> list[list[tuple[int, int]]]:
+    """First sample and end of the blocks of each log."""
     independent = sum(len(log) / log.oversampling for log in logs)
     states = len({(log.source, state) for log in logs for state, _ in chunks_by_state(log)})
     count = min(BLOCKS, int(independent / _LEAST_PER_BLOCK), _most_factors(states, builder))
-    count = ranks.as_first(count, "blocks")
-    total, out = sum(map(len, logs)), []
-    for log in logs:
-        spans = block_spans(len(log), max(1, round(count * len(log) / max(total, 1))))
-        for number, (start, stop) in enumerate(spans):
-            out.append(replace(log if len(spans) == 1 else log[start:stop], block=number))
-    return out
+    count, total = ranks.as_first(count, "blocks"), sum(map(len, logs))
+    return [block_spans(len(log), max(1, round(count * len(log) / max(total, 1)))) for log in logs]
 
 
 def _compress_chunks(
@@ -166,32 +184,60 @@ def _compress_chunks(
 
     Without `loaded`, those of readings in the air alone.
     """
-    parts: dict[PartKey, Part] = {}
-    workspace, compressor = builder.workspaces.take(), RowCompressor()
-
-    def part(samples: Samples, state: ContactState, unloaded: bool) -> Part:
-        key = _key(samples, state, unloaded) if by_log else _key(None, state)
-        source, at, fold, block, in_the_air = key
-        return parts.setdefault(key, Part(source, at, TriangularFactor(builder.width), 0, fold, block, in_the_air))
-
+    parts, workspace = _Parts(builder, by_log), builder.workspaces.take()
     for samples, state in chunks:
         if loaded:
-            own = part(samples, state, False)
-            own.samples += len(samples)
-            for support, stacked in builder.stacked_rows(samples, state, workspace):
-                if weight_rows is not None:
-                    rows = stacked[len(support) + 1 :]
-                    rows *= weight_rows(samples, support, rows)
-                compressor.add(own.factor, support, stacked, samples.oversampling)
+            parts.add(samples, state, workspace, weight_rows)
         for channel in unloaded_offset_equations(builder, samples):
-            in_the_air = part(samples, state, True)
+            in_the_air = parts.part(samples, state, samples.block, unloaded=True)
             if channel.masked:
                 in_the_air.masked.add(channel.offset)
             else:
                 in_the_air.factor.add(*channel.row(builder), samples.oversampling)
-    compressor.finish()
+    parts.finish()
     builder.workspaces.give_back(workspace)
-    return list(parts.values())
+    return list(parts.parts.values())
+
+
+class _Parts:
+    """Parts that chunks are compressed to, with a compressor for each block that the last chunk has rows of."""
+
+    def __init__(self, builder: RowBuilder, by_log: bool) -> None:
+        self.parts: dict[PartKey, Part] = {}
+        self._builder, self._by_log = builder, by_log
+        self._compressors: dict[PartKey, RowCompressor] = {}
+
+    def part(self, samples: Samples, state: ContactState, block: int, unloaded: bool = False) -> Part:
+        key = (samples.source, state, samples.fold, block, unloaded) if self._by_log else _key(None, state)
+        source, at, fold, block, in_the_air = key
+        return self.parts.setdefault(
+            key, Part(source, at, TriangularFactor(self._builder.width), 0, fold, block, in_the_air)
+        )
+
+    def add(
+        self, samples: Samples, state: ContactState, workspace: Workspace, weight_rows: RowWeighting | None
+    ) -> None:
+        """Add the rows of a chunk, which are made at once, to the parts of its blocks."""
+        spans = [(self.part(samples, state, block), start, end) for block, start, end in blocks_in(samples)]
+        if spans[0][0].key not in self._compressors:  # no later chunk is of the blocks before
+            self.finish()
+        compressors = [self._compressors.setdefault(part.key, RowCompressor()) for part, *_ in spans]
+        for part, start, end in spans:
+            part.samples += end - start
+        for rows, index in self._builder.blocks(samples, state, workspace):
+            support, stacked = rows.block.support, rows.stacked.T
+            if weight_rows is not None:
+                weighted = stacked[len(support) + 1 :]
+                weighted *= weight_rows(samples, support, weighted)
+            for compressor, (part, start, end) in zip(compressors, spans, strict=True):
+                own = rows_of_samples(rows, *span_of_samples(index, start, end), workspace)
+                compressor.add(part.factor, support, own, samples.oversampling)
+
+    def finish(self) -> None:
+        """Bring the factors up to date."""
+        for compressor in self._compressors.values():
+            compressor.finish()
+        self._compressors.clear()
 
 
 def noise_gram_by_part(
@@ -245,66 +291,6 @@ def merge_factors(factors: Iterable[TriangularFactor], builder: RowBuilder) -> T
     return out
 
 
-@one_thread()
-def linear_problem(factor: TriangularFactor, builder: RowBuilder, robot: Robot, friction: bool = True) -> LinearProblem:
-    """Pose the linear problem in all 12 L parameters of the bodies from a factor that `compress` made.
-
-    Raises:
-        ValueError: the builder has extra parameters; `assemble` eliminates them.
-    """
-    if builder.extras:
-        raise ValueError("builder: found extra terms; accepted: one without, or torchid.assemble")
-    own = corrected_triangle(factor, column_prior(builder, robot, friction))
-    return problem_from_triangle(own.R, factor.rows, factor.oversampling, builder, robot, friction, own.held)
-
-
-def column_prior(builder: RowBuilder, robot: Robot, friction: bool = True) -> ColumnPrior:
-    """The nominal parameters in the builder's columns, and deviations within their scale of those that are free."""
-    columns, nominal = builder.columns.parameter_map, robot.nominal.flatten()
-    scale = np.where(free_parameters(robot, friction), parameter_scale(robot.nominal).flatten(), 0.0)
-    return ColumnPrior(columns @ nominal, columns * (PRIOR_DEVIATION * scale))
-
-
-def problem_from_triangle(
-    R: Array, rows: int, oversampling: float, builder: RowBuilder, robot: Robot, friction: bool, held: Array | None
-) -> LinearProblem:
-    """The problem in all 12 L parameters from a triangle in the regrouped columns, right-hand side last.
-
-    Args:
-        R: (M, columns + 1).
-        rows: that went into it.
-        oversampling: of them.
-        builder: of the rows.
-        robot: the robot.
-        friction: whether friction is free.
-        held: (columns, Q), as `CorrectedTriangle` has it.
-    """
-    count = builder.columns.count
-    return LinearProblem(
-        A=R[:count, :-1] @ builder.columns.parameter_map,
-        b=R[:count, -1],
-        residual=float(np.square(R[count:, -1]).sum()),
-        rows=rows,
-        nominal=robot.nominal.flatten(),
-        scale=parameter_scale(robot.nominal).flatten(),
-        free=free_parameters(robot, friction),
-        oversampling=oversampling,
-        held=None if held is None else R[:count, :-1] @ held,
-    )
-
-
-def free_parameters(robot: Robot, friction: bool = True) -> np.ndarray:
-    """Parameters that can be fitted, (12 L,) bool.
-
-    All but inertial parameters of massless bodies, friction of welds, and any friction if not `friction`.
-    """
-    free = np.ones(robot.nominal.shape, dtype=bool)
-    free[[body.massless for body in robot.bodies], parameters.INERTIAL] = False
-    still = [body.joint is None or body.joint.kind == "fixed" for body in robot.bodies]
-    free[still if friction else slice(None), parameters.FRICTION] = False
-    return free.flatten()
-
-
 def split_into_folds(logs: Sequence[Samples], builder: RowBuilder) -> list[Samples]:
     """The logs, in order, cut into blocks contiguous in time, with the fold of each.
 
@@ -340,34 +326,6 @@ def fold_count(independent: float, states: int, builder: RowBuilder) -> int:
 def _most_factors(states: int, builder: RowBuilder) -> int:
     """Number of factors of each of some contact states that there is memory for."""
     return _MEMORY // (8 * (builder.width + 1) ** 2 * max(states, 1) * worker_count(builder.device))
-
-
-def lay_out_folds(
-    lengths: Sequence[int], count: int, most: Sequence[int] | None = None
-) -> list[list[tuple[int, int, int]]]:
-    """Blocks of each log: first sample, end and fold.
-
-    Args:
-        lengths: samples of each log.
-        count: number of folds.
-        most: blocks of each log at most.
-    """
-    total, preceding, out = sum(lengths), 0, []
-    for index, length in enumerate(lengths):
-        blocks = max(1, round(count * length / max(total, 1)))
-        spans = block_spans(length, blocks if most is None else min(blocks, most[index]))
-        middles = (preceding + (start + stop) / 2 for start, stop in spans)
-        folds = (min(int(count * middle / max(total, 1)), count - 1) for middle in middles)
-        out.append([(*span, fold) for span, fold in zip(spans, folds, strict=True)])
-        preceding += length
-    used = sorted({fold for blocks in out for _, _, fold in blocks})  # rounding may leave a fold empty
-    return [[(start, stop, used.index(fold)) for start, stop, fold in blocks] for blocks in out]
-
-
-def block_spans(length: int, blocks: int) -> list[tuple[int, int]]:
-    """First sample and end of each of some blocks of a log."""
-    ends = [length * k // blocks for k in range(blocks + 1)]
-    return list(zip(ends, ends[1:], strict=False))
 
 
 def merge_states(parts: Sequence[Part], builder: RowBuilder) -> list[Part]:

@@ -10,11 +10,12 @@ import numpy as np
 from torchid import parameters
 from torchid.parameters import PER_BODY, Array
 from torchid.problem.chunks import one_thread
-from torchid.problem.compression import Part, column_prior, merge_factors, problem_from_triangle
+from torchid.problem.compression import Part, merge_factors
 from torchid.problem.eliminated_terms import EliminatedTerms, SignCondition
 from torchid.problem.extras import Extra
 from torchid.problem.linear import LinearProblem
 from torchid.problem.noise_gram import NoiseShares, corrected_triangle, scale_columns
+from torchid.problem.posing import column_prior, problem_from_triangle
 from torchid.problem.rows import RowBuilder
 from torchid.robot import Robot
 from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, column_scale, is_significant

@@ -24,6 +24,7 @@ from torch import Tensor
 from torchid import ranks
 from torchid.errors import format_percent
 from torchid.parameters import Array
+from torchid.problem.blocks import span_of_samples
 from torchid.problem.chunk_dynamics import Workspace
 from torchid.problem.chunks import ProgressCallback, map_chunks, one_thread
 from torchid.problem.contact_state import ContactState
@@ -171,7 +172,8 @@ def _noise_gram_of_chunks(
             builder.blocks(with_noise_alone(samples, builder.sensors.noise), state, workspace) if scales else ()
         ):
             for number, start, end in spans:
-                sums, (first, last) = out.setdefault((samples.source, number, state), {}), _span(index, start, end)
+                sums = out.setdefault((samples.source, number, state), {})
+                first, last = span_of_samples(index, start, end)
                 for column in set(scales) & set(rows.block.support):
                     of_column = rows.values[rows.block.support.index(column), :, first:last]
                     _add(sums, noise_of_reading(column, of_column.square().sum()), 1.0)
@@ -183,16 +185,9 @@ def _noise_gram_of_chunks(
             for number, start, end in spans:
                 sums = out.setdefault((samples.source, number, state), {})
                 for copy, weight in enumerate((-1.0, 0.5, 0.5)):
-                    first, last = _span(index, copy * count + start, copy * count + end)
+                    first, last = span_of_samples(index, copy * count + start, copy * count + end)
                     _add(sums, {rows.block.support: gram_matrix(rows.values[:, :, first:last].flatten(1))}, weight)
     return out
-
-
-def _span(index: Tensor | slice, start: int, end: int) -> tuple[int, int]:
-    """Which of the samples of a block, all or some of those of a chunk, lie between two of the chunk."""
-    if isinstance(index, Tensor):  # of samples whose contacts have one rank
-        start, end = torch.searchsorted(index, torch.tensor([start, end]).to(index)).tolist()
-    return start, end
 
 
 @dataclass(frozen=True)

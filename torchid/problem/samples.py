@@ -61,6 +61,7 @@ class Samples:
         folder: where the tensors of a log larger than memory are stored; None for one in memory.
         fold: number of the cross-validation fold of these samples, see `split_into_folds`.
         block: number of the block in which they are compressed, see `compress_in_blocks`.
+        blocks: (N,), that of each sample; None for one that all are in.
         has_force_normal: whether the log has forces along the ground's normal, which contacts may be read along.
         motion_noise: noise of the motion, None without any.
         pages: of files that the tensors are mapped to; None for those in memory.
@@ -93,6 +94,7 @@ class Samples:
     delayed_torque: Tensor | None = None
     noise_share: float | None = None
     stribeck: Tensor | None = None
+    blocks: Tensor | None = None
 
     __repr__ = short_repr
 
@@ -136,7 +138,7 @@ class Samples:
         return self if step == 1 else self[::step]
 
     def to(self, device: torch.device | str, non_blocking: bool = False) -> Samples:
-        """The samples on another device, all but readings in the air: these become a few means, on the CPU."""
+        """The samples on another device, all but readings in the air, which become a few means, and `blocks`."""
         return self._each_that_moves(lambda x: x.to(device, non_blocking=non_blocking))
 
     def pin_memory(self) -> Samples:
@@ -153,7 +155,8 @@ class Samples:
         self._each_that_moves(kept)
 
     def _each_that_moves(self, change: Callable[[Tensor], Tensor]) -> Samples:
-        return replace(replace(self, unloaded=None)._each(change), unloaded=self.unloaded)
+        moved = replace(self, unloaded=None, blocks=None)._each(change)
+        return replace(moved, unloaded=self.unloaded, blocks=self.blocks)
 
     def motion(self) -> Motion:
         """The motion of these samples, for the regressor."""

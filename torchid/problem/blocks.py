@@ -1,0 +1,76 @@
+"""How logs are cut into folds and blocks, and the rows of a chunk by blocks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from torchid.problem.chunk_dynamics import Workspace
+from torchid.problem.rows import BlockRows
+from torchid.problem.samples import Samples
+
+
+def lay_out_folds(
+    lengths: Sequence[int], count: int, most: Sequence[int] | None = None
+) -> list[list[tuple[int, int, int]]]:
+    """Blocks of each log: first sample, end and fold.
+
+    Args:
+        lengths: samples of each log.
+        count: number of folds.
+        most: blocks of each log at most.
+    """
+    total, preceding, out = sum(lengths), 0, []
+    for index, length in enumerate(lengths):
+        blocks = max(1, round(count * length / max(total, 1)))
+        spans = block_spans(length, blocks if most is None else min(blocks, most[index]))
+        middles = (preceding + (start + stop) / 2 for start, stop in spans)
+        folds = (min(int(count * middle / max(total, 1)), count - 1) for middle in middles)
+        out.append([(*span, fold) for span, fold in zip(spans, folds, strict=True)])
+        preceding += length
+    used = sorted({fold for blocks in out for _, _, fold in blocks})  # rounding may leave a fold empty
+    return [[(start, stop, used.index(fold)) for start, stop, fold in blocks] for blocks in out]
+
+
+def block_spans(length: int, blocks: int) -> list[tuple[int, int]]:
+    """First sample and end of each of some blocks of a log."""
+    ends = [length * k // blocks for k in range(blocks + 1)]
+    return list(zip(ends, ends[1:], strict=False))
+
+
+def cut_logs(logs: Sequence[Samples], spans: Sequence[Sequence[tuple[int, int]]]) -> list[Samples]:
+    """Pieces of each log, numbered as blocks, by first sample and end."""
+    return [
+        replace(log if len(own) == 1 else log[slice(*span)], block=number, blocks=None)
+        for log, own in zip(logs, spans, strict=True)
+        for number, span in enumerate(own)
+    ]
+
+
+def blocks_in(samples: Samples) -> list[tuple[int, int, int]]:
+    """Number, first sample and end of the blocks that a chunk has samples of."""
+    if samples.blocks is None:
+        return [(samples.block, 0, len(samples))]
+    numbers, counts = torch.unique_consecutive(samples.blocks, return_counts=True)
+    ends = counts.cumsum(0).tolist()
+    return list(zip(numbers.tolist(), [0, *ends[:-1]], ends, strict=True))
+
+
+def span_of_samples(index: Tensor | slice, start: int, end: int) -> tuple[int, int]:
+    """Which of the samples of some rows, all or some of those of a chunk, lie between two of the chunk."""
+    if isinstance(index, Tensor):  # of samples whose contacts have one rank
+        start, end = torch.searchsorted(index, torch.tensor([start, end]).to(index)).tolist()
+    return start, end
+
+
+def rows_of_samples(rows: BlockRows, first: int, last: int, workspace: Workspace) -> Tensor:
+    """The rows of some of the samples, as `RowCompressor.add` takes them; where these are all, without a copy."""
+    width, each, count = rows.values.shape
+    if last - first == count:
+        return rows.stacked.T
+    out = workspace.empty("rows of some samples", rows.values, width, width + each * (last - first))
+    out[:, width:].unflatten(1, (each, last - first)).copy_(rows.values[..., first:last])
+    return out.T
