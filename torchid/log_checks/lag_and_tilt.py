@@ -216,7 +216,7 @@ def fit_contact_sensors(log: Log, model: NominalModel, cutoff_hz: float) -> Devi
         wrenches = [(k, builder.recorded_wrench(x, k, kinematics)) for k in range(len(contacts)) for x in changes]
         return np.stack([torch.einsum("nwv,nw->nv", J[:, k], w).numpy() for k, w in wrenches], axis=2)
 
-    return _fit(samples, model, columns, _SENSOR_PRIOR_STD)
+    return fit_deviation(samples, model, columns, _SENSOR_PRIOR_STD)
 
 
 def fit_lag(log: Log, model: NominalModel, cutoff_hz: float) -> Deviation | None:
@@ -240,7 +240,9 @@ def fit_lag(log: Log, model: NominalModel, cutoff_hz: float) -> Deviation | None
             torque[:, base : base + robot.n, 0] = builder.recorded_torque(rates[number])[:, : robot.n].numpy()
             return np.nan_to_num(torque)
 
-        found = _fit(bind_some_samples(pieces, robot, model.contacts, _SAMPLES), model, columns, _LAG_PRIOR_STD_S)
+        found = fit_deviation(
+            bind_some_samples(pieces, robot, model.contacts, _SAMPLES), model, columns, _LAG_PRIOR_STD_S
+        )
         if found is None:
             return None
         without = found.without if out is None else out.without
@@ -267,7 +269,7 @@ def fit_torque_offsets(log: Log, model: NominalModel, cutoff_hz: float) -> Devia
         constant[builder.tree.base_rows + np.arange(robot.n), np.arange(robot.n)] = -1.0
         return np.broadcast_to(constant, (len(part), *constant.shape))
 
-    return _fit(samples, model, columns, _OFFSET_PRIOR_SHARE * _torque_rms(log) or 1.0, offsets=False)
+    return fit_deviation(samples, model, columns, _OFFSET_PRIOR_SHARE * _torque_rms(log) or 1.0, offsets=False)
 
 
 def _torque_rms(log: Log) -> float:
@@ -311,7 +313,7 @@ def _tilt_of(samples: Sequence[Samples], model: NominalModel) -> Deviation | Non
         turned = [force_series(builder, _turned(part, axis), phi)[1][0] for axis in range(2)]
         return np.stack([level - one for one in turned], axis=2) / _SMALL_ANGLE
 
-    return _fit(samples, model, columns, _TILT_PRIOR_STD_RAD)
+    return fit_deviation(samples, model, columns, _TILT_PRIOR_STD_RAD)
 
 
 def _turned(samples: Samples, axis: int) -> Samples:
@@ -323,7 +325,7 @@ def _turned(samples: Samples, axis: int) -> Samples:
     return replace(samples, base=replace(base, specific_force=base.specific_force - change @ base.rotation))
 
 
-def _fit(
+def fit_deviation(
     samples: Sequence[Samples],
     model: NominalModel,
     columns: UnknownColumns,
