@@ -50,6 +50,11 @@ def test_a_spelling_is_found_whole(stem: str, column: str, found: bool) -> None:
     assert bool(spelled(stem).search(column)) == found
 
 
+def test_stamps_of_simulink_are_a_log_s_and_torques_out_of_a_motor_are_none() -> None:
+    assert propose_field("out/tout") == propose_field("tout") == "time"
+    assert propose_field("tau_out") == "joint_torque"
+
+
 def test_fields_that_differ_in_what_they_are_of_are_not_alike() -> None:
     assert propose_field("imu/linear_acceleration") == "imu_specific_force"
     assert propose_field("imu_angular_velocty") == "imu_angular_velocity"

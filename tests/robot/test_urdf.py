@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from urdfs import ARM, BASE, HINGE, INERTIA, INERTIAL, TREE, inertial, joint, link, mimic, refusal, table, write
 
 from torchid.errors import UnknownNameError
+from torchid.report.urdf_files import identified_urdf
 from torchid.robot import load_robot
 
 WRONG_NAMES = {
@@ -204,6 +206,24 @@ def test_malformed_xml_is_refused(text: str, tmp_path: Path) -> None:
     path = tmp_path / "machine.urdf"
     path.write_text(text)
     assert "XML: not well-formed" in refusal(path)
+
+
+def test_prefixes_that_nothing_declares_change_no_robot(tmp_path: Path) -> None:
+    plain, prefixed = tmp_path / "plain.urdf", tmp_path / "prefixed.urdf"
+    plain.write_text(f'<robot name="m">{BASE}{ARM}{HINGE}</robot>')
+    tags = {"<joint ": '<joint drake:n="1" ', "<mass ": "<drake:note/><mass drake:unit='kg' "}
+    text = plain.read_text()
+    for tag, with_prefix in tags.items():
+        text = text.replace(tag, with_prefix)
+    prefixed.write_text(text)
+    one, other = load_robot(plain), load_robot(prefixed)
+    np.testing.assert_array_equal(other.nominal, one.nominal)
+    assert other.joint_names == one.joint_names
+    prefixed.write_bytes(identified_urdf(other, 1.5 * other.nominal))
+    assert b'drake:n="1"' in prefixed.read_bytes()  # the file's other readers keep what they had
+    np.testing.assert_allclose(load_robot(prefixed).nominal, 1.5 * one.nominal, rtol=1e-12)
+    prefixed.write_text(text.replace("</robot>", ""))
+    assert "XML: not well-formed" in refusal(prefixed)
 
 
 def test_a_file_of_another_format_is_refused_by_its_root(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from torchid.errors import format_percent, join_names
 from torchid.estimators import ConsistentEstimate, Estimate, SgdEstimate
 from torchid.estimators.posterior import NominalError
 from torchid.fitting.calibration import list_confounded
-from torchid.fitting.misfit import AT_THE_FLOOR, unexplained_torques
+from torchid.fitting.misfit import AT_THE_FLOOR, unexplained_joints, unexplained_torques
 from torchid.identifiability.confounding import TotalMass
 from torchid.log_checks.weight import MAX_MASS_ERROR
 from torchid.logs.time_range import log_title
@@ -142,7 +142,9 @@ def _judge(run: Identification) -> ErrorComparison:
 def _headline(run: Identification, judged: ErrorComparison) -> str:
     if run.worse:
         return f"WORSE THAN {judged.of}: {describe_worse(run.worse, judged.of)}"
-    explained = run.misfit.explained and not any((*_unlike_sensors(judged.identified), *_unlike_torques(run)))
+    explained = run.misfit.explained and not any(
+        (*_unlike_sensors(judged.identified), *_unlike_torques(run), *_unlike_joints(run))
+    )
     return judged.headline("" if explained else "these forces")
 
 
@@ -166,6 +168,8 @@ def _attention(run: Identification, judged: ErrorComparison) -> Iterator[str]:
     """What the user should look at, the most urgent first."""
     if run.worse:
         yield ADVICE
+    if run.suspected:
+        yield f"torchid check finds in {run.suspected}"
     if isinstance(run.estimate, SgdEstimate) and run.estimate.deviation > _FAR_FROM_LEAST:
         yield _unfinished(run.estimate)
     yield from list(_unlike_sensors(judged.identified)) or _unlike_torques(run)
@@ -174,6 +178,7 @@ def _attention(run: Identification, judged: ErrorComparison) -> Iterator[str]:
         advice = "estimator.name=consistent finds the best that can be"
         yield f"negative, which nothing is: {join_names(impossible)}; {advice}"
     yield from _impossible(run)
+    yield from _unlike_joints(run)
     if not run.misfit.explained:
         why = run.misfit.in_short
         yield f"friction, compliance or contacts are missing, or a sensor is wrong (torchid check): {why}"
@@ -241,6 +246,15 @@ def _unlike_torques(run: Identification) -> Iterator[str]:
     """That the fit itself leaves most of the joint torques."""
     if found := unexplained_torques(run.metrics["train"].identified):
         yield f"{found}; check signs, units and order of torques and joints: torchid check"
+
+
+def _unlike_joints(run: Identification) -> Iterator[str]:
+    """That the fit leaves much of the torque of single joints of a bolted robot."""
+    fitted = run.metrics["train"].identified
+    if run.experiment.robot.fixed_base and (joints := unexplained_joints(fitted)):
+        left = fitted.by_joint_relative
+        named = join_names([f"{format_percent(left[name] or 0.0)} % of the torque of {name}" for name in joints])
+        yield f"the fit leaves {named}; check sign, unit and gear there, and its encoder: torchid check"
 
 
 def _far_off(nominal: NominalError | None) -> Iterator[str]:

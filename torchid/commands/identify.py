@@ -21,6 +21,7 @@ from torchid.commands.plausibility import TrainingLogs, require_not_worse, requi
 from torchid.commands.reading import LogReader, check_parts
 from torchid.commands.results import Identification, write_run
 from torchid.commands.run_figures import Drawing, drawing, fit_figures
+from torchid.commands.suspicion import suspected_mistake
 from torchid.commands.training import Training, descent_settings, require_trainable, training_folder
 from torchid.config import ExperimentConfig, inputs_of
 from torchid.errors import NumericalWarning, format_count, warn_about_file
@@ -263,7 +264,7 @@ def _identify(
     logs.clear()  # checks of a log and figures need room, too
     ready.blocks = blocks = []
     require_not_worse(run.worse, run.metrics["train"].identified, checked)
-    return run, solved.training, begun
+    return replace(run, suspected=suspected_mistake(run, checked)), solved.training, begun
 
 
 def _read(reader: LogReader, experiment: Experiment, bars: Progress) -> dict[str, list[Samples]]:

@@ -77,6 +77,7 @@ class Identification:
         forces: of the first samples of a log, as measured and as predicted; None where there are but factors.
         traces: of all of that log.
         reused: what an earlier run has left in the cache, in words.
+        suspected: what the checks find in its training logs if it is doubtful, in words.
     """
 
     experiment: Experiment
@@ -104,6 +105,7 @@ class Identification:
     forces: ForceSeries | None
     traces: LogForces | None
     reused: Sequence[str] = ()
+    suspected: str = ""
 
     def __getitem__(self, name: str) -> BodyEstimate:
         """Identified parameters of a body, by its name, or else by that of its joint or of any link of it.

@@ -30,6 +30,8 @@ _NAMED = 3
 
 _UNEXPLAINED = 5.0  # residual in units of the stated noise; recorded logs with honest noise figures stay below 2
 _SHARE = 0.5  # and of the weighted forces, where the noise was estimated to be as large; recorded logs stay below 0.35
+_JOINT_SHARE = 0.4  # of the torque of one joint: a gear of half the ratio leaves 0.5
+_SMALL_SHARE = 0.05  # of the torques of all joints: what flexibility, filters and friction's shape leave of any
 AT_THE_FLOOR = 1.3
 """Errors up to which noise of the readings may be all that is left, over what it leaves."""
 
@@ -175,6 +177,21 @@ def unexplained_torques(fitted: Metrics) -> str:
     beyond = (one for one in groups if (fitted.rms_of(one) or 0.0) > AT_THE_FLOOR * (fitted.noise.get(one) or 0.0))
     share = max((fitted.relative_of(one) or 0.0 for one in beyond), default=0.0)
     return f"the fit leaves {100.0 * share:.3g} % of the joint torques" if share > _SHARE else ""
+
+
+def unexplained_joints(fitted: Metrics) -> list[str]:
+    """Joints of whose torque a fit leaves a large part that is no small force, nor the noise of readings where known.
+
+    Noise that is estimated from residuals takes a joint that the model does not explain for a noisy one.
+    """
+    torques = {
+        name: (error, error / share)
+        for name, error in fitted.by_joint_rms.items()
+        if error is not None and (share := fitted.by_joint_relative.get(name))
+    }
+    size = np.sqrt(np.mean([measured**2 for _, measured in torques.values()])) if torques else 0.0
+    least = max(_SMALL_SHARE * size, AT_THE_FLOOR * (fitted.noise.get("joint_torque") or 0.0))
+    return [name for name, (error, measured) in torques.items() if error > max(_JOINT_SHARE * measured, least)]
 
 
 _LEVEL = 1e-3  # share of fits without such friction that show some

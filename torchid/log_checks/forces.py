@@ -11,9 +11,10 @@ import numpy as np
 import torch
 
 from torchid.errors import InputError, join_names
+from torchid.log_checks.encoders import check_encoders, is_bolted_arm
 from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, Finding, Skipped, refused
 from torchid.log_checks.lag_and_tilt import Trial, check_lag_and_tilt, check_torque_offsets, without_lag
-from torchid.log_checks.mistakes import possible_mistakes
+from torchid.log_checks.mistakes import joint_mistakes, possible_mistakes
 from torchid.log_checks.model import (
     MAX_TRIAL_DIFFERENTIATED_SAMPLES,
     TRIAL_SAMPLES,
@@ -24,12 +25,13 @@ from torchid.log_checks.model import (
     bind_some_samples,
     default_cutoff_hz,
     preprocess_pieces,
+    without_friction,
 )
 from torchid.log_checks.scales import TimeScale, TorqueGains, fit_time_scale, fit_torque_gains, motion_cutoff_hz
 from torchid.logs import Log
 from torchid.logs.log import WRENCHES, BoolArray, FloatArray
 from torchid.logs.segments import with_delayed_torques
-from torchid.parameters import COULOMB, FRICTION, VISCOUS
+from torchid.parameters import COULOMB, VISCOUS
 from torchid.problem import Samples
 from torchid.problem.samples import require_forces
 from torchid.robot import Robot
@@ -133,7 +135,7 @@ def _misfit_findings(
 ) -> Iterator[Finding | Skipped]:
     """The mistake that explains forces unlike the URDF's, or single deviations of forces that are like them."""
     fit, explanation, robot = model.compare(samples), None, model.robot
-    if fit.largest_misfit > MAX_MISFIT and (bare := _without_friction(robot)) is not None:
+    if fit.largest_misfit > MAX_MISFIT and (bare := without_friction(robot)) is not None:
         without = replace(model, robot=bare)
         if (better := without.compare(samples)).largest_misfit <= MAX_MISFIT:
             yield _friction_finding(robot, fit, better)
@@ -149,6 +151,7 @@ def _misfit_findings(
         trial = without_lag(trial)
         log = trial.log
     moved, unexplained = check_lag_and_tilt(trial, derived)
+    moved = check_encoders(trial, moved, unexplained)
     scale = None if moved else _fit_time_scale(log, model)
     if found := moved or [one for one in [_time_scale_finding(scale)] if one is not None]:
         alike = None if moved else fit_torque_gains(samples, model)
@@ -191,13 +194,6 @@ def _scaled(log: Log, samples: Sequence[Samples], robot: Robot, fit: TorqueFit |
     return replace(log, joint_torque=log.joint_torque * factor), scaled
 
 
-def _without_friction(robot: Robot) -> Robot | None:
-    """The robot without the friction that its file states; None if it states none."""
-    nominal = robot.nominal.copy()
-    nominal[:, FRICTION] = 0.0
-    return replace(robot, nominal=nominal) if robot.nominal[:, FRICTION].any() else None
-
-
 def _friction_finding(robot: Robot, stated: ModelFit, without: ModelFit) -> Finding:
     """Friction in the robot's file that the forces contradict, and nothing else; the largest of each kind is named."""
     largest = []
@@ -218,7 +214,8 @@ def _best_mistake(
     """The mistake whose correction leaves the least misfit, if that is small enough: one of torques, by the torques."""
     robot, best, least, shares = model.robot, None, min(fit.misfit, 1.0), (0.0, 0.0)
     filtered = cache(lambda: preprocess_pieces(log, cutoff, MAX_TRIAL_DIFFERENTIATED_SAMPLES))
-    for mistake in possible_mistakes(log):
+    of_joints = list(joint_mistakes(log)) if is_bolted_arm(model) else []
+    for mistake in (*possible_mistakes(log), *of_joints):
         if not _may_explain(mistake.field, fit) or mistake.field.startswith(derived):
             continue
         try:
@@ -233,6 +230,8 @@ def _best_mistake(
         trial = model.compare(samples, least if of_torques else min(least, MAX_RESIDUAL_SHARE * min(fit.misfit, 1.0)))
         if trial.compared != fit.compared or (of_torques and trial.implausible > fit.implausible):
             continue  # compare the same forces only
+        if mistake in of_joints and trial.reversed:
+            continue  # the torque tells which way its joint turns
         before, after = (x.torque_misfit or 0.0 if of_torques else x.misfit for x in (fit, trial))
         if after < MAX_RESIDUAL_SHARE * min(before, 1.0) and trial.misfit < least:
             best, least, shares = mistake, trial.misfit, (before, after)

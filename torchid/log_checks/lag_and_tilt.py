@@ -85,13 +85,13 @@ class Trial:
         return bind_some_samples(self.pieces, self.model.robot, self.model.contacts, _SAMPLES)
 
     @cached_property
-    def rows(self) -> _Rows | None:
+    def rows(self) -> DeviationRows | None:
         """Rows of the samples, None where no force was measured. Raises InputError: as `samples`."""
-        return _Rows.of(self.samples, self.model)
+        return DeviationRows.of(self.samples, self.model)
 
 
 @dataclass(frozen=True, eq=False)
-class _Rows:
+class DeviationRows:
     """Whitened rows of some samples, and columns of what may differ from the URDF in them.
 
     Attributes:
@@ -106,7 +106,7 @@ class _Rows:
     parts: list[tuple[FloatArray, BoolArray, FloatArray, FloatArray]]
 
     @classmethod
-    def of(cls, samples: Sequence[Samples], model: NominalModel) -> _Rows | None:
+    def of(cls, samples: Sequence[Samples], model: NominalModel) -> DeviationRows | None:
         """The rows of the forces that are measured, None without any."""
         builder = deviation_builder(samples, model)
         if builder is None:
@@ -179,7 +179,7 @@ def check_lag_and_tilt(trial: Trial, derived: tuple[str, ...] = ()) -> tuple[lis
 
 def check_tilt(samples: Sequence[Samples], model: NominalModel) -> Iterator[Finding]:
     """A finding about a vertical that gravity is not along, in filtered logs of a robot."""
-    yield from _tilt_findings(_tilt_of(_Rows.of(some_samples(samples, _SAMPLES), model), model), model)
+    yield from _tilt_findings(_tilt_of(DeviationRows.of(some_samples(samples, _SAMPLES), model), model), model)
 
 
 def check_torque_offsets(trial: Trial) -> Iterator[Finding]:
@@ -272,7 +272,7 @@ def fit_contact_sensors(trial: Trial) -> Deviation | None:
         wrenches = [(k, builder.recorded_wrench(x, k, kinematics)) for k in range(len(contacts)) for x in changes]
         return np.stack([torch.einsum("nwv,nw->nv", J[:, k], w).numpy() for k, w in wrenches], axis=2)
 
-    return _fit(trial.rows, columns, _SENSOR_PRIOR_STD)
+    return fit_deviation(trial.rows, columns, _SENSOR_PRIOR_STD)
 
 
 def fit_lag(trial: Trial) -> Deviation | None:
@@ -294,7 +294,7 @@ def fit_lag(trial: Trial) -> Deviation | None:
             torque[:, base : base + robot.n, 0] = builder.recorded_torque(rates[number])[:, : robot.n].numpy()
             return np.nan_to_num(torque)
 
-        found = _fit(moved.rows, columns, _LAG_PRIOR_STD_S)
+        found = fit_deviation(moved.rows, columns, _LAG_PRIOR_STD_S)
         if found is None:
             return None
         without = found.without if out is None else out.without
@@ -321,7 +321,7 @@ def fit_torque_offsets(trial: Trial) -> Deviation | None:
         constant[builder.tree.base_rows + np.arange(robot.n), np.arange(robot.n)] = -1.0
         return np.broadcast_to(constant, (len(part), *constant.shape))
 
-    return _fit(trial.rows, columns, _OFFSET_PRIOR_SHARE * _torque_rms(log) or 1.0, offsets=robot.n)
+    return fit_deviation(trial.rows, columns, _OFFSET_PRIOR_SHARE * _torque_rms(log) or 1.0, offsets=robot.n)
 
 
 def _torque_rms(log: Log) -> float:
@@ -359,14 +359,14 @@ def fit_tilt(trial: Trial) -> Deviation | None:
     return _tilt_of(trial.rows, trial.model)
 
 
-def _tilt_of(rows: _Rows | None, model: NominalModel) -> Deviation | None:
+def _tilt_of(rows: DeviationRows | None, model: NominalModel) -> Deviation | None:
     def columns(builder: RowBuilder, part: Samples, number: int) -> FloatArray:
         phi = model.robot.nominal.flatten()[None]
         level = force_series(builder, part, phi)[1][0]
         turned = [force_series(builder, _turned(part, axis), phi)[1][0] for axis in range(2)]
         return np.stack([level - one for one in turned], axis=2) / _SMALL_ANGLE
 
-    return _fit(rows, columns, _TILT_PRIOR_STD_RAD)
+    return fit_deviation(rows, columns, _TILT_PRIOR_STD_RAD)
 
 
 def _turned(samples: Samples, axis: int) -> Samples:
@@ -378,7 +378,9 @@ def _turned(samples: Samples, axis: int) -> Samples:
     return replace(samples, base=replace(base, specific_force=base.specific_force - change @ base.rotation))
 
 
-def _fit(rows: _Rows | None, columns: UnknownColumns, prior_std: float, offsets: int = 0) -> Deviation | None:
+def fit_deviation(
+    rows: DeviationRows | None, columns: UnknownColumns, prior_std: float, offsets: int = 0
+) -> Deviation | None:
     """Unknowns by their columns, beside parameters, friction, armature and all but so many `offsets` of torques."""
     if rows is None:
         return None

@@ -27,6 +27,8 @@ _ENDS = ("front rear", "front hind", "front back", "fore hind", "Front Rear", "F
 _NAME_PARTS = re.compile(r"([A-Za-z0-9]+)")
 #: Largest number of joints for which exchanged neighbours are tried.
 _MAX_CHAIN_JOINTS = 12
+#: The same of joints that are tried one at a time: those of a hand, or of two arms.
+_MAX_SINGLE_JOINTS = 24
 
 
 def exchanged_names(names: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
@@ -73,6 +75,7 @@ def _by_first_letter(names: Sequence[str]) -> tuple[str, ...] | None:
 
 #: Fields that can be derived from positions and orientation.
 _JOINT_RATES = ("joint_velocity", "joint_acceleration")
+_JOINT_MOTION = ("joint_position", *_JOINT_RATES)
 _BASE_RATES = ("base_angular_velocity_base", "base_angular_acceleration_base")
 #: Vectors along the world's axes.
 _WORLD_FIELDS = (
@@ -180,6 +183,39 @@ def _reverse_joint(joint: int) -> Callable[[Log], Log]:
         position = log.joint_position.copy()
         position[:, joint] *= -1.0
         return dataclasses.replace(_remove(_JOINT_RATES)(log), joint_position=position)
+
+    return correct
+
+
+def joint_mistakes(log: Log) -> Iterator[Mistake]:
+    """Single joints of an arm or a hand that are counted the other way, or from another right angle."""
+    if len(log.joint_names) > _MAX_SINGLE_JOINTS:
+        return
+    for joint, name in enumerate(log.joint_names):
+        flip = f"logs.columns: scale {{{name}: -1}} of joint_position, and of velocity and acceleration"
+        both = (*_JOINT_MOTION, "joint_torque")
+        yield Mistake("joint_position", f"{name} reversed", flip, _flip_joint(joint, _JOINT_MOTION), True)
+        yield Mistake("joint_position", f"{name} reversed, with its torque", flip, _flip_joint(joint, both), True)
+        for degrees in (90, -90, 180):
+            text, advice = f"{name} read from another zero", f"add {degrees} degrees to its positions"
+            yield Mistake("joint_position", text, advice, _shift_joint(joint, np.radians(degrees)), True)
+
+
+def _flip_joint(joint: int, fields: Sequence[str]) -> Callable[[Log], Log]:
+    def correct(log: Log) -> Log:
+        flipped = {name: x.copy() for name in fields if (x := getattr(log, name)) is not None}
+        for x in flipped.values():
+            x[:, joint] *= -1.0
+        return dataclasses.replace(log, **flipped)
+
+    return correct
+
+
+def _shift_joint(joint: int, angle: float) -> Callable[[Log], Log]:
+    def correct(log: Log) -> Log:
+        position = log.joint_position.copy()
+        position[:, joint] += angle
+        return dataclasses.replace(log, joint_position=position)
 
     return correct
 

@@ -123,6 +123,11 @@ class ModelFit:
         return 0 if self.torque is None else int(self.torque.implausible.sum())
 
     @property
+    def reversed(self) -> int:
+        """Number of torques that are."""
+        return 0 if self.torque is None else int((self.torque.implausible & (self.torque.gain < 0.0)).sum())
+
+    @property
     def wrench_misfit(self) -> float | None:
         """The larger misfit of base force and base moment."""
         return max((part for part in (self.base_force, self.base_moment) if part is not None), default=None)
@@ -197,6 +202,13 @@ def recorded_link_poses(log: Log, robot: Robot) -> LinkPoses:
     """Poses of the links at the samples of a log of all the robot's joints."""
     order = [log.joint_names.index(name) for name in robot.joint_names]
     return robot.link_poses(torch.from_numpy(log.joint_position[:, order]))
+
+
+def without_friction(robot: Robot) -> Robot | None:
+    """The robot without the friction that its file states; None if it states none."""
+    nominal = robot.nominal.copy()
+    nominal[:, parameters.FRICTION] = 0.0
+    return replace(robot, nominal=nominal) if robot.nominal[:, parameters.FRICTION].any() else None
 
 
 @dataclass(frozen=True)

@@ -226,7 +226,7 @@ _FIELD_WORDS = (
         "joint_position",
         r"\b(observation state|gc|qs?|qj|th|theta|qpos|pos|posi[ctz]\w+|angles?|winkel|gelenkwinkel|ang[ou]l[io]s?)\b",
     ),
-    ("time", rf"\b(t|ts|{_STAMPS}|ticks?|clock|millis|sec|secs|seconds|zeit|temp[os]|tiempo)\b"),
+    ("time", rf"\b(t|ts|tout|{_STAMPS}|ticks?|clock|millis|sec|secs|seconds|zeit|temp[os]|tiempo)\b"),
 )
 #: Fields that a unit alone tells: of `LF_HAA [deg]`, `LF_HAA [deg/s]`.
 _BY_QUANTITY = {

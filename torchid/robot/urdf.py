@@ -28,7 +28,7 @@ from torchid.guards import (
     format_bytes,
     read_bytes,
 )
-from torchid.robot.xml_files import MJCF_WORLD, OWN, is_mjcf, read_xml
+from torchid.robot.xml_files import MJCF_WORLD, OWN, drop_prefixed, is_mjcf, read_xml
 
 MOVING_TYPES = ("revolute", "continuous", "prismatic")
 JOINT_TYPES = (*MOVING_TYPES, "fixed")
@@ -130,6 +130,7 @@ def read_urdf(path: Path) -> tuple[list[Link], list[TreeJoint]]:
 def _read_elements(path: Path) -> etree._Element:
     """The URDF's XML, reduced to the elements in `_KEPT`."""
     root = parse_xml(path).getroot()
+    drop_prefixed(root)
     for tag in ("link", "joint"):
         count = len(root.findall(tag))
         if count > MAX_LINKS:

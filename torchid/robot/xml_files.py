@@ -24,6 +24,9 @@ MJCF_WORLD = "world"
 def read_xml(path: Path, root: str | None = None) -> etree._ElementTree:
     """The XML tree of a robot's file; entities stay unresolved and nothing is fetched.
 
+    Prefixes that no xmlns declares, as in the `drake:acceleration` of many URDFs, are taken for parts of names, as the
+    parsers of ROS and MuJoCo do, which know no namespaces.
+
     Args:
         path: the file.
         root: tag that its root must have, "" for any, as of a part that MJCF includes; None: one of `ROOTS`.
@@ -42,7 +45,7 @@ def read_xml(path: Path, root: str | None = None) -> etree._ElementTree:
         accepted = f"a {kind} of at most {format_bytes(MAX_URDF)}"
         raise UrdfError(path, "file", f"cannot be read ({error})", accepted) from error
     try:
-        tree = etree.parse(io.BytesIO(content), etree.XMLParser(resolve_entities=False, no_network=True))
+        tree = _parse(content)
     except (etree.XMLSyntaxError, ValueError, LookupError) as error:
         found = excerpt(getattr(error, "msg", None) or str(error), 200)
         raise UrdfError(path, "XML", f"not well-formed: {found}", f"a well-formed {kind}") from error
@@ -50,6 +53,29 @@ def read_xml(path: Path, root: str | None = None) -> etree._ElementTree:
     if root != "" and tag not in ([root] if root else ROOTS):
         raise UrdfError(path, "XML root", f"<{excerpt(tag)}>", f"<{root}>" if root else "<robot>, or <mujoco> of MJCF")
     return tree
+
+
+def _parse(content: bytes) -> etree._ElementTree:
+    parser = etree.XMLParser(resolve_entities=False, no_network=True)
+    try:
+        return etree.parse(io.BytesIO(content), parser)
+    except etree.XMLSyntaxError:
+        if any(one.type != etree.ErrorTypes.NS_ERR_UNDEFINED_NAMESPACE for one in parser.error_log):
+            raise
+    return etree.parse(io.BytesIO(content), etree.XMLParser(resolve_entities=False, no_network=True, recover=True))
+
+
+def drop_prefixed(root: etree._Element) -> None:
+    """Drop elements and attributes below a root whose names have a prefix that nothing declares."""
+    for element in list(root.iter(etree.Element)):
+        for name in [name for name in element.attrib if _is_prefixed(str(name))]:
+            del element.attrib[name]
+        for child in [child for child in element if _is_prefixed(str(child.tag))]:
+            element.remove(child)
+
+
+def _is_prefixed(name: str) -> bool:
+    return ":" in name and not name.startswith("{")
 
 
 def file_kind(path: Path) -> str:
