@@ -20,7 +20,7 @@ from walking import MACHINES
 from torchid.commands.identify import identify
 from torchid.config import load_config
 from torchid.log_checks import NOTE, SUSPICIOUS, Checked
-from torchid.log_checks.frozen import check_excitation, check_still_base
+from torchid.log_checks.frozen import check_excitation, check_rest, check_still_base
 from torchid.logs import Log, write_log
 from torchid.logs.segments import with_delayed_torques
 
@@ -206,6 +206,24 @@ def test_a_log_in_which_nothing_moves_is_named(moves: str) -> None:
         rest["base_quat_xyzw"] = value(log.base_quat_xyzw)
     findings = list(check_excitation(replace(log, **rest)))
     assert [(one.name, one.severity) for one in findings] == ([("no motion", NOTE)] if moves == "nothing" else [])
+
+
+def test_joints_that_rest_while_others_move_are_named_with_their_share_of_the_time() -> None:
+    log, rng, third = demo_log(), np.random.default_rng(0), len(demo_log()) // 3
+    position = log.joint_position.copy()
+    position[:, 2] = position[0, 2]
+    position[third : 2 * third, 5] = position[third, 5]
+    moves, rests = (
+        replace(log, joint_position=x + 1e-5 * rng.normal(size=x.shape)) for x in (log.joint_position, position)
+    )
+    assert list(check_rest(moves)) == []
+    [found] = check_rest(rests)
+    assert (found.name, found.severity) == ("rest", NOTE)
+    assert found.channels == (log.joint_names[2], log.joint_names[5])
+    shares = [float(x) for x in re.findall(r"(\d+) %", found.found)]
+    assert shares[0] >= 98.0
+    assert 30.0 <= shares[1] <= 40.0
+    assert list(check_rest(replace(rests, joint_torque=None))) == []
 
 
 def test_clean_logs_give_no_alarm() -> None:

@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from motions import value
 
 from torchid.errors import TorchidWarning
 from torchid.logs import Log
 from torchid.logs.log import FloatArray
 from torchid.logs.preprocess import lacks_derivatives, make_timeline, move_to_timeline, preprocess
 from torchid.logs.sign_filter import wider_low_pass, with_sign_filter
-from torchid.logs.signal_noise import signal_noise
+from torchid.logs.signal_noise import MOST_SAMPLES, signal_noise
 from torchid.logs.timeline import Timeline
 
 CUTOFF, RATE = 20.0, 500.0  # Hz
@@ -134,3 +135,41 @@ def test_where_signals_are_exact_friction_reverses_at_once() -> None:
     log, _ = recorded(0.0)
     timeline = timeline_of(log)
     assert with_sign_filter(timeline, log, signal_noise(log, timeline)) is timeline
+
+
+def held(log: Log, joint: int, samples: int, velocity_noise: float, position_noise: float) -> Log:
+    """The log with a joint that is held still for its first samples, whose noise goes on."""
+    rng, still = np.random.default_rng(1), np.arange(samples)
+    position = log.joint_position.copy()
+    position[still, joint] = position[samples - 1, joint] + position_noise * rng.normal(size=samples)
+    if log.joint_velocity is None:
+        return replace(log, joint_position=position)
+    velocity = log.joint_velocity.copy()
+    velocity[still, joint] = velocity_noise * rng.normal(size=samples)
+    return replace(log, joint_position=position, joint_velocity=velocity)
+
+
+@pytest.mark.parametrize(("velocity_noise", "position_noise"), [(0.02, 1e-4), (0.02, 0.0), (0.0, 1e-4)])
+def test_noise_of_a_joint_that_never_moves_is_no_direction(velocity_noise: float, position_noise: float) -> None:
+    log, _ = noisy(0, velocity_noise, position_noise)
+    moves = preprocess(log, CUTOFF).joint_direction
+    rests = preprocess(held(log, 2, len(log), velocity_noise, position_noise), CUTOFF).joint_direction
+    assert moves is not None
+    assert rests is not None
+    np.testing.assert_array_equal(rests[:, 2], 0.0)
+    np.testing.assert_array_equal(np.delete(rests, 2, axis=1), np.delete(moves, 2, axis=1))
+
+
+def test_a_joint_that_rests_where_noise_is_estimated_may_move_later() -> None:
+    log = held(noisy(0, 0.0, 1e-4)[0], 2, MOST_SAMPLES, 0.0, 1e-4)
+    timeline, start = timeline_of(log), log.select(slice(0, MOST_SAMPLES))
+    noise = signal_noise(log, timeline)
+    pieces = [slice(first, first + 1111) for first in range(0, len(log), 1111)]
+    parts = [(log.time[piece], log.joint_position[piece]) for piece in pieces]
+    alone, whole, in_parts = (
+        value(with_sign_filter(timeline, *one).sign_noise)
+        for one in ((start, noise), (log, noise), (start, noise, parts))
+    )
+    np.testing.assert_array_equal(np.isinf(alone), [False, False, True, False])
+    assert np.isfinite(whole).all()
+    np.testing.assert_array_equal(in_parts, whole)

@@ -26,7 +26,7 @@ from torchid.reprs import decimal
 if TYPE_CHECKING:
     from torchid.commands.results import Identification
 
-_FEW_GROUPS = 2
+_FEW_GROUPS, _FEW_NAMED = 2, 4
 _IN_PART = " in part"
 #: By the least and the largest error of a group of rows, as shares of the URDF's.
 _VERDICTS = {
@@ -182,6 +182,7 @@ def _attention(run: Identification, judged: ErrorComparison) -> Iterator[str]:
     if not run.misfit.explained:
         why = run.misfit.in_short
         yield f"friction, compliance or contacts are missing, or a sensor is wrong (torchid check): {why}"
+        yield from _resting(run)
     if run.experiment.config.estimator.total_mass is None and _contradicts_nominal(run.mass):
         ratio = f"{run.mass.value / run.mass.nominal:.3g} times the {run.experiment.robot.format}'s"
         yield f"the total mass is {ratio}: weigh the robot, or mend units and gains of forces: torchid check"
@@ -194,6 +195,14 @@ def _attention(run: Identification, judged: ErrorComparison) -> Iterator[str]:
     yield from _far_off(run.posterior.nominal_error)
     if run.noise.suggested:
         yield f"noise: {noise_advice(run.noise.suggested)}"
+
+
+def _resting(run: Identification) -> Iterator[str]:
+    """That joints rest, where a width of friction's sign has not been tried."""
+    if run.resting and run.choices.sign_width is None:
+        names = join_names([f"{name} {100.0 * share:.0f} %" for name, share in run.resting.items()], _FEW_NAMED)
+        why = "where one sticks, its friction is less than Coulomb's, and too little is found"
+        yield f"actuators.sign_width=auto, as joints rest ({names}): {why}"
 
 
 def _undetermined(run: Identification) -> Iterator[str]:

@@ -32,7 +32,7 @@ from torchid.fitting.cross_validation import CrossValidation, RidgeChoice, Score
 from torchid.fitting.experiment import Experiment, set_up, with_noise
 from torchid.fitting.factor_files import FactorFile, read_fleet
 from torchid.fitting.fit import Fit, LogFitter
-from torchid.fitting.misfit import misfit, unfitted_friction
+from torchid.fitting.misfit import misfit, resting_joints, unfitted_friction
 from torchid.fitting.noise import NoiseSummary
 from torchid.fitting.posterior import fitted_posterior
 from torchid.fitting.robust import RobustSummary, fit_robustly
@@ -241,6 +241,7 @@ def _identify(
         noise=ready.noise,
         motion_noise=fit.assembly.noise,
         misfit=misfit(estimate, ready.noise, blocks, fit.scatter, unfitted_friction(problem, experiment.robot)),
+        resting=resting_joints(problem, experiment.robot, builder, logs["train"]),
         robust=solved.robust,
         states=ready.states,
         by_state=alone,

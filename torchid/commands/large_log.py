@@ -201,7 +201,9 @@ class LargeLog:
         rates = settings.filter_hz, settings.sample_rate_hz, self.sign_width, self.stribeck
         whole = make_timeline(blocks.time, lacks_derivatives(first), *rates)
         noise = signal_noise(first, whole, self.motion_noise if standing is None else {})
-        whole = whole and with_sign_filter(whole, first, noise)
+        read = partial(start.read, only=("joint_position",))
+        parts = ((start.time[piece], read(piece).joint_position) for piece in self._pieces(start, len(start)))
+        whole = whole and with_sign_filter(whole, first, noise, parts)
         coverage = {} if whole is None else self._coverage(blocks, first, whole)
         contacts = None if first.contact_active is None else contacts_alone(blocks, partial(self._pieces, blocks))
         air = None if contacts is None or not with_unloaded else in_the_air(contacts)

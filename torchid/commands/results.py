@@ -58,6 +58,7 @@ class Identification:
         noise: that rows were weighted with.
         motion_noise: what noise of the motion had added to the normal equations.
         misfit: what the fit leaves of the forces, and what noise would leave.
+        resting: share of the time at rest of joints that rest often, where friction goes with the sign of velocities.
         robust: how outliers were down-weighted, if so.
         states: contact states of the training logs.
         by_state: what each of them determines on its own.
@@ -86,6 +87,7 @@ class Identification:
     noise: NoiseSummary
     motion_noise: NoiseShares
     misfit: Misfit
+    resting: Mapping[str, float]
     robust: RobustSummary | None
     states: list[StateReport]
     by_state: dict[str, Estimate]
@@ -248,6 +250,7 @@ def _metrics_document(run: Identification) -> dict[str, object]:
         "rows": estimate.rows,
         "residual_std": estimate.residual_std,
         "misfit": _misfit_document(run.misfit),
+        "resting_joints": dict(run.resting),
         "motion_noise": asdict(run.motion_noise),
         "nominal_error": None if run.posterior.nominal_error is None else asdict(run.posterior.nominal_error),
         "total_mass": run.mass.value if run.mass.determined else None,

@@ -15,8 +15,9 @@ from torchid.estimators import Estimate
 from torchid.estimators.least_squares import residual_std
 from torchid.fitting.noise import GroupNoise, NoiseSummary
 from torchid.identifiability.block_scatter import BlockScatter
-from torchid.parameters import FRICTION, INERTIAL, PER_BODY, Array
-from torchid.problem import LinearProblem
+from torchid.logs.sign_filter import OFTEN, resting_share
+from torchid.parameters import COULOMB, FRICTION, INERTIAL, PER_BODY, Array
+from torchid.problem import LinearProblem, RowBuilder, Samples
 from torchid.problem.chunks import one_thread
 from torchid.problem.compressed_log import Block
 from torchid.problem.metrics import Metrics
@@ -277,3 +278,34 @@ def unfitted_friction(problem: LinearProblem, robot: Robot) -> UnfittedFriction 
         ratio=float(explained @ explained) / max(rank * noise, np.finfo(float).tiny),
         combinations=rank,
     )
+
+
+_MOST_SAMPLES = 50_000  # evenly spaced
+
+
+def resting_joints(
+    problem: LinearProblem, robot: Robot, builder: RowBuilder, logs: Sequence[Samples]
+) -> dict[str, float]:
+    """Share of the time that joints are at rest, of those that rest more than motion does, the most first.
+
+    Of joints whose torque is measured and whose Coulomb friction is fitted with the sign of their velocity: one that
+    sticks has any friction up to that.
+
+    Args:
+        problem: of the fit.
+        robot: with the joints.
+        builder: of the rows of the fit.
+        logs: that were fitted.
+    """
+    count = sum(map(len, logs))
+    if builder.tree.sign_width is not None or not count or not robot.n:
+        return {}
+    step = max(1, count // _MOST_SAMPLES)
+    thin = [log.every(step) for log in logs]
+    share = resting_share(np.concatenate([log.joint_velocity.cpu().numpy() for log in thin]))
+    directions = [log.joint_velocity if log.direction is None else log.direction for log in thin]
+    share[~np.any([x.cpu().numpy().any(axis=0) for x in directions], axis=0)] = 1.0  # by the noise of their velocity
+    is_free = problem.free.reshape(-1, PER_BODY)[1:, COULOMB]
+    fitted = builder.sensors.torque[: robot.n] & (is_free @ (robot.joint_map[0] != 0.0))
+    order = [joint for joint in np.argsort(-share, kind="stable").tolist() if fitted[joint] and share[joint] > OFTEN]
+    return {robot.joint_names[joint]: float(share[joint]) for joint in order}

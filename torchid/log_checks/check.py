@@ -31,7 +31,7 @@ from torchid.log_checks.findings import (
     refused,
 )
 from torchid.log_checks.forces import check_forces_against_urdf
-from torchid.log_checks.frozen import check_excitation, check_repeats, check_still_base
+from torchid.log_checks.frozen import check_excitation, check_repeats, check_rest, check_still_base
 from torchid.log_checks.model import Declared
 from torchid.log_checks.motion import (
     check_angle_unit,
@@ -162,7 +162,7 @@ def check(
     repaired = repair_log(log, _findings(results))
     blocking = _blocking_finding(results)
     if blocking is None or blocking.field != "time":
-        results += [*check_derivatives(repaired), *check_angular_velocity(repaired, robot)]
+        results += [*check_rest(repaired), *check_derivatives(repaired), *check_angular_velocity(repaired, robot)]
         results += check_accelerometer(repaired, robot)
     compared = repaired
     if _blocking_finding(results) is None:

@@ -24,6 +24,8 @@ from torchid.log_checks.findings import (
 from torchid.log_checks.model import MIN_MOTION
 from torchid.logs import Log
 from torchid.logs.log import CONTACT_READINGS, WRENCHES, BoolArray, FloatArray
+from torchid.logs.sign_filter import OFTEN, resting_share
+from torchid.logs.signal_noise import rough_noise
 
 #: Samples at one extreme value from which on it is a limit of the sensor.
 MIN_SAMPLES_AT_LIMIT = 5
@@ -367,6 +369,30 @@ def check_excitation(log: Log) -> Iterator[Finding]:
     text = f"nothing moves: no joint by more than {moved:.2g} rad (slides: m)"
     advice = "record motion: one posture determines what balances gravity in it, no inertia and no friction"
     yield Finding("no motion", NOTE, "joint_position", text, advice)
+
+
+_REST_LAG_S, _FEWEST_OF_REST = 0.1, 100  # [s]; samples
+
+
+def check_rest(log: Log) -> Iterator[Finding]:
+    """A note of joints with a torque that rest while others move: what friction holds them then is not Coulomb's.
+
+    Of positions a tenth of a second apart, whose noise is what is not smooth from sample to sample.
+    """
+    lag = max(1, round(_REST_LAG_S / float(np.median(np.diff(log.time))))) if len(log) > 1 else 1
+    if log.joint_torque is None or len(log) < lag + _FEWEST_OF_REST:
+        return
+    seconds = (log.time[lag:] - log.time[:-lag])[:, None]
+    velocity = (log.joint_position[lag:] - log.joint_position[:-lag]) / seconds
+    noise = np.sqrt(2.0) * rough_noise(log.joint_position) / float(np.median(seconds))
+    share = np.where(np.isfinite(log.joint_torque).any(axis=0), resting_share(velocity, noise), 0.0)
+    order = [joint for joint in np.argsort(-share, kind="stable").tolist() if share[joint] > OFTEN]
+    if order and np.ptp(log.joint_position, axis=0).max() > MIN_MOTION:
+        names = [log.joint_names[joint] for joint in order]
+        named = join_names([f"{name} {100.0 * share[joint]:.0f} %" for name, joint in zip(names, order, strict=True)])
+        text = f"much of the time: {named}; where a joint sticks, friction is anything below Coulomb's"
+        advice = "fit with actuators.sign_width: auto, or record joints that turn without pauses"
+        yield Finding("rest", NOTE, "joint_position", text, advice, tuple(names))
 
 
 def _turned_deg(quat: FloatArray) -> float:

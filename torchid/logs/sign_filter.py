@@ -6,6 +6,7 @@ sign comes out too large. The sign needs no derivative, so that it bears more of
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,16 +26,27 @@ _LEAST_WIDTH = 1e-9  # [rad/s or m/s] of a joint without noise among others: at 
 _LEAST_CHANGE = 1e-4  # of a tanh's argument over a step, across which its mean is its middle
 _NODES = 9  # within a step, of what Stribeck friction loses with speed
 _WIDEST = 0.4  # largest cutoff over the sample rate
+_UNKNOWN = 0.2  # share of the variance of noise by which it may be smaller than estimated
+_SURELY = 3.0  # standard deviations of noise, beyond which a joint moves
+_SLOW = 0.1  # of a joint's root mean square velocity
+OFTEN = 0.2
+"""Share of the time at rest that tells: of sines it is 0.05, of Gaussian motion 0.08."""
 _EVIDENT = 0.01  # share of the velocities' power by which the error must fall: less is a few per cent of the reversals
 
 
-def with_sign_filter(timeline: Timeline, log: Log, noise: SignalNoise) -> Timeline:
+def with_sign_filter(
+    timeline: Timeline, log: Log, noise: SignalNoise, parts: Iterable[tuple[FloatArray, FloatArray]] | None = None
+) -> Timeline:
     """A timeline of a log, or of one whose start this is, with the filter of `wider_low_pass` and the noise behind it.
+
+    A joint that moves less than the noise of its velocity all the time has noise without bound: nobody knows its sign.
+    Positions tell, further apart the noisier they are, as the mean velocity between two has noise of their own then.
 
     Args:
         timeline: of the log.
         log: as recorded, or its start.
         noise: of its motion, by this timeline.
+        parts: stamps (N,) [s] and joint positions (N, n) of all parts of the log, in order; None where `log` is all.
 
     Warns:
         TorchidWarning: the timeline's own filter takes off much of the joints' motion.
@@ -49,9 +61,45 @@ def with_sign_filter(timeline: Timeline, log: Log, noise: SignalNoise) -> Timeli
         derivatives = noise_of_derivatives(step, replace(timeline, low_pass=wider.low_pass))
     name, order = ("joint_position", 1) if log.joint_velocity is None else ("joint_velocity", 0)
     std = noise.std.get(name)
-    if std is None or not std.any():
+    if std is None or not std.any() or timeline.cutoff_hz is None:
         return timeline
-    return replace(timeline, sign_noise=std * np.sqrt(derivatives[order, order]))
+    of_sign, of_position = std * np.sqrt(derivatives[order, order]), noise.std["joint_position"]
+    step, noisy = float(np.median(np.diff(log.time))), of_sign > 0.0
+    lag = max(1, round(np.sqrt(2.0) * float(np.median(of_position[noisy] / of_sign[noisy])) / step))
+    square = mean_square_velocity([(log.time, log.joint_position)] if parts is None else parts, lag)
+    expected = (1.0 - _UNKNOWN) * 2.0 * np.square(of_position / (lag * step))  # of the positions' noise, at least
+    still = noisy & (square < np.square(of_sign) + expected)
+    return replace(timeline, sign_noise=np.where(still, np.inf, of_sign))
+
+
+def mean_square_velocity(parts: Iterable[tuple[FloatArray, FloatArray]], lag: int) -> FloatArray:
+    """Mean square of the joints' mean velocities over so many samples, (n,); infinite of a log that is no longer.
+
+    Args:
+        parts: stamps (N,) [s] and joint positions (N, n) of all parts of a log, in order.
+        lag: the samples.
+    """
+    squares: FloatArray | float = np.inf
+    done, count, last = 0, 0, list[tuple[FloatArray, FloatArray]]()
+    for time, position in parts:
+        some = slice(-done % lag, None, lag)
+        at, q = (np.concatenate(x) for x in zip(*last, (time[some], position[some]), strict=True))
+        mean = np.diff(q, axis=0) / np.diff(at)[:, None]
+        if len(mean):
+            squares = (squares if count else 0.0) + np.square(mean).sum(axis=0)
+        done, count, last = done + len(time), count + len(mean), [(at[-1:], q[-1:])]
+    return np.asarray(squares / max(count, 1))
+
+
+def resting_share(velocity: FloatArray, noise: FloatArray | float = 0.0) -> FloatArray:
+    """Share of the time, (n,), in which joints move slower than a tenth of their velocity's root mean square.
+
+    Args:
+        velocity: (N, n) [rad/s or m/s].
+        noise: standard deviation of that of velocities, (n,) [rad/s or m/s]; three of it are rest, too.
+    """
+    slow = np.maximum(_SLOW * np.sqrt(np.square(velocity).mean(axis=0)), _SURELY * noise)
+    return np.asarray((np.abs(velocity) <= slow).mean(axis=0))
 
 
 @dataclass(frozen=True)
@@ -144,9 +192,9 @@ def noisy_width(timeline: Timeline, columns: slice) -> float | FloatArray | None
 
     None for at once: a timeline without a width and without noise.
 
-    With Gaussian noise s a velocity that is read as u has the mean sign erf(u / (sqrt(2) s)), as all velocities within
-    so little are as probable. With this width w, tanh(u / w) lacks as much of a sign during a reversal. A fit on
-    sign(u), wrong where noise is the larger, finds too little Coulomb friction, and viscous friction in its place.
+    With Gaussian noise s, as `with_sign_filter` has it, a velocity that is read as u has the mean sign
+    erf(u / (sqrt(2) s)). With this width w, tanh(u / w) lacks as much of a sign during a reversal. A fit on sign(u),
+    wrong where noise is the larger, finds too little Coulomb friction, and viscous friction in its place.
 
     Source: regression calibration (Carroll, Ruppert, Stefanski, Crainiceanu, "Measurement Error in Nonlinear Models",
     2006, chapter 4); squares of widths add up as in MacKay's moderated output (Neural Computation 4, 1992).

@@ -97,7 +97,8 @@ class Timeline:
         sign_width: of Coulomb friction's sign [rad/s or m/s], as in `KinematicTree`, None for the sign itself.
         stribeck: Stribeck velocity [rad/s or m/s], as in `KinematicTree`, None without one.
         sign_low_pass: wider filter of the velocities that this sign is of, None for `low_pass`.
-        sign_noise: (n,), of these velocities behind their filter [rad/s or m/s], None for none.
+        sign_noise: (n,), of these velocities behind their filter [rad/s or m/s], infinite of joints that move less than
+            that; None for none.
     """
 
     native: FloatArray
