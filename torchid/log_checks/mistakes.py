@@ -23,8 +23,10 @@ from torchid.parameters import GRAVITY
 
 #: Parts of names that differ between left and right, and between front and rear.
 _SIDES = ("left right", "Left Right", "LEFT RIGHT", "l r", "L R", "FL FR", "RL RR", "HL HR", "LF RF", "LH RH")
-_ENDS = ("front rear", "front hind", "front back", "fore hind", "Front Rear", "FL RL", "FR RR", "LF LH", "RF RH")
-_ENDS += tuple(pair.lower() for pair in _ENDS[-4:])
+_ENDS = (
+    *("front rear", "front hind", "front back", "fore hind", "Front Rear", "FL RL", "FR RR", "LF LH", "RF RH"),
+    *("fl rl", "fr rr", "lf lh", "rf rh"),
+)
 _NAME_PARTS = re.compile(r"([A-Za-z0-9]+)")
 _WORDS = re.compile(r"([A-Z]+(?![a-z])|[A-Z]?[a-z]+|[0-9]+)")
 #: Largest number of joints for which exchanged neighbours are tried, and of pairs of limbs that are.
