@@ -50,12 +50,17 @@ def test_the_logs_of_an_experiment_file_are_checked_one_by_one(
     assert max(map(len, printed.splitlines())) <= 100
 
 
+ONE_FOOT = "{set: null, contact_wrenches: {front_left_foot: [fx, fy, fz]}}"
+
+
 @pytest.mark.parametrize(
     ("sensors", "settings", "said"),
     [
         ("joints", [], "joint_torque '{joint}', does not fit"),
         ("contacts", [], ""),
         ("contacts", ["preprocessing.cutoff_hz=60"], "preprocessing.cutoff_hz, does not fit"),
+        (ONE_FOOT, [], "sensors, does not fit"),  # of which the base's six rows cannot be told
+        (ONE_FOOT, ["sensors.on_base_lost=warn"], ""),
     ],
 )
 def test_a_log_that_identify_would_refuse_is_not_usable(

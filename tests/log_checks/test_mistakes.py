@@ -131,6 +131,22 @@ def test_sides_are_exchanged_by_name(names: tuple[str, ...], other: tuple[str, .
     assert next(exchanged_names(names)) == ("left and right", other)
 
 
+@pytest.mark.parametrize(
+    ("names", "limbs", "pairs"),
+    [
+        (("leg1/yaw", "leg1/lift", "leg2/yaw", "leg2/lift", "leg3/yaw", "leg3/lift"), "leg1 and leg3", 4),
+        (tuple(f"{x}_{y}" for x in ("lf", "rf", "lh", "rh") for y in ("haa", "kfe")) + ("tail",), "lf and lh", 7),
+        (("joint1", "joint2", "joint3"), "", 0),  # of a chain, whose neighbours are tried
+    ],
+)
+def test_two_limbs_among_others_are_exchanged_by_name(names: tuple[str, ...], limbs: str, pairs: int) -> None:
+    found = {what: other for what, other in exchanged_names(names) if what.split()[0] not in ("left", "front", "the")}
+    assert len(found) == pairs
+    one, _, other = limbs.partition(" and ")
+    if pairs:
+        assert [name.replace(one, "?").replace(other, one).replace("?", other) for name in names] == list(found[limbs])
+
+
 def test_names_without_sides_have_none_to_exchange() -> None:
     assert "left and right" not in [what for what, _ in exchanged_names(("shell", "roller", "elbow"))]
     assert list(exchanged_names(("one",))) == []

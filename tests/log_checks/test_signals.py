@@ -190,6 +190,14 @@ def test_an_angular_velocity_of_the_wrong_sign_is_not_blamed_on_the_orientation(
     assert (finding.field, finding.found) == ("base_angular_velocity_base", "the sign is reversed")
 
 
+def test_the_turn_of_a_gyroscope_along_other_axes_than_the_base_is_found() -> None:
+    log, turn = flying(), Rotation.from_rotvec([20.0, -40.0, 100.0], degrees=True)
+    omega = turn.inv().apply(value(log.base_angular_velocity_base))
+    finding = only(check(replace(log, base_angular_velocity_base=omega)), "frame or order")
+    assert (finding.field, finding.severity) == ("base_angular_velocity_base", REJECTED)
+    assert "turned by (20, -40, 100) degrees" in finding.found
+
+
 def test_a_joint_that_turns_more_than_twice_is_in_degrees_unless_it_can() -> None:
     log = scaled(demo_log(), "joint_position", 180.0 / np.pi)
     for checked in (check(log), of_demo(log)):

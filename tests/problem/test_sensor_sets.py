@@ -158,7 +158,7 @@ def test_who_asks_to_go_on_is_warned() -> None:
 def test_the_axes_of_line_contacts_are_named_where_the_base_is_lost() -> None:
     lost = [StateReport("l_blade + r_sole", 9, 2, 4, 0.0), StateReport("r_blade + r_sole", 9, 4, 6, 0.1)]
     contacts = [Contact("l_blade", "line", "x"), Contact("r_blade", "line"), Contact("r_sole", "point")]
-    with pytest.raises(BaseLostError, match="set its line_axis: l_blade along x; accepted: more sensors"):
+    with pytest.raises(BaseLostError, match="along x of l_blade: set line_axis of those along another; accepted: more"):
         require_base(lost, contacts=contacts)
     with pytest.raises(BaseLostError) as raised:
         require_base(lost, contacts=contacts[2:])

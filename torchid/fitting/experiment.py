@@ -104,7 +104,8 @@ class Scene:
         """
         stated = stated_noise(self.config.sensors.noise, self.robot)
         delay, finds_tilt = self.config.actuators.delay or 0.0, self.config.robot.base_tilt == AUTO
-        return Declared(SensorNoise.of_known(stated) if stated else None, self.terms, delay, finds_tilt)
+        noise = SensorNoise.of_known(stated) if stated else None
+        return Declared(noise, self.terms, delay, finds_tilt, self.config.sensors.on_base_lost == "warn")
 
     @property
     def loss(self) -> RobustLoss | None:

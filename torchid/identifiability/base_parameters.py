@@ -323,9 +323,9 @@ def require_base(reports: Sequence[StateReport], on_base_lost: str = "error", co
     where = "; ".join(f"{r.name} ({r.samples} samples): {_describe_rank(r)}" for r in lost[:4])
     message = f"sensors: the base is lost, rank(S_b V_x) < 6, in contact with {where}"
     touching = {frame for report in lost for frame in report.name.split(" + ")}
-    lines = [f"{c.frame} along {c.line_axis}" for c in contacts if c.kind == "line" and c.frame in touching]
+    lines = [f"{c.line_axis} of {c.frame}" for c in contacts if c.kind == "line" and c.frame in touching]
     if lines:
-        message += f"; if a line runs along another axis of its frame, set its line_axis: {join_names(lines)}"
+        message += f"; lines count as along {join_names(lines)}: set line_axis of those along another"
     if on_base_lost == "error":
         raise BaseLostError(f"{message}; accepted: more sensors, other contacts, or sensors.on_base_lost: warn")
     warn(f"{message}; parameters of some bodies cannot be determined there", BaseLostWarning)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache
-from itertools import product
 
 import numpy as np
 import torch
@@ -27,13 +26,13 @@ from torchid.log_checks.model import (
     preprocess_pieces,
     without_friction,
 )
+from torchid.log_checks.required_sensors import check_required
 from torchid.log_checks.scales import TimeScale, TorqueGains, fit_time_scale, fit_torque_gains, motion_cutoff_hz
 from torchid.logs import Log
 from torchid.logs.log import WRENCHES, BoolArray, FloatArray
 from torchid.logs.segments import with_delayed_torques
 from torchid.parameters import COULOMB, VISCOUS
 from torchid.problem import Samples
-from torchid.problem.samples import require_forces
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
 from torchid.settings import AUTO
@@ -119,11 +118,8 @@ def check_forces_against_urdf(
     except InputError as error:
         yield refused(error)
         return
-    try:
-        for part, sensors in product(samples, [] if required is None else [required]):
-            require_forces(part, robot, contacts, sensors)
-    except InputError as error:
-        yield refused(error)
+    if required is not None:
+        yield from check_required(samples, robot, contacts, required, model.declared.goes_on_without_base)
     if log.joint_torque is None and log.contact_wrench is None:
         yield Skipped(_FORCE_CHECK, "neither joint torques nor contact wrenches")
     else:

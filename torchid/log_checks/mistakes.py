@@ -23,16 +23,23 @@ from torchid.parameters import GRAVITY
 
 #: Parts of names that differ between left and right, and between front and rear.
 _SIDES = ("left right", "Left Right", "LEFT RIGHT", "l r", "L R", "FL FR", "RL RR", "HL HR", "LF RF", "LH RH")
-_ENDS = ("front rear", "front hind", "front back", "fore hind", "Front Rear", "FL RL", "FR RR", "LF LH", "RF RH")
+_ENDS = (
+    *("front rear", "front hind", "front back", "fore hind", "Front Rear", "FL RL", "FR RR", "LF LH", "RF RH"),
+    *("fl rl", "fr rr", "lf lh", "rf rh"),
+)
 _NAME_PARTS = re.compile(r"([A-Za-z0-9]+)")
-#: Largest number of joints for which exchanged neighbours are tried.
-_MAX_CHAIN_JOINTS = 12
-#: The same of joints that are tried one at a time: those of a hand, or of two arms.
+_WORDS = re.compile(r"([A-Z]+(?![a-z])|[A-Z]?[a-z]+|[0-9]+)")
+#: Largest number of joints for which exchanged neighbours are tried, and of pairs of limbs that are.
+_MAX_CHAIN_JOINTS, _MAX_PAIRS = 12, 28
+#: Largest number of joints that are tried one at a time: those of a hand, or of two arms.
 _MAX_SINGLE_JOINTS = 24
 
 
-def exchanged_names(names: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Possible true names of the columns, with a description of the exchange: sides, ends, or the order."""
+def exchanged_names(names: Sequence[str], shortest: int = 2) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Possible true names of the columns, with a description: sides, ends, two limbs, or the order.
+
+    `shortest`: number of names that a limb has at least.
+    """
     known = {tuple(names)}
     for description, pairs in (("left and right", _SIDES), ("front and rear", _ENDS)):
         permuted = _exchanged(names, pairs)
@@ -40,6 +47,7 @@ def exchanged_names(names: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]
             known.add(permuted)
             yield description, permuted
     for description, permuted in (
+        *_exchanged_pairs(names, shortest),
         ("alphabetical order and this", tuple(sorted(names))),
         ("the order", tuple(names[::-1])),
     ):
@@ -62,6 +70,26 @@ def _exchanged(names: Sequence[str], pairs: Sequence[str]) -> tuple[str, ...] | 
         if sorted(exchanged) == sorted(names) and exchanged != tuple(names):
             return exchanged
     return _by_first_letter(names) if pairs is _SIDES else None
+
+
+def _exchanged_pairs(names: Sequence[str], shortest: int) -> list[tuple[str, tuple[str, ...]]]:
+    """The names with two limbs exchanged, which differ in a word, or the first two: `lf_hip` and `rf_hip`.
+
+    Of limbs with at least the `shortest` number of names; none of a robot with too many limbs to try all pairs.
+    """
+    limbs: dict[tuple[int, int], dict[str, dict[tuple[str, str], str]]] = {}  # by place, limb, and what is beside it
+    for name in names:
+        words = _WORDS.split(name)
+        for first, last in ((1, 4), *((word, word + 1) for word in range(1, len(words), 2))):
+            before, limb, after = ("".join(part) for part in (words[:first], words[first:last], words[last:]))
+            limbs.setdefault((first, last), {}).setdefault(limb, {})[before, after] = name
+    exchanged: dict[tuple[str, ...], str] = {}
+    for of_place in limbs.values():
+        for (one, its), (other, others) in itertools.combinations(of_place.items(), 2):
+            if its.keys() == others.keys() and len(its) >= shortest:
+                partner = {a: b for key in its for a, b in ((its[key], others[key]), (others[key], its[key]))}
+                exchanged.setdefault(tuple(partner.get(name, name) for name in names), f"{one} and {other}")
+    return [(text, permuted) for permuted, text in exchanged.items()] if len(exchanged) <= _MAX_PAIRS else []
 
 
 def _by_first_letter(names: Sequence[str]) -> tuple[str, ...] | None:
@@ -225,7 +253,7 @@ def _order_mistakes(log: Log) -> Iterator[Mistake]:
     for description, permuted in (*exchanged_names(log.joint_names), *_exchanged_neighbours(log.joint_names)):
         text, advice = f"{description} exchanged", "give joint_names in the order of the columns"
         yield Mistake("joint_names", text, advice, _rename("joint_names", permuted), True)
-    for description, permuted in exchanged_names(log.contact_names):
+    for description, permuted in exchanged_names(log.contact_names, shortest=1):
         order = [log.contact_names.index(name) for name in permuted]
         text = f"{description} exchanged"
         advice = "give contact_names in the order of the columns"

@@ -59,12 +59,14 @@ class Declared:
         terms: extra parameters that are fitted, as offsets and scales of sensors.
         delay: how much later than recorded joint torques act [s]; `AUTO`: to be found.
         finds_tilt: whether the tilt of the base is to be found.
+        goes_on_without_base: whether a fit goes on where the base is lost.
     """
 
     noise: SensorNoise | None = None
     terms: ExtraTerms = dataclasses.field(default_factory=ExtraTerms)
     delay: float | str = 0.0
     finds_tilt: bool = False
+    goes_on_without_base: bool = False
 
     @property
     def known_delay(self) -> float:

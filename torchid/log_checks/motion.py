@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from torchid.errors import LogError, join_names
 from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, Finding, Skipped, channel_names
@@ -273,7 +274,10 @@ def check_angular_velocity(log: Log, robot: Robot | None) -> Iterator[Finding | 
         if comparison is None:
             yield Skipped(_ANGULAR_VELOCITY_CHECK, f"{field}: the log is too short")
             continue
-        mistake = _best_mistake(log.time, quat, omega, comparison.misfit) if comparison.misfit > MAX_MISFIT else None
+        mistake = None
+        if comparison.misfit > MAX_MISFIT:
+            data = log.time, quat, omega, comparison.misfit
+            mistake = _best_mistake(*data) or _mounted_otherwise(*data)
         if mistake is None:
             yield from _derivative_findings(comparison, field, "base_quat", ("x", "y", "z"))
         else:
@@ -336,6 +340,20 @@ def _best_mistake(time: FloatArray, quat: FloatArray, omega: FloatArray, misfit:
         if trial is not None and trial.misfit < least:
             best, least = mistake, trial.misfit
     return best
+
+
+def _mounted_otherwise(time: FloatArray, quat: FloatArray, omega: FloatArray, misfit: float) -> _Mistake | None:
+    """An angular velocity along the axes of another frame, which is found; None if that does not explain the misfit."""
+    lag = max(2, round(LAG_S / float(np.median(np.diff(time)))))
+    true, read = (_differences(_integrate(time, x), lag, 1) for x in (_omega(time, quat), omega))
+    turn = Rotation.align_vectors(true - true.mean(axis=0), read - read.mean(axis=0))[0]
+    turned = omega @ turn.as_matrix().T
+    trial = compare_derivative(time, _integrate(time, _omega(time, quat)), turned)
+    if trial is None or trial.misfit > MAX_RESIDUAL_SHARE * misfit:
+        return None
+    degrees = ", ".join(f"{x:.0f}" for x in turn.as_rotvec(degrees=True))
+    text = f"fits the orientation if it is turned by ({degrees}) degrees about the base's axes"
+    return _Mistake(text, "imu_frame is the frame of the URDF along whose axes the IMU reads", "", quat, turned)
 
 
 def completed(log: Log, robot: Robot | None) -> tuple[Log, list[Finding]]:

@@ -99,7 +99,8 @@ def _unexplained_motion(
     moving = sorted((name for name, own in alone.items() if own), key=lambda name: -(alone[name] or 0.0))
     most = join_names([f"{name} {format_percent(alone[name] or 0.0)} %" for name in moving])
     text = f"standing feet move {100 * slip:.3g} % as much as the base above them, and no usual mistake explains it"
-    advice = "check signs, scales and zeros of joint positions, the base's orientation and position, and the flags"
+    advice = "check signs, scales and zeros of joint positions, the base's orientation and position, the flags, and"
+    advice += " the frames under contacts"
     return Finding("standing feet", SUSPICIOUS, "all", f"{text}: {most}" if most else text, advice, tuple(moving))
 
 

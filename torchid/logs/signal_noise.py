@@ -153,6 +153,7 @@ def noise_of_derivatives(step: float, timeline: Timeline) -> FloatArray:
 
 
 _MUCH = 0.1  # share of an acceleration's variance
+_MOSTLY = 0.5
 _LITTLE = 0.03  # share at the cutoff that is proposed
 _NAMED = 4
 #: Accelerations, and what each is derived from, with the number of derivatives.
@@ -175,10 +176,14 @@ def warn_of_noisy_accelerations(log: Log, preprocessed: Log, timeline: Timeline,
         noise: of the log.
 
     Warns:
-        TorchidWarning: one, with a lower cutoff that would do.
+        TorchidWarning: one, with a lower cutoff that would do, or that no joint moves.
     """
     noisy = sorted(_noise_shares(log, preprocessed, noise), key=lambda one: -one[1])
     if not noisy:
+        return
+    if log.joint_names and {name for name, share, _ in noisy if share > _MOSTLY} >= set(log.joint_names):
+        found = f"no joint moves: accelerations of all {len(log.joint_names)} are mostly noise"
+        warn_about_file(f"{found}; one posture tells what balances gravity in it, no inertia and no friction")
         return
     names = [f"{name} ({100.0 * share:.0f} %)" for name, share, _ in noisy]
     found = f"a large part of these accelerations is noise: {join_names(names, _NAMED)}"
