@@ -73,8 +73,7 @@ class ScenarioAnalysis:
         return f"sensor plan for {self.name}"
 
     def _headline(self) -> str:
-        plan = self.plan
-        names = join_names([one.name for one in plan.chosen])
+        plan, names = self.plan, join_names([one.name for one in self.plan.chosen])
         what = f"{len(plan.chosen)} sensors at a cost of {plan.cost:g} ({plan.proof}): {names}"
         return f"{self.name}, {len(self.states)} contact states, {what}"
 
@@ -285,9 +284,8 @@ def _analyze_scenario(
         if not _is_planned(plan, request.proposed, contacts):
             proposed = tuple(problem.assess(request.proposed, contacts))
         at_best = problem.stack.problem(request.proposed, contacts=contacts)
-    base = base_parameters(replace(at_best, free=free))
     progress("done", 1, 1)
-    return ScenarioAnalysis(name, states, plan, proposed, base)
+    return ScenarioAnalysis(name, states, plan, proposed, base_parameters(replace(at_best, free=free)))
 
 
 def _sets_to_compare(
@@ -296,9 +294,7 @@ def _sets_to_compare(
     """Sensor sets to compare by accuracy: those with a name, and those planned for contact states of the logs."""
     scene, sets = request.scene, dict(request.compared)
     recorded = {state for samples in train for state, _ in chunks_by_state(samples)}
-    for scenario in results:
-        plan = scenario.plan
-        planned = sensor_set(scene.robot, scene.contacts, plan.chosen, scene.noise)
+    for scenario, plan in ((one, one.plan) for one in results):
         known = any(_is_planned(plan, other, scene.contacts) for other in sets.values())
         if known or not recorded & set(scenario.states):
             continue
@@ -306,8 +302,8 @@ def _sets_to_compare(
             needed = f"sensors.contact_wrenches: {{{scalar[0]}: [{NORMAL_FORCE}]}}"
             bound = f"the file's sensors do not read {', '.join(scalar)} along the normal ({needed})"
             warn(f"{bound}; no accuracy of the {scenario.plan_label}")
-            continue
-        sets[scenario.plan_label] = planned
+        else:
+            sets[scenario.plan_label] = sensor_set(scene.robot, scene.contacts, plan.chosen, scene.noise)
     return sets
 
 

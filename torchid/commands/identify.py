@@ -323,8 +323,7 @@ def _robust(fit: Fit, ready: _Prepared, bars: Progress) -> tuple[Fit, RobustSumm
     if loss is None:
         return fit, None
     bar = bars.add_task("weighing outliers down", total=loss.passes * sum(map(len, train)))
-    done = partial(bars.advance, bar)
-    robust = fit_robustly(train, ready.fitter, loss, first=fit, parts=ready.parts, progress=done)
+    robust = fit_robustly(train, ready.fitter, loss, first=fit, parts=ready.parts, progress=partial(bars.advance, bar))
     bars.update(bar, total=1, completed=1)
     if not robust.summary.converged:
         message = f"estimator.robust: not converged after {robust.summary.passes} passes; accepted: more passes"

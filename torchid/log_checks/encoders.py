@@ -12,8 +12,9 @@ import numpy as np
 import torch
 
 from torchid.errors import InputError, join_names
+from torchid.log_checks.deviation import Deviation, DeviationRows, Trial, UnknownColumns, fit_deviation
 from torchid.log_checks.findings import REJECTED, SUSPICIOUS, Finding
-from torchid.log_checks.lag_and_tilt import Deviation, DeviationRows, Trial, UnknownColumns, fit_deviation, fit_tilt
+from torchid.log_checks.lag_and_tilt import fit_tilt
 from torchid.log_checks.mistakes import joint_mistakes
 from torchid.log_checks.model import (
     TRIAL_SAMPLES,

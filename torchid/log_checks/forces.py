@@ -10,9 +10,10 @@ import numpy as np
 import torch
 
 from torchid.errors import InputError, join_names
+from torchid.log_checks.deviation import Trial
 from torchid.log_checks.encoders import check_encoders, is_bolted_arm
 from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, Finding, Skipped, refused
-from torchid.log_checks.lag_and_tilt import Trial, check_lag_and_tilt, check_torque_offsets, without_lag
+from torchid.log_checks.lag_and_tilt import check_lag_and_tilt, check_torque_offsets, without_lag
 from torchid.log_checks.mistakes import joint_mistakes, possible_mistakes
 from torchid.log_checks.model import (
     MAX_TRIAL_DIFFERENTIATED_SAMPLES,

@@ -2,49 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 
 import numpy as np
 import torch
 
 from torchid.errors import InputError
+from torchid.log_checks.deviation import (
+    COMPARED_SAMPLES,
+    Deviation,
+    DeviationRows,
+    Trial,
+    fit_deviation,
+)
 from torchid.log_checks.findings import NOTE, SUSPICIOUS, Finding
 from torchid.log_checks.model import (
-    MAX_TRIAL_DIFFERENTIATED_SAMPLES,
     Declared,
     NominalModel,
     bind_some_samples,
-    deviation_builder,
-    preprocess_pieces,
     some_samples,
 )
-from torchid.log_checks.scales import (
-    CORRELATED_SAMPLES,
-    TIME_BLOCKS,
-    accumulate_blocks,
-    deviation_columns,
-    prior_columns,
-    rows_with_bases,
-)
 from torchid.logs import Log
-from torchid.logs.log import BoolArray, FloatArray
+from torchid.logs.log import FloatArray
 from torchid.logs.segments import with_delayed_torques
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.predict import force_series
 from torchid.regressor.kinematics import GRAVITY_WORLD
 
-#: Samples that are compared.
-_SAMPLES = 240
 #: Lag and tilt that are reported: filters of sensors are late by 10 ms, and a table is level to 2 degrees.
 MIN_LAG_S, MIN_TILT_DEG = 0.025, 6.0
-#: Size of such a deviation in standard deviations, and the share of it that every block of time must show.
-_MIN_STANDARD_DEVIATIONS, _MIN_BLOCK_SHARE = 4.0, 0.5
-#: Unexplained forces without the deviation over those with it (1.2 at most in logs without a mistake), and what it may
-#: leave: more, and the forces are another robot's.
-_MIN_UNEXPLAINED_RATIO, _MAX_LEFT = 1.25, 1.5
 #: Gain of a contact's sensor relative to the others, and turn of its axes, that are reported.
 _MIN_SENSOR_GAIN, _MIN_TURN_DEG = 0.15, 10.0
 #: Offset of a torque, over the rms of all torques, that is reported: those of good sensors are 0.08 of it.
@@ -55,104 +43,6 @@ _LAG_PRIOR_STD_S, _TILT_PRIOR_STD_RAD, _SENSOR_PRIOR_STD, _OFFSET_PRIOR_SHARE = 
 #: Times that torques are shifted by what the slope of their readings says, which is exact for small lags alone.
 _SHIFTS, _LEAST_SHIFT_S = 8, 2e-3
 _SMALL_ANGLE = 1e-4
-
-UnknownColumns = Callable[[RowBuilder, Samples, int], FloatArray]
-"""Change of the generalized forces that are required (N, n_rows, k) by a unit of each unknown, of samples by number."""
-
-
-@dataclass(frozen=True, eq=False)
-class Trial:
-    """Some filtered samples of a log, with their rows, for all that may be wrong with it.
-
-    Attributes:
-        log: the log.
-        model: robot, contacts, and what is declared.
-        cutoff_hz: of the filter.
-    """
-
-    log: Log
-    model: NominalModel
-    cutoff_hz: float
-
-    @cached_property
-    def pieces(self) -> list[Log]:
-        """Runs of the log, filtered. Raises InputError: it cannot be filtered."""
-        return preprocess_pieces(self.log, self.cutoff_hz, MAX_TRIAL_DIFFERENTIATED_SAMPLES)
-
-    @cached_property
-    def samples(self) -> list[Samples]:
-        """Samples of them. Raises InputError: as `pieces`, or the log does not match the robot."""
-        return bind_some_samples(self.pieces, self.model.robot, self.model.contacts, _SAMPLES)
-
-    @cached_property
-    def rows(self) -> DeviationRows | None:
-        """Rows of the samples, None where no force was measured. Raises InputError: as `samples`."""
-        return DeviationRows.of(self.samples, self.model)
-
-
-@dataclass(frozen=True, eq=False)
-class DeviationRows:
-    """Whitened rows of some samples, and columns of what may differ from the URDF in them.
-
-    Attributes:
-        builder: of the rows.
-        samples: that they are of.
-        parts: of each of the samples, bases W (N, n_rows, n_rows), which rows are not zero, columns (N, n_rows, P),
-            those of offsets of torques last, and what the nominal parameters leave (N, n_rows).
-    """
-
-    builder: RowBuilder
-    samples: Sequence[Samples]
-    parts: list[tuple[FloatArray, BoolArray, FloatArray, FloatArray]]
-
-    @classmethod
-    def of(cls, samples: Sequence[Samples], model: NominalModel) -> DeviationRows | None:
-        """The rows of the forces that are measured, None without any."""
-        builder = deviation_builder(samples, model)
-        if builder is None:
-            return None
-        prior, parts = prior_columns(builder, model.robot, samples), []
-        nominal = builder.to_columns(model.robot.nominal.flatten()[None])[0].numpy()
-        for part in samples:
-            rows, W, equations = rows_with_bases(builder, part)
-            columns = deviation_columns(builder, rows, W, part, prior)
-            parts.append((W, equations, columns, rows[..., :-1] @ nominal - rows[..., -1]))
-        return cls(builder, samples, parts)
-
-
-@dataclass(frozen=True, eq=False)
-class Deviation:
-    """Unknowns beside the parameters, estimated with these.
-
-    Attributes:
-        value, spread: (k,), of the whole log, and their standard deviations.
-        blocks: (TIME_BLOCKS, k), by block of time.
-        without, left: forces that the best URDF near the given one leaves unexplained without the unknowns and with
-            them, rms in `UNMODELLED_FORCE_SHARE` of the forces.
-    """
-
-    value: FloatArray
-    spread: FloatArray
-    blocks: FloatArray
-    without: float
-    left: float
-
-    @property
-    def clear(self) -> BoolArray:
-        """Unknowns (k,) that are certain and that every block agrees on, where all explain the forces much better."""
-        agree = (self.blocks * np.sign(self.value) > _MIN_BLOCK_SHARE * np.abs(self.value)).all(axis=0)
-        improves = self.without > _MIN_UNEXPLAINED_RATIO * self.left and self.left < _MAX_LEFT
-        return np.asarray(agree & (np.abs(self.value) > _MIN_STANDARD_DEVIATIONS * self.spread) & improves)
-
-    @property
-    def is_clear(self) -> bool:
-        """Whether the largest unknown is."""
-        return bool(self.clear[np.argmax(np.abs(self.value))])
-
-    @property
-    def gain(self) -> str:
-        """How much better forces are explained with it."""
-        return f"{self.without / max(self.left, 1e-9):.2g} times as much is unexplained otherwise"
 
 
 def check_lag_and_tilt(trial: Trial, derived: tuple[str, ...] = ()) -> tuple[list[Finding], float]:
@@ -179,7 +69,7 @@ def check_lag_and_tilt(trial: Trial, derived: tuple[str, ...] = ()) -> tuple[lis
 
 def check_tilt(samples: Sequence[Samples], model: NominalModel) -> Iterator[Finding]:
     """A finding about a vertical that gravity is not along, in filtered logs of a robot."""
-    yield from _tilt_findings(_tilt_of(DeviationRows.of(some_samples(samples, _SAMPLES), model), model), model)
+    yield from _tilt_findings(_tilt_of(DeviationRows.of(some_samples(samples, COMPARED_SAMPLES), model), model), model)
 
 
 def check_torque_offsets(trial: Trial) -> Iterator[Finding]:
@@ -286,7 +176,7 @@ def fit_lag(trial: Trial) -> Deviation | None:
     robot, contacts, out, shift, moved = trial.model.robot, trial.model.contacts, None, 0.0, trial
     for _ in range(_SHIFTS):
         slopes = [replace(one, joint_torque=_slope(one)) for one in moved.pieces]
-        rates = bind_some_samples(slopes, robot, contacts, _SAMPLES)
+        rates = bind_some_samples(slopes, robot, contacts, COMPARED_SAMPLES)
 
         def columns(builder: RowBuilder, part: Samples, number: int, rates: Sequence[Samples] = rates) -> FloatArray:
             torque = np.zeros((len(part), builder.tree.n_rows, 1))
@@ -376,31 +266,3 @@ def _turned(samples: Samples, axis: int) -> Samples:
         return replace(samples, base=base.tilted(-angle[:2], len(samples)))
     change = base.specific_force.new_tensor(np.cross(angle, GRAVITY_WORLD))
     return replace(samples, base=replace(base, specific_force=base.specific_force - change @ base.rotation))
-
-
-def fit_deviation(
-    rows: DeviationRows | None, columns: UnknownColumns, prior_std: float, offsets: int = 0
-) -> Deviation | None:
-    """Unknowns by their columns, beside parameters, friction, armature and all but so many `offsets` of torques."""
-    if rows is None:
-        return None
-    parts = []
-    for number, (part, (W, equations, K, target)) in enumerate(zip(rows.samples, rows.parts, strict=True)):
-        projected = np.einsum("nvr,nvk->nrk", W, columns(rows.builder, part, number))
-        Y = np.concatenate([target[..., None], projected], axis=2)
-        parts.append((K[..., : K.shape[2] - offsets], Y, equations))
-    normal = accumulate_blocks(parts)
-
-    def solve(block: int | None) -> tuple[FloatArray, FloatArray, float, float]:
-        G = normal.unexplained(block)
-        H = G[1:, 1:] + CORRELATED_SAMPLES / prior_std**2 * np.eye(len(G) - 1)
-        x = np.linalg.solve(H, G[1:, 0])
-        left = G[0, 0] - 2.0 * G[0, 1:] @ x + x @ G[1:, 1:] @ x
-        return np.asarray(x), np.asarray(np.diag(np.linalg.inv(H))), float(G[0, 0]), float(left)
-
-    value, variance, without, left = solve(None)
-    unexplained = np.sqrt(np.maximum([without, left], 0.0) / max(normal.rows, 1))
-    spread = np.sqrt(CORRELATED_SAMPLES * max(1.0, float(unexplained[1]) ** 2) * variance)
-    return Deviation(
-        value, spread, np.array([solve(block)[0] for block in range(TIME_BLOCKS)]), *map(float, unexplained)
-    )

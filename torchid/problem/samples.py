@@ -347,12 +347,9 @@ def _contacts(log: Log, robot: Robot, contacts: Sequence[Contact]) -> tuple[list
     order = [log.contact_names.index(frame) for frame in frames]
     if frames and log.contact_active is None:
         raise LogError(log.source, "contact_active", "missing", "(N, C) bool: which contact touches the ground when")
-    active = (
-        np.zeros((len(log), 0), dtype=bool)
-        if log.contact_active is None
-        else columns_in_order(log.contact_active, order)
-    )
-    return order, active
+    if log.contact_active is None:
+        return order, np.zeros((len(log), 0), dtype=bool)
+    return order, columns_in_order(log.contact_active, order)
 
 
 def require_forces(samples: Samples, robot: Robot, contacts: Sequence[Contact], required: SensorSet) -> None:

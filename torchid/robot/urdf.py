@@ -129,8 +129,7 @@ def read_urdf(path: Path) -> tuple[list[Link], list[TreeJoint]]:
 
 def _read_elements(path: Path) -> etree._Element:
     """The URDF's XML, reduced to the elements in `_KEPT`."""
-    root = parse_xml(path).getroot()
-    drop_prefixed(root)
+    drop_prefixed(root := parse_xml(path).getroot())
     for tag in ("link", "joint"):
         count = len(root.findall(tag))
         if count > MAX_LINKS:
