@@ -148,6 +148,16 @@ def test_a_base_force_that_a_constant_would_predict_as_well_is_not_explained(
     assert ("but the model does not explain these forces" in said.split("rms error")[0]) is told
 
 
+@pytest.mark.parametrize(("share", "told"), [(5e-4, True), (2e-3, False)])
+def test_forces_that_the_file_itself_predicts_are_said_to_be_computed(
+    consistent: Identification, share: float, told: bool
+) -> None:
+    pair = consistent.metrics["test"]
+    near = replace(pair.nominal, relative=dict.fromkeys(pair.nominal.relative, share))
+    metrics = consistent.metrics | {"test": pair._replace(nominal=near)}
+    assert ("were they computed from it" in text(replace(consistent, metrics=metrics), 200)) == told
+
+
 def test_projected_forces_that_no_bodies_would_predict_as_well_are_not_explained(consistent: Identification) -> None:
     pair = consistent.metrics["test"]
     found = replace(pair.identified, relative={**pair.identified.relative, "nullspace": 1.31})

@@ -88,6 +88,7 @@ _FAR_FROM_LEAST = 3.0  # standard errors by noise, rms; those that are printed c
 _MUCH_MORE = 1.5  # residuals of bodies that can exist over the least: 1.001 of honest logs, 1.9 to 30 with a unit wrong
 _EXACT = 1e-3  # of what the nominal parameters leave: signals without noise, of which a solver's tolerance is left
 _CLEAR_ERRORS = 4.0  # standard errors of a total mass from which on it is not the URDF's
+_COMPUTED = 1e-3  # of the measured, to which no file predicts what a real robot does: friction alone is more
 _ANOTHER_ROBOT = 1.0  # of each body that data determine: no file of the same robot is off by so much
 
 
@@ -173,6 +174,7 @@ def _attention(run: Identification, judged: ErrorComparison) -> Iterator[str]:
     if isinstance(run.estimate, SgdEstimate) and run.estimate.deviation > _FAR_FROM_LEAST:
         yield _unfinished(run.estimate)
     yield from list(_unlike_sensors(judged.identified)) or _unlike_torques(run)
+    yield from _computed(judged)
     impossible = [one.term for one in run.violations if one.term is not None]
     if impossible:
         advice = "estimator.name=consistent finds the best that can be"
@@ -249,6 +251,14 @@ def _unlike_sensors(identified: Metrics) -> Iterator[str]:
     if share is not None and share > _LARGER_THAN_MEASURED and (of_weight or 0.0) > MAX_MASS_ERROR:
         ratio = f"base force: errors of {share:.2g} times what its measurements vary by"
         yield f"{ratio}; check frames, signs and units of contact forces and of the base's pose: torchid check"
+
+
+def _computed(judged: ErrorComparison) -> Iterator[str]:
+    """That the robot's file itself predicts the forces better than any file predicts those of a real robot."""
+    shares = [share for group in ERROR_GROUPS if (share := judged.nominal.relative_of(group)) is not None]
+    if shares and max(shares) < _COMPUTED:
+        to = f"to {format_percent(max(shares))} %"
+        yield f"the {judged.of} predicts these forces {to}: were they computed from it, or commanded, not measured?"
 
 
 def _unlike_torques(run: Identification) -> Iterator[str]:
