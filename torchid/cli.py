@@ -312,7 +312,7 @@ def _evaluate(options: argparse.Namespace) -> None:
 def _replay(options: argparse.Namespace) -> None:
     with importing():
         from torchid.commands.replay import parse_gains, replay
-        from torchid.terminal.runs import print_replay
+        from torchid.terminal.simulations import print_replay
 
     gains = parse_gains("--kp", options.kp), parse_gains("--kd", options.kd)
     found = replay(options.run, options.log, options.window, options.output, options.overwrite, *gains, options.samples)
@@ -392,7 +392,7 @@ def _simulate(options: argparse.Namespace) -> None:
     with importing():
         from torchid.commands.simulate import simulate
         from torchid.config import load_simulation
-        from torchid.terminal.runs import print_all_motions, print_simulation
+        from torchid.terminal.simulations import print_all_motions, print_simulation
 
     config = load_simulation(options.file, options.overrides)
     stabilities = simulate(config)

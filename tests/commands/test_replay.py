@@ -21,7 +21,7 @@ from torchid.fitting.calibration import Comparison
 from torchid.report.figures import drift_figure
 from torchid.sensing import Contact
 from torchid.simulation.replay import Drift
-from torchid.terminal.runs import replay_lines
+from torchid.terminal.simulations import replay_lines
 
 UNSEEN = str(DEMO / "sway_test.npz")
 pytestmark = pytest.mark.filterwarnings("ignore:identified.urdf")

@@ -13,7 +13,7 @@ from torchid.cli import main
 from torchid.config import SimulationConfig
 from torchid.simulation import Stability
 from torchid.terminal.lines import LINES
-from torchid.terminal.runs import simulation_lines
+from torchid.terminal.simulations import simulation_lines
 
 STANDS = Stability((0.622, 0.835), 0.001, 0.0002, 0.076, 0.0, 0.01, (0.0, 0.33))
 

@@ -1,26 +1,18 @@
-"""What commands on a run print, `evaluate`, `sample` and `replay`, and `simulate`."""
+"""What commands on a run print, `evaluate` and `sample`."""
 
 from __future__ import annotations
-
-from collections import Counter
-from collections.abc import Mapping
-from dataclasses import asdict
 
 import numpy as np
 
 from torchid.commands.answer import ErrorComparison
 from torchid.commands.evaluate import EvaluatedRun
-from torchid.commands.replay import Replay
 from torchid.commands.sample import DrawnSamples
-from torchid.commands.simulate import nominal_name, simulated_balls
-from torchid.config import SimulationConfig
-from torchid.errors import format_count, format_percent
+from torchid.errors import format_count
 from torchid.parameters import COULOMB, MASS, PARAMETERS, PER_BODY, Array
 from torchid.problem.metrics import describe_worse, worse_than_nominal
 from torchid.report.parameter_files import table_of_draws
-from torchid.report.tables import error_tables, print_tables, stability_table, terminal_width
-from torchid.simulation import Stability
-from torchid.terminal.lines import LABEL, LINES, column_lines, error_lines, labelled, print_rolling, wrap_words
+from torchid.report.tables import error_tables, print_tables, terminal_width
+from torchid.terminal.lines import LABEL, column_lines, error_lines, labelled, wrap_words
 
 MOST_LOGS = 8
 """Logs of which a sentence is printed each: two lines at 80 columns, within a screen."""
@@ -122,128 +114,3 @@ def _shown(drawn: DrawnSamples, table: Array, verbose: bool) -> list[int]:
         widest = of_bodies[np.argsort(-relative[of_bodies], kind="stable")][:_MOST_PARAMETERS]
         out += sorted(number for number in widest.tolist() if relative[number] > 0.0)
     return [*out, *range(len(posterior.nominal), min(table.shape[1], len(posterior.nominal) + _MOST_PARAMETERS))]
-
-
-_TEXT_LINES = 2
-
-
-def print_simulation(config: SimulationConfig, stabilities: Mapping[str, Stability]) -> None:
-    """Print the answer for the terminal's width."""
-    print("\n".join(simulation_lines(config, stabilities, terminal_width())))
-
-
-def simulation_lines(config: SimulationConfig, stabilities: Mapping[str, Stability], width: int) -> list[str]:
-    """The answer, in lines of at most so many columns, but for names that are longer.
-
-    Args:
-        config: what was simulated.
-        stabilities: how the robot stood, by motion; at least one.
-        width: of the terminal.
-    """
-    lines = [*wrap_words(_headline(config, stabilities), width), ""]
-    end = labelled("rolling", balls, width, _TEXT_LINES) if (balls := simulated_balls(config)) else []
-    nominal, kind = nominal_name(config), "URDF" if config.robot.mjcf is None else "MJCF"
-    text = f"logs/ and {nominal}; the truth: exact/ and the simulated {kind}"
-    end += labelled("to identify", text, width, _TEXT_LINES)
-    end.append(f"{'written to':{LABEL}}{config.output}")
-    room = LINES - len(lines) - len(end)
-    return [*lines, *_motion_lines(config, stabilities, room, width), *end]
-
-
-def print_all_motions(config: SimulationConfig, stabilities: Mapping[str, Stability]) -> None:
-    """Print how the robot stood in every motion."""
-    print_rolling(simulated_balls(config))
-    print_tables(stability_table({name: asdict(stability) for name, stability in stabilities.items()}))
-    print(f"{'written to':{LABEL}}{config.output}")
-
-
-def _headline(config: SimulationConfig, stabilities: Mapping[str, Stability]) -> str:
-    seconds = sum(motion.duration_s for motion in config.motions)
-    motions = format_count(len(stabilities), "motion")
-    found = stabilities.values()
-    slip, margin = 1e3 * max(one.slip for one in found), 1e3 * min(one.zmp_margin for one in found)
-    bounds = f"feet slip by at most {slip:.1f} mm, the zero-moment point stays {margin:.0f} mm inside the support"
-    effort = max(one.effort for one in found)
-    limits = f", torques reach {100 * effort:.0f} % of their limits" if effort else ""
-    return f"The robot stands throughout {motions}, {seconds:.4g} s: {bounds}{limits}"
-
-
-def _motion_lines(config: SimulationConfig, stabilities: Mapping[str, Stability], room: int, width: int) -> list[str]:
-    """A table of the motions, the nearest to a bound first, in at most so many lines."""
-
-    def use(one: Stability) -> float:
-        """The largest share of a bound that is used up."""
-        bounds, margin = config.bounds, one.zmp_margin
-        near = bounds.zmp_m / margin if margin > 0.0 else 1.0
-        return max(one.slip / bounds.slip_m, one.height_change / bounds.height_m, one.effort, near)
-
-    order = sorted(stabilities, key=lambda name: use(stabilities[name]), reverse=True)
-    shown = order[: room - 1 if len(order) < room else room - 2]  # a heading, how many others there are
-    found = [stabilities[name] for name in shown]
-    columns = [
-        ("slip [mm]", [f"{1e3 * one.slip:.1f}" for one in found]),
-        ("ZMP inside by [mm]", [f"{1e3 * one.zmp_margin:.0f}" for one in found]),
-        ("effort [%]", [f"{100 * one.effort:.0f}" if one.effort else "" for one in found]),
-        ("base height [m]", ["{:.3f} to {:.3f}".format(*one.base_height) for one in found]),
-        ("feet up [%]", [", ".join(f"{100 * share:.0f}" for share in one.unloaded) for one in found]),
-    ]
-    lines = column_lines(("motion", shown), columns, width)
-    if len(order) > len(shown):
-        lines.append(f"and {format_count(len(order) - len(shown), 'motion')} farther from the bounds: --verbose")
-    return lines
-
-
-_MOST = 6  # joints in the answer
-_SHARES = (0.2, 0.4, 1.0)  # of a window
-
-
-def print_replay(replayed: Replay, verbose: bool = False) -> None:
-    """Print the answer for the terminal's width; `verbose`: with all joints."""
-    print("\n".join(replay_lines(replayed, terminal_width(), verbose)))
-
-
-def replay_lines(replayed: Replay, width: int, verbose: bool = False) -> list[str]:
-    """A sentence, the drift at a few times, and the joints that drift most; lines of at most so many columns.
-
-    Args:
-        replayed: what was found.
-        width: of the terminal.
-        verbose: with all joints.
-    """
-    lines = wrap_words(_drift(replayed), width, "  ")
-    names, columns = list[str](), [(f"{share * replayed.window:g} s", list[str]()) for share in _SHARES]
-    for name in replayed.at(replayed.window):
-        drawn = [f"{len(replayed.sampled)} samples"] if replayed.sampled else []
-        names += [f"{name}, {who}" for who in (replayed.of, "identified", *drawn)]
-        for (_, column), share in zip(columns, _SHARES, strict=True):
-            column += [f"{x:.4g}" for x in replayed.at(share * replayed.window)[name]]
-            if drawn:
-                column.append(" to ".join(f"{x:.3g}" for x in replayed.ranges_at(share * replayed.window)[name]))
-    lines += column_lines(("median drift after", names), columns, width)
-    joints = sorted(replayed.by_joint().items(), key=lambda x: -x[1].identified)
-    few = joints if verbose else joints[:_MOST]
-    cells = [
-        (replayed.of, [f"{x.nominal:.4g}" for _, x in few]),
-        ("identified", [f"{x.identified:.4g}" for _, x in few]),
-    ]
-    lines += ["", *column_lines((f"joint, after {replayed.window:g} s", [name for name, _ in few]), cells, width)]
-    if len(few) < len(joints):
-        lines.append(f"and {format_count(len(joints) - len(few), 'joint')} drifting less: --verbose")
-    if replayed.output is not None:
-        lines.append(f"{'written to':{LABEL}}{replayed.output}")
-    return lines
-
-
-def _drift(replayed: Replay) -> str:
-    """How much less the identified robot drifts."""
-    drifts = replayed.at(replayed.window)
-    what = Counter(name.partition(" [")[0] for name in drifts)  # with units where joints have two
-    named = {name: bare if what[bare := name.partition(" [")[0]] == 1 else name for name in drifts}
-    shares = [
-        f"{named[name]} {format_percent(after / before)} %" if before else named[name]
-        for name, (before, after) in drifts.items()
-    ]
-    worse = any(after > before for before, after in drifts.values())
-    head = f"WORSE THAN {replayed.of}: drift" if worse else "Drift"
-    of = f"of {replayed.driven} alone, as a share of the {replayed.of}'s"
-    return f"{head} after {replayed.window:g} s {of}: {', '.join(shares)} ({format_count(replayed.windows, 'window')})"
