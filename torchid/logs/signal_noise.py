@@ -153,7 +153,7 @@ def noise_of_derivatives(step: float, timeline: Timeline) -> FloatArray:
 
 
 _MUCH = 0.1  # share of an acceleration's variance
-_MOSTLY = 0.5
+_STILL = 3.0  # rms of positions over that of their noise, up to which a joint does not move
 _LITTLE = 0.03  # share at the cutoff that is proposed
 _NAMED = 4
 #: Accelerations, and what each is derived from, with the number of derivatives.
@@ -181,9 +181,9 @@ def warn_of_noisy_accelerations(log: Log, preprocessed: Log, timeline: Timeline,
     noisy = sorted(_noise_shares(log, preprocessed, noise), key=lambda one: -one[1])
     if not noisy:
         return
-    if log.joint_names and {name for name, share, _ in noisy if share > _MOSTLY} >= set(log.joint_names):
-        found = f"no joint moves: accelerations of all {len(log.joint_names)} are mostly noise"
-        warn_about_file(f"{found}; one posture tells what balances gravity in it, no inertia and no friction")
+    if _stands_still(log, noise):
+        found = "no joint moves by more than the noise of its positions"
+        warn_about_file(f"{found}; one posture shows weights, no friction, and inertia only if the base moves")
         return
     names = [f"{name} ({100.0 * share:.0f} %)" for name, share, _ in noisy]
     found = f"a large part of these accelerations is noise: {join_names(names, _NAMED)}"
@@ -194,6 +194,14 @@ def warn_of_noisy_accelerations(log: Log, preprocessed: Log, timeline: Timeline,
         lower = cutoff * float(np.median([_slower(share, order) for _, share, order in noisy]))  # some hardly move
         advice = f"a cutoff of {lower:.2g} Hz, if the motion is that slow, or faster motion"
     warn_about_file(f"{found}; what rests on them is uncertain; accepted: {advice}")
+
+
+def _stands_still(log: Log, noise: SignalNoise) -> bool:
+    """Whether no joint moves by more than its positions' noise."""
+    std = noise.std.get("joint_position")
+    if std is None or log.joint_position is None or not log.joint_names:
+        return False
+    return bool((np.nanstd(log.joint_position, axis=0) < _STILL * std).all())
 
 
 def _slower(share: float, order: int) -> float:
