@@ -182,8 +182,10 @@ def warn_of_noisy_accelerations(log: Log, preprocessed: Log, timeline: Timeline,
     if not noisy:
         return
     if _stands_still(log, noise):
-        found = "no joint moves by more than the noise of its positions"
-        warn_about_file(f"{found}; one posture shows weights, no friction, and inertia only if the base moves")
+        warn_about_file(
+            "no joint moves by more than the noise of its positions; one posture shows weights, no friction, and "
+            "inertia only if the base moves"
+        )
         return
     names = [f"{name} ({100.0 * share:.0f} %)" for name, share, _ in noisy]
     found = f"a large part of these accelerations is noise: {join_names(names, _NAMED)}"
