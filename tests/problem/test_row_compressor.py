@@ -163,6 +163,16 @@ def test_rows_that_most_columns_would_be_combined_for_are_factorized_until_other
     assert relative_difference(factor.triangle().numpy(), np.vstack(chunks)) < 1e-12
 
 
+@pytest.mark.parametrize("small", [1e-3, 1e-12, 1e-70])
+def test_a_column_that_the_sampled_rows_hardly_have_takes_no_digits_of_others(small: float) -> None:
+    """As friction that only slow samples show: its combination for these alone would be as large as it is small."""
+    chunks = exact_rows(well_conditioned, 3)
+    for rows in chunks:
+        rows[:: 300 // (3 * (COLUMNS + 1)), 4] *= small
+        rows[:, -1] = rows[:, :-1] @ PARAMETERS
+    assert relative_difference(compressed(chunks).triangle().numpy(), np.vstack(chunks)) < 1e-12
+
+
 def test_levels_make_rows_well_conditioned_and_can_be_undone() -> None:
     rows = np.vstack(exact_rows(nearly_dependent, 1, 1e-3))
     levels = ColumnLevels.of(np.linalg.qr(rows, mode="r"))

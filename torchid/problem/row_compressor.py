@@ -34,6 +34,9 @@ person and an arm). With this eigenvalue that is a relative change of any sum of
 _CERTIFIED = (16.0 * _LEAST_EIGENVALUE, 4.0 * _LEAST_EIGENVALUE, _LEAST_EIGENVALUE)
 """What the least eigenvalue is shown to be: the larger, the later it is looked at again."""
 
+_MOST_GROWTH = 10.0
+"""Length of a combined column over that before, up to which no more than a digit of the column is lost."""
+
 _ROWS_PER_COLUMN = 3  # of the sample of a chunk that its columns are combined by
 _MOST_COMBINED = 0.5  # of the columns: where more are combined, QR is as fast, and the Gram matrix mostly fails
 _LEAST_ROWS = 2000  # of a chunk that columns are combined for: of fewer, that takes longer than Householder QR of them
@@ -82,10 +85,20 @@ class ColumnLevels:
         inverse = np.linalg.solve(self.T_unit, np.eye(len(self.size))[:, self.lower])
         return np.asarray(inverse * self.size[self.lower] / self.size[:, None])
 
-    def apply(self, X: Array) -> None:
-        """Change columns, (n, M) by column, in place."""
+    def apply(self, X: Array) -> bool:
+        """Change columns, (n, M) by column, in place; returns whether they were.
+
+        They are not where one would become much longer: rows that these levels were not made of, in which a column is
+        not as small as in those, and so has a combination that costs others their digits.
+        """
         if len(self.lower):
-            X[self.lower] = self.to_lower @ X
+            before, after = X[self.lower], self.to_lower @ X
+            with np.errstate(over="ignore", invalid="ignore"):  # what is not finite stays so
+                squares = (np.einsum("km,km->k", one, one) for one in (before, after))
+                if np.less(_MOST_GROWTH**2 * next(squares), next(squares)).any():
+                    return False
+            X[self.lower] = after
+        return True
 
     def squares_before(self, gram: Array) -> Array:
         """Squares of the lengths that the lower columns had, (k,), from the Gram matrix of changed ones."""
@@ -130,8 +143,7 @@ class _Sum:
         return cls(levels, np.zeros_like(levels.T_unit))
 
     def add(self, X: Array) -> bool:
-        """Add rows by column, (n, M), which are combined in place, if the sum may be used; returns whether it was."""
-        self.levels.apply(X)
+        """Add rows by combined column, (n, M), if the sum may be used; returns whether it was."""
         gram = X @ X.T  # numpy does half of the products
         total, lower = self.gram + gram, self.levels.lower
         total[lower, lower] += _FLOOR**2 * self.levels.squares_before(gram)
@@ -230,10 +242,11 @@ class RowCompressor:
         if known is None:
             factor.add_in_place(support, stacked, oversampling)
             return
-        if known.add(X):
+        combined = known.levels.apply(X)
+        if combined and known.add(X):
             self._sums[support] = known
         else:
-            self._factorize(factor, support, stacked, known)
+            self._factorize(factor, support, stacked, known, combined)
         factor.count(count, oversampling)
 
     def finish(self) -> None:
@@ -256,15 +269,19 @@ class RowCompressor:
             self._levels[support] = levels
         return _Sum.of_nothing(self._levels[support])
 
-    def _factorize(self, factor: TriangularFactor, support: tuple[int, ...], stacked: Tensor, known: _Sum) -> None:
-        """Add rows in combined columns, and what they were to be added to, by QR; combine columns anew."""
-        stacked[: stacked.shape[1]] = torch.from_numpy(known.triangle())
-        R = known.levels.undo(triangularize(stacked).numpy())
+    def _factorize(
+        self, factor: TriangularFactor, support: tuple[int, ...], stacked: Tensor, known: _Sum, combined: bool
+    ) -> None:
+        """Add rows, their columns `combined` or not, and what they were to be added to, by QR; combine columns anew."""
+        before = known.triangle() if combined else known.levels.undo(known.triangle())
+        stacked[: stacked.shape[1]] = torch.from_numpy(before)
+        R = triangularize(stacked).numpy()
+        R = known.levels.undo(R) if combined else R
         self._sums.pop(support, None)
         if np.isfinite(R).all():
-            anew = _Sum.of_nothing(ColumnLevels.of(R))
+            anew, X = _Sum.of_nothing(ColumnLevels.of(R)), R.T.copy()
             self._levels[support] = anew.levels
-            if anew.add(R.T.copy()):
+            if anew.levels.apply(X) and anew.add(X):
                 self._sums[support] = anew
                 return
         factor.absorb(support, torch.from_numpy(R))
