@@ -28,7 +28,7 @@ def suspected_mistake(run: Identification, logs: TrainingLogs) -> str:
     if not is_far_off and not joints:
         return ""
     log, finding = logs.finding or (None, None)
-    if finding is None:
+    if finding is None or not finding.whole:  # some samples are no reason for parameters
         return ""
     found = f"{log}: {finding.field}: {finding.found}"
     if is_far_off and not run.misfit.explained and finding.rejects_all:
