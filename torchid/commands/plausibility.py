@@ -11,7 +11,7 @@ import numpy as np
 from rich.progress import Progress
 
 from torchid import parameters
-from torchid.commands.check import Segment, segments_to_check
+from torchid.commands.check import LogSegment, segments_to_check
 from torchid.commands.reading import scene_of_log, settle_contacts
 from torchid.commands.results import Identification
 from torchid.config.logs import LogsConfig
@@ -86,14 +86,14 @@ class TrainingLogs:
                     return
                 done(100.0 * len(segment.log) / segment.of)
 
-    def _segments(self, files: LogsConfig) -> Iterator[tuple[Scene, Segment]]:
+    def _segments(self, files: LogsConfig) -> Iterator[tuple[Scene, LogSegment]]:
         for path in files.train:
             with suppress(InputError):  # larger than memory
                 own = scene_of_log(self.scene, path)
                 yield from ((own, one) for one in segments_to_check(path, files, own.config.preprocessing))
 
 
-def _large_findings(of: tuple[Scene, Segment]) -> list[Finding]:
+def _large_findings(of: tuple[Scene, LogSegment]) -> list[Finding]:
     """Findings on a large part of a segment of a log, none where its contacts cannot be settled."""
     scene, segment = of
     settings = scene.config.preprocessing
