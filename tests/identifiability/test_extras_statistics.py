@@ -24,8 +24,8 @@ from torchid.logs.preprocess import preprocess
 from torchid.parameters import WRENCH_COMPONENTS
 from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log
 from torchid.problem.chunks import chunks_by_state
+from torchid.problem.elimination import free_parameters
 from torchid.problem.extras import CHANNELS
-from torchid.problem.posing import free_parameters
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet, named_sensors, with_ft_sensors
 

@@ -23,10 +23,10 @@ from torchid.problem.compression import (
     merge_factors,
     split_into_folds,
 )
+from torchid.problem.elimination import column_prior, free_parameters
 from torchid.problem.linear import parameter_scale
 from torchid.problem.motion_noise import MotionNoise
 from torchid.problem.noise_gram import LEAST_SIGNAL, ColumnPrior, NoiseShares, corrected_triangle
-from torchid.problem.posing import column_prior, free_parameters
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, named_sensors
 

@@ -14,9 +14,9 @@ from torchid.config import FootConfig, MotionConfig, SimulationConfig
 from torchid.config.simulation import WaveConfig
 from torchid.errors import InputError, UnknownNameError
 from torchid.simulation import LEAD_S, Simulation, set_up_simulation
-from torchid.simulation.controller import Goal
+from torchid.simulation.controller import Setpoint
 
-HZ = 500.0  # goals per second
+HZ = 500.0  # setpoints per second
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,7 @@ def biped() -> Simulation:
     return set_up_simulation(shipped(Path("nowhere")))
 
 
-def goals(biped: Simulation, motion: MotionConfig) -> tuple[Array, list[Goal]]:
+def setpoints(biped: Simulation, motion: MotionConfig) -> tuple[Array, list[Setpoint]]:
     found = biped.reference(motion)
     return found.time, list(found)
 
@@ -37,7 +37,7 @@ def wave(what: str, hz: float, amplitude: float, phase: float = 0.0) -> WaveConf
 
 
 def test_a_motion_starts_at_rest_in_the_stance_before_its_log(biped: Simulation) -> None:
-    time, found = goals(biped, squat(0.05))
+    time, found = setpoints(biped, squat(0.05))
     assert time[0] == -LEAD_S
     assert len(found) == len(time) == round((LEAD_S + 2.0) * HZ)
     np.testing.assert_allclose(found[0].com[0], biped.stance.com, rtol=0.0, atol=1e-12)
@@ -46,10 +46,10 @@ def test_a_motion_starts_at_rest_in_the_stance_before_its_log(biped: Simulation)
 
 
 def test_waves_are_sines_of_the_time_of_the_log_and_phases_are_in_turns(biped: Simulation) -> None:
-    time, found = goals(biped, MotionConfig("m", 2.0, [wave("com_z", 0.7, 0.05, 0.2)]))
+    time, found = setpoints(biped, MotionConfig("m", 2.0, [wave("com_z", 0.7, 0.05, 0.2)]))
     after = time >= 0.0
     angle = 2 * np.pi * (0.7 * time + 0.2)
-    moved = np.array([goal.com for goal in found]) - np.array([1, 0, 0])[:, None] * biped.stance.com
+    moved = np.array([setpoint.com for setpoint in found]) - np.array([1, 0, 0])[:, None] * biped.stance.com
     rate = 2 * np.pi * 0.7
     expected = 0.05 * np.stack([np.sin(angle), rate * np.cos(angle), -(rate**2) * np.sin(angle)], axis=1)
     inside = slice(2, -2)  # differences are one-sided at the ends
@@ -62,25 +62,25 @@ def test_waves_of_one_name_add_up(biped: Simulation) -> None:
     index = biped.plant.joint_names.index("torso_pitch")
 
     def moved(*waves: WaveConfig) -> Array:
-        joints = np.array([goal.joints[0, index] for goal in goals(biped, MotionConfig("m", 1.0, list(waves)))[1]])
+        joints = np.array([one.joints[0, index] for one in setpoints(biped, MotionConfig("m", 1.0, list(waves)))[1]])
         return np.asarray(joints - biped.stance.position[7 + index])
 
     np.testing.assert_allclose(moved(first, second), moved(first) + moved(second), rtol=0.0, atol=1e-14)
 
 
 def test_only_the_joints_that_a_wave_names_are_driven(biped: Simulation) -> None:
-    found = goals(biped, MotionConfig("m", 0.1, [wave("torso_roll", 1.0, 0.1), wave("base_yaw", 1.0, 0.1)]))[1]
+    found = setpoints(biped, MotionConfig("m", 0.1, [wave("torso_roll", 1.0, 0.1), wave("base_yaw", 1.0, 0.1)]))[1]
     driven = [name for name, flag in zip(biped.plant.joint_names, found[0].driven, strict=True) if flag]
     assert driven == ["torso_roll"]
 
 
 def test_a_turning_base_has_the_angular_velocity_of_its_rotation(biped: Simulation) -> None:
-    time, found = goals(biped, MotionConfig("m", 1.0, [wave("base_yaw", 0.8, 0.1)]))
-    yaw = np.array([np.arctan2(goal.base[1, 0], goal.base[0, 0]) for goal in found])
+    time, found = setpoints(biped, MotionConfig("m", 1.0, [wave("base_yaw", 0.8, 0.1)]))
+    yaw = np.array([np.arctan2(setpoint.base[1, 0], setpoint.base[0, 0]) for setpoint in found])
     np.testing.assert_allclose(
         yaw[time >= 0.0], 0.1 * np.sin(2 * np.pi * 0.8 * time[time >= 0.0]), rtol=0.0, atol=1e-12
     )
-    rate = np.array([goal.base_rate[0] for goal in found])
+    rate = np.array([setpoint.base_rate[0] for setpoint in found])
     np.testing.assert_allclose(np.gradient(yaw, time)[2:-2], rate[2:-2, 2], rtol=0.0, atol=1e-9)
 
 
@@ -88,9 +88,9 @@ def test_a_turning_base_has_the_angular_velocity_of_its_rotation(biped: Simulati
 
 
 def heights_and_loads(biped: Simulation, motion: MotionConfig) -> tuple[Array, Array, Array]:
-    time, found = goals(biped, motion)
-    lift = np.array([goal.feet[:, 0, 2] - biped.stance.feet[:, 2] for goal in found])
-    return time, lift, np.array([goal.load for goal in found])
+    time, found = setpoints(biped, motion)
+    lift = np.array([setpoint.feet[:, 0, 2] - biped.stance.feet[:, 2] for setpoint in found])
+    return time, lift, np.array([setpoint.load for setpoint in found])
 
 
 def test_feet_are_lifted_in_turn_in_the_middle_of_their_part_of_the_period(biped: Simulation) -> None:

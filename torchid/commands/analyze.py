@@ -27,8 +27,8 @@ from torchid.parameters import WRENCH_COMPONENTS
 from torchid.problem import Samples
 from torchid.problem.chunks import chunks_by_state, one_thread, thread_count
 from torchid.problem.contact_state import ContactState
+from torchid.problem.elimination import free_parameters
 from torchid.problem.linear import parameter_scale
-from torchid.problem.posing import free_parameters
 from torchid.report.analysis import (
     SetAccuracy,
     accuracy_figure,

@@ -41,7 +41,7 @@ MOST_CHECKED = 100_000
 
 
 @dataclass(frozen=True)
-class Segment:
+class LogSegment:
     """Successive samples of a log, with a name that says which, and how many the log has."""
 
     log: Log
@@ -172,7 +172,7 @@ def _read_log_to_check(path: Path, logs: LogsConfig, settings: PreprocessingConf
     return _read_with_gaps(path, logs, settings)
 
 
-def segments_to_check(path: Path, logs: LogsConfig, settings: PreprocessingConfig) -> Iterator[Segment]:
+def segments_to_check(path: Path, logs: LogsConfig, settings: PreprocessingConfig) -> Iterator[LogSegment]:
     """One of the logs of an experiment in equal segments of at most `MOST_CHECKED` samples, the middle first.
 
     Raises:
@@ -182,17 +182,17 @@ def segments_to_check(path: Path, logs: LogsConfig, settings: PreprocessingConfi
     yield from recorded_segments(path, logs, settings)
 
 
-def recorded_segments(path: Path, logs: LogsConfig, settings: PreprocessingConfig) -> Iterator[Segment]:
+def recorded_segments(path: Path, logs: LogsConfig, settings: PreprocessingConfig) -> Iterator[LogSegment]:
     """As `segments_to_check`, of a log of any size."""
     if settings.bridge_gaps_s is not None or existing_log_kind(path) in (LogKind.BAG, LogKind.JOINED):
         log = _read_with_gaps(path, logs, settings)
         for segment in _segments(len(log)):
-            yield Segment(log.select(segment), _segment_name(path, segment, len(log)), len(log))
+            yield LogSegment(log.select(segment), _segment_name(path, segment, len(log)), len(log))
         return
     with open_log_blocks(path, None, logs.columns, settings.needs_flags) as blocks:
         for segment in _segments(len(blocks)):
             log = blocks.read(segment, allow_gaps=True)
-            yield Segment(log, _segment_name(path, segment, len(blocks)), len(blocks))
+            yield LogSegment(log, _segment_name(path, segment, len(blocks)), len(blocks))
 
 
 def _read_with_gaps(path: Path, logs: LogsConfig, settings: PreprocessingConfig) -> Log:

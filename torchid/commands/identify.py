@@ -17,11 +17,10 @@ from torchid.commands.cached_reading import CachedReader, open_reader
 from torchid.commands.chosen_settings import Choices, with_chosen_settings, with_ridge, with_sample_rates
 from torchid.commands.evaluate import compare_forces, trace_forces
 from torchid.commands.folder import RUN, check_free, claim_folder
-from torchid.commands.plausibility import TrainingLogs, require_not_worse, require_plausible
+from torchid.commands.plausibility import TrainingLogs, require_not_worse, require_plausible, suspected_mistake
 from torchid.commands.reading import LogReader, check_parts
 from torchid.commands.results import Identification, write_run
 from torchid.commands.run_figures import Drawing, drawing, fit_figures
-from torchid.commands.suspicion import suspected_mistake
 from torchid.commands.training import Training, descent_settings, require_trainable, training_folder
 from torchid.config import ExperimentConfig, inputs_of
 from torchid.errors import NumericalWarning, format_count, warn_about_file

@@ -1,4 +1,4 @@
-"""Refuse fits that no robot can have produced; the checks of the training logs say why."""
+"""Whether a robot can have produced a fit: refuse or doubt it, with what the checks of the training logs find."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ import numpy as np
 from rich.progress import Progress
 
 from torchid import parameters
-from torchid.commands.check import Segment, segments_to_check
+from torchid.commands.check import LogSegment, segments_to_check
 from torchid.commands.reading import scene_of_log, settle_contacts
+from torchid.commands.results import Identification
 from torchid.config.logs import LogsConfig
 from torchid.copies import can_copy, share_between_copies
 from torchid.errors import (
@@ -26,7 +27,7 @@ from torchid.errors import (
 from torchid.estimators import LeastSquares, SgdEstimate
 from torchid.fitting.experiment import Scene
 from torchid.fitting.fit import Fit
-from torchid.fitting.misfit import beyond_models, unexplained_torques
+from torchid.fitting.misfit import beyond_models, unexplained_joints, unexplained_torques
 from torchid.identifiability.confounding import ExtraEstimate, TotalMass, estimate_extras, total_mass
 from torchid.log_checks import Finding
 from torchid.log_checks.check import check
@@ -85,14 +86,14 @@ class TrainingLogs:
                     return
                 done(100.0 * len(segment.log) / segment.of)
 
-    def _segments(self, files: LogsConfig) -> Iterator[tuple[Scene, Segment]]:
+    def _segments(self, files: LogsConfig) -> Iterator[tuple[Scene, LogSegment]]:
         for path in files.train:
             with suppress(InputError):  # larger than memory
                 own = scene_of_log(self.scene, path)
                 yield from ((own, one) for one in segments_to_check(path, files, own.config.preprocessing))
 
 
-def _large_findings(of: tuple[Scene, Segment]) -> list[Finding]:
+def _large_findings(of: tuple[Scene, LogSegment]) -> list[Finding]:
     """Findings on a large part of a segment of a log, none where its contacts cannot be settled."""
     scene, segment = of
     settings = scene.config.preprocessing
@@ -214,6 +215,35 @@ def require_not_worse(worse: list[WorseThanNominal], fitted: Metrics, logs: Trai
         warn_about_file(f"{found}; {finding.advice}", NumericalWarning)
     elif message is not None:
         warn_about_file(f"{message}; {ADVICE}", NumericalWarning)
+
+
+def suspected_mistake(run: Identification, logs: TrainingLogs) -> str:
+    """What the checks find in the training logs where a fit is doubtful, in words; "" where it is not, or they do not.
+
+    A fit is doubtful if its bodies are far off the robot's file, or if it leaves a large part of a joint's torque:
+    masses make up for an encoder that is off or in degrees, and noise that is estimated for a torque of another gear.
+
+    Args:
+        run: a finished run.
+        logs: that it is of.
+
+    Raises:
+        ImplausibleFitError: forces that the model does not explain, with bodies far off the robot's file, of a log that
+            the checks reject.
+    """
+    nominal, fitted = run.posterior.nominal_error, run.metrics["train"].identified
+    is_far_off = nominal is not None and nominal.prior_is_narrow
+    joints = unexplained_joints(fitted) if run.experiment.robot.fixed_base else []
+    if not is_far_off and not joints:
+        return ""
+    log, finding = logs.finding or (None, None)
+    if finding is None or not finding.whole:  # some samples are no reason for parameters
+        return ""
+    found = f"{log}: {finding.field}: {finding.found}"
+    if is_far_off and not run.misfit.explained and finding.rejects_all:
+        reason = f"{nominal}, and the model does not explain these forces"
+        raise ImplausibleFitError.at_field("logs", f"{reason}; torchid check finds in {found}", finding.advice)
+    return f"{found}; {finding.advice}"
 
 
 def implausibility(problem: LinearProblem, phi: Array, mass: TotalMass, robot: Robot) -> str | None:

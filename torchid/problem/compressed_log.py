@@ -10,12 +10,10 @@ from torchid.problem.chunks import ProgressCallback, chunks_by_state, one_thread
 from torchid.problem.compression import (
     LEAST_PER_FOLD,
     Part,
-    compress_parts,
+    compress_spans,
     compress_unloaded,
     fold_count,
     merge_by_key,
-    merge_folds,
-    merge_states,
 )
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
@@ -128,19 +126,17 @@ def compress_log(log: Samples, builder: RowBuilder, progress: ProgressCallback |
     states = {state for state, _ in chunks_by_state(log)}
     folds = round(len(log) / log.oversampling / LEAST_PER_FOLD)  # rounded, as its share of the folds of a fit is
     blocks = fold_count(LEAST_PER_FOLD * folds, len(states), builder)
-    parts = [
-        part
-        for part in compress_parts(_cut(log, piece_spans(len(log), blocks)), builder, progress=progress)
-        if not part.unloaded
-    ]
+    parts = compress_spans([log], [piece_spans(len(log), blocks)], builder, progress)
     unloaded: dict[SampleSpan, list[Part]] = {}
     for count in range(1, blocks + 1):
         spans = block_spans(len(log), count)
         for part in _compact(compress_unloaded(_cut(log, spans), builder)):
             unloaded.setdefault(spans[part.fold], []).append(part)
-    pieces = sorted(_compact(merge_states(parts, builder)), key=lambda part: part.fold)
-    by_state = _compact(merge_folds(parts, builder))
-    return CompressedLog(log.source, len(log), log.oversampling, log.noise_left, blocks, pieces, by_state, unloaded)
+    pieces = merge_by_key(sorted(parts, key=lambda part: part.block), sorted((part.block,) for part in parts), builder)
+    by_state = merge_by_key(parts, [(part.state,) for part in parts], builder)
+    return CompressedLog(
+        log.source, len(log), log.oversampling, log.noise_left, blocks, _compact(pieces), _compact(by_state), unloaded
+    )
 
 
 def fold_compressed(logs: Sequence[CompressedLog], builder: RowBuilder) -> list[CompressedBlock]:

@@ -148,15 +148,25 @@ def compress_in_blocks(
         progress: called with the number of samples done.
         weight_rows: as in `compress_parts`.
     """
-    spans = _spans_of_blocks(logs, builder)
+    parts = compress_spans(logs, _spans_of_blocks(logs, builder), builder, progress, weight_rows)
+    if not any(extra.what == "offset" and extra.contact is not None for extra in builder.extras):
+        return parts
+    return [*parts, *compress_unloaded(logs, builder)]
+
+
+def compress_spans(
+    logs: Sequence[Samples],
+    spans: Sequence[Sequence[tuple[int, int]]],
+    builder: RowBuilder,
+    progress: ProgressCallback | None = None,
+    weight_rows: RowWeighting | None = None,
+) -> list[Part]:
+    """As `compress_in_blocks`, without readings in the air; `spans`: first sample and end of the blocks of each log."""
     numbers = [np.repeat(range(len(own)), np.diff(own)[:, 0]) for own in spans]
     numbered = [
         replace(log, unloaded=None, blocks=torch.from_numpy(own)) for log, own in zip(logs, numbers, strict=True)
     ]
-    parts = _compress_parts(numbered, cut_logs(numbered, spans), builder, None, None, progress, weight_rows)
-    if not any(extra.what == "offset" and extra.contact is not None for extra in builder.extras):
-        return parts
-    return [*parts, *compress_unloaded(logs, builder)]
+    return _compress_parts(numbered, cut_logs(numbered, spans), builder, None, None, progress, weight_rows)
 
 
 def cut_into_blocks(logs: Sequence[Samples], builder: RowBuilder) -> list[Samples]:

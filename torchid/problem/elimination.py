@@ -1,4 +1,4 @@
-"""Elimination of extra parameters (sensor offsets and scales, actuator terms) from the linear problem."""
+"""The linear problem in the parameters of all bodies that triangular factors pose, extra parameters eliminated."""
 
 from __future__ import annotations
 
@@ -13,9 +13,8 @@ from torchid.problem.chunks import one_thread
 from torchid.problem.compression import Part, merge_factors
 from torchid.problem.eliminated_terms import EliminatedTerms, SignCondition
 from torchid.problem.extras import Extra
-from torchid.problem.linear import LinearProblem
-from torchid.problem.noise_gram import NoiseShares, corrected_triangle, scale_columns
-from torchid.problem.posing import column_prior, problem_from_triangle
+from torchid.problem.linear import PRIOR_DEVIATION, LinearProblem, TriangularFactor, parameter_scale
+from torchid.problem.noise_gram import ColumnPrior, NoiseShares, corrected_triangle, scale_columns
 from torchid.problem.rows import RowBuilder
 from torchid.robot import Robot
 from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, column_scale, is_significant
@@ -98,6 +97,19 @@ class Assembly:
 
 
 @one_thread()
+def linear_problem(factor: TriangularFactor, builder: RowBuilder, robot: Robot, friction: bool = True) -> LinearProblem:
+    """Pose the linear problem in all 12 L parameters of the bodies from a factor that `compress` made.
+
+    Raises:
+        ValueError: the builder has extra parameters; `assemble` eliminates them.
+    """
+    if builder.extras:
+        raise ValueError("builder: found extra terms; accepted: one without, or torchid.assemble")
+    own = corrected_triangle(factor, column_prior(builder, robot, friction))
+    return problem_from_triangle(own.R, factor.rows, factor.oversampling, builder, robot, friction, own.held)
+
+
+@one_thread()
 def assemble(
     parts: Sequence[Part],
     builder: RowBuilder,
@@ -157,6 +169,53 @@ def assemble(
     known = np.asarray(np.linalg.qr(np.delete(of_all_logs, np.s_[count:-1], axis=1), mode="r"))
     if_known = problem_from_triangle(known, everything.rows, oversampling, builder, robot, friction, None)
     return Assembly(problem, tuple(eliminations), if_known, noise, forces, reading_noise=reading_noise)
+
+
+def column_prior(builder: RowBuilder, robot: Robot, friction: bool = True) -> ColumnPrior:
+    """The nominal parameters in the builder's columns, and deviations within their scale of those that are free."""
+    columns, nominal = builder.columns.parameter_map, robot.nominal.flatten()
+    scale = np.where(free_parameters(robot, friction), parameter_scale(robot.nominal).flatten(), 0.0)
+    return ColumnPrior(columns @ nominal, columns * (PRIOR_DEVIATION * scale))
+
+
+def problem_from_triangle(
+    R: Array, rows: int, oversampling: float, builder: RowBuilder, robot: Robot, friction: bool, held: Array | None
+) -> LinearProblem:
+    """The problem in all 12 L parameters from a triangle in the regrouped columns, right-hand side last.
+
+    Args:
+        R: (M, columns + 1).
+        rows: that went into it.
+        oversampling: of them.
+        builder: of the rows.
+        robot: the robot.
+        friction: whether friction is free.
+        held: (columns, Q), as `CorrectedTriangle` has it.
+    """
+    count = builder.columns.count
+    return LinearProblem(
+        A=R[:count, :-1] @ builder.columns.parameter_map,
+        b=R[:count, -1],
+        residual=float(np.square(R[count:, -1]).sum()),
+        rows=rows,
+        nominal=robot.nominal.flatten(),
+        scale=parameter_scale(robot.nominal).flatten(),
+        free=free_parameters(robot, friction),
+        oversampling=oversampling,
+        held=None if held is None else R[:count, :-1] @ held,
+    )
+
+
+def free_parameters(robot: Robot, friction: bool = True) -> np.ndarray:
+    """Parameters that can be fitted, (12 L,) bool.
+
+    All but inertial parameters of massless bodies, friction of welds, and any friction if not `friction`.
+    """
+    free = np.ones(robot.nominal.shape, dtype=bool)
+    free[[body.massless for body in robot.bodies], parameters.INERTIAL] = False
+    still = [body.joint is None or body.joint.kind == "fixed" for body in robot.bodies]
+    free[still if friction else slice(None), parameters.FRICTION] = False
+    return free.flatten()
 
 
 def _bounded_terms(of_all: Elimination, robot: Robot) -> EliminatedTerms | None:

@@ -153,7 +153,7 @@ def split_at_lost_feet(stands: BoolArray, known: BoolArray) -> Iterator[list[sli
         yield runs
 
 
-class Walk:
+class LegOdometry:
     """Heading and place of a base above feet that keep theirs, or roll, while they stand."""
 
     def __init__(self, stands: BoolArray, normal: Sequence[float]) -> None:

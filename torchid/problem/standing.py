@@ -20,8 +20,8 @@ from torchid.logs.timeline import SampleRate
 from torchid.problem.floor_pose import (
     FEWEST_POINTS,
     Footholds,
+    LegOdometry,
     StanceFoot,
-    Walk,
     find_sole_axis,
     foot_to_base,
     points_of,
@@ -192,12 +192,12 @@ def stand_in_parts(
     dropped = {"too few feet stand": few, "feet in a line": int((~known).sum()) - few}
     _require_some(source, active, known, few)
     normal = contacts[0].normal
-    walk = Walk(stands, normal)
+    odometry = LegOdometry(stands, normal)
     segments: list[slice] = []
     for runs in split_at_lost_feet(stands, known):
         samples = slice(runs[0].start, runs[-1].stop)
-        if walk.begin(samples.start) or normal == UP or not segments:
-            _walk_along(walk, runs, footholds, [part.start for part in parts], add)
+        if odometry.begin(samples.start) or normal == UP or not segments:
+            _follow_segment(odometry, runs, footholds, [part.start for part in parts], add)
             segments.append(samples)
         else:
             lost = "heading on a floor that is not level"
@@ -206,21 +206,21 @@ def stand_in_parts(
     return StandingSegments(tuple(segments), named, float(np.sqrt(uneven / max(counted, 1))))
 
 
-def _walk_along(
-    walk: Walk,
+def _follow_segment(
+    odometry: LegOdometry,
     runs: Sequence[slice],
     footholds: Callable[[slice], Footholds],
     starts: Sequence[int],
     add: Callable[[slice, FloatArray, FloatArray], None],
 ) -> None:
-    """Walk along a segment, in parts that begin at some of the samples `starts`."""
+    """Follow a segment, in parts that begin at some of the samples `starts`."""
     first, last = runs[0].start, runs[-1].stop
     borders = [first, *(start for start in starts if first < start < last), last]
     before: FloatArray | None = None
     for start, stop in zip(borders, borders[1:], strict=False):
         begin = start if before is None else start - 1  # where the part before has ended
         own = [slice(max(run.start, begin), min(run.stop, stop)) for run in runs if run.stop > begin < stop > run.start]
-        rotation, position = walk.along(own, footholds(slice(begin, stop)))
+        rotation, position = odometry.along(own, footholds(slice(begin, stop)))
         quat = make_sign_continuous(Rotation.from_matrix(rotation).as_quat())
         if before is not None and float(quat[0] @ before) < 0.0:
             quat = -quat

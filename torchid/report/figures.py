@@ -11,6 +11,7 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 
 from torchid.errors import format_percent
@@ -60,7 +61,7 @@ def error_figure(sets: Mapping[str, Comparison[Metrics]], of: str = "URDF") -> F
         for shift, metrics, color, label in pairs:
             heights = [100.0 * (metrics.relative.get(group) or 0.0) for group in groups]
             bars = axis.bar(index + shift, heights, 0.38, color=color, label=label)
-            axis.bar_label(bars, fmt=lambda height: format_percent(height / 100.0), fontsize=8)
+            axis.bar_label(bars, fmt=lambda height: format_percent(height / 100.0), fontsize=8, padding=2)
         _draw_noise(axis, identified, groups)
         axis.margins(y=0.1)
         axis.set_xticks(index, [group_name(group).replace(" ", "\n") for group in groups])
@@ -90,7 +91,8 @@ def identifiability_figure(body_names: Sequence[str], estimate: Estimate) -> Fig
     shown = np.flatnonzero((verdicts != FIXED).any(axis=1))
     free = np.flatnonzero((verdicts != FIXED).any(axis=0))
     share = estimate.data_share.reshape(-1, PER_BODY)[np.ix_(shown, free)]
-    figure = Figure(figsize=(11.0, 0.24 * len(shown) + 1.8), layout="constrained")
+    apart = ConstrainedLayoutEngine(wspace=0.08)  # else the label of the colors reads as one of the other axis
+    figure = Figure(figsize=(11.0, 0.24 * len(shown) + 1.8), layout=apart)
     left, right = figure.subplots(1, 2, width_ratios=[1.9, 1.0])
     image = left.imshow(share, cmap="Blues", vmin=0.0, vmax=1.0, aspect="auto")
     for row, body in enumerate(shown):
@@ -107,7 +109,7 @@ def identifiability_figure(body_names: Sequence[str], estimate: Estimate) -> Fig
     right.axvline(estimate.rank + 0.5, color="0.5", linewidth=0.8)
     right.set_title(f"singular values, rank {estimate.rank}", loc="left", fontsize=8)
     right.set_xlabel("number")
-    right.set_ylabel("singular value [standard deviations per scale]", labelpad=12)
+    right.set_ylabel("singular value [standard deviations per scale]")
     right.grid(visible=True)
     return figure
 

@@ -140,11 +140,12 @@ def _rank_share_cell(state: Mapping[str, Any]) -> str:
 
 def noise_table(groups: Sequence[Mapping[str, Any]]) -> Table:
     """Standard deviations that weight the rows, by group: fields of `GroupNoise`."""
-    table = Table(title="Noise that weights the rows: standard deviations", title_justify="left")
-    for heading in ("", "used", "", "residuals show"):
-        table.add_column(heading, justify="left" if not heading else "right")
+    title = "Noise that weights the rows: standard deviations; residuals show what a filter leaves of it"
+    table = Table(title=title, title_justify="left")
+    for heading in ("", "used", "origin", "residuals show"):
+        table.add_column(heading, justify="left" if heading in ("", "origin") else "right")
     for group in groups:
-        residual = "-" if group["residual"] is None else f"{group['residual']:.3g}"
+        residual = "-" if group["residual"] is None else f"{group['residual']:.3g} {group['unit']}"
         table.add_row(group["group"], f"{group['used']:.3g} {group['unit']}", group["origin"], residual)
     return table
 

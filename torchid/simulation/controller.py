@@ -123,7 +123,7 @@ def _flattened(R: Array, foot: Foot) -> Array:
 
 
 @dataclass(frozen=True)
-class Goal:
+class Setpoint:
     """What to do at one instant; `p`, `v`, `a`: position, velocity, acceleration.
 
     Attributes:
@@ -146,7 +146,7 @@ class Goal:
 
 
 class Controller:
-    """Joint torques from the state of the plant and a goal."""
+    """Joint torques from the state of the plant and a setpoint."""
 
     def __init__(
         self, plant: Plant, feet: tuple[Foot, ...], rotations: Array, friction: tuple[float, float] = (0.0, 0.0)
@@ -158,16 +158,16 @@ class Controller:
         self._rotations = rotations
         self._landed: list[tuple[Array, Array] | None] = [None] * len(feet)
 
-    def torque(self, goal: Goal) -> Array:
+    def torque(self, setpoint: Setpoint) -> Array:
         """Torques (n,) [N m] for the plant as last observed."""
         plant = self._plant
         M, bias = plant.inertia, plant.bias
         feet = [plant.foot(i) for i in range(len(self._feet))]
-        acceleration = self._acceleration(goal, M, bias, feet)
+        acceleration = self._acceleration(setpoint, M, bias, feet)
         needed = M @ acceleration + bias
         velocity = plant.velocity[6:] + _PREVIEW * acceleration[6:]
         lost = self._coulomb * np.tanh(velocity / _SMOOTH) + self._viscous * velocity
-        joints = (needed - self._contact_forces(needed[:6], goal.load, feet))[6:] + lost
+        joints = (needed - self._contact_forces(needed[:6], setpoint.load, feet))[6:] + lost
         return joints if plant.has_motor.all() else self._of_motors(joints)
 
     def _of_motors(self, needed: Array) -> Array:
@@ -179,7 +179,7 @@ class Controller:
         out[motors] = np.linalg.lstsq(exerted, needed, rcond=_SINGULAR)[0][: len(motors)]
         return out
 
-    def _acceleration(self, goal: Goal, M: Array, bias: Array, feet: list[FootMotion]) -> Array:
+    def _acceleration(self, setpoint: Setpoint, M: Array, bias: Array, feet: list[FootMotion]) -> Array:
         """The generalized acceleration (nv,) that meets all tasks best, by weighted least squares."""
         plant = self._plant
         velocity, nv = plant.velocity, plant.nv
@@ -187,18 +187,18 @@ class Controller:
 
         com_J = M[:3] / plant.mass  # the base's linear rows are the momentum of everything
         drift = (bias[:3] - plant.weight) / plant.mass
-        target = _servo(goal.com[0] - plant.com, goal.com[1] - com_J @ velocity, goal.com[2])
+        target = _servo(setpoint.com[0] - plant.com, setpoint.com[1] - com_J @ velocity, setpoint.com[2])
         tasks.append((_CENTRE, com_J, target - drift))
 
         turn = np.zeros((3, nv))
         turn[:, 3:6] = np.eye(3)
-        error = rotation_error(np.eye(3), plant.base_rotation.T @ goal.base)
-        tasks.append((_TURN, turn, _servo(error, goal.base_rate[0] - velocity[3:6], goal.base_rate[1])))
+        error = rotation_error(np.eye(3), plant.base_rotation.T @ setpoint.base)
+        tasks.append((_TURN, turn, _servo(error, setpoint.base_rate[0] - velocity[3:6], setpoint.base_rate[1])))
 
         for i, foot in enumerate(feet):
-            p, v, a = goal.feet[i]
+            p, v, a = setpoint.feet[i]
             off = np.concatenate([p - foot.position, rotation_error(foot.rotation, self._rotations[i])])
-            if goal.load[i] > ALOFT:
+            if setpoint.load[i] > ALOFT:
                 if radius := self._feet[i].rolling_radius:
                     off[:3] = self._rolled_position(i, foot) - foot.position
                     foot = foot.rolling(radius)
@@ -215,8 +215,8 @@ class Controller:
         tasks.append((_CONSTRAINED, J_constraints, _servo(-off, -J_constraints @ velocity, -constraint_bias)))
 
         joints = np.zeros((plant.n, nv))
-        joints[:, 6:] = np.diag(np.where(goal.driven, _JOINT, _POSTURE))
-        p, v, a = goal.joints
+        joints[:, 6:] = np.diag(np.where(setpoint.driven, _JOINT, _POSTURE))
+        p, v, a = setpoint.joints
         tasks.append((1.0, joints, joints[:, 6:] @ _servo(p - plant.position[7:], v - velocity[6:], a)))
 
         A = np.vstack([weight * J for weight, J, _ in tasks])
@@ -269,7 +269,7 @@ LEAD_S = 2.0  # waves grow to their amplitude in this time, before the log begin
 
 
 class ReferenceMotion:
-    """The reference of a motion from a stance: a goal for every control step from -LEAD_S to its end.
+    """The reference of a motion from a stance: a setpoint for every control step from -LEAD_S to its end.
 
     Args:
         config: waves and steps.
@@ -329,8 +329,8 @@ class ReferenceMotion:
         """The sets of feet, (S, F), that carry the robot at one time or another."""
         return np.unique(self._load > ALOFT, axis=0)
 
-    def __iter__(self) -> Iterator[Goal]:
-        """The goals, one per control step."""
+    def __iter__(self) -> Iterator[Setpoint]:
+        """The setpoints, one per control step."""
         stance = self._stance
         n = self._moved.shape[2] - len(BODY)
         rest = np.zeros((3, 3 + n))
@@ -342,7 +342,7 @@ class ReferenceMotion:
             moved = self._moved[:, i]
             lifted = feet.copy()
             lifted[:, :, 2] += self._lift[:, i].T
-            yield Goal(
+            yield Setpoint(
                 com=rest[:, :3] + moved[:, :3],
                 base=turns[i],
                 base_rate=moved[1:, 3:6],

@@ -54,7 +54,7 @@ class Simulation:
             raise InputError.at_field(field, found, "three points on the floor that do not, at any time")
 
     def reference(self, config: MotionConfig) -> ReferenceMotion:
-        """The reference of a motion: a goal for every control step.
+        """The reference of a motion: a setpoint for every control step.
 
         Raises:
             UnknownNameError: it moves what the robot does not have.
@@ -113,13 +113,13 @@ def record(
     controller = Controller(plant, simulation.feet, stance.rotations, config.friction.levels or (0.0, 0.0))
     plant.place(stance.position)
     frames: list[tuple[Array, ...]] = []
-    per_goal = round(config.physics_hz / config.control_hz)
+    per_setpoint = round(config.physics_hz / config.control_hz)
     report_every = max(1, round(config.control_hz * _REPORT_S))
-    for step, (time, goal) in enumerate(zip(motion.time, motion, strict=True)):
-        for substep in range(per_goal):
+    for step, (time, setpoint) in enumerate(zip(motion.time, motion, strict=True)):
+        for substep in range(per_setpoint):
             plant.observe()
             if substep == 0:
-                torque = controller.torque(goal)
+                torque = controller.torque(setpoint)
             before = [x.copy() for x in (plant.position, plant.velocity, plant.feet_positions, plant.feet_rotations)]
             plant.push(torque)
             if time >= 0.0:
