@@ -148,7 +148,9 @@ def test_cross_validation_is_what_refitting_by_hand_gives(run: Path, demo: tuple
     assert (metrics["verdict"], metrics["worse_than_nominal"]) == (None, [])
 
 
-def test_of_long_training_logs_every_kth_sample_is_scored(run: Path, demo: tuple[RowBuilder, Samples]) -> None:
+def test_of_long_training_logs_every_kth_sample_is_scored(
+    run: Path, demo: tuple[RowBuilder, Samples], monkeypatch: pytest.MonkeyPatch
+) -> None:
     _, log = demo
     experiment = with_own_noise(run)
     builder, evaluation = experiment.builder(experiment.sensors), experiment.evaluation()
@@ -168,18 +170,25 @@ def test_of_long_training_logs_every_kth_sample_is_scored(run: Path, demo: tuple
     assert (whole.samples, thinned.samples) == (len(log), sum(len(block[::4]) for block in blocks))
     assert Scorer(evaluation, builder).scored(blocks) == (1, len(log)), "short logs are scored whole"
     assert whole.metrics.identified.as_dict() == json.loads((run / "metrics.json").read_text())["train"]
-    assert whole.cross_validation is not None
-    assert thinned.cross_validation is not None
-    for pair in (
-        *zip(whole.metrics, thinned.metrics, strict=True),
-        (whole.cross_validation.identified, thinned.cross_validation.identified),
-        (whole.cross_validation.nominal, thinned.cross_validation.nominal),
-    ):
-        every, some = (metrics.rms for metrics in pair)
-        assert some[WHITENED] == every[WHITENED], "of all samples"
-        for group in ROW_GROUPS:
-            assert some[group] != every[group]
-            assert some[group] == pytest.approx(every[group], rel=0.02), group
+
+    monkeypatch.setattr("torchid.fitting.cross_validation.ENOUGH_SCORED", len(log) // 3)
+    alike, independent = score(len(log)), [replace(block, oversampling=1.0) for block in blocks]
+    assert alike.samples == sum(len(block[::3]) for block in blocks), "fewer than independent ones are left out"
+    assert Scorer(evaluation, builder).scored(independent) == (1, len(log)), "of a log without filter all"
+    monkeypatch.setattr("torchid.fitting.cross_validation.ENOUGH_SCORED", 1)
+    step = Scorer(evaluation, builder).scored(blocks)[0]
+    assert step == int(log.oversampling) == 6, "the filter's band is left"
+
+    def metrics(of: TrainingScore) -> list[Metrics]:
+        assert of.cross_validation is not None
+        return [*of.metrics, of.cross_validation.identified, of.cross_validation.nominal]
+
+    for few, off in (thinned, 0.02), (alike, 0.003):
+        for every, some in zip(metrics(whole), metrics(few), strict=True):
+            assert some.rms[WHITENED] == every.rms[WHITENED], "of all samples"
+            for group in ROW_GROUPS:
+                assert some.rms[group] != every.rms[group]
+                assert some.rms[group] == pytest.approx(every.rms[group], rel=off), group
 
 
 @pytest.mark.parametrize(

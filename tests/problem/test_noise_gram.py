@@ -153,7 +153,7 @@ def test_contacts_of_different_rank_are_told_apart(robot: Robot, builder: RowBui
 def test_long_logs_are_sampled(robot: Robot, builder: RowBuilder, monkeypatch: pytest.MonkeyPatch) -> None:
     samples = motion(robot, 6000)
     whole = compress([samples], builder).whole_noise_gram().numpy()
-    monkeypatch.setattr("torchid.problem.noise_gram._PERTURBED", 1500)
+    monkeypatch.setattr("torchid.problem.noise_gram._MOST_PERTURBED", 1500)
     sampled = compress([samples], builder).whole_noise_gram().numpy()
     size = np.sqrt(np.diag(gram(compress([samples], builder))).clip(1e-9))
     off, scaled = ((x / np.outer(size, size)) for x in (sampled - whole, whole))

@@ -21,7 +21,14 @@ from torchid.problem import Evaluation, ExtraTerms, Metrics, RowBuilder, Samples
 from torchid.problem.chunk_dynamics import Workspace
 from torchid.problem.chunks import ProgressCallback, map_chunks, one_thread, thread_count
 from torchid.problem.compressed_log import Block
-from torchid.problem.compression import Part, compress_in_blocks, compress_unloaded, merge_states, split_into_folds
+from torchid.problem.compression import (
+    Part,
+    compress_in_blocks,
+    compress_unloaded,
+    merge_blocks_of_folds,
+    merge_states,
+    split_into_folds,
+)
 from torchid.problem.contact_state import ContactState
 from torchid.problem.metrics import ForceSums
 from torchid.sensing.sensors import recorded_components
@@ -30,9 +37,13 @@ from torchid.settings import RidgeRule
 RIDGES = tuple(float(f"1e{power}") for power in range(-7, 2))
 """Ridges that are tried, in decades: finer steps change predictions by less than their spread over the folds."""
 
-MOST_SCORED = 100_000
-"""Samples of training logs that errors of forces are computed of at most, evenly spread.
-Those of a filtered log are alike: every 11th of a million gives errors within 0.1 % of those of all."""
+MOST_SCORED, ENOUGH_SCORED = 100_000, 20_000
+"""Samples of training logs that errors of forces are computed of at most, evenly spread, and that are enough of them.
+
+Of a filtered log one in `oversampling` has the whole band of the errors' squares, and so their mean: one in 3 of 60,000
+gives errors within 0.01 % of those of all, one in 6 within 0.1 %. Fewer are a random sample of it: every 11th of a
+million gives errors within 0.1 %.
+"""
 
 
 @dataclass(frozen=True)
@@ -94,7 +105,8 @@ def cross_validate(
         LogError: too few samples to leave some out.
     """
     blocks = split_into_folds(logs, fitter.builder)
-    fit = fitter.fit(compress_in_blocks(blocks, fitter.builder))
+    parts = merge_blocks_of_folds(compress_in_blocks(blocks, fitter.builder), fitter.builder)
+    fit = fitter.solve_problem(fitter.build_problem(parts))  # scatter between blocks is not needed
     without_folds = fitter.fit_without_folds(fit)
 
     def compared(one: Fit) -> Comparison[Calibration]:
@@ -204,7 +216,7 @@ class TrainingScore:
 class Scorer:
     """Errors of parameters on logs: `evaluation` predicts forces, `builder` makes the rows of a fit.
 
-    `most`: samples of training logs whose forces are predicted at most.
+    `most`: samples of training logs whose forces are predicted at most; of filtered ones `ENOUGH_SCORED` are enough.
     """
 
     evaluation: Evaluation
@@ -212,9 +224,10 @@ class Scorer:
     most: int = MOST_SCORED
 
     def scored(self, logs: Sequence[Block]) -> tuple[int, int]:
-        """Of training logs: the least k so that every k-th sample of each is `most` in all, and their number."""
-        lengths = [len(log) for log in logs if isinstance(log, Samples)]
-        step = max(1, -(-sum(lengths) // self.most))
+        """Of training logs: k so that every k-th sample of each is scored, and the number of these."""
+        whole = [log for log in logs if isinstance(log, Samples)]
+        lengths, alike = [len(log) for log in whole], min((log.oversampling for log in whole), default=1.0)
+        step = max(1, -(-sum(lengths) // self.most), min(int(alike), sum(lengths) // ENOUGH_SCORED))
         while step < max(lengths, default=1) and sum(-(-length // step) for length in lengths) > self.most:
             step += 1  # each log has a first sample
         return step, sum(-(-length // step) for length in lengths)
@@ -226,10 +239,10 @@ class Scorer:
 
         Rows of the fit's sensors count where a log has all their readings.
         """
-        pairs = self._force_sums(logs, compared, progress, 1)
+        pairs = self._force_sums(logs, {log.fold: compared for log in logs} or {0: compared}, progress, 1)
         whole = [with_all_readings(log, self.builder) for log in logs]
         _add_squares(pairs, residuals_of_samples(self.builder, whole, compared))
-        return Comparison(*self._metrics([pairs]))
+        return Comparison(*self._metrics(pairs))
 
     def score_training(
         self,
@@ -241,7 +254,7 @@ class Scorer:
     ) -> TrainingScore:
         """Errors of the fit on the training logs, and of fits without a fold each on that fold, in one pass.
 
-        Of more than `most` samples every k-th is evaluated; the whitened projected residual comes from all.
+        Of many samples every k-th is evaluated; the whitened projected residual comes from all.
 
         Args:
             logs: as `split_into_folds` or `fold_compressed` has cut them; compressed ones give only the whitened
@@ -253,65 +266,53 @@ class Scorer:
         """
         step, samples = self.scored(logs)
         first = 0 if self.builder.extras else 1  # nominal parameters differ between fits by extra parameters alone
-        sums = []
-        for fold in sorted({log.fold for log in logs}):
-            of_fold = [log for log in logs if log.fold == fold]
-            own = [part for part in parts if part.fold == fold]
-            others = without_folds[fold][first:] if without_folds else ()
-            sums.append(self._sums(of_fold, own, [*compared, *others], progress, step))
-        metrics = self._metrics(sums)
+        by_fold: dict[int, Sequence[Calibration]] = {
+            fold: [*compared, *(without_folds[fold][first:] if without_folds else ())]
+            for fold in sorted({log.fold for log in logs})
+        }
+        pairs = self._force_sums([log for log in logs if isinstance(log, Samples)], by_fold, progress, step)
+        for fold, of_fold in by_fold.items():
+            own = [log for log in logs if log.fold == fold], [part for part in parts if part.fold == fold]
+            _add_squares(pairs, sum_residuals(self.builder, *own, of_fold))
+        metrics = self._metrics(pairs)
         held_out = None
         if without_folds:
             held_out = CrossValidation(len(without_folds), metrics[0 if first else 2], metrics[-1])
         return TrainingScore(Comparison(*metrics[:2]), held_out, samples)
 
-    def _sums(
-        self,
-        logs: Sequence[Block],
-        parts: Sequence[Part],
-        calibrations: Sequence[Calibration],
-        progress: ProgressCallback | None,
-        step: int = 1,
-    ) -> list[tuple[ForceSums, ForceSums]]:
-        """Of the measured forces and of the errors, for each calibration; forces of every `step`-th sample."""
-        pairs = self._force_sums([log for log in logs if isinstance(log, Samples)], calibrations, progress, step)
-        _add_squares(pairs, sum_residuals(self.builder, logs, parts, calibrations))
-        return pairs
-
     def _force_sums(
         self,
         logs: Sequence[Samples],
-        calibrations: Sequence[Calibration],
+        compared: Mapping[int, Sequence[Calibration]],
         progress: ProgressCallback | None,
         step: int,
     ) -> list[tuple[ForceSums, ForceSums]]:
-        """As `_sums`, without the rows of a fit; empty without samples."""
-        rows = self.evaluation.robot.n_rows
+        """Of the measured forces and of the errors of every `step`-th sample, for each calibration of its log's fold.
+
+        Empty without samples.
+        """
+        rows, (some, *_) = self.evaluation.robot.n_rows, compared.values()
         if not logs:
-            return [(ForceSums(rows), ForceSums(rows)) for _ in calibrations]
-        phi = np.stack([one.parameters(self.evaluation) for one in calibrations])
-        if not calibrations[0].changes_readings:
+            return [(ForceSums(rows), ForceSums(rows)) for _ in some]
+        phi = {fold: np.stack([x.parameters(self.evaluation) for x in own]) for fold, own in compared.items()}
+        if not some[0].changes_readings:
             measured, *errors = self.evaluation.force_sums([log.every(step) for log in logs], phi, progress)
-            pairs = [(ForceSums.total([measured]), error) for error in errors]
-        else:
-            pairs = []
-            for number, one in enumerate(calibrations):
-                with warnings.catch_warnings():
-                    if number != 1:  # the identified ones say the same
-                        warnings.simplefilter("ignore", TorchidWarning)
-                    readings = one.calibrate(logs, step)
-                measured, error = self.evaluation.force_sums(
-                    readings, phi[number : number + 1], progress if number else None
-                )
-                pairs.append((measured, error))
+            return [(ForceSums.total([measured]), error) for error in errors]
+        pairs = []
+        for number in range(len(some)):
+            identified = number == 1  # of all fits, which would say the same
+            with warnings.catch_warnings():
+                if not identified:
+                    warnings.simplefilter("ignore", TorchidWarning)
+                readings = [one for log in logs for one in compared[log.fold][number].calibrate([log], step)]
+            of_one = {fold: own[number : number + 1] for fold, own in phi.items()}
+            measured, error = self.evaluation.force_sums(readings, of_one, progress if identified else None)
+            pairs.append((measured, error))
         return pairs
 
-    def _metrics(self, sums: Sequence[Sequence[tuple[ForceSums, ForceSums]]]) -> list[Metrics]:
-        """Of each calibration, over all folds."""
-        return [
-            self.evaluation.summarize(*(ForceSums.total(each) for each in zip(*same, strict=True)))
-            for same in zip(*sums, strict=True)
-        ]
+    def _metrics(self, sums: Sequence[tuple[ForceSums, ForceSums]]) -> list[Metrics]:
+        """Of each calibration."""
+        return [self.evaluation.summarize(*pair) for pair in sums]
 
 
 def _add_squares(pairs: Sequence[tuple[ForceSums, ForceSums]], squares: Sequence[ResidualSquares]) -> None:

@@ -281,23 +281,22 @@ def compress_unloaded(logs: Sequence[Samples], builder: RowBuilder) -> list[Part
 @one_thread()
 def _merge_parts(of_workers: Iterable[list[Part]]) -> list[Part]:
     """The parts of all workers, those of one log, contact state and fold merged, on the CPU."""
-    total: dict[PartKey, Part] = {}
+    total: dict[PartKey, list[Part]] = {}
     for part in chain.from_iterable(of_workers):
         part.factor = part.factor.to_cpu()
-        same = total.setdefault(part.key, part)
-        if same is not part:
-            same.samples += part.samples
-            same.masked |= part.masked
-            same.factor.merge(part.factor)
-    return list(total.values())
+        total.setdefault(part.key, []).append(part)
+    for first, *others in total.values():
+        first.samples += sum(part.samples for part in others)
+        first.masked = first.masked.union(*(part.masked for part in others))
+        first.factor.merge(*(part.factor for part in others))
+    return [first for first, *_ in total.values()]
 
 
 @one_thread()
 def merge_factors(factors: Iterable[TriangularFactor], builder: RowBuilder) -> TriangularFactor:
     """One factor of the rows of several."""
     out = TriangularFactor(builder.width)
-    for factor in factors:
-        out.merge(factor)
+    out.merge(*factors)
     return out
 
 
@@ -359,10 +358,11 @@ def merge_blocks_of_folds(parts: Sequence[Part], builder: RowBuilder) -> list[Pa
 @one_thread()
 def merge_by_key(parts: Sequence[Part], keys: Sequence[tuple[object, ...]], builder: RowBuilder) -> list[Part]:
     """One part for each key, with whatever else of the first; the factors of the parts stay as they are."""
-    out: dict[tuple[object, ...], Part] = {}
+    alike: dict[tuple[object, ...], list[Part]] = {}
     for part, key in zip(parts, keys, strict=True):
-        merged = out.setdefault(key, replace(part, factor=TriangularFactor(builder.width), samples=0, masked=set()))
-        merged.factor.merge(part.factor)
-        merged.masked |= part.masked
-        merged.samples += part.samples
-    return list(out.values())
+        alike.setdefault(key, []).append(part)
+    out = []
+    for own in alike.values():
+        factor, masked = merge_factors((part.factor for part in own), builder), set().union(*(x.masked for x in own))
+        out.append(replace(own[0], factor=factor, samples=sum(part.samples for part in own), masked=masked))
+    return out

@@ -203,21 +203,22 @@ class Evaluation:
 
         Without the whitened projected residual, which depends on sensors.
         """
-        measured, *errors = self.force_sums(logs, phi, progress)
+        measured, *errors = self.force_sums(logs, {log.fold: phi for log in logs} or {0: phi}, progress)
         return [self.summarize(measured, error) for error in errors]
 
     def force_sums(
-        self, logs: Sequence[Samples], phi: Array, progress: ProgressCallback | None = None
+        self, logs: Sequence[Samples], phi: Mapping[int, Array], progress: ProgressCallback | None = None
     ) -> list[ForceSums]:
-        """Sums of squares of the measured forces, then of the errors of each row of `phi` (M, 12 L)."""
+        """Sums of squares of the measured forces, then of the errors of each row of `phi` (M, 12 L) of a log's fold."""
         builder, base = self.builder, self.robot.base_rows
-        columns, joints = builder.to_columns(phi), slice(base, base + self.robot.n)
+        columns = {fold: builder.to_columns(own) for fold, own in phi.items()}
+        count, joints = 1 + len(next(iter(phi.values()))), slice(base, base + self.robot.n)
 
         def sum_chunks(chunks: Iterator[tuple[Samples, ContactState]]) -> list[ForceSums]:
-            sums = [ForceSums(self.robot.n_rows) for _ in range(len(phi) + 1)]
+            sums = [ForceSums(self.robot.n_rows) for _ in range(count)]
             for samples, state in chunks:
                 kinematics = builder.kinematics(samples)
-                forces = measured_and_predicted_forces(builder, samples, state, columns, kinematics)
+                forces = measured_and_predicted_forces(builder, samples, state, columns[samples.fold], kinematics)
                 sums[0].add_contact_forces(forces.measured[:, joints], forces.torque[:, joints])
                 errors = torch.cat([-forces.measured[None], forces.predicted - forces.measured])
                 for total, error in zip(sums, builder.motors.of(builder.tree, kinematics, errors), strict=True):

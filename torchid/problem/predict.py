@@ -249,7 +249,10 @@ def null_space_components(
     uncoupled = [base + joint for joint in layout.uncoupled_joints]
     for index, V in builder.null_space_bases(state, kinematics):
         forces = vectors[:, index]
-        inside = (V.mT @ forces[..., coupled].permute(1, 2, 0)).permute(2, 0, 1)
+        by_sample = (
+            forces[..., coupled].permute(1, 2, 0).contiguous()
+        )  # of other layouts products take ten times as long
+        inside = (V.mT.contiguous() @ by_sample).permute(2, 0, 1)
         yield torch.cat([inside, forces[..., uncoupled]], dim=2)
 
 
