@@ -10,6 +10,7 @@ from raw_logs import log_refusal
 
 from torchid.errors import LogError, TorchidWarning
 from torchid.logs import Columns, read_log
+from torchid.logs.tables import sample_row_names
 
 ROWS = "t,joint,q,mode\n0,a,1,x\n0,b,2,x\n0.1,a,3,x\n0.1,b,4,x\n"
 COLUMNS = Columns(rows_of="joint", time="t", joint_position="q.{joint}")
@@ -109,3 +110,16 @@ def test_names_of_old_spreadsheets_are_read(tmp_path: Path) -> None:
 def test_stamps_that_begin_anew_are_said_to_be_those_of_another_recording(tmp_path: Path) -> None:
     episodes = written(tmp_path / "x.csv", "time,joint_position.a\n0,1\n1,2\n0,3\n")
     assert "of recordings one after the other (episodes) a file for each" in log_refusal(episodes)
+
+
+EACH = "".join(f"{0.1 * k:.1f},{joint},{k}\n" for k in range(20) for joint in "ab")
+EPISODES = "".join(f"{0.1 * k:.1f},{number},{k}\n" for number in range(2) for k in range(20))
+FRACTIONS = "".join(f"{second},{nano},{nano}\n" for second in range(3) for nano in range(0, 10**9, 10**8))
+
+
+@pytest.mark.parametrize(("rows", "expected"), [(EACH, "name"), (EPISODES, None), (FRACTIONS, None)])
+def test_rows_are_those_of_joints_where_successive_ones_share_a_stamp(
+    tmp_path: Path, rows: str, expected: str | None
+) -> None:
+    found = sample_row_names(written(tmp_path / "x.csv", f"time,name,q\n{rows}"))
+    assert (None if found is None else found.column) == expected

@@ -318,7 +318,9 @@ def _try(path: Path, proposal: MapProposal) -> Log | InputError:
 def _describe_log(out: Initiated, read: Log | InputError, fields: set[str]) -> None:
     """What there is of the log, by the names of the file's fields, or why it is not read."""
     if isinstance(read, InputError):
-        out.missing.append(f"the log is not read with this file yet: {read.field}: {read.found}")
+        out.missing.append(
+            f"the log is not read with this file yet: {read.field}: {read.found}; accepted: {read.accepted}"
+        )
         return
     recorded = {name: variant for variant, name in VARIANTS.items() if variant in fields}
     has = [recorded.get(name, name) for name, array in read.arrays().items() if array.size]

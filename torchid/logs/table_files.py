@@ -295,7 +295,7 @@ def _read_json(
 
 def _json_batch(pa: Any, block: JsonColumns, names: Iterable[str]) -> Any:
     """Columns of some lines, NaN for those that no line has."""
-    count = len(next(iter(block.values())))
+    count = len(next(iter(block.values()), ()))
     words = pa.dictionary(pa.int32(), pa.string())
     columns = {name: block.get(name, np.full(count, np.nan)) for name in names}
     made = {name: pa.array(x, words if isinstance(x, list) else pa.float64()) for name, x in columns.items()}
@@ -304,6 +304,7 @@ def _json_batch(pa: Any, block: JsonColumns, names: Iterable[str]) -> Any:
 
 def _sample_json(pa: Any, path: Path) -> tuple[list[str], Any]:
     columns = _first_lines(path)
+    check_header(list(columns))
     return list(columns), _json_batch(pa, columns, columns) if columns else None
 
 

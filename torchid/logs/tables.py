@@ -173,7 +173,10 @@ def save_table(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 
 
 def _wide(pa: Any, path: Path, table: Any, rows: RowNames) -> dict[str, NDArray[Any]]:
-    return with_a_row_for_each_stamp(pa, table, rows, partial(check_size, path, whole=True))
+    """A table with a row for each joint as columns of each; LogError for names that are none."""
+    wide = with_a_row_for_each_stamp(pa, table, rows, partial(check_size, path, whole=True))
+    check_header(list(wide))
+    return wide
 
 
 def _batches(pa: Any, path: Path, columns: Columns | None, whole: bool = True) -> Iterator[tuple[_Layout, Any]]:
