@@ -185,7 +185,7 @@ def test_a_conversion_that_is_interrupted_leaves_nothing(
         raise KeyboardInterrupt
 
     assert write_module.save_table is table_module.save_table
-    monkeypatch.setattr(table_module, "_save_csv", interrupted)
+    monkeypatch.setattr("torchid.logs.table_files._save_csv", interrupted)
     before = files_in(log.parent)
     assert main(["convert", str(log), str(log.parent / "out.csv")]) == 1
     assert "interrupted; nothing was written" in capsys.readouterr().err

@@ -259,6 +259,7 @@ RPY = np.stack([0.2 * np.sin(TIME), 0.1 - 0.3 * TIME, 3.0 + 0.4 * TIME], axis=1)
     ("names", "factor"),
     [
         (["roll", "pitch", "yaw"], 1.0),
+        (["Rumpf.Rot.Roll", "Rumpf.Rot.Nick", "Rumpf.Rot.Gier"], 1.0),
         (["imu_roll_deg", "imu_pitch_deg", "imu_yaw_deg"], 180.0 / np.pi),
         (["base_rpy_0", "base_rpy_1", "base_rpy_2"], 1.0),
         (["euler.x [deg]", "euler.y [deg]", "euler.z [deg]"], 180.0 / np.pi),

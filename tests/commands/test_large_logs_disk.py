@@ -120,7 +120,7 @@ def test_a_table_takes_one_file_for_each_field_however_many_batches_it_is_read_i
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, made_in: list[str]
 ) -> None:
     experiment(tmp_path, recorded(2_000), ".parquet")
-    monkeypatch.setattr("torchid.logs.tables._ROWS", 100)
+    monkeypatch.setattr("torchid.logs.table_files._ROWS", 100)
     with open_log_blocks(tmp_path / "log.parquet", tmp_path) as blocks:
         assert len(blocks) == 2_000
         assert len(made_in) == 1 + len(blocks.fields), "time too"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -268,11 +269,74 @@ def groups_h5(path: Path, log: Log) -> Path:
     return path
 
 
+ROWS_MAP = """
+rows_of: joint
+time: {column: t_ms, unit: ms}
+joint_position: {column: "angle.{joint}", unit: deg}
+joint_velocity: "speed.{joint}"
+joint_torque: "effort.{joint}"
+base_quat_wxyz: "base_q{axis}"
+base_position_world: "base_p{axis}"
+contact_active: "{contact}_state"
+"""
+
+
+def rows_csv(path: Path, log: Log) -> Path:
+    """A row for each joint and stamp, joints last to first, with the base's pose and words for feet in each."""
+    quantities = {
+        "angle": np.degrees(in_order(log, log.joint_position)),
+        "speed": in_order(log, log.joint_velocity),
+        "effort": in_order(log, log.joint_torque),
+    }
+    assert log.base_position_world is not None
+    shared: dict[str, Any] = {f"base_q{axis}": wxyz(log)[:, k] for k, axis in enumerate("wxyz")}
+    shared |= {f"base_p{axis}": log.base_position_world[:, k] for k, axis in enumerate("xyz")}
+    flags = zip(log.contact_names, log.contact_active.T, strict=True)
+    shared |= {f"{foot}_state": np.where(x, "STANCE", "SWING") for foot, x in flags}
+    columns = {"t_ms": np.repeat(log.time * 1e3, 12), "joint": np.tile(ORDER[::-1], len(log))}
+    columns |= {name: x[:, ::-1].ravel() for name, x in quantities.items()}
+    return save_csv(path, columns | {name: np.repeat(x, 12) for name, x in shared.items()})
+
+
+LINES_MAP = """
+time: stamp
+joint_position: "joints.{joint}.pos"
+joint_velocity: "joints.{joint}.vel"
+joint_torque: "joints.{joint}.moment"
+base_quat_xyzw: "base.quat[{component}]"
+base_position_world: "base.position.{axis}"
+contact_active: "touch.{contact}"
+"""
+
+
+def json_lines(path: Path, log: Log) -> Path:
+    """An object a line, of a stamp, joints by name, the pose of the base, and words for the feet."""
+    given = zip(("pos", "vel", "moment"), (log.joint_position, log.joint_velocity, log.joint_torque), strict=True)
+    series = {name: in_order(log, x) for name, x in given}
+    quat, position = log.base_quat_xyzw, log.base_position_world
+    feet = dict(zip(log.contact_names, log.contact_active.T, strict=True))
+    assert quat is not None
+    assert position is not None
+    lines = [
+        {
+            "stamp": float(stamp),
+            "joints": {joint: {name: float(x[n, k]) for name, x in series.items()} for k, joint in enumerate(ORDER)},
+            "base": {"quat": quat[n].tolist(), "position": dict(zip("xyz", position[n].tolist(), strict=True))},
+            "touch": {foot: "on" if x[n] else "off" for foot, x in feet.items()},
+        }
+        for n, stamp in enumerate(log.time)
+    ]
+    path.write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+    return path
+
+
 DIALECTS: dict[str, tuple[str, str, Callable[[Path, Log], Path]]] = {
     "motor numbers in degrees": ("motors.csv", MOTORS_MAP, motors_csv),
     "PD law": ("controller.npz", PD_MAP, pd_npz),
     "LowState": ("low_state.csv", LOW_STATE_MAP, low_state_csv),
     "nested names": ("nested.parquet", NESTED_MAP, nested_parquet),
     "groups": ("groups.h5", GROUPS_MAP, groups_h5),
+    "rows of joints": ("rows.csv", ROWS_MAP, rows_csv),
+    "JSON lines": ("lines.jsonl", LINES_MAP, json_lines),
 }
 """File name, map and writer of each dialect, of a log with velocities and an IMU."""

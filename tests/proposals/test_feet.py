@@ -79,6 +79,20 @@ def test_arrays_of_lf_and_rf_are_wrenches_of_the_left_and_right_foot_of_a_biped(
     assert {"lh_wrench", "rh_wrench"} <= set(out.columns["ignore"])
 
 
+def test_truth_values_of_each_foot_are_flags_whatever_they_are_called() -> None:
+    flags = {f"{side}_foot_state": swinging(k) > 0.0 for k, side in enumerate(("left", "right"))}
+    entry = proposed(BIPED, flags).columns["contact_active"]
+    assert entry == {"columns": {"r_ankle": "right_foot_state", "l_ankle": "left_foot_state"}}
+    counts = {name: 3.0 + x for name, x in flags.items()}
+    assert "contact_active" not in proposed(BIPED, counts).columns
+
+
+def test_moments_of_each_joint_are_torques_and_one_of_something_else_is_not() -> None:
+    columns = {f"{joint}_moment": swinging(k) for k, joint in enumerate(BIPED.joints)}
+    assert proposed(BIPED, columns).columns["joint_torque"] == {"column": "{joint}_moment"}
+    assert "joint_torque" not in proposed(BIPED, {"l_hip_moment": swinging(0), "moment": swinging(1)}).columns
+
+
 def test_wrenches_of_hands_are_none_of_feet() -> None:
     columns = {f"{side}_hand_f{axis}": swinging(k) for side in ("left", "right") for k, axis in enumerate("xyz")}
     assert "contact_wrench_local" not in proposed(BIPED, columns).columns

@@ -22,7 +22,7 @@ from torchid.logs.blocks import GIGABYTE, log_bytes
 from torchid.logs.containers import LogKind, existing_log_kind, log_files
 from torchid.logs.lazy_arrays import MappedPages
 from torchid.logs.low_pass import import_signal
-from torchid.logs.tables import is_text_table
+from torchid.logs.table_files import is_text_table
 from torchid.logs.time_range import split_range
 from torchid.problem import Samples
 from torchid.sensing import SensorSet

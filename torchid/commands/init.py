@@ -44,7 +44,7 @@ from torchid.logs.name_matching import KnownRobot, propose_field
 from torchid.logs.time_range import split_range
 from torchid.parameters import GRAVITY
 from torchid.proposals.column_groups import MapProposal
-from torchid.proposals.file_samples import FileSample, read_bag_sample, read_sample, states_degrees, texts_in
+from torchid.proposals.file_samples import FileSample, read_bag_sample, read_sample, rows_of, states_degrees, texts_in
 from torchid.proposals.maps import propose_map
 from torchid.proposals.topics import USED_TYPES, frame_of, propose_topics
 from torchid.robot import Robot, load_robot
@@ -86,7 +86,7 @@ class Initiated:
 
 _NO_CONTACT = (
     "contacts: no link is called a foot, so that nothing but gravity acts on the base; name the frames that touch the"
-    " ground, or that rotors push at (docs/contacts.md)"
+    " ground, or that rotors push at (docs/contacts.md), or robot.fixed_base: true if the base stands still"
 )
 
 
@@ -135,20 +135,24 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> Initiated:
 
 def _of_columns(files: Sequence[Path], robot: Robot) -> tuple[list[GuessedContact], set[str], MapProposal]:
     """Contacts, fields and a map of a table or arrays, or of several that are one log."""
-    samples, in_degrees, size = [], set[str](), 0.0
+    samples, in_degrees, size, rows = [], set[str](), 0.0, None
     for file in files:
         size = memory_needed(file, PreprocessingConfig().memory_gb, size)
         if size > PreprocessingConfig().memory_gb:
             accepted = "a log of a part of the recording, whose map holds for all of it"
             raise LogError(file, "file", f"arrays of {size:.2g} GB", accepted)
         with about_file(file):
-            samples.append(read_sample(file))
+            rows = rows_of(file) if len(files) == 1 else None
+            samples.append(read_sample(file, rows))
             in_degrees |= set(samples[-1]) if states_degrees(file) else set()
     samples = _named_apart(samples, [file.name for file in files])
     sample = {name: values for of_file in reversed(samples) for name, values in of_file.items()}
     contacts = guess_contacts(robot, stated_contacts(sample, robot), texts_in(sample))
     proposal = propose_map(sample, _known(robot, contacts), samples if len(files) > 1 else (), in_degrees)
     fields = {*(name.partition(".")[0] for name in sample), *proposal.columns}
+    if rows is not None:
+        proposal.columns = {"rows_of": rows.column, **proposal.columns}
+        proposal.notes["rows_of"] = "the column that names the joint of each row, as rows share stamps"
     if "joint_position" not in fields:
         proposal.notes |= notes_on_arrays(sample, len(robot.joint_names))
     _add_imu_frame(robot, fields, proposal)
@@ -314,7 +318,9 @@ def _try(path: Path, proposal: MapProposal) -> Log | InputError:
 def _describe_log(out: Initiated, read: Log | InputError, fields: set[str]) -> None:
     """What there is of the log, by the names of the file's fields, or why it is not read."""
     if isinstance(read, InputError):
-        out.missing.append(f"the log is not read with this file yet: {read.field}: {read.found}")
+        out.missing.append(
+            f"the log is not read with this file yet: {read.field}: {read.found}; accepted: {read.accepted}"
+        )
         return
     recorded = {name: variant for variant, name in VARIANTS.items() if variant in fields}
     has = [recorded.get(name, name) for name, array in read.arrays().items() if array.size]

@@ -90,6 +90,8 @@ def without_rolling(contacts: Sequence[GuessedContact], robot: Robot) -> list[Gu
 
 def _balls_of_limbs(robot: Robot, shapes: CollisionShapes) -> list[str]:
     """Balls at the ends of limbs: of more than two that begin at the base, or called feet; no fingers or wheels."""
+    if re.search(_NO_FEET, robot.base_link, re.IGNORECASE):  # of a hand
+        return []
     parents, limbs = [body.parent for body in robot.bodies], dict[int, str]()
     for name in robot.links:
         body = root = robot.links[name][0]

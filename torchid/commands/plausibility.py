@@ -149,16 +149,23 @@ def require_plausible(fit: Fit, logs: TrainingLogs, samples: Sequence[Samples] =
     if finding is not None and (reason is not None or finding.rejects_all):
         checks = f"{log}: {finding.field}: {finding.found}"
         raise ImplausibleFitError.at_field(
-            "logs", f"{reason or unexplained}; torchid check finds in {checks}", finding.advice
+            "logs", f"{reason or unexplained}; torchid check finds in {checks}", _advice(finding.advice, scene)
         )
     if reason is not None:
         of = scene.robot.format
         accepted = f"data and {of} that fit each other; usual reasons: {_USUAL.format(of=of)}"
-        raise ImplausibleFitError.at_field("logs", reason, accepted)
+        raise ImplausibleFitError.at_field("logs", reason, _advice(accepted, scene))
     named = "" if finding is None else f"; torchid check finds in {log}: {finding.field}: {finding.found}"
     advice = "check units, frames, quaternion order and contact_active, or state the noise that there is"
     warn_about_file(f"{unexplained}{named}; {advice}", NumericalWarning)
     return mass
+
+
+def _advice(text: str, scene: Scene) -> str:
+    """What to do, first of all where nothing holds the robot: then masses of 0 explain forces of no weight."""
+    if scene.contacts or scene.robot.fixed_base or "under contacts" in text:
+        return text
+    return f"name under contacts what touches the ground, or robot.fixed_base: true if the base stands still; or {text}"
 
 
 def _warn_of_tilt(samples: Sequence[Samples], scene: Scene) -> None:

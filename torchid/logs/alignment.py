@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from torchid.errors import LogError, about_file, warn_about_file
 from torchid.logs.arrays import parse_names
+from torchid.logs.column_entries import KEY
 from torchid.logs.column_map import Columns
 from torchid.logs.column_matching import columns_by_file
 from torchid.logs.columns import KINDS, names_field
@@ -157,6 +158,10 @@ def _maps(paths: Sequence[Path], columns: Columns | None) -> list[Columns | None
     """The entries of a map that each file has columns of."""
     if columns is None:
         return [None for _ in paths]
+    if columns.rows_of is not None:
+        raise LogError.at_field(
+            f"{KEY}.rows_of", "given for several files", "one file; or convert it to one of columns"
+        )
     given = []
     for path in paths:
         with about_file(os.fspath(path)):

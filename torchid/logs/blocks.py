@@ -37,7 +37,8 @@ from torchid.logs.log import (
 )
 from torchid.logs.mapped_fields import map_arrays
 from torchid.logs.read import build_log, check_fields_given
-from torchid.logs.tables import is_text_table, read_table, table_blocks, table_size
+from torchid.logs.table_files import is_text_table
+from torchid.logs.tables import read_table, table_blocks, table_size
 from torchid.logs.time_range import split_range
 
 GIGABYTE = 1e9

@@ -63,6 +63,8 @@ class Columns:
         contact_name: as well, of {contact}.
         plates: by pattern of the contact, pose of the force plate whose axes and origin `contact_wrench_world` and
             `contact_wrench_point_world` have.
+        rows_of: the column that names the joint of a row, of a table with a row for each joint at each stamp: its
+            other columns are then `position.l_knee`, ...
         ignore: columns that are not needed; * and ? stand for others.
     """
 
@@ -100,6 +102,7 @@ class Columns:
     joint_name: Name = "{joint}"
     contact_name: Name = "{contact}"
     plates: dict[Name, Plate] = dataclasses.field(default_factory=dict)
+    rows_of: Name | None = None
     ignore: Names = dataclasses.field(default_factory=list)
 
     @property

@@ -34,13 +34,15 @@ OPENSIM = (".mot", ".sto")
 #: Tables of text, by whatever their cells are separated.
 _PLAIN_TEXT = (".tsv", ".txt", ".dat")
 TEXT_TABLES = (".csv", *_PLAIN_TEXT, *OPENSIM)
-TABLES = (*TEXT_TABLES, ".parquet")
+#: Tables with an object of JSON in each line.
+JSON_LINES = (".jsonl", ".ndjson")
+TABLES = (*TEXT_TABLES, *JSON_LINES, ".parquet")
 #: Logs that torchid compress has made factors of.
 FACTORS = ".factor"
 #: Files of ROS 1 (.bag) and ROS 2; those of ROS 2 may also lie in a folder.
 BAGS = (".bag", ".mcap", ".db3")
 WRITABLE = (*_WRITTEN, ".csv", ".parquet")
-READABLE = (*WRITABLE, ".mat", *_PLAIN_TEXT, *OPENSIM, *BAGS)
+READABLE = (*WRITABLE, ".mat", *_PLAIN_TEXT, *OPENSIM, *JSON_LINES, *BAGS)
 
 
 class LogKind(Enum):

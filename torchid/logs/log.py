@@ -326,7 +326,9 @@ def check_time(time: FloatArray) -> None:
     if not_increasing.any():
         i = int(np.argmax(not_increasing))
         found = f"{time[i + 1]} at sample {i + 1}, after {time[i]} at sample {i}"
-        raise LogError.at_field("time", found, "strictly increasing seconds")
+        several = "; of recordings one after the other (episodes) a file for each"
+        accepted = "strictly increasing seconds" + several * bool(time[i + 1] < time[i])
+        raise LogError.at_field("time", found, accepted)
 
 
 def parse_time(array: NDArray[Any]) -> FloatArray:
@@ -371,6 +373,13 @@ def normalize_normals(normals: FloatArray, active: BoolArray, labels: tuple[str,
     return np.where(known[..., None], normals / np.where(known, norm, 1.0)[..., None], np.nan)
 
 
+FLAG_WORDS = {
+    "true": 1, "false": 0, "yes": 1, "no": 0, "on": 1, "off": 0, "stance": 1, "swing": 0, "contact": 1, "air": 0,
+}  # fmt: skip
+"""What words mean whether a contact touches, in small letters."""
+FLAG_ACCEPTED = "true and false, 1 and 0, yes and no, on and off, stance and swing, or contact and air"
+
+
 def parse_flags(name: str, array: NDArray[Any], labels: tuple[str, ...]) -> BoolArray:
     """The array as booleans, LogError unless it holds booleans or the numbers 0 and 1."""
     if array.dtype.kind == "b":
@@ -379,7 +388,5 @@ def parse_flags(name: str, array: NDArray[Any], labels: tuple[str, ...]) -> Bool
     bad = (values != 0.0) & (values != 1.0)
     if bad.any():
         index = tuple(int(i) for i in np.unravel_index(np.argmax(bad), bad.shape))
-        raise LogError.at_field(
-            name, f"{values[index]:g} at {describe_element(index, labels)}", "true and false, or 1 and 0"
-        )
+        raise LogError.at_field(name, f"{values[index]:g} at {describe_element(index, labels)}", FLAG_ACCEPTED)
     return np.asarray(values, dtype=np.bool_)

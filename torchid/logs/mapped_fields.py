@@ -301,6 +301,10 @@ def map_arrays(columns: Columns, given: Sequence[str], load: Take) -> MappedFiel
         InputError: a map that does not fit the arrays, or itself.
     """
     check_columns(columns)
+    if columns.rows_of is not None:
+        raise LogError.at_field(
+            f"{KEY}.rows_of", "given for arrays", "a table: rows are those of CSV, Parquet, JSON lines"
+        )
     columns = columns_of_file(columns, given)
     entries = [part.entry for part in list_parts(columns).values()]
     texts = [text for entry in entries for text in (entry.column, *entry.columns.values()) if text]

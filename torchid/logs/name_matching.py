@@ -189,7 +189,7 @@ _LISTED, _LONGEST = 12, 60
 #: What force plates read; under which foot each lies, no name of a column says.
 OF_PLATES = (WRENCHES[1], POINTS)
 #: Words for the base in recordings, and how names of columns begin with one.
-BASES = "base|root|trunk|torso|pelvis|body|mocap|odom|odometry"
+BASES = "base|root|trunk|torso|pelvis|body|rumpf|mocap|odom|odometry"
 OF_BASE = rf"\b({BASES}|floating base)"
 _STAMPS = r"(times?|datetime|timestamps?|stamps?|tstamps?|duration)"
 _NOT_ANGULAR = r"(?<!ang )(?<!angular )"

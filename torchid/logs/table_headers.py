@@ -51,6 +51,7 @@ class TextHeader:
         times_of_day: columns whose first cell is hours, minutes and seconds.
         is_open: whether rows end with a separator, so that the last column is empty.
         in_degrees: whether angles are in degrees.
+        encoding: of its letters: that of most files, or that of western Europe's spreadsheets.
     """
 
     texts: list[str]
@@ -62,6 +63,7 @@ class TextHeader:
     times_of_day: tuple[str, ...]
     is_open: bool
     in_degrees: bool
+    encoding: str
 
     @property
     def named(self) -> list[str]:
@@ -84,11 +86,11 @@ def read_header(path: Path) -> TextHeader:
         above, in_degrees = _opensim_lines(path, stream) if is_opensim else (0, False)
         lines = [line for _ in range(_LINES) if (line := stream.readline(BLOCK))]
         rest = stream.read(BLOCK)
-    texts = [line.decode("utf-8-sig" if not number else "utf-8", "replace") for number, line in enumerate(lines)]
-    texts = [text.rstrip("\r\n") for text in texts]
+    encoding = _encoding(lines)
+    texts = [line.decode(encoding, "replace").removeprefix("\ufeff").rstrip("\r\n") for line in lines]
     row = next((number for number, text in enumerate(texts) if _is_row(text)), len(texts))
     named = _named(texts, row)
-    _require_names(path, lines, named, row)
+    _require_names(path, lines, texts, named, row)
     first = next((number for number in range(named + 1, row) if not _COMMENT.match(texts[number])), min(row, named + 1))
     title = _COMMENT.sub("", texts[named])
     separator = _separator(path, title, "".join(texts[row : row + 1]), is_opensim)
@@ -111,7 +113,16 @@ def read_header(path: Path) -> TextHeader:
     zones = {name: bool(match[3]) for name, match in dates.items()}
     is_open = len(sample) == len(cells) > 1 and not sample[-1] and not cells[-1]
     mark, is_all = "," if comma else ".", not rows.strip()
-    return TextHeader(names, above + first, separator, mark, is_all, zones, of_day, is_open, in_degrees)
+    return TextHeader(names, above + first, separator, mark, is_all, zones, of_day, is_open, in_degrees, encoding)
+
+
+def _encoding(lines: Sequence[bytes]) -> str:
+    """That of letters: UTF-8, or where these are none, Latin-1, as of degree signs and umlauts in old spreadsheets."""
+    try:
+        b"".join(lines).decode()
+    except UnicodeDecodeError:
+        return "utf-8" if any(b"\0" in line for line in lines) else "latin-1"
+    return "utf-8"
 
 
 def _opensim_lines(path: Path, stream: BinaryIO) -> tuple[int, bool]:
@@ -131,15 +142,16 @@ def _opensim_lines(path: Path, stream: BinaryIO) -> tuple[int, bool]:
     raise LogError(path, "header", f"no line {_END}", f"OpenSim's lines up to {_END}, then the names of the columns")
 
 
-def _require_names(path: Path, lines: Sequence[bytes], named: int, row: int) -> None:
+def _require_names(path: Path, lines: Sequence[bytes], texts: Sequence[str], named: int, row: int) -> None:
     """LogError where the line with names, by its number and that of the first row, has none."""
-    if not lines or not lines[named].decode("utf-8-sig").strip():
+    if lines and any(b"\0" in line for line in lines[: row + 1]):
+        lines[named].decode()  # raises of UTF-16
+    if not lines or not texts[named].strip():
         raise LogError(path, "header", "an empty line", "the names of the columns")
     if len(lines[named]) == BLOCK:
         raise LogError(path, "header", f"a line of at least {BLOCK} bytes", "the names of the columns")
     if named == row:
-        numbers = lines[row].decode("utf-8-sig").rstrip("\r\n")
-        raise LogError(path, "header", f"numbers, '{excerpt(numbers)}'", "the names of the columns")
+        raise LogError(path, "header", f"numbers, '{excerpt(texts[row])}'", "the names of the columns")
 
 
 def _named(texts: Sequence[str], row: int) -> int:

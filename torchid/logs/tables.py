@@ -1,44 +1,35 @@
-"""Logs as tables, CSV and Parquet (the only module that imports pyarrow)."""
+"""Logs as tables: CSV, Parquet and JSON lines."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import LogError, excerpt, format_count, how_to_install, warn_about_file
-from torchid.guards import MAX_ARRAYS, MAX_SCHEMA, check_names, check_unpacked_size
+from torchid.errors import LogError, format_count, warn_about_file
 from torchid.logs.column_map import Columns
 from torchid.logs.columns import TEXT_COLUMN, TableLayout, check_header, parse_header, to_columns
-from torchid.logs.containers import TEXT_TABLES, atomic_output, reader_errors_explained
+from torchid.logs.containers import atomic_output, reader_errors_explained
 from torchid.logs.log import field_shape
+from torchid.logs.long_tables import RowNames, find_row_names, row_names_in_map, with_a_row_for_each_stamp
 from torchid.logs.mapped_fields import MappedFields, map_table
-from torchid.logs.table_headers import BLOCK, NestedColumns, TextHeader, read_header
+from torchid.logs.table_files import (
+    check_size,
+    column_names,
+    count_bytes,
+    import_pyarrow,
+    read_rows,
+    sample_rows,
+    whole_table,
+    write_table,
+)
+from torchid.logs.table_values import column_values, is_number, is_stamp, text_or_flags, to_numbers
 from torchid.logs.units import IN_DEGREES, quantities_of
-
-#: Rows that are converted at a time.
-_ROWS = 2**16
-#: Rows from which a map is proposed.
-_SAMPLE = 2**12
-#: Limits on the metadata of a Parquet file (bytes of names and statistics, entries of lists); checksums are verified.
-_PARQUET = {
-    "thrift_string_size_limit": 2**26,
-    "thrift_container_size_limit": MAX_SCHEMA,
-    "page_checksum_verification": True,
-}
-_BAD_CELL = re.compile(r"In CSV column #(\d+): (?:Row #(\d+): )?.*?invalid value '(.{0,40})", re.DOTALL)
-_SHORT_ROW = re.compile(r".*?Row #(\d+): Expected (\d+) columns, got (\d+)", re.DOTALL)
-_PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
-_QUOTES = "'\n"
-_EMPTY = ["", " ", "  ", "nan", "NaN", "NAN"]
-_FLAGS = {"true": "1", "false": "0"}
-_NUMBERS = "numbers, or empty cells where nothing was measured"
-
 
 _Layout = TableLayout | MappedFields  # which columns a table's fields come from
 
@@ -53,7 +44,7 @@ def read_table(path: Path, columns: Columns | None = None) -> dict[str, NDArray[
     Raises:
         LogError: one line with the file and the column.
     """
-    pa = _pyarrow(path)
+    pa = import_pyarrow(path)
     with _complete(path):
         (layout, _), *rest = _batches(pa, path, columns)
         batches = [batch for _, batch in rest]
@@ -62,85 +53,41 @@ def read_table(path: Path, columns: Columns | None = None) -> dict[str, NDArray[
         return fields
 
 
-def sample_table(path: Path) -> dict[str, NDArray[Any] | None]:
-    """The columns of a table with some of their first rows; a text alone where it is in all, None for other texts.
+def sample_table(path: Path, rows: RowNames | None = None) -> dict[str, NDArray[Any] | None]:
+    """The columns of a table with some of their first rows; flags of words, a text alone where it is in all, else None.
+
+    Args:
+        path: the file.
+        rows: of a table with a row for each joint, of which all rows are taken.
 
     Raises:
         LogError: the file cannot be read, or has no rows.
     """
-    pa = _pyarrow(path)
+    pa = import_pyarrow(path)
     with _complete(path):
-        names, batch = (_sample_csv if is_text_table(path) else _sample_parquet)(pa, path)
-        if batch is None or not batch.num_rows:
-            raise LogError.at_field("time", "no samples", "at least one sample")
+        if rows is not None:
+            return {**_wide(pa, path, whole_table(pa, path), rows)}
+        names, batch = sample_rows(pa, path)
         columns = dict(zip(batch.schema.names, batch.columns, strict=True))
-        read = {name: x for name, x in columns.items() if _is_number(pa, x.type) or _is_stamp(pa, x.type)}
+        read = {name: x for name, x in columns.items() if is_number(pa, x.type) or is_stamp(pa, x.type)}
         texts = {name: x for name, x in columns.items() if pa.types.is_string(x.type) or pa.types.is_dictionary(x.type)}
-        found = {name: _numbers(pa, x) for name, x in read.items()} | {name: _one(x) for name, x in texts.items()}
+        found = {name: to_numbers(pa, x) for name, x in read.items()}
+        found |= {name: x for name, of in texts.items() if (x := text_or_flags(of)) is not None}
         return {name: found.get(name) for name in names}
 
 
-def _one(values: Any) -> NDArray[Any] | None:
-    """The text (1,) that all rows of a column have; None where they differ."""
-    texts = values.unique().to_pylist()
-    return np.array(texts) if len(texts) == 1 and texts[0] else None
+def sample_row_names(path: Path) -> RowNames | None:
+    """What names the joint of each row, of a table with a row for each joint and stamp; None of other tables."""
+    pa = import_pyarrow(path)
+    with _complete(path):
+        return find_row_names(pa, sample_rows(pa, path)[1])
 
 
-def _is_number(pa: Any, type_: Any) -> bool:
-    return bool(pa.types.is_integer(type_) or pa.types.is_floating(type_) or pa.types.is_boolean(type_))
-
-
-def _is_stamp(pa: Any, type_: Any) -> bool:
-    return bool(pa.types.is_timestamp(type_) or pa.types.is_time(type_) or pa.types.is_duration(type_))
-
-
-def _numbers(pa: Any, values: Any) -> NDArray[Any]:
-    """Numbers (N,) of a column: of dates seconds since 1970, of times of day since midnight, NaN for empty cells."""
-    if not _is_stamp(pa, values.type):
-        return np.asarray(values.to_numpy(False))
-    whole = np.asarray(values.cast(pa.int32() if values.type.bit_width == 32 else pa.int64()).to_numpy(False))
-    return whole / _PER_SECOND[values.type.unit]
-
-
-def _stamp_types(pa: Any, header: TextHeader) -> dict[str, Any]:
-    """Types of the columns of a table of text that hold dates or times of day."""
-    dates = {name: pa.timestamp("ns", "UTC" if zone else None) for name, zone in header.dates.items()}
-    return dates | dict.fromkeys(header.times_of_day, pa.time64("ns"))
-
-
-def _csv_options(header: TextHeader) -> Any:
-    import pyarrow.csv
-
-    # one thread: else error messages have no row number
-    rows = {"skip_rows": header.lines, "column_names": header.texts}
-    return pyarrow.csv.ReadOptions(use_threads=False, block_size=BLOCK, **rows)
-
-
-def _sample_csv(pa: Any, path: Path) -> tuple[list[str], Any]:
-    import pyarrow.csv
-
-    header = read_header(path)
-    check_header(header.texts)
-    if header.is_all:
-        return header.texts, None
-    options = _csv_options(header)
-    marks = {"decimal_point": header.decimal_mark, "null_values": _EMPTY, "strings_can_be_null": True}
-    convert = pyarrow.csv.ConvertOptions(column_types=_stamp_types(pa, header), **marks)
-    with path.open("rb") as stream:
-        parse = pyarrow.csv.ParseOptions(delimiter=header.separator)
-        return header.texts, pyarrow.csv.open_csv(stream, options, parse, convert).read_next_batch()
-
-
-def _sample_parquet(pa: Any, path: Path) -> tuple[list[str], Any]:
-    import pyarrow.parquet
-
-    with pyarrow.parquet.ParquetFile(path, **_PARQUET) as file:
-        nested = NestedColumns(pa, file)
-        check_header(nested.names)
-        _check_size(path, file.metadata.num_rows, len(nested.names), whole=False)
-        plain = [name for name, type_ in nested.types.items() if _is_number(pa, type_) or _is_stamp(pa, type_)]
-        batch = next(file.iter_batches(_SAMPLE, columns=nested.in_file(plain)), None) if plain else None
-    return nested.names, None if batch is None else nested.flat(batch)
+def table_size(path: Path) -> int:
+    """Bytes of a table's numbers, without reading them. Raises LogError: the file cannot be read."""
+    pa = import_pyarrow(path)
+    with _complete(path):
+        return count_bytes(pa, path)
 
 
 def table_blocks(path: Path, columns: Columns | None = None) -> Iterator[dict[str, NDArray[Any]]]:
@@ -167,7 +114,7 @@ def _without_repeats(blocks: Iterable[dict[str, NDArray[Any]]]) -> Iterator[dict
 
 
 def _every_block(path: Path, columns: Columns | None) -> Iterator[dict[str, NDArray[Any]]]:
-    pa = _pyarrow(path)
+    pa = import_pyarrow(path)
     with _complete(path):
         rows = 0
         for layout, batch in _batches(pa, path, columns, whole=False):
@@ -180,11 +127,6 @@ def _every_block(path: Path, columns: Columns | None) -> Iterator[dict[str, NDAr
 
 def _complete(path: Path) -> AbstractContextManager[None]:
     return reader_errors_explained("file", f"a complete {path.suffix.lower()} file")
-
-
-def is_text_table(path: Path) -> bool:
-    """Whether a table is of text."""
-    return path.suffix.lower() in TEXT_TABLES
 
 
 def _layout(texts: list[str], columns: Columns | None, in_degrees: bool = False) -> _Layout:
@@ -210,7 +152,7 @@ def _fields(pa: Any, layout: _Layout, batches: list[Any]) -> dict[str, NDArray[A
 
     def take(column: str) -> NDArray[Any]:
         # popped, to release its memory
-        return _values(pa, column, columns.pop(column)) if columns else np.zeros(0)
+        return column_values(pa, column, columns.pop(column)) if columns else np.zeros(0)
 
     out = layout.read(take)
     if not out["joint_names"].size:  # a robot without joints
@@ -224,173 +166,31 @@ def save_table(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     Raises:
         LogError: a name is not valid in a column, or the file cannot be written.
     """
-    pa = _pyarrow(path)
+    pa = import_pyarrow(path)
     columns = to_columns(arrays)
     with atomic_output(path) as temporary:
-        if path.suffix.lower() == ".parquet":
-            import pyarrow.parquet
-
-            table = pa.table({text: pa.array(np.ascontiguousarray(x)) for text, x in columns.items()})
-            pyarrow.parquet.write_table(table, temporary, use_dictionary=[TEXT_COLUMN], write_page_checksum=True)
-        else:
-            _save_csv(pa, temporary, columns)
+        write_table(pa, temporary, columns, path.suffix.lower() == ".parquet")
 
 
-def _pyarrow(path: Path) -> Any:
-    """The module pyarrow; LogError where it is not installed."""
-    try:
-        import pyarrow
-    except ImportError as error:
-        found = f"a {path.suffix.lower()} file, but pyarrow is not installed"
-        raise LogError(path, "file", found, f"a .npz file, or {how_to_install('tables')}") from error
-    return pyarrow
+def _wide(pa: Any, path: Path, table: Any, rows: RowNames) -> dict[str, NDArray[Any]]:
+    """A table with a row for each joint as columns of each; LogError for names that are none."""
+    wide = with_a_row_for_each_stamp(pa, table, rows, partial(check_size, path, whole=True))
+    check_header(list(wide))
+    return wide
 
 
 def _batches(pa: Any, path: Path, columns: Columns | None, whole: bool = True) -> Iterator[tuple[_Layout, Any]]:
     """The layout of a table, first with None, then with each batch of rows."""
-    return (_read_csv if is_text_table(path) else _read_parquet)(pa, path, columns, whole)
-
-
-def _read_csv(pa: Any, path: Path, columns: Columns | None, whole: bool) -> Iterator[tuple[_Layout, Any]]:
-    import pyarrow.csv
-
-    header = read_header(path)
-    layout = _layout(header.named, columns, header.in_degrees)
-    yield layout, None
-    if header.is_all:
-        return
-    words = pa.dictionary(pa.int32(), pa.string())
-    may_be_text = {TEXT_COLUMN, *layout.flags}
-    types = {text: words if text in may_be_text else pa.float64() for text in layout.sources}
-    types |= {text: type_ for text, type_ in _stamp_types(pa, header).items() if text in types}
-    with path.open("rb") as stream:
-        try:
-            reader = pyarrow.csv.open_csv(
-                stream,
-                _csv_options(header),
-                pyarrow.csv.ParseOptions(delimiter=header.separator),
-                pyarrow.csv.ConvertOptions(
-                    column_types=types,
-                    null_values=_EMPTY,
-                    strings_can_be_null=True,
-                    decimal_point=header.decimal_mark,
-                    include_columns=layout.sources if columns is not None or header.is_open else None,
-                ),
-            )
-            for batch in _bounded(path, reader, len(types), whole):
-                yield layout, batch
-        except pa.ArrowInvalid as error:
-            if (bad := _bad_cell(path, header, error)) is None:
-                raise
-            raise bad from error
-
-
-def _bad_cell(path: Path, header: TextHeader, error: Exception) -> LogError | None:
-    """The error of a cell that is no number, or of a row with too many cells or too few; None for any other."""
-    if row := _SHORT_ROW.match(str(error)):
-        return LogError(path, f"row {row[1]}", f"{row[3]} cells", f"{row[2]} cells, as there are names")
-    bad = _BAD_CELL.match(str(error))
-    if bad is None:
-        return None
-    column, row_number, found = bad.groups()
-    where = "" if row_number is None else f" in row {row_number}"
-    found = found.strip(_QUOTES)
-    other = "." if header.decimal_mark == "," else ","
-    mixed = found.count(other) == 1 and found.replace(other, "").lstrip("-").isdigit()
-    accepted = f"the decimal mark '{header.decimal_mark}' throughout, as in other rows" if mixed else _NUMBERS
-    return LogError(path, f"column '{header.texts[int(column)]}'", f"'{excerpt(found)}'{where}", accepted)
-
-
-def _read_parquet(pa: Any, path: Path, columns: Columns | None, whole: bool) -> Iterator[tuple[_Layout, Any]]:
-    import pyarrow.parquet
-
-    with pyarrow.parquet.ParquetFile(path, **_PARQUET) as file:
-        texts = NestedColumns(pa, file).names
-        layout = _layout(texts, columns)
-    # as a dictionary: one long text, repeated in every row, could fill the memory
-    with pyarrow.parquet.ParquetFile(
-        path, read_dictionary=[TEXT_COLUMN] if TEXT_COLUMN in texts else None, **_PARQUET
-    ) as file:
-        used, nested = set(layout.sources), NestedColumns(pa, file)
-        for name, type_ in nested.types.items():
-            number = _is_number(pa, type_) and (name in layout.flags or not pa.types.is_boolean(type_))
-            number |= _is_stamp(pa, type_)
-            if name in used and not (pa.types.is_dictionary(type_) if name == TEXT_COLUMN else number):
-                accepted = "text" if name == TEXT_COLUMN else "real numbers"
-                raise LogError(path, f"column '{name}'", f"values of type {type_}", accepted)
-        _check_size(path, file.metadata.num_rows, len(used), whole)
+    if columns is not None and columns.rows_of is not None:
+        table = whole_table(pa, path)
+        wide = _wide(pa, path, table, row_names_in_map(columns, table.column_names))
+        layout = _layout(list(wide), columns)
         yield layout, None
-        only = None if columns is None else nested.in_file(layout.sources)
-        for batch in _bounded(path, file.iter_batches(_ROWS, columns=only), len(used), whole):
-            yield layout, nested.flat(batch)
-
-
-def _bounded(path: Path, batches: Iterable[Any], columns: int, whole: bool) -> Iterator[Any]:
-    """The batches, with their total size checked: a file may contain more rows than it declares."""
-    rows = 0
-    for batch in batches:
-        rows += batch.num_rows
-        _check_size(path, rows, columns, whole)
-        if batch.num_rows:
-            yield batch
-
-
-def table_size(path: Path) -> int:
-    """Bytes of a table's numbers, without reading them. Raises LogError: the file cannot be read."""
-    _pyarrow(path)
-    with _complete(path):
-        if is_text_table(path):
-            columns = len(read_header(path).texts)
-            with path.open("rb") as stream:
-                return 8 * columns * sum(piece.count(b"\n") for piece in iter(lambda: stream.read(BLOCK), b""))
-        import pyarrow.parquet
-
-        with pyarrow.parquet.ParquetFile(path, **_PARQUET) as file:
-            return 8 * int(file.metadata.num_rows) * int(file.metadata.num_columns)
-
-
-def _check_size(path: Path, rows: int, columns: int, whole: bool) -> None:
-    if whole and 8 * rows * columns > MAX_ARRAYS:
-        accepted = f"at most {MAX_ARRAYS} bytes in all"
-        raise LogError(path, "file", f"{rows} rows of {columns} columns", accepted)
-    check_unpacked_size(path, 8 * rows * columns)
-
-
-def _values(pa: Any, column: str, values: Any) -> NDArray[Any]:
-    """A column's values (N,), NaN for empty cells; for text, the common value of all rows."""
-    if not pa.types.is_dictionary(values.type):
-        if pa.types.is_boolean(values.type) and values.null_count:
-            values = values.cast(pa.float64())
-        return _numbers(pa, values.combine_chunks())
-    values = values.unify_dictionaries()
-    words = values.unique().to_pylist()
-    if column == TEXT_COLUMN:
-        if len(words) != 1 or words[0] is None:
-            found = " and ".join("an empty cell" if word is None else f"'{excerpt(word)}'" for word in words[:2])
-            raise LogError.at_field(f"column '{column}'", found, "one name, the same in every row")
-        check_names([1], len(words[0]))
-        return np.array(words[0].strip())
-    numbers = {word: np.nan if word is None else _number(column, word) for word in words}
-    coded = pa.array([numbers[word] for word in words])
-    codes = pa.compute.index_in(values.cast(pa.string()), pa.array(words, pa.string()))
-    return np.asarray(coded.take(codes.combine_chunks()).to_numpy(zero_copy_only=False))
-
-
-def _number(column: str, word: str) -> float:
-    try:
-        return float(_FLAGS.get(word.strip().lower(), word.replace(",", ".")))
-    except ValueError as error:
-        raise LogError.at_field(f"column '{column}'", f"'{excerpt(word)}'", "true and false, or 1 and 0") from error
-
-
-def _save_csv(pa: Any, path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
-    """Write numbers as the shortest exact text, NaN as an empty cell."""
-    import pyarrow.csv
-
-    def rows(first: int) -> Any:
-        block = {text: x[first : first + _ROWS] for text, x in columns.items()}
-        return pa.table({text: pa.array(np.ascontiguousarray(x), from_pandas=True) for text, x in block.items()})
-
-    with path.open("xb") as stream, pyarrow.csv.CSVWriter(stream, rows(0).schema) as writer:
-        for first in range(0, len(columns["time"]), _ROWS):
-            writer.write_table(rows(first))
+        yield layout, pa.RecordBatch.from_pydict({name: pa.array(wide[name]) for name in layout.sources})
+        return
+    names, in_degrees = column_names(pa, path)
+    layout = _layout(names, columns, in_degrees)
+    yield layout, None
+    texts = {TEXT_COLUMN, *layout.flags}
+    for batch in read_rows(pa, path, layout.sources, texts, columns is not None, whole):
+        yield layout, batch

@@ -152,6 +152,7 @@ def vertical_in_base(quat_xyzw: FloatArray) -> FloatArray:
 _NAMES = ("roll", "pitch", "yaw")
 _OTHER_NAMES = {
     "roulis": "roll", "tangage": "pitch", "lacet": "yaw", "nickwinkel": "pitch", "gierwinkel": "yaw",
+    "nick": "pitch", "gier": "yaw",
     "balanceo": "roll", "cabeceo": "pitch", "guinada": "yaw",
 }  # fmt: skip
 _ANGLE = re.compile(rf"(?<![a-z])({'|'.join([*_NAMES, *_OTHER_NAMES])})(?![a-z])", re.IGNORECASE)

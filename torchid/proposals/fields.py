@@ -43,6 +43,7 @@ MOMENT = re.compile(r"moment|torque|(?<![a-z])[mt]\{axis", re.IGNORECASE)
 """In patterns of columns."""
 
 _SIDEWAYS = re.compile(r"(?<![a-z])(f[xy]|m[xyz])(?![a-z])", re.IGNORECASE)  # components that tell of no contact
+_MOMENTS = {"moment", "moments", "momente"}  # of each joint; of feet and plates others
 _DRIVE = re.compile(r"joint|motor|current|temp|limit|volt", re.IGNORECASE)  # of a limb, but of no foot
 _FOOT = re.compile(r"foot|feet", re.IGNORECASE)
 
@@ -137,6 +138,8 @@ class FieldMatcher:
         name, axes = family.proposed, len(family.axes) == 3
         if not name and "time" in quantities_with(family.unit) and increases(self.sample[family.columns[0]]):
             return "time"
+        if not name and "{joint}" in family.pattern and _MOMENTS & set(words_of(family.pattern)):
+            return "joint_torque"
         if not name and axes and re.fullmatch(OF_BASE, family.stem) and family.unit_may_be("length"):
             return "base_position_world"
         of_foot = "{contact}" in family.pattern or _FOOT.search(family.words) is not None
@@ -290,6 +293,8 @@ def find_foot_readings(sample: FileSample, columns: Sequence[str], robot: KnownR
         if _is_of_feet(column, robot):
             inner = () if (values := sample[column]) is None else values.shape[1:]
             rest, part, component = _component(column, inner)
+            is_flag = (values is not None) and values.dtype.kind == "b" and not inner
+            part = part or ("normal" if is_flag else "")  # words or truth values tell, whatever their name is
             foot = by_side.get(_side(rest, robot), "")
             found[limb_and_words(rest)[1], part if foot else ""][foot][component] = column
     out = []

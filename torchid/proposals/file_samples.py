@@ -16,11 +16,13 @@ from numpy.typing import NDArray
 from torchid.errors import TorchidError, excerpt
 from torchid.logs.arrays import fields_of_records, require_plain
 from torchid.logs.containers import LogKind, existing_log_kind, list_bag_files, open_container, reader_errors_explained
+from torchid.logs.long_tables import RowNames
 from torchid.logs.name_matching import KnownRobot, limb_and_words, match_names, propose_field
 from torchid.logs.ros_messages import make_deserializer
 from torchid.logs.ros_read import list_channels, open_bag_file
+from torchid.logs.table_files import is_text_table
 from torchid.logs.table_headers import read_header
-from torchid.logs.tables import is_text_table, sample_table
+from torchid.logs.tables import sample_row_names, sample_table
 
 FileSample = Mapping[str, NDArray[Any] | None]
 """Columns of a table or arrays with some of their rows, some of them names; None for what is neither."""
@@ -30,14 +32,19 @@ _NAMES = 300  # elements of a list of names
 _SORTED = 0.9  # of the steps of stamps, forwards
 
 
-def read_sample(path: Path) -> FileSample:
-    """The columns of a table or the arrays of a file, with some of the rows of tables.
+def rows_of(path: Path) -> RowNames | None:
+    """What names the joint of each row, of a table with a row for each joint and stamp; LogError as `read_sample`."""
+    return sample_row_names(path) if existing_log_kind(path) is LogKind.TABLE else None
+
+
+def read_sample(path: Path, rows: RowNames | None = None) -> FileSample:
+    """The columns of a table or the arrays of a file, with some of the rows of tables; `rows` as from `rows_of`.
 
     Raises:
         LogError: it cannot be read, or is a bag.
     """
     if existing_log_kind(path) is LogKind.TABLE:
-        return sample_table(path)
+        return sample_table(path, rows)
     out: dict[str, NDArray[Any] | None] = {}
     with open_container(path) as container:
         for name in container.declared_bytes():
