@@ -120,7 +120,7 @@ def measure_stages(builder: RowBuilder, samples: Samples, limits: Limits) -> Sta
                 layout = builder.layout(state)
                 if layout.contact_bodies:
                     contact = builder.contact_rows(layout, known)
-                    exhaust(builder.whitened_bases(layout, contact, contact.of_measured(), known.rotation_world_base))
+                    exhaust(builder.whitened_bases(layout, contact, contact.of_measured(), known))
 
         def rows() -> None:
             for chunk, state in chunks:

@@ -215,7 +215,7 @@ def test_noise_sensors_extras_and_folds_change_the_name_of_factors(demo: Path, t
     values = {name: x for name, x in values.items() if name not in STATED_FIELDS}  # change samples
     terms = {"armature": True, "torque_offset": True, "asymmetric_coulomb": True, "stiffness": True}
     terms |= {"sign_width": 0.01, "stribeck": 0.1}
-    assert terms.keys() | {"delay"} == {x.name for x in fields(ActuatorsConfig)}, "a delay changes samples"
+    assert terms.keys() | {"delay", "stiction"} == {x.name for x in fields(ActuatorsConfig)}, "both change samples"
     others = [f"sensors.noise.{name}={json.dumps(x)}" for name, x in values.items()]
     others += [f"actuators.{name}={json.dumps(x)}" for name, x in terms.items()]
     others += ["sensors.set=full", "sensors.offsets={joint_torque: log}", "sensors.scales={joint_torque: all}"]
@@ -223,11 +223,12 @@ def test_noise_sensors_extras_and_folds_change_the_name_of_factors(demo: Path, t
     assert len({same, *map(key, others)}) == 1 + len(others)
 
 
-def test_stated_noise_of_the_motion_changes_the_name_of_samples(demo: Path, tmp_path: Path) -> None:
+def test_stated_noise_of_the_motion_and_joints_at_rest_change_the_name_of_samples(demo: Path, tmp_path: Path) -> None:
     def key(*more: str) -> str:
         return content_key(content_of_scene(set_up(load_config(demo, (f"output={tmp_path / 'run'}", *more)))))
 
     names = [key(f"sensors.noise.{name}={x}") for name in STATED_FIELDS for x in (0.0, 0.1)]
+    names.append(key("actuators.stiction=true"))
     assert len({key(), key("sensors.noise.base_force=1.5"), *names}) == 1 + len(names)
 
 

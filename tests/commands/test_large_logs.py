@@ -46,7 +46,8 @@ SUFFIXES = (".npz", ".csv", ".parquet", ".h5")
 def test_blocks_give_the_samples_of_the_whole_log(tmp_path: Path, name: str, jitter: float) -> None:
     settings, tolerance = SETTINGS[name]
     file = experiment(tmp_path, recorded(jitter=jitter), ".h5")
-    whole, large = samples_of(file, *overrides(settings)), samples_of(file, *overrides(settings), SMALL)
+    chosen = (*overrides(settings), "actuators.stiction=true")
+    whole, large = samples_of(file, *chosen), samples_of(file, *chosen, SMALL)
     assert is_on_disk(large)
     assert not is_on_disk(whole)
     assert_same(large, whole, tolerance)
@@ -65,14 +66,18 @@ def test_a_long_log_in_memory_is_worked_on_in_blocks_by_threads(
 ) -> None:
     settings, tolerance = SETTINGS[name]
     file = experiment(tmp_path, recorded(jitter=0.3))
-    whole, before = samples_of(file, *overrides(settings)), torch.get_num_threads()
+    chosen = (*overrides(settings), "actuators.stiction=true")
+    whole, before = samples_of(file, *chosen), torch.get_num_threads()
     request.getfixturevalue("small_blocks")
     torch.set_num_threads(threads)
     try:
-        blocks = samples_of(file, *overrides(settings))
+        blocks = samples_of(file, *chosen)
     finally:
         torch.set_num_threads(before)
     assert not is_on_disk(blocks)
+    assert whole.resting is not None
+    assert whole.resting.any(0).all()
+    assert not whole.resting.all()
     assert_same(blocks, whole, tolerance)
     assert sorted(os.listdir(tmp_path)) == ["log.npz", "run.yaml"]
 

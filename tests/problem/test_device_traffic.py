@@ -101,6 +101,21 @@ def test_the_host_waits_for_one_decision_in_each_chunk_and_copies_nothing(
     assert traffic(builder, chunks) == expected
 
 
+@pytest.mark.parametrize(
+    ("name", "sensors"), [("quadruped", "joints"), pytest.param("bolted arm", "mixed", marks=SLOW)]
+)
+def test_where_joints_rest_the_host_waits_for_the_rows_of_each_state_at_the_end(
+    name: str, sensors: str, tmp_path: Path
+) -> None:
+    builder, chunks = chunks_of(name, sensors, False, ExtraTerms(), tmp_path)
+    rng = np.random.default_rng(0)
+    resting = [torch.from_numpy(rng.random(samples.joint_position.shape) < 0.3) for samples, _ in chunks]
+    with_rest = [(replace(samples, resting=own), state) for (samples, state), own in zip(chunks, resting, strict=True)]
+    states = len({state for _, state in chunks})
+    more = {"problem/compression.py, close: _local_scalar_dense (a number)": states}
+    assert traffic(builder, with_rest) == traffic(builder, chunks) | more
+
+
 def test_a_state_that_is_met_for_the_first_time_costs_a_few_copies_once(tmp_path: Path) -> None:
     """Indices and constants; and the test above sees them, were they made again in every chunk."""
     builder, chunks = chunks_of("quadruped", "joints", True, ExtraTerms(), tmp_path)

@@ -9,6 +9,7 @@ but neither A^T A nor A^T b, which are all that a least-squares fit depends on.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from random_samples import NOISE, random_samples, sensor_set
 from synthetic import PANDA, TALOS_FULL, Array, load
 
 import torchid
-from torchid.problem import RowBuilder
+from torchid.problem import RowBuilder, compress
 from torchid.problem.chunks import chunks_by_state
 from torchid.problem.predict import predict_by_columns, predict_forces
 
@@ -29,6 +30,10 @@ FORCE = [0, 1, 2]  # of the six components of a wrench, those that a point conta
 
 SENSOR_SETS = {name: sensor_set(name, ROBOT, FEET) for name in ("full", "contacts", "joints", "mixed")}
 SAMPLES, STATE = random_samples(ROBOT, FEET, 60, 0)
+
+
+RESTING = torch.from_numpy(np.random.default_rng(3).random((len(SAMPLES), ROBOT.n)) < 0.3)
+"""Joints whose torque counts as unmeasured, others in each sample."""
 
 
 def by_public_modules(sensors: torchid.SensorSet) -> tuple[Array, Array]:
@@ -85,3 +90,19 @@ def test_forces_are_the_same_by_columns_of_k_and_without_them(robot: torchid.Rob
     by_columns, without = predict_by_columns(builder, dynamics, phi), predict_forces(builder, dynamics, phi)
     assert without.shape == (7, robot.n_rows, 20)
     np.testing.assert_allclose(by_columns, without, rtol=0.0, atol=1e-13 * without.abs().max().item())
+
+
+@pytest.mark.parametrize("name", SENSOR_SETS)
+def test_a_torque_is_unmeasured_where_its_joint_rests(name: str) -> None:
+    sensors = SENSOR_SETS[name]
+    builder = RowBuilder(ROBOT, FEET, sensors)
+    factor, gram, equations = compress([replace(SAMPLES, resting=RESTING)], builder), 0.0, 0
+    for number, (resting, active) in enumerate(zip(RESTING.numpy(), SAMPLES.active.tolist(), strict=True)):
+        own = RowBuilder(ROBOT, FEET, replace(sensors, torque=sensors.torque & ~resting))  # a sensor set of its own
+        rows, W = own.rows_by_sample(SAMPLES[number : number + 1], tuple(active))
+        gram, equations = gram + (rows[0].T @ rows[0]).numpy(), equations + int(W.any(1).sum())
+    R = factor.triangle().numpy()
+    size = np.linalg.norm(R, axis=0) + 1e-3 * np.linalg.norm(R)
+    np.testing.assert_allclose(R.T @ R / np.outer(size, size), gram / np.outer(size, size), rtol=0.0, atol=1e-14)
+    assert factor.rows == equations
+    assert (equations < compress([SAMPLES], builder).rows) == sensors.torque.any()

@@ -18,7 +18,6 @@ from torchid.commands.results import Identification
 from torchid.config import load_config
 from torchid.estimators import SgdEstimate
 from torchid.estimators.least_squares import COMBINED, IDENTIFIED, ConstrainedEstimate
-from torchid.fitting.separable import SignWidthChoice
 from torchid.parameters import FRICTION, INERTIAL, PER_BODY
 from torchid.problem import Metrics
 from torchid.problem.metrics import DECISIVE_GROUPS, LIMB_GROUPS, WHITENED, WorseThanNominal
@@ -73,17 +72,22 @@ def test_the_errors_on_unseen_motion_come_first_with_the_noise(consistent: Ident
     assert str(consistent.experiment.config.output) in " ".join(said.split("\n")[-1:])
 
 
-def test_joints_that_rest_are_named_where_forces_are_not_explained_and_no_width_was_tried(
-    consistent: Identification,
-) -> None:
+def test_joints_that_rest_are_named_where_forces_are_not_explained(consistent: Identification) -> None:
     assert consistent.resting == {}
-    resting = replace(consistent, resting={"front_left_knee": 0.62, "rear_left_hip": 0.31})
+    resting = replace(consistent, resting={"front_left_knee": 1.0, "rear_left_hip": 0.31})
     unexplained = replace(resting, misfit=replace(resting.misfit, lack_of_fit=9.0))
     said = " ".join(text(unexplained).split())
-    assert "actuators.sign_width=auto, as joints rest (front_left_knee 62 %, rear_left_hip 31 %)" in said
-    width = SignWidthChoice(None, (0.1, None), (1.0, 1.0))
-    tried = replace(unexplained, choices=replace(unexplained.choices, sign_width=width))
-    assert all("sign_width" not in text(run) for run in (resting, tried))
+    assert "actuators.stiction=true, as joints rest (front_left_knee 100 %, rear_left_hip 31 %)" in said
+    assert "stiction" not in text(resting)
+
+
+def test_joints_that_never_move_are_named_where_their_torque_counts_as_unmeasured(consistent: Identification) -> None:
+    config = consistent.experiment.config
+    taken = replace(config, actuators=replace(config.actuators, stiction=True))
+    run = replace(consistent, experiment=replace(consistent.experiment, config=taken))
+    assert "stiction" not in text(replace(run, resting={"rear_left_hip": 0.9}))
+    said = " ".join(text(replace(run, resting={"front_left_knee": 1.0, "rear_left_hip": 0.9})).split())
+    assert "no friction of front_left_knee: at rest, or within 1/cutoff of it, throughout" in said
 
 
 def test_errors_on_motion_that_was_fitted_are_not_those_of_unseen_motion(consistent: Identification) -> None:

@@ -16,7 +16,7 @@ from rich.progress import Progress
 from torchid import ranks
 from torchid.commands.chosen_settings import with_chosen_settings
 from torchid.commands.folder import ANALYSIS, check_free, new_folder, write_json
-from torchid.commands.reading import LogReader, check_parts
+from torchid.commands.reading import LogReader, check_read
 from torchid.commands.sensor_set_accuracy import accuracies
 from torchid.config import AnalyzeConfig, dump_config, inputs_of
 from torchid.copies import can_copy, in_copies
@@ -221,7 +221,7 @@ def _read(request: AnalysisRequest, bars: Progress) -> tuple[list[Samples], list
         bars.advance(reading)
 
     train, test = reader.read(files.train, request.proposed, done), reader.read(files.test, None, done)
-    check_parts({"train": train, "test": test})
+    check_read({"train": train, "test": test})
     return train, test
 
 

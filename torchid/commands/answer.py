@@ -184,7 +184,7 @@ def _attention(run: Identification, judged: ErrorComparison) -> Iterator[str]:
     if not run.misfit.explained:
         why = run.misfit.in_short
         yield f"friction, compliance or contacts are missing, or a sensor is wrong (torchid check): {why}"
-        yield from _resting(run)
+    yield from _resting(run)
     if run.experiment.config.estimator.total_mass is None and _contradicts_nominal(run.mass):
         ratio = f"{run.mass.value / run.mass.nominal:.3g} times the {run.experiment.robot.format}'s"
         yield f"the total mass is {ratio}: weigh the robot, or mend units and gains of forces: torchid check"
@@ -200,11 +200,16 @@ def _attention(run: Identification, judged: ErrorComparison) -> Iterator[str]:
 
 
 def _resting(run: Identification) -> Iterator[str]:
-    """That joints rest, where a width of friction's sign has not been tried."""
-    if run.resting and run.choices.sign_width is None:
+    """That joints rest where forces are not explained, or all the time where their torques count as unmeasured then."""
+    if run.experiment.config.actuators.stiction:
+        if still := [name for name, share in run.resting.items() if share == 1.0]:
+            names = join_names(still, _FEW_NAMED)
+            why = "no torque counts as measured then (actuators.stiction)"
+            yield f"no friction of {names}: at rest, or within 1/cutoff of it, throughout; {why}"
+    elif run.resting and not run.misfit.explained:
         names = join_names([f"{name} {100.0 * share:.0f} %" for name, share in run.resting.items()], _FEW_NAMED)
         why = "where one sticks, its friction is less than Coulomb's, and too little is found"
-        yield f"actuators.sign_width=auto, as joints rest ({names}): {why}"
+        yield f"actuators.stiction=true, as joints rest ({names}): {why}"
 
 
 def _undetermined(run: Identification) -> Iterator[str]:

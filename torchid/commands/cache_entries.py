@@ -80,6 +80,7 @@ def content_of_scene(scene: Scene) -> dict[str, Any]:
         "sign_width": config.actuators.sign_width,
         "delay": config.actuators.known_delay,
         **({} if config.actuators.stribeck is None else {"stribeck": config.actuators.stribeck}),
+        **({"stiction": True} if config.actuators.stiction else {}),
         "topics": topics,
         "columns": json.dumps(columns),  # as text: the order of names in it is that of the log
     }

@@ -32,8 +32,9 @@ from torchid.fitting.separable import (
 )
 from torchid.logs import Log
 from torchid.logs.cutoff import CutoffChoice, choose_cutoff
+from torchid.logs.dry_friction import dry_friction_by_setting
 from torchid.logs.log import FloatArray
-from torchid.logs.preprocess import dry_friction, lacks_derivatives, make_timeline
+from torchid.logs.preprocess import lacks_derivatives, make_timeline
 from torchid.logs.sign_filter import with_sign_filter
 from torchid.logs.signal_noise import SignalNoise
 from torchid.logs.timeline import LOSSLESS_RATE
@@ -250,6 +251,6 @@ class WidthReader(LogReader):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", TorchidWarning)  # said where the log was read
                 filtered = timeline and with_sign_filter(timeline, clean, log.motion_noise or SignalNoise({}))
-            by_setting = dry_friction(clean, filtered) if filtered else (lambda *_: {})
+            by_setting = dry_friction_by_setting(clean, filtered) if filtered else (lambda *_: {})
             self._directions[log.source] = _Directions(log.time, joint_order(log, self.scene.robot), by_setting)
         return log

@@ -18,7 +18,7 @@ from torchid.commands.chosen_settings import Choices, with_chosen_settings, with
 from torchid.commands.evaluate import compare_forces, trace_forces
 from torchid.commands.folder import RUN, check_free, claim_folder
 from torchid.commands.plausibility import TrainingLogs, require_not_worse, require_plausible, suspected_mistake
-from torchid.commands.reading import LogReader, check_parts
+from torchid.commands.reading import LogReader, check_read
 from torchid.commands.results import Identification, write_run
 from torchid.commands.run_figures import Drawing, drawing, fit_figures
 from torchid.commands.training import Training, descent_settings, require_trainable, training_folder
@@ -281,7 +281,7 @@ def _read(reader: LogReader, experiment: Experiment, bars: Progress) -> dict[str
         name: reader.read(paths, None if name == "test" else experiment.sensors, lambda _: bars.advance(reading))
         for name, paths in files.items()
     }
-    check_parts(logs)
+    check_read(logs)
     if experiment.config.estimator.name == "sgd":  # it sees samples one by one, not what noise adds on average
         logs["train"] = [replace(log, motion_noise=None) for log in logs["train"]]
     return logs

@@ -32,7 +32,7 @@ from torchid.logs.preprocess import (
     make_timeline,
 )
 from torchid.logs.segments import count_samples, long_segments
-from torchid.logs.sign_filter import with_sign_filter
+from torchid.logs.sign_filter import with_sign_filter, with_signs_of
 from torchid.logs.signal_noise import MOST_SAMPLES, signal_noise, warn_of_noisy_accelerations
 from torchid.logs.timeline import SPLINE_BLOCK, Timeline
 from torchid.problem import Samples, bind_log
@@ -94,7 +94,7 @@ class LargeLog:
         required: sensors whose every value must be there, None if gaps are allowed.
         folder: where there is room for the samples; None: in memory.
         motion_noise: of the recorded motion, as far as it is stated, as `preprocess` takes it.
-        sign_width, stribeck: as `preprocess` takes them.
+        sign_width, stribeck, finds_rest: as `preprocess` takes them.
         columns: as of `read_log`.
         loaded: the robot with what it carried in the log, if it carried something.
     """
@@ -108,6 +108,7 @@ class LargeLog:
     motion_noise: Mapping[str, float] = field(default_factory=dict)
     sign_width: float | None = None
     stribeck: float | None = None
+    finds_rest: bool = False
     columns: Columns | None = None
     loaded: Robot | None = None
 
@@ -198,7 +199,7 @@ class LargeLog:
         longest = max(chosen, key=lambda segment: segment.stop - segment.start)
         start = blocks if standing is None else blocks.part(longest)
         first = start.read(slice(0, min(len(start), MOST_SAMPLES)))
-        rates = settings.filter_hz, settings.sample_rate_hz, self.sign_width, self.stribeck
+        rates = settings.filter_hz, settings.sample_rate_hz, self.sign_width, self.stribeck, self.finds_rest
         whole = make_timeline(blocks.time, lacks_derivatives(first), *rates)
         noise = signal_noise(first, whole, self.motion_noise if standing is None else {})
         read = partial(start.read, only=("joint_position",))
@@ -225,10 +226,10 @@ class LargeLog:
         usable = long_segments(blocks.time, standing.segments, whole)
         for segment in usable:
             part = blocks.part(segment)
-            rates = settings.filter_hz, settings.sample_rate_hz, self.sign_width, self.stribeck
+            rates = settings.filter_hz, settings.sample_rate_hz, self.sign_width, self.stribeck, self.finds_rest
             timeline = make_timeline(part.time, True, *rates)
             if timeline is not None:
-                timeline = replace(timeline, sign_low_pass=whole.sign_low_pass, sign_noise=whole.sign_noise)
+                timeline = with_signs_of(timeline, whole)
             out.append(Segment(part, timeline, first, None if air is None else air[segment]))
             first += len(out[-1].time)
         too_short = count_samples(standing.segments) - count_samples(usable)

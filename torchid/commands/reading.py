@@ -146,10 +146,10 @@ class LogReader:
         """A log as recorded, filtered, differentiated and resampled."""
         settings = self.scene.config.preprocessing
         rates, terms = (settings.filter_hz, settings.sample_rate_hz), self.scene.terms
-        dry = terms.sign_width, terms.stribeck
+        dry, finds_rest = (terms.sign_width, terms.stribeck), self.scene.config.actuators.stiction
         if settings.base_motion is None:
-            return preprocess(clean, *rates, self._stated, *dry)
-        return preprocess_standing(clean, self.scene.robot, self.scene.contacts, *rates, *dry)
+            return preprocess(clean, *rates, self._stated, *dry, finds_rest)
+        return preprocess_standing(clean, self.scene.robot, self.scene.contacts, *rates, *dry, finds_rest)
 
     def _slipping(self, log: Log, samples: Samples, recorded: Log) -> FloatArray | None:
         """Stamps of samples in which a contact slips; None where all are kept.
@@ -206,6 +206,7 @@ class LogReader:
             motion_noise=self._stated,
             sign_width=scene.terms.sign_width,
             stribeck=scene.terms.stribeck,
+            finds_rest=scene.config.actuators.stiction,
             columns=None if scene.config.logs is None else scene.config.logs.columns,
             loaded=scene_of_log(scene, path).robot,
         )
@@ -245,18 +246,24 @@ def _with_flags(log: Log, scene: Scene) -> tuple[Log, BoolArray]:
     return log, np.ones(len(log), dtype=bool)
 
 
-def check_parts(logs: Mapping[str, Sequence[Samples]]) -> None:
-    """Make sure that no sample has two uses, of parts of logs of which the experiment file alone does not say.
+def check_read(logs: Mapping[str, Sequence[Samples]]) -> None:
+    """Make sure that no sample has two uses, which of parts of logs no file says, and that something is left to fit.
 
     Args:
         logs: by their key in `logs`.
 
     Raises:
         ConfigError: as `require_apart`.
+        LogError: torques of joints at rest count as unmeasured, and all joints of a bolted robot rest.
 
     Warns:
-        TorchidWarning: likewise.
+        TorchidWarning: as `require_apart`.
     """
+    train = logs.get("train", ())
+    bolted = [log for log in train if log.base.specific_force is None and log.resting is not None]
+    if train and len(bolted) == len(train) and all(bool(x.resting.all()) for x in bolted if x.resting is not None):
+        found = "true, but all joints are at rest, or within 1/cutoff of it, throughout: no torque counts as measured"
+        raise LogError(train[0].source, "actuators.stiction", found, "logs whose joints move, or false")
     parts = {key: [split_range(log.source) for log in of_key] for key, of_key in logs.items()}
     spans = {split_range(log.source): log.time[[0, -1]].tolist() for of_key in logs.values() for log in of_key}
 

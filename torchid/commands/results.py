@@ -58,7 +58,8 @@ class Identification:
         noise: that rows were weighted with.
         motion_noise: what noise of the motion had added to the normal equations.
         misfit: what the fit leaves of the forces, and what noise would leave.
-        resting: share of the time at rest of joints that rest often, where friction goes with the sign of velocities.
+        resting: share of the time at rest of joints that rest often, where friction goes with the sign of velocities or
+            torques then count as unmeasured.
         robust: how outliers were down-weighted, if so.
         states: contact states of the training logs.
         by_state: what each of them determines on its own.

@@ -91,6 +91,7 @@ class ActuatorsConfig:
     `stribeck` [rad/s or m/s]: friction at rest beyond Coulomb friction, which drops with exp(-(velocity / stribeck)^2);
     auto, with the velocity that leaves least, or without such friction where the logs do not determine it.
     `delay` [s]: joint torques act so much later than recorded or commanded; auto, the delay that leaves least.
+    `stiction`: where a joint rests, friction is whatever holds it, so that its torque counts as unmeasured.
     """
 
     armature: bool = False
@@ -100,6 +101,7 @@ class ActuatorsConfig:
     stiffness: bool = False
     sign_width: PositiveOrAuto = None
     delay: NumberOrAuto = None
+    stiction: bool = False
 
     @property
     def known_delay(self) -> float:
@@ -295,7 +297,7 @@ def _check_extras(config: _Common) -> None:
     if config.preprocessing.zero_in_air and twice:
         found = "set together with preprocessing.zero_in_air, which subtracts the same"
         raise ConfigError.at_field(f"sensors.offsets.{twice[0]}", found, "one of the two")
-    unknowns = {f"actuators.{name}": x is True for name, x in vars(actuators).items()}
+    unknowns = {f"actuators.{name}": x is True for name, x in vars(actuators).items() if name != "stiction"}
     unknowns["actuators.stribeck"] = actuators.stribeck is not None
     unknowns |= {f"sensors.{name}": bool(getattr(sensors, name)) for name in ("offsets", "scales")}
     for field, is_set in unknowns.items():

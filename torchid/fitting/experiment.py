@@ -92,8 +92,10 @@ class Scene:
         scales = {str(channel): scope for channel, scope in sensors.scales.items()}
         actuators = vars(self.config.actuators)
         known = {name: None if actuators[name] == AUTO else actuators[name] for name in ("sign_width", "stribeck")}
-        known["delay"] = False  # logs are read with the delay
-        return ExtraTerms(offsets, scales, **actuators | known)
+        terms = {
+            name: x for name, x in actuators.items() if name not in ("delay", "stiction")
+        }  # logs are read with both
+        return ExtraTerms(offsets, scales, **terms | known)
 
     @property
     def declared(self) -> Declared:

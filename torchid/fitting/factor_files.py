@@ -317,10 +317,10 @@ def row_model(experiment: Experiment, builder: RowBuilder) -> RowModel:
     """What the rows of an experiment are formed with."""
     settings = vars(experiment.config.preprocessing)
     model = RowModel.of(experiment.robot, builder, {name: x for name, x in settings.items() if name not in _APART})
-    delay = experiment.config.actuators.known_delay
-    if not delay:  # a factor without stays what it was
-        return model
-    return replace(model, settings=model.settings | {"actuators.delay": delay})
+    actuators = experiment.config.actuators
+    known: dict[str, Value] = {"actuators.delay": actuators.known_delay, "actuators.stiction": actuators.stiction}
+    added: dict[str, Value] = {name: x for name, x in known.items() if x}  # a factor without stays what it was
+    return replace(model, settings=model.settings | added) if added else model
 
 
 @plain_dataclass(frozen=True)

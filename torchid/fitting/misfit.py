@@ -289,7 +289,8 @@ def resting_joints(
     """Share of the time that joints are at rest, of those that rest more than motion does, the most first.
 
     Of joints whose torque is measured and whose Coulomb friction is fitted with the sign of their velocity: one that
-    sticks has any friction up to that.
+    sticks has any friction up to that. Where torques of joints at rest count as unmeasured, it is the share of samples
+    in which they do.
 
     Args:
         problem: of the fit.
@@ -298,13 +299,19 @@ def resting_joints(
         logs: that were fitted.
     """
     count = sum(map(len, logs))
-    if builder.tree.sign_width is not None or not count or not robot.n:
+    taken = any(log.resting is not None for log in logs)
+    if (builder.tree.sign_width is not None and not taken) or not count or not robot.n:
         return {}
     step = max(1, count // _MOST_SAMPLES)
     thin = [log.every(step) for log in logs]
-    share = resting_share(np.concatenate([log.joint_velocity.cpu().numpy() for log in thin]))
-    directions = [log.joint_velocity if log.direction is None else log.direction for log in thin]
-    share[~np.any([x.cpu().numpy().any(axis=0) for x in directions], axis=0)] = 1.0  # by the noise of their velocity
+    flags = [log.resting.cpu().numpy() for log in thin if log.resting is not None]
+    if flags:
+        share = np.concatenate(flags).mean(axis=0)
+    else:
+        share = resting_share(np.concatenate([log.joint_velocity.cpu().numpy() for log in thin]))
+        directions = [log.joint_velocity if log.direction is None else log.direction for log in thin]
+        still = ~np.any([x.cpu().numpy().any(axis=0) for x in directions], axis=0)
+        share[still] = 1.0  # by the noise of their velocity
     is_free = problem.free.reshape(-1, PER_BODY)[1:, COULOMB]
     fitted = builder.sensors.torque[: robot.n] & (is_free @ (robot.joint_map[0] != 0.0))
     order = [joint for joint in np.argsort(-share, kind="stable").tolist() if fitted[joint] and share[joint] > OFTEN]

@@ -293,13 +293,15 @@ class Reweighting:
         """Square roots of the weights of rows (M, len(support) + 1)."""
         theta = self._parameters[samples.source][list(support)].to(rows)
         u = (rows[:, :-1] @ theta - rows[:, -1]) / self.scale
+        weights = self.loss.weight(u).sqrt()[:, None]
+        u = u if samples.resting is None else u[rows.any(1)]  # without those that a sample has not
         weight, slope = self.loss.weight(u), self.loss.slope(u)
         digits = u.abs().log10().clamp(*_DECADES)
         counts = torch.histc(digits, _BINS, *_DECADES).cpu().numpy()
         sums = [len(u), *(float(x.sum()) for x in (weight, (weight * u).square(), slope, slope.square()))]
         self._histogram += counts
         self._terms.append(sums)
-        return weight.sqrt()[:, None]
+        return weights
 
     def for_worker(self) -> Reweighting:
         """As `RowWeighting.for_worker`."""

@@ -391,7 +391,7 @@ def check_rest(log: Log) -> Iterator[Finding]:
         names = [log.joint_names[joint] for joint in order]
         named = join_names([f"{name} {100.0 * share[joint]:.0f} %" for name, joint in zip(names, order, strict=True)])
         text = f"much of the time: {named}; where a joint sticks, friction is anything below Coulomb's"
-        advice = "fit with actuators.sign_width: auto, or record joints that turn without pauses"
+        advice = "fit with actuators.stiction: true, or record joints that turn without pauses"
         yield Finding("rest", NOTE, "joint_position", text, advice, tuple(names))
 
 

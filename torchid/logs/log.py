@@ -131,6 +131,8 @@ class Log:
             filtered, where it is that sign. No part of a file.
         joint_stribeck: (N, n), what the filter makes of sign(v) exp(-(v / v_s)^2) of the joint velocities v with a
             Stribeck velocity v_s; None without one, and in a log that was not filtered. No part of a file.
+        joint_rests: (N, n), whether a joint is at rest or a filter's reach from it, where friction is any that holds it
+            (see `torchid.logs.rest`); None where `preprocess` was not asked for it. No part of a file.
         contact_share: (N, C), what the filter makes of a reading that is 1 while the contact is active and 0 else; None
             in a log that was not filtered, where it is `contact_active`. No part of a file.
         contact_unloaded: (N, C, 6), or (N, C, 7) with `contact_force_normal`, as recorded even in a filtered log: what
@@ -180,6 +182,7 @@ class Log:
     motion_noise: SignalNoise | None = None
     joint_stribeck: FloatArray | None = None
     noise_share: float | None = None
+    joint_rests: BoolArray | None = None
 
     __repr__ = short_repr
 
@@ -231,7 +234,7 @@ class Log:
     def select(self, index: slice | NDArray[np.intp] | BoolArray) -> Log:
         """The log of the chosen samples: a slice (no data is copied), sample numbers (M,) or a mask (N,)."""
         chosen: dict[str, Any] = {name: array[index] for name, array in self.arrays().items()}
-        for name in ("joint_direction", "joint_stribeck", "contact_share", "contact_unloaded"):
+        for name in ("joint_direction", "joint_stribeck", "joint_rests", "contact_share", "contact_unloaded"):
             if (array := getattr(self, name)) is not None:
                 chosen[name] = array[index]
         return dataclasses.replace(self, **chosen)

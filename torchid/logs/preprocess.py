@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from itertools import takewhile
 from typing import Any
 
 import numpy as np
 
 from torchid.errors import InputError, LogError, about_file
+from torchid.logs.dry_friction import channels_together, dry_friction
 from torchid.logs.gaps import Coverage, measure_coverage, require_no_turns, warn_of_gaps
 from torchid.logs.log import (
     CONTACT_READINGS,
@@ -23,7 +23,7 @@ from torchid.logs.log import (
     column_labels,
 )
 from torchid.logs.quaternion import angular_acceleration_base, angular_velocity_base, make_sign_continuous
-from torchid.logs.sign_filter import mean_dry, mean_stribeck, noisy_width, with_sign_filter
+from torchid.logs.sign_filter import with_sign_filter
 from torchid.logs.signal_noise import signal_noise, warn_of_noisy_accelerations
 from torchid.logs.timeline import JITTER, SampleRate, Timeline, lay_out_timeline, nearest_known
 from torchid.settings import AUTO
@@ -48,6 +48,7 @@ def preprocess(
     motion_noise: Mapping[str, float] | None = None,
     sign_width: float | None = None,
     stribeck: float | None = None,
+    finds_rest: bool = False,
 ) -> Log:
     """Fill in velocities and accelerations, after a zero-phase low-pass filter and before resampling, both optional.
 
@@ -81,6 +82,7 @@ def preprocess(
             for at once.
         stribeck: velocity over which friction at rest drops to Coulomb friction [rad/s or m/s]; None: there is no such
             friction.
+        finds_rest: whether joints at rest are to be marked, whose torques then count as unmeasured (`joint_rests`).
 
     Returns:
         The preprocessed log, which shares the memory of unchanged fields; `log` itself where nothing has to be done.
@@ -94,7 +96,8 @@ def preprocess(
             faster than the filter lets through, or accelerations are noise to a large part.
     """
     with about_file(log.source):
-        timeline = make_timeline(log.time, lacks_derivatives(log), cutoff_hz, sample_rate_hz, sign_width, stribeck)
+        dry = sign_width, stribeck, finds_rest
+        timeline = make_timeline(log.time, lacks_derivatives(log), cutoff_hz, sample_rate_hz, *dry)
     noise = log.motion_noise or signal_noise(log, timeline, motion_noise)
     if timeline is None:
         return replace(log, motion_noise=noise) if noise.found else log
@@ -116,12 +119,13 @@ def make_timeline(
     sample_rate_hz: SampleRate,
     sign_width: float | None = None,
     stribeck: float | None = None,
+    finds_rest: bool = False,
 ) -> Timeline | None:
     """The timeline of `preprocess`; None where nothing has to be done. Raises and warns as `lay_out_timeline`."""
-    if cutoff_hz is None and sample_rate_hz in (None, AUTO) and not differentiates:
+    if cutoff_hz is None and sample_rate_hz in (None, AUTO) and not (differentiates or finds_rest):
         return None
     timeline = lay_out_timeline(time, cutoff_hz, sample_rate_hz, differentiates)
-    return replace(timeline, sign_width=sign_width, stribeck=stribeck)
+    return replace(timeline, sign_width=sign_width, stribeck=stribeck, finds_rest=finds_rest)
 
 
 def gapless_fields(log: Log, timeline: Timeline) -> list[str]:
@@ -204,51 +208,7 @@ def _motion(log: Log, timeline: Timeline) -> dict[str, FloatArray]:
             is_turned = names[0] == "base_quat_xyzw"
             out |= _orientation(log, derivatives, timeline) if is_turned else dict(zip(names, derivatives, strict=True))
         joints |= {names[0]: x for names, x in zip(same, smoothed, strict=True) if names[0] in DERIVATIVE_CHAINS[0]}
-    return out | _dry_friction(log, joints, timeline)
-
-
-def _dry_friction(log: Log, smoothed: Mapping[str, FloatArray], timeline: Timeline) -> dict[str, FloatArray]:
-    """`joint_direction` and, with a Stribeck velocity, `joint_stribeck`, (K, n); none where nothing is filtered.
-
-    The filter smears its torque as all others; velocities with reversals that it would take off are filtered less.
-
-    Args:
-        log: the log.
-        smoothed: its joint positions and, if it has them, velocities.
-        timeline: with the width of the sign (`noisy_width`).
-    """
-    if log.joint_direction is not None:
-        given = {"joint_direction": log.joint_direction, "joint_stribeck": log.joint_stribeck}
-        return {key: timeline.evaluate(timeline.smooth(x), (0,))[0] for key, x in given.items() if x is not None}
-    if timeline.low_pass is None:
-        return {}
-    name = "joint_position" if log.joint_velocity is None else "joint_velocity"
-    known, wider = smoothed[name], timeline.sign_low_pass
-    if wider is not None:
-        known = replace(timeline, low_pass=wider).smooth(getattr(log, name))
-    steps, means = np.diff(timeline.grid), dict[str, Callable[..., FloatArray]](joint_direction=mean_dry)
-    if timeline.stribeck is not None:
-        means["joint_stribeck"] = partial(mean_stribeck, stribeck=timeline.stribeck)
-    out = {key: np.empty((len(timeline.output_stamps), known.shape[1])) for key in means}
-    together = _channels_together(len(known))
-    for start in range(0, known.shape[1], together):
-        columns = slice(start, start + together)
-        width, x = noisy_width(timeline, columns), known[:, columns]
-        halfway = np.diff(x, axis=0) / steps[:, None] if name == "joint_position" else 0.5 * (x[1:] + x[:-1])
-        before, after = np.concatenate([halfway[:1], halfway]), np.concatenate([halfway, halfway[-1:]])
-        for key, mean in means.items():
-            filtered = timeline.low_pass(mean(before, after, width=width))
-            out[key][:, columns] = timeline.evaluate(filtered, (0,))[0]
-    return out
-
-
-def dry_friction(log: Log, timeline: Timeline) -> Callable[[float | None, float | None], dict[str, FloatArray]]:
-    """`joint_direction` and `joint_stribeck` of the preprocessed log by `sign_width` and `stribeck` of `preprocess`."""
-    name = "joint_position" if log.joint_velocity is None else "joint_velocity"
-    signs = timeline if timeline.sign_low_pass is None else replace(timeline, low_pass=timeline.sign_low_pass)
-    smoothed = {name: signs.smooth(getattr(log, name))}
-    own = replace(timeline, sign_low_pass=None)
-    return lambda width, stribeck: _dry_friction(log, smoothed, replace(own, sign_width=width, stribeck=stribeck))
+    return out | dry_friction(log, joints, timeline)
 
 
 def _continuous(log: Log, name: str) -> FloatArray:
@@ -274,15 +234,6 @@ def _orientation(log: Log, derivatives: list[FloatArray], timeline: Timeline) ->
 
 # -------------------------------------------------------------------------------------------- fields that may have gaps
 
-#: Values that are filtered together: few, so that copies of a long log are small; many, so that a short one needs few
-#: calls.
-_VALUES_TOGETHER = 2**14
-
-
-def _channels_together(count: int) -> int:
-    """How many channels of so many samples are filtered by one call."""
-    return max(1, _VALUES_TOGETHER // max(count, 1))
-
 
 def _resample_measured(log: Log, name: str, timeline: Timeline, coverage: Coverage | None) -> FloatArray:
     """The field `name` (N, ...) at the output's stamps (K, ...), filtered like all others.
@@ -303,7 +254,7 @@ def _resample_measured(log: Log, name: str, timeline: Timeline, coverage: Covera
     flags = log.contact_active if name in CONTACT_READINGS else None
     complete = np.argwhere(coverage.complete)
     out = np.full((len(timeline.output_stamps), *values.shape[1:]), np.nan)
-    together = _channels_together(len(values))
+    together = channels_together(len(values))
     for start in range(0, len(complete), together):
         columns = (slice(None), *complete[start : start + together].T)
         clean = values[columns]

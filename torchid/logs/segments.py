@@ -20,7 +20,7 @@ from torchid.logs.preprocess import (
     move_to_timeline,
     unloaded_readings,
 )
-from torchid.logs.sign_filter import with_sign_filter
+from torchid.logs.sign_filter import with_sign_filter, with_signs_of
 from torchid.logs.signal_noise import signal_noise, warn_of_noisy_accelerations
 from torchid.logs.timeline import FEWEST_DIFFERENTIATED, LONGEST_STEP, SampleRate, Timeline, spline_derivatives
 
@@ -32,6 +32,7 @@ def preprocess_segments(
     sample_rate_hz: SampleRate,
     sign_width: float | None = None,
     stribeck: float | None = None,
+    finds_rest: bool = False,
 ) -> tuple[Log, int]:
     """As `preprocess`, of segments of a log without what is between them.
 
@@ -42,6 +43,7 @@ def preprocess_segments(
         sample_rate_hz: likewise.
         sign_width: likewise.
         stribeck: likewise.
+        finds_rest: likewise.
 
     Returns:
         One log of all segments, and how many samples were in segments too short for the filter or for derivatives.
@@ -52,8 +54,9 @@ def preprocess_segments(
     Warns:
         TorchidWarning: as `preprocess`.
     """
+    rates = cutoff_hz, sample_rate_hz, sign_width, stribeck, finds_rest
     with about_file(log.source):
-        whole = make_timeline(log.time, lacks_derivatives(log), cutoff_hz, sample_rate_hz, sign_width, stribeck)
+        whole = make_timeline(log.time, lacks_derivatives(log), *rates)
         if whole is None:
             return _joined([log.select(segment) for segment in segments]), 0
         usable = long_segments(log.time, segments, whole)
@@ -69,10 +72,10 @@ def preprocess_segments(
     for segment in usable:
         part = log.select(segment)
         with about_file(log.source):
-            timeline = make_timeline(part.time, True, cutoff_hz, sample_rate_hz, sign_width, stribeck)
+            timeline = make_timeline(part.time, True, *rates)
         if timeline is None:
             raise ValueError("nothing to derive")
-        timeline = dataclasses.replace(timeline, sign_low_pass=whole.sign_low_pass, sign_noise=whole.sign_noise)
+        timeline = with_signs_of(timeline, whole)
         parts.append(move_to_timeline(part, timeline, coverage))
         if segment is longest_of:
             with about_file(log.source):

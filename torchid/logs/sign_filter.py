@@ -39,6 +39,9 @@ def with_sign_filter(
 ) -> Timeline:
     """A timeline of a log, or of one whose start this is, with the filter of `wider_low_pass` and the noise behind it.
 
+    Where joints at rest are to be found, with the velocity that they have at most: a tenth of the root mean square, as
+    in `resting_share`, or three standard deviations of noise.
+
     A joint that moves less than the noise of its velocity all the time has noise without bound: nobody knows its sign.
     Positions tell, further apart the noisier they are, as the mean velocity between two has noise of their own then.
 
@@ -60,16 +63,27 @@ def with_sign_filter(
         step = float(np.median(np.diff(log.time)))
         derivatives = noise_of_derivatives(step, replace(timeline, low_pass=wider.low_pass))
     name, order = ("joint_position", 1) if log.joint_velocity is None else ("joint_velocity", 0)
-    std = noise.std.get(name)
-    if std is None or not std.any() or timeline.cutoff_hz is None:
+    std, none = noise.std.get(name), np.zeros(len(log.joint_names))
+    is_noisy = std is not None and bool(std.any()) and timeline.cutoff_hz is not None
+    if not (is_noisy or timeline.finds_rest):
         return timeline
-    of_sign, of_position = std * np.sqrt(derivatives[order, order]), noise.std["joint_position"]
-    step, noisy = float(np.median(np.diff(log.time))), of_sign > 0.0
-    lag = max(1, round(np.sqrt(2.0) * float(np.median(of_position[noisy] / of_sign[noisy])) / step))
+    of_sign = (none if std is None else std) * np.sqrt(derivatives[order, order])
+    of_position, step, noisy = noise.std.get("joint_position", none), float(np.median(np.diff(log.time))), of_sign > 0.0
+    ratio = float(np.median(of_position[noisy] / of_sign[noisy])) if noisy.any() else 0.0
+    lag = max(1, round(np.sqrt(2.0) * ratio / step))
     square = mean_square_velocity([(log.time, log.joint_position)] if parts is None else parts, lag)
     expected = (1.0 - _UNKNOWN) * 2.0 * np.square(of_position / (lag * step))  # of the positions' noise, at least
     still = noisy & (square < np.square(of_sign) + expected)
-    return replace(timeline, sign_noise=np.where(still, np.inf, of_sign))
+    if timeline.finds_rest:
+        slow = np.maximum(_SLOW * np.sqrt(np.where(np.isfinite(square), square, 0.0)), _SURELY * of_sign)
+        timeline = replace(timeline, rest_speed=np.where(still, np.inf, slow))
+    return replace(timeline, sign_noise=np.where(still, np.inf, of_sign)) if is_noisy else timeline
+
+
+def with_signs_of(timeline: Timeline, whole: Timeline) -> Timeline:
+    """The timeline of a segment with what `with_sign_filter` has found of the whole log."""
+    found = {name: getattr(whole, name) for name in ("sign_low_pass", "sign_noise", "rest_speed")}
+    return replace(timeline, **found)
 
 
 def mean_square_velocity(parts: Iterable[tuple[FloatArray, FloatArray]], lag: int) -> FloatArray:

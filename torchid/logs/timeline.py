@@ -99,6 +99,8 @@ class Timeline:
         sign_low_pass: wider filter of the velocities that this sign is of, None for `low_pass`.
         sign_noise: (n,), of these velocities behind their filter [rad/s or m/s], infinite of joints that move less than
             that; None for none.
+        finds_rest: whether joints at rest are found.
+        rest_speed: (n,), of joints at rest at most [rad/s or m/s], see `torchid.logs.rest`; None without these.
     """
 
     native: FloatArray
@@ -113,6 +115,8 @@ class Timeline:
     stribeck: float | None = None
     sign_low_pass: LowPass | None = None
     sign_noise: FloatArray | None = None
+    finds_rest: bool = False
+    rest_speed: FloatArray | None = None
 
     @property
     def output_stamps(self) -> FloatArray:
@@ -182,16 +186,17 @@ class Timeline:
         last = np.searchsorted(self.native, self.output_stamps + slack, side="right") - 1
         return values[np.maximum(last, 0)]
 
-    def widen_flags(self, flags: BoolArray) -> BoolArray:
+    def widen_flags(self, flags: BoolArray, of_grid: bool = False) -> BoolArray:
         """Flags (N, ...) at the output's stamps (K, ...): true where they are within `reach` of the stamp.
 
-        A flag holds until the next sample.
+        A flag holds until the next sample. `of_grid`: flags (M, ...) at the stamps of the grid.
         """
         if self.keeps_stamps and not self.reach:
             return flags[self.kept]
-        slack = JITTER * float(np.median(np.diff(self.native)))  # a stamp may round to just before its sample
+        stamps = self.grid if of_grid else self.native
+        slack = JITTER * float(np.median(np.diff(stamps)))  # a stamp may round to just before its sample
         first, last = (
-            np.searchsorted(self.native, self.output_stamps + slack + reach, side="right") - 1
+            np.searchsorted(stamps, self.output_stamps + slack + reach, side="right") - 1
             for reach in (-self.reach, self.reach)
         )
         count = np.concatenate([np.zeros((1, *flags.shape[1:]), dtype=np.intp), np.cumsum(flags, axis=0)])

@@ -3,14 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from torchid.problem.chunk_dynamics import Workspace
-from torchid.problem.rows import BlockRows
+from torchid.problem.row_blocks import RowBlock
 from torchid.problem.samples import Samples
+
+
+@dataclass(frozen=True)
+class BlockRows:
+    """Rows of a block at B samples.
+
+    `stacked`: (columns + 1, columns + 1 + r B), the rows by column, the right-hand side last, after room for a factor;
+    `values`: (columns + 1, r, B), the rows in it. `absent`: (r, B) bool, rows of zeros, which a sample has not, as one
+    torque more is unmeasured there; None if all are there.
+    """
+
+    block: RowBlock
+    stacked: Tensor
+    values: Tensor
+    absent: Tensor | None
+
+    @classmethod
+    def empty(
+        cls, block: RowBlock, rows: int, like: Tensor, workspace: Workspace, absent: Tensor | None = None
+    ) -> BlockRows:
+        """Memory for so many rows at each of the samples of a tensor (..., B)."""
+        width, samples = len(block.support) + 1, like.shape[-1]
+        stacked = workspace.empty("rows", like, width, width + rows * samples)
+        return cls(block, stacked, stacked[:, width:].unflatten(1, (rows, samples)), absent)
 
 
 def lay_out_folds(

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchid.regressor.kinematics import BodyStates, JointMotion
 
@@ -59,6 +59,7 @@ class ChunkKinematics:
         recorded_normals: whether each of these has normals of its own.
         ground_axes: (3, 3, B) in base axes by contact that is read along the ground's normal, see
             `torchid.regressor.regressor.ground_axes`.
+        resting: (n, B) bool, joints whose torque counts as unmeasured, see `Samples`; None for none.
     """
 
     joints: JointMotion
@@ -68,6 +69,14 @@ class ChunkKinematics:
     arms: Mapping[int, Tensor]
     recorded_normals: bool
     ground_axes: Mapping[int, Tensor]
+    resting: Tensor | None
+
+    def without_rest(self, forces: Tensor, base_rows: int, value: float = math.nan) -> Tensor:
+        """Generalized forces (M, B, n_rows) with a value in the rows of joints at rest."""
+        if self.resting is None:
+            return forces
+        at = nn.functional.pad(self.resting.T, (base_rows, forces.shape[2] - base_rows - len(self.resting)))
+        return forces.masked_fill(at, value)
 
     def every(self, step: int) -> ChunkKinematics:
         """The kinematics of every `step`-th sample from the first on, views."""
@@ -79,6 +88,7 @@ class ChunkKinematics:
             {contact: arm[..., ::step] for contact, arm in self.arms.items()},
             self.recorded_normals,
             {contact: axes[..., ::step] for contact, axes in self.ground_axes.items()},
+            None if self.resting is None else self.resting[..., ::step],
         )
 
 
@@ -109,5 +119,6 @@ class ChunkDynamics(ChunkKinematics):
             {contact: pick(arms) for contact, arms in self.arms.items()},
             self.recorded_normals,
             {contact: pick(axes) for contact, axes in self.ground_axes.items()},
+            None if self.resting is None else pick(self.resting),
             pick(self.wrenches),
         )

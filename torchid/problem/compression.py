@@ -9,6 +9,7 @@ from itertools import chain
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from torchid import ranks
 from torchid.problem.blocks import block_spans, blocks_in, cut_logs, lay_out_folds, rows_of_samples, span_of_samples
@@ -204,7 +205,7 @@ def _compress_chunks(
                 in_the_air.masked.add(channel.offset)
             else:
                 in_the_air.factor.add(*channel.row(builder), samples.oversampling)
-    parts.finish()
+    parts.close()
     builder.workspaces.give_back(workspace)
     return list(parts.parts.values())
 
@@ -216,6 +217,7 @@ class _Parts:
         self.parts: dict[PartKey, Part] = {}
         self._builder, self._by_log = builder, by_log
         self._compressors: dict[PartKey, RowCompressor] = {}
+        self._absent: dict[tuple[PartKey, float], Tensor] = {}  # rows of zeros by oversampling, on the device
 
     def part(self, samples: Samples, state: ContactState, block: int, unloaded: bool = False) -> Part:
         key = (samples.source, state, samples.fold, block, unloaded) if self._by_log else _key(None, state)
@@ -242,6 +244,16 @@ class _Parts:
             for compressor, (part, start, end) in zip(compressors, spans, strict=True):
                 own = rows_of_samples(rows, *span_of_samples(index, start, end), workspace)
                 compressor.add(part.factor, support, own, samples.oversampling)
+                if rows.absent is not None:
+                    key, first, last = (part.key, samples.oversampling), *span_of_samples(index, start, end)
+                    self._absent[key] = self._absent.get(key, 0) + rows.absent[:, first:last].sum()
+
+    def close(self) -> None:
+        """Bring the factors, and their numbers of rows, up to date, for which the host waits for a GPU."""
+        self.finish()
+        for (key, oversampling), absent in self._absent.items():
+            self.parts[key].factor.count(-int(absent), oversampling)
+        self._absent.clear()
 
     def finish(self) -> None:
         """Bring the factors up to date."""

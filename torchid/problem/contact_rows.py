@@ -14,6 +14,7 @@ from torchid.problem.row_blocks import turn_rows
 from torchid.problem.wrench_rows import wrenches_at_ground
 from torchid.regressor.regressor import generalized_forces
 from torchid.regressor.tree import KinematicTree
+from torchid.rounding import KINEMATIC_TOLERANCE, relative_tolerance
 from torchid.sensing.limbs import limb_null_space
 from torchid.sensing.projection import any_suspect, null_space, whitened_null_space
 
@@ -100,7 +101,12 @@ def orthonormal_bases(
 
 
 def whitened_bases(
-    layout: ContactStateLayout, rows: ContactRows, measured: Tensor, axes: Tensor | None, order: Tensor
+    layout: ContactStateLayout,
+    rows: ContactRows,
+    measured: Tensor,
+    axes: Tensor | None,
+    order: Tensor,
+    resting: Tensor | None = None,
 ) -> Iterator[tuple[Tensor | slice, Tensor]]:
     """Bases W of the null spaces of the unmeasured rows under which the projected noise is white, grouped by rank.
 
@@ -110,10 +116,63 @@ def whitened_bases(
         measured: (k, m, B), those that are measured.
         axes: (B, 3, 3) or None, as of `whitened_null_space`.
         order: (m,), as of `whitened_null_space`.
+        resting: (joints, B), coupled joints whose torque is unmeasured at a sample; None for none.
 
     Yields:
-        (index of the samples, W): W is (m, r, B'), turned where the layout says so.
+        (index of the samples, W): W is (m, r, B'), turned where the layout says so, with a column of zeros for each row
+        that a sample loses by `resting`.
     """
+    if resting is None:
+        yield from _measured_bases(layout, rows, measured, axes, order)
+        return
+    base, alone = rows.width - len(resting), not rows.unmeasured
+    if alone:  # W is triangular, and stays so: noise of contacts then links no resting joint to others
+        measured = torch.cat([measured[:, :base], measured[:, base:].masked_fill(resting, 0.0)], dim=1)
+    for index, W in _measured_bases(layout, rows, measured, axes, order):
+        own = resting[:, index]
+        if alone:
+            W[base:].masked_fill_(own[:, None], 0.0)
+        else:
+            leave_out_torques(W, own, layout.row_std)
+            if layout.blocks.are_turned:
+                turn_rows(W)
+        yield index, W
+
+
+def leave_out_torques(W: Tensor, resting: Tensor, row_std: Tensor | None = None) -> None:
+    """Make rows of bases zero in place, of joints whose torque is one more unmeasured force.
+
+    What is left of the span of W is orthogonal to `W^T e_j` of each such joint j. A reflection from the right, which
+    keeps the noise white, turns that direction into the first column that is not zero yet, which then becomes zero:
+    shapes are the same for all samples, whatever rests. Where `W^T e_j` is rounding, no row had a torque of j.
+
+    Args:
+        W: (base rows + joints, r, B).
+        resting: (joints, B) bool.
+        row_std: (base rows + joints,), noise that W is divided by; None for 1.
+    """
+    base, columns = len(W) - len(resting), torch.arange(W.shape[1], device=W.device)[:, None]
+    least = relative_tolerance(KINEMATIC_TOLERANCE, W.shape[:2], torch.finfo(W.dtype).eps)
+    left_out = resting.new_zeros(resting.shape[1], dtype=torch.int64)
+    for joint, rests in enumerate(resting, start=base):
+        if W.device.type == "cpu" and not rests.any():
+            continue
+        size = torch.linalg.vector_norm(W[joint], dim=0)
+        rests = rests & (size > (least if row_std is None else least / row_std[joint]))
+        v = W[joint] * rests
+        target = (columns == left_out) & rests
+        v += target * torch.copysign(size, v)
+        length = (v * v).sum(0)
+        W.addcmul_((W * v).sum(1, keepdim=True), v * torch.where(length > 0.0, 2.0 / length, 0.0), value=-1)
+        W.masked_fill_(target, 0.0)
+        left_out += rests
+    W[base:].masked_fill_(resting[:, None], 0.0)
+
+
+def _measured_bases(
+    layout: ContactStateLayout, rows: ContactRows, measured: Tensor, axes: Tensor | None, order: Tensor
+) -> Iterator[tuple[Tensor | slice, Tensor]]:
+    """As `whitened_bases`, of joints whose torque is measured at every sample."""
     if not layout.has_own_limbs:
         yield from _general_bases(layout, rows, slice(None), measured, axes, order)
         return

@@ -345,9 +345,9 @@ class TriangularFactor:
         return total
 
     def count(self, rows: int, oversampling: float = 1.0) -> None:
-        """Count rows that `absorb` is given something for."""
+        """Count rows that `absorb` is given something for; a negative number takes rows of zeros back."""
         self.rows += rows
-        self.independent_rows += rows / oversampling
+        self.independent_rows = self.independent_rows + rows / oversampling if self.rows else 0.0
 
     @torch.no_grad()
     def absorb(self, support: tuple[int, ...], rows: Tensor) -> None:

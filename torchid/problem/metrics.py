@@ -221,6 +221,7 @@ class Evaluation:
                 forces = measured_and_predicted_forces(builder, samples, state, columns[samples.fold], kinematics)
                 sums[0].add_contact_forces(forces.measured[:, joints], forces.torque[:, joints])
                 errors = torch.cat([-forces.measured[None], forces.predicted - forces.measured])
+                errors = kinematics.without_rest(errors, base)
                 for total, error in zip(sums, builder.motors.of(builder.tree, kinematics, errors), strict=True):
                     total.rows.add(error)
                 vectors = torch.cat([forces.torque[None], forces.predicted - forces.torque])

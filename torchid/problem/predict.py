@@ -16,6 +16,7 @@ from torchid.logs.lazy_arrays import Spill
 from torchid.parameters import Array
 from torchid.problem.chunk_dynamics import ChunkDynamics, ChunkKinematics
 from torchid.problem.chunks import chunks_by_state, one_thread
+from torchid.problem.contact_rows import leave_out_torques
 from torchid.problem.contact_state import ContactState
 from torchid.problem.extras import ACTUATORS, Extra, contact_extra_column, dof_extra_column
 from torchid.problem.rows import RowBuilder
@@ -242,18 +243,24 @@ def null_space_components(
 ) -> Iterator[Tensor]:
     """V_x^T of generalized forces (M, B, n_rows), V_x the contacts' null space, in groups of one rank, (M, B', r).
 
-    Joints away from contacts pass unchanged.
+    Joints away from contacts pass unchanged. NaN in place of what joints at rest leave unknown.
     """
     layout, base = builder.layout(state), builder.tree.base_rows
     coupled = [*range(base), *(base + joint for joint in layout.coupled_joints)]
     uncoupled = [base + joint for joint in layout.uncoupled_joints]
+    resting = builder.coupled_at_rest(layout, kinematics)
+    alone = kinematics.without_rest(vectors, base)[..., uncoupled]
+    vectors = kinematics.without_rest(vectors, base, 0.0)
     for index, V in builder.null_space_bases(state, kinematics):
-        forces = vectors[:, index]
-        by_sample = (
-            forces[..., coupled].permute(1, 2, 0).contiguous()
-        )  # of other layouts products take ten times as long
+        if resting is not None:
+            V = V.clone()
+            leave_out_torques(V.permute(1, 2, 0), resting[:, index])
+        # contiguous, as products of other layouts take ten times as long
+        by_sample = vectors[:, index][..., coupled].permute(1, 2, 0).contiguous()
         inside = (V.mT.contiguous() @ by_sample).permute(2, 0, 1)
-        yield torch.cat([inside, forces[..., uncoupled]], dim=2)
+        if resting is not None:
+            inside = inside.masked_fill(~V.any(1), torch.nan)
+        yield torch.cat([inside, alone[:, index]], dim=2)
 
 
 def at_motors(builder: RowBuilder, samples: Samples, forces: Array) -> Array:

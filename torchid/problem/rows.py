@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from torchid.parameters import Array
 from torchid.problem.base_motion import levelled_base_axes
+from torchid.problem.blocks import BlockRows
 from torchid.problem.chunk_dynamics import ChunkDynamics, ChunkKinematics, Workspace, Workspaces
 from torchid.problem.contact_rows import ContactRows, contact_rows, orthonormal_bases, whitened_bases
 from torchid.problem.contact_state import ContactState, ContactStateLayout, ContactStateLayouts, RowColumns
@@ -29,26 +30,6 @@ from torchid.regressor.regressor import (
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
-
-
-@dataclass(frozen=True)
-class BlockRows:
-    """Rows of a block at B samples.
-
-    `stacked`: (columns + 1, columns + 1 + r B), the rows by column, the right-hand side last, after room for a factor;
-    `values`: (columns + 1, r, B), the rows in it.
-    """
-
-    block: RowBlock
-    stacked: Tensor
-    values: Tensor
-
-    @classmethod
-    def empty(cls, block: RowBlock, rows: int, like: Tensor, workspace: Workspace) -> BlockRows:
-        """Memory for so many rows at each of the samples of a tensor (..., B)."""
-        width, samples = len(block.support) + 1, like.shape[-1]
-        stacked = workspace.empty("rows", like, width, width + rows * samples)
-        return cls(block, stacked, stacked[:, width:].unflatten(1, (rows, samples)))
 
 
 @dataclass(frozen=True)
@@ -133,7 +114,8 @@ class RowBuilder(nn.Module):
         states, rotation = body_states(self.tree, motion, joints), samples.base.rotation
         arms, along = self._layouts.ground(states, samples.contact_normal, rotation)
         screw_axes, recorded_normals = joint_screw_axes(self.tree, states), samples.contact_normal is not None
-        return ChunkKinematics(joints, states, screw_axes, rotation, arms, recorded_normals, along)
+        resting = None if samples.resting is None else samples.resting.T
+        return ChunkKinematics(joints, states, screw_axes, rotation, arms, recorded_normals, along, resting)
 
     def dynamics(self, samples: Samples, workspace: Workspace | None = None) -> ChunkDynamics:
         """Dynamics of some samples; with a workspace, valid until the next call with the same."""
@@ -198,7 +180,7 @@ class RowBuilder(nn.Module):
             W[sample, dofs[:, None], torch.arange(basis.shape[1], device=self.device)] = basis.permute(2, 0, 1)
         for slot, (joint, part) in enumerate(self._uncoupled_rows(samples, layout, dynamics, workspace), start=coupled):
             rows[:, slot, self.tree.index([*part.block.support, self.width])] = part.values[:, 0].T
-            W[:, base + joint, slot] = 1.0 / self._layouts.dof_std[joint]
+            W[:, base + joint, slot] = self._uncoupled_weight(joint, dynamics)
         return rows, W
 
     def null_space_bases(
@@ -214,11 +196,20 @@ class RowBuilder(nn.Module):
         return contact_rows(self.tree, layout, kinematics, self._layouts.frame_origin)
 
     def whitened_bases(
-        self, layout: ContactStateLayout, rows: ContactRows, measured: Tensor, rotation_world_base: Tensor | None
+        self, layout: ContactStateLayout, rows: ContactRows, measured: Tensor, kinematics: ChunkKinematics
     ) -> Iterator[tuple[Tensor | slice, Tensor]]:
         """W, (base rows + coupled joints, r, B'), of contact rows with the samples it belongs to, grouped by rank."""
-        axes = self.noise_axes(rotation_world_base) if self.sensors.noise.base_axes_differ else None
-        return whitened_bases(layout, rows, measured, axes, self.tree.index(layout.blocks.order))
+        rotation, resting = kinematics.rotation_world_base, self.coupled_at_rest(layout, kinematics)
+        axes = self.noise_axes(rotation) if self.sensors.noise.base_axes_differ else None
+        return whitened_bases(layout, rows, measured, axes, self.tree.index(layout.blocks.order), resting)
+
+    def coupled_at_rest(self, layout: ContactStateLayout, kinematics: ChunkKinematics) -> Tensor | None:
+        """Which coupled joints and readings in limbs have torques that count as unmeasured, (k, B); None for none."""
+        resting = kinematics.resting
+        if resting is None or not layout.coupled_joints:
+            return None
+        in_limbs = resting.new_zeros(self.tree.n_dofs - len(resting), resting.shape[1])
+        return torch.cat([resting, in_limbs])[self.tree.index(layout.coupled_joints)]
 
     def contact_jacobian(self, samples: Samples) -> Tensor:
         """Jacobians of all contacts along their frames' axes, active or not, (B, C, 6, n_rows).
@@ -289,9 +280,10 @@ class RowBuilder(nn.Module):
         """Uncoupled joints, and the row of each."""
         torque = self._torque_of_bodies(samples)
         for joint, block in layout.uncoupled_joints.items():
-            weight = 1.0 / self._layouts.dof_std[joint]
-            W = torque.new_full((1, 1, len(samples)), weight)
-            rows = BlockRows.empty(block, 1, W, workspace)
+            weight = self._uncoupled_weight(joint, dynamics)
+            W = weight[None, None]
+            absent = None if dynamics.resting is None else W[0] == 0.0
+            rows = BlockRows.empty(block, 1, W, workspace, absent)
             torch.mul(torque[:, joint], weight, out=rows.values[-1, 0])
             self._project(None, W, dynamics, rows, workspace)
             subtract_payload(block, rows.values, samples.payload, self.columns.parameter_map)
@@ -299,6 +291,12 @@ class RowBuilder(nn.Module):
                 extra = self.extras[column - self.columns.count]
                 torch.mul(dof_extra_column(extra, joint, samples, self.tree), weight, out=rows.values[number, 0])
             yield joint, rows
+
+    def _uncoupled_weight(self, joint: int, dynamics: ChunkDynamics) -> Tensor:
+        """W of an uncoupled joint, (B,) [1 / N m]."""
+        screw_axes, resting = dynamics.screw_axes, dynamics.resting
+        weight = screw_axes.new_full(screw_axes.shape[-1:], 1.0 / self._layouts.dof_std[joint])
+        return weight if resting is None or joint >= len(resting) else weight.masked_fill_(resting[joint], 0.0)
 
     def _coupled_rows(
         self, samples: Samples, layout: ContactStateLayout, dynamics: ChunkDynamics, workspace: Workspace
@@ -312,7 +310,7 @@ class RowBuilder(nn.Module):
         f = nn.functional.pad(torque, (self.tree.base_rows, 0))
         if len(layout.wrench_std):
             f = f + (measured.permute(2, 1, 0) @ self._measured_wrench(samples, layout, dynamics)[..., None])[..., 0]
-        for index, W in self.whitened_bases(layout, rows, measured, dynamics.rotation_world_base):
+        for index, W in self.whitened_bases(layout, rows, measured, dynamics):
             own = measured[..., index].permute(2, 0, 1)
             part = _Part(samples[index], f[index].T, own, dynamics.select(index))
             yield index, W, self._projected_blocks(W, part, layout, workspace)
@@ -321,9 +319,10 @@ class RowBuilder(nn.Module):
         self, W: Tensor, part: _Part, layout: ContactStateLayout, workspace: Workspace
     ) -> Iterator[BlockRows]:
         base = self.tree.base_rows
+        absent = None if part.dynamics.resting is None else ~W.any(0)
         for block in layout.blocks.of_rank(W.shape[1]):
             own = W[:, block.rows]
-            rows = BlockRows.empty(block, own.shape[1], W, workspace)
+            rows = BlockRows.empty(block, own.shape[1], W, workspace, None if absent is None else absent[block.rows])
             torch.sum(own * part.f[:, None], dim=0, out=rows.values[-1])
             self._project(own[:base] if base else None, own[base:], part.dynamics, rows, workspace)
             subtract_payload(block, rows.values, part.samples.payload, self.columns.parameter_map)

@@ -50,10 +50,8 @@ class Samples:
         active: (N, C) bool.
         oversampling: samples per independent sample of the sensors' noise, above 1 in a filtered log: half the sample
             rate over the noise bandwidth of the filter.
-        noise_share: of the variance of that noise, which a filter has left; None for 1 / `oversampling`, which it is
-            unless samples were dropped after the filter.
-        contact_normal: (N, C, 3), unit vectors in the world that point away from the ground; None for those that the
-            contacts state.
+        noise_share: of that noise's variance, which is left; None for 1 / `oversampling`: no samples dropped since.
+        contact_normal: (N, C, 3), unit vectors in the world away from the ground; None for those of the contacts.
         share: (N, C), of a constant contact reading that the filter leaves, as `Log.contact_share`; None for `active`.
         unloaded: (N, C, 6), readings of contact sensors while the contact is in the air, NaN elsewhere, as
             `Log.contact_unloaded`, on the CPU; None without such readings.
@@ -66,6 +64,7 @@ class Samples:
         motion_noise: noise of the motion, None without any.
         pages: of files that the tensors are mapped to; None for those in memory.
         payload: (12 L,), what the robot carried beside its own parameters, see `payload_parameters`; None for nothing.
+        resting: (N, n) bool, joints whose torque counts as unmeasured, as they rest (`Log.joint_rests`); None for none.
         delayed_torque: (N, D, n), joint torques of D delays, in a search for the best; None otherwise.
     """
 
@@ -95,6 +94,7 @@ class Samples:
     noise_share: float | None = None
     stribeck: Tensor | None = None
     blocks: Tensor | None = None
+    resting: Tensor | None = None
 
     __repr__ = short_repr
 
@@ -259,6 +259,7 @@ def bind_log(log: Log, robot: Robot, contacts: Sequence[Contact], required: Sens
         stribeck=None if log.joint_stribeck is None else torch.from_numpy(columns_in_order(log.joint_stribeck, order)),
         motion_noise=bind_motion_noise(log, order, robot.fixed_base, imu),
         noise_share=log.noise_share,
+        resting=None if log.joint_rests is None else torch.from_numpy(columns_in_order(log.joint_rests, order)),
     )
     if required is not None:
         log_joints.require_limb_sensors(log, robot, required)

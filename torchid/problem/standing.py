@@ -76,6 +76,7 @@ def preprocess_standing(
     sample_rate_hz: SampleRate,
     sign_width: float | None = None,
     stribeck: float | None = None,
+    finds_rest: bool = False,
 ) -> Log:
     """As `preprocess`, with the motion of the base from the feet that stand; samples with too few of them are left out.
 
@@ -87,6 +88,7 @@ def preprocess_standing(
         sample_rate_hz: likewise.
         sign_width: likewise.
         stribeck: likewise.
+        finds_rest: likewise.
 
     Raises:
         InputError: as `stand_on_feet` and `preprocess`, or no segment is long enough for the filter.
@@ -95,7 +97,7 @@ def preprocess_standing(
         TorchidWarning: as `preprocess`; number of samples left out, with the reasons; feet that are not on one floor.
     """
     standing = stand_on_feet(log, robot, contacts)
-    dry = sign_width, stribeck
+    dry = sign_width, stribeck, finds_rest
     out, too_short = preprocess_segments(standing.log, standing.segments, cutoff_hz, sample_rate_hz, *dry)
     warn_of_standing(log.source, len(log), standing, too_short)
     return out
