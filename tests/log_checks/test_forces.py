@@ -345,7 +345,7 @@ def test_one_torque_in_another_unit_is_rejected_by_name() -> None:
 
 def test_forces_that_are_far_too_large_are_not_explained_by_what_makes_them_small() -> None:
     swapped = of_demo(replace(demo_log(), contact_wrench_local=value(demo_log().contact_wrench_local)[:, ::-1]))
-    assert "no usual mistake" in only(swapped, "forces").found
+    assert "; see force without contact of contact_active" in only(swapped, "forces").found
     assert not found(swapped, EXPLAINED)
 
 

@@ -97,6 +97,21 @@ def test_errors_on_motion_that_was_fitted_are_not_those_of_unseen_motion(consist
     assert said.startswith("Much better than the URDF on motion that the fit has seen (sway_train.npz)")
 
 
+def test_logs_in_which_nothing_moves_judge_neither_inertia_nor_friction(
+    consistent: Identification, free: Identification
+) -> None:
+    assert list(consistent.at_rest) == list(free.at_rest) == []
+    for run, rests, where in (
+        (consistent, "test", "the test logs (sway_test.npz)"),
+        (free, "train", "blocks of the training logs, each left out of the fit (5)"),
+    ):
+        said = " ".join(text(replace(run, at_rest=[rests])).split())
+        assert said.startswith(f"At rest alone, as nothing moves in {where}: errors of ")
+        assert "; inertia and friction are not judged" in said
+        assert "etter than the URDF" not in said
+    assert "At rest" not in text(replace(consistent, at_rest=["train"]))  # the test moves
+
+
 def test_without_test_logs_blocks_left_out_are_judged_and_the_text_says_so(free: Identification) -> None:
     first = text(free).split("rms error of")[0].replace("\n", " ")
     assert "blocks of the training logs, each left out of the fit (5)" in first

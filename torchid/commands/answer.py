@@ -46,12 +46,14 @@ class ErrorComparison:
         nominal: errors of the nominal parameters.
         identified: likewise.
         of: what the nominal parameters are those of, "URDF" or "MJCF".
+        at_rest: whether nothing moves there.
     """
 
     text: str
     nominal: Metrics
     identified: Metrics
     of: str
+    at_rest: bool = False
 
     def errors(self, groups: Sequence[str] = DECISIVE_GROUPS) -> Iterator[tuple[str, float, float, float | None]]:
         """Groups of rows with both errors, and what noise of the readings leaves."""
@@ -73,6 +75,9 @@ class ErrorComparison:
         floor = ", as near as the sensors' noise allows" if known and max(known) < AT_THE_FLOOR else ""
         if unexplained:
             floor = f", {'and' if verdict == _NO_BETTER else 'but'} the model does not explain {unexplained}"
+        if self.at_rest:
+            judged = f"errors of {shares} of the {self.of}'s{floor}; inertia and friction are not judged"
+            return f"At rest alone, as nothing moves in {self.text}: {judged}"
         words, part = verdict.removesuffix(_IN_PART), _IN_PART * verdict.endswith(_IN_PART)
         return f"{words} than the {self.of}{part} on {self.text}: errors of {shares} of the {self.of}'s{floor}"
 
@@ -130,14 +135,14 @@ def _judge(run: Identification) -> ErrorComparison:
         files = run.experiment.config.logs
         names = [log_title(path) for path in files.test]
         motion = "motion that the fit has seen" if tests_on_seen_samples(files) else "unseen motion"
-        text = f"{motion} ({join_names(names, 2)})"
-        return ErrorComparison(text, run.metrics["test"].nominal, run.metrics["test"].identified, of)
+        at_rest = "test" in run.at_rest
+        text = f"{'the test logs' if at_rest else motion} ({join_names(names, 2)})"
+        return ErrorComparison(text, run.metrics["test"].nominal, run.metrics["test"].identified, of, at_rest)
     if run.validation is not None:
         text = f"blocks of the training logs, each left out of the fit ({run.validation.folds})"
-        return ErrorComparison(text, run.validation.nominal, run.validation.identified, of)
-    return ErrorComparison(
-        "the training logs themselves", run.metrics["train"].nominal, run.metrics["train"].identified, of
-    )
+        return ErrorComparison(text, run.validation.nominal, run.validation.identified, of, "train" in run.at_rest)
+    nominal, identified = run.metrics["train"]
+    return ErrorComparison("the training logs themselves", nominal, identified, of, "train" in run.at_rest)
 
 
 def _headline(run: Identification, judged: ErrorComparison) -> str:

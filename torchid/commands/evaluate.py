@@ -31,6 +31,7 @@ from torchid.parameters import Array
 from torchid.problem import Evaluation, Metrics, Samples
 from torchid.problem.chunks import one_thread
 from torchid.problem.contact_state import state_name
+from torchid.problem.excitation import is_at_rest
 from torchid.problem.metrics import DECISIVE_GROUPS, WHITENED, describe_errors, group_name
 from torchid.problem.predict import at_motors, force_series, noise_series, projected_forces
 from torchid.report.figure_style import save_figures
@@ -59,6 +60,7 @@ class EvaluatedRun:
         excluded: rejected samples left out, by the name of a log.
         forces: of the first samples of the first log, as measured and as predicted.
         robot: whose they are.
+        at_rest: names of logs in which nothing moves.
         usual: errors on the own logs of the run, by group of rows, the larger of train and test.
         explained: whether the model explains the forces that the run was fitted to.
         output: the folder that they were written to, if any.
@@ -68,6 +70,7 @@ class EvaluatedRun:
     excluded: dict[str, int]
     forces: ForceSeries
     robot: Robot
+    at_rest: Sequence[str] = ()
     usual: Mapping[str, float] = field(default_factory=dict)
     explained: bool = True
     output: Path | None = None
@@ -236,6 +239,7 @@ def _evaluate(fitted: FittedRun, logs: Sequence[str | Path], folder: Path | None
         excluded=excluded,
         forces=forces,
         robot=experiment.robot,
+        at_rest=[split_range(log.source).name for log in samples if is_at_rest([log])],
         usual=fitted.usual,
         explained=fitted.explained,
     )

@@ -44,6 +44,7 @@ from torchid.problem.chunks import one_thread
 from torchid.problem.compressed_log import Block, fold_compressed, merge_blocks
 from torchid.problem.compression import Part, compress_in_blocks, merge_folds, merge_states, split_into_folds
 from torchid.problem.contact_state import ContactState, state_name
+from torchid.problem.excitation import is_at_rest
 from torchid.problem.metrics import LOG_SETS
 from torchid.report.tables import progress_bars
 
@@ -225,9 +226,8 @@ def _identify(
     with clock("identifiability"):
         whole = merge_folds(_with_states(fit.parts, ready.factors), builder)
         alone = _by_state(fitter, whole)
-        added = ranks.from_first(
-            lambda: _contributions(experiment, builder, whole, logs["train"], problem, bars), "contributions"
-        )
+        adding = partial(_contributions, experiment, builder, whole, logs["train"], problem, bars)
+        added = ranks.from_first(adding, "contributions")
     with clock("evaluate"):
         without_folds = [experiment.calibrations(one, builder) for one in fitter.fit_without_folds(fit)]
         scorer, of_blocks = Scorer(evaluation, builder), merge_states(fit.parts, builder)
@@ -241,6 +241,7 @@ def _identify(
         motion_noise=fit.assembly.noise,
         misfit=misfit(estimate, ready.noise, blocks, fit.scatter, unfitted_friction(problem, experiment.robot)),
         resting=resting_joints(problem, experiment.robot, builder, logs["train"]),
+        at_rest=[name for name in LOG_SETS if is_at_rest(logs[name])],
         robust=solved.robust,
         states=ready.states,
         by_state=alone,
@@ -298,10 +299,7 @@ def _compressed(
 ) -> tuple[list[Part], bool]:
     """The compressed training logs, and whether they were in the cache."""
     streaming = bars.add_task("streaming samples", total=sum(map(len, train)))
-
-    def compute() -> list[Part]:
-        return compress_in_blocks(train, builder, progress=partial(bars.advance, streaming))
-
+    compute = partial(compress_in_blocks, train, builder, progress=partial(bars.advance, streaming))
     keys = reader.keys if isinstance(reader, CachedReader) else {}
     paths = [str(path) for path in experiment.config.logs.train]
     if not isinstance(reader, CachedReader) or not all(ranks.gather(keys.keys() >= {*paths}, "logs in the cache")):

@@ -60,6 +60,7 @@ class Identification:
         misfit: what the fit leaves of the forces, and what noise would leave.
         resting: share of the time at rest of joints that rest often, where friction goes with the sign of velocities or
             torques then count as unmeasured.
+        at_rest: sets of logs, "train" and "test", in which nothing moves.
         robust: how outliers were down-weighted, if so.
         states: contact states of the training logs.
         by_state: what each of them determines on its own.
@@ -89,6 +90,7 @@ class Identification:
     motion_noise: NoiseShares
     misfit: Misfit
     resting: Mapping[str, float]
+    at_rest: Sequence[str]
     robust: RobustSummary | None
     states: list[StateReport]
     by_state: dict[str, Estimate]
@@ -252,6 +254,7 @@ def _metrics_document(run: Identification) -> dict[str, object]:
         "residual_std": estimate.residual_std,
         "misfit": _misfit_document(run.misfit),
         "resting_joints": dict(run.resting),
+        "at_rest": list(run.at_rest),
         "motion_noise": asdict(run.motion_noise),
         "nominal_error": None if run.posterior.nominal_error is None else asdict(run.posterior.nominal_error),
         "total_mass": run.mass.value if run.mass.determined else None,

@@ -27,6 +27,7 @@ from torchid.log_checks.findings import (
     Skipped,
     channel_groups,
     channel_names,
+    explained,
     median_step,
     refused,
 )
@@ -40,6 +41,7 @@ from torchid.log_checks.motion import (
     check_loops,
     completed,
 )
+from torchid.log_checks.single_joints import check_single_joints, check_still_velocities
 from torchid.log_checks.spikes import check_jumps
 from torchid.log_checks.stamps import check_magnitudes, check_missing_values, check_time_stamps
 from torchid.log_checks.standing_feet import check_gyroscope, check_standing_feet
@@ -162,7 +164,12 @@ def check(
     repaired = repair_log(log, _findings(results))
     blocking = _blocking_finding(results)
     if blocking is None or blocking.field != "time":
-        results += [*check_rest(repaired), *check_derivatives(repaired), *check_angular_velocity(repaired, robot)]
+        results += [
+            *check_rest(repaired),
+            *check_still_velocities(repaired),
+            *check_derivatives(repaired),
+            *check_angular_velocity(repaired, robot),
+        ]
         results += check_accelerometer(repaired, robot)
     compared = repaired
     if _blocking_finding(results) is None:
@@ -177,7 +184,9 @@ def check(
         results += unfit
     if _blocking_finding(results) is None:
         unbiased = subtract_contact_offsets(compared)
-        results += check_forces_against_urdf(unbiased, robot, contacts, cutoff_hz, derived, declared, required)
+        forces = list(check_forces_against_urdf(unbiased, robot, contacts, cutoff_hz, derived, declared, required))
+        results += forces
+        results += check_single_joints(unbiased, robot, contacts, cutoff_hz, declared, forces)
         results += check_limb_sensors(compared, robot, contacts, cutoff_hz)
     blocking = _blocking_finding(results)
     if blocking is None or blocking.name == "sign":
@@ -239,7 +248,8 @@ def _skip_dependent(blocking: Finding) -> Skipped:
 
 
 def _collect(log: Log, repaired: Log, results: Sequence[Finding | Skipped]) -> Checked:
-    findings = sorted(_merge_alike(_findings(results)), key=lambda finding: SEVERITIES.index(finding.severity))
+    merged = explained(tuple(_merge_alike(_findings(results))), len(log))
+    findings = sorted(merged, key=lambda finding: SEVERITIES.index(finding.severity))
     return Checked(log, repaired, tuple(findings), tuple(skip for skip in results if isinstance(skip, Skipped)))
 
 

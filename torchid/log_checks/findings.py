@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import InputError
+from torchid.errors import InputError, join_names
 from torchid.logs import Log
 from torchid.logs.log import CONTACT_READINGS, NORMALS, BoolArray, FloatArray, column_labels
 from torchid.parameters import WRENCH_COMPONENTS
@@ -22,6 +22,7 @@ NOTE = "note"
 
 SEVERITIES = (REJECTED, SUSPICIOUS, NOTE)
 
+_FEW_NAMED = 3
 #: Steps on either side that a step or a run of repeats is compared with.
 NEIGHBOUR_STEPS = 10
 
@@ -85,6 +86,22 @@ class Finding:
         for span in self.spans:
             mask[span.first : span.last + 1] = True
         return mask
+
+
+UNEXPLAINED = ", and no usual mistake explains it"
+"""How a finding ends, or goes on, that names no mistake."""
+_EXPLAINING_SHARE = 0.05  # of the samples, on which a finding may be the reason of another one on all
+
+
+def explained(findings: Sequence[Finding], samples: int) -> list[Finding]:
+    """Findings of which those that name no mistake refer to others beside them that do."""
+    named = [
+        f"{one.name} of {one.field}"
+        for one in findings
+        if one.severity != NOTE and UNEXPLAINED not in one.found and one.mask(samples).mean() > _EXPLAINING_SHARE
+    ]
+    see = f"; see {join_names(named, _FEW_NAMED)}" if named else UNEXPLAINED
+    return [replace(one, found=one.found.replace(UNEXPLAINED, see)) for one in findings]
 
 
 def refused(error: InputError) -> Finding:

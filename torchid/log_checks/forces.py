@@ -12,7 +12,7 @@ import torch
 from torchid.errors import InputError, join_names
 from torchid.log_checks.deviation import Trial
 from torchid.log_checks.encoders import check_encoders, is_bolted_arm
-from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, Finding, Skipped, refused
+from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, UNEXPLAINED, Finding, Skipped, refused
 from torchid.log_checks.lag_and_tilt import check_lag_and_tilt, check_torque_offsets, without_lag
 from torchid.log_checks.mistakes import joint_mistakes, possible_mistakes
 from torchid.log_checks.model import (
@@ -169,10 +169,7 @@ def _misfit_findings(
 
 def _contradiction(fit: ModelFit, robot: Robot, held: bool) -> Finding:
     """A finding about forces that no usual mistake explains; `held`: whether anything is known to hold the robot."""
-    text = (
-        f"measured forces differ from the {robot.format}'s by {_percent(fit.largest_misfit)}, "
-        "and no usual mistake explains it"
-    )
+    text = f"measured forces differ from the {robot.format}'s by {_percent(fit.largest_misfit)}{UNEXPLAINED}"
     advice = f"check units, frames, the order of joints and contacts, friction, the {robot.format}'s base link and"
     advice += f" masses, and whether the {robot.format} is that of this robot"
     if not held:

@@ -21,11 +21,11 @@ from torchid.log_checks.findings import (
     finite_median,
     neighbours_of,
 )
-from torchid.log_checks.model import MIN_MOTION
 from torchid.logs import Log
 from torchid.logs.log import CONTACT_READINGS, WRENCHES, BoolArray, FloatArray
 from torchid.logs.sign_filter import OFTEN, resting_share
 from torchid.logs.signal_noise import rough_noise
+from torchid.problem.excitation import MIN_MOTION, MIN_TURN_DEG
 
 #: Samples at one extreme value from which on it is a limit of the sensor.
 MIN_SAMPLES_AT_LIMIT = 5
@@ -57,8 +57,6 @@ _FLOAT32_ROUNDING_SHARE = 2.0 * float(np.finfo(np.float32).eps)
 _MIN_GRID_SHARE, _MIN_GRID_STEPS, _MAX_GRID_QUANTA, _GRID_TOLERANCE_QUANTA = 0.95, 10, 10.5, 0.1
 #: Quantiles of the step size at which a quantum is looked for.
 _SMALL_STEP_QUANTILES = (0.001, 0.005, 0.02)
-#: Turn [degrees] from which on a base moves.
-_MIN_TURN_DEG = 1.0
 #: Runs of repeats in one channel above which none is checked: coarse channels repeat all the time.
 _MAX_RUNS = 20000
 
@@ -346,7 +344,7 @@ def check_still_base(log: Log) -> Iterator[Finding]:
     position, quat = log.base_position_world, log.base_quat_xyzw
     if position is None or quat is None or np.ptp(position, axis=0).any():
         return
-    if (turned := _turned_deg(quat)) < _MIN_TURN_DEG:
+    if (turned := _turned_deg(quat)) < MIN_TURN_DEG:
         return
     text = f"one position throughout, though the base turns by {turned:.2g} degrees"
     others = (log.base_linear_velocity_world, log.base_linear_acceleration_world, log.imu_specific_force)
@@ -364,7 +362,7 @@ def check_excitation(log: Log) -> Iterator[Finding]:
     moved = float(np.nanmax(np.ptp(log.joint_position, axis=0), initial=0.0))
     if moved > MIN_MOTION or (position is not None and np.ptp(position, axis=0).max() > MIN_MOTION):
         return
-    if quat is not None and _turned_deg(quat) > _MIN_TURN_DEG:
+    if quat is not None and _turned_deg(quat) > MIN_TURN_DEG:
         return
     text = f"nothing moves: no joint by more than {moved:.2g} rad (slides: m)"
     advice = "record motion: one posture determines what balances gravity in it, no inertia and no friction"

@@ -33,6 +33,8 @@ from torchid.regressor.kinematics import GRAVITY_WORLD
 
 #: Lag and tilt that are reported: filters of sensors are late by 10 ms, and a table is level to 2 degrees.
 MIN_LAG_S, MIN_TILT_DEG = 0.025, 6.0
+#: Lag of filters, beyond which a smaller one is reported, too, where it is certain: by so many standard deviations.
+_FILTER_LAG_S, _MIN_STANDARD_DEVIATIONS = 0.01, 4.0
 #: Gain of a contact's sensor relative to the others, and turn of its axes, that are reported.
 _MIN_SENSOR_GAIN, _MIN_TURN_DEG = 0.15, 10.0
 #: Offset of a torque, over the rms of all torques, that is reported: those of good sensors are 0.08 of it.
@@ -82,7 +84,9 @@ def check_torque_offsets(trial: Trial) -> Iterator[Finding]:
 
 
 def _lag_findings(lag: Deviation | None, declared: Declared) -> Iterator[Finding]:
-    if lag is not None and abs(lag.value[0]) > MIN_LAG_S and lag.is_clear:
+    if lag is None or not lag.is_clear:
+        return
+    if abs(lag.value[0]) > min(MIN_LAG_S, _FILTER_LAG_S + _MIN_STANDARD_DEVIATIONS * float(lag.spread[0])):
         seconds, late = float(lag.value[0]), "later" if lag.value[0] > 0.0 else "earlier"
         text = f"torques are {1e3 * abs(seconds):.3g} +- {1e3 * lag.spread[0]:.2g} ms {late} than the motion"
         advice = f"check their stamps and filters, or set actuators.delay: {declared.known_delay - seconds:.2g}"

@@ -202,7 +202,7 @@ def _mountings() -> Iterator[Mistake]:
 def reversed_joints(log: Log) -> Iterator[Mistake]:
     """Joints whose position is reversed, one at a time: many logs to try."""
     for joint, name in enumerate(log.joint_names):
-        advice = f"logs.columns.joint_position.scale: {{{name}: -1}}, and likewise velocity and torque"
+        advice = f"logs.columns.joint_position.scale: {{{name}: -1}}, of velocity and torque too if they count likewise"
         yield Mistake("joint_position", f"{name} reversed", advice, _reverse_joint(joint))
 
 

@@ -20,6 +20,7 @@ from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import preprocess
 from torchid.logs.signal_noise import SignalNoise
 from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log
+from torchid.problem.excitation import MIN_MOTION
 from torchid.problem.extras import list_extras
 from torchid.problem.predict import force_series, null_space_part
 from torchid.problem.samples import concatenate
@@ -40,8 +41,8 @@ MIN_ROW_SIGNAL_RATIO = 2.0
 MAX_GAIN_RATIO = 10.0
 #: Misfit of the base force above which contact wrenches do not decide on the sign of a torque.
 _MAX_WRENCH_MISFIT = 0.3
-#: Travel [rad or m] below which a joint stands still, and what dry friction may then carry of the largest load.
-MIN_MOTION, MAX_FRICTION_SHARE = 0.01, 0.2
+#: What dry friction may carry of the largest load where a joint stands still.
+MAX_FRICTION_SHARE = 0.2
 #: Torque below the resolution of any sensor.
 MIN_TORQUE_NM = 1e-9
 #: Forces that no parameters explain (flexibility, filters, shape of friction), over the rms of each kind of force.

@@ -10,14 +10,19 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation, Slerp
 
 from torchid.errors import InputError, format_percent, join_names
-from torchid.log_checks.findings import REJECTED, SUSPICIOUS, Finding, Skipped, find_spans, median_step, widen_mask
-from torchid.log_checks.mistakes import possible_mistakes, reversed_joints
-from torchid.log_checks.model import (
-    LinkPoses,
-    default_cutoff_hz,
-    preprocess_pieces,
-    recorded_link_poses,
+from torchid.log_checks.findings import (
+    REJECTED,
+    SUSPICIOUS,
+    UNEXPLAINED,
+    Finding,
+    Skipped,
+    find_spans,
+    median_step,
+    widen_mask,
 )
+from torchid.log_checks.mistakes import possible_mistakes, reversed_joints
+from torchid.log_checks.model import LinkPoses, default_cutoff_hz, preprocess_pieces, recorded_link_poses
+from torchid.log_checks.single_joints import still_in_limb
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.quaternion import rotate_to_world
@@ -69,8 +74,9 @@ def check_standing_feet(
     radius = list(_radius_findings(log, robot, contacts, slip, poses))
     yield from radius
     other_pose = iter(()) if radius or derived or poses is None else _pose_findings(log, contacts, slip, poses)
+    single = None if radius or derived else _single_foot(log, robot, contacts, slip, poses)
     if slip < MAX_SLIP_SHARE:
-        yield from () if radius or derived else list(_single_foot(log, robot, contacts, slip, poses)) or other_pose
+        yield from other_pose if single is None else [single]
         return
     best, least = None, MAX_RESIDUAL_SHARE * slip
     for mistake in (*possible_mistakes(log), *reversed_joints(log)):
@@ -85,7 +91,7 @@ def check_standing_feet(
         share = f"{100 * slip:.3g} % as much as the base above them, {format_percent(least)} % once corrected"
         text = f"{best.description}: standing feet move {share}"
         yield Finding("unit, sign or frame", REJECTED, best.field, text, best.advice)
-    elif (found := next(other_pose, None)) is not None:
+    elif (found := single or next(other_pose, None)) is not None:
         yield found
     elif slip > MAX_UNEXPLAINED_SLIP_SHARE:
         yield _unexplained_motion(log, robot, contacts, slip, poses)
@@ -98,7 +104,7 @@ def _unexplained_motion(
     alone = {c.frame: measure_foot_slip(log, robot, [c], poses) for c in contacts}
     moving = sorted((name for name, own in alone.items() if own), key=lambda name: -(alone[name] or 0.0))
     most = join_names([f"{name} {format_percent(alone[name] or 0.0)} %" for name in moving])
-    text = f"standing feet move {100 * slip:.3g} % as much as the base above them, and no usual mistake explains it"
+    text = f"standing feet move {100 * slip:.3g} % as much as the base above them{UNEXPLAINED}"
     advice = "check signs, scales and zeros of joint positions, the base's orientation and position, the flags, and"
     advice += " the frames under contacts"
     return Finding("standing feet", SUSPICIOUS, "all", f"{text}: {most}" if most else text, advice, tuple(moving))
@@ -106,19 +112,22 @@ def _unexplained_motion(
 
 def _single_foot(
     log: Log, robot: Robot, contacts: Sequence[Contact], slip: float, poses: LinkPoses | None
-) -> Iterator[Finding]:
+) -> Finding | None:
     """A finding about the one foot that moves though it stands while the others do not."""
     if slip < MIN_SINGLE_SHARE:
-        return
+        return None
     without = {c.frame: measure_foot_slip(log, robot, [x for x in contacts if x is not c], poses) for c in contacts}
     left = {frame: rest for frame, rest in without.items() if rest is not None}
     frame = min(left, key=lambda name: left[name], default="")
     if not frame or left[frame] > MAX_OTHERS_SHARE * slip:
-        return
+        return None
     text = f"{frame} moves though it stands: standing feet move {format_percent(slip)} % as much as the base above"
     text += f" them, {format_percent(left[frame])} % without it"
     advice = "check zeros, scales and signs of the joint positions in its limb, its flags, and whether it slips"
-    yield Finding("standing feet", SUSPICIOUS, "joint_position", text, advice, (frame,))
+    if still := join_names(still_in_limb(log, robot, frame)):
+        text += f"; {still} of its limb stands still throughout: a dead encoder?"
+        advice = f"look whether {still} moves, for a dead encoder, and leave the log out; else {advice}"
+    return Finding("standing feet", SUSPICIOUS, "joint_position", text, advice, (frame,))
 
 
 def _pose_findings(log: Log, contacts: Sequence[Contact], slip: float, poses: LinkPoses) -> Iterator[Finding]:
@@ -368,7 +377,7 @@ def _compare(vectors: FloatArray, rates: FloatArray, omega: FloatArray) -> Itera
         yield Finding("frame", REJECTED, _FIELD, found, "imu_frame is the frame along whose axes the IMU reads")
     elif difference > MAX_UNEXPLAINED_DIFFERENCE:
         advice = "check unit, axes and imu_frame, signs and zeros of joint positions, and the flags"
-        yield Finding("standing feet", SUSPICIOUS, _FIELD, f"{text}, and no usual mistake explains it", advice)
+        yield Finding("standing feet", SUSPICIOUS, _FIELD, f"{text}{UNEXPLAINED}", advice)
 
 
 def _factor_finding(factor: float, text: str) -> Finding:

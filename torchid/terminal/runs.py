@@ -33,7 +33,10 @@ def evaluation_lines(evaluated: EvaluatedRun, width: int) -> list[str]:
         width: of the terminal.
     """
     of = evaluated.robot.format
-    judged = [ErrorComparison(name, pair.nominal, pair.identified, of) for name, pair in evaluated.metrics.items()]
+    judged = [
+        ErrorComparison(name, pair.nominal, pair.identified, of, name in evaluated.at_rest)
+        for name, pair in evaluated.metrics.items()
+    ]
     judged.sort(key=_worst, reverse=True)
     shown = [_sentence(one, evaluated.explained) for one in judged[:MOST_LOGS]]
     lines = [line for sentence in shown for line in wrap_words(sentence, width, "  ")]
