@@ -1,6 +1,7 @@
 """Copies of this process, by fork, that work on its other cores: nothing has to be imported or handed over to them.
 
-Whoever calls torchid as a library may have threads that a copy lacks: only the command line allows copies.
+Whoever calls torchid as a library may have threads that a copy lacks: only the command line allows copies. Processes
+that share the work of a run (`torchid.ranks`) have no copies; they can take the part of these.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from functools import partial
 from multiprocessing.connection import Connection
 from typing import Generic, TypeVar
 
-from torchid.ranks import is_launched
+from torchid import ranks
 from torchid.staging import interrupts_deferred
 
 T = TypeVar("T")
@@ -39,7 +40,7 @@ def copies_allowed() -> Iterator[None]:
 
 def can_copy() -> bool:
     """Whether copies of this process may be made now."""
-    return _allowed and not _uses_a_gpu() and not is_launched()  # torchrun has started processes for all cores
+    return _allowed and not _uses_a_gpu() and not ranks.is_launched()  # torchrun has started processes for all cores
 
 
 class Copy(Generic[T]):
@@ -84,9 +85,9 @@ class Copy(Generic[T]):
         """What the function returns, or raises."""
         if self._results is not None:
             with suppress(EOFError, OSError, pickle.UnpicklingError):
-                done, value = pickle.loads(self._results.recv_bytes())
-                if done:
-                    return value
+                found: tuple[T, ...] = pickle.loads(self._results.recv_bytes())
+                if found:
+                    return found[0]
         return self._work()
 
 
@@ -132,6 +133,33 @@ def share_between_copies(items: Sequence[Item], work: Callable[[Item], T], count
     return [next(rest) if number % count else own[number // count] for number in range(len(items))]
 
 
+def share_between_processes(items: Sequence[Item], work: Callable[[Item], T], count: int) -> list[T]:
+    """As `share_between_copies`; processes that share the work of a run, which all call this, are the copies.
+
+    What meets a warning or an error in one of them the first one does again, which alone says things.
+    """
+    if ranks.world_size() == 1:
+        return share_between_copies(items, work, count)
+    own = range(ranks.rank(), len(items), ranks.world_size())
+    with ranks.apart():
+        attempts = {number: _attempt(partial(work, items[number])) for number in own}
+    found = {number: one for of_process in ranks.gather(attempts, "shares") for number, one in of_process.items()}
+    return [
+        found[number][0] if found[number] else ranks.from_first(partial(work, item), "a share")
+        for number, item in enumerate(items)
+    ]
+
+
+def _attempt(work: Callable[[], T]) -> tuple[T, ...]:
+    """What a function returns, alone in a tuple; an empty one where it meets a warning or an error."""
+    with suppress(Exception), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.simplefilter("ignore", DeprecationWarning)
+        warnings.simplefilter("ignore", PendingDeprecationWarning)
+        return (work(),)
+    return ()
+
+
 def _uses_a_gpu() -> bool:
     """Whether this process has a connection to a GPU, which a copy cannot use."""
     torch = sys.modules.get("torch")
@@ -148,11 +176,6 @@ def _call(work: Callable[[], T], results: Connection, sender: Connection) -> Non
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     if (torch := sys.modules.get("torch")) is not None:
         torch.set_num_threads(1)  # threads of the original are not there
-    message: tuple[bool, T | None] = (False, None)
-    with suppress(Exception), warnings.catch_warnings():
-        warnings.simplefilter("error")
-        warnings.simplefilter("ignore", DeprecationWarning)
-        warnings.simplefilter("ignore", PendingDeprecationWarning)
-        message = (True, work())
+    found = _attempt(work)
     with suppress(Exception):
-        sender.send_bytes(pickle.dumps(message))  # `send` would leave tensors behind in this process
+        sender.send_bytes(pickle.dumps(found))  # `send` would leave tensors behind in this process

@@ -173,5 +173,9 @@ def test_long_files_are_summed_up_while_something_else_is_done(
         monkeypatch.setattr("torchid.commands.cache._YOUNG", -1.0)
         cache = Cache(tmp_path / "cache", 1.0)
         sums += [cache.checksum(log, [log], meanwhile) for _ in range(2)]
-    assert sums == [hashlib.sha256(content).hexdigest()] * 3
+        monkeypatch.setattr("torchid.commands.manifest._PART", 30)
+        sums.append(Cache(tmp_path / "cache", 1.0).checksum(log, [log]))
+    assert sums[:3] == [hashlib.sha256(content).hexdigest()] * 3
     assert done == [log], "the second time nothing is read"
+    of_parts = "".join(hashlib.sha256(content[start : start + 30]).hexdigest() for start in range(0, 100, 30))
+    assert sums[3] == hashlib.sha256(of_parts.encode()).hexdigest()

@@ -88,7 +88,7 @@ def test_a_run_from_the_cache_has_the_results_of_one_without_to_the_last_bit(
     assert main([*line, f"output={tmp_path / 'first'}"]) == 0
     assert results(tmp_path / "first") == expected
     assert "from cache" not in capsys.readouterr().out
-    for opened in ("reading.read_log", "large_log.open_log_blocks", "cached_reading.log_bytes", "cache.file_checksum"):
+    for opened in ("reading.read_log", "large_log.open_log_blocks", "cached_reading.log_bytes", "cache.part_checksum"):
         monkeypatch.setattr(f"torchid.commands.{opened}", None)
     monkeypatch.setattr(sys.modules["torchid.commands.identify"], "compress_in_blocks", None)
     assert main([*line, f"output={tmp_path / 'second'}"]) == 0

@@ -8,11 +8,13 @@ import shutil
 import signal
 import sys
 import time
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch.distributed as dist  # noqa: TID251
 import yaml
 from demo import shortened_demo
 from repository import DEMO
@@ -34,6 +36,7 @@ import torchid
 from torchid import ranks
 from torchid.cli import main
 from torchid.commands.checkpoint import CHECKPOINT
+from torchid.copies import share_between_processes
 from torchid.parameters import Array
 from torchid.problem.linear import parameter_scale
 
@@ -311,6 +314,37 @@ def test_an_item_that_fails_ends_what_a_process_does_apart(monkeypatch: pytest.M
         ranks.share_out([0, 0], lambda item: 1 / item, "items", sizes=[1, 1])
     assert ranks._sharing is together
     assert not together.about
+
+
+def share_items(folder: Path) -> int:
+    """What each of two processes does: shares items, one of which has something to say and one fails; writes what."""
+
+    def work(item: int) -> list[int]:
+        if item == 4:
+            warnings.warn("four", UserWarning, stacklevel=1)
+        return [60 // (item - 7), ranks.world_size(), os.getpid()]
+
+    dist.init_process_group("gloo")
+    number = dist.get_rank()
+    with warnings.catch_warnings(record=True) as said, ranks.share_work():
+        warnings.simplefilter("always")
+        found = share_between_processes(range(1, 6), work, 1)
+        ranks.gather(None, "the end")
+    with pytest.raises(ZeroDivisionError), ranks.share_work():
+        share_between_processes(range(6, 9), work, 1)
+    document = {"found": found, "said": [str(one.message) for one in said], "process": os.getpid()}
+    (folder / f"{number}.json").write_text(json.dumps(document))
+    return 0
+
+
+def test_processes_share_items_as_copies_would_and_the_first_alone_says_things(tmp_path: Path) -> None:
+    status, _, complained = finish_forked(2, lambda: share_items(tmp_path))
+    assert status == 0, complained
+    first, second = (json.loads((tmp_path / f"{number}.json").read_text()) for number in range(2))
+    one, other = first["process"], second["process"]
+    assert first["found"] == second["found"]
+    assert first["found"] == [[-10, 1, one], [-12, 1, other], [-15, 1, one], [-20, 1, one], [-30, 1, one]]
+    assert (first["said"], second["said"]) == (["four"], [])
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ from large import SMALL, experiment, recorded, tensors
 from shared_work import finish_forked
 
 from torchid import ranks
-from torchid.commands import large_log, reading
+from torchid.commands import cached_reading, large_log, manifest, reading
 from torchid.commands.cache import FOLDER
 from torchid.commands.cached_reading import CachedReader, _shares, open_cache
 from torchid.commands.reading import LogReader
@@ -38,7 +38,8 @@ def read_all(calls: Sequence[Sequence[str]], folder: Path) -> int:
     """What each of two processes does: reads logs of several experiments, and writes which of them it has opened."""
     opened: list[str] = []
     bound: list[int] = []
-    read_log, bind = reading.read_log, large_log.LargeLog._bound
+    summed: list[list[Any]] = []
+    read_log, bind, sum_up = reading.read_log, large_log.LargeLog._bound, manifest.part_checksum
 
     def open_and_read(path: Path, *rest: Any, **named: Any) -> Any:
         opened.append(Path(path).name)
@@ -48,12 +49,18 @@ def read_all(calls: Sequence[Sequence[str]], folder: Path) -> int:
         bound.append(block.piece.start)
         return bind(log, cover, block)
 
+    def note_and_sum_up(part: manifest.FilePart) -> str:
+        summed.append([part.path.name, part.start])
+        return sum_up(part)
+
     reading.read_log, large_log.LargeLog._bound = open_and_read, note_and_bind  # type: ignore[method-assign]
+    cached_reading.part_checksum, manifest._PART = note_and_sum_up, 100_000
     dist.init_process_group("gloo")
     rank, found = dist.get_rank(), []
     for file, *more in calls:
         opened.clear()
         bound.clear()
+        summed.clear()
         reading._WHOLE_GB, large_log.BLOCK_GB = (0.0, 1e-4) if "in blocks" in more else (0.04, 0.01)
         overrides = [x.replace("RANK", str(rank)) for x in more if x != "in blocks"]
         with warnings.catch_warnings(record=True) as said, ranks.share_work():
@@ -66,7 +73,12 @@ def read_all(calls: Sequence[Sequence[str]], folder: Path) -> int:
             except ValueError as failure:
                 error = str(failure)
         entry = {"opened": list(opened), "logs": [digest(x) for x in logs], "error": error, "cache": cache is not None}
-        entry |= {"blocks": sorted(bound), "said": [str(x.message) for x in said], "sources": [x.source for x in logs]}
+        entry |= {
+            "summed": list(summed),
+            "blocks": sorted(bound),
+            "said": [str(x.message) for x in said],
+            "sources": [x.source for x in logs],
+        }
         found.append(entry)
     (folder / f"{rank}.json").write_text(json.dumps(found))
     return 0
@@ -132,6 +144,14 @@ def test_each_log_is_read_by_one_process_and_all_have_it(read: dict[str, list[An
     assert all(x["opened"] for x in read["first"])
     assert [x["opened"] for x in read["second"]] == [[], []]
     assert [len(x["opened"]) for x in read["without"]] == [3, 3]
+
+
+@pytest.mark.parametrize("name", ["first", "parts", "blocks"])
+def test_each_part_of_a_file_is_summed_up_once(read: dict[str, list[Any]], name: str) -> None:
+    summed = [[tuple(part) for part in one["summed"]] for one in read[name]]
+    assert all(summed)
+    assert len({*summed[0], *summed[1]}) == len(summed[0]) + len(summed[1])
+    assert [x["summed"] for x in read["second"]] == [[], []], "the index knows them"
 
 
 @pytest.mark.parametrize("name", ["first", "second", "apart", "little room"])

@@ -17,7 +17,7 @@ import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -27,10 +27,11 @@ import torch
 from numpy.typing import NDArray
 
 import torchid
-from torchid.commands.manifest import file_checksum
-from torchid.copies import Copy
+from torchid.commands.manifest import checksum_of_parts, file_checksum, file_parts, file_states, part_checksum
+from torchid.copies import in_copies
 from torchid.errors import excerpt, warn
 from torchid.logs.blocks import GIGABYTE
+from torchid.problem.chunks import thread_count
 from torchid.staging import NEW, atomic_file, is_leftover, remove_leftover, staging_folder
 
 FOLDER = ".torchid_cache"
@@ -204,29 +205,39 @@ class Cache:
     # ------------------------------------------------------------------------------------------- checksums of logs
 
     def checksum(self, path: Path, files: Sequence[Path], meanwhile: Callable[[], None] = lambda: None) -> str:
-        """SHA-256 of the content of a log; that of the index, where no file has changed since.
+        """Checksum of the content of a log; that of the index, where no file has changed since.
 
         Args:
             path: of the log.
             files: that it consists of.
-            meanwhile: called while a copy of this process sums up long files.
+            meanwhile: called while copies of this process sum up long files.
 
         Raises:
             OSError: one cannot be read.
         """
-        states, known = file_states(files), self._known(path)
-        if known.get("files") == states and _NAME.fullmatch(str(known.get("sha256"))):
-            return str(known["sha256"])
+        states = file_states(files)
+        if found := self.known_checksum(path, states):
+            return found
         if sum(state[0] for state in states) < _LONG:
-            found = file_checksum(*files)
+            sums = [part_checksum(part) for part in file_parts(files)]
         else:
-            with Copy(partial(file_checksum, *files)) as summing:
+            with in_copies(file_parts(files), part_checksum, max(thread_count() - 1, 1)) as summing:
                 meanwhile()
-                found = summing.result()
+                sums = summing()
+        self.note_checksum(path, files, states, found := checksum_of_parts(sums))
+        return found
+
+    def known_checksum(self, path: Path, states: Sequence[Sequence[int]]) -> str:
+        """Checksum in the index of a log whose files have these states; none without it."""
+        known = self._known(path)
+        found = str(known.get("sha256")) if known.get("files") == states else ""
+        return found if _NAME.fullmatch(found) else ""
+
+    def note_checksum(self, path: Path, files: Sequence[Path], states: list[list[int]], found: str) -> None:
+        """Note the checksum of a log for the index, unless its files have just changed."""
         youngest = max(max(state[1:3]) for state in states) / 1e9
         if states == file_states(files) and abs(time.time() - youngest) > _YOUNG:
             self._noted[_place(path)] = {"files": states, "sha256": found}
-        return found
 
     def array_bytes(self, path: Path, checksum: str, limit: float) -> int | None:
         """What `note_array_bytes` has noted, None if nothing."""
@@ -282,17 +293,6 @@ def _place(path: Path) -> str:
     return os.path.realpath(path)
 
 
-def file_states(files: Sequence[Path]) -> list[list[int]]:
-    """What of files changes when their content does, as documents of JSON have it. Raises OSError: one is not there."""
-    return [_state(file) for file in files]
-
-
-def _state(path: Path) -> list[int]:
-    """What changes with a file; ctime does so even where somebody sets the other times back."""
-    x = path.stat()
-    return [x.st_size, x.st_mtime_ns, x.st_ctime_ns, x.st_ino]
-
-
 def _last_used(folder: Path) -> float:
     try:
         return (folder / _DESCRIPTION).stat().st_mtime
@@ -342,7 +342,7 @@ class _Hashing:
 
 def written_file(path: Path, sha256: str) -> dict[str, Any]:
     """What the description of an entry says of a file with this checksum."""
-    return {"state": _state(path), "sha256": sha256}
+    return {"state": file_states([path])[0], "sha256": sha256}
 
 
 def _write(folder: Path, arrays: Mapping[str, NDArray[Any]]) -> Files:
@@ -383,7 +383,7 @@ def _read(folder: Path, key: str) -> CacheEntry:
 
 
 def _mapped(path: Path, written: Mapping[str, Any]) -> NDArray[Any]:
-    if _state(path) != written["state"] and file_checksum(path) != written["sha256"]:
+    if file_states([path])[0] != written["state"] and file_checksum(path) != written["sha256"]:
         raise _DamagedError(f"{path.name} has changed")
     array: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
     return array

@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from torchid import ranks
-from torchid.commands.cache import FOLDER, TOKEN, Cache, Files, content_key, file_states, missing_folders, remove_empty
+from torchid.commands.cache import FOLDER, TOKEN, Cache, Files, content_key, missing_folders, remove_empty
 from torchid.commands.cache_entries import ReadLog, RecordedWarning, content_of_scene, samples_entry, samples_of_entry
+from torchid.commands.manifest import FilePart, checksum_of_parts, file_parts, file_states, part_checksum
 from torchid.commands.reading import LogReader, fits_contact_offsets, payload_of
 from torchid.commands.shared_log import on_one_machine, read_together
 from torchid.errors import TorchidWarning, warn
@@ -249,6 +250,7 @@ class CachedReader(LogReader):
         All processes then find the same entries, and read what is not there themselves: what cannot be read fails in
         all of them, as without a cache.
         """
+        self._sum_up_together(paths)
         to_read = self._logs_to_read(paths, required)
         self.cache.keep([one.key for one in to_read])
         missing = {one.key: number for number, one in enumerate(to_read) if not self.cache.has(one.key)}
@@ -293,6 +295,24 @@ class CachedReader(LogReader):
         if folder:
             fill(folder)
 
+    def _sum_up_together(self, paths: Sequence[Path]) -> None:
+        """Work out checksums of logs, each process of some parts of their files, if all see the same files."""
+        seen = [_states_of_log(path) for path in paths]
+        if any(other != seen for other in ranks.gather(seen, "states of logs")):
+            return
+        there = [(split_range(path).file, path, states) for path, states in zip(paths, seen, strict=True) if states]
+        known = [bool(self.cache.known_checksum(log, states)) for log, _, states in there]
+        new = [
+            one for one, is_known in zip(there, ranks.as_first(known, "known checksums"), strict=True) if not is_known
+        ]
+        parts = [(log, part) for log in dict.fromkeys(log for log, *_ in new) for part in file_parts(log_files(log))]
+        sums = ranks.share_out(parts, _part_checksum, "checksums of logs", [part.size for _, part in parts])
+        for log, path, states in new:
+            of_log = [found for (other, _), found in zip(parts, sums, strict=True) if other == log]
+            if all(of_log):
+                self._contents[path] = content = _Content(checksum_of_parts(of_log), log_files(path), states)
+                self.cache.note_checksum(log, content.files, states, content.checksum)
+
     def _logs_to_read(self, paths: Sequence[Path], required: SensorSet | None) -> list[_LogToRead]:
         """What will be read, up to the first log that cannot be; bags that are not in the cache count as nothing."""
         to_read, held, limit = [], self._held, self.scene.config.preprocessing.memory_gb
@@ -316,6 +336,22 @@ class CachedReader(LogReader):
         gigabytes = together - self._held
         in_place = existing_log_kind(path) is LogKind.ARRAYS and size >= GIGABYTE * gigabytes
         return _LogToRead(path, key, too_much, size, in_place and self._takes_blocks(path, gigabytes))
+
+
+def _states_of_log(path: Path) -> list[list[int]]:
+    """The states of the files of a log; none where it cannot be read, which reading then says."""
+    try:
+        existing_log_kind(path)
+        return file_states(log_files(path))
+    except Exception:  # noqa: B902 - as above
+        return []
+
+
+def _part_checksum(part: tuple[Path, FilePart]) -> str:
+    """Checksum of a part of a log; none where it cannot be read."""
+    with suppress(OSError):
+        return part_checksum(part[1])
+    return ""
 
 
 def _shares(sizes: Mapping[int, int]) -> list[list[int]]:

@@ -192,7 +192,7 @@ def with_ridge(
         return experiment, None
     bar = bars.add_task("choosing the ridge", total=None)
     fitter = experiment.fitter(builder, conditions)
-    choice = ranks.from_first(partial(experiment.choose_ridge, parts, blocks, fitter, conditions), "ridge")
+    choice = ranks.as_first(experiment.choose_ridge(parts, blocks, fitter, conditions), "ridge")
     bars.update(bar, total=1, completed=1)
     chosen = replace(config, estimator=replace(config.estimator, ridge=choice.ridge))
     return replace(experiment, config=chosen), choice

@@ -20,7 +20,7 @@ from torchid.commands.folder import RUN, check_free, claim_folder
 from torchid.commands.plausibility import TrainingLogs, require_not_worse, require_plausible, suspected_mistake
 from torchid.commands.reading import LogReader, check_read
 from torchid.commands.results import Identification, write_run
-from torchid.commands.run_figures import Drawing, drawing, fit_figures
+from torchid.commands.run_figures import Drawing, drawing, figures_left, fit_figures
 from torchid.commands.training import Training, descent_settings, require_trainable, training_folder
 from torchid.config import ExperimentConfig, inputs_of
 from torchid.errors import NumericalWarning, format_count, warn_about_file
@@ -91,6 +91,7 @@ def identify(config: ExperimentConfig, resume: bool = False) -> Identification:
         run, training, begun = _identify(config, resume, bars, stack)
         if output is not None:
             bars.add_task("writing", total=None)
+            begun.append(stack.enter_context(drawing(figures_left(run, begun), config)))
             ranks.from_first(partial(write_run, run, output, config.overwrite, training, begun), "run folder")
     return run
 
@@ -143,8 +144,7 @@ def _data_of_logs(experiment: Experiment, clock: _Clock, bars: Progress) -> _Dat
     with clock("settings"):
         experiment, choices = with_chosen_settings(experiment, bars)
     with clock("read"):
-        reader = open_reader(experiment)
-        logs = _read(reader, experiment, bars)
+        reader, logs = _read(experiment, bars)
     with clock("noise"):
         states = state_reports(logs["train"], experiment.builder(experiment.sensors))
         require_base(states, experiment.config.sensors.on_base_lost, experiment.contacts)
@@ -165,8 +165,7 @@ def _data_of_factors(experiment: Experiment, clock: _Clock, bars: Progress) -> _
         reading = bars.add_task("reading factors", total=len(experiment.config.logs.train))
         fleet = read_fleet(experiment, lambda _: bars.advance(reading))
         require_base(fleet.states, experiment.config.sensors.on_base_lost, experiment.contacts)
-        reader = open_reader(experiment)
-        logs = _read(reader, experiment, bars)
+        reader, logs = _read(experiment, bars)
     with clock("compress"):
         builder = fleet.experiment.builder(fleet.experiment.sensors)
         blocks = fold_compressed([one.log for one in fleet.files], builder)
@@ -208,7 +207,7 @@ def _solved(ready: _Prepared, evaluation: Evaluation, checked: TrainingLogs, bar
 
 def _identify(
     config: ExperimentConfig, resume: bool, bars: Progress, stack: ExitStack
-) -> tuple[Identification, Training | None, Drawing | None]:
+) -> tuple[Identification, Training | None, list[Drawing]]:
     """What the logs say, how it was trained, if so, and figures of it that are drawn until the stack is left."""
     clock = _Clock()
     ready = _prepare(config, clock, bars)
@@ -222,7 +221,8 @@ def _identify(
         shown = [*logs["test"], *logs["train"]][:1]
         forces = ranks.from_first(lambda: [compare_forces(evaluation, log, compared) for log in shown], "forces")
         figures = fit_figures(experiment.robot, estimate, fit.extras, ready.ridge, *forces)
-        begun = stack.enter_context(drawing(figures, experiment.config)) if config.output else None
+        copied = config.output is not None and ranks.world_size() == 1  # several processes draw all of them at last
+        begun = [stack.enter_context(drawing(figures, experiment.config))] if copied else []
     with clock("identifiability"):
         whole = merge_folds(_with_states(fit.parts, ready.factors), builder)
         alone = _by_state(fitter, whole)
@@ -268,12 +268,12 @@ def _identify(
     return replace(run, suspected=suspected_mistake(run, checked)), solved.training, begun
 
 
-def _read(reader: LogReader, experiment: Experiment, bars: Progress) -> dict[str, list[Samples]]:
-    """Logs by use; those that are trained on, or decide when to stop, have every sensor of the set.
+def _read(experiment: Experiment, bars: Progress) -> tuple[LogReader, dict[str, list[Samples]]]:
+    """What has read the logs, and these by use; those of which there are but factors are left out.
 
-    Those of which there are but factors are left out.
+    Those that are trained on, or decide when to stop, have every sensor of the set.
     """
-    settings = experiment.config.logs
+    reader, settings = open_reader(experiment), experiment.config.logs
     files = {name: getattr(settings, name) for name in ("train", "validation", "test")}
     if settings.compressed:
         files["train"] = []
@@ -285,7 +285,7 @@ def _read(reader: LogReader, experiment: Experiment, bars: Progress) -> dict[str
     check_read(logs)
     if experiment.config.estimator.name == "sgd":  # it sees samples one by one, not what noise adds on average
         logs["train"] = [replace(log, motion_noise=None) for log in logs["train"]]
-    return logs
+    return reader, logs
 
 
 def _reused(reader: LogReader) -> list[str]:

@@ -15,7 +15,7 @@ from torchid.commands.chosen_settings import Choices
 from torchid.commands.folder import RUN, check_free, check_free_file, new_folder, write_json
 from torchid.commands.named_results import BodyEstimate, ParameterTable, body_estimate, parameter_table, run_lines
 from torchid.commands.report import DATA, report_document, write_page
-from torchid.commands.run_figures import Drawing, all_figures, drawing, write_events, write_figures
+from torchid.commands.run_figures import Drawing, all_figures, drawing, figures_left, write_events, write_figures
 from torchid.commands.training import Training, body_eigenvalues
 from torchid.config import dump_config, inputs_of
 from torchid.errors import during
@@ -198,7 +198,7 @@ def write_run(
     output: Path,
     overwrite: bool = False,
     training: Training | None = None,
-    begun: Drawing | None = None,
+    begun: Sequence[Drawing] = (),
 ) -> None:
     """Write the run folder.
 
@@ -214,9 +214,8 @@ def write_run(
     """
     config, robot = replace(run.experiment.config, output=output), run.experiment.robot
     run = replace(run, experiment=replace(run.experiment, config=config))
-    figures, begun = all_figures(run), begun or Drawing()
-    rest = {name: figure for name, figure in figures.items() if name not in begun.names}
-    with during("writing", output), new_folder(output, overwrite) as folder, drawing(rest, config) as others:
+    order, left = tuple(all_figures(run)), figures_left(run, begun)
+    with during("writing", output), new_folder(output, overwrite) as folder, drawing(left, config) as rest:
         (folder / "config.yaml").write_text(dump_config(config))
         write_json(folder / "parameters.json", parameters_document(robot, run.estimate, run.by_state, run.extras))
         write_json(folder / "metrics.json", _metrics_document(run))
@@ -226,7 +225,7 @@ def write_run(
         write_page(folder, output)
         if training is not None:
             training.copy_curves(folder)
-        write_events(run, folder, lambda: write_figures(folder, config.figures.format, figures, (begun, others)))
+        write_events(run, folder, lambda: write_figures(folder, config.figures.format, order, [*begun, rest]))
     if training is not None:
         training.remove_checkpoint()
 

@@ -1,4 +1,4 @@
-"""Figures of a run, drawn by copies of this process, and what it writes for TensorBoard."""
+"""Figures of a run, drawn by several processes, and what it writes for TensorBoard."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from torchid import ranks
 from torchid.commands.answer import answer
 from torchid.commands.training import body_eigenvalues, known_parameters
 from torchid.config import ExperimentConfig, dump_config
-from torchid.copies import in_copies
+from torchid.copies import in_copies, share_between_processes
 from torchid.estimators import ConstrainedEstimate, Estimate, SgdEstimate
 from torchid.fitting.cross_validation import RidgeChoice
 from torchid.identifiability.confounding import ExtraEstimate
@@ -99,14 +100,26 @@ class Drawing:
 def drawing(figures: Figures, config: ExperimentConfig) -> Iterator[Drawing]:
     """Copies of this process that draw figures of the run of an experiment within the block, on all cores but one.
 
+    Processes that share the work call this together, and have drawn them when the block begins.
+
     Args:
         figures: to draw.
         config: of the experiment, with an output.
     """
     folder, form = config.output or Path(), config.figures.format
     files = [(folder / f"{name}.{form}", make) for name, make in figures.items()]
+    if ranks.world_size() > 1:
+        there = share_between_processes(files, lambda file: draw_for(*file), ranks.world_size())
+        yield Drawing(tuple(figures), lambda: there)
+        return
     with in_copies(files, lambda file: draw_for(*file), max(thread_count() - 1, 1)) as drawn:
         yield Drawing(tuple(figures), drawn)
+
+
+def figures_left(run: Identification, drawn: Iterable[Drawing]) -> Figures:
+    """Those of a run that are not being drawn yet."""
+    begun = {name for one in drawn for name in one.names}
+    return {name: figure for name, figure in all_figures(run).items() if name not in begun}
 
 
 def write_figures(folder: Path, form: str, order: Iterable[str], drawn: Iterable[Drawing]) -> Mapping[str, bytes]:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+import torch
 
 from torchid import ranks
 from torchid.commands.cache import Files, written_file
@@ -157,7 +158,7 @@ class _Rows:
         found = recorded_sensors(self._log.robot, self._log.contacts, [samples])
         if self.recorded is not None:
             found = SensorSet(found.torque & self.recorded.torque, found.wrench & self.recorded.wrench)
-        self.like, self.recorded = samples[:0], found
+        self.like, self.recorded = samples[torch.arange(0)], found  # with no memory that would be sent along
 
     def _open(self, name: str, rows: np.ndarray[Any, Any], total: int) -> tuple[BinaryIO, int]:
         """The file of a tensor, as large as it will be, and where its rows begin; all processes make the same."""

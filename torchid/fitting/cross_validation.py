@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchid.copies import share_between_copies
+from torchid import ranks
+from torchid.copies import share_between_processes
 from torchid.errors import LogError, TorchidWarning
 from torchid.fitting.calibration import Calibration, Comparison, calibration_at, calibrations
 from torchid.fitting.fit import BatchEstimator, Fit, LogFitter
@@ -154,7 +155,8 @@ def choose_ridge(
     if len(folds) < 2:
         raise _too_few(blocks)
     together = merge_states(parts, fitter.builder)
-    count, squares = min(thread_count(), len(estimators)), np.empty((len(folds), len(estimators)))
+    count = min(max(thread_count(), ranks.world_size()), len(estimators))
+    squares = np.empty((len(folds), len(estimators)))
     shares = [(fold, first) for first in range(count) for fold in folds]  # five folds are no two equal halves
 
     def held_out(share: tuple[int, int]) -> Array:
@@ -162,7 +164,7 @@ def choose_ridge(
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", TorchidWarning)  # the fit says the same
-        for (fold, first), found in zip(shares, share_between_copies(shares, held_out, thread_count()), strict=True):
+        for (fold, first), found in zip(shares, share_between_processes(shares, held_out, thread_count()), strict=True):
             squares[folds.index(fold), first::count] = found
     means = squares.mean(axis=0)
     best, ridges = int(means.argmin()), tuple(float(estimator.ridge) for estimator in estimators)

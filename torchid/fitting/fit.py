@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 from torch import Tensor
 
-from torchid.copies import share_between_copies
+from torchid.copies import share_between_processes
 from torchid.errors import TorchidWarning, UnknownNameError
 from torchid.estimators import Estimate, LeastSquares
 from torchid.estimators.least_squares import Minimizer
@@ -218,7 +218,7 @@ class LogFitter:
                 rest = [block for block in blocks if block.fold != fold]
                 return self.solve_problem(LogProblem(rest, self.assemble(rest, noise)))
 
-        return share_between_copies(folds, without, thread_count())
+        return share_between_processes(folds, without, thread_count())
 
 
 def _is_homogeneous(problem: LinearProblem, forces: float) -> bool:

@@ -226,16 +226,21 @@ class Coverage:
         nan = np.isnan(values)
         if active is not None:
             active = active.reshape(active.shape + (1,) * (values.ndim - 2))
-        self.values += len(values) - nan.sum(axis=0)
         self.measurable += len(values) if active is None else active.sum(axis=0)
-        if active is not None:
-            nan &= active
-        count = nan.sum(axis=0)
-        new = (count > 0) & (self.missing == 0)
-        self.first[new] = self.samples + np.argmax(nan, axis=0)[new]
-        self.last[count > 0] = self.samples + (len(nan) - 1 - np.argmax(nan[::-1], axis=0))[count > 0]
-        self.missing += count
+        self.values += len(values)
+        if nan.any():
+            self.values -= nan.sum(axis=0)
+            self._add_missing(nan if active is None else nan & active)
         self.samples += len(values)
+
+    def _add_missing(self, missing: BoolArray) -> None:
+        """Add what is missing of the samples that are added, (N, ...)."""
+        count = missing.sum(axis=0)
+        if count.any():
+            new = (count > 0) & (self.missing == 0)
+            self.first[new] = self.samples + np.argmax(missing, axis=0)[new]
+            self.last[count > 0] = self.samples + (len(missing) - 1 - np.argmax(missing[::-1], axis=0))[count > 0]
+            self.missing += count
 
     @property
     def complete(self) -> BoolArray:
