@@ -46,6 +46,7 @@ ALL: dict[str, Any] = {
         "stiffness": False,
         "sign_width": 0.01,
         "delay": -0.002,
+        "stiction": True,
     },
     "estimator": {"name": "least_squares", "ridge": 1e-5, "rank_tolerance": 1e-7, "friction": False},
     "analysis": {
