@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from torch import Tensor, nn
 
+from torchid.problem.samples import Samples
 from torchid.regressor.kinematics import BodyStates, JointMotion
 
 
@@ -122,3 +123,13 @@ class ChunkDynamics(ChunkKinematics):
             None if self.resting is None else pick(self.resting),
             pick(self.wrenches),
         )
+
+
+@dataclass(frozen=True)
+class ChunkPart:
+    """Samples of one rank: their generalized forces f, (base rows + coupled joints, B), and measured contact rows."""
+
+    samples: Samples
+    f: Tensor
+    measured: Tensor
+    dynamics: ChunkDynamics

@@ -5,8 +5,9 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
+from importlib.util import find_spec
 from itertools import chain, pairwise
 from typing import TypeVar
 
@@ -35,6 +36,7 @@ CHUNK = 4096
 _LEAST, _EACH = 2048, 4  # samples per chunk where there are fewer chunks than so many for each worker
 _LET_GO = 4  # chunks of a worker, after which pages that samples are mapped to leave the memory of the process
 _WORTH_COPYING = 50_000  # samples of a pass: copies save 0.8 us of each on two cores, and take 15 to 30 ms to make
+_WORTH_LOADING = 200_000  # samples of a pass: kernels take 0.4 s to load and save 1.6 to 3 us of each on two cores
 _MOST_ON_GPU = 64 * CHUNK  # samples per chunk: launching the work on one takes the host 12 ms, whatever its size
 _SHARE_OF_GPU, _ON_GPU = 8, 48 * 2**10  # a chunk takes one of so many parts of a GPU's memory; bytes of a sample
 
@@ -68,6 +70,7 @@ def map_chunks(
     for samples, state, _ in tasks:
         builder.layout(state, samples.contact_normal is not None)
     sizes = [_size(samples, index) for samples, _, index in tasks]
+    choose_kernels(builder, sum(sizes))
     ranks.require_same(hash(tuple((size, state) for size, (_, state, _) in zip(sizes, tasks, strict=True))), "logs")
     share = ranks.own_share(sizes)
     own, done = tasks[share], sizes[share]
@@ -83,6 +86,21 @@ def map_chunks(
     if report is not None:
         report(0)
     return list(chain.from_iterable(ranks.gather(results, "chunks")))
+
+
+def choose_kernels(builder: RowBuilder, samples: int) -> None:
+    """Let a builder use compiled kernels for so many samples, if these pay and can be had, else torch's operators.
+
+    They need Numba (extra `[fast]`) that suits the installed NumPy, and a place on disk where it may keep them.
+    """
+    plain = builder.device.type == "cpu" and builder.tree.ancestors.dtype == torch.float64 and not builder.extras
+    if not plain or samples < _WORTH_LOADING or find_spec("numba") is None:
+        builder.compiled = None
+    elif builder.compiled is None:
+        with suppress(ImportError, RuntimeError):
+            from torchid.problem.compiled_rows import CompiledRows  # loads what shorter logs do without
+
+            builder.compiled = CompiledRows(builder)
 
 
 def _pieces(

@@ -174,7 +174,7 @@ def _measured_bases(
 ) -> Iterator[tuple[Tensor | slice, Tensor]]:
     """As `whitened_bases`, of joints whose torque is measured at every sample."""
     if not layout.has_own_limbs:
-        yield from _general_bases(layout, rows, slice(None), measured, axes, order)
+        yield from general_bases(layout, rows, slice(None), measured, axes, order)
         return
     joints = [columns[6:] - 6 for columns in rows.unmeasured_columns]
     W, suspect = limb_null_space(rows.unmeasured, joints, layout.row_std, measured, layout.wrench_std, axes)
@@ -182,7 +182,7 @@ def _measured_bases(
     if any_suspect(suspect):
         doubtful = torch.nonzero(suspect)[:, 0]
         some_axes = None if axes is None else axes[doubtful]
-        for index, basis in _general_bases(layout, rows, doubtful, measured[..., doubtful], some_axes, order):
+        for index, basis in general_bases(layout, rows, doubtful, measured[..., doubtful], some_axes, order):
             if basis.shape[1] == W.shape[1]:
                 W[..., doubtful[index]] = basis
             else:
@@ -199,7 +199,7 @@ def _measured_bases(
     yield from lost
 
 
-def _general_bases(
+def general_bases(
     layout: ContactStateLayout,
     rows: ContactRows,
     index: Tensor | slice,

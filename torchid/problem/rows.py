@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchid.parameters import Array
 from torchid.problem.base_motion import levelled_base_axes
 from torchid.problem.blocks import BlockRows
-from torchid.problem.chunk_dynamics import ChunkDynamics, ChunkKinematics, Workspace, Workspaces
+from torchid.problem.chunk_dynamics import ChunkDynamics, ChunkKinematics, ChunkPart, Workspace, Workspaces
 from torchid.problem.contact_rows import ContactRows, contact_rows, orthonormal_bases, whitened_bases
 from torchid.problem.contact_state import ContactState, ContactStateLayout, ContactStateLayouts, RowColumns
 from torchid.problem.extras import ExtraTerms, KnownTorques, NoiseGroups, dof_extra_column, extra_columns, list_extras
@@ -31,15 +31,8 @@ from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
 
-
-@dataclass(frozen=True)
-class _Part:
-    """Samples of one rank: their generalized forces f, (base rows + coupled joints, B), and measured contact rows."""
-
-    samples: Samples
-    f: Tensor
-    measured: Tensor
-    dynamics: ChunkDynamics
+if TYPE_CHECKING:
+    from torchid.problem.compiled_rows import CompiledRows
 
 
 class RowBuilder(nn.Module):
@@ -53,7 +46,8 @@ class RowBuilder(nn.Module):
 
     `frames`: node of each contact, and the pose of the contact frame in the node's joint frame, (4, 4) [m]. `width`:
     number of columns, those of the bodies' parameters and one for each of `extras`. `workspaces`: of passes over rows.
-    `noise_sources`: of `noise_groups`, the group of each base row and of each measured force.
+    `noise_sources`: of `noise_groups`, the group of each base row and of each measured force. `compiled`: kernels that
+    `blocks` takes its rows from, see `torchid.problem.chunks.map_chunks`; None for torch's.
     """
 
     def __init__(
@@ -81,14 +75,16 @@ class RowBuilder(nn.Module):
         self._layouts = ContactStateLayouts(robot, self.columns, contacts, sensors, self.extras)
         self.frames = self._layouts.frames
         self.width = self.columns.count + len(self.extras)
+        self.dof_std = self._layouts.dof_std
         self.workspaces = Workspaces()
+        self.compiled: CompiledRows | None = None
 
     def __repr__(self) -> str:
         return f"RowBuilder: {len(self.contacts)} contacts, {self.width} columns, {self.sensors!r}"
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> RowBuilder:
         self._layouts.clear()  # their tensors are not buffers of the module
-        self.workspaces = Workspaces()
+        self.workspaces, self.compiled = Workspaces(), None
         super()._apply(fn, recurse)
         return self
 
@@ -150,8 +146,11 @@ class RowBuilder(nn.Module):
         self, samples: Samples, state: ContactState, workspace: Workspace | None = None
     ) -> Iterator[tuple[BlockRows, Tensor | slice]]:
         """The same with the samples that each block is of, in order."""
-        workspace, dynamics = workspace or Workspace(), self.dynamics(samples, workspace)
-        layout = self._layouts.layout(state, dynamics.recorded_normals)
+        workspace, layout = workspace or Workspace(), self.layout(state, samples.contact_normal is not None)
+        if self.compiled is not None and (made := self.compiled.blocks(samples, layout, workspace)) is not None:
+            yield from ((rows, slice(None)) for rows in made)
+            return
+        dynamics = self.dynamics(samples, workspace)
         for index, _, blocks in self._coupled_rows(samples, layout, dynamics, workspace):
             yield from ((rows, index) for rows in blocks)
         yield from ((rows, slice(None)) for _, rows in self._uncoupled_rows(samples, layout, dynamics, workspace))
@@ -269,7 +268,7 @@ class RowBuilder(nn.Module):
             return samples.time.new_full((len(samples), self.tree.n_dofs), torch.nan)
         return samples.torque
 
-    def _torque_of_bodies(self, samples: Samples) -> Tensor:
+    def torque_of_bodies(self, samples: Samples) -> Tensor:
         """Recorded torques and wrenches without what known armatures and springs need, (B, n + 6 F) [N m, N]."""
         torque = self.recorded_torque(samples)
         return torque if self.known_torques.none else torque - self.known_torques.of(samples)
@@ -278,7 +277,7 @@ class RowBuilder(nn.Module):
         self, samples: Samples, layout: ContactStateLayout, dynamics: ChunkDynamics, workspace: Workspace
     ) -> Iterator[tuple[int, BlockRows]]:
         """Uncoupled joints, and the row of each."""
-        torque = self._torque_of_bodies(samples)
+        torque = self.torque_of_bodies(samples)
         for joint, block in layout.uncoupled_joints.items():
             weight = self._uncoupled_weight(joint, dynamics)
             W = weight[None, None]
@@ -306,17 +305,24 @@ class RowBuilder(nn.Module):
             return
         rows = self.contact_rows(layout, dynamics)
         measured = rows.of_measured()
-        torque = self._torque_of_bodies(samples)[:, self.tree.index(layout.coupled_joints)]
-        f = nn.functional.pad(torque, (self.tree.base_rows, 0))
-        if len(layout.wrench_std):
-            f = f + (measured.permute(2, 1, 0) @ self._measured_wrench(samples, layout, dynamics)[..., None])[..., 0]
+        f = self.coupled_forces(samples, layout, measured, dynamics)
         for index, W in self.whitened_bases(layout, rows, measured, dynamics):
             own = measured[..., index].permute(2, 0, 1)
-            part = _Part(samples[index], f[index].T, own, dynamics.select(index))
+            part = ChunkPart(samples[index], f[index].T, own, dynamics.select(index))
             yield index, W, self._projected_blocks(W, part, layout, workspace)
 
+    def coupled_forces(
+        self, samples: Samples, layout: ContactStateLayout, measured: Tensor | None, kinematics: ChunkKinematics | None
+    ) -> Tensor:
+        """Measured forces in the base rows and coupled joints, (B, m); of contacts by their `measured` rows."""
+        torque = self.torque_of_bodies(samples)[:, self.tree.index(layout.coupled_joints)]
+        f = nn.functional.pad(torque, (self.tree.base_rows, 0))
+        if measured is None or kinematics is None or not len(layout.wrench_std):
+            return f
+        return f + (measured.permute(2, 1, 0) @ self._measured_wrench(samples, layout, kinematics)[..., None])[..., 0]
+
     def _projected_blocks(
-        self, W: Tensor, part: _Part, layout: ContactStateLayout, workspace: Workspace
+        self, W: Tensor, part: ChunkPart, layout: ContactStateLayout, workspace: Workspace
     ) -> Iterator[BlockRows]:
         base = self.tree.base_rows
         absent = None if part.dynamics.resting is None else ~W.any(0)
@@ -330,7 +336,7 @@ class RowBuilder(nn.Module):
                 rows.values[-1 - len(block.extras) : -1] = self._extra_columns(part, layout, block, own)
             yield rows
 
-    def _extra_columns(self, part: _Part, layout: ContactStateLayout, block: RowBlock, W: Tensor) -> Tensor:
+    def _extra_columns(self, part: ChunkPart, layout: ContactStateLayout, block: RowBlock, W: Tensor) -> Tensor:
         """Columns of a block's extra parameters, (extras, r, B)."""
         extras = [self.extras[column - self.columns.count] for column in block.extras]
         touching = {contact for extra in extras for contact, _ in extra.contacts}

@@ -14,8 +14,8 @@ from torch import Tensor
 BASE = 6
 """Rows of the base in a generalized force."""
 
-_WELL_CONDITIONED = 1e4  # of a limb, in the Frobenius norm: a knee that is not straight
-_PIVOT = 1e-6  # what is left of the square of a column: below it, the columns are nearly dependent
+WELL_CONDITIONED = 1e4  # of a limb, in the Frobenius norm: a knee that is not straight
+PIVOT = 1e-6  # what is left of the square of a column: below it, the columns are nearly dependent
 _OF_BASE = (slice(0, 3), slice(3, BASE))  # force and moment
 
 
@@ -52,7 +52,7 @@ def limb_null_space(
     for k in dict.fromkeys(len(limb) for limb in limbs):
         alike = [number for number, limb in enumerate(limbs) if len(limb) == k]
         motion, condition = _solve([limbs[number] for number in alike])
-        suspect |= ~(condition < _WELL_CONDITIONED**2)  # so written, undefined ones are suspect too
+        suspect |= ~(condition < WELL_CONDITIONED**2)  # so written, undefined ones are suspect too
         white[BASE:m].index_copy_(0, torch.cat([joints[number] for number in alike]), motion)
     base, own = white[:BASE], white[BASE:m]
     for row, J, std in zip(white[m:], J_m, wrench_std, strict=True):
@@ -81,7 +81,7 @@ def _orthonormalize(columns: Tensor, suspect: Tensor) -> None:
 
     By the modified Gram-Schmidt process: a Cholesky factor of their products would square their condition.
     """
-    least = _PIVOT * columns.square().sum(0)
+    least = PIVOT * columns.square().sum(0)
     for j in range(columns.shape[1]):
         column, rest = columns[:, j], columns[:, j + 1 :]
         size = column.square().sum(0)

@@ -1,0 +1,285 @@
+"""Rows of a chunk by the compiled kernels of `torchid.kernels`: the same as `RowBuilder`'s."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchid.kernels import limbs, rows, states
+from torchid.kernels.tiles import TILE
+from torchid.parameters import Array
+from torchid.problem.blocks import BlockRows
+from torchid.problem.chunk_dynamics import ChunkKinematics, Workspace
+from torchid.problem.contact_rows import general_bases
+from torchid.problem.contact_state import ContactStateLayout
+from torchid.problem.row_blocks import RowBlock, subtract_payload
+from torchid.problem.samples import Samples
+from torchid.regressor.kinematics import BodyStates, JointMotion, Motion, joint_motion
+from torchid.regressor.tree import KinematicTree
+from torchid.sensing.limbs import PIVOT, WELL_CONDITIONED
+
+if TYPE_CHECKING:
+    from torchid.problem.rows import RowBuilder
+
+
+@dataclass(frozen=True)
+class _Tiles:
+    """Motion of all joints, (6, L, P), and states of all nodes, (P / TILE, L, STATE, TILE), as the kernels have them.
+
+    `samples`: B, the first ones of the P. `motion`: of their joints, as torch has it.
+    """
+
+    joints: Tensor
+    states: Tensor
+    samples: int
+    motion: JointMotion
+
+    def kinematics(self, index: Tensor) -> ChunkKinematics:
+        """Of some samples: what the rows of contacts that are fixed to bodies are made of."""
+        parts = self.states[index // TILE, :, :, index % TILE].permute(2, 1, 0)
+        rotation = parts[: states.POSITION].unflatten(0, (3, 3))
+        starts = (states.POSITION, states.OMEGA, states.ALPHA, states.FORCE, states.SCREW)
+        vectors = (parts[start : start + 3] for start in starts[:-1])
+        joints = JointMotion(*(x[:, index] for x in vars(self.motion).values()))
+        return ChunkKinematics(joints, BodyStates(rotation, *vectors), parts[states.SCREW :], None, {}, False, {}, None)
+
+
+@dataclass(frozen=True)
+class _Limbs:
+    """What `limbs.write_bases` takes of a contact state."""
+
+    limbs: np.ndarray
+    wrenches: Array
+    dofs: np.ndarray
+    moved: np.ndarray
+    ratios: Array
+    row_std: Array
+
+    @classmethod
+    def of(cls, tree: KinematicTree, layout: ContactStateLayout) -> _Limbs:
+        own, wrenches, dofs = list[list[int]](), list[Tensor](), list[int]()
+        moved, ratios = list[tuple[int, int]](), list[float]()
+        for body in layout.contact_bodies:
+            first, count = len(moved), len(body.joints)
+            for number, joint in enumerate(body.joints):
+                for node in tree.path(body.body):
+                    if ratio := float(tree.joint_map[node, layout.coupled_joints[joint]]):
+                        moved.append((number, node))
+                        ratios.append(ratio)
+            own.append([body.body, count, len(dofs), first, len(moved)])
+            wrenches.extend(part.rows for part in body.unmeasured)
+            dofs.extend(body.joints)
+        flat = torch.cat(wrenches).flatten().numpy()
+        return cls(np.array(own), flat, np.array(dofs), np.array(moved), np.array(ratios), layout.row_std.numpy())
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What `rows.write_rows` takes of some blocks."""
+
+    blocks: np.ndarray
+    moved: np.ndarray
+    ratios: Array
+    bodies: np.ndarray
+    kept: np.ndarray
+
+    @classmethod
+    def of(cls, blocks: tuple[RowBlock, ...], base: int, dofs: int | None) -> _Plan:
+        """Of blocks that combine so many degrees of freedom after those of the base; None for one row and one each."""
+        table, moved, ratios = list[list[int]](), list[list[int]](), list[float]()
+        bodies, kept, first = list[list[int]](), list[int](), 1  # the first path sum stays 0
+        for number, block in enumerate(blocks):
+            of_base, width = int(block.base != "none"), len(block.support) + 1
+            if dofs is None:
+                table.append([0, 1, width, 0, 0, number, number + 1])
+            else:
+                count = block.rows.stop - block.rows.start
+                table.append([block.rows.start, count, width, 0, first * of_base, 0, base + dofs])
+            for place, (node, moving, ratio, above) in enumerate(block.moved):
+                upper = 0 if above is None else first + above
+                dof, column = number if dofs is None else base + moving, len(block.inertial) + 2 * place
+                moved.append([number, node, dof, first + of_base + place, upper, column])
+                ratios.append(ratio)
+            column = 0
+            for run in block.nodes:
+                for place, node in enumerate(run.nodes):
+                    path_sum = first + run.sources[place if len(run.sources) > 1 else 0]
+                    bodies.append([node, number, path_sum, column, len(kept), len(run.kept)])
+                    column += len(run.kept)
+                kept.extend(run.kept)
+            first += of_base + len(block.moved)
+        bodies.sort(key=lambda x: (x[0], -x[5], x[1]))
+        return cls(
+            np.array([[*row, first] for row in table]),
+            np.array(moved, dtype=int).reshape(-1, 6),
+            np.array(ratios, dtype=float),
+            np.array(bodies, dtype=int).reshape(-1, 6),
+            np.array(kept, dtype=int),
+        )
+
+    def placed(self, samples: int) -> tuple[np.ndarray, int]:
+        """The blocks, one after the other in memory for so many samples, and how many numbers they are."""
+        out, width = self.blocks.copy(), self.blocks[:, 2]
+        ends = np.cumsum(width * (width + self.blocks[:, 1] * samples))
+        out[1:, 3] = ends[:-1]
+        return out, int(ends[-1])
+
+
+class CompiledRows:
+    """Makes the rows of a builder, float64 on a CPU, where no joint rests; of extra parameters it has no columns."""
+
+    def __init__(self, builder: RowBuilder) -> None:
+        """Work out the constants."""
+        tree = builder.tree
+        self._builder = builder
+        self._parent = np.maximum(tree.parents, 0)
+        self._pose = np.ascontiguousarray(tree.T_parent_joint[:, :3]).reshape(-1)
+        self._slides = np.array(tree.slides, dtype=float)
+        self._limbs: dict[int, _Limbs] = {}
+        self._plans: dict[int, _Plan] = {}
+
+    def blocks(self, samples: Samples, layout: ContactStateLayout, workspace: Workspace) -> Iterator[BlockRows] | None:
+        """As `RowBuilder.blocks`, each of all samples; None where joints rest or ranks of contacts differ."""
+        if samples.resting is not None:
+            return None
+        tiles = self._tiles(samples.motion(), workspace)
+        bases = self._bases_by_kernel if _stands_on_limbs(self._builder, layout) else self._bases
+        coupled = bases(samples, layout, tiles, workspace)
+        return None if coupled is None else self._blocks(samples, layout, tiles, coupled, workspace)
+
+    def _blocks(
+        self,
+        samples: Samples,
+        layout: ContactStateLayout,
+        tiles: _Tiles,
+        coupled: tuple[Tensor, Tensor],
+        workspace: Workspace,
+    ) -> Iterator[BlockRows]:
+        payload, parameter_map = samples.payload, self._builder.columns.parameter_map
+        of_rank = layout.blocks.of_rank(coupled[0].shape[2])
+        joints, apart = list(layout.uncoupled_joints), tuple(layout.uncoupled_joints.values())
+        for made in self._write(of_rank, len(layout.coupled_joints), tiles, *coupled, workspace):
+            subtract_payload(made.block, made.values, payload, parameter_map)
+            yield made
+        weights = torch.from_numpy(1.0 / self._builder.dof_std[joints])[None, :, None, None].repeat(1, 1, 1, TILE)
+        torque = self._builder.torque_of_bodies(samples)[:, self._builder.tree.index(joints)]
+        for made in self._write(apart, None, tiles, weights, torque, workspace):
+            subtract_payload(made.block, made.values, payload, parameter_map)
+            yield made
+
+    def _write(
+        self,
+        blocks: tuple[RowBlock, ...],
+        dofs: int | None,
+        tiles: _Tiles,
+        W: Tensor,
+        f: Tensor,
+        workspace: Workspace,
+    ) -> Iterator[BlockRows]:
+        """Rows of blocks, from tiles (T, degrees of freedom, rank, TILE) of W, or one for all, and forces (B, dofs).
+
+        `dofs`: as of `_Plan.of`.
+        """
+        if not blocks:
+            return
+        key = id(blocks[0])  # of those that the builder's layouts keep
+        if (plan := self._plans.get(key)) is None:
+            plan = self._plans[key] = _Plan.of(blocks, self._builder.tree.base_rows, dofs)
+        forces = workspace.empty("forces", W, f.shape[1], tiles.samples)
+        forces.copy_(f.T)
+        placed, size = plan.placed(tiles.samples)
+        flat = workspace.empty("rows", W, size)
+        step = W[0].numel() if len(W) > 1 else 0
+        rows.write_rows(
+            *(_flat(tiles.states), _flat(tiles.joints), tiles.joints.shape[1], tiles.samples),
+            *(_flat(W), W.shape[2], step, _flat(forces)),
+            *(placed, plan.moved, plan.ratios, plan.bodies, plan.kept, flat.numpy()),
+        )
+        for block, (_, count, width, start, *_) in zip(blocks, placed.tolist(), strict=True):
+            stacked = flat[start:][: width * (width + count * tiles.samples)].unflatten(0, (width, -1))
+            yield BlockRows(block, stacked, stacked[:, width:].unflatten(1, (count, tiles.samples)), None)
+
+    def _tiles(self, motion: Motion, workspace: Workspace) -> _Tiles:
+        joints = joint_motion(self._builder.tree, motion)
+        nodes, samples = joints.position.shape
+        padded = -(-samples // TILE) * TILE
+        out = workspace.empty("joints", joints.position, 6, nodes, padded)
+        base = workspace.empty("base", joints.position, 9, padded)
+        out[..., samples:], base[:, samples:] = 0.0, 0.0
+        own, angle = out[..., :samples], joints.position * self._builder.tree.revolute
+        torch.cos(angle, out=own[states.COSINE])
+        torch.sin(angle, out=own[states.SINE])
+        torch.mul(joints.position, self._builder.tree.prismatic, out=own[states.SLIDE])
+        own[states.VELOCITY], own[states.ACCELERATION] = joints.velocity, joints.acceleration
+        own[states.DIRECTION] = joints.direction
+        of_base = (motion.base_angular_velocity, motion.base_angular_acceleration, motion.base_specific_force)
+        torch.cat([x.T for x in of_base], out=base[:, :samples])
+        made = workspace.empty("states", base, padded // TILE, nodes, states.STATE, TILE)
+        states.write_states(self._parent, self._pose, self._slides, _flat(out), _flat(base), _flat(made))
+        return _Tiles(out, made, samples, joints)
+
+    def _bases(
+        self, samples: Samples, layout: ContactStateLayout, tiles: _Tiles, workspace: Workspace
+    ) -> tuple[Tensor, Tensor] | None:
+        """Tiles (T, degrees of freedom, rank, TILE) of W, forces (B, degrees of freedom); None where ranks differ."""
+        builder, m = self._builder, len(layout.row_std)
+        if not m:
+            return tiles.states.new_empty(1, 0, 0, TILE), tiles.states.new_empty(tiles.samples, 0)
+        kinematics = builder.kinematics(samples)
+        contact = builder.contact_rows(layout, kinematics)
+        measured = contact.of_measured()
+        bases = list(builder.whitened_bases(layout, contact, measured, kinematics))
+        if len(bases) != 1 or len(bases[0][1][0, 0]) != tiles.samples:
+            return None
+        basis = bases[0][1]
+        padded = workspace.empty("W by row", basis, *basis.shape[:2], len(tiles.states) * TILE)
+        padded[..., : tiles.samples], padded[..., tiles.samples :] = basis, 0.0
+        W = workspace.empty("W", basis, len(tiles.states), *basis.shape[:2], TILE)
+        W.copy_(padded.unflatten(2, (-1, TILE)).permute(2, 0, 1, 3))
+        return W, builder.coupled_forces(samples, layout, measured, kinematics)
+
+    def _bases_by_kernel(
+        self, samples: Samples, layout: ContactStateLayout, tiles: _Tiles, workspace: Workspace
+    ) -> tuple[Tensor, Tensor] | None:
+        """The same where `_stands_on_limbs`."""
+        key = id(layout)  # which the builder keeps
+        if key not in self._limbs:
+            self._limbs[key] = _Limbs.of(self._builder.tree, layout)
+        own = self._limbs[key]
+        count, nodes = tiles.states.shape[:2]
+        W = workspace.empty("W", tiles.states, count, len(own.row_std), limbs.BASE, TILE)
+        suspect = torch.empty(count * TILE, dtype=torch.bool)
+        limbs.write_bases(
+            *(_flat(tiles.states), nodes, own.limbs, own.wrenches, own.dofs, own.moved, own.ratios, own.row_std),
+            *(WELL_CONDITIONED**2, PIVOT, _flat(W), suspect.numpy()),
+        )
+        doubtful = torch.nonzero(suspect[: tiles.samples])[:, 0]
+        if len(doubtful):
+            order = self._builder.tree.index(layout.blocks.order)
+            contact = self._builder.contact_rows(layout, tiles.kinematics(doubtful))
+            for index, basis in general_bases(layout, contact, slice(None), contact.of_measured(), None, order):
+                if basis.shape[1] != limbs.BASE:
+                    return None
+                W[doubtful[index] // TILE, :, :, doubtful[index] % TILE] = basis.permute(2, 0, 1)
+        return W, self._builder.coupled_forces(samples, layout, None, None)
+
+
+def _stands_on_limbs(builder: RowBuilder, layout: ContactStateLayout) -> bool:
+    """Whether all contacts are limbs with unmeasured forces that are fixed to bodies."""
+    parts = [part for body in layout.contact_bodies for part in body.unmeasured]
+    return (
+        layout.has_own_limbs
+        and not len(layout.wrench_std)
+        and not builder.sensors.noise.base_axes_differ
+        and all(part.line_of_action == (None, None) for part in parts)
+        and sum(len(part.rows) for part in parts) == len(layout.coupled_joints)
+    )
+
+
+def _flat(x: Tensor) -> Array:
+    return x.view(-1).numpy()
