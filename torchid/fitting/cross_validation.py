@@ -310,7 +310,6 @@ class Scorer:
         return pairs
 
     def _metrics(self, sums: Sequence[tuple[ForceSums, ForceSums]]) -> list[Metrics]:
-        """Of each calibration."""
         return [self.evaluation.summarize(*pair) for pair in sums]
 
 
