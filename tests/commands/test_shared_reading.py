@@ -19,6 +19,7 @@ from large import SMALL, experiment, recorded, tensors
 from shared_work import finish_forked
 
 from torchid import ranks
+from torchid.commands import cache as caches
 from torchid.commands import cached_reading, large_log, manifest, reading
 from torchid.commands.cache import FOLDER
 from torchid.commands.cached_reading import CachedReader, _shares, open_cache
@@ -54,7 +55,7 @@ def read_all(calls: Sequence[Sequence[str]], folder: Path) -> int:
         return sum_up(part)
 
     reading.read_log, large_log.LargeLog._bound = open_and_read, note_and_bind  # type: ignore[method-assign]
-    cached_reading.part_checksum, manifest._PART = note_and_sum_up, 100_000
+    cached_reading.part_checksum, manifest._PART, caches._YOUNG = note_and_sum_up, 100_000, -1.0
     dist.init_process_group("gloo")
     rank, found = dist.get_rank(), []
     for file, *more in calls:
