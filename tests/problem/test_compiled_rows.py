@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -90,6 +91,14 @@ def test_straight_knees_are_no_exception() -> None:
     position[7], position[70, :3] = 0.0, 0.0
     samples = replace(samples, active=torch.ones_like(samples.active), joint_position=position)
     assert assert_same_rows(plain, fast, samples) == 1
+
+
+def test_a_numba_that_does_not_work_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    builder = RowBuilder(QUADRUPED, POINTS, sensor_set("joints", QUADRUPED, POINTS))
+    monkeypatch.setitem(sys.modules, "torchid.problem.compiled_rows", None)  # importing it then fails
+    with pytest.warns(torchid.errors.TorchidWarning, match="Numba: .*without it"):
+        choose_kernels(builder, ENOUGH)
+    assert builder.compiled is None
 
 
 def test_long_passes_use_kernels_and_give_the_same_factor(monkeypatch: pytest.MonkeyPatch) -> None:

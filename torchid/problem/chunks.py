@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import cache
 from importlib.util import find_spec
 from itertools import chain, pairwise
@@ -17,6 +17,7 @@ from threadpoolctl import ThreadpoolController
 
 from torchid import ranks
 from torchid.copies import can_copy, share_between_copies
+from torchid.errors import excerpt, warn
 from torchid.problem.contact_state import ContactState
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
@@ -92,15 +93,20 @@ def choose_kernels(builder: RowBuilder, samples: int) -> None:
     """Let a builder use compiled kernels for so many samples, if these pay and can be had, else torch's operators.
 
     They need Numba (extra `[fast]`) that suits the installed NumPy, and a place on disk where it may keep them.
+
+    Warns:
+        TorchidWarning: Numba is there, but not these.
     """
     plain = builder.device.type == "cpu" and builder.tree.ancestors.dtype == torch.float64 and not builder.extras
     if not plain or samples < _WORTH_LOADING or find_spec("numba") is None:
         builder.compiled = None
     elif builder.compiled is None:
-        with suppress(ImportError, RuntimeError):
+        try:
             from torchid.problem.compiled_rows import CompiledRows  # loads what shorter logs do without
-
-            builder.compiled = CompiledRows(builder)
+        except (ImportError, RuntimeError) as error:
+            warn(f"Numba: {excerpt(str(error))}; rows are made without it, which takes 1.5 times as long")
+            return
+        builder.compiled = CompiledRows(builder)
 
 
 def _pieces(
