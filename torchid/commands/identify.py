@@ -299,7 +299,10 @@ def _compressed(
 ) -> tuple[list[Part], bool]:
     """The compressed training logs, and whether they were in the cache."""
     streaming = bars.add_task("streaming samples", total=sum(map(len, train)))
-    compute = partial(compress_in_blocks, train, builder, progress=partial(bars.advance, streaming))
+
+    def compute() -> list[Part]:
+        return compress_in_blocks(train, builder, progress=partial(bars.advance, streaming))
+
     keys = reader.keys if isinstance(reader, CachedReader) else {}
     paths = [str(path) for path in experiment.config.logs.train]
     if not isinstance(reader, CachedReader) or not all(ranks.gather(keys.keys() >= {*paths}, "logs in the cache")):
