@@ -35,6 +35,7 @@ from torchid.estimators import Consistent, LeastSquares
 from torchid.parameters import FRICTION, Array, perturb_parameters
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
 from torchid.problem.base_motion import BaseMotion
+from torchid.problem.chunks import choose_kernels
 from torchid.regressor import FrameJacobian, Regressor
 from torchid.robot import Robot, load_robot
 from torchid.sensing import Contact, SensorNoise, named_sensors
@@ -270,8 +271,9 @@ def measure(
         "per sample, Gram": (lambda: per_sample.by_gram(few), len(few)),
         "torchid": (bench.fit, count),
     }
-    by_stages = samples[torch.arange(0, count, max(1, count // _STAGED))]
-    return medians(pipelines, repeats, device), measure_stages(builder, by_stages, limits)
+    measured, by_stages = medians(pipelines, repeats, device), samples[torch.arange(0, count, max(1, count // _STAGED))]
+    choose_kernels(builder, len(by_stages))
+    return measured, measure_stages(builder, by_stages, limits)
 
 
 def main() -> None:
