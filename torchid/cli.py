@@ -196,7 +196,9 @@ def _add_work_on_logs(commands: _Commands) -> None:
     """Commands that write logs anew."""
     convert = commands.add_parser("convert", help=_CONVERT, description=_CONVERT)
     convert.add_argument(
-        "source", metavar="IN", help="log: .npz, .h5, .mat, .csv, .txt, .parquet, .mot, .sto, or a bag of ROS messages"
+        "source",
+        metavar="IN",
+        help="log: .npz, .h5, .mat, .csv, .txt, .parquet, .jsonl, .mot, .sto, or a bag of ROS messages",
     )
     convert.add_argument("target", metavar="OUT", help="file to write: .npz, .h5, .csv or .parquet")
     _add_maps(convert)
@@ -222,7 +224,7 @@ def _add_starts(commands: _Commands) -> None:
     init.add_argument(
         "log",
         metavar="LOG",
-        help="table, arrays or bag: .csv, .txt, .parquet, .mot, .sto, .npz, .h5, .mat, .mcap, .db3, .bag; "
+        help="table, arrays or bag: .csv, .txt, .parquet, .jsonl, .mot, .sto, .npz, .h5, .mat, .mcap, .db3, .bag; "
         "or several, 'FILE + FILE@SECONDS'",
     )
     what = "file to write, a new one (default: experiment.yaml)"
