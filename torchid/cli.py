@@ -195,11 +195,8 @@ def _add_maps(command: argparse.ArgumentParser) -> None:
 def _add_work_on_logs(commands: _Commands) -> None:
     """Commands that write logs anew."""
     convert = commands.add_parser("convert", help=_CONVERT, description=_CONVERT)
-    convert.add_argument(
-        "source",
-        metavar="IN",
-        help="log: .npz, .h5, .mat, .csv, .txt, .parquet, .jsonl, .mot, .sto, or a bag of ROS messages",
-    )
+    read = "log: .npz, .h5, .mat, .csv, .txt, .parquet, .jsonl, .mot, .sto, or a bag of ROS messages"
+    convert.add_argument("source", metavar="IN", help=read)
     convert.add_argument("target", metavar="OUT", help="file to write: .npz, .h5, .csv or .parquet")
     _add_maps(convert)
     convert.add_argument("--overwrite", action="store_true", help="replace OUT if it exists")

@@ -164,13 +164,7 @@ def check(
     repaired = repair_log(log, _findings(results))
     blocking = _blocking_finding(results)
     if blocking is None or blocking.field != "time":
-        results += [
-            *check_rest(repaired),
-            *check_still_velocities(repaired),
-            *check_derivatives(repaired),
-            *check_angular_velocity(repaired, robot),
-        ]
-        results += check_accelerometer(repaired, robot)
+        results += _check_motion(repaired, robot)
     compared = repaired
     if _blocking_finding(results) is None:
         filled = rejected_samples((x for x in _findings(results) if x.field != "contact_active"), len(log))
@@ -183,11 +177,7 @@ def check(
         compared, unfit = _longest_standing(compared, robot, contacts)
         results += unfit
     if _blocking_finding(results) is None:
-        unbiased = subtract_contact_offsets(compared)
-        forces = list(check_forces_against_urdf(unbiased, robot, contacts, cutoff_hz, derived, declared, required))
-        results += forces
-        results += check_single_joints(unbiased, robot, contacts, cutoff_hz, declared, forces)
-        results += check_limb_sensors(compared, robot, contacts, cutoff_hz)
+        results += _check_forces(compared, robot, contacts, cutoff_hz, derived, declared, required)
     blocking = _blocking_finding(results)
     if blocking is None or blocking.name == "sign":
         scaled = declared is not None and "contact_force" in declared.terms.scales
@@ -195,6 +185,32 @@ def check(
     else:
         results.append(_skip_dependent(blocking))
     return _collect(log, repaired, results)
+
+
+def _check_motion(log: Log, robot: Robot | None) -> Iterator[Finding | Skipped]:
+    """Whether positions, velocities and accelerations of the joints and the base agree."""
+    yield from check_rest(log)
+    yield from check_still_velocities(log)
+    yield from check_derivatives(log)
+    yield from check_angular_velocity(log, robot)
+    yield from check_accelerometer(log, robot)
+
+
+def _check_forces(
+    log: Log,
+    robot: Robot | None,
+    contacts: Sequence[Contact],
+    cutoff_hz: float | None,
+    derived: tuple[str, ...],
+    declared: Declared | None,
+    required: SensorSet | None,
+) -> Iterator[Finding | Skipped]:
+    """Whether forces agree with the robot's file; arguments as of `check`."""
+    unbiased = subtract_contact_offsets(log)
+    found = list(check_forces_against_urdf(unbiased, robot, contacts, cutoff_hz, derived, declared, required))
+    yield from found
+    yield from check_single_joints(unbiased, robot, contacts, cutoff_hz, declared, found)
+    yield from check_limb_sensors(log, robot, contacts, cutoff_hz)
 
 
 def _longest_standing(log: Log, robot: Robot, contacts: Sequence[Contact]) -> tuple[Log, list[Finding]]:
