@@ -1,15 +1,15 @@
 """Time the regressor and the whole pipeline against a per-sample pipeline of Pinocchio and NumPy, in one run.
 
-    python scripts/benchmark.py [--samples 65536] [--repeats 5] [--device cuda]
+    python scripts/benchmark.py [--samples 262144] [--repeats 5] [--device cuda]
 
 Needs the packages pin and example-robot-data (extra `[oracle]`) and Clarabel (extra `[certified]`). Pipelines
 start from the arrays of a log and end with parameters. Sensors are `joints` (torques measured, contact forces not); all
 feet are in contact in two thirds of the samples. Consistent parameters are timed on noisy data of Solo12 that were
 generated with other, physically consistent parameters.
 
-With `--device cuda` torchid's part runs on a GPU, the per-sample pipelines on the CPU as ever. With `--samples 262144`
-torchid uses the compiled kernels of the extra `[fast]`. A second table has the stages of the compression beside their
-floors, see `scripts/stages.py`.
+As many samples as the default use the compiled kernels of the extra `[fast]` where Numba is installed, 65,536 do not.
+With `--device cuda` torchid's part runs on a GPU, the per-sample pipelines on the CPU as ever. A second table has the
+stages of the compression beside their floors, see `scripts/stages.py`.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 from stages import Limits, Stages, measure_stages, stage_table, synchronize
+from threadpoolctl import ThreadpoolController
 
 from torchid.errors import TorchidWarning, how_to_install
 from torchid.estimators import Consistent, LeastSquares
@@ -244,6 +245,13 @@ def microseconds(work: Callable[[], object], samples: int, device: torch.device)
     return (time.perf_counter() - start) / samples * 1e6
 
 
+def blas_kernels() -> str:
+    """Library of linear algebra, and the processor whose kernels it has chosen."""
+    libraries = ThreadpoolController().select(user_api="blas").info()
+    names = {f"{x['internal_api']} {x['version']}, {x.get('architecture', 'unknown')} kernels" for x in libraries}
+    return "; ".join(sorted(names)) or "unknown"
+
+
 def measure(
     case: Case, count: int, repeats: int, device: torch.device, limits: Limits
 ) -> tuple[dict[str, float], Stages]:
@@ -279,7 +287,7 @@ def measure(
 def main() -> None:
     """Measure all robots and print one table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--samples", type=int, default=65536)
+    parser.add_argument("--samples", type=int, default=262_144)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--device", type=torch.device, default=_CPU, help="cpu or cuda")
     arguments = parser.parse_args()
@@ -305,6 +313,7 @@ def main() -> None:
     consistent.add_row(*(f"{seconds:.2f}" for seconds in measured.values()))
     console = Console(width=100)
     console.print(table)
+    console.print(f"products of matrices: {blas_kernels()}")
     console.print(stage_table(stages, limits, device))
     console.print(consistent)
 
