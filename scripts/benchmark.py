@@ -45,6 +45,7 @@ _CPU = torch.device("cpu")
 _PAUSE = 0.1  # seconds before each time that is taken: OpenBLAS' threads spin for some 30 ms after their last product
 _STAGED = 65536  # samples whose stages are timed: so few that torch works on them, see `choose_kernels`
 _DENSE = 16384  # samples whose whole regressor a GPU has at a time: 1.7 GB of G1
+_FEW = 2048  # samples that the per-sample pipelines are timed with
 
 
 @dataclass(frozen=True)
@@ -261,7 +262,7 @@ def measure(
     per_sample = PerSample(robots_folder() / case.urdf, robot, case)
     regressor = Regressor(robot).to(device)
     there, step = samples.to(device), 1024 if device.type == "cpu" else _DENSE
-    few = samples[torch.arange(0, count, 32)]
+    few = samples[torch.arange(0, count, max(1, count // _FEW))]
 
     def in_chunks(work: Callable[[Samples], object]) -> Callable[[], None]:
         def run() -> None:
