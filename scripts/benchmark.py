@@ -261,21 +261,22 @@ def measure(
     robot, builder, samples = bench.robot, bench.builder, bench.samples
     per_sample = PerSample(robots_folder() / case.urdf, robot, case)
     regressor = Regressor(robot).to(device)
-    there, step = samples.to(device), 1024 if device.type == "cpu" else _DENSE
+    step = 1024 if device.type == "cpu" else _DENSE
+    some = samples[: min(count, _STAGED)].to(device)
     few = samples[torch.arange(0, count, max(1, count // _FEW))]
 
     def in_chunks(work: Callable[[Samples], object]) -> Callable[[], None]:
         def run() -> None:
             with torch.inference_mode():
-                for start in range(0, count, step):
-                    work(there[start : start + step])
+                for start in range(0, len(some), step):
+                    work(some[start : start + step])
 
         return run
 
     pipelines: dict[str, tuple[Callable[[], object], int]] = {
         "K, Pinocchio": (lambda: per_sample.regressors(few), len(few)),
-        "K, torchid, 12 L columns": (in_chunks(lambda part: regressor.from_motion(part.motion())), count),
-        "wrench columns, torchid": (in_chunks(builder.dynamics), count),
+        "K, torchid, 12 L columns": (in_chunks(lambda part: regressor.from_motion(part.motion())), len(some)),
+        "wrench columns, torchid": (in_chunks(builder.dynamics), len(some)),
         "per sample, lstsq": (lambda: per_sample.by_stack(few), len(few)),
         "per sample, Gram": (lambda: per_sample.by_gram(few), len(few)),
         "torchid": (bench.fit, count),
