@@ -254,15 +254,20 @@ class CompiledRows:
         count, nodes = tiles.states.shape[:2]
         W = workspace.empty("W", tiles.states, count, len(own.row_std), limbs.BASE, TILE)
         suspect = torch.empty(count * TILE, dtype=torch.bool)
+        axes = self._builder.noise_axes(samples.base.rotation, self._builder.sensors.noise)
+        along = workspace.empty("axes", tiles.states, 3, 3, count * TILE)
+        along[..., : tiles.samples] = torch.eye(3)[..., None] if axes is None else axes.permute(1, 2, 0)
+        along[..., tiles.samples :] = 0.0
         limbs.write_bases(
-            *(_flat(tiles.states), nodes, own.limbs, own.wrenches, own.dofs, own.moved, own.ratios, own.row_std),
-            *(WELL_CONDITIONED**2, PIVOT, _flat(W), suspect.numpy()),
+            *(_flat(tiles.states), _flat(along), nodes, own.limbs, own.wrenches, own.dofs, own.moved, own.ratios),
+            *(own.row_std, WELL_CONDITIONED**2, PIVOT, _flat(W), suspect.numpy()),
         )
         doubtful = torch.nonzero(suspect[: tiles.samples])[:, 0]
         if len(doubtful):
             order = self._builder.tree.index(layout.blocks.order)
             contact = self._builder.contact_rows(layout, tiles.kinematics(doubtful))
-            for index, basis in general_bases(layout, contact, slice(None), contact.of_measured(), None, order):
+            axes = None if axes is None else axes[doubtful]
+            for index, basis in general_bases(layout, contact, slice(None), contact.of_measured(), axes, order):
                 if basis.shape[1] != limbs.BASE:
                     return None
                 W[doubtful[index] // TILE, :, :, doubtful[index] % TILE] = basis.permute(2, 0, 1)
@@ -275,7 +280,6 @@ def _stands_on_limbs(builder: RowBuilder, layout: ContactStateLayout) -> bool:
     return (
         layout.has_own_limbs
         and not len(layout.wrench_std)
-        and not builder.sensors.noise.base_axes_differ
         and all(part.line_of_action == (None, None) for part in parts)
         and sum(len(part.rows) for part in parts) == len(layout.coupled_joints)
     )
