@@ -17,6 +17,7 @@ import torchid
 from torchid.problem import RowBuilder, Samples, chunks, compress
 from torchid.problem.chunk_dynamics import Workspace
 from torchid.problem.chunks import choose_kernels, chunks_by_state
+from torchid.problem.extras import ExtraTerms
 
 pytest.importorskip("numba", reason="compiled kernels need Numba, of the extra [fast]")
 
@@ -26,9 +27,11 @@ SOLES = [torchid.Contact(f"{side}_sole_link", "flat") for side in ("left", "righ
 ENOUGH = 10**9  # samples of a pass for which kernels are used
 
 
-def builders(robot: torchid.Robot, contacts: list[torchid.Contact], sensors: torchid.SensorSet) -> list[RowBuilder]:
+def builders(
+    robot: torchid.Robot, contacts: list[torchid.Contact], sensors: torchid.SensorSet, terms: ExtraTerms | None = None
+) -> list[RowBuilder]:
     """With torch's operators, and with kernels."""
-    plain, fast = RowBuilder(robot, contacts, sensors), RowBuilder(robot, contacts, sensors)
+    plain, fast = (RowBuilder(robot, contacts, sensors, terms) for _ in range(2))
     choose_kernels(fast, ENOUGH)
     assert fast.compiled is not None
     return [plain, fast]
@@ -91,6 +94,19 @@ def test_a_known_payload_and_smooth_friction_are_in_the_rows() -> None:
     payload = np.random.default_rng(0).normal(size=QUADRUPED.nominal.size)
     assert assert_same_rows(plain, fast, replace(samples, payload=payload)) == 1
     assert assert_same_rows(plain, fast, replace(samples, resting=samples.joint_position > 0.0)) == 0, "torch's"
+
+
+@pytest.mark.parametrize("sensors", ["joints", "mixed"])
+def test_extra_parameters_of_joints_are_in_the_rows(sensors: str) -> None:
+    actuators = dict.fromkeys(("armature", "stiffness", "asymmetric_coulomb", "torque_offset"), True)
+    terms = ExtraTerms(**actuators, scales={"joint_torque": (("front_*",), ("rear_*",))}, stribeck=0.1, delay=True)
+    plain, fast = builders(QUADRUPED, POINTS, sensor_set(sensors, QUADRUPED, POINTS), terms)
+    samples = random_samples(QUADRUPED, POINTS, 300, 8, states=3)[0]
+    assert assert_same_rows(plain, fast, samples) == len(list(chunks_by_state(samples)))
+    of_contacts = ExtraTerms(offsets={"contact_force": "all"})
+    other = RowBuilder(QUADRUPED, POINTS, sensor_set(sensors, QUADRUPED, POINTS), of_contacts)
+    choose_kernels(other, ENOUGH)
+    assert (other.compiled is None) == bool(other.extras), "torch's"
 
 
 @pytest.mark.parametrize("of_base", [lambda x: x, by_axis], ids=["alike", "by axis"])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -17,6 +17,7 @@ from torchid.problem.blocks import BlockRows
 from torchid.problem.chunk_dynamics import ChunkKinematics, Workspace
 from torchid.problem.contact_rows import general_bases
 from torchid.problem.contact_state import ContactStateLayout
+from torchid.problem.extras import dof_extra_column
 from torchid.problem.row_blocks import RowBlock, subtract_payload
 from torchid.problem.samples import Samples
 from torchid.regressor.kinematics import BodyStates, JointMotion, Motion, joint_motion
@@ -131,7 +132,7 @@ class _Plan:
 
 
 class CompiledRows:
-    """Makes the rows of a builder, float64 on a CPU, where no joint rests; of extra parameters it has no columns."""
+    """Makes the rows of a builder, float64 on a CPU, where no joint rests; extra parameters are those of joints."""
 
     def __init__(self, builder: RowBuilder) -> None:
         """Work out the constants."""
@@ -160,17 +161,34 @@ class CompiledRows:
         coupled: tuple[Tensor, Tensor],
         workspace: Workspace,
     ) -> Iterator[BlockRows]:
-        payload, parameter_map = samples.payload, self._builder.columns.parameter_map
         of_rank = layout.blocks.of_rank(coupled[0].shape[2])
         joints, apart = list(layout.uncoupled_joints), tuple(layout.uncoupled_joints.values())
+        in_W = {joint: row for row, joint in enumerate(layout.coupled_joints, start=self._builder.tree.base_rows)}
         for made in self._write(of_rank, len(layout.coupled_joints), tiles, *coupled, workspace):
-            subtract_payload(made.block, made.values, payload, parameter_map)
+            self._complete(made, samples, coupled[0], in_W)
             yield made
         weights = torch.from_numpy(1.0 / self._builder.dof_std[joints])[None, :, None, None].repeat(1, 1, 1, TILE)
         torque = self._builder.torque_of_bodies(samples)[:, self._builder.tree.index(joints)]
-        for made in self._write(apart, None, tiles, weights, torque, workspace):
-            subtract_payload(made.block, made.values, payload, parameter_map)
+        made_apart = self._write(apart, None, tiles, weights, torque, workspace)
+        for number, (joint, made) in enumerate(zip(joints, made_apart, strict=True)):
+            self._complete(made, samples, weights, {joint: number})
             yield made
+
+    def _complete(self, made: BlockRows, samples: Samples, W: Tensor, in_W: Mapping[int, int]) -> None:
+        """Write what kernels leave out: a known payload, and columns of extra parameters, from tiles of W.
+
+        `in_W`: by joint, where it is among the degrees of freedom.
+        """
+        builder, block = self._builder, made.block
+        subtract_payload(block, made.values, samples.payload, builder.columns.parameter_map)
+        first = len(block.inertial) + len(block.friction)
+        for out, column in zip(made.values[first:-1], block.extras, strict=True):
+            extra = builder.extras[column - builder.columns.count]
+            out.zero_()
+            for joint in [joint for joint in extra.dofs if joint in in_W]:
+                weight = W[:, in_W[joint], block.rows].expand(-(-len(samples) // TILE), -1, -1)
+                weight = weight.transpose(0, 1).flatten(1)[:, : len(samples)]
+                out.addcmul_(weight, dof_extra_column(extra, joint, samples, builder.tree))
 
     def _write(
         self,
