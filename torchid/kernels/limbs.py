@@ -167,13 +167,13 @@ def _write_base(axes: Array, row_std: Array, V: Array) -> None:
 def _turn_base(axes: Array, row_std: Array, V: Array) -> None:
     """Divide rows of the base by their noise again, and turn them to the base's own axes."""
     for first in (0, 3):
+        a, b, c = 1.0 / row_std[first], 1.0 / row_std[first + 1], 1.0 / row_std[first + 2]
         for column in range(BASE):
             x = V[(first * BASE + column) * TILE :]
             y = V[((first + 1) * BASE + column) * TILE :]
             z = V[((first + 2) * BASE + column) * TILE :]
             for t in range(TILE):
-                v = x[t] / row_std[first], y[t] / row_std[first + 1], z[t] / row_std[first + 2]
-                x[t], y[t], z[t] = turn(axes, t, v)
+                x[t], y[t], z[t] = turn(axes, t, (a * x[t], b * y[t], c * z[t]))
 
 
 @compiled(ARRAY, ARRAY, "int64", TABLE, ARRAY, INDEX, TABLE, ARRAY, ARRAY, "float64", "float64", ARRAY, FLAGS)
