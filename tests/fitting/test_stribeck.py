@@ -92,7 +92,8 @@ def test_the_mean_over_a_step_is_that_of_many_velocities_between(width: float | 
     between = before + (after - before) * ((np.arange(20000) + 0.5) / 20000)[:, None]
     sign = np.sign(between) if width is None else np.tanh(between / width)
     expected = (sign * np.exp(-np.square(between / velocity))).mean(axis=0)
-    np.testing.assert_allclose(mean_stribeck(before, after, width, velocity), expected, rtol=0.0, atol=off)
+    found = mean_stribeck(np.stack([before, after]), width, velocity)[0]
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=off)
 
 
 def _held(count: int, cutoff_hz: float | None) -> tuple[int, float]:

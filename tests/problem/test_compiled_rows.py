@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,7 @@ import torchid
 from torchid.problem import RowBuilder, Samples, chunks, compress
 from torchid.problem.chunk_dynamics import Workspace
 from torchid.problem.chunks import choose_kernels, chunks_by_state
+from torchid.problem.extras import ExtraTerms
 
 pytest.importorskip("numba", reason="compiled kernels need Numba, of the extra [fast]")
 
@@ -25,12 +27,20 @@ SOLES = [torchid.Contact(f"{side}_sole_link", "flat") for side in ("left", "righ
 ENOUGH = 10**9  # samples of a pass for which kernels are used
 
 
-def builders(robot: torchid.Robot, contacts: list[torchid.Contact], sensors: torchid.SensorSet) -> list[RowBuilder]:
+def builders(
+    robot: torchid.Robot, contacts: list[torchid.Contact], sensors: torchid.SensorSet, terms: ExtraTerms | None = None
+) -> list[RowBuilder]:
     """With torch's operators, and with kernels."""
-    plain, fast = RowBuilder(robot, contacts, sensors), RowBuilder(robot, contacts, sensors)
+    plain, fast = (RowBuilder(robot, contacts, sensors, terms) for _ in range(2))
     choose_kernels(fast, ENOUGH)
     assert fast.compiled is not None
     return [plain, fast]
+
+
+def by_axis(sensors: torchid.SensorSet) -> torchid.SensorSet:
+    """With noise of the base that differs from axis to axis of the levelled base."""
+    noise = replace(sensors.noise, base_force=(0.3, 2.0, 0.9), base_moment=(0.2, 0.03, 0.08))
+    return replace(sensors, noise=noise)
 
 
 def assert_same_rows(plain: RowBuilder, fast: RowBuilder, samples: Samples) -> int:
@@ -62,9 +72,11 @@ def assert_same_rows(plain: RowBuilder, fast: RowBuilder, samples: Samples) -> i
     ids=["quadruped", "biped", "mimic joints", "arm with a prismatic gripper"],
 )
 def test_rows_are_those_of_torch(robot: torchid.Robot, contacts: list[torchid.Contact], sensors: str) -> None:
-    plain, fast = builders(robot, contacts, sensor_set(sensors, robot, contacts))
     samples = random_samples(robot, contacts, 300, 3, states=3)[0]
-    assert assert_same_rows(plain, fast, samples) == len(list(chunks_by_state(samples)))
+    alike = sensor_set(sensors, robot, contacts)
+    for own in (alike,) if robot.fixed_base else (alike, by_axis(alike)):
+        plain, fast = builders(robot, contacts, own)
+        assert assert_same_rows(plain, fast, samples) == len(list(chunks_by_state(samples)))
 
 
 def test_a_sensor_in_a_limb_has_rows_of_all_six_components() -> None:
@@ -84,8 +96,25 @@ def test_a_known_payload_and_smooth_friction_are_in_the_rows() -> None:
     assert assert_same_rows(plain, fast, replace(samples, resting=samples.joint_position > 0.0)) == 0, "torch's"
 
 
-def test_straight_knees_are_no_exception() -> None:
-    plain, fast = builders(QUADRUPED, POINTS, sensor_set("joints", QUADRUPED, POINTS))
+@pytest.mark.parametrize("sensors", ["joints", "mixed"])
+def test_extra_parameters_of_joints_are_in_the_rows(sensors: str) -> None:
+    actuators = dict.fromkeys(("armature", "stiffness", "asymmetric_coulomb", "torque_offset"), True)
+    terms = ExtraTerms(**actuators, scales={"joint_torque": (("front_*",), ("rear_*",))}, stribeck=0.1, delay=True)
+    plain, fast = builders(QUADRUPED, POINTS, sensor_set(sensors, QUADRUPED, POINTS), terms)
+    samples = random_samples(QUADRUPED, POINTS, 300, 8, states=3)[0]
+    assert assert_same_rows(plain, fast, samples) == len(list(chunks_by_state(samples)))
+    of_contacts = ExtraTerms(offsets={"contact_force": "all"})
+    other = RowBuilder(QUADRUPED, POINTS, sensor_set(sensors, QUADRUPED, POINTS), of_contacts)
+    choose_kernels(other, ENOUGH)
+    assert (other.compiled is None) == bool(other.extras), "torch's"
+
+
+@pytest.mark.parametrize("of_base", [lambda x: x, by_axis], ids=["alike", "by axis"])
+def test_straight_knees_are_no_exception(
+    of_base: Callable[[torchid.SensorSet], torchid.SensorSet], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr("torchid.problem.compiled_rows.CompiledRows._bases")  # which takes W from torch
+    plain, fast = builders(QUADRUPED, POINTS, of_base(sensor_set("joints", QUADRUPED, POINTS)))
     samples = random_samples(QUADRUPED, POINTS, 100, 6, states=1)[0]
     position = samples.joint_position.clone()
     position[7], position[70, :3] = 0.0, 0.0

@@ -324,7 +324,7 @@ def _row_noise(builder: RowBuilder, samples: Samples, noise: SensorNoise) -> Ten
     n, base = builder.tree.n_dofs, builder.tree.base_rows
     std = np.append(noise.base_std[:base], noise.dof_std(builder.tree.n, n))
     rows = torch.diag(samples.time.new_tensor(std))[:, None].expand(-1, len(samples), -1)
-    axes = builder.noise_axes(samples.base.rotation) if noise.base_axes_differ else None
+    axes = builder.noise_axes(samples.base.rotation, noise)
     if axes is None:
         return rows
     force, moment, rest = rows.split([3, 3, len(std) - 6], dim=2)

@@ -152,9 +152,34 @@ def _orthonormalize(V: Array, m: int, least_pivot: float, suspect: Array) -> Non
                 subtract(along, v[row * _ROW : row * _ROW + TILE], others[row * _ROW : row * _ROW + TILE])
 
 
-@compiled(ARRAY, "int64", TABLE, ARRAY, INDEX, TABLE, ARRAY, ARRAY, "float64", "float64", ARRAY, FLAGS)
+@compiled()
+def _write_base(axes: Array, row_std: Array, V: Array) -> None:
+    """Write what the base's motion does to its own rows, along the axes of their noise and in units of it."""
+    for row in range(BASE):
+        axis, first = row % 3, row - row % 3
+        for k in range(3):
+            part = axes[(3 * k + axis) * TILE : (3 * k + axis + 1) * TILE]
+            at = (row * BASE + first + k) * TILE
+            scale(row_std[row], part, V[at : at + TILE])
+
+
+@compiled()
+def _turn_base(axes: Array, row_std: Array, V: Array) -> None:
+    """Divide rows of the base by their noise again, and turn them to the base's own axes."""
+    for first in (0, 3):
+        a, b, c = 1.0 / row_std[first], 1.0 / row_std[first + 1], 1.0 / row_std[first + 2]
+        for column in range(BASE):
+            x = V[(first * BASE + column) * TILE :]
+            y = V[((first + 1) * BASE + column) * TILE :]
+            z = V[((first + 2) * BASE + column) * TILE :]
+            for t in range(TILE):
+                x[t], y[t], z[t] = turn(axes, t, (a * x[t], b * y[t], c * z[t]))
+
+
+@compiled(ARRAY, ARRAY, "int64", TABLE, ARRAY, INDEX, TABLE, ARRAY, ARRAY, "float64", "float64", ARRAY, FLAGS)
 def write_bases(
     states: Array,
+    axes: Array,
     nodes: int,
     limbs: Index,
     wrenches: Array,
@@ -171,6 +196,7 @@ def write_bases(
 
     Args:
         states: of `write_states`.
+        axes: (9, P), by rows the matrix whose columns are the axes that noise of the base rows is along, in the base's.
         nodes: L.
         limbs: (limbs, 5): node in contact, joints k, the first in `wrenches` and `dofs`, the first in `moved` and the
             last.
@@ -188,7 +214,8 @@ def write_bases(
     for limb in range(len(limbs)):
         most = max(most, limbs[limb, 1])
     rows, scratch, condition = np.zeros(most * (BASE + most) * TILE), np.zeros(3 * TILE), np.zeros(TILE)
-    for tile in range(len(suspect) // TILE):
+    of_base, samples = np.zeros(9 * TILE), len(suspect)
+    for tile in range(samples // TILE):
         own = states[tile * nodes * STATE * TILE : (tile + 1) * nodes * STATE * TILE]
         V = bases[tile * m * _ROW : (tile + 1) * m * _ROW]
         V[:], condition[:] = 0.0, 0.0
@@ -198,13 +225,16 @@ def write_bases(
             own_moved, own_ratios = moved[start:end], ratios[start:end]
             _write_limb(own, state, wrenches[6 * first : 6 * (first + k)], own_moved, own_ratios, k, rows)
             _solve(rows, k, dofs[first : first + k], scratch, V, condition)
-        for row in range(BASE):
-            V[(row * BASE + row) * TILE : (row * BASE + row + 1) * TILE] = row_std[row]
+        for k in range(9):
+            start = k * samples + tile * TILE
+            of_base[k * TILE : (k + 1) * TILE] = axes[start : start + TILE]
+        _write_base(of_base, row_std, V)
         for row in range(BASE, m):
             scale(row_std[row], V[row * _ROW : (row + 1) * _ROW], V[row * _ROW : (row + 1) * _ROW])
         doubtful = suspect[tile * TILE : (tile + 1) * TILE]
         for t in range(TILE):
             doubtful[t] = not condition[t] < worst  # so written, undefined ones are suspect too
         _orthonormalize(V, m, least_pivot, doubtful)
-        for row in range(m):
+        _turn_base(of_base, row_std, V)
+        for row in range(BASE, m):
             scale(1.0 / row_std[row], V[row * _ROW : (row + 1) * _ROW], V[row * _ROW : (row + 1) * _ROW])

@@ -64,9 +64,9 @@ def _directions(known: FloatArray, are_positions: bool, timeline: Timeline, low_
         columns = slice(start, start + together)
         width, x = noisy_width(timeline, columns), known[:, columns]
         halfway = np.diff(x, axis=0) / steps[:, None] if are_positions else 0.5 * (x[1:] + x[:-1])
-        before, after = np.concatenate([halfway[:1], halfway]), np.concatenate([halfway, halfway[-1:]])
+        halfway = np.concatenate([halfway[:1], halfway, halfway[-1:]])
         for key, mean in means.items():
-            out[key][:, columns] = timeline.evaluate(low_pass(mean(before, after, width=width)), (0,))[0]
+            out[key][:, columns] = timeline.evaluate(low_pass(mean(halfway, width=width)), (0,))[0]
     return out
 
 

@@ -188,16 +188,18 @@ def _error(low_pass: LowPass, values: FloatArray, correlation: FloatArray) -> fl
     return lost + 2.0 * float(response[0] * correlation[0] + 2.0 * response[1] * correlation[1])
 
 
-def mean_sign(before: FloatArray, after: FloatArray) -> FloatArray:
-    """Mean of the sign of what goes from one value to another, (M,)."""
-    size = np.abs(before) + np.abs(after)
-    return np.divide(before + after, size, out=np.zeros_like(size), where=size > 0.0)
+def mean_sign(velocity: FloatArray) -> FloatArray:
+    """Mean of the sign of what goes from each value to the next, (M, ...) of (M + 1, ...)."""
+    size = np.abs(velocity)
+    total = size[:-1] + size[1:]
+    return np.divide(velocity[:-1] + velocity[1:], total, out=np.zeros_like(total), where=total > 0.0)
 
 
-def mean_tanh(before: FloatArray, after: FloatArray) -> FloatArray:
+def mean_tanh(velocity: FloatArray) -> FloatArray:
     """Likewise of the hyperbolic tangent, whose integral is log cosh."""
-    change, tanh = after - before, np.tanh(0.5 * (before + after))
-    integral = np.logaddexp(after, -after) - np.logaddexp(before, -before)
+    size = np.abs(velocity)
+    integral = np.diff(size + np.log1p(np.exp(-2.0 * size)), axis=0)
+    change, tanh = np.diff(velocity, axis=0), np.tanh(0.5 * (velocity[:-1] + velocity[1:]))
     return np.divide(integral, change, out=tanh, where=np.abs(change) > _LEAST_CHANGE)
 
 
@@ -218,23 +220,20 @@ def noisy_width(timeline: Timeline, columns: slice) -> float | FloatArray | None
     return np.maximum(np.hypot(timeline.sign_width or 0.0, _REVERSAL * timeline.sign_noise[columns]), _LEAST_WIDTH)
 
 
-def mean_dry(before: FloatArray, after: FloatArray, width: float | FloatArray | None) -> FloatArray:
+def mean_dry(velocity: FloatArray, width: float | FloatArray | None) -> FloatArray:
     """Mean of the sign as Coulomb friction has it: over a width [rad/s or m/s], None for at once."""
-    return mean_sign(before, after) if width is None else mean_tanh(before / width, after / width)
+    return mean_sign(velocity) if width is None else mean_tanh(velocity / width)
 
 
-def mean_stribeck(
-    before: FloatArray, after: FloatArray, width: float | FloatArray | None, stribeck: float
-) -> FloatArray:
+def mean_stribeck(velocity: FloatArray, width: float | FloatArray | None, stribeck: float) -> FloatArray:
     """Mean of this sign times exp(-(v / v_s)^2), by that of the sign less what is lost with speed, smooth where v is 0.
 
     Args:
-        before: (M,), velocity at the beginning [rad/s or m/s].
-        after: (M,), at the end.
+        velocity: (M + 1, ...), where each of M successive intervals begins and the last one ends [rad/s or m/s].
         width: as of `mean_dry`.
         stribeck: v_s [rad/s or m/s].
     """
-    mean = mean_dry(before, after, width)
+    mean, before, after = mean_dry(velocity, width), velocity[:-1], velocity[1:]
     for node, weight in zip(*leggauss(_NODES), strict=True):
         v = 0.5 * (before + after) + 0.5 * node * (after - before)
         sign = np.sign(v) if width is None else np.tanh(v / width)

@@ -289,7 +289,8 @@ def lay_out_timeline(
         kept, output = _resampled(grid, step, kept, cutoff_hz, sample_rate_hz)
     if low_pass is None or cutoff_hz is None:
         return Timeline(native, grid, kept, output, None, 0.0, float(time[0]))
-    passed = low_pass.noise_share * 0.5 / float(np.median(np.diff(grid)))
+    between = step if grid is native else float(np.median(np.diff(grid)))
+    passed = low_pass.noise_share * 0.5 / between
     return Timeline(native, grid, kept, output, low_pass, REACH_PERIODS / cutoff_hz, float(time[0]), passed)
 
 

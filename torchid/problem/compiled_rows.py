@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -17,6 +17,7 @@ from torchid.problem.blocks import BlockRows
 from torchid.problem.chunk_dynamics import ChunkKinematics, Workspace
 from torchid.problem.contact_rows import general_bases
 from torchid.problem.contact_state import ContactStateLayout
+from torchid.problem.extras import dof_extra_column
 from torchid.problem.row_blocks import RowBlock, subtract_payload
 from torchid.problem.samples import Samples
 from torchid.regressor.kinematics import BodyStates, JointMotion, Motion, joint_motion
@@ -131,7 +132,7 @@ class _Plan:
 
 
 class CompiledRows:
-    """Makes the rows of a builder, float64 on a CPU, where no joint rests; of extra parameters it has no columns."""
+    """Makes the rows of a builder, float64 on a CPU, where no joint rests; extra parameters are those of joints."""
 
     def __init__(self, builder: RowBuilder) -> None:
         """Work out the constants."""
@@ -160,17 +161,34 @@ class CompiledRows:
         coupled: tuple[Tensor, Tensor],
         workspace: Workspace,
     ) -> Iterator[BlockRows]:
-        payload, parameter_map = samples.payload, self._builder.columns.parameter_map
         of_rank = layout.blocks.of_rank(coupled[0].shape[2])
         joints, apart = list(layout.uncoupled_joints), tuple(layout.uncoupled_joints.values())
+        in_W = {joint: row for row, joint in enumerate(layout.coupled_joints, start=self._builder.tree.base_rows)}
         for made in self._write(of_rank, len(layout.coupled_joints), tiles, *coupled, workspace):
-            subtract_payload(made.block, made.values, payload, parameter_map)
+            self._complete(made, samples, coupled[0], in_W)
             yield made
         weights = torch.from_numpy(1.0 / self._builder.dof_std[joints])[None, :, None, None].repeat(1, 1, 1, TILE)
         torque = self._builder.torque_of_bodies(samples)[:, self._builder.tree.index(joints)]
-        for made in self._write(apart, None, tiles, weights, torque, workspace):
-            subtract_payload(made.block, made.values, payload, parameter_map)
+        made_apart = self._write(apart, None, tiles, weights, torque, workspace)
+        for number, (joint, made) in enumerate(zip(joints, made_apart, strict=True)):
+            self._complete(made, samples, weights, {joint: number})
             yield made
+
+    def _complete(self, made: BlockRows, samples: Samples, W: Tensor, in_W: Mapping[int, int]) -> None:
+        """Write what kernels leave out: a known payload, and columns of extra parameters, from tiles of W.
+
+        `in_W`: by joint, where it is among the degrees of freedom.
+        """
+        builder, block = self._builder, made.block
+        subtract_payload(block, made.values, samples.payload, builder.columns.parameter_map)
+        first = len(block.inertial) + len(block.friction)
+        for out, column in zip(made.values[first:-1], block.extras, strict=True):
+            extra = builder.extras[column - builder.columns.count]
+            out.zero_()
+            for joint in [joint for joint in extra.dofs if joint in in_W]:
+                weight = W[:, in_W[joint], block.rows].expand(-(-len(samples) // TILE), -1, -1)
+                weight = weight.transpose(0, 1).flatten(1)[:, : len(samples)]
+                out.addcmul_(weight, dof_extra_column(extra, joint, samples, builder.tree))
 
     def _write(
         self,
@@ -254,15 +272,20 @@ class CompiledRows:
         count, nodes = tiles.states.shape[:2]
         W = workspace.empty("W", tiles.states, count, len(own.row_std), limbs.BASE, TILE)
         suspect = torch.empty(count * TILE, dtype=torch.bool)
+        axes = self._builder.noise_axes(samples.base.rotation, self._builder.sensors.noise)
+        along = workspace.empty("axes", tiles.states, 3, 3, count * TILE)
+        along[..., : tiles.samples] = torch.eye(3)[..., None] if axes is None else axes.permute(1, 2, 0)
+        along[..., tiles.samples :] = 0.0
         limbs.write_bases(
-            *(_flat(tiles.states), nodes, own.limbs, own.wrenches, own.dofs, own.moved, own.ratios, own.row_std),
-            *(WELL_CONDITIONED**2, PIVOT, _flat(W), suspect.numpy()),
+            *(_flat(tiles.states), _flat(along), nodes, own.limbs, own.wrenches, own.dofs, own.moved, own.ratios),
+            *(own.row_std, WELL_CONDITIONED**2, PIVOT, _flat(W), suspect.numpy()),
         )
         doubtful = torch.nonzero(suspect[: tiles.samples])[:, 0]
         if len(doubtful):
             order = self._builder.tree.index(layout.blocks.order)
             contact = self._builder.contact_rows(layout, tiles.kinematics(doubtful))
-            for index, basis in general_bases(layout, contact, slice(None), contact.of_measured(), None, order):
+            axes = None if axes is None else axes[doubtful]
+            for index, basis in general_bases(layout, contact, slice(None), contact.of_measured(), axes, order):
                 if basis.shape[1] != limbs.BASE:
                     return None
                 W[doubtful[index] // TILE, :, :, doubtful[index] % TILE] = basis.permute(2, 0, 1)
@@ -275,7 +298,6 @@ def _stands_on_limbs(builder: RowBuilder, layout: ContactStateLayout) -> bool:
     return (
         layout.has_own_limbs
         and not len(layout.wrench_std)
-        and not builder.sensors.noise.base_axes_differ
         and all(part.line_of_action == (None, None) for part in parts)
         and sum(len(part.rows) for part in parts) == len(layout.coupled_joints)
     )

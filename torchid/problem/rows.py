@@ -29,7 +29,7 @@ from torchid.regressor.regressor import (
 )
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
-from torchid.sensing import Contact, SensorSet
+from torchid.sensing import Contact, SensorNoise, SensorSet
 
 if TYPE_CHECKING:
     from torchid.problem.compiled_rows import CompiledRows
@@ -199,7 +199,7 @@ class RowBuilder(nn.Module):
     ) -> Iterator[tuple[Tensor | slice, Tensor]]:
         """W, (base rows + coupled joints, r, B'), of contact rows with the samples it belongs to, grouped by rank."""
         rotation, resting = kinematics.rotation_world_base, self.coupled_at_rest(layout, kinematics)
-        axes = self.noise_axes(rotation) if self.sensors.noise.base_axes_differ else None
+        axes = self.noise_axes(rotation, self.sensors.noise)
         return whitened_bases(layout, rows, measured, axes, self.tree.index(layout.blocks.order), resting)
 
     def coupled_at_rest(self, layout: ContactStateLayout, kinematics: ChunkKinematics) -> Tensor | None:
@@ -243,11 +243,11 @@ class RowBuilder(nn.Module):
         point = self._layouts.frame_origin(contact)
         return torch.cat([forces_at_base(kinematics.states, body, point, forces, arms), wrenches], dim=1)
 
-    def noise_axes(self, rotation_world_base: Tensor | None) -> Tensor | None:
-        """Axes of the stated noise of the base rows, (B, 3, 3); None for the base's own, if its attitude is unknown."""
-        return (
-            None if rotation_world_base is None or not self.tree.base_rows else levelled_base_axes(rotation_world_base)
-        )
+    def noise_axes(self, rotation_world_base: Tensor | None, noise: SensorNoise | None = None) -> Tensor | None:
+        """Axes of the stated noise of base rows, (B, 3, 3); None for the base's own: no attitude, or alike noise."""
+        if rotation_world_base is None or not self.tree.base_rows or (noise and not noise.base_axes_differ):
+            return None
+        return levelled_base_axes(rotation_world_base)
 
     def recorded_wrench(self, samples: Samples, contact: int, kinematics: ChunkKinematics) -> Tensor:
         """Recorded wrench of a contact along the axes of its components, (B, 6) [N, N m], NaN where not recorded."""
