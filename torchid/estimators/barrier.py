@@ -105,6 +105,13 @@ class ConicTensors:
         self.variables = torch.from_numpy(problem.variables)
         self.G, self.h = torch.from_numpy(problem.G), torch.from_numpy(problem.h)
         self.H = torch.from_numpy(problem.hessian)
+        self._row_columns = torch.from_numpy(np.flatnonzero(problem.G.any(axis=0)))  # bounds are on one variable each
+        self._rows = self.G[:, self._row_columns]
+
+    def with_rows(self, stiffness: Tensor) -> Tensor:
+        """Hessian of the quadratic and of rows with a stiffness each, (M,): H + G^T diag(stiffness) G, (n, n)."""
+        at = self._row_columns
+        return self.H.index_put((at[:, None], at), self._rows.T @ (stiffness[:, None] * self._rows), accumulate=True)
 
     def factors(self, x: Tensor) -> tuple[Tensor, Tensor] | None:
         """Cholesky factors (K, 4, 4) of the blocks and slacks (M,) of the rows at x, (n,); None if it is infeasible."""
@@ -163,8 +170,7 @@ class _CentralPath(ConicTensors):
         flat = whitened.flatten(2)  # (K, V, 16)
         gradient = quadratic_gradient - kappa * (self.G.T @ (1.0 / slack))
         gradient.index_put_((self.variables,), -kappa * flat[..., ::5].sum(-1), accumulate=True)
-        scaled = self.G / slack[:, None]
-        hessian = self.H + kappa * scaled.T @ scaled
+        hessian = self.with_rows(kappa / slack.square())
         rows, columns = self.variables[:, :, None], self.variables[:, None, :]
         curvature = kappa * (flat @ flat.mT)
         hessian.index_put_((rows.expand_as(curvature), columns.expand_as(curvature)), curvature, accumulate=True)
@@ -349,7 +355,7 @@ class _PrimalDual(ConicTensors):
 
         curvature = flat @ (whitened @ point.Z[:, None]).flatten(2).mT
         stiffness = point.y / point.slack
-        hessian = torch.addmm(self.H, self.G.T, stiffness[:, None] * self.G)
+        hessian = self.with_rows(stiffness)
         rows, columns = self.variables[:, :, None], self.variables[:, None, :]
         hessian.index_put_((rows.expand_as(curvature), columns.expand_as(curvature)), curvature, accumulate=True)
         N = self.null_space

@@ -50,7 +50,7 @@ class _Variables:
         self.scale = problem.scale.reshape(-1, PER_BODY)
         self.nominal = problem.nominal.reshape(-1, PER_BODY) / self.scale
         self.bodies = [int(body) for body in problem.free_bodies()]
-        self.deviations = np.eye(self.count)
+        self.deviations, self._are_deviations = np.eye(self.count), True
 
     def ten(self, body: int) -> np.ndarray:
         """Variables of a body's inertial parameters, (10,)."""
@@ -64,6 +64,11 @@ class _Variables:
         """
         for body, root in roots.items():
             self.deviations[np.ix_(self.ten(body), self.ten(body))] = parameters.change_of_frame(root)
+            self._are_deviations = False
+
+    def of_deviations(self, rows: Array) -> Array:
+        """Rows on the deviations, (m, n), as rows on x."""
+        return rows if self._are_deviations else rows @ self.deviations
 
     def row(self, body: int, weights: Array) -> tuple[Array, float]:
         """`weights @ phi` of a body, (12,), as a row on x and a constant."""
@@ -134,7 +139,7 @@ def build_conic_problem(
 
 
 def _compressed(problem: LinearProblem, x: _Variables, prior: Array) -> tuple[Array, Array, float]:
-    """Data and quadratic prior as ||root x - target||^2 + constant, with no more rows than columns."""
+    """Data, with no more rows than columns, and quadratic prior as ||root x - target||^2 + constant."""
     free, rows, terms = problem.free, max(problem.rows, 1), problem.terms
     A, b = problem.A[:, free] * problem.scale[free], problem.b - problem.A @ problem.nominal
     if terms is not None:
@@ -142,12 +147,12 @@ def _compressed(problem: LinearProblem, x: _Variables, prior: Array) -> tuple[Ar
             [[A, np.zeros((len(A), len(terms.size)))], [terms.C[:, free] * problem.scale[free], terms.D * terms.size]]
         )
         b = np.append(b, terms.z - terms.C @ problem.nominal)
-    A, b = A @ x.deviations / np.sqrt(rows), b / np.sqrt(rows)
-    right = np.concatenate([b, np.zeros(len(prior))])
-    triangle = np.asarray(np.linalg.qr(np.column_stack([np.concatenate([A, prior]), right]), mode="r"))
-    count = A.shape[1]
-    unexplained = problem.residual / rows + float(np.square(triangle[count:, count]).sum())
-    return triangle[:count, :count], triangle[:count, count], unexplained
+    A, b, unexplained = x.of_deviations(A) / np.sqrt(rows), b / np.sqrt(rows), problem.residual / rows
+    if len(A) > x.count:
+        triangle = np.asarray(np.linalg.qr(np.column_stack([A, b]), mode="r"))
+        A, b = triangle[: x.count, : x.count], triangle[: x.count, x.count]
+        unexplained += float(np.square(triangle[x.count :, x.count]).sum())
+    return np.concatenate([A, prior]), np.append(b, np.zeros(len(prior))), unexplained
 
 
 def _floor(problem: LinearProblem, ridge: float) -> float:

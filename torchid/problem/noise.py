@@ -27,7 +27,7 @@ from torchid.parameters import Array
 from torchid.problem.chunks import map_in_workers, one_thread
 from torchid.problem.elimination import Assembly
 from torchid.problem.rows import RowBuilder
-from torchid.problem.sampled_rows import CLIP, SampledChunk, SampledRows, noise_root
+from torchid.problem.sampled_rows import CLIP, SampledChunk, SampledRows, noise_root, supports, whitened
 from torchid.rounding import MAD_PER_STD, RANK_TOLERANCE, is_significant
 
 _LEAST, _MOST = 1e-4, 1e3  # variance of the logarithms: deviations are 0.5 % apart, or anything
@@ -269,7 +269,7 @@ class VarianceComponentEstimator:
             for own, slots in chunk.blocks:
                 sources = scale[own[..., None]] * chunk.sources[:, own[..., None], slots[:, None]]
                 both = torch.cat([sources.mT, r[:, slots, None]], dim=3)
-                solved = torch.linalg.solve_triangular(noise_root(sources), both, upper=False)
+                solved = whitened(noise_root(sources), both)
                 white, y = solved[..., :-1], solved[..., -1:]  # (B, k, r, e), (B, k, r, 1)
                 pairs = index[own[..., None]], index[own[:, None]]
                 M.index_put_(pairs, (white.mT @ white).square().sum(0), accumulate=True)
@@ -297,7 +297,10 @@ class VarianceComponentEstimator:
         def of_chunk(chunk: SampledChunk) -> tuple[Tensor, Tensor, Tensor]:
             white = rows.whiten(chunk, variance, _THINNED)
             own = white.sources.square().sum(2)
-            fitted = white.rows[..., :-1] @ directions[chunk.log]
+            fitted = white.rows.new_zeros(*white.rows.shape[:2], directions[chunk.log].shape[1])
+            for support, slots in supports(white.rows).items():
+                at = torch.tensor(support, dtype=torch.long)
+                fitted[:, slots] = white.rows[:, torch.tensor(slots)[:, None], at] @ directions[chunk.log][at]
             leverage = (white.sources[::_THINNED] @ fitted).square().sum((0, 2))
             return leverage, own[::_THINNED].sum(0), (own > _NEGLIGIBLE).sum(0)
 

@@ -166,13 +166,20 @@ class SampledRows:
         if (variance == 1.0).all():
             return replace(chunk, rows=chunk.rows[::step])
         scale = torch.from_numpy(np.sqrt(variance)[self.group_of])
-        rows, sources = chunk.rows[::step].clone(), torch.zeros_like(chunk.sources)
+        before, sources, coupled = chunk.rows[::step], torch.zeros_like(chunk.sources), []
+        std = torch.ones_like(before[..., :1])  # of rows on their own
         for own, slots in chunk.blocks:
             of = slice(None), own[..., None], slots[:, None]
             U = scale[of[1]] * chunk.sources[of]
             L = noise_root(U)
-            rows[:, slots] = torch.linalg.solve_triangular(L[::step], rows[:, slots], upper=False)
-            sources[of] = torch.linalg.solve_triangular(L, U.mT, upper=False).mT
+            sources[of] = whitened(L, U.mT).mT
+            if slots.shape[1] == 1:
+                std[:, slots[:, 0]] = L[::step, ..., 0]
+            else:
+                coupled.append((slots, L[::step]))
+        rows = before / std
+        for slots, L in coupled:
+            rows[:, slots] = whitened(L, before[:, slots])
         return replace(chunk, rows=rows, sources=sources)
 
     @one_thread()
@@ -187,15 +194,16 @@ class SampledRows:
         def factor_of(chunk: SampledChunk) -> TriangularFactor:
             chunk = self.whiten(chunk, variance)
             rows, present = chunk.rows, chunk.sources.abs().sum(1) > 0.0
-            readings = chunk.sources.square().sum(2)
+            readings, root = chunk.sources.square().sum(2), rows.new_ones(len(rows))
             if columns is not None:
                 size = torch.linalg.vector_norm(rows[..., :-1] @ columns[chunk.log] - rows[..., -1], dim=1)
                 limit = _radius(present.sum(1))
                 weight = (limit / size).clamp_max(1.0)
-                rows, readings = rows * weight.sqrt()[:, None, None], readings * weight[:, None]
+                root, readings = weight.sqrt(), readings * weight[:, None]
             factor = TriangularFactor(self.builder.width)
-            for support, slots in _supports(rows).items():
+            for support, slots in supports(rows).items():
                 own = rows[:, torch.tensor(slots)[:, None], torch.tensor([*support, self.builder.width])]
+                own *= root[:, None, None]
                 factor.add(support, own[present[:, slots]], chunk.oversampling)
             for column, sources in self._scaled.items():
                 factor.add_noise_gram(noise_of_reading(column, readings[:, sources].sum()))
@@ -212,8 +220,16 @@ class SampledRows:
 
 def noise_root(sources: Tensor) -> Tensor:
     """L (..., r, r) with `L L^T` the covariance of rows that have these sources (..., e, r); 1 of rows of zeros."""
+    if sources.shape[-1] == 1:
+        size = torch.linalg.vector_norm(sources, dim=-2, keepdim=True)
+        return torch.where(size == 0.0, 1.0, size)
     S = sources.mT @ sources
     return torch.linalg.cholesky(S + torch.diag_embed((S.diagonal(dim1=-2, dim2=-1) == 0.0).to(S)))
+
+
+def whitened(root: Tensor, rows: Tensor) -> Tensor:
+    """L^-1 X of rows X (..., r, columns) with such a root (..., r, r): a quotient where r is 1."""
+    return rows / root if root.shape[-1] == 1 else torch.linalg.solve_triangular(root, rows, upper=False)
 
 
 def _blocks(present: np.ndarray) -> tuple[tuple[Tensor, Tensor], ...]:
@@ -245,7 +261,7 @@ def _sources_of_scales(builder: RowBuilder) -> dict[int, list[int]]:
     }
 
 
-def _supports(rows: Tensor) -> dict[tuple[int, ...], list[int]]:
+def supports(rows: Tensor) -> dict[tuple[int, ...], list[int]]:
     """Columns in which rows (B, n_rows, width + 1), right-hand side last, are not zero: numbers of rows by these."""
     out: dict[tuple[int, ...], list[int]] = {}
     for slot, used in enumerate((rows[..., :-1] != 0.0).any(0).numpy()):
