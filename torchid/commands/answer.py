@@ -272,8 +272,8 @@ def _computed(judged: ErrorComparison) -> Iterator[str]:
 
 
 def _unlike_torques(run: Identification) -> Iterator[str]:
-    """That the fit itself leaves most of the joint torques."""
-    if found := unexplained_torques(run.metrics["train"].identified):
+    """That the fit itself leaves most of the joint torques that it was of."""
+    if found := unexplained_torques(run.metrics["train"].identified, run.experiment.sensors):
         yield f"{found}; check signs, units and order of torques and joints: torchid check"
 
 
