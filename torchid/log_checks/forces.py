@@ -65,7 +65,7 @@ _TIME_UNIT_TOLERANCE = 0.1
 #: Gain of a torque relative to the other joints, and shift of a wrench's point, that are reported: errors of gears and
 #: calibrations are smaller.
 MIN_GAIN_RATIO, MIN_POINT_SHIFT_M = 1.15, 0.03
-#: The same of all torques alike: masses of a URDF may be off by a fifth.
+#: The same of all torques alike where contact forces do not say what the robot weighs: masses may be off by a fifth.
 MIN_COMMON_GAIN_RATIO = 1.3
 #: Size of such a deviation in standard deviations, which include the errors of the URDF.
 MIN_STANDARD_DEVIATIONS = 4.0
@@ -338,8 +338,14 @@ def _known_and_right_joints(fit: TorqueGains) -> tuple[BoolArray, BoolArray]:
     """Joints (m,) whose factors are known, and those of them whose factors are 1 within what a URDF is off by."""
     known = fit.spread[: len(fit.gain)] < _MAX_REFERENCE_SPREAD * np.maximum(np.abs(fit.gain), 1.0)
     known &= _agree(fit.gain, fit.reverse)
-    is_off = _is_beyond(fit.gain, fit.gain, MIN_COMMON_GAIN_RATIO)
-    return known, known & ~is_off & ~_is_beyond(fit.reverse, fit.reverse, MIN_COMMON_GAIN_RATIO)
+    least = _least_common_ratio(fit)
+    is_off = _is_beyond(fit.gain, fit.gain, least) | _is_beyond(fit.reverse, fit.reverse, least)
+    return known, known & ~is_off
+
+
+def _least_common_ratio(fit: TorqueGains) -> float:
+    """Factor of all torques alike that is no error of the URDF's masses."""
+    return MIN_GAIN_RATIO if fit.common is not None and fit.common.is_weighed else MIN_COMMON_GAIN_RATIO
 
 
 def _common_gain_findings(of_joints: TorqueGains, robot: Robot) -> Iterator[Finding]:
@@ -347,7 +353,7 @@ def _common_gain_findings(of_joints: TorqueGains, robot: Robot) -> Iterator[Find
     fit = of_joints.common
     if fit is None or _known_and_right_joints(of_joints)[1].any() or not _agree(fit.gain, fit.reverse):
         return
-    if not _is_beyond(fit.gain, fit.reverse, MIN_COMMON_GAIN_RATIO):
+    if not _is_beyond(fit.gain, fit.reverse, _least_common_ratio(of_joints)):
         return
     value, agreeing = np.array([fit.gain - 1.0]), fit.blocks[:, None] - 1.0
     if _is_certain(value, np.array([fit.spread]), agreeing, MIN_COMMON_BLOCK_SHARE).all():
