@@ -18,7 +18,7 @@ from torchid.commands.results import Identification
 from torchid.config import load_config
 from torchid.estimators import SgdEstimate
 from torchid.estimators.least_squares import COMBINED, IDENTIFIED, ConstrainedEstimate
-from torchid.parameters import FRICTION, INERTIAL, PER_BODY
+from torchid.parameters import COULOMB, FRICTION, INERTIAL, PER_BODY
 from torchid.problem import Metrics
 from torchid.problem.metrics import DECISIVE_GROUPS, LIMB_GROUPS, WHITENED, WorseThanNominal
 from torchid.sensing import named_sensors
@@ -217,6 +217,18 @@ def test_a_fit_that_leaves_most_of_the_torques_is_not_explained_by_other_forces(
     said = text(replace(of_these, metrics=consistent.metrics | {"train": pair._replace(identified=found)}), 400)
     assert ("attention     the fit leaves 70 % of the joint torques; check signs, units" in said) is told
     assert ("but the model does not explain these forces" in said.split("rms error")[0]) is told
+
+
+@pytest.mark.parametrize(("errors", "told"), [(-5.0, True), (-3.0, False)])
+def test_friction_that_drives_a_joint_beyond_its_errors_points_to_a_reversed_torque(
+    consistent: Identification, errors: float, told: bool
+) -> None:
+    phi, at = consistent.estimate.phi.copy(), 2 * PER_BODY + COULOMB
+    phi[at] = errors * consistent.estimate.standard_error[at]
+    said = text(replace(consistent, estimate=replace(consistent.estimate, phi=phi)), 400)
+    body = consistent.experiment.robot.bodies[2]
+    assert body.joint is not None
+    assert (f"friction drives {body.joint.name}: its torque is reversed" in said) is told
 
 
 @pytest.mark.parametrize(("share", "unlike"), [(0.3, True), (0.6, False)])
