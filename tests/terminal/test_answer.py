@@ -18,9 +18,10 @@ from torchid.commands.results import Identification
 from torchid.config import load_config
 from torchid.estimators import SgdEstimate
 from torchid.estimators.least_squares import COMBINED, IDENTIFIED, ConstrainedEstimate
-from torchid.parameters import FRICTION, INERTIAL, PER_BODY
+from torchid.parameters import COULOMB, FRICTION, INERTIAL, PER_BODY
 from torchid.problem import Metrics
 from torchid.problem.metrics import DECISIVE_GROUPS, LIMB_GROUPS, WHITENED, WorseThanNominal
+from torchid.sensing import named_sensors
 from torchid.terminal.identification import answer_lines
 from torchid.terminal.lines import LINES
 
@@ -186,27 +187,48 @@ def test_projected_forces_that_no_bodies_would_predict_as_well_are_not_explained
 
 
 @pytest.mark.parametrize(
-    ("group", "share", "noise", "in_air", "told"),
+    ("group", "share", "noise", "in_air", "read", "told"),
     [
-        ("joint_torque", 0.7, None, False, True),
-        ("nullspace", 0.7, None, True, True),
-        ("joint_torque", 0.7, None, True, False),
-        ("joint_torque", 0.4, None, False, False),
-        ("joint_torque", 0.7, 1.9, False, False),
-        ("base_moment", 0.7, None, False, False),
+        ("joint_torque", 0.7, None, False, "full", True),
+        ("nullspace", 0.7, None, True, "full", True),
+        ("joint_torque", 0.7, None, True, "full", False),
+        ("joint_torque", 0.4, None, False, "full", False),
+        ("joint_torque", 0.7, 1.9, False, "full", False),
+        ("base_moment", 0.7, None, False, "full", False),
+        ("nullspace", 0.7, None, False, "joints", True),
+        ("joint_torque", 0.7, None, False, "joints", False),
+        ("nullspace", 0.7, None, False, "contacts", False),
     ],
 )
 def test_a_fit_that_leaves_most_of_the_torques_is_not_explained_by_other_forces(
-    consistent: Identification, group: str, share: float, noise: float | None, in_air: bool, told: bool
+    consistent: Identification, group: str, share: float, noise: float | None, in_air: bool, read: str, told: bool
 ) -> None:
-    """By `noise` of the readings that is about as large it may be; limbs in the air are no measure of all torques."""
+    """By `noise` of the readings that is about as large it may be; limbs in the air are no measure of all torques.
+
+    Nor is what the sensors of the fit do not read: friction, for contact sensors.
+    """
     pair = consistent.metrics["train"]
     fitted = pair.identified
     errors: dict[str, Any] = {"rms": {**fitted.rms, group: 2.0}, "relative": {**fitted.relative, group: share}}
     found = replace(fitted, **errors, noise={**fitted.noise, group: noise}, limbs_in_air=in_air)
-    said = text(replace(consistent, metrics=consistent.metrics | {"train": pair._replace(identified=found)}), 400)
+    experiment = consistent.experiment
+    sensors = named_sensors(read, experiment.robot.n, len(experiment.contacts))
+    of_these = replace(consistent, experiment=replace(experiment, sensors=sensors))
+    said = text(replace(of_these, metrics=consistent.metrics | {"train": pair._replace(identified=found)}), 400)
     assert ("attention     the fit leaves 70 % of the joint torques; check signs, units" in said) is told
     assert ("but the model does not explain these forces" in said.split("rms error")[0]) is told
+
+
+@pytest.mark.parametrize(("errors", "told"), [(-5.0, True), (-3.0, False)])
+def test_friction_that_drives_a_joint_beyond_its_errors_points_to_a_reversed_torque(
+    consistent: Identification, errors: float, told: bool
+) -> None:
+    phi, at = consistent.estimate.phi.copy(), 2 * PER_BODY + COULOMB
+    phi[at] = errors * consistent.estimate.standard_error[at]
+    said = text(replace(consistent, estimate=replace(consistent.estimate, phi=phi)), 400)
+    body = consistent.experiment.robot.bodies[2]
+    assert body.joint is not None
+    assert (f"friction drives {body.joint.name}: its torque is reversed" in said) is told
 
 
 @pytest.mark.parametrize(("share", "unlike"), [(0.3, True), (0.6, False)])

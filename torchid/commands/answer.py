@@ -17,6 +17,7 @@ from torchid.fitting.misfit import AT_THE_FLOOR, unexplained_joints, unexplained
 from torchid.identifiability.confounding import TotalMass
 from torchid.log_checks.weight import MAX_MASS_ERROR
 from torchid.logs.time_range import log_title
+from torchid.parameters import COULOMB, PER_BODY
 from torchid.problem import Metrics
 from torchid.problem.metrics import ADVICE, DECISIVE_GROUPS, ERROR_GROUPS, LIMB_GROUPS, describe_worse, group_name
 from torchid.report.tables import noise_advice
@@ -185,6 +186,7 @@ def _attention(run: Identification, judged: ErrorComparison) -> Iterator[str]:
         advice = "estimator.name=consistent finds the best that can be"
         yield f"negative, which nothing is: {join_names(impossible)}; {advice}"
     yield from _impossible(run)
+    yield from _driving(run)
     yield from _unlike_joints(run)
     if not run.misfit.explained:
         why = run.misfit.in_short
@@ -238,6 +240,15 @@ def _impossible(run: Identification) -> Iterator[str]:
         yield f"no bodies that can exist explain these forces: {left}; unit, gear or sign of a torque? (torchid check)"
 
 
+def _driving(run: Identification) -> Iterator[str]:
+    """That Coulomb friction is negative far beyond its standard errors, which least squares lets it be."""
+    found, error = (x.reshape(-1, PER_BODY)[:, COULOMB] for x in (run.estimate.phi, run.estimate.standard_error))
+    bodies = np.array(run.experiment.robot.bodies, object)[found < -_CLEAR_ERRORS * error]
+    if len(bodies) and (run.misfit.share or 0.0) > _EXACT:
+        names = join_names([body.joint.name for body in bodies], _FEW_NAMED)
+        yield f"friction drives {names}: its torque is reversed, or its friction of another shape: torchid check"
+
+
 def _unfinished(estimate: SgdEstimate) -> str:
     """That a descent ended far from where least squares, whose standard errors it has, would end."""
     objective = estimate.objective / (estimate.unconstrained or estimate.objective)
@@ -272,8 +283,8 @@ def _computed(judged: ErrorComparison) -> Iterator[str]:
 
 
 def _unlike_torques(run: Identification) -> Iterator[str]:
-    """That the fit itself leaves most of the joint torques."""
-    if found := unexplained_torques(run.metrics["train"].identified):
+    """That the fit itself leaves most of the joint torques that it was of."""
+    if found := unexplained_torques(run.metrics["train"].identified, run.experiment.sensors):
         yield f"{found}; check signs, units and order of torques and joints: torchid check"
 
 

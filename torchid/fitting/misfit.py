@@ -23,6 +23,7 @@ from torchid.problem.compressed_log import Block
 from torchid.problem.metrics import Metrics
 from torchid.robot import Robot
 from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, is_significant
+from torchid.sensing import SensorSet
 
 _MUCH = 1.5  # times the residual that noise leaves; stated noise is seldom known better
 _ALIKE = 2.0  # times the blocks' part of the residuals if these were noise, which alone gives 0.8 to 1.3
@@ -169,12 +170,19 @@ def beyond_models(
     return None
 
 
-def unexplained_torques(fitted: Metrics) -> str:
+def unexplained_torques(fitted: Metrics, sensors: SensorSet | None = None) -> str:
     """That a fit leaves most of the joint torques, however well it explains other forces; "" where it does not.
 
     Of all torques, or of what no contact has a part in. Noise of the readings, where it is known, explains what it may.
+    Where the `sensors` of the fit are given, of what they read alone: nothing where they read no torque, as friction is
+    not fitted then, and without any wrench what no contact has a part in.
     """
-    groups = ("nullspace",) if fitted.limbs_in_air else ("joint_torque", "nullspace")
+    groups = ["joint_torque", "nullspace"]
+    unread = sensors is not None and sensors.wrench.size > 0 and not sensors.wrench.any()
+    if fitted.limbs_in_air or unread:
+        groups.remove("joint_torque")
+    if sensors is not None and not sensors.torque.any():
+        groups.clear()
     beyond = (one for one in groups if (fitted.rms_of(one) or 0.0) > AT_THE_FLOOR * (fitted.noise.get(one) or 0.0))
     share = max((fitted.relative_of(one) or 0.0 for one in beyond), default=0.0)
     return f"the fit leaves {100.0 * share:.3g} % of the joint torques" if share > _SHARE else ""

@@ -21,7 +21,6 @@ from torchid.log_checks.model import (
     Declared,
     ModelFit,
     NominalModel,
-    TorqueFit,
     bind_some_samples,
     default_cutoff_hz,
     preprocess_pieces,
@@ -29,6 +28,7 @@ from torchid.log_checks.model import (
 )
 from torchid.log_checks.required_sensors import check_required
 from torchid.log_checks.scales import TimeScale, TorqueGains, fit_time_scale, fit_torque_gains, motion_cutoff_hz
+from torchid.log_checks.torque_fit import TorqueFit, torque_findings
 from torchid.logs import Log
 from torchid.logs.log import WRENCHES, BoolArray, FloatArray
 from torchid.logs.segments import with_delayed_torques
@@ -51,11 +51,6 @@ MAX_RESIDUAL_SHARE = 0.5
 MAX_CLEAR_MISFIT = 0.2
 #: The same, above which it may be another factor than that of a unit: those of currents are anything.
 _MAX_UNIT_MISFIT = 0.1
-#: Factors of single torques in another unit, and the tolerance of such a factor (see `model.MAX_GAIN_RATIO`).
-TORQUE_UNIT_FACTORS = {1e-3: "in mN m", 1e3: "in kN m"}
-_UNIT_TOLERANCE_RATIO = 3.0
-#: How far the factor of a reversed torque may be from -1: others are no mistake of sign.
-_SIGN_TOLERANCE_RATIO = 3.0
 _TINY = 1e-9
 #: Factor of time that no error of inertias explains: its square is 2.25.
 MIN_TIME_FACTOR = 1.5
@@ -70,7 +65,7 @@ _TIME_UNIT_TOLERANCE = 0.1
 #: Gain of a torque relative to the other joints, and shift of a wrench's point, that are reported: errors of gears and
 #: calibrations are smaller.
 MIN_GAIN_RATIO, MIN_POINT_SHIFT_M = 1.15, 0.03
-#: The same of all torques alike: masses of a URDF may be off by a fifth.
+#: The same of all torques alike where contact forces do not say what the robot weighs: masses may be off by a fifth.
 MIN_COMMON_GAIN_RATIO = 1.3
 #: Size of such a deviation in standard deviations, which include the errors of the URDF.
 MIN_STANDARD_DEVIATIONS = 4.0
@@ -134,13 +129,17 @@ def _misfit_findings(
     fit, explanation, robot = model.compare(samples), None, model.robot
     if fit.largest_misfit > MAX_MISFIT and (bare := without_friction(robot)) is not None:
         without = replace(model, robot=bare)
-        if (better := without.compare(samples)).largest_misfit <= MAX_MISFIT:
+        better = without.compare(samples)
+        if better.largest_misfit <= MAX_MISFIT or _is_mostly_friction(fit, better):
             yield _friction_finding(robot, fit, better)
             robot, model, fit = bare, without, better
     if fit.largest_misfit > MAX_MISFIT:
         explanation = _best_mistake(log, model, cutoff, fit, derived)
     if explanation is not None:
         yield explanation
+        return
+    if fit.torque is not None and fit.torque.driving.any():  # which no lag, tilt or zero does
+        yield from torque_findings(robot, fit.torque)
         return
     log, samples = _scaled(log, samples, robot, fit.torque)
     trial = Trial(log, model, cutoff)
@@ -160,11 +159,18 @@ def _misfit_findings(
         gains = fit_torque_gains(samples, model) if held else None
         yield from list(_gain_and_point_findings(log, gains, robot)) or [_contradiction(fit, robot, held)]
         return
-    torques = [] if fit.torque is None else list(_torque_findings(robot, fit.torque))
+    torques = [] if fit.torque is None else list(torque_findings(robot, fit.torque))
     yield from torques
     if not any(isinstance(item, Finding) for item in torques):
         scaled = list(_gain_and_point_findings(log, fit_torque_gains(samples, model), robot))
         yield from scaled or check_torque_offsets(trial)
+
+
+def _is_mostly_friction(stated: ModelFit, without: ModelFit) -> bool:
+    """Whether most of what torques differ by is friction that the robot's file states, whatever else is wrong."""
+    if stated.torque is None or without.torque is None:
+        return False
+    return without.torque.misfit * without.torque.size < MAX_RESIDUAL_SHARE * stated.torque.misfit * stated.torque.size
 
 
 def _contradiction(fit: ModelFit, robot: Robot, held: bool) -> Finding:
@@ -195,10 +201,12 @@ def _friction_finding(robot: Robot, stated: ModelFit, without: ModelFit) -> Find
         body = robot.bodies[int(np.argmax(np.abs(robot.nominal[:, number])))]
         if (value := robot.nominal[robot.bodies.index(body), number]) and body.joint is not None:
             largest.append(f"{kind} up to {value:g} in {body.joint.name}")
-    text = (
-        f"measured forces differ from the {robot.format}'s by {_percent(stated.largest_misfit)}, "
-        f"by {_percent(without.largest_misfit)} without the friction that it states: {', '.join(largest)}"
-    )
+    text = f"measured forces differ from the {robot.format}'s by {_percent(stated.largest_misfit)}"
+    if without.largest_misfit <= MAX_MISFIT:
+        text += f", by {_percent(without.largest_misfit)} without the friction that it states"
+    else:
+        text += ", mostly by the friction that it states"
+    text += f": {', '.join(largest)}"
     return Finding("friction", NOTE, "all", text, f"nothing, as a fit finds friction; or 0 in the {robot.format}")
 
 
@@ -251,33 +259,6 @@ def _may_explain(field: str, fit: ModelFit) -> bool:
 
 def _percent(share: float) -> str:
     return f"{100.0 * share:.3g} %" if share < 10.0 else f"{share:.3g} times their size"
-
-
-def _torque_findings(robot: Robot, fit: TorqueFit) -> Iterator[Finding | Skipped]:
-    """Findings about single torques: sign, unit and scale."""
-
-    def finding(name: str, severity: str, where: BoolArray, problem: str, advice: str) -> Finding:
-        joints = tuple(robot.joint_names[joint] for joint in fit.joints[where])
-        gains = join_names([f"{gain:.3g}" for gain in fit.gain[where]])
-        text = f"{join_names(joints)}: {problem}factors that fit the {robot.format} best: {gains}"
-        return Finding(name, severity, "joint_torque", text, advice, joints)
-
-    is_reversed = fit.implausible & (fit.gain < -1.0 / _SIGN_TOLERANCE_RATIO) & (fit.gain > -_SIGN_TOLERANCE_RATIO)
-    if is_reversed.any():
-        hangs = "; or robot.base_tilt, if the base is not upright" if robot.fixed_base else ""
-        yield finding("sign", REJECTED, is_reversed, "reversed; ", f"reverse these torques{hangs}")
-    scaled = fit.implausible & ~is_reversed
-    for factor, unit in TORQUE_UNIT_FACTORS.items():
-        low, high = factor / _UNIT_TOLERANCE_RATIO, factor * _UNIT_TOLERANCE_RATIO
-        in_unit = fit.implausible & (fit.gain > low) & (fit.gain < high)
-        if in_unit.any():
-            yield finding("unit", REJECTED, in_unit, f"{unit}; ", f"multiply by {factor:g}")
-            scaled = scaled & ~in_unit
-    if scaled.any():
-        yield finding("scale", SUSPICIOUS, scaled, "", "check gear ratios, torque constants and units")
-    if not fit.determined.all():
-        names = join_names([robot.joint_names[joint] for joint in fit.joints[~fit.determined]])
-        yield Skipped("sign of torques", f"too little in this motion but friction and noise: {names}")
 
 
 def _fit_time_scale(log: Log, model: NominalModel) -> TimeScale | None:
@@ -357,8 +338,14 @@ def _known_and_right_joints(fit: TorqueGains) -> tuple[BoolArray, BoolArray]:
     """Joints (m,) whose factors are known, and those of them whose factors are 1 within what a URDF is off by."""
     known = fit.spread[: len(fit.gain)] < _MAX_REFERENCE_SPREAD * np.maximum(np.abs(fit.gain), 1.0)
     known &= _agree(fit.gain, fit.reverse)
-    is_off = _is_beyond(fit.gain, fit.gain, MIN_COMMON_GAIN_RATIO)
-    return known, known & ~is_off & ~_is_beyond(fit.reverse, fit.reverse, MIN_COMMON_GAIN_RATIO)
+    least = _least_common_ratio(fit)
+    is_off = _is_beyond(fit.gain, fit.gain, least) | _is_beyond(fit.reverse, fit.reverse, least)
+    return known, known & ~is_off
+
+
+def _least_common_ratio(fit: TorqueGains) -> float:
+    """Factor of all torques alike that is no error of the URDF's masses."""
+    return MIN_GAIN_RATIO if fit.common is not None and fit.common.is_weighed else MIN_COMMON_GAIN_RATIO
 
 
 def _common_gain_findings(of_joints: TorqueGains, robot: Robot) -> Iterator[Finding]:
@@ -366,7 +353,7 @@ def _common_gain_findings(of_joints: TorqueGains, robot: Robot) -> Iterator[Find
     fit = of_joints.common
     if fit is None or _known_and_right_joints(of_joints)[1].any() or not _agree(fit.gain, fit.reverse):
         return
-    if not _is_beyond(fit.gain, fit.reverse, MIN_COMMON_GAIN_RATIO):
+    if not _is_beyond(fit.gain, fit.reverse, _least_common_ratio(of_joints)):
         return
     value, agreeing = np.array([fit.gain - 1.0]), fit.blocks[:, None] - 1.0
     if _is_certain(value, np.array([fit.spread]), agreeing, MIN_COMMON_BLOCK_SHARE).all():

@@ -164,7 +164,8 @@ def possible_mistakes(log: Log) -> Iterator[Mistake]:
         reverse = "reverse them; a base that hangs upside down looks the same (give base_quat)"
         yield Mistake("joint_torque", "all reversed", reverse, _multiply("joint_torque", -1.0), True)
         yield from _unit_mistakes("joint_torque", "torque", after_filter=True)
-        for description, permuted in exchanged_names(log.joint_names):  # of limbs, or of drives in another order
+        orders = (*exchanged_names(log.joint_names), *_exchanged_neighbours(log.joint_names))
+        for description, permuted in orders:  # of limbs, of drives in another order, or of two plugs
             order = [log.joint_names.index(name) for name in permuted]
             advice = "give torques in the order of joint_names, as positions"
             yield Mistake("joint_torque", f"{description} exchanged", advice, _reorder(("joint_torque",), order), True)

@@ -9,20 +9,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.optimize import nnls
 
 from torchid import parameters
 from torchid.errors import TorchidWarning
 from torchid.log_checks.findings import median_step
+from torchid.log_checks.torque_fit import TorqueFit, fit_projected, fit_single_rows, held_by_friction
 from torchid.logs import Log
 from torchid.logs.cutoff import usual_cutoff_hz
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import preprocess
 from torchid.logs.signal_noise import SignalNoise
 from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log
-from torchid.problem.excitation import MIN_MOTION
 from torchid.problem.extras import list_extras
-from torchid.problem.predict import force_series, null_space_part
+from torchid.problem.predict import force_series
 from torchid.problem.samples import concatenate
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet, named_sensors
@@ -33,22 +32,12 @@ MAX_DIFFERENTIATED_SAMPLES, PIECES = 40000, 4
 MAX_TRIAL_DIFFERENTIATED_SAMPLES = 10000
 #: Evenly spread samples that are compared with the model; fewer where many corrected logs are tried.
 COMPARED_SAMPLES, TRIAL_SAMPLES = 800, 150
-#: Independent part of a torque in the projected forces, over the residual, from which on its gain is determined.
-MIN_SIGNAL_RATIO = 1.0
-#: The same in a joint's row, where contact wrenches are known or there are none: a correlation of 0.9.
-MIN_ROW_SIGNAL_RATIO = 2.0
-#: Gain that no model error explains: missing friction makes up a factor of several, a gear ratio 50 to 160.
-MAX_GAIN_RATIO = 10.0
 #: Misfit of the base force above which contact wrenches do not decide on the sign of a torque.
 _MAX_WRENCH_MISFIT = 0.3
-#: What dry friction may carry of the largest load where a joint stands still.
-MAX_FRICTION_SHARE = 0.2
 #: Torque below the resolution of any sensor.
 MIN_TORQUE_NM = 1e-9
 #: Forces that no parameters explain (flexibility, filters, shape of friction), over the rms of each kind of force.
 UNMODELLED_FORCE_SHARE = 0.05
-#: Smaller singular values, over the largest, are raised to this share: the data do not determine such combinations.
-_MIN_SINGULAR_VALUE_SHARE, _TINY = 1e-12, 1e-100
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,32 +62,6 @@ class Declared:
     def known_delay(self) -> float:
         """The delay [s], 0 where it is to be found."""
         return 0.0 if isinstance(self.delay, str) else self.delay
-
-
-@dataclass(frozen=True, eq=False)
-class TorqueFit:
-    """Factors of joint torques that fit the URDF best.
-
-    Attributes:
-        joints: numbers of the m joints whose torque was measured.
-        gain: (m,) factor that each measured torque should be multiplied by.
-        determined: (m,) bool, whether the data determine the gain.
-        scale: (m,) factor of torques that have an unknown one by the experiment; all else here is of torques with it.
-        misfit: norm of the difference between measured and model torques, over the norm of the model's.
-        misfit_corrected: as `misfit`, with torques multiplied by their gain where that is determined and implausible.
-    """
-
-    joints: np.ndarray
-    gain: FloatArray
-    determined: BoolArray
-    scale: FloatArray
-    misfit: float
-    misfit_corrected: float
-
-    @property
-    def implausible(self) -> BoolArray:
-        """Joints (m,) whose torque is reversed or off by more than `MAX_GAIN_RATIO`."""
-        return _implausible_gains(self.gain, self.determined)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,11 +113,6 @@ class ModelFit:
     def largest_misfit(self) -> float:
         """That of all forces, or of the torques alone: forces that fit do not make up for torques that do not."""
         return max(self.misfit, self.torque_misfit or 0.0)
-
-
-def _implausible_gains(gain: FloatArray, determined: BoolArray) -> BoolArray:
-    """Which determined gains (m,) no model error explains."""
-    return determined & ((gain < 0.0) | (np.abs(np.log(np.maximum(np.abs(gain), _TINY))) > np.log(MAX_GAIN_RATIO)))
 
 
 def default_cutoff_hz(log: Log) -> float:
@@ -248,13 +206,14 @@ class NominalModel:
         if measured.any() and np.square(known).sum() <= least**2 * (1 + len(known)):
             extras = list_extras(robot, self.contacts, builder.sensors, ExtraTerms(scales=scales))
             alike = [extra.dofs for extra in extras if extra.dofs and max(extra.dofs) < robot.n]
-            fit = _fit_projected(builder, samples, required, torque, np.flatnonzero(measured), alike)
+            fit = fit_projected(builder, samples, required, torque, np.flatnonzero(measured), alike)
             contact_part = acting[:, base : base + robot.n] - torque
             torque[:, fit.joints] *= fit.scale
             consistent = force is not None and force < _MAX_WRENCH_MISFIT and np.isfinite(contact_part).all()
             if (consistent or not self.contacts) and not fit.determined.all() and not robot.loops:
-                fit = _fit_single_rows(fit, required[:, base : base + robot.n] - contact_part, torque)
-            fit = replace(fit, determined=fit.determined & ~_held_by_friction(samples, torque)[fit.joints])
+                velocity = np.concatenate([part.joint_velocity.numpy() for part in samples])
+                fit = fit_single_rows(fit, required[:, base : base + robot.n] - contact_part, torque, velocity)
+            fit = replace(fit, determined=fit.determined & ~held_by_friction(samples, torque)[fit.joints])
         return ModelFit(fit, force, moment)
 
     def _builder(self, measured: BoolArray) -> RowBuilder:
@@ -268,13 +227,6 @@ class NominalModel:
         return self._builders[key]
 
 
-def _held_by_friction(samples: Sequence[Samples], torque: FloatArray) -> BoolArray:
-    """Which joints (n,) stand still under a load that dry friction may carry: their torque (N, n) may be anything."""
-    position = np.concatenate([part.joint_position.numpy() for part in samples])
-    load = np.sqrt(np.square(np.nan_to_num(torque)).mean(axis=0))
-    return np.asarray((np.ptp(position, axis=0) < MIN_MOTION) & (load < MAX_FRICTION_SHARE * load.max(initial=0.0)))
-
-
 def _misfit(measured: FloatArray, model: FloatArray, scaled: bool) -> float | None:
     """Norm of the difference over that of the model, over samples (N, k) that were measured; None without any.
 
@@ -286,66 +238,6 @@ def _misfit(measured: FloatArray, model: FloatArray, scaled: bool) -> float | No
         return None
     factor = float((measured[known] * model[known]).sum() / np.square(measured[known]).sum()) if scaled else 1.0
     return float(np.linalg.norm((factor if factor > 0.0 else 1.0) * measured[known] - model[known]) / size)
-
-
-def _fit_projected(
-    builder: RowBuilder,
-    samples: Sequence[Samples],
-    required: FloatArray,
-    torque: FloatArray,
-    joints: np.ndarray,
-    alike: Sequence[Sequence[int]],
-) -> TorqueFit:
-    """Gains by least squares in the null space of the contacts, where contact forces vanish.
-
-    `alike`: joints that share an unknown scale.
-    """
-    base = builder.tree.base_rows
-    passive = [row for row in builder.motors.passive if row not in joints]
-    rows = [*range(base), *(base + joints), *(base + row for row in passive)]
-    vectors = np.zeros((1 + len(joints), *required.shape))
-    vectors[0] = required
-    for index, joint in enumerate(joints):
-        vectors[1 + index, :, base + joint] = torque[:, joint]
-    ends = np.cumsum([len(part) for part in samples])[:-1]
-    parts = np.split(vectors, ends, axis=1)
-    projected = np.concatenate([null_space_part(builder, s, v) for s, v in zip(samples, parts, strict=True)], axis=1)
-    projected = projected[..., rows].reshape(1 + len(joints), -1)
-    y, A = projected[0], projected[1:].T
-    scale = _fit_scales(y, A, [np.isin(joints, group) for group in alike])
-    A = A * scale
-    norms = np.linalg.norm(A, axis=0)
-    norms[norms == 0.0] = 1.0
-    U, values, Vh = np.linalg.svd(A / norms, full_matrices=False)
-    inverse = Vh.T / np.maximum(values, max(_MIN_SINGULAR_VALUE_SHARE * values.max(initial=0.0), _TINY))
-    gain = inverse @ (U.T @ y) / norms
-    independent = norms / np.sqrt(np.square(inverse).sum(axis=1))  # norm of each column orthogonal to all others
-    determined = independent * np.abs(gain) > MIN_SIGNAL_RATIO * np.linalg.norm(y - A @ gain)
-    corrected = np.where(_implausible_gains(gain, determined), gain, 1.0)
-    size = max(float(np.linalg.norm(y)), _TINY)
-    misfits = (float(np.linalg.norm(y - A @ factor)) / size for factor in (np.ones(len(joints)), corrected))
-    return TorqueFit(joints, gain, determined, scale, *misfits)
-
-
-def _fit_scales(y: FloatArray, A: FloatArray, groups: Sequence[BoolArray]) -> FloatArray:
-    """Factors (m,) of the columns of A (M, m) whose sum is nearest to y, positive, one for each group (m,), else 1."""
-    scale = np.ones(A.shape[1])
-    if groups:
-        free = np.array(groups, float)
-        best, _ = nnls(A @ free.T, y - A[:, ~np.any(groups, axis=0)].sum(axis=1))
-        scale[np.any(groups, axis=0)] = (best @ free)[np.any(groups, axis=0)]
-    return np.where(scale > 0.0, scale, 1.0)
-
-
-def _fit_single_rows(fit: TorqueFit, required: FloatArray, torque: FloatArray) -> TorqueFit:
-    """The fit, with undetermined gains taken from the row of each joint, less the contribution of the contacts."""
-    gain, determined = fit.gain.copy(), fit.determined.copy()
-    for index in np.flatnonzero(~determined):
-        y, x = required[:, fit.joints[index]], torque[:, fit.joints[index]]
-        gain[index] = y @ x / (x @ x)
-        residual = np.linalg.norm(y - gain[index] * x)
-        determined[index] = abs(gain[index]) * np.linalg.norm(x) > MIN_ROW_SIGNAL_RATIO * residual
-    return replace(fit, gain=gain, determined=determined)
 
 
 def deviation_builder(samples: Sequence[Samples], model: NominalModel) -> RowBuilder | None:

@@ -253,12 +253,16 @@ def _best_factor(equations: NormalEquations) -> TimeScale:
 
 @dataclass(frozen=True, eq=False)
 class CommonGain:
-    """A factor of all torques alike, by either regression, its standard deviation, and by block, (TIME_BLOCKS,)."""
+    """A factor of all torques alike, by either regression, its standard deviation, and by block, (TIME_BLOCKS,).
+
+    `is_weighed`: whether all contact forces were measured, which say what a floating base's bodies weigh.
+    """
 
     gain: float
     reverse: float
     spread: float
     blocks: FloatArray
+    is_weighed: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -308,7 +312,8 @@ def fit_torque_gains(samples: Sequence[Samples], model: NominalModel) -> TorqueG
         target = rows[..., :-1] @ nominal - contact_part
         K = deviation_columns(builder, rows, W, part, columns, ARMATURE_SCALE)
         parts.append((K, np.concatenate([target[..., None], projected], axis=2), equations))
-    return _solve_gains(accumulate_blocks(parts), joints)
+    forces = sensors.wrench[:, :3]
+    return _solve_gains(accumulate_blocks(parts), joints, bool(forces.size and forces.all()) and not robot.fixed_base)
 
 
 def _point_shift_forces(builder: RowBuilder, samples: Samples, measured: np.ndarray) -> FloatArray:
@@ -332,14 +337,14 @@ def _has_moments(measured: np.ndarray) -> bool:
     return bool(measured.size and measured.all())
 
 
-def _solve_gains(equations: NormalEquations, joints: np.ndarray) -> TorqueGains:
+def _solve_gains(equations: NormalEquations, joints: np.ndarray, is_weighed: bool) -> TorqueGains:
     m = len(joints)
     each, alike = np.eye(m + 3), np.column_stack([np.repeat([1.0, 0.0], [m, 3]), np.eye(m + 3)[:, m:]])
     x, reverse, spread, blocks = _fit_gains(equations, each, m)
     common = None
     if m:
         factor, bound, certainty, by_block = _fit_gains(equations, alike, m)
-        common = CommonGain(float(factor[0]), float(bound[0]), float(certainty[0]), by_block[:, 0])
+        common = CommonGain(float(factor[0]), float(bound[0]), float(certainty[0]), by_block[:, 0], is_weighed)
     return TorqueGains(joints, x[:m], reverse[:m], x[m:], spread, blocks, common)
 
 

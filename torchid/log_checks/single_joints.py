@@ -12,7 +12,6 @@ from torchid.errors import InputError, format_percent, join_names
 from torchid.log_checks.deviation import COMPARED_SAMPLES, DeviationRows
 from torchid.log_checks.findings import NOTE, SUSPICIOUS, Finding, Skipped
 from torchid.log_checks.model import (
-    MAX_FRICTION_SHARE,
     MAX_TRIAL_DIFFERENTIATED_SAMPLES,
     UNMODELLED_FORCE_SHARE,
     Declared,
@@ -21,6 +20,7 @@ from torchid.log_checks.model import (
     preprocess_pieces,
 )
 from torchid.log_checks.scales import CORRELATED_SAMPLES
+from torchid.log_checks.torque_fit import MAX_FRICTION_SHARE
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.segments import with_delayed_torques

@@ -181,13 +181,13 @@ def mjcf_of_urdf(
         springs: by joint, stiffness [N m/rad or N/m] and position at rest [rad or m], of those that were fitted.
 
     Warns:
-        TorchidWarning: meshes that MuJoCo does not read, or bodies that it will refuse.
+        TorchidWarning: meshes that are not found or that MuJoCo does not read, or bodies that it will refuse.
     """
     model = _Model(robot, without_links_beyond_welds(robot, phi), armature, springs or {}, meshes)
     warn_if_inconsistent(robot, model.phi, "MJCF")
     if model.left_out:
         names = join_names(list(dict.fromkeys(model.left_out)))
-        warn(f"{robot.path}: meshes that MuJoCo does not read are left out: {names}")
+        warn(f"{robot.path}: meshes that are not found, or that MuJoCo does not read, are left out: {names}")
     etree.indent(model.root)
     return etree.tostring(model.root, encoding="utf-8", xml_declaration=True)
 
