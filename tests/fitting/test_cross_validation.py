@@ -32,15 +32,18 @@ from torchid.problem import (
     compress_parts,
     linear_problem,
 )
+from torchid.problem.chunks import chunks_by_state, map_chunks
 from torchid.problem.compression import (
     FOLDS,
     compress_in_blocks,
+    compress_in_folds,
     cut_into_blocks,
+    merge_blocks_of_folds,
     merge_folds,
     merge_states,
     split_into_folds,
 )
-from torchid.problem.metrics import ROW_GROUPS, WHITENED, describe_worse, worse_than_nominal
+from torchid.problem.metrics import ROW_GROUPS, WHITENED, Evaluation, ForceSums, describe_worse, worse_than_nominal
 from torchid.report.figures import ridge_figure
 from torchid.sensing import Contact, SensorNoise, named_sensors
 
@@ -107,6 +110,42 @@ def test_parts_of_folds_together_are_those_of_the_logs(demo: tuple[RowBuilder, S
         assert (part.samples, part.factor.rows) == (cut[part.key].samples, cut[part.key].factor.rows)
         assert part.factor.independent_rows == pytest.approx(cut[part.key].factor.independent_rows)
         assert torch.allclose(R.T @ R, expected.T @ expected, rtol=0.0, atol=1e-12 * float(expected.norm() ** 2))
+    of_blocks = {part.key: part for part in merge_blocks_of_folds(blocks, builder)}
+    without_blocks = compress_in_folds(folds, builder)
+    assert {part.key for part in without_blocks} == set(of_blocks)
+    for part in without_blocks:
+        expected = of_blocks[part.key]
+        for one, other in (
+            (
+                part.factor.triangle().T @ part.factor.triangle(),
+                expected.factor.triangle().T @ expected.factor.triangle(),
+            ),
+            (part.factor.whole_noise_gram(), expected.factor.whole_noise_gram()),
+        ):
+            assert other.any()
+            assert torch.allclose(one, other, rtol=0.0, atol=1e-12 * float(expected.factor.triangle().norm() ** 2))
+
+
+def test_small_chunks_of_folds_are_joined_and_each_keeps_its_parameters(demo: tuple[RowBuilder, Samples]) -> None:
+    builder, log = demo
+    robot, states = torchid.load_robot(DEMO / "quadruped.urdf"), [state for state, _ in chunks_by_state(log)]
+    folds = split_into_folds([log], builder)
+    loaded = [replace(fold, unloaded=None) for fold in folds]
+    (made,) = map_chunks(loaded, builder, list, threads=1)
+    assert sorted(state for _, state in made) == sorted(states), "one chunk for all folds"
+    assert sum(len(samples) for samples, _ in made) == len(log)
+    strangers = [replace(fold, source=f"{fold.fold}") for fold in loaded]
+    for others in (strangers, folds):  # other logs, and readings in the air, of which each fold has equations
+        assert len(map_chunks(others, builder, list, threads=1)[0]) == sum(len(list(chunks_by_state(x))) for x in folds)
+    evaluation, nominal = Evaluation(robot, builder.contacts), robot.nominal.flatten()
+    phi = {fold: np.stack([nominal, (1.0 + 0.1 * fold) * nominal]) for fold in range(FOLDS)}
+    together = evaluation.force_sums(folds, phi)
+    apart = [ForceSums.total(same) for same in zip(*(evaluation.force_sums([x], phi) for x in folds), strict=True)]
+    for one, other in zip(together, apart, strict=True):
+        assert np.allclose(one.rows.squares, other.rows.squares, rtol=1e-13)
+        assert np.array_equal(one.rows.count, other.rows.count)
+        assert np.allclose(one.projected.squares, other.projected.squares, rtol=1e-13)
+    assert not np.allclose(together[1].rows.squares, together[2].rows.squares, rtol=0.01)
 
 
 # ------------------------------------------------------------------------------------------------------- whole runs

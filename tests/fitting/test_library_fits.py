@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from demo import shortened_demo
+from shared_work import differences
 
 import torchid
 from torchid.cli import main
@@ -82,8 +83,9 @@ def test_cross_validation_predicts_blocks_that_a_fit_has_not_seen(tmp_path: Path
     fitter = fitter_with(torchid.estimate_noise(logs, fitter_with(stated), STATED).noise)
     found = torchid.cross_validate(logs, fitter)
     assert found.folds == written["cross_validation"]["folds"]
-    assert found.identified.as_dict() == written["cross_validation"]["identified"]
-    assert found.nominal.as_dict() == written["cross_validation"]["nominal"]
+    for name in ("identified", "nominal"):  # a run's folds are sums of blocks, which round otherwise
+        of_run = dict(differences(getattr(found, name).as_dict(), written["cross_validation"][name]))
+        assert max(of_run.values()) < 1e-11, of_run
 
     fit = fitter.fit(torchid.compress_in_blocks(logs, fitter.builder))
     compared = torchid.calibrations(fit, robot, fitter.builder)

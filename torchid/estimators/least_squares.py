@@ -16,7 +16,7 @@ from torchid.parameters import Array
 from torchid.problem import LinearProblem
 from torchid.problem.chunks import one_thread
 from torchid.reprs import short_repr
-from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, relative_tolerance
+from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, numerical_rank
 from torchid.settings import NotNegative, Tolerance, validate_settings
 
 IDENTIFIED, PRIOR, COMBINED = "identified", "dominated by the prior", "only in combination"
@@ -216,17 +216,12 @@ class LeastSquares(Regularized):
 
     def _gain(self, problem: LinearProblem) -> Array:
         """What takes residuals at the nominal parameters to deviations of the free ones in their scale, (P', R)."""
-        pinv, *_ = self._pseudo_inverse(problem)
-        if not self.ridge:
-            return pinv
-        A = problem.A[:, problem.free] * problem.scale[problem.free]
-        return np.asarray(pinv @ (A @ _ridge_inverse(A, self.ridge * problem.rows)))  # no rounding in A's null space
+        return self._decomposition(problem).inverse(self.ridge * problem.rows)
 
-    def _pseudo_inverse(self, problem: LinearProblem) -> tuple[Array, Array, int]:
-        """Minimum-norm inverse of the free, scaled columns, their singular values and rank."""
-        A = problem.A[:, problem.free] * problem.scale[problem.free]
-        key = "pseudo-inverse", self.rank_tolerance
-        return problem.shared(key, lambda: _pseudo_inverse(A, self.rank_tolerance))
+    def _decomposition(self, problem: LinearProblem) -> _Decomposition:
+        """Of the free, scaled columns, which all ridges have in common."""
+        key = "decomposition", self.rank_tolerance
+        return problem.shared(key, lambda: _Decomposition.of(problem, self.rank_tolerance))
 
     @report_rounding("least_squares")
     @one_thread()  # twice as fast as two on some hundred columns
@@ -243,7 +238,8 @@ class LeastSquares(Regularized):
         """
         free, scale = problem.free, problem.scale[problem.free]
         A, gain = problem.A[:, free] * scale, self._gain(problem)
-        pinv, values, rank = self._pseudo_inverse(problem)
+        decomposition = self._decomposition(problem)
+        values, rank, pinv = decomposition.values, decomposition.rank, decomposition.inverse()
         null_share = np.linalg.norm(np.eye(A.shape[1]) - pinv @ A, axis=1)  # of each parameter in the null space
         phi = _moved(problem, gain)
         cost = problem.cost(phi)
@@ -285,17 +281,23 @@ def _moved(problem: LinearProblem, gain: Array) -> Array:
     return phi
 
 
-def _pseudo_inverse(A: Array, tolerance: float) -> tuple[Array, Array, int]:
-    """Minimum-norm inverse, singular values and rank, from one call of `torch.linalg.lstsq`."""
-    identity = torch.eye(A.shape[0], dtype=torch.float64)
-    rcond = relative_tolerance(tolerance, A.shape)
-    solved = torch.linalg.lstsq(torch.from_numpy(np.ascontiguousarray(A)), identity, rcond=rcond, driver="gelss")
-    return solved.solution.numpy(), solved.singular_values.numpy(), int(solved.rank)
+@dataclass(frozen=True)
+class _Decomposition:
+    """Singular value decomposition of columns (R, P): (R, K), (K,) and (K, P), of which `rank` values are not zero."""
 
+    U: Array
+    values: Array
+    Vh: Array
+    rank: int
 
-def _ridge_inverse(A: Array, weight: float) -> Array:
-    """The matrix, (P, R), that takes b to the minimizer of ||A x - b||^2 + weight ||x||^2."""
-    count, columns = A.shape
-    stacked = np.vstack([A, np.sqrt(weight) * np.eye(columns)])
-    target = torch.eye(len(stacked), count, dtype=torch.float64)
-    return torch.linalg.lstsq(torch.from_numpy(stacked), target, driver="gels").solution.numpy()
+    @classmethod
+    def of(cls, problem: LinearProblem, tolerance: float) -> _Decomposition:
+        A = problem.A[:, problem.free] * problem.scale[problem.free]
+        U, values, Vh = np.linalg.svd(A, full_matrices=False)
+        return cls(U, values, Vh, numerical_rank(values, tolerance, A.shape))
+
+    def inverse(self, weight: float = 0.0) -> Array:
+        """The matrix, (P, R), that takes b to the minimizer of ||A x - b||^2 + weight ||x||^2, of least norm for 0."""
+        values = self.values[: self.rank]
+        damped = values[:, None] / (np.square(values) + weight)[:, None]
+        return np.asarray(self.Vh[: self.rank].T @ (damped * self.U[:, : self.rank].T))

@@ -15,7 +15,7 @@ from torchid import ranks
 from torchid.copies import share_between_processes
 from torchid.errors import LogError, TorchidWarning
 from torchid.fitting.calibration import Calibration, Comparison, calibration_at, calibrations
-from torchid.fitting.fit import BatchEstimator, Fit, LogFitter
+from torchid.fitting.fit import BatchEstimator, LogFitter
 from torchid.fitting.robust import RobustLoss
 from torchid.parameters import Array
 from torchid.problem import Evaluation, ExtraTerms, Metrics, RowBuilder, Samples
@@ -24,9 +24,8 @@ from torchid.problem.chunks import ProgressCallback, map_chunks, one_thread, thr
 from torchid.problem.compressed_log import Block
 from torchid.problem.compression import (
     Part,
-    compress_in_blocks,
+    compress_in_folds,
     compress_unloaded,
-    merge_blocks_of_folds,
     merge_states,
     split_into_folds,
 )
@@ -102,21 +101,15 @@ def cross_validate(
     Raises:
         LogError: too few samples to leave some out.
     """
-    blocks = split_into_folds(logs, fitter.builder)
-    parts = merge_blocks_of_folds(compress_in_blocks(blocks, fitter.builder), fitter.builder)
-    fit = fitter.solve_problem(fitter.build_problem(parts))  # scatter between blocks is not needed
-    without_folds = fitter.fit_without_folds(fit)
-
-    def compared(one: Fit) -> Comparison[Calibration]:
-        return calibrations(one, fitter.robot, fitter.builder, loss)
-
-    evaluation = Evaluation(fitter.robot, fitter.builder.contacts, str(fitter.builder.device), terms)
-    scores = Scorer(evaluation, fitter.builder).score_training(
-        blocks, merge_states(fit.parts, fitter.builder), compared(fit), [compared(one) for one in without_folds]
-    )
-    if scores.cross_validation is None:
+    robot, builder = fitter.robot, fitter.builder
+    blocks = split_into_folds(logs, builder)
+    problem = fitter.build_problem(compress_in_folds(blocks, builder))  # scatter between blocks is not needed
+    compared = [calibrations(one, robot, builder, loss) for one in fitter.fit_without_folds(problem)]
+    if not compared:
         raise _too_few(logs)
-    return scores.cross_validation
+    scorer = Scorer(Evaluation(robot, builder.contacts, str(builder.device), terms), builder)
+    scores = scorer.score_by_fold(blocks, merge_states(problem.parts, builder), dict(enumerate(compared)))
+    return CrossValidation(len(compared), *scores)
 
 
 @one_thread()
@@ -241,7 +234,7 @@ class Scorer:
         pairs = self._force_sums(logs, {log.fold: compared for log in logs} or {0: compared}, progress, 1)
         whole = [with_all_readings(log, self.builder) for log in logs]
         _add_squares(pairs, residuals_of_samples(self.builder, whole, compared))
-        return Comparison(*self._metrics(pairs))
+        return Comparison(*(self.evaluation.summarize(*pair) for pair in pairs))
 
     def score_training(
         self,
@@ -263,21 +256,30 @@ class Scorer:
             without_folds: those of a fit without each fold, by its number; none without cross-validation.
             progress: called with the number of samples done, of those that are `scored`.
         """
-        step, samples = self.scored(logs)
         first = 0 if self.builder.extras else 1  # nominal parameters differ between fits by extra parameters alone
         by_fold: dict[int, Sequence[Calibration]] = {
             fold: [*compared, *(without_folds[fold][first:] if without_folds else ())]
             for fold in sorted({log.fold for log in logs})
         }
-        pairs = self._force_sums([log for log in logs if isinstance(log, Samples)], by_fold, progress, step)
-        for fold, of_fold in by_fold.items():
+        metrics = self.score_by_fold(logs, parts, by_fold, progress)
+        count = len(without_folds)
+        held_out = CrossValidation(count, metrics[0 if first else 2], metrics[-1]) if count else None
+        return TrainingScore(Comparison(*metrics[:2]), held_out, self.scored(logs)[1])
+
+    def score_by_fold(
+        self,
+        logs: Sequence[Block],
+        parts: Sequence[Part],
+        compared: Mapping[int, Sequence[Calibration]],
+        progress: ProgressCallback | None = None,
+    ) -> list[Metrics]:
+        """Errors of some parameters each on one fold of the training logs; arguments as `score_training`."""
+        whole, step = [log for log in logs if isinstance(log, Samples)], self.scored(logs)[0]
+        pairs = self._force_sums(whole, compared, progress, step)
+        for fold, of_fold in compared.items():
             own = [log for log in logs if log.fold == fold], [part for part in parts if part.fold == fold]
             _add_squares(pairs, sum_residuals(self.builder, *own, of_fold))
-        metrics = self._metrics(pairs)
-        held_out = None
-        if without_folds:
-            held_out = CrossValidation(len(without_folds), metrics[0 if first else 2], metrics[-1])
-        return TrainingScore(Comparison(*metrics[:2]), held_out, samples)
+        return [self.evaluation.summarize(*pair) for pair in pairs]
 
     def _force_sums(
         self,
@@ -308,9 +310,6 @@ class Scorer:
             measured, error = self.evaluation.force_sums(readings, of_one, progress if identified else None)
             pairs.append((measured, error))
         return pairs
-
-    def _metrics(self, sums: Sequence[tuple[ForceSums, ForceSums]]) -> list[Metrics]:
-        return [self.evaluation.summarize(*pair) for pair in sums]
 
 
 def _add_squares(pairs: Sequence[tuple[ForceSums, ForceSums]], squares: Sequence[ResidualSquares]) -> None:

@@ -205,7 +205,7 @@ class LogFitter:
         return Fit(problem.parts, assembly, estimate, extras)
 
     @one_thread()
-    def fit_without_folds(self, fit: Fit) -> list[Fit]:
+    def fit_without_folds(self, fit: Fit | LogProblem) -> list[Fit]:
         """For every fold of a fit, in order, that of all others, weighted as it is; none where there is only one."""
         folds, noise = sorted({part.fold for part in fit.parts}), fit.assembly.reading_noise
         if len(folds) < 2:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchid.problem.chunk_dynamics import Workspace
 from torchid.problem.row_blocks import RowBlock
-from torchid.problem.samples import Samples
+from torchid.problem.samples import Samples, concatenate
 
 
 @dataclass(frozen=True)
@@ -74,13 +74,49 @@ def cut_logs(logs: Sequence[Samples], spans: Sequence[Sequence[tuple[int, int]]]
     ]
 
 
-def blocks_in(samples: Samples) -> list[tuple[int, int, int]]:
-    """Number, first sample and end of the blocks that a chunk has samples of."""
+def are_of_one_log(piece: Samples, other: Samples) -> bool:
+    """Whether two pieces differ in samples, folds and blocks alone, and have no readings in the air.
+
+    Each fold, and each chunk, has equations of its own of these readings.
+    """
+    if piece.unloaded is not None or other.unloaded is not None:
+        return False
+    own, others = (
+        {name: x for name, x in (vars(log) | vars(log.base)).items() if name not in ("base", "fold", "block", "blocks")}
+        for log in (piece, other)
+    )
+    return all(
+        x is others[name] or isinstance(x, Tensor) is isinstance(others[name], Tensor) is True
+        for name, x in own.items()
+    )
+
+
+def join_pieces(pieces: Sequence[Samples]) -> Samples:
+    """Pieces of one log as one, which has the fold and block of each sample."""
+    if len(pieces) == 1:
+        return pieces[0]
+    numbers = [
+        torch.tensor([[piece.fold, piece.block]]).expand(len(piece), 2) if piece.blocks is None else piece.blocks
+        for piece in pieces
+    ]
+    return replace(concatenate([replace(piece, blocks=None) for piece in pieces]), blocks=torch.cat(numbers))
+
+
+def blocks_in(samples: Samples) -> list[tuple[int, int, int, int]]:
+    """Fold, number, first sample and end of the blocks that a chunk has samples of."""
     if samples.blocks is None:
-        return [(samples.block, 0, len(samples))]
-    numbers, counts = torch.unique_consecutive(samples.blocks, return_counts=True)
+        return [(samples.fold, samples.block, 0, len(samples))]
+    numbers, counts = torch.unique_consecutive(samples.blocks, return_counts=True, dim=0)
     ends = counts.cumsum(0).tolist()
-    return list(zip(numbers.tolist(), [0, *ends[:-1]], ends, strict=True))
+    spans = zip(numbers.tolist(), [0, *ends[:-1]], ends, strict=True)
+    return [(fold, number, start, end) for (fold, number), start, end in spans]
+
+
+def folds_in(samples: Samples) -> list[tuple[int, int, int]]:
+    """Number, first sample and end of the folds that a chunk has samples of."""
+    spans = [(fold, start, end) for fold, _, start, end in blocks_in(samples)]
+    starts = [at for at, (fold, *_) in enumerate(spans) if not at or fold != spans[at - 1][0]]
+    return [(*spans[at][:2], spans[last - 1][2]) for at, last in zip(starts, [*starts[1:], len(spans)], strict=True)]
 
 
 def span_of_samples(index: Tensor | slice, start: int, end: int) -> tuple[int, int]:

@@ -79,17 +79,17 @@ class ChunkKinematics:
         at = nn.functional.pad(self.resting.T, (base_rows, forces.shape[2] - base_rows - len(self.resting)))
         return forces.masked_fill(at, value)
 
-    def every(self, step: int) -> ChunkKinematics:
-        """The kinematics of every `step`-th sample from the first on, views."""
+    def some(self, index: slice) -> ChunkKinematics:
+        """The kinematics of some samples, views."""
         return ChunkKinematics(
-            JointMotion(*(x[..., ::step] for x in vars(self.joints).values())),
-            BodyStates(*(x[..., ::step] for x in vars(self.states).values())),
-            self.screw_axes[..., ::step],
-            None if self.rotation_world_base is None else self.rotation_world_base[::step],
-            {contact: arm[..., ::step] for contact, arm in self.arms.items()},
+            JointMotion(*(x[..., index] for x in vars(self.joints).values())),
+            BodyStates(*(x[..., index] for x in vars(self.states).values())),
+            self.screw_axes[..., index],
+            None if self.rotation_world_base is None else self.rotation_world_base[index],
+            {contact: arm[..., index] for contact, arm in self.arms.items()},
             self.recorded_normals,
-            {contact: axes[..., ::step] for contact, axes in self.ground_axes.items()},
-            None if self.resting is None else self.resting[..., ::step],
+            {contact: axes[..., index] for contact, axes in self.ground_axes.items()},
+            None if self.resting is None else self.resting[..., index],
         )
 
 

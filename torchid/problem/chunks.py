@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
 from itertools import chain, pairwise
@@ -18,6 +19,7 @@ from threadpoolctl import ThreadpoolController
 from torchid import ranks
 from torchid.copies import can_copy, share_between_copies
 from torchid.errors import excerpt, warn
+from torchid.problem.blocks import are_of_one_log, join_pieces
 from torchid.problem.contact_state import ContactState
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
@@ -28,8 +30,6 @@ Result = TypeVar("Result")
 
 ProgressCallback = Callable[[int], None]
 """Called with the number of samples, or of other steps, done since the last call."""
-
-_Chosen = tuple[Samples, ContactState, "slice | torch.Tensor"]  # samples of a log in a contact state, and which
 
 CHUNK = 4096
 """Samples per chunk: fewer lose to dispatch, and to workers' waits for Python's lock; more to memory traffic."""
@@ -67,12 +67,12 @@ def map_chunks(
     size, sharing = chunk or chunk_size(builder.device), ranks.as_first(workers, "workers")
     if chunk is None and sharing > 1:
         size = min(size, max(sum(map(len, logs)) // (_EACH * sharing), _LEAST))
-    tasks = [(samples, state, index) for samples in logs for state, index in chunks_by_state(samples, size, sharing)]
-    for samples, state, _ in tasks:
-        builder.layout(state, samples.contact_normal is not None)
-    sizes = [_size(samples, index) for samples, _, index in tasks]
+    tasks = _chunks(logs, size, sharing)
+    for task in tasks:
+        builder.layout(task.state, task.parts[0][0].contact_normal is not None)
+    sizes = [len(task) for task in tasks]
     choose_kernels(builder, sum(sizes))
-    ranks.require_same(hash(tuple((size, state) for size, (_, state, _) in zip(sizes, tasks, strict=True))), "logs")
+    ranks.require_same(hash(tuple(zip(sizes, (task.state for task in tasks), strict=True))), "logs")
     share = ranks.own_share(sizes)
     own, done = tasks[share], sizes[share]
     workers = min(workers, max(len(own), 1))  # to start a thread takes as long as a small chunk
@@ -80,7 +80,7 @@ def map_chunks(
     reported = sum(done[::workers] if copied else done)
     report = None if progress is None else _ProgressOfAll(progress, sum(sizes), reported)
 
-    def run(part: Iterator[_Chosen], reporting: bool = True) -> Result:
+    def run(part: Iterator[_Chunk], reporting: bool = True) -> Result:
         return reduce(_pieces(part, builder.device, report if reporting else None))
 
     results = _run_in_copies(own, run, workers) if copied else run_in_workers(own, run, workers)
@@ -112,15 +112,16 @@ def choose_kernels(builder: RowBuilder, samples: int) -> None:
 
 
 def _pieces(
-    tasks: Iterator[_Chosen], device: torch.device, report: ProgressCallback | None
+    tasks: Iterator[_Chunk], device: torch.device, report: ProgressCallback | None
 ) -> Iterator[tuple[Samples, ContactState]]:
     """The samples of some chunks on a device; says how many of them are done."""
 
     def chosen() -> Iterator[tuple[Samples, ContactState]]:
-        for number, (samples, state, index) in enumerate(tasks, start=1):
-            yield samples[index], state
-            if samples.pages is not None and number % _LET_GO == 0:
-                samples.pages.release()
+        for number, task in enumerate(tasks, start=1):
+            yield join_pieces([samples[index] for samples, index in task.parts]), task.state
+            pages = task.parts[0][0].pages
+            if pages is not None and number % _LET_GO == 0:
+                pages.release()
 
     for piece, state in upload(chosen(), device):
         yield piece, state
@@ -145,8 +146,35 @@ class _ProgressOfAll:
                 self._reported = reached
 
 
+@dataclass(frozen=True)
+class _Chunk:
+    """Samples of one contact state, of one log: pieces of it, and which of their samples."""
+
+    state: ContactState
+    parts: list[tuple[Samples, slice | torch.Tensor]]
+
+    def __len__(self) -> int:
+        return sum(_size(samples, index) for samples, index in self.parts)
+
+
 def _size(samples: Samples, index: slice | torch.Tensor) -> int:
     return len(range(*index.indices(len(samples)))) if isinstance(index, slice) else len(index)
+
+
+def _chunks(logs: Sequence[Samples], size: int, workers: int) -> list[_Chunk]:
+    """Chunks of at most so many samples, small ones of one log joined: a chunk takes milliseconds, however small."""
+    out: list[_Chunk] = []
+    last: dict[tuple[str, ContactState], _Chunk] = {}
+    for samples in logs:
+        for state, index in chunks_by_state(samples, size, workers):
+            before = last.get((samples.source, state))
+            fits = before is not None and len(before) + _size(samples, index) <= size
+            if before is not None and fits and are_of_one_log(before.parts[0][0], samples):
+                before.parts.append((samples, index))
+            else:
+                out.append(_Chunk(state, [(samples, index)]))
+                last[samples.source, state] = out[-1]
+    return out
 
 
 def chunks_by_state(

@@ -150,9 +150,20 @@ def compress_in_blocks(
         weight_rows: as in `compress_parts`.
     """
     parts = compress_spans(logs, _spans_of_blocks(logs, builder), builder, progress, weight_rows)
-    if not any(extra.what == "offset" and extra.contact is not None for extra in builder.extras):
-        return parts
-    return [*parts, *compress_unloaded(logs, builder)]
+    return [*parts, *_unloaded_for_offsets(logs, builder)]
+
+
+def _unloaded_for_offsets(logs: Sequence[Samples], builder: RowBuilder) -> list[Part]:
+    """`compress_unloaded` where there are offsets to find."""
+    fitted = any(extra.what == "offset" and extra.contact is not None for extra in builder.extras)
+    return compress_unloaded(logs, builder) if fitted else []
+
+
+def compress_in_folds(logs: Sequence[Samples], builder: RowBuilder) -> list[Part]:
+    """What `merge_blocks_of_folds` makes of the parts of `compress_in_blocks`, without factors of the blocks."""
+    pieces = [replace(piece, block=0) for piece in cut_into_blocks(logs, builder)]
+    parts = _compress_parts([replace(log, unloaded=None) for log in logs], pieces, builder, None, None, None, None)
+    return [*parts, *_unloaded_for_offsets(logs, builder)]
 
 
 def compress_spans(
@@ -165,7 +176,8 @@ def compress_spans(
     """As `compress_in_blocks`, without readings in the air; `spans`: first sample and end of the blocks of each log."""
     numbers = [np.repeat(range(len(own)), np.diff(own)[:, 0]) for own in spans]
     numbered = [
-        replace(log, unloaded=None, blocks=torch.from_numpy(own)) for log, own in zip(logs, numbers, strict=True)
+        replace(log, unloaded=None, blocks=torch.from_numpy(np.column_stack([np.full_like(own, log.fold), own])))
+        for log, own in zip(logs, numbers, strict=True)
     ]
     return _compress_parts(numbered, cut_logs(numbered, spans), builder, None, None, progress, weight_rows)
 
@@ -200,7 +212,7 @@ def _compress_chunks(
         if loaded:
             parts.add(samples, state, workspace, weight_rows)
         for channel in unloaded_offset_equations(builder, samples):
-            in_the_air = parts.part(samples, state, samples.block, unloaded=True)
+            in_the_air = parts.part(samples, state, samples.fold, samples.block, unloaded=True)
             if channel.masked:
                 in_the_air.masked.add(channel.offset)
             else:
@@ -219,18 +231,18 @@ class _Parts:
         self._compressors: dict[PartKey, RowCompressor] = {}
         self._absent: dict[tuple[PartKey, float], Tensor] = {}  # rows of zeros by oversampling, on the device
 
-    def part(self, samples: Samples, state: ContactState, block: int, unloaded: bool = False) -> Part:
-        key = (samples.source, state, samples.fold, block, unloaded) if self._by_log else _key(None, state)
-        source, at, fold, block, in_the_air = key
+    def part(self, samples: Samples, state: ContactState, fold: int, block: int, unloaded: bool = False) -> Part:
+        key = (samples.source, state, fold, block, unloaded) if self._by_log else _key(None, state)
+        source, at, in_fold, in_block, in_the_air = key
         return self.parts.setdefault(
-            key, Part(source, at, TriangularFactor(self._builder.width), 0, fold, block, in_the_air)
+            key, Part(source, at, TriangularFactor(self._builder.width), 0, in_fold, in_block, in_the_air)
         )
 
     def add(
         self, samples: Samples, state: ContactState, workspace: Workspace, weight_rows: RowWeighting | None
     ) -> None:
         """Add the rows of a chunk, which are made at once, to the parts of its blocks."""
-        spans = [(self.part(samples, state, block), start, end) for block, start, end in blocks_in(samples)]
+        spans = [(self.part(samples, state, fold, at), start, end) for fold, at, start, end in blocks_in(samples)]
         if spans[0][0].key not in self._compressors:  # no later chunk is of the blocks before
             self.finish()
         compressors = [self._compressors.setdefault(part.key, RowCompressor()) for part, *_ in spans]

@@ -218,7 +218,7 @@ class Evaluation:
             sums = [ForceSums(self.robot.n_rows) for _ in range(count)]
             for samples, state in chunks:
                 kinematics = builder.kinematics(samples)
-                forces = measured_and_predicted_forces(builder, samples, state, columns[samples.fold], kinematics)
+                forces = measured_and_predicted_forces(builder, samples, state, columns, kinematics)
                 sums[0].add_contact_forces(forces.measured[:, joints], forces.torque[:, joints])
                 errors = torch.cat([-forces.measured[None], forces.predicted - forces.measured])
                 errors = kinematics.without_rest(errors, base)
@@ -232,7 +232,8 @@ class Evaluation:
                         total.projected.add(inside.flatten()[:, None])
             return sums
 
-        parts = map_chunks(logs, builder, sum_chunks, progress=progress)
+        loaded = [replace(log, unloaded=None) for log in logs]
+        parts = map_chunks(loaded, builder, sum_chunks, progress=progress)
         return [ForceSums.total(same) for same in zip(*parts, strict=True)]
 
     def _noise_sums(
@@ -241,7 +242,7 @@ class Evaluation:
         """Sums of the variances of the measured forces, from some samples of a chunk: they hardly change."""
         sums, step = SumsOfSquares(self.robot.n_rows), -(-len(samples) // _NOISE_SAMPLES)
         part = samples.every(step)
-        variance = reading_variance(self.builder, part, state, kinematics.every(step), noise)
+        variance = reading_variance(self.builder, part, state, kinematics.some(slice(None, None, step)), noise)
         sums.add(variance.sqrt(), len(samples) / len(part))
         return sums
 

@@ -11,10 +11,11 @@ Source: Fuller, "Measurement Error Models", 1987, section 2.2; the noise that is
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import pairwise
+from itertools import groupby
+from operator import itemgetter
 from typing import TypeVar
 
 import numpy as np
@@ -115,12 +116,12 @@ def estimate_noise_gram(
     total: dict[Key, NoiseGram] = {}
     if not logs:
         return total
-    reduce, chunk = partial(_noise_gram_of_chunks, builder, by_log), chunk_size(builder.device) // len(_COPIES)
+    reduce, chunk = partial(_noise_gram_of_chunks, builder, by_log, key), chunk_size(builder.device) // len(_COPIES)
     for of_worker in map_chunks(logs, builder, reduce, chunk):
-        for (source, number, state), noise_gram in of_worker.items():
+        for of_key, noise_gram in of_worker.items():
             halves = {support: x.cpu().triu() for support, x in noise_gram.items()}
             both = {support: x + x.triu(1).T for support, x in halves.items()}  # to the last bit, as files have one
-            _add(total.setdefault(key(by_log[source][number], state), {}), both, float(step))
+            _add(total.setdefault(of_key, {}), both, float(step))
     return total
 
 
@@ -163,16 +164,28 @@ def _spread(piece: Samples, step: int, progress: ProgressCallback | None) -> Sam
     return taken
 
 
-_Place = tuple[str, int, ContactState]
 _COPIES = ((0.0, -1.0), (1.0, 0.5), (-1.0, 0.5))  # of each sample: the side that noise moves it to, and its weight
+
+
+def _alike(ends: Iterable[tuple[Key, int]]) -> Iterator[tuple[Key, int, int]]:
+    """Successive samples with one key: that, the first and the end, from the key and the end of each piece."""
+    start = 0
+    for key, run in groupby(ends, key=itemgetter(0)):
+        *_, (_, end) = run
+        if end > start:
+            yield key, start, end
+        start = end
 
 
 @torch.no_grad()
 def _noise_gram_of_chunks(
-    builder: RowBuilder, pieces: Mapping[str, Sequence[Samples]], chunks: Iterator[tuple[Samples, ContactState]]
-) -> dict[_Place, NoiseGram]:
-    """By log, number of the piece and contact state: half of what pairs of samples with noise have more."""
-    out: dict[_Place, NoiseGram] = {}
+    builder: RowBuilder,
+    pieces: Mapping[str, Sequence[Samples]],
+    key: Callable[[Samples, ContactState], Key],
+    chunks: Iterator[tuple[Samples, ContactState]],
+) -> dict[Key, NoiseGram]:
+    """By key of the piece: half of what pairs of samples with noise have more."""
+    out: dict[Key, NoiseGram] = {}
     workspace, scales = builder.workspaces.take(), scale_columns(builder)
     sides = [side for side, _ in _COPIES]
     for samples, state in chunks:
@@ -180,12 +193,12 @@ def _noise_gram_of_chunks(
         starts = torch.stack([piece.time[0] for piece in own]).to(samples.time)
         of_piece = torch.searchsorted(starts, samples.time.contiguous(), right=True)
         ends = torch.bincount(of_piece - 1, minlength=len(own)).cumsum(0).tolist()
-        spans = [(number, start, end) for number, (start, end) in enumerate(pairwise([0, *ends])) if end > start]
+        spans = list(_alike((key(piece, state), end) for piece, end in zip(own, ends, strict=True)))
         for rows, index in (
             builder.blocks(with_noise_alone(samples, builder.sensors.noise), state, workspace) if scales else ()
         ):
-            for number, start, end in spans:
-                sums = out.setdefault((samples.source, number, state), {})
+            for of_key, start, end in spans:
+                sums = out.setdefault(of_key, {})
                 first, last = span_of_samples(index, start, end)
                 for column in set(scales) & set(rows.block.support):
                     of_column = rows.values[rows.block.support.index(column), :, first:last]
@@ -196,8 +209,8 @@ def _noise_gram_of_chunks(
         repeated = samples[torch.arange(count, device=samples.time.device).repeat(len(sides))]
         perturbed = noise.perturbed(repeated, side[:, None])
         for rows, index in builder.blocks(perturbed, state, workspace):
-            for number, start, end in spans:
-                sums = out.setdefault((samples.source, number, state), {})
+            for of_key, start, end in spans:
+                sums = out.setdefault(of_key, {})
                 for copy, (_, weight) in enumerate(_COPIES):
                     first, last = span_of_samples(index, copy * count + start, copy * count + end)
                     _add(sums, {rows.block.support: gram_matrix(rows.values[:, :, first:last].flatten(1))}, weight)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchid.logs.lazy_arrays import Spill
 from torchid.parameters import Array
+from torchid.problem.blocks import folds_in
 from torchid.problem.chunk_dynamics import ChunkDynamics, ChunkKinematics
 from torchid.problem.chunks import chunks_by_state, one_thread
 from torchid.problem.contact_rows import leave_out_torques
@@ -176,9 +177,9 @@ def reading_variance(
 
 
 def measured_and_predicted_forces(
-    builder: RowBuilder, samples: Samples, state: ContactState, phi: Tensor, kinematics: ChunkKinematics
+    builder: RowBuilder, samples: Samples, state: ContactState, phi: Mapping[int, Tensor], kinematics: ChunkKinematics
 ) -> GeneralizedForces:
-    """Measured and predicted forces of samples that share a contact state; `phi` is (M, width).
+    """Measured and predicted forces of samples that share a contact state; `phi` is (M, width) by fold.
 
     Sensors are taken as calibrated: of the extras only those of actuators enter. A payload adds to each `phi`, known
     armatures and springs to each prediction.
@@ -186,14 +187,25 @@ def measured_and_predicted_forces(
     base_rows = builder.tree.base_rows
     torque = torch.nn.functional.pad(builder.recorded_torque(samples), (base_rows, 0))
     measured = torque + contact_forces(builder, samples, state, kinematics).T
+    by_fold = [
+        _predicted(builder, samples[start:end], kinematics.some(slice(start, end)), phi[fold])
+        for fold, start, end in folds_in(samples)
+    ]
+    predicted = by_fold[0] if len(by_fold) == 1 else torch.cat(by_fold, dim=1)
+    return GeneralizedForces(measured, torque, predicted)
+
+
+def _predicted(builder: RowBuilder, samples: Samples, kinematics: ChunkKinematics, phi: Tensor) -> Tensor:
+    """What `measured_and_predicted_forces` predicts at parameters (M, width), (M, B, n_rows)."""
     predicted = predict_forces(builder, kinematics, with_payload_columns(builder, samples, phi)).mT
+    base_rows = builder.tree.base_rows
     if not builder.known_torques.none:
         predicted[..., base_rows:] += builder.known_torques.of(samples)
     for number, extra in enumerate(builder.extras, start=builder.columns.count):
         for dof in extra.dofs if extra.what in ACTUATORS else ():
             column = dof_extra_column(extra, dof, samples, builder.tree)
             predicted[..., base_rows + dof] += phi[:, number, None] * column
-    return GeneralizedForces(measured, torque, predicted)
+    return predicted
 
 
 def noise_series(builder: RowBuilder, samples: Samples, noise: SensorNoise) -> Array:
@@ -215,7 +227,8 @@ def force_series(builder: RowBuilder, samples: Samples, phi: Array) -> tuple[Arr
     with torch.no_grad(), one_thread():
         for state, index in chunks_by_state(samples):
             chunk = samples[index].to(builder.device)
-            forces = measured_and_predicted_forces(builder, chunk, state, columns, builder.kinematics(chunk))
+            by_fold, kinematics = {chunk.fold: columns}, builder.kinematics(chunk)
+            forces = measured_and_predicted_forces(builder, chunk, state, by_fold, kinematics)
             where = index if isinstance(index, slice) else index.numpy()
             measured[where] = forces.measured.cpu().numpy()
             predicted[:, where] = forces.predicted.cpu().numpy()

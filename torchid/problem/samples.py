@@ -59,7 +59,7 @@ class Samples:
         folder: where the tensors of a log larger than memory are stored; None for one in memory.
         fold: number of the cross-validation fold of these samples, see `split_into_folds`.
         block: number of the block in which they are compressed, see `compress_in_blocks`.
-        blocks: (N,), that of each sample; None for one that all are in.
+        blocks: (N, 2), fold and block of each sample; None for those that all are in.
         has_force_normal: whether the log has forces along the ground's normal, which contacts may be read along.
         motion_noise: noise of the motion, None without any.
         pages: of files that the tensors are mapped to; None for those in memory.
