@@ -188,8 +188,9 @@ class LogReader:
         """
         settings = self.scene.config.preprocessing
         filled = settings.bridge_gaps_s is not None or settings.zero_in_air
-        delayed = bool(self.scene.config.actuators.known_delay)
-        whole = settings.exclude_rejected or settings.derived or filled or delayed or split_range(path).joins
+        logs, delayed = self.scene.config.logs, bool(self.scene.config.actuators.known_delay)
+        joined = split_range(path).joins or bool(logs and logs.columns and logs.columns.other_times)
+        whole = settings.exclude_rejected or settings.derived or filled or delayed or joined
         return gigabytes > _WHOLE_GB and not whole and not self.scene.robot.loops
 
     def _large_log(self, path: Path, required: SensorSet | None, folder: Path | None) -> LargeLog:
