@@ -16,7 +16,7 @@ from synthetic import ANYMAL, PANDA, ROBOTS, SOLO12
 
 from torchid.commands.init import Initiated, init
 from torchid.config import load_config
-from torchid.errors import TorchidWarning
+from torchid.errors import LogError, TorchidWarning
 from torchid.logs import Log, read_log
 from torchid.proposals.numbers import point_along_z, threshold
 
@@ -371,3 +371,12 @@ def test_arrays_with_stamps_of_their_own_are_interpolated_to_the_fastest(tmp_pat
     assert log.imu_angular_velocity is not None
     np.testing.assert_allclose(log.joint_velocity, dq[: len(log)], rtol=1e-12)
     np.testing.assert_allclose(log.imu_angular_velocity, np.sin(3.0 * log.time[:, None] + np.arange(3)), atol=1e-6)
+
+
+def test_rows_of_joints_in_several_files_are_refused_in_one_line(tmp_path: Path) -> None:
+    rows = [f"{t:.3f},{name},0.1" for t in TIME[:20] for name in ("FL_HAA", "FL_HFE", "FL_KFE")]
+    for name in ("position", "effort"):
+        (tmp_path / f"{name}.csv").write_text("\n".join([f"stamp,joint,{name}", *rows]) + "\n")
+    with pytest.raises(LogError, match="position.csv: column 'joint': a row for each joint, in one of several files"):
+        init(SOLO12, tmp_path / "position.csv + effort.csv", tmp_path / "x.yaml")
+    assert not (tmp_path / "x.yaml").exists()

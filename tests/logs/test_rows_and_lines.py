@@ -112,6 +112,8 @@ def test_names_of_old_spreadsheets_are_read(tmp_path: Path) -> None:
 def test_stamps_that_begin_anew_are_said_to_be_those_of_another_recording(tmp_path: Path) -> None:
     episodes = written(tmp_path / "x.csv", "time,joint_position.a\n0,1\n1,2\n0,3\n")
     assert "of recordings one after the other (episodes) the name with [#0] for the first" in log_refusal(episodes)
+    coarse = written(tmp_path / "y.csv", "time,joint_position.a\n0,1\n0,2\n1,3\n")
+    assert "where rows are steps of a clock that stamps round, logs.columns.time: {step: ...}" in log_refusal(coarse)
 
 
 EACH = "".join(f"{0.1 * k:.1f},{joint},{k}\n" for k in range(20) for joint in "ab")

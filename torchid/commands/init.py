@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections import Counter
 from collections.abc import Sequence
@@ -15,6 +14,7 @@ from torchid.commands.init_logs import Split, keys_for_gaps, keys_for_length, sp
 from torchid.commands.init_proposals import (
     GuessedContact,
     guess_contacts,
+    held_joints,
     hints,
     like_torques,
     limb_sensors,
@@ -25,6 +25,7 @@ from torchid.commands.init_proposals import (
     read_sensors,
     stated_contacts,
     unreadable,
+    welded_at,
     without_rolling,
 )
 from torchid.commands.reading import memory_needed
@@ -47,7 +48,7 @@ from torchid.proposals.maps import propose_map
 from torchid.proposals.stamps import arrays_by_stamps
 from torchid.proposals.topics import USED_TYPES, frame_of, propose_topics
 from torchid.robot import Robot, load_robot
-from torchid.robot.urdf import has_fixed_base, position_limits
+from torchid.robot.urdf import has_fixed_base
 from torchid.robot.xml_files import is_mjcf
 
 _FORCES = ("joint_torque", "contact_wrench_local", "contact_wrench_world", "contact_force_normal", "ft_wrench")
@@ -142,7 +143,11 @@ def _of_columns(files: Sequence[Path], robot: Robot) -> tuple[list[GuessedContac
             accepted = "a log of a part of the recording, whose map holds for all of it"
             raise LogError(file, "file", f"arrays of {size:.2g} GB", accepted)
         with about_file(file):
-            rows = rows_of(file) if len(files) == 1 else None
+            if (rows := rows_of(file)) is not None and len(files) > 1:
+                accepted = "one table, joined by stamp and joint; or a column for each joint"
+                raise LogError(
+                    file, f"column '{rows.column}'", "a row for each joint, in one of several files", accepted
+                )
             samples.append(read_sample(file, rows))
             in_degrees |= set(samples[-1]) if states_degrees(file) else set()
     samples = _named_apart(samples, [file.name for file in files])
@@ -272,7 +277,7 @@ def _describe(
         )
     if _is_fixed(contacts, fields) and not robot.fixed_base:
         out.guessed.append("robot.fixed_base: true, as there is neither a foot nor a motion of the base")
-    if held := _held(robot, proposal):
+    if held := held_joints(robot, proposal.lacking):
         out.guessed.append(f"robot.weld: {_WELDED}: {join_names(held)}")
     if proposal.left_out:
         out.guessed.append(f"{format_count(len(proposal.left_out), what)} not needed: {join_names(proposal.left_out)}")
@@ -349,7 +354,7 @@ def _text(
     from_feet = _from_feet(contacts, fields)
     own: dict[str, object] = {"mjcf" if is_mjcf(Path(urdf)) else "urdf": _relative(Path(urdf), output)}
     own |= {"fixed_base": True} if robot.fixed_base or _is_fixed(contacts, fields) else {}
-    own |= {"weld": weld} if (weld := _weld(robot, proposal)) else {}
+    own |= {"weld": weld} if (weld := welded_at(robot, held_joints(robot, proposal.lacking))) else {}
     names = f"{excerpt(log.name)} and {excerpt(robot.path.name)}"
     lines = [f"# {names}, by torchid init; what is marked as guessed should be checked"]
     lines += yaml_lines("robot", own)
@@ -381,19 +386,6 @@ def _text(
     lines += yaml_lines("estimator", {"name": "consistent", "ridge": split.ridge})
     lines += yaml_lines("output", f"runs/{output.stem}")
     return "\n".join(lines) + "\n"
-
-
-def _held(robot: Robot, proposal: MapProposal) -> list[str]:
-    """Joints that a log lacks, but for those without a motor in loops, which follow from the others."""
-    return [name for name in proposal.lacking if name not in robot.passive]
-
-
-def _weld(robot: Robot, proposal: MapProposal) -> list[str] | dict[str, float]:
-    """Joints that a log lacks, each at 0, or at the middle of its range if that is elsewhere."""
-    limits = position_limits(robot.path)
-    ranges = {name: limits.get(name, (-math.inf, math.inf)) for name in _held(robot, proposal)}
-    at = {name: 0.0 if low <= 0.0 <= high else float(f"{(low + high) / 2:.4g}") for name, (low, high) in ranges.items()}
-    return at if any(at.values()) else list(at)
 
 
 def _relative(path: Path, output: Path) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import warnings
 from collections.abc import Collection, Mapping, Sequence
@@ -18,7 +19,7 @@ from torchid.parameters import WRENCH_COMPONENTS
 from torchid.proposals.column_groups import Family
 from torchid.proposals.file_samples import FileSample, stated_names
 from torchid.robot import CollisionShapes, Robot, load_robot
-from torchid.robot.urdf import fixed_joints
+from torchid.robot.urdf import fixed_joints, position_limits
 
 _FEET = (r"foot|feet", r"sole", r"ankle_roll|ankle_flexion", r"toe|ankle|paw|hoof")
 """Words in names of links that touch the ground, the surest first."""
@@ -99,6 +100,19 @@ def _balls_of_limbs(robot: Robot, shapes: CollisionShapes) -> list[str]:
             limbs.setdefault(root, name)
     called = [name for name in limbs.values() if re.search("|".join(_FEET), name, re.IGNORECASE)]
     return list(limbs.values()) if len(limbs) > 2 else called
+
+
+def held_joints(robot: Robot, lacking: Sequence[str]) -> list[str]:
+    """Joints that a log lacks, but for those without a motor in loops, which follow from the others."""
+    return [name for name in lacking if name not in robot.passive]
+
+
+def welded_at(robot: Robot, held: Sequence[str]) -> list[str] | dict[str, float]:
+    """Joints that are held, each at 0, or at the middle of its range if that is elsewhere."""
+    limits = position_limits(robot.path)
+    ranges = {name: limits.get(name, (-math.inf, math.inf)) for name in held}
+    at = {name: 0.0 if low <= 0.0 <= high else float(f"{(low + high) / 2:.4g}") for name, (low, high) in ranges.items()}
+    return at if any(at.values()) else list(at)
 
 
 _SENSOR = r"(?<![a-z])(ft|force|torque|load_?cell)(?![a-z])"
