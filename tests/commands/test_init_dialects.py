@@ -14,6 +14,7 @@ from dialects import save_csv
 from scipy.spatial.transform import Rotation
 from synthetic import ANYMAL, PANDA, ROBOTS, SOLO12
 
+from torchid.commands.check import recorded_segments
 from torchid.commands.init import Initiated, init
 from torchid.config import load_config
 from torchid.errors import LogError, TorchidWarning
@@ -371,6 +372,10 @@ def test_arrays_with_stamps_of_their_own_are_interpolated_to_the_fastest(tmp_pat
     assert log.imu_angular_velocity is not None
     np.testing.assert_allclose(log.joint_velocity, dq[: len(log)], rtol=1e-12)
     np.testing.assert_allclose(log.imu_angular_velocity, np.sin(3.0 * log.time[:, None] + np.arange(3)), atol=1e-6)
+    config = load_config(tmp_path / "x.yaml")
+    assert config.logs is not None
+    (segment,) = recorded_segments(tmp_path / "x.h5", config.logs, config.preprocessing)
+    np.testing.assert_array_equal(segment.log.joint_position, log.joint_position)
 
 
 def test_rows_of_joints_in_several_files_are_refused_in_one_line(tmp_path: Path) -> None:

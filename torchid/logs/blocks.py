@@ -69,6 +69,12 @@ def log_bytes(path: Path, limit: float) -> int:
             return sum(container.declared_bytes().values())
 
 
+def has_blocks(path: Path, columns: Columns | None) -> bool:
+    """Whether a log can be read a block at a time: no bag, and nothing that is interpolated to stamps of others."""
+    is_joined = existing_log_kind(path) in (LogKind.BAG, LogKind.JOINED)
+    return not is_joined and not (columns is not None and columns.other_times)
+
+
 def count_samples_from(start: int, error: LogError) -> LogError:
     """An error in a part of a log, with samples counted from the start of the log."""
     found = _SAMPLE.sub(lambda match: f"sample {int(match[1]) + start}", error.found)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import LogError
-from torchid.guards import MAX_JSON, MAX_LETTERS, MAX_NAMES, check_fields
+from torchid.guards import MAX_DOCUMENT, MAX_LETTERS, MAX_NAMES, check_fields
 from torchid.logs.lazy_arrays import LazyArray
 
 
@@ -21,8 +21,8 @@ class JsonDocument:
     def __init__(self, path: Path) -> None:
         """Read a file; LogError for one that is too large, ValueError where it is damaged or holds no object."""
         size = path.stat().st_size
-        if size > MAX_JSON:
-            accepted = f"at most {MAX_JSON} bytes, or .jsonl with a record in each line"
+        if size > MAX_DOCUMENT:
+            accepted = f"at most {MAX_DOCUMENT} bytes, or .jsonl with a record in each line"
             raise LogError(path, "file", f"a JSON document of {size} bytes", accepted)
         document = _read(path.read_text(encoding="utf-8-sig"))
         if not isinstance(document, dict) and not _are_records(document):
