@@ -195,7 +195,7 @@ def _add_maps(command: argparse.ArgumentParser) -> None:
 def _add_work_on_logs(commands: _Commands) -> None:
     """Commands that write logs anew."""
     convert = commands.add_parser("convert", help=_CONVERT, description=_CONVERT)
-    read = "log: .npz, .h5, .mat, .csv, .txt, .parquet, .jsonl, .mot, .sto, or a bag of ROS messages"
+    read = "log: .npz, .h5, .mat, .json, .csv, .txt, .parquet, .jsonl, .mot, .sto, or a bag of ROS messages"
     convert.add_argument("source", metavar="IN", help=read)
     convert.add_argument("target", metavar="OUT", help="file to write: .npz, .h5, .csv or .parquet")
     _add_maps(convert)
@@ -221,8 +221,8 @@ def _add_starts(commands: _Commands) -> None:
     init.add_argument(
         "log",
         metavar="LOG",
-        help="table, arrays or bag: .csv, .txt, .parquet, .jsonl, .mot, .sto, .npz, .h5, .mat, .mcap, .db3, .bag; "
-        "or several, 'FILE + FILE@SECONDS'",
+        help="table, arrays or bag: .csv, .txt, .parquet, .jsonl, .mot, .sto, .npz, .h5, .mat, .json, .mcap, .db3, "
+        ".bag; or several, 'FILE + FILE@SECONDS'",
     )
     what = "file to write, a new one (default: experiment.yaml)"
     init.add_argument("--output", default="experiment.yaml", metavar="FILE", help=what)

@@ -35,7 +35,7 @@ from torchid.commands.reading import LogReader
 from torchid.config import load_config
 from torchid.errors import ConfigError, LogError, UnknownNameError
 from torchid.fitting.experiment import set_up
-from torchid.logs import Log, read_log
+from torchid.logs import Log, Topics, read_log
 from torchid.logs.unitree import HG, JOINT_ORDERS
 from torchid.robot import load_robot
 
@@ -319,3 +319,43 @@ def test_a_bag_without_anything_is_answered_by_what_is_missing(tmp_path: Path) -
 def test_a_low_state_of_another_robot_than_the_urdf_is_named(tmp_path: Path) -> None:
     said = init(G1, write_low_states(tmp_path / "x.db3", moving(GO2), GO2), tmp_path / "x.yaml")
     assert any("/lowstate is a LowState, but of another robot than the URDF" in line for line in said.guessed)
+
+
+@pytest.mark.parametrize("topics", [("/legs/joint_states", "/arms/joint_states"), ("/joint_states", "/joint_states")])
+def test_joints_of_several_publishers_are_those_of_one_robot(tmp_path: Path, topics: tuple[str, str]) -> None:
+    """Each at its own rate, on topics of their own or on one; none of them is welded."""
+    names = load_robot(SOLO12).joint_names
+    of = {topics[0] + "0": names[:8][::-1], topics[1] + "1": (*names[8:], "gripper")}
+    entries, angle = list[Entry](), np.arange(13)
+    for number, (topic, own) in enumerate(of.items()):
+        places = angle[: len(own)] + 8 * number
+        for k in range(0, 200, 1 + number):
+            stamp = START + k * 5_000_000 + number
+            values = np.sin(0.02 * k + places)
+            joints = joint_state(stamp, own, position=values, velocity=4.0 * np.cos(0.02 * k + places), effort=values)
+            entries.append((topic[:-1], stamp, JOINT_STATE, joints))
+    said, found, log = started(SOLO12, write_bag(tmp_path / "x.mcap", sorted(entries, key=lambda one: one[1])))
+    assert not any("weld" in text for text in said.guessed)
+    assert found["joint_states"] == (
+        topics[0] if len(set(topics)) > 1 else {"topic": topics[0], "joints": [*names[:8]]}
+    )
+    assert found["other_joint_states"] == [{"topic": topics[1], "joints": [*names[8:]]}]
+    assert set(log.joint_names) == set(names)
+    assert log.joint_torque is not None
+    assert log.joint_velocity is not None
+    place = np.array([7 - k if k < 8 else k for k in map(names.index, log.joint_names)])
+    begin = float(np.arcsin(log.joint_position[0, log.joint_names.index(names[7])]))  # of the log, in angle
+    np.testing.assert_allclose(log.joint_position, np.sin(begin + 4.0 * log.time[:, None] + place), atol=1e-5)
+    np.testing.assert_allclose(log.joint_velocity, 4.0 * np.cos(begin + 4.0 * log.time[:, None] + place), atol=1e-4)
+    np.testing.assert_allclose(log.joint_torque, log.joint_position, atol=1e-12)
+
+
+def test_a_joint_of_two_topics_is_refused(tmp_path: Path) -> None:
+    state = [("/a", ["x", "y"]), ("/b", ["y", "z"])]
+    stamps = [START + k * 5_000_000 for k in range(20)]
+    entries = [(t, s, JOINT_STATE, joint_state(s, own, position=[0.1, 0.2])) for s in stamps for t, own in state]
+    given = Topics(joint_states="/a", other_joint_states=["/b"])  # type: ignore[arg-type,list-item]
+    with pytest.raises(
+        LogError, match="/b: joint 'y', of another topic too; accepted: logs.topics.other_joint_states.0"
+    ):
+        read_log(write_bag(tmp_path / "x.mcap", entries), given)

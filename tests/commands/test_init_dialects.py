@@ -7,14 +7,17 @@ from typing import Any
 
 import h5py
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from dialects import save_csv
 from scipy.spatial.transform import Rotation
 from synthetic import ANYMAL, PANDA, ROBOTS, SOLO12
 
+from torchid.commands.check import recorded_segments
 from torchid.commands.init import Initiated, init
 from torchid.config import load_config
-from torchid.errors import TorchidWarning
+from torchid.errors import LogError, TorchidWarning
 from torchid.logs import Log, read_log
 from torchid.proposals.numbers import point_along_z, threshold
 
@@ -329,3 +332,56 @@ def test_forces_point_along_z_in_the_world_alone() -> None:
     assert point_along_z(up)
     assert point_along_z(-up), "those of the robot on the ground"
     assert not point_along_z(tilted)
+
+
+def test_episodes_of_lists_are_recordings_of_which_the_last_is_held_back(tmp_path: Path) -> None:
+    """As of LeRobot's Parquet: stamps begin anew in each episode."""
+    q, _, tau = motion(8)
+    lists = {
+        f"observation.{name}": pa.array([x[k % len(TIME)] for k in range(3 * len(TIME))])
+        for name, x in (("state", q), ("effort", tau))
+    }
+    episode = np.repeat(np.arange(3), len(TIME))
+    pq.write_table(pa.table(lists | {"timestamp": np.tile(TIME, 3), "episode_index": episode}), tmp_path / "x.parquet")
+    target = tmp_path / "x.yaml"
+    said = init(PANDA, tmp_path / "x.parquet", target)
+    logs = load_config(target).logs
+    assert logs is not None
+    assert [path.name for path in logs.train + logs.test] == [f"x.parquet[#{k}]" for k in range(3)]
+    assert len(logs.test) == 1
+    assert "logs: 3 recordings one after the other, as stamps begin anew; the last held back as test" in said.guessed
+    for path in logs.train + logs.test:
+        log = read_log(path, columns=logs.columns)
+        np.testing.assert_array_equal(log.joint_position, q)
+        np.testing.assert_array_equal(log.joint_torque, tau)
+
+
+def test_arrays_with_stamps_of_their_own_are_interpolated_to_the_fastest(tmp_path: Path) -> None:
+    q, dq, tau = motion(12)
+    acc, gyro = (np.sin(3.0 * TIME[::4, None] + np.arange(3)) + offset for offset in ([0.0, 0.0, 9.8], [0.0] * 3))
+    with h5py.File(tmp_path / "x.h5", "w") as file:
+        joints = {"stamp": TIME, "q": q, "dq": np.degrees(dq), "tau": tau}
+        imu = {"stamp": 1e3 * TIME[::4], "acc": acc, "gyro": gyro}
+        file.update({f"{of}/{name}": x for of, xs in (("joints", joints), ("imu", imu)) for name, x in xs.items()})
+    said, log, given = started(SOLO12, tmp_path / "x.h5")
+    assert [entry.column for entry in given["other_times"]] == ["imu/stamp"]
+    assert not any("not read" in text for text in said.missing)
+    np.testing.assert_allclose(log.time, TIME[: len(log)], atol=1e-12)
+    np.testing.assert_array_equal(log.joint_position, q[: len(log)])
+    assert log.joint_velocity is not None
+    assert log.imu_angular_velocity is not None
+    np.testing.assert_allclose(log.joint_velocity, dq[: len(log)], rtol=1e-12)
+    np.testing.assert_allclose(log.imu_angular_velocity, np.sin(3.0 * log.time[:, None] + np.arange(3)), atol=1e-6)
+    config = load_config(tmp_path / "x.yaml")
+    assert config.logs is not None
+    (segment,) = recorded_segments(tmp_path / "x.h5", config.logs, config.preprocessing)
+    np.testing.assert_array_equal(segment.log.joint_position, log.joint_position)
+
+
+def test_rows_of_joints_in_several_files_are_refused_in_one_line(tmp_path: Path) -> None:
+    rows = [f"{t:.3f},{name},0.1" for t in TIME[:20] for name in ("FL_HAA", "FL_HFE", "FL_KFE")]
+    for name in ("position", "effort"):
+        (tmp_path / f"{name}.csv").write_text("\n".join([f"stamp,joint,{name}", *rows]) + "\n")
+    with pytest.raises(LogError, match="position.csv: column 'joint': a row for each joint, in one of several files"):
+        init(SOLO12, tmp_path / "position.csv + effort.csv", tmp_path / "x.yaml")
+    assert not (tmp_path / "x.yaml").exists()

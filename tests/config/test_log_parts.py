@@ -45,6 +45,16 @@ def test_a_range_behind_a_pattern_is_that_of_each_file(folder: Path) -> None:
     assert names(logs.test) == ["a.npz[80%:]", "b.npz[80%:]"]
 
 
+def test_numbers_of_recordings_stand_for_each_of_them(folder: Path) -> None:
+    logs = load(folder, train=["a.npz[#0:3]", "a.npz[#5]"], test=["*.npz[#3]"])
+    assert names(logs.train) == ["a.npz[#0]", "a.npz[#1]", "a.npz[#2]", "a.npz[#5]"]
+    assert names(logs.test) == ["a.npz[#3]", "b.npz[#3]"]
+    with pytest.raises(ConfigError, match=r"a.npz\[#1\] is given twice"):
+        load(folder, train=["a.npz[#0:3]", "a.npz[#1]"])
+    with pytest.raises(ConfigError, match=r"a.npz and .*a.npz\[#1\] share samples"):
+        load(folder, train=["a.npz", "a.npz[#1]"])
+
+
 def test_a_mapping_says_the_same_in_words(folder: Path) -> None:
     entries = [{"file": "a.npz", "from": 0, "to": 30.5}, {"file": "b.npz", "from": -10}, {"file": "c.h5", "to": "80%"}]
     assert names(load(folder, train=entries).train) == ["a.npz[0:30.5]", "b.npz[-10:]", "c.h5[:80%]"]

@@ -18,6 +18,7 @@ from torchid.logs import Log
 from torchid.logs.cutoff import choose_cutoff
 from torchid.logs.log import FloatArray
 from torchid.logs.preprocess import preprocess
+from torchid.logs.signal_noise import MOST_SAMPLES
 
 RATE, COUNT = 500.0, 15_000
 TIME = 7.0 + np.arange(COUNT) / RATE
@@ -167,6 +168,14 @@ def test_uneven_stamps_and_a_motionless_channel_make_no_difference() -> None:
     assert choose_cutoff([uneven], {"joint_position": 1e-3}).cutoff_hz == pytest.approx(
         choose_cutoff([noisy], {"joint_position": 1e-3}).cutoff_hz, rel=0.13
     )
+
+
+def test_samples_that_were_not_measured_are_passed_over() -> None:
+    """Those at the end of a table whose rows are the union of several clocks, which are left out of the fit."""
+    _, noisy = encoders(1.5, 1e-4)
+    lost = noisy.joint_position.copy()
+    lost[[MOST_SAMPLES + 7, *range(COUNT - 5, COUNT)]] = np.nan
+    assert choose_cutoff([replace(noisy, joint_position=lost)]) == choose_cutoff([noisy])
 
 
 @pytest.mark.parametrize(("factor", "step"), [(1e3, "2 s"), (1e9, "2e+06 s")], ids=["ms", "ns"])

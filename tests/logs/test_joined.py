@@ -16,6 +16,7 @@ from repository import DEMO
 
 from torchid.errors import ConfigError, LogError, TorchidWarning
 from torchid.logs import Log, read_log, write_log
+from torchid.logs.blocks import open_log_blocks
 from torchid.logs.time_range import LogFile, join_files, split_range
 
 MOTION = ("joint_position", "base_quat_xyzw", "base_position_world")
@@ -335,3 +336,38 @@ def test_files_without_stamps_have_those_of_one_step_each_from_its_first_sample(
     np.savez(tmp_path / "clock.npz", time=0.005 * np.arange(50), q=np.stack([angle, -angle], axis=1))
     mixed = read_log(tmp_path / f"clock.npz + feet.{suffix}", columns=parsed_map(text))
     np.testing.assert_array_equal(mixed.time, 0.005 * np.arange(47))
+
+
+def test_arrays_of_one_file_that_have_stamps_of_their_own_are_those_of_two_files(tmp_path: Path) -> None:
+    """Of two stamps that are as many, each belongs to what its name begins like."""
+    columns = parsed_map("""
+    time: joints/stamp
+    other_times: [{column: imu/stamp_us, unit: us}]
+    joint_order: [a, b]
+    joint_position: joints/q
+    imu_frame: trunk
+    imu_specific_force: imu/acc
+    imu_angular_velocity: imu/gyro
+    ignore: [camera/t]
+    """)
+    fast = 2.0 + np.arange(400) / 1000.0
+    for slow in (2.01 + np.arange(150) / 400.0, 2.0004 + np.arange(400) / 1000.0):
+        q, acc, gyro = (np.sin(7.0 * x[:, None] + np.arange(k)) for x, k in ((fast, 2), (slow, 3), (slow, 3)))
+        joints = {"stamp": fast, "q": q}
+        imu = {"stamp_us": 1e6 * slow, "acc": acc, "gyro": gyro}
+        parts = {"joints": joints, "imu": imu, "camera": {"t": np.arange(3.0)}}
+        np.savez(tmp_path / "one.npz", **{f"{of}/{name}": x for of, xs in parts.items() for name, x in xs.items()})
+        for of in ("joints", "imu"):
+            np.savez(tmp_path / f"{of}.npz", **{f"{of}/{name}": x for name, x in parts[of].items()})
+        found = read_log(tmp_path / "one.npz", columns=columns)
+        expected = read_log(tmp_path / "joints.npz + imu.npz", columns=columns)
+        assert found.time[0] >= slow[0]
+        assert found.time[-1] <= slow[-1]
+        for name, x in expected.arrays().items():
+            np.testing.assert_array_equal(getattr(found, name), x, err_msg=name)
+        assert np.abs(found.imu_specific_force - np.sin(7.0 * found.time[:, None] + np.arange(3))).max() < 1e-9
+    with (
+        pytest.raises(LogError, match="stamps beside those of time \\('imu/stamp_us'\\), read whole"),
+        open_log_blocks(tmp_path / "one.npz", None, columns),
+    ):
+        pass

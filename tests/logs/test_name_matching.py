@@ -53,6 +53,8 @@ def test_a_spelling_is_found_whole(stem: str, column: str, found: bool) -> None:
 def test_stamps_of_simulink_are_a_log_s_and_torques_out_of_a_motor_are_none() -> None:
     assert propose_field("out/tout") == propose_field("tout") == "time"
     assert propose_field("tau_out") == "joint_torque"
+    assert [propose_field(x) for x in ("J_1", "hip_phi", "dtau_J")] == ["joint_position", "joint_position", ""]
+    assert [propose_field(x) for x in ("hip_dphi", "micros", "imu_q0")] == ["joint_velocity", "time", "base_quat_wxyz"]
 
 
 def test_fields_that_differ_in_what_they_are_of_are_not_alike() -> None:

@@ -255,9 +255,7 @@ def test_absent_and_foreign_files_are_named(tmp_path: Path) -> None:
     (tmp_path / "folder.npz").mkdir()
     assert "a folder" in log_refusal(tmp_path / "folder.npz")
     (tmp_path / "log.xls").write_text("time\n0\n")
-    accepted = (
-        ".npz, .h5, .hdf5, .csv, .parquet, .mat, .tsv, .txt, .dat, .mot, .sto, .jsonl, .ndjson, .bag, .mcap, .db3"
-    )
+    accepted = ".npz, .h5, .hdf5, .csv, .parquet, .mat, .json, .tsv, .txt, .dat, .mot, .sto, .jsonl, .ndjson, .bag"
     assert f"extension '.xls'; accepted: {accepted}" in log_refusal(tmp_path / "log.xls")
     for suffix in SUFFIXES:
         (tmp_path / f"text{suffix}").write_text("not a log")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -109,7 +111,9 @@ def test_names_of_old_spreadsheets_are_read(tmp_path: Path) -> None:
 
 def test_stamps_that_begin_anew_are_said_to_be_those_of_another_recording(tmp_path: Path) -> None:
     episodes = written(tmp_path / "x.csv", "time,joint_position.a\n0,1\n1,2\n0,3\n")
-    assert "of recordings one after the other (episodes) a file for each" in log_refusal(episodes)
+    assert "of recordings one after the other (episodes) the name with [#0] for the first" in log_refusal(episodes)
+    coarse = written(tmp_path / "y.csv", "time,joint_position.a\n0,1\n0,2\n1,3\n")
+    assert "where rows are steps of a clock that stamps round, logs.columns.time: {step: ...}" in log_refusal(coarse)
 
 
 EACH = "".join(f"{0.1 * k:.1f},{joint},{k}\n" for k in range(20) for joint in "ab")
@@ -123,3 +127,57 @@ def test_rows_are_those_of_joints_where_successive_ones_share_a_stamp(
 ) -> None:
     found = sample_row_names(written(tmp_path / "x.csv", f"time,name,q\n{rows}"))
     assert (None if found is None else found.column) == expected
+
+
+TIMES, ANGLES = [0.0, 0.1, 0.2, 0.3], [[0.1, 1.0], [0.2, 2.0], [None, None], [0.4, 4.0]]
+RECORDS: list[dict[str, Any]] = [
+    {"t": t, "joints": {"q": q}, "effort": None if k == 1 else [1.0, k], "mode": "run"}
+    for k, (t, q) in enumerate(zip(TIMES, ANGLES, strict=True))
+]
+RECORDS[2]["joints"] = {}
+EFFORT = [[1, 0], None, [1, 2], [1, 3]]
+DOCUMENTS = {
+    "records": RECORDS,
+    "records within": {"meta": {"robot": "x"}, "steps": RECORDS},
+    "arrays": {"t": TIMES, "joints": {"q": ANGLES}, "effort": [x or [None, None] for x in EFFORT], "note": [[1], []]},
+    "numbered rows": {  # as pandas writes them
+        "t": {str(k): t for k, t in enumerate(TIMES)},
+        "joints": {"q": ANGLES},
+        "effort": [x or [None, None] for x in EFFORT],
+    },
+}
+
+
+@pytest.mark.parametrize("kind", [*DOCUMENTS, "lines"])
+def test_documents_of_json_are_read_as_arrays(tmp_path: Path, kind: str) -> None:
+    of = "steps/" if kind == "records within" else ""
+    text = "\n".join(map(json.dumps, RECORDS)) if kind == "lines" else json.dumps(DOCUMENTS[kind], indent=1)
+    columns = Columns(
+        time=f"{of}t",  # type: ignore[arg-type]
+        joint_order=["a", "b"],
+        joint_position=f"{of}joints/q",  # type: ignore[arg-type]
+        joint_torque=f"{of}effort",  # type: ignore[arg-type]
+        ignore=["*mode", "note", "meta/*"],
+    )
+    log = read_log(written(tmp_path / "x.json", f"\ufeff{text}"), columns=columns, allow_gaps=True)
+    np.testing.assert_array_equal(log.time, TIMES)
+    np.testing.assert_array_equal(log.joint_position, np.array(ANGLES, dtype=float))
+    np.testing.assert_array_equal(log.joint_torque, [[1, 0], [np.nan] * 2, [1, 2], [1, 3]])
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ('{"time": [0, 1', "cannot be read (JSONDecodeError"),
+        ("[1, 2]", "a list, no object of arrays and no list of records"),
+        (
+            '{"time": [0, 1], "joint_position": [[1], [1, 2]], "joint_names": ["a"]}',
+            "Python objects (pickled), references",
+        ),
+        ("[" * 100_000, "cannot be read (RecursionError"),
+        (json.dumps([{str(k): 0} for k in range(1000)]), "1000 arrays, more than the 200 that a log may have"),
+    ],
+    ids=["ends too soon", "numbers", "ragged", "nested", "keys"],
+)
+def test_documents_of_json_that_are_no_log_are_refused_in_one_line(tmp_path: Path, text: str, found: str) -> None:
+    assert found in log_refusal(written(tmp_path / "x.json", text))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +18,7 @@ from large import recorded
 from torchid.errors import LogError
 from torchid.logs import Log, read_log, write_log
 from torchid.logs.blocks import open_log_blocks
+from torchid.logs.tables import save_table
 from torchid.logs.time_range import TimeRange, share_samples, split_range
 
 TIME = np.arange(300) / 100.0 + 5.0  # three seconds from 5 s on
@@ -158,3 +161,30 @@ def test_a_field_of_another_length_is_refused_in_a_part_too(tmp_path: Path) -> N
     np.savez(tmp_path / "log.npz", **fields)
     with pytest.raises(LogError, match="joint_torque: shape \\(300, 12\\); accepted: 600 samples"):
         read_log(f"{tmp_path / 'log.npz'}[:50%]")
+
+
+@pytest.mark.parametrize("save", [lambda path, x: np.savez(path, **x), save_table], ids=["log.npz", "log.csv"])
+def test_recordings_one_after_the_other_are_as_in_files_of_their_own(
+    tmp_path: Path, save: Callable[[Path, dict[str, np.ndarray]], None], request: pytest.FixtureRequest
+) -> None:
+    path, starts = tmp_path / request.node.callspec.id, [0, 40, 65, 125]
+    fields = {name: x for name, x in recorded(125).items() if name != "contact_wrench_local"}
+    whole = [slice(*ends) for ends in pairwise(starts)]
+    anew = np.concatenate([fields["time"][part] - fields["time"][part.start] for part in whole])
+    save(path, fields | {"time": anew})
+    for number, part in enumerate(whole):
+        alone = {name: x[part] if len(x) == 125 else x for name, x in (fields | {"time": anew}).items()}
+        np.savez(tmp_path / "alone.npz", **alone)
+        name = f"{path}[#{number}]"
+        assert_equal(read_log(name), expected := read_log(tmp_path / "alone.npz"))
+        with open_log_blocks(Path(name), tmp_path) as blocks:
+            assert_equal(blocks.read(slice(0, len(expected))), expected)
+    with pytest.raises(
+        LogError, match=r"recording: \[#3\] of a file in which stamps begin 3 times; accepted: \[#0\] to"
+    ):
+        read_log(f"{path}[#3]")
+    for name in (str(path), f"{path}[:80%]"):
+        with pytest.raises(LogError, match=r"at sample 40, after .* the name with \[#0\] for the first, or \[#0:8\]"):
+            read_log(name)
+    one, other = split_range(f"{path}[#1]").range, split_range(f"{path}[#2]").range
+    assert (share_samples(one, one), share_samples(one, other), share_samples(one, None)) == (True, False, True)

@@ -24,8 +24,8 @@ from torchid.fitting.experiment import set_up_scene
 from torchid.log_checks import Checked
 from torchid.log_checks.check import check
 from torchid.logs import Columns, Log, Topics, read_log, write_log
-from torchid.logs.blocks import open_log_blocks
-from torchid.logs.containers import LogKind, atomic_output, existing_log_kind, new_log_kind
+from torchid.logs.blocks import has_blocks, open_log_blocks
+from torchid.logs.containers import atomic_output, new_log_kind
 from torchid.logs.time_range import log_title, split_range
 from torchid.report.figure_style import save_figure
 from torchid.report.log_checks import log_check_document, log_check_figure
@@ -184,7 +184,7 @@ def segments_to_check(path: Path, logs: LogsConfig, settings: PreprocessingConfi
 
 def recorded_segments(path: Path, logs: LogsConfig, settings: PreprocessingConfig) -> Iterator[LogSegment]:
     """As `segments_to_check`, of a log of any size."""
-    if settings.bridge_gaps_s is not None or existing_log_kind(path) in (LogKind.BAG, LogKind.JOINED):
+    if settings.bridge_gaps_s is not None or not has_blocks(path, logs.columns):
         log = _read_with_gaps(path, logs, settings)
         for segment in _segments(len(log)):
             yield LogSegment(log.select(segment), _segment_name(path, segment, len(log)), len(log))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections import Counter
 from collections.abc import Sequence
@@ -11,13 +10,12 @@ from pathlib import Path
 from textwrap import fill
 
 from torchid.commands.folder import check_free_file
+from torchid.commands.init_logs import Split, keys_for_gaps, keys_for_length, split_logs
 from torchid.commands.init_proposals import (
     GuessedContact,
-    Split,
     guess_contacts,
+    held_joints,
     hints,
-    keys_for_gaps,
-    keys_for_length,
     like_torques,
     limb_sensors,
     measured_torques,
@@ -25,9 +23,9 @@ from torchid.commands.init_proposals import (
     notes_on_arrays,
     proposed_sensors,
     read_sensors,
-    split_log,
     stated_contacts,
     unreadable,
+    welded_at,
     without_rolling,
 )
 from torchid.commands.reading import memory_needed
@@ -35,20 +33,22 @@ from torchid.config.preprocessing import PreprocessingConfig
 from torchid.config.yaml_text import inline_yaml, yaml_lines
 from torchid.errors import ConfigError, InputError, LogError, about_file, excerpt, format_count, join_names
 from torchid.fitting.checked_settings import is_along_base
-from torchid.logs import Columns, Log, Topics, read_log
+from torchid.logs import Columns, Log, Topics
 from torchid.logs.column_entries import OF_FILE
 from torchid.logs.columns import is_column
 from torchid.logs.containers import LogKind, atomic_output, existing_log_kind
 from torchid.logs.log import VARIANTS
 from torchid.logs.name_matching import KnownRobot, propose_field
+from torchid.logs.read import read_recordings
 from torchid.logs.time_range import split_range
 from torchid.parameters import GRAVITY
 from torchid.proposals.column_groups import MapProposal
 from torchid.proposals.file_samples import FileSample, read_bag_sample, read_sample, rows_of, states_degrees, texts_in
 from torchid.proposals.maps import propose_map
+from torchid.proposals.stamps import arrays_by_stamps
 from torchid.proposals.topics import USED_TYPES, frame_of, propose_topics
 from torchid.robot import Robot, load_robot
-from torchid.robot.urdf import has_fixed_base, position_limits
+from torchid.robot.urdf import has_fixed_base
 from torchid.robot.xml_files import is_mjcf
 
 _FORCES = ("joint_torque", "contact_wrench_local", "contact_wrench_world", "contact_force_normal", "ft_wrench")
@@ -116,10 +116,11 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> Initiated:
     _state_flags(contacts, fields, proposal)
     contacts = contacts if _knows_ground(robot, contacts, fields) else without_rolling(contacts, robot)
     read = _try(path, proposal)
-    gaps = keys_for_gaps(read) | keys_for_length(read)
-    split = split_log(read, "base_motion" in _from_feet(contacts, fields))
-    limbs = list(proposal.columns.get("ft_wrenches", ())) or read_sensors(robot, read)
-    torques = measured_torques(robot, read)
+    logs = [] if isinstance(read, InputError) else read
+    gaps = keys_for_gaps(logs) | keys_for_length(logs)
+    split = split_logs(logs, "base_motion" in _from_feet(contacts, fields))
+    limbs = list(proposal.columns.get("ft_wrenches", ())) or read_sensors(robot, logs)
+    torques = measured_torques(robot, logs)
     sensors = proposed_sensors(fields, limbs, contacts, torques)
     text = _text(robot, urdf, path, target, contacts, fields, proposal, gaps, split, sensors)
     _describe(out, robot, contacts, fields, proposal)
@@ -142,13 +143,18 @@ def _of_columns(files: Sequence[Path], robot: Robot) -> tuple[list[GuessedContac
             accepted = "a log of a part of the recording, whose map holds for all of it"
             raise LogError(file, "file", f"arrays of {size:.2g} GB", accepted)
         with about_file(file):
-            rows = rows_of(file) if len(files) == 1 else None
+            if (rows := rows_of(file)) is not None and len(files) > 1:
+                accepted = "one table, joined by stamp and joint; or a column for each joint"
+                raise LogError(
+                    file, f"column '{rows.column}'", "a row for each joint, in one of several files", accepted
+                )
             samples.append(read_sample(file, rows))
             in_degrees |= set(samples[-1]) if states_degrees(file) else set()
     samples = _named_apart(samples, [file.name for file in files])
     sample = {name: values for of_file in reversed(samples) for name, values in of_file.items()}
     contacts = guess_contacts(robot, stated_contacts(sample, robot), texts_in(sample))
-    proposal = propose_map(sample, _known(robot, contacts), samples if len(files) > 1 else (), in_degrees)
+    clocks = arrays_by_stamps(sample) if existing_log_kind(files[0]) is LogKind.ARRAYS and len(files) == 1 else ()
+    proposal = propose_map(sample, _known(robot, contacts), samples if len(files) > 1 else (), in_degrees, clocks)
     fields = {*(name.partition(".")[0] for name in sample), *proposal.columns}
     if rows is not None:
         proposal.columns = {"rows_of": rows.column, **proposal.columns}
@@ -271,7 +277,7 @@ def _describe(
         )
     if _is_fixed(contacts, fields) and not robot.fixed_base:
         out.guessed.append("robot.fixed_base: true, as there is neither a foot nor a motion of the base")
-    if held := _held(robot, proposal):
+    if held := held_joints(robot, proposal.lacking):
         out.guessed.append(f"robot.weld: {_WELDED}: {join_names(held)}")
     if proposal.left_out:
         out.guessed.append(f"{format_count(len(proposal.left_out), what)} not needed: {join_names(proposal.left_out)}")
@@ -305,17 +311,17 @@ def _describe_found(
         out.found.append(f"{proposal.key} of {', '.join(known)}")
 
 
-def _try(path: Path, proposal: MapProposal) -> Log | InputError:
-    """The log as it is read with the map, or why it is not."""
+def _try(path: Path, proposal: MapProposal) -> list[Log] | InputError:
+    """The recordings of the log as they are read with the map, or why it is not."""
     try:
         maps = {"columns": Columns, "topics": Topics}[proposal.key]
         given = {proposal.key: maps(**proposal.columns)} if proposal.columns else {}
-        return read_log(path, allow_gaps=True, **given)
+        return read_recordings(path, **given)
     except InputError as error:
         return error
 
 
-def _describe_log(out: Initiated, read: Log | InputError, fields: set[str]) -> None:
+def _describe_log(out: Initiated, read: list[Log] | InputError, fields: set[str]) -> None:
     """What there is of the log, by the names of the file's fields, or why it is not read."""
     if isinstance(read, InputError):
         out.missing.append(
@@ -323,8 +329,10 @@ def _describe_log(out: Initiated, read: Log | InputError, fields: set[str]) -> N
         )
         return
     recorded = {name: variant for variant, name in VARIANTS.items() if variant in fields}
-    has = [recorded.get(name, name) for name, array in read.arrays().items() if array.size]
-    out.found.append(f"{len(read)} samples over {read.time[-1] - read.time[0]:.4g} s: {', '.join(has)}")
+    has = [recorded.get(name, name) for name, array in read[0].arrays().items() if array.size]
+    seconds = sum(float(log.time[-1] - log.time[0]) for log in read)
+    several = f" in {len(read)} recordings" * (len(read) > 1)
+    out.found.append(f"{sum(map(len, read))} samples over {seconds:.4g} s{several}: {', '.join(has)}")
 
 
 # ------------------------------------------------------------------------------------------------------- the file
@@ -346,7 +354,7 @@ def _text(
     from_feet = _from_feet(contacts, fields)
     own: dict[str, object] = {"mjcf" if is_mjcf(Path(urdf)) else "urdf": _relative(Path(urdf), output)}
     own |= {"fixed_base": True} if robot.fixed_base or _is_fixed(contacts, fields) else {}
-    own |= {"weld": weld} if (weld := _weld(robot, proposal)) else {}
+    own |= {"weld": weld} if (weld := welded_at(robot, held_joints(robot, proposal.lacking))) else {}
     names = f"{excerpt(log.name)} and {excerpt(robot.path.name)}"
     lines = [f"# {names}, by torchid init; what is marked as guessed should be checked"]
     lines += yaml_lines("robot", own)
@@ -355,9 +363,9 @@ def _text(
         lines.append("contacts:  # guessed: from names of links")
         lines += [f"  - {inline_yaml(contact.entry)}" for contact in contacts]
     name = _relative(log, output)
-    whole = split_range(log).range is not None or not split.has_test
-    lines += ["logs:", f"  train: {inline_yaml([name if whole else f'{name}[:80%]'])}"]
-    lines += [] if whole else [f"  test: {inline_yaml([f'{name}[80%:]'])}"]
+    train, test = ([""], []) if split_range(log).range is not None else (split.train, split.test)
+    lines += ["logs:", f"  train: {inline_yaml([f'{name}{part}' for part in train])}"]
+    lines += [f"  test: {inline_yaml([f'{name}{part}' for part in test])}"] if test else []
     if proposal.columns:
         lines.append(f"  {proposal.key}:  # {_WHAT[proposal.key]}")
         for key, value in proposal.columns.items():
@@ -378,19 +386,6 @@ def _text(
     lines += yaml_lines("estimator", {"name": "consistent", "ridge": split.ridge})
     lines += yaml_lines("output", f"runs/{output.stem}")
     return "\n".join(lines) + "\n"
-
-
-def _held(robot: Robot, proposal: MapProposal) -> list[str]:
-    """Joints that a log lacks, but for those without a motor in loops, which follow from the others."""
-    return [name for name in proposal.lacking if name not in robot.passive]
-
-
-def _weld(robot: Robot, proposal: MapProposal) -> list[str] | dict[str, float]:
-    """Joints that a log lacks, each at 0, or at the middle of its range if that is elsewhere."""
-    limits = position_limits(robot.path)
-    ranges = {name: limits.get(name, (-math.inf, math.inf)) for name in _held(robot, proposal)}
-    at = {name: 0.0 if low <= 0.0 <= high else float(f"{(low + high) / 2:.4g}") for name, (low, high) in ranges.items()}
-    return at if any(at.values()) else list(at)
 
 
 def _relative(path: Path, output: Path) -> str:

@@ -1,7 +1,8 @@
-"""What `torchid init` proposes for a run, contacts, sensors, filters and parts of a log, with hints at the rest."""
+"""What `torchid init` proposes for contacts and sensors, with hints at what it did not find."""
 
 from __future__ import annotations
 
+import math
 import re
 import warnings
 from collections.abc import Collection, Mapping, Sequence
@@ -12,16 +13,13 @@ import numpy as np
 
 from torchid.errors import InputError, TorchidWarning, excerpt, format_count, join_names
 from torchid.logs import Log
-from torchid.logs.cutoff import choose_cutoff
 from torchid.logs.log import FORCE_NORMAL, WRENCHES
-from torchid.logs.low_pass import DROPPED_PERIODS
 from torchid.logs.name_matching import OF_PLATES, is_current, is_desired, propose_field, within
 from torchid.parameters import WRENCH_COMPONENTS
-from torchid.problem.compression import LEAST_PER_FOLD
 from torchid.proposals.column_groups import Family
 from torchid.proposals.file_samples import FileSample, stated_names
 from torchid.robot import CollisionShapes, Robot, load_robot
-from torchid.robot.urdf import fixed_joints
+from torchid.robot.urdf import fixed_joints, position_limits
 
 _FEET = (r"foot|feet", r"sole", r"ankle_roll|ankle_flexion", r"toe|ankle|paw|hoof")
 """Words in names of links that touch the ground, the surest first."""
@@ -104,6 +102,19 @@ def _balls_of_limbs(robot: Robot, shapes: CollisionShapes) -> list[str]:
     return list(limbs.values()) if len(limbs) > 2 else called
 
 
+def held_joints(robot: Robot, lacking: Sequence[str]) -> list[str]:
+    """Joints that a log lacks, but for those without a motor in loops, which follow from the others."""
+    return [name for name in lacking if name not in robot.passive]
+
+
+def welded_at(robot: Robot, held: Sequence[str]) -> list[str] | dict[str, float]:
+    """Joints that are held, each at 0, or at the middle of its range if that is elsewhere."""
+    limits = position_limits(robot.path)
+    ranges = {name: limits.get(name, (-math.inf, math.inf)) for name in held}
+    at = {name: 0.0 if low <= 0.0 <= high else float(f"{(low + high) / 2:.4g}") for name, (low, high) in ranges.items()}
+    return at if any(at.values()) else list(at)
+
+
 _SENSOR = r"(?<![a-z])(ft|force|torque|load_?cell)(?![a-z])"
 _MOST_SENSORS = 16  # in limbs that are looked at
 
@@ -116,9 +127,9 @@ def limb_sensors(robot: Robot) -> dict[str, str]:
     return {joint: child for joint, child in list(in_limbs.items())[:_MOST_SENSORS] if _can_be_split(robot, joint)}
 
 
-def read_sensors(robot: Robot, log: Log | InputError) -> list[str]:
-    """Sensors in limbs that a log has readings of, of those that the robot can be split at."""
-    names = () if isinstance(log, InputError) else log.ft_names
+def read_sensors(robot: Robot, logs: Sequence[Log]) -> list[str]:
+    """Sensors in limbs that recordings have readings of, of those that the robot can be split at."""
+    names = logs[0].ft_names if logs else ()
     joints = fixed_joints(robot.path) if names else {}
     return [name for name in names[:_MOST_SENSORS] if name in joints and _can_be_split(robot, name)]
 
@@ -134,12 +145,13 @@ def _can_be_split(robot: Robot, joint: str) -> bool:
     return True
 
 
-def measured_torques(robot: Robot, log: Log | InputError) -> list[str]:
-    """Joints whose torque a log has, if it has that of some driven ones alone; none otherwise."""
-    if isinstance(log, InputError) or log.joint_torque is None:
+def measured_torques(robot: Robot, logs: Sequence[Log]) -> list[str]:
+    """Joints whose torque recordings have, if they have that of some driven ones alone; none otherwise."""
+    of_joints = [zip(x.joint_names, x.joint_torque.T, strict=True) for x in logs if x.joint_torque is not None]
+    if not of_joints:
         return []
-    of_joints = zip(log.joint_names, log.joint_torque.T, strict=True)
-    known = {name: bool(np.isfinite(torque).any()) for name, torque in of_joints}
+    finite = [(name, bool(np.isfinite(torque).any())) for of_log in of_joints for name, torque in of_log]
+    known = {name: any(x for other, x in finite if other == name) for name, _ in finite}
     driven = [name for name in robot.joint_names if name in known and name not in robot.passive]
     measured = [name for name in driven if known[name]]
     return measured if len(measured) < len(driven) else []
@@ -182,57 +194,6 @@ def like_torques(families: Sequence[Family]) -> tuple[str, list[dict[str, object
     return (_LIKE_CURRENTS if currents else _LIKE_TORQUES if families else ""), entries
 
 
-_TESTED = 0.2  # of a log
-_FEWEST_FOLDS = 2
-_FOLD_MARGIN = 1.1  # more samples than folds need, as their number is known once they are filtered
-_LEAST_TEST = 1.5  # of what a filter spoils at both ends: a third of a test is left
-_RIDGE = 1e-3  # where nothing can be left out to choose it by
-
-
-@dataclass(frozen=True)
-class Split:
-    """How a log is used.
-
-    Attributes:
-        has_test: whether its last fifth is held back.
-        ridge: auto, where there are enough samples to leave some out.
-        guessed, missing: why not, and what a filter leaves nothing of, in words; "" where all is as usual.
-    """
-
-    has_test: bool = True
-    ridge: str | float = "auto"
-    guessed: str = ""
-    missing: str = ""
-
-
-def split_log(log: Log | InputError, base_is_derived: bool = False) -> Split:
-    """The split of a log, by the filter that `preprocessing.cutoff_hz: auto` chooses; as usual if it is not read.
-
-    Args:
-        log: as it is read, or why it is not.
-        base_is_derived: whether the motion of the base is worked out of that of the joints.
-    """
-    if isinstance(log, InputError) or len(log) < 2:
-        return Split()
-    try:
-        cutoff_hz = choose_cutoff([log], base_is_derived=base_is_derived).cutoff_hz
-    except InputError:  # which a fit will say
-        return Split()
-    length = float(log.time[-1] - log.time[0])
-    spoiled = 0.0 if cutoff_hz is None else 2.0 * DROPPED_PERIODS / cutoff_hz
-    independent_hz = (len(log) - 1) / length if cutoff_hz is None else 2.0 * cutoff_hz
-    folded = spoiled + _FOLD_MARGIN * _FEWEST_FOLDS * LEAST_PER_FOLD / independent_hz
-    if _TESTED * length >= _LEAST_TEST * spoiled and (1.0 - _TESTED) * length >= folded:
-        return Split()
-    filtered = "" if cutoff_hz is None else f" (the filter of {cutoff_hz:g} Hz spoils {spoiled:.2g} s)"
-    if length <= spoiled:
-        return Split(False, _RIDGE, missing=f"motion: {length:.2g} s are too short for a fit{filtered}")
-    guessed = f"logs.test: none, as {length:.2g} s are too short for a part to be held back{filtered}"
-    if length >= folded:
-        return Split(False, guessed=guessed)
-    return Split(False, _RIDGE, f"{guessed}, or to choose the ridge by ({_RIDGE:g})")
-
-
 # ---------------------------------------------------------------------------------------------------------------- hints
 
 _OTHER_FILE = "; if another file has it: torchid init ROBOT 'FILE + FILE@SECONDS', docs/logs.md"
@@ -240,11 +201,6 @@ _LIMB_SENSOR = re.compile(r"(?<![a-z])(ft|loadcell|load_cell)(?![a-z]).*[xyz]$|(
 _EULER = re.compile(r"(?<![a-z])(roll|pitch|yaw|rpy|euler)(?![a-z])", re.IGNORECASE)
 _AS_ANGLES = "base_quat_wxyz: {rpy: ...}"
 _STEP = re.compile(r"(dt|time_?step|sample_?rate|fps|rate_?hz|freq\w*)", re.IGNORECASE)
-_MOTION = ("joint_position", "base_quat_xyzw", "base_position_world", *("imu_specific_force", "imu_angular_velocity"))
-_BRIDGED_S = 0.05
-"""Gaps that `init` has bridged [s]."""
-_MANY = 100_000
-"""Samples that a fit works on for about a second; of more, no more are kept than a filter leaves information in."""
 
 
 def missing_columns(joints: int, fields: Collection[str], partial: Mapping[str, Sequence[str]], what: str) -> list[str]:
@@ -345,46 +301,3 @@ def notes_on_arrays(sample: FileSample, joints: int) -> dict[str, str]:
 
 def _like(names: Sequence[str]) -> str:
     return f"'{excerpt(names[0])}'" + (f" and {len(names) - 1} more" if len(names) > 1 else "")
-
-
-# ----------------------------------------------------------------------------------------------------------------- gaps
-
-
-def _gaps_in_motion(log: Log) -> tuple[float, bool, str]:
-    """Gaps in the motion of a log: how long the longest takes, whether some are at an end, and a field with one.
-
-    The length [s] is that from the value before to that after; gaps at an end do not count for it. Channels that are
-    NaN throughout are none.
-    """
-    longest, at_end, found = 0.0, False, ""
-    for name in _MOTION:
-        values = getattr(log, name)
-        for missing in () if values is None else np.isnan(values).reshape(len(log), -1).T:
-            known = np.flatnonzero(~missing)
-            if not missing.any() or len(known) < 2:
-                continue
-            at_end |= bool(missing[0] or missing[-1])
-            longest = max(longest, *np.diff(log.time[known])[np.diff(known) > 1].tolist(), 0.0)
-            found = found or name
-    return longest, at_end, found
-
-
-def keys_for_gaps(read: Log | InputError) -> dict[str, tuple[object, str]]:
-    """The keys of preprocessing that a log with gaps in its motion needs, with the reason."""
-    longest, at_end, name = (0.0, False, "") if isinstance(read, InputError) else _gaps_in_motion(read)
-    out: dict[str, tuple[object, str]] = {}
-    if 0.0 < longest <= _BRIDGED_S:
-        out["bridge_gaps_s"] = (_BRIDGED_S, f"as gaps of {name} take up to {longest:.2g} s")
-    if longest > _BRIDGED_S or at_end:
-        reason = (
-            f"as gaps of {name} take up to {longest:.2g} s" if longest > _BRIDGED_S else f"as {name} has one at an end"
-        )
-        out["exclude_rejected"] = (True, reason)
-    return out
-
-
-def keys_for_length(read: Log | InputError) -> dict[str, tuple[object, str]]:
-    """The keys of preprocessing that a long log should have, with the reason."""
-    if isinstance(read, InputError) or len(read) <= _MANY:
-        return {}
-    return {"sample_rate_hz": ("auto", f"as {len(read)} samples are many: five for each period of the cutoff are kept")}

@@ -19,7 +19,7 @@ from torchid.fitting.experiment import S, Scene
 from torchid.log_checks import Checked, drop_rejected
 from torchid.log_checks.check import check
 from torchid.logs import Log, read_log
-from torchid.logs.blocks import GIGABYTE, log_bytes
+from torchid.logs.blocks import GIGABYTE, has_blocks, log_bytes
 from torchid.logs.containers import LogKind, existing_log_kind
 from torchid.logs.flags import with_flags_by_force
 from torchid.logs.log import BoolArray, FloatArray
@@ -188,8 +188,9 @@ class LogReader:
         """
         settings = self.scene.config.preprocessing
         filled = settings.bridge_gaps_s is not None or settings.zero_in_air
-        delayed = bool(self.scene.config.actuators.known_delay)
-        whole = settings.exclude_rejected or settings.derived or filled or delayed or split_range(path).joins
+        logs, delayed = self.scene.config.logs, bool(self.scene.config.actuators.known_delay)
+        joined = not has_blocks(path, None if logs is None else logs.columns)
+        whole = settings.exclude_rejected or settings.derived or filled or delayed or joined
         return gigabytes > _WHOLE_GB and not whole and not self.scene.robot.loops
 
     def _large_log(self, path: Path, required: SensorSet | None, folder: Path | None) -> LargeLog:

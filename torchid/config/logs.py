@@ -17,7 +17,7 @@ from torchid.errors import ConfigError, LogError, UnknownNameError, excerpt, war
 from torchid.logs import Columns, Topics
 from torchid.logs.containers import FACTORS, READABLE, list_bag_files
 from torchid.logs.remote import RemoteFile, as_path, list_matching
-from torchid.logs.time_range import JOINED, JOINED_ACCEPTED, LogFile, LogPart, join_files, split_range
+from torchid.logs.time_range import JOINED, JOINED_ACCEPTED, LogFile, LogPart, each_recording, join_files, split_range
 from torchid.robot.payloads import INERTIA_ACCEPTED, Payload
 from torchid.settings import STRICT
 
@@ -326,6 +326,7 @@ def _part(field: str, path: Path) -> LogPart:
 def _matching(field: str, paths: Sequence[Path]) -> list[Path]:
     """The paths, with every file that matches in place of a name with * or ? in it."""
     out: list[Path] = []
+    paths = [one for path in paths for one in _each_recording(path)]
     for path in paths:
         if isinstance(path, RemoteFile) and path.suffix != FACTORS:
             raise ConfigError.at_field(field, f"{path}, by URL", f"{FACTORS} files by URL; logs on this machine")
@@ -353,6 +354,12 @@ def _matching(field: str, paths: Sequence[Path]) -> list[Path]:
     if again:
         raise ConfigError.at_field(field, f"{again[0]} is given twice", "every log once")
     return out
+
+
+def _each_recording(path: Path) -> list[Path]:
+    """Paths of the recordings that a name such as `walk.npz[#0:40]` stands for; else the path itself."""
+    names = [path.name] if isinstance(path, RemoteFile) or path.exists() else each_recording(path.name)
+    return [path] if names == [path.name] else [path.with_name(name) for name in names]
 
 
 def _listed(pattern: Path) -> Sequence[Path]:

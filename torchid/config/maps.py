@@ -23,6 +23,7 @@ MAPS_ACCEPTED = {
     "logs.columns.plates": "poses by contact: {l_foot: {position: [0.3, 0.2, 0], rpy_deg: [180, 0, 90]}}",
     "logs.columns.*": "the name of a column, a pattern such as {joint}_q, or a mapping with column, unit, scale, ...",
     "logs.topics.joint_states": "the name of a topic, or a mapping with topic and joints",
+    "logs.topics.other_joint_states": "a list of entries like joint_states: [/arms/joint_states]",
     "logs.topics.low_state": "a mapping with topic and robot, or joints by number of the motor",
 }
 """Accepted for entries of maps, in messages, where their types alone say too little."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import LogError, about_file, warn_about_file
+from torchid.errors import LogError, about_file, excerpt, warn_about_file
 from torchid.logs.arrays import parse_names
 from torchid.logs.column_entries import KEY
 from torchid.logs.column_map import Columns
@@ -32,6 +33,7 @@ from torchid.logs.log import (
     parse_time,
     to_float64,
 )
+from torchid.logs.name_matching import words_of
 from torchid.logs.quaternion import make_sign_continuous
 from torchid.logs.tables import sample_table
 from torchid.logs.time_range import LogFile
@@ -143,13 +145,59 @@ def read_joined(
     for file, own in zip(files, maps, strict=True):
         with about_file(os.fspath(file.path)):
             parts.append(_stamped(read(file.path, own), file.shift_s))
-    paths = [file.path for file in files]
-    _require_once(paths, parts)
-    time = _common_stamps(paths, [part["time"] for part in parts])
+    return _joined([file.path.name for file in files], parts, [os.fspath(file.path) for file in files])
+
+
+def align_by_stamps(raw: Fields, sources: Mapping[str, Sequence[str]], others: Mapping[str, FloatArray]) -> Fields:
+    """The fields of a file of which some have stamps of their own: all at those of `time`, within what all cover.
+
+    A field has the stamps that are as many as its samples, of several those that `own_stamps` says.
+
+    Args:
+        raw: fields of the file, `time` among them.
+        sources: arrays that each field comes from.
+        others: stamps (K,) [s] beside those of `time`, by the name of their array.
+
+    Raises:
+        LogError: as `read_joined`.
+    """
+    stamps = {next(iter(sources["time"]), "time"): raw["time"], **others}
+    parts: dict[str, Fields] = {name: {"time": time} for name, time in stamps.items()}
+    for field, values in raw.items():
+        if field != "time":
+            beside = next(iter(sources.get(field, ())), "")
+            parts[own_stamps(values if field_shape(field)[:1] == ("N",) else None, beside, stamps)][field] = values
+    used = {name: _stamped(part, 0.0) for name, part in parts.items() if len(part) > 1}
+    return _joined([f"what has the stamps '{excerpt(name)}'" for name in used], list(used.values()))
+
+
+def own_stamps(values: NDArray[Any] | None, name: str, stamps: Mapping[str, NDArray[Any]]) -> str:
+    """The stamps, by name, of an array (N, ...): as many; of several those with most of the first words of its name.
+
+    The first ones where none are as many, or of what has no samples.
+
+    Args:
+        values: of the array, None for what has no samples.
+        name: of the array.
+        stamps: (K,) each.
+    """
+    as_many = [] if values is None else [one for one, time in stamps.items() if len(time) == len(values)]
+    words = words_of(name)
+
+    def alike(one: str) -> int:
+        return len(os.path.commonprefix([words_of(one), words]))
+
+    return max(as_many or [next(iter(stamps))], key=alike)
+
+
+def _joined(labels: Sequence[str], parts: Sequence[Fields], files: Sequence[str] = ()) -> Fields:
+    """The fields of all parts of a log at the stamps of the first; `files`: that they are in, if in several."""
+    _require_once(labels, parts)
+    time = _common_stamps(labels, [part["time"] for part in parts])
     names = _common_names(parts)
     out: Fields = {}
-    for path, part in zip(paths, parts, strict=True):
-        with about_file(os.fspath(path)):
+    for number, part in enumerate(parts):
+        with about_file(files[number]) if files else nullcontext():
             out |= _aligned(_in_order(part, names), time, parts[0]["time"][0])
     return out | {name: np.array(of, dtype=np.str_) for name, of in names.items()} | {"time": time}
 
@@ -192,28 +240,28 @@ def _stamped(raw: Fields, shift_s: float) -> Fields:
     return out | {"time": time + shift_s if shift_s else time}
 
 
-def _require_once(paths: Sequence[Path], parts: Sequence[Fields]) -> None:
+def _require_once(labels: Sequence[str], parts: Sequence[Fields]) -> None:
     """Refuse a field of two files."""
-    owners: dict[str, Path] = {}
-    for path, part in zip(paths, parts, strict=True):
+    owners: dict[str, str] = {}
+    for label, part in zip(labels, parts, strict=True):
         for name in part:
             if name in owners and name not in ("time", *NAME_FIELDS):
-                found = f"both in {owners[name].name} and in {path.name}"
+                found = f"both in {owners[name]} and in {label}"
                 raise LogError.at_field(name, found, "every field but time in one of several files alone")
-            owners.setdefault(name, path)
+            owners.setdefault(name, label)
 
 
-def _common_stamps(paths: Sequence[Path], stamps: Sequence[FloatArray]) -> FloatArray:
+def _common_stamps(labels: Sequence[str], stamps: Sequence[FloatArray]) -> FloatArray:
     """The stamps of the first file within the time that all cover."""
     time = stamps[0]
     slack = stamp_slack(time)
-    late = max(range(len(paths)), key=lambda number: stamps[number][0])
-    early = min(range(len(paths)), key=lambda number: stamps[number][-1])
+    late = max(range(len(labels)), key=lambda number: stamps[number][0])
+    early = min(range(len(labels)), key=lambda number: stamps[number][-1])
     common = time[(time >= stamps[late][0] - slack) & (time <= stamps[early][-1] + slack)]
     if not len(common):
-        found = f"no stamp of {paths[0].name} that all files cover: "
-        found += f"{paths[late].name} starts at {stamps[late][0]:.6f} s, "
-        found += f"{paths[early].name} ends at {stamps[early][-1]:.6f} s"
+        found = f"no stamp of {labels[0]} that all files cover: "
+        found += f"{labels[late]} starts at {stamps[late][0]:.6f} s, "
+        found += f"{labels[early]} ends at {stamps[early][-1]:.6f} s"
         raise LogError.at_field("time", found, "stamps of one clock, or shift_s, what is added to those of a file")
     return common
 

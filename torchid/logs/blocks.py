@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import LogError, about_file
+from torchid.errors import LogError, about_file, excerpt
 from torchid.logs.arrays import lazy_part, parse_names, require_plain
 from torchid.logs.column_map import Columns
 from torchid.logs.containers import Container, LogKind, existing_log_kind, open_container, reader_errors_explained
@@ -67,6 +67,12 @@ def log_bytes(path: Path, limit: float) -> int:
             return most if is_text_table(path) and most <= limit else table_size(path)
         with open_container(path, whole=False) as container:
             return sum(container.declared_bytes().values())
+
+
+def has_blocks(path: Path, columns: Columns | None) -> bool:
+    """Whether a log can be read a block at a time: no bag, and nothing that is interpolated to stamps of others."""
+    is_joined = existing_log_kind(path) in (LogKind.BAG, LogKind.JOINED)
+    return not is_joined and not (columns is not None and columns.other_times)
 
 
 def count_samples_from(start: int, error: LogError) -> LogError:
@@ -224,6 +230,7 @@ def open_log_blocks(
             blocks = _check_blocks(str(path), names, fields)
             if part.range is not None:
                 blocks = blocks.part(part.range.select(blocks.time))
+            check_time(blocks.time)
         yield blocks
 
 
@@ -243,6 +250,9 @@ def _open_arrays(
     given = list(container.declared_bytes())
     mapped = None if columns is None else map_arrays(columns, given, load)
     check_fields_given(given if mapped is None else mapped.given, needs_flags)
+    if mapped is not None and (others := list(mapped.other_times(given))):
+        accepted = "a larger preprocessing.memory_gb, or the file that torchid convert makes of it"
+        raise LogError.at_field("file", f"stamps beside those of time ('{excerpt(others[0])}'), read whole", accepted)
     if mapped is None:
         text = [name for name in given if _is_text(name)]
         return {name: load(name) for name in text}, {name: lazy(name) for name in given if name not in text}
@@ -285,12 +295,11 @@ def _is_text(name: str) -> bool:
 
 
 def _check_blocks(source: str, names: dict[str, NDArray[Any]], fields: dict[str, LazyArray]) -> LogBlocks:
-    """The log, after all checks of names, shapes and stamps."""
+    """The log, after all checks of names and shapes."""
     time = fields.pop("time")
     check_shape("time", _empty(time), SHAPES["time"], {})
     with reader_errors_explained("time", _ACCEPTED):
         stamps = to_float64("time", np.asarray(time[:]))
-    check_time(stamps)
     sizes = {"N": len(stamps)}
     for name, letter in NAME_FIELDS.items():
         sizes[letter] = len(parse_names(name, names[name])) if name in names else 0

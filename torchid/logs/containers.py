@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from torchid.errors import LogError, TorchidError, during, excerpt
 from torchid.guards import MAX_ARRAYS, check_fields, check_names, check_unpacked_size
 from torchid.logs.hdf5 import Hdf5, import_h5py, save_hdf5
+from torchid.logs.json_documents import JsonDocument
 from torchid.logs.lazy_arrays import LazyArray, Spill
 from torchid.logs.matlab import MatFile, byte_order
 from torchid.logs.time_range import split_range
@@ -26,9 +27,9 @@ from torchid.staging import atomic_file
 
 # --------------------------------------------------------------------------------------------------- kinds of log files
 
-#: Containers of named arrays; Matlab's are HDF5 (`save -v7.3`) or of its own format before.
+#: Containers of named arrays; JSON is read whole; Matlab's are HDF5 (`save -v7.3`) or of its own format before.
 _WRITTEN = (".npz", ".h5", ".hdf5")
-ARRAYS = (*_WRITTEN, ".mat")
+ARRAYS = (*_WRITTEN, ".mat", ".json")
 #: Tables of OpenSim, motions and storages: text with lines before the names of the columns.
 OPENSIM = (".mot", ".sto")
 #: Tables of text, by whatever their cells are separated.
@@ -42,7 +43,7 @@ FACTORS = ".factor"
 #: Files of ROS 1 (.bag) and ROS 2; those of ROS 2 may also lie in a folder.
 BAGS = (".bag", ".mcap", ".db3")
 WRITABLE = (*_WRITTEN, ".csv", ".parquet")
-READABLE = (*WRITABLE, ".mat", *_PLAIN_TEXT, *OPENSIM, *JSON_LINES, *BAGS)
+READABLE = (*WRITABLE, ".mat", ".json", *_PLAIN_TEXT, *OPENSIM, *JSON_LINES, *BAGS)
 
 
 class LogKind(Enum):
@@ -151,7 +152,7 @@ def reader_errors_explained(field: str, accepted: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def open_container(path: Path, whole: bool = True) -> Iterator[Container]:
-    """Open a .npz, .h5, .hdf5 or .mat file; LogError where it is missing, of another kind, damaged or too large.
+    """Open a .npz, .h5, .hdf5, .mat or .json file; LogError where it is missing, of another kind, damaged or too large.
 
     Args:
         path: the file.
@@ -161,7 +162,11 @@ def open_container(path: Path, whole: bool = True) -> Iterator[Container]:
     if not path.is_file():
         found = "a folder" if path.is_dir() else "no such file"
         raise LogError(path, "file", found, f"an existing log ({', '.join(ARRAYS)})")
-    kind = {".npz": "a complete .npz (zip) archive", ".mat": "a complete file of Matlab 5 or later"}
+    kind = {
+        ".npz": "a complete .npz (zip) archive",
+        ".mat": "a complete file of Matlab 5 or later",
+        ".json": "a complete JSON document: an object of arrays, or a list of records",
+    }
     with contextlib.ExitStack() as stack:
         with reader_errors_explained("file", kind.get(suffix, "a complete HDF5 file")):
             container: Container
@@ -169,6 +174,8 @@ def open_container(path: Path, whole: bool = True) -> Iterator[Container]:
                 container = stack.enter_context(open_npz(path))
             elif suffix == ".mat" and byte_order(path):
                 container = MatFile(path)
+            elif suffix == ".json":
+                container = JsonDocument(path)
             else:
                 h5py = import_h5py(path)
                 container = Hdf5(stack.enter_context(h5py.File(path, "r")), h5py, path.stat().st_size)

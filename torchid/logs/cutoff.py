@@ -144,10 +144,14 @@ def _powers(
 
     With each the field that they are worked out of. `known`: those whose noise is stated.
     """
-    rate = (len(log) - 1) / float(log.time[-1] - log.time[0])
-    for name, values, std, order in _noisy_sources(log, noise, base_is_derived):
-        even = spline_derivatives(log.time, values, np.linspace(log.time[0], log.time[-1], len(log)), (0,))[0]
-        length = min(len(log), int(np.ceil(_SEGMENT_S * rate)))
+    for name, every, std, order in _noisy_sources(log, noise, base_is_derived):
+        measured = np.isfinite(every).all(axis=1)  # gaps, whose samples are left out later, are passed over
+        values, time = every[measured], log.time[measured]
+        if len(time) < 2:
+            continue
+        rate = (len(time) - 1) / float(time[-1] - time[0])
+        even = spline_derivatives(time, values, np.linspace(time[0], time[-1], len(time)), (0,))[0]
+        length = min(len(time), int(np.ceil(_SEGMENT_S * rate)))
         frequency, power = import_signal().welch(even, fs=rate, nperseg=length, axis=0, detrend="linear")
         total = power.sum(axis=1)
         of_noise = np.full(len(frequency), 2.0 * float(np.square(std).sum()) / rate)
@@ -157,7 +161,7 @@ def _powers(
             of_quantization = float(np.square(step[step < np.inf]).sum()) / 12.0
             of_noise = _with_coloured_noise(frequency, total, of_noise, of_quantization)
         densities = np.stack([total - of_noise, of_noise])
-        upto = np.cumsum(densities * (2.0 * np.pi * frequency) ** (2 * order), axis=1) * frequency[1] * len(log) / rate
+        upto = np.cumsum(densities * (2.0 * np.pi * frequency) ** (2 * order), axis=1) * frequency[1] * len(time) / rate
         yield np.interp(candidates, frequency, upto[0]), np.interp(candidates, frequency, upto[1]), name
 
 

@@ -329,8 +329,9 @@ def check_time(time: FloatArray) -> None:
     if not_increasing.any():
         i = int(np.argmax(not_increasing))
         found = f"{time[i + 1]} at sample {i + 1}, after {time[i]} at sample {i}"
-        several = "; of recordings one after the other (episodes) a file for each"
-        accepted = "strictly increasing seconds" + several * bool(time[i + 1] < time[i])
+        several = "; of recordings one after the other (episodes) the name with [#0] for the first, or [#0:8]"
+        coarse = "; where rows are steps of a clock that stamps round, logs.columns.time: {step: ...}"
+        accepted = "strictly increasing seconds" + (several if time[i + 1] < time[i] else coarse)
         raise LogError.at_field("time", found, accepted)
 
 

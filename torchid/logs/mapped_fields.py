@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from torchid.errors import LogError
 from torchid.logs.arrays import fields_of_records, parse_names, with_parts
-from torchid.logs.column_entries import FRACTIONS, KEY, Gains, PdLaw
+from torchid.logs.column_entries import FRACTIONS, KEY, ColumnEntry, Gains, PdLaw, TimeEntry
 from torchid.logs.column_map import PLACEHOLDER, Columns, check_columns, list_parts, values_by_name, values_of_all
-from torchid.logs.column_matching import columns_of_file, match_columns
+from torchid.logs.column_matching import Matched, columns_of_file, match_columns
 from torchid.logs.columns import TEXT_COLUMN, TableLayout, is_column, parse_header
 from torchid.logs.entry_values import EntryValues, Take, entry_values
 from torchid.logs.force_plates import PlatePoses
@@ -125,6 +125,13 @@ class MappedFields:
     def _law(self) -> PdLaw | None:
         torque = self.columns.joint_torque
         return None if torque is None else torque.pd
+
+    def other_times(self, given: Sequence[str]) -> dict[str, ColumnEntry]:
+        """Entries of stamps beside those of `time`, of those that a file has, by their array."""
+        if "time" not in self.fields or self.step is not None:
+            return {}
+        others = {entry.column: entry for entry in self.columns.other_times if entry.column}
+        return {name: entry for name, entry in others.items() if name in given and name not in self._own("time")}
 
     def text(self, take: Take) -> dict[str, NDArray[Any]]:
         """Names, and the IMU's frame."""
@@ -310,12 +317,21 @@ def map_arrays(columns: Columns, given: Sequence[str], load: Take) -> MappedFiel
     texts = [text for entry in entries for text in (entry.column, *entry.columns.values()) if text]
     given = with_parts(given, [name for text in texts for name in _named_fields(text, given, load)])
     named = {name: parse_names(name, load(name)) for name in NAME_FIELDS if name in given}
+    others = {entry.column for entry in columns.other_times} - {columns.time.column if columns.time else None}
+    given = [name for name in given if name not in others]
     matching = match_columns(columns, given, lambda name: name in SHAPES or name in VARIANTS, named)
     if matching is None:
         return None
     native = {name: (name,) for name in matching.others}
     values = entry_values(matching.matched, matching.names)
     return MappedFields(matching.names, columns, native, values).check()
+
+
+def read_stamps(entry: ColumnEntry, load: Take) -> FloatArray:
+    """Stamps (N,) [s] of an entry of `other_times`; LogError for an array that holds none."""
+    (part,) = list_parts(Columns(time=TimeEntry(**vars(entry)))).values()
+    matched = Matched(part, (), (entry.column or "",), False, False)
+    return entry_values({part.key: matched}, {})[part.key].read(load)
 
 
 def _named_fields(text: str, given: Sequence[str], load: Take) -> list[str]:

@@ -205,7 +205,7 @@ _FIELD_WORDS = (
         rf"{OF_BASE} (twist )*(lin ?vel|linear|lin|vel|velocity|v)\b",
     ),
     ("base_angular_velocity_base", rf"{OF_BASE} (twist )*(ang ?vel|angular|ang|omega)\b"),
-    ("base_quat_wxyz", rf"{OF_BASE} (q|rot|rotation)\b"),
+    ("base_quat_wxyz", rf"({OF_BASE}|\bimu) (q|rot|rotation)\b"),
     ("joint_acceleration", r"\b(ddqj?|qdd|qpp|thdd|qacc|joints? acc|joints? accelerations?)\b"),
     ("imu_angular_velocity", r"\b(gyr|gyro\w*|giroscop\w*|omega|ang vel|angular velocity|drehraten?|imu g)\b"),
     ("imu_specific_force", r"\b(acc|acc?el\w*|linear acceleration|specific force|beschleunigung|imu a|a body)\b"),
@@ -220,13 +220,15 @@ _FIELD_WORDS = (
     ),
     (
         "joint_velocity",
-        r"\b(dqs?|dqj|d q|qd|qp|qdot|thd|gv|v|qvel|vels?|veloc\w+|speeds?|rates?|vitesses?|geschw)\b|geschwindigkeit\b",
+        r"\b(dqs?|dqj|d q|qd|qp|qdot|thd|dphi|phid|gv|v|qvel|vels?|veloc\w+|speeds?|rates?|vitesses?|geschw)\b"
+        r"|geschwindigkeit\b",
     ),
     (
         "joint_position",
-        r"\b(observation state|gc|qs?|qj|th|theta|qpos|pos|posi[ctz]\w+|angles?|winkel|gelenkwinkel|ang[ou]l[io]s?)\b",
+        r"\b(observation state|gc|qs?|qj|th|theta|phi|qpos|pos|posi[ctz]\w+|angles?|winkel|gelenkwinkel)\b"
+        r"|\bang[ou]l[io]s?\b|^j$",
     ),
-    ("time", rf"\b(t|ts|tout|{_STAMPS}|ticks?|clock|millis|sec|secs|seconds|zeit|temp[os]|tiempo)\b"),
+    ("time", rf"\b(t|ts|tout|{_STAMPS}|ticks?|clock|millis|micros|sec|secs|seconds|zeit|temp[os]|tiempo)\b"),
 )
 #: Fields that a unit alone tells: of `LF_HAA [deg]`, `LF_HAA [deg/s]`.
 _BY_QUANTITY = {

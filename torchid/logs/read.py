@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import LogError, about_file, current_file, during, warn_about_file
-from torchid.logs.alignment import read_joined
+from torchid.logs.alignment import align_by_stamps, read_joined
 from torchid.logs.arrays import load_part, parse_frame, parse_names, require_plain
 from torchid.logs.column_map import Columns
 from torchid.logs.containers import (
@@ -51,13 +51,13 @@ from torchid.logs.log import (
     parse_time,
     to_float64,
 )
-from torchid.logs.mapped_fields import map_arrays
+from torchid.logs.mapped_fields import map_arrays, read_stamps
 from torchid.logs.name_matching import is_foreign, unknown_columns
 from torchid.logs.quaternion import make_sign_continuous, rotate_to_base, rotate_to_world
 from torchid.logs.ros_read import read_bag
 from torchid.logs.ros_topics import Topics
 from torchid.logs.tables import read_table, save_table
-from torchid.logs.time_range import TimeRange, split_range
+from torchid.logs.time_range import Recording, TimeRange, recording_starts, split_range
 
 
 def read_log(
@@ -77,7 +77,8 @@ def read_log(
 
     Args:
         path: the file; of a ROS 2 bag also its folder. A range of time behind it takes a part of the log, as if nothing
-            else had been recorded: `walk.npz[0:30]`, see `TimeRange`. Several files of one recording are one log with
+            else had been recorded: `walk.npz[0:30]`, see `TimeRange`; `[#2]` the third of recordings whose stamps begin
+            anew. Several files of one recording are one log with
             the stamps of the first: `motion.csv + plates.csv`, see `read_joined`.
         topics: topics of a bag (.bag, .mcap, .db3).
         progress: called with the share of a bag that has been read.
@@ -98,20 +99,60 @@ def read_log(
     if columns is not None and not isinstance(columns, Columns):
         raise TypeError(f"columns: found {type(columns).__name__}; accepted: torchid.Columns(joint_position=...)")
     with during("reading", os.fspath(path)):
-        part, check = split_range(path), partial(check_fields_given, needs_flags=needs_flags)
-        kind = existing_log_kind(part.file)
-        if kind is LogKind.ARRAYS:
-            raw = _read_arrays(part.file, columns, check)
-        else:
-            if kind is LogKind.JOINED:
-                raw = read_joined(part.files, columns, partial(_read_one, bridge_gaps_s))
-            elif kind is LogKind.TABLE:
-                raw = read_table(part.file, columns)
-            else:
-                raw = read_bag(part.file, topics, progress, needs_flags)
-            check(raw)
+        part, raw = split_range(path), _read_raw(path, topics, progress, columns, bridge_gaps_s, needs_flags)
         raw = raw if part.range is None else _cut(raw, part.range)
         return build_log(bridge_gaps(about_world_origin(raw), bridge_gaps_s), allow_gaps)
+
+
+def read_recordings(
+    path: str | os.PathLike[str], topics: Topics | None = None, columns: Columns | None = None
+) -> list[Log]:
+    """The recordings of a log, with their gaps: several where stamps begin anew, as of episodes in one file.
+
+    Args:
+        path: as of `read_log`.
+        topics: likewise.
+        columns: likewise.
+
+    Raises:
+        LogError: likewise.
+    """
+    if split_range(path).range is not None:
+        return [read_log(path, topics, allow_gaps=True, columns=columns)]
+    with during("reading", os.fspath(path)):
+        raw = _read_raw(path, topics, None, columns, None, True)
+        starts = recording_starts(_stamps(raw))
+        if len(starts) == 1:
+            return [build_log(raw, allow_gaps=True)]
+    logs = []
+    for number in range(len(starts)):
+        one = Recording(f"[#{number}]", number)
+        with during("reading", f"{os.fspath(path)}{one.text}"):
+            logs.append(build_log(_cut(raw, one), allow_gaps=True))
+    return logs
+
+
+def _read_raw(
+    path: str | os.PathLike[str],
+    topics: Topics | None,
+    progress: Callable[[float], None] | None,
+    columns: Columns | None,
+    bridge_gaps_s: float | None,
+    needs_flags: bool,
+) -> dict[str, NDArray[Any]]:
+    """The fields of all of a file, or of several, as they are there."""
+    part, check = split_range(path), partial(check_fields_given, needs_flags=needs_flags)
+    kind = existing_log_kind(part.file)
+    if kind is LogKind.ARRAYS:
+        return _read_arrays(part.file, columns, check)
+    if kind is LogKind.JOINED:
+        raw = read_joined(part.files, columns, partial(_read_one, bridge_gaps_s))
+    elif kind is LogKind.TABLE:
+        raw = read_table(part.file, columns)
+    else:
+        raw = read_bag(part.file, topics, progress, needs_flags)
+    check(raw)
+    return raw
 
 
 def build_log(raw: dict[str, NDArray[Any]], allow_gaps: bool = False) -> Log:
@@ -119,9 +160,9 @@ def build_log(raw: dict[str, NDArray[Any]], allow_gaps: bool = False) -> Log:
     return _to_canonical(_check_values(about_world_origin(raw), allow_gaps))
 
 
-def _cut(raw: dict[str, NDArray[Any]], range_: TimeRange) -> dict[str, NDArray[Any]]:
+def _cut(raw: dict[str, NDArray[Any]], range_: TimeRange | Recording) -> dict[str, NDArray[Any]]:
     """The fields of a file with the samples of a part alone; LogError where their numbers differ."""
-    time = parse_time(raw["time"])
+    time = _stamps(raw)
     samples, out = range_.select(time), dict(raw)
     for name, array in raw.items():
         if field_shape(name)[:1] == ("N",):
@@ -129,6 +170,12 @@ def _cut(raw: dict[str, NDArray[Any]], range_: TimeRange) -> dict[str, NDArray[A
                 raise LogError.at_field(name, f"shape {array.shape}", f"{len(time)} samples, as time has")
             out[name] = array[samples]
     return out
+
+
+def _stamps(raw: dict[str, NDArray[Any]]) -> FloatArray:
+    """Stamps (N,) [s], which may begin anew."""
+    check_shape("time", raw["time"], SHAPES["time"], {})
+    return to_float64("time", raw["time"])
 
 
 def check_fields_given(names: Collection[str], needs_flags: bool = True) -> None:
@@ -165,7 +212,12 @@ def _read_arrays(
         names = list(container.declared_bytes())
         mapped = None if columns is None else map_arrays(columns, names, load)
         check(names if mapped is None else mapped.given)
-        return {name: load(name) for name in names} if mapped is None else _as_many_as_controls(mapped.read(take))
+        if mapped is None:
+            return {name: load(name) for name in names}
+        raw = mapped.read(take)
+        if others := {name: read_stamps(entry, load) for name, entry in mapped.other_times(names).items()}:
+            return align_by_stamps(raw, {name: mapped.sources_of(name) for name in mapped.fields}, others)
+        return _as_many_as_controls(raw)
 
 
 def _as_many_as_controls(raw: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:

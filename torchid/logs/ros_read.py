@@ -259,6 +259,7 @@ def _motion(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries]) -
         decoder = bag.decoders.get(role)
         if isinstance(decoder, (JointStates, LowState)):
             out["joint_names"] = np.array(decoder.names, dtype=np.str_)
+            out |= _with_other_joints(bag, clock, series, out)
         elif isinstance(decoder, Odometry) and bag.topics.odometry is not None:
             _check_frame(bag, role, bag.topics.odometry.frame, "the robot's base link")
         elif isinstance(decoder, Imu) and bag.topics.imu is not None:
@@ -270,6 +271,34 @@ def _motion(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries]) -
     out.pop(_FEET, None)
     if bag.topics.low_state is not None and bag.topics.low_state.frame is not None:
         out["imu_frame"] = np.array(bag.topics.low_state.frame)
+    return out
+
+
+def _with_other_joints(
+    bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries], first: dict[str, NDArray[Any]]
+) -> dict[str, NDArray[Any]]:
+    """The fields of joints of all topics; torques are NaN, and velocities left out, where some topic has none."""
+    parts = [first]
+    for role in bag.topics.joint_topics:
+        decoder = bag.decoders[role]
+        if role != "joint_states" and isinstance(decoder, JointStates):
+            known = {name for part in parts for name in part["joint_names"].tolist()}
+            if again := [name for name in decoder.names if name in known]:
+                accepted = f"logs.topics.{role}.joints, those that no other topic has"
+                raise LogError.at_field(bag.rows[role].topic, f"joint '{again[0]}', of another topic too", accepted)
+            parts.append(clock.align(series[role]) | {"joint_names": np.array(decoder.names, dtype=np.str_)})
+    if len(parts) == 1:
+        return {}
+    out = {name: np.concatenate([part[name] for part in parts], axis=-1) for name in ("joint_names", "joint_position")}
+    if any("joint_torque" in part for part in parts):
+        torques = [part.get("joint_torque", np.full_like(part["joint_position"], np.nan)) for part in parts]
+        out["joint_torque"] = np.concatenate(torques, axis=1)
+    given = [part["joint_velocity"] for part in parts if "joint_velocity" in part]
+    if len(given) == len(parts):
+        out["joint_velocity"] = np.concatenate(given, axis=1)
+    elif given:
+        warn_about_file("velocities of some topics of joints alone: left out, and derived from positions")
+        first.pop("joint_velocity", None)
     return out
 
 

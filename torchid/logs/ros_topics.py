@@ -164,6 +164,7 @@ class Topics:
         contact_active: by contact, its flag; optional for contacts with a wrench or such a force.
         contact_force_threshold: [N], force above which a contact that is not in `contact_active` is active.
         ft_wrenches: by fixed joint, the wrench of the parent side on the child side, in the joint's child frame.
+        other_joint_states: those of joints that the messages of `joint_states` lack.
         rate_topic: topic whose stamps the log takes: `contact_wrenches.l_sole`, ...; by default that of the joints.
     """
 
@@ -177,6 +178,13 @@ class Topics:
     contact_force_threshold: _Force | None = None
     ft_wrenches: _Wrenches = dataclasses.field(default_factory=dict)
     rate_topic: str | None = None
+    other_joint_states: list[Annotated[JointTopic, BeforeValidator(_topic)]] = dataclasses.field(default_factory=list)
+
+    @property
+    def joint_topics(self) -> dict[str, JointTopic]:
+        """Topics of joint states by their role."""
+        several = {f"other_joint_states.{number}": topic for number, topic in enumerate(self.other_joint_states)}
+        return ({} if self.joint_states is None else {"joint_states": self.joint_states}) | several
 
     @property
     def by_role(self) -> dict[str, AnyTopic]:
@@ -187,7 +195,8 @@ class Topics:
             for key in ("contact_wrenches", "contact_force_normal", "contact_active", "ft_wrenches")
             for name, topic in getattr(self, key).items()
         }
-        return {role: topic for role, topic in {**single, **several}.items() if topic is not None}
+        every = {**single, **self.joint_topics, **several}
+        return {role: topic for role, topic in every.items() if topic is not None}
 
     @property
     def clock(self) -> str:
@@ -226,7 +235,9 @@ def check_topics(topics: Topics, needs_flags: bool = True) -> None:
         raise ConfigError.at_field("logs.topics", found, f"one of the two, {accepted}")
     if topics.low_state is not None:
         _check_low_state(topics, topics.low_state)
-    given = [] if topics.joint_states is None else list(topics.joint_states.names.values())
+    if topics.other_joint_states and topics.joint_states is None:
+        raise ConfigError.at_field("logs.topics.other_joint_states", "given without joint_states", "both, or neither")
+    given = [name for topic in topics.joint_topics.values() for name in topic.names.values()]
     if again := [name for name in given if given.count(name) > 1]:
         found = f"two names of '{excerpt(again[0])}'"
         raise ConfigError.at_field("logs.topics.joint_states.names", found, "each joint of the robot once")
@@ -305,9 +316,10 @@ def require_joints(topics: Topics | None, joints: Collection[str]) -> None:
     Raises:
         InputError: one is not; the message names the robots that it could be.
     """
-    for joint in () if topics is None or topics.joint_states is None else topics.joint_states.names.values():
+    called = [] if topics is None else [(key, x) for key, of in topics.joint_topics.items() for x in of.names.values()]
+    for role, joint in called:
         if joint not in joints:
-            raise UnknownNameError.at_field("logs.topics.joint_states.names", joint, joints)
+            raise UnknownNameError.at_field(f"logs.topics.{role}.names", joint, joints)
     if topics is None or topics.low_state is None:
         return
     low_state, key = topics.low_state, "logs.topics.low_state"

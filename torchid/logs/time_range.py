@@ -1,4 +1,4 @@
-"""Parts of a log in time: `walk.npz[0:30]` names the first thirty seconds of a file."""
+"""Parts of a log: `walk.npz[0:30]` names the first thirty seconds, `walk.npz[#2]` the third recording of a file."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from torchid.errors import LogError, excerpt
-from torchid.logs.log import FloatArray
+from torchid.logs.log import FloatArray, check_time
 
 RANGE_ACCEPTED = (
-    "[START:END], each empty, seconds from the log's first stamp (below 0: before its end) or a share of it (80%)"
+    "[START:END], each empty, seconds from the log's first stamp (below 0: before its end) or a share of it (80%); [#2]"
+    " for the third of recordings one after the other"
 )
 """Accepted after the name of a log, in messages."""
 
@@ -73,8 +74,9 @@ class TimeRange:
             time: (N,) [s], all stamps of the log.
 
         Raises:
-            LogError: a bound is outside of the log, or nothing is within.
+            LogError: a bound is outside of the log, or nothing is within, or stamps that do not increase.
         """
+        check_time(time)
         since = time - time[0]
         step = float(np.median(np.diff(since))) if len(since) > 1 else 0.0
         length, slack = float(since[-1]) + step, _SLACK * step
@@ -104,10 +106,56 @@ def _parse_bound(text: str, otherwise: _Bound) -> _Bound:
     return _Bound("end", -value) if sign == "-" else _Bound("start", value)
 
 
-def share_samples(one: TimeRange | None, other: TimeRange | None) -> bool | None:
-    """Whether two ranges of a log overlap (None: all of it); None where that depends on how long the log is."""
+_RECORDING = re.compile(r"\[#(\d{1,9})\]")
+_RECORDINGS = re.compile(r"\[#(\d{1,9}):(\d{1,9})\]")
+_MOST_RECORDINGS = 100_000  # that one name stands for
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One of several recordings, such as episodes, that follow one another in a file: each has stamps of its own.
+
+    Attributes:
+        text: `[#2]`.
+        number: counted from 0.
+    """
+
+    text: str
+    number: int
+
+    def select(self, time: FloatArray) -> slice:
+        """Its samples; LogError where there are not so many recordings.
+
+        Args:
+            time: (N,) [s], all stamps of the file, which begin anew with each recording.
+        """
+        starts = recording_starts(time)
+        if self.number >= len(starts):
+            found = f"{self.text} of a file in which stamps begin {len(starts)} times"
+            raise LogError.at_field("recording", found, f"[#0] to [#{len(starts) - 1}]")
+        return slice(*[*starts, len(time)][self.number : self.number + 2])
+
+
+def recording_starts(time: FloatArray) -> list[int]:
+    """The first samples of recordings that follow one another, where stamps (N,) go back."""
+    return [0, *(np.flatnonzero(np.diff(time) < 0.0) + 1).tolist()]
+
+
+def each_recording(name: str) -> list[str]:
+    """The names of the recordings that a name such as `walk.npz[#2:40]` stands for; itself for any other."""
+    file, bracket, rest = name.rpartition("[")
+    if (found := _RECORDINGS.fullmatch(bracket + rest)) is None:
+        return [name]
+    first, stop = (int(x) for x in found.groups())
+    return [f"{file}[#{k}]" for k in range(first, min(stop, first + _MOST_RECORDINGS))]
+
+
+def share_samples(one: TimeRange | Recording | None, other: TimeRange | Recording | None) -> bool | None:
+    """Whether two parts of a log overlap (None: all of it); None where that depends on how long the log is."""
     if one is None or other is None:
         return True
+    if isinstance(one, Recording) or isinstance(other, Recording):
+        return one == other
     early, late = one.start.is_before(other.stop), other.start.is_before(one.stop)
     return False if early is False or late is False else None if None in (early, late) else True
 
@@ -161,10 +209,10 @@ def _shifted(text: str) -> LogFile:
 
 @dataclass(frozen=True)
 class LogPart:
-    """The file (or folder) of a log, or several as one name, and which part of it in time is meant, None for all."""
+    """The file (or folder) of a log, or several as one name, and which part of it is meant, None for all."""
 
     file: Path
-    range: TimeRange | None
+    range: TimeRange | Recording | None
 
     @cached_property
     def files(self) -> tuple[LogFile, ...]:
@@ -211,8 +259,10 @@ def split_range(path: str | os.PathLike[str]) -> LogPart:
     file, bracket, inside = path.name.rpartition("[")
     if not inside.endswith("]") or not file or os.path.lexists(path):
         return LogPart(path, None)
+    if found := _RECORDING.fullmatch(bracket + inside):
+        return LogPart(path.with_name(file), Recording(bracket + inside, int(found[1])))
     try:
         return LogPart(path.with_name(file), TimeRange.parse(bracket + inside))
     except ValueError as error:
-        found = f"'{excerpt(bracket + inside)}' behind its name, and no file of that name"
-        raise LogError(path, "time range", found, RANGE_ACCEPTED) from error
+        text = f"'{excerpt(bracket + inside)}' behind its name, and no file of that name"
+        raise LogError(path, "time range", text, RANGE_ACCEPTED) from error

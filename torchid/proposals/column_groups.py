@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import excerpt
 from torchid.logs.arrays import TRANSPOSED
 from torchid.logs.column_map import PLACEHOLDER
 from torchid.logs.name_matching import SUFFIXES, KnownRobot, is_current, joints_by_place, propose_field, spelled, within
 from torchid.logs.units import OF_JOINTS, quantities_with, split_unit
-from torchid.proposals.file_samples import FileSample, side_by_side
+from torchid.proposals.file_samples import FileSample
 
 _NUMBER = re.compile(r"\d+")
 _AXIS = re.compile(
@@ -29,22 +28,6 @@ _BEHIND = re.compile(
 
 
 _OF_A_JOINT = {"imu_angular_velocity": "joint_velocity", "imu_specific_force": "joint_acceleration"}
-_SECONDS = r"secs?|seconds"
-_FRACTIONS = {
-    "nanoseconds": r"nano_?secs?|nsecs?|nano_?seconds|nanos|ns",
-    "microseconds": r"micro_?secs?|usecs?|micro_?seconds|micros|us",
-}
-
-
-def split_stamps(columns: Sequence[str]) -> dict[str, tuple[str, str]]:
-    """Columns of whole seconds, with key and column of the rest beside them: `stamp.sec` and `stamp.nanosec`."""
-    before = r"(.*?)(?:(?<![A-Za-z])|(?<=[a-z])(?=[A-Z]))"
-    seconds, *rest = (
-        {found[1]: x for x in columns if (found := re.fullmatch(f"{before}(?i:{words})", x))}
-        for words in (_SECONDS, *_FRACTIONS.values())
-    )
-    pairs = ((key, of) for key, of in zip(_FRACTIONS, rest, strict=True))
-    return {seconds[stem]: (key, column) for key, of in pairs for stem, column in of.items() if stem in seconds}
 
 
 @dataclass(frozen=True)
@@ -117,17 +100,6 @@ class Family:
         """Likewise, with the number that counting begins with."""
         first = min(self.numbers, default=0)
         return self.entry | ({"first_index": first} if first > 0 else {})
-
-
-def first_of_stamps(families: Sequence[Family], sample: FileSample, notes: dict[str, str]) -> list[Family]:
-    """The first of stamps of several limbs, with a note where others differ; else the families as they are."""
-    columns = [column for one in families for column in one.columns]
-    values = side_by_side(sample, columns) if len(columns) > 1 else np.empty(0)
-    if values.ndim != 2:
-        return list(families)
-    if apart := float(np.ptp(values, axis=1).max()):
-        notes["time"] = f"of '{excerpt(columns[0])}', from which others differ by up to {apart:.2g}"
-    return [Family(columns[0], columns[:1], ("",), (), ("",))]
 
 
 @dataclass(frozen=True)

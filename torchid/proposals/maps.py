@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Collection, Sequence
 from typing import Any
@@ -18,16 +17,9 @@ from torchid.logs.name_matching import SUFFIXES, KnownRobot, is_desired, propose
 from torchid.logs.unitree import JOINT_ORDERS, numbered_joints, usual_order
 from torchid.logs.units import IN_DEGREES, quantities_of, quantities_with, unit_factor
 from torchid.proposals.base import field_beside, field_of_base, field_of_quaternion, find_angles, settle_velocities
-from torchid.proposals.column_groups import (
-    Family,
-    MapProposal,
-    find_families,
-    first_of_stamps,
-    split_arrays,
-    split_stamps,
-)
+from torchid.proposals.column_groups import Family, MapProposal, find_families, split_arrays
 from torchid.proposals.fields import MOMENT, FieldMatcher, find_foot_readings, frame_of_forces
-from torchid.proposals.file_samples import FileSample, counts, increases, listed_order, side_by_side, with_samples_first
+from torchid.proposals.file_samples import FileSample, listed_order, side_by_side, with_samples_first
 from torchid.proposals.numbers import (
     LEAST_GRAVITY,
     UnitProposer,
@@ -35,7 +27,9 @@ from torchid.proposals.numbers import (
     gravity_share,
     step_of_stamps,
     threshold,
+    unit_of_step,
 )
+from torchid.proposals.stamps import first_of_stamps, has_stamps_of, split_stamps, stamps_first
 
 _GAINS = re.compile(r"\b(kp|kd)\b", re.IGNORECASE)
 _LAW = {"joint_position": "position", "joint_velocity": "velocity", "joint_torque": "feed_forward"}
@@ -43,7 +37,11 @@ _TOUCH = 0.05  # of the robot's weight, what a contact bears at least
 
 
 def propose_map(
-    sample: FileSample, robot: KnownRobot, files: Sequence[Collection[str]] = (), in_degrees: Collection[str] = ()
+    sample: FileSample,
+    robot: KnownRobot,
+    files: Sequence[Collection[str]] = (),
+    in_degrees: Collection[str] = (),
+    clocks: Sequence[Collection[str]] = (),
 ) -> MapProposal:
     """Sort foreign columns into fields of a log by what they are called and what is in them.
 
@@ -52,9 +50,10 @@ def propose_map(
         robot: whose log it is.
         files: columns of each of several files that are one log, whose stamps may differ in name.
         in_degrees: columns of files whose header says that angles are in degrees.
+        clocks: arrays with each of several stamps in one file.
     """
     turned, notes = with_samples_first(sample, len(robot.joints))
-    out = _Proposer(turned, robot, files, in_degrees).propose()
+    out = _Proposer(turned, robot, files, in_degrees, clocks).propose()
     out.notes = notes | out.notes
     if notes and "ignore" in out.columns:  # by their names in the file
         apart = [name for name in turned if name not in sample]
@@ -65,9 +64,15 @@ def propose_map(
 
 class _Proposer:
     def __init__(
-        self, sample: FileSample, robot: KnownRobot, files: Sequence[Collection[str]], in_degrees: Collection[str]
+        self,
+        sample: FileSample,
+        robot: KnownRobot,
+        files: Sequence[Collection[str]],
+        in_degrees: Collection[str],
+        clocks: Sequence[Collection[str]],
     ) -> None:
-        self.sample, self.robot, self.files, self.in_degrees = dict(sample), robot, files, in_degrees
+        self.sample, self.robot, self.in_degrees = dict(sample), robot, in_degrees
+        self.files, self.clocks = files, clocks
         self.match = FieldMatcher(self.sample, robot)
         self.joints, self.feet = robot.joints, robot.feet
         self.native = {name for name in sample if is_column(name) or name in (*SHAPES, *VARIANTS)}
@@ -96,7 +101,11 @@ class _Proposer:
         stamps = [one for one in families if one.columns[0] in self.fractions or self.match.field(one) == "time"]
         used = [one for one in families if one not in stamps and self._place(one)]
         stamps = first_of_stamps(stamps, self.sample, self.out.notes) if of_limbs else stamps
-        used += [one for one in self._stamps_first(stamps) if self._place(one, "time")]
+        known = {column for one in used for column in one.columns} | split | self.native
+        stamps = [one for one in stamps if has_stamps_of(one, known, self.clocks)]
+        positions = self.out.columns.get("joint_position", {})
+        stamps = stamps_first(stamps, self.sample, positions, self.fractions, bool(self.clocks))
+        used += [one for one in stamps if self._place(one, "time")]
         used += self._place_of_base([one for one in families if one not in used])
         if "time" in self.out.columns:
             self.out.columns = {"time": self.out.columns["time"], **self.out.columns}
@@ -190,18 +199,6 @@ class _Proposer:
         self.out.columns[field] = {"column": text}
         self._note(field, f"columns {start} to {stop or 'the last'} of '{name}'")
 
-    def _stamps_first(self, families: Sequence[Family]) -> list[Family]:
-        """Families of stamps, those that increase first, numbers of samples last, of others those beside positions."""
-        entry = self.out.columns.get("joint_position", {})
-        beside = next(iter(entry.get("columns", {}).values()), "") or entry.get("column", "joint_position")
-
-        def rank(family: Family) -> tuple[bool, bool, int]:
-            first = family.columns[0]
-            forwards = first in self.fractions or increases(self.sample[first])
-            return not forwards, counts(self.sample[first]), -len(os.path.commonprefix([first, beside]))
-
-        return sorted(families, key=rank)
-
     def _place_of_base(self, families: Sequence[Family]) -> list[Family]:
         """Families that have become the pose of a base, of a robot with feet or of a single body, by their numbers."""
         if not self.feet and self.joints:  # of an arm, that of its hand
@@ -254,7 +251,7 @@ class _Proposer:
         """Whether a family is the stamps of a file that has none yet."""
         others = self.out.columns.get("other_times", [])
         known = [entry["column"] for entry in (self.out.columns["time"], *others)]
-        ours = [given for given in self.files if family.columns[0] in given]
+        ours = [given for given in self.files or self.clocks if family.columns[0] in given]
         if (
             not ours
             or any(column in given for given in ours for column in known)
@@ -263,7 +260,11 @@ class _Proposer:
             return False
         entry: dict[str, Any] = family.entry
         self._add_stated_unit(family, entry, "other_times", ("time",))
+        step = float(np.median(np.diff(np.asarray(self.sample[family.columns[0]]))))
+        entry |= {"unit": unit_of_step(step)} if not family.unit and unit_of_step(step) != "s" else {}
         self.out.columns["other_times"] = [*others, entry]
+        if self.clocks:
+            self.out.notes["other_times"] = "stamps of the arrays beside them, which are interpolated to those of time"
         return True
 
     def _place_feet(self, columns: Sequence[str]) -> set[str]:

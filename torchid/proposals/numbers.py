@@ -47,6 +47,11 @@ def step_of_stamps(sample: FileSample) -> tuple[str, float] | None:
     return None
 
 
+def unit_of_step(step: float) -> str:
+    """The unit of stamps, by the step between them."""
+    return next((unit for unit in ("s", "ms", "us", "ns") if _STEP[0] <= step * UNITS["time"][unit] <= _STEP[1]), "s")
+
+
 class UnitProposer:
     """Adds units to the entries of a map, with a note for each."""
 
@@ -179,8 +184,7 @@ class UnitProposer:
         step = float(np.median(np.diff(time[:, 0])))
         if not step > 0.0:  # which nothing of what follows can be compared with
             return None
-        unit = next((u for u in ("s", "ms", "us", "ns") if _STEP[0] <= step * UNITS["time"][u] <= _STEP[1]), "s")
-        if native and unit != "s" and self._columns:
+        if (unit := unit_of_step(step)) != "s" and native and self._columns:
             self._columns["time"] = {"column": "time"}
         self._set("time", unit, f"from steps of {step:.3g}")
         return np.asarray(time[:, 0] * self._stated.get("time", UNITS["time"][unit]))
@@ -223,7 +227,7 @@ class UnitProposer:
 
     def _add_speed(self, velocity: Numbers, position: Numbers, seconds: Numbers, slide: NDArray[np.bool_]) -> None:
         """The unit of velocities, by the slope of positions [rad, m]."""
-        if position.shape != velocity.shape:
+        if not position.shape == velocity.shape == (len(seconds), *position.shape[1:]):
             return
         slope = np.gradient(position, seconds, axis=0)
         slope = np.where(np.abs(slope) * np.median(np.diff(seconds)) > 1.0, np.nan, slope)  # a jump of a turn

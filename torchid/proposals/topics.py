@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -32,6 +32,10 @@ def propose_topics(sample: Mapping[str, TopicSample], robot: KnownRobot) -> MapP
         robot: whose bag it is.
     """
     return _Proposer(sample, robot).propose()
+
+
+_Joints = tuple[str, list[str], list[str]]
+"""Topic, names of joints in some of its messages, and fields of a log that these give beside positions."""
 
 
 class _Proposer:
@@ -81,35 +85,65 @@ class _Proposer:
     # --------------------------------------------------------------------------------------------------- joints, base
 
     def _place_joints(self) -> None:
-        """The joint states that have most of the robot's joints, then most of their efforts; others are welded."""
-        joints, best = set(self.robot.joints), ("", -1.0, dict[str, bool](), dict[str, str]())
-        for name, topic in self._of(JointStates.types).items():
-            named = {joint: None for message in topic.messages[:50] for joint in message.name}
-            matched = match_joints(list(named), self.robot.joints)
-            parts = {field: any(len(getattr(x, part)) for x in topic.messages[:1]) for part, field in _EFFORT.items()}
-            score = len(matched) + 0.1 * sum(parts.values())
-            if (joints & named.keys() or self._has_most(matched)) and score > best[1]:
-                best = (name, score, parts, matched)
-        name, _, parts, matched = best
-        if not name:
+        """Joint states with most of the robot's joints, then most of their efforts, then others; the rest is welded."""
+        sources, found = self._joint_sources(), list[tuple[str, dict[str, Any]]]()
+        placed, fields = set[str](), set[str]()
+        while (best := self._best_joints(sources, placed)) is not None:
+            name, _, parts = source = best
+            matched = self._joints_in(source, placed)
+            found.append((name, self._joint_entry(source, matched, [x for x in sources if x[0] == name])))
+            placed |= set(matched.values())
+            fields |= set(parts)
+        if not found:
             return
-        named = {joint: None for message in self.topics[name].messages[:50] for joint in message.name}
-        entry: dict[str, Any] = {"topic": name}
+        complete = {"joint_position"} if self._has_most(placed) else set()
+        self.out.lacking = [x for x in self.robot.joints if complete and x not in placed]
+        (topic, first), *others = found
+        self._add("joint_states", topic, first, *complete, *fields)
+        if others:
+            self.out.columns["other_joint_states"] = [entry if len(entry) > 1 else name for name, entry in others]
+            self.out.notes["other_joint_states"] = "joints that the messages of joint_states lack"
+            self.used |= {name for name, _ in others}
+
+    def _joint_sources(self) -> list[_Joints]:
+        """Topics of joint states with the joints of their messages, each set of these for itself, and their fields."""
+        out = dict[tuple[str, tuple[str, ...]], _Joints]()
+        for topic, sample in self._of(JointStates.types).items():
+            for message in sample.messages[:50]:
+                fields = [field for part, field in _EFFORT.items() if len(getattr(message, part))]
+                out.setdefault((topic, tuple(sorted(message.name))), (topic, list(message.name), fields))
+        return list(out.values())
+
+    def _joints_in(self, source: _Joints, placed: Collection[str]) -> dict[str, str]:
+        """Joints of the robot that no other source has, by their names in one."""
+        every = match_joints(source[1], self.robot.joints)
+        is_ours = set(self.robot.joints) & set(source[1]) or self._has_most(every.values())
+        return {text: joint for text, joint in every.items() if is_ours and joint not in placed}
+
+    def _best_joints(self, sources: Sequence[_Joints], placed: Collection[str]) -> _Joints | None:
+        """The source with most joints that none has yet."""
+        scores = [len(self._joints_in(x, placed)) + 0.1 * len(x[2]) for x in sources if self._joints_in(x, placed)]
+        left = [x for x in sources if self._joints_in(x, placed)]
+        return left[scores.index(max(scores))] if left else None
+
+    def _joint_entry(self, source: _Joints, matched: Mapping[str, str], of_topic: Sequence[_Joints]) -> dict[str, Any]:
+        """The entry of some joints by their names in the messages of a topic, with notes; `of_topic`: its sources."""
+        topic, named, _ = source
+        entry: dict[str, Any] = {"topic": topic}
         notes = list[str]()
-        if {*matched.values()} != joints or len(named) > len(matched):
-            entry["joints"] = [joint for joint in self.robot.joints if joint in matched.values()]
+        if len(named) > len(matched):
             notes.append(f"those of the robot among the {len(named)} joints of its messages")
+        if len(named) > len(matched) or len(of_topic) > 1:
+            entry["joints"] = [joint for joint in self.robot.joints if joint in matched.values()]
         if called := {text: joint for text, joint in matched.items() if text != joint}:
             entry["names"] = called
             notes.append(f"names of {format_count(len(called), 'joint')}, which the messages spell otherwise")
         if notes:
-            self.out.notes["joint_states"] = "; ".join(notes)
-        complete = {"joint_position"} if self._has_most(matched) else set()
-        self.out.lacking = [x for x in self.robot.joints if complete and x not in matched.values()]
-        self._add("joint_states", name, entry, *complete, *(field for field, given in parts.items() if given))
+            self.out.notes.setdefault("joint_states", "; ".join(notes))
+        return entry
 
-    def _has_most(self, matched: Mapping[str, str]) -> bool:
-        """Whether most of the robot's joints are matched."""
+    def _has_most(self, matched: Collection[str]) -> bool:
+        """Whether most of the robot's joints are among some."""
         return 2 * len(matched) >= max(len(self.robot.joints), 1)
 
     def _place_low_state(self) -> None:

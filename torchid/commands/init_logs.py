@@ -1,0 +1,146 @@
+"""How `torchid init` has a log used: its recordings, what is held back of them, gaps and samples."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchid.errors import InputError
+from torchid.logs import Log
+from torchid.logs.cutoff import choose_cutoff
+from torchid.logs.low_pass import DROPPED_PERIODS
+from torchid.problem.compression import LEAST_PER_FOLD
+
+_MOTION = ("joint_position", "base_quat_xyzw", "base_position_world", *("imu_specific_force", "imu_angular_velocity"))
+_BRIDGED_S = 0.05
+"""Gaps that `init` has bridged [s]."""
+_MANY = 100_000
+"""Samples that a fit works on for about a second; of more, no more are kept than a filter leaves information in."""
+_TESTED = 0.2  # of a log, or of its recordings
+_FEWEST_FOLDS = 2
+_FOLD_MARGIN = 1.1  # more samples than folds need, as their number is known once they are filtered
+_LEAST_TEST = 1.5  # of what a filter spoils at both ends: a third of a test is left
+_RIDGE = 1e-3  # where nothing can be left out to choose it by
+
+
+@dataclass(frozen=True)
+class Split:
+    """How a log is used.
+
+    Attributes:
+        train, test: its parts that are fitted and held back, as behind its name.
+        ridge: auto, where there are enough samples to leave some out.
+        guessed, missing: why not, and what a filter leaves nothing of, in words; "" where all is as usual.
+    """
+
+    train: tuple[str, ...] = (f"[:{1.0 - _TESTED:.0%}]",)
+    test: tuple[str, ...] = (f"[{1.0 - _TESTED:.0%}:]",)
+    ridge: str | float = "auto"
+    guessed: str = ""
+    missing: str = ""
+
+
+def split_logs(logs: Sequence[Log], base_is_derived: bool = False) -> Split:
+    """The split of a log, by the filter that `preprocessing.cutoff_hz: auto` chooses; as usual if it is not read.
+
+    Args:
+        logs: its recordings, one or several; none where it is not read.
+        base_is_derived: whether the motion of the base is worked out of that of the joints.
+    """
+    if not any(len(log) > 1 for log in logs):
+        return Split()
+    try:
+        cutoff_hz = choose_cutoff(logs, base_is_derived=base_is_derived).cutoff_hz
+    except InputError:  # which a fit will say
+        return Split()
+    lengths = [float(log.time[-1] - log.time[0]) for log in logs]
+    spoiled = 0.0 if cutoff_hz is None else 2.0 * DROPPED_PERIODS / cutoff_hz
+    independent_hz = sum(map(len, logs)) / sum(lengths) if cutoff_hz is None else 2.0 * cutoff_hz
+    folded = _FOLD_MARGIN * _FEWEST_FOLDS * LEAST_PER_FOLD / independent_hz
+    filtered = "" if cutoff_hz is None else f" (the filter of {cutoff_hz:g} Hz spoils {spoiled:.2g} s)"
+    if len(logs) > 1:
+        return _split_recordings(lengths, spoiled, folded, filtered)
+    (length,) = lengths
+    if _TESTED * length >= _LEAST_TEST * spoiled and (1.0 - _TESTED) * length >= spoiled + folded:
+        return Split()
+    if length <= spoiled:
+        return Split(("",), (), _RIDGE, missing=f"motion: {length:.2g} s are too short for a fit{filtered}")
+    guessed = f"logs.test: none, as {length:.2g} s are too short for a part to be held back{filtered}"
+    if length >= spoiled + folded:
+        return Split(("",), (), guessed=guessed)
+    return Split(("",), (), _RIDGE, f"{guessed}, or to choose the ridge by ({_RIDGE:g})")
+
+
+def _split_recordings(lengths: Sequence[float], spoiled: float, folded: float, filtered: str) -> Split:
+    """The split of recordings of some lengths [s] that follow one another: the last fifth of them is held back.
+
+    Those of which a filter leaves next to nothing are left out.
+    """
+    long = [number for number, length in enumerate(lengths) if length >= _LEAST_TEST * spoiled]
+    guessed = f"logs: {len(lengths)} recordings one after the other, as stamps begin anew"
+    if len(long) < len(lengths):
+        guessed += f"; {len(lengths) - len(long)} of them left out as too short{filtered}"
+    if not long:
+        text = f"motion: {len(lengths)} recordings of {max(lengths):.2g} s at most are too short for a fit{filtered}"
+        return Split(_numbered(list(range(len(lengths)))), (), _RIDGE, missing=text)
+    held = max(1, round(_TESTED * len(long))) if len(long) > 1 else 0
+    train, test = long[: len(long) - held], long[len(long) - held :]
+    guessed += f"; the last {held} held back as test" * (held > 1) + "; the last held back as test" * (held == 1)
+    is_enough = sum(lengths[number] - spoiled for number in train) >= folded
+    return Split(_numbered(train), _numbered(test), "auto" if is_enough else _RIDGE, guessed)
+
+
+def _numbered(numbers: Sequence[int]) -> tuple[str, ...]:
+    """Numbers of recordings, in order, as behind the name of a file."""
+    first = [number for number in numbers if number - 1 not in numbers]
+    after = [number + 1 for number in numbers if number + 1 not in numbers]
+    runs = zip(first, after, strict=True)
+    return tuple(f"[#{start}:{stop}]" if stop > start + 1 else f"[#{start}]" for start, stop in runs)
+
+
+# ----------------------------------------------------------------------------------------------------------------- gaps
+
+
+def _gaps_in_motion(log: Log) -> tuple[float, bool, str]:
+    """Gaps in the motion of a log: how long the longest takes, whether some are at an end, and a field with one.
+
+    The length [s] is that from the value before to that after; gaps at an end do not count for it. Channels that are
+    NaN throughout are none.
+    """
+    longest, at_end, found = 0.0, False, ""
+    for name in _MOTION:
+        values = getattr(log, name)
+        for missing in () if values is None else np.isnan(values).reshape(len(log), -1).T:
+            known = np.flatnonzero(~missing)
+            if not missing.any() or len(known) < 2:
+                continue
+            at_end |= bool(missing[0] or missing[-1])
+            longest = max(longest, *np.diff(log.time[known])[np.diff(known) > 1].tolist(), 0.0)
+            found = found or name
+    return longest, at_end, found
+
+
+def keys_for_gaps(logs: Sequence[Log]) -> dict[str, tuple[object, str]]:
+    """The keys of preprocessing that recordings with gaps in their motion need, with the reason."""
+    found = [_gaps_in_motion(log) for log in logs]
+    longest, at_end = max((x for x, *_ in found), default=0.0), any(x for _, x, _ in found)
+    name = next((x for *_, x in found if x), "")
+    out: dict[str, tuple[object, str]] = {}
+    if 0.0 < longest <= _BRIDGED_S:
+        out["bridge_gaps_s"] = (_BRIDGED_S, f"as gaps of {name} take up to {longest:.2g} s")
+    if longest > _BRIDGED_S or at_end:
+        reason = (
+            f"as gaps of {name} take up to {longest:.2g} s" if longest > _BRIDGED_S else f"as {name} has one at an end"
+        )
+        out["exclude_rejected"] = (True, reason)
+    return out
+
+
+def keys_for_length(logs: Sequence[Log]) -> dict[str, tuple[object, str]]:
+    """The keys of preprocessing that long recordings should have, with the reason."""
+    samples = sum(map(len, logs))
+    if samples <= _MANY:
+        return {}
+    return {"sample_rate_hz": ("auto", f"as {samples} samples are many: five for each period of the cutoff are kept")}
