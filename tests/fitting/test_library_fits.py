@@ -85,7 +85,7 @@ def test_cross_validation_predicts_blocks_that_a_fit_has_not_seen(tmp_path: Path
     assert found.folds == written["cross_validation"]["folds"]
     for name in ("identified", "nominal"):  # a run's folds are sums of blocks, which round otherwise
         of_run = dict(differences(getattr(found, name).as_dict(), written["cross_validation"][name]))
-        assert max(of_run.values()) < 1e-11, of_run
+        assert max(of_run.values()) < 1e-9, of_run
 
     fit = fitter.fit(torchid.compress_in_blocks(logs, fitter.builder))
     compared = torchid.calibrations(fit, robot, fitter.builder)
