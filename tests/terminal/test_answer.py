@@ -88,7 +88,7 @@ def test_joints_that_never_move_are_named_where_their_torque_counts_as_unmeasure
     run = replace(consistent, experiment=replace(consistent.experiment, config=taken))
     assert "stiction" not in text(replace(run, resting={"rear_left_hip": 0.9}))
     said = " ".join(text(replace(run, resting={"front_left_knee": 1.0, "rear_left_hip": 0.9})).split())
-    assert "no friction of front_left_knee: at rest, or within 1/cutoff of it, throughout" in said
+    assert "no friction of front_left_knee: at rest, or too near to it for the filter, throughout" in said
 
 
 def test_errors_on_motion_that_was_fitted_are_not_those_of_unseen_motion(consistent: Identification) -> None:

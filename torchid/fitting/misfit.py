@@ -291,6 +291,12 @@ def unfitted_friction(problem: LinearProblem, robot: Robot) -> UnfittedFriction 
 _MOST_SAMPLES = 50_000  # evenly spaced
 
 
+def unmeasured_at_rest(logs: Sequence[Samples]) -> float | None:
+    """Share of the joint torques of some logs that count as unmeasured, as joints rest; None where none does."""
+    flags = [log.resting for log in logs if log.resting is not None and log.resting.numel()]
+    return float(sum(one.sum() for one in flags)) / sum(one.numel() for one in flags) if flags else None
+
+
 def resting_joints(
     problem: LinearProblem, robot: Robot, builder: RowBuilder, logs: Sequence[Samples]
 ) -> dict[str, float]:
