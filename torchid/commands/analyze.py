@@ -171,10 +171,9 @@ def analyze(config: AnalyzeConfig) -> Analysis:
     output = None if config.output is None else _analysis_folder(config.output)
     if output is not None:
         ranks.from_first(partial(check_free, output, config.overwrite, ANALYSIS, inputs_of(config)), "output")
-    scene = set_up_scene(config)
-    request = AnalysisRequest.of(scene)
+    request = AnalysisRequest.of(set_up_scene(config))
     with progress_bars() as bars:
-        scene, _ = with_chosen_settings(scene, bars)
+        scene, _ = with_chosen_settings(request.scene, bars)
         request = replace(request, scene=scene)
         train, test = _read(request, bars)
         if train:
