@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from repository import DEMO
 from torchid.config import load_config
 from torchid.errors import LogError
 from torchid.estimators import Conditions, Consistent, LeastSquares
-from torchid.fitting.delay import EARLIEST, LATEST, DelayChoice, choose_delay
+from torchid.fitting.delay import EARLIEST, LATEST, DelayChoice, choose_delay, unfitted_delay
 from torchid.fitting.experiment import set_up
 from torchid.fitting.fit import LogFitter
 from torchid.logs import Log, preprocess, read_log
@@ -26,10 +28,20 @@ def chosen(
     *logs: Log, estimator: LeastSquares | Consistent | None = None, terms: ExtraTerms | None = None, std: float = NOISE
 ) -> DelayChoice:
     """What is found in logs of the arm."""
+    return looked_for(choose_delay, *logs, estimator=estimator, terms=terms, std=std)
+
+
+def looked_for(
+    look: Callable[..., Any],
+    *logs: Log,
+    estimator: LeastSquares | Consistent | None = None,
+    terms: ExtraTerms | None = None,
+    std: float = NOISE,
+) -> Any:
     robot, terms = arm()[0], terms or ExtraTerms()
     builder = RowBuilder(robot, (), named_sensors("joints", robot.n, 0, SensorNoise(joint_torque=std)), terms)
     fitter = LogFitter(robot=robot, builder=builder, estimator=estimator or LeastSquares())
-    return choose_delay([bind_log(log, robot, ()) for log in logs], fitter, terms)
+    return look([bind_log(log, robot, ()) for log in logs], fitter, terms)
 
 
 @pytest.mark.parametrize("delay", [DELAY, -0.0042, 0.0231, 0.05])
@@ -44,6 +56,19 @@ def test_a_delay_of_a_part_of_a_step_is_found_to_a_microsecond(
     assert found.delay == pytest.approx(delay, abs=1e-6)
     assert found.residual < 1e-2 * found.undelayed_residual
     assert f"{1e3 * delay:.3g} ±" in str(found)
+
+
+def test_a_delay_that_nobody_fits_is_told_from_none() -> None:
+    for delay, seeds in ((0.0, range(10)), (DELAY, range(2)), (-DELAY, range(2))):
+        for seed in seeds:
+            log = preprocess(recorded(delay, NOISE, seed), 30.0)
+            found = looked_for(unfitted_delay, log)
+            assert found is not None
+            assert found.significant == (delay != 0.0)
+            assert abs(found.value - delay) < 0.1 * abs(delay) + 4.0 * found.standard_error
+            assert str(found).startswith("torques are ")
+            assert (" late " in str(found)) == (found.value < 0.0), "of the motion"
+    assert looked_for(unfitted_delay, recorded(seconds=0.07)) is None
 
 
 def test_it_is_found_beside_armatures_springs_offsets_and_scales() -> None:

@@ -91,6 +91,25 @@ def test_intervals_hold_the_friction_of_joints_that_pause_only_with_their_torque
     assert held[False] <= 2
 
 
+def test_what_holds_a_joint_at_rest_is_not_in_the_filtered_torques_that_count_as_measured() -> None:
+    cutoff, (log, velocity) = 8.0, recorded(0)
+    slow = np.abs(velocity) <= 0.1 * np.sqrt(np.square(velocity).mean(0))
+    largest, rests = np.zeros(2), None
+    for seed in range(20):  # of friction that pushes either way, in steps
+        pushes = np.repeat(np.sign(np.random.default_rng(seed).normal(size=(len(slow), 2))), 1 + seed, axis=0)
+        held = replace(log, joint_torque=np.where(slow, pushes[: len(slow)], 0.0))
+        filtered = preprocess(held, cutoff, finds_rest=True)
+        rests = filtered.joint_rests
+        assert rests is not None
+        assert filtered.joint_torque is not None
+        largest = np.maximum(largest, np.abs(np.where(rests, 0.0, filtered.joint_torque)).max(0))
+    assert (largest < 0.0357).all(), "of it: what the filter leaves 1/cutoff after a pause, whichever way it pushed"
+    assert rests is not None
+    away = np.convolve(slow[:, 0], np.ones(2 * round(1.0 / (cutoff * STEP)) + 1), "same") == 0.0
+    kept, within_reach = (~rests[:, 0]).mean(), away.mean()
+    assert kept > 1.15 * within_reach > 0.0, "turns between two moves weigh less than pauses"
+
+
 def test_a_joint_that_never_moves_has_no_row_and_no_friction() -> None:
     log, _ = recorded(0, moving=(1.0, 0.0))
     fit = fitted(log, True)

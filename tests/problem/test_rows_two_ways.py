@@ -19,6 +19,7 @@ from random_samples import NOISE, random_samples, sensor_set
 from synthetic import PANDA, TALOS_FULL, Array, load
 
 import torchid
+from torchid.identifiability.base_parameters import state_reports
 from torchid.problem import RowBuilder, compress
 from torchid.problem.chunks import chunks_by_state
 from torchid.problem.predict import predict_by_columns, predict_forces
@@ -104,5 +105,8 @@ def test_a_torque_is_unmeasured_where_its_joint_rests(name: str) -> None:
     R = factor.triangle().numpy()
     size = np.linalg.norm(R, axis=0) + 1e-3 * np.linalg.norm(R)
     np.testing.assert_allclose(R.T @ R / np.outer(size, size), gram / np.outer(size, size), rtol=0.0, atol=1e-14)
+    reports = state_reports([replace(SAMPLES, resting=RESTING)], builder)
+    assert sum(one.samples * (one.mean_rows or 0.0) for one in reports) == pytest.approx(equations, rel=1e-14)
+    assert {one.mean_rows for one in state_reports([SAMPLES], builder)} == {None}
     assert factor.rows == equations
     assert (equations < compress([SAMPLES], builder).rows) == sensors.torque.any()

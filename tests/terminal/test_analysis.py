@@ -107,6 +107,11 @@ def test_what_is_lost_and_what_would_help_comes_first(lame: Analysis) -> None:
     assert posture.startswith("attention     the base is lost where all joints are at zero")
 
 
+def test_ranks_of_the_base_are_said_to_be_those_of_joints_that_move(lame: Analysis) -> None:
+    (_, attention) = (line for line in analysis_lines(replace(lame, resting=0.31), 1000) if "attention" in line)
+    assert "31 % of the logs' torques count as unmeasured at rest (actuators.stiction); the base is" in attention
+
+
 def test_sensors_that_suffice_are_named_with_the_proof(lame: Analysis) -> None:
     said = analysis_lines(sound(lame), 10_000)
     assert said[0] == "12 sensors suffice: the base is observable in all 2 contact states"

@@ -18,6 +18,7 @@ from torchid.commands.results import Identification
 from torchid.config import load_config
 from torchid.estimators import SgdEstimate
 from torchid.estimators.least_squares import COMBINED, IDENTIFIED, ConstrainedEstimate
+from torchid.fitting.delay import UnfittedDelay
 from torchid.parameters import COULOMB, FRICTION, INERTIAL, PER_BODY
 from torchid.problem import Metrics
 from torchid.problem.metrics import DECISIVE_GROUPS, LIMB_GROUPS, WHITENED, WorseThanNominal
@@ -76,6 +77,10 @@ def test_the_errors_on_unseen_motion_come_first_with_the_noise(consistent: Ident
 def test_joints_that_rest_are_named_where_forces_are_not_explained(consistent: Identification) -> None:
     assert consistent.resting == {}
     resting = replace(consistent, resting={"front_left_knee": 1.0, "rear_left_hip": 0.31})
+    late = replace(resting.misfit, delay=UnfittedDelay(-0.0061, 0.0001))
+    assert "torques are 6.1 ± 0.1 ms late (actuators.delay: auto)" in " ".join(
+        text(replace(resting, misfit=late)).split()
+    )
     unexplained = replace(resting, misfit=replace(resting.misfit, lack_of_fit=9.0))
     said = " ".join(text(unexplained).split())
     assert "actuators.stiction=true, as joints rest (front_left_knee 100 %, rear_left_hip 31 %)" in said
@@ -88,7 +93,7 @@ def test_joints_that_never_move_are_named_where_their_torque_counts_as_unmeasure
     run = replace(consistent, experiment=replace(consistent.experiment, config=taken))
     assert "stiction" not in text(replace(run, resting={"rear_left_hip": 0.9}))
     said = " ".join(text(replace(run, resting={"front_left_knee": 1.0, "rear_left_hip": 0.9})).split())
-    assert "no friction of front_left_knee: at rest, or within 1/cutoff of it, throughout" in said
+    assert "no friction of front_left_knee: at rest, or too near to it for the filter, throughout" in said
 
 
 def test_errors_on_motion_that_was_fitted_are_not_those_of_unseen_motion(consistent: Identification) -> None:

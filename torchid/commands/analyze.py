@@ -22,6 +22,7 @@ from torchid.config import AnalyzeConfig, dump_config, inputs_of
 from torchid.copies import can_copy, in_copies
 from torchid.errors import ConfigError, SensorError, UnknownNameError, during, join_names, warn
 from torchid.fitting.experiment import Scene, set_up_scene, with_noise
+from torchid.fitting.misfit import unmeasured_at_rest
 from torchid.identifiability.base_parameters import BaseParameters, base_parameters
 from torchid.parameters import WRENCH_COMPONENTS
 from torchid.problem import Samples
@@ -83,12 +84,14 @@ class Analysis:
     """Results by scenario, the accuracy of sensor sets on logs, and the folder that they were written to, if any.
 
     Of processes that share the work, the first alone has the scenarios: to look for sensors is the work of one.
+    `resting`: share of the training logs' torques that count as unmeasured, as joints rest, if any does.
     """
 
     scene: Scene
     scenarios: tuple[ScenarioAnalysis, ...]
     accuracies: dict[str, SetAccuracy]
     output: Path | None
+    resting: float | None = None
 
     __repr__ = short_repr
 
@@ -106,8 +109,8 @@ class Analysis:
                 "proposed": None if proposed is None else observability_document(proposed),
                 "base_parameters": base_parameters_document(scenario.base, names),
             }
-        accuracies = {name: accuracy.as_dict() for name, accuracy in self.accuracies.items()}
-        return {"scenarios": scenarios, "accuracy": accuracies or None}
+        accuracy = {name: one.as_dict() for name, one in self.accuracies.items()} or None
+        return {"scenarios": scenarios, "accuracy": accuracy, "resting_share": self.resting}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,10 +171,9 @@ def analyze(config: AnalyzeConfig) -> Analysis:
     output = None if config.output is None else _analysis_folder(config.output)
     if output is not None:
         ranks.from_first(partial(check_free, output, config.overwrite, ANALYSIS, inputs_of(config)), "output")
-    scene = set_up_scene(config)
-    request = AnalysisRequest.of(scene)
+    request = AnalysisRequest.of(set_up_scene(config))
     with progress_bars() as bars:
-        scene, _ = with_chosen_settings(scene, bars)
+        scene, _ = with_chosen_settings(request.scene, bars)
         request = replace(request, scene=scene)
         train, test = _read(request, bars)
         if train:
@@ -193,7 +195,7 @@ def analyze(config: AnalyzeConfig) -> Analysis:
             bars.add_task("comparing sensor sets", total=None)
             later = compare({name: one for name, one in sets.items() if not any(name in part for part in early)})
             compared = {name: one for part in (*compared_early(), later) for name, one in part.items()}
-        analysis = Analysis(scene, tuple(results), compared, output)
+        analysis = Analysis(scene, tuple(results), compared, output, unmeasured_at_rest(train))
         if output is not None:
             bars.add_task("writing", total=None)
             ranks.from_first(partial(_write_analysis, analysis, output, config.overwrite), "analysis folder")
@@ -216,11 +218,10 @@ def _read(request: AnalysisRequest, bars: Progress) -> tuple[list[Samples], list
     if files is None:
         return [], []
     reading = bars.add_task("reading logs", total=len(files.train) + len(files.test))
-
-    def done(_: Path) -> None:
-        bars.advance(reading)
-
-    train, test = reader.read(files.train, request.proposed, done), reader.read(files.test, None, done)
+    train, test = (
+        reader.read(paths, sensors, lambda _: bars.advance(reading))
+        for paths, sensors in ((files.train, request.proposed), (files.test, None))
+    )
     check_read({"train": train, "test": test})
     return train, test
 
@@ -255,8 +256,7 @@ def _analyze_scenario(
     """Plan sensors for one scenario, and check those that are proposed."""
     scene, settings = request.scene, request.scene.config.analysis
     robot, contacts = scene.robot, scene.contacts
-    estimator = scene.config.estimator
-    free = free_parameters(robot, estimator.friction) & ~scene.frozen()
+    free = free_parameters(robot, scene.config.estimator.friction) & ~scene.frozen()
     problem = PlanningProblem(
         robot=robot,
         contacts=contacts,

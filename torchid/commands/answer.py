@@ -212,7 +212,7 @@ def _resting(run: Identification) -> Iterator[str]:
         if still := [name for name, share in run.resting.items() if share == 1.0]:
             names = join_names(still, _FEW_NAMED)
             why = "no torque counts as measured then (actuators.stiction)"
-            yield f"no friction of {names}: at rest, or within 1/cutoff of it, throughout; {why}"
+            yield f"no friction of {names}: at rest, or too near to it for the filter, throughout; {why}"
     elif run.resting and not run.misfit.explained:
         names = join_names([f"{name} {100.0 * share:.0f} %" for name, share in run.resting.items()], _FEW_NAMED)
         why = "where one sticks, its friction is less than Coulomb's, and too little is found"

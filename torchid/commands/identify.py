@@ -28,6 +28,7 @@ from torchid.estimators import Conditions, Estimate, Violation, violations
 from torchid.estimators.conditions import term_violations
 from torchid.fitting.calibration import Calibration, Comparison, warn_of_confounded, warn_of_disagreement
 from torchid.fitting.cross_validation import CrossValidation, RidgeChoice, Scorer
+from torchid.fitting.delay import unfitted_delay
 from torchid.fitting.experiment import Experiment, set_up, with_noise
 from torchid.fitting.factor_files import FactorFile, read_fleet
 from torchid.fitting.fit import Fit, LogFitter
@@ -233,13 +234,14 @@ def _identify(
         scorer, of_blocks = Scorer(evaluation, builder), merge_states(fit.parts, builder)
         scores = _scores(scorer, logs["test"], blocks, of_blocks, compared, without_folds, bars)
         traces = ranks.from_first(lambda: [trace_forces(evaluation, log, compared) for log in shown], "traces")
+        delay = ranks.from_first(partial(unfitted_delay, logs["train"], fitter, experiment.terms), "delay")
     run = Identification(
         experiment=experiment,
         estimate=estimate,
         extras=fit.extras,
         noise=ready.noise,
         motion_noise=fit.assembly.noise,
-        misfit=misfit(estimate, ready.noise, blocks, fit.scatter, unfitted_friction(problem, experiment.robot)),
+        misfit=misfit(estimate, ready.noise, blocks, fit.scatter, unfitted_friction(problem, experiment.robot), delay),
         resting=resting_joints(problem, experiment.robot, builder, logs["train"]),
         at_rest=[name for name in LOG_SETS if is_at_rest(logs[name])],
         robust=solved.robust,
@@ -343,11 +345,9 @@ def _by_state(fitter: LogFitter, parts: Sequence[Part]) -> dict[str, Estimate]:
     samples = Counter[ContactState]()
     for part in parts:
         samples[part.state] += part.samples
-    out = {}
-    for state, _ in samples.most_common():
-        problem = fitter.assemble([part for part in parts if part.state == state]).problem
-        out[state_name(fitter.builder.contacts, state)] = fitter.least_squares.solve(problem)
-    return out
+    by_state = {state: [part for part in parts if part.state == state] for state, _ in samples.most_common()}
+    problems = {state_name(fitter.builder.contacts, x): fitter.assemble(own).problem for x, own in by_state.items()}
+    return {name: fitter.least_squares.solve(problem) for name, problem in problems.items()}
 
 
 def _contributions(

@@ -263,7 +263,7 @@ def check_read(logs: Mapping[str, Sequence[Samples]]) -> None:
     train = logs.get("train", ())
     bolted = [log for log in train if log.base.specific_force is None and log.resting is not None]
     if train and len(bolted) == len(train) and all(bool(x.resting.all()) for x in bolted if x.resting is not None):
-        found = "true, but all joints are at rest, or within 1/cutoff of it, throughout: no torque counts as measured"
+        found = "true, but all joints are at rest, or too near to it for the filter, throughout"
         raise LogError(train[0].source, "actuators.stiction", found, "logs whose joints move, or false")
     parts = {key: [split_range(log.source) for log in of_key] for key, of_key in logs.items()}
     spans = {split_range(log.source): log.time[[0, -1]].tolist() for of_key in logs.values() for log in of_key}

@@ -289,6 +289,7 @@ def _misfit_document(misfit: Misfit) -> dict[str, object]:
         "expected_residual_std": misfit.expected,
         "lack_of_fit": misfit.lack_of_fit,
         "standard_error_growth": misfit.error_growth,
+        "unfitted_delay": misfit.delay.value if misfit.delay is not None and misfit.delay.significant else None,
         "unfitted_friction": None if misfit.friction is None else misfit.friction.ratio,
     }
 

@@ -95,6 +95,7 @@ class _State:
     base_singular_value: NotNegative | None
     base_full_share: NotNegative | None
     base_rank_shares: dict[int, NotNegative]
+    mean_rows: NotNegative | None = None
 
 
 @dataclass(config=STRICT, frozen=True)

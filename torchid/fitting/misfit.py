@@ -13,6 +13,7 @@ from scipy.special import chdtri
 
 from torchid.estimators import Estimate
 from torchid.estimators.least_squares import residual_std
+from torchid.fitting.delay import UnfittedDelay
 from torchid.fitting.noise import GroupNoise, NoiseSummary
 from torchid.identifiability.block_scatter import BlockScatter
 from torchid.logs.sign_filter import OFTEN, resting_share
@@ -51,6 +52,7 @@ class Misfit:
             that by noise, None likewise.
         groups: of readings and base rows that exceed their noise most.
         friction: that was not fitted, None where all of it was.
+        delay: of joint torques that was not fitted, None where it was, or nothing tells.
         share: residual over that of the nominal parameters, None where these leave nothing.
     """
 
@@ -61,6 +63,7 @@ class Misfit:
     groups: tuple[GroupNoise, ...]
     friction: UnfittedFriction | None = None
     share: float | None = None
+    delay: UnfittedDelay | None = None
 
     @property
     def alike(self) -> bool:
@@ -77,7 +80,11 @@ class Misfit:
     def explained(self) -> bool:
         """Whether noise may be all that the model leaves."""
         much = self.expected is not None and self.residual > _MUCH * self.expected
-        return not (much or self.alike or (self.friction is not None and self.friction.significant))
+        return not (much or self.alike or any(one is not None and one.significant for one in self._unfitted))
+
+    @property
+    def _unfitted(self) -> tuple[UnfittedFriction | UnfittedDelay | None, ...]:
+        return self.friction, self.delay
 
     def _reasons(self) -> list[str]:
         """Why noise cannot be all that the model leaves, none where it may be."""
@@ -88,8 +95,7 @@ class Misfit:
             reasons.append(
                 f"residuals are correlated in time, between blocks {self.lack_of_fit:.2g} times noise's variance"
             )
-        if self.friction is not None and self.friction.significant:
-            reasons.append(str(self.friction))
+        reasons += [str(one) for one in self._unfitted if one is not None and one.significant]
         return reasons
 
     @property
@@ -119,6 +125,7 @@ def misfit(
     logs: Sequence[Block],
     scatter: BlockScatter | None,
     friction: UnfittedFriction | None,
+    delay: UnfittedDelay | None = None,
 ) -> Misfit:
     """What a fit leaves of the forces.
 
@@ -128,6 +135,7 @@ def misfit(
         logs: these logs.
         scatter: of the estimate between blocks of them.
         friction: that was not fitted.
+        delay: of joint torques that was not fitted.
     """
     left = np.average([log.noise_left for log in logs], weights=[len(log) for log in logs])
     stated = any(one.origin == "stated" for one in noise.groups)
@@ -145,6 +153,7 @@ def misfit(
         groups=tuple(sorted(beyond, key=lambda one: -excess[one.group])),
         friction=friction,
         share=float(np.sqrt(estimate.cost / estimate.nominal_cost)) if estimate.nominal_cost > 0.0 else None,
+        delay=delay,
     )
 
 
@@ -289,6 +298,12 @@ def unfitted_friction(problem: LinearProblem, robot: Robot) -> UnfittedFriction 
 
 
 _MOST_SAMPLES = 50_000  # evenly spaced
+
+
+def unmeasured_at_rest(logs: Sequence[Samples]) -> float | None:
+    """Share of the joint torques of some logs that count as unmeasured, as joints rest; None where none does."""
+    flags = [log.resting for log in logs if log.resting is not None and log.resting.numel()]
+    return float(sum(one.sum() for one in flags)) / sum(one.numel() for one in flags) if flags else None
 
 
 def resting_joints(

@@ -19,6 +19,7 @@ from torchid.parameters import PARAMETERS, PER_BODY, Array
 from torchid.problem import LinearProblem, RowBuilder, Samples
 from torchid.problem.chunks import chunks_by_state, one_thread, subsample_states
 from torchid.problem.contact_state import ContactState, state_name
+from torchid.problem.predict import null_space_components
 from torchid.rounding import RANK_TOLERANCE, is_significant, numerical_rank
 from torchid.sensing import Contact
 from torchid.sensing.projection import base_rank, base_singular_values
@@ -261,6 +262,8 @@ class StateReport:
         base_singular_value: median of its smallest singular value; near 0, base accelerations are nearly lost.
         base_full_share: share of the samples at rank 6.
         base_rank_shares: share at each rank that occurs, descending.
+        mean_rows: equations per sample, on average, where torques of joints at rest count as unmeasured; else None. The
+            base is judged as if no joint rested.
     """
 
     name: str
@@ -270,6 +273,7 @@ class StateReport:
     base_singular_value: float | None
     base_full_share: float | None = None
     base_rank_shares: dict[int, float] = field(default_factory=dict)
+    mean_rows: float | None = None
 
 
 @one_thread()
@@ -281,18 +285,24 @@ def state_reports(logs: Sequence[Samples], builder: RowBuilder) -> list[StateRep
         every = torch.arange(len(samples))
         for state, index in chunks_by_state(samples):
             counts[state] += len(every[index])
-    rows, values, weights = (
+    rows, left, values, weights = (
         Counter[ContactState](),
+        defaultdict[ContactState, float](float),
         defaultdict[ContactState, list[Tensor]](list),
         defaultdict[ContactState, list[Tensor]](list),
     )
     for samples, state, weight in subsample_states(logs, _CHECKED):
-        for _, V in builder.null_space_bases(state, builder.kinematics(samples.to(builder.device))):
+        kinematics = builder.kinematics(samples.to(builder.device))
+        if samples.resting is not None:
+            nothing = kinematics.screw_axes.new_zeros(1, len(samples), builder.tree.n_rows)
+            for inside in null_space_components(builder, state, kinematics, nothing):
+                left[state] += weight * float(torch.isfinite(inside).sum())
+        for _, V in builder.null_space_bases(state, kinematics):
             rows[state] = max(rows[state], V.shape[2] + len(builder.layout(state).uncoupled_joints))
             if builder.tree.base_rows:
                 values[state].append(base_singular_values(V).cpu())
                 weights[state].append(torch.full((len(V),), weight))
-    return [
+    reports = [
         StateReport(
             state_name(builder.contacts, state),
             count,
@@ -301,6 +311,8 @@ def state_reports(logs: Sequence[Samples], builder: RowBuilder) -> list[StateRep
         )
         for state, count in counts.most_common()
     ]
+    means = (left[state] / count if state in left else None for state, count in counts.most_common())
+    return [replace(report, mean_rows=mean) for report, mean in zip(reports, means, strict=True)]
 
 
 def require_base(reports: Sequence[StateReport], on_base_lost: str = "error", contacts: Sequence[Contact] = ()) -> None:
@@ -356,7 +368,9 @@ def _merged(same: Sequence[StateReport]) -> StateReport:
     ranks = dict(sorted(shares.items(), reverse=True))
     values = sorted((report.base_singular_value or 0.0, report.samples) for report in same)
     middle = sum(below <= samples / 2 for below in accumulate(count for _, count in values))
-    merged = replace(same[0], samples=samples, rows=max(report.rows for report in same))
+    means = [(one.samples / samples, one.mean_rows) for one in same]
+    mean_rows = sum(share * mean for share, mean in means if mean is not None) if means[0][1] is not None else None
+    merged = replace(same[0], samples=samples, rows=max(report.rows for report in same), mean_rows=mean_rows)
     if not ranks:
         return merged
     return replace(

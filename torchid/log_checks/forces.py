@@ -11,6 +11,7 @@ import torch
 
 from torchid.errors import InputError, join_names
 from torchid.log_checks.deviation import Trial
+from torchid.log_checks.drift import check_torque_drift
 from torchid.log_checks.encoders import check_encoders, is_bolted_arm
 from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, UNEXPLAINED, Finding, Skipped, refused
 from torchid.log_checks.lag_and_tilt import check_lag_and_tilt, check_torque_offsets, without_lag
@@ -163,7 +164,7 @@ def _misfit_findings(
     yield from torques
     if not any(isinstance(item, Finding) for item in torques):
         scaled = list(_gain_and_point_findings(log, fit_torque_gains(samples, model), robot))
-        yield from scaled or check_torque_offsets(trial)
+        yield from scaled or list(check_torque_offsets(trial)) or check_torque_drift(trial)
 
 
 def _is_mostly_friction(stated: ModelFit, without: ModelFit) -> bool:

@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 
 from torchid.logs.log import BoolArray, FloatArray, Log
-from torchid.logs.low_pass import LowPass
+from torchid.logs.low_pass import LowPass, import_signal
 from torchid.logs.sign_filter import mean_dry, mean_stribeck, noisy_width
 from torchid.logs.timeline import Timeline
 
 #: Values that are filtered together: few, so that copies of a long log are small; many, so that a short one needs few
 #: calls.
 _VALUES_TOGETHER = 2**14
+_ROUNDING = 1e-9  # share of a weight
 
 
 def channels_together(count: int) -> int:
@@ -71,14 +72,30 @@ def _directions(known: FloatArray, are_positions: bool, timeline: Timeline, low_
 
 
 def _rests(known: FloatArray, are_positions: bool, speed: FloatArray, timeline: Timeline) -> BoolArray:
-    """Which joints, (K, n), are no faster than `speed` (n,) within the filter's reach of a stamp.
+    """Which joints, (K, n), are no faster than `speed` (n,) at a stamp, or in too much of what a filter mixes there.
 
-    The filter mixes what holds a joint at rest with friction of the motion before and after.
+    What holds a joint at rest is unknown, up to Coulomb friction either way. Of that the filter leaves the weight of
+    the samples at rest at most; as much as a pause weighs that ends its reach before the stamp counts as nothing.
     """
-    if not are_positions:
-        return timeline.widen_flags(np.abs(known) <= speed, of_grid=True)
-    slow = np.abs(np.diff(known, axis=0)) <= speed * np.diff(timeline.grid)[:, None]
-    return timeline.widen_flags(np.concatenate([slow[:1], slow]) | np.concatenate([slow, slow[-1:]]), of_grid=True)
+    if are_positions:
+        slow = np.abs(np.diff(known, axis=0)) <= speed * np.diff(timeline.grid)[:, None]
+        rests = np.concatenate([slow[:1], slow]) | np.concatenate([slow, slow[-1:]])
+    else:
+        rests = np.abs(known) <= speed
+    low_pass = timeline.low_pass
+    if low_pass is None:
+        return timeline.widen_flags(rests, of_grid=True)
+    weights = np.abs(low_pass.impulse_response)
+    steps = np.arange(len(weights)) - len(weights) // 2
+    accepted = weights[steps * float(np.median(np.diff(timeline.grid))) > timeline.reach].sum()
+    out = np.empty((len(timeline.output_stamps), rests.shape[1]), dtype=bool)
+    together = channels_together(len(rests))
+    for start in range(0, rests.shape[1], together):
+        own = slice(start, start + together)
+        at_rest = import_signal().fftconvolve(rests[:, own].astype(float), weights[:, None], mode="full", axes=0)
+        (share,) = timeline.evaluate(at_rest[len(weights) // 2 :][: len(rests)], (0,))
+        out[:, own] = share > (1.0 + _ROUNDING) * accepted
+    return out
 
 
 def dry_friction_by_setting(

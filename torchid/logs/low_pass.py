@@ -67,6 +67,14 @@ class LowPass:
         slowest = max(float(np.max(np.abs(np.roots(section[3:])))) for section in self.sections)
         return math.ceil(math.log(_SETTLED) / math.log(slowest))
 
+    @cached_property
+    def impulse_response(self) -> FloatArray:
+        """What is left of a sample of 1, before, at and after it, (M,) with that sample in the middle."""
+        reach = self.settling + self.padding
+        impulse = np.zeros(2 * reach + 1)
+        impulse[reach] = 1.0
+        return self(impulse[:, None])[:, 0]
+
     @property
     def noise_share(self) -> float:
         """Share of the power of white noise that passes: equivalent noise bandwidth over half the sample rate."""

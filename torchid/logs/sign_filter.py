@@ -181,9 +181,8 @@ def _error(low_pass: LowPass, values: FloatArray, correlation: FloatArray) -> fl
 
     `correlation`: of the noise with itself and with that of the next sample, summed over channels.
     """
-    impulse = np.zeros(2 * low_pass.padding + 2 * low_pass.settling + 1)
-    impulse[len(impulse) // 2] = 1.0
-    response = low_pass(impulse[:, None])[len(impulse) // 2 :, 0]
+    response = low_pass.impulse_response
+    response = response[len(response) // 2 :]
     lost = float(np.square(values - low_pass(values)).mean(axis=0).sum())
     return lost + 2.0 * float(response[0] * correlation[0] + 2.0 * response[1] * correlation[1])
 

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from rich.table import Table
 from rich.text import Text
 
-from torchid.errors import format_count
+from torchid.errors import format_count, format_percent
 from torchid.identifiability.base_parameters import BaseParameters, format_base_parameters, unobservable_parameters
 from torchid.identifiability.information import ExpectedErrors
 from torchid.problem import Metrics
@@ -175,6 +175,12 @@ def observability_table(title: str, states: Sequence[BaseObservability]) -> Tabl
         random = (f"{state.generic.rank} of 6", f"{state.generic.median:.2g}", f"{state.generic.low:.2g}")
         table.add_row(Text(state.name), *random, zero, *logs)
     return table
+
+
+def resting_message(share: float) -> str:
+    """What the logs lack of what ranks of the base count on: a share of the torques, of joints at rest."""
+    what = f"{format_percent(share)} % of the logs' torques count as unmeasured at rest (actuators.stiction)"
+    return f"{what}; the base is judged as if joints moved, errors are of the rows left"
 
 
 def describe_losses(states: Sequence[BaseObservability]) -> list[str]:

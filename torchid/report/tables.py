@@ -121,7 +121,7 @@ def state_table(states: Sequence[Mapping[str, Any]]) -> Table:
         table.add_row(
             Text(str(state["name"])),
             str(state["samples"]),
-            str(state["rows"]),
+            str(state["rows"]) if state["mean_rows"] is None else f"{state['mean_rows']:.2g} of {state['rows']}",
             "fixed base" if rank is None else f"{rank} of 6",
             _rank_share_cell(state),
             "" if smallest is None else f"{smallest:.2g}",

@@ -20,6 +20,7 @@ from torchid.report.analysis import (
     describe_singular_postures,
     observability_table,
     removal_table,
+    resting_message,
     sets_table,
 )
 from torchid.report.tables import print_tables, terminal_width
@@ -60,6 +61,8 @@ def print_analysis_tables(analysis: Analysis) -> None:
     print_rolling(analysis.scene.rolling)
     for scenario in analysis.scenarios:
         _print_scenario(scenario)
+    if analysis.resting is not None:
+        print_labelled("attention", resting_message(analysis.resting))
     if analysis.accuracies:
         print_tables(accuracy_table(analysis.accuracies))
         for message in confounded_messages(analysis.accuracies):
@@ -164,6 +167,8 @@ def _attention(analysis: Analysis, scenarios: Sequence[ScenarioAnalysis]) -> Ite
 
     for one in scenarios:
         yield from named(one, describe_losses(_judged_states(one)))
+    if analysis.resting is not None:
+        yield resting_message(analysis.resting)
     if analysis.scene.config.analysis.scenarios is None:
         for one in scenarios:
             found = analysis.accuracies.get("proposed" if one.proposed is not None else one.plan_label)
