@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from torchid.errors import InputError
-from torchid.estimators.nominal_spread import nominal_spread
+from torchid.estimators.posterior import nominal_spread
 from torchid.parameters import Array
 from torchid.problem import LinearProblem
 from torchid.problem.chunks import one_thread
