@@ -26,7 +26,7 @@ from torchid.commands.cache_entries import NOT_IN_SAMPLES, content_of_scene, fac
 from torchid.commands.reading import LogReader
 from torchid.config import load_config
 from torchid.config.experiment import ActuatorsConfig
-from torchid.config.preprocessing import PreprocessingConfig
+from torchid.config.log_reading import PreprocessingConfig
 from torchid.config.robot import ContactConfig, NoiseConfig, RobotConfig
 from torchid.errors import TorchidWarning
 from torchid.fitting.experiment import set_up, with_noise

@@ -14,9 +14,8 @@ import numpy as np
 from torchid.commands.folder import check_free_file
 from torchid.commands.reading import memory_needed, scene_of_log, settle_contacts
 from torchid.config import load_analysis
+from torchid.config.log_reading import PreprocessingConfig, load_columns, load_topics
 from torchid.config.logs import LogsConfig
-from torchid.config.maps import load_columns, load_topics
-from torchid.config.preprocessing import PreprocessingConfig
 from torchid.config.robot import ContactConfig
 from torchid.errors import ConfigError, LogError, about_file, current_file, format_count
 from torchid.fitting.checked_settings import resolve_contacts

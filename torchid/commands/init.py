@@ -29,7 +29,7 @@ from torchid.commands.init_proposals import (
     without_rolling,
 )
 from torchid.commands.reading import memory_needed
-from torchid.config.preprocessing import PreprocessingConfig
+from torchid.config.log_reading import PreprocessingConfig
 from torchid.config.yaml_text import inline_yaml, yaml_lines
 from torchid.errors import ConfigError, InputError, LogError, about_file, excerpt, format_count, join_names
 from torchid.fitting.checked_settings import is_along_base

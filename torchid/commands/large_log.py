@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from torchid.commands.segmented_log import RecordedBlock, Segment, SegmentedLog, in_the_air, require_kept, row_numbers
-from torchid.config.preprocessing import PreprocessingConfig
+from torchid.config.log_reading import PreprocessingConfig
 from torchid.errors import LogError, about_file
 from torchid.logs import Columns, Log
 from torchid.logs.blocks import GIGABYTE, LogBlocks, bridge_in_blocks, count_samples_from, open_log_blocks
