@@ -45,8 +45,8 @@ from torchid.problem.chunks import one_thread
 from torchid.problem.compressed_log import Block, fold_compressed, merge_blocks
 from torchid.problem.compression import Part, compress_in_blocks, merge_folds, merge_states, split_into_folds
 from torchid.problem.contact_state import ContactState, state_name
-from torchid.problem.excitation import is_at_rest
 from torchid.problem.metrics import LOG_SETS
+from torchid.problem.motion_noise import is_at_rest
 from torchid.report.tables import progress_bars
 
 

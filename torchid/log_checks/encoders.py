@@ -40,7 +40,7 @@ from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.segments import with_delayed_torques
 from torchid.logs.signal_noise import rough_noise
 from torchid.problem import RowBuilder, Samples, bind_log
-from torchid.problem.excitation import MIN_MOTION
+from torchid.problem.motion_noise import MIN_MOTION
 from torchid.problem.predict import force_series
 from torchid.robot import Robot
 from torchid.robot.urdf import position_limits
