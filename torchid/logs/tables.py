@@ -16,7 +16,18 @@ from torchid.errors import LogError, excerpt, format_count, join_names, warn_abo
 from torchid.guards import MAX_COLUMNS
 from torchid.logs.column_entries import FRACTIONS, KEY
 from torchid.logs.column_map import Columns
-from torchid.logs.columns import TEXT_COLUMN, TableLayout, check_header, parse_header, to_columns
+from torchid.logs.columns import (
+    TEXT_COLUMN,
+    TableLayout,
+    check_header,
+    column_values,
+    is_number,
+    is_stamp,
+    parse_header,
+    text_or_flags,
+    to_columns,
+    to_numbers,
+)
 from torchid.logs.containers import atomic_output, reader_errors_explained
 from torchid.logs.log import field_shape
 from torchid.logs.mapped_fields import MappedFields, map_table
@@ -31,7 +42,6 @@ from torchid.logs.table_files import (
     whole_table,
     write_table,
 )
-from torchid.logs.table_values import column_values, is_number, is_stamp, text_or_flags, to_numbers
 from torchid.logs.units import IN_DEGREES, quantities_of
 
 _Layout = TableLayout | MappedFields  # which columns a table's fields come from
