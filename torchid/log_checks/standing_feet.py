@@ -28,8 +28,8 @@ from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.quaternion import rotate_to_world
 from torchid.logs.units import advise_units, units_of_ratio
 from torchid.problem.base_motion import imu_pose
+from torchid.problem.floor_pose import rolled_distance
 from torchid.robot import Robot
-from torchid.robot.rolling import rolled_distance
 from torchid.sensing import Contact
 
 #: Motion of standing feet over that of the base above them. Soft soles and rolling feet have 0.05 to 0.2.
