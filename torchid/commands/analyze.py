@@ -19,14 +19,14 @@ from torchid.commands.folder import ANALYSIS, check_free, new_folder, write_json
 from torchid.commands.reading import LogReader, check_read
 from torchid.commands.sensor_set_accuracy import accuracies
 from torchid.config import AnalyzeConfig, dump_config, inputs_of
-from torchid.copies import can_copy, in_copies
 from torchid.errors import ConfigError, SensorError, UnknownNameError, during, join_names, warn
 from torchid.fitting.experiment import Scene, set_up_scene, with_noise
 from torchid.fitting.misfit import unmeasured_at_rest
 from torchid.identifiability.base_parameters import BaseParameters, base_parameters
+from torchid.parallel import can_copy, in_copies, one_thread, thread_count
 from torchid.parameters import WRENCH_COMPONENTS
 from torchid.problem import Samples
-from torchid.problem.chunks import chunks_by_state, one_thread, thread_count
+from torchid.problem.chunks import chunks_by_state
 from torchid.problem.contact_state import ContactState
 from torchid.problem.elimination import free_parameters
 from torchid.problem.linear import parameter_scale

@@ -32,10 +32,9 @@ from torchid.fitting.separable import (
 )
 from torchid.logs import Log
 from torchid.logs.cutoff import CutoffChoice, choose_cutoff
-from torchid.logs.dry_friction import dry_friction_by_setting
+from torchid.logs.dry_friction import dry_friction_by_setting, with_sign_filter
 from torchid.logs.log import FloatArray
 from torchid.logs.preprocess import lacks_derivatives, make_timeline
-from torchid.logs.sign_filter import with_sign_filter
 from torchid.logs.signal_noise import SignalNoise
 from torchid.logs.timeline import LOSSLESS_RATE
 from torchid.problem import ExtraTerms, RowBuilder, Samples

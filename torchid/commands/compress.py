@@ -27,8 +27,8 @@ from torchid.identifiability.base_parameters import StateReport, merge_state_rep
 from torchid.logs.containers import FACTORS, log_files
 from torchid.logs.remote import is_url
 from torchid.logs.time_range import log_title, split_range
+from torchid.parallel import one_thread
 from torchid.problem import Samples
-from torchid.problem.chunks import one_thread
 from torchid.problem.compressed_log import compress_log
 from torchid.problem.sampled_rows import LogElsewhere
 from torchid.report.tables import progress_bars

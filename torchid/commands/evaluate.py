@@ -27,9 +27,9 @@ from torchid.fitting.cross_validation import Scorer
 from torchid.fitting.experiment import Experiment, require_device, set_up, with_estimated_noise
 from torchid.guards import MAX_JSON, MAX_YAML, read_bytes
 from torchid.logs.time_range import log_title, split_range
+from torchid.parallel import one_thread
 from torchid.parameters import Array
 from torchid.problem import Evaluation, Metrics, Samples
-from torchid.problem.chunks import one_thread
 from torchid.problem.contact_state import state_name
 from torchid.problem.metrics import DECISIVE_GROUPS, WHITENED, describe_errors, group_name
 from torchid.problem.motion_noise import is_at_rest

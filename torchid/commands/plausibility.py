@@ -15,7 +15,6 @@ from torchid.commands.check import LogSegment, segments_to_check
 from torchid.commands.reading import scene_of_log, settle_contacts
 from torchid.commands.results import Identification
 from torchid.config.logs import LogsConfig
-from torchid.copies import can_copy, share_between_copies
 from torchid.errors import (
     ImplausibleFitError,
     InputError,
@@ -34,9 +33,9 @@ from torchid.log_checks.check import check
 from torchid.log_checks.findings import SEVERITIES
 from torchid.log_checks.lag_and_tilt import check_tilt
 from torchid.log_checks.model import NominalModel
+from torchid.parallel import can_copy, one_thread, share_between_copies, thread_count
 from torchid.parameters import GRAVITY, PARAMETERS, PER_BODY, Array
 from torchid.problem import LinearProblem, Samples
-from torchid.problem.chunks import one_thread, thread_count
 from torchid.problem.metrics import ADVICE, Metrics, WorseThanNominal, describe_worse
 from torchid.robot import Robot
 from torchid.rounding import is_significant

@@ -8,14 +8,13 @@ from functools import partial
 
 from torchid import ranks
 from torchid.commands.plausibility import TrainingLogs, require_plausible
-from torchid.copies import share_between_copies
 from torchid.errors import ImplausibleFitError, LogError, warn
 from torchid.fitting.calibration import Calibration, list_confounded
 from torchid.fitting.experiment import Scene, batch_estimator
 from torchid.identifiability.information import error_directions, expected_errors
+from torchid.parallel import share_between_copies, thread_count
 from torchid.parameters import Array
 from torchid.problem import Evaluation, ExtraTerms, RowBuilder, Samples, assemble, compress_parts
-from torchid.problem.chunks import thread_count
 from torchid.problem.compression import split_into_folds
 from torchid.problem.elimination import Assembly
 from torchid.problem.samples import require_forces

@@ -12,9 +12,9 @@ import torch
 
 from torchid.errors import InputError
 from torchid.estimators.posterior import nominal_spread
+from torchid.parallel import one_thread
 from torchid.parameters import Array
 from torchid.problem import LinearProblem
-from torchid.problem.chunks import one_thread
 from torchid.reprs import short_repr
 from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, numerical_rank
 from torchid.settings import NotNegative, Tolerance, validate_settings

@@ -12,9 +12,9 @@ from torchid import parameters
 from torchid.estimators.conditions import Conditions
 from torchid.estimators.conic_formulation import build_conic_problem
 from torchid.estimators.conic_problem import ConicProblem
+from torchid.parallel import one_thread
 from torchid.parameters import FRICTION, INERTIAL, PER_BODY, Array
 from torchid.problem import LinearProblem
-from torchid.problem.chunks import one_thread
 from torchid.problem.elimination import eliminate_columns
 from torchid.reprs import short_repr
 from torchid.rounding import RANK_TOLERANCE, is_significant

@@ -13,9 +13,9 @@ from torchid.estimators.conditions import Conditions
 from torchid.estimators.conic_formulation import Prior, build_conic_problem
 from torchid.estimators.conic_problem import SEARCH_RADIUS, ConicProblem, Solution
 from torchid.estimators.least_squares import residual_std
+from torchid.parallel import one_thread
 from torchid.parameters import Array
 from torchid.problem import LinearProblem
-from torchid.problem.chunks import one_thread
 
 _RIDGES = 10.0 ** -np.arange(0.0, 15.0, 2.0)  # relative to the least misfit without conditions, or to the floor
 _SETTLED = 1e-5  # relative change of the misfit, with a hundredth of the ridge, at which the path has converged

@@ -12,9 +12,9 @@ from torchid.config.estimator import EstimatorConfig
 from torchid.errors import ConfigError, UnknownNameError, warn_about_file
 from torchid.estimators import Conditions, Enclosure, Mirror
 from torchid.identifiability.confounding import mass_weights
+from torchid.parallel import one_thread
 from torchid.parameters import PARAMETERS, PER_BODY, Array
 from torchid.problem import LinearProblem
-from torchid.problem.chunks import one_thread
 from torchid.robot import Robot, body_extents, mirror_pairs
 
 _FRICTION = PARAMETERS[parameters.FRICTION]

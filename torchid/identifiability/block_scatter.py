@@ -10,9 +10,9 @@ from scipy.special import ndtri, stdtrit  # scipy.stats takes 0.2 s to import
 
 from torchid.estimators.least_squares import residual_std
 from torchid.identifiability.confounding import ParameterCovariance, mass_weights
+from torchid.parallel import one_thread
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import RowBuilder
-from torchid.problem.chunks import one_thread
 from torchid.problem.compression import Part
 from torchid.problem.elimination import Assembly
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from torchid import parameters
 from torchid.estimators import Estimate
+from torchid.parallel import one_thread
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, RowBuilder
-from torchid.problem.chunks import one_thread
 from torchid.problem.compression import Part, merge_factors
 from torchid.problem.elimination import Assembly, Elimination
 from torchid.problem.extras import Extra

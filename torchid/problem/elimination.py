@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from torchid import parameters
+from torchid.parallel import one_thread
 from torchid.parameters import PER_BODY, Array
-from torchid.problem.chunks import one_thread
 from torchid.problem.compression import Part, merge_factors
 from torchid.problem.eliminated_terms import EliminatedTerms, SignCondition
 from torchid.problem.extras import Extra

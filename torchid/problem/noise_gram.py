@@ -24,9 +24,10 @@ from torch import Tensor
 
 from torchid import ranks
 from torchid.errors import format_percent
+from torchid.parallel import one_thread
 from torchid.parameters import Array
 from torchid.problem.blocks import span_of_samples
-from torchid.problem.chunks import ProgressCallback, chunk_size, map_chunks, one_thread
+from torchid.problem.chunks import ProgressCallback, chunk_size, map_chunks
 from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import TriangularFactor, gram_matrix
 from torchid.problem.motion_noise import with_noise_alone

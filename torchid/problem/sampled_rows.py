@@ -15,8 +15,9 @@ from scipy.special import chdtri, ndtr
 from torch import Tensor
 
 from torchid import ranks
+from torchid.parallel import map_in_workers, one_thread
 from torchid.parameters import Array
-from torchid.problem.chunks import chunks_by_state, map_in_workers, one_thread, worker_count
+from torchid.problem.chunks import chunks_by_state, worker_count
 from torchid.problem.compression import Part
 from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import TriangularFactor
