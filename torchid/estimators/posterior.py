@@ -127,8 +127,8 @@ def whitened_rows(
     """
     noise = max(noise, _LEAST_NOISE * float(np.linalg.norm(problem.b)) / max(problem.rows, 1) ** 0.5, 1e-300)
     covariance = noise**2 * np.eye(len(problem.b))
-    if problem.held is not None:
-        covariance += problem.held @ problem.held.T
+    if problem.shrinkage is not None:
+        covariance += problem.shrinkage @ problem.shrinkage.T
     L = np.linalg.cholesky(covariance)
     A = scipy.linalg.solve_triangular(L, problem.A, lower=True)
     b = scipy.linalg.solve_triangular(L, problem.b, lower=True)

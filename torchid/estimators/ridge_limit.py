@@ -217,7 +217,9 @@ class _EqualityProblem:
         misfit = plain.objective(start + step)
         nothing = np.zeros((0, len(path.problem.nominal)))
         terms = None if path.problem.terms is None else path.problem.terms.without_rows()
-        without_data = replace(path.problem, A=nothing, b=np.zeros(0), residual=0.0, rows=1, held=None, terms=terms)
+        without_data = replace(
+            path.problem, A=nothing, b=np.zeros(0), residual=0.0, rows=1, shrinkage=None, terms=terms
+        )
         alone = build_conic_problem(without_data, path.conditions, 1.0, path.prior)
         rows = basis.T @ alone.deviations
         size = np.linalg.norm(rows, axis=1)

@@ -255,11 +255,15 @@ def with_known_masses(
         more[:, free] = weights[:, None] * equations / scale
         rows = np.concatenate([rows, more])
         values = np.append(values, weights * missing + more @ problem.nominal)
-    held = problem.held
-    if held is not None:
-        held = np.concatenate([held, np.zeros((len(rows), held.shape[1]))])
+    shrinkage = problem.shrinkage
+    if shrinkage is not None:
+        shrinkage = np.concatenate([shrinkage, np.zeros((len(rows), shrinkage.shape[1]))])
     return replace(
-        problem, A=np.concatenate([A, rows]), b=np.append(b, values), rows=problem.rows + len(values), held=held
+        problem,
+        A=np.concatenate([A, rows]),
+        b=np.append(b, values),
+        rows=problem.rows + len(values),
+        shrinkage=shrinkage,
     )
 
 

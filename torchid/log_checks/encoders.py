@@ -16,7 +16,7 @@ from torchid.log_checks.deviation import (
     COMPARED_SAMPLES,
     Deviation,
     DeviationRows,
-    Trial,
+    FilteredLog,
     UnknownColumns,
     fit_deviation,
 )
@@ -329,31 +329,31 @@ def fit_missing_gravity(samples: Sequence[Samples], model: NominalModel) -> Devi
     return fit_deviation(DeviationRows.of(samples, model), columns, _GRAVITY_PRIOR_STD)
 
 
-def check_encoders(trial: Trial, moved: list[Finding], unexplained: float) -> list[Finding]:
+def check_encoders(filtered: FilteredLog, moved: list[Finding], unexplained: float) -> list[Finding]:
     """Findings about a bolted arm's torques without gravity, zeros of encoders and joints that are reversed.
 
     Args:
-        trial: of the log.
+        filtered: the log.
         moved: findings about lags and tilts, which are returned where nothing here explains the forces better.
         unexplained: what the best URDF near the given one leaves of the forces, in `UNMODELLED_FORCE_SHARE`.
     """
-    model = trial.model
-    if not is_bolted_arm(model) or trial.log.joint_torque is None:
+    model = filtered.model
+    if not is_bolted_arm(model) or filtered.log.joint_torque is None:
         return moved
     try:
-        samples = bind_some_samples(trial.pieces, model.robot, (), TIME_SCALE_SAMPLES)
+        samples = bind_some_samples(filtered.pieces, model.robot, (), TIME_SCALE_SAMPLES)
         gravity = fit_missing_gravity(samples, model)
         if gravity is not None and gravity.is_clear and _ALL_OF_GRAVITY[0] < gravity.value[0] < _ALL_OF_GRAVITY[1]:
             return [_gravity_finding(gravity)]
         zeros = fit_zeros(samples, model)
         if zeros is not None and (found := list(_zero_findings(zeros, model))):
-            tilt = fit_tilt(trial) if any(one.name == "tilt" for one in moved) else None
+            tilt = fit_tilt(filtered) if any(one.name == "tilt" for one in moved) else None
             if tilt is None or zeros.left < _BETTER_THAN_A_TILT * tilt.left:
                 return [*(one for one in moved if one.name != "tilt"), *found]
             names = join_names([name for one in found for name in one.channels])
             also = f"; or the zero of {names}, which explains it as well"
             return [replace(one, advice=one.advice + also) if one.name == "tilt" else one for one in moved]
-        mistaken = None if moved else _reversed_joint(trial.pieces, model, unexplained)
+        mistaken = None if moved else _reversed_joint(filtered.pieces, model, unexplained)
     except InputError:  # reported by `check_forces_against_urdf`
         return moved
     return moved if mistaken is None else [mistaken]
