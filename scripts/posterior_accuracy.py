@@ -32,9 +32,9 @@ from torchid.estimators import Conditions
 from torchid.estimators.posterior import Posterior, whitened_rows
 from torchid.estimators.truncated_gaussian import TruncatedGaussian
 from torchid.identifiability.structure import structural_samples
+from torchid.parallel import one_thread
 from torchid.parameters import FRICTION, Array, perturb_parameters
 from torchid.problem import RowBuilder, compress, linear_problem
-from torchid.problem.chunks import one_thread
 from torchid.robot import load_robot
 from torchid.sensing import Contact, named_sensors
 

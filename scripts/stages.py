@@ -16,9 +16,10 @@ import torch
 from rich.table import Table
 
 from torchid import parameters
+from torchid.parallel import one_thread
 from torchid.problem import RowBuilder, Samples, compress
 from torchid.problem.chunk_dynamics import Workspace
-from torchid.problem.chunks import chunk_size, chunks_by_state, one_thread
+from torchid.problem.chunks import chunk_size, chunks_by_state
 from torchid.problem.contact_state import ContactState
 
 STAGES = ("kinematics, wrench columns", "null space W", "projection to rows", "factorization")

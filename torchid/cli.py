@@ -12,8 +12,8 @@ from typing import Any, NoReturn, TypeAlias
 from torchid import __version__
 from torchid.boundary import importing, plain_streams, run_guarded, run_in_ranks
 from torchid.commands import EXPORT_FORMATS, SAMPLE_FORMATS
-from torchid.copies import copies_allowed
 from torchid.errors import ConfigError, during
+from torchid.parallel import copies_allowed
 from torchid.ranks import end_process, is_launched_first, share_work
 
 _IDENTIFY = "fit a robot to the logs of an experiment file and write a run folder"

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from torchid.commands.cache import Cache, content_key
-from torchid.copies import copies_allowed
 from torchid.errors import TorchidWarning
+from torchid.parallel import copies_allowed
 
 
 def arrays_of(megabytes: float) -> dict[str, np.ndarray]:

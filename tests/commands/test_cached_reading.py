@@ -37,11 +37,11 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def read_with(kind: type[LogReader], file: Path, *more: str) -> Samples:
     """Samples of the training log."""
-    scene = set_up(load_config(file, more))
-    cache = open_cache(scene)
+    setup = set_up(load_config(file, more))
+    cache = open_cache(setup)
     assert cache is not None
-    reader = CachedReader(scene, cache) if kind is CachedReader else kind(scene)
-    (samples,) = reader.read(scene.config.logs.train, scene.sensors)
+    reader = CachedReader(setup, cache) if kind is CachedReader else kind(setup)
+    (samples,) = reader.read(setup.config.logs.train, setup.sensors)
     return samples
 
 
@@ -59,12 +59,12 @@ def read_twice(file: Path, *more: str) -> list[tuple[list[str], dict[str, int], 
     """What is said, what is excluded and how many samples there are, when logs are read without a cache, then twice."""
     out = []
     for cached in (False, True, True):
-        scene = set_up(load_config(file, more))
-        cache = open_cache(scene)
+        setup = set_up(load_config(file, more))
+        cache = open_cache(setup)
         assert cache is not None
-        reader = CachedReader(scene, cache) if cached else LogReader(scene)
+        reader = CachedReader(setup, cache) if cached else LogReader(setup)
         with pytest.warns(TorchidWarning) as said:
-            logs = reader.read(scene.config.logs.train, scene.sensors)
+            logs = reader.read(setup.config.logs.train, setup.sensors)
         out.append(([str(x.message) for x in said], dict(reader.excluded), sum(map(len, logs))))
     return out
 
@@ -105,10 +105,10 @@ def test_a_sensor_that_was_not_recorded_is_missed_as_without_a_cache(
     fields = recorded(1_000)
     del fields["contact_wrench_local"]
     file = experiment(tmp_path, fields)
-    scene = set_up(load_config(file, (*overrides({}), f"output={tmp_path / 'run'}")))
-    cache = open_cache(scene)
+    setup = set_up(load_config(file, (*overrides({}), f"output={tmp_path / 'run'}")))
+    cache = open_cache(setup)
     assert cache is not None
-    CachedReader(scene, cache).read(scene.config.logs.train, scene.sensors)
+    CachedReader(setup, cache).read(setup.config.logs.train, setup.sensors)
     assert keys_in(tmp_path)
     complaints = []
     for more in ((), (NONE,)):
@@ -120,14 +120,14 @@ def test_a_sensor_that_was_not_recorded_is_missed_as_without_a_cache(
 
 def test_entries_with_something_else_in_them_are_dropped(demo: Path, tmp_path: Path) -> None:
     """As another program could write them, with all checksums."""
-    scene = set_up(load_config(demo, (f"output={tmp_path / 'run'}",)))
-    cache = open_cache(scene)
+    setup = set_up(load_config(demo, (f"output={tmp_path / 'run'}",)))
+    cache = open_cache(setup)
     assert cache is not None
-    CachedReader(scene, cache).read(scene.config.logs.train, scene.sensors)
+    CachedReader(setup, cache).read(setup.config.logs.train, setup.sensors)
     (key,) = keys_in(tmp_path)
     for document, arrays in (({}, {}), ({"axes": {"time": [0]}}, {"time": np.zeros((2, 2))}), ({"axes": 3}, {})):
         shutil.rmtree(cache.folder / key)
         assert cache.save(key, document, arrays)
         with pytest.warns(TorchidWarning, match="a damaged entry"):
-            (log,) = CachedReader(scene, cache).read(scene.config.logs.train, scene.sensors)
+            (log,) = CachedReader(setup, cache).read(setup.config.logs.train, setup.sensors)
         assert len(log) == 250

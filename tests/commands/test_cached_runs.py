@@ -22,11 +22,11 @@ from trainings import trust_new_files
 
 from torchid.cli import main
 from torchid.commands.cache import FOLDER, content_key
-from torchid.commands.cache_entries import NOT_IN_SAMPLES, content_of_scene, factors_key
+from torchid.commands.cache_entries import NOT_IN_SAMPLES, content_of_setup, factors_key
 from torchid.commands.reading import LogReader
 from torchid.config import load_config
 from torchid.config.experiment import ActuatorsConfig
-from torchid.config.preprocessing import PreprocessingConfig
+from torchid.config.log_reading import PreprocessingConfig
 from torchid.config.robot import ContactConfig, NoiseConfig, RobotConfig
 from torchid.errors import TorchidWarning
 from torchid.fitting.experiment import set_up, with_noise
@@ -131,7 +131,7 @@ CHANGED = {
 
 
 def content(file: Path, *more: str) -> str:
-    return content_key(content_of_scene(set_up(load_config(file, more))))
+    return content_key(content_of_setup(set_up(load_config(file, more))))
 
 
 @pytest.mark.parametrize("name", [one.name for one in fields(PreprocessingConfig)])
@@ -201,11 +201,11 @@ def test_offsets_of_contacts_need_samples_of_another_name(demo: Path) -> None:
 
 def test_noise_sensors_extras_and_folds_change_the_name_of_factors(demo: Path, tmp_path: Path) -> None:
     def key(*more: str) -> str:
-        scene = set_up(load_config(demo, (f"output={tmp_path / 'run'}", *more)))
-        logs = LogReader(scene).read(scene.config.logs.train, scene.sensors)
-        scene = with_noise(scene, NoiseSummary(scene.noise, [], {}, 0))
-        builder = scene.builder(scene.sensors)
-        return factors_key(scene, builder, ["samples"], split_into_folds(logs, builder))
+        setup = set_up(load_config(demo, (f"output={tmp_path / 'run'}", *more)))
+        logs = LogReader(setup).read(setup.config.logs.train, setup.sensors)
+        setup = with_noise(setup, NoiseSummary(setup.noise, [], {}, 0))
+        builder = setup.builder(setup.sensors)
+        return factors_key(setup, builder, ["samples"], split_into_folds(logs, builder))
 
     same = key()
     assert key("estimator.ridge=3.0", "estimator.friction=false", "preprocessing.memory_gb=3") == same
@@ -225,7 +225,7 @@ def test_noise_sensors_extras_and_folds_change_the_name_of_factors(demo: Path, t
 
 def test_stated_noise_of_the_motion_and_joints_at_rest_change_the_name_of_samples(demo: Path, tmp_path: Path) -> None:
     def key(*more: str) -> str:
-        return content_key(content_of_scene(set_up(load_config(demo, (f"output={tmp_path / 'run'}", *more)))))
+        return content_key(content_of_setup(set_up(load_config(demo, (f"output={tmp_path / 'run'}", *more)))))
 
     names = [key(f"sensors.noise.{name}={x}") for name in STATED_FIELDS for x in (0.0, 0.1)]
     names.append(key("actuators.stiction=true"))

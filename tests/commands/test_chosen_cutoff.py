@@ -83,8 +83,8 @@ def test_logs_are_checked_before_a_cutoff_is_chosen_and_analyzed_with_it(tmp_pat
 
 
 def test_no_log_is_read_while_nobody_has_chosen() -> None:
-    scene = set_up(load_config(FILE, AUTO))
-    assert "auto, not yet chosen" in refused(lambda: LogReader(scene), "preprocessing.cutoff_hz", ConfigError)
+    setup = set_up(load_config(FILE, AUTO))
+    assert "auto, not yet chosen" in refused(lambda: LogReader(setup), "preprocessing.cutoff_hz", ConfigError)
 
 
 def test_other_words_are_refused() -> None:

@@ -307,9 +307,9 @@ def test_a_limb_sensor_is_planned_at_a_fixed_joint_only(experiment: Path, capsys
 
 @pytest.mark.parametrize("scope", ["log", "all"])
 def test_a_scope_alone_is_that_of_the_channels_that_are_measured(experiment: Path, scope: str) -> None:
-    scene = set_up(load_config(experiment / "quadruped.yaml", [f"sensors.offsets={scope}", f"sensors.scales={scope}"]))
-    extras = list_extras(scene.robot, scene.contacts, scene.sensors, scene.terms)
-    assert {x.name for x in extras} == set(scene.robot.joint_names)
+    setup = set_up(load_config(experiment / "quadruped.yaml", [f"sensors.offsets={scope}", f"sensors.scales={scope}"]))
+    extras = list_extras(setup.robot, setup.contacts, setup.sensors, setup.terms)
+    assert {x.name for x in extras} == set(setup.robot.joint_names)
 
 
 @pytest.mark.parametrize("command", ["identify", "analyze", "simulate"])

@@ -113,17 +113,17 @@ def test_a_urdf_with_stated_loops_is_the_same_robot(tmp_path: Path) -> None:
     (tmp_path / "leg.urdf").write_bytes(identified_urdf(w.robot, w.robot.nominal))
     frames, passive = list(w.robot.loops[0].frames), ["knee", "coup*"]
     file = experiment(tmp_path, w, urdf="leg.urdf", loops=[{"frames": frames, "max_gap": 0.001}], passive=passive)
-    scene = set_up(load_config(file))
-    assert scene.robot.loops == (Loop((frames[0], frames[1]), "point", 0.001),)
-    assert scene.robot.passive == w.robot.passive
-    assert scene.sensors.torque.all()
-    (tmp_path / "again.xml").write_bytes(mjcf_of_urdf(scene.robot, scene.robot.nominal, {}))
+    setup = set_up(load_config(file))
+    assert setup.robot.loops == (Loop((frames[0], frames[1]), "point", 0.001),)
+    assert setup.robot.passive == w.robot.passive
+    assert setup.sensors.torque.all()
+    (tmp_path / "again.xml").write_bytes(mjcf_of_urdf(setup.robot, setup.robot.nominal, {}))
     (loop,) = load_robot(tmp_path / "again.xml").loops
     assert loop.frames == (f"loop1 of {frames[0]}", f"loop1 of {frames[1]}")
     q = torch.from_numpy(w.log.joint_position)
-    one, other = (LoopClosures(robot).jacobian(q) for robot in (scene.robot, w.robot))
+    one, other = (LoopClosures(robot).jacobian(q) for robot in (setup.robot, w.robot))
     np.testing.assert_allclose(one, other, atol=1e-13)
-    (samples,) = LogReader(scene).read(scene.config.logs.train, scene.sensors)
+    (samples,) = LogReader(setup).read(setup.config.logs.train, setup.sensors)
     np.testing.assert_allclose(samples.joint_position, q, atol=1e-9)
 
 

@@ -53,8 +53,8 @@ def experiment(
 
 def samples_of(file: Path) -> Samples:
     """The samples of the training log."""
-    scene = set_up(load_config(file))
-    return LogReader(scene).read(scene.config.logs.train, scene.sensors)[0]
+    setup = set_up(load_config(file))
+    return LogReader(setup).read(setup.config.logs.train, setup.sensors)[0]
 
 
 def fit_of(run: Path) -> Any:

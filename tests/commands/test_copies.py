@@ -18,10 +18,10 @@ from demo import shortened_demo
 from random_samples import random_samples
 from synthetic import SOLO12, load
 
-from torchid import copies
+from torchid import parallel
 from torchid.cli import main
-from torchid.copies import Copy, copies_allowed, share_between_copies
 from torchid.fitting.robust import Reweighting, RobustLoss
+from torchid.parallel import Copy, copies_allowed, share_between_copies
 from torchid.problem import RowBuilder, chunks, compress_parts
 from torchid.problem.chunks import map_chunks
 from torchid.sensing import Contact, named_sensors
@@ -160,7 +160,7 @@ def test_a_figure_that_cannot_be_drawn_is_said_in_one_line(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("torchid.commands.run_figures.error_figure", fails)
-    monkeypatch.setattr(copies, "_allowed", True)
+    monkeypatch.setattr(parallel, "_allowed", True)
     settings, output = str(place / "demo" / "quadruped.yaml"), tmp_path / "run"
     assert main(["identify", settings, "estimator.ridge=0.1", f"output={output}", "--quiet"]) == 1
     *_, line = capsys.readouterr().err.splitlines()

@@ -171,8 +171,8 @@ def test_a_width_counts_where_logs_are_read_block_by_block_too() -> None:
 
     def directions(width: float | None, memory_gb: float) -> Array:
         settings = [f"actuators.sign_width={width or 'null'}", f"preprocessing.memory_gb={memory_gb}"]
-        scene = set_up(load_config(DEMO / "quadruped.yaml", settings))
-        (samples,) = LogReader(scene).read(scene.config.logs.train, scene.sensors)
+        setup = set_up(load_config(DEMO / "quadruped.yaml", settings))
+        (samples,) = LogReader(setup).read(setup.config.logs.train, setup.sensors)
         assert samples.direction is not None
         return samples.direction.numpy()
 
@@ -239,13 +239,13 @@ def test_outliers_do_not_move_the_offsets_of_a_new_log_where_fits_are_robust(run
     ["preprocessing.base_motion=contacts"], ["preprocessing.memory_gb=1e-6"],
 ])  # fmt: skip
 def test_logs_that_are_read_once_are_those_that_would_be_read_with_each_friction(settings: list[str]) -> None:
-    scene = set_up(load_config(DEMO / "quadruped.yaml", [*settings, "actuators.sign_width=auto"]))
-    reader = WidthReader(scene)
+    setup = set_up(load_config(DEMO / "quadruped.yaml", [*settings, "actuators.sign_width=auto"]))
+    reader = WidthReader(setup)
     for width, stribeck in ((0.1, None), (0.003, 0.2), (None, 0.05), (0.1, None)):
         own = f"actuators.sign_width={width or 'null'}", f"actuators.stribeck={stribeck or 'null'}"
         stated = load_config(DEMO / "quadruped.yaml", [*settings, *own])
-        (expected,) = LogReader(set_up(stated)).read(stated.logs.train, scene.sensors)
-        (samples,) = reader.logs(set_up(stated).terms, scene.sensors)
+        (expected,) = LogReader(set_up(stated)).read(stated.logs.train, setup.sensors)
+        (samples,) = reader.logs(set_up(stated).terms, setup.sensors)
         for name, there in vars(expected).items():
             found = getattr(samples, name)
             if isinstance(there, torch.Tensor):

@@ -17,7 +17,7 @@ from trainings import trust_new_files
 
 from torchid.cli import main
 from torchid.commands.cache import content_key
-from torchid.commands.cache_entries import content_of_scene
+from torchid.commands.cache_entries import content_of_setup
 from torchid.commands.reading import LogReader
 from torchid.config import dump_config, load_config
 from torchid.fitting.experiment import set_up
@@ -149,7 +149,7 @@ def test_the_map_is_part_of_the_name_of_cached_samples(tmp_path: Path, change: s
     file = experiment(tmp_path, MOTORS)
 
     def name(*overrides: str) -> str:
-        return content_key(content_of_scene(set_up(load_config(file, overrides))))
+        return content_key(content_of_setup(set_up(load_config(file, overrides))))
 
     assert name() == name()
     assert name(change) != name()
@@ -162,7 +162,7 @@ def test_the_order_of_names_in_a_map_is_part_of_the_name_of_cached_samples(tmp_p
         settings = yaml.safe_load(file.read_text())
         settings["logs"]["columns"]["contact_active"] = {"columns": {foot: f"c_{foot}" for foot in feet}}
         file.write_text(yaml.safe_dump(settings, sort_keys=False))
-        names.append(content_key(content_of_scene(set_up(load_config(file)))))
+        names.append(content_key(content_of_setup(set_up(load_config(file)))))
     assert names[0] != names[1]
 
 

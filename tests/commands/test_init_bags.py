@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation
 from synthetic import G1, ROBOTS, SOLO12
 
 from torchid.cli import main
-from torchid.commands.init import Initiated, init
+from torchid.commands.init import InitReport, init
 from torchid.commands.reading import LogReader
 from torchid.config import load_config
 from torchid.errors import ConfigError, LogError, UnknownNameError
@@ -47,7 +47,7 @@ COUNTS = np.random.default_rng(2).integers(10, 200, (40, 4))
 pytestmark = pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")  # of frames and of times of receipt
 
 
-def started(urdf: Path, bag: Path) -> tuple[Initiated, dict[str, Any], Log]:
+def started(urdf: Path, bag: Path) -> tuple[InitReport, dict[str, Any], Log]:
     """What was said, the topics of the new file, and the log that it reads."""
     target = bag.with_suffix(".yaml")
     target.unlink(missing_ok=True)

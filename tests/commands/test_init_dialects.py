@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from synthetic import ANYMAL, PANDA, ROBOTS, SOLO12
 
 from torchid.commands.check import recorded_segments
-from torchid.commands.init import Initiated, init
+from torchid.commands.init import InitReport, init
 from torchid.config import load_config
 from torchid.errors import LogError, TorchidWarning
 from torchid.logs import Log, read_log
@@ -36,7 +36,7 @@ def motion(joints: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarr
     return 0.4 * np.sin(turn), 0.4 * rate * np.cos(turn), rng.normal(size=(len(TIME), joints))
 
 
-def started(urdf: Path, log: Path) -> tuple[Initiated, Log, dict[str, Any]]:
+def started(urdf: Path, log: Path) -> tuple[InitReport, Log, dict[str, Any]]:
     """What init said, the log as it is read with what it wrote, and the map."""
     target = log.with_suffix(".yaml")
     said = init(urdf, log, target)

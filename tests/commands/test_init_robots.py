@@ -77,6 +77,6 @@ def test_balls_roll_where_the_log_says_where_the_ground_is(tmp_path: Path, orien
     names = {"joint_names": np.array(log.joint_names), "contact_names": np.array(log.contact_names)}
     np.savez(tmp_path / "log.npz", **arrays, **names)
     said = init(ROBOTS / MACHINES["hyq"][0], tmp_path / "log.npz", tmp_path / "new.yaml")
-    scene = set_up(load_config(tmp_path / "new.yaml"))
-    assert {bool(contact.radius) for contact in scene.contacts} == {oriented}
+    setup = set_up(load_config(tmp_path / "new.yaml"))
+    assert {bool(contact.radius) for contact in setup.contacts} == {oriented}
     assert ("radius 0, as no orientation" in str(said).replace("\n" + " " * 14, " ")) is not oriented

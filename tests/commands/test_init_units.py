@@ -13,7 +13,7 @@ from motions import value
 from repository import DEMO
 
 from torchid.cli import main
-from torchid.commands.init import Initiated, init
+from torchid.commands.init import InitReport, init
 from torchid.config import load_config
 from torchid.errors import LogError
 from torchid.fitting.experiment import set_up
@@ -124,7 +124,7 @@ def test_a_unit_that_nobody_knows_is_named(tmp_path: Path) -> None:
     assert "unit 'gon' of its columns is none of angle or length" in said[0]
 
 
-def without(log: Log, joints: tuple[str, ...], folder: Path) -> Initiated:
+def without(log: Log, joints: tuple[str, ...], folder: Path) -> InitReport:
     kept = tuple(name for name in log.joint_names if name not in joints)
     what = ("{} [deg]", "{} [mrad/s]", "{} [Ncm]")
     path = save_csv(folder / "x.csv", {"t": log.time, **with_units(log, kept, what)})

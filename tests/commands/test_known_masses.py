@@ -226,7 +226,7 @@ def test_a_known_mass_is_as_well_known_where_other_rows_are_mostly_noise_of_the_
     rng, count = np.random.default_rng(0), 3 * PER_BODY
     A, b = rng.normal(size=(2 * count, count)), rng.normal(size=2 * count)
     problem = LinearProblem(A, b, 0.0, 2 * count, np.ones(count), np.ones(count), np.ones(count, dtype=bool))
-    lacking, total = replace(problem, held=0.5 * A), mass_weights(3)
+    lacking, total = replace(problem, shrinkage=0.5 * A), mass_weights(3)
     known = [with_known_masses(x, [KnownMass("a", total, 7.0)]) for x in (problem, lacking)]
     errors = [combination_standard_error(x, LeastSquares().solve(x), total) for x in (problem, lacking, *known)]
     assert errors[1] > 2.0 * errors[0]

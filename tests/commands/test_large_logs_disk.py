@@ -45,10 +45,10 @@ IDENTIFY = ("estimator.ridge=0.001", "sensors=joints")
 
 
 def fitted(file: Path, *more: str) -> np.ndarray:
-    scene = set_up(load_config(file, (*overrides({"cutoff_hz": 20}), *more)))
-    builder = RowBuilder(scene.robot, scene.contacts, scene.sensors)
-    logs = LogReader(scene).read(scene.config.logs.train, scene.sensors)
-    problem = linear_problem(compress(logs, builder), builder, scene.robot)
+    setup = set_up(load_config(file, (*overrides({"cutoff_hz": 20}), *more)))
+    builder = RowBuilder(setup.robot, setup.contacts, setup.sensors)
+    logs = LogReader(setup).read(setup.config.logs.train, setup.sensors)
+    problem = linear_problem(compress(logs, builder), builder, setup.robot)
     return LeastSquares(1e-3).solve(problem).phi
 
 
@@ -60,11 +60,11 @@ def test_the_parameters_are_the_same(tmp_path: Path) -> None:
 
 def test_logs_that_fit_one_by_one_but_not_together_go_to_the_disk_when_the_limit_is_reached(tmp_path: Path) -> None:
     file = experiment(tmp_path, recorded(3_000), ".h5")
-    scene, size = set_up(load_config(file, overrides({}))), log_bytes(tmp_path / "log.h5", 0.0)
-    settings = replace(scene.config.preprocessing, memory_gb=2.5e-9 * size)
-    reader = LogReader(replace(scene, config=replace(scene.config, preprocessing=settings)))
+    setup, size = set_up(load_config(file, overrides({}))), log_bytes(tmp_path / "log.h5", 0.0)
+    settings = replace(setup.config.preprocessing, memory_gb=2.5e-9 * size)
+    reader = LogReader(replace(setup, config=replace(setup.config, preprocessing=settings)))
     files = [tmp_path / "log.h5"] * 3
-    logs = [*reader.read(files[:1], scene.sensors), *reader.read(files[1:], None)]
+    logs = [*reader.read(files[:1], setup.sensors), *reader.read(files[1:], None)]
     assert [is_on_disk(samples) for samples in logs] == [False, False, True]
     for samples in logs[1:]:
         assert_same(samples, logs[0], 1e-10)
@@ -72,9 +72,9 @@ def test_logs_that_fit_one_by_one_but_not_together_go_to_the_disk_when_the_limit
 
 def recalibrated(file: Path, terms: str, *more: str) -> tuple[Samples, Samples]:
     """A log as it was recorded and with its readings calibrated."""
-    scene = set_up(load_config(file, (*overrides({}), "sensors.set=full", f"sensors.offsets={terms}", *more)))
-    builder = RowBuilder(scene.robot, scene.contacts, scene.sensors, scene.terms)
-    samples = LogReader(scene).read(scene.config.logs.train, None)[0]
+    setup = set_up(load_config(file, (*overrides({}), "sensors.set=full", f"sensors.offsets={terms}", *more)))
+    builder = RowBuilder(setup.robot, setup.contacts, setup.sensors, setup.terms)
+    samples = LogReader(setup).read(setup.config.logs.train, None)[0]
     values = np.arange(1.0, 1.0 + len(builder.extras))
     return samples, calibrate_readings(samples, builder.extras, values, builder.tree)
 
@@ -131,10 +131,10 @@ def test_bags_take_memory_too_and_are_read_whole_whatever_is_held(tmp_path: Path
     file = experiment(tmp_path, recorded(200))
     log = read_log(tmp_path / "log.npz")
     write_bag(tmp_path / "log.mcap", entries_of(log))
-    scene, size = set_up(load_config(file, overrides({}))), log_bytes(tmp_path / "log.npz", 0.0)
-    settings = replace(scene.config.preprocessing, memory_gb=1.5e-9 * size)
-    logs = replace(scene.config.logs, topics=parsed(topics_of(log)))
-    reader = LogReader(replace(scene, config=replace(scene.config, preprocessing=settings, logs=logs)))
+    setup, size = set_up(load_config(file, overrides({}))), log_bytes(tmp_path / "log.npz", 0.0)
+    settings = replace(setup.config.preprocessing, memory_gb=1.5e-9 * size)
+    logs = replace(setup.config.logs, topics=parsed(topics_of(log)))
+    reader = LogReader(replace(setup, config=replace(setup.config, preprocessing=settings, logs=logs)))
     found = reader.read([tmp_path / name for name in ("log.mcap", "log.npz", "log.mcap")], None)
     assert [is_on_disk(samples) for samples in found] == [False, True, False]
 
@@ -278,10 +278,10 @@ def watch():
         peak.append(used())
         time.sleep(0.01)
 torch.set_num_threads(1)
-scene = set_up(load_config(sys.argv[1], sys.argv[2:]))
+setup = set_up(load_config(sys.argv[1], sys.argv[2:]))
 before, peak = used(), []
 threading.Thread(target=watch, daemon=True).start()
-samples = LogReader(scene).read(scene.config.logs.train, scene.sensors)[0]
+samples = LogReader(setup).read(setup.config.logs.train, setup.sensors)[0]
 size = sum(x.nbytes for part in (samples, samples.base) for x in vars(part).values() if isinstance(x, torch.Tensor))
 print(json.dumps({"peak": max(peak) - before, "bytes": size / 2**20}))
 """

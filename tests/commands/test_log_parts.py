@@ -49,8 +49,8 @@ def read(demo: Path, logs: list[str], *overrides: str) -> list[Samples]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", TorchidWarning)
         config = load_config(demo / "quadruped.yaml", overrides)
-        scene = set_up(replace(config, logs=replace(config.logs, train=[demo / name for name in logs])))
-        return LogReader(scene, demo).read(scene.config.logs.train, None)
+        setup = set_up(replace(config, logs=replace(config.logs, train=[demo / name for name in logs])))
+        return LogReader(setup, demo).read(setup.config.logs.train, None)
 
 
 @pytest.mark.parametrize(
@@ -140,10 +140,10 @@ def test_parts_that_turn_out_to_overlap_are_warned_of_or_refused(demo: Path, tmp
 
 def test_the_cache_tells_parts_apart(demo: Path, tmp_path: Path) -> None:
     def reader() -> CachedReader:
-        scene = set_up(load_config(demo / "quadruped.yaml", [f"output={tmp_path / 'run'}"]))
-        cache = open_cache(scene)
+        setup = set_up(load_config(demo / "quadruped.yaml", [f"output={tmp_path / 'run'}"]))
+        cache = open_cache(setup)
         assert cache is not None
-        return CachedReader(scene, cache)
+        return CachedReader(setup, cache)
 
     paths = [demo / f"sway_train.npz{text}" for text in ("", "[:7]", "[7:]", "[:7.01]")]
     first, second = reader(), reader()

@@ -27,11 +27,11 @@ def test_a_pass_over_mapped_samples_lets_go_of_their_pages_and_finds_the_same_nu
 ) -> None:
     demo = shortened_demo(tmp_path / "demo", 300) / "quadruped.yaml"
     config = load_config(demo, [f"output={tmp_path / 'run'}"])
-    scene = set_up(config)
-    [log] = open_reader(scene).read(config.logs.train, scene.sensors)
+    setup = set_up(config)
+    [log] = open_reader(setup).read(config.logs.train, setup.sensors)
     before = {name: x.clone() for name, x in tensors(log).items()}
     assert mapped_kilobytes(tmp_path / FOLDER) > 0
-    builder, seen = scene.builder(scene.sensors), []
+    builder, seen = setup.builder(setup.sensors), []
 
     def look(chunks: Iterator[tuple[Samples, ContactState]]) -> None:
         for samples, _ in chunks:
@@ -59,9 +59,9 @@ def mapped_kilobytes(folder: Path) -> int:
 def test_samples_far_apart_are_taken_from_files_without_their_pages_staying_in_memory(tmp_path: Path) -> None:
     demo = shortened_demo(tmp_path / "demo", 300) / "quadruped.yaml"
     config = load_config(demo, [f"output={tmp_path / 'run'}"])
-    scene = set_up(config)
-    reader = open_reader(scene)
-    [log] = reader.read(config.logs.train, scene.sensors)
+    setup = set_up(config)
+    reader = open_reader(setup)
+    [log] = reader.read(config.logs.train, setup.sensors)
     near, far = torch.arange(0, len(log), 2), torch.arange(0, len(log), 30)
     expected = {name: x[far].nan_to_num() for name, x in tensors(log).items()}
     assert log[near].pages is log.pages
@@ -77,8 +77,8 @@ def test_samples_far_apart_are_taken_from_files_without_their_pages_staying_in_m
 def test_mapped_samples_that_are_sent_to_another_process_are_in_its_memory(tmp_path: Path) -> None:
     demo = shortened_demo(tmp_path / "demo", 300) / "quadruped.yaml"
     config = load_config(demo, [f"output={tmp_path / 'run'}"])
-    scene = set_up(config)
-    [log] = open_reader(scene).read(config.logs.train, scene.sensors)
+    setup = set_up(config)
+    [log] = open_reader(setup).read(config.logs.train, setup.sensors)
     there = pickle.loads(pickle.dumps(log))  # noqa: S301 - what was just written
     there.pages.release()
     for name, x in tensors(there).items():

@@ -78,8 +78,8 @@ def test_blocks_have_the_noise_of_the_whole_log(demo: Path, tmp_path: Path, sett
     def noise(*more: str) -> MotionNoise:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", TorchidWarning)
-            scene = set_up(load_config(demo / "quadruped.yaml", [f"preprocessing={settings}", *more]))
-            (samples,) = LogReader(scene, tmp_path).read([demo / "noisy.npz"], None)
+            setup = set_up(load_config(demo / "quadruped.yaml", [f"preprocessing={settings}", *more]))
+            (samples,) = LogReader(setup, tmp_path).read([demo / "noisy.npz"], None)
         assert samples.motion_noise is not None
         return samples.motion_noise
 

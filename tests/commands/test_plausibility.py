@@ -18,12 +18,12 @@ from urdfs import inertial, joint, link, write
 import torchid
 from torchid.cli import main
 from torchid.commands.plausibility import force_gain, implausibility, is_implausible_factor
-from torchid.copies import copies_allowed
 from torchid.estimators import LeastSquares
 from torchid.identifiability.confounding import TotalMass
 from torchid.log_checks import REJECTED, SUSPICIOUS, Checked, Finding, Span
 from torchid.log_checks.check import check
 from torchid.logs import Log
+from torchid.parallel import copies_allowed
 from torchid.problem import (
     LinearProblem,
     RowBuilder,

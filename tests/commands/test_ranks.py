@@ -36,7 +36,7 @@ import torchid
 from torchid import ranks
 from torchid.cli import main
 from torchid.commands.checkpoint import CHECKPOINT
-from torchid.copies import share_between_processes
+from torchid.parallel import share_between_processes
 from torchid.parameters import Array
 from torchid.problem.linear import parameter_scale
 

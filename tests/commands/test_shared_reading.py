@@ -66,11 +66,11 @@ def read_all(calls: Sequence[Sequence[str]], folder: Path) -> int:
         overrides = [x.replace("RANK", str(rank)) for x in more if x != "in blocks"]
         with warnings.catch_warnings(record=True) as said, ranks.share_work():
             warnings.simplefilter("always")
-            scene = set_up(load_config(Path(file), overrides))
-            cache, logs, error = open_cache(scene), [], ""
+            setup = set_up(load_config(Path(file), overrides))
+            cache, logs, error = open_cache(setup), [], ""
             try:
-                reader = LogReader(scene) if cache is None else CachedReader(scene, cache)
-                logs = reader.read(scene.config.logs.train, scene.sensors)
+                reader = LogReader(setup) if cache is None else CachedReader(setup, cache)
+                logs = reader.read(setup.config.logs.train, setup.sensors)
             except ValueError as failure:
                 error = str(failure)
         entry = {"opened": list(opened), "logs": [digest(x) for x in logs], "error": error, "cache": cache is not None}
@@ -236,13 +236,13 @@ def alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def read_by(file: Path, cached: bool, *more: str) -> tuple[dict[str, torch.Tensor], list[str]]:
     """All tensors of a log's samples, read with or without a cache, and what was said."""
-    scene = set_up(load_config(file, [f"output={file.parent / 'run'}", *more]))
-    cache = open_cache(scene)
+    setup = set_up(load_config(file, [f"output={file.parent / 'run'}", *more]))
+    cache = open_cache(setup)
     assert cache is not None
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        reader = CachedReader(scene, cache) if cached else LogReader(scene)
-        (samples,) = reader.read(scene.config.logs.train, scene.sensors)
+        reader = CachedReader(setup, cache) if cached else LogReader(setup)
+        (samples,) = reader.read(setup.config.logs.train, setup.sensors)
     return tensors(samples), [str(one.message) for one in said]
 
 

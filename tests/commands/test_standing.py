@@ -128,19 +128,19 @@ def test_samples_that_the_checks_reject_are_left_out_too(written: Written) -> No
         position[500:503, 2] += 1.5
         return replace(log, **NO_BASE, joint_position=position)
 
-    scene = set_up(load_config(written(with_spike, base_motion="contacts", exclude_rejected=True)))
-    reader = LogReader(scene)
+    setup = set_up(load_config(written(with_spike, base_motion="contacts", exclude_rejected=True)))
+    reader = LogReader(setup)
     with pytest.warns(TorchidWarning, match="samples excluded"):
-        (samples,) = reader.read(scene.config.logs.train, scene.sensors)
+        (samples,) = reader.read(setup.config.logs.train, setup.sensors)
     assert sum(reader.excluded.values()) > 3
     assert float(value(samples.base.angular_acceleration).abs().max()) < 20.0
 
 
 def test_a_log_that_would_be_read_in_blocks_is_taken_whole(written: Written, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = set_up(load_config(written(base_motion="contacts")))
-    (one,) = LogReader(scene).read(scene.config.logs.train, scene.sensors)
+    setup = set_up(load_config(written(base_motion="contacts")))
+    (one,) = LogReader(setup).read(setup.config.logs.train, setup.sensors)
     monkeypatch.setattr("torchid.commands.reading._WHOLE_GB", 0.0)
-    (other,) = LogReader(scene).read(scene.config.logs.train, scene.sensors)
+    (other,) = LogReader(setup).read(setup.config.logs.train, setup.sensors)
     np.testing.assert_array_equal(value(one.base.specific_force), value(other.base.specific_force))
 
 
@@ -151,10 +151,10 @@ def test_cached_samples_of_one_setting_are_not_those_of_the_other(
     file, override = written(lambda log: log, cache_gb=1), "preprocessing.base_motion=contacts"
 
     def read(*more: str) -> np.ndarray:
-        scene = set_up(load_config(file, more))
-        cache = open_cache(scene)
+        setup = set_up(load_config(file, more))
+        cache = open_cache(setup)
         assert cache is not None
-        (samples,) = CachedReader(scene, cache).read(scene.config.logs.train, scene.sensors)
+        (samples,) = CachedReader(setup, cache).read(setup.config.logs.train, setup.sensors)
         return np.asarray(value(samples.base.specific_force))
 
     one, two = read(), read(override)
@@ -182,8 +182,8 @@ def test_samples_near_changes_of_detected_contacts_are_dropped(written: Written)
     counts = []
     for margin in (0.0, 0.05):
         file = written(lambda log: replace(log, **NO_FLAGS), detect_contacts={"margin_s": margin})
-        scene = set_up(load_config(file))
-        counts.append(len(LogReader(scene).read(scene.config.logs.train, scene.sensors)[0]))
+        setup = set_up(load_config(file))
+        counts.append(len(LogReader(setup).read(setup.config.logs.train, setup.sensors)[0]))
     assert counts[1] < counts[0] - 50
 
 
@@ -192,8 +192,8 @@ def test_contacts_that_may_stand_count_unless_something_takes_them_to_keep_still
     counts = []
     for more in ({}, {"max_slip": 100.0}):
         file = written(lambda log: replace(log, **NO_FLAGS), detect_contacts={"touch": 0.2}, **more)
-        scene = set_up(load_config(file))
-        samples = LogReader(scene).read(scene.config.logs.train, scene.sensors)[0]
+        setup = set_up(load_config(file))
+        samples = LogReader(setup).read(setup.config.logs.train, setup.sensors)[0]
         counts.append(len(samples))
     assert counts[1] < counts[0] - 20, counts
 

@@ -243,13 +243,13 @@ def test_what_rows_lack_is_no_share_of_the_data_and_part_of_the_standard_error(r
     held, more = 0.3 * (problem.A * problem.scale), rng.normal(size=(40, 2))
     held[:, 2] = problem.A[:, 2] * problem.scale[2]  # the third parameter is the prior's alone
     held[:, 3:] = 0.0
-    lacking = replace(problem, held=np.hstack([PRIOR_DEVIATION * held, more]))
+    lacking = replace(problem, shrinkage=np.hstack([PRIOR_DEVIATION * held, more]))
     before, estimate = (LeastSquares(ridge).solve(x) for x in (problem, lacking))
     assert np.array_equal(estimate.phi, before.phi)
     shares = before.data_share * np.array([0.7, 0.7, 0.0, 1.0, 1.0, 1.0])
     assert np.allclose(estimate.data_share, shares, atol=1e-9)
     unit = np.eye(8)
-    moved = [LeastSquares(ridge).solve(replace(problem, b=problem.b - lacking.held @ z)).phi for z in unit]
+    moved = [LeastSquares(ridge).solve(replace(problem, b=problem.b - lacking.shrinkage @ z)).phi for z in unit]
     expected = np.sqrt(before.noise_error**2 + np.square(np.array(moved) - before.phi).sum(0))
     assert np.allclose(estimate.noise_error, expected, rtol=1e-9, equal_nan=True)
     quarter = LeastSquares(ridge).solve(lacking.fraction(0.25))
@@ -259,8 +259,8 @@ def test_what_rows_lack_is_no_share_of_the_data_and_part_of_the_standard_error(r
 def test_what_rows_lack_has_their_number_and_the_parameters() -> None:
     problem = random_problem(np.random.default_rng(0), 9, 3, 3)
     for shape in ((8, 3), (9, 2)):
-        with pytest.raises(ValueError, match=r"held: found shape .*; accepted: 9 rows, at least 3 columns"):
-            replace(problem, held=np.zeros(shape))
+        with pytest.raises(ValueError, match=r"shrinkage: found shape .*; accepted: 9 rows, at least 3 columns"):
+            replace(problem, shrinkage=np.zeros(shape))
 
 
 def test_friction_of_an_excavator_is_not_held_back_by_a_prior_of_light_robots() -> None:

@@ -147,13 +147,13 @@ def test_a_delay_reaches_across_no_break_of_a_log_and_knows_nothing_beside_what_
 @pytest.mark.parametrize("sensors", ["joints", pytest.param("full", marks=pytest.mark.slow)])
 def test_torques_of_a_quadruped_on_its_feet_are_found_to_be_as_late_as_they_are(sensors: str) -> None:
     """The demo's noisy log has no delay; its torques are then taken from 4 ms later."""
-    scene = set_up(load_config(DEMO / "quadruped.yaml", [f"sensors.set={sensors}"]))
+    setup = set_up(load_config(DEMO / "quadruped.yaml", [f"sensors.set={sensors}"]))
     recorded_log, found = read_log(DEMO / "sway_train.npz"), []
     for late in (0.0, 0.004):
         log = preprocess(with_delayed_torques(recorded_log, -late), cutoff_hz=8.0)
-        samples = bind_log(log, scene.robot, scene.contacts)
-        fitter = scene.fitter(scene.builder(scene.sensors), scene.conditions())
-        found.append(choose_delay([samples], fitter, scene.terms))
+        samples = bind_log(log, setup.robot, setup.contacts)
+        fitter = setup.fitter(setup.builder(setup.sensors), setup.conditions())
+        found.append(choose_delay([samples], fitter, setup.terms))
     none, delayed = found
     assert none.delay == 0.0
     assert delayed.interval[0] < 0.004 < delayed.interval[1]

@@ -81,7 +81,7 @@ def test_rows_are_white_under_noise_along_the_axes_of_the_levelled_base() -> Non
 
 
 @dataclass(frozen=True)
-class Scene:
+class RobotSetup:
     """A quadruped that is upright on three or four feet, without noise, and what is true."""
 
     experiment: Callable[..., Experiment]
@@ -90,7 +90,7 @@ class Scene:
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+def setup(tmp_path_factory: pytest.TempPathFactory) -> RobotSetup:
     robot, rng = load(SOLO12), np.random.default_rng(1)
     oracle = Oracle.of(robot)
     oracle.perturb(rng, 0.2)
@@ -105,7 +105,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
         return set_up(load_config(file, overrides))
 
     contacts_in_use = experiment().contacts
-    return Scene(experiment, bind_log(log, robot, contacts_in_use), true_parameters(oracle, robot).ravel())
+    return RobotSetup(experiment, bind_log(log, robot, contacts_in_use), true_parameters(oracle, robot).ravel())
 
 
 @dataclass(frozen=True)
@@ -117,9 +117,9 @@ class Fits:
     estimated: list[Estimate]
 
 
-def read(scene: Scene, rng: np.random.Generator, push: Array) -> Samples:
+def read(setup: RobotSetup, rng: np.random.Generator, push: Array) -> Samples:
     """With noise of sensors, and forces on the base (N, 6) that nothing measures: what the feet then seem to bear."""
-    samples, experiment = scene.samples, scene.experiment()
+    samples, experiment = setup.samples, setup.experiment()
     builder = RowBuilder(experiment.robot, experiment.contacts, experiment.sensors)
     J = builder.contact_jacobian(samples)[:, :, :3].flatten(1, 2).numpy()
     J = J * np.repeat(samples.active.numpy(), 3, axis=1)[..., None]
@@ -133,21 +133,21 @@ def read(scene: Scene, rng: np.random.Generator, push: Array) -> Samples:
     return replace(samples, wrench=wrench, torque=torque)
 
 
-def axes_of(scene: Scene) -> Array:
-    return levelled_base_axes(scene.samples.base.rotation).numpy()
+def axes_of(setup: RobotSetup) -> Array:
+    return levelled_base_axes(setup.samples.base.rotation).numpy()
 
 
-def pushed(scene: Scene, rng: np.random.Generator) -> Samples:
+def pushed(setup: RobotSetup, rng: np.random.Generator) -> Samples:
     push = (TRUE.base_std * rng.normal(size=(SAMPLES, 6))).reshape(-1, 2, 3)
-    return read(scene, rng, np.einsum("nij,nkj->nki", axes_of(scene), push).reshape(-1, 6))
+    return read(setup, rng, np.einsum("nij,nkj->nki", axes_of(setup), push).reshape(-1, 6))
 
 
-def shaken(scene: Scene, rng: np.random.Generator) -> Samples:
+def shaken(setup: RobotSetup, rng: np.random.Generator) -> Samples:
     """With noise of sensors, and of accelerations as differentiated odometry has them."""
-    samples = read(scene, rng, np.zeros((SAMPLES, 6)))
-    mass = scene.true.reshape(-1, PER_BODY)[:, MASS].sum()
+    samples = read(setup, rng, np.zeros((SAMPLES, 6)))
+    mass = setup.true.reshape(-1, PER_BODY)[:, MASS].sum()
     noise = np.array([HORIZONTAL, HORIZONTAL, VERTICAL]) / mass * rng.normal(size=(SAMPLES, 3))
-    force = samples.base.specific_force + torch.from_numpy(np.einsum("nij,nj->ni", axes_of(scene), noise))
+    force = samples.base.specific_force + torch.from_numpy(np.einsum("nij,nj->ni", axes_of(setup), noise))
     return replace(samples, base=replace(samples.base, specific_force=force))
 
 
@@ -162,12 +162,14 @@ def origins(found: NoiseSummary) -> dict[str, str]:
     return {one.group: one.origin for one in found.groups}
 
 
-def fits(scene: Scene, sensors: str, noisy: Callable[[Scene, np.random.Generator], Samples], repeats: int) -> Fits:
+def fits(
+    setup: RobotSetup, sensors: str, noisy: Callable[[RobotSetup, np.random.Generator], Samples], repeats: int
+) -> Fits:
     """Of repeated experiments, with the guess and with the noise that each of them shows."""
-    experiment = scene.experiment(f"sensors={sensors}", "sensors.on_base_lost=warn")
+    experiment = setup.experiment(f"sensors={sensors}", "sensors.on_base_lost=warn")
     out = Fits([], [], [])
     for seed in range(repeats):
-        samples = noisy(scene, np.random.default_rng(seed))
+        samples = noisy(setup, np.random.default_rng(seed))
         found = experiment.estimate_noise([samples], experiment.sensors)
         out.found.append(found)
         out.guessed.append(fit(experiment, samples, SensorNoise()))
@@ -181,18 +183,18 @@ def mass_errors(estimates: list[Estimate], true: Array) -> Array:
     return masses / true.reshape(-1, PER_BODY)[:, MASS].sum() - 1.0
 
 
-def check_intervals(scene: Scene, sensors: str, repeats: int) -> None:
-    found = fits(scene, sensors, pushed, repeats)
-    after, before = (covered(x, scene.true).mean(axis=0) for x in (found.estimated, found.guessed))
+def check_intervals(setup: RobotSetup, sensors: str, repeats: int) -> None:
+    found = fits(setup, sensors, pushed, repeats)
+    after, before = (covered(x, setup.true).mean(axis=0) for x in (found.estimated, found.guessed))
     assert len(after) > 50
     allowed = stats.binom.ppf([1e-5, 1.0 - 1e-5], repeats, 0.95) / repeats
     assert 0.92 < after.mean() < 0.98
     assert after.min() >= allowed[0] - 0.02, "noise that is estimated adds a little to the errors"
     assert before.mean() < after.mean() - 0.03, "with the guess, errors of all rows count alike"
     if sensors != "joints":
-        before, after = (np.sqrt(np.mean(mass_errors(x, scene.true) ** 2)) for x in (found.guessed, found.estimated))
+        before, after = (np.sqrt(np.mean(mass_errors(x, setup.true) ** 2)) for x in (found.guessed, found.estimated))
         assert after < 0.5 * before
-    for group, true in NoiseGroups.of(scene.experiment().robot).values(TRUE).items():
+    for group, true in NoiseGroups.of(setup.experiment().robot).values(TRUE).items():
         here = [(x.used, x.origin) for found_once in found.found for x in found_once.groups if x.group == group]
         if here and group != "contact_moment" and [origin for _, origin in here].count("estimated") == repeats:
             assert np.median([used for used, _ in here]) == pytest.approx(true, rel=0.1), group
@@ -201,21 +203,21 @@ def check_intervals(scene: Scene, sensors: str, repeats: int) -> None:
 
 
 @pytest.mark.parametrize("sensors", slow_but(["full"], ["full", "contacts", "joints"]))
-def test_intervals_hold_the_truth_with_the_noise_that_residuals_show(scene: Scene, sensors: str) -> None:
-    check_intervals(scene, sensors, QUICK)
+def test_intervals_hold_the_truth_with_the_noise_that_residuals_show(setup: RobotSetup, sensors: str) -> None:
+    check_intervals(setup, sensors, QUICK)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sensors", ["full", "contacts", "joints"])
-def test_intervals_hold_the_truth_in_many_experiments(scene: Scene, sensors: str) -> None:
-    check_intervals(scene, sensors, MANY)
+def test_intervals_hold_the_truth_in_many_experiments(setup: RobotSetup, sensors: str) -> None:
+    check_intervals(setup, sensors, MANY)
 
 
 @pytest.mark.parametrize("sensors", slow_but(["full"], ["full", "contacts"]))
-def test_differentiated_odometry_spoils_the_mass_no_more(scene: Scene, sensors: str) -> None:
+def test_differentiated_odometry_spoils_the_mass_no_more(setup: RobotSetup, sensors: str) -> None:
     """Noise of accelerations stands in K, and pulls the mass down: by as much as rows that show it are trusted."""
-    found = fits(scene, sensors, shaken, 6)
-    before, after = (mass_errors(x, scene.true) for x in (found.guessed, found.estimated))
+    found = fits(setup, sensors, shaken, 6)
+    before, after = (mass_errors(x, setup.true) for x in (found.guessed, found.estimated))
     assert before.mean() < -0.005
     assert abs(after.mean()) < 0.1 * abs(before.mean())
 
@@ -223,12 +225,12 @@ def test_differentiated_odometry_spoils_the_mass_no_more(scene: Scene, sensors: 
 # ---------------------------------------------------------------------------------------------- what is stated is kept
 
 
-def test_noise_that_is_all_stated_is_used_to_the_last_bit(scene: Scene) -> None:
+def test_noise_that_is_all_stated_is_used_to_the_last_bit(setup: RobotSetup) -> None:
     stated = (
         "sensors.noise={joint_torque: 0.1, contact_force: 0.2, contact_moment: 0.02, base_force: 1, base_moment: 0.2}"
     )
-    experiment = scene.experiment(stated)
-    samples = pushed(scene, np.random.default_rng(0))
+    experiment = setup.experiment(stated)
+    samples = pushed(setup, np.random.default_rng(0))
     found = experiment.estimate_noise([samples], experiment.sensors)
     used = with_noise(experiment, found)
     assert set(origins(found).values()) == {"stated"}
@@ -239,21 +241,21 @@ def test_noise_that_is_all_stated_is_used_to_the_last_bit(scene: Scene) -> None:
     assert np.array_equal(before.standard_error, after.standard_error, equal_nan=True)
 
 
-def test_stated_noise_that_residuals_contradict_is_kept_and_the_estimate_suggested(scene: Scene) -> None:
+def test_stated_noise_that_residuals_contradict_is_kept_and_the_estimate_suggested(setup: RobotSetup) -> None:
     stated = "sensors.noise={joint_torque: 0.1, contact_force: 0.2, base_force: 0.2, base_moment: 0.15}"
-    experiment = scene.experiment(stated)
-    found = experiment.estimate_noise([pushed(scene, np.random.default_rng(0))], experiment.sensors)
+    experiment = setup.experiment(stated)
+    found = experiment.estimate_noise([pushed(setup, np.random.default_rng(0))], experiment.sensors)
     assert found.noise.base_force == (0.2,) * 3
     assert found.suggested["joint_torque"] == pytest.approx(dict.fromkeys(experiment.robot.joint_names, 0.1), rel=0.1)
     assert found.suggested["contact_force"] == pytest.approx(0.2, rel=0.2)
-    right = scene.experiment("sensors.noise={joint_torque: 0.1, contact_force: 0.2}")
-    assert not right.estimate_noise([pushed(scene, np.random.default_rng(0))], right.sensors).suggested
+    right = setup.experiment("sensors.noise={joint_torque: 0.1, contact_force: 0.2}")
+    assert not right.estimate_noise([pushed(setup, np.random.default_rng(0))], right.sensors).suggested
 
 
-def test_what_is_estimated_keeps_the_proportion_to_what_is_stated(scene: Scene) -> None:
+def test_what_is_estimated_keeps_the_proportion_to_what_is_stated(setup: RobotSetup) -> None:
     """As where a filter has left a tenth of a sensor's noise: weights and intervals are those of the right noise."""
-    samples = pushed(scene, np.random.default_rng(0))
-    alone, beside = scene.experiment(), scene.experiment("sensors.noise={joint_torque: 1.0}")
+    samples = pushed(setup, np.random.default_rng(0))
+    alone, beside = setup.experiment(), setup.experiment("sensors.noise={joint_torque: 1.0}")
     estimated, proportional = (x.estimate_noise([samples], x.sensors).noise for x in (alone, beside))
     assert proportional.joint_torque == (1.0,) * 12
     ratio = 1.0 / np.mean(estimated.joint_torque)
@@ -266,11 +268,11 @@ def test_what_is_estimated_keeps_the_proportion_to_what_is_stated(scene: Scene) 
 # -------------------------------------------------------------------------------------------------------------- limits
 
 
-def test_impacts_do_not_pass_for_noise(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    samples = pushed(scene, np.random.default_rng(0))
+def test_impacts_do_not_pass_for_noise(setup: RobotSetup, monkeypatch: pytest.MonkeyPatch) -> None:
+    samples = pushed(setup, np.random.default_rng(0))
     hit = samples.base.specific_force.clone()
     hit[::25] += 20.0
-    experiment = scene.experiment()
+    experiment = setup.experiment()
 
     def estimated(specific_force: torch.Tensor) -> SensorNoise:
         moved = replace(samples, base=replace(samples.base, specific_force=specific_force))
@@ -285,30 +287,30 @@ def test_impacts_do_not_pass_for_noise(scene: Scene, monkeypatch: pytest.MonkeyP
     assert np.max(np.divide(spoilt.joint_torque, clean.joint_torque)) < 1.2
 
 
-def test_exact_logs_and_logs_of_a_few_samples_leave_noise_that_is_positive(scene: Scene) -> None:
-    experiment = scene.experiment()
-    exact = experiment.estimate_noise([scene.samples], experiment.sensors)
-    few = experiment.estimate_noise([scene.samples[:3]], experiment.sensors)
+def test_exact_logs_and_logs_of_a_few_samples_leave_noise_that_is_positive(setup: RobotSetup) -> None:
+    experiment = setup.experiment()
+    exact = experiment.estimate_noise([setup.samples], experiment.sensors)
+    few = experiment.estimate_noise([setup.samples[:3]], experiment.sensors)
     assert min(one.used for groups in (exact.groups, few.groups) for one in groups) > 0.0
     assert exact.noise.joint_torque == pytest.approx((1e-3 * SensorNoise().joint_torque,) * 12), "the floor"
     assert "assumed" in origins(few).values()
 
 
 @pytest.mark.parametrize("size", [1e-9, 1e3])
-def test_noise_that_nobody_stated_is_as_much_smaller_as_the_robot(scene: Scene, size: float) -> None:
+def test_noise_that_nobody_stated_is_as_much_smaller_as_the_robot(setup: RobotSetup, size: float) -> None:
     """Of robots of millimetres, whose torques are nanonewtonmetres, and of those of tons."""
-    samples = pushed(scene, np.random.default_rng(0))
+    samples = pushed(setup, np.random.default_rng(0))
     assert samples.torque is not None
     assert samples.wrench is not None
     scaled = replace(samples, torque=size * samples.torque, wrench=size * samples.wrench)
-    experiment = scene.experiment()
+    experiment = setup.experiment()
     found, expected = (experiment.estimate_noise([one], experiment.sensors).noise for one in (scaled, samples))
     np.testing.assert_allclose(found.joint_torque, size * np.array(expected.joint_torque), rtol=0.05)
     assert found.contact_force == pytest.approx(size * expected.contact_force, rel=0.05)
 
 
-def test_the_same_logs_give_the_same_noise_beside_settings_that_do_not_state_it(scene: Scene) -> None:
-    experiment, samples = scene.experiment(), pushed(scene, np.random.default_rng(0))
+def test_the_same_logs_give_the_same_noise_beside_settings_that_do_not_state_it(setup: RobotSetup) -> None:
+    experiment, samples = setup.experiment(), pushed(setup, np.random.default_rng(0))
     found, again = (experiment.estimate_noise([samples], experiment.sensors) for _ in range(2))
     assert found == again
     used = with_noise(experiment, found)
@@ -318,8 +320,8 @@ def test_the_same_logs_give_the_same_noise_beside_settings_that_do_not_state_it(
     assert used.estimate_noise([samples], experiment.sensors).noise == found.noise
 
 
-def test_the_sensors_of_a_log_are_those_whose_every_value_it_has(scene: Scene) -> None:
-    samples, experiment = scene.samples, scene.experiment()
+def test_the_sensors_of_a_log_are_those_whose_every_value_it_has(setup: RobotSetup) -> None:
+    samples, experiment = setup.samples, setup.experiment()
     wrench, torque = samples.wrench.clone(), samples.torque.clone()
     wrench[~samples.active] = torch.nan
     torque[5, 2] = wrench[0, 0, 1] = torch.nan

@@ -76,7 +76,7 @@ def test_a_person_whose_feet_never_leave_the_plates_is_told_that_offset_and_mass
         assert x["told_apart"] is False
         assert x["inflation"] > 3.0 * INFLATION_LIMIT
         assert any(name.endswith((" m", " mcx", " mcy", " mcz")) for name in x["mixed_with"])
-    assert metrics["total_mass_told_from_offsets"] is False
+    assert metrics["total_mass_separable_from_offsets"] is False
     verdicts = {body["name"]: body["verdict"]["m"] for body in parameters["bodies"]}
     assert "identified" not in verdicts.values()
 

@@ -8,7 +8,7 @@ from typing import Any
 from dialects import in_order, with_velocity
 from repository import DEMO
 
-from torchid.commands.init import Initiated, init
+from torchid.commands.init import InitReport, init
 from torchid.config import load_config
 from torchid.fitting.experiment import set_up
 from torchid.logs import Log, read_log
@@ -20,7 +20,7 @@ def recorded() -> Log:
     return with_velocity(read_log(DEMO / "sway_train.npz").select(slice(0, 300)))
 
 
-def initiated(path: Path, urdf: Path = URDF) -> tuple[Log, Initiated, str]:
+def initiated(path: Path, urdf: Path = URDF) -> tuple[Log, InitReport, str]:
     """The log that an experiment file of `init` reads, what was said, and the file."""
     said = init(urdf, path, path.with_suffix(".yaml"))
     config = load_config(path.with_suffix(".yaml"))

@@ -60,8 +60,8 @@ def experiment(folder: Path, fields: Fields, suffix: str = ".npz") -> Path:
 
 
 def samples_of(file: Path, *overrides: str, required: bool = True) -> Samples:
-    scene = set_up(load_config(file, overrides))
-    return LogReader(scene).read(scene.config.logs.train, scene.sensors if required else None)[0]
+    setup = set_up(load_config(file, overrides))
+    return LogReader(setup).read(setup.config.logs.train, setup.sensors if required else None)[0]
 
 
 def tensors(samples: Samples) -> dict[str, torch.Tensor]:

@@ -13,9 +13,9 @@ import torch
 from synthetic import Oracle, load, random_states
 from urdfs import joint, link, write
 
+from torchid.parallel import one_thread
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
-from torchid.problem.chunks import one_thread
 from torchid.problem.contact_state import ContactState
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet

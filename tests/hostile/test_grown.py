@@ -18,7 +18,7 @@ from repository import DEMO
 from torchid.cli import main
 from torchid.commands.checkpoint import load_checkpoint
 from torchid.config import load_analysis, load_config, load_simulation
-from torchid.config.maps import load_columns, load_topics
+from torchid.config.log_reading import load_columns, load_topics
 from torchid.errors import InputError, is_plain
 from torchid.logs import Topics, read_log
 from torchid.parameters import PARAMETERS

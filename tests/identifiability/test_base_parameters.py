@@ -27,8 +27,8 @@ from torchid.identifiability.base_parameters import (
     unobservable_parameters,
 )
 from torchid.identifiability.structure import structural_problem
+from torchid.parallel import one_thread
 from torchid.problem import LinearProblem
-from torchid.problem.chunks import one_thread
 from torchid.regressor import Regressor
 from torchid.robot import Robot
 from torchid.sensing import named_sensors

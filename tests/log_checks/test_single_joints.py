@@ -17,7 +17,7 @@ from walking import MACHINES
 
 from torchid.log_checks import NOTE, SUSPICIOUS
 from torchid.log_checks.check import check
-from torchid.log_checks.single_joints import check_still_velocities, still_joints
+from torchid.log_checks.encoders import check_still_velocities, still_joints
 from torchid.logs import Log
 from torchid.robot import Robot, load_robot
 

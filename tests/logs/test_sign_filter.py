@@ -10,9 +10,9 @@ from motions import value
 
 from torchid.errors import TorchidWarning
 from torchid.logs import Log
+from torchid.logs.dry_friction import wider_low_pass, with_sign_filter
 from torchid.logs.log import FloatArray
 from torchid.logs.preprocess import lacks_derivatives, make_timeline, move_to_timeline, preprocess
-from torchid.logs.sign_filter import wider_low_pass, with_sign_filter
 from torchid.logs.signal_noise import MOST_SAMPLES, signal_noise
 from torchid.logs.timeline import Timeline
 

@@ -164,7 +164,7 @@ def test_a_corrected_factor_is_that_of_the_rows_without_noise(robot: Robot, buil
     factor = compress([motion(robot, 2000, 0.01)], builder)
     corrected_factor = corrected_triangle(factor, column_prior(builder, robot))
     R, noise = corrected_factor.R, corrected_factor.noise
-    assert corrected_factor.held is None
+    assert corrected_factor.shrinkage is None
     plain, noise_gram = gram(factor), factor.whole_noise_gram().numpy()
     assert 0.0 < noise.largest < 1.0 - LEAST_SIGNAL
     assert noise.lost == 0
@@ -227,14 +227,14 @@ def test_combinations_that_are_mostly_noise_follow_the_data_as_far_as_these_go_a
     assert np.allclose(combinations @ (best - nominal), expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
     assert corrected.noise.lost == lost
     if not lost:
-        assert corrected.held is None
+        assert corrected.shrinkage is None
         return
-    assert corrected.held is not None
-    off = combinations @ (phi - corrected.held[:, : count + 2] @ deviations - best)
+    assert corrected.shrinkage is not None
+    off = combinations @ (phi - corrected.shrinkage[:, : count + 2] @ deviations - best)
     assert np.abs(off).max() < 1e-9 * np.abs(expected).max()
-    of_extra = np.abs(corrected.held[:, count + 2 :])
+    of_extra = np.abs(corrected.shrinkage[:, count + 2 :])
     along = (1.0 - follows) * combinations[:, -1] * best[-1]
-    assert np.allclose(combinations @ corrected.held[:, -1], along, rtol=1e-9, atol=1e-9 * of_extra.max())
+    assert np.allclose(combinations @ corrected.shrinkage[:, -1], along, rtol=1e-9, atol=1e-9 * of_extra.max())
 
 
 def test_combinations_with_more_noise_than_information_keep_to_the_prior() -> None:
@@ -247,8 +247,8 @@ def test_combinations_with_more_noise_than_information_keep_to_the_prior() -> No
         corrected = corrected_triangle(factor, prior)
         best = np.linalg.solve(corrected.R[:-1, :-1], corrected.R[:-1, -1])
         assert combinations[1] @ best == pytest.approx(combinations[1] @ prior.nominal, rel=1e-9)
-        assert corrected.held is not None
-        assert np.allclose(combinations[1] @ corrected.held[:, :2], combinations[1], rtol=1e-9)
+        assert corrected.shrinkage is not None
+        assert np.allclose(combinations[1] @ corrected.shrinkage[:, :2], combinations[1], rtol=1e-9)
 
 
 @pytest.mark.parametrize("ridge", slow_but([0.0], [0.0, 1e-6]))
@@ -299,7 +299,7 @@ def test_without_noise_nothing_changes(robot: Robot, builder: RowBuilder) -> Non
     prior = column_prior(builder, robot)
     corrected = corrected_triangle(factor, prior)
     R, noise = corrected.R, corrected.noise
-    assert corrected.held is None
+    assert corrected.shrinkage is None
     assert np.allclose(R, factor.triangle().numpy(), rtol=1e-12)
     assert noise == NoiseShares()
     little = compress([motion(robot, 300, 1e-9)], builder)

@@ -14,7 +14,7 @@ from urdfs import joint, link, write
 from torchid.config.robot import ContactConfig
 from torchid.errors import ConfigError, UrdfError
 from torchid.fitting.checked_settings import resolve_contacts
-from torchid.robot.rolling import rolled_distance
+from torchid.problem.floor_pose import rolled_distance
 
 
 def shape(geometry: str, origin: str = "") -> str:

@@ -25,8 +25,8 @@ from torchid.log_checks.findings import Finding
 from torchid.log_checks.standing_feet import check_standing_feet
 from torchid.logs import Log, write_log
 from torchid.problem import RowBuilder, bind_log, compress, linear_problem
+from torchid.problem.floor_pose import rolled_distance
 from torchid.robot import Robot
-from torchid.robot.rolling import rolled_distance
 from torchid.sensing import Contact, named_sensors
 from torchid.simulation import Stability, set_up_simulation
 

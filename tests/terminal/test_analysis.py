@@ -63,10 +63,10 @@ def with_logs(analysis: Analysis, rank: int, *confounded: str, sets: int = 1) ->
     names = ["proposed", *(f"set {k}" for k in range(1, sets))]
     advice = tuple(f"mend that {message}" for message in confounded)
     accuracy = SetAccuracy(11, rank, ExpectedErrors(rms, rms), None, confounded, advice)
-    scene = analysis.scene
-    settings = replace(scene.config.analysis, scenarios=None)
-    scene = replace(scene, config=replace(scene.config, analysis=settings))
-    return replace(analysis, scene=scene, accuracies=dict.fromkeys(names, accuracy))
+    setup = analysis.setup
+    settings = replace(setup.config.analysis, scenarios=None)
+    setup = replace(setup, config=replace(setup.config, analysis=settings))
+    return replace(analysis, setup=setup, accuracies=dict.fromkeys(names, accuracy))
 
 
 def in_scenarios(analysis: Analysis, count: int) -> Analysis:
@@ -123,7 +123,7 @@ def test_sensors_that_suffice_are_named_with_the_proof(lame: Analysis) -> None:
 
 def test_parameters_are_counted_that_are_known_alone_in_sums_and_not_at_all(lame: Analysis) -> None:
     (scenario,) = lame.scenarios
-    base, names = scenario.base, lame.scene.robot.body_names
+    base, names = scenario.base, lame.setup.robot.body_names
     sizes = [int((row != 0.0).sum()) for row in base.combination]
     unseen = unobservable_parameters(base, names)
     hidden = sum(len(line.split(": ")[1].split(", ")) for line in unseen)
@@ -159,7 +159,7 @@ def test_the_scenario_with_the_fault_comes_first(lame: Analysis) -> None:
 
 @pytest.mark.parametrize("width", WIDTHS)
 def test_names_are_never_broken(lame: Analysis, width: int) -> None:
-    names = {*FEET, *TORQUES, *lame.scene.robot.body_names}
+    names = {*FEET, *TORQUES, *lame.setup.robot.body_names}
     words = " ".join(analysis_lines(lame, width)).split()
     long = [word.strip(",:;()") for word in words if "-limb-" in word]
     assert long

@@ -19,14 +19,14 @@ from torchid.commands.folder import ANALYSIS, check_free, new_folder, write_json
 from torchid.commands.reading import LogReader, check_read
 from torchid.commands.sensor_set_accuracy import accuracies
 from torchid.config import AnalyzeConfig, dump_config, inputs_of
-from torchid.copies import can_copy, in_copies
 from torchid.errors import ConfigError, SensorError, UnknownNameError, during, join_names, warn
-from torchid.fitting.experiment import Scene, set_up_scene, with_noise
+from torchid.fitting.experiment import RobotSetup, set_up_robot, with_noise
 from torchid.fitting.misfit import unmeasured_at_rest
 from torchid.identifiability.base_parameters import BaseParameters, base_parameters
+from torchid.parallel import can_copy, in_copies, one_thread, thread_count
 from torchid.parameters import WRENCH_COMPONENTS
 from torchid.problem import Samples
-from torchid.problem.chunks import chunks_by_state, one_thread, thread_count
+from torchid.problem.chunks import chunks_by_state
 from torchid.problem.contact_state import ContactState
 from torchid.problem.elimination import free_parameters
 from torchid.problem.linear import parameter_scale
@@ -87,7 +87,7 @@ class Analysis:
     `resting`: share of the training logs' torques that count as unmeasured, as joints rest, if any does.
     """
 
-    scene: Scene
+    setup: RobotSetup
     scenarios: tuple[ScenarioAnalysis, ...]
     accuracies: dict[str, SetAccuracy]
     output: Path | None
@@ -98,11 +98,11 @@ class Analysis:
     def _headline(self) -> str:
         sets = f"; accuracy of {join_names(list(self.accuracies))}" if self.accuracies else ""
         chosen = [f"{one.name}: {len(one.plan.chosen)} sensors, cost {one.plan.cost:g}" for one in self.scenarios]
-        return f"{self.scene.robot.path.name}; {'; '.join(chosen)}{sets}"
+        return f"{self.setup.robot.path.name}; {'; '.join(chosen)}{sets}"
 
     def to_dict(self) -> dict[str, Any]:
         """What `analysis.json` has."""
-        names, scenarios = self.scene.robot.body_names, {}
+        names, scenarios = self.setup.robot.body_names, {}
         for scenario in self.scenarios:
             proposed = scenario.proposed
             scenarios[scenario.name] = sensor_plan_document(scenario.plan) | {
@@ -118,7 +118,7 @@ class AnalysisRequest:
     """What an experiment file requests, its names looked up.
 
     Attributes:
-        scene: robot, contacts and settings.
+        setup: robot, contacts and settings.
         candidates: sensors to choose from.
         keep: those that are there anyway.
         exclude: those that cannot be.
@@ -126,7 +126,7 @@ class AnalysisRequest:
         compared: sensor sets to compare, by name.
     """
 
-    scene: Scene
+    setup: RobotSetup
     candidates: tuple[Candidate, ...]
     keep: frozenset[Candidate]
     exclude: frozenset[Candidate]
@@ -134,28 +134,28 @@ class AnalysisRequest:
     compared: Mapping[str, SensorSet]
 
     @classmethod
-    def of(cls, scene: Scene) -> AnalysisRequest:
+    def of(cls, setup: RobotSetup) -> AnalysisRequest:
         """The request of an experiment file. Raises InputError: a name that nothing has, or that is taken."""
-        settings, config = scene.config.analysis, scene.config
+        settings, config = setup.config.analysis, setup.config
         choice = settings.candidates
         with _errors_at("analysis"):
             offered = candidates(
-                robot=scene.robot,
-                contacts=scene.contacts,
+                robot=setup.robot,
+                contacts=setup.contacts,
                 joint_torques=choice.joint_torques,
                 per=choice.contacts,
                 costs=settings.costs,
                 ft_sensors=choice.ft_sensors,
                 normal_forces=choice.normal_forces,
             )
-        proposed = None if config.sensors.empty else scene.sensors_of(config.sensors)
+        proposed = None if config.sensors.empty else setup.sensors_of(config.sensors)
         return cls(
-            scene=scene,
+            setup=setup,
             candidates=offered,
             keep=_candidates_named(settings.keep, "keep", offered),
             exclude=_candidates_named(settings.exclude, "exclude", offered),
             proposed=proposed,
-            compared=_sets_named(scene, proposed),
+            compared=_sets_named(setup, proposed),
         )
 
 
@@ -171,23 +171,23 @@ def analyze(config: AnalyzeConfig) -> Analysis:
     output = None if config.output is None else _analysis_folder(config.output)
     if output is not None:
         ranks.from_first(partial(check_free, output, config.overwrite, ANALYSIS, inputs_of(config)), "output")
-    request = AnalysisRequest.of(set_up_scene(config))
+    request = AnalysisRequest.of(set_up_robot(config))
     with progress_bars() as bars:
-        scene, _ = with_chosen_settings(request.scene, bars)
-        request = replace(request, scene=scene)
+        setup, _ = with_chosen_settings(request.setup, bars)
+        request = replace(request, setup=setup)
         train, test = _read(request, bars)
         if train:
-            scene = with_noise(scene, ranks.from_first(partial(scene.estimate_noise, train), "noise"))
-            request = AnalysisRequest.of(scene)
+            setup = with_noise(setup, ranks.from_first(partial(setup.estimate_noise, train), "noise"))
+            request = AnalysisRequest.of(setup)
         results: list[ScenarioAnalysis] = []
 
         def plan() -> dict[str, SensorSet]:
-            for name, states in scenarios(scene, train).items():
+            for name, states in scenarios(setup, train).items():
                 results.append(_analyze_scenario(request, name, states, train, bars))
             return _sets_to_compare(request, results, train)
 
         def compare(sets: Mapping[str, SensorSet]) -> dict[str, SetAccuracy]:
-            return accuracies(scene, sets, train, test) if train else {}
+            return accuracies(setup, sets, train, test) if train else {}
 
         early = [{name: one} for name, one in request.compared.items()][: thread_count() - 1 if can_copy() else 0]
         with in_copies(early, compare, len(early)) as compared_early:
@@ -195,7 +195,7 @@ def analyze(config: AnalyzeConfig) -> Analysis:
             bars.add_task("comparing sensor sets", total=None)
             later = compare({name: one for name, one in sets.items() if not any(name in part for part in early)})
             compared = {name: one for part in (*compared_early(), later) for name, one in part.items()}
-        analysis = Analysis(scene, tuple(results), compared, output, unmeasured_at_rest(train))
+        analysis = Analysis(setup, tuple(results), compared, output, unmeasured_at_rest(train))
         if output is not None:
             bars.add_task("writing", total=None)
             ranks.from_first(partial(_write_analysis, analysis, output, config.overwrite), "analysis folder")
@@ -214,7 +214,7 @@ def _analysis_folder(output: Path) -> Path:
 
 
 def _read(request: AnalysisRequest, bars: Progress) -> tuple[list[Samples], list[Samples]]:
-    files, reader = request.scene.config.logs, LogReader(request.scene)
+    files, reader = request.setup.config.logs, LogReader(request.setup)
     if files is None:
         return [], []
     reading = bars.add_task("reading logs", total=len(files.train) + len(files.test))
@@ -226,14 +226,14 @@ def _read(request: AnalysisRequest, bars: Progress) -> tuple[list[Samples], list
     return train, test
 
 
-def scenarios(scene: Scene, train: Sequence[Samples]) -> dict[str, tuple[ContactState, ...]]:
+def scenarios(setup: RobotSetup, train: Sequence[Samples]) -> dict[str, tuple[ContactState, ...]]:
     """Contact states by scenario: those of the settings, or else of the logs, most frequent first.
 
     Raises:
         UnknownNameError: a frame that is no contact.
     """
-    frames = [contact.frame for contact in scene.contacts]
-    chosen = scene.config.analysis.scenarios
+    frames = [contact.frame for contact in setup.contacts]
+    chosen = setup.config.analysis.scenarios
     if chosen is None:
         recorded: Counter[ContactState] = Counter()
         for samples in train:
@@ -254,9 +254,9 @@ def _analyze_scenario(
     request: AnalysisRequest, name: str, states: tuple[ContactState, ...], train: Sequence[Samples], bars: Progress
 ) -> ScenarioAnalysis:
     """Plan sensors for one scenario, and check those that are proposed."""
-    scene, settings = request.scene, request.scene.config.analysis
-    robot, contacts = scene.robot, scene.contacts
-    free = free_parameters(robot, scene.config.estimator.friction) & ~scene.frozen()
+    setup, settings = request.setup, request.setup.config.analysis
+    robot, contacts = setup.robot, setup.contacts
+    free = free_parameters(robot, setup.config.estimator.friction) & ~setup.frozen()
     problem = PlanningProblem(
         robot=robot,
         contacts=contacts,
@@ -265,7 +265,7 @@ def _analyze_scenario(
         prior=parameter_scale(robot.nominal).flatten() * free,
         keep=request.keep,
         exclude=request.exclude,
-        noise=scene.noise,
+        noise=setup.noise,
         logs=tuple(train),
         criterion=settings.criterion or ("stack" if robot.fixed_base else "per_sample"),
         seed=settings.seed,
@@ -292,18 +292,18 @@ def _sets_to_compare(
     request: AnalysisRequest, results: Sequence[ScenarioAnalysis], train: Sequence[Samples]
 ) -> dict[str, SensorSet]:
     """Sensor sets to compare by accuracy: those with a name, and those planned for contact states of the logs."""
-    scene, sets = request.scene, dict(request.compared)
+    setup, sets = request.setup, dict(request.compared)
     recorded = {state for samples in train for state, _ in chunks_by_state(samples)}
     for scenario, plan in ((one, one.plan) for one in results):
-        known = any(_is_planned(plan, other, scene.contacts) for other in sets.values())
+        known = any(_is_planned(plan, other, setup.contacts) for other in sets.values())
         if known or not recorded & set(scenario.states):
             continue
-        if scalar := _planned_along_normals(plan, scene.contacts):
+        if scalar := _planned_along_normals(plan, setup.contacts):
             needed = f"sensors.contact_wrenches: {{{scalar[0]}: [{NORMAL_FORCE}]}}"
             bound = f"the file's sensors do not read {', '.join(scalar)} along the normal ({needed})"
             warn(f"{bound}; no accuracy of the {scenario.plan_label}")
         else:
-            sets[scenario.plan_label] = sensor_set(scene.robot, scene.contacts, plan.chosen, scene.noise)
+            sets[scenario.plan_label] = sensor_set(setup.robot, setup.contacts, plan.chosen, setup.noise)
     return sets
 
 
@@ -327,26 +327,26 @@ def _is_planned(plan: SensorPlan, sensors: SensorSet, contacts: Sequence[Contact
 
 def _write_analysis(analysis: Analysis, output: Path, overwrite: bool = False) -> None:
     """Write the folder; one that stands there may be replaced with `overwrite`."""
-    scene, names = analysis.scene, analysis.scene.robot.body_names
+    setup, names = analysis.setup, analysis.setup.robot.body_names
     texts, figures = [], {}
     for scenario in analysis.scenarios:
         which = "planned" if scenario.proposed is None else "proposed"
         texts.append(base_parameters_text(f"{scenario.name}, {which} sensors", scenario.base, names))
-        figures[f"sensors-{scenario.name}"] = _picture(scene, scenario)
+        figures[f"sensors-{scenario.name}"] = _picture(setup, scenario)
     if analysis.accuracies:
         figures["accuracy"] = accuracy_figure(analysis.accuracies)
     with during("writing", output), new_folder(output, overwrite, ANALYSIS) as folder:
-        (folder / "config.yaml").write_text(dump_config(scene.config))
+        (folder / "config.yaml").write_text(dump_config(setup.config))
         write_json(folder / "analysis.json", analysis.to_dict())
         (folder / "base_parameters.txt").write_text("\n\n".join(texts))
-        save_figures(figures, folder, scene.config.figures.format)
+        save_figures(figures, folder, setup.config.figures.format)
 
 
-def _picture(scene: Scene, scenario: ScenarioAnalysis) -> Figure:
+def _picture(setup: RobotSetup, scenario: ScenarioAnalysis) -> Figure:
     """The robot's tree with the planned sensors."""
-    plan, robot = scenario.plan, scene.robot
-    sensors = sensor_set(robot, scene.contacts, plan.chosen)
-    used = [c for c, *active in zip(scene.contacts, *scenario.states, strict=True) if any(active)]
+    plan, robot = scenario.plan, setup.robot
+    sensors = sensor_set(robot, setup.contacts, plan.chosen)
+    used = [c for c, *active in zip(setup.contacts, *scenario.states, strict=True) if any(active)]
     wrenches = {
         contact.frame: [
             WRENCH_COMPONENTS[k] if row[0] else contact.component_name(k) for k in np.flatnonzero(row).tolist()
@@ -388,13 +388,13 @@ def _candidates_named(names: Sequence[str], field: str, offered: Sequence[Candid
     return frozenset(by_name[name][0] for name in names)
 
 
-def _sets_named(scene: Scene, proposed: SensorSet | None) -> dict[str, SensorSet]:
+def _sets_named(setup: RobotSetup, proposed: SensorSet | None) -> dict[str, SensorSet]:
     """The proposed set and those that the file compares."""
     sets = {} if proposed is None else {"proposed": proposed}
-    for name, choice in scene.config.analysis.compare.items():
+    for name, choice in setup.config.analysis.compare.items():
         field = f"analysis.compare.{name}"
         if name in sets:
             raise ConfigError.at_field(field, "the name of what stands under sensors", "another name")
         with _errors_at(field, instead_of="sensors"):
-            sets[name] = scene.sensors_of(choice)
+            sets[name] = setup.sensors_of(choice)
     return sets

@@ -28,10 +28,9 @@ from numpy.typing import NDArray
 
 import torchid
 from torchid.commands.manifest import checksum_of_parts, file_checksum, file_parts, file_states, part_checksum
-from torchid.copies import in_copies
 from torchid.errors import excerpt, warn
 from torchid.logs.blocks import GIGABYTE
-from torchid.problem.chunks import thread_count
+from torchid.parallel import in_copies, thread_count
 from torchid.staging import NEW, atomic_file, is_leftover, remove_leftover, staging_folder
 
 FOLDER = ".torchid_cache"

@@ -23,7 +23,7 @@ from torchid.commands.manifest import file_checksum
 from torchid.commands.reading import fits_contact_offsets
 from torchid.config.robot import RobotConfig
 from torchid.errors import TorchidWarning
-from torchid.fitting.experiment import Experiment, Scene
+from torchid.fitting.experiment import Experiment, RobotSetup
 from torchid.fitting.factor_documents import PackedPart, PartPacker, PartReader
 from torchid.logs.lazy_arrays import MappedPages
 from torchid.logs.time_range import log_title
@@ -59,12 +59,12 @@ class ReadLog:
     warned: list[RecordedWarning]
 
 
-def content_of_scene(scene: Scene) -> dict[str, Any]:
+def content_of_setup(setup: RobotSetup) -> dict[str, Any]:
     """All that the samples of a log depend on beside the log, as a document.
 
     Of the sensors that are fitted it is whether contacts have offsets: then samples have readings in the air.
     """
-    config, robot = scene.config, scene.robot
+    config, robot = setup.config, setup.robot
     settings = {name: x for name, x in asdict(config.preprocessing).items() if name not in NOT_IN_SAMPLES}
     topics = None if config.logs is None or config.logs.topics is None else asdict(config.logs.topics)
     columns = None if config.logs is None or config.logs.columns is None else asdict(config.logs.columns)
@@ -73,8 +73,8 @@ def content_of_scene(scene: Scene) -> dict[str, Any]:
         "urdf": [config.robot.path.name, _robot_checksum(config.robot)],
         "robot": [robot.base_link, robot.fixed_base, list(robot.ft_names), robot.welded, robot.base_tilt],
         **_loops(robot),
-        "contacts": [asdict(contact) for contact in scene.contacts],
-        "unloaded": fits_contact_offsets(scene),
+        "contacts": [asdict(contact) for contact in setup.contacts],
+        "unloaded": fits_contact_offsets(setup),
         "preprocessing": settings,
         "motion_noise": config.sensors.noise.motion,
         "sign_width": config.actuators.sign_width,

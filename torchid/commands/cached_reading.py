@@ -12,12 +12,12 @@ from typing import Any
 
 from torchid import ranks
 from torchid.commands.cache import FOLDER, TOKEN, Cache, Files, content_key, missing_folders, remove_empty
-from torchid.commands.cache_entries import ReadLog, RecordedWarning, content_of_scene, samples_entry, samples_of_entry
+from torchid.commands.cache_entries import ReadLog, RecordedWarning, content_of_setup, samples_entry, samples_of_entry
 from torchid.commands.manifest import FilePart, checksum_of_parts, file_parts, file_states, part_checksum
 from torchid.commands.reading import LogReader, fits_contact_offsets, payload_of
 from torchid.commands.shared_log import on_one_machine, read_together
 from torchid.errors import TorchidWarning, warn
-from torchid.fitting.experiment import Scene
+from torchid.fitting.experiment import RobotSetup
 from torchid.fitting.noise import recorded_sensors
 from torchid.logs.blocks import GIGABYTE, log_bytes
 from torchid.logs.containers import LogKind, existing_log_kind, log_files
@@ -30,18 +30,18 @@ from torchid.sensing import SensorSet
 from torchid.sensing.sensors import recorded_components
 
 
-def open_reader(scene: Scene) -> LogReader:
+def open_reader(setup: RobotSetup) -> LogReader:
     """What reads logs, through the cache beside the output if there is to be one. All processes call this together."""
-    cache = open_cache(scene)
-    return LogReader(scene) if cache is None else CachedReader(scene, cache)
+    cache = open_cache(setup)
+    return LogReader(setup) if cache is None else CachedReader(setup, cache)
 
 
-def open_cache(scene: Scene) -> Cache | None:
+def open_cache(setup: RobotSetup) -> Cache | None:
     """The cache beside the output of an experiment; None without any, or where processes have no common folder.
 
     All processes that share the work call this together.
     """
-    size, output = scene.config.preprocessing.cache_gb, scene.config.output
+    size, output = setup.config.preprocessing.cache_gb, setup.config.output
     if not size or output is None:
         return None
     cache = Cache(output.absolute().parent / FOLDER, size)
@@ -102,12 +102,12 @@ class CachedReader(LogReader):
         reused: logs that an earlier run has read.
     """
 
-    def __init__(self, scene: Scene, cache: Cache) -> None:
-        super().__init__(scene)
+    def __init__(self, setup: RobotSetup, cache: Cache) -> None:
+        super().__init__(setup)
         self.cache, self.keys, self.reused = cache, dict[str, str](), set[str]()
         self._new = set[str]()  # keys that were not there when this run began
         self._contents: dict[Path, _Content] = {}
-        self._scene_content = content_of_scene(scene)
+        self._setup_content = content_of_setup(setup)
         self._mapped: list[MappedPages] = []
 
     def release(self) -> None:
@@ -127,7 +127,7 @@ class CachedReader(LogReader):
         return logs
 
     def _together(self, path: Path) -> float:
-        room = self.scene.config.preprocessing.memory_gb - self._held
+        room = self.setup.config.preprocessing.memory_gb - self._held
         content, part = self._content(path), split_range(path)
         file = part.file
         is_text = any(is_text_table(one.path) for one in part.files)
@@ -174,7 +174,7 @@ class CachedReader(LogReader):
         """A log as it is read without a cache; warnings go to a list."""
         with _collecting_warnings(warned):
             samples = super()._samples(path, required, together)
-        recorded = recorded_sensors(self.scene.robot, self.scene.contacts, [samples])
+        recorded = recorded_sensors(self.setup.robot, self.setup.contacts, [samples])
         return ReadLog(samples, recorded, self.excluded.get(str(path)), warned)
 
     # ---------------------------------------------------------------------------------------------- keys and entries
@@ -194,7 +194,7 @@ class CachedReader(LogReader):
 
     def _import_filters(self) -> None:
         """Import what reads a log that is not in the cache, as one of unknown content hardly is."""
-        if self.scene.config.preprocessing.filter_hz is not None:
+        if self.setup.config.preprocessing.filter_hz is not None:
             import_signal()
 
     def _key(self, path: Path, required: SensorSet | None, together: float | None) -> str | None:
@@ -206,15 +206,15 @@ class CachedReader(LogReader):
         content = self._content(path)
         if content is None:
             return None
-        settings = self.scene.config.preprocessing
+        settings = self.setup.config.preprocessing
         drops = settings.exclude_rejected or settings.margin_s is not None or settings.max_slip is not None
         masks = None if required is None or not drops else [required.torque.tolist(), required.wrench.tolist()]
         blocks = None if together is None else settings.memory_gb
         part = split_range(path)
         log = [content.checksum, part.kind, None if part.range is None else part.range.text]
-        added = payload_of(self.scene, path)
+        added = payload_of(self.setup, path)
         carried = [] if added is None else [added.tolist()]
-        return content_key([self._scene_content, log, blocks, masks, *carried])
+        return content_key([self._setup_content, log, blocks, masks, *carried])
 
     def _store(self, key: str, path: Path, read: ReadLog) -> bool:
         """Whether an entry is there now; none is written of a log that has changed since its key was made."""
@@ -239,7 +239,7 @@ class CachedReader(LogReader):
 
     def _has(self, found: ReadLog, required: SensorSet) -> bool:
         """Whether every value of the required sensors was recorded."""
-        needed = recorded_components(self.scene.contacts, required, found.samples.wrench_in_world)
+        needed = recorded_components(self.setup.contacts, required, found.samples.wrench_in_world)
         return not (required.torque & ~found.recorded.torque).any() and not (needed & ~found.recorded.wrench).any()
 
     # ------------------------------------------------------------------------------------------ several processes
@@ -281,7 +281,7 @@ class CachedReader(LogReader):
                 return None
             one = to_read[number]
             log = self._large_log(one.path, required, None if one.together is None else self.folder)
-            return read_together(log, fits_contact_offsets(self.scene), Path(folder), self.cache.limit)
+            return read_together(log, fits_contact_offsets(self.setup), Path(folder), self.cache.limit)
 
         def fill_for_all(folder: Path) -> tuple[dict[str, Any], Files] | None:
             begun.append(ranks.as_first(str(folder), "a folder for a log"))
@@ -315,7 +315,7 @@ class CachedReader(LogReader):
 
     def _logs_to_read(self, paths: Sequence[Path], required: SensorSet | None) -> list[_LogToRead]:
         """What will be read, up to the first log that cannot be; bags that are not in the cache count as nothing."""
-        to_read, held, limit = [], self._held, self.scene.config.preprocessing.memory_gb
+        to_read, held, limit = [], self._held, self.setup.config.preprocessing.memory_gb
         try:
             for path in paths:
                 together = self._together(path)

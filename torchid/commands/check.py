@@ -12,15 +12,14 @@ from typing import Any
 import numpy as np
 
 from torchid.commands.folder import check_free_file
-from torchid.commands.reading import memory_needed, scene_of_log, settle_contacts
+from torchid.commands.reading import memory_needed, settle_contacts, setup_of_log
 from torchid.config import load_analysis
+from torchid.config.log_reading import PreprocessingConfig, load_columns, load_topics
 from torchid.config.logs import LogsConfig
-from torchid.config.maps import load_columns, load_topics
-from torchid.config.preprocessing import PreprocessingConfig
 from torchid.config.robot import ContactConfig
 from torchid.errors import ConfigError, LogError, about_file, current_file, format_count
 from torchid.fitting.checked_settings import resolve_contacts
-from torchid.fitting.experiment import set_up_scene
+from torchid.fitting.experiment import set_up_robot
 from torchid.log_checks import Checked
 from torchid.log_checks.check import check
 from torchid.logs import Columns, Log, Topics, read_log, write_log
@@ -110,17 +109,17 @@ def check_experiment(
         if config.logs is None:
             raise ConfigError.at_field("logs", "missing", "logs to check")
         config.logs.require_samples("check")
-        scene = set_up_scene(config)
-        required = None if config.sensors.empty else scene.sensors_of(config.sensors)
+        setup = set_up_robot(config)
+        required = None if config.sensors.empty else setup.sensors_of(config.sensors)
     files = [*config.logs.train, *config.logs.validation, *config.logs.test]
     checked = []
     with progress_bars() as bars:
         for file in bars.track(files, description="checking"):
-            settings, own = config.preprocessing, scene_of_log(scene, file)
+            settings, own = config.preprocessing, setup_of_log(setup, file)
             log, _ = settle_contacts(_read_log_to_check(file, config.logs, settings), own)
-            rest = scene.contacts, settings.filter_hz, settings.derived, scene.declared, required
+            rest = setup.contacts, settings.filter_hz, settings.derived, setup.declared, required
             found = check(log, own.robot, *rest)
-            checked.append(replace(found, rolling=scene.rolling))
+            checked.append(replace(found, rolling=setup.rolling))
     return checked
 
 

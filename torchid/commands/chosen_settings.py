@@ -19,7 +19,7 @@ from torchid.errors import TorchidWarning, about_file, join_names, warn_about_fi
 from torchid.estimators import Conditions
 from torchid.fitting.cross_validation import RidgeChoice
 from torchid.fitting.delay import DelayChoice, choose_delay
-from torchid.fitting.experiment import Experiment, S, Scene
+from torchid.fitting.experiment import Experiment, RobotSetup, S
 from torchid.fitting.fit import LogFitter
 from torchid.fitting.noise import recorded_sensors
 from torchid.fitting.separable import (
@@ -32,10 +32,9 @@ from torchid.fitting.separable import (
 )
 from torchid.logs import Log
 from torchid.logs.cutoff import CutoffChoice, choose_cutoff
-from torchid.logs.dry_friction import dry_friction_by_setting
+from torchid.logs.dry_friction import dry_friction_by_setting, with_sign_filter
 from torchid.logs.log import FloatArray
 from torchid.logs.preprocess import lacks_derivatives, make_timeline
-from torchid.logs.sign_filter import with_sign_filter
 from torchid.logs.signal_noise import SignalNoise
 from torchid.logs.timeline import LOSSLESS_RATE
 from torchid.problem import ExtraTerms, RowBuilder, Samples
@@ -79,11 +78,11 @@ class Choices:
         return {name.replace("_", " "): choice for name, choice in vars(self).items()}
 
 
-def with_chosen_settings(scene: S, bars: Progress) -> tuple[S, Choices]:
-    """The scene with numbers, or none, where its settings leave them to the training logs, and how they were chosen.
+def with_chosen_settings(setup: S, bars: Progress) -> tuple[S, Choices]:
+    """The setup with numbers, or none, where its settings leave them to the training logs, and how they were chosen.
 
     Args:
-        scene: with logs to fit on; without sensors, all that were recorded count.
+        setup: with logs to fit on; without sensors, all that were recorded count.
         bars: shows that this goes on.
 
     Raises:
@@ -92,37 +91,37 @@ def with_chosen_settings(scene: S, bars: Progress) -> tuple[S, Choices]:
     Warns:
         TorchidWarning: a delay is to be found in logs that are not filtered.
     """
-    if scene.config.logs is None:
-        return scene, Choices()
+    if setup.config.logs is None:
+        return setup, Choices()
     cutoff = tilt = width = delay = stribeck = None
-    if scene.config.preprocessing.cutoff_hz == AUTO:
-        cutoff = _chosen("cutoff", partial(_cutoff, scene), bars)
-        settings = replace(scene.config.preprocessing, cutoff_hz=cutoff.cutoff_hz)
-        scene = replace(scene, config=replace(scene.config, preprocessing=settings))
-    if scene.config.robot.base_tilt == AUTO:
-        tilt = _chosen("base tilt", partial(_base_tilt, scene), bars)
-        stated = replace(scene.config.robot, base_tilt=tilt.tilt)
-        robot = replace(scene.robot, base_tilt=tilt.tilt)
-        scene = replace(scene, robot=robot, config=replace(scene.config, robot=stated))
-    reader = WidthReader(scene)
-    if scene.config.actuators.sign_width == AUTO:
-        width = _chosen("sign width", partial(choose_sign_width, partial(_logs_of, scene, reader, "sign_width")), bars)
-        scene = _with_actuators(scene, sign_width=width.width)
-    if scene.config.actuators.delay == AUTO:
-        if cutoff is None and scene.config.preprocessing.cutoff_hz is None:
+    if setup.config.preprocessing.cutoff_hz == AUTO:
+        cutoff = _chosen("cutoff", partial(_cutoff, setup), bars)
+        settings = replace(setup.config.preprocessing, cutoff_hz=cutoff.cutoff_hz)
+        setup = replace(setup, config=replace(setup.config, preprocessing=settings))
+    if setup.config.robot.base_tilt == AUTO:
+        tilt = _chosen("base tilt", partial(_base_tilt, setup), bars)
+        stated = replace(setup.config.robot, base_tilt=tilt.tilt)
+        robot = replace(setup.robot, base_tilt=tilt.tilt)
+        setup = replace(setup, robot=robot, config=replace(setup.config, robot=stated))
+    reader = WidthReader(setup)
+    if setup.config.actuators.sign_width == AUTO:
+        width = _chosen("sign width", partial(choose_sign_width, partial(_logs_of, setup, reader, "sign_width")), bars)
+        setup = _with_actuators(setup, sign_width=width.width)
+    if setup.config.actuators.delay == AUTO:
+        if cutoff is None and setup.config.preprocessing.cutoff_hz is None:
             warn_about_file(_UNFILTERED)
-        delay = _chosen("delay of torques", partial(_delay, scene, reader), bars)
-        scene = _with_actuators(scene, delay=delay.delay)
-    if scene.config.actuators.stribeck == AUTO:
-        reader = WidthReader(scene) if scene.config.actuators.known_delay and delay else reader
-        stribeck = _chosen("Stribeck velocity", partial(_stribeck, scene, reader), bars)
-        scene = _with_actuators(scene, stribeck=stribeck.velocity)
-    return scene, Choices(cutoff, tilt, width, delay, stribeck)
+        delay = _chosen("delay of torques", partial(_delay, setup, reader), bars)
+        setup = _with_actuators(setup, delay=delay.delay)
+    if setup.config.actuators.stribeck == AUTO:
+        reader = WidthReader(setup) if setup.config.actuators.known_delay and delay else reader
+        stribeck = _chosen("Stribeck velocity", partial(_stribeck, setup, reader), bars)
+        setup = _with_actuators(setup, stribeck=stribeck.velocity)
+    return setup, Choices(cutoff, tilt, width, delay, stribeck)
 
 
-def with_sample_rates(choices: Choices, scene: Scene, logs: Sequence[Samples]) -> Choices:
+def with_sample_rates(choices: Choices, setup: RobotSetup, logs: Sequence[Samples]) -> Choices:
     """The choices with what `preprocessing.sample_rate_hz: auto` has made of logs, if they were read so."""
-    if scene.config.preprocessing.sample_rate_hz != AUTO:
+    if setup.config.preprocessing.sample_rate_hz != AUTO:
         return choices
     rates = {log.source: 1.0 / float(np.median(np.diff(log.time.numpy()))) for log in logs if len(log) > 1}
     return replace(choices, sample_rate=SampleRates(rates))
@@ -136,46 +135,48 @@ def _chosen(name: str, choose: Callable[[], Chosen], bars: Progress) -> Chosen:
     return choice
 
 
-def _cutoff(scene: Scene) -> CutoffChoice:
+def _cutoff(setup: RobotSetup) -> CutoffChoice:
     """By the middle of each training log."""
-    settings, files = scene.config.preprocessing, scene.config.logs
+    settings, files = setup.config.preprocessing, setup.config.logs
     if files is None:
         return CutoffChoice(None, by_noise=False)
     logs = [next(recorded_segments(path, files, settings)).log for path in files.train]
-    stated, from_feet = scene.config.sensors.noise.motion, settings.base_motion is not None
+    stated, from_feet = setup.config.sensors.noise.motion, settings.base_motion is not None
     rate = None if settings.sample_rate_hz == AUTO else settings.sample_rate_hz
     return choose_cutoff(logs, stated, rate, base_is_derived=from_feet)
 
 
-def _base_tilt(scene: Scene) -> TiltChoice:
-    return choose_base_tilt(*_logs_and_fitter(scene, WidthReader(scene)))
+def _base_tilt(setup: RobotSetup) -> TiltChoice:
+    return choose_base_tilt(*_logs_and_fitter(setup, WidthReader(setup)))
 
 
-def _delay(scene: Scene, reader: WidthReader) -> DelayChoice:
-    return choose_delay(*_logs_and_fitter(scene, reader), scene.terms)
+def _delay(setup: RobotSetup, reader: WidthReader) -> DelayChoice:
+    return choose_delay(*_logs_and_fitter(setup, reader), setup.terms)
 
 
-def _stribeck(scene: Scene, reader: WidthReader) -> StribeckChoice:
-    return choose_stribeck(partial(_logs_of, scene, reader, "stribeck"), scene.terms)
+def _stribeck(setup: RobotSetup, reader: WidthReader) -> StribeckChoice:
+    return choose_stribeck(partial(_logs_of, setup, reader, "stribeck"), setup.terms)
 
 
-def _logs_of(scene: Scene, reader: WidthReader, name: str, value: float | None) -> tuple[Sequence[Samples], LogFitter]:
+def _logs_of(
+    setup: RobotSetup, reader: WidthReader, name: str, value: float | None
+) -> tuple[Sequence[Samples], LogFitter]:
     """As `_logs_and_fitter`, with a value of one of the settings of actuators."""
-    return _logs_and_fitter(_with_actuators(scene, **{name: value}), reader)
+    return _logs_and_fitter(_with_actuators(setup, **{name: value}), reader)
 
 
-def _logs_and_fitter(scene: Scene, reader: WidthReader) -> tuple[Sequence[Samples], LogFitter]:
+def _logs_and_fitter(setup: RobotSetup, reader: WidthReader) -> tuple[Sequence[Samples], LogFitter]:
     """The training logs, and a fitter of their rows."""
-    sensors = scene.sensors if isinstance(scene, Experiment) else None
-    logs = reader.logs(scene.terms, sensors)
+    sensors = setup.sensors if isinstance(setup, Experiment) else None
+    logs = reader.logs(setup.terms, sensors)
     if sensors is None:
-        sensors = recorded_sensors(scene.robot, scene.contacts, logs, scene.noise)
-    return logs, scene.fitter(scene.builder(sensors), Conditions(names=scene.robot.body_names))
+        sensors = recorded_sensors(setup.robot, setup.contacts, logs, setup.noise)
+    return logs, setup.fitter(setup.builder(sensors), Conditions(names=setup.robot.body_names))
 
 
-def _with_actuators(scene: S, **stated: Any) -> S:
-    config = scene.config
-    return replace(scene, config=replace(config, actuators=replace(config.actuators, **stated)))
+def _with_actuators(setup: S, **stated: Any) -> S:
+    config = setup.config
+    return replace(setup, config=replace(config, actuators=replace(config.actuators, **stated)))
 
 
 def with_ridge(
@@ -226,24 +227,24 @@ class WidthReader(LogReader):
     So are logs whose base moves as the feet say: they are filtered in segments.
     """
 
-    def __init__(self, scene: Scene) -> None:
-        super().__init__(scene)
+    def __init__(self, setup: RobotSetup) -> None:
+        super().__init__(setup)
         self._directions: dict[str, _Directions] = {}
         self._logs: list[Samples] | None = None
 
     def logs(self, terms: ExtraTerms, required: SensorSet | None) -> list[Samples]:
         """The training logs as `read` gives them with the dry friction of terms; with the same `required` each time."""
-        files, actuators = self.scene.config.logs, self.scene.config.actuators
+        files, actuators = self.setup.config.logs, self.setup.config.actuators
         if self._logs is None or len(self._directions) < len(self._logs):
             own: dict[str, Any] = {"sign_width": terms.sign_width, "stribeck": terms.stribeck}
-            config = replace(self.scene.config, actuators=replace(actuators, **own))
-            self.scene, self._directions = replace(self.scene, config=config), {}
+            config = replace(self.setup.config, actuators=replace(actuators, **own))
+            self.setup, self._directions = replace(self.setup, config=config), {}
             self._logs = self.read(files.train if files else [], required)
             return self._logs
         return [self._directions[log.source].applied(log, terms) for log in self._logs]
 
     def _preprocessed(self, clean: Log) -> Log:
-        log, settings = super()._preprocessed(clean), self.scene.config.preprocessing
+        log, settings = super()._preprocessed(clean), self.setup.config.preprocessing
         if settings.base_motion is None:
             rates = settings.filter_hz, settings.sample_rate_hz
             with about_file(log.source):
@@ -252,5 +253,5 @@ class WidthReader(LogReader):
                 warnings.simplefilter("ignore", TorchidWarning)  # said where the log was read
                 filtered = timeline and with_sign_filter(timeline, clean, log.motion_noise or SignalNoise({}))
             by_setting = dry_friction_by_setting(clean, filtered) if filtered else (lambda *_: {})
-            self._directions[log.source] = _Directions(log.time, joint_order(log, self.scene.robot), by_setting)
+            self._directions[log.source] = _Directions(log.time, joint_order(log, self.setup.robot), by_setting)
         return log

@@ -27,10 +27,10 @@ from torchid.identifiability.base_parameters import StateReport, merge_state_rep
 from torchid.logs.containers import FACTORS, log_files
 from torchid.logs.remote import is_url
 from torchid.logs.time_range import log_title, split_range
+from torchid.parallel import one_thread
 from torchid.problem import Samples
-from torchid.problem.chunks import one_thread
 from torchid.problem.compressed_log import compress_log
-from torchid.problem.sampled_rows import LogElsewhere
+from torchid.problem.sampled_rows import LogOfOtherProcess
 from torchid.report.tables import progress_bars
 
 
@@ -132,10 +132,11 @@ def _warning_in_first_process() -> Iterator[None]:
             warnings.warn(message, category, stacklevel=2)
 
 
-def _with_those_elsewhere(logs: Sequence[Samples]) -> list[Samples | LogElsewhere]:
+def _with_those_elsewhere(logs: Sequence[Samples]) -> list[Samples | LogOfOtherProcess]:
     """All logs of the experiment in order; of those that other processes have, their size."""
-    of_processes: list[list[Samples | LogElsewhere]] = [
-        [*sizes] for sizes in ranks.gather([LogElsewhere(len(x), x.oversampling) for x in logs], "sizes of the samples")
+    of_processes: list[list[Samples | LogOfOtherProcess]] = [
+        [*sizes]
+        for sizes in ranks.gather([LogOfOtherProcess(len(x), x.oversampling) for x in logs], "sizes of the samples")
     ]
     of_processes[ranks.rank()] = [*logs]
     return list(chain.from_iterable(of_processes))

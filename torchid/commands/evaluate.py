@@ -27,12 +27,12 @@ from torchid.fitting.cross_validation import Scorer
 from torchid.fitting.experiment import Experiment, require_device, set_up, with_estimated_noise
 from torchid.guards import MAX_JSON, MAX_YAML, read_bytes
 from torchid.logs.time_range import log_title, split_range
+from torchid.parallel import one_thread
 from torchid.parameters import Array
 from torchid.problem import Evaluation, Metrics, Samples
-from torchid.problem.chunks import one_thread
 from torchid.problem.contact_state import state_name
-from torchid.problem.excitation import is_at_rest
 from torchid.problem.metrics import DECISIVE_GROUPS, WHITENED, describe_errors, group_name
+from torchid.problem.motion_noise import is_at_rest
 from torchid.problem.predict import at_motors, force_series, noise_series, projected_forces
 from torchid.report.figure_style import save_figures
 from torchid.report.figures import error_figure

@@ -39,14 +39,14 @@ from torchid.fitting.robust import RobustSummary, fit_robustly
 from torchid.identifiability.base_parameters import StateReport, require_base, state_reports
 from torchid.identifiability.confounding import TotalMass
 from torchid.identifiability.contributions import Contributions, contributions
+from torchid.parallel import one_thread
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Evaluation, LinearProblem, Metrics, RowBuilder, Samples
-from torchid.problem.chunks import one_thread
 from torchid.problem.compressed_log import Block, fold_compressed, merge_blocks
 from torchid.problem.compression import Part, compress_in_blocks, merge_folds, merge_states, split_into_folds
 from torchid.problem.contact_state import ContactState, state_name
-from torchid.problem.excitation import is_at_rest
 from torchid.problem.metrics import LOG_SETS
+from torchid.problem.motion_noise import is_at_rest
 from torchid.report.tables import progress_bars
 
 

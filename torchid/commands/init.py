@@ -29,7 +29,7 @@ from torchid.commands.init_proposals import (
     without_rolling,
 )
 from torchid.commands.reading import memory_needed
-from torchid.config.preprocessing import PreprocessingConfig
+from torchid.config.log_reading import PreprocessingConfig
 from torchid.config.yaml_text import inline_yaml, yaml_lines
 from torchid.errors import ConfigError, InputError, LogError, about_file, excerpt, format_count, join_names
 from torchid.fitting.checked_settings import is_along_base
@@ -63,7 +63,7 @@ _WELDED = "joints that the log lacks, held still; one that moves needs readings"
 
 
 @dataclass
-class Initiated:
+class InitReport:
     """What `init` has written, and what a user should know of it.
 
     Attributes:
@@ -90,7 +90,7 @@ _NO_CONTACT = (
 )
 
 
-def init(urdf: str | Path, log: str | Path, output: str | Path) -> Initiated:
+def init(urdf: str | Path, log: str | Path, output: str | Path) -> InitReport:
     """Write an experiment file for a robot and a log, complete or not at all.
 
     Args:
@@ -112,7 +112,7 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> Initiated:
     is_bag = existing_log_kind(path) is LogKind.BAG
     robot = load_robot(urdf, fixed_base=has_fixed_base(Path(urdf)))
     contacts, fields, proposal = _of_bag(part.file, robot) if is_bag else _of_columns(files, robot)
-    out = Initiated(target)
+    out = InitReport(target)
     _state_flags(contacts, fields, proposal)
     contacts = contacts if _knows_ground(robot, contacts, fields) else without_rolling(contacts, robot)
     read = _try(path, proposal)
@@ -263,7 +263,7 @@ def _state_flags(contacts: Sequence[GuessedContact], fields: set[str], proposal:
 
 
 def _describe(
-    out: Initiated, robot: Robot, contacts: Sequence[GuessedContact], fields: set[str], proposal: MapProposal
+    out: InitReport, robot: Robot, contacts: Sequence[GuessedContact], fields: set[str], proposal: MapProposal
 ) -> None:
     """What was found, guessed and missed, in lines."""
     what = proposal.key.removesuffix("s")
@@ -299,7 +299,7 @@ def _describe(
 
 
 def _describe_found(
-    out: Initiated, robot: Robot, contacts: Sequence[GuessedContact], fields: set[str], proposal: MapProposal
+    out: InitReport, robot: Robot, contacts: Sequence[GuessedContact], fields: set[str], proposal: MapProposal
 ) -> None:
     """The robot, and what of a map there is."""
     frames = join_names([contact.frame for contact in contacts])
@@ -321,7 +321,7 @@ def _try(path: Path, proposal: MapProposal) -> list[Log] | InputError:
         return error
 
 
-def _describe_log(out: Initiated, read: list[Log] | InputError, fields: set[str]) -> None:
+def _describe_log(out: InitReport, read: list[Log] | InputError, fields: set[str]) -> None:
     """What there is of the log, by the names of the file's fields, or why it is not read."""
     if isinstance(read, InputError):
         out.missing.append(

@@ -17,10 +17,11 @@ import torch
 from torch import Tensor
 
 from torchid.commands.segmented_log import RecordedBlock, Segment, SegmentedLog, in_the_air, require_kept, row_numbers
-from torchid.config.preprocessing import PreprocessingConfig
+from torchid.config.log_reading import PreprocessingConfig
 from torchid.errors import LogError, about_file
 from torchid.logs import Columns, Log
 from torchid.logs.blocks import GIGABYTE, LogBlocks, bridge_in_blocks, count_samples_from, open_log_blocks
+from torchid.logs.dry_friction import with_sign_filter, with_signs_of
 from torchid.logs.gaps import Coverage, warn_of_gaps
 from torchid.logs.lazy_arrays import Filled, MappedPages, Spill, growing_array
 from torchid.logs.log import CONTACT_READINGS, NORMALS, BoolArray
@@ -32,12 +33,11 @@ from torchid.logs.preprocess import (
     make_timeline,
 )
 from torchid.logs.segments import count_samples, long_segments
-from torchid.logs.sign_filter import with_sign_filter, with_signs_of
 from torchid.logs.signal_noise import MOST_SAMPLES, signal_noise, warn_of_noisy_accelerations
 from torchid.logs.timeline import SPLINE_BLOCK, Timeline
+from torchid.parallel import one_thread, thread_count
 from torchid.problem import Samples, bind_log
 from torchid.problem.base_motion import BaseMotion
-from torchid.problem.chunks import one_thread, thread_count
 from torchid.problem.contact_slip import (
     away_from_own_changes,
     base_velocity,

@@ -12,10 +12,9 @@ from rich.progress import Progress
 
 from torchid import parameters
 from torchid.commands.check import LogSegment, segments_to_check
-from torchid.commands.reading import scene_of_log, settle_contacts
+from torchid.commands.reading import settle_contacts, setup_of_log
 from torchid.commands.results import Identification
 from torchid.config.logs import LogsConfig
-from torchid.copies import can_copy, share_between_copies
 from torchid.errors import (
     ImplausibleFitError,
     InputError,
@@ -25,7 +24,7 @@ from torchid.errors import (
     warn_about_file,
 )
 from torchid.estimators import LeastSquares, SgdEstimate
-from torchid.fitting.experiment import Scene
+from torchid.fitting.experiment import RobotSetup
 from torchid.fitting.fit import Fit
 from torchid.fitting.misfit import beyond_models, unexplained_joints, unexplained_torques
 from torchid.identifiability.confounding import ExtraEstimate, TotalMass, estimate_extras, total_mass
@@ -34,9 +33,9 @@ from torchid.log_checks.check import check
 from torchid.log_checks.findings import SEVERITIES
 from torchid.log_checks.lag_and_tilt import check_tilt
 from torchid.log_checks.model import NominalModel
+from torchid.parallel import can_copy, one_thread, share_between_copies, thread_count
 from torchid.parameters import GRAVITY, PARAMETERS, PER_BODY, Array
 from torchid.problem import LinearProblem, Samples
-from torchid.problem.chunks import one_thread, thread_count
 from torchid.problem.metrics import ADVICE, Metrics, WorseThanNominal, describe_worse
 from torchid.robot import Robot
 from torchid.rounding import is_significant
@@ -56,9 +55,9 @@ _USUAL = (
 class TrainingLogs:
     """The training logs of an experiment, checked once the first fit of them is doubtful."""
 
-    def __init__(self, scene: Scene, bars: Progress | None = None) -> None:
+    def __init__(self, setup: RobotSetup, bars: Progress | None = None) -> None:
         """Nothing is checked yet; `bars`: gets one for the checks, which take a while for long logs."""
-        self.scene, self._bars = scene, bars or Progress(disable=True)
+        self.setup, self._bars = setup, bars or Progress(disable=True)
 
     @cached_property
     def finding(self) -> tuple[str, Finding] | None:
@@ -66,7 +65,7 @@ class TrainingLogs:
 
         Nothing after a segment that is rejected as a whole is looked at, nor are logs larger than memory.
         """
-        files = self.scene.config.logs
+        files = self.setup.config.logs
         if files is None or files.compressed:
             return None
         total = 100.0 * len(files.train)
@@ -86,22 +85,22 @@ class TrainingLogs:
                     return
                 done(100.0 * len(segment.log) / segment.of)
 
-    def _segments(self, files: LogsConfig) -> Iterator[tuple[Scene, LogSegment]]:
+    def _segments(self, files: LogsConfig) -> Iterator[tuple[RobotSetup, LogSegment]]:
         for path in files.train:
             with suppress(InputError):  # larger than memory
-                own = scene_of_log(self.scene, path)
+                own = setup_of_log(self.setup, path)
                 yield from ((own, one) for one in segments_to_check(path, files, own.config.preprocessing))
 
 
-def _large_findings(of: tuple[Scene, LogSegment]) -> list[Finding]:
+def _large_findings(of: tuple[RobotSetup, LogSegment]) -> list[Finding]:
     """Findings on a large part of a segment of a log, none where its contacts cannot be settled."""
-    scene, segment = of
-    settings = scene.config.preprocessing
+    setup, segment = of
+    settings = setup.config.preprocessing
     try:
-        flagged, _ = settle_contacts(segment.log, scene)
+        flagged, _ = settle_contacts(segment.log, setup)
     except InputError:
         return []
-    checked = check(flagged, scene.robot, scene.contacts, settings.filter_hz, settings.derived, scene.declared)
+    checked = check(flagged, setup.robot, setup.contacts, settings.filter_hz, settings.derived, setup.declared)
     severe = [one for one in checked.findings if one.severity in SEVERITIES[:2]]
     return [one for one in severe if one.mask(len(checked.log)).mean() > _PART]
 
@@ -126,52 +125,52 @@ def require_plausible(fit: Fit, logs: TrainingLogs, samples: Sequence[Samples] =
         NumericalWarning: forces that no parameters explain, for whatever reason.
         TorchidWarning: a bolted base that is tilted, which masses make up for in part.
     """
-    estimate, scene = fit.estimate, logs.scene
+    estimate, setup = fit.estimate, logs.setup
     if not estimate.rank:
         raise SensorError.at_field("sensors", "no parameter is in reach of them", "other sensors, contacts or logs")
     if not max(fit.assembly.problem.cost(np.zeros_like(estimate.phi)), fit.assembly.forces) > 0.0:
         raise ImplausibleFitError.at_field("logs", "all measured forces are 0", "forces; NaN where none was measured")
     block_error = 0.0 if fit.scatter is None else fit.scatter.mass_error
-    tolerance = scene.config.estimator.rank_tolerance
+    tolerance = setup.config.estimator.rank_tolerance
     by_data = LeastSquares(rank_tolerance=tolerance).solve(fit.assembly.problem)
     if fit.assembly.homogeneous:
-        by_data_alone = estimate_extras(fit.assembly, by_data, scene.robot.body_names, tolerance)
-        _require_scales(by_data_alone, bool(scene.contacts))
+        by_data_alone = estimate_extras(fit.assembly, by_data, setup.robot.body_names, tolerance)
+        _require_scales(by_data_alone, bool(setup.contacts))
     mass, mass_by_data = (total_mass(fit.assembly, x, tolerance, block_error) for x in (estimate, by_data))
-    reason = implausibility(fit.assembly.data or fit.assembly.problem, estimate.phi, mass_by_data, scene.robot)
+    reason = implausibility(fit.assembly.data or fit.assembly.problem, estimate.phi, mass_by_data, setup.robot)
     unexplained = None  # a descent that is not finished leaves much that a model explains
     if not isinstance(estimate, SgdEstimate):
-        unexplained = beyond_models(estimate, fit.assembly.problem, fit.assembly.forces, scene.noise_stated)
+        unexplained = beyond_models(estimate, fit.assembly.problem, fit.assembly.forces, setup.noise_stated)
     if reason is None and unexplained is None:
-        _warn_of_tilt(samples, scene)
+        _warn_of_tilt(samples, setup)
         return mass
     log, finding = logs.finding or (None, None)
     if finding is not None and (reason is not None or finding.rejects_all):
         checks = f"{log}: {finding.field}: {finding.found}"
         raise ImplausibleFitError.at_field(
-            "logs", f"{reason or unexplained}; torchid check finds in {checks}", _advice(finding.advice, scene)
+            "logs", f"{reason or unexplained}; torchid check finds in {checks}", _advice(finding.advice, setup)
         )
     if reason is not None:
-        of = scene.robot.format
+        of = setup.robot.format
         accepted = f"data and {of} that fit each other; usual reasons: {_USUAL.format(of=of)}"
-        raise ImplausibleFitError.at_field("logs", reason, _advice(accepted, scene))
+        raise ImplausibleFitError.at_field("logs", reason, _advice(accepted, setup))
     named = "" if finding is None else f"; torchid check finds in {log}: {finding.field}: {finding.found}"
     advice = "check units, frames, quaternion order and contact_active, or state the noise that there is"
     warn_about_file(f"{unexplained}{named}; {advice}", NumericalWarning)
     return mass
 
 
-def _advice(text: str, scene: Scene) -> str:
+def _advice(text: str, setup: RobotSetup) -> str:
     """What to do, first of all where nothing holds the robot: then masses of 0 explain forces of no weight."""
-    if scene.contacts or scene.robot.fixed_base or "under contacts" in text:
+    if setup.contacts or setup.robot.fixed_base or "under contacts" in text:
         return text
     return f"name under contacts what touches the ground, or robot.fixed_base: true if the base stands still; or {text}"
 
 
-def _warn_of_tilt(samples: Sequence[Samples], scene: Scene) -> None:
+def _warn_of_tilt(samples: Sequence[Samples], setup: RobotSetup) -> None:
     """Say that a bolted base which counts as upright is tilted."""
-    if samples and scene.robot.fixed_base and scene.config.robot.base_tilt is None:
-        for one in check_tilt(samples, NominalModel(scene.robot, scene.contacts, scene.declared)):
+    if samples and setup.robot.fixed_base and setup.config.robot.base_tilt is None:
+        for one in check_tilt(samples, NominalModel(setup.robot, setup.contacts, setup.declared)):
             warn_about_file(f"robot.base_tilt: {one.found}; {one.advice}")
 
 
@@ -210,7 +209,7 @@ def require_not_worse(worse: list[WorseThanNominal], fitted: Metrics, logs: Trai
     Warns:
         NumericalWarning: the URDF's parameters predict better, for whatever reason.
     """
-    message, unexplained = describe_worse(worse, logs.scene.robot.format), unexplained_torques(fitted)
+    message, unexplained = describe_worse(worse, logs.setup.robot.format), unexplained_torques(fitted)
     if message is None and not unexplained:
         return
     log, finding = logs.finding or (None, None)

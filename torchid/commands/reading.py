@@ -15,7 +15,7 @@ from torchid.commands.large_log import BLOCK_GB, LargeLog
 from torchid.commands.segmented_log import require_kept
 from torchid.config.logs import require_apart
 from torchid.errors import ConfigError, LogError
-from torchid.fitting.experiment import S, Scene
+from torchid.fitting.experiment import RobotSetup, S
 from torchid.log_checks import Checked, drop_rejected
 from torchid.log_checks.check import check
 from torchid.logs import Log, read_log
@@ -45,21 +45,21 @@ class LogReader:
     Logs whose arrays together take more than the memory they may take are kept on the disk from then on, all but bags.
 
     Attributes:
-        scene: robot, contacts and settings.
+        setup: robot, contacts and settings.
         folder: on whose disk logs are kept, as long as they are used.
         excluded: how many samples of each log were left out because they are rejected, by path.
     """
 
-    def __init__(self, scene: Scene, folder: Path | None = None) -> None:
-        """Nothing is read yet; without a `folder` it is the one that the output of the scene goes to, or a temporary.
+    def __init__(self, setup: RobotSetup, folder: Path | None = None) -> None:
+        """Nothing is read yet; without a `folder` it is the one that the output of the setup goes to, or a temporary.
 
         Raises:
             ConfigError: settings that leave the cutoff to the logs, where it has not been chosen.
         """
-        if scene.config.preprocessing.cutoff_hz == "auto":
+        if setup.config.preprocessing.cutoff_hz == "auto":
             raise ConfigError.at_field("preprocessing.cutoff_hz", "auto, not yet chosen", "a number [Hz] or null")
-        self.scene = scene
-        self.folder = _folder_beside(scene.config.output) if folder is None else folder
+        self.setup = setup
+        self.folder = _folder_beside(setup.config.output) if folder is None else folder
         self.excluded: dict[str, int] = {}
         self._held = 0.0  # arrays of logs in memory [GB]
 
@@ -76,7 +76,7 @@ class LogReader:
         Raises:
             LogError: a file that cannot be read, or does not fit the robot.
         """
-        limit, logs = self.scene.config.preprocessing.memory_gb, []
+        limit, logs = self.setup.config.preprocessing.memory_gb, []
         for path in paths:
             together = self._together(path)
             bag = existing_log_kind(path) is LogKind.BAG
@@ -87,7 +87,7 @@ class LogReader:
             if on_read is not None:
                 on_read(path)
         names = ranks.as_first([log.source for log in logs], "names of the logs")  # they may lie elsewhere there
-        added = [payload_of(self.scene, path) for path in paths]
+        added = [payload_of(self.setup, path) for path in paths]
         return [replace(log, source=name, payload=x) for log, name, x in zip(logs, names, added, strict=True)]
 
     def release(self) -> None:
@@ -95,7 +95,7 @@ class LogReader:
 
     def _together(self, path: Path) -> float:
         """What a log takes in memory with those before it [GB]."""
-        return memory_needed(path, self.scene.config.preprocessing.memory_gb, self._held)
+        return memory_needed(path, self.setup.config.preprocessing.memory_gb, self._held)
 
     def _samples(self, path: Path, required: SensorSet | None, together: float | None) -> Samples:
         """The samples of a log; `together`: what it takes with those before it [GB], if that is too much."""
@@ -103,9 +103,9 @@ class LogReader:
 
     def _small(self, path: Path, required: SensorSet | None) -> Samples:
         """A log that fits into memory."""
-        settings, files = self.scene.config.preprocessing, self.scene.config.logs
+        settings, files = self.setup.config.preprocessing, self.setup.config.logs
         if self._takes_blocks(path, log_bytes(path, GIGABYTE * _WHOLE_GB) / GIGABYTE):
-            return self._large_log(path, required, None).samples(fits_contact_offsets(self.scene))
+            return self._large_log(path, required, None).samples(fits_contact_offsets(self.setup))
         topics, columns = (None, None) if files is None else (files.topics, files.columns)
         allow_gaps, bridge_gaps_s = settings.exclude_rejected, settings.bridge_gaps_s
         read = read_log(
@@ -116,15 +116,15 @@ class LogReader:
             bridge_gaps_s=bridge_gaps_s,
             needs_flags=settings.needs_flags,
         )
-        own = scene_of_log(self.scene, path)
-        acting = with_delayed_torques(without_welded_joints(read, own.robot), self.scene.config.actuators.known_delay)
+        own = setup_of_log(self.setup, path)
+        acting = with_delayed_torques(without_welded_joints(read, own.robot), self.setup.config.actuators.known_delay)
         recorded, certain = settle_contacts(with_loop_joints(acting, own.robot), own)
         checked = self._checked(recorded, own.robot)
         clean = recorded if checked is None else checked.repaired
         log = self._preprocessed(clean)
-        samples = bind_log(log, self.scene.robot, self.scene.contacts, required)
+        samples = bind_log(log, self.setup.robot, self.setup.contacts, required)
         slip = self._slipping(log, samples, recorded)
-        if not fits_contact_offsets(self.scene):
+        if not fits_contact_offsets(self.setup):
             samples = replace(samples, unloaded=None)
         if checked is not None:
             count = len(samples)
@@ -144,12 +144,12 @@ class LogReader:
 
     def _preprocessed(self, clean: Log) -> Log:
         """A log as recorded, filtered, differentiated and resampled."""
-        settings = self.scene.config.preprocessing
-        rates, terms = (settings.filter_hz, settings.sample_rate_hz), self.scene.terms
-        dry, finds_rest = (terms.sign_width, terms.stribeck), self.scene.config.actuators.stiction
+        settings = self.setup.config.preprocessing
+        rates, terms = (settings.filter_hz, settings.sample_rate_hz), self.setup.terms
+        dry, finds_rest = (terms.sign_width, terms.stribeck), self.setup.config.actuators.stiction
         if settings.base_motion is None:
             return preprocess(clean, *rates, self._stated, *dry, finds_rest)
-        return preprocess_standing(clean, self.scene.robot, self.scene.contacts, *rates, *dry, finds_rest)
+        return preprocess_standing(clean, self.setup.robot, self.setup.contacts, *rates, *dry, finds_rest)
 
     def _slipping(self, log: Log, samples: Samples, recorded: Log) -> FloatArray | None:
         """Stamps of samples in which a contact slips; None where all are kept.
@@ -157,91 +157,91 @@ class LogReader:
         Warns:
             TorchidWarning: there are some, or nothing says whether there are.
         """
-        settings, scene = self.scene.config.preprocessing, self.scene
-        if settings.max_slip is None or not scene.contacts:
+        settings, setup = self.setup.config.preprocessing, self.setup
+        if settings.max_slip is None or not setup.contacts:
             return None
         derived = settings.base_motion is not None
-        rest = scene.robot, scene.contacts, settings.slip_limit, settings.filter_hz, derived
+        rest = setup.robot, setup.contacts, settings.slip_limit, settings.filter_hz, derived
         slip = measure_slip(log, samples, recorded, *rest)
         warn_of_slip(slip, log.source)
         return np.asarray(samples.time.numpy()[slip.slips.any(axis=1)])
 
     def _large(self, path: Path, required: SensorSet | None, together: float) -> Samples:
         """A log that does not, with those before it [GB]."""
-        settings = self.scene.config.preprocessing
+        settings = self.setup.config.preprocessing
         needed = f"a preprocessing.memory_gb above {together:.2g}"
         arrays = f"arrays of {together:.2g} GB, which are not in memory at once"
         if split_range(path).joins:
             found = f"several files with {arrays}"
             raise LogError(path, "file", found, f"{needed}, or the one file that torchid convert makes of them")
-        if self.scene.config.actuators.known_delay:
+        if self.setup.config.actuators.known_delay:
             raise LogError(path, "actuators.delay", f"set for {arrays}", f"{needed}, or parts of the log")
         if settings.exclude_rejected:
             accepted = f"{needed}, or parts of the logs that torchid check passes"
             raise LogError(path, "preprocessing.exclude_rejected", f"set for {arrays}", accepted)
-        return self._large_log(path, required, self.folder).samples(fits_contact_offsets(self.scene))
+        return self._large_log(path, required, self.folder).samples(fits_contact_offsets(self.setup))
 
     def _takes_blocks(self, path: Path, gigabytes: float) -> bool:
         """Whether a log with so much in arrays is read block by block even if there is memory for it.
 
         Where fields are worked out of others, blocks take more passes over it.
         """
-        settings = self.scene.config.preprocessing
+        settings = self.setup.config.preprocessing
         filled = settings.bridge_gaps_s is not None or settings.zero_in_air
-        logs, delayed = self.scene.config.logs, bool(self.scene.config.actuators.known_delay)
+        logs, delayed = self.setup.config.logs, bool(self.setup.config.actuators.known_delay)
         joined = not has_blocks(path, None if logs is None else logs.columns)
         whole = settings.exclude_rejected or settings.derived or filled or delayed or joined
-        return gigabytes > _WHOLE_GB and not whole and not self.scene.robot.loops
+        return gigabytes > _WHOLE_GB and not whole and not self.setup.robot.loops
 
     def _large_log(self, path: Path, required: SensorSet | None, folder: Path | None) -> LargeLog:
         """A log that is read block by block."""
-        scene = self.scene
-        settings = scene.config.preprocessing
+        setup = self.setup
+        settings = setup.config.preprocessing
         return LargeLog(
             path,
             settings,
-            scene.robot,
-            scene.contacts,
+            setup.robot,
+            setup.contacts,
             required,
             folder,
             motion_noise=self._stated,
-            sign_width=scene.terms.sign_width,
-            stribeck=scene.terms.stribeck,
-            finds_rest=scene.config.actuators.stiction,
-            columns=None if scene.config.logs is None else scene.config.logs.columns,
-            loaded=scene_of_log(scene, path).robot,
+            sign_width=setup.terms.sign_width,
+            stribeck=setup.terms.stribeck,
+            finds_rest=setup.config.actuators.stiction,
+            columns=None if setup.config.logs is None else setup.config.logs.columns,
+            loaded=setup_of_log(setup, path).robot,
         )
 
     @property
     def _stated(self) -> dict[str, float]:
-        return self.scene.config.sensors.noise.motion
+        return self.setup.config.sensors.noise.motion
 
     def _checked(self, log: Log, robot: Robot) -> Checked | None:
         """What the checks of a log say, if rejected samples are to be left out."""
-        settings = self.scene.config.preprocessing
+        settings = self.setup.config.preprocessing
         if not settings.exclude_rejected:
             return None
-        declared = replace(self.scene.declared, delay=0.0)  # the log has been read with it
-        return check(log, robot, self.scene.contacts, settings.filter_hz, settings.derived, declared)
+        declared = replace(self.setup.declared, delay=0.0)  # the log has been read with it
+        return check(log, robot, self.setup.contacts, settings.filter_hz, settings.derived, declared)
 
 
-def settle_contacts(log: Log, scene: Scene) -> tuple[Log, BoolArray]:
+def settle_contacts(log: Log, setup: RobotSetup) -> tuple[Log, BoolArray]:
     """A log with the flags and zeros of contacts that the settings want, and where the flags (N,) are certain."""
-    flagged, certain = _with_flags(log, scene)
-    if not scene.config.preprocessing.zero_in_air:
+    flagged, certain = _with_flags(log, setup)
+    if not setup.config.preprocessing.zero_in_air:
         return flagged, certain
-    zeroed = zero_in_air(flagged, scene.contacts)
-    if scene.config.preprocessing.contact_threshold is None:
+    zeroed = zero_in_air(flagged, setup.contacts)
+    if setup.config.preprocessing.contact_threshold is None:
         return zeroed, certain
-    return _with_flags(zeroed, scene)
+    return _with_flags(zeroed, setup)
 
 
-def _with_flags(log: Log, scene: Scene) -> tuple[Log, BoolArray]:
+def _with_flags(log: Log, setup: RobotSetup) -> tuple[Log, BoolArray]:
     """A log with contact flags as recorded, from joint torques or from forces, and where they are certain."""
-    settings = scene.config.preprocessing
+    settings = setup.config.preprocessing
     if settings.detect_contacts is not None:
-        rest = settings.detect_contacts, settings.takes_possible_contacts, scene.terms.sign_width
-        return with_detected_contacts(log, scene.robot, scene.contacts, *rest)
+        rest = settings.detect_contacts, settings.takes_possible_contacts, setup.terms.sign_width
+        return with_detected_contacts(log, setup.robot, setup.contacts, *rest)
     if settings.contact_threshold is not None:
         return with_flags_by_force(log, settings.contact_threshold)
     return log, np.ones(len(log), dtype=bool)
@@ -275,9 +275,9 @@ def check_read(logs: Mapping[str, Sequence[Samples]]) -> None:
     require_apart(parts, share)
 
 
-def fits_contact_offsets(scene: Scene) -> bool:
+def fits_contact_offsets(setup: RobotSetup) -> bool:
     """Whether offsets of contact sensors are fitted, the only use of their readings in the air."""
-    return any(channel.startswith("contact") for channel in scene.terms.offsets)
+    return any(channel.startswith("contact") for channel in setup.terms.offsets)
 
 
 def memory_needed(path: Path, memory_gb: float, held: float = 0.0) -> float:
@@ -298,12 +298,12 @@ def _folder_beside(output: Path | None) -> Path:
     return next((folder for folder in output.absolute().parents if folder.is_dir()), Path.cwd())
 
 
-def payload_of(scene: Scene, path: str | Path) -> Array | None:
+def payload_of(setup: RobotSetup, path: str | Path) -> Array | None:
     """What the robot carried in a log, (12 L,), as `Samples.payload` has it; None for nothing."""
-    payloads = () if scene.config.logs is None else scene.config.logs.payloads_of(path)
-    return payload_parameters(scene.robot, payloads) if payloads else None
+    payloads = () if setup.config.logs is None else setup.config.logs.payloads_of(path)
+    return payload_parameters(setup.robot, payloads) if payloads else None
 
 
-def scene_of_log(scene: S, path: str | Path) -> S:
-    """The scene with the nominal robot as it was in a log, for whatever compares recordings with it."""
-    return replace(scene, robot=with_payload(scene.robot, payload_of(scene, path)))
+def setup_of_log(setup: S, path: str | Path) -> S:
+    """The setup with the nominal robot as it was in a log, for whatever compares recordings with it."""
+    return replace(setup, robot=with_payload(setup.robot, payload_of(setup, path)))

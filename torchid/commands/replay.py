@@ -22,9 +22,9 @@ from torchid.estimators.posterior import PRIOR_ERROR
 from torchid.fitting.calibration import Comparison
 from torchid.fitting.posterior import PosteriorSampler, read_posterior
 from torchid.logs.time_range import split_range
+from torchid.parallel import one_thread
 from torchid.parameters import Array
 from torchid.problem import Samples
-from torchid.problem.chunks import one_thread
 from torchid.problem.extras import ACTUATORS
 from torchid.report import FittedJoints, identified_name, identified_robot
 from torchid.report.figure_style import save_figures

@@ -258,7 +258,7 @@ def _metrics_document(run: Identification) -> dict[str, object]:
         "nominal_error": None if run.posterior.nominal_error is None else asdict(run.posterior.nominal_error),
         "total_mass": run.mass.value if run.mass.determined else None,
         "total_mass_standard_error": run.mass.standard_error if np.isfinite(run.mass.standard_error) else None,
-        "total_mass_told_from_offsets": run.mass.separable,
+        "total_mass_separable_from_offsets": run.mass.separable,
         "confounded": [asdict(one) | {"message": str(one)} for one in list_confounded(run.extras)],
         "total_mass_nominal": float(robot.nominal[:, 0].sum()),
         "smallest_eigenvalue": body_eigenvalues(robot, estimate.phi),

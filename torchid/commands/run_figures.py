@@ -15,14 +15,13 @@ from torchid import ranks
 from torchid.commands.answer import answer
 from torchid.commands.training import body_eigenvalues, known_parameters
 from torchid.config import ExperimentConfig, dump_config
-from torchid.copies import in_copies, share_between_processes
 from torchid.estimators import ConstrainedEstimate, Estimate, SgdEstimate
 from torchid.fitting.cross_validation import RidgeChoice
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.identifiability.contributions import Contributions
 from torchid.logs.time_range import log_title
+from torchid.parallel import in_copies, share_between_processes, thread_count
 from torchid.problem import Metrics
-from torchid.problem.chunks import thread_count
 from torchid.problem.metrics import LOG_SETS
 from torchid.report.figure_style import Drawn, draw_for
 from torchid.report.figures import contribution_figure, error_figure, identifiability_figure, ridge_figure

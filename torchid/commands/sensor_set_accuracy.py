@@ -8,14 +8,13 @@ from functools import partial
 
 from torchid import ranks
 from torchid.commands.plausibility import TrainingLogs, require_plausible
-from torchid.copies import share_between_copies
 from torchid.errors import ImplausibleFitError, LogError, warn
 from torchid.fitting.calibration import Calibration, list_confounded
-from torchid.fitting.experiment import Scene, batch_estimator
+from torchid.fitting.experiment import RobotSetup, batch_estimator
 from torchid.identifiability.information import error_directions, expected_errors
+from torchid.parallel import share_between_copies, thread_count
 from torchid.parameters import Array
 from torchid.problem import Evaluation, ExtraTerms, RowBuilder, Samples, assemble, compress_parts
-from torchid.problem.chunks import thread_count
 from torchid.problem.compression import split_into_folds
 from torchid.problem.elimination import Assembly
 from torchid.problem.samples import require_forces
@@ -25,7 +24,7 @@ from torchid.sensing.sensors import measured_components
 
 
 def accuracies(
-    scene: Scene,
+    setup: RobotSetup,
     sets: Mapping[str, SensorSet],
     train: Sequence[Samples],
     test: Sequence[Samples],
@@ -38,14 +37,14 @@ def accuracies(
     Warns:
         TorchidWarning: the training logs lack a sensor of a set, or no robot can have left its fit; it is left out.
     """
-    evaluation = scene.evaluation()
-    reference = _reference(scene, train)
+    evaluation = setup.evaluation()
+    reference = _reference(setup, train)
 
     def accuracy(name: str) -> SetAccuracy | None:
         try:
             for samples in train:
-                require_forces(samples, scene.robot, scene.contacts, sets[name])
-            return _accuracy(scene, sets[name], train, test, evaluation, reference)
+                require_forces(samples, setup.robot, setup.contacts, sets[name])
+            return _accuracy(setup, sets[name], train, test, evaluation, reference)
         except LogError as error:
             warn(f"{error.source}: {error.field}: {error.found}; no accuracy of the sensors '{name}'")
         except ImplausibleFitError as error:
@@ -60,7 +59,7 @@ def accuracies(
 class _Reference:
     """Sensors whose readings predictions are compared with, and their extra parameters by the training logs."""
 
-    scene: Scene
+    setup: RobotSetup
     builder: RowBuilder
     assembly: Assembly
 
@@ -71,58 +70,58 @@ class _Reference:
             for elimination, own in zip(assembly.eliminations, assembly.extras_at(phi), strict=True)
             for extra, value in zip(elimination.extras, own, strict=True)
         }
-        robot, loss = self.scene.robot, self.scene.loss
+        robot, loss = self.setup.robot, self.setup.loss
         return Calibration(robot=robot, builder=self.builder, phi=phi, values=values, loss=loss)
 
 
-def _reference(scene: Scene, train: Sequence[Samples]) -> _Reference | None:
+def _reference(setup: RobotSetup, train: Sequence[Samples]) -> _Reference | None:
     """All sensors, None if some log lacks one or there is nothing to calibrate."""
-    robot = scene.robot
-    sensors = named_sensors("full", robot.n, len(scene.contacts), scene.noise, len(robot.ft_names))
+    robot = setup.robot
+    sensors = named_sensors("full", robot.n, len(setup.contacts), setup.noise, len(robot.ft_names))
     sensors = with_ft_sensors(sensors, robot, robot.ft_names)
-    builder = scene.builder(sensors)
+    builder = setup.builder(sensors)
     if not builder.extras:
         return None
     try:
         for samples in train:
-            require_forces(samples, robot, scene.contacts, sensors)
+            require_forces(samples, robot, setup.contacts, sensors)
     except LogError:
         return None
-    return _Reference(scene, builder, assemble(compress_parts(train, builder), builder, robot))
+    return _Reference(setup, builder, assemble(compress_parts(train, builder), builder, robot))
 
 
 def _accuracy(
-    scene: Scene,
+    setup: RobotSetup,
     sensors: SensorSet,
     train: Sequence[Samples],
     test: Sequence[Samples],
     evaluation: Evaluation,
     reference: _Reference | None,
 ) -> SetAccuracy:
-    settings, robot = scene.config.estimator, scene.robot
-    builder, conditions = scene.builder(sensors), scene.conditions()
-    fitter = scene.fitter(builder, conditions)
+    settings, robot = setup.config.estimator, setup.robot
+    builder, conditions = setup.builder(sensors), setup.conditions()
+    fitter = setup.fitter(builder, conditions)
     if settings.name == "sgd":
         settings = replace(settings, name="least_squares")
     blocks = split_into_folds(train, builder)
     parts = compress_parts(blocks, builder)
     if settings.chooses_ridge:
-        choice = ranks.from_first(partial(scene.choose_ridge, parts, blocks, fitter, conditions), "ridge")
+        choice = ranks.from_first(partial(setup.choose_ridge, parts, blocks, fitter, conditions), "ridge")
         settings = replace(settings, ridge=choice.ridge)
     fit = fitter.fit(parts, batch_estimator(settings, conditions).solve)
-    require_plausible(fit, TrainingLogs(scene))
+    require_plausible(fit, TrainingLogs(setup))
     estimate, problem = fit.estimate, fit.assembly.problem
     noise = estimate.residual_std
     variance = noise**2 * problem.oversampling
-    prior_error = scene.config.analysis.prior_error
+    prior_error = setup.config.analysis.prior_error
     directions = error_directions(problem, settings.numeric_ridge, variance, prior_error, settings.rank_tolerance)
-    scaled_noise = scene.noise.scaled(noise)
-    bodies = Evaluation(robot, scene.contacts, scene.config.device, ExtraTerms(sign_width=scene.terms.sign_width))
+    scaled_noise = setup.noise.scaled(noise)
+    bodies = Evaluation(robot, setup.contacts, setup.config.device, ExtraTerms(sign_width=setup.terms.sign_width))
     expected = expected_errors(bodies.builder, test or train, directions, scaled_noise)
-    calibration = (reference or _Reference(scene, builder, fit.assembly)).calibration(estimate.phi)
+    calibration = (reference or _Reference(setup, builder, fit.assembly)).calibration(estimate.phi)
     phi = calibration.parameters(evaluation)
     measured = evaluation.metrics(calibration.calibrate(test), phi[None])[0] if test else None
-    possible = measured_components(scene.contacts, sensors)
+    possible = measured_components(setup.contacts, sensors)
     channels, confounded = int(sensors.torque.sum() + possible.sum()), list_confounded(fit.extras)
     words, advice = tuple(map(str, confounded)), tuple(one.in_short for one in confounded)
     return SetAccuracy(channels, estimate.rank, expected, measured, words, advice)

@@ -22,10 +22,9 @@ from torchid.commands.cache import Files, written_file
 from torchid.commands.cache_entries import ReadLog, RecordedWarning, named_tensors, samples_entry
 from torchid.commands.large_log import LargeLog
 from torchid.commands.manifest import file_checksum
-from torchid.copies import can_copy, share_between_copies
 from torchid.fitting.noise import recorded_sensors
+from torchid.parallel import can_copy, share_between_copies, thread_count
 from torchid.problem import Samples
-from torchid.problem.chunks import thread_count
 from torchid.sensing import SensorSet
 
 

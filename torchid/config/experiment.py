@@ -12,9 +12,8 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from torchid.config.estimator import MASS_ACCEPTED, ROBUST_ACCEPTED, EstimatorConfig, validate_keys
+from torchid.config.log_reading import MAPS_ACCEPTED, PreprocessingConfig
 from torchid.config.logs import SETS, LogsConfig, entries_spelled_out, resolve_logs
-from torchid.config.maps import MAPS_ACCEPTED
-from torchid.config.preprocessing import PreprocessingConfig
 from torchid.config.reading import FileKind, Settings, load, plain_sections
 from torchid.config.robot import (
     CHOICE_ACCEPTED,

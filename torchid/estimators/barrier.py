@@ -12,8 +12,8 @@ from torch import Tensor
 
 from torchid.errors import InputError, NumericalWarning, warn
 from torchid.estimators.conic_problem import EQUAL_WITHIN, ConicProblem, Solution
+from torchid.parallel import one_thread
 from torchid.parameters import Array
-from torchid.problem.chunks import one_thread
 
 _SHRINK = 0.02  # of the barrier's weight from stage to stage
 _STAGE_CENTRED = 0.25  # squared Newton decrement at which a full step ends a stage

@@ -9,8 +9,8 @@ import scipy.linalg
 
 from torchid.estimators.barrier import find_strictly_feasible
 from torchid.estimators.conic_problem import ConicProblem
+from torchid.parallel import one_thread
 from torchid.parameters import Array
-from torchid.problem.chunks import one_thread
 
 UPPER = np.triu_indices(4)
 """Rows and columns of the ten entries that a symmetric (4, 4) matrix is held in."""

@@ -12,8 +12,8 @@ from scipy import sparse
 from torchid.errors import InputError, NumericalWarning, warn
 from torchid.estimators.barrier import find_strictly_feasible
 from torchid.estimators.conic_problem import ConicProblem, Solution
+from torchid.parallel import one_thread
 from torchid.parameters import Array
-from torchid.problem.chunks import one_thread
 
 _TOLERANCE = 1e-10  # relative gap that Clarabel is asked for
 _LOOSE = 1e-6  # relative gap above which the next try follows, and after the last one a warning

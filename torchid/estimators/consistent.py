@@ -16,9 +16,9 @@ from torchid.estimators.conic_formulation import Prior, build_conic_problem
 from torchid.estimators.conic_problem import ConicProblem, Solution
 from torchid.estimators.least_squares import ConstrainedEstimate, Minimizer, Regularized, report_rounding
 from torchid.estimators.ridge_limit import RidgeLimit, ridge_limit
+from torchid.parallel import one_thread
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import LinearProblem
-from torchid.problem.chunks import one_thread
 from torchid.problem.eliminated_terms import AT_BOUND
 from torchid.reprs import short_repr
 from torchid.rounding import relative_tolerance

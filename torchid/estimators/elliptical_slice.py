@@ -13,8 +13,8 @@ from torch import Tensor
 from torchid.errors import NumericalWarning, warn
 from torchid.estimators.barrier_gaussian import CURVATURE, ENTRY_WEIGHTS, UPPER, BarrierGaussian
 from torchid.estimators.conic_problem import ConicProblem
+from torchid.parallel import one_thread
 from torchid.parameters import Array
-from torchid.problem.chunks import one_thread
 
 _CHAINS = 512  # that find out how many passes make a state new
 _TRIES = (3, 6, 15)  # on an ellipse, at once, after which a chain stays where it is; each halves the arc

@@ -10,9 +10,9 @@ from torch import Tensor, nn
 
 from torchid import parameters
 from torchid.estimators.conditions import Conditions
+from torchid.parallel import one_thread
 from torchid.parameters import PER_BODY
 from torchid.problem import LinearProblem
-from torchid.problem.chunks import one_thread
 
 _LEAST_FRICTION = 0.01  # of its scale: initial friction if the URDF has none, since a softplus is never 0
 _LEAST_EIGENVALUE = 1e-3  # above the margin: initial one of a body whose nominal eigenvalue is smaller

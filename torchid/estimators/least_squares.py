@@ -11,10 +11,10 @@ import numpy as np
 import torch
 
 from torchid.errors import InputError
-from torchid.estimators.nominal_spread import nominal_spread
+from torchid.estimators.posterior import nominal_spread
+from torchid.parallel import one_thread
 from torchid.parameters import Array
 from torchid.problem import LinearProblem
-from torchid.problem.chunks import one_thread
 from torchid.reprs import short_repr
 from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, numerical_rank
 from torchid.settings import NotNegative, Tolerance, validate_settings
@@ -230,8 +230,8 @@ class LeastSquares(Regularized):
 
         Standard errors, `noise_error`, propagate the sensor noise, scaled to the observed residual, through the
         estimator, and count only as many rows as the filtered noise leaves independent. Of the prior's bias they
-        contain what `held` of the problem says; `kept_error` has that of a ridge. They are NaN where the data alone do
-        not determine the parameter.
+        contain what `shrinkage` of the problem says; `kept_error` has that of a ridge. They are NaN where the data
+        alone do not determine the parameter.
 
         Raises:
             InputError: a decomposition failed.
@@ -248,9 +248,9 @@ class LeastSquares(Regularized):
         observable[free], identifiable[free] = null_share**2 < 1.0 - _OBSERVABLE, null_share < UNOBSERVABLE_SHARE
         noise_error, data_share = np.full(len(phi), np.nan), np.full(len(phi), np.nan)
         noise_error[free], by_data = noise * scale * np.linalg.norm(gain, axis=1), A
-        if problem.held is not None and problem.held_parameters is not None:
-            noise_error[free] = np.hypot(noise_error[free], scale * np.linalg.norm(gain @ problem.held, axis=1))
-            by_data = A - problem.held_parameters
+        if problem.shrinkage is not None and problem.parameter_shrinkage is not None:
+            noise_error[free] = np.hypot(noise_error[free], scale * np.linalg.norm(gain @ problem.shrinkage, axis=1))
+            by_data = A - problem.parameter_shrinkage
         noise_error[~identifiable] = np.nan
         kept_error = None
         if self.ridge:

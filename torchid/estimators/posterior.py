@@ -1,4 +1,4 @@
-"""What a fit and a prior leave open, a Gaussian within conditions, and the width of the prior by the likelihood."""
+"""What a fit and a prior leave open, a Gaussian within conditions; how wide the prior is by the data."""
 
 from __future__ import annotations
 
@@ -12,13 +12,12 @@ from torchid import parameters
 from torchid.estimators.conditions import Conditions
 from torchid.estimators.conic_formulation import build_conic_problem
 from torchid.estimators.conic_problem import ConicProblem
-from torchid.estimators.nominal_spread import WIDTHS, likelihood_of_widths
-from torchid.parameters import INERTIAL, PER_BODY, Array
+from torchid.parallel import one_thread
+from torchid.parameters import FRICTION, INERTIAL, PER_BODY, Array
 from torchid.problem import LinearProblem
-from torchid.problem.chunks import one_thread
 from torchid.problem.elimination import eliminate_columns
 from torchid.reprs import short_repr
-from torchid.rounding import RANK_TOLERANCE
+from torchid.rounding import RANK_TOLERANCE, is_significant
 
 PRIOR_ERROR = 0.2
 """Default standard deviation of the nominal parameters, as a share of each body; that of `analysis.prior_error`."""
@@ -128,8 +127,8 @@ def whitened_rows(
     """
     noise = max(noise, _LEAST_NOISE * float(np.linalg.norm(problem.b)) / max(problem.rows, 1) ** 0.5, 1e-300)
     covariance = noise**2 * np.eye(len(problem.b))
-    if problem.held is not None:
-        covariance += problem.held @ problem.held.T
+    if problem.shrinkage is not None:
+        covariance += problem.shrinkage @ problem.shrinkage.T
     L = np.linalg.cholesky(covariance)
     A = scipy.linalg.solve_triangular(L, problem.A, lower=True)
     b = scipy.linalg.solve_triangular(L, problem.b, lower=True)
@@ -160,6 +159,7 @@ def _widen(covariance: Array, weights: Array, least: float) -> None:
         covariance += (least - variance) / variance**2 * np.outer(along, along)
 
 
+_WIDTHS = np.geomspace(0.01, 10.0, 300)  # errors of nominal bodies that are considered, as shares of them, 2.3 % each
 _LEVEL = 1e-3  # share of robots whose files are as wrong as the prior says, and that are called otherwise
 _MUCH = 1.5  # times the prior's width: less changes ranges little
 
@@ -207,7 +207,7 @@ def nominal_error(posterior: Posterior) -> NominalError | None:
     Bodies that data do not determine are taken to be as wrong as those that they do. Friction and extra parameters may
     have any value, as files seldom state them; conditions on the parameters are left out.
 
-    Source: as `likelihood_of_widths` has it.
+    Source: as `_likelihood_of_widths` has it.
     """
     inertial = np.zeros(len(posterior.nominal), dtype=bool).reshape(-1, PER_BODY)
     inertial[:, INERTIAL] = True
@@ -218,9 +218,9 @@ def nominal_error(posterior: Posterior) -> NominalError | None:
     columns = posterior.A[:, posterior.free] * posterior.scale[posterior.free]
     nuisance = np.hstack([columns[:, ~inertial], posterior.D * posterior.extra_size])
     rows = np.column_stack([columns @ units[:, inertial], posterior.b - posterior.A @ posterior.nominal])
-    widths = np.append(WIDTHS, PRIOR_ERROR)
+    widths = np.append(_WIDTHS, PRIOR_ERROR)
     rows = eliminate_columns(np.hstack([nuisance, rows]), range(nuisance.shape[1]))
-    likelihood = likelihood_of_widths(rows, widths)
+    likelihood = _likelihood_of_widths(rows, widths)
     if likelihood is None:
         return None
     best = int(likelihood.argmax())
@@ -230,3 +230,50 @@ def nominal_error(posterior: Posterior) -> NominalError | None:
         evidence=float(likelihood[best] - likelihood[-1]),
         combinations=int((widths[best] * np.linalg.svd(rows[:, :-1], compute_uv=False) > 1.0).sum()),
     )
+
+
+def nominal_spread(problem: LinearProblem, noise: float) -> Array:
+    """Standard deviation of the nominal values of the free parameters, (P',), in units of their scale.
+
+    One for inertial parameters and one for friction, which files seldom state, each with the other group at its best:
+    the root of the mean square over all widths, weighted by their likelihood. The likeliest alone may be the narrowest
+    by chance where data say little.
+
+    Args:
+        problem: of a fit.
+        noise: standard deviation of its rows, correlation counted.
+    """
+    columns = problem.A[:, problem.free] * problem.scale[problem.free]
+    target = problem.b - problem.A @ problem.nominal
+    place, spread = np.flatnonzero(problem.free) % PER_BODY, np.zeros(columns.shape[1])
+    size = max(float(np.linalg.norm(problem.b)), float(np.linalg.norm(columns)))
+    if size == 0.0:
+        return spread
+    noise = max(noise, _LEAST_NOISE * size / max(problem.rows, 1) ** 0.5)
+    of_friction = (place >= FRICTION.start) & (place < FRICTION.stop)
+    for group in (~of_friction, of_friction):
+        whole = np.column_stack([columns[:, ~group], columns[:, group], target])
+        rows = eliminate_columns(whole, range(np.count_nonzero(~group))) / noise
+        likelihood = _likelihood_of_widths(rows, _WIDTHS)
+        if likelihood is not None:
+            weight = np.exp(0.5 * (likelihood - likelihood.max()))
+            spread[group] = np.sqrt(weight @ np.square(_WIDTHS) / weight.sum())
+    return spread
+
+
+def _likelihood_of_widths(rows: Array, widths: Array) -> Array | None:
+    """Twice the logarithm of the likelihood of widths (W,), (W,); None where the rows determine nothing.
+
+    Source: type-II maximum likelihood (MacKay, Neural Computation 4, 1992).
+
+    Args:
+        rows: (R, c + 1), with noise of unit variance: columns of deviations from the nominal values, and right-hand
+            sides that are left at these.
+        widths: standard deviations of the deviations.
+    """
+    U, values, _ = np.linalg.svd(rows[:, :-1], full_matrices=False)
+    kept = is_significant(values, RANK_TOLERANCE)
+    if not kept.any():
+        return None
+    found, of_data = np.square(U[:, kept].T @ rows[:, -1]), 1.0 + np.outer(np.square(widths), np.square(values[kept]))
+    return np.asarray(-(np.log(of_data) + found / of_data).sum(axis=1))

@@ -13,9 +13,9 @@ from torchid.estimators.conditions import Conditions
 from torchid.estimators.conic_formulation import Prior, build_conic_problem
 from torchid.estimators.conic_problem import SEARCH_RADIUS, ConicProblem, Solution
 from torchid.estimators.least_squares import residual_std
+from torchid.parallel import one_thread
 from torchid.parameters import Array
 from torchid.problem import LinearProblem
-from torchid.problem.chunks import one_thread
 
 _RIDGES = 10.0 ** -np.arange(0.0, 15.0, 2.0)  # relative to the least misfit without conditions, or to the floor
 _SETTLED = 1e-5  # relative change of the misfit, with a hundredth of the ridge, at which the path has converged
@@ -217,7 +217,9 @@ class _EqualityProblem:
         misfit = plain.objective(start + step)
         nothing = np.zeros((0, len(path.problem.nominal)))
         terms = None if path.problem.terms is None else path.problem.terms.without_rows()
-        without_data = replace(path.problem, A=nothing, b=np.zeros(0), residual=0.0, rows=1, held=None, terms=terms)
+        without_data = replace(
+            path.problem, A=nothing, b=np.zeros(0), residual=0.0, rows=1, shrinkage=None, terms=terms
+        )
         alone = build_conic_problem(without_data, path.conditions, 1.0, path.prior)
         rows = basis.T @ alone.deviations
         size = np.linalg.norm(rows, axis=1)

@@ -20,9 +20,9 @@ from torchid.estimators.least_squares import ConstrainedEstimate, report_roundin
 from torchid.estimators.optimizers import OPTIMIZERS, make_optimizer, make_schedule, step_schedule
 from torchid.estimators.residual import CANDIDATE_WEIGHTS, ResidualEffect, WeightChoice, choose_weight, residual_effect
 from torchid.estimators.sgd import Loss, LossTerms, Sgd, add_up, validate_state
+from torchid.parallel import one_thread
 from torchid.parameters import Array
 from torchid.problem import Batch, LinearProblem, MiniBatches
-from torchid.problem.chunks import one_thread
 
 _BLOCKS, _EVERY = 20, 4  # blocks of samples; one in four is held out to choose the weight of a residual module
 _FEWEST = 2  # blocks for a standard error

@@ -13,8 +13,9 @@ from torch import Tensor
 from torchid.estimators.barrier_gaussian import BarrierGaussian, barrier_gaussian
 from torchid.estimators.conic_problem import ConicProblem
 from torchid.estimators.elliptical_slice import EllipticalSlice, inside
+from torchid.parallel import run_in_workers
 from torchid.parameters import Array
-from torchid.problem.chunks import run_in_workers, worker_count
+from torchid.problem.chunks import worker_count
 
 _CHAINS, _BATCHES = 512, 2  # chains of a batch, which one thread works on, and batches at most
 

@@ -12,15 +12,15 @@ import torch
 from torch import Tensor
 
 from torchid import ranks
-from torchid.copies import share_between_processes
 from torchid.errors import LogError, TorchidWarning
 from torchid.fitting.calibration import Calibration, Comparison, calibration_at, calibrations
 from torchid.fitting.fit import BatchEstimator, LogFitter
 from torchid.fitting.robust import RobustLoss
+from torchid.parallel import one_thread, share_between_processes, thread_count
 from torchid.parameters import Array
 from torchid.problem import Evaluation, ExtraTerms, Metrics, RowBuilder, Samples
 from torchid.problem.chunk_dynamics import Workspace
-from torchid.problem.chunks import ProgressCallback, map_chunks, one_thread, thread_count
+from torchid.problem.chunks import ProgressCallback, map_chunks
 from torchid.problem.compressed_log import Block
 from torchid.problem.compression import (
     Part,

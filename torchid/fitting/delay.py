@@ -11,16 +11,15 @@ from numpy.polynomial import chebyshev
 from scipy.interpolate import BSpline, make_interp_spline
 from torch import Tensor
 
-from torchid.copies import in_copies, share_between_copies
 from torchid.errors import LogError, warn
 from torchid.estimators import LeastSquares
 from torchid.fitting.fit import Fit, LogFitter
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.logs.segments import recorded_at_delays, unbroken_segments
 from torchid.logs.timeline import spline_degree
+from torchid.parallel import in_copies, share_between_copies, thread_count
 from torchid.parameters import Array
 from torchid.problem import ExtraTerms, RowBuilder, Samples
-from torchid.problem.chunks import thread_count
 from torchid.problem.compression import Part, compress_in_blocks, compress_parts, merge_blocks_of_folds, merge_states
 from torchid.problem.extras import DELAY
 from torchid.problem.linear import TriangularFactor

@@ -33,7 +33,7 @@ from torchid.log_checks.model import Declared
 from torchid.problem import Evaluation, ExtraTerms, RowBuilder, Samples
 from torchid.problem.compressed_log import Block
 from torchid.problem.compression import Part
-from torchid.problem.sampled_rows import LogElsewhere
+from torchid.problem.sampled_rows import LogOfOtherProcess
 from torchid.reprs import short_repr
 from torchid.robot import Robot, load_robot
 from torchid.robot.constraints import matching_joints
@@ -43,7 +43,7 @@ from torchid.settings import AUTO
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scene:
+class RobotSetup:
     """Robot and contacts of an experiment file, with its settings.
 
     Attributes:
@@ -174,7 +174,9 @@ class Scene:
         """Nominal and identified parameters of a fit, with the extra parameters that fit them best."""
         return calibrations(fit, self.robot, builder, self.loss)
 
-    def estimate_noise(self, logs: Sequence[Samples | LogElsewhere], sensors: SensorSet | None = None) -> NoiseSummary:
+    def estimate_noise(
+        self, logs: Sequence[Samples | LogOfOtherProcess], sensors: SensorSet | None = None
+    ) -> NoiseSummary:
         """The noise that bound logs show of some sensors, or of all that those here have; what is stated is kept."""
         if sensors is None:
             here = [log for log in logs if isinstance(log, Samples)]
@@ -215,24 +217,24 @@ class Scene:
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
-class Experiment(Scene):
-    """A scene with the sensors of its fit."""
+class Experiment(RobotSetup):
+    """A setup with the sensors of its fit."""
 
     config: ExperimentConfig
     sensors: SensorSet
 
 
-S = TypeVar("S", bound=Scene)
+S = TypeVar("S", bound=RobotSetup)
 
 
-def with_noise(scene: S, summary: NoiseSummary) -> S:
-    """The scene with estimated noise beside what its settings state, so that every later step uses it."""
-    return with_estimated_noise(scene, summary.known, summary.any_stated)
+def with_noise(setup: S, summary: NoiseSummary) -> S:
+    """The setup with estimated noise beside what its settings state, so that every later step uses it."""
+    return with_estimated_noise(setup, summary.known, summary.any_stated)
 
 
-def with_estimated_noise(scene: S, estimated: Mapping[str, Any], any_stated: bool) -> S:
+def with_estimated_noise(setup: S, estimated: Mapping[str, Any], any_stated: bool) -> S:
     """As `with_noise`, by field of `SensorNoise`; `any_stated`: of the noise of what the sensors read."""
-    known = replace(scene, estimated_noise=estimated, noise_stated=any_stated)
+    known = replace(setup, estimated_noise=estimated, noise_stated=any_stated)
     if isinstance(known, Experiment):
         return replace(known, sensors=replace(known.sensors, noise=known.noise))
     return known
@@ -247,7 +249,7 @@ def require_device(device: str) -> None:
         raise ConfigError.at_field("device", f"'{device}' is not available here", "cpu, cuda, cuda:0, ...")
 
 
-def set_up_scene(config: ExperimentConfig | AnalyzeConfig) -> Scene:
+def set_up_robot(config: ExperimentConfig | AnalyzeConfig) -> RobotSetup:
     """Load the robot of an experiment file and look its contacts up.
 
     Raises:
@@ -271,24 +273,24 @@ def set_up_scene(config: ExperimentConfig | AnalyzeConfig) -> Scene:
     contacts, rolling = resolve_contacts(config.contacts, robot)
     contacts = suited_to_preprocessing(with_scalar_sensors(contacts, config.sensors), config, robot)
     stated = [replace(c, radius=contact.radius) for c, contact in zip(config.contacts, contacts, strict=True)]
-    scene = Scene(config=replace(config, contacts=stated), robot=robot, contacts=contacts, rolling=rolling)
-    check_scale_groups(scene.terms, robot, contacts)
+    setup = RobotSetup(config=replace(config, contacts=stated), robot=robot, contacts=contacts, rolling=rolling)
+    check_scale_groups(setup.terms, robot, contacts)
     stated_noise(config.sensors.noise, robot)
-    return scene
+    return setup
 
 
 def set_up(config: ExperimentConfig) -> Experiment:
-    """As `set_up_scene`, with sensors resolved by name.
+    """As `set_up_robot`, with sensors resolved by name.
 
     Raises:
         InputError: whatever in the file does not fit the robot, or extra parameters of sensors that are not among the
             measured.
     """
-    scene = set_up_scene(config)
-    sensors = scene.sensors_of(config.sensors)
-    config = replace(config, contacts=scene.config.contacts)
-    experiment = Experiment(**vars(scene) | {"config": config}, sensors=sensors)
-    check_terms(experiment.terms, config.actuators, scene.robot, scene.contacts, sensors)
+    setup = set_up_robot(config)
+    sensors = setup.sensors_of(config.sensors)
+    config = replace(config, contacts=setup.config.contacts)
+    experiment = Experiment(**vars(setup) | {"config": config}, sensors=sensors)
+    check_terms(experiment.terms, config.actuators, setup.robot, setup.contacts, sensors)
     return experiment
 
 

@@ -10,16 +10,15 @@ from typing import Protocol
 import numpy as np
 from torch import Tensor
 
-from torchid.copies import share_between_processes
 from torchid.errors import TorchidWarning, UnknownNameError
 from torchid.estimators import Estimate, LeastSquares
 from torchid.estimators.least_squares import Minimizer
 from torchid.fitting.prior_knowledge import TOTAL, KnownMass, with_known_masses
 from torchid.identifiability.block_scatter import BlockScatter, block_scatter
 from torchid.identifiability.confounding import ExtraEstimate, estimate_extras, mass_weights
+from torchid.parallel import one_thread, share_between_processes, thread_count
 from torchid.parameters import PER_BODY
 from torchid.problem import LinearProblem, RowBuilder, assemble
-from torchid.problem.chunks import one_thread, thread_count
 from torchid.problem.compression import Part, merge_blocks_of_folds, merge_states
 from torchid.problem.elimination import Assembly
 from torchid.problem.noise_gram import scale_columns

@@ -16,10 +16,10 @@ from torchid.estimators.least_squares import residual_std
 from torchid.fitting.delay import UnfittedDelay
 from torchid.fitting.noise import GroupNoise, NoiseSummary
 from torchid.identifiability.block_scatter import BlockScatter
-from torchid.logs.sign_filter import OFTEN, resting_share
+from torchid.logs.dry_friction import OFTEN, resting_share
+from torchid.parallel import one_thread
 from torchid.parameters import COULOMB, FRICTION, INERTIAL, PER_BODY, Array
 from torchid.problem import LinearProblem, RowBuilder, Samples
-from torchid.problem.chunks import one_thread
 from torchid.problem.compressed_log import Block
 from torchid.problem.metrics import Metrics
 from torchid.robot import Robot

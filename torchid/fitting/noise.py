@@ -16,7 +16,7 @@ from torchid.parameters import Array
 from torchid.problem import Samples
 from torchid.problem.extras import noise_key
 from torchid.problem.noise import GroupVariances, VarianceComponentEstimator, fitted_directions
-from torchid.problem.sampled_rows import LogElsewhere, SampledRows
+from torchid.problem.sampled_rows import LogOfOtherProcess, SampledRows
 from torchid.reprs import short_repr
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet
@@ -72,7 +72,7 @@ class NoiseSummary:
 
 
 def estimate_noise(
-    logs: Sequence[Samples | LogElsewhere], fitter: LogFitter, stated: Collection[str] = ()
+    logs: Sequence[Samples | LogOfOtherProcess], fitter: LogFitter, stated: Collection[str] = ()
 ) -> NoiseSummary:
     """The noise of sensors, by fits of a sample of the logs that are weighted again until the noise settles.
 

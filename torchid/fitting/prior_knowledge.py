@@ -12,9 +12,9 @@ from torchid.config.estimator import EstimatorConfig
 from torchid.errors import ConfigError, UnknownNameError, warn_about_file
 from torchid.estimators import Conditions, Enclosure, Mirror
 from torchid.identifiability.confounding import mass_weights
+from torchid.parallel import one_thread
 from torchid.parameters import PARAMETERS, PER_BODY, Array
 from torchid.problem import LinearProblem
-from torchid.problem.chunks import one_thread
 from torchid.robot import Robot, body_extents, mirror_pairs
 
 _FRICTION = PARAMETERS[parameters.FRICTION]
@@ -255,11 +255,15 @@ def with_known_masses(
         more[:, free] = weights[:, None] * equations / scale
         rows = np.concatenate([rows, more])
         values = np.append(values, weights * missing + more @ problem.nominal)
-    held = problem.held
-    if held is not None:
-        held = np.concatenate([held, np.zeros((len(rows), held.shape[1]))])
+    shrinkage = problem.shrinkage
+    if shrinkage is not None:
+        shrinkage = np.concatenate([shrinkage, np.zeros((len(rows), shrinkage.shape[1]))])
     return replace(
-        problem, A=np.concatenate([A, rows]), b=np.append(b, values), rows=problem.rows + len(values), held=held
+        problem,
+        A=np.concatenate([A, rows]),
+        b=np.append(b, values),
+        rows=problem.rows + len(values),
+        shrinkage=shrinkage,
     )
 
 

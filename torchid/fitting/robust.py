@@ -17,9 +17,10 @@ from torchid.errors import UnknownNameError
 from torchid.estimators import ConstrainedEstimate
 from torchid.fitting.fit import Fit, LogFitter, Solve, with_block_errors
 from torchid.identifiability.confounding import ExtraEstimate
+from torchid.parallel import one_thread
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples, compress_parts
-from torchid.problem.chunks import ProgressCallback, one_thread
+from torchid.problem.chunks import ProgressCallback
 from torchid.problem.compression import (
     Part,
     PartKey,

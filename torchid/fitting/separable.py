@@ -14,14 +14,13 @@ import numpy as np
 import torch
 from scipy.optimize import minimize, minimize_scalar
 
-from torchid.copies import share_between_copies
 from torchid.errors import warn
 from torchid.estimators import LeastSquares
 from torchid.fitting.fit import LogFitter
 from torchid.identifiability.confounding import ExtraEstimate
+from torchid.parallel import share_between_copies, thread_count
 from torchid.parameters import Array
 from torchid.problem import ExtraTerms, RowBuilder, Samples, compress_parts
-from torchid.problem.chunks import thread_count
 from torchid.problem.compression import compress_in_blocks
 from torchid.problem.extras import DELAYED, dof_extra_column
 from torchid.problem.sampled_rows import SampledRows

@@ -15,9 +15,10 @@ from torch import Tensor, nn
 
 from torchid import parameters
 from torchid.errors import BaseLostError, BaseLostWarning, NumericalWarning, format_percent, join_names, warn
+from torchid.parallel import one_thread
 from torchid.parameters import PARAMETERS, PER_BODY, Array
 from torchid.problem import LinearProblem, RowBuilder, Samples
-from torchid.problem.chunks import chunks_by_state, one_thread, subsample_states
+from torchid.problem.chunks import chunks_by_state, subsample_states
 from torchid.problem.contact_state import ContactState, state_name
 from torchid.problem.predict import null_space_components
 from torchid.rounding import RANK_TOLERANCE, is_significant, numerical_rank

@@ -10,9 +10,9 @@ from scipy.special import ndtri, stdtrit  # scipy.stats takes 0.2 s to import
 
 from torchid.estimators.least_squares import residual_std
 from torchid.identifiability.confounding import ParameterCovariance, mass_weights
+from torchid.parallel import one_thread
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import RowBuilder
-from torchid.problem.chunks import one_thread
 from torchid.problem.compression import Part
 from torchid.problem.elimination import Assembly
 
@@ -43,7 +43,7 @@ class BlockScatter:
     Attributes:
         blocks: their number G.
         deviations: (G, 12 L), whose norm over the blocks is the standard error of the parameters; 1.96 times it is half
-            of a 95 % interval. Where rows are mostly noise of the motion, rows of what they lack follow (`held` of
+            of a 95 % interval. Where rows are mostly noise of the motion, rows of what they lack follow (`shrinkage` of
             `LinearProblem`): no scatter shows that.
         without_ridge: (G, 12 L), the same of the estimate without regularization.
         extras: the same of the extra parameters, (G, M) for each elimination, without regularization.
@@ -105,14 +105,14 @@ def block_scatter(
     known = axes[:, of_motion < _LITTLE_NOISE]
     expected = noise * np.trace(known.T @ (of_rows - of_rows @ shares).sum(axis=0) @ known)
     factor = np.sqrt((count - 1) / count) * stdtrit(count - 1, 0.975) / _NORMAL
-    held = np.zeros((0, basis.shape[1])) if problem.held is None else problem.held.T @ problem.A @ basis
-    without_ridge = np.concatenate([factor * _left_out(scores, shares), held]) @ basis.T
+    shrinkage = np.zeros((0, basis.shape[1])) if problem.shrinkage is None else problem.shrinkage.T @ problem.A @ basis
+    without_ridge = np.concatenate([factor * _left_out(scores, shares), shrinkage]) @ basis.T
     with_ridge = without_ridge
     if ridge > 0.0:
         values = covariance.values[: basis.shape[1]]
         shrunk = values / np.sqrt(values**2 + ridge * problem.rows)
         scattered = factor * _left_out(scores * shrunk, shares * np.outer(shrunk, shrunk))
-        with_ridge = np.concatenate([scattered, held * shrunk]) * shrunk @ basis.T
+        with_ridge = np.concatenate([scattered, shrinkage * shrunk]) * shrunk @ basis.T
     return BlockScatter(
         blocks=count,
         deviations=with_ridge,

@@ -9,9 +9,9 @@ import numpy as np
 
 from torchid import parameters
 from torchid.estimators import Estimate
+from torchid.parallel import one_thread
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, RowBuilder
-from torchid.problem.chunks import one_thread
 from torchid.problem.compression import Part, merge_factors
 from torchid.problem.elimination import Assembly, Elimination
 from torchid.problem.extras import Extra
@@ -245,9 +245,9 @@ def combination_standard_error(
     if np.linalg.norm(along @ covariance.null_space) > UNOBSERVABLE_SHARE * np.linalg.norm(along):
         return float("inf")
     noise = np.sqrt(problem.oversampling) * estimate.residual_std * np.linalg.norm(along @ covariance.root)
-    if problem.held is None:
+    if problem.shrinkage is None:
         return float(noise)
-    by_rows = covariance.root.T @ (problem.A[:, problem.free] * covariance.scale).T @ problem.held
+    by_rows = covariance.root.T @ (problem.A[:, problem.free] * covariance.scale).T @ problem.shrinkage
     return float(np.hypot(noise, np.linalg.norm(along @ covariance.root @ by_rows)))
 
 

@@ -17,9 +17,10 @@ from torchid.identifiability.information import (
     sensor_information,
     triangular_factor,
 )
+from torchid.parallel import one_thread
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, RowBuilder, Samples
-from torchid.problem.chunks import ProgressCallback, one_thread
+from torchid.problem.chunks import ProgressCallback
 from torchid.problem.compression import Part
 from torchid.problem.contact_state import state_name
 from torchid.problem.elimination import eliminate_columns

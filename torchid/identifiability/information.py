@@ -10,9 +10,10 @@ import scipy.linalg
 import torch
 from torch import Tensor
 
+from torchid.parallel import one_thread
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, RowBuilder, Samples
-from torchid.problem.chunks import ProgressCallback, chunks_by_state, one_thread, subsample_states
+from torchid.problem.chunks import ProgressCallback, chunks_by_state, subsample_states
 from torchid.problem.contact_state import ContactState
 from torchid.problem.metrics import ROW_GROUPS, ForceSums, finite_or_none
 from torchid.problem.predict import null_space_components, predict_by_columns

@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from torchid.errors import UrdfError
+from torchid.parallel import one_thread
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, RowBuilder, Samples, compress, linear_problem
 from torchid.problem.base_motion import BaseMotion
-from torchid.problem.chunks import one_thread
 from torchid.problem.contact_state import ContactState
 from torchid.regressor import FrameJacobian, motion_from_state
 from torchid.regressor.kinematics import (

@@ -1,10 +1,13 @@
-"""Blocks of rows in the inertial and friction parameters, tile by tile: no wrench column leaves the cache."""
+"""Blocks of rows in the inertial and friction parameters, tile by tile: no wrench column leaves the cache.
+
+Wrenches per unit of each inertial parameter are made as in `torchid.regressor.columns`.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
-from torchid.kernels.states import DIRECTION, SCREW, STATE, VELOCITY, power
+from torchid.kernels.states import ALPHA, DIRECTION, FORCE, OMEGA, POSITION, SCREW, STATE, VELOCITY, power
 from torchid.kernels.tiles import (
     ARRAY,
     INDEX,
@@ -14,14 +17,93 @@ from torchid.kernels.tiles import (
     accumulate,
     add,
     compiled,
+    cross,
     dot,
     load,
     multiply,
     store,
     times,
+    turn,
+    turn_back,
 )
-from torchid.kernels.wrenches import FUNCTIONS, INERTIA, WRENCH, write_wrenches
 from torchid.parameters import Array
+
+_INERTIA = 4  # the first parameter that demands no force
+_WRENCH = 6 * TILE
+
+# Functions of a body's motion in its own axes, of which all its unit wrenches are made: nothing, the specific force and
+# its negative, the angular acceleration, products (yz, zx, xy) of angular velocities, their negatives, the sum and
+# the differences of these two, differences of squares (y - z, z - x, x - y), and their negative sums
+_F, _LESS_F, _A, _P, _LESS_P, _SUM, _A_P, _P_A, _DIFFER, _INWARD = range(1, 31, 3)
+_FUNCTIONS = 31
+
+_FORCES = np.array(
+    [
+        [_F, _F + 1, _F + 2],
+        [_INWARD, _SUM + 2, _P_A + 1],
+        [_P_A + 2, _INWARD + 1, _SUM],
+        [_SUM + 1, _P_A, _INWARD + 2],
+    ]
+)
+"""Components of the force per unit of the mass and of the first moments: `m a + [alpha]x h + omega x (omega x h)`."""
+
+_MOMENTS = np.array(
+    [
+        [0, 0, 0],
+        [0, _LESS_F + 2, _F + 1],
+        [_F + 2, 0, _LESS_F],
+        [_LESS_F + 1, _F, 0],
+        [_A, _P + 1, _LESS_P + 2],
+        [_A_P + 1, _SUM, _DIFFER + 2],
+        [_SUM + 2, _DIFFER + 1, _A_P],
+        [_LESS_P, _A + 1, _P + 2],
+        [_DIFFER, _A_P + 2, _SUM + 1],
+        [_P, _LESS_P + 1, _A + 2],
+    ]
+)
+"""The same of the moment, and per unit of the inertias: `h x a + I alpha + omega x (I omega)`."""
+
+
+@compiled()
+def _write_functions(state: Array, out: Array) -> None:
+    for t in range(TILE):
+        omega, alpha = turn_back(state, t, load(state, OMEGA, t)), turn_back(state, t, load(state, ALPHA, t))
+        force = turn_back(state, t, load(state, FORCE, t))
+        (x, y, z), product = omega, (omega[1] * omega[2], omega[2] * omega[0], omega[0] * omega[1])
+        store(out, _F, t, force)
+        store(out, _LESS_F, t, times(-1.0, force))
+        store(out, _A, t, alpha)
+        store(out, _P, t, product)
+        store(out, _LESS_P, t, times(-1.0, product))
+        store(out, _SUM, t, add(alpha, product))
+        store(out, _A_P, t, add(alpha, times(-1.0, product)))
+        store(out, _P_A, t, add(product, times(-1.0, alpha)))
+        store(out, _DIFFER, t, (y * y - z * z, z * z - x * x, x * x - y * y))
+        store(out, _INWARD, t, (-(y * y) - z * z, -(z * z) - x * x, -(x * x) - y * y))
+
+
+@compiled()
+def _turn_functions(state: Array, functions: Array, chosen: Index, out: Array) -> None:
+    """Write a vector with chosen functions as components in the body's axes, in the base's."""
+    x = functions[chosen[0] * TILE : (chosen[0] + 1) * TILE]
+    y = functions[chosen[1] * TILE : (chosen[1] + 1) * TILE]
+    z = functions[chosen[2] * TILE : (chosen[2] + 1) * TILE]
+    for t in range(TILE):
+        store(out, 0, t, turn(state, t, (x[t], y[t], z[t])))
+
+
+@compiled()
+def _write_wrenches(state: Array, parameters: Index, functions: Array, wrenches: Array) -> None:
+    """Write the wrenches at the base origin of a unit of each of some parameters of a body."""
+    _write_functions(state, functions)
+    for number in range(len(parameters)):
+        parameter, out = parameters[number], wrenches[number * _WRENCH : (number + 1) * _WRENCH]
+        _turn_functions(state, functions, _MOMENTS[parameter], out[3 * TILE :])
+        if parameter < _INERTIA:
+            _turn_functions(state, functions, _FORCES[parameter], out)
+            for t in range(TILE):
+                moment = cross(load(state, POSITION, t), load(out, 0, t))
+                store(out, 3, t, add(load(out, 3, t), moment))
 
 
 @compiled()
@@ -64,7 +146,7 @@ def _add_screw(ratio: float, w: Array, screw: Array, above: Array, out: Array) -
 @compiled()
 def _write_powers(wrench: Array, sums: Array, count: int, rows: Array, at: int, step: int, size: int) -> None:
     for row in range(count):
-        path_sum = sums[row * WRENCH : (row + 1) * WRENCH]
+        path_sum = sums[row * _WRENCH : (row + 1) * _WRENCH]
         out = rows[at + row * step : at + row * step + size]
         for t in range(size):
             out[t] = power(wrench, path_sum, t)
@@ -76,7 +158,7 @@ def _write_powers_of_moments(
 ) -> None:
     moment = wrench[3 * TILE :]
     for row in range(count):
-        path_sum = sums[row * WRENCH + 3 * TILE : (row + 1) * WRENCH]
+        path_sum = sums[row * _WRENCH + 3 * TILE : (row + 1) * _WRENCH]
         out = rows[at + row * step : at + row * step + size]
         for t in range(size):
             out[t] = dot(load(moment, 0, t), load(path_sum, 0, t))
@@ -90,9 +172,9 @@ def _write_columns(
     count, width, offset = block[1:4]
     size = min(TILE, samples - start)
     for number in range(len(parameters)):
-        wrench = wrenches[number * WRENCH : (number + 1) * WRENCH]
+        wrench = wrenches[number * _WRENCH : (number + 1) * _WRENCH]
         at = offset + (column + number) * (width + count * samples) + width + start
-        if parameters[number] < INERTIA:
+        if parameters[number] < _INERTIA:
             _write_powers(wrench, sums, count, rows, at, samples, size)
         else:
             _write_powers_of_moments(wrench, sums, count, rows, at, samples, size)
@@ -125,9 +207,9 @@ def _write_moved(
         velocity = joints[VELOCITY * nodes * padded + at : VELOCITY * nodes * padded + at + size]
         for row in range(count):
             at = (dof * rank + first + row) * TILE
-            w, at = W[at : at + TILE], (above * most + row) * WRENCH
-            upper, at = sums[at : at + WRENCH], (path_sum * most + row) * WRENCH
-            _add_screw(ratios[number], w, screw, upper, sums[at : at + WRENCH])
+            w, at = W[at : at + TILE], (above * most + row) * _WRENCH
+            upper, at = sums[at : at + _WRENCH], (path_sum * most + row) * _WRENCH
+            _add_screw(ratios[number], w, screw, upper, sums[at : at + _WRENCH])
             at = offset + column * long + width + row * samples + start
             multiply(ratios[number], w, direction, rows[at : at + size])
             multiply(ratios[number], w, velocity, rows[at + long : at + long + size])
@@ -151,11 +233,11 @@ def _write_bodies(
     known = -1
     for number in range(len(bodies)):
         node, block, path_sum, column, first, count = bodies[number]
-        parameters, at = kept[first : first + count], path_sum * most * WRENCH
+        parameters, at = kept[first : first + count], path_sum * most * _WRENCH
         if node != known:
             known = node
-            write_wrenches(states[node * STATE * TILE : (node + 1) * STATE * TILE], parameters, functions, wrenches)
-        own = sums[at : at + most * WRENCH]
+            _write_wrenches(states[node * STATE * TILE : (node + 1) * STATE * TILE], parameters, functions, wrenches)
+        own = sums[at : at + most * _WRENCH]
         _write_columns(blocks[block], column, parameters, wrenches, own, samples, start, rows)
 
 
@@ -201,8 +283,8 @@ def write_rows(
     padded, most = len(joints) // (6 * nodes), 0
     for block in range(len(blocks)):
         most = max(most, blocks[block, 1])
-    sums = np.zeros(blocks[0, 7] * most * WRENCH)
-    functions, wrenches = np.zeros(FUNCTIONS * TILE), np.zeros(10 * WRENCH)
+    sums = np.zeros(blocks[0, 7] * most * _WRENCH)
+    functions, wrenches = np.zeros(_FUNCTIONS * TILE), np.zeros(10 * _WRENCH)
     for tile in range(padded // TILE):
         start = tile * TILE
         size = min(TILE, samples - start)

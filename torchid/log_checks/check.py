@@ -20,6 +20,7 @@ from torchid.log_checks.contacts import (
     check_slip,
     subtract_contact_offsets,
 )
+from torchid.log_checks.encoders import check_single_joints, check_still_velocities
 from torchid.log_checks.findings import (
     REJECTED,
     SEVERITIES,
@@ -41,7 +42,6 @@ from torchid.log_checks.motion import (
     check_loops,
     completed,
 )
-from torchid.log_checks.single_joints import check_single_joints, check_still_velocities
 from torchid.log_checks.spikes import check_jumps
 from torchid.log_checks.stamps import check_magnitudes, check_missing_values, check_time_stamps
 from torchid.log_checks.standing_feet import check_gyroscope, check_standing_feet

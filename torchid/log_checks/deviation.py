@@ -41,7 +41,7 @@ UnknownColumns = Callable[[RowBuilder, Samples, int], FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
-class Trial:
+class FilteredLog:
     """Some filtered samples of a log, with their rows, for all that may be wrong with it.
 
     Attributes:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import stats
 
 from torchid.errors import InputError
-from torchid.log_checks.deviation import COMPARED_SAMPLES, DeviationRows, Trial
+from torchid.log_checks.deviation import COMPARED_SAMPLES, DeviationRows, FilteredLog
 from torchid.log_checks.findings import SUSPICIOUS, Finding
 from torchid.log_checks.model import bind_some_samples
 from torchid.log_checks.scales import CORRELATED_SAMPLES
@@ -24,7 +24,7 @@ _MIN_SHARE = 0.1
 _TINY = 1e-9
 
 
-def check_torque_drift(trial: Trial) -> Iterator[Finding]:
+def check_torque_drift(filtered: FilteredLog) -> Iterator[Finding]:
     """Findings about joints whose torque drifts over the log, for logs that nothing else is wrong with.
 
     Each joint has an unknown constant torque in each block of time, beside all URDFs near the given one. A drift is
@@ -32,14 +32,14 @@ def check_torque_drift(trial: Trial) -> Iterator[Finding]:
     and noise do in blocks that are alike is in it. The level is divided by the number of joints (Bonferroni).
 
     Args:
-        trial: of the log.
+        filtered: the log.
     """
-    log, robot = trial.log, trial.model.robot
+    log, robot = filtered.log, filtered.model.robot
     if log.joint_torque is None or not np.isfinite(log.joint_torque).any():
         return
     with suppress(InputError):  # reported by `check_forces_against_urdf`
         least = _MIN_SHARE * float(np.sqrt(np.nanmean(np.square(log.joint_torque))))
-        slope, deviation = _slopes(trial)
+        slope, deviation = _slopes(filtered)
         known = deviation > 0.0
         chance = 2.0 * stats.t.sf(np.abs(slope[known]) / deviation[known], _BLOCKS - 2)
         for joint in np.flatnonzero(known)[chance * robot.n < _LEVEL].tolist():
@@ -50,11 +50,11 @@ def check_torque_drift(trial: Trial) -> Iterator[Finding]:
                 yield Finding("drift", SUSPICIOUS, "joint_torque", text, advice, (name,))
 
 
-def _slopes(trial: Trial) -> tuple[FloatArray, FloatArray]:
+def _slopes(filtered: FilteredLog) -> tuple[FloatArray, FloatArray]:
     """By how much constant torques change over the log, with standard deviations, (n,) each; 0 where unknown."""
-    robot, contacts = trial.model.robot, trial.model.contacts
-    samples = bind_some_samples(trial.pieces, robot, contacts, _MORE_SAMPLES * COMPARED_SAMPLES)
-    rows, n = DeviationRows.of(samples, trial.model), robot.n
+    robot, contacts = filtered.model.robot, filtered.model.contacts
+    samples = bind_some_samples(filtered.pieces, robot, contacts, _MORE_SAMPLES * COMPARED_SAMPLES)
+    rows, n = DeviationRows.of(samples, filtered.model), robot.n
     if rows is None:
         return np.zeros(n), np.zeros(n)
     W, _, K, target = (np.concatenate([part[k] for part in rows.parts]) for k in range(4))

@@ -1,4 +1,4 @@
-"""Zeros of the encoders of a bolted arm, joints that it counts the other way, and torques without gravity.
+"""Encoders that torques contradict: dead ones, other zeros, joints counted the other way; stops, and missing gravity.
 
 All for every URDF near the given one: masses that are 15 to 20 % off turn gravity, too, but not as another zero does.
 """
@@ -6,26 +6,262 @@ All for every URDF near the given one: masses that are 15 to 20 % off turn gravi
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
-from torchid.errors import InputError, join_names
-from torchid.log_checks.deviation import Deviation, DeviationRows, Trial, UnknownColumns, fit_deviation
-from torchid.log_checks.findings import REJECTED, SUSPICIOUS, Finding
+from torchid.errors import InputError, format_percent, join_names
+from torchid.log_checks.deviation import (
+    COMPARED_SAMPLES,
+    Deviation,
+    DeviationRows,
+    FilteredLog,
+    UnknownColumns,
+    fit_deviation,
+)
+from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, Finding, Skipped
 from torchid.log_checks.lag_and_tilt import fit_tilt
 from torchid.log_checks.mistakes import joint_mistakes
 from torchid.log_checks.model import (
+    MAX_TRIAL_DIFFERENTIATED_SAMPLES,
     TRIAL_SAMPLES,
+    UNMODELLED_FORCE_SHARE,
+    Declared,
     NominalModel,
     bind_some_samples,
+    default_cutoff_hz,
+    preprocess_pieces,
 )
-from torchid.log_checks.scales import TIME_SCALE_SAMPLES
+from torchid.log_checks.scales import CORRELATED_SAMPLES, TIME_SCALE_SAMPLES
+from torchid.log_checks.torque_fit import MAX_FRICTION_SHARE
 from torchid.logs import Log
-from torchid.logs.log import FloatArray
-from torchid.problem import RowBuilder, Samples
+from torchid.logs.log import BoolArray, FloatArray
+from torchid.logs.segments import with_delayed_torques
+from torchid.logs.signal_noise import rough_noise
+from torchid.problem import RowBuilder, Samples, bind_log
+from torchid.problem.motion_noise import MIN_MOTION
 from torchid.problem.predict import force_series
+from torchid.robot import Robot
+from torchid.robot.urdf import position_limits
+from torchid.sensing import Contact
+
+#: Time over which positions are averaged, and velocities added up: a tenth of a second resolves motion up to 5 Hz.
+_AVERAGED_S = 0.1
+#: Largest range of averages of white noise, in their standard deviations, in a thousand of them.
+_NOISE_RANGE = 8.0
+#: Travel by a joint's velocity over its noise, and over that of its position, from which on it moves.
+_MIN_SIGNAL_TO_NOISE, _MIN_TRAVEL_RATIO = 20.0, 10.0
+#: Share of what is unexplained, from which on a torque of one joint makes it up: 1.25 times as much is left without.
+_MIN_SHARE = 1.0 - 1.25**-2
+#: Distance from a limit, over a joint's range, that is at the stop: URDFs have them to a hundredth.
+_STOP_SHARE = 0.01
+#: Samples at a stop that are needed; torque that is unexplained there, in standard deviations of what is elsewhere, and
+#: the share of these samples in which it pushes against the stop.
+_MIN_AT_STOP, _MIN_DEVIATIONS, _MIN_PUSHING = 5, 4.0, 0.8
+#: What may be unexplained elsewhere, in `UNMODELLED_FORCE_SHARE` of the forces: more, and it is another mistake's.
+_MAX_UNEXPLAINED = 1.0
+
+
+def still_joints(log: Log) -> tuple[str, ...]:
+    """Joints whose positions never move beyond their noise, while others do."""
+    position = log.joint_position
+    if len(log) < 2 or not position.size or np.ptp(position, axis=0).max() <= MIN_MOTION:
+        return ()
+    count = max(1, round(_AVERAGED_S / float(np.median(np.diff(log.time)))))
+    whole = count * (len(log) // count)
+    if whole < 2 * count:
+        return ()
+    averages = position[:whole].reshape(-1, count, position.shape[1]).mean(axis=1)
+    noise = rough_noise(position) / np.sqrt(count)
+    still = np.ptp(averages, axis=0) <= np.minimum(_NOISE_RANGE * noise, MIN_MOTION)
+    return tuple(name for name, rests in zip(log.joint_names, still, strict=True) if rests)
+
+
+def check_still_velocities(log: Log) -> Iterator[Finding]:
+    """A finding about joints whose velocities move them while their positions stand still."""
+    names, velocity = still_joints(log), log.joint_velocity
+    if not names or velocity is None:
+        return
+    step = float(np.median(np.diff(log.time)))
+    lag = max(1, round(_AVERAGED_S / step))
+    travelled = step * np.cumsum(velocity, axis=0)
+    moved, read = (x[lag:] - x[:-lag] for x in (travelled, log.joint_position))
+    size, still = (np.std(x, axis=0) for x in (moved, read))
+    least = np.maximum(_MIN_SIGNAL_TO_NOISE * step * np.sqrt(lag) * rough_noise(velocity), _MIN_TRAVEL_RATIO * still)
+    dead = [name for name in names if size[(j := log.joint_names.index(name))] > max(least[j], 1e-9)]
+    if dead:
+        ranges = [f"{name} {np.ptp(travelled[:, log.joint_names.index(name)]):.2g}" for name in dead]
+        text = f"positions stand still while velocities move these joints by (rad, slides: m) {join_names(ranges)}"
+        yield _dead_encoder(SUSPICIOUS, dead, text)
+
+
+def still_in_limb(log: Log, robot: Robot, frame: str) -> list[str]:
+    """The joints between the base and a link that stand still in the log."""
+    still, body, found = still_joints(log), robot.links[frame][0], list[str]()
+    while body > 0:
+        joint = robot.bodies[body].joint
+        if joint is not None and joint.name in still:
+            found.append(joint.name)
+        body = robot.bodies[body].parent
+    return found[::-1]
+
+
+def check_single_joints(
+    log: Log,
+    robot: Robot | None,
+    contacts: Sequence[Contact],
+    cutoff_hz: float | None,
+    declared: Declared | None,
+    found: Sequence[Finding | Skipped],
+) -> Iterator[Finding]:
+    """Findings about joints that stand still, or reach their limits, and whose torque the URDF does not explain.
+
+    Args: as `check_forces_against_urdf`, and what it has found; nothing more is said of a log that it rejects.
+    """
+    if any(isinstance(one, Finding) and one.rejects_all for one in found):
+        return
+    if robot is None or log.joint_torque is None or set(log.joint_names) != set(robot.joint_names):
+        return
+    still, stops, model = still_joints(log), _stops(log, robot), NominalModel(robot, contacts, declared or Declared())
+    if not (still or stops) or "joint_torque" in model.declared.terms.scales:  # the size of torques is not known
+        return
+    try:
+        moved = with_delayed_torques(log, model.declared.known_delay)
+        free = _FreeTorques.of(moved, model, cutoff_hz or default_cutoff_hz(log), stops)
+    except InputError:  # reported by `check_forces_against_urdf`
+        return
+    if free is not None:
+        yield from _still_findings(free, robot, still)
+        yield from _stop_findings(free, robot, stops)
+
+
+@dataclass(frozen=True, eq=False)
+class _FreeTorques:
+    """What a further torque of one joint would have to be, to explain what the best URDF near the given one leaves.
+
+    Attributes:
+        error: (N, n) of readings beyond what is explained [N m or N], NaN of joints without readings.
+        share: (n,) of what is unexplained that it makes up.
+        position: (N, n).
+        load: (n,) rms of the torques.
+        is_fitted: (N,), samples at no stop, which the URDF is fitted to and `share` is of.
+        unexplained: rms of what is left in them, in `UNMODELLED_FORCE_SHARE` of the forces.
+    """
+
+    error: FloatArray
+    share: FloatArray
+    position: FloatArray
+    load: FloatArray
+    is_fitted: BoolArray
+    unexplained: float
+
+    @classmethod
+    def of(cls, log: Log, model: NominalModel, cutoff_hz: float, stops: Sequence[_Stop]) -> _FreeTorques | None:
+        """By some samples of a log, evenly spread ones and as many at stops."""
+        [piece, *_] = preprocess_pieces(log, cutoff_hz, MAX_TRIAL_DIFFERENTIATED_SAMPLES)
+        samples = bind_log(piece, model.robot, model.contacts)
+        position = samples.joint_position.numpy()
+        at_stop = np.zeros(len(position), bool)
+        for stop in stops:
+            at_stop |= stop.reached(position)
+        chosen = [
+            where[np.unique(np.linspace(0, len(where) - 1, COMPARED_SAMPLES).astype(int))]
+            for where in (np.flatnonzero(~at_stop), np.flatnonzero(at_stop))
+            if len(where)
+        ]
+        index = np.sort(np.concatenate(chosen))
+        some = samples[torch.from_numpy(index)]
+        rows = DeviationRows.of([some], model)
+        if rows is None or at_stop.all():
+            return None
+        [(W, equations, K, target)] = rows.parts
+        fitted, base = ~at_stop[index], rows.builder.tree.base_rows
+        A, b = K[fitted].reshape(-1, K.shape[2]), target[fitted].reshape(-1)
+        x = np.linalg.solve(A.T @ A + CORRELATED_SAMPLES * np.eye(A.shape[1]), A.T @ b)
+        left = target - K @ x
+        columns = W[:, base : base + model.robot.n]  # (N, n, n_rows)
+        size = np.square(columns).sum(axis=2)
+        along = np.einsum("njr,nr->nj", columns, left)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            error = np.where(size > 0.0, -along / size, np.nan)
+            made_up = np.where(size > 0.0, np.square(along) / size, 0.0)
+        total = float(np.square(left[fitted]).sum())
+        share = made_up[fitted].sum(axis=0) / max(total, 1e-300)
+        torque = rows.builder.recorded_torque(some)[:, : model.robot.n].numpy()
+        load = np.sqrt(np.nanmean(np.square(np.nan_to_num(torque)), axis=0))
+        unexplained = float(np.sqrt(total / max(int(equations[fitted].sum()), 1)))
+        return cls(error, share, position[index], load, fitted, unexplained)
+
+
+@dataclass(frozen=True)
+class _Stop:
+    """A limit [rad or m] of a joint, by number, its side, -1 or 1, and how near it is reached."""
+
+    joint: int
+    limit: float
+    side: int
+    margin: float
+
+    def reached(self, position: FloatArray) -> BoolArray:
+        """In which of the positions (N, n), in the robot's order, it is."""
+        return np.asarray(self.side * (position[:, self.joint] - self.limit) > -self.margin)
+
+
+def _stops(log: Log, robot: Robot) -> list[_Stop]:
+    """Limits that joints which move reach in a few samples, but not in most."""
+    limits = position_limits(robot.path) if robot.format == "URDF" else {}
+    order = [log.joint_names.index(name) for name in robot.joint_names]
+    position, out = log.joint_position[:, order], list[_Stop]()
+    for joint, name in enumerate(robot.joint_names):
+        low, high = limits.get(name, (0.0, 0.0))
+        for side, limit in ((-1, low), (1, high)) if high > low else ():
+            stop = _Stop(joint, limit, side, _STOP_SHARE * (high - low))
+            count = int(stop.reached(position).sum())
+            if _MIN_AT_STOP <= count < 0.5 * len(log):
+                out.append(stop)
+    return out
+
+
+def _still_findings(free: _FreeTorques, robot: Robot, still: Sequence[str]) -> Iterator[Finding]:
+    """Joints that stand still with a torque that no joint at rest needs; a note where friction may hold them."""
+    rms = np.sqrt(np.nanmean(np.square(free.load))) if free.load.any() else 0.0
+    for name in still:
+        joint = robot.joint_names.index(name)
+        error = float(np.sqrt(np.nanmean(np.square(free.error[free.is_fitted, joint]))))
+        if not free.share[joint] > _MIN_SHARE or not error > UNMODELLED_FORCE_SHARE * rms:
+            continue
+        unit = "N" if name in robot.sliding else "N m"
+        text = f"{name} stands still, with {error:.2g} {unit} rms that a joint at rest does not need and that are"
+        text += f" {format_percent(float(free.share[joint]))} % of what is unexplained"
+        held = error < MAX_FRICTION_SHARE * float(free.load.max())
+        yield _dead_encoder(NOTE if held else SUSPICIOUS, [name], text, "friction or a brake" * held)
+
+
+def _dead_encoder(severity: str, names: Sequence[str], text: str, held_by: str = "") -> Finding:
+    advice = f"none if {held_by} holds it; else " * bool(held_by)
+    advice += "look whether these joints move, for a dead encoder, and leave the log out"
+    return Finding("dead encoder", severity, "joint_position", text, advice, tuple(names))
+
+
+def _stop_findings(free: _FreeTorques, robot: Robot, stops: Sequence[_Stop]) -> Iterator[Finding]:
+    """Joints at limits against which their torque pushes more than it errs elsewhere, where the URDF explains it."""
+    for stop in stops if free.unexplained <= _MAX_UNEXPLAINED else ():
+        name, reached = robot.joint_names[stop.joint], stop.reached(free.position)
+        error = free.error[:, stop.joint]
+        usual, here = error[free.is_fitted], stop.side * error[reached]
+        usual, here = usual[np.isfinite(usual)], here[np.isfinite(here)]
+        if len(here) < _MIN_AT_STOP or not len(usual):
+            continue
+        spread = float(np.sqrt(np.square(usual).mean()))
+        if np.median(here) < _MIN_DEVIATIONS * spread or np.mean(here > 0.0) < _MIN_PUSHING:
+            continue
+        unit = ("N", "m") if name in robot.sliding else ("N m", "rad")
+        text = f"{name} pushes against its limit of {stop.limit:.3g} {unit[1]} with {np.median(here):.2g} {unit[0]}"
+        text += f" that the {robot.format} does not explain ({spread:.2g} {unit[0]} rms elsewhere)"
+        advice = "leave these samples out: a stop's force is in no model; or record motion within the limits"
+        yield Finding("stop", SUSPICIOUS, "joint_position", text, advice, (name,))
+
 
 #: Zero that is reported: 3 degrees of a hinge, 3 cm of a slide. Arms are calibrated to tenths of a degree.
 MIN_ZERO_DEG, MIN_ZERO_M = 3.0, 0.03
@@ -93,31 +329,31 @@ def fit_missing_gravity(samples: Sequence[Samples], model: NominalModel) -> Devi
     return fit_deviation(DeviationRows.of(samples, model), columns, _GRAVITY_PRIOR_STD)
 
 
-def check_encoders(trial: Trial, moved: list[Finding], unexplained: float) -> list[Finding]:
+def check_encoders(filtered: FilteredLog, moved: list[Finding], unexplained: float) -> list[Finding]:
     """Findings about a bolted arm's torques without gravity, zeros of encoders and joints that are reversed.
 
     Args:
-        trial: of the log.
+        filtered: the log.
         moved: findings about lags and tilts, which are returned where nothing here explains the forces better.
         unexplained: what the best URDF near the given one leaves of the forces, in `UNMODELLED_FORCE_SHARE`.
     """
-    model = trial.model
-    if not is_bolted_arm(model) or trial.log.joint_torque is None:
+    model = filtered.model
+    if not is_bolted_arm(model) or filtered.log.joint_torque is None:
         return moved
     try:
-        samples = bind_some_samples(trial.pieces, model.robot, (), TIME_SCALE_SAMPLES)
+        samples = bind_some_samples(filtered.pieces, model.robot, (), TIME_SCALE_SAMPLES)
         gravity = fit_missing_gravity(samples, model)
         if gravity is not None and gravity.is_clear and _ALL_OF_GRAVITY[0] < gravity.value[0] < _ALL_OF_GRAVITY[1]:
             return [_gravity_finding(gravity)]
         zeros = fit_zeros(samples, model)
         if zeros is not None and (found := list(_zero_findings(zeros, model))):
-            tilt = fit_tilt(trial) if any(one.name == "tilt" for one in moved) else None
+            tilt = fit_tilt(filtered) if any(one.name == "tilt" for one in moved) else None
             if tilt is None or zeros.left < _BETTER_THAN_A_TILT * tilt.left:
                 return [*(one for one in moved if one.name != "tilt"), *found]
             names = join_names([name for one in found for name in one.channels])
             also = f"; or the zero of {names}, which explains it as well"
             return [replace(one, advice=one.advice + also) if one.name == "tilt" else one for one in moved]
-        mistaken = None if moved else _reversed_joint(trial.pieces, model, unexplained)
+        mistaken = None if moved else _reversed_joint(filtered.pieces, model, unexplained)
     except InputError:  # reported by `check_forces_against_urdf`
         return moved
     return moved if mistaken is None else [mistaken]

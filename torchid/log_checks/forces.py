@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from torchid.errors import InputError, join_names
-from torchid.log_checks.deviation import Trial
+from torchid.log_checks.deviation import FilteredLog
 from torchid.log_checks.drift import check_torque_drift
 from torchid.log_checks.encoders import check_encoders, is_bolted_arm
 from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, UNEXPLAINED, Finding, Skipped, refused
@@ -143,12 +143,12 @@ def _misfit_findings(
         yield from torque_findings(robot, fit.torque)
         return
     log, samples = _scaled(log, samples, robot, fit.torque)
-    trial = Trial(log, model, cutoff)
+    filtered = FilteredLog(log, model, cutoff)
     if model.declared.delay == AUTO:
-        trial = without_lag(trial)
-        log = trial.log
-    moved, unexplained = check_lag_and_tilt(trial, derived)
-    moved = check_encoders(trial, moved, unexplained)
+        filtered = without_lag(filtered)
+        log = filtered.log
+    moved, unexplained = check_lag_and_tilt(filtered, derived)
+    moved = check_encoders(filtered, moved, unexplained)
     scale = None if moved else _fit_time_scale(log, model)
     if found := moved or [one for one in [_time_scale_finding(scale)] if one is not None]:
         alike = None if moved else fit_torque_gains(samples, model)
@@ -164,7 +164,7 @@ def _misfit_findings(
     yield from torques
     if not any(isinstance(item, Finding) for item in torques):
         scaled = list(_gain_and_point_findings(log, fit_torque_gains(samples, model), robot))
-        yield from scaled or list(check_torque_offsets(trial)) or check_torque_drift(trial)
+        yield from scaled or list(check_torque_offsets(filtered)) or check_torque_drift(filtered)
 
 
 def _is_mostly_friction(stated: ModelFit, without: ModelFit) -> bool:

@@ -22,10 +22,10 @@ from torchid.log_checks.findings import (
     neighbours_of,
 )
 from torchid.logs import Log
+from torchid.logs.dry_friction import OFTEN, resting_share
 from torchid.logs.log import CONTACT_READINGS, WRENCHES, BoolArray, FloatArray
-from torchid.logs.sign_filter import OFTEN, resting_share
 from torchid.logs.signal_noise import rough_noise
-from torchid.problem.excitation import MIN_MOTION, MIN_TURN_DEG
+from torchid.problem.motion_noise import MIN_MOTION, MIN_TURN_DEG
 
 #: Samples at one extreme value from which on it is a limit of the sensor.
 MIN_SAMPLES_AT_LIMIT = 5

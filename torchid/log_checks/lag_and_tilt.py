@@ -14,7 +14,7 @@ from torchid.log_checks.deviation import (
     COMPARED_SAMPLES,
     Deviation,
     DeviationRows,
-    Trial,
+    FilteredLog,
     fit_deviation,
 )
 from torchid.log_checks.findings import NOTE, SUSPICIOUS, Finding
@@ -47,21 +47,21 @@ _SHIFTS, _LEAST_SHIFT_S = 8, 2e-3
 _SMALL_ANGLE = 1e-4
 
 
-def check_lag_and_tilt(trial: Trial, derived: tuple[str, ...] = ()) -> tuple[list[Finding], float]:
+def check_lag_and_tilt(filtered: FilteredLog, derived: tuple[str, ...] = ()) -> tuple[list[Finding], float]:
     """Findings about torques that lag or lead, a vertical that gravity is not along, and single contact sensors.
 
     The number is what the best URDF near the given one leaves unexplained without any of these, in
     `UNMODELLED_FORCE_SHARE` of the forces; infinite where nothing could be compared.
 
     Args:
-        trial: of the log.
+        filtered: the log.
         derived: how names of fields begin that were not recorded.
     """
-    log, model = trial.log, trial.model
+    log, model = filtered.log, filtered.model
     try:
-        lag = fit_lag(trial)
-        tilt = fit_tilt(trial) if not "base_quat_xyzw".startswith(derived) else None
-        sensors = fit_contact_sensors(trial)
+        lag = fit_lag(filtered)
+        tilt = fit_tilt(filtered) if not "base_quat_xyzw".startswith(derived) else None
+        sensors = fit_contact_sensors(filtered)
     except InputError:  # reported by `check_forces_against_urdf`
         return [], np.inf
     unexplained = min((x.without for x in (lag, tilt) if x is not None), default=np.inf)
@@ -74,13 +74,13 @@ def check_tilt(samples: Sequence[Samples], model: NominalModel) -> Iterator[Find
     yield from _tilt_findings(_tilt_of(DeviationRows.of(some_samples(samples, COMPARED_SAMPLES), model), model), model)
 
 
-def check_torque_offsets(trial: Trial) -> Iterator[Finding]:
+def check_torque_offsets(filtered: FilteredLog) -> Iterator[Finding]:
     """Findings about single joints whose torque reads too much by a constant, for logs that nothing else is wrong with.
 
     Args: as `check_lag_and_tilt`.
     """
     with suppress(InputError):  # reported by `check_forces_against_urdf`
-        yield from _offset_findings(fit_torque_offsets(trial), trial.log, trial.model)
+        yield from _offset_findings(fit_torque_offsets(filtered), filtered.log, filtered.model)
 
 
 def _lag_findings(lag: Deviation | None, declared: Declared) -> Iterator[Finding]:
@@ -141,7 +141,7 @@ def _contact_sensor_findings(found: Deviation | None, log: Log, model: NominalMo
         yield Finding(name, SUSPICIOUS, log.contact_wrench_field, text, advice, (contact.frame,))
 
 
-def fit_contact_sensors(trial: Trial) -> Deviation | None:
+def fit_contact_sensors(filtered: FilteredLog) -> Deviation | None:
     """By how much each contact's wrench is more than is read, and turned, (4 C,): a share, and three angles' sines.
 
     The axes are those of the readings. A turn about an axis across the forces takes the share cos - 1 beside it. None
@@ -150,8 +150,8 @@ def fit_contact_sensors(trial: Trial) -> Deviation | None:
     Raises:
         InputError: as `fit_lag`.
     """
-    contacts = trial.model.contacts
-    if trial.log.contact_wrench is None or not contacts:
+    contacts = filtered.model.contacts
+    if filtered.log.contact_wrench is None or not contacts:
         return None
 
     @torch.no_grad()
@@ -166,18 +166,18 @@ def fit_contact_sensors(trial: Trial) -> Deviation | None:
         wrenches = [(k, builder.recorded_wrench(x, k, kinematics)) for k in range(len(contacts)) for x in changes]
         return np.stack([torch.einsum("nwv,nw->nv", J[:, k], w).numpy() for k, w in wrenches], axis=2)
 
-    return fit_deviation(trial.rows, columns, _SENSOR_PRIOR_STD)
+    return fit_deviation(filtered.rows, columns, _SENSOR_PRIOR_STD)
 
 
-def fit_lag(trial: Trial) -> Deviation | None:
+def fit_lag(filtered: FilteredLog) -> Deviation | None:
     """By how much joint torques are later than the motion, (1,) [s]; None where no torque was measured.
 
     Raises:
         InputError: the log cannot be filtered, or does not match the robot.
     """
-    if trial.log.joint_torque is None:
+    if filtered.log.joint_torque is None:
         return None
-    robot, contacts, out, shift, moved = trial.model.robot, trial.model.contacts, None, 0.0, trial
+    robot, contacts, out, shift, moved = filtered.model.robot, filtered.model.contacts, None, 0.0, filtered
     for _ in range(_SHIFTS):
         slopes = [replace(one, joint_torque=_slope(one)) for one in moved.pieces]
         rates = bind_some_samples(slopes, robot, contacts, COMPARED_SAMPLES)
@@ -196,17 +196,17 @@ def fit_lag(trial: Trial) -> Deviation | None:
         shift = float(out.value[0])
         if abs(found.value[0]) < _LEAST_SHIFT_S or abs(shift) > 2.0 * _LAG_PRIOR_STD_S:
             break
-        moved = replace(trial, log=with_delayed_torques(trial.log, -shift))
+        moved = replace(filtered, log=with_delayed_torques(filtered.log, -shift))
     return out
 
 
-def fit_torque_offsets(trial: Trial) -> Deviation | None:
+def fit_torque_offsets(filtered: FilteredLog) -> Deviation | None:
     """By how much each joint's torque is less than is read, (n,) [N m or N]; None where no torque was measured.
 
     Raises:
         InputError: as `fit_lag`.
     """
-    log, robot = trial.log, trial.model.robot
+    log, robot = filtered.log, filtered.model.robot
     if log.joint_torque is None:
         return None
 
@@ -215,7 +215,7 @@ def fit_torque_offsets(trial: Trial) -> Deviation | None:
         constant[builder.tree.base_rows + np.arange(robot.n), np.arange(robot.n)] = -1.0
         return np.broadcast_to(constant, (len(part), *constant.shape))
 
-    return fit_deviation(trial.rows, columns, _OFFSET_PRIOR_SHARE * _torque_rms(log) or 1.0, offsets=robot.n)
+    return fit_deviation(filtered.rows, columns, _OFFSET_PRIOR_SHARE * _torque_rms(log) or 1.0, offsets=robot.n)
 
 
 def _torque_rms(log: Log) -> float:
@@ -224,23 +224,23 @@ def _torque_rms(log: Log) -> float:
     return float(np.sqrt(np.nanmean(np.square(torque)))) if np.isfinite(torque).any() else 0.0
 
 
-def without_lag(trial: Trial) -> Trial:
-    """The trial of a log with joint torques as late as the motion, where it is clear by how much they are not.
+def without_lag(filtered: FilteredLog) -> FilteredLog:
+    """The log with joint torques as late as the motion, where it is clear by how much they are not.
 
     Raises:
         InputError: as `fit_lag`.
     """
-    lag = fit_lag(trial)
+    lag = fit_lag(filtered)
     if lag is None or not lag.is_clear:
-        return trial
-    return replace(trial, log=with_delayed_torques(trial.log, -float(lag.value[0])))
+        return filtered
+    return replace(filtered, log=with_delayed_torques(filtered.log, -float(lag.value[0])))
 
 
 def _slope(log: Log) -> FloatArray | None:
     return None if log.joint_torque is None else np.gradient(log.joint_torque, log.time, axis=0)
 
 
-def fit_tilt(trial: Trial) -> Deviation | None:
+def fit_tilt(filtered: FilteredLog) -> Deviation | None:
     """By how much gravity is turned about x and y from where the log says it is, (2,) [rad].
 
     The axes are the world's, of a fixed base its own. None where no force was measured, or an IMU felt gravity.
@@ -248,9 +248,9 @@ def fit_tilt(trial: Trial) -> Deviation | None:
     Raises:
         InputError: as `fit_lag`.
     """
-    if trial.log.imu_specific_force is not None and not trial.model.robot.fixed_base:
+    if filtered.log.imu_specific_force is not None and not filtered.model.robot.fixed_base:
         return None
-    return _tilt_of(trial.rows, trial.model)
+    return _tilt_of(filtered.rows, filtered.model)
 
 
 def _tilt_of(rows: DeviationRows | None, model: NominalModel) -> Deviation | None:

@@ -9,8 +9,9 @@ import torch
 
 from torchid.errors import InputError
 from torchid.log_checks.findings import REJECTED, Finding, refused
+from torchid.parallel import one_thread
 from torchid.problem import RowBuilder, Samples
-from torchid.problem.chunks import one_thread, subsample_states
+from torchid.problem.chunks import subsample_states
 from torchid.problem.contact_state import state_name
 from torchid.problem.samples import require_forces
 from torchid.robot import Robot

@@ -21,8 +21,9 @@ from torchid.log_checks.model import (
 )
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
+from torchid.parallel import one_thread
 from torchid.problem import RowBuilder, Samples
-from torchid.problem.chunks import chunks_by_state, one_thread
+from torchid.problem.chunks import chunks_by_state
 from torchid.problem.linear import parameter_scale
 from torchid.problem.predict import force_series
 from torchid.robot import Robot

@@ -10,6 +10,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation, Slerp
 
 from torchid.errors import InputError, format_percent, join_names
+from torchid.log_checks.encoders import still_in_limb
 from torchid.log_checks.findings import (
     REJECTED,
     SUSPICIOUS,
@@ -22,14 +23,13 @@ from torchid.log_checks.findings import (
 )
 from torchid.log_checks.mistakes import possible_mistakes, reversed_joints
 from torchid.log_checks.model import LinkPoses, default_cutoff_hz, preprocess_pieces, recorded_link_poses
-from torchid.log_checks.single_joints import still_in_limb
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.quaternion import rotate_to_world
 from torchid.logs.units import advise_units, units_of_ratio
 from torchid.problem.base_motion import imu_pose
+from torchid.problem.floor_pose import rolled_distance
 from torchid.robot import Robot
-from torchid.robot.rolling import rolled_distance
 from torchid.sensing import Contact
 
 #: Motion of standing feet over that of the base above them. Soft soles and rolling feet have 0.05 to 0.2.

@@ -12,7 +12,7 @@ from torchid.errors import join_names
 from torchid.log_checks.findings import REJECTED, SUSPICIOUS, Finding, Skipped
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.problem import RowBuilder, Samples
-from torchid.problem.excitation import MIN_MOTION
+from torchid.problem.motion_noise import MIN_MOTION
 from torchid.problem.predict import null_space_part
 from torchid.robot import Robot
 

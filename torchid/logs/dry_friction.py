@@ -1,18 +1,25 @@
-"""What dry friction goes with at the stamps of a preprocessed log: directions of joints, and where they rest."""
+"""What dry friction goes with at the stamps of a preprocessed log: directions of joints, and where they rest.
+
+A low-pass filter for accelerations takes vibration off the velocities, and with it their reversals: the mean of the
+sign comes out too large. The sign needs no derivative, so that it bears more of the noise: its filter is as wide as the
+noise of the velocities allows.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.polynomial.legendre import leggauss
 
+from torchid.errors import about_file, warn_about_file
 from torchid.logs.log import BoolArray, FloatArray, Log
 from torchid.logs.low_pass import LowPass, import_signal
-from torchid.logs.sign_filter import mean_dry, mean_stribeck, noisy_width
-from torchid.logs.timeline import Timeline
+from torchid.logs.signal_noise import MOST_SAMPLES, SignalNoise, noise_of_derivatives, rough_noise
+from torchid.logs.timeline import JITTER, Timeline, spline_derivatives
 
 #: Values that are filtered together: few, so that copies of a long log are small; many, so that a short one needs few
 #: calls.
@@ -107,3 +114,225 @@ def dry_friction_by_setting(
     smoothed = {name: signs.smooth(getattr(log, name))}
     own = replace(timeline, sign_low_pass=None)
     return lambda width, stribeck: dry_friction(log, smoothed, replace(own, sign_width=width, stribeck=stribeck))
+
+
+_FEWEST = 100  # samples
+_DOUBLINGS = 8  # of the cutoff
+_MUCH = 0.05  # share of the velocities' power that is worth a warning
+_REVERSAL = float(np.sqrt(2.0 / np.pi) / np.log(2.0))  # width of tanh over deviation of erf
+_LEAST_WIDTH = 1e-9  # [rad/s or m/s] of a joint without noise among others: at once
+_LEAST_CHANGE = 1e-4  # of a tanh's argument over a step, across which its mean is its middle
+_NODES = 9  # within a step, of what Stribeck friction loses with speed
+_WIDEST = 0.4  # largest cutoff over the sample rate
+_UNKNOWN = 0.2  # share of the variance of noise by which it may be smaller than estimated
+_SURELY = 3.0  # standard deviations of noise, beyond which a joint moves
+_SLOW = 0.1  # of a joint's root mean square velocity
+OFTEN = 0.2
+"""Share of the time at rest that tells: of sines it is 0.05, of Gaussian motion 0.08."""
+_EVIDENT = 0.01  # share of the velocities' power by which the error must fall: less is a few per cent of the reversals
+
+
+def with_sign_filter(
+    timeline: Timeline, log: Log, noise: SignalNoise, parts: Iterable[tuple[FloatArray, FloatArray]] | None = None
+) -> Timeline:
+    """A timeline of a log, or of one whose start this is, with the filter of `wider_low_pass` and the noise behind it.
+
+    Where joints at rest are to be found, with the velocity that they have at most: a tenth of the root mean square, as
+    in `resting_share`, or three standard deviations of noise.
+
+    A joint that moves less than the noise of its velocity all the time has noise without bound: nobody knows its sign.
+    Positions tell, further apart the noisier they are, as the mean velocity between two has noise of their own then.
+
+    Args:
+        timeline: of the log.
+        log: as recorded, or its start.
+        noise: of its motion, by this timeline.
+        parts: stamps (N,) [s] and joint positions (N, n) of all parts of the log, in order; None where `log` is all.
+
+    Warns:
+        TorchidWarning: the timeline's own filter takes off much of the joints' motion.
+    """
+    wider, derivatives = wider_low_pass(log, timeline), noise.derivatives
+    if wider is not None:
+        if wider.lost > _MUCH:
+            with about_file(log.source):
+                warn_about_file(f"joints move faster than the filter lets through: {wider}")
+        timeline = replace(timeline, sign_low_pass=wider.low_pass)
+        step = float(np.median(np.diff(log.time)))
+        derivatives = noise_of_derivatives(step, replace(timeline, low_pass=wider.low_pass))
+    name, order = ("joint_position", 1) if log.joint_velocity is None else ("joint_velocity", 0)
+    std, none = noise.std.get(name), np.zeros(len(log.joint_names))
+    is_noisy = std is not None and bool(std.any()) and timeline.cutoff_hz is not None
+    if not (is_noisy or timeline.finds_rest):
+        return timeline
+    of_sign = (none if std is None else std) * np.sqrt(derivatives[order, order])
+    of_position, step, noisy = noise.std.get("joint_position", none), float(np.median(np.diff(log.time))), of_sign > 0.0
+    ratio = float(np.median(of_position[noisy] / of_sign[noisy])) if noisy.any() else 0.0
+    lag = max(1, round(np.sqrt(2.0) * ratio / step))
+    square = mean_square_velocity([(log.time, log.joint_position)] if parts is None else parts, lag)
+    expected = (1.0 - _UNKNOWN) * 2.0 * np.square(of_position / (lag * step))  # of the positions' noise, at least
+    still = noisy & (square < np.square(of_sign) + expected)
+    if timeline.finds_rest:
+        slow = np.maximum(_SLOW * np.sqrt(np.where(np.isfinite(square), square, 0.0)), _SURELY * of_sign)
+        timeline = replace(timeline, rest_speed=np.where(still, np.inf, slow))
+    return replace(timeline, sign_noise=np.where(still, np.inf, of_sign)) if is_noisy else timeline
+
+
+def with_signs_of(timeline: Timeline, whole: Timeline) -> Timeline:
+    """The timeline of a segment with what `with_sign_filter` has found of the whole log."""
+    found = {name: getattr(whole, name) for name in ("sign_low_pass", "sign_noise", "rest_speed")}
+    return replace(timeline, **found)
+
+
+def mean_square_velocity(parts: Iterable[tuple[FloatArray, FloatArray]], lag: int) -> FloatArray:
+    """Mean square of the joints' mean velocities over so many samples, (n,); infinite of a log that is no longer.
+
+    Args:
+        parts: stamps (N,) [s] and joint positions (N, n) of all parts of a log, in order.
+        lag: the samples.
+    """
+    squares: FloatArray | float = np.inf
+    done, count, last = 0, 0, list[tuple[FloatArray, FloatArray]]()
+    for time, position in parts:
+        some = slice(-done % lag, None, lag)
+        at, q = (np.concatenate(x) for x in zip(*last, (time[some], position[some]), strict=True))
+        mean = np.diff(q, axis=0) / np.diff(at)[:, None]
+        if len(mean):
+            squares = (squares if count else 0.0) + np.square(mean).sum(axis=0)
+        done, count, last = done + len(time), count + len(mean), [(at[-1:], q[-1:])]
+    return np.asarray(squares / max(count, 1))
+
+
+def resting_share(velocity: FloatArray, noise: FloatArray | float = 0.0) -> FloatArray:
+    """Share of the time, (n,), in which joints move slower than a tenth of their velocity's root mean square.
+
+    Args:
+        velocity: (N, n) [rad/s or m/s].
+        noise: standard deviation of that of velocities, (n,) [rad/s or m/s]; three of it are rest, too.
+    """
+    slow = np.maximum(_SLOW * np.sqrt(np.square(velocity).mean(axis=0)), _SURELY * noise)
+    return np.asarray((np.abs(velocity) <= slow).mean(axis=0))
+
+
+@dataclass(frozen=True)
+class WiderLowPass:
+    """A filter that leaves velocities a smaller error than that of a timeline.
+
+    Attributes:
+        low_pass: the filter.
+        cutoff_hz: of it [Hz].
+        lost: by how much the error is smaller, as a share of the velocities' power.
+    """
+
+    low_pass: LowPass
+    cutoff_hz: float
+    lost: float
+
+    def __str__(self) -> str:
+        """What is lost, what follows and what helps."""
+        return (
+            f"{100.0 * self.lost:.0f} % of the power of their velocities is taken off, with whose squares forces go,"
+            f" measured and fitted ones; accepted: preprocessing.cutoff_hz of {self.cutoff_hz:.3g} or more"
+        )
+
+
+def wider_low_pass(log: Log, timeline: Timeline) -> WiderLowPass | None:
+    """The filter of velocities that leaves their least error, of motion that is lost and noise that is left together.
+
+    None for that of the timeline, unless a wider one is clearly better.
+
+    Source: Stein's unbiased estimate of the risk (Annals of Statistics 9, 1981), of a linear filter; the noise is
+    whatever is not smooth from sample to sample, quantization included, so that it is rather too large.
+
+    Args:
+        log: as recorded, or its start.
+        timeline: that it is preprocessed to.
+    """
+    cutoff, low_pass = timeline.cutoff_hz, timeline.low_pass
+    start = log.select(slice(0, MOST_SAMPLES))
+    if cutoff is None or low_pass is None or len(start) < max(_FEWEST, 2 * low_pass.padding):
+        return None
+    name = "joint_position" if start.joint_velocity is None else "joint_velocity"
+    values: FloatArray = getattr(start, name)
+    if not values.shape[1] or not np.isfinite(values).all():
+        return None
+    step = float(np.median(np.diff(start.time)))
+    if np.ptp(np.diff(start.time)) > JITTER * step:
+        even = start.time[0] + step * np.arange(int((start.time[-1] - start.time[0]) / step) + 1)
+        values = spline_derivatives(start.time, values, even, (0,))[0]
+    correlation = np.square(rough_noise(values)).sum() * np.array([1.0, 0.0])
+    if name == "joint_position":
+        values = np.diff(values, axis=0) / step
+        correlation = correlation[0] / step**2 * np.array([2.0, -1.0])
+    cutoffs = [cutoff * 2.0**k for k in range(1, _DOUBLINGS) if cutoff * 2.0**k < _WIDEST / step]
+    wider = [LowPass.butterworth(one, step) for one in cutoffs]
+    first, *errors = (_error(one, values, correlation) for one in [low_pass, *wider])
+    power = float(np.square(values).mean(axis=0).sum())
+    best = int(np.argmin([first, *errors])) - 1
+    if best < 0 or first - errors[best] <= _EVIDENT * power:
+        return None
+    return WiderLowPass(wider[best], cutoffs[best], (first - errors[best]) / power)
+
+
+def _error(low_pass: LowPass, values: FloatArray, correlation: FloatArray) -> float:
+    """Mean squared error of filtered channels (M, n), summed, but for a constant.
+
+    `correlation`: of the noise with itself and with that of the next sample, summed over channels.
+    """
+    response = low_pass.impulse_response
+    response = response[len(response) // 2 :]
+    lost = float(np.square(values - low_pass(values)).mean(axis=0).sum())
+    return lost + 2.0 * float(response[0] * correlation[0] + 2.0 * response[1] * correlation[1])
+
+
+def mean_sign(velocity: FloatArray) -> FloatArray:
+    """Mean of the sign of what goes from each value to the next, (M, ...) of (M + 1, ...)."""
+    size = np.abs(velocity)
+    total = size[:-1] + size[1:]
+    return np.divide(velocity[:-1] + velocity[1:], total, out=np.zeros_like(total), where=total > 0.0)
+
+
+def mean_tanh(velocity: FloatArray) -> FloatArray:
+    """Likewise of the hyperbolic tangent, whose integral is log cosh."""
+    size = np.abs(velocity)
+    integral = np.diff(size + np.log1p(np.exp(-2.0 * size)), axis=0)
+    change, tanh = np.diff(velocity, axis=0), np.tanh(0.5 * (velocity[:-1] + velocity[1:]))
+    return np.divide(integral, change, out=tanh, where=np.abs(change) > _LEAST_CHANGE)
+
+
+def noisy_width(timeline: Timeline, columns: slice) -> float | FloatArray | None:
+    """Width over which the sign of some joints' velocities reverses on average where noisy ones pass through 0.
+
+    None for at once: a timeline without a width and without noise.
+
+    With Gaussian noise s, as `with_sign_filter` has it, a velocity that is read as u has the mean sign
+    erf(u / (sqrt(2) s)). With this width w, tanh(u / w) lacks as much of a sign during a reversal. A fit on sign(u),
+    wrong where noise is the larger, finds too little Coulomb friction, and viscous friction in its place.
+
+    Source: regression calibration (Carroll, Ruppert, Stefanski, Crainiceanu, "Measurement Error in Nonlinear Models",
+    2006, chapter 4); squares of widths add up as in MacKay's moderated output (Neural Computation 4, 1992).
+    """
+    if timeline.sign_noise is None:
+        return timeline.sign_width
+    return np.maximum(np.hypot(timeline.sign_width or 0.0, _REVERSAL * timeline.sign_noise[columns]), _LEAST_WIDTH)
+
+
+def mean_dry(velocity: FloatArray, width: float | FloatArray | None) -> FloatArray:
+    """Mean of the sign as Coulomb friction has it: over a width [rad/s or m/s], None for at once."""
+    return mean_sign(velocity) if width is None else mean_tanh(velocity / width)
+
+
+def mean_stribeck(velocity: FloatArray, width: float | FloatArray | None, stribeck: float) -> FloatArray:
+    """Mean of this sign times exp(-(v / v_s)^2), by that of the sign less what is lost with speed, smooth where v is 0.
+
+    Args:
+        velocity: (M + 1, ...), where each of M successive intervals begins and the last one ends [rad/s or m/s].
+        width: as of `mean_dry`.
+        stribeck: v_s [rad/s or m/s].
+    """
+    mean, before, after = mean_dry(velocity, width), velocity[:-1], velocity[1:]
+    for node, weight in zip(*leggauss(_NODES), strict=True):
+        v = 0.5 * (before + after) + 0.5 * node * (after - before)
+        sign = np.sign(v) if width is None else np.tanh(v / width)
+        mean = mean + 0.5 * weight * sign * np.expm1(-((v / stribeck) ** 2))
+    return np.asarray(mean)

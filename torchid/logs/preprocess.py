@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from torchid.errors import InputError, LogError, about_file
-from torchid.logs.dry_friction import channels_together, dry_friction
+from torchid.logs.dry_friction import channels_together, dry_friction, with_sign_filter
 from torchid.logs.gaps import Coverage, measure_coverage, require_no_turns, warn_of_gaps
 from torchid.logs.log import (
     CONTACT_READINGS,
@@ -23,7 +23,6 @@ from torchid.logs.log import (
     column_labels,
 )
 from torchid.logs.quaternion import angular_acceleration_base, angular_velocity_base, make_sign_continuous
-from torchid.logs.sign_filter import with_sign_filter
 from torchid.logs.signal_noise import signal_noise, warn_of_noisy_accelerations
 from torchid.logs.timeline import JITTER, SampleRate, Timeline, lay_out_timeline, nearest_known
 from torchid.settings import AUTO

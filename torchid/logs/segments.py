@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from torchid.errors import LogError, about_file
+from torchid.logs.dry_friction import with_sign_filter, with_signs_of
 from torchid.logs.gaps import measure_coverage, warn_of_gaps
 from torchid.logs.log import BoolArray, FloatArray, Log
 from torchid.logs.low_pass import DROPPED_PERIODS
@@ -20,7 +21,6 @@ from torchid.logs.preprocess import (
     move_to_timeline,
     unloaded_readings,
 )
-from torchid.logs.sign_filter import with_sign_filter, with_signs_of
 from torchid.logs.signal_noise import signal_noise, warn_of_noisy_accelerations
 from torchid.logs.timeline import FEWEST_DIFFERENTIATED, LONGEST_STEP, SampleRate, Timeline, spline_derivatives
 

@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 
 from torchid.errors import LogError, excerpt, how_to_install
 from torchid.guards import MAX_ARRAYS, MAX_SCHEMA, check_unpacked_size
-from torchid.logs.columns import TEXT_COLUMN, check_header
+from torchid.logs.columns import TEXT_COLUMN, check_header, is_number, is_stamp
 from torchid.logs.containers import JSON_LINES, TEXT_TABLES
 from torchid.logs.json_lines import JsonColumns, read_json_lines
 from torchid.logs.table_headers import BLOCK, NestedColumns, TextHeader, read_header
-from torchid.logs.table_values import is_number, is_stamp
 
 #: Rows that are converted at a time; lines of JSON.
 _ROWS, _LINES = 2**16, 2**12

@@ -100,7 +100,7 @@ class Timeline:
         sign_noise: (n,), of these velocities behind their filter [rad/s or m/s], infinite of joints that move less than
             that; None for none.
         finds_rest: whether joints at rest are found.
-        rest_speed: (n,), of joints at rest at most [rad/s or m/s], see `torchid.logs.sign_filter`; None without these.
+        rest_speed: (n,), of joints at rest at most [rad/s or m/s], see `torchid.logs.dry_friction`; None without these.
     """
 
     native: FloatArray

@@ -8,8 +8,9 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from torchid.parallel import one_thread
 from torchid.parameters import Array
-from torchid.problem.chunks import chunks_by_state, one_thread
+from torchid.problem.chunks import chunks_by_state
 from torchid.problem.contact_state import ContactState
 from torchid.problem.predict import predict_forces, with_payload_columns
 from torchid.problem.rows import RowBuilder

@@ -5,20 +5,17 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
 from importlib.util import find_spec
 from itertools import chain, pairwise
 from typing import TypeVar
 
 import numpy as np
 import torch
-from threadpoolctl import ThreadpoolController
 
 from torchid import ranks
-from torchid.copies import can_copy, share_between_copies
 from torchid.errors import excerpt, warn
+from torchid.parallel import can_copy, one_thread, run_in_workers, share_between_copies, thread_count
 from torchid.problem.blocks import are_of_one_log, join_pieces
 from torchid.problem.contact_state import ContactState
 from torchid.problem.rows import RowBuilder
@@ -231,40 +228,6 @@ def subsample_states(logs: Sequence[Samples], count: int) -> Iterator[tuple[Samp
             yield samples[index[torch.linspace(0, len(index) - 1, share).long()]], state, len(index) / share
 
 
-def run_in_workers(tasks: Sequence[Task], run: Callable[[Iterator[Task]], Result], workers: int) -> list[Result]:
-    """Results of `run`, one per worker, each called without gradients on every n-th task; no worker is without one.
-
-    A failure or an interrupt stops all workers at their next task.
-    """
-    stop = threading.Event()
-
-    def work(first: int) -> Result:
-        torch.set_num_threads(1)
-        with torch.no_grad(), stopping():
-            return run(task for task in tasks[first::workers] if not stop.is_set())
-
-    @contextmanager
-    def stopping() -> Iterator[None]:
-        try:
-            yield
-        except BaseException:
-            stop.set()
-            raise
-
-    workers = min(workers, max(len(tasks), 1))
-    with one_thread():
-        if workers == 1:
-            return [work(0)]
-        with ThreadPoolExecutor(workers) as pool, stopping():
-            return list(pool.map(work, range(workers)))
-
-
-def map_in_workers(tasks: Sequence[Task], work: Callable[[Task], Result], workers: int | None = None) -> list[Result]:
-    """What a function makes of each task, in their order, by threads: by default as many as `thread_count`."""
-    parts = run_in_workers(tasks, lambda own: [work(task) for task in own], workers or thread_count())
-    return [parts[number % len(parts)][number // len(parts)] for number in range(len(tasks))]
-
-
 def _run_in_copies(tasks: Sequence[Task], run: Callable[[Iterator[Task], bool], Result], workers: int) -> list[Result]:
     """As `run_in_workers`, to the last bit, by this process, whose chunks are reported, and copies of it.
 
@@ -290,42 +253,6 @@ def chunk_size(device: torch.device) -> int:
 def worker_count(device: torch.device) -> int:
     """Default number of workers: on a CPU one per thread that torch would use, on a GPU one."""
     return thread_count() if device.type == "cpu" else 1
-
-
-def thread_count() -> int:
-    """Threads that torch would use for one operation, outside of `one_thread`."""
-    return torch.get_num_threads() if _outside is None else _outside
-
-
-_outside: int | None = None  # `thread_count` while a block runs with one thread
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Run the block with one intra-op thread, of torch and of NumPy's linear algebra.
-
-    These arrays are too small to split: on a busy two-core machine two threads made evaluation eight times slower, a
-    consistent estimate three times, and the QR decomposition of 275 rows of 157 columns twenty times.
-    """
-    global _outside
-    before, outermost = torch.get_num_threads(), _outside is None
-    torch.set_num_threads(1)
-    try:
-        if outermost:
-            _outside = before
-            with _pools().limit(limits=1, user_api="blas"):
-                yield
-        else:
-            yield
-    finally:
-        if outermost:
-            _outside = None
-        torch.set_num_threads(before)
-
-
-@cache
-def _pools() -> ThreadpoolController:
-    return ThreadpoolController()
 
 
 def upload(chunks: Iterable[tuple[Samples, Label]], device: torch.device) -> Iterator[tuple[Samples, Label]]:

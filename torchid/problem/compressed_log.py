@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from torchid.parallel import one_thread
 from torchid.problem.blocks import block_spans, lay_out_folds
-from torchid.problem.chunks import ProgressCallback, chunks_by_state, one_thread
+from torchid.problem.chunks import ProgressCallback, chunks_by_state
 from torchid.problem.compression import (
     LEAST_PER_FOLD,
     Part,

@@ -12,9 +12,10 @@ import torch
 from torch import Tensor
 
 from torchid import ranks
+from torchid.parallel import one_thread
 from torchid.problem.blocks import block_spans, blocks_in, cut_logs, lay_out_folds, rows_of_samples, span_of_samples
 from torchid.problem.chunk_dynamics import Workspace
-from torchid.problem.chunks import ProgressCallback, chunks_by_state, map_chunks, one_thread, worker_count
+from torchid.problem.chunks import ProgressCallback, chunks_by_state, map_chunks, worker_count
 from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import TriangularFactor
 from torchid.problem.noise_gram import NoiseGram, estimate_noise_gram

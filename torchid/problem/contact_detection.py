@@ -19,7 +19,7 @@ from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import find_unloaded
 from torchid.problem.contact_slip import base_velocity, contact_velocities, keep_still
 from torchid.problem.detection_forces import ForcesAlongNormals, fitted_parameters
-from torchid.problem.detection_motion import Prepared, detection_cutoff_hz, nyquist_hz, prepare
+from torchid.problem.detection_motion import DetectionSamples, detection_cutoff_hz, nyquist_hz, prepare
 from torchid.problem.samples import require_contacts
 from torchid.robot import Robot
 from torchid.rounding import STD_PER_MAD
@@ -174,7 +174,7 @@ class Filtered(NamedTuple):
 
     time: FloatArray
     cutoff_hz: float
-    parts: Callable[[], Iterable[Prepared]]
+    parts: Callable[[], Iterable[DetectionSamples]]
 
 
 def detect_in_parts(

@@ -28,7 +28,7 @@ from torchid.logs.timeline import SPLINE_BLOCK, lay_out_timeline
 from torchid.problem.contact_detection import Detection, DetectionConfig, Filtered, detect_in_parts, name_flags
 from torchid.problem.detection_motion import (
     MAX_GAPS,
-    Prepared,
+    DetectionSamples,
     bind_for_detection,
     filter_hz,
     for_detection,
@@ -110,7 +110,7 @@ def detect_in_blocks(
         for one in coverage.values():
             one.add(np.where(torque.broken, np.nan, 0.0)[None], None)
 
-        def parts() -> Iterator[Prepared]:
+        def parts() -> Iterator[DetectionSamples]:
             for piece in pieces(len(timeline.output_stamps)):
                 samples, part = timeline.part(piece.start, piece.stop)
                 with quiet():

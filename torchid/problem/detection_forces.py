@@ -13,7 +13,7 @@ from torchid import ranks
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.parameters import FRICTION, GRAVITY, PER_BODY
 from torchid.problem.compression import compress_parts
-from torchid.problem.detection_motion import Prepared
+from torchid.problem.detection_motion import DetectionSamples
 from torchid.problem.elimination import assemble
 from torchid.problem.extras import ExtraTerms
 from torchid.problem.linear import PRIOR_DEVIATION, LinearProblem
@@ -61,7 +61,7 @@ class ForcesAlongNormals:
     @classmethod
     def of(
         cls,
-        parts: Iterable[Prepared],
+        parts: Iterable[DetectionSamples],
         count: int,
         robot: Robot,
         contacts: Sequence[Contact],
@@ -96,7 +96,7 @@ class ForcesAlongNormals:
         balance = dataclasses.replace(self.balance, robot=dataclasses.replace(self.balance.robot, nominal=nominal))
         return dataclasses.replace(self, balance=balance, actuators=np.outer(armature, [1.0, 0.0, 0.0]))
 
-    def of_part(self, part: Prepared) -> FloatArray:
+    def of_part(self, part: DetectionSamples) -> FloatArray:
         """Forces (K, C) [N] of some samples."""
         chosen = [slice(start, start + _TOGETHER) for start in range(0, len(part.log), _TOGETHER)]
         equations = (self.balance.equations(part.samples[x], part.rotation[x]) for x in chosen)

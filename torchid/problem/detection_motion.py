@@ -34,7 +34,7 @@ _FEWEST_TORQUES = 3  # above a contact, one for each component of a force
 
 
 @dataclasses.dataclass(frozen=True)
-class Prepared:
+class DetectionSamples:
     """Successive samples of a log for detection, or all of them.
 
     Attributes:
@@ -58,7 +58,7 @@ class Prepared:
         return bool(self.log.imu_frame) or self.log.base_linear_acceleration_world is not None
 
 
-def prepare(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: float) -> Prepared:
+def prepare(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: float) -> DetectionSamples:
     """A log as recorded, with joint torques, prepared for detection.
 
     A base of which neither pose nor IMU was recorded counts as still, and tilted as if all feet stood.
@@ -84,7 +84,7 @@ def require_torque(source: str, given: bool) -> None:
         raise LogError(source, "joint_torque", "missing", "the field, from which preprocessing.detect_contacts is")
 
 
-def bind_for_detection(known: Log, robot: Robot, contacts: Sequence[Contact]) -> Prepared:
+def bind_for_detection(known: Log, robot: Robot, contacts: Sequence[Contact]) -> DetectionSamples:
     """A preprocessed log, or a part of one, in the robot's order; LogError as `prepare`."""
     order = joint_order(known, robot)
     position, velocity, acceleration, torque = (
@@ -98,7 +98,7 @@ def bind_for_detection(known: Log, robot: Robot, contacts: Sequence[Contact]) ->
         known.source, torch.from_numpy(known.time), position, velocity, acceleration, base,
         torch.cat([torque, in_limbs], dim=1), None, False, torch.ones(len(known), len(contacts), dtype=torch.bool),
     )  # fmt: skip
-    return Prepared(known, samples, rotation)
+    return DetectionSamples(known, samples, rotation)
 
 
 def detection_cutoff_hz(cutoff_hz: float, time: FloatArray) -> float:

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from torchid import parameters
+from torchid.parallel import one_thread
 from torchid.parameters import PER_BODY, Array
-from torchid.problem.chunks import one_thread
 from torchid.problem.compression import Part, merge_factors
 from torchid.problem.eliminated_terms import EliminatedTerms, SignCondition
 from torchid.problem.extras import Extra
@@ -106,7 +106,7 @@ def linear_problem(factor: TriangularFactor, builder: RowBuilder, robot: Robot, 
     if builder.extras:
         raise ValueError("builder: found extra terms; accepted: one without, or torchid.assemble")
     own = corrected_triangle(factor, column_prior(builder, robot, friction))
-    return problem_from_triangle(own.R, factor.rows, factor.oversampling, builder, robot, friction, own.held)
+    return problem_from_triangle(own.R, factor.rows, factor.oversampling, builder, robot, friction, own.shrinkage)
 
 
 @one_thread()
@@ -133,10 +133,10 @@ def assemble(
     reading_noise = reading_noise or dict.fromkeys(scale_columns(builder), 0.0)
     prior = replace(column_prior(builder, robot, friction), reading_noise=reading_noise)
     corrected = corrected_triangle(everything, prior)
-    of_all_logs, noise, held = corrected.R, corrected.noise, corrected.held
+    of_all_logs, noise, shrinkage = corrected.R, corrected.noise, corrected.shrinkage
     forces, oversampling = float(np.square(of_all_logs[:, -1]).sum()), everything.oversampling
     if not builder.extras:
-        problem = problem_from_triangle(of_all_logs, everything.rows, oversampling, builder, robot, friction, held)
+        problem = problem_from_triangle(of_all_logs, everything.rows, oversampling, builder, robot, friction, shrinkage)
         return Assembly(problem, (), problem, noise, forces)
     count = builder.columns.count
     per_log, of_all = ([n for n, extra in enumerate(builder.extras) if extra.per_log is own] for own in (True, False))
@@ -150,8 +150,10 @@ def assemble(
             elimination, rest = _eliminate(source, extras, columns, rest, builder, np.linalg.norm(columns, axis=0))
             eliminations.append(elimination)
             remaining.append(rest)
-            lacking.append((rest, None if own.held is None else np.delete(own.held, [count + n for n in per_log], 0)))
-        held = _held_together(lacking)
+            lacking.append(
+                (rest, None if own.shrinkage is None else np.delete(own.shrinkage, [count + n for n in per_log], 0))
+            )
+        shrinkage = _joined_shrinkage(lacking)
         rows = np.asarray(np.linalg.qr(np.concatenate(remaining), mode="r"))
     if of_all:
         extras = tuple(builder.extras[number] for number in of_all)
@@ -162,8 +164,8 @@ def assemble(
         rows = np.asarray(np.linalg.qr(rows, mode="r"))
     spent = oversampling * sum(elimination.inverse.shape[1] for elimination in eliminations)
     rows_left = max(everything.rows - round(spent), 1)
-    held = None if held is None else held[:count]
-    problem = problem_from_triangle(rows, rows_left, oversampling, builder, robot, friction, held)
+    shrinkage = None if shrinkage is None else shrinkage[:count]
+    problem = problem_from_triangle(rows, rows_left, oversampling, builder, robot, friction, shrinkage)
     if of_all:
         problem = replace(problem, terms=_bounded_terms(eliminations[-1], robot))
     known = np.asarray(np.linalg.qr(np.delete(of_all_logs, np.s_[count:-1], axis=1), mode="r"))
@@ -179,7 +181,7 @@ def column_prior(builder: RowBuilder, robot: Robot, friction: bool = True) -> Co
 
 
 def problem_from_triangle(
-    R: Array, rows: int, oversampling: float, builder: RowBuilder, robot: Robot, friction: bool, held: Array | None
+    R: Array, rows: int, oversampling: float, builder: RowBuilder, robot: Robot, friction: bool, shrinkage: Array | None
 ) -> LinearProblem:
     """The problem in all 12 L parameters from a triangle in the regrouped columns, right-hand side last.
 
@@ -190,7 +192,7 @@ def problem_from_triangle(
         builder: of the rows.
         robot: the robot.
         friction: whether friction is free.
-        held: (columns, Q), as `CorrectedTriangle` has it.
+        shrinkage: (columns, Q), as `CorrectedTriangle` has it.
     """
     count = builder.columns.count
     return LinearProblem(
@@ -202,7 +204,7 @@ def problem_from_triangle(
         scale=parameter_scale(robot.nominal).flatten(),
         free=free_parameters(robot, friction),
         oversampling=oversampling,
-        held=None if held is None else R[:count, :-1] @ held,
+        shrinkage=None if shrinkage is None else R[:count, :-1] @ shrinkage,
     )
 
 
@@ -248,13 +250,15 @@ def _dry_friction(robot: Robot, dof: int) -> Array:
     return row.flatten()
 
 
-def _held_together(logs: Sequence[tuple[Array, Array | None]]) -> Array | None:
-    """What the parameters that fit the rows of all logs best lack, (columns, Q), by rows and `held` of each."""
-    width = max((held.shape[1] for _, held in logs if held is not None), default=0)
+def _joined_shrinkage(logs: Sequence[tuple[Array, Array | None]]) -> Array | None:
+    """What the parameters that fit the rows of all logs best lack, (columns, Q), by rows and `shrinkage` of each."""
+    width = max((shrinkage.shape[1] for _, shrinkage in logs if shrinkage is not None), default=0)
     if not width:
         return None
     rows = np.concatenate([rest[:, :-1] for rest, _ in logs])
-    lacking = [np.zeros((len(rest), width)) if held is None else rest[:, :-1] @ held for rest, held in logs]
+    lacking = [
+        np.zeros((len(rest), width)) if shrinkage is None else rest[:, :-1] @ shrinkage for rest, shrinkage in logs
+    ]
     scale = column_scale(rows)
     return np.asarray(scale[:, None] * (np.linalg.pinv(rows * scale, rcond=RANK_TOLERANCE) @ np.concatenate(lacking)))
 

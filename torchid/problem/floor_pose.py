@@ -1,4 +1,4 @@
-"""Tilt, height, heading and place of a base above points that stand on a floor."""
+"""Tilt, height, heading and place of a base above points that stand on a floor, and how far feet roll on it."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from torchid.errors import LogError
 from torchid.logs.log import BoolArray, FloatArray
-from torchid.robot.rolling import rolled_distance
 from torchid.sensing import Contact
 from torchid.sensing.sensors import UP
 
@@ -274,3 +274,23 @@ def _rotation_between(start: FloatArray, end: FloatArray) -> FloatArray:
     x, y, z = np.cross(start, end)
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.asarray(np.eye(3) + cross + cross @ cross / (1.0 + float(start @ end)))
+
+
+def rolled_distance(rotation: FloatArray, radius: float, normal: FloatArray, axis: str | None = None) -> FloatArray:
+    """How far the origin of a frame goes that rolls without slipping, (N, 3) [m], from the first sample on.
+
+    Args:
+        rotation: of the frame to the world, (N, 3, 3).
+        radius: of the sphere or cylinder about its origin [m].
+        normal: of the ground, (3,) or (N, 3).
+        axis: x, y or z of the frame, along which a cylinder is; None for a sphere.
+    """
+    normals = np.broadcast_to(normal, (len(rotation), 3))
+    if axis is not None:
+        along = rotation[:, :, "xyz".index(axis)]
+        across = normals - along * (along * normals).sum(axis=1, keepdims=True)
+        normals = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), np.finfo(float).tiny)
+    turned = Rotation.from_matrix(rotation[1:] @ rotation[:-1].transpose(0, 2, 1)).as_rotvec()
+    steps = radius * np.cross(turned, 0.5 * (normals[1:] + normals[:-1]))
+    out: FloatArray = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    return out

@@ -34,9 +34,10 @@ class LinearProblem:
         free: (P,) bool, parameters to fit; the others stay nominal.
         oversampling: rows per independent row, at least 1: a low-pass filter leaves noise correlated, so that rows hold
             less information than their number suggests.
-        held: (R, Q), None without any: what the right-hand side lacks, of rows that are mostly noise of the motion, for
-            independent deviations of unit variance from the nominal parameters. The first P are of the parameters, by
-            `PRIOR_DEVIATION` of their scale: A (phi - nominal) - held @ deviations is what to expect of b - A nominal.
+        shrinkage: (R, Q), None without any: what the right-hand side lacks, of rows that are mostly noise of the
+            motion, for independent deviations of unit variance from the nominal parameters. The first P are of the
+            parameters, by `PRIOR_DEVIATION` of their scale: A (phi - nominal) - shrinkage @ deviations is what to
+            expect of b - A nominal.
         terms: unknowns beside the parameters that physics bounds, None without any.
     """
 
@@ -48,7 +49,7 @@ class LinearProblem:
     scale: Array
     free: np.ndarray
     oversampling: float = 1.0
-    held: Array | None = field(default=None, kw_only=True)
+    shrinkage: Array | None = field(default=None, kw_only=True)
     terms: EliminatedTerms | None = field(default=None, kw_only=True)
     _shared: dict[Hashable, object] = field(default_factory=dict, init=False, repr=False, compare=False)
 
@@ -71,8 +72,10 @@ class LinearProblem:
             raise ValueError(
                 f"b, nominal, scale, free: found shapes {shapes}; accepted: {rows} rows, {columns} columns"
             )
-        if self.held is not None and (len(self.held) != rows or self.held.shape[1] < columns):
-            raise ValueError(f"held: found shape {self.held.shape}; accepted: {rows} rows, at least {columns} columns")
+        if self.shrinkage is not None and (len(self.shrinkage) != rows or self.shrinkage.shape[1] < columns):
+            raise ValueError(
+                f"shrinkage: found shape {self.shrinkage.shape}; accepted: {rows} rows, at least {columns} columns"
+            )
         for name in ("A", "b", "residual", "nominal", "scale"):
             if not np.isfinite(getattr(self, name)).all():
                 raise ValueError(f"{name}: found a number that is not finite; accepted: finite numbers")
@@ -122,15 +125,15 @@ class LinearProblem:
         """The problem scaled to a share of its rows: that share of its information."""
         root = float(np.sqrt(share))
         rows = max(round(share * self.rows), 1)
-        held = None if self.held is None else root * self.held
+        shrinkage = None if self.shrinkage is None else root * self.shrinkage
         terms = None if self.terms is None else self.terms.scaled(root)
         out = replace(self, A=root * self.A, b=root * self.b, residual=share * self.residual, rows=rows)
-        return replace(out, held=held, terms=terms)
+        return replace(out, shrinkage=shrinkage, terms=terms)
 
     @property
-    def held_parameters(self) -> Array | None:
-        """The part of `held` by deviations of the free parameters, (R, P'), in units of their scale."""
-        return None if self.held is None else self.held[:, : len(self.free)][:, self.free] / PRIOR_DEVIATION
+    def parameter_shrinkage(self) -> Array | None:
+        """The part of `shrinkage` by deviations of the free parameters, (R, P'), in units of their scale."""
+        return None if self.shrinkage is None else self.shrinkage[:, : len(self.free)][:, self.free] / PRIOR_DEVIATION
 
     def prediction_distance(self, phi: Array, other: Array) -> float:
         """Rms difference of the projected whitened forces that two parameter vectors, (P,), predict."""

@@ -1,7 +1,8 @@
-"""Noise in the motion of bound samples, and samples with more of it."""
+"""Noise in the motion of bound samples, samples with more of it, and whether anything moves."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -14,7 +15,7 @@ from torch import Tensor
 
 from torchid.logs import Log
 from torchid.logs.signal_noise import SignalNoise
-from torchid.parameters import Array
+from torchid.parameters import GRAVITY, Array
 
 if TYPE_CHECKING:
     from torchid.problem.samples import Samples
@@ -200,3 +201,35 @@ def _turned(quat_xyzw: Tensor, angle: Tensor) -> Tensor:
 
 def _plus(x: Tensor | None, off: Tensor) -> Tensor | None:
     return None if x is None else x + off
+
+
+MIN_MOTION = 0.01
+"""Travel [rad or m] up to which a joint stands still."""
+MIN_TURN_DEG = 1.0
+"""Turn [degrees] from which on a base moves."""
+_MIN_ACCELERATION = 0.1 * GRAVITY  # [m/s^2] rms, of a base that is shaken; noise of a pose in half a millimetre: 0.4
+_MOST_SAMPLES = 5_000  # evenly spaced
+
+
+def is_at_rest(logs: Sequence[Samples]) -> bool:
+    """Whether in none of some logs a joint or the base moves; not so without any log.
+
+    Forces at rest tell what balances gravity, no inertia and no friction.
+    """
+    return bool(logs) and not any(_moves(log) for log in logs)
+
+
+def _moves(log: Samples) -> bool:
+    """Whether a joint of a filtered log travels, or its base turns or is shaken."""
+    thin = log.every(max(1, len(log) // _MOST_SAMPLES))
+    position, base = thin.joint_position, thin.base
+    if position.shape[1] and float((position.amax(dim=0) - position.amin(dim=0)).max()) > MIN_MOTION:
+        return True
+    if base.quat_xyzw is not None:
+        cosine = (base.quat_xyzw @ base.quat_xyzw[0]).abs().clamp(max=1.0)
+        if float(2.0 * torch.arccos(cosine).max()) > math.radians(MIN_TURN_DEG):
+            return True
+    force = base.specific_force
+    if force is None:
+        return False
+    return float((force - force.mean(dim=0)).square().sum(dim=1).mean().sqrt()) > _MIN_ACCELERATION

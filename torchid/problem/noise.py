@@ -23,8 +23,8 @@ import scipy.optimize
 import torch
 from torch import Tensor
 
+from torchid.parallel import map_in_workers, one_thread
 from torchid.parameters import Array
-from torchid.problem.chunks import map_in_workers, one_thread
 from torchid.problem.elimination import Assembly
 from torchid.problem.rows import RowBuilder
 from torchid.problem.sampled_rows import CLIP, SampledChunk, SampledRows, noise_root, supports, whitened

@@ -24,9 +24,10 @@ from torch import Tensor
 
 from torchid import ranks
 from torchid.errors import format_percent
+from torchid.parallel import one_thread
 from torchid.parameters import Array
 from torchid.problem.blocks import span_of_samples
-from torchid.problem.chunks import ProgressCallback, chunk_size, map_chunks, one_thread
+from torchid.problem.chunks import ProgressCallback, chunk_size, map_chunks
 from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import TriangularFactor, gram_matrix
 from torchid.problem.motion_noise import with_noise_alone
@@ -240,14 +241,14 @@ class CorrectedTriangle:
     Attributes:
         R: (columns + 1, columns + 1), upper triangular, right-hand side last.
         noise: what has been taken off.
-        held: (columns, P + extra parameters), None without any: by how much the parameters that fit R best do not
+        shrinkage: (columns, P + extra parameters), None without any: by how much the parameters that fit R best do not
             follow deviations from the nominal ones: unit ones of the prior, and those of extra parameters as they are
             found. They follow all of those that are not mostly noise.
     """
 
     R: Array
     noise: NoiseShares = field(default_factory=NoiseShares)
-    held: Array | None = None
+    shrinkage: Array | None = None
 
 
 @one_thread()
@@ -308,8 +309,8 @@ def corrected_triangle(factor: TriangularFactor, prior: ColumnPrior) -> Correcte
     if not noise.lost:
         return CorrectedTriangle(triangle, noise)
     deviations = np.where(np.isin(range(len(best)), scales), np.maximum(np.abs(1.0 + best), 1.0), best)
-    held, count = ((remaining + lacking) / left)[:, None] * combinations, len(prior.nominal)
-    units = np.hstack([held[:, :count] @ prior.spread, held[:, count:] * deviations[count:]])
+    shrinkage, count = ((remaining + lacking) / left)[:, None] * combinations, len(prior.nominal)
+    units = np.hstack([shrinkage[:, :count] @ prior.spread, shrinkage[:, count:] * deviations[count:]])
     return CorrectedTriangle(triangle, noise, whitening @ turn @ units)
 
 

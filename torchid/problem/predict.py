@@ -13,10 +13,11 @@ import torch
 from torch import Tensor
 
 from torchid.logs.lazy_arrays import Spill
+from torchid.parallel import one_thread
 from torchid.parameters import Array
 from torchid.problem.blocks import folds_in
 from torchid.problem.chunk_dynamics import ChunkDynamics, ChunkKinematics
-from torchid.problem.chunks import chunks_by_state, one_thread
+from torchid.problem.chunks import chunks_by_state
 from torchid.problem.contact_rows import leave_out_torques
 from torchid.problem.contact_state import ContactState
 from torchid.problem.extras import ACTUATORS, Extra, contact_extra_column, dof_extra_column

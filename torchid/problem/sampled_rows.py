@@ -15,8 +15,9 @@ from scipy.special import chdtri, ndtr
 from torch import Tensor
 
 from torchid import ranks
+from torchid.parallel import map_in_workers, one_thread
 from torchid.parameters import Array
-from torchid.problem.chunks import chunks_by_state, map_in_workers, one_thread, worker_count
+from torchid.problem.chunks import chunks_by_state, worker_count
 from torchid.problem.compression import Part
 from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import TriangularFactor
@@ -55,7 +56,7 @@ class SampledChunk:
 
 
 @dataclass(frozen=True)
-class LogElsewhere:
+class LogOfOtherProcess:
     """A log that another process has: its number of samples, and their oversampling."""
 
     count: int
@@ -77,7 +78,7 @@ class SampledRows:
 
     @one_thread()
     @torch.no_grad()
-    def __init__(self, logs: Sequence[Samples | LogElsewhere], builder: RowBuilder, chunk: int = _CHUNK) -> None:
+    def __init__(self, logs: Sequence[Samples | LogOfOtherProcess], builder: RowBuilder, chunk: int = _CHUNK) -> None:
         """Compute the rows of random samples, always the same ones.
 
         Logs elsewhere are those of processes that share the work, each with successive ones; all get the rows of all.
@@ -101,7 +102,7 @@ class SampledRows:
         for samples, state in drawn:
             builder.layout(state, samples.contact_normal is not None)
         self.chunks = map_in_workers(drawn, lambda one: self._chunk(*one), worker_count(builder.device))
-        elsewhere = any(isinstance(log, LogElsewhere) for log in logs)
+        elsewhere = any(isinstance(log, LogOfOtherProcess) for log in logs)
         if any(ranks.gather(elsewhere, "logs that others have")):
             self.chunks = list(chain.from_iterable(ranks.gather(self.chunks, "samples for the noise")))
 
@@ -275,7 +276,7 @@ def _radius(rows: Tensor) -> Tensor:
 
 
 def _random_chunks(
-    logs: Sequence[Samples | LogElsewhere], most: int, chunk: int
+    logs: Sequence[Samples | LogOfOtherProcess], most: int, chunk: int
 ) -> Iterator[tuple[Samples, ContactState]]:
     """About `most` random samples (regular ones could be in phase with a gait), log by log and state by state.
 
@@ -285,7 +286,7 @@ def _random_chunks(
     for log in logs:
         count = min(len(log), max(round(min(share, 4.0 / log.oversampling) * len(log)), 1))
         index = torch.from_numpy(np.sort(rng.choice(len(log), count, replace=False)))
-        if isinstance(log, LogElsewhere):
+        if isinstance(log, LogOfOtherProcess):
             continue
         chosen = replace(log[index], oversampling=max(1.0, log.oversampling * count / len(log)), folder=None)
         for state, where in chunks_by_state(chosen, chunk):

@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 from torchid.errors import TorchidError, excerpt
 from torchid.logs.arrays import fields_of_records, require_plain
 from torchid.logs.containers import LogKind, existing_log_kind, list_bag_files, open_container, reader_errors_explained
-from torchid.logs.long_tables import RowNames
 from torchid.logs.name_matching import KnownRobot, limb_and_words, match_names, propose_field
 from torchid.logs.ros_messages import make_deserializer
 from torchid.logs.ros_read import list_channels, open_bag_file
 from torchid.logs.table_files import is_text_table
 from torchid.logs.table_headers import read_header
-from torchid.logs.tables import sample_row_names, sample_table
+from torchid.logs.tables import RowNames, sample_row_names, sample_table
 
 FileSample = Mapping[str, NDArray[Any] | None]
 """Columns of a table or arrays with some of their rows, some of them names; None for what is neither."""

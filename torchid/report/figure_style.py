@@ -16,9 +16,8 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from torchid.copies import share_between_copies
 from torchid.errors import during, escape
-from torchid.problem.chunks import thread_count
+from torchid.parallel import share_between_copies, thread_count
 
 # the palette of Okabe and Ito, which the colour-blind tell apart
 MEASURED_COLOR, NOMINAL_COLOR, IDENTIFIED_COLOR, NOISE_COLOR = "#111111", "#d55e00", "#0072b2", "#8c8c8c"

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 
 from torchid.identifiability.structure import random_postures, resting_samples
+from torchid.parallel import one_thread
 from torchid.parameters import Array
 from torchid.problem import RowBuilder
-from torchid.problem.chunks import one_thread
 from torchid.problem.contact_state import ContactState, state_name
 from torchid.robot import Robot
 from torchid.rounding import BASE_RANK_TOLERANCE

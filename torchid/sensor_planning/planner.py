@@ -9,12 +9,12 @@ from itertools import count
 
 import numpy as np
 
-from torchid.copies import share_between_copies
 from torchid.errors import SensorError
 from torchid.identifiability.structure import random_postures
+from torchid.parallel import share_between_copies, thread_count
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples
-from torchid.problem.chunks import subsample_states, thread_count
+from torchid.problem.chunks import subsample_states
 from torchid.problem.contact_state import ContactState
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot

@@ -18,9 +18,10 @@ from torchid.errors import SensorError
 from torchid.identifiability.base_parameters import structural_rank
 from torchid.identifiability.information import prior_directions, reading_directions, rows_information
 from torchid.identifiability.structure import structural_problem, structural_samples
+from torchid.parallel import one_thread, run_in_workers
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, RowBuilder, Samples
-from torchid.problem.chunks import one_thread, run_in_workers, subsample_states, worker_count
+from torchid.problem.chunks import subsample_states, worker_count
 from torchid.problem.contact_state import ContactState
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet

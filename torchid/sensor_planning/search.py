@@ -13,8 +13,8 @@ import numpy as np
 from scipy.optimize import Bounds, LinearConstraint, milp
 
 from torchid.errors import SensorError
+from torchid.parallel import one_thread
 from torchid.parameters import Array
-from torchid.problem.chunks import one_thread
 from torchid.sensor_planning.demands import (
     TOLERANCE,
     Candidate,

@@ -16,7 +16,7 @@ from torchid.errors import InputError, LogError
 from torchid.logs import Log
 from torchid.logs.log import BoolArray
 from torchid.parameters import Array
-from torchid.robot.rolling import rolled_distance
+from torchid.problem.floor_pose import rolled_distance
 from torchid.sensing.sensors import NORMAL_INDEX
 from torchid.simulation.constraints import Foot, find_feet, form_polygon
 from torchid.simulation.controller import Controller, ReferenceMotion, Stance, find_stance

@@ -45,8 +45,8 @@ def analysis_lines(analysis: Analysis, width: int) -> list[str]:
         lines += labelled("smallest set", _smallest_text(scenarios[0]), width, _TEXT_LINES + 1)
     else:
         lines += _scenario_lines(scenarios, width)
-    if analysis.scene.rolling:
-        lines += labelled("rolling", analysis.scene.rolling, width, _TEXT_LINES)
+    if analysis.setup.rolling:
+        lines += labelled("rolling", analysis.setup.rolling, width, _TEXT_LINES)
     attention = list(_attention(analysis, scenarios))
     for one in attention[:_MOST_ATTENTION]:
         lines += labelled("attention", one, width, _TEXT_LINES)
@@ -58,7 +58,7 @@ def analysis_lines(analysis: Analysis, width: int) -> list[str]:
 
 def print_analysis_tables(analysis: Analysis) -> None:
     """Print all tables of all scenarios."""
-    print_rolling(analysis.scene.rolling)
+    print_rolling(analysis.setup.rolling)
     for scenario in analysis.scenarios:
         _print_scenario(scenario)
     if analysis.resting is not None:
@@ -169,7 +169,7 @@ def _attention(analysis: Analysis, scenarios: Sequence[ScenarioAnalysis]) -> Ite
         yield from named(one, describe_losses(_judged_states(one)))
     if analysis.resting is not None:
         yield resting_message(analysis.resting)
-    if analysis.scene.config.analysis.scenarios is None:
+    if analysis.setup.config.analysis.scenarios is None:
         for one in scenarios:
             found = analysis.accuracies.get("proposed" if one.proposed is not None else one.plan_label)
             if found is not None and found.rank < one.base.rank:
