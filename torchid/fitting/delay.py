@@ -137,8 +137,9 @@ class UnfittedDelay:
 
     def __str__(self) -> str:
         """By how much torques are late or early, and what finds it."""
-        size, when = f"{1e3 * abs(self.value):.2g} ± {1e3 * self.standard_error:.1g} ms", "late" * (self.value < 0.0)
-        return f"torques are {size} {when or 'early'} (actuators.delay: auto)"
+        size, error = 1e3 * abs(self.value), 1e3 * self.standard_error
+        when = "late" if self.value < 0.0 else "early"
+        return f"torques are {size:.2g} ± {error:.1g} ms {when} (actuators.delay: auto)"
 
 
 def unfitted_delay(logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms) -> UnfittedDelay | None:
