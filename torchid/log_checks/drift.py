@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 
 import numpy as np
-from scipy import stats
+from scipy.special import stdtr
 
 from torchid.errors import InputError
 from torchid.log_checks.deviation import COMPARED_SAMPLES, DeviationRows, FilteredLog
@@ -41,7 +41,7 @@ def check_torque_drift(filtered: FilteredLog) -> Iterator[Finding]:
         least = _MIN_SHARE * float(np.sqrt(np.nanmean(np.square(log.joint_torque))))
         slope, deviation = _slopes(filtered)
         known = deviation > 0.0
-        chance = 2.0 * stats.t.sf(np.abs(slope[known]) / deviation[known], _BLOCKS - 2)
+        chance = 2.0 * stdtr(_BLOCKS - 2, -np.abs(slope[known]) / deviation[known])
         for joint in np.flatnonzero(known)[chance * robot.n < _LEVEL].tolist():
             if abs(slope[joint]) > least:
                 name, unit = robot.joint_names[joint], "N" if robot.joint_names[joint] in robot.sliding else "N m"
