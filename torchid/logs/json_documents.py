@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from torchid.errors import LogError
 from torchid.guards import MAX_DOCUMENT, MAX_LETTERS, MAX_NAMES, check_fields
-from torchid.logs.lazy_arrays import LazyArray
+from torchid.logs.lazy_arrays import ArraysInMemory
 
 
-class JsonDocument:
+class JsonDocument(ArraysInMemory):
     """The arrays of a document, read whole; `group/name` of those in objects, and of records in lists."""
 
     def __init__(self, path: Path) -> None:
@@ -27,20 +27,7 @@ class JsonDocument:
         document = _read(path.read_text(encoding="utf-8-sig"))
         if not isinstance(document, dict) and not _are_records(document):
             raise ValueError(f"a {type(document).__name__}, no object of arrays and no list of records")
-        self._arrays = dict(_flat("", document))
-        check_fields(self._arrays, len(self._arrays))
-
-    def declared_bytes(self) -> dict[str, int]:
-        """Bytes of each array, by name."""
-        return {name: array.nbytes for name, array in self._arrays.items()}
-
-    def load(self, name: str) -> NDArray[Any]:
-        """The array `name`; text is an array of str."""
-        return self._arrays[name]
-
-    def lazy(self, name: str, folder: Path | None) -> LazyArray:
-        """The same, in memory."""
-        return self._arrays[name]
+        super().__init__(_flat("", document))
 
 
 def _read(text: str) -> Any:

@@ -1,4 +1,4 @@
-"""Arrays of a log that are not in memory: on the disk, or worked out where they are sliced.
+"""Arrays of a log that may not be in memory: on the disk, or worked out where they are sliced; or read whole.
 
 On the disk they are in temporary files that vanish with the process, or mapped to files. Worked out are fields of other
 fields or foreign arrays, and what fills gaps.
@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import InputError, LogError
+from torchid.guards import check_fields
 from torchid.logs.flags import runs
 from torchid.logs.log import FloatArray
 
@@ -252,3 +253,24 @@ class _Gaps:
         out = np.concatenate([np.zeros((0, 4)), *self._found, *last])
         out[:, 2] = np.where(np.isnan(out[:, 2]), out[:, 3], out[:, 2])
         return out
+
+
+class ArraysInMemory:
+    """Named arrays of a file that was read whole."""
+
+    def __init__(self, arrays: Iterable[tuple[str, NDArray[Any]]]) -> None:
+        """Take them; LogError where they are too many."""
+        self._arrays = dict(arrays)
+        check_fields(self._arrays, len(self._arrays))
+
+    def declared_bytes(self) -> dict[str, int]:
+        """Bytes of each array, by name."""
+        return {name: array.nbytes for name, array in self._arrays.items()}
+
+    def load(self, name: str) -> NDArray[Any]:
+        """The array `name`; text is an array of str."""
+        return self._arrays[name]
+
+    def lazy(self, name: str, folder: Path | None) -> LazyArray:
+        """The same, in memory."""
+        return self._arrays[name]

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.guards import MAX_ARRAYS, check_fields, check_names, check_unpacked_size
-from torchid.logs.lazy_arrays import LazyArray
+from torchid.guards import MAX_ARRAYS, check_names, check_unpacked_size
+from torchid.logs.lazy_arrays import ArraysInMemory
 
 _HEADER = 128
 _ORDERS = {b"\x00\x01IM": "<", b"\x01\x00MI": ">"}  # of bytes, by version and mark at the end of the header
@@ -32,7 +32,7 @@ _MOST_ELEMENTS = 10_000
 _PIECE = 2**22
 
 
-class MatFile:
+class MatFile(ArraysInMemory):
     """The arrays of a file of Matlab 5 to 7.2, read whole; `structure/field` of those in structures."""
 
     def __init__(self, path: Path) -> None:
@@ -41,20 +41,7 @@ class MatFile:
 
         _check(path)
         read = loadmat(path, simplify_cells=True)
-        self._arrays = dict(_flat("", {name: x for name, x in read.items() if not name.startswith("__")}))
-        check_fields(self._arrays, len(self._arrays))
-
-    def declared_bytes(self) -> dict[str, int]:
-        """Bytes of each array, by name."""
-        return {name: array.nbytes for name, array in self._arrays.items()}
-
-    def load(self, name: str) -> NDArray[Any]:
-        """The array `name`; text is an array of str."""
-        return self._arrays[name]
-
-    def lazy(self, name: str, folder: Path | None) -> LazyArray:
-        """The same, in memory."""
-        return self._arrays[name]
+        super().__init__(_flat("", {name: x for name, x in read.items() if not name.startswith("__")}))
 
 
 def _flat(name: str, value: object) -> Iterator[tuple[str, NDArray[Any]]]:
