@@ -14,12 +14,13 @@ from random_samples import NOISE, random_samples, sensor_set
 from synthetic import PANDA, TALOS, TALOS_FULL, load
 
 import torchid
-from torchid.problem import RowBuilder, Samples, chunks, compress
+from torchid.problem import RowBuilder, Samples, TriangularFactor, chunks, compress, compress_parts, row_compressor
 from torchid.problem.chunk_dynamics import Workspace
 from torchid.problem.chunks import choose_kernels, chunks_by_state
 from torchid.problem.extras import ExtraTerms
 
 pytest.importorskip("numba", reason="compiled kernels need Numba, of the extra [fast]")
+kernels = pytest.importorskip("torchid.kernels.gram")
 
 QUADRUPED = torchid.load_robot(Path(torchid.__file__).parent / "demo" / "quadruped.urdf")
 POINTS = [torchid.Contact(f"{end}_{side}_foot", "point") for end in ("front", "rear") for side in ("left", "right")]
@@ -60,6 +61,20 @@ def assert_same_rows(plain: RowBuilder, fast: RowBuilder, samples: Samples) -> i
     return made
 
 
+def assert_same_factors(found: TriangularFactor, expected: TriangularFactor) -> None:
+    assert (found.rows, found.independent_rows) == (expected.rows, expected.independent_rows)
+    assert_same_grams(found.triangle(), expected.triangle())
+
+
+def assert_same_grams(found: torch.Tensor, expected: torch.Tensor) -> None:
+    gram = expected.T @ expected
+    size = gram.diagonal().sqrt()
+    size = size.clamp(min=1e-3 * size.max())  # of a column that is zero rounding is left
+    np.testing.assert_allclose(
+        found.T @ found / size / size[:, None], gram / size / size[:, None], rtol=0.0, atol=1e-12
+    )
+
+
 @pytest.mark.parametrize("sensors", ["joints", "mixed", "contacts", "full"])
 @pytest.mark.parametrize(
     ("robot", "contacts"),
@@ -77,6 +92,79 @@ def test_rows_are_those_of_torch(robot: torchid.Robot, contacts: list[torchid.Co
     for own in (alike,) if robot.fixed_base else (alike, by_axis(alike)):
         plain, fast = builders(robot, contacts, own)
         assert assert_same_rows(plain, fast, samples) == len(list(chunks_by_state(samples)))
+
+
+@pytest.mark.parametrize(
+    ("columns", "rows", "lower"), [(1, 1, 0), (2, 385, 1), (7, 400, 3), (13, 1000, 0), (24, 30, 5)]
+)
+def test_gram_matrices_are_those_of_numpy(columns: int, rows: int, lower: int) -> None:
+    rng = np.random.default_rng(columns)
+    X, combination = rng.normal(size=(columns, columns + rows)), rng.normal(size=(lower, columns))
+    chosen = np.sort(rng.permutation(columns)[:lower])
+    changed, expected = X.copy(), X.copy()
+    (gram, squares), (reference, before) = ((np.full((columns, columns), np.nan), np.full(lower, np.nan)) for _ in "ab")
+    kernels.write_gram(changed, columns, chosen, combination, squares, gram)
+    row_compressor.write_gram(expected, columns, chosen, combination, before, reference)
+    np.testing.assert_array_equal(changed[:, :columns], X[:, :columns])
+    np.testing.assert_allclose(changed, expected, rtol=0.0, atol=1e-13)
+    np.testing.assert_allclose(squares, before, rtol=1e-13)
+    np.testing.assert_allclose(gram, reference, rtol=0.0, atol=1e-13 * reference.max())
+    np.testing.assert_array_equal(gram, gram.T)
+
+
+@pytest.mark.parametrize("sensors", ["joints", "full"])
+@pytest.mark.parametrize(
+    ("robot", "contacts"),
+    [(QUADRUPED, POINTS), (load(TALOS_FULL), SOLES), (load(PANDA, fixed_base=True), [])],
+    ids=["quadruped", "biped with mimic joints", "arm"],
+)
+def test_rows_that_are_multiplied_at_once_give_the_same_factor(
+    robot: torchid.Robot, contacts: list[torchid.Contact], sensors: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(row_compressor, "_LEAST_ROWS", 0)
+    monkeypatch.setattr(row_compressor, "_ROWS_PER_COLUMN", 1)
+    monkeypatch.setattr(row_compressor, "_MOST_COMBINED", 1.0)
+    plain, fast = builders(robot, contacts, sensor_set(sensors, robot, contacts))
+    samples = random_samples(robot, contacts, 2500, 4, states=1)[0]
+    expected = compress_parts([samples], plain, chunk=700, threads=1)
+    multiplied = list[bool]()
+
+    def counted(*args: object) -> object:
+        multiplied.append((made := grams(*args)) is not None)
+        return made
+
+    assert fast.compiled is not None
+    grams = fast.compiled.grams
+    monkeypatch.setattr(fast.compiled, "grams", counted)
+    monkeypatch.setattr(chunks, "_WORTH_LOADING", 0)
+    found = compress_parts([samples], fast, chunk=700, threads=1)
+    assert multiplied == [False, True, True, True]
+    assert_same_factors(found[0].factor, expected[0].factor)
+
+
+def test_rows_unlike_those_before_are_made_again_and_factorized(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A robot that holds a pose, and then moves."""
+    plain, fast = builders(QUADRUPED, POINTS, sensor_set("joints", QUADRUPED, POINTS))
+    samples = random_samples(QUADRUPED, POINTS, 9000, 9, states=1)[0]
+    still = torch.ones(9000, 1, dtype=torch.float64)
+    still[:6000] = 1e-7
+    motion = {
+        f"joint_{name}": getattr(samples, f"joint_{name}") * still for name in ("position", "velocity", "acceleration")
+    }
+    base = {name: getattr(samples.base, name) * still for name in ("angular_velocity", "angular_acceleration")}
+    samples = replace(samples, base=replace(samples.base, **base), **motion)
+    monkeypatch.setattr(chunks, "_WORTH_LOADING", 0)
+    refused, add_gram = list[bool](), row_compressor.RowCompressor.add_gram
+
+    def counted(*args: object) -> bool:
+        refused.append(not (added := add_gram(*args)))
+        return added
+
+    monkeypatch.setattr(row_compressor.RowCompressor, "add_gram", counted)
+    expected = compress_parts([samples], plain, chunk=3000, threads=1)
+    found = compress_parts([samples], fast, chunk=3000, threads=1)
+    assert any(refused)
+    assert_same_factors(found[0].factor, expected[0].factor)
 
 
 def test_a_sensor_in_a_limb_has_rows_of_all_six_components() -> None:
@@ -139,8 +227,4 @@ def test_long_passes_use_kernels_and_give_the_same_factor(monkeypatch: pytest.Mo
     monkeypatch.setattr(chunks, "_WORTH_LOADING", len(samples))
     found = compress([samples], builder).triangle()
     assert builder.compiled is not None
-    gram = expected.T @ expected
-    size = gram.diagonal().clamp(min=1e-12).sqrt()
-    np.testing.assert_allclose(
-        found.T @ found / size / size[:, None], gram / size / size[:, None], rtol=0.0, atol=1e-12
-    )
+    assert_same_grams(found, expected)

@@ -16,7 +16,8 @@ from torchid.logs.preprocess import preprocess
 from torchid.problem import ExtraTerms, RowBuilder, Samples, TriangularFactor, bind_log, compress_parts
 from torchid.problem.blocks import block_spans
 from torchid.problem.compressed_log import compress_log, fold_compressed, merge_blocks, piece_spans
-from torchid.problem.compression import FOLDS, Part, merge_folds, merge_states, split_into_folds
+from torchid.problem.compression import FOLDS, split_into_folds
+from torchid.problem.parts import Part, merge_folds, merge_states
 from torchid.sensing import named_sensors
 
 

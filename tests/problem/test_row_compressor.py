@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partialmethod
 
 import numpy as np
 import pytest
@@ -41,9 +42,14 @@ KINDS = {"well conditioned": well_conditioned, "nearly dependent": nearly_depend
 kinds = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 
 
-@pytest.fixture(autouse=True)
-def combined_columns_of_short_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(autouse=True, params=["NumPy", "compiled"])
+def combined_columns_of_short_chunks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Chunks of these tests are so short, and combine so many columns, that they would be factorized."""
+    if request.param == "compiled":
+        pytest.importorskip("numba", reason="compiled kernels need Numba, of the extra [fast]")
+        from torchid.kernels.gram import write_gram
+
+        monkeypatch.setattr(RowCompressor, "__init__", partialmethod(RowCompressor.__init__, write_gram))
     monkeypatch.setattr(module, "_LEAST_ROWS", 0)
     monkeypatch.setattr(module, "_MOST_COMBINED", 1.0)
 
@@ -177,11 +183,13 @@ def test_levels_make_rows_well_conditioned_and_can_be_undone() -> None:
     rows = np.vstack(exact_rows(nearly_dependent, 1, 1e-3))
     levels = ColumnLevels.of(np.linalg.qr(rows, mode="r"))
     X = rows.T.copy()
-    levels.apply(X)
+    gram = levels.apply(X, 0, module.write_gram)
+    assert gram is not None
+    np.testing.assert_allclose(gram, X @ X.T, rtol=0.0, atol=1e-13 * gram.max())
     unit = X / np.linalg.norm(X, axis=1, keepdims=True)
     assert np.linalg.eigvalsh(unit @ unit.T).min() > module._LEAST_EIGENVALUE
     assert 0 < len(levels.lower) < COLUMNS
-    np.testing.assert_allclose(levels.squares_before(X @ X.T), np.square(rows[:, levels.lower]).sum(0), rtol=1e-12)
+    np.testing.assert_allclose(levels.squares_before(gram), np.square(rows[:, levels.lower]).sum(0), rtol=1e-12)
     kept = np.setdiff1d(np.arange(COLUMNS + 1), levels.lower)
     np.testing.assert_array_equal(X[kept], rows.T[kept])
     R = levels.undo(np.linalg.qr(X.T, mode="r"))

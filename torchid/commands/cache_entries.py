@@ -30,8 +30,8 @@ from torchid.logs.time_range import log_title
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.base_motion import BaseMotion
 from torchid.problem.chunks import worker_count
-from torchid.problem.compression import Part
 from torchid.problem.motion_noise import MotionNoise
+from torchid.problem.parts import Part
 from torchid.robot import Robot
 from torchid.robot.urdf import parse_xml
 from torchid.sensing import SensorSet

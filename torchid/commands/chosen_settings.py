@@ -39,8 +39,8 @@ from torchid.logs.signal_noise import SignalNoise
 from torchid.logs.timeline import LOSSLESS_RATE
 from torchid.problem import ExtraTerms, RowBuilder, Samples
 from torchid.problem.compressed_log import Block
-from torchid.problem.compression import Part
 from torchid.problem.log_joints import columns_in_order, joint_order
+from torchid.problem.parts import Part
 from torchid.sensing import SensorSet
 from torchid.settings import AUTO
 

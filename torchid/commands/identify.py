@@ -43,10 +43,11 @@ from torchid.parallel import one_thread
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Evaluation, LinearProblem, Metrics, RowBuilder, Samples
 from torchid.problem.compressed_log import Block, fold_compressed, merge_blocks
-from torchid.problem.compression import Part, compress_in_blocks, merge_folds, merge_states, split_into_folds
+from torchid.problem.compression import compress_in_blocks, split_into_folds
 from torchid.problem.contact_state import ContactState, state_name
 from torchid.problem.metrics import LOG_SETS
 from torchid.problem.motion_noise import is_at_rest
+from torchid.problem.parts import Part, merge_folds, merge_states
 from torchid.report.tables import progress_bars
 
 

@@ -22,15 +22,10 @@ from torchid.problem import Evaluation, ExtraTerms, Metrics, RowBuilder, Samples
 from torchid.problem.chunk_dynamics import Workspace
 from torchid.problem.chunks import ProgressCallback, map_chunks
 from torchid.problem.compressed_log import Block
-from torchid.problem.compression import (
-    Part,
-    compress_in_folds,
-    compress_unloaded,
-    merge_states,
-    split_into_folds,
-)
+from torchid.problem.compression import compress_in_folds, compress_unloaded, split_into_folds
 from torchid.problem.contact_state import ContactState
 from torchid.problem.metrics import ForceSums
+from torchid.problem.parts import Part, merge_states
 from torchid.sensing.sensors import recorded_components
 from torchid.settings import RidgeRule
 

@@ -20,9 +20,10 @@ from torchid.logs.timeline import spline_degree
 from torchid.parallel import in_copies, share_between_copies, thread_count
 from torchid.parameters import Array
 from torchid.problem import ExtraTerms, RowBuilder, Samples
-from torchid.problem.compression import Part, compress_in_blocks, compress_parts, merge_blocks_of_folds, merge_states
+from torchid.problem.compression import compress_in_blocks, compress_parts
 from torchid.problem.extras import DELAY
 from torchid.problem.linear import TriangularFactor
+from torchid.problem.parts import Part, merge_blocks_of_folds, merge_states
 
 EARLIEST, LATEST = -0.02, 0.06
 """Delays that are tried [s]: beyond, the stamps are those of another clock."""

@@ -32,7 +32,7 @@ from torchid.fitting.robust import RobustLoss
 from torchid.log_checks.model import Declared
 from torchid.problem import Evaluation, ExtraTerms, RowBuilder, Samples
 from torchid.problem.compressed_log import Block
-from torchid.problem.compression import Part
+from torchid.problem.parts import Part
 from torchid.problem.sampled_rows import LogOfOtherProcess
 from torchid.reprs import short_repr
 from torchid.robot import Robot, load_robot

@@ -19,9 +19,9 @@ from torchid.identifiability.confounding import ExtraEstimate, estimate_extras, 
 from torchid.parallel import one_thread, share_between_processes, thread_count
 from torchid.parameters import PER_BODY
 from torchid.problem import LinearProblem, RowBuilder, assemble
-from torchid.problem.compression import Part, merge_blocks_of_folds, merge_states
 from torchid.problem.elimination import Assembly
 from torchid.problem.noise_gram import scale_columns
+from torchid.problem.parts import Part, merge_blocks_of_folds, merge_states
 from torchid.reprs import short_repr
 from torchid.robot import Robot
 from torchid.rounding import RANK_TOLERANCE

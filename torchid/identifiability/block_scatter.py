@@ -13,8 +13,8 @@ from torchid.identifiability.confounding import ParameterCovariance, mass_weight
 from torchid.parallel import one_thread
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import RowBuilder
-from torchid.problem.compression import Part
 from torchid.problem.elimination import Assembly
+from torchid.problem.parts import Part
 
 LEAST_BLOCKS = 8
 """With fewer blocks their scatter says too little."""

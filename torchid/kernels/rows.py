@@ -114,6 +114,8 @@ def _start_block(
     forces: Array,
     samples: int,
     start: int,
+    room: int,
+    to: int,
     size: int,
     most: int,
     sums: Array,
@@ -124,9 +126,9 @@ def _start_block(
     for row in range(count):
         if of_base:
             for k in range(6):
-                at, to = (k * rank + first + row) * TILE, ((of_base * most + row) * 6 + k) * TILE
-                sums[to : to + TILE] = W[at : at + TILE]
-        at = offset + (width - 1) * (width + count * samples) + width + row * samples + start
+                at, own = (k * rank + first + row) * TILE, ((of_base * most + row) * 6 + k) * TILE
+                sums[own : own + TILE] = W[at : at + TILE]
+        at = offset + (width - 1) * (width + count * room) + width + row * room + to
         out = rows[at : at + size]
         out[:] = 0.0
         for k in range(dof, end):
@@ -166,18 +168,18 @@ def _write_powers_of_moments(
 
 @compiled()
 def _write_columns(
-    block: Index, column: int, parameters: Index, wrenches: Array, sums: Array, samples: int, start: int, rows: Array
+    block: Index, column: int, parameters: Index, wrenches: Array, sums: Array, room: int, to: int, rows: Array
 ) -> None:
     """Write a body's columns: its wrenches times the path sum of each row."""
     count, width, offset = block[1:4]
-    size = min(TILE, samples - start)
+    size = min(TILE, room - to)
     for number in range(len(parameters)):
         wrench = wrenches[number * _WRENCH : (number + 1) * _WRENCH]
-        at = offset + (column + number) * (width + count * samples) + width + start
+        at = offset + (column + number) * (width + count * room) + width + to
         if parameters[number] < _INERTIA:
-            _write_powers(wrench, sums, count, rows, at, samples, size)
+            _write_powers(wrench, sums, count, rows, at, room, size)
         else:
-            _write_powers_of_moments(wrench, sums, count, rows, at, samples, size)
+            _write_powers_of_moments(wrench, sums, count, rows, at, room, size)
 
 
 @compiled()
@@ -185,8 +187,9 @@ def _write_moved(
     states: Array,
     joints: Array,
     nodes: int,
-    samples: int,
     start: int,
+    room: int,
+    to: int,
     W: Array,
     rank: int,
     most: int,
@@ -197,11 +200,11 @@ def _write_moved(
     rows: Array,
 ) -> None:
     """Write the path sums of the nodes that blocks move, and their columns of friction."""
-    padded, size = len(joints) // (6 * nodes), min(TILE, samples - start)
+    padded, size = len(joints) // (6 * nodes), min(TILE, room - to)
     for number in range(len(moved)):
         block, node, dof, path_sum, above, column = moved[number]
         first, count, width, offset = blocks[block, :4]
-        long, at = width + count * samples, node * padded + start
+        long, at = width + count * room, node * padded + start
         screw = states[(node * STATE + SCREW) * TILE : (node + 1) * STATE * TILE]
         direction = joints[DIRECTION * nodes * padded + at : DIRECTION * nodes * padded + at + size]
         velocity = joints[VELOCITY * nodes * padded + at : VELOCITY * nodes * padded + at + size]
@@ -210,7 +213,7 @@ def _write_moved(
             w, at = W[at : at + TILE], (above * most + row) * _WRENCH
             upper, at = sums[at : at + _WRENCH], (path_sum * most + row) * _WRENCH
             _add_screw(ratios[number], w, screw, upper, sums[at : at + _WRENCH])
-            at = offset + column * long + width + row * samples + start
+            at = offset + column * long + width + row * room + to
             multiply(ratios[number], w, direction, rows[at : at + size])
             multiply(ratios[number], w, velocity, rows[at + long : at + long + size])
 
@@ -218,8 +221,8 @@ def _write_moved(
 @compiled()
 def _write_bodies(
     states: Array,
-    samples: int,
-    start: int,
+    room: int,
+    to: int,
     most: int,
     blocks: Index,
     bodies: Index,
@@ -238,7 +241,58 @@ def _write_bodies(
             known = node
             _write_wrenches(states[node * STATE * TILE : (node + 1) * STATE * TILE], parameters, functions, wrenches)
         own = sums[at : at + most * _WRENCH]
-        _write_columns(blocks[block], column, parameters, wrenches, own, samples, start, rows)
+        _write_columns(blocks[block], column, parameters, wrenches, own, room, to, rows)
+
+
+@compiled()
+def write_span(
+    states: Array,
+    joints: Array,
+    nodes: int,
+    samples: int,
+    bases: Array,
+    rank: int,
+    step: int,
+    forces: Array,
+    blocks: Index,
+    moved: Index,
+    ratios: Array,
+    bodies: Index,
+    kept: Index,
+    begin: int,
+    end: int,
+    sums: Array,
+    rows: Array,
+) -> None:
+    """As `write_rows`, but of samples from one on, a multiple of `TILE`, with room for these alone.
+
+    `sums`: memory for path sums, see `path_sums`.
+    """
+    most, room = _most_rows(blocks), end - begin
+    functions, wrenches = np.zeros(_FUNCTIONS * TILE), np.zeros(10 * _WRENCH)
+    for start in range(begin, end, TILE):
+        to, tile = start - begin, start // TILE
+        size = min(TILE, room - to)
+        own = states[tile * nodes * STATE * TILE : (tile + 1) * nodes * STATE * TILE]
+        W = bases[tile * step :]
+        for block in range(len(blocks)):
+            _start_block(blocks[block], W, rank, forces, samples, start, room, to, size, most, sums, rows)
+        _write_moved(own, joints, nodes, start, room, to, W, rank, most, blocks, moved, ratios, sums, rows)
+        _write_bodies(own, room, to, most, blocks, bodies, kept, sums, functions, wrenches, rows)
+
+
+@compiled()
+def _most_rows(blocks: Index) -> int:
+    most = 0
+    for block in range(len(blocks)):
+        most = max(most, blocks[block, 1])
+    return most
+
+
+@compiled()
+def path_sums(blocks: Index) -> Array:
+    """Memory for the path sums of a tile, the first of which are zero."""
+    return np.zeros(blocks[0, 7] * _most_rows(blocks) * _WRENCH)
 
 
 @compiled(ARRAY, ARRAY, "int64", "int64", ARRAY, "int64", "int64", ARRAY, TABLE, TABLE, ARRAY, TABLE, INDEX, ARRAY)
@@ -280,17 +334,22 @@ def write_rows(
         kept: numbers of inertial parameters.
         rows: each block (columns, columns + rows B) as in `torchid.problem.rows.BlockRows`, one after the other.
     """
-    padded, most = len(joints) // (6 * nodes), 0
-    for block in range(len(blocks)):
-        most = max(most, blocks[block, 1])
-    sums = np.zeros(blocks[0, 7] * most * _WRENCH)
-    functions, wrenches = np.zeros(_FUNCTIONS * TILE), np.zeros(10 * _WRENCH)
-    for tile in range(padded // TILE):
-        start = tile * TILE
-        size = min(TILE, samples - start)
-        own = states[tile * nodes * STATE * TILE : (tile + 1) * nodes * STATE * TILE]
-        W = bases[tile * step :]
-        for block in range(len(blocks)):
-            _start_block(blocks[block], W, rank, forces, samples, start, size, most, sums, rows)
-        _write_moved(own, joints, nodes, samples, start, W, rank, most, blocks, moved, ratios, sums, rows)
-        _write_bodies(own, samples, start, most, blocks, bodies, kept, sums, functions, wrenches, rows)
+    write_span(
+        states,
+        joints,
+        nodes,
+        samples,
+        bases,
+        rank,
+        step,
+        forces,
+        blocks,
+        moved,
+        ratios,
+        bodies,
+        kept,
+        0,
+        samples,
+        path_sums(blocks),
+        rows,
+    )

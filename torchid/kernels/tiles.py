@@ -21,13 +21,17 @@ Function = TypeVar("Function", bound=Callable[..., object])
 Vector = tuple[float, float, float]
 Index = np.ndarray
 
-ARRAY, INDEX, FLAGS, TABLE = "float64[::1]", "int64[::1]", "boolean[::1]", "int64[:,::1]"
+ARRAY, MATRIX, INDEX, FLAGS, TABLE = "float64[::1]", "float64[:,::1]", "int64[::1]", "boolean[::1]", "int64[:,::1]"
 
 
-def compiled(*arguments: str) -> Callable[[Function], Function]:
-    """Compile a function: for arguments of given types at once, kept on disk, or where others call it."""
+def compiled(*arguments: str, sums: bool = False) -> Callable[[Function], Function]:
+    """Compile a function: for arguments of given types at once, kept on disk, or where others call it.
+
+    `sums`: terms of its sums may be added in any order, as a sum by vector instructions needs it.
+    """
     signature = [f"void({', '.join(arguments)})"] if arguments else []
-    options = {"nogil": True, "cache": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
+    fastmath = {"contract", "nsz", "reassoc"} if sums else {"contract", "nsz"}
+    options = {"nogil": True, "cache": True, "error_model": "numpy", "fastmath": fastmath}
 
     def compile_function(function: Function) -> Function:
         return numba.njit(*signature, **options)(function)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -10,7 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchid.kernels import limbs, rows, states
+from torchid.kernels import compression, limbs, rows, states
+from torchid.kernels.gram import write_gram
 from torchid.kernels.tiles import TILE
 from torchid.parameters import Array
 from torchid.problem.blocks import BlockRows
@@ -19,6 +20,7 @@ from torchid.problem.contact_rows import general_bases
 from torchid.problem.contact_state import ContactStateLayout
 from torchid.problem.extras import dof_extra_column
 from torchid.problem.row_blocks import RowBlock, subtract_payload
+from torchid.problem.row_compressor import ColumnLevels
 from torchid.problem.samples import Samples
 from torchid.regressor.kinematics import BodyStates, JointMotion, Motion, joint_motion
 from torchid.regressor.tree import KinematicTree
@@ -26,6 +28,8 @@ from torchid.sensing.limbs import PIVOT, WELL_CONDITIONED
 
 if TYPE_CHECKING:
     from torchid.problem.rows import RowBuilder
+
+LevelsOfBlocks = Callable[[tuple[int, ...]], ColumnLevels | None]
 
 
 @dataclass(frozen=True)
@@ -123,16 +127,56 @@ class _Plan:
             np.array(kept, dtype=int),
         )
 
+    @property
+    def of_bodies(self) -> tuple[np.ndarray, Array, np.ndarray, np.ndarray]:
+        """What follows the blocks in the arguments of `rows.write_rows`."""
+        return self.moved, self.ratios, self.bodies, self.kept
+
     def placed(self, samples: int) -> tuple[np.ndarray, int]:
         """The blocks, one after the other in memory for so many samples, and how many numbers they are."""
         out, width = self.blocks.copy(), self.blocks[:, 2]
-        ends = np.cumsum(width * (width + self.blocks[:, 1] * samples))
-        out[1:, 3] = ends[:-1]
-        return out, int(ends[-1])
+        sizes = width * (width + self.blocks[:, 1] * samples)
+        out[:, 3] = _starts(sizes)
+        return out, int(sizes.sum())
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Blocks of rows that kernels make at once.
+
+    Attributes:
+        blocks: the blocks.
+        dofs: as of `_Plan.of`.
+        tiles: of all samples.
+        W: tiles (T, degrees of freedom, rank, TILE) of it, or one for all.
+        f: measured forces, (B, degrees of freedom).
+        joints: of each block, where those that it combines are among the degrees of freedom.
+    """
+
+    blocks: tuple[RowBlock, ...]
+    dofs: int | None
+    tiles: _Tiles
+    W: Tensor
+    f: Tensor
+    joints: Sequence[Mapping[int, int]]
+
+    def arrays(self, workspace: Workspace) -> tuple[Array, Array, int, int, Array, int, int, Array]:
+        """The first arguments of `rows.write_rows`."""
+        joints, samples = self.tiles.joints, self.tiles.samples
+        forces = workspace.empty("forces", self.W, self.f.shape[1], samples)
+        forces.copy_(self.f.T)
+        step = self.W[0].numel() if len(self.W) > 1 else 0
+        of_tiles = _flat(self.tiles.states), _flat(joints), joints.shape[1], samples
+        return *of_tiles, _flat(self.W), self.W.shape[2], step, _flat(forces)
 
 
 class CompiledRows:
-    """Makes the rows of a builder, float64 on a CPU, where no joint rests; extra parameters are those of joints."""
+    """Makes the rows of a builder, float64 on a CPU, where no joint rests; extra parameters are those of joints.
+
+    `write_gram`: the kernel that multiplies them.
+    """
+
+    write_gram = staticmethod(write_gram)
 
     def __init__(self, builder: RowBuilder) -> None:
         """Work out the constants."""
@@ -146,39 +190,55 @@ class CompiledRows:
 
     def blocks(self, samples: Samples, layout: ContactStateLayout, workspace: Workspace) -> Iterator[BlockRows] | None:
         """As `RowBuilder.blocks`, each of all samples; None where joints rest or ranks of contacts differ."""
+        groups = self._groups(samples, layout, workspace)
+        if groups is None:
+            return None
+        return (made for group in groups for made in self._written(group, samples, workspace))
+
+    def grams(
+        self, samples: Samples, layout: ContactStateLayout, workspace: Workspace, levels: LevelsOfBlocks
+    ) -> list[tuple[RowBlock, Array, Array]] | None:
+        """Blocks, squares and Gram matrices as `GramWriter` writes them, of rows that never leave the caches.
+
+        None where `blocks` gives none, where rows have more to them than the kernels know, or where `levels` have none
+        of a block's columns.
+        """
+        if samples.payload is not None or self._builder.extras:
+            return None
+        groups = self._groups(samples, layout, workspace)
+        if groups is None:
+            return None
+        made = list[tuple[RowBlock, Array, Array]]()
+        for group in groups:
+            known = [own for block in group.blocks if (own := levels(block.support)) is not None]
+            if len(known) < len(group.blocks):
+                return None
+            made.extend(self._multiplied(group, known, workspace))
+        return made
+
+    def _groups(
+        self, samples: Samples, layout: ContactStateLayout, workspace: Workspace
+    ) -> tuple[_Group, _Group] | None:
+        """The coupled rows, and the others; None as for `blocks`."""
         if samples.resting is not None:
             return None
-        tiles = self._tiles(samples.motion(), workspace)
-        bases = self._bases_by_kernel if _stands_on_limbs(self._builder, layout) else self._bases
+        builder, tiles = self._builder, self._tiles(samples.motion(), workspace)
+        bases = self._bases_by_kernel if _stands_on_limbs(builder, layout) else self._bases
         coupled = bases(samples, layout, tiles, workspace)
-        return None if coupled is None else self._blocks(samples, layout, tiles, coupled, workspace)
-
-    def _blocks(
-        self,
-        samples: Samples,
-        layout: ContactStateLayout,
-        tiles: _Tiles,
-        coupled: tuple[Tensor, Tensor],
-        workspace: Workspace,
-    ) -> Iterator[BlockRows]:
+        if coupled is None:
+            return None
         of_rank = layout.blocks.of_rank(coupled[0].shape[2])
         joints, apart = list(layout.uncoupled_joints), tuple(layout.uncoupled_joints.values())
-        in_W = {joint: row for row, joint in enumerate(layout.coupled_joints, start=self._builder.tree.base_rows)}
-        for made in self._write(of_rank, len(layout.coupled_joints), tiles, *coupled, workspace):
-            self._complete(made, samples, coupled[0], in_W)
-            yield made
-        weights = torch.from_numpy(1.0 / self._builder.dof_std[joints])[None, :, None, None].repeat(1, 1, 1, TILE)
-        torque = self._builder.torque_of_bodies(samples)[:, self._builder.tree.index(joints)]
-        made_apart = self._write(apart, None, tiles, weights, torque, workspace)
-        for number, (joint, made) in enumerate(zip(joints, made_apart, strict=True)):
-            self._complete(made, samples, weights, {joint: number})
-            yield made
+        in_W = {joint: row for row, joint in enumerate(layout.coupled_joints, start=builder.tree.base_rows)}
+        weights = torch.from_numpy(1.0 / builder.dof_std[joints])[None, :, None, None].repeat(1, 1, 1, TILE)
+        torque = builder.torque_of_bodies(samples)[:, builder.tree.index(joints)]
+        return (
+            _Group(of_rank, len(layout.coupled_joints), tiles, *coupled, [in_W] * len(of_rank)),
+            _Group(apart, None, tiles, weights, torque, [{joint: number} for number, joint in enumerate(joints)]),
+        )
 
     def _complete(self, made: BlockRows, samples: Samples, W: Tensor, in_W: Mapping[int, int]) -> None:
-        """Write what kernels leave out: a known payload, and columns of extra parameters, from tiles of W.
-
-        `in_W`: by joint, where it is among the degrees of freedom.
-        """
+        """Write what kernels leave out: a known payload, and columns of extra parameters; see `_Group`."""
         builder, block = self._builder, made.block
         subtract_payload(block, made.values, samples.payload, builder.columns.parameter_map)
         first = len(block.inertial) + len(block.friction)
@@ -190,37 +250,46 @@ class CompiledRows:
                 weight = weight.transpose(0, 1).flatten(1)[:, : len(samples)]
                 out.addcmul_(weight, dof_extra_column(extra, joint, samples, builder.tree))
 
-    def _write(
-        self,
-        blocks: tuple[RowBlock, ...],
-        dofs: int | None,
-        tiles: _Tiles,
-        W: Tensor,
-        f: Tensor,
-        workspace: Workspace,
-    ) -> Iterator[BlockRows]:
-        """Rows of blocks, from tiles (T, degrees of freedom, rank, TILE) of W, or one for all, and forces (B, dofs).
-
-        `dofs`: as of `_Plan.of`.
-        """
-        if not blocks:
+    def _written(self, group: _Group, samples: Samples, workspace: Workspace) -> Iterator[BlockRows]:
+        if not group.blocks:
             return
-        key = id(blocks[0])  # of those that the builder's layouts keep
-        if (plan := self._plans.get(key)) is None:
-            plan = self._plans[key] = _Plan.of(blocks, self._builder.tree.base_rows, dofs)
-        forces = workspace.empty("forces", W, f.shape[1], tiles.samples)
-        forces.copy_(f.T)
-        placed, size = plan.placed(tiles.samples)
-        flat = workspace.empty("rows", W, size)
-        step = W[0].numel() if len(W) > 1 else 0
-        rows.write_rows(
-            *(_flat(tiles.states), _flat(tiles.joints), tiles.joints.shape[1], tiles.samples),
-            *(_flat(W), W.shape[2], step, _flat(forces)),
-            *(placed, plan.moved, plan.ratios, plan.bodies, plan.kept, flat.numpy()),
+        plan, count = self._plan(group), len(samples)
+        placed, size = plan.placed(count)
+        flat = workspace.empty("rows", group.W, size)
+        rows.write_rows(*group.arrays(workspace), placed, *plan.of_bodies, flat.numpy())
+        for block, in_W, (_, each, width, start, *_) in zip(group.blocks, group.joints, placed.tolist(), strict=True):
+            stacked = flat[start:][: width * (width + each * count)].unflatten(0, (width, -1))
+            made = BlockRows(block, stacked, stacked[:, width:].unflatten(1, (each, count)), None)
+            self._complete(made, samples, group.W, in_W)
+            yield made
+
+    def _multiplied(
+        self, group: _Group, levels: Sequence[ColumnLevels], workspace: Workspace
+    ) -> Iterator[tuple[RowBlock, Array, Array]]:
+        if not group.blocks:
+            return
+        plan = self._plan(group)
+        placed, size = plan.placed(min(compression.SPAN, group.tiles.samples))
+        flat, widths = workspace.empty("rows", group.W, size), plan.blocks[:, 2]
+        counts = np.array([len(own.lower) for own in levels])
+        lower, combination = (
+            np.concatenate([getattr(own, name).ravel() for own in levels]) for name in ("lower", "to_lower")
         )
-        for block, (_, count, width, start, *_) in zip(blocks, placed.tolist(), strict=True):
-            stacked = flat[start:][: width * (width + count * tiles.samples)].unflatten(0, (width, -1))
-            yield BlockRows(block, stacked, stacked[:, width:].unflatten(1, (count, tiles.samples)), None)
+        table = np.column_stack([_starts(counts), counts, _starts(counts * widths), _starts(widths**2)])
+        squares, grams = np.empty(len(lower)), np.empty(int((widths**2).sum()))
+        compression.write_grams(
+            *(*group.arrays(workspace), placed, *plan.of_bodies, table, lower, combination, flat.numpy()),
+            *(squares, grams),
+        )
+        for block, (first, count, _, start), width in zip(group.blocks, table.tolist(), widths.tolist(), strict=True):
+            gram = grams[start : start + width**2].reshape(width, width)
+            yield block, squares[first : first + count], gram
+
+    def _plan(self, group: _Group) -> _Plan:
+        key = id(group.blocks[0])  # of those that the builder's layouts keep
+        if (plan := self._plans.get(key)) is None:
+            plan = self._plans[key] = _Plan.of(group.blocks, self._builder.tree.base_rows, group.dofs)
+        return plan
 
     def _tiles(self, motion: Motion, workspace: Workspace) -> _Tiles:
         joints = joint_motion(self._builder.tree, motion)
@@ -301,6 +370,11 @@ def _stands_on_limbs(builder: RowBuilder, layout: ContactStateLayout) -> bool:
         and all(part.line_of_action == (None, None) for part in parts)
         and sum(len(part.rows) for part in parts) == len(layout.coupled_joints)
     )
+
+
+def _starts(sizes: np.ndarray) -> np.ndarray:
+    """Where things of some sizes start, one after the other."""
+    return np.cumsum(sizes) - sizes
 
 
 def _flat(x: Tensor) -> Array:

@@ -8,14 +8,8 @@ from dataclasses import dataclass, replace
 from torchid.parallel import one_thread
 from torchid.problem.blocks import block_spans, lay_out_folds
 from torchid.problem.chunks import ProgressCallback, chunks_by_state
-from torchid.problem.compression import (
-    LEAST_PER_FOLD,
-    Part,
-    compress_spans,
-    compress_unloaded,
-    fold_count,
-    merge_by_key,
-)
+from torchid.problem.compression import LEAST_PER_FOLD, compress_spans, compress_unloaded, fold_count
+from torchid.problem.parts import Part, merge_by_key
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.reprs import short_repr

@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
-from itertools import chain
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchid import ranks
-from torchid.parallel import one_thread
 from torchid.problem.blocks import block_spans, blocks_in, cut_logs, lay_out_folds, rows_of_samples, span_of_samples
 from torchid.problem.chunk_dynamics import Workspace
 from torchid.problem.chunks import ProgressCallback, chunks_by_state, map_chunks, worker_count
 from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import TriangularFactor
 from torchid.problem.noise_gram import NoiseGram, estimate_noise_gram
+from torchid.problem.parts import Part, PartKey, merge_factors, merge_parts
 from torchid.problem.row_compressor import RowCompressor, RowWeighting
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.problem.unloaded_sensors import unloaded_offset_equations
-from torchid.reprs import short_repr
 
 FOLDS = 5
 """Number of cross-validation folds of the training samples."""
@@ -37,32 +35,6 @@ BLOCKS = 20
 _LEAST_PER_BLOCK = 10  # independent samples
 
 _MEMORY = 2**30  # [bytes] of factors
-PartKey = tuple[str, ContactState, int, int, bool]  # source, state, fold, block, unloaded
-
-
-@dataclass
-class Part:
-    """Compressed rows of one log (named by `source`) in one contact state, one fold and one block of it.
-
-    Equations of unloaded contact sensors are in parts of their own, `unloaded`, which count no samples. `masked`:
-    indices of extras that are offsets without such an equation, because their readings in the air are masked.
-    """
-
-    source: str
-    state: ContactState
-    factor: TriangularFactor
-    samples: int
-    fold: int = 0
-    block: int = 0
-    unloaded: bool = False
-    masked: set[int] = field(default_factory=set)
-
-    __repr__ = short_repr
-
-    @property
-    def key(self) -> PartKey:
-        """Which rows it has."""
-        return self.source, self.state, self.fold, self.block, self.unloaded
 
 
 def compress(
@@ -88,7 +60,7 @@ def compress_by_state(
 ) -> dict[ContactState, TriangularFactor]:
     """As `compress`, but with a factor for every contact state in the logs."""
     reduce = partial(_compress_chunks, builder, by_log=False)
-    parts = _merge_parts(map_chunks(logs, builder, reduce, chunk, threads, progress))
+    parts = merge_parts(map_chunks(logs, builder, reduce, chunk, threads, progress))
     add_noise_gram(parts, estimate_noise_gram(logs, builder, lambda _, state: _key(None, state)))
     return {part.state: part.factor for part in parts}
 
@@ -126,7 +98,7 @@ def _compress_parts(
         return _compress_chunks(builder, chunks, by_log=True, weight_rows=weighting), weighting
 
     done = map_chunks(logs, builder, reduce, chunk, threads, progress)
-    parts = _merge_parts(of_worker for of_worker, _ in done)
+    parts = merge_parts(of_worker for of_worker, _ in done)
     if weight_rows is None:
         add_noise_gram(parts, noise_gram_by_part(pieces, builder, progress))
     else:
@@ -246,10 +218,16 @@ class _Parts:
         spans = [(self.part(samples, state, fold, at), start, end) for fold, at, start, end in blocks_in(samples)]
         if spans[0][0].key not in self._compressors:  # no later chunk is of the blocks before
             self.finish()
-        compressors = [self._compressors.setdefault(part.key, RowCompressor()) for part, *_ in spans]
+        compressors = [self._compressors.setdefault(part.key, self._compressor()) for part, *_ in spans]
         for part, start, end in spans:
             part.samples += end - start
+        one = weight_rows is None and len(spans) == 1
+        done = self._add_grams(samples, state, workspace, spans[0][0], compressors[0]) if one else {}
+        if done and all(done.values()):
+            return
         for rows, index in self._builder.blocks(samples, state, workspace):
+            if done.get(id(rows.block)):
+                continue
             support, stacked = rows.block.support, rows.stacked.T
             if weight_rows is not None:
                 weighted = stacked[len(support) + 1 :]
@@ -260,6 +238,24 @@ class _Parts:
                 if rows.absent is not None:
                     key, first, last = (part.key, samples.oversampling), *span_of_samples(index, start, end)
                     self._absent[key] = self._absent.get(key, 0) + rows.absent[:, first:last].sum()
+
+    def _add_grams(
+        self, samples: Samples, state: ContactState, workspace: Workspace, part: Part, compressor: RowCompressor
+    ) -> dict[int, bool]:
+        """Add Gram matrices of a chunk's rows to a part, where kernels give them; by block, whether it was added."""
+        kernels, layout = self._builder.compiled, self._builder.layout(state, samples.contact_normal is not None)
+        levels = partial(compressor.levels, part.factor)
+        made = None if kernels is None else kernels.grams(samples, layout, workspace, levels)
+        done = dict[int, bool]()
+        for block, squares, gram in made or []:
+            count = (block.rows.stop - block.rows.start) * len(samples)
+            own = part.factor, block.support, squares, gram, count, samples.oversampling
+            done[id(block)] = compressor.add_gram(*own)
+        return done
+
+    def _compressor(self) -> RowCompressor:
+        kernels = self._builder.compiled
+        return RowCompressor() if kernels is None else RowCompressor(kernels.write_gram)
 
     def close(self) -> None:
         """Bring the factors, and their numbers of rows, up to date, for which the host waits for a GPU."""
@@ -300,29 +296,7 @@ def add_noise_gram(parts: Sequence[Part], noise_gram: Mapping[PartKey, NoiseGram
 
 def compress_unloaded(logs: Sequence[Samples], builder: RowBuilder) -> list[Part]:
     """Those parts of `compress_parts` that are of readings in the air."""
-    return _merge_parts(map_chunks(logs, builder, partial(_compress_chunks, builder, by_log=True, loaded=False)))
-
-
-@one_thread()
-def _merge_parts(of_workers: Iterable[list[Part]]) -> list[Part]:
-    """The parts of all workers, those of one log, contact state and fold merged, on the CPU."""
-    total: dict[PartKey, list[Part]] = {}
-    for part in chain.from_iterable(of_workers):
-        part.factor = part.factor.to_cpu()
-        total.setdefault(part.key, []).append(part)
-    for first, *others in total.values():
-        first.samples += sum(part.samples for part in others)
-        first.masked = first.masked.union(*(part.masked for part in others))
-        first.factor.merge(*(part.factor for part in others))
-    return [first for first, *_ in total.values()]
-
-
-@one_thread()
-def merge_factors(factors: Iterable[TriangularFactor], builder: RowBuilder) -> TriangularFactor:
-    """One factor of the rows of several."""
-    out = TriangularFactor(builder.width)
-    out.merge(*factors)
-    return out
+    return merge_parts(map_chunks(logs, builder, partial(_compress_chunks, builder, by_log=True, loaded=False)))
 
 
 def split_into_folds(logs: Sequence[Samples], builder: RowBuilder) -> list[Samples]:
@@ -360,34 +334,3 @@ def fold_count(independent: float, states: int, builder: RowBuilder) -> int:
 def _most_factors(states: int, builder: RowBuilder) -> int:
     """Number of factors of each of some contact states that there is memory for."""
     return _MEMORY // (8 * (builder.width + 1) ** 2 * max(states, 1) * worker_count(builder.device))
-
-
-def merge_states(parts: Sequence[Part], builder: RowBuilder) -> list[Part]:
-    """Parts with the contact states of each log and fold merged; offset equations of unloaded sensors stay apart."""
-    return merge_by_key(parts, [(part.source, part.fold, part.unloaded) for part in parts], builder)
-
-
-def merge_folds(parts: Sequence[Part], builder: RowBuilder) -> list[Part]:
-    """Parts with the folds of each log and contact state merged; offset equations of unloaded sensors stay apart."""
-    return merge_by_key(parts, [(part.source, part.state, part.unloaded) for part in parts], builder)
-
-
-def merge_blocks_of_folds(parts: Sequence[Part], builder: RowBuilder) -> list[Part]:
-    """Parts with the blocks of each log, contact state and fold merged."""
-    if not any(part.block for part in parts):
-        return list(parts)
-    keys = [(part.source, part.state, part.fold, part.unloaded) for part in parts]
-    return [replace(part, block=0) for part in merge_by_key(parts, keys, builder)]
-
-
-@one_thread()
-def merge_by_key(parts: Sequence[Part], keys: Sequence[tuple[object, ...]], builder: RowBuilder) -> list[Part]:
-    """One part for each key, with whatever else of the first; the factors of the parts stay as they are."""
-    alike: dict[tuple[object, ...], list[Part]] = {}
-    for part, key in zip(parts, keys, strict=True):
-        alike.setdefault(key, []).append(part)
-    out = []
-    for own in alike.values():
-        factor, masked = merge_factors((part.factor for part in own), builder), set().union(*(x.masked for x in own))
-        out.append(replace(own[0], factor=factor, samples=sum(part.samples for part in own), masked=masked))
-    return out

@@ -42,6 +42,27 @@ _MOST_COMBINED = 0.5  # of the columns: where more are combined, QR is as fast, 
 _LEAST_ROWS = 2000  # of a chunk that columns are combined for: of fewer, that takes longer than Householder QR of them
 
 
+class GramWriter(Protocol):
+    """Replaces columns by combinations of all, and multiplies: `write_gram`, or its namesake in `torchid.kernels`."""
+
+    def __call__(
+        self, columns: Array, first: int, lower: np.ndarray, combination: Array, squares: Array, gram: Array, /
+    ) -> None:
+        """See `torchid.kernels.gram.write_gram`."""
+
+
+def write_gram(
+    columns: Array, first: int, lower: np.ndarray, combination: Array, squares: Array, gram: Array, /
+) -> None:
+    """What the kernel of this name does, by NumPy."""
+    X = columns[:, first:]
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite stays so
+        if len(lower):
+            squares[:] = np.einsum("km,km->k", X[lower], X[lower])
+            X[lower] = combination @ X
+        np.matmul(X, X.T, out=gram)  # half of the products
+
+
 @dataclass(frozen=True)
 class ColumnLevels:
     """A change of columns, X to X T, after which rows like those it was made of are well conditioned.
@@ -77,7 +98,7 @@ class ColumnLevels:
         for start, end in zip(bounds[1:-1], bounds[2:], strict=True):
             combination = scipy.linalg.solve_triangular(pivoted[:start, :start], pivoted[:start, start:end])
             T[np.ix_(order[:start], order[start:end])] = -combination
-        return cls(T, size, np.sort(order[bounds[1] :]))
+        return cls(T, size, np.sort(order[bounds[1] :]).astype(int))
 
     @cached_property
     def from_all(self) -> Array:
@@ -85,20 +106,33 @@ class ColumnLevels:
         inverse = np.linalg.solve(self.T_unit, np.eye(len(self.size))[:, self.lower])
         return np.asarray(inverse * self.size[self.lower] / self.size[:, None])
 
-    def apply(self, X: Array) -> bool:
-        """Change columns, (n, M) by column, in place; returns whether they were.
+    def apply(self, columns: Array, first: int, write_gram: GramWriter) -> Array | None:
+        """Change columns in place; returns their Gram matrix, (n, n), or None if they were left as they are.
 
-        They are not where one would become much longer: rows that these levels were not made of, in which a column is
+        They are where one would become much longer: rows that these levels were not made of, in which a column is
         not as small as in those, and so has a combination that costs others their digits.
+
+        Args:
+            columns: (n, first + M), rows by column, contiguous.
+            first: number of rows that are no part of it.
+            write_gram: changes them and multiplies.
         """
-        if len(self.lower):
-            before, after = X[self.lower], self.to_lower @ X
-            with np.errstate(over="ignore", invalid="ignore"):  # what is not finite stays so
-                squares = (np.einsum("km,km->k", one, one) for one in (before, after))
-                if np.less(_MOST_GROWTH**2 * next(squares), next(squares)).any():
-                    return False
-            X[self.lower] = after
-        return True
+        gram, squares, before = np.empty_like(self.T_unit), np.empty(len(self.lower)), columns[self.lower, first:]
+        write_gram(columns, first, self.lower, self.to_lower, squares, gram)
+        if self.are_of(gram, squares):
+            return gram
+        columns[self.lower, first:] = before
+        return None
+
+    def are_of(self, gram: Array, squares: Array) -> bool:
+        """Whether rows are like those that these levels were made of, so that none of their columns became much longer.
+
+        Args:
+            gram: (n, n), of changed columns.
+            squares: (k,), sums of squares of what the lower columns were.
+        """
+        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite stays so
+            return not np.less(_MOST_GROWTH**2 * squares, gram[self.lower, self.lower]).any()
 
     def squares_before(self, gram: Array) -> Array:
         """Squares of the lengths that the lower columns had, (k,), from the Gram matrix of changed ones."""
@@ -142,9 +176,8 @@ class _Sum:
     def of_nothing(cls, levels: ColumnLevels) -> _Sum:
         return cls(levels, np.zeros_like(levels.T_unit))
 
-    def add(self, X: Array) -> bool:
-        """Add rows by combined column, (n, M), if the sum may be used; returns whether it was."""
-        gram = X @ X.T  # numpy does half of the products
+    def add(self, gram: Array) -> bool:
+        """Add the Gram matrix of rows in combined columns, if the sum may be used; returns whether it was."""
         total, lower = self.gram + gram, self.levels.lower
         total[lower, lower] += _FLOOR**2 * self.levels.squares_before(gram)
         if not self._is_certain(total):
@@ -210,7 +243,9 @@ class RowCompressor:
     columns then combined anew. Few rows, and all on a GPU and in single precision, are factorized.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, write_gram: GramWriter = write_gram) -> None:
+        """`write_gram`: NumPy's way, or a compiled one."""
+        self._write_gram = write_gram
         self._factor: TriangularFactor | None = None
         # of this factor alone: it is the same to the last bit, whatever the worker had before
         self._levels: dict[tuple[int, ...], ColumnLevels] = {}
@@ -237,17 +272,42 @@ class RowCompressor:
         if stacked.device.type != "cpu" or stacked.dtype != torch.float64 or count < least:
             factor.add_in_place(support, stacked, oversampling)
             return
-        X = stacked.numpy()[room:].T
-        known = known or self._start(support, X)
+        columns = stacked.T.numpy()
+        known = known or self._start(support, columns[:, room:])
         if known is None:
             factor.add_in_place(support, stacked, oversampling)
             return
-        combined = known.levels.apply(X)
-        if combined and known.add(X):
+        gram = known.levels.apply(columns, room, self._write_gram)
+        if gram is not None and known.add(gram):
             self._sums[support] = known
         else:
-            self._factorize(factor, support, stacked, known, combined)
+            self._factorize(factor, support, stacked, known, gram is not None)
         factor.count(count, oversampling)
+
+    def levels(self, factor: TriangularFactor, support: tuple[int, ...]) -> ColumnLevels | None:
+        """Those in which rows of a block are added to a factor; None before there are any."""
+        known = self._sums.get(support) if factor is self._factor else None
+        return None if known is None else known.levels
+
+    def add_gram(
+        self,
+        factor: TriangularFactor,
+        support: tuple[int, ...],
+        squares: Array,
+        gram: Array,
+        count: int,
+        oversampling: float,
+    ) -> bool:
+        """Add what `GramWriter` writes of so many rows in the present levels, if it may be used.
+
+        Returns:
+            whether it was; else the rows are to be given to `add`.
+        """
+        known = self._sums[support]
+        added = known.levels.are_of(gram, squares) and known.add(gram)
+        if added:
+            factor.count(count, oversampling)
+        return added
 
     def finish(self) -> None:
         """Bring the factor up to date."""
@@ -279,9 +339,10 @@ class RowCompressor:
         R = known.levels.undo(R) if combined else R
         self._sums.pop(support, None)
         if np.isfinite(R).all():
-            anew, X = _Sum.of_nothing(ColumnLevels.of(R)), R.T.copy()
+            anew = _Sum.of_nothing(ColumnLevels.of(R))
             self._levels[support] = anew.levels
-            if anew.levels.apply(X) and anew.add(X):
+            gram = anew.levels.apply(R.T.copy(), 0, self._write_gram)
+            if gram is not None and anew.add(gram):
                 self._sums[support] = anew
                 return
         factor.absorb(support, torch.from_numpy(R))

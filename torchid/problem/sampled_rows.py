@@ -18,10 +18,10 @@ from torchid import ranks
 from torchid.parallel import map_in_workers, one_thread
 from torchid.parameters import Array
 from torchid.problem.chunks import chunks_by_state, worker_count
-from torchid.problem.compression import Part
 from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import TriangularFactor
 from torchid.problem.noise_gram import noise_of_reading
+from torchid.problem.parts import Part
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.regressor.kinematics import joint_motion
