@@ -251,3 +251,24 @@ def test_a_log_is_checked_against_one_robot_alone(runs: dict[str, Path]) -> None
     file = runs["mjcf"].parent / "quadruped.xml"
     with pytest.raises(ConfigError, match="urdf or mjcf"):
         torchid.check(LOG, robot={"mjcf": file, "urdf": DEMO / "quadruped.urdf"})
+
+
+FOOT = '<geom type="capsule" fromto="0 0 0 0 0 -.3" size="0.05"/></body>'
+PLANAR = f"""<mujoco><worldbody><body name="trunk"><joint name="x" type="slide" axis="1 0 0"/>
+<joint name="z" type="slide" axis="0 0 1"/><geom type="sphere" size="0.1"/>
+<body name="l_foot"><joint name="l_hip"/>{FOOT}<body name="r_foot"><joint name="r_hip"/>{FOOT}</body>
+</worldbody></mujoco>"""
+
+
+def test_init_writes_what_a_fit_takes_of_a_trunk_on_slides_with_feet(tmp_path: Path) -> None:
+    """Its base is fixed: nothing of the base's motion is missing, and no foot is looked for that stands."""
+    robot, log, file = (tmp_path / name for name in ("planar.xml", "log.npz", "new.yaml"))
+    robot.write_text(PLANAR)
+    motion = np.sin(np.outer(np.arange(200) / 100.0, [3.0, 5.0, 7.0, 11.0]))
+    arrays = {"time": np.arange(200) / 100.0, "joint_position": motion, "joint_torque": motion}
+    np.savez(log, joint_names=np.array(["x", "z", "l_hip", "r_hip"]), **arrays)
+    assert main(["init", str(robot), str(log), "--output", str(file)]) == 0
+    setup = set_up(load_config(file))
+    assert setup.robot.fixed_base
+    assert [contact.frame for contact in setup.contacts] == ["l_foot", "r_foot"]
+    assert yaml.safe_load(file.read_text())["logs"]["columns"]["contact_active"] == {"always": ["l_foot", "r_foot"]}

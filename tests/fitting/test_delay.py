@@ -71,6 +71,14 @@ def test_a_delay_that_nobody_fits_is_told_from_none() -> None:
     assert looked_for(unfitted_delay, recorded(seconds=0.07)) is None
 
 
+def test_a_delay_beyond_those_that_are_tried_has_no_standard_error() -> None:
+    """Torques 30 ms late are no 20 ± 0.1 ms late; a look that nobody asked for warns of no setting."""
+    found = looked_for(unfitted_delay, preprocess(recorded(1.5 * EARLIEST, NOISE), 30.0))
+    assert found is not None
+    assert found.significant
+    assert str(found) == "torques are 20 ms late or more: are they stamped by the clock of the positions?"
+
+
 def test_it_is_found_beside_armatures_springs_offsets_and_scales() -> None:
     """A reading s y - o of a torque: scales go with the torques of the delay that is found."""
     robot, _ = arm()

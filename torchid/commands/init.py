@@ -113,12 +113,12 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> InitReport:
     robot = load_robot(urdf, fixed_base=has_fixed_base(Path(urdf)))
     contacts, fields, proposal = _of_bag(part.file, robot) if is_bag else _of_columns(files, robot)
     out = InitReport(target)
-    _state_flags(contacts, fields, proposal)
+    _state_flags(robot, contacts, fields, proposal)
     contacts = contacts if _knows_ground(robot, contacts, fields) else without_rolling(contacts, robot)
     read = _try(path, proposal)
     logs = [] if isinstance(read, InputError) else read
     gaps = keys_for_gaps(logs) | keys_for_length(logs)
-    split = split_logs(logs, "base_motion" in _from_feet(contacts, fields))
+    split = split_logs(logs, "base_motion" in _from_feet(robot, contacts, fields))
     limbs = list(proposal.columns.get("ft_wrenches", ())) or read_sensors(robot, logs)
     torques = measured_torques(robot, logs)
     sensors = proposed_sensors(fields, limbs, contacts, torques)
@@ -234,28 +234,28 @@ def _is_fixed(contacts: Sequence[GuessedContact], fields: set[str]) -> bool:
 
 
 def _knows_ground(robot: Robot, contacts: Sequence[GuessedContact], fields: set[str]) -> bool:
-    return robot.fixed_base or bool(set(_POSE) & fields) or "base_motion" in _from_feet(contacts, fields)
+    return robot.fixed_base or bool(set(_POSE) & fields) or "base_motion" in _from_feet(robot, contacts, fields)
 
 
-def _lacks_base_motion(contacts: Sequence[GuessedContact], fields: set[str]) -> bool:
+def _lacks_base_motion(robot: Robot, contacts: Sequence[GuessedContact], fields: set[str]) -> bool:
     pose = set(_POSE) & fields and "base_position_world" in fields
-    return not _is_fixed(contacts, fields) and not pose and not set(_IMU) <= fields
+    return not robot.fixed_base and not _is_fixed(contacts, fields) and not pose and not set(_IMU) <= fields
 
 
-def _from_feet(contacts: Sequence[GuessedContact], fields: set[str]) -> dict[str, object]:
+def _from_feet(robot: Robot, contacts: Sequence[GuessedContact], fields: set[str]) -> dict[str, object]:
     """Keys of preprocessing that take what was not recorded from joints and feet, if there are enough of these."""
     out: dict[str, object] = {}
     kinds = [contact.type for contact in contacts]
-    if _lacks_base_motion(contacts, fields) and ("flat" in kinds or len(kinds) > 2):
+    if _lacks_base_motion(robot, contacts, fields) and ("flat" in kinds or len(kinds) > 2):
         out["base_motion"] = "contacts"
-    if contacts and "contact_active" not in fields and "joint_torque" in fields:
+    if not robot.fixed_base and contacts and "contact_active" not in fields and "joint_torque" in fields:
         out["detect_contacts"] = True
     return out
 
 
-def _state_flags(contacts: Sequence[GuessedContact], fields: set[str], proposal: MapProposal) -> None:
+def _state_flags(robot: Robot, contacts: Sequence[GuessedContact], fields: set[str], proposal: MapProposal) -> None:
     """Let every foot touch throughout, where neither the log nor torques say which does."""
-    if contacts and "contact_active" not in fields and "detect_contacts" not in _from_feet(contacts, fields):
+    if contacts and "contact_active" not in fields and "detect_contacts" not in _from_feet(robot, contacts, fields):
         always = [contact.frame for contact in contacts]
         is_map = proposal.key == "columns"
         proposal.columns["contact_active"] = {"always": always} if is_map else dict.fromkeys(always, True)
@@ -288,11 +288,11 @@ def _describe(
         out.missing.append(_NO_CONTACT)
     out.missing += [*unreadable(proposal.not_numbers, fields)]
     out.missing += hints(proposal.left_out, fields, robot.joint_names, what, proposal.like_torques)
-    from_feet = _from_feet(contacts, fields)
+    from_feet = _from_feet(robot, contacts, fields)
     if contacts and "contact_active" not in fields:
         instead = "detected from joint torques" if "detect_contacts" in from_feet else "set to touch throughout"
         out.missing.append(f"contact_active: which foot touches when; {instead}")
-    if _lacks_base_motion(contacts, fields):
+    if _lacks_base_motion(robot, contacts, fields):
         instead = "; taken from the feet that stand" if "base_motion" in from_feet else ""
         lacks = "its orientation alone, no position or IMU" if set(_POSE) & fields else "neither its pose nor an IMU"
         out.missing.append(f"motion of the base: {lacks}{instead}")
@@ -351,7 +351,7 @@ def _text(
     sensors: str | dict[str, object],
 ) -> str:
     """The experiment file, with comments."""
-    from_feet = _from_feet(contacts, fields)
+    from_feet = _from_feet(robot, contacts, fields)
     own: dict[str, object] = {"mjcf" if is_mjcf(Path(urdf)) else "urdf": _relative(Path(urdf), output)}
     own |= {"fixed_base": True} if robot.fixed_base or _is_fixed(contacts, fields) else {}
     own |= {"weld": weld} if (weld := welded_at(robot, held_joints(robot, proposal.lacking))) else {}

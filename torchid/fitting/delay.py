@@ -98,6 +98,13 @@ def choose_delay(logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms) 
     Warns:
         TorchidWarning: the best delay is at an end of those that are tried.
     """
+    choice = _search(logs, fitter, terms)
+    if not choice.confounded_with and _is_at_end(choice.found):
+        warn(f"actuators.delay: {choice.found:g} s or beyond; are torques and positions stamped by the same clock?")
+    return choice
+
+
+def _search(logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms) -> DelayChoice:
     ridge = max(fitter.estimator.ridge, _RIDGE)
     fitter = replace(fitter, estimator=replace(fitter.estimator, ridge=ridge))  # type: ignore[type-var]
     plain = replace(fitter, estimator=LeastSquares(ridge, rank_tolerance=fitter.estimator.rank_tolerance))
@@ -110,14 +117,17 @@ def choose_delay(logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms) 
         near = _Delays(many, fitter, terms, ends, best, _NARROW, in_blocks=True)
         before, best = best, near.best(best)
         is_scaled = any(extra.what == "scale" for extra in fitter.builder.extras)
-        if (best not in ends or best in (EARLIEST, LATEST)) and not (is_scaled and abs(best - before) > _SAME):
+        if (best not in ends or _is_at_end(best)) and not (is_scaled and abs(best - before) > _SAME):
             break
     with in_copies([best, 0.0], near.residual, max(thread_count() - 1, 1)) as residuals:
         term = near.term(near.fit_in_blocks(best))
         left, without = residuals()
-    if term.separable and best in (EARLIEST, LATEST):
-        warn(f"actuators.delay: {best:g} s or beyond; are torques and positions stamped by the same clock?")
     return _choice(best, term, left, without)
+
+
+def _is_at_end(delay: float) -> bool:
+    """Whether no delay beyond was tried, so that its standard error says nothing."""
+    return delay in (EARLIEST, LATEST)
 
 
 @dataclass(frozen=True)
@@ -140,6 +150,8 @@ class UnfittedDelay:
         """By how much torques are late or early, and what finds it."""
         size, error = 1e3 * abs(self.value), 1e3 * self.standard_error
         when = "late" if self.value < 0.0 else "early"
+        if _is_at_end(self.value):
+            return f"torques are {size:.2g} ms {when} or more: are they stamped by the clock of the positions?"
         return f"torques are {size:.2g} ± {error:.1g} ms {when} (actuators.delay: auto)"
 
 
@@ -149,7 +161,7 @@ def unfitted_delay(logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms
     One step from none by least squares, and `choose_delay` only where that is significant: without conditions, a
     negative armature with a delay may be a spring.
 
-    Args and warnings: as of `choose_delay`.
+    Args: as of `choose_delay`.
     """
     if not fitter.builder.sensors.torque[: fitter.robot.n].any():
         return None
@@ -166,7 +178,7 @@ def unfitted_delay(logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms
     first = UnfittedDelay(term.value, term.standard_error if term.separable else np.inf)
     if not first.significant:
         return first
-    choice = choose_delay(middles, fitter, terms)
+    choice = _search(middles, fitter, terms)
     error = np.inf if choice.standard_error is None or choice.confounded_with else choice.standard_error
     return UnfittedDelay(choice.found, error)
 
