@@ -177,7 +177,7 @@ def analyze(config: AnalyzeConfig) -> Analysis:
         request = replace(request, setup=setup)
         train, test = _read(request, bars)
         if train:
-            setup = with_noise(setup, ranks.from_first(partial(setup.estimate_noise, train), "noise"))
+            setup = with_noise(setup, ranks.from_first(partial(setup.estimate_noise, train, suggest=False), "noise"))
             request = AnalysisRequest.of(setup)
         results: list[ScenarioAnalysis] = []
 
