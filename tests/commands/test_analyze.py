@@ -16,11 +16,14 @@ from synthetic import Oracle
 
 import torchid
 from torchid.cli import main
+from torchid.commands import analyze as commands_analyze
 from torchid.commands.analyze import analyze
 from torchid.commands.reading import LogReader
+from torchid.commands.sensor_set_accuracy import accuracies
 from torchid.config import load_analysis
 from torchid.errors import TorchidWarning
 from torchid.identifiability.information import ExpectedErrors
+from torchid.parallel import copies_allowed
 from torchid.problem.metrics import ROW_GROUPS
 from torchid.report.analysis import SetAccuracy, accuracy_figure, describe_singular_postures
 from torchid.report.figures import tree_figure
@@ -317,7 +320,9 @@ def test_what_is_planned_for_flight_is_not_compared_on_logs_of_a_robot_that_stan
     assert answers["scenarios"]["air"]["sensors"] == []
 
 
-def test_a_bolted_arm_without_contacts_is_asked_what_the_stack_of_its_log_needs(experiment: Path) -> None:
+def test_a_bolted_arm_without_contacts_is_asked_what_the_stack_of_its_log_needs(
+    experiment: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     time, hz = np.arange(200)[:, None] * 0.01, 1.0 + 0.3 * np.arange(len(TORQUES))
     position, velocity = np.sin(hz * time + np.arange(len(TORQUES))), hz * np.cos(hz * time + np.arange(len(TORQUES)))
     oracle = Oracle(experiment / "quadruped.urdf", TORQUES, fixed_base=True)
@@ -345,6 +350,23 @@ def test_a_bolted_arm_without_contacts_is_asked_what_the_stack_of_its_log_needs(
     assert scenario.plan.cost < len(TORQUES)
     assert set(analysis.accuracies) == {"proposed", "sensor plan for logs"}
     assert {removal.base_rank for removal in scenario.plan.removals} == {None}
+
+    called = []
+    monkeypatch.setattr(commands_analyze, "thread_count", lambda: 2)
+    monkeypatch.setattr(commands_analyze, "accuracies", lambda *given: called.append(given) or accuracies(*given))
+    with copies_allowed(), pytest.warns(TorchidWarning):
+        beside = analyze(load_analysis(file, ["overwrite=true"]))
+    assert not called  # copies have compared all sets
+    assert list(beside.accuracies) == list(analysis.accuracies)
+    for name, one in analysis.accuracies.items():
+        found = beside.accuracies[name]
+        assert (found.channels, found.rank) == (one.channels, one.rank)
+        assert found.measured is not None
+        assert one.measured is not None
+        for group in ("joint_torque", "nullspace"):
+            assert found.expected.total[group] == pytest.approx(one.expected.total[group], rel=1e-9)
+            assert found.measured.rms[group] == pytest.approx(one.measured.rms[group], rel=1e-9)
+    assert beside.scenarios[0].plan.removals == scenario.plan.removals
 
 
 WELDS = tuple(f"{leg}_sole" for leg in LEGS)

@@ -235,6 +235,8 @@ def test_noise_that_is_all_stated_is_used_to_the_last_bit(setup: RobotSetup) -> 
     used = with_noise(experiment, found)
     assert set(origins(found).values()) == {"stated"}
     assert found.passes == 1
+    unfitted = experiment.estimate_noise([samples], experiment.sensors, suggest=False)
+    assert (unfitted.noise, origins(unfitted), unfitted.passes) == (found.noise, origins(found), 0)
     assert used.config == experiment.config
     before, after = fit(experiment, samples), fit(used, samples)
     assert (before.phi == after.phi).all()
@@ -248,6 +250,8 @@ def test_stated_noise_that_residuals_contradict_is_kept_and_the_estimate_suggest
     assert found.noise.base_force == (0.2,) * 3
     assert found.suggested["joint_torque"] == pytest.approx(dict.fromkeys(experiment.robot.joint_names, 0.1), rel=0.1)
     assert found.suggested["contact_force"] == pytest.approx(0.2, rel=0.2)
+    unasked = experiment.estimate_noise([pushed(setup, np.random.default_rng(0))], experiment.sensors, suggest=False)
+    assert (unasked.noise, unasked.suggested) == (found.noise, {})
     right = setup.experiment("sensors.noise={joint_torque: 0.1, contact_force: 0.2}")
     assert not right.estimate_noise([pushed(setup, np.random.default_rng(0))], right.sensors).suggested
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -14,19 +13,20 @@ import numpy as np
 from rich.progress import Progress
 
 from torchid import ranks
+from torchid.commands.analysis_request import AnalysisRequest, errors_at
 from torchid.commands.chosen_settings import with_chosen_settings
 from torchid.commands.folder import ANALYSIS, check_free, new_folder, write_json
 from torchid.commands.reading import LogReader, check_read
 from torchid.commands.sensor_set_accuracy import accuracies
 from torchid.config import AnalyzeConfig, dump_config, inputs_of
-from torchid.errors import ConfigError, SensorError, UnknownNameError, during, join_names, warn
+from torchid.errors import ConfigError, UnknownNameError, during, join_names, warn
 from torchid.fitting.experiment import RobotSetup, set_up_robot, with_noise
 from torchid.fitting.misfit import unmeasured_at_rest
 from torchid.identifiability.base_parameters import BaseParameters, base_parameters
-from torchid.parallel import can_copy, in_copies, one_thread, thread_count
+from torchid.parallel import can_copy, in_copies, one_thread, thread_count, threads_at_most
 from torchid.parameters import WRENCH_COMPONENTS
 from torchid.problem import Samples
-from torchid.problem.chunks import chunks_by_state
+from torchid.problem.chunks import chunks_by_state, copies_share_passes
 from torchid.problem.contact_state import ContactState
 from torchid.problem.elimination import free_parameters
 from torchid.problem.linear import parameter_scale
@@ -44,9 +44,16 @@ from torchid.report.tables import progress_bars
 from torchid.reprs import short_repr
 from torchid.sensing import Contact, SensorSet
 from torchid.sensing.sensors import NORMAL_FORCE, measured_components
-from torchid.sensor_planning.demands import Candidate, candidates, count_channels, sensor_set
+from torchid.sensor_planning.demands import count_channels, sensor_set
 from torchid.sensor_planning.observability import BaseObservability
-from torchid.sensor_planning.planner import PlanningProblem, SensorPlan, plan_sensors
+from torchid.sensor_planning.planner import (
+    PlanningProblem,
+    SensorChoice,
+    SensorPlan,
+    StepCallback,
+    choose_sensors,
+    explain_choice,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -71,7 +78,7 @@ class ScenarioAnalysis:
     @property
     def plan_label(self) -> str:
         """Name of the planned sensors among the sets that are compared."""
-        return f"sensor plan for {self.name}"
+        return _plan_label(self.name)
 
     def _headline(self) -> str:
         plan, names = self.plan, join_names([one.name for one in self.plan.chosen])
@@ -113,52 +120,6 @@ class Analysis:
         return {"scenarios": scenarios, "accuracy": accuracy, "resting_share": self.resting}
 
 
-@dataclass(frozen=True, kw_only=True)
-class AnalysisRequest:
-    """What an experiment file requests, its names looked up.
-
-    Attributes:
-        setup: robot, contacts and settings.
-        candidates: sensors to choose from.
-        keep: those that are there anyway.
-        exclude: those that cannot be.
-        proposed: the sensors of the file, None if it names none.
-        compared: sensor sets to compare, by name.
-    """
-
-    setup: RobotSetup
-    candidates: tuple[Candidate, ...]
-    keep: frozenset[Candidate]
-    exclude: frozenset[Candidate]
-    proposed: SensorSet | None
-    compared: Mapping[str, SensorSet]
-
-    @classmethod
-    def of(cls, setup: RobotSetup) -> AnalysisRequest:
-        """The request of an experiment file. Raises InputError: a name that nothing has, or that is taken."""
-        settings, config = setup.config.analysis, setup.config
-        choice = settings.candidates
-        with _errors_at("analysis"):
-            offered = candidates(
-                robot=setup.robot,
-                contacts=setup.contacts,
-                joint_torques=choice.joint_torques,
-                per=choice.contacts,
-                costs=settings.costs,
-                ft_sensors=choice.ft_sensors,
-                normal_forces=choice.normal_forces,
-            )
-        proposed = None if config.sensors.empty else setup.sensors_of(config.sensors)
-        return cls(
-            setup=setup,
-            candidates=offered,
-            keep=_candidates_named(settings.keep, "keep", offered),
-            exclude=_candidates_named(settings.exclude, "exclude", offered),
-            proposed=proposed,
-            compared=_sets_named(setup, proposed),
-        )
-
-
 @one_thread()
 def analyze(config: AnalyzeConfig) -> Analysis:
     """Plan and check sensors as an experiment file says under `analysis`, and write a folder if there is an output.
@@ -177,29 +138,55 @@ def analyze(config: AnalyzeConfig) -> Analysis:
         request = replace(request, setup=setup)
         train, test = _read(request, bars)
         if train:
-            setup = with_noise(setup, ranks.from_first(partial(setup.estimate_noise, train), "noise"))
+            setup = with_noise(setup, ranks.from_first(partial(setup.estimate_noise, train, suggest=False), "noise"))
             request = AnalysisRequest.of(setup)
+        choices: dict[str, SensorChoice] = {}
+        progress: dict[str, StepCallback] = {}
         results: list[ScenarioAnalysis] = []
 
-        def plan() -> dict[str, SensorSet]:
+        def choose() -> dict[str, SensorSet]:
             for name, states in scenarios(setup, train).items():
-                results.append(_analyze_scenario(request, name, states, train, bars))
-            return _sets_to_compare(request, results, train)
+                progress[name] = _progress(name, bars)
+                choices[name] = _choose_sensors(request, states, train, progress[name])
+            return _sets_to_compare(request, choices, train)
+
+        def explain() -> None:
+            results.extend(_explain_choice(request, name, one, progress[name]) for name, one in choices.items())
 
         def compare(sets: Mapping[str, SensorSet]) -> dict[str, SetAccuracy]:
-            return accuracies(setup, sets, train, test) if train else {}
+            return accuracies(setup, sets, train, test) if train and sets else {}
 
-        early = [{name: one} for name, one in request.compared.items()][: thread_count() - 1 if can_copy() else 0]
-        with in_copies(early, compare, len(early)) as compared_early:
-            sets = ranks.from_first(plan, "sensor sets")
-            bars.add_task("comparing sensor sets", total=None)
-            later = compare({name: one for name, one in sets.items() if not any(name in part for part in early)})
-            compared = {name: one for part in (*compared_early(), later) for name, one in part.items()}
+        def compare_beside(sets: Mapping[str, SensorSet]) -> dict[str, SetAccuracy]:
+            with threads_at_most(thread_count() if is_long else 1):
+                return compare(sets)
+
+        is_long, processes = copies_share_passes([*train, *test]), thread_count() if train and can_copy() else 1
+        early = _shares(request.compared, processes - 1)
+        with in_copies(early, compare_beside, len(early)) as compared_early:
+            sets = ranks.from_first(choose, "sensor sets")
+            left = {name: one for name, one in sets.items() if not any(name in share for share in early)}
+            later = [] if is_long or processes == 1 else _shares(left, processes)
+            with in_copies(later, compare_beside, len(later)) as compared_later:
+                ranks.from_first(explain, "sensor plans")
+                bars.add_task("comparing sensor sets", total=None)
+                found = [*compared_early(), *compared_later(), {} if later else compare(left)]
+        compared = {name: share[name] for name in sets for share in found if name in share}
         analysis = Analysis(setup, tuple(results), compared, output, unmeasured_at_rest(train))
         if output is not None:
             bars.add_task("writing", total=None)
             ranks.from_first(partial(_write_analysis, analysis, output, config.overwrite), "analysis folder")
     return analysis
+
+
+def _plan_label(name: str) -> str:
+    """Name of the sensors planned for a scenario among the sets that are compared."""
+    return f"sensor plan for {name}"
+
+
+def _shares(sets: Mapping[str, SensorSet], count: int) -> list[dict[str, SensorSet]]:
+    """Sensor sets in so many shares of about equal number, none of them empty."""
+    names = list(sets)
+    return [{name: sets[name] for name in names[first::count]} for first in range(min(count, len(names)))]
 
 
 def _analysis_folder(output: Path) -> Path:
@@ -250,19 +237,18 @@ def scenarios(setup: RobotSetup, train: Sequence[Samples]) -> dict[str, tuple[Co
     return out
 
 
-def _analyze_scenario(
-    request: AnalysisRequest, name: str, states: tuple[ContactState, ...], train: Sequence[Samples], bars: Progress
-) -> ScenarioAnalysis:
-    """Plan sensors for one scenario, and check those that are proposed."""
+def _choose_sensors(
+    request: AnalysisRequest, states: tuple[ContactState, ...], train: Sequence[Samples], progress: StepCallback
+) -> SensorChoice:
+    """Choose sensors for one scenario."""
     setup, settings = request.setup, request.setup.config.analysis
-    robot, contacts = setup.robot, setup.contacts
-    free = free_parameters(robot, setup.config.estimator.friction) & ~setup.frozen()
+    robot = setup.robot
     problem = PlanningProblem(
         robot=robot,
-        contacts=contacts,
+        contacts=setup.contacts,
         states=states,
         candidates=request.candidates,
-        prior=parameter_scale(robot.nominal).flatten() * free,
+        prior=parameter_scale(robot.nominal).flatten() * _free(setup),
         keep=request.keep,
         exclude=request.exclude,
         noise=setup.noise,
@@ -270,59 +256,78 @@ def _analyze_scenario(
         criterion=settings.criterion or ("stack" if robot.fixed_base else "per_sample"),
         seed=settings.seed,
     )
+    with errors_at("analysis"):
+        return choose_sensors(problem, progress)
+
+
+def _explain_choice(
+    request: AnalysisRequest, name: str, choice: SensorChoice, progress: StepCallback
+) -> ScenarioAnalysis:
+    """What each chosen sensor is needed for, and a check of those that are proposed."""
+    setup, problem, contacts = request.setup, choice.problem, request.setup.contacts
+    with errors_at("analysis"):
+        plan = explain_choice(choice, progress)
+    progress("base parameters", 0, 1)
+    if request.proposed is None:
+        proposed, at_best = None, problem.stack.problem(sensor_set(setup.robot, contacts, plan.chosen))
+    else:
+        proposed = plan.observability
+        if not _is_chosen(plan, request.proposed, contacts):
+            proposed = tuple(problem.assess(request.proposed, contacts))
+        at_best = problem.stack.problem(request.proposed, contacts=contacts)
+    progress("done", 1, 1)
+    return ScenarioAnalysis(name, problem.states, plan, proposed, base_parameters(replace(at_best, free=_free(setup))))
+
+
+def _free(setup: RobotSetup) -> np.ndarray:
+    """Parameters that are free, (12 L,) bool."""
+    return free_parameters(setup.robot, setup.config.estimator.friction) & ~setup.frozen()
+
+
+def _progress(name: str, bars: Progress) -> StepCallback:
     bar = bars.add_task(f"{name}: looking for sensors", total=None)
 
     def progress(what: str, step: int, steps: int) -> None:
         bars.update(bar, description=f"{name}: {what}", completed=step, total=steps)
 
-    with _errors_at("analysis"):
-        plan = plan_sensors(problem, progress)
-    progress("base parameters", 0, 1)
-    proposed, at_best = None, problem.stack.problem(sensor_set(robot, contacts, plan.chosen))
-    if request.proposed is not None:
-        proposed = plan.observability
-        if not _is_planned(plan, request.proposed, contacts):
-            proposed = tuple(problem.assess(request.proposed, contacts))
-        at_best = problem.stack.problem(request.proposed, contacts=contacts)
-    progress("done", 1, 1)
-    return ScenarioAnalysis(name, states, plan, proposed, base_parameters(replace(at_best, free=free)))
+    return progress
 
 
 def _sets_to_compare(
-    request: AnalysisRequest, results: Sequence[ScenarioAnalysis], train: Sequence[Samples]
+    request: AnalysisRequest, choices: Mapping[str, SensorChoice], train: Sequence[Samples]
 ) -> dict[str, SensorSet]:
     """Sensor sets to compare by accuracy: those with a name, and those planned for contact states of the logs."""
     setup, sets = request.setup, dict(request.compared)
     recorded = {state for samples in train for state, _ in chunks_by_state(samples)}
-    for scenario, plan in ((one, one.plan) for one in results):
-        known = any(_is_planned(plan, other, setup.contacts) for other in sets.values())
-        if known or not recorded & set(scenario.states):
+    for name, choice in choices.items():
+        known = any(_is_chosen(choice, other, setup.contacts) for other in sets.values())
+        if known or not recorded & set(choice.problem.states):
             continue
-        if scalar := _planned_along_normals(plan, setup.contacts):
+        if scalar := _chosen_along_normals(choice, setup.contacts):
             needed = f"sensors.contact_wrenches: {{{scalar[0]}: [{NORMAL_FORCE}]}}"
             bound = f"the file's sensors do not read {', '.join(scalar)} along the normal ({needed})"
-            warn(f"{bound}; no accuracy of the {scenario.plan_label}")
+            warn(f"{bound}; no accuracy of the {_plan_label(name)}")
         else:
-            sets[scenario.plan_label] = sensor_set(setup.robot, setup.contacts, plan.chosen, setup.noise)
+            sets[_plan_label(name)] = sensor_set(setup.robot, setup.contacts, choice.chosen, setup.noise)
     return sets
 
 
-def _planned_along_normals(plan: SensorPlan, contacts: Sequence[Contact]) -> tuple[str, ...]:
-    """Frames of contacts at which a plan has a scalar sensor alone, while others of the same frames read wrenches."""
-    wrench = sensor_set(plan.problem.robot, contacts, plan.chosen).wrench
+def _chosen_along_normals(choice: SensorChoice, contacts: Sequence[Contact]) -> tuple[str, ...]:
+    """Frames of contacts at which a scalar sensor alone is chosen, while others of the same frames read wrenches."""
+    wrench = sensor_set(choice.problem.robot, contacts, choice.chosen).wrench
     return tuple(
         planned.frame
-        for planned, contact, row in zip(plan.problem.contacts, contacts, wrench, strict=True)
+        for planned, contact, row in zip(choice.problem.contacts, contacts, wrench, strict=True)
         if planned.along_normal != contact.along_normal and row.any() and not row[list(contact.components)].all()
     )
 
 
-def _is_planned(plan: SensorPlan, sensors: SensorSet, contacts: Sequence[Contact]) -> bool:
-    """Whether a set, read along the axes of these contacts, is that of a plan; what none can exert does not count."""
-    planned = sensor_set(plan.problem.robot, contacts, plan.chosen)
-    wrench, other = (measured_components(contacts, one) for one in (planned, sensors))
-    same = np.array_equal(planned.torque, sensors.torque) and np.array_equal(wrench, other)
-    return same and not _planned_along_normals(plan, contacts)
+def _is_chosen(choice: SensorChoice, sensors: SensorSet, contacts: Sequence[Contact]) -> bool:
+    """Whether a set, read along the axes of these contacts, is the chosen one; what none can exert does not count."""
+    chosen = sensor_set(choice.problem.robot, contacts, choice.chosen)
+    wrench, other = (measured_components(contacts, one) for one in (chosen, sensors))
+    same = np.array_equal(chosen.torque, sensors.torque) and np.array_equal(wrench, other)
+    return same and not _chosen_along_normals(choice, contacts)
 
 
 def _write_analysis(analysis: Analysis, output: Path, overwrite: bool = False) -> None:
@@ -358,43 +363,3 @@ def _picture(setup: RobotSetup, scenario: ScenarioAnalysis) -> Figure:
     channels, possible = count_channels(plan.chosen), count_channels(plan.problem.candidates)
     title = f"{scenario.name}: {channels} of {possible} sensor channels"
     return tree_figure(title, robot, used, measured, wrenches, constrained)
-
-
-@contextmanager
-def _errors_at(field: str, instead_of: str = "") -> Iterator[None]:
-    """Let errors name the experiment file, and a field of it before theirs or instead of its beginning."""
-    try:
-        yield
-    except UnknownNameError as error:
-        raise UnknownNameError.at_field(_field_in_file(field, instead_of, error), error.name, error.valid) from error
-    except SensorError as error:
-        raise SensorError.at_field(_field_in_file(field, instead_of, error), error.found, error.accepted) from error
-
-
-def _field_in_file(field: str, instead_of: str, error: UnknownNameError | SensorError) -> str:
-    return error.field.replace(instead_of, field, 1) if instead_of else f"{field}.{error.field}"
-
-
-def _candidates_named(names: Sequence[str], field: str, offered: Sequence[Candidate]) -> frozenset[Candidate]:
-    by_name: dict[str, list[Candidate]] = {}
-    for candidate in offered:
-        by_name.setdefault(candidate.name, []).append(candidate)
-    for name in names:
-        if name not in by_name:
-            raise UnknownNameError.at_field(f"analysis.{field}", name, by_name)
-        if len(by_name[name]) > 1:
-            found = f"'{name}', the name of several sensors: joint, contact or fixed joint"
-            raise ConfigError.at_field(f"analysis.{field}", found, "a name that only one sensor has")
-    return frozenset(by_name[name][0] for name in names)
-
-
-def _sets_named(setup: RobotSetup, proposed: SensorSet | None) -> dict[str, SensorSet]:
-    """The proposed set and those that the file compares."""
-    sets = {} if proposed is None else {"proposed": proposed}
-    for name, choice in setup.config.analysis.compare.items():
-        field = f"analysis.compare.{name}"
-        if name in sets:
-            raise ConfigError.at_field(field, "the name of what stands under sensors", "another name")
-        with _errors_at(field, instead_of="sensors"):
-            sets[name] = setup.sensors_of(choice)
-    return sets

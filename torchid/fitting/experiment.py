@@ -175,15 +175,21 @@ class RobotSetup:
         return calibrations(fit, self.robot, builder, self.loss)
 
     def estimate_noise(
-        self, logs: Sequence[Samples | LogOfOtherProcess], sensors: SensorSet | None = None
+        self,
+        logs: Sequence[Samples | LogOfOtherProcess],
+        sensors: SensorSet | None = None,
+        suggest: bool = True,
     ) -> NoiseSummary:
-        """The noise that bound logs show of some sensors, or of all that those here have; what is stated is kept."""
+        """The noise that bound logs show of some sensors, or of all that those here have; what is stated is kept.
+
+        `suggest`: as `estimate_noise` takes it.
+        """
         if sensors is None:
             here = [log for log in logs if isinstance(log, Samples)]
             sensors = recorded_sensors(self.robot, self.contacts, here, self.noise)
         # without conditions: of the estimator, only the ridge and the rank tolerance matter
         fitter = self.fitter(self.builder(sensors), Conditions(names=self.robot.body_names))
-        return estimate_noise(logs, fitter, self.config.sensors.noise.forces.keys())
+        return estimate_noise(logs, fitter, self.config.sensors.noise.forces.keys(), suggest)
 
     def choose_ridge(
         self, parts: Sequence[Part], blocks: Sequence[Block], fitter: LogFitter, conditions: Conditions

@@ -16,7 +16,7 @@ from torchid.parameters import Array
 from torchid.problem import Samples
 from torchid.problem.extras import noise_key
 from torchid.problem.noise import GroupVariances, VarianceComponentEstimator, fitted_directions
-from torchid.problem.sampled_rows import LogOfOtherProcess, SampledRows
+from torchid.problem.sampled_rows import LogOfOtherProcess, SampledRows, noise_of_sensors
 from torchid.reprs import short_repr
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet
@@ -34,7 +34,7 @@ class GroupNoise:
     `origin`: "stated", "estimated", "pooled" (residuals do not tell it from that of the other joints, and all are taken
     together), "at most" (drowned in other noise: an upper bound), "confounded" (residuals show little but its sum with
     other noise) or "assumed" (too few readings). `used`: standard deviation that rows were weighted with; `residual`:
-    that of the residuals, None if they do not determine it.
+    that of the residuals, None if they do not determine it, or nobody has looked.
     """
 
     group: str
@@ -72,7 +72,10 @@ class NoiseSummary:
 
 
 def estimate_noise(
-    logs: Sequence[Samples | LogOfOtherProcess], fitter: LogFitter, stated: Collection[str] = ()
+    logs: Sequence[Samples | LogOfOtherProcess],
+    fitter: LogFitter,
+    stated: Collection[str] = (),
+    suggest: bool = True,
 ) -> NoiseSummary:
     """The noise of sensors, by fits of a sample of the logs that are weighted again until the noise settles.
 
@@ -89,8 +92,13 @@ def estimate_noise(
         logs: bound training logs; of processes that share the work each may have some of them.
         fitter: of their rows; its sensors have the stated noise, and a guess where none is stated.
         stated: fields of `SensorNoise` that are stated.
+        suggest: whether to find what residuals show of what is stated; without it, nothing is fitted if all is.
     """
     builder, guess = fitter.builder, fitter.builder.sensors.noise
+    stds = noise_of_sensors(builder)
+    if not suggest and all(noise_key(name) in stated for name in stds):
+        groups = [GroupNoise(name, builder.noise_groups.unit(name), "stated", std, None) for name, std in stds.items()]
+        return NoiseSummary(builder.noise_groups.noise(stds, guess), groups, {}, 0)
     rows = SampledRows(logs, builder)
     if not (rows.groups and rows.chunks):
         return NoiseSummary(guess, [], {}, 0)
@@ -110,7 +118,7 @@ def estimate_noise(
         if components.change < _SETTLED or passes == _PASSES:
             break
     free = components
-    if tied and not homogeneous:
+    if tied and suggest and not homogeneous:
         free = VarianceComponentEstimator(rows).estimate(variance, columns, directions)
     common = variance[rows.groups.index(tied[0])] if tied else 1.0
     used = np.where(

@@ -317,7 +317,7 @@ def error_directions(
 
 def _root_sum_of_squares(errors: Tensor) -> Tensor:
     """Standard deviation of the sum of independent errors, (M, B, r) to (B, r)."""
-    return errors.square().sum(0).sqrt()
+    return torch.linalg.vector_norm(errors, dim=0)
 
 
 def _row_noise(builder: RowBuilder, samples: Samples, noise: SensorNoise) -> Tensor:

@@ -64,7 +64,8 @@ def structural_problem(
     """
     builder = RowBuilder(robot, contacts, sensors)
     drawn = structural_samples(robot, contacts, states) if samples is None else samples
-    return linear_problem(compress(drawn, builder), builder, robot, friction)
+    factor = compress(drawn, builder, threads=1)  # a second one would wait for Python's lock, and takes a core
+    return linear_problem(factor, builder, robot, friction)
 
 
 def structural_samples(

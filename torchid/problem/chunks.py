@@ -73,7 +73,7 @@ def map_chunks(
     share = ranks.own_share(sizes)
     own, done = tasks[share], sizes[share]
     workers = min(workers, max(len(own), 1))  # to start a thread takes as long as a small chunk
-    copied = workers > 1 and sum(done) >= _WORTH_COPYING and can_copy()
+    copied = workers > 1 and _is_worth_copying(sum(done)) and can_copy()
     reported = sum(done[::workers] if copied else done)
     report = None if progress is None else _ProgressOfAll(progress, sum(sizes), reported)
 
@@ -84,6 +84,15 @@ def map_chunks(
     if report is not None:
         report(0)
     return list(chain.from_iterable(ranks.gather(results, "chunks")))
+
+
+def copies_share_passes(logs: Sequence[Samples]) -> bool:
+    """Whether copies of this process share a pass over some logs, so that little is won by work beside it."""
+    return _is_worth_copying(sum(map(len, logs)))
+
+
+def _is_worth_copying(samples: int) -> bool:
+    return samples >= _WORTH_COPYING
 
 
 def choose_kernels(builder: RowBuilder, samples: int) -> None:

@@ -270,7 +270,7 @@ def null_space_components(
             V = V.clone()
             leave_out_torques(V.permute(1, 2, 0), resting[:, index])
         # contiguous, as products of other layouts take ten times as long
-        by_sample = vectors[:, index][..., coupled].permute(1, 2, 0).contiguous()
+        by_sample = vectors[:, index].permute(1, 2, 0)[:, coupled].contiguous()
         inside = (V.mT.contiguous() @ by_sample).permute(2, 0, 1)
         if resting is not None:
             inside = inside.masked_fill(~V.any(1), torch.nan)

@@ -164,17 +164,13 @@ class ContactRequirement:
 
 
 @dataclass(frozen=True)
-class SensorPlan:
-    """The recommended sensors of a scenario, with the reasons.
+class SensorChoice:
+    """The recommended sensors of a scenario.
 
     Attributes:
-        problem: that it solves.
+        problem: that they solve.
         chosen: the recommended set. Its `cost` is the least possible if `proven`; `lower_bound`: no set costs less.
         parts: independent parts. The minimal sets of the robot are the unions of one set of each part.
-        branches: chains of joints, and which of them contacts constrain; `requirements`: of every group of contacts.
-        observability: of the base with the recommended set, state by state.
-        stack_rank, stack_full: rank of the stack of samples with it, and with all candidates.
-        removals: ranks without each of its sensors.
     """
 
     problem: PlanningProblem
@@ -183,12 +179,6 @@ class SensorPlan:
     lower_bound: float
     proven: bool
     parts: tuple[PartPlan, ...]
-    branches: tuple[Branch, ...]
-    requirements: tuple[ContactRequirement, ...]
-    observability: tuple[BaseObservability, ...]
-    stack_rank: int
-    stack_full: int
-    removals: tuple[Removal, ...]
 
     @property
     def proof(self) -> str:
@@ -196,7 +186,35 @@ class SensorPlan:
         return "no cheaper set exists" if self.proven else "not proven to be the cheapest"
 
 
+@dataclass(frozen=True)
+class SensorPlan(SensorChoice):
+    """The same with the reasons.
+
+    Attributes:
+        branches: chains of joints, and which of them contacts constrain; `requirements`: of every group of contacts.
+        observability: of the base with the recommended set, state by state.
+        stack_rank, stack_full: rank of the stack of samples with it, and with all candidates.
+        removals: ranks without each of its sensors.
+    """
+
+    branches: tuple[Branch, ...]
+    requirements: tuple[ContactRequirement, ...]
+    observability: tuple[BaseObservability, ...]
+    stack_rank: int
+    stack_full: int
+    removals: tuple[Removal, ...]
+
+
 def plan_sensors(problem: PlanningProblem, progress: StepCallback | None = None) -> SensorPlan:
+    """The cheapest sensor set for a scenario, and of these the most informative one, with the reasons.
+
+    Raises:
+        SensorError: as `choose_sensors`.
+    """
+    return explain_choice(choose_sensors(problem, progress), progress)
+
+
+def choose_sensors(problem: PlanningProblem, progress: StepCallback | None = None) -> SensorChoice:
     """The cheapest sensor set for a scenario, and of these the most informative one.
 
     Raises:
@@ -207,32 +225,39 @@ def plan_sensors(problem: PlanningProblem, progress: StepCallback | None = None)
         raise SensorError("sensors", "criterion", f"'{problem.criterion}'", ", ".join(CRITERIA))
     if problem.criterion == "per_sample" and problem.robot.fixed_base:
         raise SensorError("sensors", "criterion", "per_sample, which needs a floating base", "stack")
-    stack = problem.stack
     parts: tuple[PartPlan, ...] = ()
     if problem.criterion == "stack":
-        chosen = irredundant_set(
-            stack, problem.keep, problem.exclude, _counted(report, "leaving sensors out", len(problem.candidates))
-        )
+        done = _counted(report, "leaving sensors out", len(problem.candidates))
+        chosen = irredundant_set(problem.stack, problem.keep, problem.exclude, done)
         cost, floor = total_cost(chosen), total_cost(problem.keep)
         least = CheapestSet(chosen, cost, floor, cost <= floor)
     else:
         all_demands = demands(problem.robot, problem.contacts, problem.states, problem.candidates, problem.seed)
         least = cheapest_set(all_demands, problem.candidates, problem.keep, problem.exclude)
         parts, chosen = _best_parts(problem, demand_groups(all_demands, problem.candidates), least, report)
-    sensors = sensor_set(problem.robot, problem.contacts, chosen)
+    return SensorChoice(problem, chosen, least.cost, least.lower_bound, least.proven, parts)
+
+
+def explain_choice(choice: SensorChoice, progress: StepCallback | None = None) -> SensorPlan:
+    """The reasons for a choice of sensors."""
+    problem, chosen, stack = choice.problem, choice.chosen, choice.problem.stack
+    (progress or (lambda *_: None))("leaving sensors out", 0, 1)
+
+    def ranks_with(sensors: Sequence[Candidate]) -> tuple[int | None, int]:
+        return _base_rank(problem, sensors), stack.rank(sensors)
+
+    fewer = [tuple(c for c in chosen if c is not candidate) for candidate in chosen]
+    (_, full), (_, rank), *without = share_between_copies(
+        [problem.candidates, chosen, *fewer], ranks_with, thread_count()
+    )
     return SensorPlan(
-        problem=problem,
-        chosen=chosen,
-        cost=least.cost,
-        lower_bound=least.lower_bound,
-        proven=least.proven,
-        parts=parts,
+        **vars(choice),
         branches=branches(problem.robot, problem.contacts, problem.states),
         requirements=contact_requirements(problem.robot, problem.contacts, problem.states, problem.seed),
-        observability=tuple(problem.assess(sensors)),
-        stack_rank=stack.rank(chosen),
-        stack_full=stack.full,
-        removals=_removals(problem, chosen, report),
+        observability=tuple(problem.assess(sensor_set(problem.robot, problem.contacts, chosen))),
+        stack_rank=rank,
+        stack_full=full,
+        removals=tuple(Removal(candidate, *ranks) for candidate, ranks in zip(chosen, without, strict=True)),
     )
 
 
@@ -315,16 +340,6 @@ def _best_parts(
         chosen = (chosen - own) | frozenset(ranked[0].sensors)
         out.append(PartPlan(frames, part.candidates, None if sets is None else tuple(sets), tuple(ranked)))
     return tuple(out), tuple(c for c in problem.candidates if c in chosen)
-
-
-def _removals(problem: PlanningProblem, chosen: Sequence[Candidate], report: StepCallback) -> tuple[Removal, ...]:
-    report("leaving sensors out", 0, 1)
-
-    def without(candidate: Candidate) -> Removal:
-        fewer = [c for c in chosen if c is not candidate]
-        return Removal(candidate, _base_rank(problem, fewer), problem.stack.rank(fewer))
-
-    return tuple(share_between_copies(chosen, without, thread_count()))
 
 
 def _base_rank(problem: PlanningProblem, chosen: Sequence[Candidate]) -> int | None:
