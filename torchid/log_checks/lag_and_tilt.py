@@ -1,4 +1,4 @@
-"""Lags and offsets of torques, tilts of gravity, contact sensors turned or off, for all URDFs near the given one."""
+"""Lags, offsets of torques, tilts of gravity, contact sensors turned or off, for all URDFs near the given one."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _SMALL_ANGLE = 1e-4
 
 
 def check_lag_and_tilt(filtered: FilteredLog, derived: tuple[str, ...] = ()) -> tuple[list[Finding], float]:
-    """Findings about torques that lag or lead, a vertical that gravity is not along, and single contact sensors.
+    """Findings about readings that lag or lead, a vertical that gravity is not along, and single contact sensors.
 
     The number is what the best URDF near the given one leaves unexplained without any of these, in
     `UNMODELLED_FORCE_SHARE` of the forces; infinite where nothing could be compared.
