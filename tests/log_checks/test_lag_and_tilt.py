@@ -23,7 +23,7 @@ from torchid.log_checks import NOTE, SUSPICIOUS, Checked
 from torchid.log_checks.frozen import check_excitation, check_rest, check_still_base
 from torchid.logs import Log, write_log
 from torchid.logs.preprocess import preprocess
-from torchid.logs.segments import with_delayed_torques
+from torchid.logs.segments import with_delayed, with_delayed_torques
 from torchid.problem import bind_log
 from torchid.problem.motion_noise import is_at_rest
 
@@ -103,6 +103,38 @@ def test_a_world_that_is_tilted_is_named_with_the_angles(machine: str) -> None:
     assert float(found[2]) == pytest.approx(9.6, abs=2.0)
     assert float(found[3]) == pytest.approx(-7.2, abs=2.0)
     assert "base_tilt: auto" in finding.advice
+
+
+READINGS = {
+    "torques": {"joint_torque": slice(None)},
+    "contact forces": {"contact_wrench_local": slice(None), "contact_active": slice(None)},
+    "forces of r_sole": {"contact_wrench_local": slice(1, 2), "contact_active": slice(1, 2)},
+    "the joints' motion": {"joint_position": slice(None)},
+}
+
+
+@pytest.mark.parametrize(
+    ("late", "rate"),
+    [("contact forces", 0.0), ("forces of r_sole", 0.0), ("torques", 0.003), ("contact forces", 0.003)]
+    + [pytest.param("the joints' motion", 0.0, marks=pytest.mark.slow)],
+)
+def test_of_torques_forces_and_motion_the_one_that_the_others_contradict_is_late(late: str, rate: float) -> None:
+    """By 30 ms, or by a clock that is 0.3 % fast, from 0 to 36 ms."""
+    case = case_of(MACHINES["biped"], "full")
+    seconds = rate * case.log.time if rate else 0.03
+    log = with_delayed(case.log, seconds, READINGS[late])
+    (finding,) = (one for one in checked(case, log).findings if one.name in ("delay", "clock"))
+    assert finding.field == next(iter(READINGS[late]))
+    assert "; or " not in finding.found
+    if rate:
+        found = re.match(rf"{late} are .*\(\+- ([\d.]+) ms\): a clock that is ([\d.]+) % fast", finding.found)
+        assert found is not None
+        certain = 1e-3 * float(found[1]) / case.log.time[-1]
+        assert 1e-2 * float(found[2]) == pytest.approx(rate, abs=max(3.0 * certain, 2e-4))
+    else:
+        found = re.match(rf"{late} (?:are|is) ([\d.]+) \+- [\d.]+ ms later", finding.found)
+        assert found is not None
+        assert float(found[1]) == pytest.approx(30.0, abs=5.0)
 
 
 @pytest.mark.parametrize(

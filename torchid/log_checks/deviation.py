@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from torchid.log_checks.model import (
     MAX_TRIAL_DIFFERENTIATED_SAMPLES,
@@ -18,6 +19,7 @@ from torchid.log_checks.model import (
 from torchid.log_checks.scales import (
     CORRELATED_SAMPLES,
     TIME_BLOCKS,
+    NormalEquations,
     accumulate_blocks,
     deviation_columns,
     prior_columns,
@@ -34,7 +36,7 @@ COMPARED_SAMPLES = 240
 _MIN_STANDARD_DEVIATIONS, _MIN_BLOCK_SHARE = 4.0, 0.5
 #: Unexplained forces without the deviation over those with it (1.2 at most in logs without a mistake), and what it may
 #: leave: more, and the forces are another robot's.
-_MIN_UNEXPLAINED_RATIO, _MAX_LEFT = 1.25, 1.5
+MIN_UNEXPLAINED_RATIO, _MAX_LEFT = 1.25, 1.5
 
 UnknownColumns = Callable[[RowBuilder, Samples, int], FloatArray]
 """Change of the generalized forces that are required (N, n_rows, k) by a unit of each unknown, of samples by number."""
@@ -121,8 +123,17 @@ class Deviation:
     def clear(self) -> BoolArray:
         """Unknowns (k,) that are certain and that every block agrees on, where all explain the forces much better."""
         agree = (self.blocks * np.sign(self.value) > _MIN_BLOCK_SHARE * np.abs(self.value)).all(axis=0)
-        improves = self.without > _MIN_UNEXPLAINED_RATIO * self.left and self.left < _MAX_LEFT
-        return np.asarray(agree & (np.abs(self.value) > _MIN_STANDARD_DEVIATIONS * self.spread) & improves)
+        return np.asarray(agree & self.certain & self.improves)
+
+    @property
+    def certain(self) -> BoolArray:
+        """Unknowns (k,) that are not 0 by their standard deviations."""
+        return np.asarray(np.abs(self.value) > _MIN_STANDARD_DEVIATIONS * self.spread)
+
+    @property
+    def improves(self) -> bool:
+        """Whether all unknowns together explain the forces much better."""
+        return self.without > MIN_UNEXPLAINED_RATIO * self.left and self.left < _MAX_LEFT
 
     @property
     def is_clear(self) -> bool:
@@ -135,29 +146,58 @@ class Deviation:
         return f"{self.without / max(self.left, 1e-9):.2g} times as much is unexplained otherwise"
 
 
+@dataclass(frozen=True, eq=False)
+class UnknownEquations:
+    """Equations of unknowns by their columns, beside all that may differ from the URDF.
+
+    `normal`: of what the nominal parameters leave, and of the k unknowns, in this order.
+    """
+
+    normal: NormalEquations
+
+    @classmethod
+    def of(cls, rows: DeviationRows, columns: UnknownColumns, offsets: int = 0) -> UnknownEquations:
+        """Of all samples of the rows; see `fit_deviation`."""
+        parts = []
+        for number, (part, (W, equations, K, target)) in enumerate(zip(rows.samples, rows.parts, strict=True)):
+            projected = np.einsum("nvr,nvk->nrk", W, columns(rows.builder, part, number))
+            Y = np.concatenate([target[..., None], projected], axis=2)
+            parts.append((K[..., : K.shape[2] - offsets], Y, equations))
+        return cls(accumulate_blocks(parts))
+
+    @cached_property
+    def _products(self) -> dict[int | None, FloatArray]:
+        """Of what the parameters leave (1 + k, 1 + k), of the whole log and by block of time."""
+        return {block: self.normal.unexplained(block) for block in (None, *range(TIME_BLOCKS))}
+
+    @property
+    def unexplained_without(self) -> float:
+        """As `Deviation.without`."""
+        return self._rms(float(self._products[None][0, 0]))
+
+    def _rms(self, squares: float) -> float:
+        return float(np.sqrt(max(squares, 0.0) / max(self.normal.rows, 1)))
+
+    def fit(self, prior_std: float, combined: FloatArray | None = None) -> Deviation:
+        """The unknowns, or those whose columns are `combined` (k, m) of them, with their prior standard deviation."""
+        map_ = np.eye(self.normal.YtY.shape[1]) if combined is None else block_diag(1.0, combined)
+
+        def solve(block: int | None) -> tuple[FloatArray, FloatArray, float]:
+            G = map_.T @ self._products[block] @ map_
+            H = G[1:, 1:] + CORRELATED_SAMPLES / prior_std**2 * np.eye(len(G) - 1)
+            x = np.linalg.solve(H, G[1:, 0])
+            left = G[0, 0] - 2.0 * G[0, 1:] @ x + x @ G[1:, 1:] @ x
+            return np.asarray(x), np.asarray(np.diag(np.linalg.inv(H))), float(left)
+
+        value, variance, squares = solve(None)
+        left = self._rms(squares)
+        spread = np.sqrt(CORRELATED_SAMPLES * max(1.0, left**2) * variance)
+        blocks = np.array([solve(block)[0] for block in range(TIME_BLOCKS)])
+        return Deviation(value, spread, blocks, self.unexplained_without, left)
+
+
 def fit_deviation(
     rows: DeviationRows | None, columns: UnknownColumns, prior_std: float, offsets: int = 0
 ) -> Deviation | None:
     """Unknowns by their columns, beside parameters, friction, armature and all but so many `offsets` of torques."""
-    if rows is None:
-        return None
-    parts = []
-    for number, (part, (W, equations, K, target)) in enumerate(zip(rows.samples, rows.parts, strict=True)):
-        projected = np.einsum("nvr,nvk->nrk", W, columns(rows.builder, part, number))
-        Y = np.concatenate([target[..., None], projected], axis=2)
-        parts.append((K[..., : K.shape[2] - offsets], Y, equations))
-    normal = accumulate_blocks(parts)
-
-    def solve(block: int | None) -> tuple[FloatArray, FloatArray, float, float]:
-        G = normal.unexplained(block)
-        H = G[1:, 1:] + CORRELATED_SAMPLES / prior_std**2 * np.eye(len(G) - 1)
-        x = np.linalg.solve(H, G[1:, 0])
-        left = G[0, 0] - 2.0 * G[0, 1:] @ x + x @ G[1:, 1:] @ x
-        return np.asarray(x), np.asarray(np.diag(np.linalg.inv(H))), float(G[0, 0]), float(left)
-
-    value, variance, without, left = solve(None)
-    unexplained = np.sqrt(np.maximum([without, left], 0.0) / max(normal.rows, 1))
-    spread = np.sqrt(CORRELATED_SAMPLES * max(1.0, float(unexplained[1]) ** 2) * variance)
-    return Deviation(
-        value, spread, np.array([solve(block)[0] for block in range(TIME_BLOCKS)]), *map(float, unexplained)
-    )
+    return None if rows is None else UnknownEquations.of(rows, columns, offsets).fit(prior_std)

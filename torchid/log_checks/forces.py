@@ -14,7 +14,8 @@ from torchid.log_checks.deviation import FilteredLog
 from torchid.log_checks.drift import check_torque_drift
 from torchid.log_checks.encoders import check_encoders, is_bolted_arm
 from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, UNEXPLAINED, Finding, Skipped, refused
-from torchid.log_checks.lag_and_tilt import check_lag_and_tilt, check_torque_offsets, without_lag
+from torchid.log_checks.lag_and_tilt import check_lag_and_tilt, check_torque_offsets
+from torchid.log_checks.lags import without_lag
 from torchid.log_checks.mistakes import joint_mistakes, possible_mistakes
 from torchid.log_checks.model import (
     MAX_TRIAL_DIFFERENTIATED_SAMPLES,

@@ -1,4 +1,4 @@
-"""Lags and offsets of torques, tilts of gravity, contact sensors turned or off, for all URDFs near the given one."""
+"""Lags, offsets of torques, tilts of gravity, contact sensors turned or off, for all URDFs near the given one."""
 
 from __future__ import annotations
 
@@ -18,37 +18,31 @@ from torchid.log_checks.deviation import (
     fit_deviation,
 )
 from torchid.log_checks.findings import NOTE, SUSPICIOUS, Finding
+from torchid.log_checks.lags import fit_lags
 from torchid.log_checks.model import (
-    Declared,
     NominalModel,
-    bind_some_samples,
     some_samples,
 )
 from torchid.logs import Log
 from torchid.logs.log import FloatArray
-from torchid.logs.segments import with_delayed_torques
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.predict import force_series
 from torchid.regressor.kinematics import GRAVITY_WORLD
 
-#: Lag and tilt that are reported: filters of sensors are late by 10 ms, and a table is level to 2 degrees.
-MIN_LAG_S, MIN_TILT_DEG = 0.025, 6.0
-#: Lag of filters, beyond which a smaller one is reported, too, where it is certain: by so many standard deviations.
-_FILTER_LAG_S, _MIN_STANDARD_DEVIATIONS = 0.01, 4.0
+#: Tilt that is reported: a table is level to 2 degrees.
+MIN_TILT_DEG = 6.0
 #: Gain of a contact's sensor relative to the others, and turn of its axes, that are reported.
 _MIN_SENSOR_GAIN, _MIN_TURN_DEG = 0.15, 10.0
 #: Offset of a torque, over the rms of all torques, that is reported: those of good sensors are 0.08 of it.
 _MIN_OFFSET_SHARE = 0.1
-#: Prior standard deviations of the lag [s], of the tilt [rad], and of gains and turns of contact sensors; of offsets,
-#: over the rms of all torques.
-_LAG_PRIOR_STD_S, _TILT_PRIOR_STD_RAD, _SENSOR_PRIOR_STD, _OFFSET_PRIOR_SHARE = 0.2, 0.3, 0.5, 0.5
-#: Times that torques are shifted by what the slope of their readings says, which is exact for small lags alone.
-_SHIFTS, _LEAST_SHIFT_S = 8, 2e-3
+#: Prior standard deviations of the tilt [rad], and of gains and turns of contact sensors; of offsets, over the rms of
+#: all torques.
+_TILT_PRIOR_STD_RAD, _SENSOR_PRIOR_STD, _OFFSET_PRIOR_SHARE = 0.3, 0.5, 0.5
 _SMALL_ANGLE = 1e-4
 
 
 def check_lag_and_tilt(filtered: FilteredLog, derived: tuple[str, ...] = ()) -> tuple[list[Finding], float]:
-    """Findings about torques that lag or lead, a vertical that gravity is not along, and single contact sensors.
+    """Findings about readings that lag or lead, a vertical that gravity is not along, and single contact sensors.
 
     The number is what the best URDF near the given one leaves unexplained without any of these, in
     `UNMODELLED_FORCE_SHARE` of the forces; infinite where nothing could be compared.
@@ -59,13 +53,13 @@ def check_lag_and_tilt(filtered: FilteredLog, derived: tuple[str, ...] = ()) -> 
     """
     log, model = filtered.log, filtered.model
     try:
-        lag = fit_lag(filtered)
+        lags = fit_lags(filtered, derived)
         tilt = fit_tilt(filtered) if not "base_quat_xyzw".startswith(derived) else None
         sensors = fit_contact_sensors(filtered)
     except InputError:  # reported by `check_forces_against_urdf`
         return [], np.inf
-    unexplained = min((x.without for x in (lag, tilt) if x is not None), default=np.inf)
-    moved = [*_lag_findings(lag, model.declared), *_tilt_findings(tilt, model)]
+    unexplained = min((x.without for x in (lags, tilt) if x is not None), default=np.inf)
+    moved = [*(() if lags is None else lags.findings(model.declared, log)), *_tilt_findings(tilt, model)]
     return moved or list(_contact_sensor_findings(sensors, log, model)), unexplained
 
 
@@ -81,16 +75,6 @@ def check_torque_offsets(filtered: FilteredLog) -> Iterator[Finding]:
     """
     with suppress(InputError):  # reported by `check_forces_against_urdf`
         yield from _offset_findings(fit_torque_offsets(filtered), filtered.log, filtered.model)
-
-
-def _lag_findings(lag: Deviation | None, declared: Declared) -> Iterator[Finding]:
-    if lag is None or not lag.is_clear:
-        return
-    if abs(lag.value[0]) > min(MIN_LAG_S, _FILTER_LAG_S + _MIN_STANDARD_DEVIATIONS * float(lag.spread[0])):
-        seconds, late = float(lag.value[0]), "later" if lag.value[0] > 0.0 else "earlier"
-        text = f"torques are {1e3 * abs(seconds):.3g} +- {1e3 * lag.spread[0]:.2g} ms {late} than the motion"
-        advice = f"check their stamps and filters, or set actuators.delay: {declared.known_delay - seconds:.2g}"
-        yield Finding("delay", SUSPICIOUS, "joint_torque", f"{text}: {lag.gain}", advice)
 
 
 def _tilt_findings(tilt: Deviation | None, model: NominalModel) -> Iterator[Finding]:
@@ -148,7 +132,7 @@ def fit_contact_sensors(filtered: FilteredLog) -> Deviation | None:
     where no wrench was measured.
 
     Raises:
-        InputError: as `fit_lag`.
+        InputError: as `fit_lags`.
     """
     contacts = filtered.model.contacts
     if filtered.log.contact_wrench is None or not contacts:
@@ -169,42 +153,11 @@ def fit_contact_sensors(filtered: FilteredLog) -> Deviation | None:
     return fit_deviation(filtered.rows, columns, _SENSOR_PRIOR_STD)
 
 
-def fit_lag(filtered: FilteredLog) -> Deviation | None:
-    """By how much joint torques are later than the motion, (1,) [s]; None where no torque was measured.
-
-    Raises:
-        InputError: the log cannot be filtered, or does not match the robot.
-    """
-    if filtered.log.joint_torque is None:
-        return None
-    robot, contacts, out, shift, moved = filtered.model.robot, filtered.model.contacts, None, 0.0, filtered
-    for _ in range(_SHIFTS):
-        slopes = [replace(one, joint_torque=_slope(one)) for one in moved.pieces]
-        rates = bind_some_samples(slopes, robot, contacts, COMPARED_SAMPLES)
-
-        def columns(builder: RowBuilder, part: Samples, number: int, rates: Sequence[Samples] = rates) -> FloatArray:
-            torque = np.zeros((len(part), builder.tree.n_rows, 1))
-            base = builder.tree.base_rows
-            torque[:, base : base + robot.n, 0] = builder.recorded_torque(rates[number])[:, : robot.n].numpy()
-            return np.nan_to_num(torque)
-
-        found = fit_deviation(moved.rows, columns, _LAG_PRIOR_STD_S)
-        if found is None:
-            return None
-        without = found.without if out is None else out.without
-        out = replace(found, value=found.value + shift, blocks=found.blocks + shift, without=without)
-        shift = float(out.value[0])
-        if abs(found.value[0]) < _LEAST_SHIFT_S or abs(shift) > 2.0 * _LAG_PRIOR_STD_S:
-            break
-        moved = replace(filtered, log=with_delayed_torques(filtered.log, -shift))
-    return out
-
-
 def fit_torque_offsets(filtered: FilteredLog) -> Deviation | None:
     """By how much each joint's torque is less than is read, (n,) [N m or N]; None where no torque was measured.
 
     Raises:
-        InputError: as `fit_lag`.
+        InputError: as `fit_lags`.
     """
     log, robot = filtered.log, filtered.model.robot
     if log.joint_torque is None:
@@ -224,29 +177,13 @@ def _torque_rms(log: Log) -> float:
     return float(np.sqrt(np.nanmean(np.square(torque)))) if np.isfinite(torque).any() else 0.0
 
 
-def without_lag(filtered: FilteredLog) -> FilteredLog:
-    """The log with joint torques as late as the motion, where it is clear by how much they are not.
-
-    Raises:
-        InputError: as `fit_lag`.
-    """
-    lag = fit_lag(filtered)
-    if lag is None or not lag.is_clear:
-        return filtered
-    return replace(filtered, log=with_delayed_torques(filtered.log, -float(lag.value[0])))
-
-
-def _slope(log: Log) -> FloatArray | None:
-    return None if log.joint_torque is None else np.gradient(log.joint_torque, log.time, axis=0)
-
-
 def fit_tilt(filtered: FilteredLog) -> Deviation | None:
     """By how much gravity is turned about x and y from where the log says it is, (2,) [rad].
 
     The axes are the world's, of a fixed base its own. None where no force was measured, or an IMU felt gravity.
 
     Raises:
-        InputError: as `fit_lag`.
+        InputError: as `fit_lags`.
     """
     if filtered.log.imu_specific_force is not None and not filtered.model.robot.fixed_base:
         return None

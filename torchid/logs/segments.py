@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -137,27 +137,43 @@ def with_delayed_torques(log: Log, delay: float) -> Log:
     Raises:
         LogError: none is left.
     """
-    if not delay or log.joint_torque is None:
-        return log
-    torque, kept = np.empty_like(log.joint_torque), recorded_at_delays(log.time, (delay,))
+    return log if not delay or log.joint_torque is None else with_delayed(log, delay, {"joint_torque": slice(None)})
+
+
+def with_delayed(log: Log, delay: float | FloatArray, channels: Mapping[str, slice]) -> Log:
+    """As `with_delayed_torques`, of some channels of fields, along their second axis; delays may be by sample (N,).
+
+    Raises:
+        LogError: no sample is left.
+    """
+    delays = np.broadcast_to(np.asarray(delay, float), len(log))
+    kept = recorded_at_delays(log.time, (delays,))
     if not kept.any():
-        found = f"{log.time[-1] - log.time[0]:.3g} s, no longer than actuators.delay of {delay:g} s"
+        longest = delays[np.argmax(np.abs(delays))]
+        found = f"{log.time[-1] - log.time[0]:.3g} s, no longer than actuators.delay of {longest:g} s"
         raise LogError(log.source, "time", found, "a longer log")
+    moved: dict[str, Any] = {name: values.copy() for name, values in log.arrays().items() if name in channels}
     for segment in unbroken_segments(log.time):
         at = segment.start + np.flatnonzero(kept[segment])
-        if len(at):
-            torque[at] = _between(log.time[segment], log.joint_torque[segment], log.time[at] - delay)
-    chosen = np.flatnonzero(kept)
-    whole = slice(int(chosen[0]), int(chosen[-1]) + 1)
-    return replace(log, joint_torque=torque).select(whole if kept[whole].all() else chosen)
+        for name, chosen in channels.items() if len(at) else ():
+            if name in moved:
+                recorded = np.asarray(log.arrays()[name][segment, chosen], float)
+                between = _between(log.time[segment], recorded.reshape(len(recorded), -1), log.time[at] - delays[at])
+                moved[name][at, chosen] = between.reshape(len(at), *recorded.shape[1:])
+    if (quat := moved.get("base_quat_xyzw")) is not None:
+        moved["base_quat_xyzw"] = quat / np.linalg.norm(quat, axis=1, keepdims=True)
+    index = np.flatnonzero(kept)
+    whole = slice(int(index[0]), int(index[-1]) + 1)
+    return replace(log, **moved).select(whole if kept[whole].all() else index)
 
 
-def recorded_at_delays(time: FloatArray, delays: tuple[float, ...]) -> BoolArray:
-    """Stamps (N,) [s] that are, by each of some delays [s], within what was recorded without a break, (N,)."""
+def recorded_at_delays(time: FloatArray, delays: Sequence[float | FloatArray]) -> BoolArray:
+    """Stamps (N,) [s] that are, by each of some delays [s] or (N,), within what was recorded without a break, (N,)."""
     kept = np.zeros(len(time), dtype=bool)
     for segment in unbroken_segments(time):
         own = time[segment]
-        kept[segment] = np.all([(own - delay >= own[0]) & (own - delay <= own[-1]) for delay in delays], axis=0)
+        earlier = [own - (delay[segment] if isinstance(delay, np.ndarray) else delay) for delay in delays]
+        kept[segment] = np.all([(at >= own[0]) & (at <= own[-1]) for at in earlier], axis=0)
     return kept
 
 

@@ -1,0 +1,339 @@
+"""Which sensors are late, or have a clock that runs at another rate: torques, contact forces, the base or the joints.
+
+A lag between two of them is one's as well as the other's; what both have to agree with tells. So each is taken to be
+the late one in turn, beside all URDFs near the given one, and the one that leaves least of the forces is named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.special import stdtr
+
+from torchid.log_checks.deviation import (
+    COMPARED_SAMPLES,
+    MIN_UNEXPLAINED_RATIO,
+    Deviation,
+    DeviationRows,
+    FilteredLog,
+    UnknownEquations,
+)
+from torchid.log_checks.findings import SUSPICIOUS, Finding
+from torchid.log_checks.model import Declared, NominalModel, bind_some_samples
+from torchid.log_checks.scales import TIME_BLOCKS
+from torchid.logs import Log
+from torchid.logs.log import SHAPES, WRENCHES, FloatArray
+from torchid.logs.segments import with_delayed, with_delayed_torques
+from torchid.problem import RowBuilder, Samples
+from torchid.problem.predict import force_series
+from torchid.sensing import Contact
+
+#: Lag that is reported: filters of sensors are late by 10 ms.
+MIN_LAG_S = 0.025
+#: Lag of filters, beyond which a smaller one is reported, too, where it is certain: by so many standard deviations.
+_FILTER_LAG_S, _MIN_STANDARD_DEVIATIONS = 0.01, 4.0
+#: Prior standard deviation of a lag, and of its change over the log [s].
+_LAG_PRIOR_STD_S = 0.2
+#: Times that readings are shifted by what their slope says, which is exact for small lags alone.
+_SHIFTS, _LEAST_SHIFT_S = 8, 2e-3
+#: Lag up to which the slopes alone tell who is not late.
+_SMALL_LAG_S = 0.05
+#: Share of logs whose clocks agree in which a lag that changes is found.
+_LEVEL = 0.01
+_SMALL_S, _TINY = 1e-4, 1e-12
+_ALL = slice(None)
+_OF_BASE, _OF_JOINTS = ("base_", "imu_"), ("joint_position", "joint_velocity", "joint_acceleration")
+TORQUES = "torques are"
+_TORQUE, _BASE = "joint torques", "the base"  # as sources, beside names of contacts
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Readings that may be late together.
+
+    Attributes:
+        what, than: they, and what they are compared with, in a sentence.
+        field: of a finding about them, with its channels.
+        sources: those of `_Sources` that a lag of them moves; of `sign` -1, all that it does not.
+        moved: channels of the fields of a filtered log.
+    """
+
+    what: str
+    than: str
+    field: str
+    sources: frozenset[str]
+    moved: Mapping[str, slice]
+    channels: tuple[str, ...] = ()
+    sign: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Lag:
+    """By how much a clock's readings are late: (1,) [s], or (2,), in the middle of the log and its change over the log.
+
+    `scatter`: standard deviation of the change by how lags in blocks of time follow a line [s].
+    """
+
+    clock: Clock
+    found: Deviation
+    scatter: float = 0.0
+
+    @property
+    def seconds(self) -> float:
+        """In the middle of the log."""
+        return float(self.found.value[0])
+
+    @property
+    def largest(self) -> float:
+        """Of its size and its change."""
+        return float(np.abs(self.found.value).max())
+
+    @property
+    def changes(self) -> bool:
+        """Whether it is one that does."""
+        return len(self.found.value) > 1
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether it is certain, and no filter's."""
+        spread = float(self.found.spread[-1])
+        if self.changes:
+            change = abs(float(self.found.value[1]))
+            chance = 2.0 * stdtr(TIME_BLOCKS - 2, -change / max(self.scatter, _TINY))
+            is_certain = change > max(_FILTER_LAG_S, _MIN_STANDARD_DEVIATIONS * spread) and chance < _LEVEL
+            return bool(self.found.improves and is_certain)
+        least = min(MIN_LAG_S, _FILTER_LAG_S + _MIN_STANDARD_DEVIATIONS * spread)
+        return self.found.is_clear and abs(self.seconds) > least
+
+    def text(self, duration: float) -> str:
+        """What is late, by how much, in a log of a duration [s]."""
+        clock, spread = self.clock, 1e3 * max(float(self.found.spread[-1]), self.scatter)
+        if not self.changes:
+            size, when = _late(self.seconds)
+            return f"{clock.what} {size} +- {spread:.2g} ms {when} than {clock.than}"
+        change = float(self.found.value[1])
+        first, last = (" ms ".join(_late(self.seconds + share * change)) for share in (-0.5, 0.5))
+        rate = 100.0 * change / duration
+        text = f"{clock.what} {first} than {clock.than} at the start and {last} at the end (+- {spread:.2g} ms)"
+        return f"{text}: a clock that is {abs(rate):.2g} % {'fast' if rate > 0.0 else 'slow'}"
+
+
+def _late(seconds: float) -> tuple[str, str]:
+    return f"{1e3 * abs(seconds):.3g}", "later" if seconds > 0.0 else "earlier"
+
+
+@dataclass(frozen=True, eq=False)
+class Lags:
+    """Clear lags, that which explains the forces best first, and what is unexplained without any (see `Deviation`)."""
+
+    clear: Sequence[Lag]
+    without: float
+
+    def findings(self, declared: Declared, log: Log) -> Iterator[Finding]:
+        """A finding about the best, with others that explain the forces as well."""
+        if not self.clear:
+            return
+        best, *others = self.clear
+        duration = float(log.time[-1] - log.time[0])
+        text, clock = best.text(duration), best.clock
+        for other in others:
+            if other.found.left < MIN_UNEXPLAINED_RATIO * best.found.left:
+                text += f"; or {other.text(duration)}, which explains as much"
+        name, advice = "delay", "check their stamps and filters; shift_s delays files of a log"
+        if best.changes:
+            name, advice = "clock", "stamp all sensors by one clock, or multiply the time of these by what makes up"
+        elif clock.field == "joint_torque":
+            delay = declared.known_delay - best.seconds
+            advice = f"check their stamps and filters, or set actuators.delay: {delay:.2g}"
+        yield Finding(name, SUSPICIOUS, clock.field, f"{text}: {best.found.gain}", advice, clock.channels)
+
+
+def fit_lags(filtered: FilteredLog, derived: tuple[str, ...] = ()) -> Lags | None:
+    """Lags of torques, contact forces, and the motions of base and joints; None where no force was measured.
+
+    Args:
+        filtered: the log.
+        derived: how names of fields begin that were not recorded.
+
+    Raises:
+        InputError: the log cannot be filtered, or does not match the robot.
+    """
+    rows = filtered.rows
+    if rows is None:
+        return None
+    trial = _Trial(filtered, _clocks(filtered, derived))
+    equations, first = trial.equations(filtered.pieces, rows), list[Lag]()
+    for clock in trial.clocks:
+        constant, changing = (equations.fit(_LAG_PRIOR_STD_S, trial.combined(clock, count)) for count in (1, 2))
+        better = constant.left > MIN_UNEXPLAINED_RATIO * changing.left
+        first.append(Lag(clock, changing if better else constant))
+    late = [lag for lag in sorted(first, key=lambda lag: lag.found.left) if lag.largest > _FILTER_LAG_S]
+    if late and late[0].largest < _SMALL_LAG_S:
+        late = [lag for lag in late if lag.found.left < MIN_UNEXPLAINED_RATIO * late[0].found.left]
+    best = [trial.refined(lag, rows) for lag in late]
+    clear = sorted((lag for lag in best if lag.is_clear), key=lambda lag: lag.found.left)
+    return Lags(clear, equations.unexplained_without)
+
+
+def without_lag(filtered: FilteredLog) -> FilteredLog:
+    """The log with joint torques as late as the motion, where these are clearly the ones that are not.
+
+    Raises:
+        InputError: as `fit_lags`.
+    """
+    lags = fit_lags(filtered)
+    if lags is None or not lags.clear or lags.clear[0].clock.what != TORQUES or lags.clear[0].changes:
+        return filtered
+    return replace(filtered, log=with_delayed_torques(filtered.log, -lags.clear[0].seconds))
+
+
+def _clocks(filtered: FilteredLog, derived: tuple[str, ...]) -> list[Clock]:
+    """What may be late. The joints' motion needs a third clock beside theirs and that of the forces."""
+    log, of_wrench = filtered.log, filtered.log.contact_wrench_field
+    contacts: Sequence[Contact] = filtered.model.contacts if log.contact_wrench is not None else ()
+    of_base = [name for name in log.arrays() if name.startswith(_OF_BASE)]
+    has_base = of_base and not filtered.model.robot.fixed_base and not "base_".startswith(derived or ("-",))
+    wrenches = frozenset(contact.frame for contact in contacts)
+    torques = frozenset([_TORQUE] if log.joint_torque is not None else [])
+    everything, motion, rest = torques | wrenches | {_BASE}, "the motion", "all else"
+    out = [Clock(TORQUES, motion, "joint_torque", torques, {"joint_torque": _ALL})] if torques else []
+    for place, contact in enumerate(contacts):
+        name, own = contact.frame, dict.fromkeys(WRENCHES, slice(place, place + 1))
+        out.append(Clock(f"forces of {name} are", motion, of_wrench, frozenset([name]), own, (name,)))
+    of_all = dict.fromkeys(WRENCHES, _ALL)
+    if len(contacts) > 1:
+        out.append(Clock("contact forces are", motion, of_wrench, wrenches, of_all))
+    if torques and wrenches:
+        both = {"joint_torque": _ALL, **of_all}
+        out.append(Clock("torques and contact forces are", motion, "all", torques | wrenches, both))
+    if has_base:
+        of_motion = dict.fromkeys((name for name in SHAPES if name.startswith(_OF_BASE)), _ALL)
+        out.append(Clock("the base's motion is", rest, of_base[0], frozenset([_BASE]), of_motion))
+        of_joints = dict.fromkeys(_OF_JOINTS, _ALL)
+        out.append(Clock("the joints' motion is", rest, "joint_position", everything, of_joints, sign=-1.0))
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """Lags of clocks in a log, one clock at a time."""
+
+    filtered: FilteredLog
+    clocks: Sequence[Clock]
+
+    @property
+    def sources(self) -> list[str]:
+        """Of forces that change with a lag, each with two columns: of a constant lag, and of one that changes."""
+        return sorted(frozenset[str]().union(*(clock.sources for clock in self.clocks)))
+
+    def combined(self, clock: Clock, count: int) -> FloatArray:
+        """How a clock's columns, one or two, are made up of those of the sources."""
+        chosen = clock.sign * np.array([float(source in clock.sources) for source in self.sources])
+        return np.asarray(np.kron(np.eye(2)[:, :count], chosen[:, None]), float)
+
+    def equations(self, pieces: Sequence[Log], rows: DeviationRows) -> UnknownEquations:
+        """Of the lags of all sources in pieces of the filtered log, whose rows these are."""
+        model, forces = self.filtered.model, _Sources.of(pieces, self.filtered.model)
+
+        def columns(builder: RowBuilder, part: Samples, number: int) -> FloatArray:
+            constant = np.stack([forces.rate(source, builder, part, number, model) for source in self.sources], axis=2)
+            return np.concatenate([constant, constant * self._elapsed(part.time.numpy())[:, None, None]], axis=2)
+
+        return UnknownEquations.of(rows, columns)
+
+    def _elapsed(self, time: FloatArray) -> FloatArray:
+        """Times (N,), from -0.5 at the start of the log to 0.5 at its end."""
+        first, last = self.filtered.log.time[[0, -1]]
+        return np.asarray((time - first) / max(last - first, _TINY) - 0.5)
+
+    def refined(self, first: Lag, rows: DeviationRows) -> Lag:
+        """A clock's lag by readings that are shifted; a constant one where it is not certain that it changes."""
+        lag = self._shifted(first, len(first.found.value), rows)
+        return self._shifted(first, 1, rows) if lag.changes and not lag.is_clear else lag
+
+    def _shifted(self, first: Lag, count: int, rows: DeviationRows) -> Lag:
+        clock, total, pieces, model = first.clock, np.zeros(count), self.filtered.pieces, self.filtered.model
+        for _ in range(_SHIFTS):
+            equations = self.equations(pieces, rows)
+            found = equations.fit(_LAG_PRIOR_STD_S, self.combined(clock, count))
+            by_block = equations.fit(_LAG_PRIOR_STD_S, self.combined(clock, 1)).blocks[:, 0]
+            out = replace(found, value=found.value + total, blocks=found.blocks + total, without=first.found.without)
+            total = out.value
+            ends = total[0] + np.array([-0.5, 0.5]) * total[1:].sum()
+            if np.abs(found.value).max() < _LEAST_SHIFT_S or np.abs(ends).max() > 2.0 * _LAG_PRIOR_STD_S:
+                break
+            pieces = [self._moved(piece, clock, total) for piece in self.filtered.pieces]
+            moved = DeviationRows.of(bind_some_samples(pieces, model.robot, model.contacts, COMPARED_SAMPLES), model)
+            if moved is None:
+                break
+            rows = moved
+        return Lag(clock, out, _scatter(by_block))
+
+    def _moved(self, piece: Log, clock: Clock, lag: FloatArray) -> Log:
+        """A piece of the filtered log with a clock's readings earlier by a lag, (1,) or (2,)."""
+        changing = lag[1:].sum() * self._elapsed(piece.time)
+        return with_delayed(piece, -(lag[0] + changing), clock.moved)
+
+
+def _scatter(blocks: FloatArray) -> float:
+    """Standard deviation of the change over a log that blocks of time (TIME_BLOCKS,) have, by a line through them."""
+    at = (np.arange(TIME_BLOCKS) + 0.5) / TIME_BLOCKS - 0.5
+    left = blocks - blocks.mean() - at * (at @ blocks) / (at @ at)
+    return float(np.sqrt(left @ left / ((TIME_BLOCKS - 2) * (at @ at))))
+
+
+@dataclass(frozen=True, eq=False)
+class _Sources:
+    """Samples by which forces change where a source of readings is late.
+
+    Attributes:
+        slopes: with slopes of torques and wrenches in their place.
+        later: with the base where it is `_SMALL_S` later.
+    """
+
+    slopes: Sequence[Samples]
+    later: Sequence[Samples]
+
+    @classmethod
+    def of(cls, pieces: Sequence[Log], model: NominalModel) -> _Sources:
+        """Of pieces of a filtered log."""
+        slopes = [replace(one, **_slopes(one, ("joint_torque", *WRENCHES))) for one in pieces]
+        later = [_with_base_later(one) for one in pieces]
+        return cls(*(bind_some_samples(x, model.robot, model.contacts, COMPARED_SAMPLES) for x in (slopes, later)))
+
+    @torch.no_grad()
+    def rate(self, source: str, builder: RowBuilder, part: Samples, number: int, model: NominalModel) -> FloatArray:
+        """Forces that are required beyond those that act, (N, n_rows), for each second that a source is late."""
+        if source == _BASE:
+            phi = model.robot.nominal.flatten()[None]
+            (acting, required), (later, needed) = (force_series(builder, x, phi) for x in (part, self.later[number]))
+            return np.asarray((required[0] - needed[0] - np.nan_to_num(acting - later)) / _SMALL_S)
+        slopes = self.slopes[number]
+        if source == _TORQUE:
+            torque, base = np.zeros((len(part), builder.tree.n_rows)), builder.tree.base_rows
+            torque[:, base : base + model.robot.n] = builder.recorded_torque(slopes)[:, : model.robot.n].numpy()
+            return np.nan_to_num(torque)
+        if slopes.wrench is None:
+            return np.zeros((len(part), builder.tree.n_rows))
+        place = [contact.frame for contact in model.contacts].index(source)
+        rates = replace(part, wrench=torch.nan_to_num(slopes.wrench * part.active[..., None]))
+        kinematics, J = builder.kinematics(part), builder.contact_jacobian(part)[:, place]
+        return np.asarray(torch.einsum("nwv,nw->nv", J, builder.recorded_wrench(rates, place, kinematics)).numpy())
+
+
+def _slopes(log: Log, names: Sequence[str]) -> dict[str, Any]:
+    """By time, of the fields that a log has."""
+    arrays = log.arrays()
+    return {name: np.gradient(arrays[name], log.time, axis=0) for name in names if name in arrays}
+
+
+def _with_base_later(log: Log) -> Log:
+    arrays, names = log.arrays(), [name for name in log.arrays() if name.startswith(_OF_BASE)]
+    later: dict[str, Any] = {name: arrays[name] + _SMALL_S * slope for name, slope in _slopes(log, names).items()}
+    if (quat := later.get("base_quat_xyzw")) is not None:
+        later["base_quat_xyzw"] = quat / np.linalg.norm(quat, axis=1, keepdims=True)
+    return replace(log, **later)
