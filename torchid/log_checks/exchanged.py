@@ -38,7 +38,8 @@ class _Exchanges:
     Attributes:
         pairs: numbers of the joints.
         share: (P,) of the exchange that fits best: 1 where it is a mistake, 0 where it is none.
-        without, left: (P,) unexplained forces without and with it, rms in deviations of the torques.
+        without: unexplained forces without any exchange, rms in deviations of the torques.
+        left: (P,) the same with it.
         equations: of what the nominal parameters leave, and of the pairs.
     """
 
@@ -135,10 +136,10 @@ def _fit_exchanges(rows: DeviationRows, robot: Robot) -> _Exchanges | None:
         change = (of_joints[:, first] - of_joints[:, second]) * (read[:, second] - read[:, first])[..., None]
         Y = np.concatenate([target[..., None], change.transpose(0, 2, 1)], axis=2)
         parts.append((K[..., : K.shape[2] - n], Y, equations))  # without offsets, which a load at rest may be
-    equations = accumulate_blocks(parts)
-    G = equations.unexplained()
+    normal = accumulate_blocks(parts)
+    G = normal.unexplained()
     product, square = G[0, 1:], np.diag(G)[1:]
-    count = max(equations.rows, 1)
+    count = max(normal.rows, 1)
     left = np.sqrt(np.maximum(G[0, 0] - 2.0 * product + square, 0.0) / count)
     share = product / np.where(square > 0.0, square, np.inf)
-    return _Exchanges(pairs, share, float(np.sqrt(max(G[0, 0], 0.0) / count)), left, equations)
+    return _Exchanges(pairs, share, float(np.sqrt(max(G[0, 0], 0.0) / count)), left, normal)

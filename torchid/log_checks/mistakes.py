@@ -175,7 +175,7 @@ def _shift_joint(joint: int, angle: float) -> Callable[[Log], Log]:
 
 def _order_mistakes(log: Log, robot: Robot | None) -> Iterator[Mistake]:
     """Exchanged names of joints and contacts, and flags assigned to the wrong contacts."""
-    for text, permuted in (*other_orders(log.joint_names, robot), *exchanged_in_limbs(log.joint_names, robot)):
+    for text, permuted in (*exchanged_in_limbs(log.joint_names, robot), *other_orders(log.joint_names, robot)):
         advice = "give joint_names in the order of the columns; of arrays without names logs.columns.joint_order: "
         advice += f"[{', '.join(permuted)}]"
         yield Mistake("joint_names", text, advice, _rename("joint_names", permuted), True)
