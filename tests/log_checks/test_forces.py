@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 from collections.abc import Callable, Sequence
@@ -261,11 +262,14 @@ def test_a_torque_that_is_friction_alone_is_reversed_where_it_would_drive_its_jo
         assert "friction, which would drive the joint" in reversed_.found
 
 
-def test_torques_of_two_neighbours_in_a_short_chain_that_are_exchanged_are_named() -> None:
-    order = [0, 2, 1, *range(3, len(arm()[1].joint_names))]
+@pytest.mark.parametrize("pair", slow_but([(1, 2), (0, 6), (4, 5)], list(itertools.combinations(range(7), 2))))
+def test_torques_of_any_two_joints_that_are_exchanged_are_named(pair: tuple[int, int]) -> None:
+    """Of wrists, too, whose torques are a hundredth of the shoulder's."""
+    order = list(range(len(arm()[1].joint_names)))
+    order[pair[0]], order[pair[1]] = pair[1], pair[0]
     finding = only(of_arm(lambda log: replace(log, joint_torque=value(log.joint_torque)[:, order])), EXPLAINED)
     assert (finding.severity, finding.field) == (REJECTED, "joint_torque")
-    assert finding.found.startswith("panda_joint2 and panda_joint3 exchanged")
+    assert finding.channels == tuple(f"panda_joint{1 + joint}" for joint in pair)
 
 
 def test_a_torque_of_the_motor_side_of_a_gear_is_suspicious() -> None:

@@ -12,8 +12,9 @@ from motions import value
 from walking import MACHINES, robot_of, truth
 
 from torchid.log_checks import NOTE
-from torchid.log_checks.mistakes import exchanged_names, joint_mistakes, possible_mistakes
+from torchid.log_checks.mistakes import joint_mistakes, possible_mistakes
 from torchid.log_checks.model import NominalModel, bind_some_samples, preprocess_pieces
+from torchid.log_checks.orders import exchanged_names
 from torchid.log_checks.scales import fit_time_scale, fit_torque_gains, motion_cutoff_hz
 from torchid.log_checks.standing_feet import measure_foot_slip
 from torchid.regressor import Regressor

@@ -60,6 +60,21 @@ def test_a_reversed_joint_is_named_and_how_to_reverse_it() -> None:
     assert f"{{{name}: -1}}" in finding.advice
 
 
+@pytest.mark.parametrize("sides_exchanged", [False, True])
+def test_the_order_of_a_simulator_is_named_and_stated_for_arrays_without_names(sides_exchanged: bool) -> None:
+    """By hips, thighs and knees, as Isaac Lab has them, taken for leg by leg."""
+    legs = ["front_left", "front_right", "rear_left", "rear_right"]
+    if sides_exchanged:
+        legs = [legs[i] for i in (1, 0, 3, 2)]
+    true = [f"{leg}_{joint}" for joint in ("hip", "thigh", "knee") for leg in legs]
+    log = STANCE.measured
+    columns = log.joint_position[:, [log.joint_names.index(name) for name in true]]
+    (finding,) = findings(replace(log, joint_names=ROBOT.joint_names, joint_position=columns))
+    assert (finding.severity, finding.field) == (REJECTED, "joint_names")
+    assert finding.found.startswith("columns in breadth-first order")
+    assert finding.advice.endswith(f"logs.columns.joint_order: [{', '.join(true)}]")
+
+
 def test_an_orientation_that_never_changes_is_not_passed_over_in_silence() -> None:
     log = STANCE.measured
     still = np.tile([0.0, 0.0, 0.0, 1.0], (len(log), 1))

@@ -88,9 +88,11 @@ class DeviationRows:
     parts: list[tuple[FloatArray, BoolArray, FloatArray, FloatArray]]
 
     @classmethod
-    def of(cls, samples: Sequence[Samples], model: NominalModel) -> DeviationRows | None:
-        """The rows of the forces that are measured, None without any."""
-        builder = deviation_builder(samples, model)
+    def of(
+        cls, samples: Sequence[Samples], model: NominalModel, torque_noise: FloatArray | None = None
+    ) -> DeviationRows | None:
+        """The rows of the forces that are measured, None without any; `torque_noise` as of `deviation_builder`."""
+        builder = deviation_builder(samples, model, torque_noise)
         if builder is None:
             return None
         prior, parts = prior_columns(builder, model.robot, samples), []

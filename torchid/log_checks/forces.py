@@ -13,6 +13,7 @@ from torchid.errors import InputError, join_names
 from torchid.log_checks.deviation import FilteredLog
 from torchid.log_checks.drift import check_torque_drift
 from torchid.log_checks.encoders import check_encoders, is_bolted_arm
+from torchid.log_checks.exchanged import check_exchanged_torques
 from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, UNEXPLAINED, Finding, Skipped, refused
 from torchid.log_checks.lag_and_tilt import check_lag_and_tilt, check_torque_offsets
 from torchid.log_checks.lags import without_lag
@@ -128,14 +129,16 @@ def _misfit_findings(
     log: Log, samples: Sequence[Samples], model: NominalModel, cutoff: float, derived: tuple[str, ...]
 ) -> Iterator[Finding | Skipped]:
     """The mistake that explains forces unlike the URDF's, or single deviations of forces that are like them."""
-    fit, explanation, robot = model.compare(samples), None, model.robot
+    fit, robot = model.compare(samples), model.robot
     if fit.largest_misfit > MAX_MISFIT and (bare := without_friction(robot)) is not None:
         without = replace(model, robot=bare)
         better = without.compare(samples)
         if better.largest_misfit <= MAX_MISFIT or _is_mostly_friction(fit, better):
             yield _friction_finding(robot, fit, better)
             robot, model, fit = bare, without, better
-    if fit.largest_misfit > MAX_MISFIT:
+    filtered = FilteredLog(log, model, cutoff)
+    explanation = check_exchanged_torques(filtered)
+    if explanation is None and fit.largest_misfit > MAX_MISFIT:
         explanation = _best_mistake(log, model, cutoff, fit, derived)
     if explanation is not None:
         yield explanation
@@ -144,7 +147,7 @@ def _misfit_findings(
         yield from torque_findings(robot, fit.torque)
         return
     log, samples = _scaled(log, samples, robot, fit.torque)
-    filtered = FilteredLog(log, model, cutoff)
+    filtered = filtered if log is filtered.log else FilteredLog(log, model, cutoff)
     if model.declared.delay == AUTO:
         filtered = without_lag(filtered)
         log = filtered.log
@@ -219,7 +222,7 @@ def _best_mistake(
     robot, best, least, shares = model.robot, None, min(fit.misfit, 1.0), (0.0, 0.0)
     filtered = cache(lambda: preprocess_pieces(log, cutoff, MAX_TRIAL_DIFFERENTIATED_SAMPLES))
     of_joints = list(joint_mistakes(log)) if is_bolted_arm(model) else []
-    for mistake in (*possible_mistakes(log), *of_joints):
+    for mistake in (*possible_mistakes(log, robot), *of_joints):
         if not _may_explain(mistake.field, fit) or mistake.field.startswith(derived):
             continue
         try:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,90 +14,16 @@ from scipy.spatial.transform import Rotation
 
 from torchid.errors import join_names
 from torchid.log_checks.motion import MAX_ANGLE_RAD
+from torchid.log_checks.orders import exchanged_in_limbs, exchanged_names, other_orders
 from torchid.logs import Log
 from torchid.logs.log import WRENCHES, FloatArray
 from torchid.logs.quaternion import inverse_rotation, make_sign_continuous
 from torchid.logs.units import advise_units, other_units
 from torchid.parameters import GRAVITY
+from torchid.robot import Robot
 
-#: Parts of names that differ between left and right, and between front and rear.
-_SIDES = ("left right", "Left Right", "LEFT RIGHT", "l r", "L R", "FL FR", "RL RR", "HL HR", "LF RF", "LH RH")
-_ENDS = (
-    *("front rear", "front hind", "front back", "fore hind", "Front Rear", "FL RL", "FR RR", "LF LH", "RF RH"),
-    *("fl rl", "fr rr", "lf lh", "rf rh"),
-)
-_NAME_PARTS = re.compile(r"([A-Za-z0-9]+)")
-_WORDS = re.compile(r"([A-Z]+(?![a-z])|[A-Z]?[a-z]+|[0-9]+)")
-#: Largest number of joints for which exchanged neighbours are tried, and of pairs of limbs that are.
-_MAX_CHAIN_JOINTS, _MAX_PAIRS = 12, 28
 #: Largest number of joints that are tried one at a time: those of a hand, or of two arms.
 _MAX_SINGLE_JOINTS = 24
-
-
-def exchanged_names(names: Sequence[str], shortest: int = 2) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Possible true names of the columns, with a description: sides, ends, two limbs, or the order.
-
-    `shortest`: number of names that a limb has at least.
-    """
-    known = {tuple(names)}
-    for description, pairs in (("left and right", _SIDES), ("front and rear", _ENDS)):
-        permuted = _exchanged(names, pairs)
-        if permuted is not None and permuted not in known:
-            known.add(permuted)
-            yield description, permuted
-    for description, permuted in (
-        *_exchanged_pairs(names, shortest),
-        ("alphabetical order and this", tuple(sorted(names))),
-        ("the order", tuple(names[::-1])),
-    ):
-        if permuted not in known and len(names) > 1:
-            known.add(permuted)
-            yield description, permuted
-
-
-def _exchanged_neighbours(names: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """The names of a short chain with two neighbours exchanged."""
-    for i in range(len(names) - 1 if len(names) <= _MAX_CHAIN_JOINTS else 0):
-        yield f"{names[i]} and {names[i + 1]}", (*names[:i], names[i + 1], names[i], *names[i + 2 :])
-
-
-def _exchanged(names: Sequence[str], pairs: Sequence[str]) -> tuple[str, ...] | None:
-    """Names with their parts exchanged within each pair; None unless that permutes the names."""
-    for some in (pairs, *([pair] for pair in pairs)):  # all pairs at once, else one at a time: some share a part
-        partner = {old: new for pair in some for old, new in (pair.split(), pair.split()[::-1])}
-        exchanged = tuple("".join(partner.get(part, part) for part in _NAME_PARTS.split(name)) for name in names)
-        if sorted(exchanged) == sorted(names) and exchanged != tuple(names):
-            return exchanged
-    return _by_first_letter(names) if pairs is _SIDES else None
-
-
-def _exchanged_pairs(names: Sequence[str], shortest: int) -> list[tuple[str, tuple[str, ...]]]:
-    """The names with two limbs exchanged, which differ in a word, or the first two: `lf_hip` and `rf_hip`.
-
-    Of limbs with at least the `shortest` number of names; none of a robot with too many limbs to try all pairs.
-    """
-    limbs: dict[tuple[int, int], dict[str, dict[tuple[str, str], str]]] = {}  # by place, limb, and what is beside it
-    for name in names:
-        words = _WORDS.split(name)
-        for first, last in ((1, 4), *((word, word + 1) for word in range(1, len(words), 2))):
-            before, limb, after = ("".join(part) for part in (words[:first], words[first:last], words[last:]))
-            limbs.setdefault((first, last), {}).setdefault(limb, {})[before, after] = name
-    exchanged: dict[tuple[str, ...], str] = {}
-    for of_place in limbs.values():
-        for (one, its), (other, others) in itertools.combinations(of_place.items(), 2):
-            if its.keys() == others.keys() and len(its) >= shortest:
-                partner = {a: b for key in its for a, b in ((its[key], others[key]), (others[key], its[key]))}
-                exchanged.setdefault(tuple(partner.get(name, name) for name in names), f"{one} and {other}")
-    return [(text, permuted) for permuted, text in exchanged.items()] if len(exchanged) <= _MAX_PAIRS else []
-
-
-def _by_first_letter(names: Sequence[str]) -> tuple[str, ...] | None:
-    """Names with left and right exchanged by first letter: LAnkle and RAnkle, lfoot and rfoot."""
-    swap = {"L": "R", "R": "L", "l": "r", "r": "l"}
-    swapped = tuple(
-        other if name[:1] in swap and (other := swap[name[0]] + name[1:]) in names else name for name in names
-    )
-    return swapped if swapped != tuple(names) else None
 
 
 #: Fields that can be derived from positions and orientation.
@@ -135,8 +60,8 @@ class Mistake:
     after_filter: bool = False
 
 
-def possible_mistakes(log: Log) -> Iterator[Mistake]:
-    """The mistakes that this log may contain."""
+def possible_mistakes(log: Log, robot: Robot | None = None) -> Iterator[Mistake]:
+    """The mistakes that this log may contain; orders of joints of other programs if the robot is known."""
     for rates in (_JOINT_RATES, _BASE_RATES):
         given = [field for field in rates if getattr(log, field) is not None]
         if given:
@@ -149,7 +74,7 @@ def possible_mistakes(log: Log) -> Iterator[Mistake]:
     if 0 < len(far) < len(log.joint_names):
         text = f"{join_names([log.joint_names[joint] for joint in far])} in degrees"
         yield Mistake("joint_position", text, "convert to radians", lambda log: _degrees_to_radians(log, far))
-    yield from _order_mistakes(log)
+    yield from _order_mistakes(log, robot)
     yield from _orientation_mistakes() if log.base_quat_xyzw is not None else _mountings()
     if log.imu_specific_force is not None:
         reading = "reversed: gravity minus acceleration"
@@ -164,11 +89,10 @@ def possible_mistakes(log: Log) -> Iterator[Mistake]:
         reverse = "reverse them; a base that hangs upside down looks the same (give base_quat)"
         yield Mistake("joint_torque", "all reversed", reverse, _multiply("joint_torque", -1.0), True)
         yield from _unit_mistakes("joint_torque", "torque", after_filter=True)
-        orders = (*exchanged_names(log.joint_names), *_exchanged_neighbours(log.joint_names))
-        for description, permuted in orders:  # of limbs, of drives in another order, or of two plugs
-            order = [log.joint_names.index(name) for name in permuted]
+        for description, permuted in other_orders(log.joint_names, robot):  # of limbs, or of drives
+            order = [permuted.index(name) for name in log.joint_names]
             advice = "give torques in the order of joint_names, as positions"
-            yield Mistake("joint_torque", f"{description} exchanged", advice, _reorder(("joint_torque",), order), True)
+            yield Mistake("joint_torque", description, advice, _reorder(("joint_torque",), order), True)
     if log.base_position_world is not None:
         yield from _unit_mistakes("base_position_world", "length")
     for field, other in (WRENCHES, WRENCHES[::-1]):
@@ -249,13 +173,14 @@ def _shift_joint(joint: int, angle: float) -> Callable[[Log], Log]:
     return correct
 
 
-def _order_mistakes(log: Log) -> Iterator[Mistake]:
+def _order_mistakes(log: Log, robot: Robot | None) -> Iterator[Mistake]:
     """Exchanged names of joints and contacts, and flags assigned to the wrong contacts."""
-    for description, permuted in (*exchanged_names(log.joint_names), *_exchanged_neighbours(log.joint_names)):
-        text, advice = f"{description} exchanged", "give joint_names in the order of the columns"
+    for text, permuted in (*exchanged_in_limbs(log.joint_names, robot), *other_orders(log.joint_names, robot)):
+        advice = "give joint_names in the order of the columns; of arrays without names logs.columns.joint_order: "
+        advice += f"[{', '.join(permuted)}]"
         yield Mistake("joint_names", text, advice, _rename("joint_names", permuted), True)
     for description, permuted in exchanged_names(log.contact_names, shortest=1):
-        order = [log.contact_names.index(name) for name in permuted]
+        order = [permuted.index(name) for name in log.contact_names]
         text = f"{description} exchanged"
         advice = "give contact_names in the order of the columns"
         yield Mistake("contact_names", text, advice, _rename("contact_names", permuted), True)

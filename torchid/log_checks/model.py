@@ -240,9 +240,14 @@ def _misfit(measured: FloatArray, model: FloatArray, scaled: bool) -> float | No
     return float(np.linalg.norm((factor if factor > 0.0 else 1.0) * measured[known] - model[known]) / size)
 
 
-def deviation_builder(samples: Sequence[Samples], model: NominalModel) -> RowBuilder | None:
-    """Rows of the forces that are measured in all samples, with declared terms; None without any force."""
-    sensors = _measured_sensors(samples, model.robot, model.contacts, model.declared.noise)
+def deviation_builder(
+    samples: Sequence[Samples], model: NominalModel, torque_noise: FloatArray | None = None
+) -> RowBuilder | None:
+    """Rows of the forces that are measured in all samples, with declared terms; None without any force.
+
+    `torque_noise`: unmodelled torque of each joint (n,) [N m or N]; None for a share of all torques alike.
+    """
+    sensors = _measured_sensors(samples, model.robot, model.contacts, model.declared.noise, torque_noise)
     motors = (sensors.torque & ~model.robot.is_passive)[: model.robot.n]
     if not motors.any() and not sensors.wrench.any():
         return None
@@ -250,7 +255,11 @@ def deviation_builder(samples: Sequence[Samples], model: NominalModel) -> RowBui
 
 
 def _measured_sensors(
-    samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact], stated: SensorNoise | None
+    samples: Sequence[Samples],
+    robot: Robot,
+    contacts: Sequence[Contact],
+    stated: SensorNoise | None,
+    torque_noise: FloatArray | None,
 ) -> SensorSet:
     """The sensors that are read in all samples; their noise is the unmodelled force of each kind, or more if stated."""
     torque = np.zeros(robot.n_dofs, bool)
@@ -271,9 +280,10 @@ def _measured_sensors(
     weight = parameters.GRAVITY * float(robot.nominal[:, parameters.MASS].sum())
     size = size or 0.1 * weight
     stated = stated or SensorNoise.of_known({})
-    torque_noise, force, moment = (max(UNMODELLED_FORCE_SHARE * x, MIN_TORQUE_NM) for x in (size, 0.5 * weight, size))
+    alike, force, moment = (max(UNMODELLED_FORCE_SHARE * x, MIN_TORQUE_NM) for x in (size, 0.5 * weight, size))
+    of_joints = np.full(robot.n, alike) if torque_noise is None else np.maximum(torque_noise, MIN_TORQUE_NM)
     noise = SensorNoise(
-        tuple(np.fmax(torque_noise, np.broadcast_to(stated.joint_torque, robot.n)).tolist()),
+        tuple(np.fmax(of_joints, np.broadcast_to(stated.joint_torque, robot.n)).tolist()),
         float(np.fmax(force, stated.contact_force)),
         float(np.fmax(moment, stated.contact_moment)),
     )

@@ -79,7 +79,7 @@ def check_standing_feet(
         yield from other_pose if single is None else [single]
         return
     best, least = None, MAX_RESIDUAL_SHARE * slip
-    for mistake in (*possible_mistakes(log), *reversed_joints(log)):
+    for mistake in (*possible_mistakes(log, robot), *reversed_joints(log)):
         if mistake.field not in _CORRECTED_FIELDS or mistake.field.startswith(derived):
             continue
         corrected = mistake.correct(log)
