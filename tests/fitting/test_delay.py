@@ -13,7 +13,7 @@ from motions import value
 from repository import DEMO
 
 from torchid.config import load_config
-from torchid.errors import LogError
+from torchid.errors import LogError, TorchidWarning
 from torchid.estimators import Conditions, Consistent, LeastSquares
 from torchid.fitting.delay import EARLIEST, LATEST, DelayChoice, choose_delay, unfitted_delay
 from torchid.fitting.experiment import set_up
@@ -56,6 +56,15 @@ def test_a_delay_of_a_part_of_a_step_is_found_to_a_microsecond(
     assert found.delay == pytest.approx(delay, abs=1e-6)
     assert found.residual < 1e-2 * found.undelayed_residual
     assert f"{1e3 * delay:.3g} ±" in str(found)
+
+
+@pytest.mark.parametrize("beyond", [EARLIEST - 0.003, LATEST + 0.003])
+def test_a_delay_beyond_those_that_are_tried_is_said_to_be_at_their_end(beyond: float) -> None:
+    end = min(max(beyond, EARLIEST), LATEST)
+    with pytest.warns(TorchidWarning, match=f"{end:g} s or beyond; are torques and positions stamped by the same"):
+        found = chosen(recorded(beyond))
+    assert found.found == end
+    assert "an end of what is tried: the best may lie beyond" in str(found)
 
 
 def test_a_delay_that_nobody_fits_is_told_from_none() -> None:

@@ -94,12 +94,18 @@ def test_noise_comes_with_the_preprocessed_log_once() -> None:
     assert preprocess(whole) is whole, "nothing to derive, and no noise"
 
 
-def test_short_logs_and_gaps_say_nothing() -> None:
+def test_short_logs_say_nothing_and_gaps_leave_the_noise_beside_them() -> None:
     log = encoders((1e-3, 1e-3))
     assert not signal_noise(log.select(slice(0, 90)), None).found
     position = log.joint_position.copy()
-    position[7] = np.nan
-    assert not signal_noise(replace(log, joint_position=position), None).found
+    position[7::50] = position[20:25, 0] = np.nan
+    for time in (log.time, log.time + np.random.default_rng(1).uniform(0.0, 3e-4, len(log))):
+        gappy = replace(log, time=time, joint_position=position)
+        np.testing.assert_allclose(signal_noise(gappy, None).std["joint_position"], 1e-3, rtol=0.1)
+    position[::20] = np.nan  # stretches of 19 samples would do, of 9 none
+    position[::10, 1] = np.nan
+    found = signal_noise(replace(log, joint_position=position), None).std["joint_position"]
+    np.testing.assert_allclose(found, [1e-3, 0.0], rtol=0.2)
     assert not SignalNoise({}).found
     assert make_timeline(TIME, False, None, None) is None
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,13 +15,15 @@ from random_samples import NOISE, random_samples, sensor_set
 from synthetic import PANDA, TALOS, TALOS_FULL, load
 
 import torchid
+from torchid.kernels import compiling_announced
 from torchid.problem import RowBuilder, Samples, TriangularFactor, chunks, compress, compress_parts, row_compressor
 from torchid.problem.chunk_dynamics import Workspace
 from torchid.problem.chunks import choose_kernels, chunks_by_state
 from torchid.problem.extras import ExtraTerms
 
-pytest.importorskip("numba", reason="compiled kernels need Numba, of the extra [fast]")
+numba = pytest.importorskip("numba", reason="compiled kernels need Numba, of the extra [fast]")
 kernels = pytest.importorskip("torchid.kernels.gram")
+tiles = pytest.importorskip("torchid.kernels.tiles")
 
 QUADRUPED = torchid.load_robot(Path(torchid.__file__).parent / "demo" / "quadruped.urdf")
 POINTS = [torchid.Contact(f"{end}_{side}_foot", "point") for end in ("front", "rear") for side in ("left", "right")]
@@ -36,6 +39,26 @@ def builders(
     choose_kernels(fast, ENOUGH)
     assert fast.compiled is not None
     return [plain, fast]
+
+
+def test_the_compiling_of_a_kernel_is_announced_and_nothing_else() -> None:
+    """Once, whoever it calls; not where it is there already, nor of functions of others."""
+    announced = list[str]()
+
+    @contextmanager
+    def announce() -> Iterator[None]:
+        announced.append("begins")
+        yield
+        announced.append("ends")
+
+    anew, other = numba.njit(tiles.turn.py_func), numba.njit(lambda x: x + 1.0)
+    tile = np.arange(9.0).repeat(tiles.TILE)
+    with compiling_announced(announce):
+        first = anew(tile, 0, (1.0, 2.0, 3.0))
+        assert announced == ["begins", "ends"]
+        assert (anew(tile, 0, (1.0, 2.0, 3.0)), other(1.0)) == (first, 2.0)
+    numba.njit(tiles.dot.py_func)((1.0, 2.0, 3.0), (1.0, 2.0, 3.0))
+    assert announced == ["begins", "ends"]
 
 
 def by_axis(sensors: torchid.SensorSet) -> torchid.SensorSet:

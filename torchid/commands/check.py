@@ -25,6 +25,7 @@ from torchid.log_checks.check import check
 from torchid.logs import Columns, Log, Topics, read_log, write_log
 from torchid.logs.blocks import has_blocks, open_log_blocks
 from torchid.logs.containers import atomic_output, new_log_kind
+from torchid.logs.read import files_of_recordings_kept
 from torchid.logs.time_range import log_title, split_range
 from torchid.report.figure_style import save_figure
 from torchid.report.log_checks import log_check_document, log_check_figure
@@ -113,7 +114,7 @@ def check_experiment(
         required = None if config.sensors.empty else setup.sensors_of(config.sensors)
     files = [*config.logs.train, *config.logs.validation, *config.logs.test]
     checked = []
-    with progress_bars() as bars:
+    with progress_bars() as bars, files_of_recordings_kept():
         for file in bars.track(files, description="checking"):
             settings, own = config.preprocessing, setup_of_log(setup, file)
             log, _ = settle_contacts(_read_log_to_check(file, config.logs, settings), own)

@@ -35,6 +35,7 @@ from torchid.logs.cutoff import CutoffChoice, choose_cutoff
 from torchid.logs.dry_friction import dry_friction_by_setting, with_sign_filter
 from torchid.logs.log import FloatArray
 from torchid.logs.preprocess import lacks_derivatives, make_timeline
+from torchid.logs.read import files_of_recordings_kept
 from torchid.logs.signal_noise import SignalNoise
 from torchid.logs.timeline import LOSSLESS_RATE
 from torchid.problem import ExtraTerms, RowBuilder, Samples
@@ -140,7 +141,8 @@ def _cutoff(setup: RobotSetup) -> CutoffChoice:
     settings, files = setup.config.preprocessing, setup.config.logs
     if files is None:
         return CutoffChoice(None, by_noise=False)
-    logs = [next(recorded_segments(path, files, settings)).log for path in files.train]
+    with files_of_recordings_kept():
+        logs = [next(recorded_segments(path, files, settings)).log for path in files.train]
     stated, from_feet = setup.config.sensors.noise.motion, settings.base_motion is not None
     rate = None if settings.sample_rate_hz == AUTO else settings.sample_rate_hz
     return choose_cutoff(logs, stated, rate, base_is_derived=from_feet)

@@ -43,6 +43,7 @@ from torchid.logs.read import read_recordings
 from torchid.logs.time_range import split_range
 from torchid.parameters import GRAVITY
 from torchid.proposals.column_groups import MapProposal
+from torchid.proposals.episodes import find_episodes
 from torchid.proposals.file_samples import FileSample, read_bag_sample, read_sample, rows_of, states_degrees, texts_in
 from torchid.proposals.maps import propose_map
 from torchid.proposals.stamps import arrays_by_stamps
@@ -150,12 +151,16 @@ def _of_columns(files: Sequence[Path], robot: Robot) -> tuple[list[GuessedContac
                 )
             samples.append(read_sample(file, rows))
             in_degrees |= set(samples[-1]) if states_degrees(file) else set()
-    samples = _named_apart(samples, [file.name for file in files])
+    episodes = find_episodes(samples[0]) if len(files) == 1 and existing_log_kind(files[0]) is LogKind.ARRAYS else None
+    samples = [episodes.sample] if episodes else _named_apart(samples, [file.name for file in files])
     sample = {name: values for of_file in reversed(samples) for name, values in of_file.items()}
     contacts = guess_contacts(robot, stated_contacts(sample, robot), texts_in(sample))
     clocks = arrays_by_stamps(sample) if existing_log_kind(files[0]) is LogKind.ARRAYS and len(files) == 1 else ()
     proposal = propose_map(sample, _known(robot, contacts), samples if len(files) > 1 else (), in_degrees, clocks)
     fields = {*(name.partition(".")[0] for name in sample), *proposal.columns}
+    if episodes is not None:
+        proposal.columns = {"episodes": episodes.entry, **proposal.columns}
+        proposal.notes["episodes"] = episodes.note
     if rows is not None:
         proposal.columns = {"rows_of": rows.column, **proposal.columns}
         proposal.notes["rows_of"] = "the column that names the joint of each row, as rows share stamps"
@@ -304,7 +309,7 @@ def _describe_found(
     """The robot, and what of a map there is."""
     frames = join_names([contact.frame for contact in contacts])
     out.found.append(f"{len(robot.joint_names)} joints" + f", contacts {frames}" * bool(contacts))
-    no_fields = ("_order", "_name", "ignore")
+    no_fields = ("_order", "_name", "ignore", "episodes")
     of_map = [name for name in proposal.columns if name in fields and not name.endswith(no_fields)]
     known = list(proposal.columns) if proposal.key == "topics" else of_map
     if known:

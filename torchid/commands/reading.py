@@ -24,6 +24,7 @@ from torchid.logs.containers import LogKind, existing_log_kind
 from torchid.logs.flags import with_flags_by_force
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import away_from_changes, away_from_stamps, preprocess
+from torchid.logs.read import files_of_recordings_kept
 from torchid.logs.segments import with_delayed_torques
 from torchid.logs.time_range import LogPart, split_range
 from torchid.parameters import Array
@@ -76,7 +77,17 @@ class LogReader:
         Raises:
             LogError: a file that cannot be read, or does not fit the robot.
         """
-        limit, logs = self.setup.config.preprocessing.memory_gb, []
+        with files_of_recordings_kept():
+            logs = self._each(paths, required, on_read)
+        names = ranks.as_first([log.source for log in logs], "names of the logs")  # they may lie elsewhere there
+        added = [payload_of(self.setup, path) for path in paths]
+        return [replace(log, source=name, payload=x) for log, name, x in zip(logs, names, added, strict=True)]
+
+    def _each(
+        self, paths: Sequence[Path], required: SensorSet | None, on_read: Callable[[Path], None] | None
+    ) -> list[Samples]:
+        """The samples of log files, one after the other."""
+        limit, logs = self.setup.config.preprocessing.memory_gb, list[Samples]()
         for path in paths:
             together = self._together(path)
             bag = existing_log_kind(path) is LogKind.BAG
@@ -86,9 +97,7 @@ class LogReader:
                 self._held = together + (logs[-1].nbytes / GIGABYTE if bag else 0.0)
             if on_read is not None:
                 on_read(path)
-        names = ranks.as_first([log.source for log in logs], "names of the logs")  # they may lie elsewhere there
-        added = [payload_of(self.setup, path) for path in paths]
-        return [replace(log, source=name, payload=x) for log, name, x in zip(logs, names, added, strict=True)]
+        return logs
 
     def release(self) -> None:
         """Take pages of files that samples are mapped to out of memory; they come back where they are used."""

@@ -66,6 +66,7 @@ class DelayChoice:
     def __str__(self) -> str:
         """The delay with its standard error, and what it is for."""
         best, left = f"{1e3 * self.found:.3g}", f"residual {self.residual:.4g}, {self.undelayed_residual:.4g} without"
+        left += "; an end of what is tried: the best may lie beyond" * (self.found in (EARLIEST, LATEST))
         if self.confounded_with:
             return f"none: any, such as {best} ms, is confounded with {', '.join(self.confounded_with)} ({left})"
         if self.standard_error is None or self.interval is None:
@@ -259,8 +260,8 @@ class _Delays:
         before = 0.0
         for _ in range(_STEPS):
             term = self.term(self.fit(delay))
-            step = float(np.clip(delay + term.value, *self.ends)) - delay
-            delay += step
+            found = float(np.clip(delay + term.value, *self.ends))  # exactly an end where it is one: it is compared
+            delay, step = found, found - delay
             if not np.isfinite(term.standard_error) or abs(step) <= _SETTLED * term.standard_error:
                 break
             ratio = step / before if before else 0.0

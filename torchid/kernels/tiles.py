@@ -7,11 +7,14 @@ the compiler use the processor's vector instructions.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar
+from contextlib import ExitStack
+from typing import Any, TypeVar
 
 import numba
 import numpy as np
+from numba.core import event
 
+from torchid.kernels import announced
 from torchid.parameters import Array
 
 TILE = 64
@@ -22,6 +25,35 @@ Vector = tuple[float, float, float]
 Index = np.ndarray
 
 ARRAY, MATRIX, INDEX, FLAGS, TABLE = "float64[::1]", "float64[:,::1]", "int64[::1]", "boolean[::1]", "int64[:,::1]"
+
+
+class _Announcer(event.Listener):  # type: ignore[misc]
+    """Announces that a kernel is compiled, with others that it calls, which Numba says of none that it has kept."""
+
+    def __init__(self) -> None:
+        self._depth, self._stack = 0, ExitStack()
+
+    def on_start(self, event: Any) -> None:
+        """Before one is compiled."""
+        if _is_kernel(event):
+            self._depth += 1
+            if self._depth == 1:
+                self._stack.enter_context(announced())
+
+    def on_end(self, event: Any) -> None:
+        """After it, or where it failed."""
+        if _is_kernel(event):
+            self._depth -= 1
+            if not self._depth:
+                self._stack.close()
+
+
+def _is_kernel(event: Any) -> bool:
+    """Whether what Numba compiles is of this package, and no function of others."""
+    return str(event.data["dispatcher"].py_func.__module__).startswith(f"{__package__}.")
+
+
+event.register("numba:compile", _Announcer())
 
 
 def compiled(*arguments: str, sums: bool = False) -> Callable[[Function], Function]:

@@ -42,6 +42,7 @@ from torchid.logs.tables import read_table, table_blocks, table_size
 from torchid.logs.time_range import split_range
 
 GIGABYTE = 1e9
+_WHOLE = "a larger preprocessing.memory_gb, or the file that torchid convert makes of it"
 _ACCEPTED = "a plain array of numbers, truth values or text"
 _SAMPLE = re.compile(r"\bsample (\d+)")
 _BYTES_PER_LETTER = 4  # of a table: a cell has at least two characters, a number eight bytes
@@ -70,9 +71,9 @@ def log_bytes(path: Path, limit: float) -> int:
 
 
 def has_blocks(path: Path, columns: Columns | None) -> bool:
-    """Whether a log can be read a block at a time: no bag, and nothing that is interpolated to stamps of others."""
+    """Whether a log can be read a block at a time: no bag, nothing interpolated to stamps of others, no episodes."""
     is_joined = existing_log_kind(path) in (LogKind.BAG, LogKind.JOINED)
-    return not is_joined and not (columns is not None and columns.other_times)
+    return not is_joined and not (columns is not None and (columns.other_times or columns.episodes))
 
 
 def count_samples_from(start: int, error: LogError) -> LogError:
@@ -248,11 +249,12 @@ def _open_arrays(
             return require_plain(name, container.lazy(name, folder))
 
     given = list(container.declared_bytes())
+    if columns is not None and columns.episodes is not None:
+        raise LogError.at_field("file", "episodes side by side, read whole", _WHOLE)
     mapped = None if columns is None else map_arrays(columns, given, load)
     check_fields_given(given if mapped is None else mapped.given, needs_flags)
     if mapped is not None and (others := list(mapped.other_times(given))):
-        accepted = "a larger preprocessing.memory_gb, or the file that torchid convert makes of it"
-        raise LogError.at_field("file", f"stamps beside those of time ('{excerpt(others[0])}'), read whole", accepted)
+        raise LogError.at_field("file", f"stamps beside those of time ('{excerpt(others[0])}'), read whole", _WHOLE)
     if mapped is None:
         text = [name for name in given if _is_text(name)]
         return {name: load(name) for name in text}, {name: lazy(name) for name in given if name not in text}

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field
 from pydantic.dataclasses import dataclass
 
+from torchid.errors import ConfigError, excerpt
 from torchid.settings import STRICT, Name, Number, Positive
 
 KEY = "logs.columns"
@@ -184,6 +185,29 @@ class Plate:
 
     position: _Three = (0.0, 0.0, 0.0)
     rpy_deg: _Three = (0.0, 0.0, 0.0)
+
+
+@dataclass(config=STRICT, frozen=True, kw_only=True)
+class Episodes:
+    """Recordings side by side in a file of arrays, which become one after the other.
+
+    Attributes:
+        axis: of arrays, that counts them: 0 of (episodes, samples, ...), 1 of (samples, episodes, ...).
+        lengths: array with the number of samples of each, where arrays are filled up behind these.
+        groups: in place of an axis, name of the groups that hold one each, with * for their number: `data/demo_*`.
+    """
+
+    axis: Literal[0, 1] = 0
+    lengths: Name | None = None
+    groups: Name | None = None
+
+
+def check_episodes(entry: Episodes | None) -> None:
+    """Raise ConfigError where groups have no number, or lengths beside them."""
+    if entry is not None and entry.groups is not None and (entry.groups.count("*") != 1 or entry.lengths is not None):
+        found = "lengths beside groups" if entry.lengths is not None else f"groups: '{excerpt(entry.groups)}'"
+        accepted = "a name with one * for the number of a group, such as data/demo_*, without lengths"
+        raise ConfigError.at_field(f"{KEY}.episodes", found, accepted)
 
 
 Stamps = Annotated[TimeEntry, BeforeValidator(_column)]

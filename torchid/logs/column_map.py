@@ -19,6 +19,7 @@ from torchid.logs.column_entries import (
     Angle,
     ColumnEntry,
     Entry,
+    Episodes,
     FlagEntry,
     Flags,
     Gains,
@@ -34,6 +35,7 @@ from torchid.logs.column_entries import (
     Vector,
     Wrench,
     WrenchEntry,
+    check_episodes,
 )
 from torchid.logs.columns import KINDS, component_names, names_field
 from torchid.logs.log import WRENCHES
@@ -65,6 +67,7 @@ class Columns:
             `contact_wrench_point_world` have.
         rows_of: the column that names the joint of a row, of a table with a row for each joint at each stamp: its
             other columns are then `position.l_knee`, ...
+        episodes: where recordings lie side by side in arrays, or in groups of these.
         ignore: columns that are not needed; * and ? stand for others.
     """
 
@@ -103,6 +106,7 @@ class Columns:
     contact_name: Name = "{contact}"
     plates: dict[Name, Plate] = dataclasses.field(default_factory=dict)
     rows_of: Name | None = None
+    episodes: Episodes | None = None
     ignore: Names = dataclasses.field(default_factory=list)
 
     @property
@@ -259,6 +263,7 @@ def check_columns(columns: Columns) -> None:
     for field, entry in (*((field, getattr(columns, field)) for field in columns.fields), *times):
         _check_given(field, entry)
     _check_plates(columns)
+    check_episodes(columns.episodes)
     for part in (*list_parts(columns).values(), *(_part(name, "time", entry) for name, entry in times)):
         _check_part(part)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import os
+import re
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import LogError, how_to_install
-from torchid.guards import CHUNK_BYTES, MAX_CHUNKS, MAX_SMALL, check_fields, check_names
+from torchid.guards import CHUNK_BYTES, MAX_CHUNKS, MAX_DATASETS, MAX_SMALL, check_fields, check_names
 from torchid.logs.lazy_arrays import LazyArray
 
 #: Filters by their HDF5 number.
@@ -22,6 +23,7 @@ _DEFLATE, _SHUFFLE, _FLETCHER32, _LZF = 1, 2, 3, 32000
 _ACCEPTED = "gzip or lzf, shuffle and fletcher32, each once (h5repack rewrites others)"
 #: Bytes of a checksum, bytes that are unpacked at a time, and bytes of an array's header in a file.
 _CHECKSUM_BYTES, _PIECE_BYTES, _HEADER_BYTES = 4, 2**22, 4096
+_NUMBER = re.compile(r"\d+")
 _DEPTH = 8  # of groups in groups
 _OF_MATLAB = ("#refs#", "#subsystem#")  # what cells and objects of its files refer to
 
@@ -39,19 +41,21 @@ class Hdf5:
     def _names(self) -> list[str]:
         """All names, `group/name` of what is in groups of the file itself; a group that holds nothing is a name too.
 
-        ValueError where there are more than a log may have, as those of a group that contains itself.
+        ValueError where there are more than a log may have, as those of a group that contains itself; arrays of groups
+        that differ in numbers, such as episodes, count once.
         """
         names, count, groups = list[str](), 0, [("", self._file)]
         for prefix, group in groups:
             count += len(group)
-            check_fields((), count)
+            if count > MAX_DATASETS:
+                raise ValueError(f"{count} arrays and groups, more than the {MAX_DATASETS} that a log may have")
             for name in group if prefix else [name for name in group if name not in _OF_MATLAB]:
                 inner = group[name] if isinstance(group.get(name, getlink=True), self._h5py.HardLink) else None
                 if isinstance(inner, self._h5py.Group) and len(inner) and prefix.count("/") < _DEPTH:
                     groups.append((f"{prefix}{name}/", inner))
                 else:
                     names.append(f"{prefix}{name}")
-        check_fields(names, len(names))
+        check_fields(names, len({_NUMBER.sub("", os.path.dirname(name)) + os.path.basename(name) for name in names}))
         return names
 
     def load(self, name: str) -> NDArray[Any]:

@@ -287,6 +287,8 @@ def map_table(columns: Columns, header: Sequence[str], in_degrees: bool = False)
         InputError: a map that does not fit the columns, or itself.
     """
     check_columns(columns)
+    if columns.episodes is not None:
+        raise LogError.at_field(f"{KEY}.episodes", "given for a table", "arrays: stamps of a table begin anew")
     columns = columns_of_file(columns, header)
     matching = match_columns(columns, header, is_column)
     if matching is None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,6 +25,7 @@ from torchid.logs.containers import (
     reader_errors_explained,
     save_arrays,
 )
+from torchid.logs.episodes import arrays_of_episodes
 from torchid.logs.force_plates import about_world_origin
 from torchid.logs.gaps import bridge_gaps, refuse_gaps
 from torchid.logs.log import (
@@ -99,9 +102,42 @@ def read_log(
     if columns is not None and not isinstance(columns, Columns):
         raise TypeError(f"columns: found {type(columns).__name__}; accepted: torchid.Columns(joint_position=...)")
     with during("reading", os.fspath(path)):
-        part, raw = split_range(path), _read_raw(path, topics, progress, columns, bridge_gaps_s, needs_flags)
+        part, kept = split_range(path), _last_file.get()
+        read = kept.read if kept is not None and isinstance(part.range, Recording) else _read_raw
+        raw = read(path, topics, progress, columns, bridge_gaps_s, needs_flags)
         raw = raw if part.range is None else _cut(raw, part.range)
         return build_log(bridge_gaps(about_world_origin(raw), bridge_gaps_s), allow_gaps)
+
+
+@contextmanager
+def files_of_recordings_kept() -> Iterator[None]:
+    """Within, a file that successive recordings are parts of (`walk.npz[#0:40]`) is read once: the last one is kept."""
+    token = _last_file.set(_LastFile())
+    try:
+        yield
+    finally:
+        _last_file.reset(token)
+
+
+class _LastFile:
+    """The fields of the file that was read last: of one file alone, whose recordings are parts of its memory."""
+
+    def __init__(self) -> None:
+        self._key: object = None
+        self._raw = dict[str, NDArray[Any]]()
+
+    def read(self, path: str | os.PathLike[str], *how: Any) -> dict[str, NDArray[Any]]:
+        """As `_read_raw`, of the same file read in the same way what is there."""
+        file = split_range(path).file
+        state = os.stat(file) if os.path.exists(file) else None
+        key = (file, state and (state.st_ino, state.st_size, state.st_mtime_ns), how)
+        if key != self._key:
+            self._key, self._raw = None, {}  # before the next: there is never more than one
+            self._raw, self._key = _read_raw(path, *how), key
+        return dict(self._raw)
+
+
+_last_file: ContextVar[_LastFile | None] = ContextVar("last file", default=None)
 
 
 def read_recordings(
@@ -201,20 +237,23 @@ def _read_arrays(
 ) -> dict[str, NDArray[Any]]:
     """The arrays of a .npz or HDF5 file; all names are checked first."""
     with open_container(path) as container:
+        arrays = arrays_of_episodes(container, columns)
 
         def load(name: str) -> NDArray[Any]:
             with reader_errors_explained(name, "a plain array of numbers, truth values or text"):
-                return require_plain(name, container.load(name))
+                return require_plain(name, arrays.load(name))
 
         def take(name: str) -> NDArray[Any]:
             return load_part(name, names, load)
 
-        names = list(container.declared_bytes())
+        names = arrays.names
         mapped = None if columns is None else map_arrays(columns, names, load)
         check(names if mapped is None else mapped.given)
         if mapped is None:
             return {name: load(name) for name in names}
         raw = mapped.read(take)
+        if "time" in raw:
+            raw["time"] = arrays.stamps(raw["time"], len(raw.get("joint_position", ())), mapped.step is not None)
         if others := {name: read_stamps(entry, load) for name, entry in mapped.other_times(names).items()}:
             return align_by_stamps(raw, {name: mapped.sources_of(name) for name in mapped.fields}, others)
         return _as_many_as_controls(raw)

@@ -101,7 +101,7 @@ def _width(name: str, values: FloatArray) -> int:
 
 def _estimate(name: str, time: FloatArray, values: FloatArray) -> FloatArray:
     """Standard deviation of the noise in a field (N, c), by channel."""
-    if name in _DERIVED or len(time) < _FEWEST or not values.size or not np.isfinite(values).all():
+    if name in _DERIVED or len(time) < _FEWEST or not values.size:
         return np.zeros(_width(name, values))
     if name != _ORIENTATION:
         return _rounded(white_noise(time, values))
@@ -117,24 +117,55 @@ def _rounded(values: FloatArray) -> FloatArray:
 def white_noise(time: FloatArray, values: FloatArray) -> FloatArray:
     """Standard deviation of white noise in smooth channels (N, c), (c,), at stamps (N,) [s]; 0 if what is there is not.
 
-    Differences of a high order leave of smooth motion less and less, of white noise always the same.
+    Differences of a high order leave of smooth motion less and less, of white noise always the same. Those across gaps
+    (NaN) are left out; too few of them show nothing.
     """
+    if not np.isfinite(values).all():
+        return np.array([_beside_gaps(time, channel) for channel in values.T])
+    lower, higher = (_left_by_differences(_evenly(time, values), order) for order in _ORDERS)
+    return _if_white(lower, higher, np.abs(values).max(axis=0))
+
+
+def _if_white(lower: FloatArray, higher: FloatArray, largest: FloatArray) -> FloatArray:
+    """What differences of the lower order leave, 0 where those of the higher leave less, or no more than rounding."""
+    return np.where((higher > _WHITE * lower) & (higher > _LEAST * largest), lower, 0.0)
+
+
+def _evenly(time: FloatArray, values: FloatArray) -> FloatArray:
+    """Channels (N, c) at even steps, between which differences are not motion."""
     steps = np.diff(time)
-    if np.ptp(steps) > JITTER * float(np.median(steps)):  # differences between uneven steps are motion
-        values = spline_derivatives(time, values, np.linspace(time[0], time[-1], len(time)), (0,))[0]
-    lower, higher = (_left_by_differences(values, order) for order in _ORDERS)
-    is_noise = (higher > _WHITE * lower) & (higher > _LEAST * np.abs(values).max(axis=0))
-    return np.where(is_noise, lower, 0.0)
+    if np.ptp(steps) <= JITTER * float(np.median(steps)):
+        return values
+    return spline_derivatives(time, values, np.linspace(time[0], time[-1], len(time)), (0,))[0]
+
+
+def _beside_gaps(time: FloatArray, channel: FloatArray) -> float:
+    """What `white_noise` finds of a channel (N,) with gaps, between them."""
+    edges = np.flatnonzero(np.diff(np.isfinite(channel), prepend=False, append=False))
+    runs = [slice(start, stop) for start, stop in edges.reshape(-1, 2) if stop - start > max(_ORDERS)]
+    if sum(run.stop - run.start for run in runs) < _FEWEST:
+        return 0.0
+    parts = [_evenly(time[run], channel[run, None]) for run in runs]
+    lower, higher = (_left(np.concatenate([_differences(x, order) for x in parts])) for order in _ORDERS)
+    return float(_if_white(lower, higher, np.nanmax(np.abs(channel), keepdims=True))[0])
 
 
 def rough_noise(values: FloatArray) -> FloatArray:
     """Standard deviation of whatever is not smooth from sample to sample in even channels (N, c), (c,)."""
-    differences = np.diff(values, n=_ORDERS[0], axis=0) / np.sqrt(comb(2 * _ORDERS[0], _ORDERS[0]))
-    return np.asarray(differences.std(axis=0))
+    return np.asarray(_differences(values, _ORDERS[0]).std(axis=0))
 
 
 def _left_by_differences(values: FloatArray, order: int) -> FloatArray:
-    differences = np.diff(values, n=order, axis=0) / np.sqrt(comb(2 * order, order))
+    return _left(_differences(values, order))
+
+
+def _differences(values: FloatArray, order: int) -> FloatArray:
+    """Of even channels (N, c), of white noise as large as the noise."""
+    return np.asarray(np.diff(values, n=order, axis=0) / np.sqrt(comb(2 * order, order)))
+
+
+def _left(differences: FloatArray) -> FloatArray:
+    """Standard deviation of differences of channels, without the few that are large."""
     off = np.abs(differences - np.median(differences, axis=0))
     return np.asarray(np.minimum(np.median(off, axis=0) / MAD_PER_STD, differences.std(axis=0)))
 

@@ -6,7 +6,8 @@ import io
 import math
 import os
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from torchid.estimators.least_squares import COMBINED, FIXED, IDENTIFIED, PRIOR,
 from torchid.fitting.calibration import Comparison
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.identifiability.contributions import Contribution, Contributions, PartContribution
+from torchid.kernels import compiling_announced
 from torchid.logs.time_range import log_title
 from torchid.parameters import PARAMETERS, PER_BODY
 from torchid.problem import Metrics
@@ -309,7 +311,11 @@ def _extra_cell(extra: ExtraEstimate) -> str:
     return f"{extra.value:.{digits}f} ± {size:.{digits}f}{mark}"
 
 
-def progress_bars() -> Progress:
+COMPILING = "compiling kernels, once on this machine (about 10 s)"
+
+
+@contextmanager
+def progress_bars() -> Iterator[Progress]:
     """Progress bars that vanish at the end and are not shown where standard error is not a terminal."""
     console = terminal_console(stderr=True)
     columns = (
@@ -319,4 +325,15 @@ def progress_bars() -> Progress:
         MofNCompleteColumn(),
         TimeRemainingColumn(),
     )
-    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bars:
+
+        @contextmanager
+        def compiling() -> Iterator[None]:
+            task = bars.add_task(COMPILING, total=None)
+            try:
+                yield
+            finally:
+                bars.remove_task(task)
+
+        with compiling_announced(compiling):
+            yield bars
