@@ -116,11 +116,9 @@ def _add_fits(commands: _Commands) -> None:
     check.add_argument("--json", metavar="FILE", help="write all findings to a .json file")
     check.add_argument("--figure", metavar="FILE", help="write an overview of all channels (.png, .pdf or .svg)")
     check.add_argument("--overwrite", action="store_true", help="replace these two files if they exist")
-    _add_amount(check)
     check.set_defaults(command=_check)
     identify = commands.add_parser("identify", help=_IDENTIFY, description=_IDENTIFY)
     _add_file(identify, "experiment file (YAML)", "for example estimator.ridge=0.01")
-    _add_amount(identify)
     identify.add_argument("--resume", action="store_true", help="continue an interrupted training (sgd)")
     identify.set_defaults(command=_identify)
 
@@ -178,11 +176,9 @@ def _add_studies(commands: _Commands) -> None:
     """Commands that need no recorded log."""
     analyze = commands.add_parser("analyze", help=_ANALYZE, description=_ANALYZE)
     _add_file(analyze, "experiment file (YAML), also without logs", "as analysis.candidates.contacts=axis")
-    _add_amount(analyze)
     analyze.set_defaults(command=_analyze)
     simulate = commands.add_parser("simulate", help=_SIMULATE, description=_SIMULATE)
     _add_file(simulate, "simulation file (YAML)", "for example sensors.bias.enabled=true")
-    _add_amount(simulate)
     simulate.set_defaults(command=_simulate)
 
 
@@ -247,6 +243,7 @@ class _PrintCompletion(argparse.Action):
 def _add_file(command: argparse.ArgumentParser, what: str, example: str) -> None:
     command.add_argument("file", help=what)
     command.add_argument("overrides", nargs="*", default=[], help=f"key.subkey=value, {example}")
+    _add_amount(command)
 
 
 def _add_amount(command: argparse.ArgumentParser) -> None:
@@ -295,7 +292,9 @@ def _compress(options: argparse.Namespace) -> None:
         from torchid.config import load_config
         from torchid.terminal.identification import print_compression
 
-    print_compression(compress(load_config(options.file, options.overrides), options.output))
+    done = compress(load_config(options.file, options.overrides), options.output)
+    if not options.quiet:
+        print_compression(done, options.verbose)
 
 
 def _evaluate(options: argparse.Namespace) -> None:

@@ -49,6 +49,16 @@ def test_the_recipes_print_what_they_show(
     assert run_page("recipes.md", tmp_path, capsys)[1] == 6
 
 
+@pytest.mark.parametrize("package", ["commands", "log_checks", "logs", "problem"])
+def test_the_list_of_modules_of_a_large_package_names_what_there_is_once(package: str) -> None:
+    folder = ROOT / "torchid" / package
+    said = ast.get_docstring(ast.parse((folder / "__init__.py").read_text())) or ""
+    named = re.findall(r"`(\w+)`", "".join(re.findall(r"^- .*(?:\n  .*)*", said, re.MULTILINE)))
+    modules = {path.stem for path in folder.glob("*.py")}
+    assert set(named) <= modules
+    assert len(named) == len(set(named)) > len(modules) / 2
+
+
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").glob("*.md")]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from pathlib import Path
 from typing import Any
@@ -22,10 +21,8 @@ from torchid.commands.reading import LogReader
 from torchid.commands.sensor_set_accuracy import accuracies
 from torchid.config import load_analysis
 from torchid.errors import TorchidWarning
-from torchid.identifiability.information import ExpectedErrors
 from torchid.parallel import copies_allowed
-from torchid.problem.metrics import ROW_GROUPS
-from torchid.report.analysis import SetAccuracy, accuracy_figure, describe_singular_postures
+from torchid.report.analysis import describe_singular_postures
 from torchid.report.figures import tree_figure
 from torchid.sensor_planning.observability import BaseObservability, PostureSummary
 
@@ -268,19 +265,6 @@ def test_a_base_that_is_often_all_but_lost_is_warned_of() -> None:
 
     (line,) = describe_singular_postures([checked(1e-3), checked(1e-8)])
     assert "in 1 of 2 contact states" in line
-
-
-def test_an_axis_of_less_than_a_decade_has_plain_numbers() -> None:
-    rms = {group: 0.05 for group in ROW_GROUPS}
-    expected = ExpectedErrors(rms, rms)
-    figure = accuracy_figure({name: SetAccuracy(1, 1, expected, None) for name in ("full", "joints")})
-    figure.savefig(io.BytesIO())
-    labels = [text.get_text() for axes in figure.axes for text in axes.yaxis.get_ticklabels(which="both")]
-    assert any(labels)
-    assert not any("$" in label for label in labels)
-    arm = ExpectedErrors(*[rms | dict.fromkeys(("base_force", "base_moment"))] * 2)
-    titles = [axes.get_title(loc="left") for axes in accuracy_figure({"full": SetAccuracy(1, 1, arm, None)}).axes]
-    assert titles == ["joint torque", "projected"]
 
 
 def test_a_key_of_another_estimator_is_refused_without_logs_too(

@@ -90,7 +90,7 @@ def test_a_run_from_the_cache_has_the_results_of_one_without_to_the_last_bit(
     assert "from cache" not in capsys.readouterr().out
     for opened in ("reading.read_log", "large_log.open_log_blocks", "cached_reading.log_bytes", "cache.part_checksum"):
         monkeypatch.setattr(f"torchid.commands.{opened}", None)
-    monkeypatch.setattr(sys.modules["torchid.commands.identify"], "compress_in_blocks", None)
+    monkeypatch.setattr("torchid.commands.prepared_data.compress_in_blocks", None)
     assert main([*line, f"output={tmp_path / 'second'}"]) == 0
     assert results(tmp_path / "second") == expected
     assert "from cache    samples of 2 logs, factors" in capsys.readouterr().out
@@ -105,7 +105,7 @@ def test_another_ridge_estimator_and_prior_read_and_compress_nothing(
     for number, more in enumerate(others):
         assert main(["identify", str(demo), *more, f"output={tmp_path / f'without{number}'}", NONE]) == 0
     monkeypatch.setattr("torchid.commands.reading.read_log", None)
-    monkeypatch.setattr(sys.modules["torchid.commands.identify"], "compress_in_blocks", None)
+    monkeypatch.setattr("torchid.commands.prepared_data.compress_in_blocks", None)
     for number, more in enumerate(others):
         assert main(["identify", str(demo), *more, f"output={tmp_path / f'with{number}'}"]) == 0
         assert results(tmp_path / f"with{number}") == results(tmp_path / f"without{number}")

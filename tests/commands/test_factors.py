@@ -16,11 +16,14 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import torchid
 from torchid.cli import main
+from torchid.commands.compress import CompressedFile
 from torchid.commands.results import Identification
 from torchid.config import load_config
 from torchid.fitting.experiment import set_up
 from torchid.fitting.factor_files import FactorFile, read_factors, read_fleet, write_factors
 from torchid.problem.metrics import ERROR_GROUPS, WHITENED
+from torchid.terminal.identification import compression_lines
+from torchid.terminal.lines import LINES
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:identified.urdf:torchid.errors.TorchidWarning"),
@@ -182,12 +185,33 @@ def test_the_cutoff_that_was_left_to_the_logs_is_printed_and_fits_their_factors(
 def test_the_table_of_files_says_what_is_in_them(
     fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["compress", str(fleet / "logs.yaml"), "--output", str(tmp_path / "f")]) == 0
-    lines = [line for line in capsys.readouterr().out.splitlines() if ".factor" in line]
-    size = (tmp_path / "f" / "sway_train.factor").stat().st_size
+    line = ["compress", str(fleet / "logs.yaml"), "--output", str(tmp_path / "f")]
+    assert main(line) == 0
+    lines = capsys.readouterr().out.splitlines()
+    sizes = {path.name: path.stat().st_size for path in (tmp_path / "f").glob("*.factor")}
     found = read_factors(tmp_path / "f" / "sway_train.factor").log
-    cells = ["sway_train.factor", str(KEPT), str(found.rows), str(len(found.by_state)), f"{size / 1e3:.0f}"]
-    assert [x.strip() for x in lines[0].strip("│").split("│")] == cells
+    cells = [
+        "sway_train.factor",
+        str(KEPT),
+        f"{sizes['sway_train.factor'] / 1e3:.0f}",
+        str(found.rows),
+        str(len(found.by_state)),
+    ]
+    assert lines[0] == f"2 logs, {2 * KEPT} samples, in {sum(sizes.values()) / 1e6:.3g} MB of factors"
+    assert cells in [line.split() for line in lines]
+    assert main([*line, "overwrite=true", "--verbose"]) == 0
+    verbose = capsys.readouterr().out.splitlines()
+    assert verbose[0].startswith("Contact states")
+    assert set(lines) < set(verbose)
+
+
+def test_a_fleet_that_is_compressed_has_its_answer_on_one_screen() -> None:
+    files = [CompressedFile(f"log_{k:03}.factor", 10**6, 1000, 6000, 5) for k in range(300)]
+    lines = compression_lines(files, 80, LINES)
+    assert lines[0] == "300 logs, 300000 samples, in 300 MB of factors"
+    assert len(lines) == LINES - 1  # and the folder
+    assert lines[-1] == f"and {300 - (LINES - 4)} files more: --verbose"
+    assert len(compression_lines(files, 80)) == 302
 
 
 def test_nothing_is_replaced_but_what_torchid_wrote(

@@ -11,16 +11,13 @@ import pytest
 import torch
 import yaml
 from repository import DEMO
-from synthetic import SOLO12, Oracle, load, make_log
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import torchid
 from torchid.cli import main
 from torchid.config import load_config
-from torchid.errors import BaseLostError
-from torchid.fitting.cross_validation import RidgeChoice, Scorer, TrainingScore, with_all_readings
+from torchid.fitting.cross_validation import RidgeChoice, Scorer, TrainingScore
 from torchid.fitting.experiment import Experiment, set_up, with_estimated_noise
-from torchid.identifiability.base_parameters import StateReport, _base_statistics, require_base
 from torchid.logs import read_log
 from torchid.logs.preprocess import preprocess
 from torchid.problem import (
@@ -383,36 +380,3 @@ def test_a_sensor_in_a_limb_that_the_urdf_predicts_better_counts() -> None:
 def test_what_was_not_measured_is_not_judged() -> None:
     nothing = Metrics(dict.fromkeys(ROW_GROUPS), dict.fromkeys(ROW_GROUPS), {}, {}, None)
     assert worse_than_nominal({"test": (nothing, nothing)}) == []
-
-
-# ------------------------------------------------------------------------------------------------------------- the base
-
-
-def test_the_rank_is_that_of_most_samples_and_not_of_the_best() -> None:
-    values = torch.ones(64, 6)
-    values[:63, 2:] = 0.0
-    rank, smallest, full, shares = _base_statistics(values, torch.ones(64))
-    assert (rank, smallest, full) == (2, 0.0, 1 / 64)
-    assert shares == {6: 1 / 64, 2: 63 / 64}
-    with pytest.raises(BaseLostError, match=r"rank 2 of 6, 6 in 1.6 % of them"):
-        require_base([StateReport("stand", 64, 6, rank, smallest, full, shares)])
-    rank, smallest, full, shares = _base_statistics(values.flip(0), torch.tensor([1000.0] + [1.0] * 63))
-    assert rank == 6, "a sample counts as often as it stands for others"
-
-
-# ----------------------------------------------------------------------------------------- whatever the sensors are
-
-
-def test_samples_without_a_reading_are_left_out_of_the_residual() -> None:
-    robot, contacts = load(SOLO12), [Contact("FL_FOOT", "point")]
-    log = make_log(Oracle.of(robot), [("FL_FOOT", 3)], [(True,), (False,)], 20, np.random.default_rng(0))
-    samples = bind_log(log, robot, contacts)
-    assert samples.torque is not None
-    assert samples.wrench is not None
-    samples.torque[3, 2] = np.nan
-    samples.wrench[4, 0, 1] = samples.wrench[5, 0, 1] = np.nan  # 5: in the air
-    for name, lost in (("full", {3, 4}), ("joints", {3}), ("contacts", {4})):
-        found = with_all_readings(samples, RowBuilder(robot, contacts, named_sensors(name, robot.n, 1)))
-        assert set(range(20)) - {samples.time.tolist().index(t) for t in found.time.tolist()} == lost
-    silent = replace(samples, torque=None)
-    assert len(with_all_readings(silent, RowBuilder(robot, contacts, named_sensors("joints", robot.n, 1)))) == 0

@@ -6,10 +6,11 @@ import warnings
 
 import numpy as np
 import pytest
+import torch
 from synthetic import ANYMAL, Oracle, load, make_log
 
 from torchid.errors import BaseLostError, BaseLostWarning, SensorError, UnknownNameError, about_file
-from torchid.identifiability.base_parameters import StateReport, require_base, state_reports
+from torchid.identifiability.base_parameters import StateReport, _base_statistics, require_base, state_reports
 from torchid.problem import RowBuilder, bind_log
 from torchid.sensing import Contact, SensorNoise, SensorSet, chosen_sensors, named_sensors, validate_contacts
 
@@ -172,3 +173,15 @@ def test_a_bolted_base_cannot_be_lost() -> None:
     assert report.base_rank is None
     assert report.base_singular_value is None
     require_base([report])
+
+
+def test_the_rank_is_that_of_most_samples_and_not_of_the_best() -> None:
+    values = torch.ones(64, 6)
+    values[:63, 2:] = 0.0
+    rank, smallest, full, shares = _base_statistics(values, torch.ones(64))
+    assert (rank, smallest, full) == (2, 0.0, 1 / 64)
+    assert shares == {6: 1 / 64, 2: 63 / 64}
+    with pytest.raises(BaseLostError, match=r"rank 2 of 6, 6 in 1.6 % of them"):
+        require_base([StateReport("stand", 64, 6, rank, smallest, full, shares)])
+    rank, smallest, full, shares = _base_statistics(values.flip(0), torch.tensor([1000.0] + [1.0] * 63))
+    assert rank == 6, "a sample counts as often as it stands for others"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,8 +13,11 @@ from matplotlib.figure import Figure
 
 from torchid.estimators.least_squares import COMBINED, FIXED
 from torchid.fitting.calibration import Comparison
+from torchid.identifiability.information import ExpectedErrors
 from torchid.parameters import PER_BODY
 from torchid.problem import Metrics
+from torchid.problem.metrics import ROW_GROUPS
+from torchid.report.analysis import SetAccuracy, accuracy_figure
 from torchid.report.figure_style import decade, label_decades
 from torchid.report.figures import contribution_figure, error_figure, identifiability_figure
 
@@ -76,3 +80,16 @@ def test_logarithmic_axes_have_numbers_that_people_write(low: float, high: float
     texts = {text.get_text() for text in axes.yaxis.get_ticklabels(which="both")}
     assert texts >= said
     assert not any("e" in text for text in texts)
+
+
+def test_an_axis_of_less_than_a_decade_has_plain_numbers() -> None:
+    rms = {group: 0.05 for group in ROW_GROUPS}
+    expected = ExpectedErrors(rms, rms)
+    figure = accuracy_figure({name: SetAccuracy(1, 1, expected, None) for name in ("full", "joints")})
+    figure.savefig(io.BytesIO())
+    labels = [text.get_text() for axes in figure.axes for text in axes.yaxis.get_ticklabels(which="both")]
+    assert any(labels)
+    assert not any("$" in label for label in labels)
+    arm = ExpectedErrors(*[rms | dict.fromkeys(("base_force", "base_moment"))] * 2)
+    titles = [axes.get_title(loc="left") for axes in accuracy_figure({"full": SetAccuracy(1, 1, arm, None)}).axes]
+    assert titles == ["joint torque", "projected"]

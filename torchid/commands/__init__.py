@@ -1,4 +1,15 @@
-"""Commands, from arguments to files and folders, and the formats that they write."""
+"""Commands, from arguments to files and folders, and the formats that they write.
+
+A module for each command: `analyze`, `check` (and `convert`), `compress`, `demo`, `evaluate`, `export`, `identify`,
+`init`, `replay`, `report`, `sample`, `simulate`. What they are made of:
+
+- reading logs: `reading`, block by block `large_log`, `segmented_log`; by several processes `shared_log`; from a cache
+  `cached_reading`, `cache_entries`, `cache`
+- a fit: `prepared_data`, `chosen_settings`, `training`, `checkpoint`, `plausibility`
+- what `identify` returns and says: `results`, `named_results`, `answer`, `run_figures`
+- parts of `init` and `analyze`: `init_logs`, `init_proposals`, `sensor_set_accuracy`
+- folders: `folder`, `manifest`
+"""
 
 # here, where the command line finds them without the imports of the commands, which take long
 EXPORT_FORMATS = ("mjcf", "urdf", "isaaclab", "json")

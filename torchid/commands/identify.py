@@ -2,66 +2,47 @@
 
 from __future__ import annotations
 
-import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from functools import partial
 
 from rich.progress import Progress
 
 from torchid import ranks
-from torchid.commands.cache_entries import cached_parts, factors_key
-from torchid.commands.cached_reading import CachedReader, open_reader
-from torchid.commands.chosen_settings import Choices, with_chosen_settings, with_ridge, with_sample_rates
+from torchid.commands.chosen_settings import with_sample_rates
 from torchid.commands.evaluate import compare_forces, trace_forces
 from torchid.commands.folder import RUN, check_free, claim_folder
 from torchid.commands.plausibility import TrainingLogs, require_not_worse, require_plausible, suspected_mistake
-from torchid.commands.reading import LogReader, check_read
+from torchid.commands.prepared_data import Clock, PreparedData, prepare
 from torchid.commands.results import Identification, write_run
 from torchid.commands.run_figures import Drawing, drawing, figures_left, fit_figures
-from torchid.commands.training import Training, descent_settings, require_trainable, training_folder
+from torchid.commands.training import Training, require_trainable, training_folder
 from torchid.config import ExperimentConfig, inputs_of
-from torchid.errors import NumericalWarning, format_count, warn_about_file
+from torchid.errors import NumericalWarning, warn_about_file
 from torchid.estimators import Conditions, Estimate, Violation, violations
 from torchid.estimators.conditions import term_violations
 from torchid.fitting.calibration import Calibration, Comparison, warn_of_confounded, warn_of_disagreement
-from torchid.fitting.cross_validation import CrossValidation, RidgeChoice, Scorer
+from torchid.fitting.cross_validation import CrossValidation, Scorer
 from torchid.fitting.delay import unfitted_delay
-from torchid.fitting.experiment import Experiment, set_up, with_noise
-from torchid.fitting.factor_files import FactorFile, read_fleet
+from torchid.fitting.factor_files import FactorFile
 from torchid.fitting.fit import Fit, LogFitter
 from torchid.fitting.misfit import misfit, resting_joints, unfitted_friction
-from torchid.fitting.noise import NoiseSummary
 from torchid.fitting.posterior import fitted_posterior
 from torchid.fitting.robust import RobustSummary, fit_robustly
-from torchid.identifiability.base_parameters import StateReport, require_base, state_reports
 from torchid.identifiability.confounding import TotalMass
 from torchid.identifiability.contributions import Contributions, contributions
 from torchid.parallel import one_thread
 from torchid.parameters import PER_BODY, Array
-from torchid.problem import Evaluation, LinearProblem, Metrics, RowBuilder, Samples
-from torchid.problem.compressed_log import Block, fold_compressed, merge_blocks
-from torchid.problem.compression import compress_in_blocks, split_into_folds
+from torchid.problem import Evaluation, LinearProblem, Metrics, Samples
+from torchid.problem.compressed_log import Block
 from torchid.problem.contact_state import ContactState, state_name
 from torchid.problem.metrics import LOG_SETS
 from torchid.problem.motion_noise import is_at_rest
 from torchid.problem.parts import Part, merge_folds, merge_states
+from torchid.report.forces import ForceSeries
 from torchid.report.tables import progress_bars
-
-
-@dataclass
-class _Clock:
-    """Adds up seconds by step: `with clock("read"): ...`."""
-
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def __call__(self, name: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
 
 
 @one_thread()
@@ -98,85 +79,6 @@ def identify(config: ExperimentConfig, resume: bool = False) -> Identification:
     return run
 
 
-@dataclass
-class _Data:
-    """Training logs in folds, or factors of them, with the noise of their weights, and compressed; test logs.
-
-    `experiment`: with that noise, and what the logs have chosen. `factors`: files that the training logs come from, if
-    they do. `reused`: what an earlier run has left in the cache, in words.
-    """
-
-    experiment: Experiment
-    logs: dict[str, list[Samples]]
-    factors: list[FactorFile]
-    excluded: Mapping[str, int]
-    states: list[StateReport]
-    noise: NoiseSummary
-    builder: RowBuilder
-    blocks: Sequence[Block]
-    parts: list[Part]
-    reused: list[str]
-    choices: Choices
-
-
-@dataclass
-class _Prepared(_Data):
-    """Data with the ridge chosen."""
-
-    conditions: Conditions
-    fitter: LogFitter
-    ridge: RidgeChoice | None
-
-
-def _prepare(config: ExperimentConfig, clock: _Clock, bars: Progress) -> _Prepared:
-    with clock("read"):
-        experiment = set_up(config)
-        conditions = experiment.conditions()
-        if config.estimator.name == "sgd":
-            descent_settings(config)  # before any work
-    data = (_data_of_factors if config.logs.compressed else _data_of_logs)(experiment, clock, bars)
-    with clock("ridge"):
-        experiment, ridge = with_ridge(data.experiment, data.parts, data.blocks, data.builder, conditions, bars)
-    fitter = experiment.fitter(data.builder, conditions)
-    return _Prepared(**vars(data) | {"experiment": experiment}, conditions=conditions, fitter=fitter, ridge=ridge)
-
-
-def _data_of_logs(experiment: Experiment, clock: _Clock, bars: Progress) -> _Data:
-    """The logs of an experiment, read and compressed."""
-    with clock("settings"):
-        experiment, choices = with_chosen_settings(experiment, bars)
-    with clock("read"):
-        reader, logs = _read(experiment, bars)
-    with clock("noise"):
-        states = state_reports(logs["train"], experiment.builder(experiment.sensors))
-        require_base(states, experiment.config.sensors.on_base_lost, experiment.contacts)
-        noise = ranks.from_first(partial(experiment.estimate_noise, logs["train"], experiment.sensors), "noise")
-        experiment = with_noise(experiment, noise)
-    reader.release()
-    with clock("compress"):
-        builder = experiment.builder(experiment.sensors)
-        blocks = split_into_folds(logs["train"], builder)
-        parts, there = _compressed(experiment, reader, builder, blocks, bars)
-    reused = [*_reused(reader), *(["factors"] if there else [])]
-    return _Data(experiment, logs, [], reader.excluded, states, noise, builder, blocks, parts, reused, choices)
-
-
-def _data_of_factors(experiment: Experiment, clock: _Clock, bars: Progress) -> _Data:
-    """The logs of an experiment that fits factors of logs."""
-    with clock("read"):
-        reading = bars.add_task("reading factors", total=len(experiment.config.logs.train))
-        fleet = read_fleet(experiment, lambda _: bars.advance(reading))
-        require_base(fleet.states, experiment.config.sensors.on_base_lost, experiment.contacts)
-        reader, logs = _read(experiment, bars)
-    with clock("compress"):
-        builder = fleet.experiment.builder(fleet.experiment.sensors)
-        blocks = fold_compressed([one.log for one in fleet.files], builder)
-        parts = merge_blocks(blocks, builder)
-    excluded = {one.log.source: one.excluded for one in fleet.files if one.excluded}
-    same = (fleet.states, fleet.noise, builder, blocks, parts, _reused(reader), Choices())
-    return _Data(fleet.experiment, logs, fleet.files, excluded, *same)
-
-
 @dataclass(frozen=True)
 class _Solved:
     """A fit, how outliers were down-weighted and how it was trained, if so, and the total mass."""
@@ -187,7 +89,9 @@ class _Solved:
     mass: TotalMass
 
 
-def _solved(ready: _Prepared, evaluation: Evaluation, checked: TrainingLogs, bars: Progress, resume: bool) -> _Solved:
+def _solved(
+    ready: PreparedData, evaluation: Evaluation, checked: TrainingLogs, bars: Progress, resume: bool
+) -> _Solved:
     """The fit of prepared data, which may be that of a robot."""
     experiment, fitter, logs = ready.experiment, ready.fitter, ready.logs
     training, solve = None, None
@@ -211,25 +115,22 @@ def _identify(
     config: ExperimentConfig, resume: bool, bars: Progress, stack: ExitStack
 ) -> tuple[Identification, Training | None, list[Drawing]]:
     """What the logs say, how it was trained, if so, and figures of it that are drawn until the stack is left."""
-    clock = _Clock()
-    ready = _prepare(config, clock, bars)
+    clock = Clock()
+    ready = prepare(config, clock, bars)
     experiment, fitter, logs, blocks = ready.experiment, ready.fitter, ready.logs, ready.blocks
     checked, builder = TrainingLogs(experiment, bars), fitter.builder
     evaluation = experiment.evaluation(experiment.noise_of_readings)
     with clock("solve"):
         solved = _solved(ready, evaluation, checked, bars, resume)
         fit, ready.parts = solved.fit, []
-        estimate, problem, compared = fit.estimate, fit.assembly.problem, experiment.calibrations(fit, builder)
+        problem, compared = fit.assembly.problem, experiment.calibrations(fit, builder)
         shown = [*logs["test"], *logs["train"]][:1]
         forces = ranks.from_first(lambda: [compare_forces(evaluation, log, compared) for log in shown], "forces")
-        figures = fit_figures(experiment.robot, estimate, fit.extras, ready.ridge, *forces)
-        copied = config.output is not None and ranks.world_size() == 1  # several processes draw all of them at last
-        begun = [stack.enter_context(drawing(figures, experiment.config))] if copied else []
+        begun = _begin_figures(ready, fit, forces, stack)
     with clock("identifiability"):
         whole = merge_folds(_with_states(fit.parts, ready.factors), builder)
         alone = _by_state(fitter, whole)
-        adding = partial(_contributions, experiment, builder, whole, logs["train"], problem, bars)
-        added = ranks.from_first(adding, "contributions")
+        added = ranks.from_first(partial(_contributions, ready, whole, problem, bars), "contributions")
     with clock("evaluate"):
         without_folds = [experiment.calibrations(one, builder) for one in fitter.fit_without_folds(fit)]
         scorer, of_blocks = Scorer(evaluation, builder), merge_states(fit.parts, builder)
@@ -238,11 +139,13 @@ def _identify(
         delay = ranks.from_first(partial(unfitted_delay, logs["train"], fitter, experiment.terms), "delay")
     run = Identification(
         experiment=experiment,
-        estimate=estimate,
+        estimate=fit.estimate,
         extras=fit.extras,
         noise=ready.noise,
         motion_noise=fit.assembly.noise,
-        misfit=misfit(estimate, ready.noise, blocks, fit.scatter, unfitted_friction(problem, experiment.robot), delay),
+        misfit=misfit(
+            fit.estimate, ready.noise, blocks, fit.scatter, unfitted_friction(problem, experiment.robot), delay
+        ),
         resting=resting_joints(problem, experiment.robot, builder, logs["train"]),
         at_rest=[name for name in LOG_SETS if is_at_rest(logs[name])],
         robust=solved.robust,
@@ -251,7 +154,7 @@ def _identify(
         contributions=added,
         metrics=scores.metrics,
         evaluated=scores.samples,
-        violations=_violations(estimate, problem, ready.conditions),
+        violations=_violations(fit.estimate, problem, ready.conditions),
         seconds=clock.seconds,
         samples=sum(map(len, blocks)),
         factors=ready.factors,
@@ -271,52 +174,16 @@ def _identify(
     return replace(run, suspected=suspected_mistake(run, checked)), solved.training, begun
 
 
-def _read(experiment: Experiment, bars: Progress) -> tuple[LogReader, dict[str, list[Samples]]]:
-    """What has read the logs, and these by use; those of which there are but factors are left out.
-
-    Those that are trained on, or decide when to stop, have every sensor of the set.
-    """
-    reader, settings = open_reader(experiment), experiment.config.logs
-    files = {name: getattr(settings, name) for name in ("train", "validation", "test")}
-    if settings.compressed:
-        files["train"] = []
-    reading = bars.add_task("reading logs", total=sum(map(len, files.values())))
-    logs = {
-        name: reader.read(paths, None if name == "test" else experiment.sensors, lambda _: bars.advance(reading))
-        for name, paths in files.items()
-    }
-    check_read(logs)
-    if experiment.config.estimator.name == "sgd":  # it sees samples one by one, not what noise adds on average
-        logs["train"] = [replace(log, motion_noise=None) for log in logs["train"]]
-    return reader, logs
+def _begin_figures(ready: PreparedData, fit: Fit, forces: Sequence[ForceSeries], stack: ExitStack) -> list[Drawing]:
+    """Figures of a fit that one process, if it writes a run, draws beside what follows, until the stack is left."""
+    experiment = ready.experiment
+    if experiment.config.output is None or ranks.world_size() > 1:  # several processes draw all of them at last
+        return []
+    figures = fit_figures(experiment.robot, fit.estimate, fit.extras, ready.ridge, *forces)
+    return [stack.enter_context(drawing(figures, experiment.config))]
 
 
-def _reused(reader: LogReader) -> list[str]:
-    """What a reader has found in its cache, in words."""
-    count = len(reader.reused) if isinstance(reader, CachedReader) else 0
-    return [f"samples of {format_count(count, 'log')}"] if count else []
-
-
-def _compressed(
-    experiment: Experiment, reader: LogReader, builder: RowBuilder, train: Sequence[Samples], bars: Progress
-) -> tuple[list[Part], bool]:
-    """The compressed training logs, and whether they were in the cache."""
-    streaming = bars.add_task("streaming samples", total=sum(map(len, train)))
-
-    def compute() -> list[Part]:
-        return compress_in_blocks(train, builder, progress=partial(bars.advance, streaming))
-
-    keys = reader.keys if isinstance(reader, CachedReader) else {}
-    paths = [str(path) for path in experiment.config.logs.train]
-    if not isinstance(reader, CachedReader) or not all(ranks.gather(keys.keys() >= {*paths}, "logs in the cache")):
-        return compute(), False
-    key = factors_key(experiment, builder, [keys[path] for path in paths], train)
-    parts, there = cached_parts(reader.cache, key, builder, train, compute)
-    bars.update(streaming, completed=sum(map(len, train)))
-    return parts, there
-
-
-def _robust(fit: Fit, ready: _Prepared, bars: Progress) -> tuple[Fit, RobustSummary | None]:
+def _robust(fit: Fit, ready: PreparedData, bars: Progress) -> tuple[Fit, RobustSummary | None]:
     """The fit with outliers down-weighted, if the settings say so; only batch estimators can.
 
     Warns:
@@ -351,18 +218,12 @@ def _by_state(fitter: LogFitter, parts: Sequence[Part]) -> dict[str, Estimate]:
     return {name: fitter.least_squares.solve(problem) for name, problem in problems.items()}
 
 
-def _contributions(
-    experiment: Experiment,
-    builder: RowBuilder,
-    parts: Sequence[Part],
-    train: Sequence[Samples],
-    problem: LinearProblem,
-    bars: Progress,
-) -> Contributions:
+def _contributions(ready: PreparedData, parts: Sequence[Part], problem: LinearProblem, bars: Progress) -> Contributions:
     """What each log, contact state and sensor adds."""
     leaving_out = bars.add_task("leaving out each in turn", total=None)
-    tolerance, names = experiment.config.estimator.rank_tolerance, experiment.robot.dof_names
-    out = contributions(parts, train, builder, problem, names, tolerance, lambda n: bars.advance(leaving_out, n))
+    tolerance, names = ready.experiment.config.estimator.rank_tolerance, ready.experiment.robot.dof_names
+    done, builder = partial(bars.advance, leaving_out), ready.fitter.builder
+    out = contributions(parts, ready.logs["train"], builder, problem, names, tolerance, done)
     bars.update(leaving_out, total=1, completed=1)
     return out
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torchid.errors import LogError, TorchidError, during, excerpt
 from torchid.guards import MAX_ARRAYS, check_fields, check_names, check_unpacked_size
 from torchid.logs.hdf5 import Hdf5, import_h5py, save_hdf5
-from torchid.logs.json_documents import JsonDocument
+from torchid.logs.json_files import JsonDocument
 from torchid.logs.lazy_arrays import LazyArray, Spill
 from torchid.logs.matlab import MatFile, byte_order
 from torchid.logs.time_range import split_range

@@ -15,7 +15,7 @@ from torchid.errors import LogError, excerpt, how_to_install
 from torchid.guards import MAX_ARRAYS, MAX_SCHEMA, check_unpacked_size
 from torchid.logs.columns import TEXT_COLUMN, check_header, is_number, is_stamp
 from torchid.logs.containers import JSON_LINES, TEXT_TABLES
-from torchid.logs.json_lines import JsonColumns, read_json_lines
+from torchid.logs.json_files import JsonColumns, read_json_lines
 from torchid.logs.table_headers import BLOCK, NestedColumns, TextHeader, read_header
 
 #: Rows that are converted at a time; lines of JSON.

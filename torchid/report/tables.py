@@ -237,17 +237,6 @@ def violation_table(violations: Sequence[Mapping[str, Any]]) -> Table:
     return table
 
 
-def compression_table(files: Sequence[Mapping[str, Any]]) -> Table:
-    """Files of factors: fields of `CompressedFile`."""
-    table = Table(title="Compressed logs", title_justify="left")
-    for heading in ("file", "samples", "rows", "contact states", "kB"):
-        table.add_column(heading, justify="left" if heading == "file" else "right", overflow="fold")
-    for file in files:
-        counts = (str(file[name]) for name in ("samples", "rows", "states"))
-        table.add_row(Text(str(file["name"])), *counts, f"{file['size'] / 1e3:.0f}")
-    return table
-
-
 def stability_table(motions: Mapping[str, Mapping[str, Any]]) -> Table:
     """Stability of a simulated robot: fields of `Stability` by motion."""
     table = Table(title="Standing", title_justify="left")

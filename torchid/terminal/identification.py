@@ -9,10 +9,10 @@ from textwrap import shorten
 import numpy as np
 
 from torchid.commands.answer import answer
-from torchid.commands.compress import Compression
+from torchid.commands.compress import CompressedFile, Compression
 from torchid.commands.results import Identification
 from torchid.commands.training import body_eigenvalues
-from torchid.errors import join_names
+from torchid.errors import format_count, join_names
 from torchid.estimators import ConsistentEstimate, ConstrainedEstimate, Estimate, SgdEstimate
 from torchid.estimators.least_squares import COMBINED, FIXED, IDENTIFIED, PRIOR, UNOBSERVABLE
 from torchid.fitting.cross_validation import CrossValidation
@@ -20,10 +20,10 @@ from torchid.fitting.misfit import Misfit
 from torchid.parameters import PARAMETERS, PER_BODY, Array
 from torchid.problem.metrics import DECISIVE_GROUPS, describe_errors
 from torchid.report.tables import (
-    compression_table,
     contribution_table,
     error_tables,
     extra_table,
+    noise_advice,
     print_tables,
     state_table,
     terminal_width,
@@ -260,11 +260,32 @@ def _print_validation(validation: CrossValidation, nominal_of: str) -> None:
     print_labelled("held out", text)
 
 
-def print_compression(done: Compression) -> None:
-    """Print contact states, noise, and the files of factors."""
-    print_tables(state_table([asdict(state) for state in done.states]))
-    print_noise(done.noise)
-    print_tables(compression_table([asdict(file) for file in done.files]))
+def print_compression(done: Compression, verbose: bool = False) -> None:
+    """Print the answer for the terminal's width; `verbose`: all tables before it, and every file."""
+    if verbose:
+        print_tables(state_table([asdict(state) for state in done.states]))
+        print_noise(done.noise)
+    print("\n".join(compression_lines(done.files, terminal_width(), None if verbose else LINES)))
     print_rolling(done.rolling)
     _print_choices(done.choices.by_name())
-    print(f"written to    {done.output}")
+    if not verbose and done.noise.suggested:
+        print_labelled("noise", noise_advice(done.noise.suggested))
+    print(f"{'written to':{LABEL}}{done.output}")
+
+
+def compression_lines(files: Sequence[CompressedFile], width: int, most: int | None = None) -> list[str]:
+    """How much was compressed to how little, and the files, in at most so many lines of at most so many columns."""
+    samples, size = (sum(x) for x in zip(*((one.samples, one.size) for one in files), strict=True))
+    said = f"{format_count(len(files), 'log')}, {format_count(samples, 'sample')}, in {size / 1e6:.3g} MB of factors"
+    head = wrap_words(said, width)
+    room = len(files) if most is None else most - len(head) - 3  # a heading, how many more there are, the folder
+    shown = files if len(files) <= room else files[: max(room, 1)]
+    columns = [
+        ("samples", [str(one.samples) for one in shown]),
+        ("kB", [f"{one.size / 1e3:.0f}" for one in shown]),
+        ("rows", [str(one.rows) for one in shown]),
+        ("contact states", [str(one.states) for one in shown]),
+    ]
+    left = len(files) - len(shown)
+    rest = [f"and {format_count(left, 'file')} more: --verbose"] if left else []
+    return [*head, *column_lines(("file", [one.name for one in shown]), columns, width), *rest]

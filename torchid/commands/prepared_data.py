@@ -1,0 +1,175 @@
+"""What `torchid identify` fits: training logs, or factors of them, read and compressed, with noise and ridge chosen."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+from rich.progress import Progress
+
+from torchid import ranks
+from torchid.commands.cache_entries import cached_parts, factors_key
+from torchid.commands.cached_reading import CachedReader, open_reader
+from torchid.commands.chosen_settings import Choices, with_chosen_settings, with_ridge
+from torchid.commands.reading import LogReader, check_read
+from torchid.commands.training import descent_settings
+from torchid.config import ExperimentConfig
+from torchid.errors import format_count
+from torchid.estimators import Conditions
+from torchid.fitting.cross_validation import RidgeChoice
+from torchid.fitting.experiment import Experiment, set_up, with_noise
+from torchid.fitting.factor_files import FactorFile, read_fleet
+from torchid.fitting.fit import LogFitter
+from torchid.fitting.noise import NoiseSummary
+from torchid.identifiability.base_parameters import StateReport, require_base, state_reports
+from torchid.problem import RowBuilder, Samples
+from torchid.problem.compressed_log import Block, fold_compressed, merge_blocks
+from torchid.problem.compression import compress_in_blocks, split_into_folds
+from torchid.problem.parts import Part
+
+
+@dataclass
+class Clock:
+    """Adds up seconds by step: `with clock("read"): ...`."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        """Add what the block takes to a step."""
+        start = time.perf_counter()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+
+
+@dataclass
+class CompressedData:
+    """Training logs in folds, or factors of them, with the noise of their weights, and compressed; test logs.
+
+    `experiment`: with that noise, and what the logs have chosen. `factors`: files that the training logs come from, if
+    they do. `reused`: what an earlier run has left in the cache, in words.
+    """
+
+    experiment: Experiment
+    logs: dict[str, list[Samples]]
+    factors: list[FactorFile]
+    excluded: Mapping[str, int]
+    states: list[StateReport]
+    noise: NoiseSummary
+    builder: RowBuilder
+    blocks: Sequence[Block]
+    parts: list[Part]
+    reused: list[str]
+    choices: Choices
+
+
+@dataclass
+class PreparedData(CompressedData):
+    """Data with the ridge chosen."""
+
+    conditions: Conditions
+    fitter: LogFitter
+    ridge: RidgeChoice | None
+
+
+def prepare(config: ExperimentConfig, clock: Clock, bars: Progress) -> PreparedData:
+    """Read and compress what an experiment fits, and choose its ridge.
+
+    Raises:
+        InputError: whatever does not fit.
+        BaseLostError: the sensors cannot see the base.
+    """
+    with clock("read"):
+        experiment = set_up(config)
+        conditions = experiment.conditions()
+        if config.estimator.name == "sgd":
+            descent_settings(config)  # before any work
+    data = (_data_of_factors if config.logs.compressed else _data_of_logs)(experiment, clock, bars)
+    with clock("ridge"):
+        experiment, ridge = with_ridge(data.experiment, data.parts, data.blocks, data.builder, conditions, bars)
+    fitter = experiment.fitter(data.builder, conditions)
+    return PreparedData(**vars(data) | {"experiment": experiment}, conditions=conditions, fitter=fitter, ridge=ridge)
+
+
+def _data_of_logs(experiment: Experiment, clock: Clock, bars: Progress) -> CompressedData:
+    """The logs of an experiment, read and compressed."""
+    with clock("settings"):
+        experiment, choices = with_chosen_settings(experiment, bars)
+    with clock("read"):
+        reader, logs = _read(experiment, bars)
+    with clock("noise"):
+        states = state_reports(logs["train"], experiment.builder(experiment.sensors))
+        require_base(states, experiment.config.sensors.on_base_lost, experiment.contacts)
+        noise = ranks.from_first(partial(experiment.estimate_noise, logs["train"], experiment.sensors), "noise")
+        experiment = with_noise(experiment, noise)
+    reader.release()
+    with clock("compress"):
+        builder = experiment.builder(experiment.sensors)
+        blocks = split_into_folds(logs["train"], builder)
+        parts, there = _compressed(experiment, reader, builder, blocks, bars)
+    reused = [*_reused(reader), *(["factors"] if there else [])]
+    return CompressedData(experiment, logs, [], reader.excluded, states, noise, builder, blocks, parts, reused, choices)
+
+
+def _data_of_factors(experiment: Experiment, clock: Clock, bars: Progress) -> CompressedData:
+    """The logs of an experiment that fits factors of logs."""
+    with clock("read"):
+        reading = bars.add_task("reading factors", total=len(experiment.config.logs.train))
+        fleet = read_fleet(experiment, lambda _: bars.advance(reading))
+        require_base(fleet.states, experiment.config.sensors.on_base_lost, experiment.contacts)
+        reader, logs = _read(experiment, bars)
+    with clock("compress"):
+        builder = fleet.experiment.builder(fleet.experiment.sensors)
+        blocks = fold_compressed([one.log for one in fleet.files], builder)
+        parts = merge_blocks(blocks, builder)
+    excluded = {one.log.source: one.excluded for one in fleet.files if one.excluded}
+    same = (fleet.states, fleet.noise, builder, blocks, parts, _reused(reader), Choices())
+    return CompressedData(fleet.experiment, logs, fleet.files, excluded, *same)
+
+
+def _read(experiment: Experiment, bars: Progress) -> tuple[LogReader, dict[str, list[Samples]]]:
+    """What has read the logs, and these by use; those of which there are but factors are left out.
+
+    Those that are trained on, or decide when to stop, have every sensor of the set.
+    """
+    reader, settings = open_reader(experiment), experiment.config.logs
+    files = {name: getattr(settings, name) for name in ("train", "validation", "test")}
+    if settings.compressed:
+        files["train"] = []
+    reading = bars.add_task("reading logs", total=sum(map(len, files.values())))
+    logs = {
+        name: reader.read(paths, None if name == "test" else experiment.sensors, lambda _: bars.advance(reading))
+        for name, paths in files.items()
+    }
+    check_read(logs)
+    if experiment.config.estimator.name == "sgd":  # it sees samples one by one, not what noise adds on average
+        logs["train"] = [replace(log, motion_noise=None) for log in logs["train"]]
+    return reader, logs
+
+
+def _reused(reader: LogReader) -> list[str]:
+    """What a reader has found in its cache, in words."""
+    count = len(reader.reused) if isinstance(reader, CachedReader) else 0
+    return [f"samples of {format_count(count, 'log')}"] if count else []
+
+
+def _compressed(
+    experiment: Experiment, reader: LogReader, builder: RowBuilder, train: Sequence[Samples], bars: Progress
+) -> tuple[list[Part], bool]:
+    """The compressed training logs, and whether they were in the cache."""
+    streaming = bars.add_task("streaming samples", total=sum(map(len, train)))
+
+    def compute() -> list[Part]:
+        return compress_in_blocks(train, builder, progress=partial(bars.advance, streaming))
+
+    keys = reader.keys if isinstance(reader, CachedReader) else {}
+    paths = [str(path) for path in experiment.config.logs.train]
+    if not isinstance(reader, CachedReader) or not all(ranks.gather(keys.keys() >= {*paths}, "logs in the cache")):
+        return compute(), False
+    key = factors_key(experiment, builder, [keys[path] for path in paths], train)
+    parts, there = cached_parts(reader.cache, key, builder, train, compute)
+    bars.update(streaming, completed=sum(map(len, train)))
+    return parts, there
