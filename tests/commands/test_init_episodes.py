@@ -7,14 +7,16 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from synthetic import UR5
+from synthetic import ROBOTS, UR5
 
 from torchid.commands.init import init
 from torchid.config import load_config
 from torchid.errors import InputError
 from torchid.logs import Log, read, read_log
 from torchid.logs.read import files_of_recordings_kept
+from torchid.robot import load_robot
 
+GO2 = ROBOTS / "go2_description/urdf/go2.urdf"
 EPISODES, SAMPLES, STEP = 5, 600, 0.01
 TIME = STEP * np.arange(SAMPLES)
 PHASE = np.random.default_rng(0).uniform(0.0, 6.0, (EPISODES, 1, 6))
@@ -54,6 +56,22 @@ def test_an_axis_of_episodes_is_told_from_that_of_samples(tmp_path: Path, axis: 
     arrays |= {"each": {"t": each}, "one clock": {"t": TIME}, "step": {"dt": np.array(STEP)}}[stamps]
     np.savez(tmp_path / "x.npz", **arrays)
     assert_recorded(logs_of(tmp_path / "x.npz"), np.full(EPISODES, SAMPLES))
+
+
+def test_robots_side_by_side_are_simulated_and_have_no_order_of_their_maker(tmp_path: Path) -> None:
+    """Episodes one after the other, each with its stamps, may be recordings of the robot."""
+    arrays = {"dof_pos": np.tile(Q, 2), "dof_vel": np.tile(DQ, 2), "torques": np.tile(TAU, 2)}
+    np.savez(tmp_path / "stacked.npz", t=TIME, **arrays)
+    np.savez(tmp_path / "alone.npz", t=TIME, **{name: x[0] for name, x in arrays.items()})
+    order = {}
+    for name in ("stacked", "alone"):
+        init(GO2, tmp_path / f"{name}.npz", tmp_path / f"{name}.yaml")
+        files = load_config(tmp_path / f"{name}.yaml").logs
+        assert files is not None
+        assert files.columns is not None
+        order[name] = files.columns.joint_order
+    assert order["stacked"] == list(load_robot(GO2).joint_names)
+    assert order["alone"][:3] == [f"FR_{joint}_joint" for joint in ("hip", "thigh", "calf")], "of 20 motors"
 
 
 def test_what_fills_up_stacked_episodes_is_cut_off(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from textwrap import fill
 
@@ -156,7 +156,8 @@ def _of_columns(files: Sequence[Path], robot: Robot) -> tuple[list[GuessedContac
     sample = {name: values for of_file in reversed(samples) for name, values in of_file.items()}
     contacts = guess_contacts(robot, stated_contacts(sample, robot), texts_in(sample))
     clocks = arrays_by_stamps(sample) if existing_log_kind(files[0]) is LogKind.ARRAYS and len(files) == 1 else ()
-    proposal = propose_map(sample, _known(robot, contacts), samples if len(files) > 1 else (), in_degrees, clocks)
+    known = replace(_known(robot, contacts), simulated=episodes is not None and "axis" in episodes.entry)
+    proposal = propose_map(sample, known, samples if len(files) > 1 else (), in_degrees, clocks)
     fields = {*(name.partition(".")[0] for name in sample), *proposal.columns}
     if episodes is not None:
         proposal.columns = {"episodes": episodes.entry, **proposal.columns}

@@ -47,6 +47,7 @@ class KnownRobot:
         moving: all joints that move, those too that mimic others.
         limbs: its joints along each part of the tree without branches, from the base outwards.
         limb_sensors: children of the fixed joints in limbs that are called force or torque sensors, by joint.
+        simulated: whether numbers are those of simulators side by side, which know the robot's file and no manual.
     """
 
     joints: Sequence[str]
@@ -61,6 +62,7 @@ class KnownRobot:
     slides: Sequence[str] = ()
     moving: Sequence[str] = ()
     limbs: Sequence[Sequence[str]] = ()
+    simulated: bool = False
 
 
 def within(stem: str) -> re.Pattern[str]:

@@ -120,6 +120,8 @@ def usual_order(kind: str, robot: KnownRobot, count: int) -> tuple[list[str | No
         count: of the numbers.
     """
     names = robot.joints if kind == "joint" else robot.feet
+    if robot.simulated and count == len(names):
+        return list(names), "as in the robot's file, though some simulators sort joints by depth or by name"
     for name in suitable_orders(robot.joints, robot.name) if kind == "joint" else ():
         order = JOINT_ORDERS[name]
         is_whole = set(order.names) == set(names) or count < len(names)
