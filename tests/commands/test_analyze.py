@@ -22,9 +22,7 @@ from torchid.commands.sensor_set_accuracy import accuracies
 from torchid.config import load_analysis
 from torchid.errors import TorchidWarning
 from torchid.parallel import copies_allowed
-from torchid.report.analysis import describe_singular_postures
 from torchid.report.figures import tree_figure
-from torchid.sensor_planning.observability import BaseObservability, PostureSummary
 
 LEGS = ("front_left", "front_right", "rear_left", "rear_right")
 FEET = tuple(f"{leg}_foot" for leg in LEGS)
@@ -256,15 +254,6 @@ def test_no_two_labels_of_the_tree_lie_on_each_other(experiment: Path) -> None:
     (axes,) = tree_figure("", robot, [*contacts, torchid.Contact(FEET[0], "point")], [], {}, []).axes
     places = [label.xy for label in axes.texts]
     assert len(set(places)) == len(places) == len(robot.bodies) + 4
-
-
-def test_a_base_that_is_often_all_but_lost_is_warned_of() -> None:
-    def checked(low: float) -> BaseObservability:
-        random, zero = PostureSummary(6, 0.1, low, low), PostureSummary(6, 0.1, 0.1, 0.1)
-        return BaseObservability((True,), "sole", random, zero, None, None, ())
-
-    (line,) = describe_singular_postures([checked(1e-3), checked(1e-8)])
-    assert "in 1 of 2 contact states" in line
 
 
 def test_a_key_of_another_estimator_is_refused_without_logs_too(

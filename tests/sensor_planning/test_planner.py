@@ -17,12 +17,15 @@ from torchid.identifiability.structure import random_postures
 from torchid.parameters import Array
 from torchid.problem import RowBuilder
 from torchid.problem.contact_state import ContactState
+from torchid.report.analysis import describe_singular_postures
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet, named_sensors
 from torchid.sensing.projection import null_space
 from torchid.sensor_planning.demands import Candidate, candidates, contained_candidates, demands, sensor_set
 from torchid.sensor_planning.observability import (
+    BaseObservability,
     LostBase,
+    PostureSummary,
     assess_sensors,
     base_values,
     describe_wrench,
@@ -331,3 +334,12 @@ def test_lost_axes_are_found_again_in_a_rotated_basis(kept: tuple[int, ...]) -> 
     turned = axes @ np.linalg.qr(np.random.default_rng(1).normal(size=(len(kept), len(kept))))[0]
     found = np.array(simple_wrench_basis(turned))
     np.testing.assert_allclose(found[np.lexsort(found.T)], axes.T[np.lexsort(axes)], rtol=0.0, atol=1e-12)
+
+
+def test_a_base_that_is_often_all_but_lost_is_warned_of() -> None:
+    def checked(low: float) -> BaseObservability:
+        random, zero = PostureSummary(6, 0.1, low, low), PostureSummary(6, 0.1, 0.1, 0.1)
+        return BaseObservability((True,), "sole", random, zero, None, None, ())
+
+    (line,) = describe_singular_postures([checked(1e-3), checked(1e-8)])
+    assert "in 1 of 2 contact states" in line

@@ -7,7 +7,7 @@ A module for each command: `analyze`, `check` (and `convert`), `compress`, `demo
   `cached_reading`, `cache_entries`, `cache`
 - a fit: `prepared_data`, `chosen_settings`, `training`, `checkpoint`, `plausibility`
 - what `identify` returns and says: `results`, `named_results`, `answer`, `run_figures`
-- parts of `init` and `analyze`: `init_logs`, `init_proposals`, `sensor_set_accuracy`
+- parts of `init` and `analyze`: `init_logs`, `init_proposals`, `analysis_request`, `sensor_set_accuracy`
 - folders: `folder`, `manifest`
 """
 
