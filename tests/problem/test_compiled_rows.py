@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from torchid.problem.extras import ExtraTerms
 
 numba = pytest.importorskip("numba", reason="compiled kernels need Numba, of the extra [fast]")
 kernels = pytest.importorskip("torchid.kernels.gram")
+compiled_rows = pytest.importorskip("torchid.problem.compiled_rows")
 tiles = pytest.importorskip("torchid.kernels.tiles")
 
 QUADRUPED = torchid.load_robot(Path(torchid.__file__).parent / "demo" / "quadruped.urdf")
@@ -80,7 +82,7 @@ def assert_same_rows(plain: RowBuilder, fast: RowBuilder, samples: Samples) -> i
             # a limb of condition 1e4, the worst that neither takes the general way with, leaves 12 digits
             np.testing.assert_allclose(rows / size, reference / size, rtol=0.0, atol=1e-10)
         layout = fast.layout(state, part.contact_normal is not None)
-        made += fast.compiled is not None and fast.compiled.blocks(part, layout, workspace) is not None
+        made += fast.compiled is not None and fast.compiled.chunk(part, layout, workspace) is not None
     return made
 
 
@@ -150,18 +152,16 @@ def test_rows_that_are_multiplied_at_once_give_the_same_factor(
     plain, fast = builders(robot, contacts, sensor_set(sensors, robot, contacts))
     samples = random_samples(robot, contacts, 2500, 4, states=1)[0]
     expected = compress_parts([samples], plain, chunk=700, threads=1)
-    multiplied = list[bool]()
+    multiplied, grams = list[int](), compiled_rows.CompiledChunk.grams
 
-    def counted(*args: object) -> object:
-        multiplied.append((made := grams(*args)) is not None)
-        return made
+    def counted(*args: Any) -> Iterator[object]:
+        multiplied.append(len(made := list(grams(*args))))
+        return iter(made)
 
-    assert fast.compiled is not None
-    grams = fast.compiled.grams
-    monkeypatch.setattr(fast.compiled, "grams", counted)
+    monkeypatch.setattr(compiled_rows.CompiledChunk, "grams", counted)
     monkeypatch.setattr(chunks, "_WORTH_LOADING", 0)
     found = compress_parts([samples], fast, chunk=700, threads=1)
-    assert multiplied == [False, True, True, True]
+    assert multiplied[0] == 0 < multiplied[1] == multiplied[2] == multiplied[3]
     assert_same_factors(found[0].factor, expected[0].factor)
 
 

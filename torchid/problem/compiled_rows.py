@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -28,8 +28,6 @@ from torchid.sensing.limbs import PIVOT, WELL_CONDITIONED
 
 if TYPE_CHECKING:
     from torchid.problem.rows import RowBuilder
-
-LevelsOfBlocks = Callable[[tuple[int, ...]], ColumnLevels | None]
 
 
 @dataclass(frozen=True)
@@ -146,7 +144,7 @@ class _Group:
 
     Attributes:
         blocks: the blocks.
-        dofs: as of `_Plan.of`.
+        plan: of these.
         tiles: of all samples.
         W: tiles (T, degrees of freedom, rank, TILE) of it, or one for all.
         f: measured forces, (B, degrees of freedom).
@@ -154,7 +152,7 @@ class _Group:
     """
 
     blocks: tuple[RowBlock, ...]
-    dofs: int | None
+    plan: _Plan
     tiles: _Tiles
     W: Tensor
     f: Tensor
@@ -168,6 +166,84 @@ class _Group:
         step = self.W[0].numel() if len(self.W) > 1 else 0
         of_tiles = _flat(self.tiles.states), _flat(joints), joints.shape[1], samples
         return *of_tiles, _flat(self.W), self.W.shape[2], step, _flat(forces)
+
+
+@dataclass(frozen=True)
+class CompiledChunk:
+    """Rows of a chunk that kernels make when they are asked for, until the workspace is used for others.
+
+    Attributes:
+        builder: whose rows these are.
+        samples: of the chunk.
+        groups: of blocks.
+        workspace: memory.
+    """
+
+    builder: RowBuilder
+    samples: Samples
+    groups: Sequence[_Group]
+    workspace: Workspace
+
+    def rows(self, without: Collection[int] = ()) -> Iterator[tuple[BlockRows, slice]]:
+        """As `RowBuilder.blocks`; `without`: identities of blocks that are left out."""
+        for group in self.groups:
+            if not all(id(block) in without for block in group.blocks):
+                yield from ((made, slice(None)) for made in self._written(group) if id(made.block) not in without)
+
+    def grams(
+        self, levels: Callable[[tuple[int, ...]], ColumnLevels | None]
+    ) -> Iterator[tuple[RowBlock, Array, Array]]:
+        """Blocks, squares and Gram matrices as `GramWriter` writes them, of rows that never leave the caches.
+
+        Of groups that have levels of all their blocks; of none where rows have more to them than the kernels know.
+        """
+        if self.samples.payload is None and not self.builder.extras:
+            for group in self.groups:
+                known = [own for block in group.blocks if (own := levels(block.support)) is not None]
+                if len(known) == len(group.blocks):
+                    yield from self._multiplied(group, known)
+
+    def _written(self, group: _Group) -> Iterator[BlockRows]:
+        count = len(self.samples)
+        placed, size = group.plan.placed(count)
+        flat = self.workspace.empty("rows", group.W, size)
+        rows.write_rows(*group.arrays(self.workspace), placed, *group.plan.of_bodies, flat.numpy())
+        for block, in_W, (_, each, width, start, *_) in zip(group.blocks, group.joints, placed.tolist(), strict=True):
+            stacked = flat[start:][: width * (width + each * count)].unflatten(0, (width, -1))
+            made = BlockRows(block, stacked, stacked[:, width:].unflatten(1, (each, count)), None)
+            self._complete(made, group.W, in_W)
+            yield made
+
+    def _multiplied(self, group: _Group, levels: Sequence[ColumnLevels]) -> Iterator[tuple[RowBlock, Array, Array]]:
+        plan = group.plan
+        placed, size = plan.placed(min(compression.SPAN, group.tiles.samples))
+        flat, widths = self.workspace.empty("rows", group.W, size), plan.blocks[:, 2]
+        counts = np.array([len(own.lower) for own in levels])
+        lower, combination = (
+            np.concatenate([getattr(own, name).ravel() for own in levels]) for name in ("lower", "to_lower")
+        )
+        table = np.column_stack([_starts(counts), counts, _starts(counts * widths), _starts(widths**2)])
+        squares, grams = np.empty(len(lower)), np.empty(int((widths**2).sum()))
+        compression.write_grams(
+            *(*group.arrays(self.workspace), placed, *plan.of_bodies, table, lower, combination, flat.numpy()),
+            *(squares, grams),
+        )
+        for block, (first, count, _, start), width in zip(group.blocks, table.tolist(), widths.tolist(), strict=True):
+            gram = grams[start : start + width**2].reshape(width, width)
+            yield block, squares[first : first + count], gram
+
+    def _complete(self, made: BlockRows, W: Tensor, in_W: Mapping[int, int]) -> None:
+        """Write what kernels leave out: a known payload, and columns of extra parameters; see `_Group`."""
+        builder, samples, block = self.builder, self.samples, made.block
+        subtract_payload(block, made.values, samples.payload, builder.columns.parameter_map)
+        first = len(block.inertial) + len(block.friction)
+        for out, column in zip(made.values[first:-1], block.extras, strict=True):
+            extra = builder.extras[column - builder.columns.count]
+            out.zero_()
+            for joint in [joint for joint in extra.dofs if joint in in_W]:
+                weight = W[:, in_W[joint], block.rows].expand(-(-len(samples) // TILE), -1, -1)
+                weight = weight.transpose(0, 1).flatten(1)[:, : len(samples)]
+                out.addcmul_(weight, dof_extra_column(extra, joint, samples, builder.tree))
 
 
 class CompiledRows:
@@ -188,38 +264,8 @@ class CompiledRows:
         self._limbs: dict[int, _Limbs] = {}
         self._plans: dict[int, _Plan] = {}
 
-    def blocks(self, samples: Samples, layout: ContactStateLayout, workspace: Workspace) -> Iterator[BlockRows] | None:
-        """As `RowBuilder.blocks`, each of all samples; None where joints rest or ranks of contacts differ."""
-        groups = self._groups(samples, layout, workspace)
-        if groups is None:
-            return None
-        return (made for group in groups for made in self._written(group, samples, workspace))
-
-    def grams(
-        self, samples: Samples, layout: ContactStateLayout, workspace: Workspace, levels: LevelsOfBlocks
-    ) -> list[tuple[RowBlock, Array, Array]] | None:
-        """Blocks, squares and Gram matrices as `GramWriter` writes them, of rows that never leave the caches.
-
-        None where `blocks` gives none, where rows have more to them than the kernels know, or where `levels` have none
-        of a block's columns.
-        """
-        if samples.payload is not None or self._builder.extras:
-            return None
-        groups = self._groups(samples, layout, workspace)
-        if groups is None:
-            return None
-        made = list[tuple[RowBlock, Array, Array]]()
-        for group in groups:
-            known = [own for block in group.blocks if (own := levels(block.support)) is not None]
-            if len(known) < len(group.blocks):
-                return None
-            made.extend(self._multiplied(group, known, workspace))
-        return made
-
-    def _groups(
-        self, samples: Samples, layout: ContactStateLayout, workspace: Workspace
-    ) -> tuple[_Group, _Group] | None:
-        """The coupled rows, and the others; None as for `blocks`."""
+    def chunk(self, samples: Samples, layout: ContactStateLayout, workspace: Workspace) -> CompiledChunk | None:
+        """The rows of a chunk, coupled ones first; None where joints rest or ranks of contacts differ."""
         if samples.resting is not None:
             return None
         builder, tiles = self._builder, self._tiles(samples.motion(), workspace)
@@ -232,63 +278,16 @@ class CompiledRows:
         in_W = {joint: row for row, joint in enumerate(layout.coupled_joints, start=builder.tree.base_rows)}
         weights = torch.from_numpy(1.0 / builder.dof_std[joints])[None, :, None, None].repeat(1, 1, 1, TILE)
         torque = builder.torque_of_bodies(samples)[:, builder.tree.index(joints)]
-        return (
-            _Group(of_rank, len(layout.coupled_joints), tiles, *coupled, [in_W] * len(of_rank)),
-            _Group(apart, None, tiles, weights, torque, [{joint: number} for number, joint in enumerate(joints)]),
+        groups = (
+            _Group(of_rank, self._plan(of_rank, len(layout.coupled_joints)), tiles, *coupled, [in_W] * len(of_rank)),
+            _Group(apart, self._plan(apart, None), tiles, weights, torque, [{x: k} for k, x in enumerate(joints)]),
         )
+        return CompiledChunk(builder, samples, [group for group in groups if group.blocks], workspace)
 
-    def _complete(self, made: BlockRows, samples: Samples, W: Tensor, in_W: Mapping[int, int]) -> None:
-        """Write what kernels leave out: a known payload, and columns of extra parameters; see `_Group`."""
-        builder, block = self._builder, made.block
-        subtract_payload(block, made.values, samples.payload, builder.columns.parameter_map)
-        first = len(block.inertial) + len(block.friction)
-        for out, column in zip(made.values[first:-1], block.extras, strict=True):
-            extra = builder.extras[column - builder.columns.count]
-            out.zero_()
-            for joint in [joint for joint in extra.dofs if joint in in_W]:
-                weight = W[:, in_W[joint], block.rows].expand(-(-len(samples) // TILE), -1, -1)
-                weight = weight.transpose(0, 1).flatten(1)[:, : len(samples)]
-                out.addcmul_(weight, dof_extra_column(extra, joint, samples, builder.tree))
-
-    def _written(self, group: _Group, samples: Samples, workspace: Workspace) -> Iterator[BlockRows]:
-        if not group.blocks:
-            return
-        plan, count = self._plan(group), len(samples)
-        placed, size = plan.placed(count)
-        flat = workspace.empty("rows", group.W, size)
-        rows.write_rows(*group.arrays(workspace), placed, *plan.of_bodies, flat.numpy())
-        for block, in_W, (_, each, width, start, *_) in zip(group.blocks, group.joints, placed.tolist(), strict=True):
-            stacked = flat[start:][: width * (width + each * count)].unflatten(0, (width, -1))
-            made = BlockRows(block, stacked, stacked[:, width:].unflatten(1, (each, count)), None)
-            self._complete(made, samples, group.W, in_W)
-            yield made
-
-    def _multiplied(
-        self, group: _Group, levels: Sequence[ColumnLevels], workspace: Workspace
-    ) -> Iterator[tuple[RowBlock, Array, Array]]:
-        if not group.blocks:
-            return
-        plan = self._plan(group)
-        placed, size = plan.placed(min(compression.SPAN, group.tiles.samples))
-        flat, widths = workspace.empty("rows", group.W, size), plan.blocks[:, 2]
-        counts = np.array([len(own.lower) for own in levels])
-        lower, combination = (
-            np.concatenate([getattr(own, name).ravel() for own in levels]) for name in ("lower", "to_lower")
-        )
-        table = np.column_stack([_starts(counts), counts, _starts(counts * widths), _starts(widths**2)])
-        squares, grams = np.empty(len(lower)), np.empty(int((widths**2).sum()))
-        compression.write_grams(
-            *(*group.arrays(workspace), placed, *plan.of_bodies, table, lower, combination, flat.numpy()),
-            *(squares, grams),
-        )
-        for block, (first, count, _, start), width in zip(group.blocks, table.tolist(), widths.tolist(), strict=True):
-            gram = grams[start : start + width**2].reshape(width, width)
-            yield block, squares[first : first + count], gram
-
-    def _plan(self, group: _Group) -> _Plan:
-        key = id(group.blocks[0])  # of those that the builder's layouts keep
+    def _plan(self, blocks: tuple[RowBlock, ...], dofs: int | None) -> _Plan:
+        key = id(blocks[0]) if blocks else 0  # of those that the builder's layouts keep
         if (plan := self._plans.get(key)) is None:
-            plan = self._plans[key] = _Plan.of(group.blocks, self._builder.tree.base_rows, group.dofs)
+            plan = self._plans[key] = _Plan.of(blocks, self._builder.tree.base_rows, dofs)
         return plan
 
     def _tiles(self, motion: Motion, workspace: Workspace) -> _Tiles:

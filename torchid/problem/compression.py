@@ -11,7 +11,15 @@ import torch
 from torch import Tensor
 
 from torchid import ranks
-from torchid.problem.blocks import block_spans, blocks_in, cut_logs, lay_out_folds, rows_of_samples, span_of_samples
+from torchid.problem.blocks import (
+    BlockRows,
+    block_spans,
+    blocks_in,
+    cut_logs,
+    lay_out_folds,
+    rows_of_samples,
+    span_of_samples,
+)
 from torchid.problem.chunk_dynamics import Workspace
 from torchid.problem.chunks import ProgressCallback, chunks_by_state, map_chunks, worker_count
 from torchid.problem.contact_state import ContactState
@@ -222,12 +230,9 @@ class _Parts:
         for part, start, end in spans:
             part.samples += end - start
         one = weight_rows is None and len(spans) == 1
-        done = self._add_grams(samples, state, workspace, spans[0][0], compressors[0]) if one else {}
-        if done and all(done.values()):
-            return
-        for rows, index in self._builder.blocks(samples, state, workspace):
-            if done.get(id(rows.block)):
-                continue
+        for rows, index in self._remaining_rows(
+            samples, state, workspace, spans[0][0], compressors[0] if one else None
+        ):
             support, stacked = rows.block.support, rows.stacked.T
             if weight_rows is not None:
                 weighted = stacked[len(support) + 1 :]
@@ -239,19 +244,28 @@ class _Parts:
                     key, first, last = (part.key, samples.oversampling), *span_of_samples(index, start, end)
                     self._absent[key] = self._absent.get(key, 0) + rows.absent[:, first:last].sum()
 
-    def _add_grams(
-        self, samples: Samples, state: ContactState, workspace: Workspace, part: Part, compressor: RowCompressor
-    ) -> dict[int, bool]:
-        """Add Gram matrices of a chunk's rows to a part, where kernels give them; by block, whether it was added."""
+    def _remaining_rows(
+        self,
+        samples: Samples,
+        state: ContactState,
+        workspace: Workspace,
+        part: Part,
+        compressor: RowCompressor | None,
+    ) -> Iterator[tuple[BlockRows, Tensor | slice]]:
+        """Add Gram matrices of a chunk's rows to a part, where kernels give them; gives all rows that were not added.
+
+        `compressor`: of the part; None if rows are not to be added as they are.
+        """
         kernels, layout = self._builder.compiled, self._builder.layout(state, samples.contact_normal is not None)
-        levels = partial(compressor.levels, part.factor)
-        made = None if kernels is None else kernels.grams(samples, layout, workspace, levels)
-        done = dict[int, bool]()
-        for block, squares, gram in made or []:
+        chunk = None if kernels is None else kernels.chunk(samples, layout, workspace)
+        if chunk is None or compressor is None:
+            return self._builder.blocks(samples, state, workspace) if chunk is None else chunk.rows()
+        added = set[int]()
+        for block, squares, gram in chunk.grams(partial(compressor.levels, part.factor)):
             count = (block.rows.stop - block.rows.start) * len(samples)
-            own = part.factor, block.support, squares, gram, count, samples.oversampling
-            done[id(block)] = compressor.add_gram(*own)
-        return done
+            if compressor.add_gram(part.factor, block.support, squares, gram, count, samples.oversampling):
+                added.add(id(block))
+        return chunk.rows(added)
 
     def _compressor(self) -> RowCompressor:
         kernels = self._builder.compiled

@@ -147,8 +147,8 @@ class RowBuilder(nn.Module):
     ) -> Iterator[tuple[BlockRows, Tensor | slice]]:
         """The same with the samples that each block is of, in order."""
         workspace, layout = workspace or Workspace(), self.layout(state, samples.contact_normal is not None)
-        if self.compiled is not None and (made := self.compiled.blocks(samples, layout, workspace)) is not None:
-            yield from ((rows, slice(None)) for rows in made)
+        if self.compiled is not None and (chunk := self.compiled.chunk(samples, layout, workspace)) is not None:
+            yield from chunk.rows()
             return
         dynamics = self.dynamics(samples, workspace)
         for index, _, blocks in self._coupled_rows(samples, layout, dynamics, workspace):
