@@ -100,7 +100,7 @@ def assert_same_grams(found: torch.Tensor, expected: torch.Tensor) -> None:
     )
 
 
-@pytest.mark.parametrize("sensors", ["joints", "mixed", "contacts", "full"])
+@pytest.mark.parametrize("sensors", ["joints", "mixed", "contacts", "full", "nothing"])
 @pytest.mark.parametrize(
     ("robot", "contacts"),
     [

@@ -15,7 +15,7 @@ from torchid.commands.chosen_settings import with_sample_rates
 from torchid.commands.evaluate import compare_forces, trace_forces
 from torchid.commands.folder import RUN, check_free, claim_folder
 from torchid.commands.plausibility import TrainingLogs, require_not_worse, require_plausible, suspected_mistake
-from torchid.commands.prepared_data import Clock, PreparedData, prepare
+from torchid.commands.prepared_data import PreparedData, Stopwatch, prepare
 from torchid.commands.results import Identification, write_run
 from torchid.commands.run_figures import Drawing, drawing, figures_left, fit_figures
 from torchid.commands.training import Training, require_trainable, training_folder
@@ -115,7 +115,7 @@ def _identify(
     config: ExperimentConfig, resume: bool, bars: Progress, stack: ExitStack
 ) -> tuple[Identification, Training | None, list[Drawing]]:
     """What the logs say, how it was trained, if so, and figures of it that are drawn until the stack is left."""
-    clock = Clock()
+    clock = Stopwatch()
     ready = prepare(config, clock, bars)
     experiment, fitter, logs, blocks = ready.experiment, ready.fitter, ready.logs, ready.blocks
     checked, builder = TrainingLogs(experiment, bars), fitter.builder

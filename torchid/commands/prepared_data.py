@@ -32,7 +32,7 @@ from torchid.problem.parts import Part
 
 
 @dataclass
-class Clock:
+class Stopwatch:
     """Adds up seconds by step: `with clock("read"): ...`."""
 
     seconds: dict[str, float] = field(default_factory=dict)
@@ -75,7 +75,7 @@ class PreparedData(CompressedData):
     ridge: RidgeChoice | None
 
 
-def prepare(config: ExperimentConfig, clock: Clock, bars: Progress) -> PreparedData:
+def prepare(config: ExperimentConfig, clock: Stopwatch, bars: Progress) -> PreparedData:
     """Read and compress what an experiment fits, and choose its ridge.
 
     Raises:
@@ -94,7 +94,7 @@ def prepare(config: ExperimentConfig, clock: Clock, bars: Progress) -> PreparedD
     return PreparedData(**vars(data) | {"experiment": experiment}, conditions=conditions, fitter=fitter, ridge=ridge)
 
 
-def _data_of_logs(experiment: Experiment, clock: Clock, bars: Progress) -> CompressedData:
+def _data_of_logs(experiment: Experiment, clock: Stopwatch, bars: Progress) -> CompressedData:
     """The logs of an experiment, read and compressed."""
     with clock("settings"):
         experiment, choices = with_chosen_settings(experiment, bars)
@@ -114,7 +114,7 @@ def _data_of_logs(experiment: Experiment, clock: Clock, bars: Progress) -> Compr
     return CompressedData(experiment, logs, [], reader.excluded, states, noise, builder, blocks, parts, reused, choices)
 
 
-def _data_of_factors(experiment: Experiment, clock: Clock, bars: Progress) -> CompressedData:
+def _data_of_factors(experiment: Experiment, clock: Stopwatch, bars: Progress) -> CompressedData:
     """The logs of an experiment that fits factors of logs."""
     with clock("read"):
         reading = bars.add_task("reading factors", total=len(experiment.config.logs.train))

@@ -66,7 +66,7 @@ class DelayChoice:
     def __str__(self) -> str:
         """The delay with its standard error, and what it is for."""
         best, left = f"{1e3 * self.found:.3g}", f"residual {self.residual:.4g}, {self.undelayed_residual:.4g} without"
-        left += "; an end of what is tried: the best may lie beyond" * (self.found in (EARLIEST, LATEST))
+        left += "; an end of what is tried: the best may lie beyond" * _is_at_end(self.found)
         if self.confounded_with:
             return f"none: any, such as {best} ms, is confounded with {', '.join(self.confounded_with)} ({left})"
         if self.standard_error is None or self.interval is None:

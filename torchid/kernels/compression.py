@@ -39,24 +39,24 @@ def write_grams(
     """Write what `write_gram` makes of the rows of each block that `write_rows` writes.
 
     Args:
-        states: this and what follows up to `kept` as of `write_rows`.
-        joints: .
-        nodes: .
-        samples: .
-        bases: .
-        rank: .
-        step: .
-        forces: .
-        blocks: where they start in `rows` is for as many samples as a span has.
-        moved: .
-        ratios: .
-        bodies: .
-        kept: .
+        states: as of `write_rows`.
+        joints: likewise.
+        nodes: likewise.
+        samples: likewise.
+        bases: likewise.
+        rank: likewise.
+        step: likewise.
+        forces: likewise.
+        blocks: likewise, but where they start in `rows` is for as many samples as a span has.
+        moved: likewise.
+        ratios: likewise.
+        bodies: likewise.
+        kept: likewise.
         levels: (blocks, 4) each: its first column in `lower`, their number, where its combination starts, and where its
             Gram matrix.
         lower: columns of each block that are replaced.
         combination: (columns replaced, columns) of each block, by what.
-        rows: memory.
+        rows: memory for those of a span.
         squares: as `lower`, are written.
         grams: (columns, columns) of each block, are written.
     """

@@ -1,7 +1,7 @@
 """Gram matrices of many rows by column, panel by panel: what is worked on stays in the second-level cache.
 
 Libraries for products of matrices are made for square ones: for a hundred columns and thousands of rows they take
-1.5 times as long, for ten columns four times.
+1.4 to 1.7 times as long, for ten columns 1.9 to 2.7 times.
 """
 
 from __future__ import annotations

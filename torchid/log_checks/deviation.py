@@ -36,7 +36,7 @@ COMPARED_SAMPLES = 240
 _MIN_STANDARD_DEVIATIONS, _MIN_BLOCK_SHARE = 4.0, 0.5
 #: Unexplained forces without the deviation over those with it (1.2 at most in logs without a mistake), and what it may
 #: leave: more, and the forces are another robot's.
-MIN_UNEXPLAINED_RATIO, _MAX_LEFT = 1.25, 1.5
+MIN_UNEXPLAINED_RATIO, MAX_LEFT = 1.25, 1.5
 
 UnknownColumns = Callable[[RowBuilder, Samples, int], FloatArray]
 """Change of the generalized forces that are required (N, n_rows, k) by a unit of each unknown, of samples by number."""
@@ -135,7 +135,7 @@ class Deviation:
     @property
     def improves(self) -> bool:
         """Whether all unknowns together explain the forces much better."""
-        return self.without > MIN_UNEXPLAINED_RATIO * self.left and self.left < _MAX_LEFT
+        return self.without > MIN_UNEXPLAINED_RATIO * self.left and self.left < MAX_LEFT
 
     @property
     def is_clear(self) -> bool:

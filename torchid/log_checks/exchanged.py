@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import InputError
-from torchid.log_checks.deviation import DeviationRows, FilteredLog
+from torchid.log_checks.deviation import MAX_LEFT, MIN_UNEXPLAINED_RATIO, DeviationRows, FilteredLog
 from torchid.log_checks.findings import REJECTED, Finding
 from torchid.log_checks.model import UNMODELLED_FORCE_SHARE
 from torchid.log_checks.scales import TIME_BLOCKS, NormalEquations, accumulate_blocks
@@ -20,10 +20,6 @@ from torchid.logs.signal_noise import rough_noise
 from torchid.problem import Samples
 from torchid.robot import Robot
 
-#: Unexplained forces as recorded over those of corrected torques, by the deviations of the latter.
-_MIN_UNEXPLAINED_RATIO = 1.25
-#: What the corrected torques may leave, in deviations of each torque: more, and the forces are another robot's.
-_MAX_LEFT = 1.5
 #: Share of the exchange that corrected torques still ask for: a scale or an offset of one of the two asks for others.
 _MAX_SHARE_LEFT = 0.25
 #: Readings of a torque whose noise is looked at.
@@ -92,8 +88,8 @@ def check_exchanged_torques(filtered: FilteredLog) -> Finding | None:
 
 def _is_right(after: _Exchanges, pair: int) -> bool:
     """Whether torques fit as they are, and not if those of a pair are exchanged."""
-    worse = after.left[pair] > _MIN_UNEXPLAINED_RATIO * after.without and (after.gains(pair) < 0.0).all()
-    return bool(worse and after.without < _MAX_LEFT and abs(after.share[pair]) < _MAX_SHARE_LEFT)
+    worse = after.left[pair] > MIN_UNEXPLAINED_RATIO * after.without and (after.gains(pair) < 0.0).all()
+    return bool(worse and after.without < MAX_LEFT and abs(after.share[pair]) < _MAX_SHARE_LEFT)
 
 
 def _finding(filtered: FilteredLog, pair: NDArray[np.intp], ratio: float) -> Finding:

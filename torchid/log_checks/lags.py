@@ -196,7 +196,7 @@ def _clocks(filtered: FilteredLog, derived: tuple[str, ...]) -> list[Clock]:
     log, of_wrench = filtered.log, filtered.log.contact_wrench_field
     contacts: Sequence[Contact] = filtered.model.contacts if log.contact_wrench is not None else ()
     of_base = [name for name in log.arrays() if name.startswith(_OF_BASE)]
-    has_base = of_base and not filtered.model.robot.fixed_base and not "base_".startswith(derived or ("-",))
+    has_base = of_base and not filtered.model.robot.fixed_base and not "base_".startswith(derived)
     wrenches = frozenset(contact.frame for contact in contacts)
     torques = frozenset([_TORQUE] if log.joint_torque is not None else [])
     everything, motion, rest = torques | wrenches | {_BASE}, "the motion", "all else"

@@ -95,10 +95,14 @@ class StackedArrays(Arrays):
         return self._of_all(time) if has_step else time
 
 
+def in_groups(pattern: str) -> re.Pattern[str]:
+    """What matches names within the groups that a pattern such as `data/demo_*` means: their number, and the rest."""
+    return re.compile(re.escape(pattern.rstrip("/")).replace(r"\*", r"(\d+)") + "/(.+)")
+
+
 def groups_of(names: Collection[str], pattern: str) -> dict[str, list[str]]:
     """Names of the groups of a file that a pattern such as `data/demo_*` means, by number, by what all have in them."""
-    regex = re.compile(re.escape(pattern.rstrip("/")).replace(r"\*", r"(\d+)") + "/(.+)")
-    found = dict[str, dict[int, str]]()
+    regex, found = in_groups(pattern), dict[str, dict[int, str]]()
     for name in names:
         if (match := regex.fullmatch(name)) is not None:
             found.setdefault(match[2], {})[int(match[1])] = name
@@ -118,7 +122,7 @@ class GroupedArrays(Arrays):
             raise LogError.at_field(
                 f"{KEY}.episodes.groups", f"'{excerpt(entry.groups or '')}', no such groups", accepted
             )
-        own = re.compile(re.escape((entry.groups or "").rstrip("/")).replace(r"\*", r"\d+") + "/.+")
+        own = in_groups(entry.groups or "")
         self.names = [*self._parts, *(x for x in self.names if not own.fullmatch(x) and x not in self._parts)]
         self._counts = dict[int, list[int]]()  # samples of each, by those of all
 

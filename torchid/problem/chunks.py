@@ -34,7 +34,7 @@ CHUNK = 4096
 _LEAST, _EACH = 2048, 4  # samples per chunk where there are fewer chunks than so many for each worker
 _LET_GO = 4  # chunks of a worker, after which pages that samples are mapped to leave the memory of the process
 _WORTH_COPYING = 50_000  # samples of a pass: copies save 0.8 us of each on two cores, and take 15 to 30 ms to make
-_WORTH_LOADING = 200_000  # samples of a pass: kernels take 0.4 s to load and save 1.6 to 3 us of each on two cores
+_WORTH_LOADING = 200_000  # samples of a pass: kernels take 0.4 s to load and save 2.6 to 6 us of each on two cores
 _MOST_ON_GPU = 64 * CHUNK  # samples per chunk: launching the work on one takes the host 12 ms, whatever its size
 _SHARE_OF_GPU, _ON_GPU = 8, 48 * 2**10  # a chunk takes one of so many parts of a GPU's memory; bytes of a sample
 
@@ -112,7 +112,7 @@ def choose_kernels(builder: RowBuilder, samples: int) -> None:
         try:
             from torchid.problem.compiled_rows import CompiledRows  # loads what shorter logs do without
         except (ImportError, RuntimeError) as error:
-            warn(f"Numba: {excerpt(str(error))}; rows are made without it, which takes 1.5 times as long")
+            warn(f"Numba: {excerpt(str(error))}; rows are made without it, which takes twice as long")
             return
         builder.compiled = CompiledRows(builder)
 

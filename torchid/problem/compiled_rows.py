@@ -320,7 +320,7 @@ class CompiledRows:
         contact = builder.contact_rows(layout, kinematics)
         measured = contact.of_measured()
         bases = list(builder.whitened_bases(layout, contact, measured, kinematics))
-        if len(bases) != 1 or len(bases[0][1][0, 0]) != tiles.samples:
+        if len(bases) != 1 or bases[0][1].shape[2] != tiles.samples:
             return None
         basis = bases[0][1]
         padded = workspace.empty("W by row", basis, *basis.shape[:2], len(tiles.states) * TILE)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import excerpt
-from torchid.logs.episodes import flat, groups_of
+from torchid.logs.episodes import flat, groups_of, in_groups
 from torchid.logs.name_matching import is_desired, propose_field, words_of
 from torchid.proposals.file_samples import FileSample, increases
 
@@ -49,9 +49,7 @@ def _in_groups(sample: FileSample) -> FoundEpisodes | None:
 
     Limbs have groups of the same length.
     """
-    found = {
-        f"{name[: match.start(2)]}*": match[1].lower() for name in sample for match in _GROUP.finditer(name) if match
-    }
+    found = {f"{name[: match.start(2)]}*": match[1].lower() for name in sample for match in _GROUP.finditer(name)}
     for groups, word in found.items():
         parts = {inner: [sample[name] for name in of] for inner, of in groups_of(sample, groups).items()}
         arrays = {inner: [x for x in of if x is not None and x.ndim] for inner, of in parts.items()}
@@ -63,15 +61,11 @@ def _in_groups(sample: FileSample) -> FoundEpisodes | None:
         of_joints = [of for inner, of in alike.items() if of[0].ndim == 2 and _is_of_joints(inner)]
         if of_joints and (not word or word in _WORDS or len(set(map(len, of_joints[0]))) > 1):
             flat_ones = {inner: np.concatenate(of[:_SHOWN]) for inner, of in alike.items()}
-            others = {name: x for name, x in sample.items() if not re.match(_regex(groups), name)}
+            others = {name: x for name, x in sample.items() if not in_groups(groups).fullmatch(name)}
             count = len(of_joints[0])
             note = f"{count} groups like '{excerpt(groups)}', a recording each; arrays are called as in these"
             return FoundEpisodes({"groups": groups}, dict.fromkeys(parts) | others | flat_ones, note)
     return None
-
-
-def _regex(groups: str) -> str:
-    return re.escape(groups).replace(r"\*", r"\d+") + "/"
 
 
 def _is_of_joints(name: str) -> bool:

@@ -300,7 +300,7 @@ def _extra_cell(extra: ExtraEstimate) -> str:
     return f"{extra.value:.{digits}f} ± {size:.{digits}f}{mark}"
 
 
-COMPILING = "compiling kernels, once on this machine (about 10 s)"
+COMPILING = "compiling kernels, once on this machine (about 20 s)"
 
 
 @contextmanager
