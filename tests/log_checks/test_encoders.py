@@ -15,8 +15,8 @@ from thinned import each_once
 from walking import MACHINES, robot_of
 
 from torchid.log_checks import REJECTED, SUSPICIOUS
-from torchid.log_checks.encoders import fit_zeros
 from torchid.log_checks.model import NominalModel, bind_some_samples, preprocess_pieces
+from torchid.log_checks.zeros import fit_zeros
 from torchid.logs import Log
 from torchid.regressor import Regressor
 
@@ -30,7 +30,7 @@ def moved(joint: int, by: float) -> Log:
     return replace(CASE.log, joint_position=position)
 
 
-@pytest.mark.parametrize(("joint", "by"), each_once([1, 3], [0.2, -0.4]))
+@pytest.mark.parametrize(("joint", "by"), each_once([1, 3], [0.2, -0.4, 0.07]))
 def test_an_encoder_that_counts_from_another_zero_is_named_with_its_offset(joint: int, by: float) -> None:
     """Beside masses 15 % off, friction and lag."""
     finding = only(checked(CASE, moved(joint, by)), "zero", "joint_position")

@@ -188,6 +188,19 @@ def test_torques_that_all_have_one_factor_contradict_the_contact_forces(factor: 
     assert float(value(stated)[1]) == pytest.approx(1.0 / factor, rel=0.2)
 
 
+@pytest.mark.parametrize("factor", slow_but([1.2], [0.8, 1.0, 1.2]))
+def test_a_common_factor_of_a_bolted_arms_torques_is_noted_as_one_of_torques_or_masses(factor: float) -> None:
+    """Beside masses up to 15 % off; the factor itself within three of its standard deviations."""
+    case = case_of(MACHINES["arm"], "contacts")
+    log = replace(case.log, joint_torque=factor * value(case.log.joint_torque))
+    findings = check(log, robot_of(case.machine), (), CUTOFF).findings
+    assert {one.severity for one in findings} <= {NOTE}
+    found = [re.match("all torques are ([0-9.]+) [+]- ([0-9.]+) times", one.found) for one in findings]
+    stated = [(float(one[1]), float(one[2])) for one in found if one is not None]
+    assert len(stated) == (factor != 1.0)
+    assert all(abs(stated_factor - factor) < 3.0 * std for stated_factor, std in stated)
+
+
 def test_a_factor_that_is_far_from_minus_one_is_not_called_a_reversed_torque() -> None:
     finding = only(of_arm(lambda log: rescaled(log, [3], -30.0)), "scale", "joint_torque")
     assert finding.channels == ("panda_joint4",)

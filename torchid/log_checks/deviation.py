@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -124,8 +124,12 @@ class Deviation:
     @property
     def clear(self) -> BoolArray:
         """Unknowns (k,) that are certain and that every block agrees on, where all explain the forces much better."""
-        agree = (self.blocks * np.sign(self.value) > _MIN_BLOCK_SHARE * np.abs(self.value)).all(axis=0)
-        return np.asarray(agree & self.certain & self.improves)
+        return np.asarray(self.steady & self.certain & self.improves)
+
+    @property
+    def steady(self) -> BoolArray:
+        """Unknowns (k,) that every block of time agrees on."""
+        return np.asarray((self.blocks * np.sign(self.value) > _MIN_BLOCK_SHARE * np.abs(self.value)).all(axis=0))
 
     @property
     def certain(self) -> BoolArray:
@@ -136,6 +140,11 @@ class Deviation:
     def improves(self) -> bool:
         """Whether all unknowns together explain the forces much better."""
         return self.without > MIN_UNEXPLAINED_RATIO * self.left and self.left < MAX_LEFT
+
+    @property
+    def explained(self) -> float:
+        """By how much less all unknowns together leave, squared."""
+        return self.without**2 - self.left**2
 
     @property
     def is_clear(self) -> bool:
@@ -179,6 +188,11 @@ class UnknownEquations:
 
     def _rms(self, squares: float) -> float:
         return float(np.sqrt(max(squares, 0.0) / max(self.normal.rows, 1)))
+
+    def with_unmodelled(self, ratio: float) -> UnknownEquations:
+        """The equations where forces that no parameters explain are `ratio` times what was presumed."""
+        one = self.normal
+        return UnknownEquations(replace(one, KtK=one.KtK / ratio**2, KtY=one.KtY / ratio**2, YtY=one.YtY / ratio**2))
 
     def fit(self, prior_std: float, combined: FloatArray | None = None) -> Deviation:
         """The unknowns, or those whose columns are `combined` (k, m) of them, with their prior standard deviation."""

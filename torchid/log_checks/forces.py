@@ -9,12 +9,13 @@ from functools import cache
 import numpy as np
 import torch
 
-from torchid.errors import InputError, join_names
+from torchid.errors import InputError
 from torchid.log_checks.deviation import FilteredLog
 from torchid.log_checks.drift import check_torque_drift
 from torchid.log_checks.encoders import check_encoders, is_bolted_arm
 from torchid.log_checks.exchanged import check_exchanged_torques
 from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, UNEXPLAINED, Finding, Skipped, refused
+from torchid.log_checks.gains import common_factor_notes, common_gain_findings, gain_and_point_findings
 from torchid.log_checks.lag_and_tilt import check_lag_and_tilt, check_torque_offsets
 from torchid.log_checks.lags import without_lag
 from torchid.log_checks.mistakes import joint_mistakes, possible_mistakes
@@ -30,10 +31,10 @@ from torchid.log_checks.model import (
     without_friction,
 )
 from torchid.log_checks.required_sensors import check_required
-from torchid.log_checks.scales import TimeScale, TorqueGains, fit_time_scale, fit_torque_gains, motion_cutoff_hz
+from torchid.log_checks.scales import TimeScale, fit_time_scale, fit_torque_gains, motion_cutoff_hz
 from torchid.log_checks.torque_fit import TorqueFit, torque_findings
 from torchid.logs import Log
-from torchid.logs.log import WRENCHES, BoolArray, FloatArray
+from torchid.logs.log import WRENCHES
 from torchid.logs.segments import with_delayed_torques
 from torchid.parameters import COULOMB, VISCOUS
 from torchid.problem import Samples
@@ -57,6 +58,8 @@ _MAX_UNIT_MISFIT = 0.1
 _TINY = 1e-9
 #: Factor of time that no error of inertias explains: its square is 2.25.
 MIN_TIME_FACTOR = 1.5
+#: Share of a deviation that every block of time must show.
+MIN_BLOCK_SHARE = 0.5
 #: Unexplained forces with the recorded time, or at rest, over those with the corrected time.
 MIN_UNEXPLAINED_RATIO = 1.5
 #: The same of the recorded time where the corrected time leaves more than `MAX_UNEXPLAINED_RATIO`: an arm with a tool
@@ -65,19 +68,6 @@ _MIN_UNEXPLAINED_RATIO_OF_ANOTHER_ROBOT = 10.0
 #: Factors from another unit of time to seconds, and their tolerance.
 TIME_UNIT_FACTORS = {60.0: "minutes", 1e-3: "ms", 1e3: "ks", 3600.0: "hours"}
 _TIME_UNIT_TOLERANCE = 0.1
-#: Gain of a torque relative to the other joints, and shift of a wrench's point, that are reported: errors of gears and
-#: calibrations are smaller.
-MIN_GAIN_RATIO, MIN_POINT_SHIFT_M = 1.15, 0.03
-#: The same of all torques alike where contact forces do not say what the robot weighs: masses may be off by a fifth.
-MIN_COMMON_GAIN_RATIO = 1.3
-#: Size of such a deviation in standard deviations, which include the errors of the URDF.
-MIN_STANDARD_DEVIATIONS = 4.0
-#: Share of a deviation that every block of time must show.
-MIN_BLOCK_SHARE = 0.5
-#: The same of a factor of all torques, for which a block alone has hardly more than the prior at 1.
-MIN_COMMON_BLOCK_SHARE = 0.3
-#: Gains with a smaller standard deviation are the reference for all others, if there are enough of them.
-_MAX_REFERENCE_SPREAD, _MIN_REFERENCE_JOINTS = 0.1, 3
 _FORCE_CHECK = "forces against the model"
 
 
@@ -156,19 +146,21 @@ def _misfit_findings(
     scale = None if moved else _fit_time_scale(log, model)
     if found := moved or [one for one in [_time_scale_finding(scale)] if one is not None]:
         alike = None if moved else fit_torque_gains(samples, model)
-        yield from (alike and list(_common_gain_findings(alike, robot))) or found
+        yield from (alike and list(common_gain_findings(alike, robot))) or found
         return
     unexplained = unexplained if scale is None else min(unexplained, scale.recorded)
     if fit.largest_misfit > MAX_MISFIT and unexplained > MAX_UNEXPLAINED_RATIO:
         held = bool(model.contacts) or robot.fixed_base
         gains = fit_torque_gains(samples, model) if held else None
-        yield from list(_gain_and_point_findings(log, gains, robot)) or [_contradiction(fit, robot, held)]
+        yield from list(gain_and_point_findings(log, gains, robot)) or [_contradiction(fit, robot, held)]
         return
     torques = [] if fit.torque is None else list(torque_findings(robot, fit.torque))
     yield from torques
     if not any(isinstance(item, Finding) for item in torques):
-        scaled = list(_gain_and_point_findings(log, fit_torque_gains(samples, model), robot))
-        yield from scaled or list(check_torque_offsets(filtered)) or check_torque_drift(filtered)
+        scaled = list(gain_and_point_findings(log, fit_torque_gains(samples, model), robot))
+        found = scaled or list(check_torque_offsets(filtered))
+        found = found or list(check_torque_drift(filtered))
+        yield from found or (common_factor_notes(filtered) if is_bolted_arm(model) else [])
 
 
 def _is_mostly_friction(stated: ModelFit, without: ModelFit) -> bool:
@@ -296,92 +288,3 @@ def _time_scale_finding(scale: TimeScale | None) -> Finding | None:
     text = f"{prefix}gravity and inertia make up the measured forces if time is multiplied by {factor:.3g}"
     advice = "give seconds; check the sample rate that the stamps were made from"
     return Finding("unit", REJECTED, "time", text, advice)
-
-
-def _gain_and_point_findings(log: Log, fit: TorqueGains | None, robot: Robot) -> Iterator[Finding]:
-    """Findings about torques with another gain and wrenches about another point."""
-    if fit is None:
-        return
-    m = len(fit.joints)
-    spread, blocks = fit.spread[:m], fit.blocks[:, :m]
-    yield from _common_gain_findings(fit, robot)
-    of = _reference_joints(fit)
-    reference, of_reverse = (float(np.median(x[of])) if of.any() else 1.0 for x in (fit.gain, fit.reverse))
-    relative = fit.gain / reference
-    off = np.abs(fit.gain) > MIN_STANDARD_DEVIATIONS * spread  # readings of nothing have no factor
-    off &= _is_beyond(relative, fit.reverse / of_reverse, MIN_GAIN_RATIO)
-    references = np.median(blocks[:, of], axis=1, keepdims=True) if of.any() else 1.0
-    off &= _is_certain(relative - 1.0, spread / reference, blocks / references - 1.0)
-    if off.any() and m > 1:
-        names = [robot.joint_names[joint] for joint in fit.joints[off]]
-        gains = join_names([f"{gain:.3g} +- {std:.2g}" for gain, std in zip(relative[off], spread[off], strict=True)])
-        text = f"{join_names(names)}: factors that fit the {robot.format} best, relative to the other joints: {gains}"
-        advice = f"check gear ratios, torque constants and units, and the {robot.format}'s friction and inertias there"
-        advice += f", or set sensors.scales: {{joint_torque: [[{', '.join(names)}]]}}"
-        yield Finding("scale", SUSPICIOUS, "joint_torque", text, advice, tuple(names))
-    shifted = _is_certain(fit.point, fit.spread[m:], fit.blocks[:, m:]) & (np.abs(fit.point) > MIN_POINT_SHIFT_M)
-    if shifted.any():
-        point = ", ".join(f"{1e3 * x:.0f}" for x in fit.point)
-        text = f"forces and moments fit the {robot.format} about a point {point} mm from the contact frames' origins"
-        advice = "give moments about the contact frame's origin, or name the sensor's own frame as the contact"
-        if log.moments_about_world_origin:
-            advice = "check the points of the moments, where the plates lie, and the base's position in the same world"
-        yield Finding("point", SUSPICIOUS, log.contact_wrench_field, text, advice)
-
-
-def _reference_joints(fit: TorqueGains) -> BoolArray:
-    """Joints (m,) whose factors are the reference for all others, none if too few are known.
-
-    Those that the URDF's masses agree with, if there are any, however many have another factor: motors of one type are
-    wrong alike. Else all of them, as the URDF may weigh too much or too little.
-    """
-    known, right = _known_and_right_joints(fit)
-    return right if right.any() else known & (known.sum() >= _MIN_REFERENCE_JOINTS)
-
-
-def _known_and_right_joints(fit: TorqueGains) -> tuple[BoolArray, BoolArray]:
-    """Joints (m,) whose factors are known, and those of them whose factors are 1 within what a URDF is off by."""
-    known = fit.spread[: len(fit.gain)] < _MAX_REFERENCE_SPREAD * np.maximum(np.abs(fit.gain), 1.0)
-    known &= _agree(fit.gain, fit.reverse)
-    least = _least_common_ratio(fit)
-    is_off = _is_beyond(fit.gain, fit.gain, least) | _is_beyond(fit.reverse, fit.reverse, least)
-    return known, known & ~is_off
-
-
-def _least_common_ratio(fit: TorqueGains) -> float:
-    """Factor of all torques alike that is no error of the URDF's masses."""
-    return MIN_GAIN_RATIO if fit.common is not None and fit.common.is_weighed else MIN_COMMON_GAIN_RATIO
-
-
-def _common_gain_findings(of_joints: TorqueGains, robot: Robot) -> Iterator[Finding]:
-    """A finding about all torques times a common factor."""
-    fit = of_joints.common
-    if fit is None or _known_and_right_joints(of_joints)[1].any() or not _agree(fit.gain, fit.reverse):
-        return
-    if not _is_beyond(fit.gain, fit.reverse, _least_common_ratio(of_joints)):
-        return
-    value, agreeing = np.array([fit.gain - 1.0]), fit.blocks[:, None] - 1.0
-    if _is_certain(value, np.array([fit.spread]), agreeing, MIN_COMMON_BLOCK_SHARE).all():
-        text = f"all torques: the factor that fits the {robot.format} best is {fit.gain:.3g} +- {fit.spread:.2g}"
-        advice = (
-            f"check units, gear ratios and torque constants, whether the {robot.format}'s masses and contact forces "
-            "are right, or set sensors.scales: {joint_torque: all}"
-        )
-        yield Finding("scale", SUSPICIOUS, "joint_torque", text, advice)
-
-
-def _agree(one: FloatArray | float, other: FloatArray | float) -> BoolArray:
-    """Whether factors by either regression are the same, within what is reported of a factor."""
-    return np.asarray(np.abs(other) < MIN_COMMON_GAIN_RATIO * np.abs(one))
-
-
-def _is_beyond(one: FloatArray | float, other: FloatArray | float, ratio: float) -> BoolArray:
-    """Whether factors by either regression are both larger than a ratio, or both smaller than its inverse."""
-    low, high = np.minimum(one, other), np.maximum(one, other)
-    return np.asarray((low > ratio) | (high < 1.0 / ratio))
-
-
-def _is_certain(value: FloatArray, spread: FloatArray, blocks: FloatArray, share: float = MIN_BLOCK_SHARE) -> BoolArray:
-    """Which values (k,) are not 0, by their standard deviations (k,) and their estimates by block (BLOCKS, k)."""
-    agree = (blocks * np.sign(value) > share * np.abs(value)).all(axis=0)
-    return np.asarray((np.abs(value) > MIN_STANDARD_DEVIATIONS * spread) & agree)

@@ -15,6 +15,7 @@ from torchid.log_checks.deviation import (
     Deviation,
     DeviationRows,
     FilteredLog,
+    UnknownColumns,
     fit_deviation,
 )
 from torchid.log_checks.findings import NOTE, SUSPICIOUS, Finding
@@ -191,13 +192,19 @@ def fit_tilt(filtered: FilteredLog) -> Deviation | None:
 
 
 def _tilt_of(rows: DeviationRows | None, model: NominalModel) -> Deviation | None:
+    return fit_deviation(rows, tilt_columns(model), _TILT_PRIOR_STD_RAD)
+
+
+def tilt_columns(model: NominalModel) -> UnknownColumns:
+    """Columns of tilts about x and y: what the forces that are required lose for each unit of an angle."""
+
     def columns(builder: RowBuilder, part: Samples, number: int) -> FloatArray:
         phi = model.robot.nominal.flatten()[None]
         level = force_series(builder, part, phi)[1][0]
         turned = [force_series(builder, _turned(part, axis), phi)[1][0] for axis in range(2)]
         return np.stack([level - one for one in turned], axis=2) / _SMALL_ANGLE
 
-    return fit_deviation(rows, columns, _TILT_PRIOR_STD_RAD)
+    return columns
 
 
 def _turned(samples: Samples, axis: int) -> Samples:
