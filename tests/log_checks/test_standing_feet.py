@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from motions import value
 from scipy.spatial.transform import Rotation, Slerp
+from simulated import QUADRUPED
 from stances import stance
 from walking import robot_of
 
 from torchid.log_checks import REJECTED, SUSPICIOUS, Finding
+from torchid.log_checks.model import recorded_link_poses, same_poses
 from torchid.log_checks.standing_feet import check_standing_feet
 from torchid.logs import Log
+from torchid.robot import load_robot
 
 STANCE = stance("quadruped", samples=500)
 ROBOT, CONTACTS = robot_of(STANCE.machine), STANCE.contacts()
@@ -73,6 +78,28 @@ def test_the_order_of_a_simulator_is_named_and_stated_for_arrays_without_names(s
     assert (finding.severity, finding.field) == (REJECTED, "joint_names")
     assert finding.found.startswith("columns in breadth-first order")
     assert finding.advice.endswith(f"logs.columns.joint_order: [{', '.join(true)}]")
+
+
+@pytest.mark.parametrize("coupled", [False, True])
+def test_links_keep_their_poses_where_no_joint_that_carries_them_has_moved(coupled: bool, tmp_path: Path) -> None:
+    """Which decides whose poses are worked out anew; a knee that follows a hind hip is moved by it."""
+    text, knee = QUADRUPED.read_text(), '<child link="front_left_shank_link"/>'
+    assert text.count(knee) == 1
+    (tmp_path / "robot.urdf").write_text(
+        text.replace(knee, f'{knee}<mimic joint="rear_left_hip"/>') if coupled else text
+    )
+    robot, feet = load_robot(tmp_path / "robot.urdf"), ["front_left_foot", "rear_right_foot"]
+    position = np.random.default_rng(2).normal(size=(3, robot.n))
+    log = Log("log", time=np.arange(3.0), joint_names=robot.joint_names, joint_position=position)
+    before, same = recorded_link_poses(log, robot), dict[str, bool]()
+    for joint, name in enumerate(robot.joint_names):
+        other = replace(log, joint_position=position + np.eye(robot.n)[joint])
+        after = recorded_link_poses(other, robot)
+        same[name] = same_poses(log, other, robot, feet)
+        assert same[name] == all(torch.equal(before[foot], after[foot]) for foot in feet), name
+        assert same_poses(log, replace(log, joint_position=position.copy()), robot, feet)
+    assert sum(same.values()) == (5 if coupled else 6)
+    assert same["rear_left_hip"] == (not coupled)
 
 
 def test_an_orientation_that_never_changes_is_not_passed_over_in_silence() -> None:

@@ -22,7 +22,7 @@ from torchid.log_checks.findings import (
     widen_mask,
 )
 from torchid.log_checks.mistakes import possible_mistakes, reversed_joints
-from torchid.log_checks.model import LinkPoses, default_cutoff_hz, preprocess_pieces, recorded_link_poses
+from torchid.log_checks.model import LinkPoses, default_cutoff_hz, preprocess_pieces, recorded_link_poses, same_poses
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.quaternion import rotate_to_world
@@ -83,7 +83,7 @@ def check_standing_feet(
         if mistake.field not in _CORRECTED_FIELDS or mistake.field.startswith(derived):
             continue
         corrected = mistake.correct(log)
-        is_posed = corrected.joint_position is log.joint_position and corrected.joint_names == log.joint_names
+        is_posed = same_poses(log, corrected, robot, [contact.frame for contact in contacts])
         trial = measure_foot_slip(corrected, robot, contacts, poses if is_posed else None)
         if trial is not None and trial < least:
             best, least = mistake, trial
