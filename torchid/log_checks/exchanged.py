@@ -8,6 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from torchid.errors import InputError
@@ -24,6 +25,8 @@ from torchid.robot import Robot
 _MAX_SHARE_LEFT = 0.25
 #: Readings of a torque whose noise is looked at.
 _MIN_READINGS = 20
+#: Third singular value of two joints' motions over the first, of more than one rate.
+_MIN_THIRD = 0.1
 _TINY = 1e-9
 
 
@@ -77,6 +80,8 @@ def check_exchanged_torques(filtered: FilteredLog) -> Finding | None:
                 continue
             pair, order = found.pairs[best], np.arange(robot.n_dofs)
             tried.append(tuple(pair))
+            if not _is_told(filtered.samples, pair):
+                continue
             order[pair] = pair[::-1]
             corrected = [replace(x, torque=None if x.torque is None else x.torque[:, order]) for x in filtered.samples]
             again = _rows(filtered, corrected, noise[order[: robot.n]])
@@ -84,6 +89,15 @@ def check_exchanged_torques(filtered: FilteredLog) -> Finding | None:
             if after is not None and _is_right(after, best):
                 return _finding(filtered, pair, after.left[best] / max(after.without, _TINY))
     return None
+
+
+def _is_told(samples: Sequence[Samples], pair: NDArray[np.intp]) -> bool:
+    """Whether two joints move at more than one rate: of a sine, either one's torques fit both."""
+    parts = [torch.cat([x.joint_position, x.joint_velocity, x.joint_acceleration], 1) for x in samples]
+    motion = torch.cat([x.unflatten(1, (3, -1))[..., pair.tolist()].flatten(1) for x in parts])
+    motion = motion - motion.mean(0)
+    size = torch.linalg.svdvals(motion / torch.linalg.vector_norm(motion, dim=0).clamp(min=_TINY))
+    return bool(size[2] > _MIN_THIRD * size[0])
 
 
 def _is_right(after: _Exchanges, pair: int) -> bool:
