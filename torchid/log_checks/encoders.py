@@ -6,6 +6,7 @@ All for every URDF near the given one: masses that are 15 to 20 % off turn gravi
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -317,12 +318,20 @@ def check_encoders(filtered: FilteredLog, moved: list[Finding], unexplained: flo
             names = join_names([name for one in found for name in one.channels])
             also = f"; or the zero of {names}, which explains it as well"
             return [replace(one, advice=one.advice + also) if one.name == "tilt" else one for one in moved]
-        if not moved and (small := check_single_zero(samples, model)):
-            return small
         mistaken = None if moved else _reversed_joint(filtered.pieces, model, unexplained)
     except InputError:  # reported by `check_forces_against_urdf`
         return moved
     return moved if mistaken is None else [mistaken]
+
+
+def single_zero_findings(filtered: FilteredLog) -> list[Finding]:
+    """A finding about one encoder's zero of a bolted arm's log in which nothing else is wrong."""
+    model = filtered.model
+    if not is_bolted_arm(model) or filtered.log.joint_torque is None:
+        return []
+    with suppress(InputError):  # reported by `check_forces_against_urdf`
+        return check_single_zero(bind_some_samples(filtered.pieces, model.robot, (), TIME_SCALE_SAMPLES), model)
+    return []
 
 
 def _gravity_finding(found: Deviation) -> Finding:

@@ -12,7 +12,7 @@ import torch
 from torchid.errors import InputError
 from torchid.log_checks.deviation import FilteredLog
 from torchid.log_checks.drift import check_torque_drift
-from torchid.log_checks.encoders import check_encoders, is_bolted_arm
+from torchid.log_checks.encoders import check_encoders, is_bolted_arm, single_zero_findings
 from torchid.log_checks.exchanged import check_exchanged_torques
 from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, UNEXPLAINED, Finding, Skipped, refused
 from torchid.log_checks.gains import common_factor_notes, common_gain_findings, gain_and_point_findings
@@ -152,13 +152,14 @@ def _misfit_findings(
     if fit.largest_misfit > MAX_MISFIT and unexplained > MAX_UNEXPLAINED_RATIO:
         held = bool(model.contacts) or robot.fixed_base
         gains = fit_torque_gains(samples, model) if held else None
-        yield from list(gain_and_point_findings(log, gains, robot)) or [_contradiction(fit, robot, held)]
+        found = list(gain_and_point_findings(log, gains, robot)) or single_zero_findings(filtered)
+        yield from found or [_contradiction(fit, robot, held)]
         return
     torques = [] if fit.torque is None else list(torque_findings(robot, fit.torque))
     yield from torques
     if not any(isinstance(item, Finding) for item in torques):
         scaled = list(gain_and_point_findings(log, fit_torque_gains(samples, model), robot))
-        found = scaled or list(check_torque_offsets(filtered))
+        found = scaled or single_zero_findings(filtered) or list(check_torque_offsets(filtered))
         found = found or list(check_torque_drift(filtered))
         yield from found or (common_factor_notes(filtered) if is_bolted_arm(model) else [])
 

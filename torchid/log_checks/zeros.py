@@ -100,7 +100,9 @@ def check_single_zero(samples: Sequence[Samples], model: NominalModel) -> list[F
     joint = int(np.argmax([one.explained for one in each]))
     best, together = each[joint], equations.fit(_ZERO_PRIOR_STD).explained
     tilted = equations.fit(_ZERO_PRIOR_STD, unit[:, n:]).explained
-    is_alone = min(best.explained / together, 1.0 - tilted / best.explained) > _MIN_EXPLAINED_SHARE
+    is_alone = (
+        best.explained > _MIN_EXPLAINED_SHARE * together and tilted < (1.0 - _MIN_EXPLAINED_SHARE) * best.explained
+    )
     is_large = abs(best.value[0]) > _least(model, MIN_SINGLE_ZERO_DEG, MIN_SINGLE_ZERO_M)[joint]
     is_clear = bool((best.certain & best.steady)[0]) and left < MAX_LEFT
     return [_finding(joint, best, 0, model)] if is_alone and is_large and is_clear else []
