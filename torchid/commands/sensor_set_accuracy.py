@@ -103,7 +103,7 @@ def _accuracy(
     fitter = setup.fitter(builder, conditions)
     if settings.name == "sgd":
         settings = replace(settings, name="least_squares")
-    blocks = split_into_folds(train, builder)
+    blocks = split_into_folds(train, builder) if settings.chooses_ridge else list(train)
     parts = compress_parts(blocks, builder)
     if settings.chooses_ridge:
         choice = ranks.from_first(partial(setup.choose_ridge, parts, blocks, fitter, conditions), "ridge")
