@@ -173,7 +173,7 @@ def test_long_files_are_summed_up_while_something_else_is_done(
         monkeypatch.setattr("torchid.commands.cache._YOUNG", -1.0)
         cache = Cache(tmp_path / "cache", 1.0)
         sums += [cache.checksum(log, [log], meanwhile) for _ in range(2)]
-        monkeypatch.setattr("torchid.commands.manifest._PART", 30)
+        monkeypatch.setattr("torchid.checksums._PART", 30)
         sums.append(Cache(tmp_path / "cache", 1.0).checksum(log, [log]))
     assert sums[:3] == [hashlib.sha256(content).hexdigest()] * 3
     assert done == [log], "the second time nothing is read"

@@ -18,9 +18,9 @@ from demo import shortened_demo
 from large import SMALL, experiment, recorded, tensors
 from shared_work import finish_forked
 
-from torchid import ranks
+from torchid import checksums, ranks
 from torchid.commands import cache as caches
-from torchid.commands import cached_reading, large_log, manifest, reading
+from torchid.commands import cached_reading, large_log, reading
 from torchid.commands.cache import FOLDER
 from torchid.commands.cached_reading import CachedReader, _shares, open_cache
 from torchid.commands.reading import LogReader
@@ -40,7 +40,7 @@ def read_all(calls: Sequence[Sequence[str]], folder: Path) -> int:
     opened: list[str] = []
     bound: list[int] = []
     summed: list[list[Any]] = []
-    read_log, bind, sum_up = reading.read_log, large_log.LargeLog._bound, manifest.part_checksum
+    read_log, bind, sum_up = reading.read_log, large_log.LargeLog._bound, checksums.part_checksum
 
     def open_and_read(path: Path, *rest: Any, **named: Any) -> Any:
         opened.append(Path(path).name)
@@ -50,12 +50,12 @@ def read_all(calls: Sequence[Sequence[str]], folder: Path) -> int:
         bound.append(block.piece.start)
         return bind(log, cover, block)
 
-    def note_and_sum_up(part: manifest.FilePart) -> str:
+    def note_and_sum_up(part: checksums.FilePart) -> str:
         summed.append([part.path.name, part.start])
         return sum_up(part)
 
     reading.read_log, large_log.LargeLog._bound = open_and_read, note_and_bind  # type: ignore[method-assign]
-    cached_reading.part_checksum, manifest._PART, caches._YOUNG = note_and_sum_up, 100_000, -1.0
+    cached_reading.part_checksum, checksums._PART, caches._YOUNG = note_and_sum_up, 100_000, -1.0
     dist.init_process_group("gloo")
     rank, found = dist.get_rank(), []
     for file, *more in calls:

@@ -18,8 +18,8 @@ from pydantic import TypeAdapter
 from torch import Tensor
 
 from torchid import ranks
+from torchid.checksums import file_checksum
 from torchid.commands.cache import Cache, CacheEntry, content_key, tensor_of
-from torchid.commands.manifest import file_checksum
 from torchid.commands.reading import fits_contact_offsets
 from torchid.config.robot import RobotConfig
 from torchid.errors import TorchidWarning

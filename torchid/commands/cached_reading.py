@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from torchid import ranks
+from torchid.checksums import FilePart, checksum_of_parts, file_parts, file_states, part_checksum
 from torchid.commands.cache import FOLDER, TOKEN, Cache, Files, content_key, missing_folders, remove_empty
 from torchid.commands.cache_entries import ReadLog, RecordedWarning, content_of_setup, samples_entry, samples_of_entry
-from torchid.commands.manifest import FilePart, checksum_of_parts, file_parts, file_states, part_checksum
 from torchid.commands.reading import LogReader, fits_contact_offsets, payload_of
 from torchid.commands.shared_log import on_one_machine, read_together
 from torchid.errors import TorchidWarning, warn

@@ -14,9 +14,9 @@ from pathlib import Path
 from rich.progress import Progress
 
 from torchid import ranks
+from torchid.checksums import file_checksum
 from torchid.commands.chosen_settings import Choices, with_chosen_settings
 from torchid.commands.folder import COMPRESSED, check_free, new_folder
-from torchid.commands.manifest import file_checksum
 from torchid.commands.reading import LogReader
 from torchid.config import ExperimentConfig, inputs_of
 from torchid.errors import ConfigError, during, excerpt
