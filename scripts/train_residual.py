@@ -26,13 +26,13 @@ from torch import Tensor, nn
 import torchid
 from torchid.boundary import run_guarded
 from torchid.commands.chosen_settings import with_chosen_settings
-from torchid.commands.reading import LogReader
 from torchid.commands.run_figures import hyperparameters
 from torchid.config import load_config
 from torchid.errors import ConfigError, about_file
 from torchid.estimators import ResidualEffect, Sgd, Trainer
 from torchid.fitting.experiment import set_up
 from torchid.problem import MiniBatches
+from torchid.reading.log_reader import LogReader
 from torchid.report.tables import progress_bars
 from torchid.report.tensorboard import RunEvents
 

@@ -17,11 +17,11 @@ import torchid
 from torchid.cli import main
 from torchid.commands import analyze as commands_analyze
 from torchid.commands.analyze import analyze
-from torchid.commands.reading import LogReader
 from torchid.commands.sensor_set_accuracy import accuracies
 from torchid.config import load_analysis
 from torchid.errors import TorchidWarning
 from torchid.parallel import copies_allowed
+from torchid.reading.log_reader import LogReader
 from torchid.report.figures import tree_figure
 
 LEGS = ("front_left", "front_right", "rear_left", "rear_right")

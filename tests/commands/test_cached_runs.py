@@ -21,9 +21,6 @@ from thinned import slow_but
 from trainings import trust_new_files
 
 from torchid.cli import main
-from torchid.commands.cache import FOLDER, content_key
-from torchid.commands.cache_entries import NOT_IN_SAMPLES, content_of_setup, factors_key
-from torchid.commands.reading import LogReader
 from torchid.config import load_config
 from torchid.config.experiment import ActuatorsConfig
 from torchid.config.log_reading import PreprocessingConfig
@@ -33,6 +30,9 @@ from torchid.fitting.experiment import set_up, with_noise
 from torchid.fitting.noise import NoiseSummary
 from torchid.logs.signal_noise import STATED_FIELDS
 from torchid.problem.compression import split_into_folds
+from torchid.reading.cache import FOLDER, content_key
+from torchid.reading.cache_entries import NOT_IN_SAMPLES, content_of_setup, factors_key
+from torchid.reading.log_reader import LogReader
 
 NONE = "preprocessing.cache_gb=0"
 OFFSETS = ("sensors.set=full", "sensors.offsets={contact_force: log}")
@@ -88,8 +88,13 @@ def test_a_run_from_the_cache_has_the_results_of_one_without_to_the_last_bit(
     assert main([*line, f"output={tmp_path / 'first'}"]) == 0
     assert results(tmp_path / "first") == expected
     assert "from cache" not in capsys.readouterr().out
-    for opened in ("reading.read_log", "large_log.open_log_blocks", "cached_reading.log_bytes", "cache.part_checksum"):
-        monkeypatch.setattr(f"torchid.commands.{opened}", None)
+    for opened in (
+        "log_reader.read_log",
+        "large_log.open_log_blocks",
+        "cached_reader.log_bytes",
+        "cache.part_checksum",
+    ):
+        monkeypatch.setattr(f"torchid.reading.{opened}", None)
     monkeypatch.setattr("torchid.commands.prepared_data.compress_in_blocks", None)
     assert main([*line, f"output={tmp_path / 'second'}"]) == 0
     assert results(tmp_path / "second") == expected
@@ -104,7 +109,7 @@ def test_another_ridge_estimator_and_prior_read_and_compress_nothing(
     others = (("estimator.ridge=0.01",), ("estimator.name=consistent", "estimator.prior=entropic"))
     for number, more in enumerate(others):
         assert main(["identify", str(demo), *more, f"output={tmp_path / f'without{number}'}", NONE]) == 0
-    monkeypatch.setattr("torchid.commands.reading.read_log", None)
+    monkeypatch.setattr("torchid.reading.log_reader.read_log", None)
     monkeypatch.setattr("torchid.commands.prepared_data.compress_in_blocks", None)
     for number, more in enumerate(others):
         assert main(["identify", str(demo), *more, f"output={tmp_path / f'with{number}'}"]) == 0
@@ -185,7 +190,7 @@ def test_the_urdf_and_the_code_change_the_name_of_samples(
     urdf = tmp_path / "demo" / "quadruped.urdf"
     urdf.write_text(urdf.read_text().replace("</robot>", "<!-- heavier --></robot>"))
     assert content(tmp_path / "demo" / demo.name) != before
-    monkeypatch.setattr("torchid.commands.cache._code", lambda: "another")
+    monkeypatch.setattr("torchid.reading.cache._code", lambda: "another")
     assert content(demo) != before
 
 
@@ -312,7 +317,7 @@ def test_where_nothing_can_be_written_a_run_goes_on_without_and_says_so_once(
     elif reason == "a full disk":
         monkeypatch.setattr("numpy.lib.format.write_array_header_1_0", refused)
     else:
-        monkeypatch.setattr("torchid.commands.cache.staging_folder", refused)
+        monkeypatch.setattr("torchid.reading.cache.staging_folder", refused)
     assert main(["identify", str(demo), f"output={tmp_path / 'run'}"]) == 0
     lines = [line for line in capsys.readouterr().err.splitlines() if FOLDER in line]
     assert len(lines) == 1

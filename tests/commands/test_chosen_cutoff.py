@@ -10,10 +10,10 @@ from refusals import refusal, refused
 from repository import DEMO
 
 from torchid.cli import main
-from torchid.commands.reading import LogReader
 from torchid.config import load_config
 from torchid.errors import ConfigError
 from torchid.fitting.experiment import set_up
+from torchid.reading.log_reader import LogReader
 
 FEW = "preprocessing.sample_rate_hz=auto"
 AUTO = ["preprocessing={cutoff_hz: auto, cache_gb: 0}", "sensors.noise={joint_position: 1e-4}", "estimator.ridge=0.01"]

@@ -19,13 +19,13 @@ from closed_loops import MODELS, LoopWorld, loop_world
 
 import torchid
 from torchid.cli import main
-from torchid.commands.reading import LogReader
 from torchid.commands.replay import replay
 from torchid.config import load_config
 from torchid.errors import TorchidError
 from torchid.fitting.experiment import set_up
 from torchid.logs import Log
 from torchid.parameters import FRICTION, perturb_parameters
+from torchid.reading.log_reader import LogReader
 from torchid.regressor.loops import LoopClosures
 from torchid.report import identified_urdf
 from torchid.report.mjcf_files import identified_mjcf, mjcf_of_urdf

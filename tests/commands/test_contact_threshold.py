@@ -17,12 +17,12 @@ from refusals import refusal, refused
 
 from torchid.cli import main
 from torchid.commands.check import check_experiment
-from torchid.commands.reading import LogReader, settle_contacts
 from torchid.config import load_config
 from torchid.errors import ConfigError
 from torchid.fitting.experiment import set_up
 from torchid.logs import Log, read_log, write_log
 from torchid.problem import Samples
+from torchid.reading.log_reader import LogReader, settle_contacts
 
 pytestmark = pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
 TOUCH = 0.1  # [N], above which there are exactly the samples in which the simulator lets a foot touch

@@ -20,12 +20,12 @@ from welded import CONTACTS, SENSORS, STATES, machine
 
 from torchid.cli import main
 from torchid.commands.chosen_settings import WidthReader
-from torchid.commands.reading import LogReader
 from torchid.config import load_config
 from torchid.fitting.calibration import Calibration
 from torchid.fitting.experiment import set_up
 from torchid.logs import read_log, write_log
 from torchid.problem import ExtraTerms, bind_log
+from torchid.reading.log_reader import LogReader
 from torchid.report.parameter_files import read_parameters, read_shared_extras
 
 EXACT = 1e-7

@@ -16,12 +16,12 @@ from repository import DEMO
 from trainings import trust_new_files
 
 from torchid.cli import main
-from torchid.commands.cache import content_key
-from torchid.commands.cache_entries import content_of_setup
-from torchid.commands.reading import LogReader
 from torchid.config import dump_config, load_config
 from torchid.fitting.experiment import set_up
 from torchid.logs import Log, read_log, write_log
+from torchid.reading.cache import content_key
+from torchid.reading.cache_entries import content_of_setup
+from torchid.reading.log_reader import LogReader
 
 SAMPLES = 300
 PARQUET, PD, MOTORS = "nested names", "PD law", "motor numbers in degrees"

@@ -31,12 +31,12 @@ from synthetic import G1, ROBOTS, SOLO12
 
 from torchid.cli import main
 from torchid.commands.init import InitReport, init
-from torchid.commands.reading import LogReader
 from torchid.config import load_config
 from torchid.errors import ConfigError, LogError, UnknownNameError
 from torchid.fitting.experiment import set_up
 from torchid.logs import Log, Topics, read_log
 from torchid.logs.unitree import HG, JOINT_ORDERS
+from torchid.reading.log_reader import LogReader
 from torchid.robot import load_robot
 
 URDF = DEMO / "quadruped.urdf"

@@ -31,7 +31,6 @@ from large import (
 from refusals import refusal
 
 from torchid.cli import main
-from torchid.commands.reading import LogReader
 from torchid.config import load_config
 from torchid.estimators import LeastSquares
 from torchid.fitting.experiment import set_up
@@ -40,6 +39,7 @@ from torchid.logs.blocks import log_bytes, open_log_blocks
 from torchid.logs.lazy_arrays import Spill, SpillError
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
 from torchid.problem.predict import calibrate_readings
+from torchid.reading.log_reader import LogReader
 
 IDENTIFY = ("estimator.ridge=0.001", "sensors=joints")
 
@@ -269,7 +269,7 @@ import json, scipy.signal, sys, threading, time, torch
 from torchid.config import load_config
 from torchid.problem.predict import calibrate_readings
 from torchid.fitting.experiment import set_up
-from torchid.commands.reading import LogReader
+from torchid.reading.log_reader import LogReader
 def used():
     lines = open("/proc/self/status").read().splitlines()
     return next(int(line.split()[1]) / 1024.0 for line in lines if line.startswith("RssAnon"))

@@ -17,15 +17,15 @@ from large import assert_same, tensors
 from trainings import trust_new_files
 
 from torchid.cli import main
-from torchid.commands.cached_reading import CachedReader, open_cache
 from torchid.commands.compress import compress
-from torchid.commands.reading import LogReader
 from torchid.config import load_config
 from torchid.errors import ConfigError, TorchidWarning
 from torchid.fitting.experiment import set_up
 from torchid.fitting.factor_files import read_factors
 from torchid.logs import read_log, write_log
 from torchid.problem import Samples
+from torchid.reading.cached_reader import CachedReader, open_cache
+from torchid.reading.log_reader import LogReader
 
 FEET = [f"{leg}_foot" for leg in ("front_left", "front_right", "rear_left", "rear_right")]
 

@@ -21,13 +21,13 @@ import torchid
 from torchid.cli import main
 from torchid.commands import EXPORT_FORMATS
 from torchid.commands.export import export
-from torchid.commands.reading import LogReader
 from torchid.commands.report import report
 from torchid.config import load_config
 from torchid.errors import ConfigError
 from torchid.fitting.experiment import set_up
 from torchid.problem.chunks import chunks_by_state
 from torchid.problem.predict import force_series
+from torchid.reading.log_reader import LogReader
 from torchid.report.mjcf_files import identified_mjcf, mjcf_of_urdf
 from torchid.robot import load_robot
 

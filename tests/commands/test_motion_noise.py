@@ -15,12 +15,12 @@ from demo import shortened_demo
 from trainings import trust_new_files
 
 from torchid.cli import main
-from torchid.commands.reading import LogReader
 from torchid.config import load_config
 from torchid.errors import TorchidWarning
 from torchid.fitting.experiment import set_up
 from torchid.logs import read_log, write_log
 from torchid.problem.motion_noise import MotionNoise
+from torchid.reading.log_reader import LogReader
 
 
 @pytest.fixture(autouse=True)

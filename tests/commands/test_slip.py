@@ -93,11 +93,11 @@ def test_blocks_of_a_long_log_lose_the_samples_that_the_whole_log_loses(
         (line,) = [str(x.message) for x in said if "samples dropped" in str(x.message)]
         return samples, line
 
-    monkeypatch.setattr("torchid.commands.reading._WHOLE_GB", np.inf)
+    monkeypatch.setattr("torchid.reading.log_reader._WHOLE_GB", np.inf)
     whole, line = read()
     assert len(whole) < len(samples_of(file, *settings, "preprocessing.max_slip=null")) - 50
-    monkeypatch.setattr("torchid.commands.reading._WHOLE_GB", 0.0)
-    monkeypatch.setattr("torchid.commands.large_log.BLOCK_GB", 1e-4)
+    monkeypatch.setattr("torchid.reading.log_reader._WHOLE_GB", 0.0)
+    monkeypatch.setattr("torchid.reading.large_log.BLOCK_GB", 1e-4)
     for more in ((), (SMALL,)):
         blocks, of_blocks = read(*more)
         assert is_on_disk(blocks) == bool(more)

@@ -20,14 +20,14 @@ from trainings import trust_new_files
 from walking import MACHINES, recorded, truth
 
 from torchid.cli import main
-from torchid.commands.cached_reading import CachedReader, open_cache
 from torchid.commands.check import check_experiment
-from torchid.commands.reading import LogReader
 from torchid.config import load_config
 from torchid.errors import ConfigError, InputError, TorchidWarning
 from torchid.fitting.experiment import set_up
 from torchid.logs import Log, write_log
 from torchid.problem.contact_detection import DetectionConfig
+from torchid.reading.cached_reader import CachedReader, open_cache
+from torchid.reading.log_reader import LogReader
 
 MACHINE = MACHINES["quadruped"]
 FEET = [{"frame": name, "type": "point"} for name in MACHINE.feet]
@@ -139,7 +139,7 @@ def test_samples_that_the_checks_reject_are_left_out_too(written: Written) -> No
 def test_a_log_that_would_be_read_in_blocks_is_taken_whole(written: Written, monkeypatch: pytest.MonkeyPatch) -> None:
     setup = set_up(load_config(written(base_motion="contacts")))
     (one,) = LogReader(setup).read(setup.config.logs.train, setup.sensors)
-    monkeypatch.setattr("torchid.commands.reading._WHOLE_GB", 0.0)
+    monkeypatch.setattr("torchid.reading.log_reader._WHOLE_GB", 0.0)
     (other,) = LogReader(setup).read(setup.config.logs.train, setup.sensors)
     np.testing.assert_array_equal(value(one.base.specific_force), value(other.base.specific_force))
 
@@ -159,7 +159,7 @@ def test_cached_samples_of_one_setting_are_not_those_of_the_other(
 
     one, two = read(), read(override)
     assert not np.array_equal(one, two)
-    monkeypatch.setattr("torchid.commands.reading.read_log", None)
+    monkeypatch.setattr("torchid.reading.log_reader.read_log", None)
     np.testing.assert_array_equal(read(override), two)
     np.testing.assert_array_equal(read(), one)
 

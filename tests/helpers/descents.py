@@ -13,11 +13,11 @@ from synthetic import UR5, Array, load, random_states
 from torch import Tensor, nn
 
 from torchid import parameters
-from torchid.commands.reading import LogReader
 from torchid.config import load_config
 from torchid.fitting.experiment import set_up
 from torchid.problem import LinearProblem, MiniBatches, RowBuilder, Samples, compress, linear_problem
 from torchid.problem.base_motion import BaseMotion
+from torchid.reading.log_reader import LogReader
 from torchid.regressor import Regressor
 from torchid.robot import Robot
 from torchid.sensing import SensorNoise, named_sensors

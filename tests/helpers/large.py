@@ -12,11 +12,11 @@ from demo import DEMO
 from motions import RATE, angles, position
 from scipy.spatial.transform import Rotation
 
-from torchid.commands.reading import LogReader
 from torchid.config import load_config
 from torchid.fitting.experiment import set_up
 from torchid.logs import read_log, write_log
 from torchid.problem import Samples
+from torchid.reading.log_reader import LogReader
 
 SAMPLES = 9_000  # two blocks and a bit
 SMALL = "preprocessing.memory_gb=0.0001"

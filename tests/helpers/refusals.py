@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from torchid.cli import main
-from torchid.commands.cache import FOLDER
 from torchid.errors import ConfigError, InputError, UnknownNameError
+from torchid.reading.cache import FOLDER
 
 
 def files_in(folder: Path) -> dict[str, bytes]:

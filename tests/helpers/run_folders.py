@@ -6,11 +6,11 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from torchid.commands.cache import FOLDER
 from torchid.commands.folder import (
     EVALUATION,
     new_folder,
 )
+from torchid.reading.cache import FOLDER
 
 Add = Callable[[Path], None]
 

@@ -25,7 +25,7 @@ BY_EPOCH = list(range(1, EPOCHS + 1))
 
 def trust_new_files(monkeypatch: pytest.MonkeyPatch) -> None:
     """A cache that trusts files that have just been written."""
-    monkeypatch.setattr("torchid.commands.cache._YOUNG", -1.0)
+    monkeypatch.setattr("torchid.reading.cache._YOUNG", -1.0)
 
 
 def command(experiment: Path, output: Path, *more: str) -> list[str]:

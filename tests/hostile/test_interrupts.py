@@ -17,7 +17,7 @@ from refusals import files_in
 from run_folders import names_in
 from thinned import slow_but
 
-from torchid.commands.cache import FOLDER
+from torchid.reading.cache import FOLDER
 from torchid.staging import NEW, staging_folder
 
 if TYPE_CHECKING:

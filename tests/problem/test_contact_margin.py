@@ -13,13 +13,13 @@ from repository import DEMO
 from synthetic import SOLO12, Array, Oracle, load, make_log
 from true_robots import true_parameters
 
-from torchid.commands.reading import LogReader
 from torchid.config import load_config
 from torchid.estimators import LeastSquares
 from torchid.fitting.experiment import set_up
 from torchid.logs import read_log, write_log
 from torchid.logs.preprocess import near_contact_changes
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
+from torchid.reading.log_reader import LogReader
 
 FEET = ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT")
 PHASE, STEP, SLIP = 40, 0.01, 0.05  # samples of a phase, s, s

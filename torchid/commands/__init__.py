@@ -3,8 +3,6 @@
 A module for each command: `analyze`, `check` (and `convert`), `compress`, `demo`, `evaluate`, `export`, `identify`,
 `init`, `replay`, `report`, `sample`, `simulate`. What they are made of:
 
-- reading logs: `reading`, block by block `large_log`, `segmented_log`; by several processes `shared_log`; from a cache
-  `cached_reading`, `cache_entries`, `cache`
 - a fit: `prepared_data`, `chosen_settings`, `training`, `checkpoint`, `plausibility`
 - what `identify` returns and says: `results`, `named_results`, `answer`, `run_figures`
 - parts of `init` and `analyze`: `init_logs`, `init_proposals`, `analysis_request`, `sensor_set_accuracy`

@@ -16,7 +16,6 @@ from torchid import ranks
 from torchid.commands.analysis_request import AnalysisRequest, errors_at
 from torchid.commands.chosen_settings import with_chosen_settings
 from torchid.commands.folder import ANALYSIS, check_free, new_folder, write_json
-from torchid.commands.reading import LogReader, check_read
 from torchid.commands.sensor_set_accuracy import accuracies
 from torchid.config import AnalyzeConfig, dump_config, inputs_of
 from torchid.errors import ConfigError, UnknownNameError, during, join_names, warn
@@ -30,6 +29,7 @@ from torchid.problem.chunks import chunks_by_state, copies_share_passes
 from torchid.problem.contact_state import ContactState
 from torchid.problem.elimination import free_parameters
 from torchid.problem.linear import parameter_scale
+from torchid.reading.log_reader import LogReader, check_read
 from torchid.report.analysis import (
     SetAccuracy,
     accuracy_figure,

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from torchid.commands.folder import check_free_file
-from torchid.commands.reading import memory_needed, settle_contacts, setup_of_log
 from torchid.config import load_analysis
 from torchid.config.log_reading import PreprocessingConfig, load_columns, load_topics
 from torchid.config.logs import LogsConfig
@@ -27,6 +26,7 @@ from torchid.logs.blocks import has_blocks, open_log_blocks
 from torchid.logs.containers import atomic_output, new_log_kind
 from torchid.logs.read import files_of_recordings_kept
 from torchid.logs.time_range import log_title, split_range
+from torchid.reading.log_reader import memory_needed, settle_contacts, setup_of_log
 from torchid.report.figure_style import save_figure
 from torchid.report.log_checks import log_check_document, log_check_figure
 from torchid.report.tables import progress_bars

@@ -14,7 +14,6 @@ from rich.progress import Progress
 
 from torchid import ranks
 from torchid.commands.check import recorded_segments
-from torchid.commands.reading import LogReader
 from torchid.errors import TorchidWarning, about_file, join_names, warn_about_file
 from torchid.estimators import Conditions
 from torchid.fitting.cross_validation import RidgeChoice
@@ -42,6 +41,7 @@ from torchid.problem import ExtraTerms, RowBuilder, Samples
 from torchid.problem.compressed_log import Block
 from torchid.problem.log_joints import columns_in_order, joint_order
 from torchid.problem.parts import Part
+from torchid.reading.log_reader import LogReader
 from torchid.sensing import SensorSet
 from torchid.settings import AUTO
 

@@ -15,7 +15,6 @@ from rich.progress import Progress
 
 from torchid import ranks
 from torchid.commands.folder import EVALUATION, RUN, check_free, new_folder, refuse_link, write_json
-from torchid.commands.reading import LogReader
 from torchid.commands.results import Identification
 from torchid.commands.run_figures import draw_forces
 from torchid.config import load_config
@@ -34,6 +33,7 @@ from torchid.problem.contact_state import state_name
 from torchid.problem.metrics import DECISIVE_GROUPS, WHITENED, describe_errors, group_name
 from torchid.problem.motion_noise import is_at_rest
 from torchid.problem.predict import at_motors, force_series, noise_series, projected_forces
+from torchid.reading.log_reader import LogReader
 from torchid.report.figure_style import save_figures
 from torchid.report.figures import error_figure
 from torchid.report.forces import ForceSeries, LogForces

@@ -28,7 +28,6 @@ from torchid.commands.init_proposals import (
     welded_at,
     without_rolling,
 )
-from torchid.commands.reading import memory_needed
 from torchid.config.log_reading import PreprocessingConfig
 from torchid.config.yaml_text import inline_yaml, yaml_lines
 from torchid.errors import ConfigError, InputError, LogError, about_file, excerpt, format_count, join_names
@@ -48,6 +47,7 @@ from torchid.proposals.file_samples import FileSample, read_bag_sample, read_sam
 from torchid.proposals.maps import propose_map
 from torchid.proposals.stamps import arrays_by_stamps
 from torchid.proposals.topics import USED_TYPES, frame_of, propose_topics
+from torchid.reading.log_reader import memory_needed
 from torchid.robot import Robot, load_robot
 from torchid.robot.urdf import has_fixed_base
 from torchid.robot.xml_files import is_mjcf

@@ -1,8 +1,7 @@
-"""Checksums of files; manifests of folders: which files torchid wrote, so that replacing removes no others."""
+"""Manifests of folders: which files torchid wrote, so that replacing removes no others."""
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import stat
@@ -12,16 +11,15 @@ from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
+from torchid.checksums import file_checksum
 from torchid.errors import excerpt
 from torchid.staging import atomic_file, is_leftover, remove_leftover
 
 MANIFEST = "manifest.json"
 
 _LARGEST = 2**24  # bytes of a manifest: those of 100 000 files
-_BLOCK = 2**20
-_PART = 2**27  # bytes of a part of a file, which take 0.1 s to sum up
 
 
 @dataclass(frozen=True)
@@ -206,54 +204,3 @@ def _look_into(top: Path, relative: str, manifest: Manifest, kind: FolderKind, c
 def _is(path: Path, size: int, checksum: str) -> bool:
     """Whether a file still is what was written."""
     return path.stat().st_size == size and file_checksum(path) == checksum
-
-
-def file_checksum(*paths: Path) -> str:
-    """SHA-256 of a file, or of several one after the other."""
-    digest = hashlib.sha256()
-    for path in paths:
-        with path.open("rb") as file:
-            while block := file.read(_BLOCK):
-                digest.update(block)
-    return digest.hexdigest()
-
-
-class FilePart(NamedTuple):
-    """So many bytes of a file, from one on, which are summed up by themselves."""
-
-    path: Path
-    start: int
-    size: int
-
-
-def file_parts(files: Sequence[Path]) -> list[FilePart]:
-    """Parts of some files, which several processes can sum up. Raises OSError: one is not there."""
-    sizes = [(file, file.stat().st_size) for file in files]
-    return [
-        FilePart(file, start, min(_PART, size - start))
-        for file, size in sizes
-        for start in range(0, max(size, 1), _PART)
-    ]
-
-
-def part_checksum(part: FilePart) -> str:
-    """SHA-256 of a part of a file. Raises OSError: it cannot be read."""
-    digest = hashlib.sha256()
-    with part.path.open("rb") as file:
-        file.seek(part.start)
-        for start in range(0, part.size, _BLOCK):
-            digest.update(file.read(min(_BLOCK, part.size - start)))
-    return digest.hexdigest()
-
-
-def checksum_of_parts(sums: Sequence[str]) -> str:
-    """Checksum of files from those of their parts: SHA-256 of these, that of the part itself where there is but one."""
-    return sums[0] if len(sums) == 1 else hashlib.sha256("".join(sums).encode()).hexdigest()
-
-
-def file_states(files: Sequence[Path]) -> list[list[int]]:
-    """What of files changes when their content does, as documents of JSON have it; ctime even where mtime is set back.
-
-    Raises OSError: one is not there.
-    """
-    return [[x.st_size, x.st_mtime_ns, x.st_ctime_ns, x.st_ino] for x in (file.stat() for file in files)]

@@ -12,7 +12,6 @@ from rich.progress import Progress
 
 from torchid import parameters
 from torchid.commands.check import LogSegment, segments_to_check
-from torchid.commands.reading import settle_contacts, setup_of_log
 from torchid.commands.results import Identification
 from torchid.config.logs import LogsConfig
 from torchid.errors import (
@@ -37,6 +36,7 @@ from torchid.parallel import can_copy, one_thread, share_between_copies, thread_
 from torchid.parameters import GRAVITY, PARAMETERS, PER_BODY, Array
 from torchid.problem import LinearProblem, Samples
 from torchid.problem.metrics import ADVICE, Metrics, WorseThanNominal, describe_worse
+from torchid.reading.log_reader import settle_contacts, setup_of_log
 from torchid.robot import Robot
 from torchid.rounding import is_significant
 

@@ -11,10 +11,7 @@ from functools import partial
 from rich.progress import Progress
 
 from torchid import ranks
-from torchid.commands.cache_entries import cached_parts, factors_key
-from torchid.commands.cached_reading import CachedReader, open_reader
 from torchid.commands.chosen_settings import Choices, with_chosen_settings, with_ridge
-from torchid.commands.reading import LogReader, check_read
 from torchid.commands.training import descent_settings
 from torchid.config import ExperimentConfig
 from torchid.errors import format_count
@@ -29,6 +26,9 @@ from torchid.problem import RowBuilder, Samples
 from torchid.problem.compressed_log import Block, fold_compressed, merge_blocks
 from torchid.problem.compression import compress_in_blocks, split_into_folds
 from torchid.problem.parts import Part
+from torchid.reading.cache_entries import cached_parts, factors_key
+from torchid.reading.cached_reader import CachedReader, open_reader
+from torchid.reading.log_reader import LogReader, check_read
 
 
 @dataclass

@@ -15,7 +15,6 @@ from rich.progress import Progress
 from torchid import parameters
 from torchid.commands.evaluate import FittedRun, read_run, require_run
 from torchid.commands.folder import REPLAY, check_free, new_folder, write_json
-from torchid.commands.reading import LogReader
 from torchid.config import FootConfig
 from torchid.errors import ConfigError, LogError, TorchidWarning, about_file, during, excerpt
 from torchid.estimators.posterior import PRIOR_ERROR
@@ -26,6 +25,7 @@ from torchid.parallel import one_thread
 from torchid.parameters import Array
 from torchid.problem import Samples
 from torchid.problem.extras import ACTUATORS
+from torchid.reading.log_reader import LogReader
 from torchid.report import FittedJoints, identified_name, identified_robot
 from torchid.report.figure_style import save_figures
 from torchid.report.figures import drift_figure

@@ -18,13 +18,13 @@ import numpy as np
 import torch
 
 from torchid import ranks
-from torchid.commands.cache import Files, written_file
-from torchid.commands.cache_entries import ReadLog, RecordedWarning, named_tensors, samples_entry
-from torchid.commands.large_log import LargeLog
-from torchid.commands.manifest import file_checksum
+from torchid.checksums import file_checksum
 from torchid.fitting.noise import recorded_sensors
 from torchid.parallel import can_copy, share_between_copies, thread_count
 from torchid.problem import Samples
+from torchid.reading.cache import Files, written_file
+from torchid.reading.cache_entries import ReadLog, RecordedWarning, named_tensors, samples_entry
+from torchid.reading.large_log import LargeLog
 from torchid.sensing import SensorSet
 
 

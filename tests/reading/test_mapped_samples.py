@@ -12,13 +12,13 @@ import torch
 from demo import shortened_demo
 from large import tensors
 
-from torchid.commands.cache import FOLDER
-from torchid.commands.cached_reading import open_reader
 from torchid.config import load_config
 from torchid.fitting.experiment import set_up
 from torchid.problem import Samples
 from torchid.problem.chunks import map_chunks
 from torchid.problem.contact_state import ContactState
+from torchid.reading.cache import FOLDER
+from torchid.reading.cached_reader import open_reader
 
 
 @pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")

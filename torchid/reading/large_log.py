@@ -16,7 +16,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchid.commands.segmented_log import RecordedBlock, Segment, SegmentedLog, in_the_air, require_kept, row_numbers
 from torchid.config.log_reading import PreprocessingConfig
 from torchid.errors import LogError, about_file
 from torchid.logs import Columns, Log
@@ -57,6 +56,7 @@ from torchid.problem.derived_blocks import (
 from torchid.problem.log_joints import distances_from_welds, warn_of_moving_welds
 from torchid.problem.samples import require_forces
 from torchid.problem.standing import StandingSegments, warn_of_standing
+from torchid.reading.segmented_log import RecordedBlock, Segment, SegmentedLog, in_the_air, require_kept, row_numbers
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
 

@@ -56,8 +56,8 @@ def test_blocks_give_the_samples_of_the_whole_log(tmp_path: Path, name: str, jit
 @pytest.fixture
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Logs in memory are read in blocks however short they are."""
-    monkeypatch.setattr("torchid.commands.reading._WHOLE_GB", 0.0)
-    monkeypatch.setattr("torchid.commands.large_log.BLOCK_GB", 1e-4)
+    monkeypatch.setattr("torchid.reading.log_reader._WHOLE_GB", 0.0)
+    monkeypatch.setattr("torchid.reading.large_log.BLOCK_GB", 1e-4)
 
 
 @pytest.mark.parametrize(("name", "threads"), each_once([*SETTINGS], [3, 1]))

@@ -14,12 +14,12 @@ from run_folders import keys_in
 from trainings import trust_new_files
 
 from torchid.cli import main
-from torchid.commands.cached_reading import CachedReader, open_cache
-from torchid.commands.reading import LogReader
 from torchid.config import load_config
 from torchid.errors import TorchidWarning
 from torchid.fitting.experiment import set_up
 from torchid.problem import Samples
+from torchid.reading.cached_reader import CachedReader, open_cache
+from torchid.reading.log_reader import LogReader
 
 NONE = "preprocessing.cache_gb=0"
 

@@ -11,11 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from torchid import ranks
-from torchid.commands.cache import FOLDER, TOKEN, Cache, Files, content_key, missing_folders, remove_empty
-from torchid.commands.cache_entries import ReadLog, RecordedWarning, content_of_setup, samples_entry, samples_of_entry
-from torchid.commands.manifest import FilePart, checksum_of_parts, file_parts, file_states, part_checksum
-from torchid.commands.reading import LogReader, fits_contact_offsets, payload_of
-from torchid.commands.shared_log import on_one_machine, read_together
+from torchid.checksums import FilePart, checksum_of_parts, file_parts, file_states, part_checksum
 from torchid.errors import TorchidWarning, warn
 from torchid.fitting.experiment import RobotSetup
 from torchid.fitting.noise import recorded_sensors
@@ -26,6 +22,10 @@ from torchid.logs.low_pass import import_signal
 from torchid.logs.table_files import is_text_table
 from torchid.logs.time_range import split_range
 from torchid.problem import Samples
+from torchid.reading.cache import FOLDER, TOKEN, Cache, Files, content_key, missing_folders, remove_empty
+from torchid.reading.cache_entries import ReadLog, RecordedWarning, content_of_setup, samples_entry, samples_of_entry
+from torchid.reading.log_reader import LogReader, fits_contact_offsets, payload_of
+from torchid.reading.shared_log import on_one_machine, read_together
 from torchid.sensing import SensorSet
 from torchid.sensing.sensors import recorded_components
 

@@ -11,8 +11,6 @@ import numpy as np
 import torch
 
 from torchid import ranks
-from torchid.commands.large_log import BLOCK_GB, LargeLog
-from torchid.commands.segmented_log import require_kept
 from torchid.config.logs import require_apart
 from torchid.errors import ConfigError, LogError
 from torchid.fitting.experiment import RobotSetup, S
@@ -34,6 +32,8 @@ from torchid.problem.contact_slip import measure_slip, warn_of_slip
 from torchid.problem.log_joints import with_loop_joints, without_welded_joints
 from torchid.problem.standing import preprocess_standing
 from torchid.problem.unloaded_sensors import zero_in_air
+from torchid.reading.large_log import BLOCK_GB, LargeLog
+from torchid.reading.segmented_log import require_kept
 from torchid.robot import Robot, payload_parameters, with_payload
 from torchid.sensing import SensorSet
 

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from torchid.commands.cache import Cache, content_key
 from torchid.errors import TorchidWarning
 from torchid.parallel import copies_allowed
+from torchid.reading.cache import Cache, content_key
 
 
 def arrays_of(megabytes: float) -> dict[str, np.ndarray]:
@@ -111,7 +111,7 @@ def test_a_copied_entry_is_taken_if_its_checksums_are_right(tmp_path: Path) -> N
 
 
 def test_of_two_that_store_the_same_at_once_both_find_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from torchid.commands import cache as module
+    from torchid.reading import cache as module
 
     write, others = module._write, [Cache(tmp_path, 1.0)]
 
@@ -131,7 +131,7 @@ def test_of_two_that_store_the_same_at_once_both_find_it(tmp_path: Path, monkeyp
 
 def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path: Path) -> None:
     code = (
-        "import os, signal, sys; from pathlib import Path; import numpy as np; from torchid.commands import cache; "
+        "import os, signal, sys; from pathlib import Path; import numpy as np; from torchid.reading import cache; "
         "cache._rename = lambda *_: os.kill(os.getpid(), signal.SIGKILL); "
         "cache.Cache(Path(sys.argv[1]), 1.0).save('0' * 64, {}, {'x': np.zeros(9)})"
     )
@@ -146,7 +146,7 @@ def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path: Path) -> None:
 
 def test_a_young_checksum_is_not_trusted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A file may change again within one tick of its time stamp."""
-    monkeypatch.setattr("torchid.commands.cache._YOUNG", 2.0)
+    monkeypatch.setattr("torchid.reading.cache._YOUNG", 2.0)
     cache, found = Cache(tmp_path / "cache", 1.0), set()
     for text in ("a", "b"):
         (tmp_path / "log").write_text(text)
@@ -169,11 +169,11 @@ def test_long_files_are_summed_up_while_something_else_is_done(
     with allowed():
         sums = [Cache(tmp_path / "cache", 1.0).checksum(log, [log], meanwhile)]
         assert not done, "a short file is summed up at once"
-        monkeypatch.setattr("torchid.commands.cache._LONG", 100)
-        monkeypatch.setattr("torchid.commands.cache._YOUNG", -1.0)
+        monkeypatch.setattr("torchid.reading.cache._LONG", 100)
+        monkeypatch.setattr("torchid.reading.cache._YOUNG", -1.0)
         cache = Cache(tmp_path / "cache", 1.0)
         sums += [cache.checksum(log, [log], meanwhile) for _ in range(2)]
-        monkeypatch.setattr("torchid.commands.manifest._PART", 30)
+        monkeypatch.setattr("torchid.checksums._PART", 30)
         sums.append(Cache(tmp_path / "cache", 1.0).checksum(log, [log]))
     assert sums[:3] == [hashlib.sha256(content).hexdigest()] * 3
     assert done == [log], "the second time nothing is read"

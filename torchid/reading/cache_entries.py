@@ -18,9 +18,7 @@ from pydantic import TypeAdapter
 from torch import Tensor
 
 from torchid import ranks
-from torchid.commands.cache import Cache, CacheEntry, content_key, tensor_of
-from torchid.commands.manifest import file_checksum
-from torchid.commands.reading import fits_contact_offsets
+from torchid.checksums import file_checksum
 from torchid.config.robot import RobotConfig
 from torchid.errors import TorchidWarning
 from torchid.fitting.experiment import Experiment, RobotSetup
@@ -32,6 +30,8 @@ from torchid.problem.base_motion import BaseMotion
 from torchid.problem.chunks import worker_count
 from torchid.problem.motion_noise import MotionNoise
 from torchid.problem.parts import Part
+from torchid.reading.cache import Cache, CacheEntry, content_key, tensor_of
+from torchid.reading.log_reader import fits_contact_offsets
 from torchid.robot import Robot
 from torchid.robot.urdf import parse_xml
 from torchid.sensing import SensorSet

@@ -18,15 +18,15 @@ from demo import shortened_demo
 from large import SMALL, experiment, recorded, tensors
 from shared_work import finish_forked
 
-from torchid import ranks
-from torchid.commands import cache as caches
-from torchid.commands import cached_reading, large_log, manifest, reading
-from torchid.commands.cache import FOLDER
-from torchid.commands.cached_reading import CachedReader, _shares, open_cache
-from torchid.commands.reading import LogReader
+from torchid import checksums, ranks
 from torchid.config import load_config
 from torchid.fitting.experiment import set_up
 from torchid.problem import Samples
+from torchid.reading import cache as caches
+from torchid.reading import cached_reader, large_log, log_reader
+from torchid.reading.cache import FOLDER
+from torchid.reading.cached_reader import CachedReader, _shares, open_cache
+from torchid.reading.log_reader import LogReader
 
 
 def digest(samples: Samples) -> str:
@@ -40,7 +40,7 @@ def read_all(calls: Sequence[Sequence[str]], folder: Path) -> int:
     opened: list[str] = []
     bound: list[int] = []
     summed: list[list[Any]] = []
-    read_log, bind, sum_up = reading.read_log, large_log.LargeLog._bound, manifest.part_checksum
+    read_log, bind, sum_up = log_reader.read_log, large_log.LargeLog._bound, checksums.part_checksum
 
     def open_and_read(path: Path, *rest: Any, **named: Any) -> Any:
         opened.append(Path(path).name)
@@ -50,19 +50,19 @@ def read_all(calls: Sequence[Sequence[str]], folder: Path) -> int:
         bound.append(block.piece.start)
         return bind(log, cover, block)
 
-    def note_and_sum_up(part: manifest.FilePart) -> str:
+    def note_and_sum_up(part: checksums.FilePart) -> str:
         summed.append([part.path.name, part.start])
         return sum_up(part)
 
-    reading.read_log, large_log.LargeLog._bound = open_and_read, note_and_bind  # type: ignore[method-assign]
-    cached_reading.part_checksum, manifest._PART, caches._YOUNG = note_and_sum_up, 100_000, -1.0
+    log_reader.read_log, large_log.LargeLog._bound = open_and_read, note_and_bind  # type: ignore[method-assign]
+    cached_reader.part_checksum, checksums._PART, caches._YOUNG = note_and_sum_up, 100_000, -1.0
     dist.init_process_group("gloo")
     rank, found = dist.get_rank(), []
     for file, *more in calls:
         opened.clear()
         bound.clear()
         summed.clear()
-        reading._WHOLE_GB, large_log.BLOCK_GB = (0.0, 1e-4) if "in blocks" in more else (0.04, 0.01)
+        log_reader._WHOLE_GB, large_log.BLOCK_GB = (0.0, 1e-4) if "in blocks" in more else (0.04, 0.01)
         overrides = [x.replace("RANK", str(rank)) for x in more if x != "in blocks"]
         with warnings.catch_warnings(record=True) as said, ranks.share_work():
             warnings.simplefilter("always")
@@ -227,8 +227,8 @@ def test_a_large_log_without_room_in_the_cache_is_read_by_all(read: dict[str, li
 @pytest.fixture
 def alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The experiment of a log that one process reads in three blocks."""
-    monkeypatch.setattr("torchid.commands.reading._WHOLE_GB", 0.0)
-    monkeypatch.setattr("torchid.commands.large_log.BLOCK_GB", 1e-4)
+    monkeypatch.setattr("torchid.reading.log_reader._WHOLE_GB", 0.0)
+    monkeypatch.setattr("torchid.reading.large_log.BLOCK_GB", 1e-4)
     fields = recorded(9_000)
     fields["contact_wrench_local"][500:700, 1, 2], fields["contact_active"][:, 1] = np.nan, True
     return experiment(tmp_path, fields)
@@ -265,7 +265,7 @@ def test_blocks_that_the_cache_does_not_take_are_read_into_memory(
 ) -> None:
     expected, said = read_by(alone, False)
     if more.endswith("=1"):
-        monkeypatch.setattr("torchid.commands.shared_log.file_checksum", full_disk)
+        monkeypatch.setattr("torchid.reading.shared_log.file_checksum", full_disk)
     found, repeated = read_by(alone, True, more)
     assert repeated == said
     assert all(torch.equal(found[name].nan_to_num(), x.nan_to_num()) for name, x in expected.items())

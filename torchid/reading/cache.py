@@ -27,7 +27,7 @@ import torch
 from numpy.typing import NDArray
 
 import torchid
-from torchid.commands.manifest import checksum_of_parts, file_checksum, file_parts, file_states, part_checksum
+from torchid.checksums import checksum_of_parts, file_checksum, file_parts, file_states, part_checksum
 from torchid.errors import excerpt, warn
 from torchid.logs.blocks import GIGABYTE
 from torchid.parallel import in_copies, thread_count
