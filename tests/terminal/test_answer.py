@@ -266,6 +266,14 @@ def test_a_descent_that_ended_many_standard_errors_from_the_least_says_so(consis
         assert ("off by 5 standard errors" in said) is told
 
 
+def test_intervals_that_count_noise_alone_say_so(consistent: Identification) -> None:
+    assert consistent.estimate.block_error is not None
+    assert "count noise alone" not in text(consistent, 400)
+    short = replace(consistent, samples=50, estimate=replace(consistent.estimate, block_error=None, oversampling=2.0))
+    said = text(short, 400)
+    assert "attention     95 % intervals count noise alone, no error of the model, which 25 independent samples" in said
+
+
 def test_residuals_that_cannot_contradict_the_model_are_said_to_show_nothing(consistent: Identification) -> None:
     assert consistent.misfit.judged
     short = replace(consistent, misfit=replace(consistent.misfit, expected=None, lack_of_fit=None))

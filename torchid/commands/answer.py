@@ -198,12 +198,20 @@ def _attention(run: Identification, judged: ErrorComparison) -> Iterator[str]:
     if not run.misfit.judged:
         reason = "no noise is stated, and the logs are too short to tell it from errors of the model"
         yield f"whether the model explains these forces is not known: {reason}; state sensors.noise, or record more"
+    yield from _noise_alone(run)
     yield from _undetermined(run)
     for one in list_confounded(run.extras):
         yield one.in_short
     yield from _far_off(run.posterior.nominal_error)
     if run.noise.suggested:
         yield f"noise: {noise_advice(run.noise.suggested)}"
+
+
+def _noise_alone(run: Identification) -> Iterator[str]:
+    """That nothing but noise is in the intervals, as there are too few blocks to scatter."""
+    if run.estimate.block_error is None:
+        count = f"{run.samples / run.estimate.oversampling:.0f} independent samples"
+        yield f"95 % intervals count noise alone, no error of the model, which {count} do not show: record more"
 
 
 def _resting(run: Identification) -> Iterator[str]:

@@ -123,8 +123,8 @@ class LogFitter:
         """Build the problem of compressed logs and solve it.
 
         Args:
-            parts: from `compress_in_blocks`, of this builder, or from `compress_parts`, without blocks: standard errors
-                then rest on the assumption that residuals are noise.
+            parts: from `compress_in_blocks`, of this builder, or from `compress_parts`, whose only blocks are
+                folds: with fewer than three, standard errors rest on the assumption that residuals are noise.
             solve: instead of the estimator's.
         """
         fit = self.solve_problem(self.build_problem(merge_blocks_of_folds(parts, self.builder)), solve)
