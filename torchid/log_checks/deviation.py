@@ -18,6 +18,8 @@ from torchid.log_checks.model import (
 )
 from torchid.log_checks.scales import (
     CORRELATED_SAMPLES,
+    MIN_BLOCK_SHARE,
+    MIN_STANDARD_DEVIATIONS,
     TIME_BLOCKS,
     NormalEquations,
     accumulate_blocks,
@@ -32,8 +34,6 @@ from torchid.problem import RowBuilder, Samples
 COMPARED_SAMPLES = 240
 """Samples of a log whose forces are compared."""
 
-#: Size of a clear deviation in standard deviations, and the share of it that every block of time must show.
-_MIN_STANDARD_DEVIATIONS, _MIN_BLOCK_SHARE = 4.0, 0.5
 #: Unexplained forces without the deviation over those with it (1.2 at most in logs without a mistake), and what it may
 #: leave: more, and the forces are another robot's.
 MIN_UNEXPLAINED_RATIO, MAX_LEFT = 1.25, 1.5
@@ -129,12 +129,12 @@ class Deviation:
     @property
     def steady(self) -> BoolArray:
         """Unknowns (k,) that every block of time agrees on."""
-        return np.asarray((self.blocks * np.sign(self.value) > _MIN_BLOCK_SHARE * np.abs(self.value)).all(axis=0))
+        return np.asarray((self.blocks * np.sign(self.value) > MIN_BLOCK_SHARE * np.abs(self.value)).all(axis=0))
 
     @property
     def certain(self) -> BoolArray:
         """Unknowns (k,) that are not 0 by their standard deviations."""
-        return np.asarray(np.abs(self.value) > _MIN_STANDARD_DEVIATIONS * self.spread)
+        return np.asarray(np.abs(self.value) > MIN_STANDARD_DEVIATIONS * self.spread)
 
     @property
     def improves(self) -> bool:

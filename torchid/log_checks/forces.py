@@ -31,7 +31,7 @@ from torchid.log_checks.model import (
     without_friction,
 )
 from torchid.log_checks.required_sensors import check_required
-from torchid.log_checks.scales import TimeScale, fit_time_scale, fit_torque_gains, motion_cutoff_hz
+from torchid.log_checks.scales import MIN_BLOCK_SHARE, TimeScale, fit_time_scale, fit_torque_gains, motion_cutoff_hz
 from torchid.log_checks.torque_fit import TorqueFit, torque_findings
 from torchid.logs import Log
 from torchid.logs.log import WRENCHES
@@ -58,10 +58,8 @@ _MAX_UNIT_MISFIT = 0.1
 _TINY = 1e-9
 #: Factor of time that no error of inertias explains: its square is 2.25.
 MIN_TIME_FACTOR = 1.5
-#: Share of a deviation that every block of time must show.
-MIN_BLOCK_SHARE = 0.5
 #: Unexplained forces with the recorded time, or at rest, over those with the corrected time.
-MIN_UNEXPLAINED_RATIO = 1.5
+_MIN_UNEXPLAINED_RATIO_OF_TIME = 1.5
 #: The same of the recorded time where the corrected time leaves more than `MAX_UNEXPLAINED_RATIO`: an arm with a tool
 #: of 2.5 kg that its URDF does not have is explained half as badly by 0.66 times the time (2.4 instead of 4.5).
 _MIN_UNEXPLAINED_RATIO_OF_ANOTHER_ROBOT = 10.0
@@ -279,7 +277,7 @@ def _time_scale_finding(scale: TimeScale | None) -> Finding | None:
         return None
     factor, log_factor = scale.factor, np.log(scale.factor)
     agree = np.log(scale.blocks) * np.sign(log_factor) > MIN_BLOCK_SHARE * abs(log_factor)
-    improves = min(scale.recorded, scale.at_rest) >= MIN_UNEXPLAINED_RATIO * scale.corrected
+    improves = min(scale.recorded, scale.at_rest) >= _MIN_UNEXPLAINED_RATIO_OF_TIME * scale.corrected
     makes_up = scale.corrected <= MAX_UNEXPLAINED_RATIO
     makes_up |= scale.recorded >= _MIN_UNEXPLAINED_RATIO_OF_ANOTHER_ROBOT * scale.corrected
     if abs(log_factor) < np.log(MIN_TIME_FACTOR) or not agree.all() or not improves or not makes_up:

@@ -9,7 +9,7 @@ import numpy as np
 from torchid.errors import join_names
 from torchid.log_checks.deviation import FilteredLog, UnknownEquations
 from torchid.log_checks.findings import NOTE, SUSPICIOUS, Finding
-from torchid.log_checks.scales import TorqueGains
+from torchid.log_checks.scales import MIN_BLOCK_SHARE, MIN_STANDARD_DEVIATIONS, TorqueGains
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.problem import RowBuilder, Samples
@@ -21,9 +21,7 @@ from torchid.robot import Robot
 MIN_GAIN_RATIO, MIN_POINT_SHIFT_M = 1.15, 0.03
 #: The same of all torques alike where contact forces do not say what the robot weighs: masses may be off by a fifth.
 MIN_COMMON_GAIN_RATIO = 1.3
-#: Size of such a deviation in standard deviations, which include the errors of the URDF.
-MIN_STANDARD_DEVIATIONS = 4.0
-#: The same of a factor of all torques, for which a block alone has hardly more than the prior at 1.
+#: Share of a factor of all torques that every block of time must show: alone it has hardly more than the prior at 1.
 MIN_COMMON_BLOCK_SHARE = 0.3
 #: Gains with a smaller standard deviation are the reference for all others, if there are enough of them.
 _MAX_REFERENCE_SPREAD, _MIN_REFERENCE_JOINTS = 0.1, 3
@@ -32,8 +30,6 @@ _MAX_REFERENCE_SPREAD, _MIN_REFERENCE_JOINTS = 0.1, 3
 _MIN_NOTED_DEVIATIONS, _MAX_DEVIATIONS_FROM_COMMON, _MIN_NOTED_JOINTS = 3.0, 2.0, 2
 #: Share of what factors of all joints together explain that the common one explains; their prior standard deviation.
 _MIN_EXPLAINED_SHARE, _FACTOR_PRIOR_STD = 0.5, 1.0
-#: Share of a deviation that every block of time must show.
-_MIN_BLOCK_SHARE = 0.5
 
 
 def gain_and_point_findings(log: Log, fit: TorqueGains | None, robot: Robot) -> Iterator[Finding]:
@@ -156,7 +152,7 @@ def _is_certain(
     value: FloatArray,
     spread: FloatArray,
     blocks: FloatArray,
-    share: float = _MIN_BLOCK_SHARE,
+    share: float = MIN_BLOCK_SHARE,
 ) -> BoolArray:
     """Which values (k,) are not 0, by their standard deviations (k,) and their estimates by block (BLOCKS, k)."""
     agree = (blocks * np.sign(value) > share * np.abs(value)).all(axis=0)

@@ -24,7 +24,7 @@ from torchid.log_checks.deviation import (
 )
 from torchid.log_checks.findings import SUSPICIOUS, Finding
 from torchid.log_checks.model import Declared, NominalModel, bind_some_samples
-from torchid.log_checks.scales import TIME_BLOCKS
+from torchid.log_checks.scales import MIN_STANDARD_DEVIATIONS, TIME_BLOCKS
 from torchid.logs import Log
 from torchid.logs.log import SHAPES, WRENCHES, FloatArray
 from torchid.logs.segments import with_delayed, with_delayed_torques
@@ -34,8 +34,8 @@ from torchid.sensing import Contact
 
 #: Lag that is reported: filters of sensors are late by 10 ms.
 MIN_LAG_S = 0.025
-#: Lag of filters, beyond which a smaller one is reported, too, where it is certain: by so many standard deviations.
-_FILTER_LAG_S, _MIN_STANDARD_DEVIATIONS = 0.01, 4.0
+#: Lag of filters, beyond which a smaller one is reported, too, where it is certain.
+_FILTER_LAG_S = 0.01
 #: Prior standard deviation of a lag, and of its change over the log [s].
 _LAG_PRIOR_STD_S = 0.2
 #: Times that readings are shifted by what their slope says, which is exact for small lags alone.
@@ -104,9 +104,9 @@ class Lag:
         if self.changes:
             change = abs(float(self.found.value[1]))
             chance = 2.0 * stdtr(TIME_BLOCKS - 2, -change / max(self.scatter, _TINY))
-            is_certain = change > max(_FILTER_LAG_S, _MIN_STANDARD_DEVIATIONS * spread) and chance < _LEVEL
+            is_certain = change > max(_FILTER_LAG_S, MIN_STANDARD_DEVIATIONS * spread) and chance < _LEVEL
             return bool(self.found.improves and is_certain)
-        least = min(MIN_LAG_S, _FILTER_LAG_S + _MIN_STANDARD_DEVIATIONS * spread)
+        least = min(MIN_LAG_S, _FILTER_LAG_S + MIN_STANDARD_DEVIATIONS * spread)
         return self.found.is_clear and abs(self.seconds) > least
 
     def text(self, duration: float) -> str:

@@ -38,6 +38,10 @@ FRICTION_TORQUE_SHARE = 1.0
 CORRELATED_SAMPLES = 10.0
 #: Blocks of time whose estimates are compared.
 TIME_BLOCKS = 6
+#: Share of a deviation that every block of time must show.
+MIN_BLOCK_SHARE = 0.5
+#: Size of a certain deviation in standard deviations, which include the errors of the URDF.
+MIN_STANDARD_DEVIATIONS = 4.0
 _TINY = 1e-9
 
 
