@@ -52,6 +52,7 @@ def things(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, object]:
         "jacobian": torchid.FrameJacobian(robot, "trunk"),
         "loops": torchid.LoopJacobian(robot),
         "projection": torchid.Projection([True, False], [False]),
+        "projected group": torchid.Projection([True] * robot.n, [])(*_no_contacts(robot))[0],
         "factor": factor,
         "part": parts[0],
         "compressed log": torchid.compress_log(samples, builder),
@@ -85,6 +86,12 @@ def things(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, object]:
         "checked logs": checked,
         "checked log": checked[0],
     }
+
+
+def _no_contacts(robot: torchid.Robot) -> tuple[torch.Tensor, ...]:
+    """A batch in the air, to project."""
+    J, K = torch.zeros(5, 0, robot.nv, dtype=torch.float64), torch.ones(5, robot.nv, 2, dtype=torch.float64)
+    return J, torch.zeros(5, 0, dtype=torch.bool), K, K[:, 6:, 0], J[:, :, 0]
 
 
 def test_no_repr_is_longer_than_ten_lines(things: Mapping[str, object]) -> None:

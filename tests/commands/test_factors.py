@@ -177,7 +177,7 @@ def test_the_cutoff_that_was_left_to_the_logs_is_printed_and_fits_their_factors(
     assert main(["compress", *auto, "--output", str(tmp_path / "f")]) == 0
     (printed,) = [line.split() for line in capsys.readouterr().out.splitlines() if line.startswith("cutoff")]
     factors = [f"logs.train=[{tmp_path}/f/*.factor]", f"output={tmp_path / 'run'}"]
-    assert "accepted: what compress printed" in refusal(["identify", *auto, *factors], tmp_path, capsys)
+    assert "accepted: the number that compress printed" in refusal(["identify", *auto, *factors], tmp_path, capsys)
     settings = load_config(fleet / "logs.yaml", [*factors, "logs.test=[]", f"preprocessing.cutoff_hz={printed[1]}"])
     assert len(read_fleet(set_up(settings)).files[0].log) > 0
 

@@ -103,3 +103,6 @@ def test_the_figure_says_how_many_rows_it_leaves_out() -> None:
     names = [f"joint_{k}" for k in range(8)]
     assert force_figure(many, names, 0).get_suptitle().startswith("Generalized forces (6 of 7 rows, the largest), walk")
     assert force_figure(series(None), names, 0).get_suptitle().startswith("Generalized forces, walk")
+    assert "gaps" not in force_figure(many, names, 0).get_suptitle()
+    measured[:20, 3] = np.nan
+    assert force_figure(many, names, 0).get_suptitle().endswith("; gaps: forces without a sensor act")

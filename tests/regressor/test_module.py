@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -154,23 +155,38 @@ def test_a_jacobian_refuses_coordinates_of_another_robot(small: Robot, columns: 
 def test_another_precision_than_the_modules_is_refused_by_both_names(small: Robot) -> None:
     state = [x.float() for x in tensors(*random_states(np.random.default_rng(23), small.n, 2))]
     for module, arguments in ((Regressor(small), state), (FrameJacobian(small, "c"), state[:1])):
-        with pytest.raises(TypeError, match=r"found torch.float32; accepted: torch.float64"):
+        with pytest.raises(TypeError, match=r"^q: found torch.float32; accepted: torch.float64"):
             module(*arguments)
         module.float()(*arguments)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.int64])
+@pytest.mark.parametrize("wrong", ["q", "v", "a"])
+def test_one_argument_of_another_precision_is_refused_by_name(small: Robot, wrong: str, dtype: torch.dtype) -> None:
+    state = dict(zip("qva", tensors(*random_states(np.random.default_rng(23), small.n, 2)), strict=True))
+    with pytest.raises(TypeError, match=f"^{wrong}: found {dtype}; accepted: torch.float64"):
+        Regressor(small)(**state | {wrong: state[wrong].to(dtype)})
+
+
 @pytest.mark.parametrize("wrong", ["joint_velocity", "joint_acceleration"])
 def test_one_part_of_a_motion_of_another_precision_is_refused_by_name(small: Robot, wrong: str) -> None:
-    q, v, a = tensors(*random_states(np.random.default_rng(23), small.n, 2))
-    state = (q, v.float(), a) if wrong == "joint_velocity" else (q, v, a.float())
-    with pytest.raises(TypeError, match=f"{wrong}: found torch.float32; accepted: torch.float64"):
-        Regressor(small)(*state)
+    motion = motion_from_state(*tensors(*random_states(np.random.default_rng(23), small.n, 2)), n=small.n)
+    with pytest.raises(TypeError, match=f"^{wrong}: found torch.float32; accepted: torch.float64"):
+        Regressor(small).from_motion(replace(motion, **{wrong: getattr(motion, wrong).float()}))
+
+
+def test_the_path_of_a_robot_is_no_robot() -> None:
+    for module in (Regressor, LoopJacobian):
+        with pytest.raises(TypeError, match="robot: found str; accepted: what torchid.load_robot returns"):
+            module(str(SOLO12))  # type: ignore[arg-type]
 
 
 def test_tensors_of_another_device_are_refused_by_its_name(small: Robot) -> None:
     q, v, a = tensors(*random_states(np.random.default_rng(23), small.n, 2))
     with pytest.raises(TypeError, match="found devices meta, cpu; accepted: one device"):
-        Regressor(small)(q.to("meta"), v, a)
+        motion_from_state(q.to("meta"), v, a, small.n)
+    with pytest.raises(TypeError, match=r"^v: found meta; accepted: cpu, the module's, which .to\(device\) changes"):
+        Regressor(small)(q, v.to("meta"), a)
     with pytest.raises(TypeError, match=r"q: found meta; accepted: cpu, the module's, which .to\(device\) changes"):
         FrameJacobian(small, "c")(q.to("meta"))
 

@@ -292,6 +292,28 @@ def test_a_part_of_a_batch_of_another_length_is_refused(wrong: int) -> None:
             project(*batch[:wrong], part, *batch[wrong + 1 :])
 
 
+@pytest.mark.parametrize("wrong", ["J_C", "torque", "wrench"])
+def test_a_part_of_a_batch_of_another_precision_or_none_is_refused_by_name(wrong: str) -> None:
+    touching = torch.ones(4, 3, dtype=torch.bool)
+    batch = {
+        "J_C": torch.ones(4, 3, 8),
+        "K": torch.ones(4, 8, 2),
+        "torque": torch.ones(4, 2),
+        "wrench": torch.ones(4, 3),
+    }
+    project = Projection([True] * 2, [False] * 3)
+    with pytest.raises(TypeError, match=f"^{wrong}: found torch.float64; accepted: torch.float32, as of K"):
+        project(active=touching, **batch | {wrong: batch[wrong].double()})
+    with pytest.raises(TypeError, match=f"^{wrong}: found NoneType; accepted: a tensor"):
+        project(active=touching, **batch | {wrong: None})
+
+
+def test_masks_have_an_entry_for_each_row() -> None:
+    for masks, name in (((True, [False]), "torque_measured"), (([True], False), "wrench_measured")):
+        with pytest.raises(ValueError, match=rf"{name}: found shape \(\); accepted: a bool for each row"):
+            Projection(*masks)  # type: ignore[arg-type]
+
+
 def test_flags_that_are_numbers_are_refused_and_never_taken_for_indices() -> None:
     numbers = torch.ones(4, 3, dtype=torch.int64)
     with pytest.raises(TypeError, match=r"active: found torch.int64; accepted: torch.bool"):

@@ -336,7 +336,7 @@ def _check_factors(config: _Common, logs: LogsConfig) -> None:
             "preprocessing.cutoff_hz",
             "auto",
             config.preprocessing.cutoff_hz == "auto",
-            "what compress printed",
+            "the number that compress printed",
         ),
         ("actuators.sign_width", "auto", config.actuators.sign_width == "auto", "the width that compress printed"),
         ("actuators.stribeck", "auto", config.actuators.stribeck == "auto", "the velocity that compress printed"),

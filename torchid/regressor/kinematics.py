@@ -109,7 +109,7 @@ def joint_motion(tree: KinematicTree, motion: Motion) -> JointMotion:
     Raises:
         TypeError: the motion's precision is not the module's.
     """
-    _require_precision(tree, vars(motion))
+    require_precision(tree, vars(motion))
     moving = tree.joint_map[:, : tree.n]
     position = moving @ motion.joint_position.T + tree.joint_constant
     velocity = moving @ motion.joint_velocity.T
@@ -170,11 +170,16 @@ def body_states(tree: KinematicTree, motion: Motion, joints: JointMotion) -> Bod
     return BodyStates(rotation, position, omega, alpha, force)
 
 
-def _require_precision(tree: KinematicTree, tensors: Mapping[str, Tensor | None]) -> None:
+def require_precision(tree: KinematicTree, tensors: Mapping[str, Tensor | None]) -> None:
+    """Refuse tensors, by name, of another precision or device than the module's.
+
+    Raises:
+        TypeError: there is one.
+    """
     for name, x in tensors.items():
         for what in ("dtype", "device"):
             expected = getattr(tree.joint_map, what)
-            if x is not None and (found := getattr(x, what)) != expected:
+            if isinstance(x, Tensor) and (found := getattr(x, what)) != expected:
                 raise TypeError(f"{name}: found {found}; accepted: {expected}, the module's, which .to({what}) changes")
 
 
@@ -190,7 +195,7 @@ def independent_positions(tree: KinematicTree, q: Tensor) -> Tensor:
         raise TypeError(f"q: found {type(q).__name__}; accepted: a tensor")
     if q.ndim != 2 or q.shape[1] != width:
         raise ValueError(f"q: found shape {tuple(q.shape)}; accepted: (B, {width})")
-    _require_precision(tree, {"q": q})
+    require_precision(tree, {"q": q})
     return q[:, width - tree.n :]
 
 

@@ -24,6 +24,7 @@ from torchid.regressor.kinematics import (
     joint_screw_axes,
     link_states,
     motion_from_state,
+    require_precision,
     rotation_matrix,
     states_at_rest,
 )
@@ -75,9 +76,10 @@ class Regressor(nn.Module):
             `.contiguous()` where layout matters.
 
         Raises:
-            TypeError: one that is not a tensor, or of another precision than the module.
+            TypeError: one that is not a tensor, or of another precision or device than the module.
             ValueError: wrong shapes.
         """
+        require_precision(self.tree, {"q": q, "v": v, "a": a})
         return self.from_motion(motion_from_state(q, v, a, self.tree.n, not self.tree.base_rows, self.gravity))
 
     def from_motion(self, motion: Motion) -> Tensor:

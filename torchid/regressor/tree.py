@@ -104,6 +104,8 @@ class KinematicTree(nn.Module):
 
     def __init__(self, robot: Robot, sign_width: float | None = None, stribeck: float | None = None) -> None:
         super().__init__()
+        if not isinstance(robot, Robot):
+            raise TypeError(f"robot: found {type(robot).__name__}; accepted: what torchid.load_robot returns")
         self.sign_width, self.stribeck = sign_width, stribeck
         self._indices: dict[tuple[int, ...], Tensor] = {}
         self._path_maps: dict[tuple[int, ...], tuple[slice | Tensor, Tensor | None]] = {}

@@ -79,7 +79,9 @@ def force_figure(
         axes[0, 0].set_xlim(left=0.0)
     known = int(np.isfinite(series.measured).any(axis=0).sum())
     shown = f" ({len(rows)} of {known} rows, the largest)" if len(rows) < known else ""
-    figure.suptitle(f"Generalized forces{shown}, {series.source}, and errors: predicted - measured", x=0.01, ha="left")
+    gaps = "; gaps: forces without a sensor act" if np.isnan(series.measured[:, rows]).any() else ""
+    title = f"Generalized forces{shown}, {series.source}, and errors: predicted - measured{gaps}"
+    figure.suptitle(title, x=0.01, ha="left")
     return figure
 
 

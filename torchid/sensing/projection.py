@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from torchid.reprs import short_repr
 from torchid.rounding import BASE_RANK_TOLERANCE, KINEMATIC_TOLERANCE, relative_tolerance
 
 _ROUNDINGS = 100.0  # of a unit term: by so many units of rounding an entry of a Jacobian may be off
@@ -28,6 +29,8 @@ class ProjectedGroup:
     K: Tensor
     f: Tensor
     base_rank: Tensor
+
+    __repr__ = short_repr
 
 
 class Projection(nn.Module):
@@ -66,20 +69,20 @@ class Projection(nn.Module):
             base_noise: floor of the base rows [N or N m], scalar or (6,).
 
         Raises:
-            ValueError: some but not all noises given, or one that is not positive.
+            ValueError: a mask that is not 1-D; some but not all noises given, or one that is not positive.
         """
         super().__init__()
         noises = (torque_noise, wrench_noise, base_noise)
         if any(x is None for x in noises) and any(x is not None for x in noises):
             raise ValueError("torque_noise, wrench_noise, base_noise: found some; accepted: all three or none")
         torque = torch.as_tensor(torque_measured, dtype=torch.bool)
+        wrench = torch.as_tensor(wrench_measured, dtype=torch.bool, device=torque.device)
+        for name, mask in (("torque_measured", torque), ("wrench_measured", wrench)):
+            if mask.ndim != 1:
+                raise ValueError(f"{name}: found shape {tuple(mask.shape)}; accepted: a bool for each row, 1-D")
         self.base_rows = base_rows
         self.register_buffer("torque_measured", torque, persistent=False)
-        self.register_buffer(
-            "wrench_measured",
-            torch.as_tensor(wrench_measured, dtype=torch.bool, device=torque.device),
-            persistent=False,
-        )
+        self.register_buffer("wrench_measured", wrench, persistent=False)
         self.register_buffer("kept", torch.cat([torque.new_ones(base_rows), torque]), persistent=False)
         self._whiten = torque_noise is not None
         if self._whiten:
@@ -113,18 +116,10 @@ class Projection(nn.Module):
             One group per contact state and rank, every sample in exactly one.
 
         Raises:
-            TypeError: `active` is not bool.
+            TypeError: one that is not a tensor; `active` is not bool; another is of another precision than `K`.
             ValueError: wrong shapes.
         """
-        rows, B, k = len(self.get_buffer("kept")), len(J_C), len(self.get_buffer("wrench_measured"))
-        accepted = ((B, k, rows), (B, k), (B, rows, *K.shape[2:3]), (B, rows - self.base_rows), (B, k))
-        if (found := tuple(tuple(x.shape) for x in (J_C, active, K, torque, wrench))) != accepted or K.ndim != 3:
-            expected = f"(B, {k}, {rows}), (B, {k}), (B, {rows}, P), (B, {rows - self.base_rows}), (B, {k})"
-            raise ValueError(
-                f"J_C, active, K, torque, wrench: found shapes {', '.join(map(str, found))}; accepted: {expected}"
-            )
-        if active.dtype != torch.bool:
-            raise TypeError(f"active: found {active.dtype}; accepted: torch.bool")
+        self._require_batch({"J_C": J_C, "active": active, "K": K, "torque": torque, "wrench": wrench})
         groups: list[ProjectedGroup] = []
         if active.shape[1]:
             states, which = torch.unique(active, dim=0, return_inverse=True)
@@ -134,6 +129,23 @@ class Projection(nn.Module):
             index = torch.nonzero(which == number)[:, 0]
             groups += self._state(index, state, J_C[index], K[index], torque[index], wrench[index])
         return groups
+
+    def _require_batch(self, batch: dict[str, Tensor]) -> None:
+        """Refuse arguments of `forward`, by name, that do not belong together."""
+        for name, x in batch.items():
+            if not isinstance(x, Tensor):
+                raise TypeError(f"{name}: found {type(x).__name__}; accepted: a tensor")
+        found = [tuple(x.shape) for x in batch.values()]
+        rows, k, K = len(self.get_buffer("kept")), len(self.get_buffer("wrench_measured")), batch["K"]
+        B, n = found[0][:1], rows - self.base_rows
+        if K.ndim != 3 or found != [(*B, k, rows), (*B, k), (*B, rows, K.shape[2]), (*B, n), (*B, k)]:
+            accepted = f"(B, {k}, {rows}), (B, {k}), (B, {rows}, P), (B, {n}), (B, {k})"
+            raise ValueError(f"{', '.join(batch)}: found shapes {', '.join(map(str, found))}; accepted: {accepted}")
+        for name, x in batch.items():
+            expected = torch.bool if name == "active" else K.dtype
+            if x.dtype != expected:
+                of = "" if name == "active" else ", as of K"
+                raise TypeError(f"{name}: found {x.dtype}; accepted: {expected}{of}")
 
     def _state(
         self, index: Tensor, state: Tensor, J: Tensor, K: Tensor, torque: Tensor, wrench: Tensor

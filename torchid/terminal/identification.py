@@ -136,8 +136,8 @@ def _columns(robot: Robot, estimate: Estimate, bodies: Sequence[int]) -> list[tu
     return [
         ("mass [kg]", masses),
         (f"{robot.format} [kg]", [decimal(nominal[k, _MASS]) for k in bodies]),
-        (f"Coulomb [{force}]", cells(_COULOMB)),
         ("CoM moved [mm]", moved),
+        (f"Coulomb [{force}]", cells(_COULOMB)),
         (f"viscous [{_per_speed(kinds)}]", cells(_VISCOUS)),
     ]
 
