@@ -10,6 +10,7 @@ from pathlib import Path
 from textwrap import fill
 
 from torchid.commands.folder import check_free_file
+from torchid.commands.init_files import log_in_folder, named_apart
 from torchid.commands.init_logs import Split, keys_for_gaps, keys_for_length, split_logs
 from torchid.commands.init_proposals import (
     GuessedContact,
@@ -33,17 +34,15 @@ from torchid.config.yaml_text import inline_yaml, yaml_lines
 from torchid.errors import ConfigError, InputError, LogError, about_file, excerpt, format_count, join_names
 from torchid.fitting.checked_settings import is_along_base
 from torchid.logs import Columns, Log, Topics
-from torchid.logs.column_entries import OF_FILE
-from torchid.logs.columns import is_column
 from torchid.logs.containers import LogKind, atomic_output, existing_log_kind
 from torchid.logs.log import VARIANTS
-from torchid.logs.name_matching import KnownRobot, propose_field
+from torchid.logs.name_matching import KnownRobot
 from torchid.logs.read import read_recordings
 from torchid.logs.time_range import split_range
 from torchid.parameters import GRAVITY
 from torchid.proposals.column_groups import MapProposal
 from torchid.proposals.episodes import find_episodes
-from torchid.proposals.file_samples import FileSample, read_bag_sample, read_sample, rows_of, states_degrees, texts_in
+from torchid.proposals.file_samples import read_bag_sample, read_sample, rows_of, states_degrees, texts_in
 from torchid.proposals.maps import propose_map
 from torchid.proposals.stamps import arrays_by_stamps
 from torchid.proposals.topics import USED_TYPES, frame_of, propose_topics
@@ -96,17 +95,18 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> InitReport:
 
     Args:
         urdf: of the robot; or its MJCF file.
-        log: a table or arrays, in the log format or not, several of these as one log, or a bag.
+        log: a table or arrays, in the log format or not, several of these or a folder of them as one log, or a bag.
         output: the file; nothing that is there is replaced.
 
     Raises:
         InputError: the URDF or the log cannot be read, or there is a file already.
     """
-    target, path = Path(output), Path(log)
+    target = Path(output)
     if target.suffix.lower() not in (".yaml", ".yml"):
         raise ConfigError("command line", "--output", f"'{target}'", "a file name that ends in .yaml or .yml")
     if os.path.lexists(target):
         raise ConfigError(target, "--output", "exists", "a new file: torchid init replaces none")
+    path, of_folder = log_in_folder(Path(log))
     part = split_range(path)
     files = [file.path for file in part.files]
     check_free_file(target, "--output", False, [urdf, *files])
@@ -126,6 +126,7 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> InitReport:
     text = _text(robot, urdf, path, target, contacts, fields, proposal, gaps, split, sensors)
     _describe(out, robot, contacts, fields, proposal)
     _describe_log(out, read, fields)
+    out.guessed += of_folder
     out.guessed += [f"preprocessing.{key}: {value}, {why}" for key, (value, why) in gaps.items()]
     out.guessed += [split.guessed] * bool(split.guessed)
     out.guessed += ["sensors.joint_torques: those that the log has, not of all joints"] * bool(torques)
@@ -152,7 +153,7 @@ def _of_columns(files: Sequence[Path], robot: Robot) -> tuple[list[GuessedContac
             samples.append(read_sample(file, rows))
             in_degrees |= set(samples[-1]) if states_degrees(file) else set()
     episodes = find_episodes(samples[0]) if len(files) == 1 and existing_log_kind(files[0]) is LogKind.ARRAYS else None
-    samples = [episodes.sample] if episodes else _named_apart(samples, [file.name for file in files])
+    samples = [episodes.sample] if episodes else named_apart(samples, [file.name for file in files])
     sample = {name: values for of_file in reversed(samples) for name, values in of_file.items()}
     contacts = guess_contacts(robot, stated_contacts(sample, robot), texts_in(sample))
     clocks = arrays_by_stamps(sample) if existing_log_kind(files[0]) is LogKind.ARRAYS and len(files) == 1 else ()
@@ -169,20 +170,6 @@ def _of_columns(files: Sequence[Path], robot: Robot) -> tuple[list[GuessedContac
         proposal.notes |= notes_on_arrays(sample, len(robot.joint_names))
     _add_imu_frame(robot, fields, proposal)
     return contacts, fields, proposal
-
-
-def _named_apart(samples: Sequence[FileSample], files: Sequence[str]) -> list[FileSample]:
-    """Columns of several files, those that others have too with the name of the file before them, but for stamps."""
-    often = Counter(name for sample in samples for name in sample)
-    again = {
-        name for name, count in often.items() if count > 1 and not is_column(name) and propose_field(name) != "time"
-    }
-    if len(set(files)) < len(files):
-        return list(samples)
-    return [
-        {f"{file}{OF_FILE}{name}" if name in again else name: x for name, x in sample.items()}
-        for file, sample in zip(files, samples, strict=True)
-    ]
 
 
 def _of_bag(file: Path, robot: Robot) -> tuple[list[GuessedContact], set[str], MapProposal]:

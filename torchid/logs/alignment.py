@@ -191,14 +191,21 @@ def own_stamps(values: NDArray[Any] | None, name: str, stamps: Mapping[str, NDAr
 
 
 def _joined(labels: Sequence[str], parts: Sequence[Fields], files: Sequence[str] = ()) -> Fields:
-    """The fields of all parts of a log at the stamps of the first; `files`: that they are in, if in several."""
+    """The fields of all parts of a log at the stamps of the first; `files`: that they are in, if in several.
+
+    A field may be in several parts, each with joints, contacts or sensors of its own.
+    """
     _require_once(labels, parts)
     time = _common_stamps(labels, [part["time"] for part in parts])
-    names = _common_names(parts)
-    out: Fields = {}
-    for number, part in enumerate(parts):
-        with about_file(files[number]) if files else nullcontext():
-            out |= _aligned(_in_order(part, names), time, parts[0]["time"][0])
+    names = _all_names(parts)
+    pieces = dict[str, list[_Piece]]()
+    for part, file in zip(parts, files or [""] * len(parts), strict=True):
+        with about_file(file) if file else nullcontext():
+            fields = {name: x for name, x in part.items() if name not in NAME_FIELDS}
+            for name, values in _aligned(fields, time, parts[0]["time"][0]).items():
+                of = names_field(name)
+                pieces.setdefault(name, []).append(_Piece(file, part.get(of, np.array(names.get(of, []))), values))
+    out = {name: _in_order(name, of, names.get(names_field(name), [])) for name, of in pieces.items()}
     return out | {name: np.array(of, dtype=np.str_) for name, of in names.items()} | {"time": time}
 
 
@@ -241,14 +248,19 @@ def _stamped(raw: Fields, shift_s: float) -> Fields:
 
 
 def _require_once(labels: Sequence[str], parts: Sequence[Fields]) -> None:
-    """Refuse a field of two files."""
-    owners: dict[str, str] = {}
+    """Refuse a field of two files, unless each has other joints, contacts or sensors of it."""
+    owners: dict[str, tuple[str, set[str]]] = {}
     for label, part in zip(labels, parts, strict=True):
         for name in part:
+            own = set(part[of].tolist()) if (of := names_field(name)) in part else set[str]()
             if name in owners and name not in ("time", *NAME_FIELDS):
-                found = f"both in {owners[name]} and in {label}"
-                raise LogError.at_field(name, found, "every field but time in one of several files alone")
-            owners.setdefault(name, label)
+                other, known = owners[name]
+                if not own or not known or own & known:
+                    found = f"both in {other} and in {label}"
+                    accepted = "every field but time in one of several files, or other joints or contacts in each"
+                    raise LogError.at_field(name, found, accepted)
+                own |= known
+            owners[name] = (label, own)
 
 
 def _common_stamps(labels: Sequence[str], stamps: Sequence[FloatArray]) -> FloatArray:
@@ -266,29 +278,38 @@ def _common_stamps(labels: Sequence[str], stamps: Sequence[FloatArray]) -> Float
     return common
 
 
-def _common_names(parts: Sequence[Fields]) -> dict[str, list[str]]:
-    """Names of joints, contacts and sensors in the order of the first file that has them."""
-    names: dict[str, list[str]] = {}
-    for part in parts:
-        for field in NAME_FIELDS:
-            if field in part:
-                names.setdefault(field, part[field].tolist())
-    return names
+def _all_names(parts: Sequence[Fields]) -> dict[str, list[str]]:
+    """Names of joints, contacts and sensors in the order of the files that have them."""
+    fields = [field for field in NAME_FIELDS if any(field in part for part in parts)]
+    every = {field: [name for part in parts if field in part for name in part[field].tolist()] for field in fields}
+    return {field: list(dict.fromkeys(names)) for field, names in every.items()}
 
 
-def _in_order(part: Fields, names: Mapping[str, list[str]]) -> Fields:
-    """The fields of a file with samples, their columns in the order of the log's names."""
-    out = {name: x for name, x in part.items() if name not in NAME_FIELDS}
-    for field, common in names.items():
-        own = part[field].tolist() if field in part else common
-        if own == common:
-            continue
-        if differing := sorted(set(own) ^ set(common)):
-            found = f"'{differing[0]}' {'missing' if differing[0] in common else 'here alone'}"
-            raise LogError.at_field(field, found, f"the same {KINDS[field]}s in all files of a log, in any order")
-        order = [own.index(name) for name in common]
-        out |= {name: x[:, order] for name, x in out.items() if names_field(name) == field and x.ndim > 1}
-    return out
+@dataclass(frozen=True, eq=False)
+class _Piece:
+    """What a file has of a field: `names` of the joints, contacts or sensors of its columns."""
+
+    file: str
+    names: NDArray[Any]
+    values: NDArray[Any]
+
+
+def _in_order(field: str, pieces: Sequence[_Piece], names: list[str]) -> NDArray[Any]:
+    """A field with its columns in the order of the log's names, those of several files side by side.
+
+    Raises:
+        LogError: a joint, contact or sensor of another field is in none of them.
+    """
+    own = [name for piece in pieces for name in piece.names.tolist()]
+    values = np.concatenate([x.values for x in pieces], axis=1) if len(pieces) > 1 else pieces[0].values
+    if own == names or values.ndim < 2:
+        return values
+    if missing := sorted(set(names) - set(own)):
+        of = names_field(field)
+        with about_file(pieces[-1].file) if pieces[-1].file else nullcontext():
+            accepted = f"the same {KINDS[of]}s in all files of a log, or in those that have {field} together"
+            raise LogError.at_field(of, f"'{missing[0]}' missing", f"{accepted}, in any order")
+    return np.asarray(values[:, [own.index(name) for name in names]])
 
 
 def _aligned(part: Fields, time: FloatArray, origin: float) -> Fields:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
@@ -222,13 +222,24 @@ OF_FILE = "::"
 """Between the name of a file and that of a column that others have, too."""
 
 
-def as_in_file(value: Any, file: str) -> Any:
-    """A map, or a part of one, with the names of a file's columns without that of the file before them."""
+def as_in_file(value: Any, file: str, others: Collection[str] = ()) -> Any:
+    """A map, or a part of one, with the names of a file's columns without that of the file before them.
+
+    Of columns by name, such as `{l_foot: "left.csv::f{axis}", r_foot: "right.csv::f{axis}"}`, those of the file alone,
+    if it has any; `others`: the names of all files.
+    """
     if isinstance(value, str):
         return value.removeprefix(f"{file}{OF_FILE}")
     if isinstance(value, list):
-        return [as_in_file(one, file) for one in value]
+        return [as_in_file(one, file, others) for one in value]
     if isinstance(value, dict):
-        return {key: as_in_file(one, file) for key, one in value.items()}
+        own = {key: as_in_file(one, file, others) for key, one in value.items()}
+        elsewhere = tuple(f"{other}{OF_FILE}" for other in others if other != file)
+        kept = {key: one for key, one in own.items() if not (isinstance(one, str) and one.startswith(elsewhere))}
+        return kept or own
     is_entry = dataclasses.is_dataclass(value) and not isinstance(value, type)
-    return dataclasses.replace(value, **as_in_file(dict(vars(value)), file)) if is_entry else value
+    return (
+        dataclasses.replace(value, **{key: as_in_file(one, file, others) for key, one in vars(value).items()})
+        if is_entry
+        else value
+    )

@@ -308,7 +308,8 @@ def columns_by_file(columns: Columns, given: Sequence[Sequence[str]], files: Seq
     """The map without the entries that are for others of several files, for each.
 
     Entries without columns are for the file with the field that they belong to. Of columns that several files have, a
-    name says before `::` of which file they are: `torques.csv::{joint}`.
+    name says before `::` of which file they are: `torques.csv::{joint}`. An entry may have
+    joints, contacts or sensors in each of several files.
 
     Args:
         columns: the map.
@@ -318,7 +319,7 @@ def columns_by_file(columns: Columns, given: Sequence[Sequence[str]], files: Seq
     Raises:
         LogError: an entry of which no file has a column.
     """
-    of_files = [as_in_file(columns, file) for file in files]
+    of_files = [as_in_file(columns, file, files) for file in files]
     maps = [columns_of_file(own, of_file) for own, of_file in zip(of_files, given, strict=True)]
     found = [_entries_in(own, of_file) for own, of_file in zip(maps, given, strict=True)]
     for name in columns.fields:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.logs.arrays import TRANSPOSED
+from torchid.logs.column_entries import OF_FILE
 from torchid.logs.column_map import PLACEHOLDER
 from torchid.logs.name_matching import SUFFIXES, KnownRobot, is_current, joints_by_place, propose_field, spelled, within
 from torchid.logs.units import OF_JOINTS, quantities_with, split_unit
@@ -74,7 +75,7 @@ class Family:
     def as_ignored(self) -> list[str]:
         """Patterns of `ignore` that its columns fit, as the file names them; no column of another name fits all."""
         pattern = PLACEHOLDER.sub("*", self.pattern.removesuffix(TRANSPOSED))
-        return self.columns if pattern == "*" else [pattern]
+        return self.columns if pattern == "*" or "*" in pattern.rpartition(OF_FILE)[0] else [pattern]
 
     @property
     def unit(self) -> str:
@@ -202,6 +203,8 @@ def _families(pattern: str, members: Sequence[tuple[str, str, str, str]], kinds:
         return [Family(column, [column], ("",), (), ("",)) for column in texts]
     by_place = kind is not None and kind.by_place
     by_name = {kind.names[name]: column for column, name, *_ in members} if kind is not None and other else {}
+    if kind is not None and f"{{{kind.kind}}}" in pattern.rpartition(OF_FILE)[0]:
+        by_name = {kind.names[name]: pattern.replace(f"{{{kind.kind}}}", name) for name in names}  # a file for each
     return [
         Family(
             pattern,

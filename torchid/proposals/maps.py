@@ -16,7 +16,7 @@ from torchid.logs.log import SHAPES, VARIANTS, WRENCHES
 from torchid.logs.name_matching import SUFFIXES, KnownRobot, is_desired, propose_field
 from torchid.logs.unitree import JOINT_ORDERS, numbered_joints, usual_order
 from torchid.logs.units import IN_DEGREES, quantities_of, quantities_with, unit_factor
-from torchid.proposals.base import field_beside, field_of_base, field_of_quaternion, find_angles, settle_velocities
+from torchid.proposals.base import field_beside, field_of_base, field_of_quaternion, find_angles
 from torchid.proposals.column_groups import Family, MapProposal, find_families, split_arrays
 from torchid.proposals.fields import MOMENT, FieldMatcher, find_foot_readings, frame_of_forces
 from torchid.proposals.file_samples import FileSample, listed_order, side_by_side, with_samples_first
@@ -29,6 +29,7 @@ from torchid.proposals.numbers import (
     threshold,
     unit_of_step,
 )
+from torchid.proposals.settling import settle_in_files
 from torchid.proposals.stamps import first_of_stamps, has_stamps_of, split_stamps, stamps_first
 
 _GAINS = re.compile(r"\b(kp|kd)\b", re.IGNORECASE)
@@ -39,7 +40,7 @@ _TOUCH = 0.05  # of the robot's weight, what a contact bears at least
 def propose_map(
     sample: FileSample,
     robot: KnownRobot,
-    files: Sequence[Collection[str]] = (),
+    files: Sequence[FileSample] = (),
     in_degrees: Collection[str] = (),
     clocks: Sequence[Collection[str]] = (),
 ) -> MapProposal:
@@ -48,7 +49,7 @@ def propose_map(
     Args:
         sample: from `read_sample`.
         robot: whose log it is.
-        files: columns of each of several files that are one log, whose stamps may differ in name.
+        files: samples of each of several files that are one log, whose stamps may differ in name.
         in_degrees: columns of files whose header says that angles are in degrees.
         clocks: arrays with each of several stamps in one file.
     """
@@ -67,7 +68,7 @@ class _Proposer:
         self,
         sample: FileSample,
         robot: KnownRobot,
-        files: Sequence[Collection[str]],
+        files: Sequence[FileSample],
         in_degrees: Collection[str],
         clocks: Sequence[Collection[str]],
     ) -> None:
@@ -123,8 +124,9 @@ class _Proposer:
         self.out.not_numbers = [name for name in foreign if name not in numeric]
         families = [one for one in families if one in used or not set(one.columns) <= taken]
         unused = [one for one in families if one not in used or len(one.numbers) > len(self.joints)]
-        ignored = {pattern for one in unused for pattern in one.as_ignored}
-        ignored |= {name for name in foreign if name not in numeric or name in of_fractions} - taken
+        read = {x for one in used for x in one.as_ignored}  # `q_*` has no more letters than `q_{joint}`, `q_x` has
+        ignored = {x for one in unused for x in (one.columns if read & {*one.as_ignored} else one.as_ignored)}
+        ignored |= {x for x in foreign if x not in numeric or x in of_fractions} - taken
         self.out.columns |= {"ignore": sorted(ignored)} if ignored else {}
         if "joint_torque" not in {*self.given, *self.out.columns}:
             alike = [one for one in families if one not in used and self.match.is_like_torques(one)]
@@ -141,9 +143,8 @@ class _Proposer:
             entries["base_angular_velocity_base"] = entries.pop("imu_angular_velocity")
         with np.errstate(all="ignore"):  # of numbers that no unit explains
             units = UnitProposer(self.sample, self.out.columns, self.out.notes, self.factors)
-            seconds = units.propose(self.robot.weight, not self.files, self.robot.slides)
-            if seconds is not None and not self.files:
-                settle_velocities(self.out, units.values, seconds)
+            units.propose(self.robot.weight, not self.files, self.robot.slides)
+            settle_in_files(self.out, self.files or [self.sample], self.factors)
 
     def _lacks_gravity(self, family: Family) -> float:
         """Minus the share of gravity in what may be an accelerometer, 0 for all else."""
@@ -358,13 +359,11 @@ class _Proposer:
         numbers = len(family.numbers) or int(np.prod(self.match.shape(family)[:1]))
         as_in_file = kind == "contact" and self.out.columns.get("joint_order") == list(self.joints)
         usual = (list(self.feet), "as in the robot's file, as joints are") if as_in_file else None
-        order, how = (
-            listed_order(self.sample, kind, self.robot, numbers) or usual or usual_order(kind, self.robot, numbers)
-        )
+        listed = listed_order(self.sample, kind, self.robot, numbers)
+        order, how = listed or usual or usual_order(kind, self.robot, numbers)
         self.out.columns[key] = order
-        listed = [name for name in self._order() if name] if kind == "joint" else order
         if kind == "joint" and not self.out.lacking:
-            self.out.lacking = [name for name in self.joints if name not in listed]
+            self.out.lacking = [name for name in self.joints if name not in self._order()]
         self.out.notes[key] = f"{how}; compare it with the manual of the robot, and with what torchid check says"
 
     def _add_units(self, family: Family, entry: dict[str, Any]) -> None:

@@ -74,7 +74,7 @@ class UnitProposer:
             one_clock: whether all columns have the same stamps.
             slides: joints that are prismatic.
         """
-        seconds = self._seconds()
+        seconds = self.seconds()
         if seconds is None:
             return None
         position, velocity = self.values(_POSITION), self.values("joint_velocity")
@@ -168,7 +168,7 @@ class UnitProposer:
         of_names = (units.get(name, units.get("*", "rad")) for name in names)
         return np.array([unit_factor(_POSITION, unit, OF_JOINTS[_POSITION]) for unit in of_names])
 
-    def _seconds(self) -> Numbers | None:
+    def seconds(self) -> Numbers | None:
         """The stamps (N,) [s]; also those of a column called `time` that has another unit."""
         if step := self._columns.get("time", {}).get("step"):
             position = self.values(_POSITION)
