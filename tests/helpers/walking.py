@@ -220,7 +220,7 @@ def truth(
         )
         ready = gait.feet(time)[1]
         J = np.stack([oracle.jacobian(q, foot) for foot in machine.feet], axis=1)
-    _unlike(oracle, rng, share)
+    unlike(oracle, rng, share)
     if not machine.bolted:  # the world's axes are anybody's
         anywhere = rng.uniform(0.4, 1.2) * rng.choice([-1.0, 1.0])
         turn = Rotation.from_euler("z", anywhere if heading is None else heading)
@@ -254,7 +254,7 @@ def _walked(
     return (make_interp_spline(knots, base, k=5), make_interp_spline(knots, q[:, 7:], k=5)), gait
 
 
-def _unlike(oracle: Oracle, rng: np.random.Generator, share: float) -> None:
+def unlike(oracle: Oracle, rng: np.random.Generator, share: float) -> None:
     """Change masses by up to `share`, centres of mass by as much of the body's radius, inertias accordingly."""
     for index in range(oracle.model.njoints):
         inertia = oracle.model.inertias[index]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from faults import demo_log, demo_robot, of_demo, only, scaled
+from flying import flight
 from mistaken import CUTOFF, MISTAKES, NAMED, SENSORS, Cell, case_of, cells, checked, judged
 from motions import value
 from recordings import in_world
@@ -250,3 +251,11 @@ def test_two_legs_that_are_exchanged_beside_two_that_are_not_are_named() -> None
     explained = only(of_demo(replace(log, joint_names=names)), EXPLAINED)
     assert (explained.severity, explained.field) == (REJECTED, "joint_names")
     assert explained.found.startswith(f"{other} and {one} exchanged: ")  # in the order of the log
+
+
+def test_the_order_of_a_drones_quaternion_is_named_though_its_small_moments_are_far_off_the_urdfs() -> None:
+    case = flight("borinot", "contacts", 1)
+    assert not [one for one in checked(case, case.log).findings if one.severity != NOTE]
+    explained = only(checked(case, value(BY_NAME["quaternion w first for last"].make(case))), EXPLAINED)
+    assert (explained.severity, explained.field) == (REJECTED, "base_quat_xyzw")
+    assert explained.found.startswith("w first against w last is mixed up: ")

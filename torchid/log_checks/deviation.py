@@ -103,6 +103,12 @@ class DeviationRows:
             parts.append((W, equations, columns, rows[..., :-1] @ nominal - rows[..., -1]))
         return cls(builder, samples, parts)
 
+    @cached_property
+    def unexplained(self) -> float:
+        """What the best URDF near the given one leaves of the forces, as `Deviation.without`."""
+        normal = accumulate_blocks([(K, target[..., None], equations) for _, equations, K, target in self.parts])
+        return float(np.sqrt(max(float(normal.unexplained()[0, 0]), 0.0) / max(normal.rows, 1)))
+
 
 @dataclass(frozen=True, eq=False)
 class Deviation:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
 import torch
 
 from torchid.errors import InputError
-from torchid.log_checks.deviation import FilteredLog
+from torchid.log_checks.deviation import MAX_LEFT, DeviationRows, FilteredLog
+from torchid.log_checks.deviation import MIN_UNEXPLAINED_RATIO as MIN_UNEXPLAINED_RATIO_OF_DEVIATIONS
 from torchid.log_checks.drift import check_torque_drift
 from torchid.log_checks.encoders import check_encoders, is_bolted_arm, single_zero_findings
 from torchid.log_checks.exchanged import check_exchanged_torques
@@ -18,7 +19,7 @@ from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, UNEXPLAINED,
 from torchid.log_checks.gains import common_factor_notes, common_gain_findings, gain_and_point_findings
 from torchid.log_checks.lag_and_tilt import check_lag_and_tilt, check_torque_offsets
 from torchid.log_checks.lags import without_lag
-from torchid.log_checks.mistakes import joint_mistakes, possible_mistakes
+from torchid.log_checks.mistakes import Mistake, joint_mistakes, possible_mistakes
 from torchid.log_checks.model import (
     MAX_TRIAL_DIFFERENTIATED_SAMPLES,
     TRIAL_SAMPLES,
@@ -127,7 +128,8 @@ def _misfit_findings(
     filtered = FilteredLog(log, model, cutoff)
     explanation = check_exchanged_torques(filtered)
     if explanation is None and fit.largest_misfit > MAX_MISFIT:
-        explanation = _best_mistake(log, model, cutoff, fit, derived)
+        trials = list(_corrected_logs(log, model, cutoff, fit, derived))
+        explanation = _best_mistake(model, fit, trials) or _mistake_beside_urdf(filtered, trials)
     if explanation is not None:
         yield explanation
         return
@@ -206,14 +208,21 @@ def _friction_finding(robot: Robot, stated: ModelFit, without: ModelFit) -> Find
     return Finding("friction", NOTE, "all", text, f"nothing, as a fit finds friction; or 0 in the {robot.format}")
 
 
-def _best_mistake(
+@dataclass(frozen=True, eq=False)
+class _Corrected:
+    """A usual mistake, and some samples of the log without it."""
+
+    mistake: Mistake
+    samples: Sequence[Samples]
+
+
+def _corrected_logs(
     log: Log, model: NominalModel, cutoff: float, fit: ModelFit, derived: tuple[str, ...]
-) -> Finding | None:
-    """The mistake whose correction leaves the least misfit, if that is small enough: one of torques, by the torques."""
-    robot, best, least, shares = model.robot, None, min(fit.misfit, 1.0), (0.0, 0.0)
+) -> Iterator[_Corrected]:
+    """The log without each mistake that may be the reason of the misfit, where the filter accepts it then."""
     filtered = cache(lambda: preprocess_pieces(log, cutoff, MAX_TRIAL_DIFFERENTIATED_SAMPLES))
-    of_joints = list(joint_mistakes(log)) if is_bolted_arm(model) else []
-    for mistake in (*possible_mistakes(log, robot), *of_joints):
+    of_joints = joint_mistakes(log) if is_bolted_arm(model) else ()
+    for mistake in (*possible_mistakes(log, model.robot), *of_joints):
         if not _may_explain(mistake.field, fit) or mistake.field.startswith(derived):
             continue
         try:
@@ -221,14 +230,22 @@ def _best_mistake(
                 pieces = [mistake.correct(piece) for piece in filtered()]
             else:
                 pieces = preprocess_pieces(mistake.correct(log), cutoff, MAX_TRIAL_DIFFERENTIATED_SAMPLES)
-            samples = bind_some_samples(pieces, robot, model.contacts, TRIAL_SAMPLES)
-        except InputError:  # the filter does not accept the corrected log
+            yield _Corrected(mistake, bind_some_samples(pieces, model.robot, model.contacts, TRIAL_SAMPLES))
+        except InputError:
             continue
-        of_torques = mistake.field == "joint_torque"
-        trial = model.compare(samples, least if of_torques else min(least, MAX_RESIDUAL_SHARE * min(fit.misfit, 1.0)))
+
+
+def _best_mistake(model: NominalModel, fit: ModelFit, trials: Sequence[_Corrected]) -> Finding | None:
+    """The mistake whose correction leaves the least misfit, if that is small enough: one of torques, by the torques."""
+    robot, best, least, shares = model.robot, None, min(fit.misfit, 1.0), (0.0, 0.0)
+    for one in trials:
+        mistake, of_torques = one.mistake, one.mistake.field == "joint_torque"
+        trial = model.compare(
+            one.samples, least if of_torques else min(least, MAX_RESIDUAL_SHARE * min(fit.misfit, 1.0))
+        )
         if trial.compared != fit.compared or (of_torques and trial.implausible > fit.implausible):
             continue  # compare the same forces only
-        if mistake in of_joints and trial.reversed:
+        if mistake.of_joint and trial.reversed:
             continue  # the torque tells which way its joint turns
         before, after = (x.torque_misfit or 0.0 if of_torques else x.misfit for x in (fit, trial))
         if after < MAX_RESIDUAL_SHARE * min(before, 1.0) and trial.misfit < least:
@@ -243,6 +260,28 @@ def _best_mistake(
     advice = best.advice + "; of currents, set sensors.scales: {joint_torque: all}" * of_currents
     advice += f"; or is {robot.path.name} another robot's?" * (after > MAX_CLEAR_MISFIT)
     return Finding("unit, sign or frame", REJECTED, best.field, f"{best.description}: {text}", advice)
+
+
+def _mistake_beside_urdf(filtered: FilteredLog, trials: Sequence[_Corrected]) -> Finding | None:
+    """The mistake without which a URDF near the given one explains the forces.
+
+    The misfit of the given one does not show it where small forces are far off without any mistake: moments about a
+    base that stands or flies upright are those of a centre of mass that is 1 cm off.
+    """
+    rows, model = filtered.rows, filtered.model
+    if rows is None or rows.unexplained <= MAX_UNEXPLAINED_RATIO:
+        return None
+    corrected = ((DeviationRows.of(one.samples, model), one.mistake) for one in trials)
+    left = sorted(((x.unexplained, one) for x, one in corrected if x is not None), key=lambda pair: pair[0])
+    if not left or left[0][0] > min(MAX_LEFT, MAX_RESIDUAL_SHARE * rows.unexplained):
+        return None
+    least, best = left[0]
+    ratio = rows.unexplained / max(least, _TINY)
+    text = f"{best.description}: {ratio:.2g} times as much of the forces is unexplained as once corrected"
+    for other_left, other in left[1:]:
+        if other_left < MIN_UNEXPLAINED_RATIO_OF_DEVIATIONS * least and other.description != best.description:
+            text += f"; or {other.field} {other.description}, which explains as much"
+    return Finding("unit, sign or frame", REJECTED, best.field, text, best.advice)
 
 
 def _may_explain(field: str, fit: ModelFit) -> bool:

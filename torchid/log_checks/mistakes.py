@@ -51,6 +51,7 @@ class Mistake:
     """A common mistake: its field, a description, advice, and the function that corrects a log.
 
     `after_filter`: a filtered log is corrected alike, by other names or by a constant linear map of what was filtered.
+    `of_joint`: of how a single joint is counted, which its friction can contradict.
     """
 
     field: str
@@ -58,6 +59,7 @@ class Mistake:
     advice: str
     correct: Callable[[Log], Log]
     after_filter: bool = False
+    of_joint: bool = False
 
 
 def possible_mistakes(log: Log, robot: Robot | None = None) -> Iterator[Mistake]:
@@ -110,6 +112,11 @@ def _orientation_mistakes() -> Iterator[Mistake]:
     yield Mistake("base_quat_xyzw", order, rename, _with_quaternions(lambda quat: np.roll(quat, -1, axis=1)))
     yield Mistake("base_quat_xyzw", order, rename, _with_quaternions(lambda quat: np.roll(quat, 1, axis=1)))
     yield Mistake("base_quat_xyzw", "rotates world to base", "give the inverse", _with_quaternions(inverse_rotation))
+    downward = "of a base whose z axis points down"  # feet that stand cannot tell whether the world's does, too
+    forward = "turn the base's axes to x forward, y left, z up, and the world's where its z axis points down, too (PX4)"
+    turn_world = _turn_world(Rotation.from_rotvec([np.pi, 0.0, 0.0]))
+    yield Mistake("base_quat_xyzw", downward, forward, _turn_base)
+    yield Mistake("base_quat_xyzw", downward, forward, lambda log: _turn_base(turn_world(log)))
     for axis, name in enumerate("xyz"):
         mirrored, turn = f"in a left-handed world, whose {name} axis is reversed", "give a right-handed world's"
         yield Mistake("base_quat_xyzw", mirrored, f"{turn} orientations and vectors", _mirror_world(axis))
@@ -147,11 +154,11 @@ def joint_mistakes(log: Log) -> Iterator[Mistake]:
     for joint, name in enumerate(log.joint_names):
         flip = f"logs.columns: scale {{{name}: -1}} of joint_position, and of velocity and acceleration"
         both = (*_JOINT_MOTION, "joint_torque")
-        yield Mistake("joint_position", f"{name} reversed", flip, _flip_joint(joint, _JOINT_MOTION), True)
-        yield Mistake("joint_position", f"{name} reversed, with its torque", flip, _flip_joint(joint, both), True)
+        yield Mistake("joint_position", f"{name} reversed", flip, _flip_joint(joint, _JOINT_MOTION), True, True)
+        yield Mistake("joint_position", f"{name} reversed, with its torque", flip, _flip_joint(joint, both), True, True)
         for degrees in (90, -90, 180):
             text, advice = f"{name} read from another zero", f"add {degrees} degrees to its positions"
-            yield Mistake("joint_position", text, advice, _shift_joint(joint, np.radians(degrees)), True)
+            yield Mistake("joint_position", text, advice, _shift_joint(joint, np.radians(degrees)), True, True)
 
 
 def _flip_joint(joint: int, fields: Sequence[str]) -> Callable[[Log], Log]:
@@ -243,6 +250,12 @@ def _turn_world(turn: Rotation) -> Callable[[Log], Log]:
         return dataclasses.replace(log, **fields)
 
     return correct
+
+
+def _turn_base(log: Log) -> Log:
+    """A log whose orientation is that of axes half a turn about x from the base's."""
+    half_turn = Rotation.from_rotvec([np.pi, 0.0, 0.0])
+    return _with_quaternions(lambda quat: (Rotation.from_quat(quat) * half_turn).as_quat())(log)
 
 
 def _mirror_world(axis: int) -> Callable[[Log], Log]:

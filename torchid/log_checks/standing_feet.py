@@ -317,9 +317,12 @@ def check_gyroscope(
 def _turning(
     log: Log, robot: Robot, contacts: Sequence[Contact], R_base_imu: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Vectors [m] that keep still in the world, their rates in the base, and the gyroscope's readings, (M, 3) each."""
+    """Vectors [m] that keep still in the world, their rates in the base, and the gyroscope's readings, (M, 3) each.
+
+    What touches with the base itself, as rotors that hold it in the air do, shows nothing of how it turns.
+    """
     poses, feet = recorded_link_poses(log, robot), [c for c in contacts if c.frame in log.contact_names]
-    feet = [c for c in feet if c.radius <= _MAX_RADIUS_M and c.frame in poses]
+    feet = [c for c in feet if c.radius <= _MAX_RADIUS_M and c.frame in poses and robot.links[c.frame][0]]
     ends = max(1, round(_TURN_END_S / median_step(log)))
     omega = np.asarray(log.imu_angular_velocity) @ R_base_imu.T
     parts = []
