@@ -230,6 +230,8 @@ def _best_mistake(
         trial = model.compare(samples, least if of_torques else min(least, MAX_RESIDUAL_SHARE * min(fit.misfit, 1.0)))
         if trial.compared != fit.compared or (of_torques and trial.implausible > fit.implausible):
             continue  # compare the same forces only
+        if of_torques and trial.mostly_implausible:
+            continue  # corrected one by one they fit after any factor
         if mistake in of_joints and trial.reversed:
             continue  # the torque tells which way its joint turns
         before, after = (x.torque_misfit or 0.0 if of_torques else x.misfit for x in (fit, trial))
