@@ -13,6 +13,8 @@ from thinned import slow_but
 
 from torchid.log_checks import NOTE, REJECTED
 from torchid.log_checks.check import check
+from torchid.log_checks.model import ModelFit
+from torchid.log_checks.torque_fit import TorqueFit
 from torchid.logs import Log
 from torchid.logs.units import UNITS, other_units, units_of_derivative_ratio, units_of_ratio
 
@@ -120,3 +122,12 @@ def test_numbers_in_every_unit_are_recognised_by_their_size(quantity: str) -> No
     assert {unit for units in other_units(quantity) for unit in units.split(" or ")} == {
         unit for unit, factor in UNITS[quantity].items() if factor != 1.0
     }
+
+
+@pytest.mark.parametrize(("reversed_joints", "most"), [(2, True), (1, False)])
+def test_torques_are_mostly_implausible_where_more_than_half_of_their_factors_are(
+    reversed_joints: int, most: bool
+) -> None:
+    gain, every = np.where(np.arange(3) < reversed_joints, -1.0, 1.0), np.ones(3, dtype=bool)
+    fit = TorqueFit(np.arange(3), gain, every, ~every, np.ones(3), size=1.0, misfit=0.9, misfit_corrected=0.06)
+    assert ModelFit(fit, None, None).mostly_implausible is most

@@ -88,7 +88,8 @@ def _digest(value: Any) -> str:
         digest.update(type(value).__name__.encode())
         if isinstance(value, torch.Tensor):
             digest.update(f"{value.dtype}{tuple(value.shape)}".encode())
-            digest.update(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes())
+            flat = value.detach().cpu().flatten().clone(memory_format=torch.contiguous_format)  # one number: stride 0
+            digest.update(flat.view(torch.uint8).numpy().tobytes())
         elif isinstance(value, dict):
             digest.update(f"{len(value)}".encode())
             left += [x for pair in value.items() for x in pair]

@@ -245,6 +245,8 @@ def _best_mistake(model: NominalModel, fit: ModelFit, trials: Sequence[_Correcte
         )
         if trial.compared != fit.compared or (of_torques and trial.implausible > fit.implausible):
             continue  # compare the same forces only
+        if of_torques and trial.mostly_implausible:
+            continue  # corrected one by one they fit after any factor
         if mistake.of_joint and trial.reversed:
             continue  # the torque tells which way its joint turns
         before, after = (x.torque_misfit or 0.0 if of_torques else x.misfit for x in (fit, trial))

@@ -89,6 +89,11 @@ class ModelFit:
         return 0 if self.torque is None else int(self.torque.implausible.sum())
 
     @property
+    def mostly_implausible(self) -> bool:
+        """Whether no model error explains more than half of the torques."""
+        return self.torque is not None and 2 * self.implausible > int(self.torque.determined.sum())
+
+    @property
     def reversed(self) -> int:
         """Number of torques that are."""
         return 0 if self.torque is None else int((self.torque.implausible & (self.torque.gain < 0.0)).sum())

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from hostile_commands import Commands
 from repository import DEMO
 from run_folders import names_in
@@ -34,7 +35,7 @@ from trainings import (
 import torchid
 from torchid import parameters
 from torchid.cli import main
-from torchid.commands.checkpoint import CHECKPOINT, load_checkpoint
+from torchid.commands.checkpoint import CHECKPOINT, load_checkpoint, save_checkpoint
 from torchid.config import load_config
 from torchid.estimators import Trainer
 from torchid.estimators.least_squares import VERDICTS
@@ -275,3 +276,9 @@ def test_an_interrupt_while_results_are_written_loses_nothing_of_the_training(
     assert load_checkpoint(training_of(output))["trainer"]["epoch"] == EPOCHS
     assert main(command(experiment, output, "--resume")) == 0
     assert_as_uninterrupted(output, run)
+
+
+def test_a_state_of_one_number_that_is_a_view_without_a_stride_comes_back(tmp_path: Path) -> None:
+    """The parameters of a run may be a single one."""
+    save_checkpoint(tmp_path, {"x": torch.tensor(2.0, dtype=torch.float64).expand(1)})
+    assert load_checkpoint(tmp_path)["x"].tolist() == [2.0]
