@@ -57,7 +57,8 @@ def export(run: str | Path, form: str, output: str | Path | None = None, overwri
 def _fitted_joints(fitted: FittedRun) -> FittedJoints:
     calibration = fitted.calibrations.identified
     of_joints = (extra for extra in calibration.builder.extras if extra.what in ACTUATORS)
-    found = ((extra, calibration.values[("", extra.label)]) for extra in of_joints)
+    values = ((extra, calibration.values.get(("", extra.label))) for extra in of_joints)
+    found = ((extra, value) for extra, value in values if value is not None)  # else no row depends on it
     return FittedJoints.of(found, calibration.builder.tree.stribeck)
 
 

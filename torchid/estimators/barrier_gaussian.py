@@ -159,10 +159,14 @@ def _minimizer(conditions: _Conditions, x: Array, near: np.ndarray) -> Array:
 
     def value(x: Array) -> float:
         misfit, slack = conic.root @ x - conic.target, (conic.G @ x - conic.h)[of_rows]
-        eigenvalues = np.linalg.eigvalsh(conditions.blocks(x[:, None])[of_blocks, 0])
-        if eigenvalues.min(initial=1.0) <= 0.0 or slack.min(initial=1.0) <= 0.0:
+        try:
+            roots = np.linalg.cholesky(conditions.blocks(x[:, None])[of_blocks, 0])
+        except np.linalg.LinAlgError:
             return np.inf
-        return float(0.5 * misfit @ misfit - np.log(eigenvalues).sum() - np.log(slack).sum())
+        if slack.min(initial=1.0) <= 0.0:
+            return np.inf
+        determinants = 2.0 * np.log(np.diagonal(roots, axis1=1, axis2=2)).sum()
+        return float(0.5 * misfit @ misfit - determinants - np.log(slack).sum())
 
     before = value(x)
     for _ in range(_STEPS):

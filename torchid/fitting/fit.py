@@ -194,7 +194,8 @@ class LogFitter:
         left = max(fit.estimate.residual_std**2 - left / max(fit.assembly.problem.rows, 1), 0.0)
         values = {x.extra.label: 1.0 + x.value for x in fit.extras}
         of_column = zip(no_readings, (x.label for x in self.builder.extras if x.what == "scale"), strict=True)
-        return {column: left / max(abs(values[label]), _LEAST_SCALE) ** 2 for column, label in of_column}
+        found = ((column, abs(values.get(label, 1.0))) for column, label in of_column)  # 1 where no row depends on it
+        return {column: left / max(scale, _LEAST_SCALE) ** 2 for column, scale in found}
 
     def solve_problem(self, problem: LogProblem, solve: Solve | None = None) -> Fit:
         """Solve what `build_problem` has built; `solve` instead of the estimator's."""

@@ -387,7 +387,7 @@ def _with_errors(fit: Fit, reweighting: Reweighting) -> Fit:
         objectives = {name: getattr(estimate, name) for name in ("objective", "unconstrained")}
         changed |= {name: x + added / problem.rows for name, x in objectives.items() if x is not None}
     estimate = replace(estimate, noise_error=factor * estimate.noise_error, **changed)
-    assembly = replace(fit.assembly, problem=replace(problem, residual=problem.residual + added))
+    assembly = replace(fit.assembly, problem=replace(problem, residual=max(problem.residual + added, 0.0)))
     extras = [replace(x, noise_error=factor * x.noise_error) for x in fit.extras]
     out = replace(fit, assembly=assembly, estimate=estimate, extras=extras)
     return out if fit.scatter is None else with_block_errors(out, fit.scatter, reweighting.newton_ratio)
