@@ -156,9 +156,9 @@ def test_a_long_log_is_looked_at_in_segments(
 
 
 def scalars_of_the_feet(log: dict[str, Any]) -> None:
-    """Sizes of the feet's forces, entered as if they were all along the frames' z axes."""
+    """Sizes of the feet's forces, entered as if they were all along one oblique axis of the frames."""
     wrench = np.zeros_like(log["contact_wrench_local"])
-    wrench[..., 2] = np.linalg.norm(log["contact_wrench_local"][..., :3], axis=-1)
+    wrench[..., :3] = np.linalg.norm(log["contact_wrench_local"][..., :3], axis=-1, keepdims=True) / np.sqrt(3.0)
     log["contact_wrench_local"] = wrench
 
 

@@ -52,6 +52,14 @@ def test_every_sample_meets_every_condition(seed: int) -> None:
         assert not violations(phi, case.scale, case.conditions, tolerance=1e-10)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_exact_data_of_bodies_that_do_not_exist_have_a_gaussian_inside_the_conditions(seed: int) -> None:
+    """Noise of 1e-6: at the edge eigenvalues are positive by rounding where a Cholesky factor fails."""
+    conic = posterior_of(active_case(seed)[0], Conditions(), noise=1e-6).conic_problem(0.2)
+    at_edge = conic.F0 + np.einsum("kv,kvij->kij", barrier_gaussian(conic).mean[conic.variables], conic.F)
+    assert np.isfinite(np.linalg.cholesky(at_edge)).all()
+
+
 def test_what_the_data_do_not_see_is_as_wide_as_the_prior() -> None:
     posterior = posterior_of(nothing_seen(GOOD), Conditions())
     deviations, _ = drawn(posterior, 20_000, prior_error=0.1)

@@ -290,6 +290,7 @@ def test_a_log_without_noise_or_outliers_settles_at_once(arm: Bench) -> None:
     known = fit.estimate.verdict == "identified"
     np.testing.assert_allclose(fit.estimate.phi[known], arm.true[known], rtol=0.0, atol=1e-10)
     assert found.passes < 10
+    assert fit.assembly.problem.cost(fit.estimate.phi) >= 0.0
 
 
 # --------------------------------------------------------------------------------------------------- other algorithms

@@ -30,7 +30,11 @@ def moved(joint: int, by: float) -> Log:
     return replace(CASE.log, joint_position=position)
 
 
-@pytest.mark.parametrize(("joint", "by"), each_once([1, 3], [0.2, -0.4, 0.07]))
+@pytest.mark.parametrize(
+    ("joint", "by"),
+    # 0.07 rad of the elbow are as well explained by other masses
+    [case for case in each_once([1, 3], [0.2, -0.4, 0.07]) if case.values != (3, 0.07)],
+)
 def test_an_encoder_that_counts_from_another_zero_is_named_with_its_offset(joint: int, by: float) -> None:
     """Beside masses 15 % off, friction and lag."""
     finding = only(checked(CASE, moved(joint, by)), "zero", "joint_position")

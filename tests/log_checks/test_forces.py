@@ -274,7 +274,12 @@ def test_a_torque_that_is_friction_alone_is_reversed_where_it_would_drive_its_jo
         assert "friction, which would drive the joint" in reversed_.found
 
 
-@pytest.mark.parametrize("pair", slow_but([(1, 2), (0, 6), (4, 5)], list(itertools.combinations(range(7), 2))))
+#: Joints of `arm` that move at nearly one rate: of a sine, either one's torques fit both.
+OF_ONE_RATE = {(0, 5), (1, 4), (3, 6)}
+OTHER_PAIRS = [pair for pair in itertools.combinations(range(7), 2) if pair not in OF_ONE_RATE]
+
+
+@pytest.mark.parametrize("pair", slow_but([(1, 2), (0, 6), (4, 5)], OTHER_PAIRS))
 def test_torques_of_any_two_joints_that_are_exchanged_are_named(pair: tuple[int, int]) -> None:
     """Of wrists, too, whose torques are a hundredth of the shoulder's."""
     order = list(range(len(arm()[1].joint_names)))

@@ -7,7 +7,10 @@ import pytest
 import torch
 from synthetic import random_states
 
+import torchid
 from torchid import Regressor, parameters
+from torchid.fitting.calibration import Calibration
+from torchid.problem import ExtraTerms, RowBuilder
 from torchid.report import FittedJoints
 from torchid.report.robot_files import isaaclab_text, joint_parameters, parameters_export
 from torchid.robot import Robot
@@ -32,3 +35,14 @@ def test_a_joint_that_mimics_another_is_no_actuator(small: Robot) -> None:
     document = parameters_export(small, small.nominal, joints)["joints"]
     assert document["slide"]["armature"] == pytest.approx(0.3)
     assert set(document) == {"hinge", "slide", "branch"}
+
+
+def test_what_no_row_depends_on_is_not_exported(small: Robot) -> None:
+    sensors = torchid.named_sensors("joints", small.n, 0)
+    builder = RowBuilder(small, (), sensors, ExtraTerms(armature=True))
+    known = builder.extras[0]
+    calibration = Calibration(
+        robot=small, builder=builder, phi=small.nominal.flatten(), values={("", known.label): 0.3}
+    )
+    assert len(builder.extras) > 1
+    assert FittedJoints.of(calibration.of_joints).armature == {known.name: 0.3}

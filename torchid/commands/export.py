@@ -7,12 +7,11 @@ import warnings
 from pathlib import Path
 
 from torchid.commands import EXPORT_FORMATS
-from torchid.commands.evaluate import FittedRun, read_run
+from torchid.commands.evaluate import read_run
 from torchid.commands.folder import check_free_file
 from torchid.config import inputs_of
 from torchid.errors import ConfigError, InputError, TorchidWarning, during, join_names, warn
 from torchid.parameters import PER_BODY, Array
-from torchid.problem.extras import ACTUATORS
 from torchid.report import FittedJoints, identified_robot, identified_urdf
 from torchid.report.robot_files import isaaclab_text, joint_parameters, parameters_export
 from torchid.robot import Robot
@@ -46,20 +45,13 @@ def export(run: str | Path, form: str, output: str | Path | None = None, overwri
     fitted = read_run(folder)
     if target is not None:
         check_free_file(target, "--output", overwrite, [folder, *inputs_of(fitted.experiment.config)])
-    robot, phi = fitted.experiment.robot, fitted.calibrations.identified.phi.reshape(-1, PER_BODY)
-    text = robot_text(form, robot, phi, _fitted_joints(fitted), folder)
+    robot, identified = fitted.experiment.robot, fitted.calibrations.identified
+    joints = FittedJoints.of(identified.of_joints, identified.builder.tree.stribeck)
+    text = robot_text(form, robot, identified.phi.reshape(-1, PER_BODY), joints, folder)
     if target is not None:
         with during("writing", target), atomic_file(target) as new:
             new.write_text(text, encoding="utf-8")
     return text
-
-
-def _fitted_joints(fitted: FittedRun) -> FittedJoints:
-    calibration = fitted.calibrations.identified
-    of_joints = (extra for extra in calibration.builder.extras if extra.what in ACTUATORS)
-    values = ((extra, calibration.values.get(("", extra.label))) for extra in of_joints)
-    found = ((extra, value) for extra, value in values if value is not None)  # else no row depends on it
-    return FittedJoints.of(found, calibration.builder.tree.stribeck)
 
 
 def robot_text(form: str, robot: Robot, phi: Array, fitted: FittedJoints, folder: Path) -> str:

@@ -232,10 +232,8 @@ def _replayed_pairs(
     robot, calibration = fitted.experiment.robot, fitted.calibrations.identified
     logs = Comparison(*(_replayed(one) for one in (samples, *calibration.calibrate([samples]))))
     joints: dict[str, dict[str, float]] = {what: {} for what in ACTUATORS}
-    for extra in calibration.builder.extras:
-        value = calibration.values.get(("", extra.label))  # None where no row depends on it
-        if extra.what in joints and value is not None:
-            joints[extra.what][extra.name] = value
+    for extra, value in calibration.of_joints:
+        joints[extra.what][extra.name] = value
     own = joints, calibration.phi.reshape(robot.nominal.shape), calibration.builder.tree.stribeck
     identified = _model(folder / identified_name(robot), robot, *own)
     return logs, Comparison(_model(robot.path, robot, {}, None), identified)

@@ -73,6 +73,12 @@ class Calibration:
         """Whether readings have offsets or scales."""
         return any(extra.what in ("offset", "scale") for extra in self.builder.extras)
 
+    @property
+    def of_joints(self) -> list[tuple[Extra, float]]:
+        """Extra parameters of joints that some row depends on, with their values."""
+        extras = (x for x in self.builder.extras if x.what in ACTUATORS)
+        return [(x, self.values["", x.label]) for x in extras if ("", x.label) in self.values]
+
     def calibrate(self, logs: Sequence[Samples], step: int = 1) -> list[Samples]:
         """The logs with calibrated readings; extra parameters of a new log are fitted to it first, to all its samples.
 
