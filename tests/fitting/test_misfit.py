@@ -88,6 +88,20 @@ def test_friction_that_is_not_fitted_shows_and_noise_does_not_look_like_it() -> 
         assert np.allclose(one.values, [0.3, 0.15], atol=0.15)
 
 
+def test_friction_that_explains_all_of_exact_forces_has_a_ratio() -> None:
+    """What is left is 0 by rounding, of either sign as a difference of squares."""
+    arm, rng = torchid.load_robot(UR5, fixed_base=True), np.random.default_rng(0)
+    free = np.zeros_like(arm.nominal, dtype=bool)
+    free[1:, :1] = True
+    for _ in range(20):
+        A, friction = rng.normal(size=(60, arm.nominal.size)), np.zeros_like(arm.nominal)
+        friction[1:, FRICTION] = rng.uniform(0.1, 1.0, (arm.n, 2))
+        nominal, scale = np.zeros(arm.nominal.size), np.ones(arm.nominal.size)
+        problem = torchid.LinearProblem(A, A @ friction.flatten(), 0.0, 60, nominal, scale, free.flatten())
+        found = unfitted_friction(problem, arm)
+        assert found is not None and np.isfinite(found.ratio)
+
+
 def test_joints_that_rest_are_told_with_their_share_where_friction_goes_with_the_sign() -> None:
     arm, count = torchid.load_robot(UR5, fixed_base=True), 3000
     t, rng = np.arange(count) / 100.0, np.random.default_rng(0)

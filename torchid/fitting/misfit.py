@@ -282,7 +282,8 @@ def unfitted_friction(problem: LinearProblem, robot: Robot) -> UnfittedFriction 
     V, values, Wh = np.linalg.svd(rows[:, :-1], full_matrices=False)
     kept = values > UNOBSERVABLE_SHARE
     explained, rank = V[:, kept].T @ rows[:, -1], int(kept.sum())
-    cost = float(rows[:, -1] @ rows[:, -1] - explained @ explained) + problem.residual
+    left = rows[:, -1] - V[:, kept] @ explained
+    cost = float(left @ left) + problem.residual
     noise = problem.oversampling * residual_std(cost, problem.rows, U.shape[1] + rank, problem.oversampling) ** 2
     inverse = Wh[kept].T / values[kept]
     found, deviation = inverse @ explained, np.maximum(np.linalg.norm(inverse, axis=1), np.finfo(float).tiny)
