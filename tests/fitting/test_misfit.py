@@ -99,7 +99,8 @@ def test_friction_that_explains_all_of_exact_forces_has_a_ratio() -> None:
         nominal, scale = np.zeros(arm.nominal.size), np.ones(arm.nominal.size)
         problem = torchid.LinearProblem(A, A @ friction.flatten(), 0.0, 60, nominal, scale, free.flatten())
         found = unfitted_friction(problem, arm)
-        assert found is not None and np.isfinite(found.ratio)
+        assert found is not None
+        assert np.isfinite(found.ratio)
 
 
 def test_joints_that_rest_are_told_with_their_share_where_friction_goes_with_the_sign() -> None:
