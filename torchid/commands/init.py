@@ -153,7 +153,7 @@ def _of_columns(files: Sequence[Path], robot: Robot) -> tuple[list[GuessedContac
             samples.append(read_sample(file, rows))
             in_degrees |= set(samples[-1]) if states_degrees(file) else set()
     episodes = find_episodes(samples[0]) if len(files) == 1 and existing_log_kind(files[0]) is LogKind.ARRAYS else None
-    samples = [episodes.sample] if episodes else named_apart(samples, [file.name for file in files])
+    samples = [episodes.sample] if episodes else named_apart(samples, [file.name for file in files], robot)
     sample = {name: values for of_file in reversed(samples) for name, values in of_file.items()}
     contacts = guess_contacts(robot, stated_contacts(sample, robot), texts_in(sample))
     clocks = arrays_by_stamps(sample) if existing_log_kind(files[0]) is LogKind.ARRAYS and len(files) == 1 else ()

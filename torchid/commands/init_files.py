@@ -17,6 +17,7 @@ from torchid.logs.time_range import JOINED
 from torchid.logs.units import UNITS
 from torchid.proposals.file_samples import FileSample, increases, read_sample, rows_of
 from torchid.proposals.numbers import unit_of_step
+from torchid.robot import Robot
 
 _MOST = 64  # files in a folder
 
@@ -24,8 +25,8 @@ _MOST = 64  # files in a folder
 def log_in_folder(path: Path) -> tuple[Path, list[str]]:
     """The name of a log; of a folder of tables and arrays that of its files as one log, and a note on these.
 
-    They are those that have stamps and something that their names say is a field, the fastest first, as its stamps are
-    those of the log.
+    They are those that have stamps and a quaternion or something that their names say is a field, the fastest first, as
+    its stamps are those of the log.
 
     Raises:
         LogError: a folder that has none, or too many files.
@@ -57,17 +58,24 @@ def _step_of(file: Path) -> float | None:
     fields = {
         propose_field(f"{file.stem}.{name}") for name, x in sample.items() if x is not None and x.dtype.kind in "fiub"
     }
-    if not stamps or not fields - {"", "time"}:
+    has_quaternion = set("wxyz") <= {name[-1:].lower() for name in sample}  # of a pose called by letters alone
+    if not stamps or not (fields - {"", "time"} or has_quaternion):
         return None
     step = float(np.median(np.diff(np.asarray(sample[stamps[0]], dtype=float))))
     return step * UNITS["time"][unit_of_step(step)]
 
 
-def named_apart(samples: Sequence[FileSample], files: Sequence[str]) -> list[FileSample]:
-    """Columns of several files, those that others have too with the name of the file before them, but for stamps."""
+def named_apart(samples: Sequence[FileSample], files: Sequence[str], robot: Robot) -> list[FileSample]:
+    """Columns of several files, those that others may have too with the name of the file before them, but for stamps.
+
+    A column that is called as a joint or a link of the robot says nothing of what it has: its file does.
+    """
     often = Counter(name for sample in samples for name in sample)
+    parts = {*robot.joint_names, *robot.links} if len(files) > 1 else set()
     again = {
-        name for name, count in often.items() if count > 1 and not is_column(name) and propose_field(name) != "time"
+        name
+        for name, count in often.items()
+        if (count > 1 or name in parts) and not is_column(name) and propose_field(name) != "time"
     }
     if len(set(files)) < len(files):
         return list(samples)
