@@ -10,8 +10,7 @@ import numpy as np
 import torch
 
 from torchid.errors import InputError
-from torchid.log_checks.deviation import MAX_LEFT, DeviationRows, FilteredLog
-from torchid.log_checks.deviation import MIN_UNEXPLAINED_RATIO as MIN_UNEXPLAINED_RATIO_OF_DEVIATIONS
+from torchid.log_checks.deviation import MAX_LEFT, MIN_UNEXPLAINED_RATIO, DeviationRows, FilteredLog
 from torchid.log_checks.drift import check_torque_drift
 from torchid.log_checks.encoders import check_encoders, is_bolted_arm, single_zero_findings
 from torchid.log_checks.exchanged import check_exchanged_torques
@@ -281,7 +280,7 @@ def _mistake_beside_urdf(filtered: FilteredLog, trials: Sequence[_Corrected]) ->
     ratio = rows.unexplained / max(least, _TINY)
     text = f"{best.description}: {ratio:.2g} times as much of the forces is unexplained as once corrected"
     for other_left, other in left[1:]:
-        if other_left < MIN_UNEXPLAINED_RATIO_OF_DEVIATIONS * least and other.description != best.description:
+        if other_left < MIN_UNEXPLAINED_RATIO * least and other.description != best.description:
             text += f"; or {other.field} {other.description}, which explains as much"
     return Finding("unit, sign or frame", REJECTED, best.field, text, best.advice)
 
