@@ -24,7 +24,7 @@ from torchid.errors import NumericalWarning, warn_about_file
 from torchid.estimators import Conditions, Estimate, Violation, violations
 from torchid.estimators.conditions import term_violations
 from torchid.fitting.calibration import Calibration, Comparison, warn_of_confounded, warn_of_disagreement
-from torchid.fitting.cross_validation import CrossValidation, Scorer
+from torchid.fitting.cross_validation import CrossValidation, Scorer, fit_without_folds
 from torchid.fitting.delay import unfitted_delay
 from torchid.fitting.factor_files import FactorFile
 from torchid.fitting.fit import Fit, LogFitter
@@ -132,7 +132,7 @@ def _identify(
         alone = _by_state(fitter, whole)
         added = ranks.from_first(partial(_contributions, ready, whole, problem, bars), "contributions")
     with clock("evaluate"):
-        without_folds = [experiment.calibrations(one, builder) for one in fitter.fit_without_folds(fit)]
+        without_folds = fit_without_folds(fit, fitter, experiment.loss)
         scorer, of_blocks = Scorer(evaluation, builder), merge_states(fit.parts, builder)
         scores = _scores(scorer, logs["test"], blocks, of_blocks, compared, without_folds, bars)
         traces = ranks.from_first(lambda: [trace_forces(evaluation, log, compared) for log in shown], "traces")

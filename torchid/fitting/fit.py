@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -10,18 +9,18 @@ from typing import Protocol
 import numpy as np
 from torch import Tensor
 
-from torchid.errors import TorchidWarning, UnknownNameError
+from torchid.errors import UnknownNameError
 from torchid.estimators import Estimate, LeastSquares
 from torchid.estimators.least_squares import Minimizer
 from torchid.fitting.prior_knowledge import TOTAL, KnownMass, with_known_masses
 from torchid.identifiability.block_scatter import BlockScatter, block_scatter
 from torchid.identifiability.confounding import ExtraEstimate, estimate_extras, mass_weights
-from torchid.parallel import one_thread, share_between_processes, thread_count
+from torchid.parallel import one_thread
 from torchid.parameters import PER_BODY
 from torchid.problem import LinearProblem, RowBuilder, assemble
 from torchid.problem.elimination import Assembly
 from torchid.problem.noise_gram import scale_columns
-from torchid.problem.parts import Part, merge_blocks_of_folds, merge_states
+from torchid.problem.parts import Part, merge_blocks_of_folds
 from torchid.reprs import short_repr
 from torchid.robot import Robot
 from torchid.rounding import RANK_TOLERANCE
@@ -203,22 +202,6 @@ class LogFitter:
         estimate = (solve or self.estimator.solve)(assembly.problem)
         extras = estimate_extras(assembly, estimate, self.robot.body_names, self.estimator.rank_tolerance)
         return Fit(problem.parts, assembly, estimate, extras)
-
-    @one_thread()
-    def fit_without_folds(self, fit: Fit | LogProblem) -> list[Fit]:
-        """For every fold of a fit, in order, that of all others, weighted as it is; none where there is only one."""
-        folds, noise = sorted({part.fold for part in fit.parts}), fit.assembly.reading_noise
-        if len(folds) < 2:
-            return []
-        blocks = merge_states(fit.parts, self.builder)
-
-        def without(fold: int) -> Fit:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", TorchidWarning)  # the fit of all of them says the same
-                rest = [block for block in blocks if block.fold != fold]
-                return self.solve_problem(LogProblem(rest, self.assemble(rest, noise)))
-
-        return share_between_processes(folds, without, thread_count())
 
 
 def _is_homogeneous(problem: LinearProblem, forces: float) -> bool:

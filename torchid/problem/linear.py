@@ -361,11 +361,11 @@ class TriangularFactor:
 
 
 def gram_matrix(X: Tensor) -> Tensor:
-    """X X^T; on the CPU NumPy's, which does half of the products."""
+    """X X^T of X (n, r, B), rows r of B samples by column; on the CPU NumPy's, which does half of the products."""
     if X.device.type != "cpu":
-        return X @ X.T
-    rows = X.numpy()
-    return torch.from_numpy(rows @ rows.T)
+        return X.flatten(1) @ X.flatten(1).T
+    by_row = X.numpy().transpose(1, 0, 2)  # whose products are together what one product of a copy is
+    return torch.from_numpy(np.matmul(by_row, by_row.transpose(0, 2, 1)).sum(0))
 
 
 def triangularize(stacked: Tensor) -> Tensor:

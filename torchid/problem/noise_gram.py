@@ -45,6 +45,7 @@ combination. Less is taken off, and the nominal parameters make up for what is t
 _MOST_SIGNAL = 2.0  # beyond, it is rounding, of combinations that the rows hardly determine
 _LEAST_PERTURBED, _MOST_PERTURBED = 5000, 20_000  # samples of all logs, evenly spread, see `_perturbed`
 _NEGLIGIBLE = 1e-5  # share of noise in any combination: far below all standard errors
+_COPIES = 3  # of each sample, see `_copies`
 _RESOLVED = 1e-5  # least singular value, of columns of unit size, along which a difference of squares is no rounding
 
 Support = tuple[int, ...]
@@ -117,7 +118,7 @@ def estimate_noise_gram(
     total: dict[Key, NoiseGram] = {}
     if not logs:
         return total
-    reduce, chunk = partial(_noise_gram_of_chunks, builder, by_log, key), chunk_size(builder.device) // len(_COPIES)
+    reduce, chunk = partial(_noise_gram_of_chunks, builder, by_log, key), chunk_size(builder.device) // _COPIES
     for of_worker in map_chunks(logs, builder, reduce, chunk):
         for of_key, noise_gram in of_worker.items():
             halves = {support: x.cpu().triu() for support, x in noise_gram.items()}
@@ -165,7 +166,16 @@ def _spread(piece: Samples, step: int, progress: ProgressCallback | None) -> Sam
     return taken
 
 
-_COPIES = ((0.0, -1.0), (1.0, 0.5), (-1.0, 0.5))  # of each sample: the side that noise moves it to, and its weight
+def _copies(spans: Sequence[tuple[int, int]]) -> tuple[Tensor, Tensor]:
+    """Of successive samples, span by span: all as they are, then all to one side, then all to the other.
+
+    Returns:
+        which samples, (3 B,), and the side that noise moves each to, (3 B,).
+    """
+    at = torch.cat([torch.arange(*span).repeat(_COPIES) for span in spans])
+    lengths = torch.tensor([end - start for start, end in spans])
+    side = torch.tensor([0.0, 1.0, -1.0]).repeat(len(spans)).repeat_interleave(lengths.repeat_interleave(_COPIES))
+    return at, side
 
 
 def _alike(ends: Iterable[tuple[Key, int]]) -> Iterator[tuple[Key, int, int]]:
@@ -188,9 +198,8 @@ def _noise_gram_of_chunks(
     """By key of the piece: half of what pairs of samples with noise have more."""
     out: dict[Key, NoiseGram] = {}
     workspace, scales = builder.workspaces.take(), scale_columns(builder)
-    sides = [side for side, _ in _COPIES]
     for samples, state in chunks:
-        noise, count, own = samples.motion_noise, len(samples), pieces[samples.source]
+        noise, own = samples.motion_noise, pieces[samples.source]
         starts = torch.stack([piece.time[0] for piece in own]).to(samples.time)
         of_piece = torch.searchsorted(starts, samples.time.contiguous(), right=True)
         ends = torch.bincount(of_piece - 1, minlength=len(own)).cumsum(0).tolist()
@@ -206,15 +215,16 @@ def _noise_gram_of_chunks(
                     _add(sums, noise_of_reading(column, of_column.square().sum()), 1.0)
         if noise is None:
             continue
-        side = torch.tensor(sides).to(samples.time).repeat_interleave(count)
-        repeated = samples[torch.arange(count, device=samples.time.device).repeat(len(sides))]
-        perturbed = noise.perturbed(repeated, side[:, None])
+        at, side = _copies([(start, end) for _, start, end in spans])
+        perturbed = noise.perturbed(samples[at.to(samples.time.device)], side.to(samples.time)[:, None])
         for rows, index in builder.blocks(perturbed, state, workspace):
             for of_key, start, end in spans:
-                sums = out.setdefault(of_key, {})
-                for copy, (_, weight) in enumerate(_COPIES):
-                    first, last = span_of_samples(index, copy * count + start, copy * count + end)
-                    _add(sums, {rows.block.support: gram_matrix(rows.values[:, :, first:last].flatten(1))}, weight)
+                sums, second = out.setdefault(of_key, {}), 2 * start + end
+                for weight, (first, last) in (
+                    (-1.0, span_of_samples(index, 3 * start, second)),
+                    (0.5, span_of_samples(index, second, 3 * end)),
+                ):
+                    _add(sums, {rows.block.support: gram_matrix(rows.values[:, :, first:last])}, weight)
     builder.workspaces.give_back(workspace)
     return out
 
