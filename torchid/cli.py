@@ -13,7 +13,7 @@ from torchid import __version__
 from torchid.boundary import importing, plain_streams, run_guarded, run_in_ranks
 from torchid.commands import EXPORT_FORMATS, SAMPLE_FORMATS
 from torchid.errors import ConfigError, during
-from torchid.parallel import copies_allowed
+from torchid.parallel import forks_allowed
 from torchid.ranks import end_process, is_launched_first, share_work
 
 _IDENTIFY = "fit a robot to the logs of an experiment file and write a run folder"
@@ -49,7 +49,7 @@ def run() -> NoReturn:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; 0 on success, 2 on bad input, 1 on anything else."""
     try:
-        with copies_allowed() if arguments is None else nullcontext():
+        with forks_allowed() if arguments is None else nullcontext():
             return run_in_ranks("torchid", lambda: _main(arguments))
     finally:
         if arguments is not None:  # whoever calls it goes on

@@ -337,7 +337,7 @@ def share_items(folder: Path) -> int:
     return 0
 
 
-def test_processes_share_items_as_copies_would_and_the_first_alone_says_things(tmp_path: Path) -> None:
+def test_processes_share_items_as_forks_would_and_the_first_alone_says_things(tmp_path: Path) -> None:
     status, _, complained = finish_forked(2, lambda: share_items(tmp_path))
     assert status == 0, complained
     first, second = (json.loads((tmp_path / f"{number}.json").read_text()) for number in range(2))

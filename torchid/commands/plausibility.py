@@ -32,7 +32,7 @@ from torchid.log_checks.check import check
 from torchid.log_checks.findings import SEVERITIES
 from torchid.log_checks.lag_and_tilt import check_tilt
 from torchid.log_checks.model import NominalModel
-from torchid.parallel import can_copy, one_thread, share_between_copies, thread_count
+from torchid.parallel import can_fork, one_thread, share_between_forks, thread_count
 from torchid.parameters import GRAVITY, PARAMETERS, PER_BODY, Array
 from torchid.problem import LinearProblem, Samples
 from torchid.problem.metrics import ADVICE, Metrics, WorseThanNominal, describe_worse
@@ -76,9 +76,9 @@ class TrainingLogs:
 
     def _findings(self, files: LogsConfig, done: Callable[[float], None]) -> Iterator[tuple[str, Finding]]:
         """Findings on large parts of segments; `done` is called with the share of each in its log in percent."""
-        segments, count = self._segments(files), thread_count() if can_copy() else 1
+        segments, count = self._segments(files), thread_count() if can_fork() else 1
         while together := list(islice(segments, count)):  # as many as are in memory at a time
-            findings = share_between_copies(together, _large_findings, count)
+            findings = share_between_forks(together, _large_findings, count)
             for (_, segment), found in zip(together, findings, strict=True):
                 yield from ((segment.name, one) for one in found)
                 if any(one.rejects_all for one in found):

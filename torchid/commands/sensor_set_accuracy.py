@@ -12,7 +12,7 @@ from torchid.errors import ImplausibleFitError, LogError, warn
 from torchid.fitting.calibration import Calibration, list_confounded
 from torchid.fitting.experiment import RobotSetup, batch_estimator
 from torchid.identifiability.information import error_directions, expected_errors
-from torchid.parallel import share_between_copies, thread_count
+from torchid.parallel import share_between_forks, thread_count
 from torchid.parameters import Array
 from torchid.problem import Evaluation, ExtraTerms, RowBuilder, Samples, assemble, compress_parts
 from torchid.problem.compression import split_into_folds
@@ -51,7 +51,7 @@ def accuracies(
             warn(f"{error}; no accuracy of the sensors '{name}'")
         return None
 
-    found = zip(sets, share_between_copies(list(sets), accuracy, thread_count()), strict=True)
+    found = zip(sets, share_between_forks(list(sets), accuracy, thread_count()), strict=True)
     return {name: one for name, one in found if one is not None}
 
 
