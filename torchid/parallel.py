@@ -1,7 +1,7 @@
 """Threads of this process, and forks of it, copies by fork(2), that share work between the cores of one machine.
 
 Nothing has to be imported by a fork, or handed over to it. Whoever calls torchid as a library may have threads that a
-fork lacks: only the command line allows forks. Processes that share the work of a run (`torchid.ranks`) have no
+fork lacks: only the command line allows forks. Processes that share the work of a run (`torchid.distributed`) have no
 forks; they can take the part of these. torch is loaded where it is used, as commands begin without it.
 """
 
@@ -21,7 +21,7 @@ from functools import cache, partial
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Generic, TypeVar
 
-from torchid import ranks
+from torchid import distributed
 from torchid.staging import interrupts_deferred
 
 if TYPE_CHECKING:
@@ -136,7 +136,8 @@ def forks_allowed() -> Iterator[None]:
 
 def can_fork() -> bool:
     """Whether forks of this process may be made now."""
-    return _allowed and not _uses_a_gpu() and not ranks.is_launched()  # torchrun has started processes for all cores
+    # torchrun has started processes for all cores
+    return _allowed and not _uses_a_gpu() and not distributed.is_launched()
 
 
 class Fork(Generic[T]):
@@ -234,14 +235,16 @@ def share_between_processes(items: Sequence[Item], work: Callable[[Item], T], co
 
     What meets a warning or an error in one of them the first one does again, which alone says things.
     """
-    if ranks.world_size() == 1:
+    if distributed.world_size() == 1:
         return share_between_forks(items, work, count)
-    own = range(ranks.rank(), len(items), ranks.world_size())
-    with ranks.apart():
+    own = range(distributed.rank(), len(items), distributed.world_size())
+    with distributed.apart():
         attempts = {number: _attempt(partial(work, items[number])) for number in own}
-    found = {number: one for of_process in ranks.gather(attempts, "shares") for number, one in of_process.items()}
+    found = {
+        number: one for of_process in distributed.all_gather(attempts, "shares") for number, one in of_process.items()
+    }
     return [
-        found[number][0] if found[number] else ranks.from_first(partial(work, item), "a share")
+        found[number][0] if found[number] else distributed.from_first(partial(work, item), "a share")
         for number, item in enumerate(items)
     ]
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from rich.progress import Progress
 
-from torchid import ranks
+from torchid import distributed
 from torchid.commands.analysis_request import AnalysisRequest, errors_at
 from torchid.commands.chosen_settings import with_chosen_settings
 from torchid.commands.folder import ANALYSIS, check_free, new_folder, write_json
@@ -131,14 +131,16 @@ def analyze(config: AnalyzeConfig) -> Analysis:
         config.logs.require_samples("analyze")
     output = None if config.output is None else _analysis_folder(config.output)
     if output is not None:
-        ranks.from_first(partial(check_free, output, config.overwrite, ANALYSIS, inputs_of(config)), "output")
+        distributed.from_first(partial(check_free, output, config.overwrite, ANALYSIS, inputs_of(config)), "output")
     request = AnalysisRequest.of(set_up_robot(config))
     with progress_bars() as bars:
         setup, _ = with_chosen_settings(request.setup, bars)
         request = replace(request, setup=setup)
         train, test = _read(request, bars)
         if train:
-            setup = with_noise(setup, ranks.from_first(partial(setup.estimate_noise, train, suggest=False), "noise"))
+            setup = with_noise(
+                setup, distributed.from_first(partial(setup.estimate_noise, train, suggest=False), "noise")
+            )
             request = AnalysisRequest.of(setup)
         choices: dict[str, SensorChoice] = {}
         progress: dict[str, StepCallback] = {}
@@ -163,18 +165,18 @@ def analyze(config: AnalyzeConfig) -> Analysis:
         is_long, processes = forks_share_passes([*train, *test]), thread_count() if train and can_fork() else 1
         early = _shares(request.compared, processes - 1)
         with in_forks(early, compare_beside, len(early)) as compared_early:
-            sets = ranks.from_first(choose, "sensor sets")
+            sets = distributed.from_first(choose, "sensor sets")
             left = {name: one for name, one in sets.items() if not any(name in share for share in early)}
             later = [] if is_long or processes == 1 else _shares(left, processes)
             with in_forks(later, compare_beside, len(later)) as compared_later:
-                ranks.from_first(explain, "sensor plans")
+                distributed.from_first(explain, "sensor plans")
                 bars.add_task("comparing sensor sets", total=None)
                 found = [*compared_early(), *compared_later(), {} if later else compare(left)]
         compared = {name: share[name] for name in sets for share in found if name in share}
         analysis = Analysis(setup, tuple(results), compared, output, unmeasured_at_rest(train))
         if output is not None:
             bars.add_task("writing", total=None)
-            ranks.from_first(partial(_write_analysis, analysis, output, config.overwrite), "analysis folder")
+            distributed.from_first(partial(_write_analysis, analysis, output, config.overwrite), "analysis folder")
     return analysis
 
 

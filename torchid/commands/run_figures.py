@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from torchid import ranks
+from torchid import distributed
 from torchid.commands.answer import answer
 from torchid.commands.training import body_eigenvalues, known_parameters
 from torchid.config import ExperimentConfig, dump_config
@@ -107,8 +107,8 @@ def drawing(figures: Figures, config: ExperimentConfig) -> Iterator[Drawing]:
     """
     folder, form = config.output or Path(), config.figures.format
     files = [(folder / f"{name}.{form}", make) for name, make in figures.items()]
-    if ranks.world_size() > 1:
-        there = share_between_processes(files, lambda file: draw_for(*file), ranks.world_size())
+    if distributed.world_size() > 1:
+        there = share_between_processes(files, lambda file: draw_for(*file), distributed.world_size())
         yield Drawing(tuple(figures), lambda: there)
         return
     with in_forks(files, lambda file: draw_for(*file), max(thread_count() - 1, 1)) as drawn:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
-from torchid import ranks
+from torchid import distributed
 from torchid.commands.plausibility import TrainingLogs, require_plausible
 from torchid.errors import ImplausibleFitError, LogError, warn
 from torchid.fitting.calibration import Calibration, list_confounded
@@ -106,7 +106,7 @@ def _accuracy(
     blocks = split_into_folds(train, builder) if settings.chooses_ridge else list(train)
     parts = compress_parts(blocks, builder)
     if settings.chooses_ridge:
-        choice = ranks.from_first(partial(setup.choose_ridge, parts, blocks, fitter, conditions), "ridge")
+        choice = distributed.from_first(partial(setup.choose_ridge, parts, blocks, fitter, conditions), "ridge")
         settings = replace(settings, ridge=choice.ridge)
     fit = fitter.fit(parts, batch_estimator(settings, conditions).solve)
     require_plausible(fit, TrainingLogs(setup))

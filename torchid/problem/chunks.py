@@ -13,7 +13,7 @@ from typing import TypeVar
 import numpy as np
 import torch
 
-from torchid import ranks
+from torchid import distributed
 from torchid.errors import excerpt, warn
 from torchid.parallel import can_fork, one_thread, run_in_workers, share_between_forks, thread_count
 from torchid.problem.blocks import are_of_one_log, join_pieces
@@ -49,7 +49,7 @@ def map_chunks(
 ) -> list[Result]:
     """Results of `reduce` over the chunks of some logs, one per worker.
 
-    Processes that share their work (`torchid.ranks`) each take some successive chunks; all get the results of all.
+    Processes that share their work (`torchid.distributed`) each take successive chunks; all get the results of all.
 
     Args:
         logs: each is moved to the builder's device chunk by chunk, see `upload`.
@@ -61,7 +61,7 @@ def map_chunks(
         progress: called with the number of samples done since the last call.
     """
     workers = threads or worker_count(builder.device)
-    size, sharing = chunk or chunk_size(builder.device), ranks.as_first(workers, "workers")
+    size, sharing = chunk or chunk_size(builder.device), distributed.broadcast(workers, "workers")
     if chunk is None and sharing > 1:
         size = min(size, max(sum(map(len, logs)) // (_EACH * sharing), _LEAST))
     tasks = _chunks(logs, size, sharing)
@@ -69,8 +69,8 @@ def map_chunks(
         builder.layout(task.state, task.parts[0][0].contact_normal is not None)
     sizes = [len(task) for task in tasks]
     choose_kernels(builder, sum(sizes))
-    ranks.require_same(hash(tuple(zip(sizes, (task.state for task in tasks), strict=True))), "logs")
-    share = ranks.own_share(sizes)
+    distributed.require_same(hash(tuple(zip(sizes, (task.state for task in tasks), strict=True))), "logs")
+    share = distributed.own_share(sizes)
     own, done = tasks[share], sizes[share]
     workers = min(workers, max(len(own), 1))  # to start a thread takes as long as a small chunk
     forked = workers > 1 and _is_worth_forking(sum(done)) and can_fork()
@@ -83,7 +83,7 @@ def map_chunks(
     results = _run_in_forks(own, run, workers) if forked else run_in_workers(own, run, workers)
     if report is not None:
         report(0)
-    return list(chain.from_iterable(ranks.gather(results, "chunks")))
+    return list(chain.from_iterable(distributed.all_gather(results, "chunks")))
 
 
 def forks_share_passes(logs: Sequence[Samples]) -> bool:

@@ -10,7 +10,7 @@ from tempfile import gettempdir
 import numpy as np
 import torch
 
-from torchid import ranks
+from torchid import distributed
 from torchid.config.logs import require_apart
 from torchid.errors import ConfigError, LogError
 from torchid.fitting.experiment import RobotSetup, S
@@ -79,7 +79,7 @@ class LogReader:
         """
         with files_of_recordings_kept():
             logs = self._each(paths, required, on_read)
-        names = ranks.as_first([log.source for log in logs], "names of the logs")  # they may lie elsewhere there
+        names = distributed.broadcast([log.source for log in logs], "names of the logs")  # they may lie elsewhere there
         added = [payload_of(self.setup, path) for path in paths]
         return [replace(log, source=name, payload=x) for log, name, x in zip(logs, names, added, strict=True)]
 
