@@ -144,7 +144,7 @@ def _identify(
         noise=ready.noise,
         motion_noise=fit.assembly.noise,
         misfit=misfit(
-            fit.estimate, ready.noise, blocks, fit.scatter, unfitted_friction(problem, experiment.robot), delay
+            fit.estimate, ready.noise, blocks, fit.jackknife, unfitted_friction(problem, experiment.robot), delay
         ),
         resting=resting_joints(problem, experiment.robot, builder, logs["train"]),
         at_rest=[name for name in LOG_SETS if is_at_rest(logs[name])],

@@ -130,7 +130,7 @@ def require_plausible(fit: Fit, logs: TrainingLogs, samples: Sequence[Samples] =
         raise SensorError.at_field("sensors", "no parameter is in reach of them", "other sensors, contacts or logs")
     if not max(fit.assembly.problem.cost(np.zeros_like(estimate.phi)), fit.assembly.forces) > 0.0:
         raise ImplausibleFitError.at_field("logs", "all measured forces are 0", "forces; NaN where none was measured")
-    block_error = 0.0 if fit.scatter is None else fit.scatter.mass_error
+    block_error = 0.0 if fit.jackknife is None else fit.jackknife.mass_error
     tolerance = setup.config.estimator.rank_tolerance
     by_data = LeastSquares(rank_tolerance=tolerance).solve(fit.assembly.problem)
     if fit.assembly.homogeneous:

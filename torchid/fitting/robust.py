@@ -390,4 +390,4 @@ def _with_errors(fit: Fit, reweighting: Reweighting) -> Fit:
     assembly = replace(fit.assembly, problem=replace(problem, residual=max(problem.residual + added, 0.0)))
     extras = [replace(x, noise_error=factor * x.noise_error) for x in fit.extras]
     out = replace(fit, assembly=assembly, estimate=estimate, extras=extras)
-    return out if fit.scatter is None else with_block_errors(out, fit.scatter, reweighting.newton_ratio)
+    return out if fit.jackknife is None else with_block_errors(out, fit.jackknife, reweighting.newton_ratio)
