@@ -36,7 +36,7 @@ from torchid.parallel import can_fork, one_thread, share_between_forks, thread_c
 from torchid.parameters import GRAVITY, PARAMETERS, PER_BODY, Array
 from torchid.problem import LinearProblem, Samples
 from torchid.problem.metrics import ADVICE, Metrics, WorseThanNominal, describe_worse
-from torchid.reading.log_reader import settle_contacts, setup_of_log
+from torchid.reading.log_reader import apply_contact_settings, setup_of_log
 from torchid.robot import Robot
 from torchid.rounding import is_significant
 
@@ -97,7 +97,7 @@ def _large_findings(of: tuple[RobotSetup, LogSegment]) -> list[Finding]:
     setup, segment = of
     settings = setup.config.preprocessing
     try:
-        flagged, _ = settle_contacts(segment.log, setup)
+        flagged, _ = apply_contact_settings(segment.log, setup)
     except InputError:
         return []
     checked = check(flagged, setup.robot, setup.contacts, settings.filter_hz, settings.derived, setup.declared)
