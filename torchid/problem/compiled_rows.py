@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchid.kernels import compression, limbs, rows, states
-from torchid.kernels.gram import write_gram
+from torchid.kernels import limbs, rows, states
+from torchid.kernels.gram import SPAN, write_gram, write_grams
 from torchid.kernels.tiles import TILE
 from torchid.parameters import Array
 from torchid.problem.blocks import BlockRows
@@ -216,7 +216,7 @@ class CompiledChunk:
 
     def _multiplied(self, group: _Group, levels: Sequence[ColumnLevels]) -> Iterator[tuple[RowBlock, Array, Array]]:
         tables = group.tables
-        placed, size = tables.placed(min(compression.SPAN, group.tiles.samples))
+        placed, size = tables.placed(min(SPAN, group.tiles.samples))
         flat, widths = self.workspace.empty("rows", group.W, size), tables.blocks[:, 2]
         counts = np.array([len(own.lower) for own in levels])
         lower, combination = (
@@ -224,7 +224,7 @@ class CompiledChunk:
         )
         table = np.column_stack([_starts(counts), counts, _starts(counts * widths), _starts(widths**2)])
         squares, grams = np.empty(len(lower)), np.empty(int((widths**2).sum()))
-        compression.write_grams(
+        write_grams(
             *(*group.arrays(self.workspace), placed, *tables.of_bodies, table, lower, combination, flat.numpy()),
             *(squares, grams),
         )
