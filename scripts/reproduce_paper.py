@@ -18,8 +18,8 @@ from paper.report import study_tables, write_study
 from paper.settings import Study
 from paper.study import Reproduction
 
-from torchid import ranks
-from torchid.boundary import run_guarded, run_in_ranks
+from torchid import distributed
+from torchid.boundary import run_distributed, run_guarded
 from torchid.commands.folder import STUDY, check_free, new_folder
 from torchid.config import load_simulation
 from torchid.errors import about_file
@@ -32,7 +32,7 @@ SENSOR_SETS = ("full", "contacts", "joints", "reduced")
 
 def main() -> int:
     """Run the study in this process, or in all that torchrun has started; the first prints and writes."""
-    return run_in_ranks("reproduce_paper", run)
+    return run_distributed("reproduce_paper", run)
 
 
 def run() -> int:
@@ -49,8 +49,8 @@ def run() -> int:
 def reproduce(options: argparse.Namespace) -> None:
     """Run the study with the options of the command line."""
     experiments = {name: CONFIGS / f"biped_{name}.yaml" for name in SENSOR_SETS}
-    with ranks.share_work(), about_file(SIMULATION):
-        ranks.from_first(partial(check_free, options.output, options.overwrite, STUDY), "output")
+    with distributed.share_work(), about_file(SIMULATION):
+        distributed.from_first(partial(check_free, options.output, options.overwrite, STUDY), "output")
         study = Study(load_simulation(SIMULATION), experiments)
         results, series = Reproduction(study.quick() if options.quick else study).run()
 
@@ -58,7 +58,7 @@ def reproduce(options: argparse.Namespace) -> None:
             with new_folder(options.output, options.overwrite, STUDY) as folder:
                 write_study(folder, results, series)
 
-        ranks.from_first(write, "study folder")
+        distributed.from_first(write, "study folder")
     print_tables(*study_tables(results).values())
     print(f"written to {options.output}")
 

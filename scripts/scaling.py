@@ -23,7 +23,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
-from torchid.ranks import join_launched, leave_launched, share_work
+from torchid.distributed import join_launched, leave_launched, share_work
 from torchid.report.figure_style import save_figure
 
 ROBOTS = (

@@ -20,6 +20,9 @@ from .commands.named_results import (
 from .commands.results import (
     Identification,
 )
+from .distributed import (
+    share_work,
+)
 from .errors import (
     TorchidError,
     TorchidWarning,
@@ -114,9 +117,6 @@ from .problem.compressed_log import (
 from .problem.compression import (
     compress_in_blocks,
     split_into_folds,
-)
-from .ranks import (
-    share_work,
 )
 from .regressor import (
     FrameJacobian,

@@ -16,7 +16,7 @@ from torchid.commands.evaluate import evaluate as evaluate_folder
 from torchid.commands.identify import identify as identify_settings
 from torchid.commands.results import Identification
 from torchid.config import load_analysis, load_config
-from torchid.config.reading import Sections, StrPath, plain_sections
+from torchid.config.settings_files import Sections, StrPath, plain_sections
 from torchid.errors import ConfigError, UnknownNameError, about_file
 from torchid.log_checks import Checked
 from torchid.log_checks.check import check as check_samples

@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout, suppress
 
-from torchid import ranks
+from torchid import distributed
 from torchid.errors import (
     BaseLostError,
     ConfoundedWarning,
@@ -78,7 +78,7 @@ def run_guarded(
             shown.count_folded()
 
 
-def run_in_ranks(program: str, run: Callable[[], int]) -> int:
+def run_distributed(program: str, run: Callable[[], int]) -> int:
     """Run a command in this process, or in all that torchrun has started: the first prints, all end with one status.
 
     Args:
@@ -89,17 +89,17 @@ def run_in_ranks(program: str, run: Callable[[], int]) -> int:
         The exit status; a process that torchrun has started does not return.
     """
     try:
-        if not ranks.join_launched():
+        if not distributed.join_launched():
             return run()
-    except ranks.ConnectionFailedError as error:
+    except distributed.ConnectionFailedError as error:
         _print_line(program, str(error))
         return 1
-    with nullcontext() if ranks.is_launched_first() else _silence():
+    with nullcontext() if distributed.is_launched_first() else _silence():
         try:
             status = run()
         except SystemExit as leaving:  # of argparse
             status = leaving.code if isinstance(leaving.code, int) else int(leaving.code is not None)
-    return ranks.leave_launched(status)
+    return distributed.leave_launched(status)
 
 
 @contextmanager

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any, NoReturn, TypeAlias
 
 from torchid import __version__
-from torchid.boundary import importing, plain_streams, run_guarded, run_in_ranks
+from torchid.boundary import importing, plain_streams, run_distributed, run_guarded
 from torchid.commands import EXPORT_FORMATS, SAMPLE_FORMATS
+from torchid.distributed import end_process, is_launched_first, share_work
 from torchid.errors import ConfigError, during
-from torchid.parallel import copies_allowed
-from torchid.ranks import end_process, is_launched_first, share_work
+from torchid.parallel import forks_allowed
 
 _IDENTIFY = "fit a robot to the logs of an experiment file and write a run folder"
 _COMPRESS = "compress the training logs of an experiment file to small files, which identify fits in their place"
@@ -49,8 +49,8 @@ def run() -> NoReturn:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; 0 on success, 2 on bad input, 1 on anything else."""
     try:
-        with copies_allowed() if arguments is None else nullcontext():
-            return run_in_ranks("torchid", lambda: _main(arguments))
+        with forks_allowed() if arguments is None else nullcontext():
+            return run_distributed("torchid", lambda: _main(arguments))
     finally:
         if arguments is not None:  # whoever calls it goes on
             gc.unfreeze()

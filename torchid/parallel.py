@@ -1,8 +1,8 @@
-"""Threads of this process, and copies of it by fork, that share work between the cores of one machine.
+"""Threads of this process, and forks of it, copies by fork(2), that share work between the cores of one machine.
 
-Nothing has to be imported by a copy, or handed over to it. Whoever calls torchid as a library may have threads that a
-copy lacks: only the command line allows copies. Processes that share the work of a run (`torchid.ranks`) have no
-copies; they can take the part of these. torch is loaded where it is used, as commands begin without it.
+Nothing has to be imported by a fork, or handed over to it. Whoever calls torchid as a library may have threads that a
+fork lacks: only the command line allows forks. Processes that share the work of a run (`torchid.distributed`) have no
+forks; they can take the part of these. torch is loaded where it is used, as commands begin without it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from functools import cache, partial
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Generic, TypeVar
 
-from torchid import ranks
+from torchid import distributed
 from torchid.staging import interrupts_deferred
 
 if TYPE_CHECKING:
@@ -124,25 +124,26 @@ _allowed = False
 
 
 @contextmanager
-def copies_allowed() -> Iterator[None]:
-    """Let functions within the block be called by copies of this process, on systems where that is safe."""
+def forks_allowed() -> Iterator[None]:
+    """Let functions within the block be called by forks of this process, on systems where that is safe."""
     global _allowed
-    _allowed = sys.platform == "linux"  # libraries of macOS fail in copies, Windows has none
+    _allowed = sys.platform == "linux"  # libraries of macOS fail in forks, Windows has none
     try:
         yield
     finally:
         _allowed = False
 
 
-def can_copy() -> bool:
-    """Whether copies of this process may be made now."""
-    return _allowed and not _uses_a_gpu() and not ranks.is_launched()  # torchrun has started processes for all cores
+def can_fork() -> bool:
+    """Whether forks of this process may be made now."""
+    # torchrun has started processes for all cores
+    return _allowed and not _uses_a_gpu() and not distributed.is_launched()
 
 
-class Copy(Generic[T]):
-    """A copy of this process that calls a function, in a `with` block at whose end it is gone.
+class Fork(Generic[T]):
+    """A fork of this process that calls a function, in a `with` block at whose end it is gone.
 
-    Where copies are not allowed, or the copy meets a warning, an error or its end, this process calls the function
+    Where forks are not allowed, or the fork meets a warning, an error or its end, this process calls the function
     itself when it needs the result: it says whatever there is to say.
     """
 
@@ -152,11 +153,11 @@ class Copy(Generic[T]):
         self._process: multiprocessing.context.ForkProcess | None = None
         self._results: Connection | None = None
 
-    def __enter__(self) -> Copy[T]:
-        if can_copy():
+    def __enter__(self) -> Fork[T]:
+        if can_fork():
             try:
                 self._start()
-            except BaseException:  # Ctrl-C meanwhile: the copy would go on writing files
+            except BaseException:  # Ctrl-C meanwhile: the fork would go on writing files
                 self.__exit__()
                 raise
         return self
@@ -173,7 +174,7 @@ class Copy(Generic[T]):
         with interrupts_deferred(), suppress(OSError):  # no memory, or too many processes
             self._results, sender = context.Pipe(duplex=False)
             with sender, warnings.catch_warnings():
-                warnings.simplefilter("ignore", DeprecationWarning)  # Python 3.12: of threads that a copy lacks
+                warnings.simplefilter("ignore", DeprecationWarning)  # Python 3.12: of threads that a fork lacks
                 self._process = context.Process(target=_call, args=(self._work, self._results, sender), daemon=True)
                 self._process.start()
 
@@ -188,13 +189,13 @@ class Copy(Generic[T]):
 
 
 @contextmanager
-def in_copies(items: Sequence[Item], work: Callable[[Item], T], count: int) -> Iterator[Callable[[], list[T]]]:
+def in_forks(items: Sequence[Item], work: Callable[[Item], T], count: int) -> Iterator[Callable[[], list[T]]]:
     """Copies of this process that work on some items within the block, while this process does something else.
 
     Args:
         items: about the same work each.
         work: a function of one; its result pickles.
-        count: of copies.
+        count: of forks.
 
     Yields:
         What waits for them: the results in the order of the items.
@@ -205,16 +206,16 @@ def in_copies(items: Sequence[Item], work: Callable[[Item], T], count: int) -> I
         return [work(item) for item in items[first::count]]
 
     def results() -> list[T]:
-        shares = [copy.result() for copy in copies]
+        shares = [fork.result() for fork in forks]
         return [shares[number % count][number // count] for number in range(len(items))]
 
     with ExitStack() as stack:
-        copies = [stack.enter_context(Copy(partial(share, first))) for first in range(count)]
+        forks = [stack.enter_context(Fork(partial(share, first))) for first in range(count)]
         yield results
 
 
-def share_between_copies(items: Sequence[Item], work: Callable[[Item], T], count: int) -> list[T]:
-    """What a function makes of each of some items, in their order; this process works on some, its copies on others.
+def share_between_forks(items: Sequence[Item], work: Callable[[Item], T], count: int) -> list[T]:
+    """What a function makes of each of some items, in their order; this process works on some, its forks on others.
 
     Args:
         items: about the same work each.
@@ -223,25 +224,27 @@ def share_between_copies(items: Sequence[Item], work: Callable[[Item], T], count
     """
     count = max(min(count, len(items)), 1)
     others = [item for number, item in enumerate(items) if number % count]
-    with in_copies(others, work, count - 1) as results:
+    with in_forks(others, work, count - 1) as results:
         own = [work(item) for item in items[::count]]
         rest = iter(results())
     return [next(rest) if number % count else own[number // count] for number in range(len(items))]
 
 
 def share_between_processes(items: Sequence[Item], work: Callable[[Item], T], count: int) -> list[T]:
-    """As `share_between_copies`; processes that share the work of a run, which all call this, are the copies.
+    """As `share_between_forks`; processes that share the work of a run, which all call this, are the forks.
 
     What meets a warning or an error in one of them the first one does again, which alone says things.
     """
-    if ranks.world_size() == 1:
-        return share_between_copies(items, work, count)
-    own = range(ranks.rank(), len(items), ranks.world_size())
-    with ranks.apart():
+    if distributed.world_size() == 1:
+        return share_between_forks(items, work, count)
+    own = range(distributed.rank(), len(items), distributed.world_size())
+    with distributed.apart():
         attempts = {number: _attempt(partial(work, items[number])) for number in own}
-    found = {number: one for of_process in ranks.gather(attempts, "shares") for number, one in of_process.items()}
+    found = {
+        number: one for of_process in distributed.all_gather(attempts, "shares") for number, one in of_process.items()
+    }
     return [
-        found[number][0] if found[number] else ranks.from_first(partial(work, item), "a share")
+        found[number][0] if found[number] else distributed.from_first(partial(work, item), "a share")
         for number, item in enumerate(items)
     ]
 
@@ -257,7 +260,7 @@ def _attempt(work: Callable[[], T]) -> tuple[T, ...]:
 
 
 def _uses_a_gpu() -> bool:
-    """Whether this process has a connection to a GPU, which a copy cannot use."""
+    """Whether this process has a connection to a GPU, which a fork cannot use."""
     torch = sys.modules.get("torch")
     return torch is not None and torch.cuda.is_initialized()
 

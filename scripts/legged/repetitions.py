@@ -190,7 +190,7 @@ class Repetitions:
     def _add(self, tally: Tally, samples: Samples) -> None:
         fit = self._fit(samples)
         base, estimate = structural_base(self.true.legged), fit.estimate
-        mass = total_mass(fit.assembly, estimate, block_error=fit.scatter.mass_error if fit.scatter else 0.0)
+        mass = total_mass(fit.assembly, estimate, block_error=fit.jackknife.mass_error if fit.jackknife else 0.0)
         known = estimate.verdict == IDENTIFIED
         off = np.abs(estimate.phi - self.true.phi.flatten()) / estimate.standard_error
         errors = combination_errors(fit, base.combination)
@@ -202,7 +202,7 @@ class Repetitions:
         tally.parameters.append(np.where(known, off <= NORMAL, np.nan))
         tally.residual.append(estimate.residual_std)
         friction = unfitted_friction(fit.assembly.problem, self.true.robot)
-        tally.misfit.append(not misfit(estimate, self.weights, [samples], fit.scatter, friction).explained)
+        tally.misfit.append(not misfit(estimate, self.weights, [samples], fit.jackknife, friction).explained)
 
 
 def combination_errors(fit: Fit, combinations: Array) -> Array:
@@ -214,8 +214,8 @@ def combination_errors(fit: Fit, combinations: Array) -> Array:
     lost = np.linalg.norm(along @ covariance.null_space, axis=1) > UNOBSERVABLE_SHARE * size
     noise = np.sqrt(problem.oversampling) * estimate.residual_std
     errors = noise * np.linalg.norm(along @ covariance.root, axis=1)
-    if fit.scatter is not None:
-        errors = np.maximum(errors, [fit.scatter.error_along(one) for one in combinations])
+    if fit.jackknife is not None:
+        errors = np.maximum(errors, [fit.jackknife.error_along(one) for one in combinations])
     return np.where(lost, np.nan, errors)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from paper.fits import Series, compress_groups, predict_series
 from paper.results import NOMINAL, TRUE, Ranks, Record, Results
 from paper.settings import SHOWN, SQUATS, TRAINING, UNSEEN, Condition, Study, conditions
-from torchid import parameters, ranks
+from torchid import distributed, parameters
 from torchid.commands.simulate import perturbed_parameters, simulate
 from torchid.config import load_config
 from torchid.errors import ConfigError, about_file
@@ -77,9 +77,9 @@ class Reproduction:
             InputError: the robot falls.
         """
         cases = conditions(self.study.simulation)
-        exact = ranks.share_out((False, True), self._simulated, "simulation", sizes=(1, 1))
+        exact = distributed.share_out((False, True), self._simulated, "simulation", sizes=(1, 1))
         draws = [(case, number) for case in cases for number in range(self._draws(case))]
-        share = draws[ranks.own_share([1] * len(draws))]
+        share = draws[distributed.own_share([1] * len(draws))]
         with progress_bars() as bars:
             bar = bars.add_task("fitting", total=len(share) * (len(self._experiments) + 1))
             done = partial(bars.advance, bar)
@@ -90,7 +90,7 @@ class Reproduction:
                 done()
                 return outcome
 
-            outcomes = ranks.share_out(draws, examine, "draws", sizes=[1] * len(draws))
+            outcomes = distributed.share_out(draws, examine, "draws", sizes=[1] * len(draws))
         records, found, shown = (
             [x for one in outcomes for x in getattr(one, part)] for part in ("records", "ranks", "shown")
         )

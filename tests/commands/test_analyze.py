@@ -20,7 +20,7 @@ from torchid.commands.analyze import analyze
 from torchid.commands.sensor_set_accuracy import accuracies
 from torchid.config import load_analysis
 from torchid.errors import TorchidWarning
-from torchid.parallel import copies_allowed
+from torchid.parallel import forks_allowed
 from torchid.reading.log_reader import LogReader
 from torchid.report.figures import tree_figure
 
@@ -327,9 +327,9 @@ def test_a_bolted_arm_without_contacts_is_asked_what_the_stack_of_its_log_needs(
     called = []
     monkeypatch.setattr(commands_analyze, "thread_count", lambda: 2)
     monkeypatch.setattr(commands_analyze, "accuracies", lambda *given: called.append(given) or accuracies(*given))
-    with copies_allowed(), pytest.warns(TorchidWarning):
+    with forks_allowed(), pytest.warns(TorchidWarning):
         beside = analyze(load_analysis(file, ["overwrite=true"]))
-    assert not called  # copies have compared all sets
+    assert not called  # forks have compared all sets
     assert list(beside.accuracies) == list(analysis.accuracies)
     for name, one in analysis.accuracies.items():
         found = beside.accuracies[name]

@@ -20,7 +20,7 @@ from rich.text import Text
 
 from torchid.boundary import run_guarded
 from torchid.cli import main
-from torchid.config.reading import check_yaml
+from torchid.config.settings_files import check_yaml
 from torchid.errors import ConfigError, ConfoundedWarning, TorchidWarning, during, is_plain
 from torchid.guards import read_bytes
 from torchid.report.tables import print_tables, table_text, terminal_console

@@ -22,7 +22,7 @@ from torchid.errors import ConfigError
 from torchid.fitting.experiment import set_up
 from torchid.logs import Log, read_log, write_log
 from torchid.problem import Samples
-from torchid.reading.log_reader import LogReader, settle_contacts
+from torchid.reading.log_reader import LogReader, apply_contact_settings
 
 pytestmark = pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
 TOUCH = 0.1  # [N], above which there are exactly the samples in which the simulator lets a foot touch
@@ -149,7 +149,7 @@ def test_flags_by_force_are_made_again_of_zeroed_forces(tmp_path: Path) -> None:
 
     def flags(log: Log, zero: bool) -> Any:
         file = experiment(tmp_path, contact_threshold={"above": 9.0, "below": 7.0}, zero_in_air=zero)
-        return value(settle_contacts(unflagged(log), set_up(load_config(file)))[0].contact_active)
+        return value(apply_contact_settings(unflagged(log), set_up(load_config(file)))[0].contact_active)
 
     log = read_log(DEMO / "sway_train.npz")
     exact, raw, zeroed = flags(log, False), flags(drifted(log, 2.0), False), flags(drifted(log, 2.0), True)

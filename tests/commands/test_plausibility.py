@@ -23,7 +23,7 @@ from torchid.identifiability.confounding import TotalMass
 from torchid.log_checks import REJECTED, SUSPICIOUS, Checked, Finding, Span
 from torchid.log_checks.check import check
 from torchid.logs import Log
-from torchid.parallel import copies_allowed
+from torchid.parallel import forks_allowed
 from torchid.problem import (
     LinearProblem,
     RowBuilder,
@@ -148,7 +148,7 @@ def test_a_long_log_is_looked_at_in_segments(
 ) -> None:
     monkeypatch.setattr("torchid.commands.check.MOST_CHECKED", 500)
     monkeypatch.setattr("torchid.commands.plausibility.thread_count", lambda: together)
-    with copies_allowed():
+    with forks_allowed():
         assert main(["identify", str(DEMO / "quadruped.yaml"), *changed(tmp_path, change, 1_300), RIDGE]) == 2
     assert f"torchid check finds in train.npz (samples {segment} of 1300, counted from there): joint_position: " in (
         capsys.readouterr().err

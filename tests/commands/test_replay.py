@@ -15,7 +15,7 @@ from repository import DEMO
 from torchid.cli import main
 from torchid.commands.folder import REPLAY
 from torchid.commands.manifest import read_manifest
-from torchid.commands.replay import SAMPLES, Replay, _feet, replay
+from torchid.commands.replay import PARAMETER_SAMPLES, Replay, _feet, replay
 from torchid.errors import ConfigError
 from torchid.fitting.calibration import Comparison
 from torchid.report.figures import drift_figure
@@ -52,7 +52,7 @@ def test_the_identified_robot_stays_nearer_to_a_new_log_than_the_urdf(
         assert (least <= largest).all()
         assert least[-1] < largest[-1] < 0.5 * nominal[1, -1]
         assert any(f"{least[-1]:.3g} to {largest[-1]:.3g}" in line for line in lines)
-    assert document["samples"]["count"] == SAMPLES
+    assert document["samples"]["count"] == PARAMETER_SAMPLES
     assert lines[0].startswith("Drift after 0.2 s of the torques of sway_test[:3] alone")
     assert len(lines) <= 20
     assert max(map(len, lines)) <= 100

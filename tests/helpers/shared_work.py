@@ -237,7 +237,7 @@ def differences(one: Any, other: Any, path: str = "") -> Iterator[tuple[str, flo
 def _identify_all(jobs: Path) -> None:
     from torchid.commands.identify import identify
     from torchid.config import load_config
-    from torchid.ranks import share_work
+    from torchid.distributed import share_work
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -99,8 +99,8 @@ def test_errors_of_combinations_are_those_of_torchid(exact: Repetitions) -> None
         expected = combination_standard_error(fit.assembly.problem, fit.estimate, base.combination[number])
         assert np.isnan(found[number]) == np.isinf(expected)
         if np.isfinite(expected):
-            assert fit.scatter is not None
-            larger = max(expected, fit.scatter.error_along(base.combination[number]))
+            assert fit.jackknife is not None
+            larger = max(expected, fit.jackknife.error_along(base.combination[number]))
             assert found[number] == pytest.approx(larger, rel=1e-9)
 
 

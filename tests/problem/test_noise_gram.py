@@ -266,10 +266,10 @@ def test_intervals_hold_what_data_that_are_mostly_noise_leave_to_the_prior(robot
         torque = torque + 0.1 * torch.from_numpy(rng.normal(size=torque.shape))
         logs = split_into_folds([replace(noisy, torque=torque, motion_noise=noise)], builder)
         fit = fitter.fit(compress_in_blocks(logs, builder))
-        assert fit.scatter is not None
+        assert fit.jackknife is not None
         known, off = fit.estimate.identifiable, np.abs(fit.estimate.phi - phi)
         missed.append((off > 1.96 * fit.estimate.standard_error)[known])
-        scattered.append((off > 1.96 * np.linalg.norm(fit.scatter.deviations[: fit.scatter.blocks], axis=0))[known])
+        scattered.append((off > 1.96 * np.linalg.norm(fit.jackknife.deviations[: fit.jackknife.blocks], axis=0))[known])
     assert np.mean(missed, axis=0).max() <= 0.1
     assert np.mean(scattered, axis=0).max() > 0.8, "the scatter alone misses one in most cases"
 

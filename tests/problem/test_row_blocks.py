@@ -11,7 +11,7 @@ from random_samples import random_samples, sensor_set
 import torchid
 from torchid import parameters
 from torchid.problem import RowBuilder, TriangularFactor
-from torchid.problem.row_blocks import RowBlock, turn_rows
+from torchid.problem.row_blocks import RowBlock, triangularize_base_rows
 
 ROBOT = torchid.load_robot(Path(torchid.__file__).parent / "demo" / "quadruped.urdf")
 FEET = [torchid.Contact(f"{end}_{side}_foot", "point") for end in ("front", "rear") for side in ("left", "right")]
@@ -100,7 +100,7 @@ def test_turned_bases_span_what_they_did(r: int) -> None:
     W[3:6, :, 1] = 0.0
     W[3:6, :, 2] = W[3, :, 2]  # moments of one direction
     turned = W.clone()
-    turn_rows(turned)
+    triangularize_base_rows(turned)
     square, turned_square = (torch.einsum("irb,jrb->bij", x, x) for x in (W, turned))
     torch.testing.assert_close(turned_square, square, rtol=0.0, atol=1e-13 * float(square.abs().max()))
     assert turned[3:6, : max(r - 3, 0)].abs().sum() < 1e-12

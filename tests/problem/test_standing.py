@@ -25,8 +25,8 @@ from torchid.logs import Log, preprocess
 from torchid.logs.blocks import LogBlocks
 from torchid.logs.preprocess import DERIVATIVE_CHAINS
 from torchid.problem import bind_log
-from torchid.problem.derived_blocks import stand_in_blocks
-from torchid.problem.standing import StandingBase, preprocess_standing, stand_on_feet
+from torchid.problem.base_pose import LogWithPose, base_pose_from_feet, preprocess_with_pose
+from torchid.problem.derived_blocks import base_pose_in_blocks
 from torchid.sensing import Contact
 
 LEVEL = (0.0, 0.0, 1.0)
@@ -36,12 +36,12 @@ MOTION = ("specific_force", "angular_velocity", "angular_acceleration")
 EXACT, ROLLING = 1e-13, 1e-7  # the latter: how far the helper has iterated
 
 
-def found(case: Stance, log: Log | None = None, contacts: tuple[Contact, ...] | None = None) -> StandingBase:
+def found(case: Stance, log: Log | None = None, contacts: tuple[Contact, ...] | None = None) -> LogWithPose:
     robot = robot_of(case.machine)
-    return stand_on_feet(case.log if log is None else log, robot, contacts or case.contacts())
+    return base_pose_from_feet(case.log if log is None else log, robot, contacts or case.contacts())
 
 
-def assert_same_pose(standing: StandingBase, case: Stance, tolerance: float, samples: slice = slice(None)) -> None:
+def assert_same_pose(standing: LogWithPose, case: Stance, tolerance: float, samples: slice = slice(None)) -> None:
     """The same rotation, and the same position but for where the floor's origin is."""
     quat, position = (value(getattr(standing.log, name)) for name in ("base_quat_xyzw", "base_position_world"))
     rotation = Rotation.from_quat(quat[samples]).as_matrix()
@@ -80,7 +80,7 @@ def test_a_walk_that_is_read_in_parts_is_that_of_the_whole_log(tmp_path: Path, n
         return (slice(start, min(start + most, count)) for start in range(0, count, most))
 
     for folder in (None, tmp_path):
-        stood, segments = stand_in_blocks(blocks, robot_of(case.machine), case.contacts(), pieces, folder)
+        stood, segments = base_pose_in_blocks(blocks, robot_of(case.machine), case.contacts(), pieces, folder)
         assert (segments.segments, segments.dropped) == (whole.segments, whole.dropped)
         assert segments.uneven == pytest.approx(whole.uneven, abs=1e-9)
         assert stood.fields.keys() == {"joint_position", "contact_active", "base_quat_xyzw", "base_position_world"}
@@ -133,7 +133,7 @@ def test_balls_of_different_sizes_stand_on_one_floor() -> None:
     robot, radii = robot_of(case.machine), np.array([0.0, 0.01, 0.02, 0.03])
     log = case.log.select(slice(0, 1))
     contacts = tuple(replace(c, radius=float(r)) for c, r in zip(case.contacts(), radii, strict=True))
-    standing = stand_on_feet(log, robot, contacts)
+    standing = base_pose_from_feet(log, robot, contacts)
     up = Rotation.from_quat(value(standing.log.base_quat_xyzw)).inv().apply(LEVEL)[0]
     poses = robot.link_poses(torch.from_numpy(log.joint_position))
     centres = np.array([poses[c.frame][0, :3, 3].numpy() for c in contacts])
@@ -215,7 +215,7 @@ def test_its_derivatives_are_those_of_a_measured_pose(
     case = stance(name, normal, 0.0, ((1, 50, 90),))
     robot, contacts = robot_of(case.machine), case.contacts()
     measured = bind_log(preprocess(case.measured, *rates), robot, contacts)
-    derived = bind_log(preprocess_standing(case.log, robot, contacts, *rates), robot, contacts)
+    derived = bind_log(preprocess_with_pose(case.log, robot, contacts, *rates), robot, contacts)
     np.testing.assert_array_equal(derived.time, measured.time)
     np.testing.assert_array_equal(derived.joint_acceleration, measured.joint_acceleration)
     for field in MOTION:
@@ -228,7 +228,7 @@ def test_a_floor_whose_slope_is_not_stated_tilts_gravity_by_that_slope() -> None
     robot = robot_of(case.machine)
     level = tuple(replace(contact, normal=LEVEL) for contact in case.contacts())
     forces = [
-        value(bind_log(preprocess_standing(case.log, robot, c, None, None), robot, c).base.specific_force).numpy()
+        value(bind_log(preprocess_with_pose(case.log, robot, c, None, None), robot, c).base.specific_force).numpy()
         for c in (case.contacts(), level)
     ]
     angle = np.arccos((forces[0] * forces[1]).sum(axis=1) / np.prod(np.linalg.norm(forces, axis=2), axis=0))
@@ -248,10 +248,10 @@ def test_nothing_is_differentiated_across_samples_with_too_few_feet(rates: tuple
     case = stance("quadruped")
     robot, contacts, log = robot_of(case.machine), case.contacts(), with_gap(case)
     with pytest.warns(TorchidWarning, match=r"20 of 160 samples left out.* \(too few feet stand: 20\)") as caught:
-        whole = preprocess_standing(log, robot, contacts, *rates)
+        whole = preprocess_with_pose(log, robot, contacts, *rates)
     assert len(caught) == 1
     assert not ((whole.time > log.time[69]) & (whole.time < log.time[90])).any()
-    parts = [preprocess_standing(log.select(x), robot, contacts, *rates) for x in (slice(0, 70), slice(90, None))]
+    parts = [preprocess_with_pose(log.select(x), robot, contacts, *rates) for x in (slice(0, 70), slice(90, None))]
     assert len(whole) == sum(map(len, parts))
     for name in ("time", "joint_acceleration", "base_angular_acceleration_base"):
         together = np.concatenate([value(getattr(part, name)) for part in parts])
@@ -265,12 +265,12 @@ def test_segments_too_short_for_the_filter_are_dropped_and_counted() -> None:
     robot, contacts = robot_of(case.machine), case.contacts()
     log = without(without(with_gap(case), 0, slice(100, 103)), 3, slice(100, 103))
     with pytest.warns(TorchidWarning, match=r"33 of 160 .*feet stand: 23, segments too short to differentiate: 10"):
-        whole = preprocess_standing(log, robot, contacts, 12.0, None)
+        whole = preprocess_with_pose(log, robot, contacts, 12.0, None)
     assert not ((whole.time > log.time[69]) & (whole.time < log.time[103])).any()
     with pytest.warns(TorchidWarning, match="23 of 160"):
-        assert ((unfiltered := preprocess_standing(log, robot, contacts, None, None)).time < log.time[100]).sum() > 66
+        assert ((unfiltered := preprocess_with_pose(log, robot, contacts, None, None)).time < log.time[100]).sum() > 66
     assert len(unfiltered) == 160 - 23 - 3 * 4
-    message = refused(lambda: preprocess_standing(log, robot, contacts, 4.0, None), "quadruped: time: segments of at")
+    message = refused(lambda: preprocess_with_pose(log, robot, contacts, 4.0, None), "quadruped: time: segments of at")
     assert "more than 1 s" in message
 
 
@@ -318,7 +318,7 @@ def test_a_log_that_says_nothing_of_the_base_is_refused_in_one_line() -> None:
     normals = np.tile(np.array(AHEAD), (len(log), 4, 1))
     tilted = replace(log, contact_normal_world=normals)
     refused(lambda: found(case, tilted), "quadruped: contact_normal_world: other normals", LogError)
-    stand_on_feet(tilted, robot, tuple(replace(contact, normal=AHEAD) for contact in contacts))
+    base_pose_from_feet(tilted, robot, tuple(replace(contact, normal=AHEAD) for contact in contacts))
 
 
 def test_feet_in_a_line_say_nothing_of_the_tilt_about_it() -> None:
@@ -354,7 +354,7 @@ def test_feet_that_are_not_on_one_floor_are_warned_of() -> None:
     bent = case.log.joint_position.copy()
     bent[:, list(robot.joint_names).index("front_left_knee")] += 0.4
     with pytest.warns(TorchidWarning, match=r"feet that stand are \d+ mm \(rms\) off one floor; check joint zeros"):
-        preprocess_standing(replace(case.log, joint_position=bent), robot, contacts, None, None)
+        preprocess_with_pose(replace(case.log, joint_position=bent), robot, contacts, None, None)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        preprocess_standing(case.log, robot, contacts, None, None)
+        preprocess_with_pose(case.log, robot, contacts, None, None)

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from torchid.errors import TorchidWarning
-from torchid.parallel import copies_allowed
+from torchid.parallel import forks_allowed
 from torchid.reading.cache import Cache, content_key
 
 
@@ -156,7 +156,7 @@ def test_a_young_checksum_is_not_trusted(tmp_path: Path, monkeypatch: pytest.Mon
     assert not (tmp_path / "cache").exists()
 
 
-@pytest.mark.parametrize("allowed", [copies_allowed, nullcontext], ids=["by a copy", "alone"])
+@pytest.mark.parametrize("allowed", [forks_allowed, nullcontext], ids=["by a copy", "alone"])
 def test_long_files_are_summed_up_while_something_else_is_done(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, allowed: Callable[[], AbstractContextManager[None]]
 ) -> None:

@@ -18,7 +18,7 @@ from demo import shortened_demo
 from large import SMALL, experiment, recorded, tensors
 from shared_work import finish_forked
 
-from torchid import checksums, ranks
+from torchid import checksums, distributed
 from torchid.config import load_config
 from torchid.fitting.experiment import set_up
 from torchid.problem import Samples
@@ -64,7 +64,7 @@ def read_all(calls: Sequence[Sequence[str]], folder: Path) -> int:
         summed.clear()
         log_reader._WHOLE_GB, large_log.BLOCK_GB = (0.0, 1e-4) if "in blocks" in more else (0.04, 0.01)
         overrides = [x.replace("RANK", str(rank)) for x in more if x != "in blocks"]
-        with warnings.catch_warnings(record=True) as said, ranks.share_work():
+        with warnings.catch_warnings(record=True) as said, distributed.share_work():
             warnings.simplefilter("always")
             setup = set_up(load_config(Path(file), overrides))
             cache, logs, error = open_cache(setup), [], ""
@@ -280,7 +280,7 @@ def full_disk(_: Path) -> str:
 def test_every_log_has_one_reader_and_the_largest_share_is_small(
     monkeypatch: pytest.MonkeyPatch, sizes: list[int], processes: int
 ) -> None:
-    monkeypatch.setattr(ranks, "_sharing", ranks._Ranks(None, 0, processes))
+    monkeypatch.setattr(distributed, "_sharing", distributed._Group(None, 0, processes))
     shares = _shares(dict(enumerate(sizes)))
     assert len(shares) == processes
     assert sorted(sum(shares, [])) == list(range(len(sizes)))

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from rich.progress import Progress
 
-from torchid import ranks
+from torchid import distributed
 from torchid.commands.analysis_request import AnalysisRequest, errors_at
 from torchid.commands.chosen_settings import with_chosen_settings
 from torchid.commands.folder import ANALYSIS, check_free, new_folder, write_json
@@ -22,10 +22,10 @@ from torchid.errors import ConfigError, UnknownNameError, during, join_names, wa
 from torchid.fitting.experiment import RobotSetup, set_up_robot, with_noise
 from torchid.fitting.misfit import unmeasured_at_rest
 from torchid.identifiability.base_parameters import BaseParameters, base_parameters
-from torchid.parallel import can_copy, in_copies, one_thread, thread_count, threads_at_most
+from torchid.parallel import can_fork, in_forks, one_thread, thread_count, threads_at_most
 from torchid.parameters import WRENCH_COMPONENTS
 from torchid.problem import Samples
-from torchid.problem.chunks import chunks_by_state, copies_share_passes
+from torchid.problem.chunks import chunks_by_state, forks_share_passes
 from torchid.problem.contact_state import ContactState
 from torchid.problem.elimination import free_parameters
 from torchid.problem.linear import parameter_scale
@@ -131,14 +131,16 @@ def analyze(config: AnalyzeConfig) -> Analysis:
         config.logs.require_samples("analyze")
     output = None if config.output is None else _analysis_folder(config.output)
     if output is not None:
-        ranks.from_first(partial(check_free, output, config.overwrite, ANALYSIS, inputs_of(config)), "output")
+        distributed.from_first(partial(check_free, output, config.overwrite, ANALYSIS, inputs_of(config)), "output")
     request = AnalysisRequest.of(set_up_robot(config))
     with progress_bars() as bars:
         setup, _ = with_chosen_settings(request.setup, bars)
         request = replace(request, setup=setup)
         train, test = _read(request, bars)
         if train:
-            setup = with_noise(setup, ranks.from_first(partial(setup.estimate_noise, train, suggest=False), "noise"))
+            setup = with_noise(
+                setup, distributed.from_first(partial(setup.estimate_noise, train, suggest=False), "noise")
+            )
             request = AnalysisRequest.of(setup)
         choices: dict[str, SensorChoice] = {}
         progress: dict[str, StepCallback] = {}
@@ -160,21 +162,21 @@ def analyze(config: AnalyzeConfig) -> Analysis:
             with threads_at_most(thread_count() if is_long else 1):
                 return compare(sets)
 
-        is_long, processes = copies_share_passes([*train, *test]), thread_count() if train and can_copy() else 1
+        is_long, processes = forks_share_passes([*train, *test]), thread_count() if train and can_fork() else 1
         early = _shares(request.compared, processes - 1)
-        with in_copies(early, compare_beside, len(early)) as compared_early:
-            sets = ranks.from_first(choose, "sensor sets")
+        with in_forks(early, compare_beside, len(early)) as compared_early:
+            sets = distributed.from_first(choose, "sensor sets")
             left = {name: one for name, one in sets.items() if not any(name in share for share in early)}
             later = [] if is_long or processes == 1 else _shares(left, processes)
-            with in_copies(later, compare_beside, len(later)) as compared_later:
-                ranks.from_first(explain, "sensor plans")
+            with in_forks(later, compare_beside, len(later)) as compared_later:
+                distributed.from_first(explain, "sensor plans")
                 bars.add_task("comparing sensor sets", total=None)
                 found = [*compared_early(), *compared_later(), {} if later else compare(left)]
         compared = {name: share[name] for name in sets for share in found if name in share}
         analysis = Analysis(setup, tuple(results), compared, output, unmeasured_at_rest(train))
         if output is not None:
             bars.add_task("writing", total=None)
-            ranks.from_first(partial(_write_analysis, analysis, output, config.overwrite), "analysis folder")
+            distributed.from_first(partial(_write_analysis, analysis, output, config.overwrite), "analysis folder")
     return analysis
 
 

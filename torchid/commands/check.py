@@ -26,7 +26,7 @@ from torchid.logs.blocks import has_blocks, open_log_blocks
 from torchid.logs.containers import atomic_output, new_log_kind
 from torchid.logs.read import files_of_recordings_kept
 from torchid.logs.time_range import log_title, split_range
-from torchid.reading.log_reader import memory_needed, settle_contacts, setup_of_log
+from torchid.reading.log_reader import apply_contact_settings, memory_needed, setup_of_log
 from torchid.report.figure_style import save_figure
 from torchid.report.log_checks import log_check_document, log_check_figure
 from torchid.report.tables import progress_bars
@@ -117,7 +117,7 @@ def check_experiment(
     with progress_bars() as bars, files_of_recordings_kept():
         for file in bars.track(files, description="checking"):
             settings, own = config.preprocessing, setup_of_log(setup, file)
-            log, _ = settle_contacts(_read_log_to_check(file, config.logs, settings), own)
+            log, _ = apply_contact_settings(_read_log_to_check(file, config.logs, settings), own)
             rest = setup.contacts, settings.filter_hz, settings.derived, setup.declared, required
             found = check(log, own.robot, *rest)
             checked.append(replace(found, rolling=setup.rolling))

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from rich.progress import Progress
 
-from torchid import ranks
+from torchid import distributed
 from torchid.commands.check import recorded_segments
 from torchid.errors import TorchidWarning, about_file, join_names, warn_about_file
 from torchid.estimators import Conditions
@@ -131,7 +131,7 @@ def with_sample_rates(choices: Choices, setup: RobotSetup, logs: Sequence[Sample
 def _chosen(name: str, choose: Callable[[], Chosen], bars: Progress) -> Chosen:
     """What the first process chooses."""
     bar = bars.add_task(f"choosing the {name}", total=None)
-    choice = ranks.from_first(choose, name)
+    choice = distributed.from_first(choose, name)
     bars.update(bar, total=1, completed=1)
     return choice
 
@@ -195,7 +195,7 @@ def with_ridge(
         return experiment, None
     bar = bars.add_task("choosing the ridge", total=None)
     fitter = experiment.fitter(builder, conditions)
-    choice = ranks.as_first(experiment.choose_ridge(parts, blocks, fitter, conditions), "ridge")
+    choice = distributed.broadcast(experiment.choose_ridge(parts, blocks, fitter, conditions), "ridge")
     bars.update(bar, total=1, completed=1)
     chosen = replace(config, estimator=replace(config.estimator, ridge=choice.ridge))
     return replace(experiment, config=chosen), choice

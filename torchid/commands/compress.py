@@ -13,7 +13,7 @@ from pathlib import Path
 
 from rich.progress import Progress
 
-from torchid import ranks
+from torchid import distributed
 from torchid.checksums import file_checksum
 from torchid.commands.chosen_settings import Choices, with_chosen_settings
 from torchid.commands.folder import COMPRESSED, check_free, new_folder
@@ -85,18 +85,20 @@ def compress(config: ExperimentConfig, output: str | Path) -> Compression:
         raise ConfigError(output, "output", "a URL", "a folder on this machine, to be copied from there")
     output = Path(output)
     config.logs.require_samples("compress")
-    ranks.from_first(partial(check_free, output, config.overwrite, COMPRESSED, inputs_of(config)), "output")
+    distributed.from_first(partial(check_free, output, config.overwrite, COMPRESSED, inputs_of(config)), "output")
     names = _file_names(config.logs.train)
-    ranks.require_same(names, "logs.train")
-    share = ranks.own_share(ranks.as_first([_size(path) for path in config.logs.train], "sizes of the logs"))
+    distributed.require_same(names, "logs.train")
+    share = distributed.own_share(
+        distributed.broadcast([_size(path) for path in config.logs.train], "sizes of the logs")
+    )
     paths = config.logs.train[share]
     with progress_bars() as bars:
         experiment, choices = with_chosen_settings(set_up(config), bars)
         builder = experiment.builder(experiment.sensors)
-        with _warning_in_first_process(), ranks.apart():
+        with _warning_in_first_process(), distributed.apart():
             logs, excluded = _read(experiment, paths, output, bars)
             states = [state_reports([log], builder) for log in logs]
-        together = merge_state_reports(chain.from_iterable(ranks.gather(states, "contact states")))
+        together = merge_state_reports(chain.from_iterable(distributed.all_gather(states, "contact states")))
         require_base(together, config.sensors.on_base_lost, experiment.contacts)
         noise = experiment.estimate_noise(_with_those_elsewhere(logs), experiment.sensors)
         factors = _compressed(with_noise(experiment, noise), noise, paths, logs, states, excluded, bars)
@@ -125,10 +127,10 @@ def _size(path: Path) -> int:
 @contextmanager
 def _warning_in_first_process() -> Iterator[None]:
     """Let the first process warn of what any of them warns of within the block."""
-    with nullcontext() if ranks.is_first() else warnings.catch_warnings(record=True) as caught:
+    with nullcontext() if distributed.is_first() else warnings.catch_warnings(record=True) as caught:
         yield
-    for of_process in ranks.gather([(str(one.message), one.category) for one in caught or ()], "warnings"):
-        for message, category in of_process if ranks.is_first() else ():
+    for of_process in distributed.all_gather([(str(one.message), one.category) for one in caught or ()], "warnings"):
+        for message, category in of_process if distributed.is_first() else ():
             warnings.warn(message, category, stacklevel=2)
 
 
@@ -136,9 +138,11 @@ def _with_those_elsewhere(logs: Sequence[Samples]) -> list[Samples | LogOfOtherP
     """All logs of the experiment in order; of those that other processes have, their size."""
     of_processes: list[list[Samples | LogOfOtherProcess]] = [
         [*sizes]
-        for sizes in ranks.gather([LogOfOtherProcess(len(x), x.oversampling) for x in logs], "sizes of the samples")
+        for sizes in distributed.all_gather(
+            [LogOfOtherProcess(len(x), x.oversampling) for x in logs], "sizes of the samples"
+        )
     ]
-    of_processes[ranks.rank()] = [*logs]
+    of_processes[distributed.rank()] = [*logs]
     return list(chain.from_iterable(of_processes))
 
 
@@ -195,19 +199,19 @@ def _write_all(
 ) -> list[CompressedFile]:
     """Write the files of all processes, by name, in the first of them: a file of each at a time."""
     rounds: Iterable[list[tuple[str, FactorFile] | None]] = ([one] for one in factors)
-    if ranks.world_size() > 1:
-        with ranks.apart():
+    if distributed.world_size() > 1:
+        with distributed.apart():
             own = list(factors)
-        most = max(ranks.gather(len(own), "numbers of files"))
-        rounds = (ranks.gather(own[k] if k < len(own) else None, "files") for k in range(most))
+        most = max(distributed.all_gather(len(own), "numbers of files"))
+        rounds = (distributed.all_gather(own[k] if k < len(own) else None, "files") for k in range(most))
     files = {}
-    writing = new_folder(output, overwrite, COMPRESSED) if ranks.is_first() else nullcontext()
+    writing = new_folder(output, overwrite, COMPRESSED) if distributed.is_first() else nullcontext()
     with during("writing", output), writing as folder:
         for of_processes in rounds:
             for name, one in filter(None, of_processes):
                 if folder is not None:
                     files[name] = _write(folder / name, one)
-    return ranks.as_first([files[name] for name in names if name in files], "files")
+    return distributed.broadcast([files[name] for name in names if name in files], "files")
 
 
 def _write(path: Path, factors: FactorFile) -> CompressedFile:

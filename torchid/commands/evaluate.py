@@ -13,7 +13,7 @@ import torch
 from pydantic import TypeAdapter
 from rich.progress import Progress
 
-from torchid import ranks
+from torchid import distributed
 from torchid.commands.folder import EVALUATION, RUN, check_free, new_folder, refuse_link, write_json
 from torchid.commands.results import Identification
 from torchid.commands.run_figures import draw_forces
@@ -167,7 +167,7 @@ def evaluate(
         if place is not None:
             form = fitted.experiment.config.figures.format
             write_there = partial(_write, evaluated, place, folder / _SETTINGS, form, replaces)
-            ranks.from_first(write_there, "evaluation folder")
+            distributed.from_first(write_there, "evaluation folder")
     return evaluated
 
 
@@ -233,7 +233,7 @@ def _evaluate(fitted: FittedRun, logs: Sequence[str | Path], folder: Path | None
         if not any(x is not None for x in pair.identified.rms.values()):
             warn(f"{log.source}: neither joint torques nor contact wrenches to compare predictions with")
     excluded = {split_range(path).name: count for path, count in reader.excluded.items()}
-    forces = ranks.from_first(partial(compare_forces, evaluation, samples[0], compared), "forces")
+    forces = distributed.from_first(partial(compare_forces, evaluation, samples[0], compared), "forces")
     return EvaluatedRun(
         metrics=metrics,
         excluded=excluded,
@@ -301,7 +301,7 @@ def _output(run: Path, logs: Sequence[str | Path], given: Path | None, overwrite
             refuse_link(output.parent)
         check_free(output, overwrite, EVALUATION, inputs if given is None else [run, *inputs])
 
-    ranks.from_first(check, "output")
+    distributed.from_first(check, "output")
     return output
 
 

@@ -10,7 +10,7 @@ from functools import partial
 
 from rich.progress import Progress
 
-from torchid import ranks
+from torchid import distributed
 from torchid.commands.chosen_settings import with_sample_rates
 from torchid.commands.evaluate import compare_forces, trace_forces
 from torchid.commands.folder import RUN, check_free, claim_folder
@@ -59,7 +59,7 @@ def identify(config: ExperimentConfig, resume: bool = False) -> Identification:
         KeyboardInterrupt: a training was interrupted; the message says how it can go on.
     """
     trains, output = config.estimator.name == "sgd", config.output
-    resume = resume or (trains and output is not None and ranks.is_restart())
+    resume = resume or (trains and output is not None and distributed.is_restart())
     with ExitStack() as stack:
 
         def claim() -> None:
@@ -69,13 +69,13 @@ def identify(config: ExperimentConfig, resume: bool = False) -> Identification:
             if output is not None:
                 check_free(output, config.overwrite, RUN, inputs_of(config))
 
-        ranks.from_first(claim, "output")
+        distributed.from_first(claim, "output")
         bars = stack.enter_context(progress_bars())
         run, training, begun = _identify(config, resume, bars, stack)
         if output is not None:
             bars.add_task("writing", total=None)
             begun.append(stack.enter_context(drawing(figures_left(run, begun), config)))
-            ranks.from_first(partial(write_run, run, output, config.overwrite, training, begun), "run folder")
+            distributed.from_first(partial(write_run, run, output, config.overwrite, training, begun), "run folder")
     return run
 
 
@@ -125,18 +125,18 @@ def _identify(
         fit, ready.parts = solved.fit, []
         problem, compared = fit.assembly.problem, experiment.calibrations(fit, builder)
         shown = [*logs["test"], *logs["train"]][:1]
-        forces = ranks.from_first(lambda: [compare_forces(evaluation, log, compared) for log in shown], "forces")
+        forces = distributed.from_first(lambda: [compare_forces(evaluation, log, compared) for log in shown], "forces")
         begun = _begin_figures(ready, fit, forces, stack)
     with clock("identifiability"):
         whole = merge_folds(_with_states(fit.parts, ready.factors), builder)
         alone = _by_state(fitter, whole)
-        added = ranks.from_first(partial(_contributions, ready, whole, problem, bars), "contributions")
+        added = distributed.from_first(partial(_contributions, ready, whole, problem, bars), "contributions")
     with clock("evaluate"):
         without_folds = fit_without_folds(fit, fitter, experiment.loss)
         scorer, of_blocks = Scorer(evaluation, builder), merge_states(fit.parts, builder)
         scores = _scores(scorer, logs["test"], blocks, of_blocks, compared, without_folds, bars)
-        traces = ranks.from_first(lambda: [trace_forces(evaluation, log, compared) for log in shown], "traces")
-        delay = ranks.from_first(partial(unfitted_delay, logs["train"], fitter, experiment.terms), "delay")
+        traces = distributed.from_first(lambda: [trace_forces(evaluation, log, compared) for log in shown], "traces")
+        delay = distributed.from_first(partial(unfitted_delay, logs["train"], fitter, experiment.terms), "delay")
     run = Identification(
         experiment=experiment,
         estimate=fit.estimate,
@@ -144,7 +144,7 @@ def _identify(
         noise=ready.noise,
         motion_noise=fit.assembly.noise,
         misfit=misfit(
-            fit.estimate, ready.noise, blocks, fit.scatter, unfitted_friction(problem, experiment.robot), delay
+            fit.estimate, ready.noise, blocks, fit.jackknife, unfitted_friction(problem, experiment.robot), delay
         ),
         resting=resting_joints(problem, experiment.robot, builder, logs["train"]),
         at_rest=[name for name in LOG_SETS if is_at_rest(logs[name])],
@@ -177,7 +177,7 @@ def _identify(
 def _begin_figures(ready: PreparedData, fit: Fit, forces: Sequence[ForceSeries], stack: ExitStack) -> list[Drawing]:
     """Figures of a fit that one process, if it writes a run, draws beside what follows, until the stack is left."""
     experiment = ready.experiment
-    if experiment.config.output is None or ranks.world_size() > 1:  # several processes draw all of them at last
+    if experiment.config.output is None or distributed.world_size() > 1:  # several processes draw all of them at last
         return []
     figures = fit_figures(experiment.robot, fit.estimate, fit.extras, ready.ridge, *forces)
     return [stack.enter_context(drawing(figures, experiment.config))]

@@ -32,11 +32,11 @@ from torchid.log_checks.check import check
 from torchid.log_checks.findings import SEVERITIES
 from torchid.log_checks.lag_and_tilt import check_tilt
 from torchid.log_checks.model import NominalModel
-from torchid.parallel import can_copy, one_thread, share_between_copies, thread_count
+from torchid.parallel import can_fork, one_thread, share_between_forks, thread_count
 from torchid.parameters import GRAVITY, PARAMETERS, PER_BODY, Array
 from torchid.problem import LinearProblem, Samples
 from torchid.problem.metrics import ADVICE, Metrics, WorseThanNominal, describe_worse
-from torchid.reading.log_reader import settle_contacts, setup_of_log
+from torchid.reading.log_reader import apply_contact_settings, setup_of_log
 from torchid.robot import Robot
 from torchid.rounding import is_significant
 
@@ -76,9 +76,9 @@ class TrainingLogs:
 
     def _findings(self, files: LogsConfig, done: Callable[[float], None]) -> Iterator[tuple[str, Finding]]:
         """Findings on large parts of segments; `done` is called with the share of each in its log in percent."""
-        segments, count = self._segments(files), thread_count() if can_copy() else 1
+        segments, count = self._segments(files), thread_count() if can_fork() else 1
         while together := list(islice(segments, count)):  # as many as are in memory at a time
-            findings = share_between_copies(together, _large_findings, count)
+            findings = share_between_forks(together, _large_findings, count)
             for (_, segment), found in zip(together, findings, strict=True):
                 yield from ((segment.name, one) for one in found)
                 if any(one.rejects_all for one in found):
@@ -97,7 +97,7 @@ def _large_findings(of: tuple[RobotSetup, LogSegment]) -> list[Finding]:
     setup, segment = of
     settings = setup.config.preprocessing
     try:
-        flagged, _ = settle_contacts(segment.log, setup)
+        flagged, _ = apply_contact_settings(segment.log, setup)
     except InputError:
         return []
     checked = check(flagged, setup.robot, setup.contacts, settings.filter_hz, settings.derived, setup.declared)
@@ -130,7 +130,7 @@ def require_plausible(fit: Fit, logs: TrainingLogs, samples: Sequence[Samples] =
         raise SensorError.at_field("sensors", "no parameter is in reach of them", "other sensors, contacts or logs")
     if not max(fit.assembly.problem.cost(np.zeros_like(estimate.phi)), fit.assembly.forces) > 0.0:
         raise ImplausibleFitError.at_field("logs", "all measured forces are 0", "forces; NaN where none was measured")
-    block_error = 0.0 if fit.scatter is None else fit.scatter.mass_error
+    block_error = 0.0 if fit.jackknife is None else fit.jackknife.mass_error
     tolerance = setup.config.estimator.rank_tolerance
     by_data = LeastSquares(rank_tolerance=tolerance).solve(fit.assembly.problem)
     if fit.assembly.homogeneous:

@@ -10,7 +10,7 @@ from functools import partial
 
 from rich.progress import Progress
 
-from torchid import ranks
+from torchid import distributed
 from torchid.commands.chosen_settings import Choices, with_chosen_settings, with_ridge
 from torchid.commands.training import descent_settings
 from torchid.config import ExperimentConfig
@@ -103,7 +103,7 @@ def _data_of_logs(experiment: Experiment, clock: Stopwatch, bars: Progress) -> C
     with clock("noise"):
         states = state_reports(logs["train"], experiment.builder(experiment.sensors))
         require_base(states, experiment.config.sensors.on_base_lost, experiment.contacts)
-        noise = ranks.from_first(partial(experiment.estimate_noise, logs["train"], experiment.sensors), "noise")
+        noise = distributed.from_first(partial(experiment.estimate_noise, logs["train"], experiment.sensors), "noise")
         experiment = with_noise(experiment, noise)
     reader.release()
     with clock("compress"):
@@ -167,7 +167,9 @@ def _compressed(
 
     keys = reader.keys if isinstance(reader, CachedReader) else {}
     paths = [str(path) for path in experiment.config.logs.train]
-    if not isinstance(reader, CachedReader) or not all(ranks.gather(keys.keys() >= {*paths}, "logs in the cache")):
+    if not isinstance(reader, CachedReader) or not all(
+        distributed.all_gather(keys.keys() >= {*paths}, "logs in the cache")
+    ):
         return compute(), False
     key = factors_key(experiment, builder, [keys[path] for path in paths], train)
     parts, there = cached_parts(reader.cache, key, builder, train, compute)

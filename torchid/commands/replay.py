@@ -40,7 +40,7 @@ from torchid.simulation.replay import Drift, Model, ReplayedLog, replay_log
 
 _ByJoint = Mapping[str, Mapping[str, float]]
 _TIMES = 25  # at which the drift is compared, within a window
-SAMPLES = 10
+PARAMETER_SAMPLES = 10
 """Robots that are drawn from what the logs leave open, where no number is given."""
 _MOST_SAMPLES = 1000
 
@@ -154,7 +154,7 @@ def replay(
     overwrite: bool = False,
     kp: float | Mapping[str, float] = 0.0,
     kd: float | Mapping[str, float] = 0.0,
-    samples: int = SAMPLES,
+    samples: int = PARAMETER_SAMPLES,
 ) -> Replay:
     """Drive the robot in MuJoCo with the torques of a log, and see how far it drifts from the log.
 

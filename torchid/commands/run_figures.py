@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from torchid import ranks
+from torchid import distributed
 from torchid.commands.answer import answer
 from torchid.commands.training import body_eigenvalues, known_parameters
 from torchid.config import ExperimentConfig, dump_config
@@ -20,7 +20,7 @@ from torchid.fitting.cross_validation import RidgeChoice
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.identifiability.contributions import Contributions
 from torchid.logs.time_range import log_title
-from torchid.parallel import in_copies, share_between_processes, thread_count
+from torchid.parallel import in_forks, share_between_processes, thread_count
 from torchid.problem import Metrics
 from torchid.problem.metrics import LOG_SETS
 from torchid.report.figure_style import Drawn, draw_for
@@ -107,11 +107,11 @@ def drawing(figures: Figures, config: ExperimentConfig) -> Iterator[Drawing]:
     """
     folder, form = config.output or Path(), config.figures.format
     files = [(folder / f"{name}.{form}", make) for name, make in figures.items()]
-    if ranks.world_size() > 1:
-        there = share_between_processes(files, lambda file: draw_for(*file), ranks.world_size())
+    if distributed.world_size() > 1:
+        there = share_between_processes(files, lambda file: draw_for(*file), distributed.world_size())
         yield Drawing(tuple(figures), lambda: there)
         return
-    with in_copies(files, lambda file: draw_for(*file), max(thread_count() - 1, 1)) as drawn:
+    with in_forks(files, lambda file: draw_for(*file), max(thread_count() - 1, 1)) as drawn:
         yield Drawing(tuple(figures), drawn)
 
 

@@ -6,13 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
-from torchid import ranks
+from torchid import distributed
 from torchid.commands.plausibility import TrainingLogs, require_plausible
 from torchid.errors import ImplausibleFitError, LogError, warn
 from torchid.fitting.calibration import Calibration, list_confounded
 from torchid.fitting.experiment import RobotSetup, batch_estimator
 from torchid.identifiability.information import error_directions, expected_errors
-from torchid.parallel import share_between_copies, thread_count
+from torchid.parallel import share_between_forks, thread_count
 from torchid.parameters import Array
 from torchid.problem import Evaluation, ExtraTerms, RowBuilder, Samples, assemble, compress_parts
 from torchid.problem.compression import split_into_folds
@@ -51,7 +51,7 @@ def accuracies(
             warn(f"{error}; no accuracy of the sensors '{name}'")
         return None
 
-    found = zip(sets, share_between_copies(list(sets), accuracy, thread_count()), strict=True)
+    found = zip(sets, share_between_forks(list(sets), accuracy, thread_count()), strict=True)
     return {name: one for name, one in found if one is not None}
 
 
@@ -106,7 +106,7 @@ def _accuracy(
     blocks = split_into_folds(train, builder) if settings.chooses_ridge else list(train)
     parts = compress_parts(blocks, builder)
     if settings.chooses_ridge:
-        choice = ranks.from_first(partial(setup.choose_ridge, parts, blocks, fitter, conditions), "ridge")
+        choice = distributed.from_first(partial(setup.choose_ridge, parts, blocks, fitter, conditions), "ridge")
         settings = replace(settings, ridge=choice.ridge)
     fit = fitter.fit(parts, batch_estimator(settings, conditions).solve)
     require_plausible(fit, TrainingLogs(setup))

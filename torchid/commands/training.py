@@ -19,7 +19,7 @@ import numpy as np
 import yaml
 from rich.progress import Progress
 
-from torchid import parameters, ranks
+from torchid import distributed, parameters
 from torchid.commands.checkpoint import CHECKPOINT, load_checkpoint, refusing_damage, save_checkpoint
 from torchid.commands.folder import (
     EVENTS,
@@ -132,9 +132,9 @@ class Training:
         trainer = Trainer(self.settings, problem, train, held_out if held_out.samples else None)
         if not trainer.closed_form.rank:
             raise SensorError.at_field("sensors", "no parameter is in reach of them", "other sensors or contacts")
-        state = ranks.from_first(partial(self._prepare, trainer, resume), "checkpoint")
+        state = distributed.from_first(partial(self._prepare, trainer, resume), "checkpoint")
         if state is not None:
-            if not ranks.is_first():
+            if not distributed.is_first():
                 trainer.load_state_dict(state)
             self._saved = trainer.epoch
         bar = bars.add_task("training", total=self.settings.epochs, completed=trainer.epoch)
@@ -172,7 +172,7 @@ class Training:
 
     def _curves(self, since: int) -> AbstractContextManager[RunEvents | None]:
         """What the first process writes curves with, from an epoch on."""
-        if self.folder is None or not ranks.is_first():
+        if self.folder is None or not distributed.is_first():
             return nullcontext()
         from torchid.report.tensorboard import RunEvents  # as in `write_events`
 
@@ -181,7 +181,7 @@ class Training:
     def _share(self) -> tuple[int, int]:
         """The part of every batch that this process takes; all take all of it where a line search asks for more."""
         name = self.config.estimator.training.optimizer["name"]
-        return (0, 1) if OPTIMIZERS[name].full_batch else (ranks.rank(), ranks.world_size())
+        return (0, 1) if OPTIMIZERS[name].full_batch else (distributed.rank(), distributed.world_size())
 
     def _train(
         self, trainer: Trainer, evaluate: Evaluate, events: RunEvents | None, progress: Callable[[str], None]
@@ -253,7 +253,7 @@ class Training:
                 stopped = f"{stopped}; --resume goes on after epoch {self._saved}"
             raise KeyboardInterrupt(stopped) from error
         except InputError:  # it would diverge again; the curves stay, to be looked at
-            if ranks.is_first() and self.folder is not None:
+            if distributed.is_first() and self.folder is not None:
                 (self.folder / CHECKPOINT).unlink(missing_ok=True)
             raise
 

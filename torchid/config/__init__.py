@@ -7,7 +7,7 @@ from torchid.config.experiment import (
     load_analysis,
     load_config,
 )
-from torchid.config.reading import dump_config
+from torchid.config.settings_files import dump_config
 from torchid.config.simulation import (
     BoundsConfig,
     FootConfig,

@@ -14,7 +14,6 @@ from pydantic.dataclasses import dataclass
 from torchid.config.estimator import MASS_ACCEPTED, ROBUST_ACCEPTED, EstimatorConfig, validate_keys
 from torchid.config.log_reading import MAPS_ACCEPTED, PreprocessingConfig
 from torchid.config.logs import SETS, LogsConfig, entries_spelled_out, resolve_logs
-from torchid.config.reading import FileKind, Settings, load, plain_sections
 from torchid.config.robot import (
     CHOICE_ACCEPTED,
     COMPONENTS_ACCEPTED,
@@ -33,6 +32,7 @@ from torchid.config.robot import (
     spelled_out,
     validate_choice,
 )
+from torchid.config.settings_files import FileKind, Settings, load, plain_sections
 from torchid.errors import ConfigError, about_file
 from torchid.logs.column_map import check_columns
 from torchid.logs.containers import FACTORS

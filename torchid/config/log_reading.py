@@ -11,7 +11,7 @@ from typing import Annotated, Literal, TypeVar
 from pydantic import BeforeValidator
 from pydantic.dataclasses import dataclass
 
-from torchid.config.reading import FileKind, Settings, load
+from torchid.config.settings_files import FileKind, Settings, load
 from torchid.errors import about_file
 from torchid.logs import Columns, Topics
 from torchid.logs.column_map import check_columns

@@ -10,8 +10,8 @@ from typing import Annotated, Literal
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from torchid.config.reading import FileKind, load
 from torchid.config.robot import ConstrainedRobot, require_one_file
+from torchid.config.settings_files import FileKind, load
 from torchid.errors import ConfigError, about_file
 from torchid.settings import STRICT, BelowOne, FileName, NotNegative, Number, Positive, Seed
 

@@ -45,7 +45,7 @@ class Estimate:
         cost, nominal_cost: sum of squared whitened residuals at `phi` and at the nominal parameters.
         rows: number of scalar equations.
         oversampling: of the rows, as in `LinearProblem`.
-        block_error: (P,), standard errors by the scatter between blocks of the logs, see `BlockScatter`; None where
+        block_error: (P,), standard errors by the scatter between blocks of the logs, see `Jackknife`; None where
             there are too few.
         kept_error: (P,), standard errors by what a ridge keeps of the error of the nominal parameters, which counts as
             large where data do not determine it as where they do (`nominal_spread`); None without a ridge.

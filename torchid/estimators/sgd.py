@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchid import parameters, ranks
+from torchid import distributed, parameters
 from torchid.estimators.conditions import Conditions
 from torchid.estimators.learnable import LearnableParameters
 from torchid.estimators.least_squares import Regularized
@@ -168,7 +168,7 @@ def add_up(terms: LossTerms, trained: Sequence[nn.Parameter]) -> LossTerms:
     trained = [x for x in trained if x.grad is not None]
     own = [x.grad.cpu().numpy() for x in trained if x.grad is not None]
     values = [{name: float(x) for name, x in sums.items()} for sums in (terms.losses, terms.squares)]
-    gradients, sums = zip(*ranks.gather((own, values), "gradients"), strict=True)
+    gradients, sums = zip(*distributed.all_gather((own, values), "gradients"), strict=True)
     for x, parts in zip(trained, zip(*gradients, strict=True), strict=True):
         x.grad = torch.from_numpy(np.sum(parts, axis=0)).to(x)
     losses, squares = (
@@ -252,7 +252,7 @@ class Loss(nn.Module):
                 misfit = (rigid if other is None else rigid + other) - batch.f
                 total, rows = total + float(misfit.square().sum()), rows + batch.rows
         if batches.share[1] > 1:
-            total, rows = (sum(parts) for parts in zip(*ranks.gather((total, rows), "loss"), strict=True))
+            total, rows = (sum(parts) for parts in zip(*distributed.all_gather((total, rows), "loss"), strict=True))
         return total / max(rows, 1)
 
     @contextmanager

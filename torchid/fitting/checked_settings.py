@@ -16,9 +16,9 @@ from torchid.logs.column_entries import for_all
 from torchid.logs.column_map import fits, require_names, values_of_all
 from torchid.logs.ros_topics import Topics, require_joints
 from torchid.problem import ExtraTerms
+from torchid.problem.base_pose import FEET
 from torchid.problem.extras import CHANNELS, ScaleGroups, measured_channels
 from torchid.problem.floor_pose import FEWEST_POINTS, points_of
-from torchid.problem.standing import FEET
 from torchid.robot import CollisionShapes, Robot, RollingShape, require_payloads
 from torchid.sensing import Contact, SensorSet, validate_contacts
 from torchid.sensing.sensors import NORMAL_FORCE, UP, join_numbers

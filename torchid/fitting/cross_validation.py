@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchid import ranks
+from torchid import distributed
 from torchid.errors import LogError, TorchidWarning
 from torchid.estimators.least_squares import Minimizer
 from torchid.fitting.calibration import Calibration, Comparison, calibration_at
@@ -176,7 +176,7 @@ def choose_ridge(
     if len(folds) < 2:
         raise _too_few(blocks)
     together = merge_states(parts, fitter.builder)
-    count = min(max(thread_count(), ranks.world_size()), len(estimators))
+    count = min(max(thread_count(), distributed.world_size()), len(estimators))
     squares = np.empty((len(folds), len(estimators)))
     shares = [(fold, first) for first in range(count) for fold in folds]  # five folds are no two equal halves
 

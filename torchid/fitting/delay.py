@@ -17,7 +17,7 @@ from torchid.fitting.fit import Fit, LogFitter
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.logs.segments import recorded_at_delays, unbroken_segments
 from torchid.logs.timeline import spline_degree
-from torchid.parallel import in_copies, share_between_copies, thread_count
+from torchid.parallel import in_forks, share_between_forks, thread_count
 from torchid.parameters import Array
 from torchid.problem import ExtraTerms, RowBuilder, Samples
 from torchid.problem.compression import compress_in_blocks, compress_parts
@@ -111,7 +111,7 @@ def _search(logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms) -> De
     plain = replace(fitter, estimator=LeastSquares(ridge, rank_tolerance=fitter.estimator.rank_tolerance))
     wide = _Delays(_torques(logs, fitter, _FEW), plain, terms, (EARLIEST, LATEST), 0.0, _WIDE)
     tried = np.linspace(EARLIEST, LATEST, _TRIED)
-    best = float(tried[int(np.argmin(share_between_copies(tried.tolist(), wide.residual, thread_count())))])
+    best = float(tried[int(np.argmin(share_between_forks(tried.tolist(), wide.residual, thread_count())))])
     many = _torques(logs, fitter, _MANY)
     for _ in range(_PASSES):
         ends = max(EARLIEST, min(best, 0.0) - _AROUND), min(LATEST, max(best, 0.0) + _AROUND)
@@ -120,7 +120,7 @@ def _search(logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms) -> De
         is_scaled = any(extra.what == "scale" for extra in fitter.builder.extras)
         if (best not in ends or _is_at_end(best)) and not (is_scaled and abs(best - before) > _SAME):
             break
-    with in_copies([best, 0.0], near.residual, max(thread_count() - 1, 1)) as residuals:
+    with in_forks([best, 0.0], near.residual, max(thread_count() - 1, 1)) as residuals:
         term = near.term(near.fit_in_blocks(best))
         left, without = residuals()
     return _choice(best, term, left, without)

@@ -247,7 +247,7 @@ def with_estimated_noise(setup: S, estimated: Mapping[str, Any], any_stated: boo
 
 
 def require_device(device: str) -> None:
-    """Refuse a device that this machine has not; it is not connected to: copies, which read logs, could not be made."""
+    """Refuse a device that this machine has not; it is not connected to: forks, which read logs, could not be made."""
     kind, _, index = device.partition(":")
     gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
     is_there = kind == "cuda" and (index or "0").isdecimal() and int(index or "0") < gpus

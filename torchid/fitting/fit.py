@@ -13,8 +13,8 @@ from torchid.errors import UnknownNameError
 from torchid.estimators import Estimate, LeastSquares
 from torchid.estimators.least_squares import Minimizer
 from torchid.fitting.prior_knowledge import TOTAL, KnownMass, with_known_masses
-from torchid.identifiability.block_scatter import BlockScatter, block_scatter
 from torchid.identifiability.confounding import ExtraEstimate, estimate_extras, mass_weights
+from torchid.identifiability.jackknife import Jackknife, jackknife_blocks
 from torchid.parallel import one_thread
 from torchid.parameters import PER_BODY
 from torchid.problem import LinearProblem, RowBuilder, assemble
@@ -65,14 +65,14 @@ class LogProblem:
 class Fit:
     """A solved `LogProblem`: parameters of the bodies, and the extra parameters of sensors and actuators.
 
-    `scatter`: of both between blocks of the logs, None where there are too few.
+    `jackknife`: of both over blocks of the logs, None where there are too few.
     """
 
     parts: list[Part]
     assembly: Assembly
     estimate: Estimate
     extras: list[ExtraEstimate]
-    scatter: BlockScatter | None = None
+    jackknife: Jackknife | None = None
 
     __repr__ = short_repr
 
@@ -128,8 +128,8 @@ class LogFitter:
         """
         fit = self.solve_problem(self.build_problem(merge_blocks_of_folds(parts, self.builder)), solve)
         estimator = self.estimator
-        scatter = block_scatter(parts, self.builder, fit.assembly, estimator.ridge, estimator.rank_tolerance)
-        return fit if scatter is None else with_block_errors(fit, scatter)
+        jackknife = jackknife_blocks(parts, self.builder, fit.assembly, estimator.ridge, estimator.rank_tolerance)
+        return fit if jackknife is None else with_block_errors(fit, jackknife)
 
     def assemble(self, parts: Sequence[Part], reading_noise: Mapping[int, float] | None = None) -> Assembly:
         """The problem of compressed logs as they are, with extra parameters eliminated and frozen ones not free.
@@ -211,16 +211,16 @@ def _is_homogeneous(problem: LinearProblem, forces: float) -> bool:
     return float(left @ left) + problem.residual <= RANK_TOLERANCE**2 * forces
 
 
-def with_block_errors(fit: Fit, scatter: BlockScatter, factor: float = 1.0) -> Fit:
-    """The fit with standard errors by the scatter between blocks of the logs, times a factor."""
-    estimate = replace(fit.estimate, block_error=factor * scatter.error)
+def with_block_errors(fit: Fit, jackknife: Jackknife, factor: float = 1.0) -> Fit:
+    """The fit with standard errors by the jackknife, times a factor."""
+    estimate = replace(fit.estimate, block_error=factor * jackknife.error)
     errors = {
         (elimination.log, extra.label): factor * float(error)
-        for elimination, deviations in zip(fit.assembly.eliminations, scatter.extras, strict=True)
+        for elimination, deviations in zip(fit.assembly.eliminations, jackknife.extras, strict=True)
         for extra, error in zip(elimination.extras, np.linalg.norm(deviations, axis=0), strict=True)
     }
     extras = [replace(x, block_error=errors[x.log, x.extra.label]) for x in fit.extras]
-    return replace(fit, estimate=estimate, extras=extras, scatter=scatter)
+    return replace(fit, estimate=estimate, extras=extras, jackknife=jackknife)
 
 
 def frozen_parameters(robot: Robot, bodies: Collection[str], field: str = "frozen") -> np.ndarray:

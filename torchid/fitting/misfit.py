@@ -15,7 +15,7 @@ from torchid.estimators import Estimate
 from torchid.estimators.least_squares import residual_std
 from torchid.fitting.delay import UnfittedDelay
 from torchid.fitting.noise import GroupNoise, NoiseSummary
-from torchid.identifiability.block_scatter import BlockScatter
+from torchid.identifiability.jackknife import Jackknife
 from torchid.logs.dry_friction import OFTEN, resting_share
 from torchid.parallel import one_thread
 from torchid.parameters import COULOMB, FRICTION, INERTIAL, PER_BODY, Array
@@ -47,7 +47,7 @@ class Misfit:
         residual: standard deviation of the whitened residuals.
         expected: the same if the stated noise and the filter were all there is; None where no noise is stated, as
             residuals say what noise there is.
-        lack_of_fit: as `BlockScatter` has it, None where blocks are too few.
+        lack_of_fit: as `Jackknife` has it, None where blocks are too few.
         error_growth: median over the identified parameters of the standard error by the scatter between blocks over
             that by noise, None likewise.
         groups: of readings and base rows that exceed their noise most.
@@ -123,7 +123,7 @@ def misfit(
     estimate: Estimate,
     noise: NoiseSummary,
     logs: Sequence[Block],
-    scatter: BlockScatter | None,
+    jackknife: Jackknife | None,
     friction: UnfittedFriction | None,
     delay: UnfittedDelay | None = None,
 ) -> Misfit:
@@ -133,7 +133,7 @@ def misfit(
         estimate: of the training logs.
         noise: that rows were weighted with.
         logs: these logs.
-        scatter: of the estimate between blocks of them.
+        jackknife: of the estimate over blocks of them.
         friction: that was not fitted.
         delay: of joint torques that was not fitted.
     """
@@ -148,7 +148,7 @@ def misfit(
     return Misfit(
         residual=estimate.residual_std,
         expected=expected,
-        lack_of_fit=None if scatter is None else scatter.lack_of_fit,
+        lack_of_fit=None if jackknife is None else jackknife.lack_of_fit,
         error_growth=growth,
         groups=tuple(sorted(beyond, key=lambda one: -excess[one.group])),
         friction=friction,

@@ -85,7 +85,7 @@ def fitted_posterior(fit: Fit, robot: Robot, conditions: Conditions) -> FittedPo
     """
     problem, estimate = fit.assembly.problem, fit.estimate
     noise = math.sqrt(problem.oversampling) * estimate.residual_std
-    deviations = None if fit.scatter is None else fit.scatter.without_ridge[: fit.scatter.blocks]
+    deviations = None if fit.jackknife is None else fit.jackknife.without_ridge[: fit.jackknife.blocks]
     reported = np.vstack([np.eye(len(problem.nominal)), mass_weights(len(robot.bodies))])
     A, b = whitened_rows(problem, noise, deviations, reported)
     D, extras = np.zeros((len(A), 0)), []

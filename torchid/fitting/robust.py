@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchid import ranks
+from torchid import distributed
 from torchid.errors import UnknownNameError
 from torchid.estimators import ConstrainedEstimate
 from torchid.fitting.fit import Fit, LogFitter, Solve, with_block_errors
@@ -228,7 +228,7 @@ def _passes(rows: _Rows, loss: RobustLoss, start: _Point, first_pass: int = 0, s
         add_noise_gram(parts, rows.noise_gram, reweighting.mean_weight)
         fit, scale = fitter.fit(parts, solve), reweighting.median_scale
         same = current == loss and _has_converged(fit, at.fit, at.scale, scale)
-        converged = ranks.as_first(same, "convergence")
+        converged = distributed.broadcast(same, "convergence")
         at = at.beyond(fit, scale, reweighting.newton_ratio)
     return _Passes(fit, at, reweighting, done, converged)
 
@@ -261,7 +261,7 @@ def fit_extras_robustly(
         steady = abs(reweighting.median_scale - scale) <= _STEADY * scale
         scale = reweighting.median_scale
         same = current == loss and steady and np.allclose(values, before, rtol=_SAME, atol=_SAME)
-        if ranks.as_first(same, "convergence"):
+        if distributed.broadcast(same, "convergence"):
             break
     return values
 
@@ -390,4 +390,4 @@ def _with_errors(fit: Fit, reweighting: Reweighting) -> Fit:
     assembly = replace(fit.assembly, problem=replace(problem, residual=max(problem.residual + added, 0.0)))
     extras = [replace(x, noise_error=factor * x.noise_error) for x in fit.extras]
     out = replace(fit, assembly=assembly, estimate=estimate, extras=extras)
-    return out if fit.scatter is None else with_block_errors(out, fit.scatter, reweighting.newton_ratio)
+    return out if fit.jackknife is None else with_block_errors(out, fit.jackknife, reweighting.newton_ratio)

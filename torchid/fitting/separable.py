@@ -18,7 +18,7 @@ from torchid.errors import warn
 from torchid.estimators import LeastSquares
 from torchid.fitting.fit import LogFitter
 from torchid.identifiability.confounding import ExtraEstimate
-from torchid.parallel import share_between_copies, thread_count
+from torchid.parallel import share_between_forks, thread_count
 from torchid.parameters import Array
 from torchid.problem import ExtraTerms, RowBuilder, Samples, compress_parts
 from torchid.problem.compression import compress_in_blocks
@@ -103,8 +103,8 @@ def choose_sign_width(
 
 def _search(left: Callable[[float | None], float], first: Sequence[float], settled: float) -> dict[float | None, float]:
     """What is left with some values, with those between the neighbours of the best of them, and with none, the last."""
-    found: dict[float | None, float] = {first[0]: left(first[0])}  # reads the logs, which copies then have
-    *rest, none = share_between_copies([*first[1:], None], left, thread_count())
+    found: dict[float | None, float] = {first[0]: left(first[0])}  # reads the logs, which forks then have
+    *rest, none = share_between_forks([*first[1:], None], left, thread_count())
     found |= dict(zip(first[1:], rest, strict=True))
     best = int(np.argmin(list(found.values())))
     between = np.log10([first[max(best - 1, 0)], first[min(best + 1, len(first) - 1)]])

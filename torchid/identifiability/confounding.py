@@ -44,7 +44,7 @@ class ExtraEstimate:
             not determine it.
         inflation: of the standard error by not knowing all other parameters, at least 1.
         confounded_with: names of other parameters, those with most influence first; empty if it is separable.
-        block_error: standard error by the scatter between blocks of the logs, see `BlockScatter`; 0 where there are too
+        block_error: standard error by the scatter between blocks of the logs, see `Jackknife`; 0 where there are too
             few.
         mass_separates: whether it is confounded with the total mass, so that stating this would separate it.
         at_bound: whether a condition on it holds with equality: it would be beyond, but cannot be.

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from torchid.identifiability.information import (
-    SAMPLES,
+    INFORMATION_SAMPLES,
     InformationGain,
     SensorInformation,
     add_information,
@@ -197,7 +197,7 @@ def _sensor_information(
     if not nuisance.of_log:
         return sensor_information(logs, builder, done=done).map(scaled)
     sources = {samples.source: [other for other in logs if other.source == samples.source] for samples in logs}
-    most = max(SAMPLES // len(sources), 1)
+    most = max(INFORMATION_SAMPLES // len(sources), 1)
     of_logs = (sensor_information(same, builder, most, done).map(scaled) for same in sources.values())
     return add_information([information.marginal(nuisance.of_log) for information in of_logs])
 

@@ -22,7 +22,7 @@ from torchid.rounding import KINEMATIC_TOLERANCE, RANK_TOLERANCE
 from torchid.sensing import SensorNoise
 from torchid.sensing.sensors import measured_components
 
-SAMPLES = 2000
+INFORMATION_SAMPLES = 2000
 """Approximate number of samples whose rows represent those of all."""
 
 _CHUNK = 256  # samples whose rows are computed together
@@ -83,7 +83,7 @@ class SensorInformation:
 @one_thread()
 @torch.no_grad()
 def sensor_information(
-    logs: Sequence[Samples], builder: RowBuilder, most: int = SAMPLES, done: ProgressCallback | None = None
+    logs: Sequence[Samples], builder: RowBuilder, most: int = INFORMATION_SAMPLES, done: ProgressCallback | None = None
 ) -> SensorInformation:
     """Information of some logs in the builder's columns, and the part of it due to each sensor.
 

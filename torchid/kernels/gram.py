@@ -1,5 +1,6 @@
 """Gram matrices of many rows by column, panel by panel: what is worked on stays in the second-level cache.
 
+Of blocks of rows that are written for some tiles, multiplied and forgotten (`write_grams`), or of rows that are there.
 Libraries for products of matrices are made for square ones: for a hundred columns and thousands of rows they take
 1.4 to 1.7 times as long, for ten columns 1.9 to 2.7 times.
 """
@@ -8,9 +9,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchid.kernels.tiles import ARRAY, INDEX, MATRIX, Index, Vector, compiled
+from torchid.kernels.rows import path_sums, write_span
+from torchid.kernels.tiles import ARRAY, INDEX, MATRIX, TABLE, TILE, Index, Vector, compiled
 from torchid.parameters import Array
 
+SPAN = 4 * TILE
+"""Samples whose rows are multiplied at once: they fill a few MB for a humanoid, and memory is not waited for."""
 _PANEL = 384  # rows: of two hundred columns they fill half of a second-level cache
 _LEFT, _RIGHT = 6, 2  # columns that are multiplied with each other at a time: their products stay in registers
 
@@ -102,3 +106,88 @@ def write_gram(columns: Array, first: int, lower: Index, combination: Array, squ
     squares[:], gram[:] = 0.0, 0.0
     add_gram(columns, first, lower, combination, squares, gram)
     mirror(gram)
+
+
+@compiled(
+    *(ARRAY, ARRAY, "int64", "int64", ARRAY, "int64", "int64", ARRAY, TABLE, TABLE, ARRAY, TABLE, INDEX),
+    *(TABLE, INDEX, ARRAY, ARRAY, ARRAY, ARRAY),
+)
+def write_grams(
+    states: Array,
+    joints: Array,
+    nodes: int,
+    samples: int,
+    bases: Array,
+    rank: int,
+    step: int,
+    forces: Array,
+    blocks: Index,
+    moved: Index,
+    ratios: Array,
+    bodies: Index,
+    kept: Index,
+    levels: Index,
+    lower: Index,
+    combination: Array,
+    rows: Array,
+    squares: Array,
+    grams: Array,
+) -> None:
+    """Write what `write_gram` makes of the rows of each block that `write_rows` writes.
+
+    Args:
+        states: as of `write_rows`.
+        joints: likewise.
+        nodes: likewise.
+        samples: likewise.
+        bases: likewise.
+        rank: likewise.
+        step: likewise.
+        forces: likewise.
+        blocks: likewise, but where they start in `rows` is for as many samples as a span has.
+        moved: likewise.
+        ratios: likewise.
+        bodies: likewise.
+        kept: likewise.
+        levels: (blocks, 4) each: its first column in `lower`, their number, where its combination starts, and where its
+            Gram matrix.
+        lower: columns of each block that are replaced.
+        combination: (columns replaced, columns) of each block, by what.
+        rows: memory for those of a span.
+        squares: as `lower`, are written.
+        grams: (columns, columns) of each block, are written.
+    """
+    sums = path_sums(blocks)
+    squares[:], grams[:] = 0.0, 0.0
+    for begin in range(0, samples, SPAN):
+        end = min(begin + SPAN, samples)
+        write_span(
+            states,
+            joints,
+            nodes,
+            samples,
+            bases,
+            rank,
+            step,
+            forces,
+            blocks,
+            moved,
+            ratios,
+            bodies,
+            kept,
+            begin,
+            end,
+            sums,
+            rows,
+        )
+        for block in range(len(blocks)):
+            count, n, offset = blocks[block, 1:4]
+            first, k, at, to = levels[block]
+            long = n + count * (end - begin)
+            columns = rows[offset : offset + n * long].reshape((n, long))
+            own = combination[at : at + k * n].reshape((k, n))
+            gram = grams[to : to + n * n].reshape((n, n))
+            add_gram(columns, n, lower[first : first + k], own, squares[first : first + k], gram)
+    for block in range(len(blocks)):
+        n, to = blocks[block, 2], levels[block, 3]
+        mirror(grams[to : to + n * n].reshape((n, n)))

@@ -52,8 +52,8 @@ from torchid.logs.low_pass import REACH_PERIODS
 from torchid.logs.time_range import log_title
 from torchid.logs.timeline import DROPPED_SAMPLES, JITTER
 from torchid.problem import Samples
+from torchid.problem.base_pose import longest_with_pose
 from torchid.problem.log_joints import without_welded_joints
-from torchid.problem.standing import longest_standing
 from torchid.reprs import short_repr
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
@@ -216,7 +216,7 @@ def _check_forces(
 def _longest_standing(log: Log, robot: Robot, contacts: Sequence[Contact]) -> tuple[Log, list[Finding]]:
     """The longest segment in which enough feet stand; or the log, and why there is none."""
     try:
-        return longest_standing(log, robot, contacts), []
+        return longest_with_pose(log, robot, contacts), []
     except InputError as error:
         return log, [refused(error)]
 

@@ -271,7 +271,7 @@ _ALL_OF_GRAVITY = (0.75, 1.25)
 #: What another zero must leave of that which a tilt leaves: of a first joint that is level, both are one.
 _BETTER_THAN_A_TILT = 0.8
 #: Unexplained forces from which on joints that count the other way are tried, what one of them must leave of them.
-_MIN_UNEXPLAINED, _MAX_RESIDUAL_SHARE = 1.0, 0.5
+_MIN_UNEXPLAINED, _MAX_REVERSED_RESIDUAL_SHARE = 1.0, 0.5
 
 
 def is_bolted_arm(model: NominalModel) -> bool:
@@ -343,7 +343,7 @@ def _gravity_finding(found: Deviation) -> Finding:
 
 def _reversed_joint(pieces: Sequence[Log], model: NominalModel, unexplained: float) -> Finding | None:
     """A finding about the joint without whose mistake forces are explained; None without such a joint."""
-    best, least = None, min(_MAX_RESIDUAL_SHARE * unexplained, _MIN_UNEXPLAINED)
+    best, least = None, min(_MAX_REVERSED_RESIDUAL_SHARE * unexplained, _MIN_UNEXPLAINED)
     for mistake in joint_mistakes(pieces[0]) if unexplained > _MIN_UNEXPLAINED else ():
         corrected = [mistake.correct(piece) for piece in pieces]
         rows = DeviationRows.of(bind_some_samples(corrected, model.robot, (), TRIAL_SAMPLES), model)

@@ -49,7 +49,7 @@ MAX_MISFIT = 0.4
 MAX_UNEXPLAINED_RATIO = 1.0
 #: Share of the misfit that a corrected mistake may leave. Misfits above 1, that of zero forces, count as 1: forces that
 #: are far too large fit better after any reduction.
-MAX_RESIDUAL_SHARE = 0.5
+MAX_FORCE_RESIDUAL_SHARE = 0.5
 #: Misfit that a corrected mistake leaves, above which it may be another robot that the forces are of: 0.05 to 0.1 is a
 #: URDF that is 20 % off, 0.33 was a robot of four times the weight whose torques were taken for kg m.
 MAX_CLEAR_MISFIT = 0.2
@@ -167,7 +167,10 @@ def _is_mostly_friction(stated: ModelFit, without: ModelFit) -> bool:
     """Whether most of what torques differ by is friction that the robot's file states, whatever else is wrong."""
     if stated.torque is None or without.torque is None:
         return False
-    return without.torque.misfit * without.torque.size < MAX_RESIDUAL_SHARE * stated.torque.misfit * stated.torque.size
+    return (
+        without.torque.misfit * without.torque.size
+        < MAX_FORCE_RESIDUAL_SHARE * stated.torque.misfit * stated.torque.size
+    )
 
 
 def _contradiction(fit: ModelFit, robot: Robot, held: bool) -> Finding:
@@ -240,7 +243,7 @@ def _best_mistake(model: NominalModel, fit: ModelFit, trials: Sequence[_Correcte
     for one in trials:
         mistake, of_torques = one.mistake, one.mistake.field == "joint_torque"
         trial = model.compare(
-            one.samples, least if of_torques else min(least, MAX_RESIDUAL_SHARE * min(fit.misfit, 1.0))
+            one.samples, least if of_torques else min(least, MAX_FORCE_RESIDUAL_SHARE * min(fit.misfit, 1.0))
         )
         if trial.compared != fit.compared or (of_torques and trial.implausible > fit.implausible):
             continue  # compare the same forces only
@@ -249,7 +252,7 @@ def _best_mistake(model: NominalModel, fit: ModelFit, trials: Sequence[_Correcte
         if mistake.of_joint and trial.reversed:
             continue  # the torque tells which way its joint turns
         before, after = (x.torque_misfit or 0.0 if of_torques else x.misfit for x in (fit, trial))
-        if after < MAX_RESIDUAL_SHARE * min(before, 1.0) and trial.misfit < least:
+        if after < MAX_FORCE_RESIDUAL_SHARE * min(before, 1.0) and trial.misfit < least:
             best, least, shares = mistake, trial.misfit, (before, after)
     if best is None:
         return None
@@ -274,7 +277,7 @@ def _mistake_beside_urdf(filtered: FilteredLog, trials: Sequence[_Corrected]) ->
         return None
     corrected = ((DeviationRows.of(one.samples, model), one.mistake) for one in trials)
     left = sorted(((x.unexplained, one) for x, one in corrected if x is not None), key=lambda pair: pair[0])
-    if not left or left[0][0] > min(MAX_LEFT, MAX_RESIDUAL_SHARE * rows.unexplained):
+    if not left or left[0][0] > min(MAX_LEFT, MAX_FORCE_RESIDUAL_SHARE * rows.unexplained):
         return None
     least, best = left[0]
     ratio = rows.unexplained / max(least, _TINY)

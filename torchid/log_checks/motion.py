@@ -160,7 +160,7 @@ MAX_RATIO_ERROR = 0.15
 #: Correlation of a derivative with that of its base.
 MIN_CORRELATION = 0.9
 #: Misfit above which other frames and orders are tried, and the share of it that the right one may leave.
-MAX_MISFIT, MAX_RESIDUAL_SHARE = 0.15, 0.3
+MAX_MISFIT, MAX_DERIVATIVE_RESIDUAL_SHARE = 0.15, 0.3
 _TINY = 1e-300
 _DERIVATIVE_CHECK = "velocities and accelerations against positions"
 
@@ -240,7 +240,7 @@ def _frame_findings(log: Log, name: str, base: str, order: int, comparison: Deri
     for rotate, actual in ((rotate_to_world, "base"), (rotate_to_base, "world")):
         rotated = rotate(log.base_quat_xyzw, getattr(log, name))
         trial = compare_derivative(log.time, getattr(log, base), rotated, order)
-        if trial is not None and trial.misfit < MAX_RESIDUAL_SHARE * comparison.misfit:
+        if trial is not None and trial.misfit < MAX_DERIVATIVE_RESIDUAL_SHARE * comparison.misfit:
             text = f"follows {base} if it is in the {actual} frame, not in the frame of its name"
             yield Finding("frame", REJECTED, name, text, f"call it {name.replace('world', actual)}")
 
@@ -334,7 +334,7 @@ def _best_mistake(time: FloatArray, quat: FloatArray, omega: FloatArray, misfit:
 
     Several may explain it: the inverse and the reversed orientation are nearly equal for a base that turns little.
     """
-    best, least = None, MAX_RESIDUAL_SHARE * misfit
+    best, least = None, MAX_DERIVATIVE_RESIDUAL_SHARE * misfit
     for mistake in _mistakes(quat, omega):
         trial = compare_derivative(time, _integrate(time, _omega(time, mistake.quat)), mistake.omega)
         if trial is not None and trial.misfit < least:
@@ -349,7 +349,7 @@ def _mounted_otherwise(time: FloatArray, quat: FloatArray, omega: FloatArray, mi
     turn = Rotation.align_vectors(true - true.mean(axis=0), read - read.mean(axis=0))[0]
     turned = omega @ turn.as_matrix().T
     trial = compare_derivative(time, _integrate(time, _omega(time, quat)), turned)
-    if trial is None or trial.misfit > MAX_RESIDUAL_SHARE * misfit:
+    if trial is None or trial.misfit > MAX_DERIVATIVE_RESIDUAL_SHARE * misfit:
         return None
     degrees = ", ".join(f"{x:.0f}" for x in turn.as_rotvec(degrees=True))
     text = f"fits the orientation if it is turned by ({degrees}) degrees about the base's axes"

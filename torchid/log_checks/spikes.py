@@ -248,7 +248,7 @@ SPREAD_BLOCK_STEPS = 128
 #: Longest excursion that counts as a spike.
 MAX_SPIKE_SAMPLES = 5
 #: Sum of both jumps of an excursion over the larger one: of a spike, and of a longer one, in which the robot moves.
-_MAX_RESIDUAL_SHARE, _MAX_LATE_RESIDUAL_SHARE = 0.3, 0.5
+_MAX_SPIKE_RESIDUAL_SHARE, _MAX_LATE_RESIDUAL_SHARE = 0.3, 0.5
 #: Threshold of the second jump of an excursion over `MIN_JUMP_SPREADS`.
 _RETURN_THRESHOLD_SHARE = 0.5
 #: Differences below this share of the channel's range are rounding.
@@ -288,7 +288,9 @@ def find_jumps(
         for i, e, s in zip(candidates[bad], excess[bad], noise[bad], strict=True)
     ]
     near = [
-        jump for jump in _pair_steps(single, MAX_SPIKE_SAMPLES, _MAX_RESIDUAL_SHARE) if jump.spreads > MIN_JUMP_SPREADS
+        jump
+        for jump in _pair_steps(single, MAX_SPIKE_SAMPLES, _MAX_SPIKE_RESIDUAL_SHARE)
+        if jump.spreads > MIN_JUMP_SPREADS
     ]
     return list(_pair_steps(near, longest, _MAX_LATE_RESIDUAL_SHARE))
 

@@ -111,7 +111,7 @@ MIN_JITTER_STEPS = 1e-3
 #: Change of a step, in rms deviations, at which motion and stamps are compared, and the samples that this needs.
 _MIN_DEVIATION_RMS, _MIN_COMPARED_SAMPLES = 3.0, 10
 #: Residual of positions with uniform stamps over that with the recorded stamps, below which the stamps jitter.
-_MAX_RESIDUAL_SHARE = 0.5
+_MAX_STAMP_RESIDUAL_SHARE = 0.5
 
 
 def check_time_stamps(log: Log) -> Iterator[Finding]:
@@ -167,7 +167,7 @@ def _is_uniformly_sampled(log: Log, steps: FloatArray, deviation: float, long: B
     left, right = steps[numbers - 1, None], steps[numbers, None]
     by_number = np.abs(ahead + behind)
     by_stamp = np.abs(2.0 * (ahead * left + behind * right) / (left + right))
-    return bool(by_number.sum() < _MAX_RESIDUAL_SHARE * by_stamp.sum())
+    return bool(by_number.sum() < _MAX_STAMP_RESIDUAL_SHARE * by_stamp.sum())
 
 
 def _gap_finding(steps: FloatArray, median: float, long: BoolArray) -> Finding:

@@ -45,7 +45,7 @@ MIN_ROLLING_SHARE, _TRIAL_RADIUS_M = 0.02, 0.01
 _POSE_UNKNOWNS = {"offset": slice(0, 3), "lag": slice(6, 7), "turn": slice(3, 6), "all": slice(0, 7)}
 _POSE_SIZE, _POSE_PRIOR_SHARE = np.array([0.3, 0.3, 0.3, 0.5, 0.5, 0.5, 0.1]), 1e-3
 #: Share of this motion, or of the difference from a gyroscope, that a corrected mistake may leave.
-MAX_RESIDUAL_SHARE = 1.0 / 3.0
+MAX_SLIP_RESIDUAL_SHARE = 1.0 / 3.0
 #: Time at either end of a stance for heel and toe, and the shortest rest of a stance.
 _STANCE_END_S, _MIN_STANCE_S = 0.05, 0.15
 #: Samples that are compared, and the rms motion that the base must have [rad, or 0.3 m].
@@ -78,7 +78,7 @@ def check_standing_feet(
     if slip < MAX_SLIP_SHARE:
         yield from other_pose if single is None else [single]
         return
-    best, least = None, MAX_RESIDUAL_SHARE * slip
+    best, least = None, MAX_SLIP_RESIDUAL_SHARE * slip
     for mistake in (*possible_mistakes(log, robot), *reversed_joints(log)):
         if mistake.field not in _CORRECTED_FIELDS or mistake.field.startswith(derived):
             continue
@@ -164,7 +164,7 @@ def _pose_findings(log: Log, contacts: Sequence[Contact], slip: float, poses: Li
             return np.append(motion(correction), _POSE_PRIOR_SHARE * as_recorded * y)
 
         x[unknowns] = size * least_squares(cost, np.zeros(len(size)), ftol=1e-3, xtol=1e-3).x
-        if (left := float(np.linalg.norm(motion(x)))) < MAX_RESIDUAL_SHARE * as_recorded:
+        if (left := float(np.linalg.norm(motion(x)))) < MAX_SLIP_RESIDUAL_SHARE * as_recorded:
             yield _pose_finding(x, slip, left / as_recorded)
             return
 
@@ -199,7 +199,7 @@ def _radius_findings(
     curvature = 0.5 * (none + twice) - once
     factor = 0.25 * (none - twice) / curvature + 1.0 if curvature > 0.0 else 0.0
     least = float(np.sqrt(squared_slip(factor))) if factor > 0.0 else slip
-    if least < MAX_RESIDUAL_SHARE * slip:
+    if least < MAX_SLIP_RESIDUAL_SHARE * slip:
         found = ", ".join(f"{factor * radius:.3g}" for radius in sorted(set(unit.values())))
         stated = ", ".join(f"{radius:.3g}" for radius in sorted({c.radius for c in points}))
         text = f"standing feet move {format_percent(slip)} % as much as the base above them if they roll on a radius of"
@@ -361,7 +361,7 @@ def _compare(vectors: FloatArray, rates: FloatArray, omega: FloatArray) -> Itera
     difference = left(omega)
     if difference < MAX_DIFFERENCE:
         return
-    limit = MAX_RESIDUAL_SHARE * difference
+    limit = MAX_SLIP_RESIDUAL_SHARE * difference
     text = f"differs by {100 * difference:.3g} % from how the base turns above the feet that stand"
     offset = _least_squares(vectors, rates - np.cross(vectors, omega), np.ones((len(omega), 1)))[:, 0]
     if (rest := left(omega + offset)) < limit:

@@ -12,7 +12,7 @@ from torchid.errors import LogError, about_file
 from torchid.logs.log import FORCE_NORMAL, BoolArray, FloatArray, Log, describe_element, normalize_normals
 from torchid.settings import STRICT, NotNegative, Positive
 
-KEY = "preprocessing.contact_threshold"
+_KEY = "preprocessing.contact_threshold"
 
 
 @dataclass(config=STRICT, frozen=True)
@@ -67,9 +67,9 @@ def flags_by_force(
             continue
         if missing.any():
             found = f"nan at {describe_element((int(np.argmax(missing)), column), log.contact_names)}"
-            accepted = f"forces to compare with {KEY}, or gaps that preprocessing.bridge_gaps_s bridges"
+            accepted = f"forces to compare with {_KEY}, or gaps that preprocessing.bridge_gaps_s bridges"
             if missing.all():
-                found, accepted = f"no force of {name}", f"forces to compare with {KEY}, or contact_active"
+                found, accepted = f"no force of {name}", f"forces to compare with {_KEY}, or contact_active"
             raise LogError(log.source, measured.field(column), found, accepted)
         loaded = hysteresis(force[:, column], settings.above, below)
         active[:, column] = without_short(loaded, shortest)
@@ -100,7 +100,7 @@ class MeasuredForces:
         for log in parts:
             scalar, wrench = log.contact_force_normal, log.contact_wrench
             if not log.contact_names or (scalar is None and wrench is None):
-                accepted = f"contact_wrench_local or {FORCE_NORMAL}, to compare with {KEY}"
+                accepted = f"contact_wrench_local or {FORCE_NORMAL}, to compare with {_KEY}"
                 raise LogError(source, "contact_wrench", "missing", accepted)
             if found is None:
                 count, field = len(log.contact_names), None if wrench is None else log.contact_wrench_field

@@ -29,7 +29,7 @@ from torchid.logs.log import (
 )
 from torchid.logs.quaternion import make_sign_continuous
 
-KEY = "preprocessing.bridge_gaps_s"
+_KEY = "preprocessing.bridge_gaps_s"
 #: Share of a gap's longest length by which rounded stamps may exceed it.
 _SLACK = 1e-6
 
@@ -93,7 +93,7 @@ def refuse_gaps(name: str, values: FloatArray, time: FloatArray, labels: tuple[s
         if start > 0 and stop < len(time)
     ]
     longest = f"the longest here takes {max(lengths):.3g} s" if lengths else "none here has values on both sides"
-    raise LogError.at_field(name, f"nan at {where}", f"finite numbers, or gaps that {KEY} bridges ({longest})")
+    raise LogError.at_field(name, f"nan at {where}", f"finite numbers, or gaps that {_KEY} bridges ({longest})")
 
 
 def _with_gaps(raw: Mapping[str, NDArray[Any]]) -> Iterator[str]:
@@ -267,7 +267,7 @@ def warn_of_gaps(log: Log, name: str, coverage: Coverage) -> None:
     ]
     if broken:
         message = f"{log.source}: {name}: NaN in part of {', '.join(broken)}: NaN throughout after preprocessing"
-        message += f", unless {KEY} bridges these gaps or preprocessing.exclude_rejected leaves them out"
+        message += f", unless {_KEY} bridges these gaps or preprocessing.exclude_rejected leaves them out"
         warn(message)
 
 

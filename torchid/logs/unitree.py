@@ -204,7 +204,7 @@ def register(store: Any, parse: Any) -> None:
     store.register({key: value for name, text in DEFINITIONS.items() for key, value in parse(text, name).items()})
 
 
-KEY = "logs.topics.low_state"
+_KEY = "logs.topics.low_state"
 #: [rad] less is no motion of a motor that a robot is said not to have.
 _MOVED = 1e-3
 #: Ticks may be off the times of receipt by this [ns], and by this share of the log: a network stalls, a clock drifts.
@@ -288,7 +288,7 @@ class LowState:
                 found = f"motor {number}, '{joint}', is 0 throughout: no such motor"
                 raise LogError.at_field(self._topic, found, self._others(alive, number))
             if joint is None and moves[number] and (name is not None or number >= len(self._order)):
-                owner = f"'{name}' has" if name is not None else f"{KEY}.joints names"
+                owner = f"'{name}' has" if name is not None else f"{_KEY}.joints names"
                 found = f"motor {number} moves, where {owner} no joint"
                 raise LogError.at_field(self._topic, found, self._others(alive, number))
 
@@ -301,8 +301,8 @@ class LowState:
             for name, order in JOINT_ORDERS.items()
             if order.message == kind and {i for i, joint in enumerate(order.joints) if joint} == numbers
         ]
-        listed = f"{KEY}.joints with a name or null for each of {format_count(len(alive), 'motor')}"
-        return f"{KEY}.robot: {' or '.join(fitting)}" if fitting else f"{listed}, null for motor {number} where unused"
+        listed = f"{_KEY}.joints with a name or null for each of {format_count(len(alive), 'motor')}"
+        return f"{_KEY}.robot: {' or '.join(fitting)}" if fitting else f"{listed}, null for motor {number} where unused"
 
     def _orientation(self, wxyz: FloatArray) -> dict[str, FloatArray]:
         """The base's orientation; nothing where quaternions are always the same, as of a driver that does not set them.
@@ -311,7 +311,7 @@ class LowState:
         """
         if not self._settings.orientation or not np.any(wxyz != wxyz[0]):
             return {}
-        return {"base_quat_xyzw": np.roll(require_unit(self._topic, wxyz, KEY), -1, axis=1)}
+        return {"base_quat_xyzw": np.roll(require_unit(self._topic, wxyz, _KEY), -1, axis=1)}
 
     # ------------------------------------------------------------------------------------------------------- stamps
 
@@ -341,6 +341,6 @@ class LowState:
                 f"ticks that advance by {np.ptp(elapsed) / 1e9:.4g} s while messages come for "
                 f"{np.ptp(received) / 1e9:.4g} s, and are off by up to {off.max() / 1e9:.3g} s"
             )
-            accepted = f"ticks of 1 ms, or {KEY}.stamps: receipt, or tick where these are right"
+            accepted = f"ticks of 1 ms, or {_KEY}.stamps: receipt, or tick where these are right"
             raise LogError.at_field(self._topic, found, accepted)
         return np.asarray(received[:1] + usual + elapsed, dtype=np.int64), True

@@ -13,9 +13,9 @@ from typing import TypeVar
 import numpy as np
 import torch
 
-from torchid import ranks
+from torchid import distributed
 from torchid.errors import excerpt, warn
-from torchid.parallel import can_copy, one_thread, run_in_workers, share_between_copies, thread_count
+from torchid.parallel import can_fork, one_thread, run_in_workers, share_between_forks, thread_count
 from torchid.problem.blocks import are_of_one_log, join_pieces
 from torchid.problem.contact_state import ContactState
 from torchid.problem.rows import RowBuilder
@@ -33,7 +33,7 @@ CHUNK = 4096
 
 _LEAST, _EACH = 2048, 4  # samples per chunk where there are fewer chunks than so many for each worker
 _LET_GO = 4  # chunks of a worker, after which pages that samples are mapped to leave the memory of the process
-_WORTH_COPYING = 50_000  # samples of a pass: copies save 0.8 us of each on two cores, and take 15 to 30 ms to make
+_WORTH_FORKING = 50_000  # samples of a pass: forks save 0.8 us of each on two cores, and take 15 to 30 ms to make
 _WORTH_LOADING = 200_000  # samples of a pass: kernels take 0.4 s to load and save 2.6 to 6 us of each on two cores
 _MOST_ON_GPU = 64 * CHUNK  # samples per chunk: launching the work on one takes the host 12 ms, whatever its size
 _SHARE_OF_GPU, _ON_GPU = 8, 48 * 2**10  # a chunk takes one of so many parts of a GPU's memory; bytes of a sample
@@ -49,7 +49,7 @@ def map_chunks(
 ) -> list[Result]:
     """Results of `reduce` over the chunks of some logs, one per worker.
 
-    Processes that share their work (`torchid.ranks`) each take some successive chunks; all get the results of all.
+    Processes that share their work (`torchid.distributed`) each take successive chunks; all get the results of all.
 
     Args:
         logs: each is moved to the builder's device chunk by chunk, see `upload`.
@@ -61,7 +61,7 @@ def map_chunks(
         progress: called with the number of samples done since the last call.
     """
     workers = threads or worker_count(builder.device)
-    size, sharing = chunk or chunk_size(builder.device), ranks.as_first(workers, "workers")
+    size, sharing = chunk or chunk_size(builder.device), distributed.broadcast(workers, "workers")
     if chunk is None and sharing > 1:
         size = min(size, max(sum(map(len, logs)) // (_EACH * sharing), _LEAST))
     tasks = _chunks(logs, size, sharing)
@@ -69,30 +69,30 @@ def map_chunks(
         builder.layout(task.state, task.parts[0][0].contact_normal is not None)
     sizes = [len(task) for task in tasks]
     choose_kernels(builder, sum(sizes))
-    ranks.require_same(hash(tuple(zip(sizes, (task.state for task in tasks), strict=True))), "logs")
-    share = ranks.own_share(sizes)
+    distributed.require_same(hash(tuple(zip(sizes, (task.state for task in tasks), strict=True))), "logs")
+    share = distributed.own_share(sizes)
     own, done = tasks[share], sizes[share]
     workers = min(workers, max(len(own), 1))  # to start a thread takes as long as a small chunk
-    copied = workers > 1 and _is_worth_copying(sum(done)) and can_copy()
-    reported = sum(done[::workers] if copied else done)
+    forked = workers > 1 and _is_worth_forking(sum(done)) and can_fork()
+    reported = sum(done[::workers] if forked else done)
     report = None if progress is None else _ProgressOfAll(progress, sum(sizes), reported)
 
     def run(part: Iterator[_Chunk], reporting: bool = True) -> Result:
         return reduce(_pieces(part, builder.device, report if reporting else None))
 
-    results = _run_in_copies(own, run, workers) if copied else run_in_workers(own, run, workers)
+    results = _run_in_forks(own, run, workers) if forked else run_in_workers(own, run, workers)
     if report is not None:
         report(0)
-    return list(chain.from_iterable(ranks.gather(results, "chunks")))
+    return list(chain.from_iterable(distributed.all_gather(results, "chunks")))
 
 
-def copies_share_passes(logs: Sequence[Samples]) -> bool:
-    """Whether copies of this process share a pass over some logs, so that little is won by work beside it."""
-    return _is_worth_copying(sum(map(len, logs)))
+def forks_share_passes(logs: Sequence[Samples]) -> bool:
+    """Whether forks of this process share a pass over some logs, so that little is won by work beside it."""
+    return _is_worth_forking(sum(map(len, logs)))
 
 
-def _is_worth_copying(samples: int) -> bool:
-    return samples >= _WORTH_COPYING
+def _is_worth_forking(samples: int) -> bool:
+    return samples >= _WORTH_FORKING
 
 
 def choose_kernels(builder: RowBuilder, samples: int) -> None:
@@ -237,8 +237,8 @@ def subsample_states(logs: Sequence[Samples], count: int) -> Iterator[tuple[Samp
             yield samples[index[torch.linspace(0, len(index) - 1, share).long()]], state, len(index) / share
 
 
-def _run_in_copies(tasks: Sequence[Task], run: Callable[[Iterator[Task], bool], Result], workers: int) -> list[Result]:
-    """As `run_in_workers`, to the last bit, by this process, whose chunks are reported, and copies of it.
+def _run_in_forks(tasks: Sequence[Task], run: Callable[[Iterator[Task], bool], Result], workers: int) -> list[Result]:
+    """As `run_in_workers`, to the last bit, by this process, whose chunks are reported, and forks of it.
 
     They wait for no lock of Python's: two take 7 to 10 % less time for a sample of a quadruped than two threads.
     """
@@ -248,7 +248,7 @@ def _run_in_copies(tasks: Sequence[Task], run: Callable[[Iterator[Task], bool], 
         return run(iter(tasks[first::workers]), first == 0)
 
     with one_thread():
-        return share_between_copies(range(workers), work, workers)
+        return share_between_forks(range(workers), work, workers)
 
 
 def chunk_size(device: torch.device) -> int:

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchid.kernels import compression, limbs, rows, states
-from torchid.kernels.gram import write_gram
+from torchid.kernels import limbs, rows, states
+from torchid.kernels.gram import SPAN, write_gram, write_grams
 from torchid.kernels.tiles import TILE
 from torchid.parameters import Array
 from torchid.problem.blocks import BlockRows
@@ -82,8 +82,8 @@ class _Limbs:
 
 
 @dataclass(frozen=True)
-class _Plan:
-    """What `rows.write_rows` takes of some blocks."""
+class _BlockTables:
+    """Some blocks as the integer tables that `rows.write_rows` takes."""
 
     blocks: np.ndarray
     moved: np.ndarray
@@ -92,7 +92,7 @@ class _Plan:
     kept: np.ndarray
 
     @classmethod
-    def of(cls, blocks: tuple[RowBlock, ...], base: int, dofs: int | None) -> _Plan:
+    def of(cls, blocks: tuple[RowBlock, ...], base: int, dofs: int | None) -> _BlockTables:
         """Of blocks that combine so many degrees of freedom after those of the base; None for one row and one each."""
         table, moved, ratios = list[list[int]](), list[list[int]](), list[float]()
         bodies, kept, first = list[list[int]](), list[int](), 1  # the first path sum stays 0
@@ -144,7 +144,7 @@ class _Group:
 
     Attributes:
         blocks: the blocks.
-        plan: of these.
+        tables: of these.
         tiles: of all samples.
         W: tiles (T, degrees of freedom, rank, TILE) of it, or one for all.
         f: measured forces, (B, degrees of freedom).
@@ -152,7 +152,7 @@ class _Group:
     """
 
     blocks: tuple[RowBlock, ...]
-    plan: _Plan
+    tables: _BlockTables
     tiles: _Tiles
     W: Tensor
     f: Tensor
@@ -205,9 +205,9 @@ class CompiledChunk:
 
     def _written(self, group: _Group) -> Iterator[BlockRows]:
         count = len(self.samples)
-        placed, size = group.plan.placed(count)
+        placed, size = group.tables.placed(count)
         flat = self.workspace.empty("rows", group.W, size)
-        rows.write_rows(*group.arrays(self.workspace), placed, *group.plan.of_bodies, flat.numpy())
+        rows.write_rows(*group.arrays(self.workspace), placed, *group.tables.of_bodies, flat.numpy())
         for block, in_W, (_, each, width, start, *_) in zip(group.blocks, group.joints, placed.tolist(), strict=True):
             stacked = flat[start:][: width * (width + each * count)].unflatten(0, (width, -1))
             made = BlockRows(block, stacked, stacked[:, width:].unflatten(1, (each, count)), None)
@@ -215,17 +215,17 @@ class CompiledChunk:
             yield made
 
     def _multiplied(self, group: _Group, levels: Sequence[ColumnLevels]) -> Iterator[tuple[RowBlock, Array, Array]]:
-        plan = group.plan
-        placed, size = plan.placed(min(compression.SPAN, group.tiles.samples))
-        flat, widths = self.workspace.empty("rows", group.W, size), plan.blocks[:, 2]
+        tables = group.tables
+        placed, size = tables.placed(min(SPAN, group.tiles.samples))
+        flat, widths = self.workspace.empty("rows", group.W, size), tables.blocks[:, 2]
         counts = np.array([len(own.lower) for own in levels])
         lower, combination = (
             np.concatenate([getattr(own, name).ravel() for own in levels]) for name in ("lower", "to_lower")
         )
         table = np.column_stack([_starts(counts), counts, _starts(counts * widths), _starts(widths**2)])
         squares, grams = np.empty(len(lower)), np.empty(int((widths**2).sum()))
-        compression.write_grams(
-            *(*group.arrays(self.workspace), placed, *plan.of_bodies, table, lower, combination, flat.numpy()),
+        write_grams(
+            *(*group.arrays(self.workspace), placed, *tables.of_bodies, table, lower, combination, flat.numpy()),
             *(squares, grams),
         )
         for block, (first, count, _, start), width in zip(group.blocks, table.tolist(), widths.tolist(), strict=True):
@@ -262,7 +262,7 @@ class CompiledRows:
         self._pose = np.ascontiguousarray(tree.T_parent_joint[:, :3]).reshape(-1)
         self._slides = np.array(tree.slides, dtype=float)
         self._limbs: dict[int, _Limbs] = {}
-        self._plans: dict[int, _Plan] = {}
+        self._tables_by_blocks: dict[int, _BlockTables] = {}
 
     def chunk(self, samples: Samples, layout: ContactStateLayout, workspace: Workspace) -> CompiledChunk | None:
         """The rows of a chunk, coupled ones first; None where joints rest or ranks of contacts differ."""
@@ -279,16 +279,16 @@ class CompiledRows:
         weights = torch.from_numpy(1.0 / builder.dof_std[joints])[None, :, None, None].repeat(1, 1, 1, TILE)
         torque = builder.torque_of_bodies(samples)[:, builder.tree.index(joints)]
         groups = (
-            _Group(of_rank, self._plan(of_rank, len(layout.coupled_joints)), tiles, *coupled, [in_W] * len(of_rank)),
-            _Group(apart, self._plan(apart, None), tiles, weights, torque, [{x: k} for k, x in enumerate(joints)]),
+            _Group(of_rank, self._tables(of_rank, len(layout.coupled_joints)), tiles, *coupled, [in_W] * len(of_rank)),
+            _Group(apart, self._tables(apart, None), tiles, weights, torque, [{x: k} for k, x in enumerate(joints)]),
         )
         return CompiledChunk(builder, samples, [group for group in groups if group.blocks], workspace)
 
-    def _plan(self, blocks: tuple[RowBlock, ...], dofs: int | None) -> _Plan:
+    def _tables(self, blocks: tuple[RowBlock, ...], dofs: int | None) -> _BlockTables:
         key = id(blocks[0]) if blocks else 0  # of those that the builder's layouts keep
-        if (plan := self._plans.get(key)) is None:
-            plan = self._plans[key] = _Plan.of(blocks, self._builder.tree.base_rows, dofs)
-        return plan
+        if (tables := self._tables_by_blocks.get(key)) is None:
+            tables = self._tables_by_blocks[key] = _BlockTables.of(blocks, self._builder.tree.base_rows, dofs)
+        return tables
 
     def _tiles(self, motion: Motion, workspace: Workspace) -> _Tiles:
         joints = joint_motion(self._builder.tree, motion)

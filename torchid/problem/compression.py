@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchid import ranks
+from torchid import distributed
 from torchid.problem.blocks import (
     BlockRows,
     block_spans,
@@ -173,7 +173,7 @@ def _spans_of_blocks(logs: Sequence[Samples], builder: RowBuilder) -> list[list[
     independent = sum(len(log) / log.oversampling for log in logs)
     states = len({(log.source, state) for log in logs for state, _ in chunks_by_state(log)})
     count = min(BLOCKS, int(independent / _LEAST_PER_BLOCK), _most_factors(states, builder))
-    count, total = ranks.as_first(count, "blocks"), sum(map(len, logs))
+    count, total = distributed.broadcast(count, "blocks"), sum(map(len, logs))
     return [block_spans(len(log), max(1, round(count * len(log) / max(total, 1)))) for log in logs]
 
 
@@ -342,7 +342,7 @@ def fold_count(independent: float, states: int, builder: RowBuilder) -> int:
         builder: of the rows.
     """
     count = max(1, min(FOLDS, int(independent / LEAST_PER_FOLD), _most_factors(states, builder)))
-    return ranks.as_first(count, "folds")
+    return distributed.broadcast(count, "folds")
 
 
 def _most_factors(states: int, builder: RowBuilder) -> int:

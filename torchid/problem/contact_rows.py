@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchid.problem.chunk_dynamics import ChunkKinematics
 from torchid.problem.contact_state import ContactStateLayout
-from torchid.problem.row_blocks import turn_rows
+from torchid.problem.row_blocks import triangularize_base_rows
 from torchid.problem.wrench_rows import wrenches_at_ground
 from torchid.regressor.regressor import generalized_forces
 from torchid.regressor.tree import KinematicTree
@@ -119,8 +119,8 @@ def whitened_bases(
         resting: (joints, B), coupled joints whose torque is unmeasured at a sample; None for none.
 
     Yields:
-        (index of the samples, W): W is (m, r, B'), turned where the layout says so, with a column of zeros for each row
-        that a sample loses by `resting`.
+        (index of the samples, W): W is (m, r, B'), triangular where the layout says so, with a column of zeros for each
+        row that a sample loses by `resting`.
     """
     if resting is None:
         yield from _measured_bases(layout, rows, measured, axes, order)
@@ -134,8 +134,8 @@ def whitened_bases(
             W[base:].masked_fill_(own[:, None], 0.0)
         else:
             leave_out_torques(W, own, layout.row_std)
-            if layout.blocks.are_turned:
-                turn_rows(W)
+            if layout.blocks.has_triangular_base:
+                triangularize_base_rows(W)
         yield index, W
 
 
@@ -211,6 +211,6 @@ def general_bases(
     A, J_m = rows.of_unmeasured(index), measured.permute(2, 0, 1)
     for part, basis in whitened_null_space(A, layout.row_std, J_m, layout.wrench_std, axes, order):
         W = basis.permute(1, 2, 0).contiguous()
-        if layout.blocks.are_turned:
-            turn_rows(W)
+        if layout.blocks.has_triangular_base:
+            triangularize_base_rows(W)
         yield part, W

@@ -25,6 +25,16 @@ from torchid.logs.preprocess import (
     unloaded_readings,
 )
 from torchid.logs.timeline import SPLINE_BLOCK, lay_out_timeline
+from torchid.problem.base_pose import (
+    PoseSegments,
+    base_pose_in_parts,
+    feet_poses,
+    points_that_stand,
+    require_floor_normals,
+    require_no_heading,
+    sole_axes,
+    standing_flags,
+)
 from torchid.problem.contact_detection import Detection, DetectionConfig, Filtered, detect_in_parts, name_flags
 from torchid.problem.detection_motion import (
     MAX_GAPS,
@@ -36,16 +46,6 @@ from torchid.problem.detection_motion import (
     require_torque,
 )
 from torchid.problem.floor_pose import Footholds, StanceFoot, foot_to_base
-from torchid.problem.standing import (
-    StandingSegments,
-    feet_poses,
-    points_that_stand,
-    require_floor_normals,
-    require_no_heading,
-    sole_axes,
-    stand_in_parts,
-    standing_flags,
-)
 from torchid.problem.unloaded_sensors import offsets_in_the_air
 from torchid.robot import Robot
 from torchid.sensing import Contact
@@ -142,10 +142,10 @@ def with_flags(blocks: LogBlocks, contacts: Sequence[Contact], active: BoolArray
 # -------------------------------------------------------------------------------------------------------- standing base
 
 
-def stand_in_blocks(
+def base_pose_in_blocks(
     blocks: LogBlocks, robot: Robot, contacts: Sequence[Contact], pieces: Pieces, folder: Path | None
-) -> tuple[LogBlocks, StandingSegments]:
-    """As `stand_on_feet`: the log with the pose of its base in the segments where it is known; passes over the joints.
+) -> tuple[LogBlocks, PoseSegments]:
+    """As `base_pose_from_feet`: the log with the base's pose where it is known, and where; passes over the joints.
 
     Args:
         blocks: the log, with flags.
@@ -155,7 +155,7 @@ def stand_in_blocks(
         folder: with room for the poses; None: in memory.
 
     Raises:
-        LogError: as `stand_on_feet`.
+        LogError: as `base_pose_from_feet`.
     """
     active = _active(blocks, contacts, pieces)
     parts = list(pieces(len(blocks)))
@@ -180,7 +180,7 @@ def stand_in_blocks(
             grows.append(rows)
         length = samples.stop
 
-    found = stand_in_parts(blocks.source, contacts, active, footholds, parts, add)
+    found = base_pose_in_parts(blocks.source, contacts, active, footholds, parts, add)
     _skip(quats, len(blocks) - length, 4)
     _skip(positions, len(blocks) - length, 3)
     fields: dict[str, Any] = {name: None for name in (*motion_fields(blocks), NORMALS) if not name.startswith("joint_")}

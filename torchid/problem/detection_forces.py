@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchid import ranks
+from torchid import distributed
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.parameters import FRICTION, GRAVITY, PER_BODY
 from torchid.problem.compression import compress_parts
@@ -229,7 +229,7 @@ def fitted_parameters(samples: Samples, builder: RowBuilder, robot: Robot) -> tu
         builder: of rows, whose extra parameters are armatures.
         robot: for the prior.
     """
-    with ranks.apart():  # each process has logs of its own
+    with distributed.apart():  # each process has logs of its own
         assembly = assemble(compress_parts([samples], builder), builder, robot)
     phi = most_probable(assembly.problem)
     armature = np.maximum(np.concatenate(assembly.extras_at(phi)), 0.0)

@@ -18,10 +18,10 @@ from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import preprocess
 from torchid.logs.timeline import JITTER
 from torchid.problem.base_motion import BaseMotion, base_motion
+from torchid.problem.base_pose import base_pose_from_feet
 from torchid.problem.floor_pose import levelled
 from torchid.problem.log_joints import joint_order
 from torchid.problem.samples import Samples
-from torchid.problem.standing import stand_on_feet
 from torchid.regressor.kinematics import GRAVITY_WORLD
 from torchid.robot import Robot
 from torchid.sensing import Contact
@@ -182,7 +182,7 @@ def _if_all_stand(log: Log, robot: Robot, contacts: Sequence[Contact]) -> FloatA
     flags = np.ones((len(log), len(contacts)), dtype=bool)
     bare = Log(log.source, log.time, log.joint_names, log.joint_position, contact_names=frames, contact_active=flags)
     try:
-        quat = stand_on_feet(bare, robot, contacts).log.base_quat_xyzw
+        quat = base_pose_from_feet(bare, robot, contacts).log.base_quat_xyzw
     except InputError:
         quat = None
     return np.tile(np.eye(3), (len(log), 1, 1)) if quat is None else _rotation(_filled(quat))

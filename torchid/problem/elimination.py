@@ -140,21 +140,9 @@ def assemble(
         return Assembly(problem, (), problem, noise, forces)
     count = builder.columns.count
     per_log, of_all = ([n for n, extra in enumerate(builder.extras) if extra.per_log is own] for own in (True, False))
-    eliminations, rows = [], of_all_logs
+    eliminations, rows = list[Elimination](), of_all_logs
     if per_log:
-        extras, remaining, lacking = tuple(builder.extras[number] for number in per_log), [], []
-        for source in dict.fromkeys(part.source for part in parts):
-            own = corrected_triangle(merge_factors((p.factor for p in parts if p.source == source), builder), prior)
-            rest = np.delete(own.R, [count + number for number in per_log], axis=1)
-            columns = own.R[:, [count + number for number in per_log]]
-            elimination, rest = _eliminate(source, extras, columns, rest, builder, np.linalg.norm(columns, axis=0))
-            eliminations.append(elimination)
-            remaining.append(rest)
-            lacking.append(
-                (rest, None if own.shrinkage is None else np.delete(own.shrinkage, [count + n for n in per_log], 0))
-            )
-        shrinkage = _joined_shrinkage(lacking)
-        rows = np.asarray(np.linalg.qr(np.concatenate(remaining), mode="r"))
+        eliminations, rows, shrinkage = _eliminate_per_log(parts, builder, prior, per_log)
     if of_all:
         extras = tuple(builder.extras[number] for number in of_all)
         sizes = np.linalg.norm(of_all_logs[:, [count + number for number in of_all]], axis=0)
@@ -171,6 +159,27 @@ def assemble(
     known = np.asarray(np.linalg.qr(np.delete(of_all_logs, np.s_[count:-1], axis=1), mode="r"))
     if_known = problem_from_triangle(known, everything.rows, oversampling, builder, robot, friction, None)
     return Assembly(problem, tuple(eliminations), if_known, noise, forces, reading_noise=reading_noise)
+
+
+def _eliminate_per_log(
+    parts: Sequence[Part], builder: RowBuilder, prior: ColumnPrior, numbers: Sequence[int]
+) -> tuple[list[Elimination], Array, Array | None]:
+    """Eliminate extra parameters that each log has of its own, of these numbers: log by log, as no other has them.
+
+    Returns:
+        What was eliminated; the triangle of what is left of all logs, (R, columns without them + 1); its shrinkage.
+    """
+    extras, at = tuple(builder.extras[number] for number in numbers), [builder.columns.count + n for n in numbers]
+    eliminations, remaining, lacking = [], [], []
+    for source in dict.fromkeys(part.source for part in parts):
+        own = corrected_triangle(merge_factors((p.factor for p in parts if p.source == source), builder), prior)
+        columns, rest = own.R[:, at], np.delete(own.R, at, axis=1)
+        elimination, rest = _eliminate(source, extras, columns, rest, builder, np.linalg.norm(columns, axis=0))
+        eliminations.append(elimination)
+        remaining.append(rest)
+        lacking.append((rest, None if own.shrinkage is None else np.delete(own.shrinkage, at, 0)))
+    rows = np.asarray(np.linalg.qr(np.concatenate(remaining), mode="r"))
+    return eliminations, rows, _joined_shrinkage(lacking)
 
 
 def column_prior(builder: RowBuilder, robot: Robot, friction: bool = True) -> ColumnPrior:

@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchid import ranks
+from torchid import distributed
 from torchid.errors import format_percent
 from torchid.parallel import one_thread
 from torchid.parameters import Array
@@ -109,7 +109,7 @@ def estimate_noise_gram(
         progress: called with 0 where some of the samples of a piece have been taken.
     """
     scaled = bool(scale_columns(builder))
-    step = ranks.as_first(max(1, sum(map(len, pieces)) // _perturbed(pieces)), "samples with noise")
+    step = distributed.broadcast(max(1, sum(map(len, pieces)) // _perturbed(pieces)), "samples with noise")
     by_log: dict[str, list[Samples]] = {}
     for piece in pieces:
         if (scaled or piece.motion_noise is not None) and len(piece):

@@ -23,7 +23,7 @@ from torchid.parameters import Array
 from torchid.regressor.columns import ColumnLayout
 from torchid.regressor.tree import KinematicTree
 
-_WORTH_TURNING = 0.8  # of the factorization's operations, what is left at most if turning the rows is to pay
+_WORTH_TRIANGULARIZING = 0.8  # of the factorization's operations, what is left at most if it is to pay
 
 
 @dataclass(frozen=True)
@@ -113,8 +113,8 @@ class RowBlocks:
     """The blocks of a contact state's coupled rows.
 
     `order`: of the degrees of freedom (base rows, then coupled joints), for a W that is triangular: joints from the
-    leaves to the base, then the base's force, then its moment. `are_turned`: whether W, where it is not triangular, is
-    to be turned (see `turn_rows`).
+    leaves to the base, then the base's force, then its moment. `has_triangular_base`: whether another W is
+    to be triangular in the base rows (see `triangularize_base_rows`).
     """
 
     def __init__(
@@ -150,17 +150,17 @@ class RowBlocks:
         self._triangular = tuple(self._triangular_blocks(leaves_first, contacts))
         self._by_rank: dict[int, tuple[RowBlock, ...]] = {}
         rank = max(len(self.order) - unmeasured, 0)
-        self.are_turned = False
+        self.has_triangular_base = False
         if tree.base_rows and unmeasured and rank:
             together, apart = self._together(rank), self._apart(rank)
-            self.are_turned = sum(x.operations for x in apart) <= _WORTH_TURNING * together.operations
+            self.has_triangular_base = sum(x.operations for x in apart) <= _WORTH_TRIANGULARIZING * together.operations
 
     def of_rank(self, rank: int) -> tuple[RowBlock, ...]:
         """The blocks of samples that have so many coupled rows."""
         if not self._unmeasured:
             return self._triangular
         if rank not in self._by_rank:
-            blocks = self._apart(rank) if self.are_turned else (self._together(rank),)
+            blocks = self._apart(rank) if self.has_triangular_base else (self._together(rank),)
             self._by_rank[rank] = blocks if rank else ()
         return self._by_rank[rank]
 
@@ -310,10 +310,10 @@ def _path_step(run: Sequence[tuple[int, int, int | None]], first: int) -> PathSt
     )
 
 
-def turn_rows(W: Tensor) -> None:
-    """Turn bases so that all but the last three columns are zero in the base's moment, all but six in its force too.
+def triangularize_base_rows(W: Tensor) -> None:
+    """Make bases triangular in the base rows: zero but for three columns in its moment, but for six in its force.
 
-    By Householder reflections from the right, one per base row, in place.
+    The R of an RQ decomposition, by Householder reflections from the right, one for each base row, in place.
 
     Args:
         W: (base rows + coupled joints, r, B).
@@ -322,13 +322,13 @@ def turn_rows(W: Tensor) -> None:
     for row in (5, 4, 3, 2, 1, 0)[: 3 if last <= 6 else 6]:
         if last < 2:
             return
-        turned = W[:, :last]
-        v = turned[row].clone()
+        left = W[:, :last]
+        v = left[row].clone()
         norm = torch.linalg.vector_norm(v, dim=0)
         v[-1] += torch.copysign(norm, v[-1])
         length = (v * v).sum(0)
         v_scaled = v * torch.where(length > 0.0, 2.0 / length, 0.0)
-        turned.addcmul_((turned * v).sum(1, keepdim=True), v_scaled, value=-1)
+        left.addcmul_((left * v).sum(1, keepdim=True), v_scaled, value=-1)
         last -= 1
 
 

@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.special import chdtri, ndtr
 from torch import Tensor
 
-from torchid import ranks
+from torchid import distributed
 from torchid.parallel import map_in_workers, one_thread
 from torchid.parameters import Array
 from torchid.problem.chunks import chunks_by_state, worker_count
@@ -103,8 +103,8 @@ class SampledRows:
             builder.layout(state, samples.contact_normal is not None)
         self.chunks = map_in_workers(drawn, lambda one: self._chunk(*one), worker_count(builder.device))
         elsewhere = any(isinstance(log, LogOfOtherProcess) for log in logs)
-        if any(ranks.gather(elsewhere, "logs that others have")):
-            self.chunks = list(chain.from_iterable(ranks.gather(self.chunks, "samples for the noise")))
+        if any(distributed.all_gather(elsewhere, "logs that others have")):
+            self.chunks = list(chain.from_iterable(distributed.all_gather(self.chunks, "samples for the noise")))
 
     def with_directions(self, logs: Sequence[Samples], builder: RowBuilder) -> SampledRows:
         """The rows of samples that differ in what Coulomb friction goes with alone, in a fifth of the time.

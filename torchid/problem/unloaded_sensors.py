@@ -104,7 +104,7 @@ def _robust_mean(y: Tensor, noise: float, oversampling: float) -> tuple[float, f
     return float(y.mean()), max(noise**2 / len(y), scatter) ** 0.5
 
 
-KEY = "preprocessing.zero_in_air"
+_KEY = "preprocessing.zero_in_air"
 _FITTED = "sensors.offsets: {contact_force: log, contact_moment: log}, which are fitted"
 
 
@@ -150,11 +150,11 @@ def offsets_in_the_air(
         TorchidWarning: likewise.
     """
     if log.contact_wrench_world is not None and not log.moments_about_world_origin:
-        found = f"given with {KEY}, though no offset is constant along the world's axes of a sensor that moves"
+        found = f"given with {_KEY}, though no offset is constant along the world's axes of a sensor that moves"
         accepted = f"{WRENCHES[0]} or {FORCE_NORMAL}; of force plates {POINTS}, or logs.columns.plates"
         raise LogError(log.source, WRENCHES[1], found, accepted)
     if log.contact_wrench is None and log.contact_force_normal is None:
-        raise LogError(log.source, WRENCHES[0], "missing", f"readings of contacts, which {KEY} is for")
+        raise LogError(log.source, WRENCHES[0], "missing", f"readings of contacts, which {_KEY} is for")
     air = _Readings.of(len(log.contact_names), parts)
     offsets, masked = np.zeros((len(log.contact_names), 7)), list[str]()
     for contact in contacts:
@@ -211,7 +211,7 @@ def _require_readings(log: Log, frame: str, component: int, count: int) -> None:
     """Refuse a channel that was read less often in the air than a mean needs."""
     if count < LEAST_READINGS:
         found = f"{count} readings of {frame} in the air, more than {UNLOADED_MARGIN_S:g} s from contact"
-        accepted = f"{LEAST_READINGS} or more for {KEY}, or {_FITTED}"
+        accepted = f"{LEAST_READINGS} or more for {_KEY}, or {_FITTED}"
         raise LogError(log.source, FORCE_NORMAL if component == 6 else log.contact_wrench_field, found, accepted)
 
 
@@ -225,7 +225,7 @@ def _warn_of_offsets(log: Log, offsets: FloatArray, masked: Sequence[str]) -> No
         if own[part].any()
     ]
     if texts:
-        warn(f"{log.source}: {KEY} has subtracted {'; '.join(texts)}")
+        warn(f"{log.source}: {_KEY} has subtracted {'; '.join(texts)}")
     if masked:
         text = f"readings of {', '.join(masked)} in the air are 0 or clamped and show no offset"
-        warn(f"{log.source}: {KEY}: {text}; {_FITTED}, may find it")
+        warn(f"{log.source}: {_KEY}: {text}; {_FITTED}, may find it")

@@ -30,7 +30,7 @@ import torchid
 from torchid.checksums import checksum_of_parts, file_checksum, file_parts, file_states, part_checksum
 from torchid.errors import excerpt, warn
 from torchid.logs.blocks import GIGABYTE
-from torchid.parallel import in_copies, thread_count
+from torchid.parallel import in_forks, thread_count
 from torchid.staging import NEW, atomic_file, is_leftover, remove_leftover, staging_folder
 
 FOLDER = ".torchid_cache"
@@ -209,7 +209,7 @@ class Cache:
         Args:
             path: of the log.
             files: that it consists of.
-            meanwhile: called while copies of this process sum up long files.
+            meanwhile: called while forks of this process sum up long files.
 
         Raises:
             OSError: one cannot be read.
@@ -220,7 +220,7 @@ class Cache:
         if sum(state[0] for state in states) < _LONG:
             sums = [part_checksum(part) for part in file_parts(files)]
         else:
-            with in_copies(file_parts(files), part_checksum, max(thread_count() - 1, 1)) as summing:
+            with in_forks(file_parts(files), part_checksum, max(thread_count() - 1, 1)) as summing:
                 meanwhile()
                 sums = summing()
         self.note_checksum(path, files, states, found := checksum_of_parts(sums))

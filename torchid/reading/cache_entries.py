@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter
 from torch import Tensor
 
-from torchid import ranks
+from torchid import distributed
 from torchid.checksums import file_checksum
 from torchid.config.robot import RobotConfig
 from torchid.errors import TorchidWarning
@@ -205,7 +205,7 @@ def factors_key(experiment: Experiment, builder: RowBuilder, samples: Sequence[s
             "blocks": [[sources.index(block.source), len(block), block.fold] for block in blocks],
             "motion_noise": [block.motion_noise is not None for block in blocks],
             "device": builder.device.type,
-            "shares": [worker_count(builder.device), ranks.world_size()],  # rows are added up by each
+            "shares": [worker_count(builder.device), distributed.world_size()],  # rows are added up by each
         }
     )
 
@@ -231,11 +231,11 @@ def cached_parts(
             found = _unpacked(entry, builder, sources)
         except Exception as error:  # noqa: B902 - whatever another program has put there
             cache.drop(key, str(error))
-    there = all(ranks.gather(found is not None, "factors in the cache"))
+    there = all(distributed.all_gather(found is not None, "factors in the cache"))
     if there and found is not None:
         return found, True
     parts = compute()
-    if ranks.is_first():
+    if distributed.is_first():
         cache.save(key, *_packed(parts, sources))
     return parts, False
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torchid import ranks
+from torchid import distributed
 from torchid.checksums import FilePart, checksum_of_parts, file_parts, file_states, part_checksum
 from torchid.errors import TorchidWarning, warn
 from torchid.fitting.experiment import RobotSetup
@@ -45,9 +45,9 @@ def open_cache(setup: RobotSetup) -> Cache | None:
     if not size or output is None:
         return None
     cache = Cache(output.absolute().parent / FOLDER, size)
-    if ranks.world_size() > 1 and not _is_common(cache.folder):
+    if distributed.world_size() > 1 and not _is_common(cache.folder):
         return None
-    if ranks.is_first():
+    if distributed.is_first():
         cache.tidy()
     return cache
 
@@ -55,14 +55,14 @@ def open_cache(setup: RobotSetup) -> Cache | None:
 def _is_common(folder: Path) -> bool:
     """Whether all processes find in a folder what the first one has just put there."""
     name, missing = "", missing_folders(folder)
-    if ranks.is_first():
+    if distributed.is_first():
         with suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)
             (folder / (token := f"{TOKEN}{secrets.token_hex(8)}")).touch()
             name = token
-    name = ranks.as_first(name, "a file for all processes")
-    found = all(ranks.gather(bool(name) and (folder / name).is_file(), "a common folder"))
-    if name and ranks.is_first():
+    name = distributed.broadcast(name, "a file for all processes")
+    found = all(distributed.all_gather(bool(name) and (folder / name).is_file(), "a common folder"))
+    if name and distributed.is_first():
         with suppress(OSError):
             (folder / name).unlink()
         remove_empty(missing)
@@ -119,10 +119,10 @@ class CachedReader(LogReader):
         self, paths: Sequence[Path], required: SensorSet | None, on_read: Callable[[Path], None] | None = None
     ) -> list[Samples]:
         """As `LogReader.read`; of processes that share the work, each reads some of the logs for all."""
-        if ranks.world_size() > 1:
+        if distributed.world_size() > 1:
             self._fill_together(paths, required)
         logs = super().read(paths, required, on_read)
-        if ranks.is_first():
+        if distributed.is_first():
             self.cache.write_index()
         return logs
 
@@ -146,7 +146,7 @@ class CachedReader(LogReader):
         if not self.cache.has(key):
             self._new.add(key)
             if (
-                ranks.world_size() == 1
+                distributed.world_size() == 1
                 and (one := self._log_to_read(path, key, together, self._together(path))).in_place
             ):
                 self._store_together([one], 0, required)
@@ -157,7 +157,7 @@ class CachedReader(LogReader):
                 found = self._read(path, required, together, warned)
             finally:
                 _reissue(warned)
-            if ranks.world_size() == 1 and self._store(key, path, found):
+            if distributed.world_size() == 1 and self._store(key, path, found):
                 found = self._load(key, path, required, together) or found
         else:
             _reissue(found.warned)
@@ -258,55 +258,57 @@ class CachedReader(LogReader):
         whole, in_pieces = {number: to_read[number].size for number in missing.values()}, list[int]()
         if on_one_machine():
             in_pieces = [
-                x for x in whole if to_read[x].in_place and whole[x] * ranks.world_size() > sum(whole.values())
+                x for x in whole if to_read[x].in_place and whole[x] * distributed.world_size() > sum(whole.values())
             ]
-        in_pieces = ranks.as_first(in_pieces, "logs to read in pieces")
+        in_pieces = distributed.broadcast(in_pieces, "logs to read in pieces")
         for number in in_pieces:
             self._store_together(to_read, number, required)
         own = _shares({number: size for number, size in whole.items() if number not in in_pieces})
-        shares = ranks.as_first(own, "logs to read")
-        for number in shares[ranks.rank()]:
+        shares = distributed.broadcast(own, "logs to read")
+        for number in shares[distributed.rank()]:
             try:
                 one = to_read[number]
                 self._store(one.key, one.path, self._read(one.path, required, one.together, []))
             except Exception:  # noqa: B902 - all processes meet it when they read the log
                 break
-        ranks.gather(None, "logs read")
+        distributed.all_gather(None, "logs read")
 
     def _store_together(self, to_read: Sequence[_LogToRead], number: int, required: SensorSet | None) -> None:
         """Store the samples of a log block by block, of which each process reads some; or not, if one of them fails."""
 
         def fill(folder: str) -> tuple[dict[str, Any], Files] | None:
-            if not all(ranks.gather(number < len(to_read), "logs to read together")):
+            if not all(distributed.all_gather(number < len(to_read), "logs to read together")):
                 return None
             one = to_read[number]
             log = self._large_log(one.path, required, None if one.together is None else self.folder)
             return read_together(log, fits_contact_offsets(self.setup), Path(folder), self.cache.limit)
 
         def fill_for_all(folder: Path) -> tuple[dict[str, Any], Files] | None:
-            begun.append(ranks.as_first(str(folder), "a folder for a log"))
+            begun.append(distributed.broadcast(str(folder), "a folder for a log"))
             written, content = fill(str(folder)), self._contents[to_read[number].path]
             return written if file_states(content.files) == content.states else None
 
         begun: list[str] = []
-        if ranks.is_first():
+        if distributed.is_first():
             self.cache.save_files(to_read[number].key, to_read[number].size, fill_for_all)
-        folder = "" if begun else ranks.as_first("", "a folder for a log")
+        folder = "" if begun else distributed.broadcast("", "a folder for a log")
         if folder:
             fill(folder)
 
     def _sum_up_together(self, paths: Sequence[Path]) -> None:
         """Work out checksums of logs, each process of some parts of their files, if all see the same files."""
         seen = [_states_of_log(path) for path in paths]
-        if any(other != seen for other in ranks.gather(seen, "states of logs")):
+        if any(other != seen for other in distributed.all_gather(seen, "states of logs")):
             return
         there = [(split_range(path).file, path, states) for path, states in zip(paths, seen, strict=True) if states]
         known = [bool(self.cache.known_checksum(log, states)) for log, _, states in there]
         new = [
-            one for one, is_known in zip(there, ranks.as_first(known, "known checksums"), strict=True) if not is_known
+            one
+            for one, is_known in zip(there, distributed.broadcast(known, "known checksums"), strict=True)
+            if not is_known
         ]
         parts = [(log, part) for log in dict.fromkeys(log for log, *_ in new) for part in file_parts(log_files(log))]
-        sums = ranks.share_out(parts, _part_checksum, "checksums of logs", [part.size for _, part in parts])
+        sums = distributed.share_out(parts, _part_checksum, "checksums of logs", [part.size for _, part in parts])
         for log, path, states in new:
             of_log = [found for (other, _), found in zip(parts, sums, strict=True) if other == log]
             if all(of_log):
@@ -356,7 +358,7 @@ def _part_checksum(part: tuple[Path, FilePart]) -> str:
 
 def _shares(sizes: Mapping[int, int]) -> list[list[int]]:
     """Numbers of logs for each process, from their sizes: the largest first, each to whoever has least so far."""
-    shares: list[list[int]] = [[] for _ in range(ranks.world_size())]
+    shares: list[list[int]] = [[] for _ in range(distributed.world_size())]
     taken = [0] * len(shares)
     for number in sorted(sizes, key=lambda number: (-sizes[number], number)):
         least = taken.index(min(taken))

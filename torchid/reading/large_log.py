@@ -37,6 +37,7 @@ from torchid.logs.timeline import SPLINE_BLOCK, Timeline
 from torchid.parallel import one_thread, thread_count
 from torchid.problem import Samples, bind_log
 from torchid.problem.base_motion import BaseMotion
+from torchid.problem.base_pose import PoseSegments, warn_of_pose
 from torchid.problem.contact_slip import (
     away_from_own_changes,
     base_velocity,
@@ -45,17 +46,16 @@ from torchid.problem.contact_slip import (
     warn_of_slip,
 )
 from torchid.problem.derived_blocks import (
+    base_pose_in_blocks,
     contacts_alone,
     detect_in_blocks,
     flag_by_force_in_blocks,
     motion_fields,
-    stand_in_blocks,
     with_flags,
     zero_in_blocks,
 )
 from torchid.problem.log_joints import distances_from_welds, warn_of_moving_welds
 from torchid.problem.samples import require_forces
-from torchid.problem.standing import StandingSegments, warn_of_standing
 from torchid.reading.segmented_log import RecordedBlock, Segment, SegmentedLog, in_the_air, require_kept, row_numbers
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
@@ -77,7 +77,7 @@ class _Derived:
 
     blocks: LogBlocks
     certain: BoolArray | None = None
-    standing: StandingSegments | None = None
+    standing: PoseSegments | None = None
 
 
 @dataclass(frozen=True)
@@ -177,7 +177,7 @@ class LargeLog:
         if settings.base_motion is None:
             return out
         rest = partial(self._pieces, recorded), self.folder
-        blocks, standing = stand_in_blocks(out.blocks, self.robot, self.contacts, *rest)
+        blocks, standing = base_pose_in_blocks(out.blocks, self.robot, self.contacts, *rest)
         return replace(out, blocks=blocks, standing=standing)
 
     def _flagged(self, blocks: LogBlocks) -> _Derived:
@@ -219,7 +219,7 @@ class LargeLog:
         )
 
     def _segments(
-        self, blocks: LogBlocks, standing: StandingSegments, whole: Timeline, air: BoolArray | None
+        self, blocks: LogBlocks, standing: PoseSegments, whole: Timeline, air: BoolArray | None
     ) -> tuple[Segment, ...]:
         """The segments of a log with a pose that are long enough, each with its timeline; warns of the others."""
         out, first, settings = list[Segment](), 0, self.settings
@@ -233,7 +233,7 @@ class LargeLog:
             out.append(Segment(part, timeline, first, None if air is None else air[segment]))
             first += len(out[-1].time)
         too_short = count_samples(standing.segments) - count_samples(usable)
-        warn_of_standing(blocks.source, len(blocks), standing, too_short)
+        warn_of_pose(blocks.source, len(blocks), standing, too_short)
         return tuple(out)
 
     def _kept(self, segmented: SegmentedLog, contacts: Log, certain: BoolArray | None) -> BoolArray | None:

@@ -10,7 +10,7 @@ from tempfile import gettempdir
 import numpy as np
 import torch
 
-from torchid import ranks
+from torchid import distributed
 from torchid.config.logs import require_apart
 from torchid.errors import ConfigError, LogError
 from torchid.fitting.experiment import RobotSetup, S
@@ -27,10 +27,10 @@ from torchid.logs.segments import with_delayed_torques
 from torchid.logs.time_range import LogPart, split_range
 from torchid.parameters import Array
 from torchid.problem import Samples, bind_log
+from torchid.problem.base_pose import preprocess_with_pose
 from torchid.problem.contact_detection import with_detected_contacts
 from torchid.problem.contact_slip import measure_slip, warn_of_slip
 from torchid.problem.log_joints import with_loop_joints, without_welded_joints
-from torchid.problem.standing import preprocess_standing
 from torchid.problem.unloaded_sensors import zero_in_air
 from torchid.reading.large_log import BLOCK_GB, LargeLog
 from torchid.reading.segmented_log import require_kept
@@ -79,7 +79,7 @@ class LogReader:
         """
         with files_of_recordings_kept():
             logs = self._each(paths, required, on_read)
-        names = ranks.as_first([log.source for log in logs], "names of the logs")  # they may lie elsewhere there
+        names = distributed.broadcast([log.source for log in logs], "names of the logs")  # they may lie elsewhere there
         added = [payload_of(self.setup, path) for path in paths]
         return [replace(log, source=name, payload=x) for log, name, x in zip(logs, names, added, strict=True)]
 
@@ -127,7 +127,7 @@ class LogReader:
         )
         own = setup_of_log(self.setup, path)
         acting = with_delayed_torques(without_welded_joints(read, own.robot), self.setup.config.actuators.known_delay)
-        recorded, certain = settle_contacts(with_loop_joints(acting, own.robot), own)
+        recorded, certain = apply_contact_settings(with_loop_joints(acting, own.robot), own)
         checked = self._checked(recorded, own.robot)
         clean = recorded if checked is None else checked.repaired
         log = self._preprocessed(clean)
@@ -158,7 +158,7 @@ class LogReader:
         dry, finds_rest = (terms.sign_width, terms.stribeck), self.setup.config.actuators.stiction
         if settings.base_motion is None:
             return preprocess(clean, *rates, self._stated, *dry, finds_rest)
-        return preprocess_standing(clean, self.setup.robot, self.setup.contacts, *rates, *dry, finds_rest)
+        return preprocess_with_pose(clean, self.setup.robot, self.setup.contacts, *rates, *dry, finds_rest)
 
     def _slipping(self, log: Log, samples: Samples, recorded: Log) -> FloatArray | None:
         """Stamps of samples in which a contact slips; None where all are kept.
@@ -234,7 +234,7 @@ class LogReader:
         return check(log, robot, self.setup.contacts, settings.filter_hz, settings.derived, declared)
 
 
-def settle_contacts(log: Log, setup: RobotSetup) -> tuple[Log, BoolArray]:
+def apply_contact_settings(log: Log, setup: RobotSetup) -> tuple[Log, BoolArray]:
     """A log with the flags and zeros of contacts that the settings want, and where the flags (N,) are certain."""
     flagged, certain = _with_flags(log, setup)
     if not setup.config.preprocessing.zero_in_air:

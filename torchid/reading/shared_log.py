@@ -17,10 +17,10 @@ from typing import Any, BinaryIO
 import numpy as np
 import torch
 
-from torchid import ranks
+from torchid import distributed
 from torchid.checksums import file_checksum
 from torchid.fitting.noise import recorded_sensors
-from torchid.parallel import can_copy, share_between_copies, thread_count
+from torchid.parallel import can_fork, share_between_forks, thread_count
 from torchid.problem import Samples
 from torchid.reading.cache import Files, written_file
 from torchid.reading.cache_entries import ReadLog, RecordedWarning, named_tensors, samples_entry
@@ -31,7 +31,7 @@ from torchid.sensing import SensorSet
 def on_one_machine() -> bool:
     """Whether all processes can write to parts of one file; over a network they would overwrite each other's pages."""
     machine = platform.node(), uuid.getnode()
-    return all(other == machine for other in ranks.gather(machine, "names of machines"))
+    return all(other == machine for other in distributed.all_gather(machine, "names of machines"))
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class _Share:
 def read_together(log: LargeLog, with_unloaded: bool, folder: Path, most: float) -> tuple[dict[str, Any], Files] | None:
     """Fill the files of an entry with the samples of a log; its document and its files.
 
-    All processes that share the work call this together; one alone makes copies, which wait for no lock of Python's as
+    All processes that share the work call this together; one alone makes forks, which wait for no lock of Python's as
     threads do. Blocks do not depend on each other, so that the samples are those of one process to the last bit.
 
     Args:
@@ -65,26 +65,28 @@ def read_together(log: LargeLog, with_unloaded: bool, folder: Path, most: float)
     Returns:
         None in all processes but the first; there, too, if one has failed: who reads the log alone meets the reason.
     """
-    copied = can_copy() and ranks.world_size() == 1 and log.folder is None
-    count = thread_count() if copied else 1
+    forked = can_fork() and distributed.world_size() == 1 and log.folder is None
+    count = thread_count() if forked else 1
 
     def fill(number: int) -> _Share:
-        own = partial(ranks.share_of, number=number, count=count) if copied else ranks.own_share
-        return _fill(log, with_unloaded, _Rows(folder, log, most), own, 0 if copied else None)
+        own = partial(distributed.share_of, number=number, count=count) if forked else distributed.own_share
+        return _fill(log, with_unloaded, _Rows(folder, log, most), own, 0 if forked else None)
 
-    own_shares = share_between_copies(range(count), fill, count)
-    shares = [share for of_process in ranks.gather(own_shares, "blocks of a log") for share in of_process]
+    own_shares = share_between_forks(range(count), fill, count)
+    shares = [share for of_process in distributed.all_gather(own_shares, "blocks of a log") for share in of_process]
     likes = [one.like for one in shares if one.like is not None]
     if any(one.failed for one in shares) or not likes:
         return None
     names = list(named_tensors(likes[0]))
     paths = [folder / f"{name}.npy" for name in names]
-    sizes = ranks.as_first([path.stat().st_size if ranks.is_first() else 0 for path in paths], "sizes of files")
-    if copied:
-        sums = share_between_copies(paths, _checksum, count)
+    sizes = distributed.broadcast(
+        [path.stat().st_size if distributed.is_first() else 0 for path in paths], "sizes of files"
+    )
+    if forked:
+        sums = share_between_forks(paths, _checksum, count)
     else:
-        sums = ranks.share_out(paths, _checksum, "checksums of files", sizes)
-    if not all(sums) or not ranks.is_first():  # the first one moves the files to their place
+        sums = distributed.share_out(paths, _checksum, "checksums of files", sizes)
+    if not all(sums) or not distributed.is_first():  # the first one moves the files to their place
         return None
     recorded = [one.recorded for one in shares if one.recorded is not None]
     sensors = SensorSet(

@@ -17,7 +17,7 @@ from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from torchid.errors import during, escape
-from torchid.parallel import share_between_copies, thread_count
+from torchid.parallel import share_between_forks, thread_count
 
 # the palette of Okabe and Ito, which the colour-blind tell apart
 MEASURED_COLOR, NOMINAL_COLOR, IDENTIFIED_COLOR, NOISE_COLOR = "#111111", "#d55e00", "#0072b2", "#8c8c8c"
@@ -79,7 +79,7 @@ def save_figures(figures: Mapping[str, Figure], folder: Path, form: str) -> None
     def save(name: str) -> None:
         save_figure(figures[name], folder / f"{name}.{form}")
 
-    share_between_copies(list(figures), save, thread_count())
+    share_between_forks(list(figures), save, thread_count())
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from torchid.errors import ConfigError, join_names
 from torchid.parameters import Array
 from torchid.robot.robot import Robot
 
-TOLERANCE = 1e-3
+MIRROR_TOLERANCE = 1e-3
 """Greatest distance of an origin from its mirror image, in units of the robot's size."""
 
 
@@ -38,7 +38,7 @@ def mirror_pairs(
 
     All of them do, or else one alone: LAnkleRoll and RAnkleRoll differ in one letter of three, L and R. With all joints
     at 0 the two bodies must be mirror images with respect to the plane through the base link's origin whose normal is
-    the base link's axis `normal`: with D the reflection, D p_i = p_j for the origins, to `TOLERANCE`, and D a_i
+    the base link's axis `normal`: with D the reflection, D p_i = p_j for the origins, to `MIRROR_TOLERANCE`, and D a_i
     parallel to a_j for the joints' axes. From one link frame to the other the reflection is R_j^T D R_i.
 
     Args:
@@ -64,11 +64,11 @@ def mirror_pairs(
     for i, j in pairs:
         pair, accepted = f"{names[i]} and {names[j]}", "mirror images when all joints are at 0"
         off = float(np.linalg.norm(D @ T[i, :3, 3] - T[j, :3, 3]))
-        if off > TOLERANCE * size:
+        if off > MIRROR_TOLERANCE * size:
             found = f"{pair} are {off:.3g} m from being mirror images along {normal} in a robot of {size:.3g} m"
-            raise ConfigError.at_field(field, found, f"{accepted}, to {TOLERANCE * size:.2g} m")
+            raise ConfigError.at_field(field, found, f"{accepted}, to {MIRROR_TOLERANCE * size:.2g} m")
         aslant = _angle(robot, T, D, i, j)
-        if aslant > TOLERANCE:
+        if aslant > MIRROR_TOLERANCE:
             raise ConfigError.at_field(field, f"the joints of {pair} are {aslant:.3g} rad off", accepted)
         if robot.bodies[i].massless != robot.bodies[j].massless:
             raise ConfigError.at_field(field, f"of {pair} one has no mass", "two bodies that have")

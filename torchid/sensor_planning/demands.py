@@ -20,9 +20,9 @@ from torchid.rounding import BASE_RANK_TOLERANCE
 from torchid.sensing import Contact, SensorNoise, SensorSet
 from torchid.sensing.sensors import NORMAL_FORCE, NORMAL_INDEX, measured_components
 
-KINDS = ("joint_torque", "contact", "normal_force", "ft_sensor")
+SENSOR_KINDS = ("joint_torque", "contact", "normal_force", "ft_sensor")
 PER = ("device", "axis", "none")
-TOLERANCE = 1e-6
+SPAN_TOLERANCE = 1e-6
 """A share of unit vectors below this counts as zero, as in the rank of S_b V_x that this predicts.
 
 Axes that a URDF's rounded angles (1.5708) tilt by 4e-6 from parallel count as independent in both.
@@ -33,9 +33,10 @@ Axes that a URDF's rounded angles (1.5708) tilt by 4e-6 from parallel count as i
 class Candidate:
     """A sensor that may be chosen.
 
-    `kind`: one of `KINDS`. `dofs`: indices in the robot's `dof_names` that a torque sensor, or a force/torque sensor in
-    a limb, measures. `contact`: index of the contact, and `components`, in `WRENCH_COMPONENTS`, of a sensor there; that
-    of a scalar sensor is the one along the ground's normal of a contact with such axes, see `with_scalar_candidates`.
+    `kind`: one of `SENSOR_KINDS`. `dofs`: indices in the robot's `dof_names` that a torque sensor, or a force/torque
+    sensor in a limb, measures. `contact`: index of the contact, and `components`, in `WRENCH_COMPONENTS`, of a sensor
+    there; that of a scalar sensor is the one along the ground's normal of a contact with such axes, see
+    `with_scalar_candidates`.
     `name`: the joint; the contact's frame for a whole device, "l_sole.fx" for one axis of it, "l_sole.fn" for a scalar
     sensor.
     """
@@ -146,7 +147,7 @@ def _in_limbs(robot: Robot, names: Sequence[str], by_axis: bool) -> list[Candida
 
 
 def _with_costs(offered: Sequence[Candidate], costs: Mapping[str, float]) -> tuple[Candidate, ...]:
-    names = [*KINDS, *(candidate.name for candidate in offered)]
+    names = [*SENSOR_KINDS, *(candidate.name for candidate in offered)]
     for name, cost in costs.items():
         if name not in names:
             raise UnknownNameError("sensors", "costs", name, names)

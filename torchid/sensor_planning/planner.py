@@ -11,7 +11,7 @@ import numpy as np
 
 from torchid.errors import SensorError
 from torchid.identifiability.structure import random_postures
-from torchid.parallel import share_between_copies, thread_count
+from torchid.parallel import share_between_forks, thread_count
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.chunks import subsample_states
@@ -247,7 +247,7 @@ def explain_choice(choice: SensorChoice, progress: StepCallback | None = None) -
         return _base_rank(problem, sensors), stack.rank(sensors)
 
     fewer = [tuple(c for c in chosen if c is not candidate) for candidate in chosen]
-    (_, full), (_, rank), *without = share_between_copies(
+    (_, full), (_, rank), *without = share_between_forks(
         [problem.candidates, chosen, *fewer], ranks_with, thread_count()
     )
     return SensorPlan(

@@ -16,7 +16,7 @@ from torchid.errors import SensorError
 from torchid.parallel import one_thread
 from torchid.parameters import Array
 from torchid.sensor_planning.demands import (
-    TOLERANCE,
+    SPAN_TOLERANCE,
     Candidate,
     Demand,
     connected_groups,
@@ -286,11 +286,11 @@ def _cheapest_vectors(target: Array, vectors: Array, cost: Array) -> tuple[float
     d, length = target.shape[1], np.linalg.norm(vectors, axis=0)
     if d == 0:
         return 0.0, ()
-    indices = np.flatnonzero(length > TOLERANCE)
+    indices = np.flatnonzero(length > SPAN_TOLERANCE)
     vectors, cost = vectors[:, indices] / length[indices], cost[indices]
     rest = orthogonal_part(vectors, target)
     length = np.linalg.norm(rest, axis=0)
-    inside = length <= TOLERANCE
+    inside = length <= SPAN_TOLERANCE
     rest = (span_basis(rest).T @ rest) / np.where(inside, 1.0, length)  # (dimensions modulo the target, N)
     best, chosen, budget = math.inf, np.zeros(0, dtype=int), _COMBINATIONS
     for g in range(len(rest) + 1):
@@ -314,7 +314,7 @@ def _flats(rest: Array, inside: np.ndarray, g: int, least: int) -> Iterator[np.n
     while some := list(islice(generators, _BATCH)):
         picked = np.array(some, dtype=int).reshape(len(some), g)
         basis = orthonormal_basis(rest[:, picked].transpose(1, 0, 2))  # (some, dimensions, g)
-        member = (np.linalg.norm(orthogonal_part(rest, basis), axis=1) <= TOLERANCE) | inside
+        member = (np.linalg.norm(orthogonal_part(rest, basis), axis=1) <= SPAN_TOLERANCE) | inside
         yield from np.unique(member[member.sum(1) >= least], axis=0)
 
 
@@ -324,7 +324,7 @@ def _cheapest_basis(vectors: Array, flat: np.ndarray) -> list[int]:
     for index in np.flatnonzero(flat).tolist():
         left = orthogonal_part(vectors[:, [index]], basis)
         length = np.linalg.norm(left)
-        if length > TOLERANCE:
+        if length > SPAN_TOLERANCE:
             basis = np.hstack([basis, left / length])
             chosen.append(index)
     return chosen

@@ -1,4 +1,4 @@
-"""How far an estimate moves without each block of the logs: standard errors that need residuals not be noise."""
+"""The delete-a-block jackknife over blocks of the logs: standard errors that need residuals not be noise."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _NORMAL = float(ndtri(0.975))
 
 
 @dataclass(frozen=True)
-class BlockScatter:
+class Jackknife:
     """What parameters scatter by from block to block of the logs, as standard errors.
 
     Blocks of successive samples are longer than whatever correlates the residuals of neighbouring ones: noise that a
@@ -77,10 +77,10 @@ class BlockScatter:
 
 
 @one_thread()
-def block_scatter(
+def jackknife_blocks(
     parts: Sequence[Part], builder: RowBuilder, assembly: Assembly, ridge: float, rank_tolerance: float
-) -> BlockScatter | None:
-    """The scatter of an estimate between the blocks of its logs; None if these are too few.
+) -> Jackknife | None:
+    """The jackknife of an estimate over the blocks of its logs; None if these are too few.
 
     Args:
         parts: of the fit, from `compress_in_blocks`.
@@ -117,7 +117,7 @@ def block_scatter(
         scattered = factor * _left_out(scores * shrunk, shares * np.outer(shrunk, shrunk))
         with_ridge = np.concatenate([scattered, shrinkage * shrunk]) * shrunk @ basis.T
     growth = float(np.square(scores @ known).sum() / expected) if expected > 0.0 else 1.0
-    return BlockScatter(
+    return Jackknife(
         blocks=count,
         deviations=with_ridge,
         without_ridge=without_ridge,

@@ -14,7 +14,7 @@ from true_robots import true_parameters
 
 from torchid.estimators import LeastSquares
 from torchid.fitting.fit import LogFitter
-from torchid.identifiability import block_scatter
+from torchid.identifiability import jackknife
 from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log, compress_parts, compression
 from torchid.problem.compression import compress_in_blocks, split_into_folds
 from torchid.problem.motion_noise import MotionNoise
@@ -44,15 +44,15 @@ def noisy(samples: Samples, noise: Array) -> Samples:
 
 @pytest.mark.parametrize("ridge", [0.0, 0.01])
 def test_deviations_are_those_of_leaving_each_block_out(monkeypatch: pytest.MonkeyPatch, ridge: float) -> None:
-    monkeypatch.setattr(block_scatter, "_LEVERAGE", 1.0)
+    monkeypatch.setattr(jackknife, "_LEVERAGE", 1.0)
     samples, fitter, true, rng = scene(200)
     exact = noisy(samples, NOISE * rng.normal(size=(len(samples), 12)))
     fitter = replace(fitter, estimator=LeastSquares(ridge))
     parts = compress_in_blocks(split_into_folds([exact], fitter.builder), fitter.builder)
     fit = fitter.fit(parts)
-    assert fit.scatter is not None
+    assert fit.jackknife is not None
     keys = list(dict.fromkeys((part.fold, part.block) for part in parts))
-    assert len(keys) == fit.scatter.blocks == 20
+    assert len(keys) == fit.jackknife.blocks == 20
     moved = []
     for key in keys:
         rest = [part for part in parts if (part.fold, part.block) != key]
@@ -63,11 +63,11 @@ def test_deviations_are_those_of_leaving_each_block_out(monkeypatch: pytest.Monk
     known = fit.estimate.identifiable
     if not ridge:
         np.testing.assert_allclose(
-            fit.scatter.deviations[:, known], factor * np.array(moved)[:, known], rtol=1e-6, atol=1e-9
+            fit.jackknife.deviations[:, known], factor * np.array(moved)[:, known], rtol=1e-6, atol=1e-9
         )
-        assert fit.scatter.error_along(np.eye(len(true))[0]) == pytest.approx(fit.scatter.error[0], rel=1e-9)
+        assert fit.jackknife.error_along(np.eye(len(true))[0]) == pytest.approx(fit.jackknife.error[0], rel=1e-9)
     else:  # the prior's bias, which is no scatter, moves with the information left
-        ratio = fit.scatter.error[known] / (factor * np.linalg.norm(np.array(moved)[:, known], axis=0))
+        ratio = fit.jackknife.error[known] / (factor * np.linalg.norm(np.array(moved)[:, known], axis=0))
         assert 0.7 < np.median(ratio) < 1.1
     assert fit.estimate.block_error is not None
     larger = np.maximum(fit.estimate.noise_error, fit.estimate.block_error)
@@ -115,9 +115,9 @@ def test_intervals_hold_the_truth_where_errors_of_neighbours_are_alike(
         off = np.abs(fit.estimate.phi - true)[known]
         held.append(off <= NORMAL * fit.estimate.standard_error[known])
         by_noise.append(off <= NORMAL * fit.estimate.noise_error[known])
-        assert fit.scatter is not None
-        assert fit.scatter.blocks == blocks
-        lack.append(fit.scatter.lack_of_fit)
+        assert fit.jackknife is not None
+        assert fit.jackknife.blocks == blocks
+        lack.append(fit.jackknife.lack_of_fit)
     assert np.concatenate(held).mean() > 0.9
     assert np.concatenate(by_noise).mean() < 0.75
     known_lack = [one for one in lack if one is not None]
@@ -130,8 +130,8 @@ def test_noise_alone_is_no_lack_of_fit() -> None:
     for _ in range(5):
         log = noisy(samples, NOISE * rng.normal(size=(len(samples), 12)))
         fit = fitter.fit(compress_in_blocks(split_into_folds([log], fitter.builder), fitter.builder))
-        assert fit.scatter is not None
-        assert 0.8 < (fit.scatter.lack_of_fit or 0.0) < 1.25
+        assert fit.jackknife is not None
+        assert 0.8 < (fit.jackknife.lack_of_fit or 0.0) < 1.25
 
 
 def test_noise_of_the_motion_that_is_known_is_no_lack_of_fit() -> None:
@@ -154,24 +154,24 @@ def test_noise_of_the_motion_that_is_known_is_no_lack_of_fit() -> None:
         motion_noise=MotionNoise(joints, bases),
     )
     fit = fitter.fit(compress_in_blocks(split_into_folds([log], fitter.builder), fitter.builder))
-    assert fit.scatter is not None
-    assert fit.scatter.lack_of_fit is not None
-    assert fit.scatter.lack_of_fit < 2.0
+    assert fit.jackknife is not None
+    assert fit.jackknife.lack_of_fit is not None
+    assert fit.jackknife.lack_of_fit < 2.0
 
 
 def test_neighbours_of_very_many_blocks_count_as_one(monkeypatch: pytest.MonkeyPatch) -> None:
     samples, fitter, _, rng = scene(200)
     log = noisy(samples, NOISE * rng.normal(size=(len(samples), 12)))
     parts = compress_in_blocks(split_into_folds([log], fitter.builder), fitter.builder)
-    all_blocks = fitter.fit(parts).scatter
-    monkeypatch.setattr(block_scatter, "MOST_BLOCKS", 10)
-    fewer = fitter.fit(parts[::-1]).scatter  # whatever order threads leave them in
+    all_blocks = fitter.fit(parts).jackknife
+    monkeypatch.setattr(jackknife, "MOST_BLOCKS", 10)
+    fewer = fitter.fit(parts[::-1]).jackknife  # whatever order threads leave them in
     assert all_blocks is not None
     assert fewer is not None
     assert (all_blocks.blocks, fewer.blocks) == (20, 10)
     ratio = fewer.error[fewer.error > 0.0] / all_blocks.error[fewer.error > 0.0]
     assert 0.7 < np.median(ratio) < 1.5
-    groups = block_scatter._numbered(parts)
+    groups = jackknife._numbered(parts)
     assert [groups["synthetic.npz", fold, block] for fold in range(5) for block in range(4)] == [
         n // 2 for n in range(20)
     ]
@@ -182,12 +182,12 @@ def test_folds_are_blocks_and_without_three_blocks_there_is_no_scatter() -> None
     exact = noisy(samples, NOISE * rng.normal(size=(len(samples), 12)))
     folds = split_into_folds([exact], fitter.builder)
     whole = fitter.fit(compress_parts(folds, fitter.builder))
-    assert whole.scatter is not None, "folds are blocks"
-    assert whole.scatter.blocks == 5
+    assert whole.jackknife is not None, "folds are blocks"
+    assert whole.jackknife.blocks == 5
     cut = fitter.fit(compress_in_blocks(folds, fitter.builder))
     np.testing.assert_allclose(cut.estimate.phi, whole.estimate.phi, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(cut.estimate.noise_error, whole.estimate.noise_error, rtol=1e-6)
     for count, blocks in ((60, 6), (30, 3), (29, None)):
         short = split_into_folds([exact[:count]], fitter.builder)
-        scatter = fitter.fit(compress_in_blocks(short, fitter.builder)).scatter
-        assert (None if scatter is None else scatter.blocks) == blocks
+        found = fitter.fit(compress_in_blocks(short, fitter.builder)).jackknife
+        assert (None if found is None else found.blocks) == blocks

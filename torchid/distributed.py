@@ -34,7 +34,7 @@ _POLL = 0.01  # [s]
 _FAILED, _END, _STATUS = "failed", "end", "status"
 
 
-class LostRankError(TorchidError):
+class LostProcessError(TorchidError):
     """Another process that shares the work has ended without a word."""
 
 
@@ -46,7 +46,7 @@ class _RemoteError(Exception):
     """Where another process failed, as the cause of the error that it sent."""
 
 
-class _Ranks:
+class _Group:
     """The processes of a group; `failed` once one has told of an error, `lost` once one has gone."""
 
     def __init__(self, group: ProcessGroup | None, rank: int, size: int) -> None:
@@ -61,13 +61,13 @@ class _Ranks:
             value: anything that pickles.
 
         Raises:
-            LostRankError: a process has gone.
+            LostProcessError: a process has gone.
             Exception: the error of a process that failed.
         """
         if self.size == 1:
             return [value]
         if self.failed or self.lost:
-            raise LostRankError("the processes of this run have parted; nothing more can be shared")
+            raise LostProcessError("the processes of this run have parted; nothing more can be shared")
         import torch.distributed as dist
 
         out: list[Any] = [None] * self.size
@@ -76,7 +76,7 @@ class _Ranks:
         except RuntimeError as error:  # of the connection
             self.lost = True
             message = f"process {self.rank} of {self.size}: another process of this run has ended"
-            raise LostRankError(f"{message}; nothing more can be shared") from error
+            raise LostProcessError(f"{message}; nothing more can be shared") from error
         errors = [sent for what, sent in out if what == _FAILED]
         if errors:
             self.failed = True
@@ -90,14 +90,14 @@ class _Ranks:
 
     def tell(self, error: Exception) -> None:
         """Send an error to all others, unless they know of it."""
-        with suppress(LostRankError):
+        with suppress(LostProcessError):
             if self.size > 1 and not (self.failed or self.lost):
                 self.exchange(_FAILED, _portable(error))
 
 
-_ALONE = _Ranks(None, 0, 1)
-_launched: _Ranks | None = None  # this process's group, if the command line has made it
-_sharing: _Ranks | None = None  # the processes that share the work now
+_ALONE = _Group(None, 0, 1)
+_launched: _Group | None = None  # this process's group, if the command line has made it
+_sharing: _Group | None = None  # the processes that share the work now
 
 
 def rank() -> int:
@@ -115,7 +115,7 @@ def is_first() -> bool:
     return rank() == 0
 
 
-def gather(value: T, about: str) -> list[T]:
+def all_gather(value: T, about: str) -> list[T]:
     """The values of all processes, in their order, the same in each of them.
 
     Args:
@@ -123,7 +123,7 @@ def gather(value: T, about: str) -> list[T]:
         about: what it is, for the message if processes disagree.
 
     Raises:
-        LostRankError: a process has ended.
+        LostProcessError: a process has ended.
         Exception: whatever ended another process.
     """
     return [value] if _sharing is None else _sharing.exchange(about, value)
@@ -134,7 +134,7 @@ def from_first(compute: Callable[[], T], about: str) -> T:
 
     Args:
         compute: whose passes over samples that process makes alone.
-        about: as for `gather`.
+        about: as for `all_gather`.
 
     Raises:
         Exception: what `compute` raises.
@@ -143,23 +143,23 @@ def from_first(compute: Callable[[], T], about: str) -> T:
     if is_first():
         with apart():
             value = compute()
-    out: T = gather(value, about)[0]  # type: ignore[assignment]
+    out: T = all_gather(value, about)[0]  # type: ignore[assignment]
     return out
 
 
-def as_first(value: T, about: str) -> T:
+def broadcast(value: T, about: str) -> T:
     """The value of the first process, for decisions that rounding could turn on another machine.
 
     Args:
         value: that of this process.
-        about: as for `gather`.
+        about: as for `all_gather`.
     """
-    return gather(value, about)[0]
+    return all_gather(value, about)[0]
 
 
 def require_same(value: object, about: str) -> None:
     """Make sure that all processes have the same, before they share work on it. Raises InputError: they have not."""
-    if any(other != value for other in gather(value, about)):
+    if any(other != value for other in all_gather(value, about)):
         raise InputError("", about, "not the same in all processes", "the same files and settings on every machine")
 
 
@@ -186,7 +186,7 @@ def share_out(items: Sequence[T], compute: Callable[[T], Result], about: str, si
     Args:
         items: the same number in all processes.
         compute: whose passes over samples a process makes alone; what it returns pickles.
-        about: as for `gather`.
+        about: as for `all_gather`.
         sizes: how much work each item is.
 
     Raises:
@@ -195,7 +195,7 @@ def share_out(items: Sequence[T], compute: Callable[[T], Result], about: str, si
     own = items[own_share(sizes)]
     with apart():
         results = [compute(item) for item in own]
-    return list(chain.from_iterable(gather(results, about)))
+    return list(chain.from_iterable(all_gather(results, about)))
 
 
 @contextmanager
@@ -223,7 +223,7 @@ def share_work() -> Iterator[None]:
     Without a group, or inside of another such block, the block is as any.
 
     Raises:
-        LostRankError: another process has ended.
+        LostProcessError: another process has ended.
         Exception: whatever ends the block of another process.
     """
     global _sharing
@@ -281,7 +281,7 @@ def join_launched() -> bool:
         dist.init_process_group("gloo", store=own, rank=rank, world_size=size, timeout=_PATIENCE)
     except (RuntimeError, ValueError) as error:
         raise ConnectionFailedError(f"the processes of this run do not reach each other ({error})") from error
-    _launched = _Ranks(dist.group.WORLD, rank, size)
+    _launched = _Group(dist.group.WORLD, rank, size)
     return True
 
 
@@ -315,7 +315,7 @@ def leave_launched(status: int) -> int:
     """
     if _launched is not None and not _launched.lost:
         _launched.failed = False  # all know
-        with suppress(LostRankError):
+        with suppress(LostProcessError):
             statuses = _launched.exchange(_STATUS, status)
             status = statuses[0] or max(statuses)
     end_process(status)
@@ -335,7 +335,7 @@ def is_restart() -> bool:
 
 
 @contextmanager
-def _group_of_cpus() -> Iterator[_Ranks]:
+def _group_of_cpus() -> Iterator[_Group]:
     """The processes of torch's default group, with connections between their CPUs."""
     dist: Any = sys.modules.get("torch.distributed")  # without it nobody has made a group
     if _launched is not None:
@@ -343,11 +343,11 @@ def _group_of_cpus() -> Iterator[_Ranks]:
     elif dist is None or not dist.is_available() or not dist.is_initialized() or dist.get_world_size() == 1:
         yield _ALONE
     elif dist.get_backend() == "gloo":
-        yield _Ranks(dist.group.WORLD, dist.get_rank(), dist.get_world_size())
+        yield _Group(dist.group.WORLD, dist.get_rank(), dist.get_world_size())
     else:
         group = dist.new_group(backend="gloo", timeout=_PATIENCE)
         try:
-            yield _Ranks(group, dist.get_rank(), dist.get_world_size())
+            yield _Group(group, dist.get_rank(), dist.get_world_size())
         finally:
             dist.destroy_process_group(group)
 

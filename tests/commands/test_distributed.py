@@ -33,7 +33,7 @@ from shared_work import (
 )
 
 import torchid
-from torchid import ranks
+from torchid import distributed
 from torchid.cli import main
 from torchid.commands.checkpoint import CHECKPOINT
 from torchid.parallel import share_between_processes
@@ -165,8 +165,8 @@ def test_every_piece_has_one_owner_and_shares_are_even(
 ) -> None:
     shares = []
     for rank in range(size):
-        monkeypatch.setattr(ranks, "_sharing", ranks._Ranks(None, rank, size))
-        shares.append(ranks.own_share(sizes))
+        monkeypatch.setattr(distributed, "_sharing", distributed._Group(None, rank, size))
+        shares.append(distributed.own_share(sizes))
     numbers = range(len(sizes))
     assert [number for share in shares for number in numbers[share]] == list(numbers)
     assert all(abs(sum(sizes[share]) - sum(sizes) / size) <= max(sizes, default=0) for share in shares)
@@ -280,7 +280,7 @@ def test_an_analysis_is_that_of_one_process(experiments: dict[str, Path], tmp_pa
         assert difference < 1e-10, where
 
 
-class Others(ranks._Ranks):
+class Others(distributed._Group):
     """One of some processes, whose exchanges are noted and answered with its own value."""
 
     def __init__(self, rank: int, size: int) -> None:
@@ -294,25 +294,25 @@ class Others(ranks._Ranks):
 
 def test_items_are_each_the_work_of_one_process_that_shares_nothing_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:
     def compute(item: int) -> tuple[int, int]:
-        assert ranks.gather(item, "inside") == [item]
-        return item, ranks.world_size()
+        assert distributed.all_gather(item, "inside") == [item]
+        return item, distributed.world_size()
 
     found = []
     for rank in range(3):
         together = Others(rank, 3)
-        monkeypatch.setattr(ranks, "_sharing", together)
-        found += ranks.share_out(range(10, 17), compute, "items", sizes=[1, 1, 1, 1, 1, 1, 6])
+        monkeypatch.setattr(distributed, "_sharing", together)
+        found += distributed.share_out(range(10, 17), compute, "items", sizes=[1, 1, 1, 1, 1, 1, 6])
         assert together.about == ["items"]
-        assert ranks._sharing is together
+        assert distributed._sharing is together
     assert found == [(item, 1) for item in range(10, 17)]
 
 
 def test_an_item_that_fails_ends_what_a_process_does_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     together = Others(0, 2)
-    monkeypatch.setattr(ranks, "_sharing", together)
+    monkeypatch.setattr(distributed, "_sharing", together)
     with pytest.raises(ZeroDivisionError):
-        ranks.share_out([0, 0], lambda item: 1 / item, "items", sizes=[1, 1])
-    assert ranks._sharing is together
+        distributed.share_out([0, 0], lambda item: 1 / item, "items", sizes=[1, 1])
+    assert distributed._sharing is together
     assert not together.about
 
 
@@ -322,22 +322,22 @@ def share_items(folder: Path) -> int:
     def work(item: int) -> list[int]:
         if item == 4:
             warnings.warn("four", UserWarning, stacklevel=1)
-        return [60 // (item - 7), ranks.world_size(), os.getpid()]
+        return [60 // (item - 7), distributed.world_size(), os.getpid()]
 
     dist.init_process_group("gloo")
     number = dist.get_rank()
-    with warnings.catch_warnings(record=True) as said, ranks.share_work():
+    with warnings.catch_warnings(record=True) as said, distributed.share_work():
         warnings.simplefilter("always")
         found = share_between_processes(range(1, 6), work, 1)
-        ranks.gather(None, "the end")
-    with pytest.raises(ZeroDivisionError), ranks.share_work():
+        distributed.all_gather(None, "the end")
+    with pytest.raises(ZeroDivisionError), distributed.share_work():
         share_between_processes(range(6, 9), work, 1)
     document = {"found": found, "said": [str(one.message) for one in said], "process": os.getpid()}
     (folder / f"{number}.json").write_text(json.dumps(document))
     return 0
 
 
-def test_processes_share_items_as_copies_would_and_the_first_alone_says_things(tmp_path: Path) -> None:
+def test_processes_share_items_as_forks_would_and_the_first_alone_says_things(tmp_path: Path) -> None:
     status, _, complained = finish_forked(2, lambda: share_items(tmp_path))
     assert status == 0, complained
     first, second = (json.loads((tmp_path / f"{number}.json").read_text()) for number in range(2))

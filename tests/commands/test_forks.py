@@ -21,37 +21,37 @@ from synthetic import SOLO12, load
 from torchid import parallel
 from torchid.cli import main
 from torchid.fitting.robust import Reweighting, RobustLoss
-from torchid.parallel import Copy, copies_allowed, share_between_copies
+from torchid.parallel import Fork, forks_allowed, share_between_forks
 from torchid.problem import RowBuilder, chunks, compress_parts
 from torchid.problem.chunks import map_chunks
 from torchid.sensing import Contact, named_sensors
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="copies are made on Linux alone")
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks are made on Linux alone")
 
 
 def test_shares_are_in_order_and_worked_on_by_as_many_processes_as_asked_for() -> None:
-    with copies_allowed():
-        shared = share_between_copies(range(7), lambda item: (item**2, os.getpid()), 3)
+    with forks_allowed():
+        shared = share_between_forks(range(7), lambda item: (item**2, os.getpid()), 3)
     assert [value for value, _ in shared] == [0, 1, 4, 9, 16, 25, 36]
     assert len({process for _, process in shared}) == 3
     assert not multiprocessing.active_children()
 
 
-def test_a_library_makes_no_copies_of_the_process_that_uses_it() -> None:
-    assert {process for process in share_between_copies(range(4), lambda _: os.getpid(), 2)} == {os.getpid()}
-    with Copy(os.getpid) as copy:
-        assert copy.result() == os.getpid()
+def test_a_library_makes_no_forks_of_the_process_that_uses_it() -> None:
+    assert {process for process in share_between_forks(range(4), lambda _: os.getpid(), 2)} == {os.getpid()}
+    with Fork(os.getpid) as fork:
+        assert fork.result() == os.getpid()
 
 
 def test_tensors_outlive_the_copy_that_made_them() -> None:
-    with copies_allowed(), Copy(lambda: (os.getpid(), torch.arange(1000.0))) as copy:
-        process, values = copy.result()
+    with forks_allowed(), Fork(lambda: (os.getpid(), torch.arange(1000.0))) as fork:
+        process, values = fork.result()
     assert process != os.getpid()
     assert torch.equal(values, torch.arange(1000.0))
 
 
-def test_passes_over_samples_find_the_same_in_copies_as_in_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(chunks, "_WORTH_COPYING", 300)
+def test_passes_over_samples_find_the_same_in_forks_as_in_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(chunks, "_WORTH_FORKING", 300)
     contacts = [Contact("FL_FOOT", "point")]
     robot = load(SOLO12)
     samples, _ = random_samples(robot, contacts, 300, 0, states=2)
@@ -68,12 +68,12 @@ def test_passes_over_samples_find_the_same_in_copies_as_in_threads(monkeypatch: 
 
     factors, weights, _ = weighted()
     assert processes() == {os.getpid()}
-    with copies_allowed():
-        of_copies, weights_of_copies, done = weighted()
+    with forks_allowed():
+        of_forks, weights_of_forks, done = weighted()
         assert len(processes()) == 2
-    assert torch.equal(of_copies, factors)
+    assert torch.equal(of_forks, factors)
     for name in ("median_scale", "mean_weight", "newton_ratio"):
-        assert getattr(weights_of_copies, name) == getattr(weights, name), name
+        assert getattr(weights_of_forks, name) == getattr(weights, name), name
     assert done == len(samples)
 
 
@@ -81,8 +81,8 @@ def test_an_error_is_that_of_this_process() -> None:
     def fails() -> None:
         raise FileNotFoundError(2, "no such thing", f"seen by {os.getpid()}")
 
-    with copies_allowed(), Copy(fails) as copy, pytest.raises(FileNotFoundError) as caught:
-        copy.result()
+    with forks_allowed(), Fork(fails) as fork, pytest.raises(FileNotFoundError) as caught:
+        fork.result()
     assert caught.value.filename == f"seen by {os.getpid()}"
 
 
@@ -91,20 +91,20 @@ def test_a_warning_is_given_by_this_process() -> None:
         warnings.warn("mind the gap", UserWarning, stacklevel=1)
         return os.getpid()
 
-    with copies_allowed(), Copy(warns) as copy, pytest.warns(UserWarning, match="mind the gap"):
-        assert copy.result() == os.getpid()
+    with forks_allowed(), Fork(warns) as fork, pytest.warns(UserWarning, match="mind the gap"):
+        assert fork.result() == os.getpid()
 
 
 def test_a_copy_that_is_killed_or_cannot_answer_is_replaced_by_this_process() -> None:
     original = os.getpid()
-    with copies_allowed(), Copy(lambda: os.getpid() if os.getpid() == original else os._exit(9)) as killed:
+    with forks_allowed(), Fork(lambda: os.getpid() if os.getpid() == original else os._exit(9)) as killed:
         assert killed.result() == original
-    with copies_allowed(), Copy(lambda: lambda: 7) as copy:  # what does not pickle
-        assert copy.result()() == 7
+    with forks_allowed(), Fork(lambda: lambda: 7) as fork:  # what does not pickle
+        assert fork.result()() == 7
 
 
 def test_none_is_left_when_the_block_ends_before_its_copy() -> None:
-    with copies_allowed(), Copy(lambda: time.sleep(60.0)):
+    with forks_allowed(), Fork(lambda: time.sleep(60.0)):
         (process,) = multiprocessing.active_children()
     assert not process.is_alive()
 
@@ -120,30 +120,30 @@ def test_none_is_left_when_ctrl_c_comes_while_it_is_started(monkeypatch: pytest.
 
     forked = os.fork
     monkeypatch.setattr(os, "fork", fork)
-    with copies_allowed(), pytest.raises(KeyboardInterrupt), Copy(lambda: time.sleep(600.0)):
+    with forks_allowed(), pytest.raises(KeyboardInterrupt), Fork(lambda: time.sleep(600.0)):
         pass
     assert not multiprocessing.active_children()
 
 
-def test_copies_make_no_copies() -> None:
+def test_forks_make_no_forks() -> None:
     def inner() -> bool:
-        return len(set(share_between_copies(range(2), lambda _: os.getpid(), 2))) == 1
+        return len(set(share_between_forks(range(2), lambda _: os.getpid(), 2))) == 1
 
-    with copies_allowed(), Copy(inner) as copy:
-        assert copy.result()
+    with forks_allowed(), Fork(inner) as fork:
+        assert fork.result()
 
 
-def test_a_command_in_its_own_process_writes_the_files_that_it_writes_without_copies(
+def test_a_command_in_its_own_process_writes_the_files_that_it_writes_without_forks(
     tmp_path: Path, figures: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
     settings, override = str(shortened_demo(tmp_path / "demo", 400) / "quadruped.yaml"), "estimator.ridge=auto"
     assert main(["identify", settings, override, f"output={tmp_path / 'alone'}", "--quiet"]) == 0
-    command = [sys.executable, "-m", "torchid", "identify", settings, override, f"output={tmp_path / 'copies'}", "-q"]
+    command = [sys.executable, "-m", "torchid", "identify", settings, override, f"output={tmp_path / 'forks'}", "-q"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert done.stderr == capsys.readouterr().err
     alone, copied = (
         {path.name.partition(".out.")[0]: path.read_bytes() for path in (tmp_path / name).iterdir()}
-        for name in ("alone", "copies")
+        for name in ("alone", "forks")
     )
     assert alone.keys() == copied.keys()
     pictures = [name for name in alone if name.endswith(".png")]

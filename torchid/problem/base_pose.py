@@ -1,4 +1,4 @@
-"""Unmeasured pose of the base, from the feet that stand on a floor."""
+"""Pose of the base in logs without it, from the feet that stand on a floor."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _HEADING_TOLERANCE = 0.02  # of a recorded normal's components against the state
 
 
 @dataclass(frozen=True)
-class StandingSegments:
+class PoseSegments:
     """Where enough feet of a log stand to say how its base does.
 
     Attributes:
@@ -57,7 +57,7 @@ class StandingSegments:
 
 
 @dataclass(frozen=True)
-class StandingBase(StandingSegments):
+class LogWithPose(PoseSegments):
     """A log with the pose of the base wherever enough feet stand.
 
     Attributes:
@@ -68,7 +68,7 @@ class StandingBase(StandingSegments):
     log: Log
 
 
-def preprocess_standing(
+def preprocess_with_pose(
     log: Log,
     robot: Robot,
     contacts: Sequence[Contact],
@@ -91,19 +91,19 @@ def preprocess_standing(
         finds_rest: likewise.
 
     Raises:
-        InputError: as `stand_on_feet` and `preprocess`, or no segment is long enough for the filter.
+        InputError: as `base_pose_from_feet` and `preprocess`, or no segment is long enough for the filter.
 
     Warns:
         TorchidWarning: as `preprocess`; number of samples left out, with the reasons; feet that are not on one floor.
     """
-    standing = stand_on_feet(log, robot, contacts)
+    standing = base_pose_from_feet(log, robot, contacts)
     dry = sign_width, stribeck, finds_rest
     out, too_short = preprocess_segments(standing.log, standing.segments, cutoff_hz, sample_rate_hz, *dry)
-    warn_of_standing(log.source, len(log), standing, too_short)
+    warn_of_pose(log.source, len(log), standing, too_short)
     return out
 
 
-def warn_of_standing(source: str, count: int, standing: StandingSegments, too_short: int) -> None:
+def warn_of_pose(source: str, count: int, standing: PoseSegments, too_short: int) -> None:
     """Say which of so many samples are left out, some in segments that are too short, and whether feet are uneven."""
     dropped = standing.dropped | ({"segments too short to differentiate": too_short} if too_short else {})
     if dropped:
@@ -116,13 +116,13 @@ def warn_of_standing(source: str, count: int, standing: StandingSegments, too_sh
         warn(f"{source}: base_motion contacts: {what}; {advice}")
 
 
-def longest_standing(log: Log, robot: Robot, contacts: Sequence[Contact]) -> Log:
-    """The longest segment of a log with the pose of the base from the feet that stand; LogError as `stand_on_feet`."""
-    standing = stand_on_feet(log, robot, contacts)
+def longest_with_pose(log: Log, robot: Robot, contacts: Sequence[Contact]) -> Log:
+    """The longest segment with the base's pose from the feet that stand; LogError as `base_pose_from_feet`."""
+    standing = base_pose_from_feet(log, robot, contacts)
     return standing.log.select(max(standing.segments, key=lambda segment: segment.stop - segment.start))
 
 
-def stand_on_feet(log: Log, robot: Robot, contacts: Sequence[Contact]) -> StandingBase:
+def base_pose_from_feet(log: Log, robot: Robot, contacts: Sequence[Contact]) -> LogWithPose:
     """Pose of the base in the world from the feet that stand on a floor, which has the contacts' common normal.
 
     The floor goes through the world's origin. Tilt and height follow from the feet of each sample alone, heading and
@@ -157,23 +157,23 @@ def stand_on_feet(log: Log, robot: Robot, contacts: Sequence[Contact]) -> Standi
     def add(samples: slice, turned: FloatArray, placed: FloatArray) -> None:
         quat[samples], position[samples] = turned, placed
 
-    found = stand_in_parts(log.source, contacts, active, whole.__getitem__, [slice(0, len(log))], add)
+    found = base_pose_in_parts(log.source, contacts, active, whole.__getitem__, [slice(0, len(log))], add)
     fields: dict[str, Any] = {name: None for name in vars(log) if name.startswith(("base_", "imu_"))} | {
         "imu_frame": ""
     }
     fields |= {"base_quat_xyzw": quat, "base_position_world": position, NORMALS: None}
-    return StandingBase(found.segments, found.dropped, found.uneven, dataclasses.replace(log, **fields))
+    return LogWithPose(found.segments, found.dropped, found.uneven, dataclasses.replace(log, **fields))
 
 
-def stand_in_parts(
+def base_pose_in_parts(
     source: str,
     contacts: Sequence[Contact],
     active: BoolArray,
     footholds: Callable[[slice], Footholds],
     parts: Sequence[slice],
     add: Callable[[slice, FloatArray, FloatArray], None],
-) -> StandingSegments:
-    """As `stand_on_feet`, of a log whose feet are worked out part by part.
+) -> PoseSegments:
+    """As `base_pose_from_feet`, of a log whose feet are worked out part by part.
 
     Args:
         source: name of the log.
@@ -205,7 +205,7 @@ def stand_in_parts(
             lost = "heading on a floor that is not level"
             dropped[lost] = dropped.get(lost, 0) + samples.stop - samples.start
     named = {reason: count for reason, count in dropped.items() if count}
-    return StandingSegments(tuple(segments), named, float(np.sqrt(uneven / max(counted, 1))))
+    return PoseSegments(tuple(segments), named, float(np.sqrt(uneven / max(counted, 1))))
 
 
 def _follow_segment(
