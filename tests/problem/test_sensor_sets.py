@@ -10,7 +10,13 @@ import torch
 from synthetic import ANYMAL, Oracle, load, make_log
 
 from torchid.errors import BaseLostError, BaseLostWarning, SensorError, UnknownNameError, about_file
-from torchid.identifiability.base_parameters import StateReport, _base_statistics, require_base, state_reports
+from torchid.identifiability.base_parameters import (
+    StateReport,
+    _base_statistics,
+    merge_state_reports,
+    require_base,
+    state_reports,
+)
 from torchid.problem import RowBuilder, bind_log
 from torchid.sensing import Contact, SensorNoise, SensorSet, chosen_sensors, named_sensors, validate_contacts
 
@@ -185,3 +191,15 @@ def test_the_rank_is_that_of_most_samples_and_not_of_the_best() -> None:
         require_base([StateReport("stand", 64, 6, rank, smallest, full, shares)])
     rank, smallest, full, shares = _base_statistics(values.flip(0), torch.tensor([1000.0] + [1.0] * 63))
     assert rank == 6, "a sample counts as often as it stands for others"
+
+
+def test_a_sample_of_a_long_log_counts_as_one_of_a_short_log() -> None:
+    short = [StateReport("stand", 1, 6, 2, value, 0.0, {2: 1.0}) for value in (0.0, 0.1, 0.4)]
+    long = StateReport("stand", 9, 8, 6, 0.3, 1.0, {6: 1.0})
+    for logs in ([*short, long], [long, *short[::-1]]):
+        (report,) = merge_state_reports([[log] for log in logs])
+        assert (report.samples, report.rows, report.base_rank, report.base_singular_value) == (12, 8, 6, 0.3)
+        assert report.base_rank_shares == {6: pytest.approx(0.75), 2: pytest.approx(0.25)}
+        assert report.base_full_share == pytest.approx(0.75)
+    (report,) = merge_state_reports([[log] for log in short])
+    assert (report.base_rank, report.base_singular_value, report.base_full_share) == (2, 0.1, 0.0)
