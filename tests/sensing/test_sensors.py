@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -203,3 +204,5 @@ def test_a_sample_of_a_long_log_counts_as_one_of_a_short_log() -> None:
         assert report.base_full_share == pytest.approx(0.75)
     (report,) = merge_state_reports([[log] for log in short])
     assert (report.base_rank, report.base_singular_value, report.base_full_share) == (2, 0.1, 0.0)
+    (report,) = merge_state_reports([[replace(long, samples=3)], *([log] for log in short)])
+    assert report.base_rank == 6, "which half of the samples reach"
