@@ -188,6 +188,8 @@ def test_tensorboard_shows_what_is_identified_and_by_what(run: Path) -> None:
     assert [value.step for value in values] == list(range(len(metrics["identifiability"]["singular_values"])))
     assert values[0].value == pytest.approx(metrics["identifiability"]["singular_values"][0], rel=1e-6)
     assert events.Scalars("identifiability/bits")[0].value == pytest.approx(metrics["identifiability"]["bits"])
+    (rate,) = events.Scalars("training/samples_per_second")
+    assert rate.value * metrics["seconds"]["compress"] == pytest.approx(metrics["samples"], rel=1e-6)
 
 
 def test_evaluating_the_test_log_again_gives_the_same_figures(run: Path, capsys: pytest.CaptureFixture[str]) -> None:

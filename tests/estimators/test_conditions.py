@@ -125,6 +125,13 @@ def test_another_total_mass_is_found() -> None:
     assert found.amount == pytest.approx(0.5)
 
 
+def test_friction_of_zero_below_its_bound_is_not_called_negative() -> None:
+    phi, lower = GOOD.copy(), np.full((1, 12), -np.inf)
+    phi[0, 11], lower[0, 11] = 0.0, 0.2
+    found = only(phi, Conditions(lower=lower))
+    assert (found.body, found.condition, found.amount) == (0, "fv beyond its bounds", 0.2)
+
+
 def test_negative_friction_is_found_even_where_a_bound_allows_it() -> None:
     phi = GOOD.copy()
     phi[0, 11] = -0.25

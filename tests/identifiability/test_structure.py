@@ -19,9 +19,15 @@ from torchid.identifiability.base_parameters import (
     structural_rank,
     unobservable_parameters,
 )
-from torchid.identifiability.structure import standing_samples, standing_states, structural_problem, structural_samples
+from torchid.identifiability.structure import (
+    random_postures,
+    standing_samples,
+    standing_states,
+    structural_problem,
+    structural_samples,
+)
 from torchid.problem.contact_state import ContactState
-from torchid.regressor import motion_from_state
+from torchid.regressor import FrameJacobian, motion_from_state
 from torchid.sensing import Contact, SensorSet, named_sensors
 
 # --------------------------------------------------------------------------------------------------------- standing
@@ -64,6 +70,22 @@ def test_active_contacts_neither_move_nor_accelerate_and_the_robot_does(case: st
     assert np.linalg.norm(v, axis=1).min() > 0.1
     assert np.linalg.norm(a, axis=1).min() > 0.1
     assert np.abs(a).max() < 1e3
+
+
+def test_postures_near_a_singular_one_are_left_out() -> None:
+    """Of twice as many the better half: as many postures without a choice are worse in half of all cases."""
+    robot, contacts = load(SOLO12), [Contact(f"{leg}_FOOT", "point") for leg in ("FL", "FR", "HL", "HR")]
+
+    def regularity(joints: Array) -> Array:
+        """The least singular value of the contact Jacobian as a share of the largest: a base pose changes neither."""
+        q = torch.from_numpy(np.hstack([np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(joints), 1)), joints]))
+        rows = [FrameJacobian(robot, contact.frame)(q)[:, :3, : robot.nv] for contact in contacts]
+        values = torch.linalg.svdvals(torch.cat(rows, dim=1)).numpy()
+        return np.asarray(values[:, -1] / values[:, 0])
+
+    q, _, _ = standing_states(robot, contacts, (True,) * 4, 200, np.random.default_rng(8))
+    others = random_postures(robot, 400, np.random.default_rng(9))
+    assert regularity(q[:, 7:].numpy()).min() > np.quantile(regularity(others), 0.4)
 
 
 ASKEW = (0.2, -0.4, 0.9)

@@ -181,6 +181,59 @@ def test_a_batch_of_no_samples_is_refused() -> None:
         MiniBatches(w.logs, w.builder, 0)
 
 
+# ------------------------------------------------------------------------------------------------ shares and held out
+
+
+@pytest.mark.parametrize("size", [2, 3])
+def test_processes_that_share_batches_have_each_sample_of_a_batch_once(size: int) -> None:
+    """Of a chunk of one sample, all but one have none."""
+    w = world("drone", "full", (1, 40))
+    for batch_size in (1, 7):
+        alone = MiniBatches(w.logs, w.builder, batch_size)
+        shares = [MiniBatches(w.logs, w.builder, batch_size, share=(rank, size)) for rank in range(size)]
+        for whole, *parts in zip(alone.epoch(2), *(batches.sized_epoch(2) for batches in shares), strict=True):
+            assert [count for _, count in parts] == [len(whole)] * size
+            assert Counter(key for part, _ in parts for key in keys(part)) == Counter(keys(whole))
+        for whole, *parts in zip(alone.chunks(), *(batches.sized_chunks() for batches in shares), strict=True):
+            assert [count for _, count in parts] == [len(whole)] * size
+            assert max(len(part) for part, _ in parts) - min(len(part) for part, _ in parts) <= 1
+            assert Counter(key for part, _ in parts for key in keys(part)) == Counter(keys(whole))
+
+
+@pytest.mark.parametrize("count", [1, 10, 2000])
+def test_blocks_are_successive_samples_of_one_log_and_as_long_as_one_another(count: int) -> None:
+    w = many()
+    blocks = [list(marks(block._logs[0])) for block in MiniBatches(w.logs, w.builder).split_blocks(count)]
+    assert [key for block in blocks for key in block] == [key for log in w.logs for key in marks(log)]
+    log_of = {key: number for number, log in enumerate(w.logs) for key in marks(log)}
+    of_logs = Counter(number for block in blocks for number in {log_of[key] for key in block})
+    assert sum(of_logs.values()) == len(blocks), "none has samples of two logs"
+    assert of_logs.keys() == {0, 1, 2}, "every log has one"
+    for number, log in enumerate(w.logs):
+        expected = min(max(count * len(log) / TOTAL, 1.0), len(log))
+        assert of_logs[number] == pytest.approx(expected, abs=0.5)
+        lengths = [len(block) for block in blocks if log_of[block[0]] == number]
+        assert max(lengths) - min(lengths) <= 1
+
+
+def test_one_block_in_every_few_is_held_out_and_the_others_are_kept() -> None:
+    w = many()
+    every, blocks = 4, [set(marks(block._logs[0])) for block in MiniBatches(w.logs, w.builder).split_blocks(22)]
+    assert len(blocks) % every == every - 1, "the last ones are kept"
+    numbers = set()
+    for seed in range(3):
+        kept, held_out = MiniBatches(w.logs, w.builder, 50, seed=seed).hold_out(22, every)
+        drawn = [blocks.index(set(marks(block._logs[0]))) for block in held_out]
+        assert [number // every for number in drawn] == list(range(len(blocks) // every))
+        left = Counter(key for log in kept._logs for key in marks(log))
+        assert left == Counter(key for number, block in enumerate(blocks) if number not in drawn for key in block)
+        assert (kept.batch_size, kept.seed) == (50, seed)
+        again = MiniBatches(w.logs, w.builder, 50, seed=seed).hold_out(22, every)[1]
+        assert [marks(x._logs[0]) for x in again] == [marks(x._logs[0]) for x in held_out]
+        numbers.add(tuple(drawn))
+    assert len(numbers) == 3, "another seed draws others"
+
+
 # --------------------------------------------------------------------------------------------------------------- rows
 
 
@@ -236,6 +289,18 @@ def test_rows_are_projections_of_the_dense_regressor_and_of_all_forces(kind: str
             expected = (W @ force[..., None])[..., 0]
             size = float((W.norm(dim=2) * force.norm(dim=1, keepdim=True)).max())
             np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-13 * size)
+
+
+def test_forces_of_parameters_are_those_of_the_dense_regressor_log_by_log() -> None:
+    """Of more samples than are worked out at once, too."""
+    w = world("drone", "full", (1100, 3))
+    phi = w.random_phi(9)
+    found = list(MiniBatches(w.logs, w.builder).generalized_forces(phi))
+    for number in range(3):
+        expected = torch.cat([log.coordinates()[number] for log in w.logs])
+        assert torch.equal(torch.cat([coordinates[number] for coordinates, _ in found]), expected)
+    force, expected = torch.cat([force for _, force in found]), torch.cat([dense(w, log, phi) for log in w.logs])
+    assert float((force - expected).abs().max()) <= 1e-13 * float(expected.abs().max())
 
 
 @pytest.mark.parametrize("kind", ["biped", "bolted arm"])

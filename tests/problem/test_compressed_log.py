@@ -16,7 +16,7 @@ from torchid.logs.preprocess import preprocess
 from torchid.problem import ExtraTerms, RowBuilder, Samples, TriangularFactor, bind_log, compress_parts
 from torchid.problem.blocks import block_spans
 from torchid.problem.compressed_log import compress_log, fold_compressed, merge_blocks, piece_spans
-from torchid.problem.compression import FOLDS, split_into_folds
+from torchid.problem.compression import FOLDS, LEAST_PER_FOLD, split_into_folds
 from torchid.problem.parts import Part, merge_folds, merge_states
 from torchid.sensing import named_sensors
 
@@ -58,21 +58,28 @@ def assert_same(found: Sequence[Part], expected: Sequence[Part]) -> None:
 
 
 @pytest.mark.parametrize(
-    "lengths",
+    "case",
     slow_but(
-        [(1500,), (100,) * 14, (700, 30, 700)],
-        [(1500,), (700, 800), (750, 750), (1200, 150, 150), (300, 1200), (100,) * 14, (700, 30, 700)],
+        [((1500,), 1.0), ((100,) * 14, 1.0), ((700, 30, 700), 1.0), ((500, 1000), 25.0)],
+        [
+            *(((1500,), 1.0), ((700, 800), 1.0), ((750, 750), 1.0), ((1200, 150, 150), 1.0), ((300, 1200), 1.0)),
+            *(((100,) * 14, 1.0), ((700, 30, 700), 1.0), ((500, 1000), 25.0), ((1500,), 20.0)),
+        ],
     ),
 )
 def test_blocks_of_compressed_logs_are_those_of_their_samples(
-    walk: tuple[RowBuilder, Samples], lengths: tuple[int, ...]
+    walk: tuple[RowBuilder, Samples], case: tuple[Sequence[int], float]
 ) -> None:
-    """Logs that are cut or held out as a whole, and readings in the air, whose means are of whole blocks."""
-    builder, samples = walk
-    logs = logs_of(samples, lengths)
+    """Logs that are cut or held out as a whole, and readings in the air, whose means are of whole blocks.
+
+    Of samples that are too close for noise of their own fewer folds are made.
+    """
+    (builder, samples), (lengths, oversampling) = walk, case
+    logs = [replace(log, oversampling=oversampling) for log in logs_of(samples, lengths)]
     expected = split_into_folds(logs, builder)
     found = fold_compressed([compress_log(log, builder) for log in logs], builder)
     assert [(x.source, x.fold, len(x)) for x in found] == [(x.source, x.fold, len(x)) for x in expected]
+    assert oversampling == 1.0 or len({x.fold for x in found}) == 1500 // (LEAST_PER_FOLD * oversampling) < FOLDS
     parts = compress_parts(expected, builder)
     merged = merge_states([part for part in parts if not part.unloaded], builder)
     unloaded = [part for part in parts if part.unloaded]

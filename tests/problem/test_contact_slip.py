@@ -107,12 +107,15 @@ def test_what_a_filter_spreads_over_a_landing_is_no_slip() -> None:
 
 
 def test_of_two_feet_that_move_apart_both_count_and_one_alone_is_not_checked() -> None:
+    """By the speed at which they do, but for the spline's error where it begins to change."""
     s, log = dragged()
     active = log.contact_active.copy()
     active[:, [0, 1]] = False
     slip = measured(s, replace(log, contact_active=active), known=False)
     assert slip.slips[:, 2].any()
     np.testing.assert_array_equal(slip.slips[:, 2], slip.slips[:, 3])
+    for foot in (2, 3):
+        np.testing.assert_allclose(slip.speed[:, foot], true_speed(s, preprocess(log).time), rtol=0.0, atol=1e-4)
     active[:, 3] = False
     assert not measured(s, replace(log, contact_active=active), known=False).checked
 

@@ -67,6 +67,10 @@ def test_errors_by_group_are_those_of_the_series(tmp_path: Path, fixed_base: boo
         about_mean = rms(measured[:, :3] - measured[:, :3].mean(axis=0))
         assert found.base_force_of_variation == pytest.approx(rms(off[:, :3]) / about_mean, rel=1e-12)
     assert list(found.by_joint_rms.values()) == pytest.approx([rms(x) for x in off[:, joints].T], rel=1e-12)
+    micro = replace(samples, torque=1e-6 * value(samples.torque), wrench=1e-6 * value(samples.wrench))
+    (small,) = evaluation.metrics([micro], 1e-6 * phi)
+    for group, share in found.relative.items():
+        assert small.relative[group] == (share if share is None else pytest.approx(share, rel=1e-9)), "has no unit"
 
 
 def test_joint_torques_are_said_to_be_of_limbs_in_the_air_only_where_no_others_count(tmp_path: Path) -> None:

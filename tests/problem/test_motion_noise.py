@@ -18,6 +18,7 @@ from torchid.errors import TorchidWarning
 from torchid.logs import Log
 from torchid.logs.preprocess import preprocess
 from torchid.problem import Samples, bind_log
+from torchid.problem.motion_noise import MIN_MOTION, MIN_TURN_DEG, MotionNoise, is_at_rest
 from torchid.robot import Robot
 
 RATE, COUNT = 500.0, 20_000
@@ -105,6 +106,46 @@ def test_pairs_are_opposite_and_a_piece_gets_what_the_whole_gets(robot: Robot) -
     assert torch.equal(piece.joint_acceleration, up.joint_acceleration[100:200])
     assert torch.equal(piece.base.specific_force, up.base.specific_force[100:200])
     assert torch.equal(noise.perturbed(samples, 0.0 * size).joint_position, samples.joint_position)
+
+
+def test_an_orientation_that_is_off_turns_what_came_from_the_world_and_no_reading_of_an_imu(robot: Robot) -> None:
+    """The specific force in the world stays as it is, up to third order of the angle."""
+    size, angle = torch.ones(COUNT, 1, dtype=torch.float64), 0.01
+    base = torch.zeros(12, 12, dtype=torch.float64)
+    base[:3, :3] = angle * torch.eye(3, dtype=torch.float64)
+    for kind in ("pose", "imu"):
+        samples = bound(kind, 0.0, robot)[:200]
+        noise = MotionNoise(torch.zeros(robot.n, 3, 3, dtype=torch.float64), base, turns_force=kind == "pose")
+        found = noise.perturbed(samples, size[:200])
+        before, after = (Rotation.from_quat(x.base.quat_xyzw) for x in (samples, found))
+        np.testing.assert_allclose(np.abs((before.inv() * after).as_rotvec()), angle, rtol=0.0, atol=angle**3)
+        force, moved = samples.base.specific_force.numpy(), found.base.specific_force.numpy()
+        if kind == "imu":
+            np.testing.assert_array_equal(moved, force)
+        else:
+            third = (np.sqrt(3.0) * angle) ** 3 * np.linalg.norm(force, axis=1).max()
+            np.testing.assert_allclose(after.apply(moved), before.apply(force), rtol=0.0, atol=0.5 * third)
+
+
+def test_a_robot_is_at_rest_unless_a_joint_travels_or_its_base_turns_or_is_shaken(robot: Robot) -> None:
+    """An accelerometer at rest reads gravity, whatever its direction."""
+    samples = bound("imu", 0.0, robot)[:100]
+    swing = torch.linspace(-1.0, 1.0, 100, dtype=torch.float64)[:, None]
+    side = torch.where(torch.arange(100) % 2 == 0, 1.0, -1.0).double()[:, None] * torch.tensor([0.6, 0.0, 0.8])
+
+    def log(travel: float = 0.0, turn_deg: float = 0.0, shake: float = 0.0) -> Samples:
+        turned = Rotation.from_rotvec([0.3, 0.2, 0.1]) * Rotation.from_rotvec(
+            np.radians(turn_deg) * 0.5 * swing.numpy() * [[0.0, 1.0, 0.0]]
+        )
+        force = torch.tensor([5.0, -3.0, 8.0], dtype=torch.float64) + shake * side
+        moved = replace(samples.base, quat_xyzw=torch.from_numpy(turned.as_quat()), specific_force=force)
+        return replace(samples, joint_position=0.7 + 0.5 * travel * swing * torch.tensor([0.0, 1.0]), base=moved)
+
+    rests = [log(), log(travel=0.9 * MIN_MOTION), log(turn_deg=0.9 * MIN_TURN_DEG), log(shake=0.09 * 9.81)]
+    assert is_at_rest(rests)
+    for moves in (log(travel=1.1 * MIN_MOTION), log(turn_deg=1.1 * MIN_TURN_DEG), log(shake=0.11 * 9.81)):
+        assert not is_at_rest([*rests, moves])
+    assert not is_at_rest([]), "nothing is known then"
 
 
 def test_sides_look_random(robot: Robot) -> None:

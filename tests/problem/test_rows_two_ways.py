@@ -19,7 +19,7 @@ from random_samples import NOISE, random_samples, sensor_set
 from synthetic import PANDA, TALOS_FULL, Array, load
 
 import torchid
-from torchid.identifiability.base_parameters import state_reports
+from torchid.identifiability.base_parameters import merge_state_reports, state_reports
 from torchid.problem import RowBuilder, compress
 from torchid.problem.chunks import chunks_by_state
 from torchid.problem.predict import predict_by_columns, predict_forces
@@ -108,5 +108,14 @@ def test_a_torque_is_unmeasured_where_its_joint_rests(name: str) -> None:
     reports = state_reports([replace(SAMPLES, resting=RESTING)], builder)
     assert sum(one.samples * (one.mean_rows or 0.0) for one in reports) == pytest.approx(equations, rel=1e-14)
     assert {one.mean_rows for one in state_reports([SAMPLES], builder)} == {None}
+    third = len(SAMPLES) // 3
+    parts = [replace(SAMPLES, resting=RESTING)[part] for part in (slice(0, third), slice(third, None))]
+    merged = {one.name: one for one in merge_state_reports(state_reports([part], builder) for part in parts)}
+    assert len(merged) == len(reports)
+    for one in reports:
+        same = merged[one.name]
+        assert (same.samples, same.rows, same.base_rank) == (one.samples, one.rows, one.base_rank)
+        assert same.mean_rows == pytest.approx(one.mean_rows, rel=1e-14)
+        assert same.base_rank_shares == pytest.approx(one.base_rank_shares, rel=1e-14)
     assert factor.rows == equations
     assert (equations < compress([SAMPLES], builder).rows) == sensors.torque.any()

@@ -1,151 +1,322 @@
-"""The nearest parameters that meet conditions."""
+"""The projection: what is not measured leaves no trace, what is left is exact."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
+from collections.abc import Sequence
+from functools import cache, cached_property
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from physical import (
-    GOOD,
-    METHODS,
-    PRIORS,
-    SCALE,
-    Case,
-    body,
-    prior_value,
-    random_bodies,
-    random_case,
-    random_parameters_within,
-)
-from synthetic import Array
+from synthetic import ANYMAL, G1, SOLO12, Array, load, random_states
+from torch import Tensor
 
-from torchid import parameters
-from torchid.errors import InputError
-from torchid.estimators import Conditions, Mirror, nearest_consistent, violations
-from torchid.estimators.consistent import Method, Prior
+from torchid.regressor import FrameJacobian
+from torchid.robot import Robot
+from torchid.sensing import Contact, ProjectedGroup, Projection
 
+FEET = [Contact(f"{leg}_FOOT", "point") for leg in ("LF", "RF", "LH", "RH")]
+SOLOS_FEET = [Contact(f"{leg}_FOOT", "point") for leg in ("FL", "FR", "HL", "HR")]
+robot_of = cache(load)
 seeds = st.integers(0, 2**32 - 1)
+few = settings(max_examples=20, deadline=None, derandomize=True)
 
 
-def drawn(rng: np.random.Generator, prior: Prior) -> tuple[Case, Array | None]:
-    """Parameters to project, with the conditions, and the bodies whose pseudo-inertias measure deviations."""
-    case = random_case(rng)
-    nominal = case.problem.nominal.reshape(case.truth.shape)
-    if prior == "entropic":  # from bodies that exist
-        return replace(case, truth=random_bodies(rng, len(nominal))), None
-    return case, nominal if prior == "pullback" else None
+def numpy_projector(A: Array) -> tuple[Array, float]:
+    """Onto the null space of one matrix (k, m), and the rounding to expect of it, which grows with A's condition."""
+    _, values, Vh = np.linalg.svd(A)
+    kept = values[values > 1e-9 * max(values, default=0.0)]
+    return Vh[len(kept) :].T @ Vh[len(kept) :], 1e-14 * float(kept[0] / kept[-1] if len(kept) else 1.0)
 
 
-@pytest.mark.parametrize("prior", PRIORS)
-@settings(max_examples=10, deadline=None, derandomize=True)
+# ------------------------------------------------------------------------------------------------------- projection
+
+
+class Scene:
+    """Random postures and forces of a robot in random contact states."""
+
+    def __init__(self, robot: Robot, contacts: Sequence[Contact], seed: int, samples: int = 12) -> None:
+        rng = np.random.default_rng(seed)
+        self.q, _, _ = map(torch.from_numpy, random_states(rng, robot.n, samples))
+        self.robot, self.contacts = robot, contacts
+        self.components = [(c, k) for c, contact in enumerate(contacts) for k in contact.components]
+        self.touching = torch.from_numpy(rng.random((samples, len(contacts))) < 0.5)
+        self.K = torch.from_numpy(rng.normal(size=(samples, robot.nv, 9)))
+        self.torque = torch.from_numpy(20.0 * rng.normal(size=(samples, robot.n)))
+        self.wrench = torch.from_numpy(50.0 * rng.normal(size=(samples, len(self.components))))
+
+    @cached_property
+    def J(self) -> Tensor:
+        frames = [FrameJacobian(self.robot, contact.frame)(self.q) for contact in self.contacts]
+        rows = [frames[c][:, k] for c, k in self.components]
+        return torch.stack(rows, dim=1) if rows else torch.zeros(len(self.q), 0, self.robot.nv, dtype=torch.float64)
+
+    @property
+    def active(self) -> Tensor:
+        return self.touching[:, [c for c, _ in self.components]]
+
+    def project(self, projection: Projection) -> list[ProjectedGroup]:
+        return projection(self.J, self.active, self.K, self.torque, self.wrench)
+
+    def expected(self, sample: int, torque: Array, wrench: Array) -> tuple[Array, float, Array]:
+        """Projector (nv, nv), its rounding, and measured force (nv,) of one sample, from the masks, by numpy."""
+        J, active = self.J[sample].numpy(), self.active[sample].numpy()
+        S = np.eye(self.robot.nv)[6:]
+        f = S[torque].T @ self.torque[sample].numpy()[torque]
+        f += J[active & wrench].T @ self.wrench[sample].numpy()[active & wrench]
+        return *numpy_projector(np.vstack([S[~torque], J[active & ~wrench]])), f
+
+
+def check(scene: Scene, torque: Array, wrench: Array) -> list[ProjectedGroup]:
+    """The projection of every sample equals numpy's, which knows no batch, state or rank."""
+    groups = scene.project(Projection(torque, wrench))
+    assert sorted(torch.cat([group.index for group in groups]).tolist()) == list(range(len(scene.q)))
+    for group in groups:
+        for i, sample in enumerate(group.index.tolist()):
+            P, rounding, f = scene.expected(sample, torque, wrench)
+            V, K, size = group.V[i].numpy(), scene.K[sample].numpy(), np.abs(f).max()
+            np.testing.assert_allclose(V @ V.T, P, rtol=0.0, atol=rounding)
+            np.testing.assert_allclose(V @ group.K[i].numpy(), P @ K, rtol=0.0, atol=10.0 * rounding)
+            np.testing.assert_allclose(V @ group.f[i].numpy(), P @ f, rtol=0.0, atol=10.0 * rounding * size)
+            assert group.base_rank[i] == np.linalg.matrix_rank(P[:6], tol=1e-6)
+            np.testing.assert_array_equal(group.active, scene.active[sample])
+    return groups
+
+
+@few
 @given(seed=seeds)
-def test_a_projection_is_the_nearest_parameters_that_meet_the_conditions(prior: Prior, seed: int) -> None:
+def test_any_sensors_project_as_sample_by_sample_with_numpy(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    case, reference = drawn(rng, prior)
-    phi, scale, conditions = case.truth, case.scale, case.conditions
+    robot, kind = robot_of(ANYMAL), rng.choice(["point", "line", "flat"])
+    scene = Scene(robot, [Contact(foot.frame, kind) for foot in FEET], seed)
+    share = rng.random(2)
+    check(scene, rng.random(robot.n) < share[0], rng.random(len(scene.components)) < share[1])
 
-    def distance(other: Array) -> float:
-        return prior_value(prior, other, phi, scale, reference)
 
-    near, sure = (
-        nearest_consistent(phi, scale, conditions, prior=prior, nominal=reference, method=method) for method in METHODS
+def test_with_everything_measured_nothing_is_projected() -> None:
+    scene = Scene(robot_of(ANYMAL), FEET, 1)
+    for group in check(scene, np.ones(12, bool), np.ones(12, bool)):
+        torch.testing.assert_close(group.V, torch.eye(18, dtype=torch.float64).expand_as(group.V), rtol=0, atol=0)
+        torch.testing.assert_close(group.K, scene.K[group.index], rtol=0, atol=0)
+        assert (group.base_rank == 6).all()
+
+
+def test_contact_sensors_leave_the_base_rows_and_nothing_else() -> None:
+    for group in check(Scene(robot_of(ANYMAL), FEET, 2), np.zeros(12, bool), np.ones(12, bool)):
+        assert group.V.shape[1:] == (18, 6)
+        assert not group.V[:, 6:].any()
+
+
+def test_without_sensors_each_foot_on_the_ground_hides_more_of_the_base() -> None:
+    """Points on the ground leave a body 6, 3, 1 and 0 ways to move."""
+    scene = Scene(robot_of(ANYMAL), FEET, 3, samples=40)
+    left = {0: 6, 1: 3, 2: 1, 3: 0, 4: 0}
+    seen = set()
+    for group in check(scene, np.zeros(12, bool), np.zeros(12, bool)):
+        feet = int(group.active.sum()) // 3
+        seen.add(feet)
+        assert group.V.shape[2] == left[feet]
+        assert group.K.shape[1:] == (left[feet], 9)
+        assert (group.base_rank == left[feet]).all()
+    assert seen == set(left)
+
+
+def test_without_contacts_a_robot_flies_in_one_state() -> None:
+    (group,) = check(Scene(robot_of(ANYMAL), [], 4), np.ones(12, bool), np.zeros(0, bool))
+    assert group.V.shape == (12, 18, 18)
+    (group,) = check(Scene(robot_of(ANYMAL), [], 4), np.zeros(12, bool), np.zeros(0, bool))
+    assert group.V.shape == (12, 18, 6)
+
+
+def test_no_samples_make_no_groups() -> None:
+    assert Scene(robot_of(ANYMAL), FEET, 4, samples=0).project(Projection([True] * 12, [False] * 12)) == []
+
+
+def test_a_bolted_base_has_no_rows_and_no_base_to_lose() -> None:
+    rng = np.random.default_rng(5)
+    K, torque, J = (torch.from_numpy(rng.normal(size=size)) for size in ((5, 4, 2), (5, 4), (5, 2, 4)))
+    active, unread = torch.ones(5, 2, dtype=torch.bool), torch.full((5, 2), torch.nan, dtype=torch.float64)
+    (group,) = Projection([True] * 4, [False, False], base_rows=0)(J, active, K, torque, unread)
+    assert group.V.shape == (5, 4, 2)
+    assert not group.base_rank.any()
+    for sample in range(5):
+        P, rounding = numpy_projector(J[sample].numpy())
+        f = (group.V[sample] @ group.f[sample]).numpy()
+        np.testing.assert_allclose(f, P @ torque[sample].numpy(), rtol=0.0, atol=10.0 * rounding)
+
+
+# --------------------------------------------------------------------------------------------------- lost directions
+
+
+def test_four_points_on_a_rigid_foot_hide_what_a_flat_foot_hides() -> None:
+    scene = Scene(load(G1), [Contact("left_ankle_roll_link", "flat")], 6)
+    scene.touching[:] = True
+    torque, nothing = np.ones(29, bool), np.zeros(6, bool)
+    (flat,) = check(scene, torque, nothing)
+    points = torch.tensor([[0.1, 0.05, -0.03], [0.1, -0.05, -0.03], [-0.1, 0.05, -0.03], [-0.1, -0.05, -0.03]])
+    twist = scene.J
+    J = torch.cat(
+        [twist[:, :3] - torch.linalg.cross(p.to(twist).view(1, 3, 1), twist[:, 3:], dim=1) for p in points], 1
     )
-    assert violations(near, scale, conditions) == []
-    outside = 1e-6 if prior == "entropic" else 1e-7  # Clarabel's iterates end up to 1e-8, with exponential cones 3e-7
-    assert violations(sure, scale, conditions, outside) == []
-    nearest = distance(near)
-    assert nearest == pytest.approx(distance(sure), rel=1e-6, abs=1e-9)
-    np.testing.assert_allclose(near / scale, sure / scale, rtol=0.0, atol=1e-4)  # sqrt(gap)
-    nominal = case.problem.nominal.reshape(phi.shape)
-    if not violations(nominal, scale, conditions):
-        for share in (1e-4, 1e-2, 1.0):
-            assert distance((1.0 - share) * near + share * nominal) >= nearest * (1.0 - 1e-8)
-    if not (conditions.enclosures or conditions.mirrors or conditions.total_mass or conditions.lower is not None):
-        for size in np.repeat([1e-4, 1e-2, 1e-1], 20):
-            other = random_parameters_within(rng, near, scale, conditions, size)
-            assert other is None or distance(other) >= nearest * (1.0 - 1e-8)
+    project = Projection(torque, np.zeros(12, bool))
+    active, unread = torch.ones(12, 12, dtype=torch.bool), torch.full((12, 12), torch.nan, dtype=torch.float64)
+    (group,) = project(J, active, scene.K, scene.torque, unread)
+    assert group.V.shape == flat.V.shape == (12, 35, 29)
+    torch.testing.assert_close(group.V @ group.V.mT, flat.V @ flat.V.mT, rtol=0.0, atol=1e-13)
+    torch.testing.assert_close(group.V @ group.K, flat.V @ flat.K, rtol=0.0, atol=1e-12)
 
 
-@pytest.mark.parametrize("prior", PRIORS)
-@pytest.mark.parametrize("method", METHODS)
-def test_parameters_that_meet_the_conditions_are_their_own_projection(method: Method, prior: Prior) -> None:
-    before = GOOD.copy()
-    found = nearest_consistent(GOOD, SCALE, Conditions(1e-4), prior=prior, method=method)
-    accuracy = 1e-5 if (method, prior) == ("certified", "entropic") else 1e-6  # sqrt(gap), an exponential cone's 1e-10
-    np.testing.assert_allclose(found / SCALE, GOOD / SCALE, rtol=0.0, atol=accuracy)
-    np.testing.assert_array_equal(GOOD, before)
+def test_each_straight_knee_hides_one_direction_of_the_base_from_the_torques() -> None:
+    """A force in the plane of hip and straight knee, along the leg, does no work on the leg's joints."""
+    scene = Scene(robot_of(SOLO12), SOLOS_FEET, 7, samples=16)
+    scene.touching[:] = True
+    rng = np.random.default_rng(7)
+    straight = torch.from_numpy(rng.random((16, 4)) < 0.5)
+    scene.q[:, [9, 12, 15, 18]] *= ~straight  # the knees
+    found = {}
+    for group in check(scene, np.ones(12, bool), np.zeros(12, bool)):
+        found |= dict(zip(group.index.tolist(), group.base_rank.tolist(), strict=True))
+    assert [found[sample] for sample in range(16)] == (6 - straight.sum(1)).tolist()
+    assert len(set(found.values())) > 3
 
 
-def test_a_projection_projects_no_further() -> None:
-    found = nearest_consistent(body(2.0, np.zeros(3), [0.1, 0.2, 0.4]), SCALE, Conditions(1e-3))
-    assert violations(found, SCALE, Conditions(1e-3)) == []
-    again = nearest_consistent(found, SCALE, Conditions(1e-3))
-    np.testing.assert_allclose(again / SCALE, found / SCALE, rtol=0.0, atol=1e-6)
+def test_samples_that_lose_rank_share_a_batch_with_others() -> None:
+    """Without hip-roll sensors, four straight parallel legs can push up and sideways, 8 ways, in a plane: 3 unseen."""
+    scene = Scene(robot_of(SOLO12), SOLOS_FEET, 8, samples=16)
+    scene.touching[:] = True
+    straight = [0, 5, 6, 15]
+    scene.q[straight, 7:] = 0.0
+    torque = np.array(["HAA" not in name for name in scene.robot.joint_names])
+    rank = {}
+    for group in check(scene, torque, np.zeros(12, bool)):
+        rank |= dict.fromkeys(group.index.tolist(), 18 - group.V.shape[2])
+    assert {rank[sample] for sample in straight} == {13}
+    assert {rank[sample] for sample in set(rank) - set(straight)} == {16}
 
 
-def test_the_metric_of_a_projection_matters() -> None:
-    """A light body's parameters move least where its own pseudo-inertia measures them."""
-    broken = body(2.0, np.zeros(3), [0.1, 0.2, 0.4])
-    measure = parameters.perturb_parameters(GOOD, 0.3, np.random.default_rng(0))
-    near = {
-        "euclidean": nearest_consistent(broken, SCALE, Conditions()),
-        "pullback": nearest_consistent(broken, SCALE, Conditions(), prior="pullback", nominal=GOOD),
-        "other": nearest_consistent(broken, SCALE, Conditions(), prior="pullback", nominal=measure),
+# ------------------------------------------------------------------------------------------------- noise, leaks, grads
+
+
+def noises(scene: Scene, rng: np.random.Generator) -> tuple[Array, Array, Array]:
+    return rng.uniform(0.1, 2.0, 12), rng.uniform(0.5, 5.0, len(scene.components)), rng.uniform(0.1, 1.0, 6)
+
+
+@few
+@given(seed=seeds)
+def test_whitened_rows_have_unit_noise_and_span_the_same_equations(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    scene, share = Scene(robot_of(ANYMAL), FEET, seed), rng.random(2)
+    torque, wrench = rng.random(12) < share[0], rng.random(12) < share[1]
+    torque_std, wrench_std, base_std = noises(scene, rng)
+    project = Projection(torque, wrench, 6, *map(torch.from_numpy, (torque_std, wrench_std, base_std)))
+    for group in scene.project(project):
+        for i, sample in enumerate(group.index.tolist()):
+            J = (scene.J[sample].numpy() * wrench_std[:, None])[scene.active[sample].numpy() & wrench]
+            covariance = np.diag(np.concatenate([base_std, torque_std]) ** 2) + J.T @ J
+            P, rounding, f = scene.expected(sample, torque, wrench)
+            V = group.V[i].numpy()
+            assert V.shape[1] == round(np.trace(P))
+            np.testing.assert_allclose(V.T @ covariance @ V, np.eye(V.shape[1]), rtol=0.0, atol=1e-12)
+            size = np.abs(V).max(initial=0.0)
+            np.testing.assert_allclose(P @ V, V, rtol=0.0, atol=10.0 * rounding * size)
+            np.testing.assert_allclose(group.K[i], V.T @ scene.K[sample].numpy(), rtol=0.0, atol=1e-13 * size)
+            np.testing.assert_allclose(group.f[i], V.T @ f, rtol=0.0, atol=1e-13 * size * np.abs(f).max())
+
+
+def test_noise_is_given_whole_or_not_at_all() -> None:
+    with pytest.raises(ValueError, match="all three or none"):
+        Projection([True], [True], torque_noise=0.5)
+    with pytest.raises(ValueError, match="all three or none"):
+        Projection([True], [True], torque_noise=0.5, wrench_noise=1.0)
+
+
+@pytest.mark.parametrize("noise", [None, 0.5], ids=["orthonormal", "whitened"])
+def test_what_is_not_measured_or_does_not_touch_never_reaches_the_result(noise: float | None) -> None:
+    rng = np.random.default_rng(9)
+    scene = Scene(robot_of(ANYMAL), FEET, 9)
+    torque, wrench = rng.random(12) < 0.5, rng.random(12) < 0.5
+    project = Projection(torque, wrench, 6, noise, noise, noise)
+    expected = scene.project(project)
+    scene.torque[:, ~torque] = torch.nan
+    scene.wrench[:, ~wrench] = torch.nan
+    scene.wrench[~scene.active] = torch.nan
+    scene.wrench.requires_grad_()
+    for group, other in zip(scene.project(project), expected, strict=True):
+        torch.testing.assert_close(group.f, other.f, rtol=0.0, atol=0.0)
+        torch.testing.assert_close(group.K, other.K, rtol=0.0, atol=0.0)
+    sum(group.f.sum() for group in scene.project(project)).backward()
+    assert scene.wrench.grad is not None
+    assert not scene.wrench.grad[~(scene.active & torch.from_numpy(wrench))].any()
+
+
+@pytest.mark.parametrize("noise", [None, 0.5], ids=["orthonormal", "whitened"])
+def test_gradients_flow_through_regressor_and_measured_forces(noise: float | None) -> None:
+    scene = Scene(robot_of(ANYMAL), FEET, 10, samples=3)
+    project = Projection([True] * 6 + [False] * 6, [True] * 3 + [False] * 9, 6, noise, noise, noise)
+    weights = torch.randn(9, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+
+    def projected(K: Tensor, torque: Tensor, wrench: Tensor) -> Tensor:
+        groups = project(scene.J, scene.active, K @ weights, torque, wrench)
+        return torch.cat([torch.cat([group.K, group.f[..., None]], dim=2).flatten() for group in groups])
+
+    assert torch.autograd.gradcheck(
+        projected, [x.clone().requires_grad_() for x in (scene.K, scene.torque, scene.wrench)], fast_mode=True
+    )
+
+
+@pytest.mark.parametrize("noise", [None, 0.5], ids=["orthonormal", "whitened"])
+def test_projected_forces_have_their_gradient_in_the_posture(noise: float | None) -> None:
+    """With feet of which nothing, part or all is measured: the null space turns with the legs."""
+    scene = Scene(robot_of(ANYMAL), FEET, 11, samples=4)
+    scene.touching[:] = torch.tensor([[1, 1, 1, 1], [1, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 0]], dtype=torch.bool)
+    project = Projection([True] * 9 + [False] * 3, [True] * 3 + [False] * 8 + [True], 6, noise, noise, noise)
+    frames = [FrameJacobian(scene.robot, foot.frame) for foot in FEET]
+
+    def squares(joints: Tensor) -> Tensor:
+        q = torch.cat([scene.q[:, :7], joints], dim=1)
+        J = torch.cat([frame(q)[:, :3] for frame in frames], dim=1)
+        groups = project(J, scene.active, scene.K, scene.torque, scene.wrench)
+        return torch.cat([(group.K.mean(2) - group.f).square().sum(1) for group in groups])
+
+    assert torch.autograd.gradcheck(squares, scene.q[:, 7:].clone().requires_grad_(), atol=1e-5, rtol=1e-6)
+
+
+@pytest.mark.parametrize("wrong", range(5), ids=["J_C", "active", "K", "torque", "wrench"])
+def test_a_part_of_a_batch_of_another_length_is_refused(wrong: int) -> None:
+    batch = (torch.ones(4, 3, 8), torch.ones(4, 3, dtype=torch.bool), *map(torch.ones, ((4, 8, 2), (4, 2), (4, 3))))
+    project = Projection([True] * 2, [False] * 3)
+    for part in (batch[wrong][:1], torch.cat([batch[wrong]] * 2)):
+        with pytest.raises(ValueError, match=r"J_C, active, K, torque, wrench: found shapes .*; accepted: \(B, 3, 8\)"):
+            project(*batch[:wrong], part, *batch[wrong + 1 :])
+
+
+@pytest.mark.parametrize("wrong", ["J_C", "torque", "wrench"])
+def test_a_part_of_a_batch_of_another_precision_or_none_is_refused_by_name(wrong: str) -> None:
+    touching = torch.ones(4, 3, dtype=torch.bool)
+    batch = {
+        "J_C": torch.ones(4, 3, 8),
+        "K": torch.ones(4, 8, 2),
+        "torque": torch.ones(4, 2),
+        "wrench": torch.ones(4, 3),
     }
-    for name, reference in (("pullback", GOOD), ("other", measure)):
-        apart = {other: prior_value("pullback", phi, broken, SCALE, reference) for other, phi in near.items()}
-        assert min(apart, key=lambda other: apart[other]) == name
+    project = Projection([True] * 2, [False] * 3)
+    with pytest.raises(TypeError, match=f"^{wrong}: found torch.float64; accepted: torch.float32, as of K"):
+        project(active=touching, **batch | {wrong: batch[wrong].double()})
+    with pytest.raises(TypeError, match=f"^{wrong}: found NoneType; accepted: a tensor"):
+        project(active=touching, **batch | {wrong: None})
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_bodies_without_mass_get_none_by_projection(method: Method) -> None:
-    phi = np.concatenate([body(1.0, np.zeros(3), [0.1, 0.2, 0.4]), np.zeros((2, 12))])
-    phi[2, 10] = 0.3  # a joint's friction, whatever hangs on it
-    found = nearest_consistent(phi, np.repeat(SCALE, 3, axis=0), Conditions(1e-4), method=method)
-    np.testing.assert_array_equal(found[1:, :10], 0.0)
-    np.testing.assert_array_equal(found[1, 10:], 0.0)
-    assert found[2, 10] == pytest.approx(0.3, abs=1e-6)
-    assert found[2, 11] == 0.0
+def test_masks_have_an_entry_for_each_row() -> None:
+    for masks, name in (((True, [False]), "torque_measured"), (([True], False), "wrench_measured")):
+        with pytest.raises(ValueError, match=rf"{name}: found shape \(\); accepted: a bool for each row"):
+            Projection(*masks)  # type: ignore[arg-type]
 
 
-def test_friction_of_zero_moves_only_to_a_mirror_image_or_a_bound() -> None:
-    phi = np.repeat(GOOD, 3, axis=0)
-    phi[:, :10] = body(2.0, np.zeros(3), [0.3, 0.4, 0.5])[:, :10]
-    phi[:, 10], phi[:, 11] = (0.0, 0.3, 0.0), (0.0, 0.0, 0.0)
-    lower = np.full(phi.shape, -np.inf)
-    lower[2, 11] = 0.2
-    mirror = Mirror(0, 1, np.eye(3))
-    found = nearest_consistent(phi, np.repeat(SCALE, 3, axis=0), Conditions(mirrors=(mirror,), lower=lower))
-    np.testing.assert_allclose(found[:, 10], [0.15, 0.15, 0.0], rtol=0.0, atol=1e-7)
-    np.testing.assert_allclose(found[:, 11], [0.0, 0.0, 0.2], rtol=0.0, atol=1e-7)
-    assert found[2, 10] == 0.0
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_distances_that_are_not_defined_are_refused(method: Method) -> None:
-    broken = body(2.0, np.zeros(3), [0.1, 0.2, 0.4])
-    for arguments in ({"prior": "entropic"}, {"prior": "pullback"}, {"prior": "pullback", "nominal": broken}):
-        with pytest.raises(InputError, match=f"{arguments['prior']}, but the pseudo-inertia of body 0 "):
-            nearest_consistent(broken, SCALE, Conditions(), method=method, **arguments)
-    assert (
-        violations(nearest_consistent(broken, SCALE, Conditions(), prior="pullback", nominal=GOOD), SCALE, Conditions())
-        == []
-    )
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"prior": "riemannian"}, "prior: found 'riemannian'; accepted: 'euclidean', 'pullback' or 'entropic'"),
-        ({"method": "sdp"}, "method: found 'sdp'; accepted: 'barrier' or 'certified'"),
-        ({"nominal": GOOD}, "nominal: found parameters for the euclidean prior"),
-        ({"prior": "pullback", "nominal": GOOD[:, :10]}, "nominal: found shape"),
-    ],
-)
-def test_arguments_of_a_projection_that_make_no_sense_are_refused(arguments: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        nearest_consistent(GOOD, SCALE, Conditions(), **arguments)
+def test_flags_that_are_numbers_are_refused_and_never_taken_for_indices() -> None:
+    numbers = torch.ones(4, 3, dtype=torch.int64)
+    with pytest.raises(TypeError, match=r"active: found torch.int64; accepted: torch.bool"):
+        Projection([True] * 2, [False] * 3)(
+            torch.ones(4, 3, 8), numbers, torch.ones(4, 8, 2), torch.ones(4, 2), torch.ones(4, 3)
+        )

@@ -1,322 +1,208 @@
-"""The projection: what is not measured leaves no trace, what is left is exact."""
+"""Contacts, sensor sets by name, and the check that the sensors see the base."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import cache, cached_property
+import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from synthetic import ANYMAL, G1, SOLO12, Array, load, random_states
-from torch import Tensor
+from synthetic import ANYMAL, Oracle, load, make_log
 
-from torchid.regressor import FrameJacobian
-from torchid.robot import Robot
-from torchid.sensing import Contact, ProjectedGroup, Projection
+from torchid.errors import BaseLostError, BaseLostWarning, SensorError, UnknownNameError, about_file
+from torchid.identifiability.base_parameters import (
+    StateReport,
+    _base_statistics,
+    merge_state_reports,
+    require_base,
+    state_reports,
+)
+from torchid.problem import RowBuilder, bind_log
+from torchid.sensing import Contact, SensorNoise, SensorSet, chosen_sensors, named_sensors, validate_contacts
 
 FEET = [Contact(f"{leg}_FOOT", "point") for leg in ("LF", "RF", "LH", "RH")]
-SOLOS_FEET = [Contact(f"{leg}_FOOT", "point") for leg in ("FL", "FR", "HL", "HR")]
-robot_of = cache(load)
-seeds = st.integers(0, 2**32 - 1)
-few = settings(max_examples=20, deadline=None, derandomize=True)
+JOINTS = ("hip", "knee", "ankle")
+SOLES = (Contact("l_sole", "flat"), Contact("r_sole", "point"))
 
 
-def numpy_projector(A: Array) -> tuple[Array, float]:
-    """Onto the null space of one matrix (k, m), and the rounding to expect of it, which grows with A's condition."""
-    _, values, Vh = np.linalg.svd(A)
-    kept = values[values > 1e-9 * max(values, default=0.0)]
-    return Vh[len(kept) :].T @ Vh[len(kept) :], 1e-14 * float(kept[0] / kept[-1] if len(kept) else 1.0)
+def test_a_contact_pushes_only_as_its_kind_can() -> None:
+    assert Contact("foot", "point").component_names == ("fx", "fy", "fz")
+    assert Contact("foot", "flat").component_names == ("fx", "fy", "fz", "mx", "my", "mz")
+    for axis in "xyz":
+        moments = tuple(f"m{other}" for other in "xyz" if other != axis)
+        assert Contact("foot", "line", axis).component_names == ("fx", "fy", "fz", *moments)
+    assert Contact("foot", "line") == Contact("foot", "line", "y")
 
 
-# ------------------------------------------------------------------------------------------------------- projection
+def test_contacts_of_the_robot_pass_unchanged() -> None:
+    assert validate_contacts(load(ANYMAL), FEET) == tuple(FEET)
 
 
-class Scene:
-    """Random postures and forces of a robot in random contact states."""
-
-    def __init__(self, robot: Robot, contacts: Sequence[Contact], seed: int, samples: int = 12) -> None:
-        rng = np.random.default_rng(seed)
-        self.q, _, _ = map(torch.from_numpy, random_states(rng, robot.n, samples))
-        self.robot, self.contacts = robot, contacts
-        self.components = [(c, k) for c, contact in enumerate(contacts) for k in contact.components]
-        self.touching = torch.from_numpy(rng.random((samples, len(contacts))) < 0.5)
-        self.K = torch.from_numpy(rng.normal(size=(samples, robot.nv, 9)))
-        self.torque = torch.from_numpy(20.0 * rng.normal(size=(samples, robot.n)))
-        self.wrench = torch.from_numpy(50.0 * rng.normal(size=(samples, len(self.components))))
-
-    @cached_property
-    def J(self) -> Tensor:
-        frames = [FrameJacobian(self.robot, contact.frame)(self.q) for contact in self.contacts]
-        rows = [frames[c][:, k] for c, k in self.components]
-        return torch.stack(rows, dim=1) if rows else torch.zeros(len(self.q), 0, self.robot.nv, dtype=torch.float64)
-
-    @property
-    def active(self) -> Tensor:
-        return self.touching[:, [c for c, _ in self.components]]
-
-    def project(self, projection: Projection) -> list[ProjectedGroup]:
-        return projection(self.J, self.active, self.K, self.torque, self.wrench)
-
-    def expected(self, sample: int, torque: Array, wrench: Array) -> tuple[Array, float, Array]:
-        """Projector (nv, nv), its rounding, and measured force (nv,) of one sample, from the masks, by numpy."""
-        J, active = self.J[sample].numpy(), self.active[sample].numpy()
-        S = np.eye(self.robot.nv)[6:]
-        f = S[torque].T @ self.torque[sample].numpy()[torque]
-        f += J[active & wrench].T @ self.wrench[sample].numpy()[active & wrench]
-        return *numpy_projector(np.vstack([S[~torque], J[active & ~wrench]])), f
+@pytest.mark.parametrize(
+    ("contacts", "error", "message"),
+    [
+        ([Contact("LF_FOO", "point")], UnknownNameError, r"contacts\[0\].frame: unknown name 'LF_FOO'; .*LF_FOOT"),
+        ([*FEET, FEET[2]], SensorError, r"contacts\[4\].frame: 'LH_FOOT' named twice; accepted: each frame once"),
+    ],
+    ids=["unknown", "twice"],
+)
+def test_a_contact_that_cannot_be_is_refused_by_its_place(
+    contacts: list[Contact], error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message) as raised, about_file("experiment.yaml"):
+        validate_contacts(load(ANYMAL), contacts)
+    assert "experiment.yaml" in str(raised.value)
 
 
-def check(scene: Scene, torque: Array, wrench: Array) -> list[ProjectedGroup]:
-    """The projection of every sample equals numpy's, which knows no batch, state or rank."""
-    groups = scene.project(Projection(torque, wrench))
-    assert sorted(torch.cat([group.index for group in groups]).tolist()) == list(range(len(scene.q)))
-    for group in groups:
-        for i, sample in enumerate(group.index.tolist()):
-            P, rounding, f = scene.expected(sample, torque, wrench)
-            V, K, size = group.V[i].numpy(), scene.K[sample].numpy(), np.abs(f).max()
-            np.testing.assert_allclose(V @ V.T, P, rtol=0.0, atol=rounding)
-            np.testing.assert_allclose(V @ group.K[i].numpy(), P @ K, rtol=0.0, atol=10.0 * rounding)
-            np.testing.assert_allclose(V @ group.f[i].numpy(), P @ f, rtol=0.0, atol=10.0 * rounding * size)
-            assert group.base_rank[i] == np.linalg.matrix_rank(P[:6], tol=1e-6)
-            np.testing.assert_array_equal(group.active, scene.active[sample])
-    return groups
+def test_a_contact_of_an_unknown_kind_cannot_be_made() -> None:
+    with pytest.raises(SensorError, match="contact 'RF_FOOT': type: 'Flat'; accepted: point, line, flat"):
+        Contact("RF_FOOT", "Flat")
+    with pytest.raises(SensorError, match="contact 'LF_FOOT': line_axis: 'w'; accepted: x, y, z"):
+        Contact("LF_FOOT", "line", "w")
 
 
-@few
-@given(seed=seeds)
-def test_any_sensors_project_as_sample_by_sample_with_numpy(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    robot, kind = robot_of(ANYMAL), rng.choice(["point", "line", "flat"])
-    scene = Scene(robot, [Contact(foot.frame, kind) for foot in FEET], seed)
-    share = rng.random(2)
-    check(scene, rng.random(robot.n) < share[0], rng.random(len(scene.components)) < share[1])
+@pytest.mark.parametrize(("name", "torque", "wrench"), [("full", 1, 1), ("contacts", 0, 1), ("joints", 1, 0)])
+def test_named_sets_are_masks(name: str, torque: bool, wrench: bool) -> None:
+    sensors = named_sensors(name, 5, 2)
+    np.testing.assert_array_equal(sensors.torque, np.full(5, bool(torque)))
+    np.testing.assert_array_equal(sensors.wrench, np.full((2, 6), bool(wrench)))
+    assert sensors.torque.dtype == sensors.wrench.dtype == np.bool_
+    assert sensors.noise == SensorNoise()
 
 
-def test_with_everything_measured_nothing_is_projected() -> None:
-    scene = Scene(robot_of(ANYMAL), FEET, 1)
-    for group in check(scene, np.ones(12, bool), np.ones(12, bool)):
-        torch.testing.assert_close(group.V, torch.eye(18, dtype=torch.float64).expand_as(group.V), rtol=0, atol=0)
-        torch.testing.assert_close(group.K, scene.K[group.index], rtol=0, atol=0)
-        assert (group.base_rank == 6).all()
+def test_another_name_is_refused_by_the_three_that_exist() -> None:
+    with pytest.raises(SensorError, match="'joint'; accepted: full, contacts, joints, or a mapping"):
+        named_sensors("joint", 5, 2)
 
 
-def test_contact_sensors_leave_the_base_rows_and_nothing_else() -> None:
-    for group in check(Scene(robot_of(ANYMAL), FEET, 2), np.zeros(12, bool), np.ones(12, bool)):
-        assert group.V.shape[1:] == (18, 6)
-        assert not group.V[:, 6:].any()
+def test_chosen_sensors_stand_where_their_names_do_in_any_order() -> None:
+    noise = SensorNoise(joint_torque=3.0)
+    chosen = chosen_sensors(JOINTS, SOLES, ["ankle", "hip"], {"r_sole": ["fz"], "l_sole": ["mz", "fx"]}, noise)
+    np.testing.assert_array_equal(chosen.torque, [True, False, True])
+    np.testing.assert_array_equal(np.argwhere(chosen.wrench), [[0, 0], [0, 5], [1, 2]])
+    assert chosen.noise is noise
+    nothing = chosen_sensors(JOINTS, SOLES, [], {})
+    assert not nothing.torque.any()
+    assert not nothing.wrench.any()
 
 
-def test_without_sensors_each_foot_on_the_ground_hides_more_of_the_base() -> None:
-    """Points on the ground leave a body 6, 3, 1 and 0 ways to move."""
-    scene = Scene(robot_of(ANYMAL), FEET, 3, samples=40)
-    left = {0: 6, 1: 3, 2: 1, 3: 0, 4: 0}
-    seen = set()
-    for group in check(scene, np.zeros(12, bool), np.zeros(12, bool)):
-        feet = int(group.active.sum()) // 3
-        seen.add(feet)
-        assert group.V.shape[2] == left[feet]
-        assert group.K.shape[1:] == (left[feet], 9)
-        assert (group.base_rank == left[feet]).all()
-    assert seen == set(left)
+@pytest.mark.parametrize(
+    ("torques", "wrenches", "error", "message"),
+    [
+        (["kneee"], {}, UnknownNameError, "sensors.joint_torques: unknown name 'kneee'; accepted: knee"),
+        ([], {"r_sol": ["fx"]}, UnknownNameError, "sensors.contact_wrenches: unknown name 'r_sol'; accepted: r_sole"),
+        ([], {"l_sole": ["tx"]}, UnknownNameError, "contact_wrenches.l_sole: unknown name 'tx'; accepted: .*fx"),
+        ([], {"r_sole": ["mz"]}, SensorError, "r_sole: 'mz', which a point contact cannot exert; accepted: fx, fy, fz"),
+    ],
+    ids=["joint", "contact", "component", "impossible component"],
+)
+def test_a_sensor_that_does_not_exist_is_refused_by_the_nearest_names(
+    torques: list[str], wrenches: dict[str, list[str]], error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        chosen_sensors(JOINTS, SOLES, torques, wrenches)
 
 
-def test_without_contacts_a_robot_flies_in_one_state() -> None:
-    (group,) = check(Scene(robot_of(ANYMAL), [], 4), np.ones(12, bool), np.zeros(0, bool))
-    assert group.V.shape == (12, 18, 18)
-    (group,) = check(Scene(robot_of(ANYMAL), [], 4), np.zeros(12, bool), np.zeros(0, bool))
-    assert group.V.shape == (12, 18, 6)
+def test_base_rows_are_trusted_to_one_contact_sensors_noise_unless_told() -> None:
+    noise = SensorNoise(contact_force=3.0, contact_moment=0.4)
+    np.testing.assert_array_equal(noise.wrench_std, [3.0, 3.0, 3.0, 0.4, 0.4, 0.4])
+    np.testing.assert_array_equal(noise.base_std, noise.wrench_std)
+    told = SensorNoise(contact_force=3.0, base_force=7.0, base_moment=0.6)
+    np.testing.assert_array_equal(told.base_std, [7.0, 7.0, 7.0, 0.6, 0.6, 0.6])
 
 
-def test_no_samples_make_no_groups() -> None:
-    assert Scene(robot_of(ANYMAL), FEET, 4, samples=0).project(Projection([True] * 12, [False] * 12)) == []
+# --------------------------------------------------------------------------------------------------------- the base
 
 
-def test_a_bolted_base_has_no_rows_and_no_base_to_lose() -> None:
-    rng = np.random.default_rng(5)
-    K, torque, J = (torch.from_numpy(rng.normal(size=size)) for size in ((5, 4, 2), (5, 4), (5, 2, 4)))
-    active, unread = torch.ones(5, 2, dtype=torch.bool), torch.full((5, 2), torch.nan, dtype=torch.float64)
-    (group,) = Projection([True] * 4, [False, False], base_rows=0)(J, active, K, torque, unread)
-    assert group.V.shape == (5, 4, 2)
-    assert not group.base_rank.any()
-    for sample in range(5):
-        P, rounding = numpy_projector(J[sample].numpy())
-        f = (group.V[sample] @ group.f[sample]).numpy()
-        np.testing.assert_allclose(f, P @ torque[sample].numpy(), rtol=0.0, atol=10.0 * rounding)
+def reports(torques: bool, first_foot: bool) -> list[StateReport]:
+    """Of a quadruped that stands on three feet half the time, on four a third, and flies for the rest."""
+    robot = load(ANYMAL)
+    states = [[True] * 4, [False, True, True, True], [False, True, True, True], [False, True, True, True],
+              [True] * 4, [False] * 4]  # fmt: skip
+    rng = np.random.default_rng(0)
+    log = make_log(Oracle.of(robot), [(foot.frame, 3) for foot in FEET], states, 60, rng)
+    wrench = np.zeros((4, 6), dtype=bool)
+    wrench[0, :3] = first_foot
+    sensors = SensorSet(np.full(robot.n, torques), wrench)
+    return state_reports([bind_log(log, robot, FEET)], RowBuilder(robot, FEET, sensors))
 
 
-# --------------------------------------------------------------------------------------------------- lost directions
+def test_torque_sensors_see_the_base_in_every_contact_state() -> None:
+    three, four, flight = reports(torques=True, first_foot=False)
+    assert (three.name, three.samples, three.rows) == ("RF_FOOT + LH_FOOT + RH_FOOT", 30, 18 - 9)
+    assert (four.name, four.samples, four.rows) == ("LF_FOOT + RF_FOOT + LH_FOOT + RH_FOOT", 20, 18 - 12)
+    assert (flight.name, flight.samples, flight.rows) == ("none", 10, 18)
+    assert three.base_rank == four.base_rank == flight.base_rank == 6
+    assert flight.base_singular_value == pytest.approx(1.0, abs=1e-14)
+    assert four.base_singular_value is not None
+    assert 1e-6 < four.base_singular_value < 1.0
+    require_base([three, four, flight])
 
 
-def test_four_points_on_a_rigid_foot_hide_what_a_flat_foot_hides() -> None:
-    scene = Scene(load(G1), [Contact("left_ankle_roll_link", "flat")], 6)
-    scene.touching[:] = True
-    torque, nothing = np.ones(29, bool), np.zeros(6, bool)
-    (flat,) = check(scene, torque, nothing)
-    points = torch.tensor([[0.1, 0.05, -0.03], [0.1, -0.05, -0.03], [-0.1, 0.05, -0.03], [-0.1, -0.05, -0.03]])
-    twist = scene.J
-    J = torch.cat(
-        [twist[:, :3] - torch.linalg.cross(p.to(twist).view(1, 3, 1), twist[:, 3:], dim=1) for p in points], 1
-    )
-    project = Projection(torque, np.zeros(12, bool))
-    active, unread = torch.ones(12, 12, dtype=torch.bool), torch.full((12, 12), torch.nan, dtype=torch.float64)
-    (group,) = project(J, active, scene.K, scene.torque, unread)
-    assert group.V.shape == flat.V.shape == (12, 35, 29)
-    torch.testing.assert_close(group.V @ group.V.mT, flat.V @ flat.V.mT, rtol=0.0, atol=1e-13)
-    torch.testing.assert_close(group.V @ group.K, flat.V @ flat.K, rtol=0.0, atol=1e-12)
+def test_one_measured_foot_among_four_sees_nothing_of_the_base_but_in_flight() -> None:
+    three, four, flight = reports(torques=False, first_foot=True)
+    assert (three.base_rank, three.rows) == (0, 0)
+    assert (four.base_rank, four.rows) == (0, 0)
+    assert (flight.base_rank, flight.rows) == (6, 6)
+    with pytest.raises(
+        BaseLostError, match="RF_FOOT \\+ LH_FOOT \\+ RH_FOOT \\(30 samples\\): rank 0 of 6; "
+    ) as raised:
+        require_base([three, four, flight])
+    assert "LF_FOOT + RF_FOOT + LH_FOOT + RH_FOOT (20 samples): rank 0 of 6" in str(raised.value)
+    assert "none" not in str(raised.value)
+    assert "accepted:" in str(raised.value)
 
 
-def test_each_straight_knee_hides_one_direction_of_the_base_from_the_torques() -> None:
-    """A force in the plane of hip and straight knee, along the leg, does no work on the leg's joints."""
-    scene = Scene(robot_of(SOLO12), SOLOS_FEET, 7, samples=16)
-    scene.touching[:] = True
-    rng = np.random.default_rng(7)
-    straight = torch.from_numpy(rng.random((16, 4)) < 0.5)
-    scene.q[:, [9, 12, 15, 18]] *= ~straight  # the knees
-    found = {}
-    for group in check(scene, np.ones(12, bool), np.zeros(12, bool)):
-        found |= dict(zip(group.index.tolist(), group.base_rank.tolist(), strict=True))
-    assert [found[sample] for sample in range(16)] == (6 - straight.sum(1)).tolist()
-    assert len(set(found.values())) > 3
+def test_who_asks_to_go_on_is_warned() -> None:
+    lost = reports(torques=False, first_foot=True)
+    with pytest.warns(BaseLostWarning, match="30 samples.*cannot be determined"):
+        require_base(lost, "warn")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        require_base([lost[2]], "warn")
 
 
-def test_samples_that_lose_rank_share_a_batch_with_others() -> None:
-    """Without hip-roll sensors, four straight parallel legs can push up and sideways, 8 ways, in a plane: 3 unseen."""
-    scene = Scene(robot_of(SOLO12), SOLOS_FEET, 8, samples=16)
-    scene.touching[:] = True
-    straight = [0, 5, 6, 15]
-    scene.q[straight, 7:] = 0.0
-    torque = np.array(["HAA" not in name for name in scene.robot.joint_names])
-    rank = {}
-    for group in check(scene, torque, np.zeros(12, bool)):
-        rank |= dict.fromkeys(group.index.tolist(), 18 - group.V.shape[2])
-    assert {rank[sample] for sample in straight} == {13}
-    assert {rank[sample] for sample in set(rank) - set(straight)} == {16}
+def test_the_axes_of_line_contacts_are_named_where_the_base_is_lost() -> None:
+    lost = [StateReport("l_blade + r_sole", 9, 2, 4, 0.0), StateReport("r_blade + r_sole", 9, 4, 6, 0.1)]
+    contacts = [Contact("l_blade", "line", "x"), Contact("r_blade", "line"), Contact("r_sole", "point")]
+    with pytest.raises(BaseLostError, match="along x of l_blade: set line_axis of those along another; accepted: more"):
+        require_base(lost, contacts=contacts)
+    with pytest.raises(BaseLostError) as raised:
+        require_base(lost, contacts=contacts[2:])
+    assert "line_axis" not in str(raised.value)
 
 
-# ------------------------------------------------------------------------------------------------- noise, leaks, grads
+def test_a_bolted_base_cannot_be_lost() -> None:
+    robot = load(ANYMAL, fixed_base=True)
+    log = make_log(Oracle.of(robot), [(foot.frame, 3) for foot in FEET], [[True] * 4], 5, np.random.default_rng(1))
+    (report,) = state_reports([bind_log(log, robot, FEET)], RowBuilder(robot, FEET, named_sensors("contacts", 12, 4)))
+    assert report.base_rank is None
+    assert report.base_singular_value is None
+    require_base([report])
 
 
-def noises(scene: Scene, rng: np.random.Generator) -> tuple[Array, Array, Array]:
-    return rng.uniform(0.1, 2.0, 12), rng.uniform(0.5, 5.0, len(scene.components)), rng.uniform(0.1, 1.0, 6)
+def test_the_rank_is_that_of_most_samples_and_not_of_the_best() -> None:
+    values = torch.ones(64, 6)
+    values[:63, 2:] = 0.0
+    rank, smallest, full, shares = _base_statistics(values, torch.ones(64))
+    assert (rank, smallest, full) == (2, 0.0, 1 / 64)
+    assert shares == {6: 1 / 64, 2: 63 / 64}
+    with pytest.raises(BaseLostError, match=r"rank 2 of 6, 6 in 1.6 % of them"):
+        require_base([StateReport("stand", 64, 6, rank, smallest, full, shares)])
+    rank, smallest, full, shares = _base_statistics(values.flip(0), torch.tensor([1000.0] + [1.0] * 63))
+    assert rank == 6, "a sample counts as often as it stands for others"
 
 
-@few
-@given(seed=seeds)
-def test_whitened_rows_have_unit_noise_and_span_the_same_equations(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    scene, share = Scene(robot_of(ANYMAL), FEET, seed), rng.random(2)
-    torque, wrench = rng.random(12) < share[0], rng.random(12) < share[1]
-    torque_std, wrench_std, base_std = noises(scene, rng)
-    project = Projection(torque, wrench, 6, *map(torch.from_numpy, (torque_std, wrench_std, base_std)))
-    for group in scene.project(project):
-        for i, sample in enumerate(group.index.tolist()):
-            J = (scene.J[sample].numpy() * wrench_std[:, None])[scene.active[sample].numpy() & wrench]
-            covariance = np.diag(np.concatenate([base_std, torque_std]) ** 2) + J.T @ J
-            P, rounding, f = scene.expected(sample, torque, wrench)
-            V = group.V[i].numpy()
-            assert V.shape[1] == round(np.trace(P))
-            np.testing.assert_allclose(V.T @ covariance @ V, np.eye(V.shape[1]), rtol=0.0, atol=1e-12)
-            size = np.abs(V).max(initial=0.0)
-            np.testing.assert_allclose(P @ V, V, rtol=0.0, atol=10.0 * rounding * size)
-            np.testing.assert_allclose(group.K[i], V.T @ scene.K[sample].numpy(), rtol=0.0, atol=1e-13 * size)
-            np.testing.assert_allclose(group.f[i], V.T @ f, rtol=0.0, atol=1e-13 * size * np.abs(f).max())
-
-
-def test_noise_is_given_whole_or_not_at_all() -> None:
-    with pytest.raises(ValueError, match="all three or none"):
-        Projection([True], [True], torque_noise=0.5)
-    with pytest.raises(ValueError, match="all three or none"):
-        Projection([True], [True], torque_noise=0.5, wrench_noise=1.0)
-
-
-@pytest.mark.parametrize("noise", [None, 0.5], ids=["orthonormal", "whitened"])
-def test_what_is_not_measured_or_does_not_touch_never_reaches_the_result(noise: float | None) -> None:
-    rng = np.random.default_rng(9)
-    scene = Scene(robot_of(ANYMAL), FEET, 9)
-    torque, wrench = rng.random(12) < 0.5, rng.random(12) < 0.5
-    project = Projection(torque, wrench, 6, noise, noise, noise)
-    expected = scene.project(project)
-    scene.torque[:, ~torque] = torch.nan
-    scene.wrench[:, ~wrench] = torch.nan
-    scene.wrench[~scene.active] = torch.nan
-    scene.wrench.requires_grad_()
-    for group, other in zip(scene.project(project), expected, strict=True):
-        torch.testing.assert_close(group.f, other.f, rtol=0.0, atol=0.0)
-        torch.testing.assert_close(group.K, other.K, rtol=0.0, atol=0.0)
-    sum(group.f.sum() for group in scene.project(project)).backward()
-    assert scene.wrench.grad is not None
-    assert not scene.wrench.grad[~(scene.active & torch.from_numpy(wrench))].any()
-
-
-@pytest.mark.parametrize("noise", [None, 0.5], ids=["orthonormal", "whitened"])
-def test_gradients_flow_through_regressor_and_measured_forces(noise: float | None) -> None:
-    scene = Scene(robot_of(ANYMAL), FEET, 10, samples=3)
-    project = Projection([True] * 6 + [False] * 6, [True] * 3 + [False] * 9, 6, noise, noise, noise)
-    weights = torch.randn(9, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-
-    def projected(K: Tensor, torque: Tensor, wrench: Tensor) -> Tensor:
-        groups = project(scene.J, scene.active, K @ weights, torque, wrench)
-        return torch.cat([torch.cat([group.K, group.f[..., None]], dim=2).flatten() for group in groups])
-
-    assert torch.autograd.gradcheck(
-        projected, [x.clone().requires_grad_() for x in (scene.K, scene.torque, scene.wrench)], fast_mode=True
-    )
-
-
-@pytest.mark.parametrize("noise", [None, 0.5], ids=["orthonormal", "whitened"])
-def test_projected_forces_have_their_gradient_in_the_posture(noise: float | None) -> None:
-    """With feet of which nothing, part or all is measured: the null space turns with the legs."""
-    scene = Scene(robot_of(ANYMAL), FEET, 11, samples=4)
-    scene.touching[:] = torch.tensor([[1, 1, 1, 1], [1, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 0]], dtype=torch.bool)
-    project = Projection([True] * 9 + [False] * 3, [True] * 3 + [False] * 8 + [True], 6, noise, noise, noise)
-    frames = [FrameJacobian(scene.robot, foot.frame) for foot in FEET]
-
-    def squares(joints: Tensor) -> Tensor:
-        q = torch.cat([scene.q[:, :7], joints], dim=1)
-        J = torch.cat([frame(q)[:, :3] for frame in frames], dim=1)
-        groups = project(J, scene.active, scene.K, scene.torque, scene.wrench)
-        return torch.cat([(group.K.mean(2) - group.f).square().sum(1) for group in groups])
-
-    assert torch.autograd.gradcheck(squares, scene.q[:, 7:].clone().requires_grad_(), atol=1e-5, rtol=1e-6)
-
-
-@pytest.mark.parametrize("wrong", range(5), ids=["J_C", "active", "K", "torque", "wrench"])
-def test_a_part_of_a_batch_of_another_length_is_refused(wrong: int) -> None:
-    batch = (torch.ones(4, 3, 8), torch.ones(4, 3, dtype=torch.bool), *map(torch.ones, ((4, 8, 2), (4, 2), (4, 3))))
-    project = Projection([True] * 2, [False] * 3)
-    for part in (batch[wrong][:1], torch.cat([batch[wrong]] * 2)):
-        with pytest.raises(ValueError, match=r"J_C, active, K, torque, wrench: found shapes .*; accepted: \(B, 3, 8\)"):
-            project(*batch[:wrong], part, *batch[wrong + 1 :])
-
-
-@pytest.mark.parametrize("wrong", ["J_C", "torque", "wrench"])
-def test_a_part_of_a_batch_of_another_precision_or_none_is_refused_by_name(wrong: str) -> None:
-    touching = torch.ones(4, 3, dtype=torch.bool)
-    batch = {
-        "J_C": torch.ones(4, 3, 8),
-        "K": torch.ones(4, 8, 2),
-        "torque": torch.ones(4, 2),
-        "wrench": torch.ones(4, 3),
-    }
-    project = Projection([True] * 2, [False] * 3)
-    with pytest.raises(TypeError, match=f"^{wrong}: found torch.float64; accepted: torch.float32, as of K"):
-        project(active=touching, **batch | {wrong: batch[wrong].double()})
-    with pytest.raises(TypeError, match=f"^{wrong}: found NoneType; accepted: a tensor"):
-        project(active=touching, **batch | {wrong: None})
-
-
-def test_masks_have_an_entry_for_each_row() -> None:
-    for masks, name in (((True, [False]), "torque_measured"), (([True], False), "wrench_measured")):
-        with pytest.raises(ValueError, match=rf"{name}: found shape \(\); accepted: a bool for each row"):
-            Projection(*masks)  # type: ignore[arg-type]
-
-
-def test_flags_that_are_numbers_are_refused_and_never_taken_for_indices() -> None:
-    numbers = torch.ones(4, 3, dtype=torch.int64)
-    with pytest.raises(TypeError, match=r"active: found torch.int64; accepted: torch.bool"):
-        Projection([True] * 2, [False] * 3)(
-            torch.ones(4, 3, 8), numbers, torch.ones(4, 8, 2), torch.ones(4, 2), torch.ones(4, 3)
-        )
+def test_a_sample_of_a_long_log_counts_as_one_of_a_short_log() -> None:
+    short = [StateReport("stand", 1, 6, 2, value, 0.0, {2: 1.0}) for value in (0.0, 0.1, 0.4)]
+    long = StateReport("stand", 9, 8, 6, 0.3, 1.0, {6: 1.0})
+    for logs in ([*short, long], [long, *short[::-1]]):
+        (report,) = merge_state_reports([[log] for log in logs])
+        assert (report.samples, report.rows, report.base_rank, report.base_singular_value) == (12, 8, 6, 0.3)
+        assert report.base_rank_shares == {6: pytest.approx(0.75), 2: pytest.approx(0.25)}
+        assert report.base_full_share == pytest.approx(0.75)
+    (report,) = merge_state_reports([[log] for log in short])
+    assert (report.base_rank, report.base_singular_value, report.base_full_share) == (2, 0.1, 0.0)
+    (report,) = merge_state_reports([[replace(long, samples=3)], *([log] for log in short)])
+    assert report.base_rank == 6, "which half of the samples reach"

@@ -193,7 +193,7 @@ def load_simulation(path: str | Path, overrides: Sequence[str] = ()) -> Simulati
     with about_file(path):
         require_one_file(config.robot)
     ratio = config.physics_hz / config.control_hz
-    if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-9:
+    if abs(ratio - max(round(ratio), 1)) > 1e-9:
         raise ConfigError(path, "control_hz", f"{config.control_hz:g}", f"{config.physics_hz:g} over a whole number")
     names = [motion.name for motion in config.motions]
     again = [name for name in names if names.count(name) > 1]

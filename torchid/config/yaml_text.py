@@ -40,7 +40,7 @@ class _Count:
     def end(self) -> None:
         anchor, count = self.open.pop()
         if anchor is not None:
-            self.anchored[anchor] = count
+            self.anchored[anchor] = count + 1
         self.add(count + 1)
 
 

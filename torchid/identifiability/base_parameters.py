@@ -377,7 +377,7 @@ def _merged(same: Sequence[StateReport]) -> StateReport:
     return replace(
         merged,
         base_rank=_common_rank(ranks),
-        base_singular_value=values[min(middle, len(values) - 1)][0],
+        base_singular_value=values[middle][0],
         base_full_share=ranks.get(6, 0.0),
         base_rank_shares=ranks,
     )

@@ -258,8 +258,8 @@ def _runs(layout: ColumnLayout, kept: Sequence[tuple[int, ...]], sources: Sequen
     """Runs of consecutive nodes that keep the same parameters and have one path sum in common, or successive ones."""
     start = 0
     while start < len(sources):
-        first, end = sources[start], start + 1
-        if first is not None and kept[start]:
+        end = start + 1
+        if kept[start]:  # which no node without a path sum has
             steps: list[int] = []
             while (
                 end < len(sources)
@@ -274,7 +274,7 @@ def _runs(layout: ColumnLayout, kept: Sequence[tuple[int, ...]], sources: Sequen
                 kept=kept[start],
                 all_kept=layout.kept[start],
                 columns=range(layout.starts[start], layout.starts[end]),
-                sources=range(first, (sources[end - 1] or 0) + 1),
+                sources=range(sources[start] or 0, (sources[end - 1] or 0) + 1),
             )
         start = end
 
@@ -282,14 +282,15 @@ def _runs(layout: ColumnLayout, kept: Sequence[tuple[int, ...]], sources: Sequen
 def _evenly_spaced(
     level: Sequence[tuple[int, int, int | None]],
 ) -> Iterator[Sequence[tuple[int, int, int | None]]]:
-    """Runs of numbers, nodes and path sums above whose differences from one to the next are the same."""
+    """Runs of numbers, nodes and path sums above whose differences from one to the next are the same.
+
+    All nodes of a level start from nothing, or none does.
+    """
     start = 0
     while start < len(level):
         end, steps = start + 1, set[tuple[int, int, int]]()
         while end < len(level):
             (number, node, above), (before, node_before, above_before) = level[end], level[end - 1]
-            if (above is None) != (above_before is None):
-                break
             step = (number - before, node - node_before, (above or 0) - (above_before or 0))
             if min(step) < 0 or len(steps | {step}) > 1:
                 break

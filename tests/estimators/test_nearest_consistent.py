@@ -1,0 +1,151 @@
+"""The nearest parameters that meet conditions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from physical import (
+    GOOD,
+    METHODS,
+    PRIORS,
+    SCALE,
+    Case,
+    body,
+    prior_value,
+    random_bodies,
+    random_case,
+    random_parameters_within,
+)
+from synthetic import Array
+
+from torchid import parameters
+from torchid.errors import InputError
+from torchid.estimators import Conditions, Mirror, nearest_consistent, violations
+from torchid.estimators.consistent import Method, Prior
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def drawn(rng: np.random.Generator, prior: Prior) -> tuple[Case, Array | None]:
+    """Parameters to project, with the conditions, and the bodies whose pseudo-inertias measure deviations."""
+    case = random_case(rng)
+    nominal = case.problem.nominal.reshape(case.truth.shape)
+    if prior == "entropic":  # from bodies that exist
+        return replace(case, truth=random_bodies(rng, len(nominal))), None
+    return case, nominal if prior == "pullback" else None
+
+
+@pytest.mark.parametrize("prior", PRIORS)
+@settings(max_examples=10, deadline=None, derandomize=True)
+@given(seed=seeds)
+def test_a_projection_is_the_nearest_parameters_that_meet_the_conditions(prior: Prior, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    case, reference = drawn(rng, prior)
+    phi, scale, conditions = case.truth, case.scale, case.conditions
+
+    def distance(other: Array) -> float:
+        return prior_value(prior, other, phi, scale, reference)
+
+    near, sure = (
+        nearest_consistent(phi, scale, conditions, prior=prior, nominal=reference, method=method) for method in METHODS
+    )
+    assert violations(near, scale, conditions) == []
+    outside = 1e-6 if prior == "entropic" else 1e-7  # Clarabel's iterates end up to 1e-8, with exponential cones 3e-7
+    assert violations(sure, scale, conditions, outside) == []
+    nearest = distance(near)
+    assert nearest == pytest.approx(distance(sure), rel=1e-6, abs=1e-9)
+    np.testing.assert_allclose(near / scale, sure / scale, rtol=0.0, atol=1e-4)  # sqrt(gap)
+    nominal = case.problem.nominal.reshape(phi.shape)
+    if not violations(nominal, scale, conditions):
+        for share in (1e-4, 1e-2, 1.0):
+            assert distance((1.0 - share) * near + share * nominal) >= nearest * (1.0 - 1e-8)
+    if not (conditions.enclosures or conditions.mirrors or conditions.total_mass or conditions.lower is not None):
+        for size in np.repeat([1e-4, 1e-2, 1e-1], 20):
+            other = random_parameters_within(rng, near, scale, conditions, size)
+            assert other is None or distance(other) >= nearest * (1.0 - 1e-8)
+
+
+@pytest.mark.parametrize("prior", PRIORS)
+@pytest.mark.parametrize("method", METHODS)
+def test_parameters_that_meet_the_conditions_are_their_own_projection(method: Method, prior: Prior) -> None:
+    before = GOOD.copy()
+    found = nearest_consistent(GOOD, SCALE, Conditions(1e-4), prior=prior, method=method)
+    accuracy = 1e-5 if (method, prior) == ("certified", "entropic") else 1e-6  # sqrt(gap), an exponential cone's 1e-10
+    np.testing.assert_allclose(found / SCALE, GOOD / SCALE, rtol=0.0, atol=accuracy)
+    np.testing.assert_array_equal(GOOD, before)
+
+
+def test_a_projection_projects_no_further() -> None:
+    found = nearest_consistent(body(2.0, np.zeros(3), [0.1, 0.2, 0.4]), SCALE, Conditions(1e-3))
+    assert violations(found, SCALE, Conditions(1e-3)) == []
+    again = nearest_consistent(found, SCALE, Conditions(1e-3))
+    np.testing.assert_allclose(again / SCALE, found / SCALE, rtol=0.0, atol=1e-6)
+
+
+def test_the_metric_of_a_projection_matters() -> None:
+    """A light body's parameters move least where its own pseudo-inertia measures them."""
+    broken = body(2.0, np.zeros(3), [0.1, 0.2, 0.4])
+    measure = parameters.perturb_parameters(GOOD, 0.3, np.random.default_rng(0))
+    near = {
+        "euclidean": nearest_consistent(broken, SCALE, Conditions()),
+        "pullback": nearest_consistent(broken, SCALE, Conditions(), prior="pullback", nominal=GOOD),
+        "other": nearest_consistent(broken, SCALE, Conditions(), prior="pullback", nominal=measure),
+    }
+    for name, reference in (("pullback", GOOD), ("other", measure)):
+        apart = {other: prior_value("pullback", phi, broken, SCALE, reference) for other, phi in near.items()}
+        assert min(apart, key=lambda other: apart[other]) == name
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_bodies_without_mass_get_none_by_projection(method: Method) -> None:
+    phi = np.concatenate([body(1.0, np.zeros(3), [0.1, 0.2, 0.4]), np.zeros((2, 12))])
+    phi[2, 10] = 0.3  # a joint's friction, whatever hangs on it
+    found = nearest_consistent(phi, np.repeat(SCALE, 3, axis=0), Conditions(1e-4), method=method)
+    np.testing.assert_array_equal(found[1:, :10], 0.0)
+    np.testing.assert_array_equal(found[1, 10:], 0.0)
+    assert found[2, 10] == pytest.approx(0.3, abs=1e-6)
+    assert found[2, 11] == 0.0
+
+
+def test_friction_of_zero_moves_only_to_a_mirror_image_or_a_bound() -> None:
+    phi = np.repeat(GOOD, 3, axis=0)
+    phi[:, :10] = body(2.0, np.zeros(3), [0.3, 0.4, 0.5])[:, :10]
+    phi[:, 10], phi[:, 11] = (0.0, 0.3, 0.0), (0.0, 0.0, 0.0)
+    lower = np.full(phi.shape, -np.inf)
+    lower[2, 11] = 0.2
+    mirror = Mirror(0, 1, np.eye(3))
+    found = nearest_consistent(phi, np.repeat(SCALE, 3, axis=0), Conditions(mirrors=(mirror,), lower=lower))
+    np.testing.assert_allclose(found[:, 10], [0.15, 0.15, 0.0], rtol=0.0, atol=1e-7)
+    np.testing.assert_allclose(found[:, 11], [0.0, 0.0, 0.2], rtol=0.0, atol=1e-7)
+    assert found[2, 10] == 0.0
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_distances_that_are_not_defined_are_refused(method: Method) -> None:
+    broken = body(2.0, np.zeros(3), [0.1, 0.2, 0.4])
+    for arguments in ({"prior": "entropic"}, {"prior": "pullback"}, {"prior": "pullback", "nominal": broken}):
+        with pytest.raises(InputError, match=f"{arguments['prior']}, but the pseudo-inertia of body 0 "):
+            nearest_consistent(broken, SCALE, Conditions(), method=method, **arguments)
+    assert (
+        violations(nearest_consistent(broken, SCALE, Conditions(), prior="pullback", nominal=GOOD), SCALE, Conditions())
+        == []
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"prior": "riemannian"}, "prior: found 'riemannian'; accepted: 'euclidean', 'pullback' or 'entropic'"),
+        ({"method": "sdp"}, "method: found 'sdp'; accepted: 'barrier' or 'certified'"),
+        ({"nominal": GOOD}, "nominal: found parameters for the euclidean prior"),
+        ({"prior": "pullback", "nominal": GOOD[:, :10]}, "nominal: found shape"),
+    ],
+)
+def test_arguments_of_a_projection_that_make_no_sense_are_refused(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        nearest_consistent(GOOD, SCALE, Conditions(), **arguments)
