@@ -54,10 +54,17 @@ def test_every_sample_meets_every_condition(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_exact_data_of_bodies_that_do_not_exist_have_a_gaussian_inside_the_conditions(seed: int) -> None:
-    """Noise of 1e-6: at the edge eigenvalues are positive by rounding where a Cholesky factor fails."""
+    """Noise of 1e-6: at the edge eigenvalues are positive by rounding where a Cholesky factor fails.
+
+    Data that are sharper by a factor leave samples narrower by it, which lie along the edge.
+    """
     conic = posterior_of(active_case(seed)[0], Conditions(), noise=1e-6).conic_problem(0.2)
     at_edge = conic.F0 + np.einsum("kv,kvij->kij", barrier_gaussian(conic).mean[conic.variables], conic.F)
     assert np.isfinite(np.linalg.cholesky(at_edge)).all()
+    blunt, sharp = (
+        drawn(posterior_of(active_case(seed)[0], Conditions(), noise), 1000)[0].std(axis=0) for noise in (1e-4, 1e-6)
+    )
+    np.testing.assert_allclose(np.median(blunt / sharp), 100.0, rtol=0.15)
 
 
 def test_what_the_data_do_not_see_is_as_wide_as_the_prior() -> None:

@@ -200,6 +200,7 @@ def test_without_held_out_logs_the_last_parameters_are_kept_and_patience_means_n
     estimate = trainer.run(lambda _: phis.append(trainer.phi()))
     assert estimate.epochs == estimate.best_epoch == 12
     np.testing.assert_array_equal(estimate.phi, phis[-1])
+    assert f"{estimate.deviation:.2g} standard errors from least squares" in repr(estimate).replace("\n ", "")
 
 
 @pytest.mark.parametrize("with_held_out", [True, False], ids=["held out", "training"])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,11 +28,12 @@ from synthetic import (
     load,
     random_states,
 )
+from torch.optim.swa_utils import AveragedModel
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from torchid import parameters
-from torchid.errors import UnknownNameError
+from torchid.errors import InputError, UnknownNameError
 from torchid.regressor import FrameJacobian, LoopJacobian, Regressor, motion_from_state
 from torchid.regressor.columns import all_wrench_columns, reduced_layout, reduction_matrix
 from torchid.regressor.kinematics import body_states, joint_motion, joint_screw_axes
@@ -121,6 +124,24 @@ def test_a_module_moved_to_single_precision_and_back_still_runs_in_double(small:
     back = K.to(torch.float32).to(torch.float64)(*state)
     assert back.dtype == torch.float64
     assert_close(back.numpy(), exact.numpy(), 1e-5)  # the constants have lost their digits
+
+
+def test_a_state_is_refused_by_another_robot_of_the_same_shapes(small: Robot, tmp_path: Path) -> None:
+    moved, renamed = tmp_path / "moved.urdf", tmp_path / "renamed.urdf"
+    text = small.path.read_text()
+    moved.write_text(text.replace('<axis xyz="0 -1 0"/>', '<axis xyz="0 -1 0.001"/>'))
+    renamed.write_text(text.replace('link name="base"', 'link name="torso"').replace('"base"', '"torso"'))
+    model = torch.nn.ModuleList([Regressor(small), FrameJacobian(small, "c"), torch.nn.Linear(3, 1)])
+    torch.save(model.state_dict(), tmp_path / "model.pt")
+    state = torch.load(tmp_path / "model.pt", weights_only=True)
+    for same in (model.float(), copy.deepcopy(model), pickle.loads(pickle.dumps(model)), AveragedModel(model).module):
+        same.load_state_dict(state)
+    Regressor(load(renamed)).load_state_dict(Regressor(small).state_dict())  # names change no equation
+    for module in (Regressor, LoopJacobian):
+        with pytest.raises(InputError, match="^load_state_dict: robot: another one, which differs at d; accepted"):
+            module(load(moved)).load_state_dict(module(small).state_dict())
+    with pytest.raises(InputError, match="another one, of 5 frames and 3 joints instead of 13 frames and 12 joints"):
+        Regressor(load(SOLO12)).load_state_dict(Regressor(small).state_dict())
 
 
 WRONG_SHAPES = {

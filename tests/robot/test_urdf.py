@@ -235,6 +235,8 @@ def test_a_file_of_another_format_is_refused_by_its_root(tmp_path: Path) -> None
 def test_a_file_that_cannot_be_opened_is_refused(tmp_path: Path) -> None:
     assert "file: no such file" in refusal(tmp_path / "missing.urdf")
     assert "file: cannot be read (a folder)" in refusal(tmp_path)
+    with pytest.raises(TypeError, match="^path: found dict; accepted: that of a URDF or MJCF file$"):
+        load_robot({"robot": "arm"})  # type: ignore[arg-type]
 
 
 def test_entities_bring_nothing_from_other_files(tmp_path: Path) -> None:

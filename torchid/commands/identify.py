@@ -23,9 +23,10 @@ from torchid.config import ExperimentConfig, inputs_of
 from torchid.errors import NumericalWarning, warn_about_file
 from torchid.estimators import Conditions, Estimate, Violation, violations
 from torchid.estimators.conditions import term_violations
+from torchid.fitting.armature import UnfittedArmature, unfitted_armature
 from torchid.fitting.calibration import Calibration, Comparison, warn_of_confounded, warn_of_disagreement
 from torchid.fitting.cross_validation import CrossValidation, Scorer, fit_without_folds
-from torchid.fitting.delay import unfitted_delay
+from torchid.fitting.delay import UnfittedDelay, unfitted_delay
 from torchid.fitting.factor_files import FactorFile
 from torchid.fitting.fit import Fit, LogFitter
 from torchid.fitting.misfit import misfit, resting_joints, unfitted_friction
@@ -35,7 +36,7 @@ from torchid.identifiability.confounding import TotalMass
 from torchid.identifiability.contributions import Contributions, contributions
 from torchid.parallel import one_thread
 from torchid.parameters import PER_BODY, Array
-from torchid.problem import Evaluation, LinearProblem, Metrics, Samples
+from torchid.problem import Evaluation, ExtraTerms, LinearProblem, Metrics, Samples
 from torchid.problem.compressed_log import Block
 from torchid.problem.contact_state import ContactState, state_name
 from torchid.problem.metrics import LOG_SETS
@@ -136,7 +137,7 @@ def _identify(
         scorer, of_blocks = Scorer(evaluation, builder), merge_states(fit.parts, builder)
         scores = _scores(scorer, logs["test"], blocks, of_blocks, compared, without_folds, bars)
         traces = distributed.from_first(lambda: [trace_forces(evaluation, log, compared) for log in shown], "traces")
-        delay = distributed.from_first(partial(unfitted_delay, logs["train"], fitter, experiment.terms), "delay")
+        of_actuators = distributed.from_first(partial(_unfitted, logs["train"], fitter, experiment.terms), "actuators")
     run = Identification(
         experiment=experiment,
         estimate=fit.estimate,
@@ -144,7 +145,12 @@ def _identify(
         noise=ready.noise,
         motion_noise=fit.assembly.noise,
         misfit=misfit(
-            fit.estimate, ready.noise, blocks, fit.jackknife, unfitted_friction(problem, experiment.robot), delay
+            fit.estimate,
+            ready.noise,
+            blocks,
+            fit.jackknife,
+            unfitted_friction(problem, experiment.robot),
+            *of_actuators,
         ),
         resting=resting_joints(problem, experiment.robot, builder, logs["train"]),
         at_rest=[name for name in LOG_SETS if is_at_rest(logs[name])],
@@ -172,6 +178,13 @@ def _identify(
     ready.blocks = blocks = []
     require_not_worse(run.worse, run.metrics["train"].identified, checked)
     return replace(run, suspected=suspected_mistake(run, checked)), solved.training, begun
+
+
+def _unfitted(
+    logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms
+) -> tuple[UnfittedDelay | None, UnfittedArmature | None]:
+    """What of joints' actuators was not fitted, and shows in the logs."""
+    return unfitted_delay(logs, fitter, terms), unfitted_armature(logs, fitter, terms)
 
 
 def _begin_figures(ready: PreparedData, fit: Fit, forces: Sequence[ForceSeries], stack: ExitStack) -> list[Drawing]:

@@ -28,6 +28,8 @@ small. With a quarter it is within 1 %, for as many passes.
 _RARE = 0.01  # share of draws that a condition excludes, above which it counts as near
 _DRAWS, _PASSES = 400, 6
 _STEPS, _DONE, _ENOUGH, _SHORTEST = 100, 1e-10, 1e-4, 1e-9  # of Newton's method
+_CLOSE = 0.05  # squared decrement from which on full steps converge quadratically
+_GROWTH = 50.0  # of the quadratic from one point of the central path to the next
 
 
 @dataclass(frozen=True)
@@ -153,12 +155,28 @@ def _near_rows(blocks: Array, rows: Array, near: np.ndarray) -> tuple[Array, Arr
 
 
 def _minimizer(conditions: _Conditions, x: Array, near: np.ndarray) -> Array:
-    """Where the density times the barriers of some conditions is largest, by Newton's method from a point inside."""
-    conic, N = conditions.conic, conditions.N
+    """Where the density times the barriers of some conditions is largest, from a point inside.
+
+    Newton's method from afar may run into conditions nearby where data are sharp, and take ever shorter steps along
+    them. Then the quadratic begins small beside the barriers, and grows.
+    """
+    found, decrement = _newton(conditions, x, near, 1.0, _STEPS)
+    if decrement < _CLOSE:
+        return found
+    share = 1.0 / _newton(conditions, x, near, 1.0, 0)[1]
+    while share < 1.0:
+        x, _ = _newton(conditions, x, near, share, _STEPS)
+        share *= _GROWTH
+    return _newton(conditions, x, near, 1.0, _STEPS)[0]
+
+
+def _newton(conditions: _Conditions, x: Array, near: np.ndarray, share: float, steps: int) -> tuple[Array, float]:
+    """Minimizer of a share of the quadratic and the barriers, from a point inside, and the last squared decrement."""
+    conic, N, sharp = conditions.conic, conditions.N, np.sqrt(share)
     of_blocks, of_rows = near[: len(conic.F0)], near[len(conic.F0) :]
 
     def value(x: Array) -> float:
-        misfit, slack = conic.root @ x - conic.target, (conic.G @ x - conic.h)[of_rows]
+        misfit, slack = sharp * (conic.root @ x - conic.target), (conic.G @ x - conic.h)[of_rows]
         try:
             roots = np.linalg.cholesky(conditions.blocks(x[:, None])[of_blocks, 0])
         except np.linalg.LinAlgError:
@@ -169,21 +187,29 @@ def _minimizer(conditions: _Conditions, x: Array, near: np.ndarray) -> Array:
         return float(0.5 * misfit @ misfit - determinants - np.log(slack).sum())
 
     before = value(x)
-    for _ in range(_STEPS):
+    for count in range(steps + 1):
         inverse = np.linalg.inv(np.linalg.cholesky(conditions.blocks(x[:, None])[of_blocks, 0]))
         slopes = np.einsum("kij,kjln,kml->kimn", inverse, conditions.slopes[of_blocks], inverse, optimize=True)
         rows = conic.G[of_rows] / (conic.G @ x - conic.h)[of_rows, None]
-        J = np.concatenate([conic.root, slopes.reshape(-1, len(x)), rows]) @ N
-        misfit = conic.root @ x - conic.target
+        J = np.concatenate([sharp * conic.root, slopes.reshape(-1, len(x)), rows]) @ N
+        misfit = share * (conic.root @ x - conic.target)
         gradient = N.T @ (conic.root.T @ misfit - np.einsum("kiin->n", slopes) - rows.sum(axis=0))
         R = np.linalg.qr(J, mode="r")
         half = scipy.linalg.solve_triangular(R, gradient, trans=1)
         step, decrement, length = -N @ scipy.linalg.solve_triangular(R, half), float(half @ half), 1.0
-        while (after := value(x + length * step)) > before - _ENOUGH * length * decrement and length > _SHORTEST:
+        if count == steps or decrement < _DONE:
+            break
+        while not _is_enough(before, after := value(x + length * step), length, decrement) and length > _SHORTEST:
             length *= 0.5
         if length <= _SHORTEST:
             break
         x, before = x + length * step, after
-        if decrement < _DONE:
-            break
-    return x
+    return x, decrement
+
+
+def _is_enough(before: float, after: float, length: float, decrement: float) -> bool:
+    """Whether a step lowers a self-concordant function by enough; near its minimum full ones do, beyond rounding.
+
+    Boyd, Vandenberghe, "Convex Optimization", section 9.6.
+    """
+    return after < np.inf and (decrement < _CLOSE or after <= before - _ENOUGH * length * decrement)

@@ -74,6 +74,10 @@ class SgdEstimate(ConstrainedEstimate):
     best_epoch: int
     residual: ResidualEffect | None
 
+    def _headline(self) -> str:
+        from_least = "" if self.unconstrained is None else f", {self.deviation:.2g} standard errors from least squares"
+        return f"{super()._headline()}{from_least}"
+
 
 class Trainer:
     """A descent on mini-batches, preconditioned by the compressed problem, with or without a residual module.

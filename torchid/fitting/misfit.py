@@ -13,6 +13,7 @@ from scipy.special import chdtri
 
 from torchid.estimators import Estimate
 from torchid.estimators.least_squares import residual_std
+from torchid.fitting.armature import UnfittedArmature
 from torchid.fitting.delay import UnfittedDelay
 from torchid.fitting.noise import GroupNoise, NoiseSummary
 from torchid.identifiability.jackknife import Jackknife
@@ -54,6 +55,7 @@ class Misfit:
         friction: that was not fitted, None where all of it was.
         delay: of joint torques that was not fitted, None where it was, or nothing tells.
         share: residual over that of the nominal parameters, None where these leave nothing.
+        armature: that was not fitted, None likewise.
     """
 
     residual: float
@@ -64,12 +66,12 @@ class Misfit:
     friction: UnfittedFriction | None = None
     share: float | None = None
     delay: UnfittedDelay | None = None
+    armature: UnfittedArmature | None = None
 
     @property
     def alike(self) -> bool:
         """Whether residuals are correlated in time more than noise is, and are more than rounding."""
-        rounding = self.share is not None and self.share < _EXACT
-        return self.lack_of_fit is not None and self.lack_of_fit > _ALIKE and not rounding
+        return self.lack_of_fit is not None and self.lack_of_fit > _ALIKE and not self._is_rounding
 
     @property
     def judged(self) -> bool:
@@ -83,8 +85,14 @@ class Misfit:
         return not (much or self.alike or any(one is not None and one.significant for one in self._unfitted))
 
     @property
-    def _unfitted(self) -> tuple[UnfittedFriction | UnfittedDelay | None, ...]:
-        return self.friction, self.delay
+    def _is_rounding(self) -> bool:
+        """Whether rounding is all that is left."""
+        return self.share is not None and self.share < _EXACT
+
+    @property
+    def _unfitted(self) -> tuple[UnfittedFriction | UnfittedDelay | UnfittedArmature | None, ...]:
+        late = self.delay is not None and self.delay.significant  # torques then go with accelerations, too
+        return self.friction, self.delay, None if late or self._is_rounding else self.armature
 
     def _reasons(self) -> list[str]:
         """Why noise cannot be all that the model leaves, none where it may be."""
@@ -126,6 +134,7 @@ def misfit(
     jackknife: Jackknife | None,
     friction: UnfittedFriction | None,
     delay: UnfittedDelay | None = None,
+    armature: UnfittedArmature | None = None,
 ) -> Misfit:
     """What a fit leaves of the forces.
 
@@ -136,6 +145,7 @@ def misfit(
         jackknife: of the estimate over blocks of them.
         friction: that was not fitted.
         delay: of joint torques that was not fitted.
+        armature: that was not fitted.
     """
     left = np.average([log.noise_left for log in logs], weights=[len(log) for log in logs])
     stated = any(one.origin == "stated" for one in noise.groups)
@@ -154,6 +164,7 @@ def misfit(
         friction=friction,
         share=float(np.sqrt(estimate.cost / estimate.nominal_cost)) if estimate.nominal_cost > 0.0 else None,
         delay=delay,
+        armature=armature,
     )
 
 

@@ -11,8 +11,11 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
+from torchid.errors import InputError, join_names
 from torchid.parameters import Array
 from torchid.robot import Robot
+
+_SAME = 1e-6  # [m], or of a unit vector: the same robot has the same constants to rounding, averaged states included
 
 
 @dataclass(frozen=True)
@@ -110,6 +113,7 @@ class KinematicTree(nn.Module):
         self._indices: dict[tuple[int, ...], Tensor] = {}
         self._path_maps: dict[tuple[int, ...], tuple[slice | Tensor, Tensor | None]] = {}
         nodes = tree_nodes(robot)
+        self._nodes, self._body_names = nodes, robot.body_names
         self.node_of = [index for index, node in enumerate(nodes) if node.body is not None]
         self.body_of = np.searchsorted(self.node_of, np.arange(len(nodes))).tolist()
         self.parents = [node.parent for node in nodes]
@@ -163,6 +167,32 @@ class KinematicTree(nn.Module):
     def _register(self, name: str, value: np.ndarray) -> None:
         dtype = torch.int64 if value.dtype.kind == "i" else torch.float64
         self.register_buffer(name, torch.tensor(np.ascontiguousarray(value), dtype=dtype), persistent=False)
+
+    def get_extra_state(self) -> Tensor:
+        """What a `state_dict` has of the robot, (L, 31 + n + 6 F) float64: all that its regressor depends on."""
+        rows = []
+        for node in self._nodes:
+            kind = [node.parent, node.slides, self.base_rows, node.offset]
+            poses = np.concatenate([node.T_parent_joint[:3], node.T_joint_link[:3]])
+            rows.append(np.concatenate([kind, node.axis, poses.ravel(), node.position_map]))
+        return torch.tensor(np.array(rows), dtype=torch.float64)
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Refuse the `state_dict` of another robot: what was trained beside its regressor is not this one's.
+
+        Raises:
+            InputError: it is another robot's.
+        """
+        own = self.get_extra_state()
+        if state.shape != own.shape:
+            sizes = [f"{len(x)} frames and {x.shape[1] - own.shape[1] + self.n_dofs} joints" for x in (state, own)]
+            found = f"another one, of {' instead of '.join(sizes)}"
+        elif differs := ((state.to(own) - own).abs().amax(dim=1) > _SAME).nonzero()[:, 0].tolist():
+            bodies = dict.fromkeys(self._body_names[self.body_of[node]] for node in differs)
+            found = f"another one, which differs at {join_names(list(bodies))}"
+        else:
+            return
+        raise InputError("load_state_dict", "robot", found, "the state of a module of the same robot")
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> KinematicTree:
         self._indices.clear()

@@ -278,11 +278,14 @@ def load_robot(
             an MJCF file has no free joint and is not said to be fixed.
         ConfigError: see `weld_positions`, `validate_loops` and `passive_joints`.
         InputError: an MJCF file, and MuJoCo is not installed.
+        TypeError: `path` is the model of another library.
 
     Warns:
         MasslessBodyWarning: a body at the end of a limb has no inertia.
         UnphysicalInertiaWarning: a link's inertia belongs to no distribution of positive mass.
     """
+    if not isinstance(path, (str, Path)):
+        raise TypeError(f"path: found {type(path).__name__}; accepted: that of a URDF or MJCF file")
     path = Path(path)
     with during("reading", path):
         links, joints = read_urdf(path)
