@@ -120,6 +120,8 @@ def _filled_up(
         for x, is_one in measured.items()
         if is_one and numeric[x].shape[:2] == shape
     }
+    if not lengths:
+        return None
     best = max(lengths, key=lambda name: int(lengths[name].sum()))
     is_filled = lengths[best].min() > 0 and min(np.max(list(lengths.values()), axis=0)) < shape[1 - axis]
     return (best, lengths[best]) if is_filled else None
