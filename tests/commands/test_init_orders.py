@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from dialects import save_csv
 from initiated import URDF, recorded
 from motions import value
 
@@ -61,3 +62,14 @@ def test_limits_tell_an_order_where_no_force_was_recorded(tmp_path: Path) -> Non
     assert_alike(log, read)
     assert "beyond their limits" in said
     assert how in said
+
+
+def test_numbered_columns_with_the_base_in_front_are_no_motors(tmp_path: Path) -> None:
+    """A position and a quaternion before twelve joints, as simulators write them, are no motors 0 to 6."""
+    log = recorded()
+    states = np.hstack([value(log.base_position_world), value(log.base_quat_xyzw), value(log.joint_position)])
+    rates = np.hstack([np.zeros((len(log), 6)), value(log.joint_velocity)])
+    columns = {f"{name}[{k}]": x for name, of in (("gc", states), ("gv", rates)) for k, x in enumerate(of.T)}
+    said = init(URDF, save_csv(tmp_path / "x.csv", {"t": log.time, **columns}), tmp_path / "x.yaml")
+    assert any("19 columns like 'gc[0]'" in text for text in said.missing)
+    assert "joint_" not in (tmp_path / "x.yaml").read_text()

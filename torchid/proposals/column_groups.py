@@ -286,7 +286,7 @@ def split_arrays(sample: FileSample, names: Sequence[str], joints: Collection[in
     out, width = list[tuple[str, str, str]](), 0
     for name in names:
         array = np.asarray(sample[name])
-        if not _has_pose(array):
+        if not has_pose(array):
             continue
         out += [(name, "[0:3]", "base_position_world"), (name, "[3:7]", "base_quat_wxyz")]
         if array.shape[1] - 7 in joints:
@@ -328,7 +328,7 @@ def _is_state(array: NDArray[Any], joints: Collection[int]) -> bool:
     return bool(alike > _ALIKE)
 
 
-def _has_pose(array: NDArray[Any]) -> bool:
+def has_pose(array: NDArray[Any]) -> bool:
     """Whether columns 3 to 6 of an array (N, k) are a quaternion."""
     if array.ndim != 2 or array.shape[1] < 7 or array.dtype.kind != "f" or len(array) < 3:
         return False
