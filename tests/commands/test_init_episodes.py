@@ -81,6 +81,53 @@ def test_what_fills_up_stacked_episodes_is_cut_off(tmp_path: Path) -> None:
     assert_recorded(logs_of(tmp_path / "x.npz"), LENGTHS)
 
 
+@pytest.mark.parametrize("filling", ["zeros", "the last sample", "NaN"])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_what_fills_up_episodes_is_found_without_their_lengths(tmp_path: Path, axis: int, filling: str) -> None:
+    """Stamps of one clock are filled up, too; two joints of the last episode stand still at its end."""
+    start = SAMPLES * STEP * np.arange(EPISODES)[:, None]
+    q, dq = Q.copy(), DQ.copy()
+    q[-1, 300:, :2], dq[-1, 300:, :2] = q[-1, 300, :2], 0.0
+
+    def filled(x: np.ndarray) -> np.ndarray:
+        of_each = x.copy()
+        for one, length in zip(of_each, LENGTHS, strict=True):
+            one[length:] = {"zeros": 0.0, "NaN": np.nan, "the last sample": one[length - 1]}[filling]
+        return np.moveaxis(of_each, 0, axis)
+
+    arrays = {"q": q, "qd": dq, "tau": TAU, "t": TIME + start}
+    np.savez(tmp_path / "x.npz", **{name: filled(x) for name, x in arrays.items()})
+    logs = logs_of(tmp_path / "x.npz")
+    assert [len(log) for log in logs] == LENGTHS.tolist()
+    for number, (log, length) in enumerate(zip(logs, LENGTHS, strict=True)):
+        np.testing.assert_array_equal(log.joint_position, q[number, :length])
+        np.testing.assert_allclose(np.diff(log.time), STEP, atol=1e-12)
+    text = (tmp_path / "x.yaml").read_text()
+    assert f"{LENGTHS.sum()} of {EPISODES * SAMPLES} samples, behind which all arrays" in text
+
+
+def test_episodes_that_end_at_rest_are_not_cut(tmp_path: Path) -> None:
+    """Encoders repeat themselves to the last bit where joints stand; torques do not."""
+    q, dq = Q.copy(), DQ.copy()
+    q[:, 400:], dq[:, 400:] = q[:, 400:401], 0.0
+    np.savez(tmp_path / "x.npz", q=q, qd=dq, tau=TAU, t=TIME)
+    assert [len(log) for log in logs_of(tmp_path / "x.npz")] == [SAMPLES] * EPISODES
+
+
+def test_a_group_with_another_number_of_joints_is_named(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "x.h5", "w") as file:
+        for number in range(EPISODES):
+            file[f"demo_{number}/q"] = Q[number]
+            file[f"demo_{number}/t"], file[f"demo_{number}/tau"] = TIME, TAU[number]
+    init(UR5, tmp_path / "x.h5", tmp_path / "x.yaml")
+    with h5py.File(tmp_path / "x.h5", "a") as file:
+        del file["demo_3/tau"]
+        file["demo_3/tau"] = TAU[3, :, :5]
+    columns = load_config(tmp_path / "x.yaml").logs.columns  # type: ignore[union-attr]
+    with pytest.raises(InputError, match=r"'demo_3/tau': shape \(600, 5\), but 'demo_0/tau' \(600, 6\)"):
+        read_log(tmp_path / "x.h5[#0]", columns=columns)
+
+
 @pytest.mark.parametrize("stamped", [True, False])
 def test_groups_of_episodes_are_recordings_in_the_order_of_their_numbers(tmp_path: Path, stamped: bool) -> None:
     """More datasets than a log has, of fewer kinds; the tenth comes behind the ninth."""

@@ -70,3 +70,13 @@ def test_a_folder_without_stamps_is_refused(tmp_path: Path) -> None:
     save_csv(tmp_path / "empty" / "note.csv", {"width": np.ones(3)})
     with pytest.raises(LogError, match="empty: file: a folder, 1 log without stamps and fields"):
         init(URDF, tmp_path / "empty", tmp_path / "robot.yaml")
+
+
+def test_arrays_in_files_of_their_own_are_asked_for_as_one_file(tmp_path: Path) -> None:
+    (tmp_path / "walk").mkdir()
+    for name in ("t", "q"):
+        np.save(tmp_path / "walk" / f"{name}.npy", np.arange(9.0))
+    with pytest.raises(LogError, match=r"2 arrays in files of their own, q.npy, t.npy; accepted: .*numpy.savez\('walk"):
+        init(URDF, tmp_path / "walk", tmp_path / "robot.yaml")
+    with pytest.raises(LogError, match=r"extension '.npy'; accepted: .*numpy.savez\('q.npz', x=x\)"):
+        init(URDF, tmp_path / "walk" / "q.npy", tmp_path / "robot.yaml")

@@ -87,3 +87,21 @@ def test_an_angular_velocity_of_the_body_is_no_linear_one() -> None:
     assert propose_field("base_ang_vel_body").startswith("base_angular_velocity")
     assert propose_field("base/v_world").startswith("base_linear_velocity")
     assert propose_field("velBody").startswith("base_linear_velocity")
+
+
+@pytest.mark.parametrize(
+    ("field", "spelled"),
+    [
+        ("joint_velocity", "dq qd qdot q_dot q.dot QDot dqdt dq/dt dq_dt dotq qdots d_q"),
+        ("joint_velocity", "theta_dot thetadot ThetaDot dtheta thDot phi_dot jvel q_vel joint_spd"),
+        ("joint_velocity", "pos_dot dpos posDot joint_position_dot angleDot joint_angular_velocity omega_joint"),
+        ("joint_acceleration", "ddq qdd qddot q_ddot q_dot_dot d2q theta_ddot ddtheta pos_ddot q_acc dof_acc"),
+        ("joint_torque", "tau trq torq joint_moment actuator_force joint_forces tau_est"),
+        ("", "q_dot_des qd_ref base_pos_dot q_d theta_dot_cmd"),
+    ],
+)  # fmt: skip
+def test_a_derivative_is_no_position_however_it_is_spelled(field: str, spelled: str) -> None:
+    """Alone, with a number, in front of a number and behind the name of a joint."""
+    forms = ("{}", "{}1", "{}_1", "FL_hip_{}", "{}.l_knee")
+    found = {text: propose_field(text) for name in spelled.split() for form in forms if (text := form.format(name))}
+    assert {text: of for text, of in found.items() if of != field} == {}

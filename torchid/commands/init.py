@@ -6,12 +6,14 @@ import os
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from textwrap import fill
 
 from torchid.commands.folder import check_free_file
 from torchid.commands.init_files import log_in_folder, named_apart
 from torchid.commands.init_logs import Split, keys_for_gaps, keys_for_length, split_logs
+from torchid.commands.init_orders import settle_order
 from torchid.commands.init_proposals import (
     GuessedContact,
     guess_contacts,
@@ -116,7 +118,8 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> InitReport:
     out = InitReport(target)
     _state_flags(robot, contacts, fields, proposal)
     contacts = contacts if _knows_ground(robot, contacts, fields) else without_rolling(contacts, robot)
-    read = _try(path, proposal)
+    bolted, detects = _is_fixed(contacts, fields), "detect_contacts" in _from_feet(robot, contacts, fields)
+    read = settle_order(proposal, partial(_try, path), robot, contacts, bolted, detects)
     logs = [] if isinstance(read, InputError) else read
     gaps = keys_for_gaps(logs) | keys_for_length(logs)
     split = split_logs(logs, "base_motion" in _from_feet(robot, contacts, fields))

@@ -20,6 +20,7 @@ from torchid.proposals.numbers import unit_of_step
 from torchid.robot import Robot
 
 _MOST = 64  # files in a folder
+_AS_ONE = "numpy.savez('{0}.npz', **{{x.stem: numpy.load(x) for x in pathlib.Path('{0}').glob('*.npy')}})"
 
 
 def log_in_folder(path: Path) -> tuple[Path, list[str]]:
@@ -36,6 +37,9 @@ def log_in_folder(path: Path) -> tuple[Path, list[str]]:
     files = sorted(file for file in path.iterdir() if file.suffix.lower() in (*TABLES, *ARRAYS) and file.is_file())
     if len(files) > _MOST:
         raise LogError(path, "file", f"a folder of {len(files)} logs", f"at most {_MOST}, the files of one log")
+    if (single := sorted(path.glob("*.npy"))) and not files:
+        found = f"{len(single)} arrays in files of their own, {join_names([file.name for file in single])}"
+        raise LogError(path, "file", found, f"one file of all: {_AS_ONE.format(path.name)}")
     steps = {file: step for file in files if (step := _step_of(file)) is not None}
     if not steps:
         accepted = "a folder of tables or arrays that have stamps, or one recorded by ROS 2; or name the files of a log"

@@ -7,7 +7,7 @@ import re
 import warnings
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -35,7 +35,7 @@ class GuessedContact:
     """A frame that touches the ground, and the type of its contact, as an experiment file has them."""
 
     frame: str
-    type: str
+    type: Literal["point", "flat"]
     radius: float | None = None
 
     @property

@@ -193,7 +193,8 @@ class Episodes:
 
     Attributes:
         axis: of arrays, that counts them: 0 of (episodes, samples, ...), 1 of (samples, episodes, ...).
-        lengths: array with the number of samples of each, where arrays are filled up behind these.
+        lengths: array with the number of samples of each, where arrays are filled up behind these; or one of these,
+            which is 0, NaN or its last sample from there on.
         groups: in place of an axis, name of the groups that hold one each, with * for their number: `data/demo_*`.
     """
 

@@ -112,7 +112,8 @@ def _suffix(path: Path, accepted: tuple[str, ...]) -> str:
     """A file's extension in small letters, LogError unless it is one of these."""
     suffix = path.suffix.lower()
     if suffix not in accepted:
-        raise LogError(path, "file", f"extension '{path.suffix}'", ", ".join(accepted))
+        one_array = f"; of an array x numpy.savez('{path.stem}.npz', x=x)" if suffix == ".npy" else ""
+        raise LogError(path, "file", f"extension '{path.suffix}'", ", ".join(accepted) + one_array)
     return suffix
 
 

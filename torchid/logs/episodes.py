@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,8 +13,6 @@ from torchid.errors import LogError, excerpt
 from torchid.logs.column_entries import KEY, Episodes
 from torchid.logs.column_map import PLACEHOLDER, Columns
 from torchid.logs.containers import Container
-
-Load = Callable[[str], NDArray[Any]]
 
 
 def arrays_of_episodes(container: Container, columns: Columns | None) -> Arrays:
@@ -57,6 +55,30 @@ def flat(array: NDArray[Any], shape: tuple[int, int], axis: int, lengths: NDArra
     return by_episode.reshape(-1, *array.shape[2:])
 
 
+def filled_lengths(array: NDArray[Any], axis: int) -> NDArray[np.int64]:
+    """Samples of each episode (E,) of an array of numbers (E, N, ...), or (N, E, ...), that is filled up behind them.
+
+    What fills it is 0 or NaN throughout, or repeats the last sample.
+
+    Args:
+        array: of a file.
+        axis: that counts episodes, 0 or 1.
+    """
+    rows = np.moveaxis(array, axis, 0)
+    rows = np.nan_to_num(rows.reshape(*rows.shape[:2], -1).astype(float))
+    differs = (rows != rows[:, -1:]).any(axis=2)
+    own = np.where(differs.any(axis=1), rows.shape[1] - differs[:, ::-1].argmax(axis=1), 0)
+    return own + rows[:, -1].any(axis=1).astype(np.int64)
+
+
+def _begun_anew(time: NDArray[Any], counts: Sequence[int] | NDArray[np.int64]) -> NDArray[Any]:
+    """Stamps of episodes of so many samples that each begin at 0, where a clock goes on from one to the next."""
+    first = np.cumsum([0, *counts])
+    if len(time) != first[-1] or not (time[first[1:-1]] > time[first[1:-1] - 1]).any():
+        return time
+    return np.asarray(time - np.repeat(time[first[:-1]], counts))
+
+
 class StackedArrays(Arrays):
     """Arrays that have an axis of episodes beside that of samples, as the positions of the joints have."""
 
@@ -71,13 +93,23 @@ class StackedArrays(Arrays):
             raise LogError.at_field(f"{KEY}.episodes", found, "arrays (episodes, samples, ...) or the other way round")
         self._shape = (int(array.shape[0]), int(array.shape[1]))
         count, samples = self._shape[:: -1 if self._axis else 1]
-        self._lengths = None if entry.lengths is None else _whole(entry.lengths, self.names, container.load)
+        self._lengths = None if entry.lengths is None else self._read_lengths(entry.lengths)
         if self._lengths is not None and (
             self._lengths.shape != (count,) or not ((self._lengths > 0) & (self._lengths <= samples)).all()
         ):
             accepted = f"{count} numbers of samples, from 1 to {samples}"
             raise LogError.at_field(f"{KEY}.episodes.lengths", f"'{entry.lengths}' has others", accepted)
         self._counts = np.full(count, samples) if self._lengths is None else self._lengths
+
+    def _read_lengths(self, name: str) -> NDArray[np.int64]:
+        """Samples of each episode: an array of numbers of them, or one that is filled up; LogError for others."""
+        array = super().load(name) if name in self.names else np.empty(0)
+        if array.dtype.kind == "f" and array.shape[:2] == self._shape:
+            return filled_lengths(array, self._axis)
+        if array.dtype.kind not in "iu":
+            accepted = f"an array of whole numbers, one for each, or one {self._shape} that is filled up behind these"
+            raise LogError.at_field(f"{KEY}.episodes.lengths", f"'{excerpt(name)}'", accepted)
+        return array.ravel().astype(np.int64)
 
     def load(self, name: str) -> NDArray[Any]:
         """One of them, with a row for each sample."""
@@ -92,7 +124,7 @@ class StackedArrays(Arrays):
 
     def stamps(self, time: NDArray[Any], rows: int, has_step: bool) -> NDArray[Any]:
         """Those that begin anew with each episode."""
-        return self._of_all(time) if has_step else time
+        return self._of_all(time) if has_step else _begun_anew(time, self._counts)
 
 
 def in_groups(pattern: str) -> re.Pattern[str]:
@@ -127,21 +159,27 @@ class GroupedArrays(Arrays):
         self._counts = dict[int, list[int]]()  # samples of each, by those of all
 
     def load(self, name: str) -> NDArray[Any]:
-        """One of them, that of all groups."""
+        """One of them, that of all groups, or of the first where each has a single value; LogError for other shapes."""
         if name not in self._parts:
             return super().load(name)
         parts = [super(GroupedArrays, self).load(part) for part in self._parts[name]]
-        if not all(part.ndim and part.shape[1:] == parts[0].shape[1:] for part in parts):
+        if not any(part.ndim for part in parts):
             return parts[0]
+        for part, text in zip(parts, self._parts[name], strict=True):
+            if not part.ndim or part.shape[1:] != parts[0].shape[1:]:
+                others = f"shape {part.shape}, but '{excerpt(self._parts[name][0])}' {parts[0].shape}"
+                accepted = "as many columns in all groups; leave other groups out of the file"
+                raise LogError.at_field(f"'{excerpt(text)}'", others, accepted)
         if not parts[0].dtype.hasobject:
             self._counts[sum(map(len, parts))] = [len(part) for part in parts]
         return np.concatenate(parts)
 
     def stamps(self, time: NDArray[Any], rows: int, has_step: bool) -> NDArray[Any]:
         """Those that begin anew with each episode."""
-        if not has_step or rows not in self._counts:
+        if rows not in self._counts:
             return time
-        return np.concatenate([time[:count] for count in self._counts[rows]])
+        counts = self._counts[rows]
+        return np.concatenate([time[:count] for count in counts]) if has_step else _begun_anew(time, counts)
 
 
 def _positions(columns: Columns, names: Collection[str]) -> str:
@@ -153,13 +191,3 @@ def _positions(columns: Columns, names: Collection[str]) -> str:
     if found is None:
         raise LogError.at_field(f"{KEY}.episodes", "given without positions of joints", f"{KEY}.joint_position too")
     return found
-
-
-def _whole(name: str, names: Collection[str], load: Load) -> NDArray[np.int64]:
-    """The array of numbers of samples; LogError where there is none."""
-    array = load(name) if name in names else np.empty(0)
-    if array.dtype.kind not in "iu":
-        raise LogError.at_field(
-            f"{KEY}.episodes.lengths", f"'{excerpt(name)}'", "an array of whole numbers, one for each"
-        )
-    return array.ravel().astype(np.int64)

@@ -208,7 +208,14 @@ _FIELD_WORDS = (
     ),
     ("base_angular_velocity_base", rf"{OF_BASE} (twist )*(ang ?vel|angular|ang|omega)\b"),
     ("base_quat_wxyz", rf"({OF_BASE}|\bimu) (q|rot|rotation)\b"),
-    ("joint_acceleration", r"\b(ddqj?|qdd|qpp|thdd|qacc|joints? acc|joints? accelerations?)\b"),
+    (
+        "joint_acceleration",
+        r"\b(ddqj?|qdd|qpp|thdd|qacc|(joints?|dof|q|motor) (ang\w* )?acc\w*|acc\w* joints?)\b",
+    ),
+    (
+        "joint_velocity",
+        r"\b((joints?|dof|motor) (ang vel|angular velocit\w+|omega)|(ang vel|angular velocit\w+|omega) (joints?|j))\b",
+    ),
     ("imu_angular_velocity", r"\b(gyr|gyro\w*|giroscop\w*|omega|ang vel|angular velocity|drehraten?|imu g)\b"),
     ("imu_specific_force", r"\b(acc|acc?el\w*|linear acceleration|specific force|beschleunigung|imu a|a body)\b"),
     ("base_quat_wxyz", r"\b(quat\w*|orienta\w*)\b"),
@@ -217,12 +224,13 @@ _FIELD_WORDS = (
     ("contact_active", r"\b(contacts?|touch|touches|stance)\b"),
     (
         "joint_torque",
-        r"\b(taus?|torques?|efforts?|eff|trq|load|qfrc|gf|generalized forces?|drehmoment|couples?|par|pares|copp\w+)\b"
+        r"\b(taus?|torques?|efforts?|eff|trq|torq|load|qfrc|gf|drehmoment|couples?|par|pares|copp\w+)\b"
+        r"|\b((generalized|actuator|joints?) forces?|joints? moments?)\b"
         r"|^us$",  # of optimal control, beside states called xs
     ),
     (
         "joint_velocity",
-        r"\b(dqs?|dqj|d q|qd|qp|qdot|thd|dphi|phid|gv|v|qvel|vels?|veloc\w+|speeds?|rates?|vitesses?|geschw)\b"
+        r"\b(dqs?|dqj|d q|qd|qp|qdot|thd|dphi|phid|gv|v|qvel|vels?|jvel|veloc\w+|speeds?|spd|rates?|vitesses?|geschw)\b"
         r"|geschwindigkeit\b",
     ),
     (
@@ -237,7 +245,22 @@ _BY_QUANTITY = {
     "angle": "joint_position", "angular velocity": "joint_velocity", "angular acceleration": "joint_acceleration",
     "torque": "joint_torque",
 }  # fmt: skip
-_APART = (("linear", "angular"), ("position", "velocity", "acceleration", "torque"), ("world", "base", "local"))
+_APART = (
+    ("linear", "angular"),
+    ("position", "velocity", "acceleration", "torque"),
+    ("world", "base", "local"),
+    ("joint", "imu"),
+)
+_SYMBOL = "(?:qs?|qj|th|thetas?|phi)"
+_TURN = f"(?:{_SYMBOL}|pos|positions?|angles?)"
+#: How names say the derivative of positions, once and twice: `q_dot`, `thetaDot`, `dpos`, `dq/dt`, `q_ddot`.
+_DERIVATIVES = (
+    ("joint_acceleration", re.compile(rf"\b(dd{_TURN}|{_TURN} ?(ddots?|dd|d ?dot|dot ?dot))\b")),
+    (
+        "joint_velocity",
+        re.compile(rf"\b(d{_TURN}|d {_SYMBOL}|{_TURN} ?dots?|dots? ?{_TURN}|{_TURN} d t|d{_TURN} ?dt)\b"),
+    ),
+)
 _DESIRED = re.compile(
     r"\b(des|desired|cmd|command(ed)?|ref|target|goal|setpoint|ff|cons|consigne|soll\w*)\b"
     r"|\b(taus?|torques?|j|q|dq|qd|pos) d\b"  # tau_d, tau_J_d
@@ -281,6 +304,10 @@ def propose_field(column: str, desired: bool = False) -> str:
     """
     column, unit = split_unit(column.removesuffix(TRANSPOSED))
     words = " ".join(words_of(column))
+    if (derived := next((field for field, regex in _DERIVATIVES if regex.search(words)), "")) and (
+        desired or not _DESIRED.search(words)
+    ):
+        return "" if re.search(OF_BASE, words) else derived
     close = difflib.get_close_matches(column.partition(".")[0], _FIELDS, n=1, cutoff=0.8)
     of_base = bool(close) and "imu" in words.split() and not close[0].startswith("imu")
     if close and not of_base and not _contradicts(words, " ".join(words_of(close[0]))):
@@ -303,6 +330,7 @@ def words_of(column: str) -> list[str]:
     """Words of a column's name, in lower case, what its letters say in other scripts among them."""
     for written, words in _WRITTEN.items():
         column = column.replace(written, f" {words} ")
+    column = re.sub(r"(?<![A-Za-z])d2(?=[A-Za-z])", "dd", column)  # of d2q
     column = "".join(letter for letter in normalize("NFKD", column) if not combining(letter))  # posicao for posição
     return [word.lower() for word in _SPLIT.split(column) if word]
 

@@ -286,7 +286,7 @@ def split_arrays(sample: FileSample, names: Sequence[str], joints: Collection[in
     out, width = list[tuple[str, str, str]](), 0
     for name in names:
         array = np.asarray(sample[name])
-        if not _has_pose(array):
+        if not has_pose(array):
             continue
         out += [(name, "[0:3]", "base_position_world"), (name, "[3:7]", "base_quat_wxyz")]
         if array.shape[1] - 7 in joints:
@@ -328,7 +328,7 @@ def _is_state(array: NDArray[Any], joints: Collection[int]) -> bool:
     return bool(alike > _ALIKE)
 
 
-def _has_pose(array: NDArray[Any]) -> bool:
+def has_pose(array: NDArray[Any]) -> bool:
     """Whether columns 3 to 6 of an array (N, k) are a quaternion."""
     if array.ndim != 2 or array.shape[1] < 7 or array.dtype.kind != "f" or len(array) < 3:
         return False
@@ -354,6 +354,7 @@ class MapProposal:
         lacking: joints of the robot without columns, if most have some.
         partial: by field that is left out for it, joints that have columns of other fields alone.
         like_torques: columns that no field takes, one for each joint, of a log without torques.
+        guessed_orders: of joints and contacts, by key, that nothing in the file says.
     """
 
     columns: dict[str, Any] = field(default_factory=dict)
@@ -365,6 +366,12 @@ class MapProposal:
     lacking: list[str] = field(default_factory=list)
     partial: dict[str, list[str]] = field(default_factory=dict)
     like_torques: list[Family] = field(default_factory=list)
+    guessed_orders: set[str] = field(default_factory=set)
+
+    def guess_order(self, key: str, order: object, why: str) -> None:
+        """Give joints or contacts an order that nothing in the file says."""
+        self.columns[key], self.notes[key] = order, why
+        self.guessed_orders.add(key)
 
     def leave_out(self, name: str) -> None:
         """Ignore the columns of an entry instead of reading them, but for those that are a part of an array."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import excerpt
-from torchid.logs.episodes import flat, groups_of, in_groups
+from torchid.logs.episodes import filled_lengths, flat, groups_of, in_groups
 from torchid.logs.name_matching import is_desired, propose_field, words_of
 from torchid.proposals.file_samples import FileSample, increases
 
@@ -84,8 +84,11 @@ def _stacked(sample: FileSample) -> FoundEpisodes | None:
     axis, why = _axis_of_episodes(numeric, stacks[first])
     count, samples = shape[axis], shape[1 - axis]
     lengths = next((name for name, x in numeric.items() if _are_lengths(name, x, count, samples)), None)
-    shown = slice(0, _SHOWN)
+    shown, more = slice(0, _SHOWN), f"; as long as '{lengths}' says"
     some = numeric[lengths].ravel().astype(int)[shown] if lengths else None
+    if lengths is None and (filled := _filled_up(numeric, shape, axis)) is not None:
+        lengths, some = filled[0], filled[1][shown]
+        more = f"; {filled[1].sum()} of {count * samples} samples, behind which all arrays are 0 or repeat their last"
 
     def flattened(x: NDArray[Any]) -> NDArray[Any]:
         if x.shape[:2] == shape:
@@ -101,7 +104,27 @@ def _stacked(sample: FileSample) -> FoundEpisodes | None:
     axes = "(episodes, samples, ...)" if axis == 0 else "(samples, episodes, ...)"
     note = f"{count} recordings side by side, arrays {axes}, {why}"
     taken = {name: flattened(x) if name in numeric and x is not None else x for name, x in sample.items()}
-    return FoundEpisodes(entry, taken, note + f"; as long as '{lengths}' says" * bool(lengths))
+    return FoundEpisodes(entry, taken, note + more * bool(lengths))
+
+
+def _filled_up(
+    numeric: Mapping[str, NDArray[Any]], shape: tuple[int, int], axis: int
+) -> tuple[str, NDArray[np.int64]] | None:
+    """The measured array that tells best where episodes are filled up, and their samples (E,); None where they are not.
+
+    A joint that stands still at the end is no filling: all arrays must be constant from there on.
+    """
+    measured = {x: propose_field(x) not in ("", "time") and numeric[x].dtype.kind == "f" for x in numeric}
+    lengths = {
+        x: filled_lengths(numeric[x], axis)
+        for x, is_one in measured.items()
+        if is_one and numeric[x].shape[:2] == shape
+    }
+    if not lengths:
+        return None
+    best = max(lengths, key=lambda name: int(lengths[name].sum()))
+    is_filled = lengths[best].min() > 0 and min(np.max(list(lengths.values()), axis=0)) < shape[1 - axis]
+    return (best, lengths[best]) if is_filled else None
 
 
 def _is_other(array: NDArray[Any], stacks: Mapping[str, NDArray[Any]]) -> bool:
@@ -116,11 +139,17 @@ def _axis_of_episodes(numeric: Mapping[str, NDArray[Any]], positions: NDArray[An
             continue
         if x.size in (rows, columns) and rows != columns and increases(np.ravel(x)):
             return (1 if x.size == rows else 0), f"as '{excerpt(name)}' has as many stamps as samples"
-        if x.shape[:2] == (rows, columns) and (increases(x[:, 0].ravel()) != increases(x[0].ravel())):
-            return (1 if increases(x[:, 0].ravel()) else 0), f"by the stamps of '{excerpt(name)}'"
+        if x.shape[:2] == (rows, columns) and (_goes_on(x[:, 0].ravel()) != _goes_on(x[0].ravel())):
+            return (1 if _goes_on(x[:, 0].ravel()) else 0), f"by the stamps of '{excerpt(name)}'"
     steps = [np.nanmedian(np.abs(np.diff(positions.astype(float), axis=axis))) if n > 1 else np.inf
              for axis, n in enumerate((rows, columns))]  # fmt: skip
     return int(steps[1] > steps[0]), "as from sample to sample little changes"
+
+
+def _goes_on(stamps: NDArray[Any]) -> bool:
+    """Whether stamps (N,), which may be filled up, change and go back at most once, where what fills them is 0."""
+    steps = np.diff(stamps.astype(float))
+    return bool(np.any(steps > 0.0) and (steps < 0.0).sum() < 2)
 
 
 def _are_lengths(name: str, array: NDArray[Any], count: int, samples: int) -> bool:

@@ -27,7 +27,7 @@ from torchid.logs.name_matching import (
 )
 from torchid.logs.unitree import JOINT_ORDERS, MOTORS, numbered_joints, suitable_orders
 from torchid.logs.units import quantities_with, split_unit
-from torchid.proposals.column_groups import Family
+from torchid.proposals.column_groups import Family, has_pose
 from torchid.proposals.file_samples import (
     FileSample,
     increases,
@@ -66,11 +66,15 @@ class FieldMatcher:
         self.names_stated = bool(self.stated) and set(self.stated) <= {*robot.joints, *robot.moving}
         self.named_joints = set(self.stated) if self.names_stated else set[str]()
         self.partial, self._suffix = dict[str, list[str]](), ""
+        self._with_base = set[int]()  # numbers of columns that have a base's position or velocity in front of joints
 
     def look_at(self, families: Sequence[Family], more: Mapping[str, str]) -> None:
         """Learn which joints the columns of a file name; `more` as from `find_families`."""
         self._suffix = more.get("joint", "").removeprefix("{joint}")
         self.named_joints = self.named_joints or self._all_named(families)
+        states = [one.columns for one in families if len(one.numbers) == len(one.columns) == len(self.robot.joints) + 7]
+        has_base = any(has_pose(side_by_side(self.sample, columns)) for columns in states)
+        self._with_base = {len(self.robot.joints) + more for more in (6, 7) if has_base}
 
     def of_limbs(self, names: Sequence[str]) -> list[tuple[Family, set[str]]]:
         """Arrays, or numbered columns, of the joints of one limb each, together all, and which of `names` these are.
@@ -196,7 +200,8 @@ class FieldMatcher:
             numbered = not self.names_stated and len(numbered_joints(self.robot.joints, count)) == count > 2
             whole |= numbered and not self._has_rival(family)
             whole |= listed_order(self.sample, "joint", self.robot, count) is not None
-        enough = whole or (count >= len(self.robot.joints) and bool(family.numbers))
+        is_motors = bool(family.numbers) and count not in self._with_base
+        enough = whole or (count >= len(self.robot.joints) and is_motors)
         return enough and len(self.robot.joints) > 0 and not any(family.axes)
 
     def _has_rival(self, family: Family) -> bool:

@@ -194,8 +194,8 @@ class _Proposer:
         if field == "base_quat_wxyz":
             field = field_of_quaternion(family, self.sample, self.force, self.out.notes)
         if field.startswith("joint_") and "joint_order" not in self.out.columns and len(part.T) == len(self.joints):
-            self.out.columns["joint_order"] = list(self.joints)
-            self.out.notes["joint_order"] = "as in the robot's file, as of libraries for dynamics"
+            why = "as in the robot's file, as of libraries for dynamics"
+            self.out.guess_order("joint_order", list(self.joints), why)
         self._add_order(family, field)
         self.out.columns[field] = {"column": text}
         self._note(field, f"columns {start} to {stop or 'the last'} of '{name}'")
@@ -362,6 +362,7 @@ class _Proposer:
         listed = listed_order(self.sample, kind, self.robot, numbers)
         order, how = listed or usual or usual_order(kind, self.robot, numbers)
         self.out.columns[key] = order
+        self.out.guessed_orders |= set() if listed else {key}
         if kind == "joint" and not self.out.lacking:
             self.out.lacking = [name for name in self.joints if name not in self._order()]
         self.out.notes[key] = f"{how}; compare it with the manual of the robot, and with what torchid check says"
