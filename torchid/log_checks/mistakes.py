@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from torchid.errors import join_names
 from torchid.log_checks.motion import MAX_ANGLE_RAD
-from torchid.log_checks.orders import exchanged_in_limbs, exchanged_names, other_orders
+from torchid.log_checks.orders import exchanged_in_limbs, exchanged_names, exchanged_pairs, other_orders
 from torchid.logs import Log
 from torchid.logs.log import WRENCHES, FloatArray
 from torchid.logs.quaternion import inverse_rotation, make_sign_continuous, rotate_to_base
@@ -197,12 +197,23 @@ def _shift_joint(joint: int, angle: float) -> Callable[[Log], Log]:
     return correct
 
 
+def exchanged_joints(names: Sequence[str], some: Collection[str]) -> Iterator[Mistake]:
+    """Names of any two joints, one of them at least among `some`, exchanged: many logs to try."""
+    for text, permuted in exchanged_pairs(names, some):
+        yield _misnamed_joints(text, permuted)
+
+
+def _misnamed_joints(text: str, permuted: tuple[str, ...]) -> Mistake:
+    """A mistake of joints whose columns are those of `permuted`."""
+    advice = "give joint_names in the order of the columns; of arrays without names logs.columns.joint_order: "
+    advice += f"[{', '.join(permuted)}]"
+    return Mistake("joint_names", text, advice, _rename("joint_names", permuted), True)
+
+
 def _order_mistakes(log: Log, robot: Robot | None) -> Iterator[Mistake]:
     """Exchanged names of joints and contacts, and flags assigned to the wrong contacts."""
     for text, permuted in (*exchanged_in_limbs(log.joint_names, robot), *other_orders(log.joint_names, robot)):
-        advice = "give joint_names in the order of the columns; of arrays without names logs.columns.joint_order: "
-        advice += f"[{', '.join(permuted)}]"
-        yield Mistake("joint_names", text, advice, _rename("joint_names", permuted), True)
+        yield _misnamed_joints(text, permuted)
     for description, permuted in exchanged_names(log.contact_names, shortest=1):
         order = [permuted.index(name) for name in log.contact_names]
         text = f"{description} exchanged"
