@@ -201,6 +201,34 @@ def _imu(case: Case) -> Log | None:
     return None if force is None else replace(case.log, imu_specific_force=-force)
 
 
+def _with_gravity(share: float) -> Callable[[Case], Log | None]:
+    """An accelerometer to whose reading a driver has added a share of gravity, by the orientation that it knows."""
+
+    def make(case: Case) -> Log | None:
+        force = case.log.imu_specific_force
+        if force is None:
+            return None
+        up = Rotation.from_quat(value(case.log.base_quat_xyzw)).inv().apply([0.0, 0.0, 9.81])
+        return replace(case.log, imu_specific_force=force + share * up)
+
+    return make
+
+
+def _imu_in_world(case: Case) -> Log | None:
+    """What an accelerometer reads, turned to the world's axes."""
+    force = case.log.imu_specific_force
+    turned = None if force is None else Rotation.from_quat(value(case.log.base_quat_xyzw)).apply(force)
+    return None if turned is None else replace(case.log, imu_specific_force=turned)
+
+
+def _moments(case: Case) -> Log | None:
+    """Moments that the robot exerts on the ground beside forces that the ground exerts."""
+    wrench = case.log.contact_wrench_local
+    if wrench is None or case.machine.kind == "point":
+        return None
+    return replace(case.log, contact_wrench_local=wrench * [1.0, 1.0, 1.0, -1.0, -1.0, -1.0])
+
+
 def _elsewhere(case: Case) -> Log | None:
     """Moments about a point 0.1 m above the contact frame's origin, as a sensor in the ankle gives them."""
     wrench = case.log.contact_wrench_local
@@ -230,6 +258,7 @@ MISTAKES = (
     Mistake("wrenches world for local", _in_world, "contact_wrench", "axes"),
     Mistake("wrenches about another point", _elsewhere, "contact_wrench", "point"),
     Mistake("wrenches moment first", _moment_first, "contact_wrench", "moment.* first"),
+    Mistake("moments reversed", _moments, "contact_wrench", "moments reversed"),
     Mistake("contact flags left for right", _flags, "contact_", "exchanged|force without contact"),
     Mistake("feet left for right", _feet, "contact_", "exchanged"),
     Mistake("joints swapped", _joints, "joint_names", "exchanged"),
@@ -244,6 +273,9 @@ MISTAKES = (
     Mistake("base velocity base for world", _base_velocity, "base_linear_velocity", "frame"),
     Mistake("acceleration with gravity", _gravity, "base_linear_acceleration", "gravity"),
     Mistake("accelerometer reversed", _imu, "imu_specific_force", "revers"),
+    Mistake("accelerometer with gravity twice", _with_gravity(1.0), "imu_specific_force", "gravity is in it twice"),
+    Mistake("accelerometer without gravity", _with_gravity(-1.0), "imu_specific_force", "gravity has been taken out"),
+    Mistake("accelerometer along the world's axes", _imu_in_world, "imu_specific_force", "along the world's axes"),
 )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import warnings
 from dataclasses import replace
 from functools import cache
@@ -19,6 +20,7 @@ from torchid.errors import LogError, TorchidWarning
 from torchid.estimators import Estimate, LeastSquares
 from torchid.log_checks import NOTE, drop_rejected
 from torchid.log_checks.check import check, excluded_stamps
+from torchid.log_checks.spikes import warn_of_steps
 from torchid.logs import Log, read_log, write_log
 from torchid.logs.preprocess import preprocess
 from torchid.problem import RowBuilder, Samples, bind_log, compress, linear_problem
@@ -141,6 +143,38 @@ def test_a_log_that_is_not_usable_is_refused_in_one_line() -> None:
     log = replace(demo_log(), joint_position=np.degrees(demo_log().joint_position))
     with pytest.raises(LogError, match=r"not usable: joint_position: unit; accepted: .*exclude_rejected: false"):
         drop_rejected(processed(demo_log()), check(log), CUTOFF, derived=True)
+
+
+@pytest.mark.parametrize(
+    ("by", "until", "told"),
+    [
+        (0.05, None, r"sway_train.npz: joint_position, step: front_left_knee by 0.0\d+ rad from 249 to 250, .*; split"),
+        (2.0 * np.pi, None, r"joint_position, wrapped angle: front_left_knee by 6.\d+ rad from 249 to 250, "),
+        (0.05, 253, None),
+        (0.002, None, None),
+    ],
+    ids=["another zero", "a whole turn", "three samples", "less than an error of its calibration"],
+)
+def test_an_encoder_that_steps_is_named_without_a_check(
+    by: float, until: int | None, told: str | None, recwarn: pytest.WarningsRecorder
+) -> None:
+    joint, part = demo_log().joint_names.index("front_left_knee"), slice(250, until)
+    log = changed(demo_log(), "joint_position", lambda q: q.__setitem__((part, joint), q[part, joint] + by))
+    warn_of_steps(log)
+    said = [str(one.message) for one in recwarn]
+    assert len(said) == (0 if told is None else 1)
+    assert told is None or re.search(told, said[0])
+
+
+def test_identify_says_that_an_encoder_steps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = shortened_demo(tmp_path / "demo", 400)
+    log = read_log(folder / "sway_train.npz")
+    stepped = changed(log, "joint_position", lambda q: q.__setitem__((slice(150, None), 2), q[150:, 2] + 0.05))
+    write_log(stepped, folder / "sway_train.npz")
+    assert main(["identify", str(folder / "quadruped.yaml"), f"output={tmp_path / 'run'}"]) == 0
+    told = [line for line in capsys.readouterr().err.splitlines() if "joint_position, step" in line]
+    assert len(told) == 1
+    assert f"sway_train.npz: joint_position, step: {log.joint_names[2]} by 0.0" in told[0]
 
 
 def test_identify_and_evaluate_count_what_they_leave_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -18,12 +19,13 @@ from synthetic import Oracle
 from thinned import SLOW
 from walking import MACHINES, robot_of, truth
 
-from torchid.log_checks import NOTE, REJECTED
+from torchid.log_checks import NOTE, REJECTED, Finding, Skipped
 from torchid.log_checks.mistakes import joint_mistakes, possible_mistakes
 from torchid.log_checks.model import NominalModel, bind_some_samples, preprocess_pieces
 from torchid.log_checks.orders import exchanged_names
 from torchid.log_checks.scales import fit_time_scale, fit_torque_gains, motion_cutoff_hz
 from torchid.log_checks.standing_feet import measure_foot_slip
+from torchid.log_checks.weight import check_accelerometer
 from torchid.logs import Log
 from torchid.logs.preprocess import preprocess
 from torchid.regressor import Regressor
@@ -44,6 +46,7 @@ UPRIGHT = (
     "time in minutes",
     "one torque x 1.3",
     "torques of limbs exchanged",
+    "moments reversed",
 )
 
 
@@ -82,9 +85,10 @@ def test_what_passes_the_filter_may_be_corrected_after_it(machine: str, sensors:
     assert {"joint_names", "contact_names", "joint_torque"} <= {mistake.field for mistake in chosen}
 
 
-def test_an_accelerometer_is_told_from_the_world_by_where_the_feet_are() -> None:
+def test_an_accelerometer_is_told_from_the_world_by_where_the_feet_are_and_by_its_mean() -> None:
     case = case_of(MACHINES["quadruped"], "joints")
-    for name in ("accelerometer reversed", "world downward"):
+    of_gravity = ("with gravity twice", "without gravity", "along the world's axes")
+    for name in ("accelerometer reversed", "world downward", *(f"accelerometer {one}" for one in of_gravity)):
         assert BY_NAME[name].named(checked(case, value(BY_NAME[name].make(case)))), name
 
 
@@ -259,3 +263,18 @@ def test_the_order_of_a_drones_quaternion_is_named_though_its_small_moments_are_
     explained = only(checked(case, value(BY_NAME["quaternion w first for last"].make(case))), EXPLAINED)
     assert (explained.severity, explained.field) == (REJECTED, "base_quat_xyzw")
     assert explained.found.startswith("w first against w last is mixed up: ")
+
+
+def test_gravity_of_a_drone_that_accelerates_as_much_is_told_by_its_mean_along_the_worlds_axes() -> None:
+    case = flight("borinot", "joints", 2)
+    robot, without = robot_of(case.machine), value(BY_NAME["accelerometer without gravity"].make(case))
+    size = float(np.median(np.linalg.norm(value(without.imu_specific_force), axis=1)))
+    assert 8.0 < size < 10.0
+    (known,) = check_accelerometer(case.log, robot)
+    assert isinstance(known, Skipped)
+    for name in ("without gravity", "with gravity twice"):
+        mistake = BY_NAME[f"accelerometer {name}"]
+        (found,) = check_accelerometer(value(mistake.make(case)), robot)
+        assert isinstance(found, Finding)
+        assert found.severity == REJECTED
+        assert re.search(mistake.words, found.found)

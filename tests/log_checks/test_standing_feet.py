@@ -54,6 +54,23 @@ def test_the_pose_in_a_left_handed_world_is_named_with_its_axis(axis: int) -> No
     assert f"left-handed world, whose {'xyz'[axis]} axis is reversed" in finding.found
 
 
+@pytest.mark.parametrize(
+    ("one", "other"), [("front_left_hip", "rear_right_knee"), ("front_left_thigh", "front_right_knee")]
+)
+def test_two_joints_of_different_legs_that_are_exchanged_are_named_with_the_right_order(one: str, other: str) -> None:
+    """In columns of an order that no program has, so that none of these is an explanation."""
+    log, order = STANCE.measured, np.random.default_rng(2).permutation(len(ROBOT.joint_names))
+    names = [log.joint_names[column] for column in order]
+    shuffled = replace(log, joint_position=log.joint_position[:, order], joint_names=tuple(names))
+    partner = {one: other, other: one}
+    mistaken = replace(shuffled, joint_names=tuple(partner.get(name, name) for name in names))
+    assert findings(shuffled) == []
+    (finding,) = findings(mistaken)
+    assert (finding.severity, finding.field) == (REJECTED, "joint_names")
+    assert sorted(finding.found.partition(" exchanged: ")[0].split(" and ")) == sorted((one, other))
+    assert finding.advice.endswith(f"logs.columns.joint_order: [{', '.join(names)}]")
+
+
 def test_a_reversed_joint_is_named_and_how_to_reverse_it() -> None:
     joint = next(i for i, name in enumerate(ROBOT.joint_names) if "knee" in name)
     log, name = STANCE.measured, STANCE.measured.joint_names[joint]

@@ -12,7 +12,7 @@ from torchid.commands.init_proposals import GuessedContact
 from torchid.config.robot import ContactConfig
 from torchid.errors import InputError, TorchidWarning, join_names
 from torchid.fitting.checked_settings import resolve_contacts
-from torchid.log_checks.forces import MAX_MISFIT, MAX_RESIDUAL_SHARE
+from torchid.log_checks.forces import MAX_FORCE_RESIDUAL_SHARE, MAX_MISFIT
 from torchid.log_checks.model import NominalModel, bind_some_samples, default_cutoff_hz, preprocess_pieces
 from torchid.log_checks.orders import joint_orders
 from torchid.logs import Log
@@ -86,7 +86,7 @@ def _settle(proposal: MapProposal, log: Log, robot: Robot, contacts: Sequence[Gu
     best = min(misfits, key=lambda one: misfits[one], default=usual)
     if usual in misfits:
         least, differ = misfits[best], f"forces differ from the robot's file by {misfits[usual]:.0%} in"
-        if least < MAX_RESIDUAL_SHARE * min(misfits[usual], 1.0):
+        if least < MAX_FORCE_RESIDUAL_SHARE * min(misfits[usual], 1.0):
             return _take(best, proposal, f"{best.how}: {differ} the usual one, by {least:.0%} in this")
         proposal.notes["joint_order"] += f"; {differ} it" + ", no other explains much more" * (least > MAX_MISFIT)
     if not outside:

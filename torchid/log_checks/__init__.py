@@ -2,7 +2,7 @@
 
 - `check` calls all in their order; `findings` are what they return
 - of signals alone: `stamps`, `frozen`, `spikes`, `motion`; of contacts and feet that stand: `contacts`, `weight`,
-  `standing_feet`
+  `standing_feet`, `gyroscope`
 - of torques against a robot's dynamics: `forces`, which calls `mistakes`, `orders`, `exchanged`, `torque_fit`, `gains`,
   `encoders`, `zeros`, `drift`, `lags`, `lag_and_tilt`, `scales`, `required_sensors`; what these compare with: `model`,
   `deviation`

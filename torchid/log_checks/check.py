@@ -34,6 +34,7 @@ from torchid.log_checks.findings import (
 )
 from torchid.log_checks.forces import check_forces_against_urdf
 from torchid.log_checks.frozen import check_excitation, check_repeats, check_rest, check_still_base
+from torchid.log_checks.gyroscope import check_gyroscope
 from torchid.log_checks.model import Declared
 from torchid.log_checks.motion import (
     check_angle_unit,
@@ -44,7 +45,7 @@ from torchid.log_checks.motion import (
 )
 from torchid.log_checks.spikes import check_jumps
 from torchid.log_checks.stamps import check_magnitudes, check_missing_values, check_time_stamps
-from torchid.log_checks.standing_feet import check_gyroscope, check_standing_feet
+from torchid.log_checks.standing_feet import check_standing_feet
 from torchid.log_checks.weight import check_accelerometer, check_weight
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray

@@ -33,6 +33,7 @@ from torchid.log_checks.model import (
     default_cutoff_hz,
     preprocess_pieces,
 )
+from torchid.log_checks.orders import joints_of_limb
 from torchid.log_checks.scales import CORRELATED_SAMPLES, TIME_SCALE_SAMPLES
 from torchid.log_checks.torque_fit import MAX_FRICTION_SHARE
 from torchid.log_checks.zeros import check_single_zero, fit_zeros, zero_findings
@@ -99,13 +100,8 @@ def check_still_velocities(log: Log) -> Iterator[Finding]:
 
 def still_in_limb(log: Log, robot: Robot, frame: str) -> list[str]:
     """The joints between the base and a link that stand still in the log."""
-    still, body, found = still_joints(log), robot.links[frame][0], list[str]()
-    while body > 0:
-        joint = robot.bodies[body].joint
-        if joint is not None and joint.name in still:
-            found.append(joint.name)
-        body = robot.bodies[body].parent
-    return found[::-1]
+    still = still_joints(log)
+    return [name for name in joints_of_limb(robot, frame) if name in still]
 
 
 def check_single_joints(

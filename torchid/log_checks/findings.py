@@ -227,10 +227,10 @@ def channel_unit(field: str, name: str) -> str:
     return "N" if component.startswith("f") else "N m"
 
 
-def channel_groups(log: Log) -> Iterator[ChannelGroup]:
-    """All groups of a log that are not empty."""
+def channel_groups(log: Log, fields: Sequence[str] | None = None) -> Iterator[ChannelGroup]:
+    """All groups of a log that are not empty; `fields`: of these alone."""
     for field in log.arrays():
-        if field in NON_SIGNAL_FIELDS:
+        if field in NON_SIGNAL_FIELDS or not (fields is None or field in fields):
             continue
         values: FloatArray = getattr(log, field)
         names = channel_names(log, field)

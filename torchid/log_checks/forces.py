@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 import torch
@@ -18,7 +17,7 @@ from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, UNEXPLAINED,
 from torchid.log_checks.gains import common_factor_notes, common_gain_findings, gain_and_point_findings
 from torchid.log_checks.lag_and_tilt import check_lag_and_tilt, check_torque_offsets
 from torchid.log_checks.lags import without_lag
-from torchid.log_checks.mistakes import Mistake, joint_mistakes, possible_mistakes
+from torchid.log_checks.mistakes import Mistake, accelerometer_axes, joint_mistakes, possible_mistakes
 from torchid.log_checks.model import (
     MAX_TRIAL_DIFFERENTIATED_SAMPLES,
     TRIAL_SAMPLES,
@@ -125,10 +124,7 @@ def _misfit_findings(
             yield _friction_finding(robot, fit, better)
             robot, model, fit = bare, without, better
     filtered = FilteredLog(log, model, cutoff)
-    explanation = check_exchanged_torques(filtered)
-    if explanation is None and fit.largest_misfit > MAX_MISFIT:
-        trials = list(_corrected_logs(log, model, cutoff, fit, derived))
-        explanation = _best_mistake(model, fit, trials) or _mistake_beside_urdf(filtered, trials)
+    explanation = _explanation(filtered, fit, derived)
     if explanation is not None:
         yield explanation
         return
@@ -161,6 +157,20 @@ def _misfit_findings(
         found = scaled or single_zero_findings(filtered) or list(check_torque_offsets(filtered))
         found = found or list(check_torque_drift(filtered))
         yield from found or (common_factor_notes(filtered) if is_bolted_arm(model) else [])
+
+
+def _explanation(filtered: FilteredLog, fit: ModelFit, derived: tuple[str, ...]) -> Finding | None:
+    """The one mistake that explains forces unlike the model's; gravity along other axes is nearly right."""
+    log, model = filtered.log, filtered.model
+    if (exchanged := check_exchanged_torques(filtered)) is not None:
+        return exchanged
+    if fit.largest_misfit <= MAX_MISFIT:
+        turned = _corrected_logs(filtered, accelerometer_axes(log, model.robot), derived)
+        return _mistake_beside_urdf(filtered, list(turned), least=0.0)
+    of_joints = joint_mistakes(log) if is_bolted_arm(model) else ()
+    possible = [x for x in (*possible_mistakes(log, model.robot), *of_joints) if _may_explain(x.field, fit)]
+    trials = list(_corrected_logs(filtered, possible, derived))
+    return _best_mistake(model, fit, trials) or _mistake_beside_urdf(filtered, trials)
 
 
 def _is_mostly_friction(stated: ModelFit, without: ModelFit) -> bool:
@@ -218,18 +228,15 @@ class _Corrected:
     samples: Sequence[Samples]
 
 
-def _corrected_logs(
-    log: Log, model: NominalModel, cutoff: float, fit: ModelFit, derived: tuple[str, ...]
-) -> Iterator[_Corrected]:
-    """The log without each mistake that may be the reason of the misfit, where the filter accepts it then."""
-    filtered = cache(lambda: preprocess_pieces(log, cutoff, MAX_TRIAL_DIFFERENTIATED_SAMPLES))
-    of_joints = joint_mistakes(log) if is_bolted_arm(model) else ()
-    for mistake in (*possible_mistakes(log, model.robot), *of_joints):
-        if not _may_explain(mistake.field, fit) or mistake.field.startswith(derived):
+def _corrected_logs(whole: FilteredLog, mistakes: Iterable[Mistake], derived: tuple[str, ...]) -> Iterator[_Corrected]:
+    """The log without each of some mistakes, where the filter accepts it then."""
+    log, model, cutoff = whole.log, whole.model, whole.cutoff_hz
+    for mistake in mistakes:
+        if mistake.field.startswith(derived):
             continue
         try:
             if mistake.after_filter:
-                pieces = [mistake.correct(piece) for piece in filtered()]
+                pieces = [mistake.correct(piece) for piece in whole.pieces]
             else:
                 pieces = preprocess_pieces(mistake.correct(log), cutoff, MAX_TRIAL_DIFFERENTIATED_SAMPLES)
             yield _Corrected(mistake, bind_some_samples(pieces, model.robot, model.contacts, TRIAL_SAMPLES))
@@ -266,24 +273,26 @@ def _best_mistake(model: NominalModel, fit: ModelFit, trials: Sequence[_Correcte
     return Finding("unit, sign or frame", REJECTED, best.field, f"{best.description}: {text}", advice)
 
 
-def _mistake_beside_urdf(filtered: FilteredLog, trials: Sequence[_Corrected]) -> Finding | None:
+def _mistake_beside_urdf(
+    filtered: FilteredLog, trials: Sequence[_Corrected], least: float = MAX_UNEXPLAINED_RATIO
+) -> Finding | None:
     """The mistake without which a URDF near the given one explains the forces.
 
     The misfit of the given one does not show it where small forces are far off without any mistake: moments about a
     base that stands or flies upright are those of a centre of mass that is 1 cm off.
     """
     rows, model = filtered.rows, filtered.model
-    if rows is None or rows.unexplained <= MAX_UNEXPLAINED_RATIO:
+    if not trials or rows is None or rows.unexplained <= least:
         return None
     corrected = ((DeviationRows.of(one.samples, model), one.mistake) for one in trials)
     left = sorted(((x.unexplained, one) for x, one in corrected if x is not None), key=lambda pair: pair[0])
     if not left or left[0][0] > min(MAX_LEFT, MAX_FORCE_RESIDUAL_SHARE * rows.unexplained):
         return None
-    least, best = left[0]
-    ratio = rows.unexplained / max(least, _TINY)
+    of_best, best = left[0]
+    ratio = rows.unexplained / max(of_best, _TINY)
     text = f"{best.description}: {ratio:.2g} times as much of the forces is unexplained as once corrected"
     for other_left, other in left[1:]:
-        if other_left < MIN_UNEXPLAINED_RATIO * least and other.description != best.description:
+        if other_left < MIN_UNEXPLAINED_RATIO * of_best and other.description != best.description:
             text += f"; or {other.field} {other.description}, which explains as much"
     return Finding("unit, sign or frame", REJECTED, best.field, text, best.advice)
 

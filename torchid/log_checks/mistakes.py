@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 
 from torchid.errors import join_names
 from torchid.log_checks.motion import MAX_ANGLE_RAD
-from torchid.log_checks.orders import exchanged_in_limbs, exchanged_names, other_orders
+from torchid.log_checks.orders import exchanged_in_limbs, exchanged_names, exchanged_pairs, other_orders
 from torchid.logs import Log
 from torchid.logs.log import WRENCHES, FloatArray
-from torchid.logs.quaternion import inverse_rotation, make_sign_continuous
+from torchid.logs.quaternion import inverse_rotation, make_sign_continuous, rotate_to_base
 from torchid.logs.units import advise_units, other_units
 from torchid.parameters import GRAVITY
 from torchid.robot import Robot
@@ -43,6 +43,7 @@ _WORLDS = {
     "y axis points up": (1.0, 0.0, 0.0),
     "x axis points up": (0.0, -1.0, 0.0),
 }
+_OPPOSITE_MOMENTS = np.array([1.0, 1.0, 1.0, -1.0, -1.0, -1.0])
 _MILLI_MOMENT_FACTORS = np.array([1.0, 1.0, 1.0, 1e-3, 1e-3, 1e-3])
 
 
@@ -87,6 +88,7 @@ def possible_mistakes(log: Log, robot: Robot | None = None) -> Iterator[Mistake]
             _multiply("imu_specific_force", -1.0),
             True,
         )
+        yield from accelerometer_axes(log, robot)
     if log.joint_torque is not None:
         reverse = "reverse them; a base that hangs upside down looks the same (give base_quat)"
         yield Mistake("joint_torque", "all reversed", reverse, _multiply("joint_torque", -1.0), True)
@@ -100,6 +102,21 @@ def possible_mistakes(log: Log, robot: Robot | None = None) -> Iterator[Mistake]
     for field, other in (WRENCHES, WRENCHES[::-1]):
         if getattr(log, field) is not None:
             yield from _wrench_mistakes(field, other)
+
+
+def accelerometer_axes(log: Log, robot: Robot | None) -> Iterator[Mistake]:
+    """An accelerometer on the base whose readings were turned to the world's axes."""
+    if log.imu_specific_force is None or log.base_quat_xyzw is None or robot is None:
+        return
+    body, T_base_imu = robot.links.get(log.imu_frame, (1, np.eye(4)))
+
+    def along_imu(log: Log) -> dict[str, Any]:
+        in_base = rotate_to_base(np.asarray(log.base_quat_xyzw), np.asarray(log.imu_specific_force))
+        return {"imu_specific_force": in_base @ T_base_imu[:3, :3]}
+
+    if body == 0:
+        advice = "give the reading of the accelerometer, along the axes of imu_frame"
+        yield Mistake("imu_specific_force", "along the world's axes", advice, _change(along_imu))
 
 
 def _orientation_mistakes() -> Iterator[Mistake]:
@@ -180,12 +197,23 @@ def _shift_joint(joint: int, angle: float) -> Callable[[Log], Log]:
     return correct
 
 
+def exchanged_joints(names: Sequence[str], some: Collection[str]) -> Iterator[Mistake]:
+    """Names of any two joints, one of them at least among `some`, exchanged: many logs to try."""
+    for text, permuted in exchanged_pairs(names, some):
+        yield _misnamed_joints(text, permuted)
+
+
+def _misnamed_joints(text: str, permuted: tuple[str, ...]) -> Mistake:
+    """A mistake of joints whose columns are those of `permuted`."""
+    advice = "give joint_names in the order of the columns; of arrays without names logs.columns.joint_order: "
+    advice += f"[{', '.join(permuted)}]"
+    return Mistake("joint_names", text, advice, _rename("joint_names", permuted), True)
+
+
 def _order_mistakes(log: Log, robot: Robot | None) -> Iterator[Mistake]:
     """Exchanged names of joints and contacts, and flags assigned to the wrong contacts."""
     for text, permuted in (*exchanged_in_limbs(log.joint_names, robot), *other_orders(log.joint_names, robot)):
-        advice = "give joint_names in the order of the columns; of arrays without names logs.columns.joint_order: "
-        advice += f"[{', '.join(permuted)}]"
-        yield Mistake("joint_names", text, advice, _rename("joint_names", permuted), True)
+        yield _misnamed_joints(text, permuted)
     for description, permuted in exchanged_names(log.contact_names, shortest=1):
         order = [permuted.index(name) for name in log.contact_names]
         text = f"{description} exchanged"
@@ -223,6 +251,8 @@ def _wrench_mistakes(field: str, other: str) -> Iterator[Mistake]:
         yield Mistake(field, f"in {unit}", f"multiply by {factor:g}", _multiply(field, factor), True)
     moments = _change(lambda log: {field: getattr(log, field) * _MILLI_MOMENT_FACTORS})
     yield Mistake(field, "moments in N mm", "multiply moments by 0.001", moments, True)
+    opposite = _change(lambda log: {field: getattr(log, field) * _OPPOSITE_MOMENTS})
+    yield Mistake(field, "moments reversed", "reverse the moments: those that the ground exerts", opposite, True)
     first = _change(lambda log: {field: np.roll(getattr(log, field), 3, axis=2)})
     yield Mistake(field, "with the moment first", "give the force first, then the moment", first, True)
     axes = "along the world's axes" if other == WRENCHES[1] else "along the contact frames' axes"

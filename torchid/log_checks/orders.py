@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 
 from torchid.robot import Robot
 
@@ -126,6 +126,24 @@ def other_orders(names: Sequence[str], robot: Robot | None) -> Iterator[tuple[st
             if permuted not in known:
                 known.add(permuted)
                 yield f"columns in {description}" + f" with {exchanged}" * bool(exchanged), permuted
+
+
+def joints_of_limb(robot: Robot, frame: str) -> list[str]:
+    """The joints between the base and a link, from the base on."""
+    body, found = robot.links[frame][0], list[str]()
+    while body > 0:
+        joint = robot.bodies[body].joint
+        found += [] if joint is None else [joint.name]
+        body = robot.bodies[body].parent
+    return found[::-1]
+
+
+def exchanged_pairs(names: Sequence[str], some: Collection[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """The names with any two exchanged, one of them at least among `some`."""
+    for one, other in itertools.combinations(names, 2):
+        if one in some or other in some:
+            partner = {one: other, other: one}
+            yield f"{one} and {other} exchanged", tuple(partner.get(name, name) for name in names)
 
 
 def exchanged_in_limbs(names: Sequence[str], robot: Robot | None) -> Iterator[tuple[str, tuple[str, ...]]]:

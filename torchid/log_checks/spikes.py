@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import format_count, join_names
+from torchid.errors import format_count, join_names, warn
 from torchid.log_checks.findings import (
     NEIGHBOUR_STEPS,
     NOTE,
@@ -18,6 +18,7 @@ from torchid.log_checks.findings import (
     ChannelGroup,
     Finding,
     Span,
+    channel_groups,
     channel_unit,
     finite_median,
     median_step,
@@ -27,6 +28,7 @@ from torchid.log_checks.findings import (
 from torchid.logs import Log
 from torchid.logs.log import CONTACT_READINGS, BoolArray, FloatArray
 from torchid.logs.preprocess import near_contact_changes
+from torchid.logs.time_range import log_title
 from torchid.rounding import STD_PER_MAD
 
 POSITION_FIELDS = ("joint_position", "base_quat_xyzw", "base_position_world")
@@ -97,6 +99,17 @@ def check_jumps(log: Log, groups: Iterable[ChannelGroup]) -> Iterator[Finding]:
         elif steps and field in _FORCE_FIELDS:
             advice = "if the sensor was reset there, split the log: each part has its own offset"
             yield _finding("step", SUSPICIOUS, field, steps, advice)
+
+
+def warn_of_steps(log: Log) -> None:
+    """Warn of joint positions that step, which a filter smears into accelerations and masses make up for in part.
+
+    Warns:
+        TorchidWarning: an encoder has another zero on either side, or an angle is wrapped.
+    """
+    for one in check_jumps(log, channel_groups(log, ("joint_position",))):
+        if one.severity == REJECTED and one.name != "spike":
+            warn(f"{log_title(log.source)}: joint_position, {one.name}: {one.found}; {one.advice}")
 
 
 def _channel_jumps(group: ChannelGroup, column: int) -> list[Jump]:

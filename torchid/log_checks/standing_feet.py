@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation, Slerp
 
-from torchid.errors import InputError, format_percent, join_names
+from torchid.errors import format_percent, join_names
 from torchid.log_checks.encoders import still_in_limb
 from torchid.log_checks.findings import (
     REJECTED,
@@ -19,15 +19,13 @@ from torchid.log_checks.findings import (
     Skipped,
     find_spans,
     median_step,
-    widen_mask,
 )
-from torchid.log_checks.mistakes import possible_mistakes, reversed_joints
-from torchid.log_checks.model import LinkPoses, default_cutoff_hz, preprocess_pieces, recorded_link_poses, same_poses
+from torchid.log_checks.mistakes import Mistake, exchanged_joints, possible_mistakes, reversed_joints
+from torchid.log_checks.model import LinkPoses, recorded_link_poses, same_poses
+from torchid.log_checks.orders import joints_of_limb
 from torchid.logs import Log
-from torchid.logs.log import BoolArray, FloatArray
+from torchid.logs.log import FloatArray
 from torchid.logs.quaternion import rotate_to_world
-from torchid.logs.units import advise_units, units_of_ratio
-from torchid.problem.base_motion import imu_pose
 from torchid.problem.floor_pose import rolled_distance
 from torchid.robot import Robot
 from torchid.sensing import Contact
@@ -50,6 +48,8 @@ MAX_SLIP_RESIDUAL_SHARE = 1.0 / 3.0
 _STANCE_END_S, _MIN_STANCE_S = 0.05, 0.15
 #: Samples that are compared, and the rms motion that the base must have [rad, or 0.3 m].
 _MAX_COMPARED_SAMPLES, _MIN_BASE_MOTION = 1500, 0.01
+#: The same for each of many pairs of joints, and their step: the shortest stance must have four.
+_MAX_TRIAL_SAMPLES, _TRIAL_STEP_S = 600, _MIN_STANCE_S / 4.0
 _LENGTH_UNIT_M = 0.3
 _CORRECTED_FIELDS = (
     *("joint_names", "joint_position", "base_quat_xyzw", "base_position_world"),
@@ -75,9 +75,27 @@ def check_standing_feet(
     yield from radius
     other_pose = iter(()) if radius or derived or poses is None else _pose_findings(log, contacts, slip, poses)
     single = None if radius or derived else _single_foot(log, robot, contacts, slip, poses)
-    if slip < MAX_SLIP_SHARE:
-        yield from other_pose if single is None else [single]
+    if slip < MAX_SLIP_SHARE and single is None:
+        yield from other_pose
         return
+    found = _usual_mistake(log, robot, contacts, slip, poses, derived) if slip >= MAX_SLIP_SHARE else None
+    if found is None and not radius and not derived:
+        found = _exchanged_joints(log, robot, contacts, slip)
+    if (found := found or single or next(other_pose, None)) is not None:
+        yield found
+    elif slip > MAX_UNEXPLAINED_SLIP_SHARE:
+        yield _unexplained_motion(log, robot, contacts, slip, poses)
+
+
+def _usual_mistake(
+    log: Log,
+    robot: Robot,
+    contacts: Sequence[Contact],
+    slip: float,
+    poses: LinkPoses | None,
+    derived: tuple[str, ...],
+) -> Finding | None:
+    """A finding about the usual mistake without which standing feet keep still best."""
     best, least = None, MAX_SLIP_RESIDUAL_SHARE * slip
     for mistake in (*possible_mistakes(log, robot), *reversed_joints(log)):
         if mistake.field not in _CORRECTED_FIELDS or mistake.field.startswith(derived):
@@ -87,14 +105,26 @@ def check_standing_feet(
         trial = measure_foot_slip(corrected, robot, contacts, poses if is_posed else None)
         if trial is not None and trial < least:
             best, least = mistake, trial
-    if best is not None:
-        share = f"{100 * slip:.3g} % as much as the base above them, {format_percent(least)} % once corrected"
-        text = f"{best.description}: standing feet move {share}"
-        yield Finding("unit, sign or frame", REJECTED, best.field, text, best.advice)
-    elif (found := single or next(other_pose, None)) is not None:
-        yield found
-    elif slip > MAX_UNEXPLAINED_SLIP_SHARE:
-        yield _unexplained_motion(log, robot, contacts, slip, poses)
+    return None if best is None else _corrected(best, slip, least)
+
+
+def _corrected(mistake: Mistake, slip: float, least: float) -> Finding:
+    """A finding about a mistake without which standing feet keep still."""
+    share = f"{100 * slip:.3g} % as much as the base above them, {format_percent(least)} % once corrected"
+    text = f"{mistake.description}: standing feet move {share}"
+    return Finding("unit, sign or frame", REJECTED, mistake.field, text, mistake.advice)
+
+
+def _exchanged_joints(log: Log, robot: Robot, contacts: Sequence[Contact], slip: float) -> Finding | None:
+    """A finding about any two joints whose names are exchanged, one of them at least between a foot and the base."""
+    every = max(1, int(_TRIAL_STEP_S / median_step(log)))
+    some = log.select(slice(0, every * _MAX_TRIAL_SAMPLES, every))
+    legs = {name for contact in contacts for name in joints_of_limb(robot, contact.frame)}
+    pairs = list(exchanged_joints(log.joint_names, legs))
+    trials = [(measure_foot_slip(mistake.correct(some), robot, contacts), mistake) for mistake in pairs]
+    left = [(share, mistake) for share, mistake in trials if share is not None]
+    least, best = min(left, key=lambda pair: pair[0], default=(slip, None))
+    return None if best is None or least > MAX_OTHERS_SHARE * slip else _corrected(best, slip, least)
 
 
 def _unexplained_motion(
@@ -277,123 +307,3 @@ def _stance_motion(
         )
         sums.append((in_world, in_base, stance.stop - stance.start))
     return sums
-
-
-#: Difference between both angular velocities, over the feet's, from which on a mistake is looked for, and where none
-#: explains it. Soft soles and balls that roll make a tenth.
-MAX_DIFFERENCE, MAX_UNEXPLAINED_DIFFERENCE = 0.3, 0.6
-#: Angular velocity [rad/s] that the difference is compared with where the base turns less: a usual gyroscope's offset
-#: is far below the share of it.
-MIN_TURNING = 0.05
-#: Samples that must be left, and time at either end of a stance that does not count.
-_MIN_SAMPLES, _TURN_END_S = 50, 0.1
-#: Length that makes an axis of a flat foot a vector between points, and the largest radius that counts as none.
-_AXIS_LENGTH_M, _MAX_RADIUS_M = 0.3, 0.03
-_UNIT_TOLERANCE = 0.1
-_FIELD, _CHECK = "imu_angular_velocity", "gyroscope against feet that stand"
-
-
-def check_gyroscope(
-    log: Log, robot: Robot | None, contacts: Sequence[Contact], cutoff_hz: float | None
-) -> Iterator[Finding | Skipped]:
-    """Findings about an angular velocity without an orientation beside it, which `check_angular_velocity` takes."""
-    if robot is None or robot.fixed_base or log.imu_angular_velocity is None or log.base_quat_xyzw is not None:
-        return
-    if log.contact_active is None or set(log.joint_names) != set(robot.joint_names):
-        return
-    try:
-        rotation, _ = imu_pose(log, robot)
-        ready = preprocess_pieces(log, cutoff_hz or default_cutoff_hz(log))[0]
-    except InputError as error:
-        yield Skipped(_CHECK, f"{error.field}: {error.found}")
-        return
-    vectors, rates, omega = _turning(ready, robot, contacts, rotation.as_matrix())
-    if len(vectors) < _MIN_SAMPLES:
-        yield Skipped(_CHECK, "no flat foot and no two feet that stand at once")
-        return
-    yield from _compare(vectors, rates, omega)
-
-
-def _turning(
-    log: Log, robot: Robot, contacts: Sequence[Contact], R_base_imu: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Vectors [m] that keep still in the world, their rates in the base, and the gyroscope's readings, (M, 3) each.
-
-    What touches with the base itself, as rotors that hold it in the air do, shows nothing of how it turns.
-    """
-    poses, feet = recorded_link_poses(log, robot), [c for c in contacts if c.frame in log.contact_names]
-    feet = [c for c in feet if c.radius <= _MAX_RADIUS_M and c.frame in poses and robot.links[c.frame][0]]
-    ends = max(1, round(_TURN_END_S / median_step(log)))
-    omega = np.asarray(log.imu_angular_velocity) @ R_base_imu.T
-    parts = []
-
-    def add(vector: FloatArray, *standing: Contact) -> None:
-        where = _stands(log, standing, ends)
-        parts.append((vector[where], np.gradient(vector, log.time, axis=0)[where], omega[where]))
-
-    for index, foot in enumerate(feet):
-        T = poses[foot.frame].numpy()
-        if foot.kind == "flat":
-            for axis in range(3):
-                add(_AXIS_LENGTH_M * T[:, :3, axis], foot)
-        for other in feet[index + 1 :]:
-            add(T[:, :3, 3] - poses[other.frame].numpy()[:, :3, 3], foot, other)
-    if not parts:
-        return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3))
-    vectors, rates, read = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return vectors, rates, read
-
-
-def _stands(log: Log, contacts: Sequence[Contact], ends: int) -> BoolArray:
-    """Samples (N,) in which all these contacts stand, for a while already and still."""
-    flags = np.asarray(log.contact_active)
-    standing = np.all([flags[:, log.contact_names.index(c.frame)] for c in contacts], axis=0)
-    return ~widen_mask(~standing, ends)
-
-
-def _compare(vectors: FloatArray, rates: FloatArray, omega: FloatArray) -> Iterator[Finding]:
-    """Findings: what stands turns in the base with minus the base's angular velocity, d/dt r = r x omega."""
-    size = max(float(np.linalg.norm(rates)), MIN_TURNING * float(np.linalg.norm(vectors)))
-
-    def left(corrected: FloatArray) -> float:
-        return float(np.linalg.norm(rates - np.cross(vectors, corrected))) / size
-
-    difference = left(omega)
-    if difference < MAX_DIFFERENCE:
-        return
-    limit = MAX_SLIP_RESIDUAL_SHARE * difference
-    text = f"differs by {100 * difference:.3g} % from how the base turns above the feet that stand"
-    offset = _least_squares(vectors, rates - np.cross(vectors, omega), np.ones((len(omega), 1)))[:, 0]
-    if (rest := left(omega + offset)) < limit:
-        values = ", ".join(f"{-x:.3g}" for x in offset)
-        found = f"{text}, {format_percent(rest)} % without a steady ({values}) rad/s"
-        yield Finding("offset", SUSPICIOUS, _FIELD, found, "subtract it: a gyroscope at rest reads its offset")
-        return
-    turned = np.cross(vectors, omega)
-    factor = float((rates * turned).sum() / max(float(np.square(turned).sum()), np.finfo(float).tiny))
-    if (rest := left(factor * omega)) < limit:
-        yield _factor_finding(factor, f"{text}, {format_percent(rest)} % times {factor:.3g}")
-        return
-    matrix = _least_squares(vectors, rates, omega)
-    if (rest := left(omega @ matrix.T)) < limit:
-        found = f"{text}, {format_percent(rest)} % along other axes"
-        yield Finding("frame", REJECTED, _FIELD, found, "imu_frame is the frame along whose axes the IMU reads")
-    elif difference > MAX_UNEXPLAINED_DIFFERENCE:
-        advice = "check unit, axes and imu_frame, signs and zeros of joint positions, and the flags"
-        yield Finding("standing feet", SUSPICIOUS, _FIELD, f"{text}{UNEXPLAINED}", advice)
-
-
-def _factor_finding(factor: float, text: str) -> Finding:
-    if factor < 0.0 and abs(factor + 1.0) < _UNIT_TOLERANCE:
-        return Finding("sign", REJECTED, _FIELD, f"reversed: {text}", "reverse it")
-    units = units_of_ratio(1.0 / factor, ("angular velocity",), _UNIT_TOLERANCE) if factor > 0.0 else ()
-    if units:
-        return Finding("unit", REJECTED, _FIELD, f"in {' or '.join(units)}: {text}", advise_units({_FIELD: units}))
-    return Finding("ratio", SUSPICIOUS, _FIELD, text, "check its unit and range")
-
-
-def _least_squares(vectors: FloatArray, rates: FloatArray, inputs: FloatArray) -> FloatArray:
-    """The matrix (3, k) that makes angular velocities of inputs (M, k) which fit d/dt r = r x (matrix inputs) best."""
-    columns = np.stack([np.cross(vectors, axis)[..., None] * inputs[:, None] for axis in np.eye(3)], axis=2)
-    solution = np.linalg.lstsq(columns.reshape(3 * len(rates), -1), rates.reshape(-1), rcond=None)[0]
-    return np.asarray(solution, np.float64).reshape(3, -1)

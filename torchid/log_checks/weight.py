@@ -12,7 +12,7 @@ from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, Finding, Ski
 from torchid.log_checks.model import recorded_link_poses
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
-from torchid.logs.quaternion import rotate_to_world
+from torchid.logs.quaternion import rotate_to_base, rotate_to_world
 from torchid.logs.units import advise_units, units_of_ratio
 from torchid.parameters import GRAVITY
 from torchid.robot import Robot
@@ -26,8 +26,15 @@ _MIN_REST_S, _MIN_AVERAGING_S = 0.5, 5.0
 _MAX_POSE_SAMPLES = 4000
 #: Relative error of an accelerometer at rest: a good one is within 0.5 %.
 _MAX_ACCELEROMETER_ERROR = 0.02
-#: Deviation of its reading from gravity in another unit.
+#: Deviation of its reading from gravity in another unit, or from twice gravity.
 _ACCELEROMETER_UNIT_TOLERANCE = 0.1
+#: Mean of a reading without gravity, and its median size where nothing else says that the base does not turn over, over
+#: gravity.
+_MAX_MEAN_WITHOUT_GRAVITY, _MAX_SIZE_WITHOUT_GRAVITY = 0.1, 0.5
+#: Mean of the vertical along the axes of a base that does not turn over.
+_MIN_MEAN_VERTICAL = 0.7
+#: Mean along the world's axes over gravity below which it has no direction.
+_MIN_MEAN_WITH_DIRECTION = 0.5
 #: Angle between gravity by the accelerometer and by the orientation of the base.
 _MAX_TILT_DEG = 5.0
 _WEIGHT_CHECK, _ACCELEROMETER_CHECK = "weight at rest", "accelerometer at rest"
@@ -121,10 +128,10 @@ def check_accelerometer(log: Log, robot: Robot | None) -> Iterator[Finding | Ski
     still = _find_rest(log)
     rests = still.sum() >= 10
     if not rests:
-        found = _accelerometer_in_motion(log)
+        found = _accelerometer_in_motion(log, robot)
         yield found or Skipped(_ACCELEROMETER_CHECK, f"the robot never rests for {_MIN_REST_S:g} s")
-        gone = found is not None and found.name == "gravity"
-        if gone or log.base_quat_xyzw is None or log.time[-1] - log.time[0] < _MIN_AVERAGING_S:
+        mistaken = found is not None and found.name == "gravity"
+        if mistaken or log.base_quat_xyzw is None or log.time[-1] - log.time[0] < _MIN_AVERAGING_S:
             return
         yield from _tilt_findings(log, robot, np.ones(len(log), bool), "on average")
         return
@@ -135,31 +142,56 @@ def check_accelerometer(log: Log, robot: Robot | None) -> Iterator[Finding | Ski
         yield _accelerometer_unit_finding(f"{size:.4g} at rest", units)
     elif size < 0.1 * GRAVITY:
         yield _no_gravity_finding(text)
+    elif _is_twice_gravity(size):
+        yield _twice_gravity_finding(text)
     elif abs(size / GRAVITY - 1.0) > _MAX_ACCELEROMETER_ERROR:
         yield Finding("gravity", SUSPICIOUS, name, f"{text}, gravity is {GRAVITY}", "calibrate the accelerometer")
     if units or size > 0.5 * GRAVITY:
         yield from _tilt_findings(log, robot, still, "at rest")
 
 
-def _accelerometer_in_motion(log: Log) -> Finding | None:
+def _accelerometer_in_motion(log: Log, robot: Robot | None) -> Finding | None:
     """Finding about unit or gravity of an accelerometer that never rests, by mean and median size, over a long log.
 
-    Both are gravity's for a base that hardly turns and falls; of one without gravity, the mean is nearly zero.
+    Both are gravity's for a base that hardly turns and falls; of one without gravity, the mean is nearly zero. Along
+    the world's axes the mean is gravity however the base accelerates: its velocity does not grow.
     """
     if log.imu_specific_force is None or log.time[-1] - log.time[0] < _MIN_AVERAGING_S:
         return None
-    sizes = (
+    mean, size = (
         float(np.linalg.norm(log.imu_specific_force.mean(axis=0))),
         float(np.median(np.linalg.norm(log.imu_specific_force, axis=1))),
     )
     by_mean, by_size = (
-        units_of_ratio(size / GRAVITY, ("acceleration",), _ACCELEROMETER_UNIT_TOLERANCE) for size in sizes
+        units_of_ratio(x / GRAVITY, ("acceleration",), _ACCELEROMETER_UNIT_TOLERANCE) for x in (mean, size)
     )
     units = tuple(unit for unit in by_size if unit in by_mean)
     if units:
-        return _accelerometer_unit_finding(f"{sizes[1]:.4g} in the median", units)
-    gone = sizes[0] < 0.1 * GRAVITY and sizes[1] < 0.5 * GRAVITY
-    return _no_gravity_finding(f"{sizes[1]:.3g} m/s^2 in the median") if gone else None
+        return _accelerometer_unit_finding(f"{size:.4g} in the median", units)
+    text, in_base = f"{size:.3g} m/s^2 in the median", _specific_force_in_base(log, robot)
+    if in_base is not None and log.base_quat_xyzw is not None:
+        vertical = rotate_to_base(log.base_quat_xyzw, np.tile([0.0, 0.0, 1.0], (len(log), 1))).mean(axis=0)
+        if np.linalg.norm(vertical) > _MIN_MEAN_VERTICAL:
+            mean = size = float(np.linalg.norm(rotate_to_world(log.base_quat_xyzw, in_base).mean(axis=0)))
+    if mean < _MAX_MEAN_WITHOUT_GRAVITY * GRAVITY and size < _MAX_SIZE_WITHOUT_GRAVITY * GRAVITY:
+        return _no_gravity_finding(text)
+    return _twice_gravity_finding(text) if _is_twice_gravity(mean) and _is_twice_gravity(size) else None
+
+
+def _specific_force_in_base(log: Log, robot: Robot | None) -> FloatArray | None:
+    """What the accelerometer reads along the axes of the base (N, 3); None where it is not known to be on the base."""
+    if log.imu_specific_force is None or robot is None or robot.links.get(log.imu_frame, (1, None))[0] != 0:
+        return None
+    return np.asarray(log.imu_specific_force @ robot.links[log.imu_frame][1][:3, :3].T)
+
+
+def _is_twice_gravity(size: float) -> bool:
+    return abs(size / (2.0 * GRAVITY) - 1.0) < _ACCELEROMETER_UNIT_TOLERANCE
+
+
+def _twice_gravity_finding(text: str) -> Finding:
+    advice = "give the reading of the accelerometer, to which nothing was added; or halve it, if its range is another"
+    return Finding("gravity", REJECTED, "imu_specific_force", f"{text}: gravity is in it twice", advice)
 
 
 def _no_gravity_finding(text: str) -> Finding:
@@ -177,11 +209,14 @@ def _tilt_findings(log: Log, robot: Robot | None, still: BoolArray, when: str) -
     """Findings about the direction of gravity, by the accelerometer against the orientation of the base."""
     if log.base_quat_xyzw is None or log.imu_specific_force is None:
         return
-    if robot is None or robot.links.get(log.imu_frame, (1, None))[0] != 0:
+    read = _specific_force_in_base(log, robot)
+    if read is None or robot is None:
         yield Skipped("gravity against orientation", "no robot with the IMU's frame on the base")
         return
-    in_base = log.imu_specific_force[still] @ robot.links[log.imu_frame][1][:3, :3].T
+    in_base = read[still]
     up = rotate_to_world(log.base_quat_xyzw[still], in_base).mean(axis=0)
+    if np.linalg.norm(up) < _MIN_MEAN_WITH_DIRECTION * GRAVITY:
+        return
     angles = np.degrees(np.arccos(np.clip(up / np.linalg.norm(up), -1.0, 1.0)))
     angle = float(angles[2])
     name, text = "imu_specific_force", f"{angle:.3g} degrees from up {when}, by base_quat"

@@ -16,6 +16,7 @@ from torchid.errors import ConfigError, LogError
 from torchid.fitting.experiment import RobotSetup, S
 from torchid.log_checks import Checked, drop_rejected
 from torchid.log_checks.check import check
+from torchid.log_checks.spikes import warn_of_steps
 from torchid.logs import Log, read_log
 from torchid.logs.blocks import GIGABYTE, has_blocks, log_bytes
 from torchid.logs.containers import LogKind, existing_log_kind
@@ -129,6 +130,8 @@ class LogReader:
         acting = with_delayed_torques(without_welded_joints(read, own.robot), self.setup.config.actuators.known_delay)
         recorded, certain = apply_contact_settings(with_loop_joints(acting, own.robot), own)
         checked = self._checked(recorded, own.robot)
+        if checked is None:
+            warn_of_steps(recorded)
         clean = recorded if checked is None else checked.repaired
         log = self._preprocessed(clean)
         samples = bind_log(log, self.setup.robot, self.setup.contacts, required)
