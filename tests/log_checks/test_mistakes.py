@@ -19,7 +19,7 @@ from synthetic import Oracle
 from thinned import SLOW
 from walking import MACHINES, robot_of, truth
 
-from torchid.log_checks import NOTE, REJECTED, Finding, Skipped
+from torchid.log_checks import NOTE, REJECTED, SUSPICIOUS, Finding, Skipped
 from torchid.log_checks.mistakes import joint_mistakes, possible_mistakes
 from torchid.log_checks.model import NominalModel, bind_some_samples, preprocess_pieces
 from torchid.log_checks.orders import exchanged_names
@@ -255,6 +255,17 @@ def test_two_legs_that_are_exchanged_beside_two_that_are_not_are_named() -> None
     explained = only(of_demo(replace(log, joint_names=names)), EXPLAINED)
     assert (explained.severity, explained.field) == (REJECTED, "joint_names")
     assert explained.found.startswith(f"{other} and {one} exchanged: ")  # in the order of the log
+
+
+@pytest.mark.parametrize(("drone", "severity"), [("hextilt", SUSPICIOUS), ("borinot", NOTE)])
+def test_moments_about_another_point_are_no_mistake_where_the_centre_of_mass_may_be_there(
+    drone: str, severity: str
+) -> None:
+    """100 mm are more than the radius of gyration of the first base (52 mm), and less than that of the second (133)."""
+    case = flight(drone, "contacts", 31)
+    found = only(checked(case, value(BY_NAME["wrenches about another point"].make(case))), "point")
+    assert found.severity == severity
+    assert ("centre of mass may be as far off" in found.advice) is (severity == NOTE)
 
 
 def test_the_order_of_a_drones_quaternion_is_named_though_its_small_moments_are_far_off_the_urdfs() -> None:

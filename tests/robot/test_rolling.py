@@ -70,6 +70,28 @@ def test_a_shape_about_the_origin_is_taken_and_no_other(
     assert bool(text) == bool(radius)
 
 
+@pytest.mark.parametrize(
+    ("kind", "origin", "found"),
+    [
+        ("continuous", '<origin rpy="1.5707963267948966 0 0"/>', 0.08),  # about the axle, y
+        ("continuous", '<origin rpy="1.5707963267948966 0 0" xyz="0 0.007 0"/>', 0.08),
+        ("continuous", '<origin rpy="1.5707963267948966 0 0" xyz="0 0.03 0"/>', 0.0),  # stands beside the frame
+        ("continuous", "", 0.0),  # a rotor's hub or a steered post: across the axle
+        ("revolute", '<origin rpy="1.5707963267948966 0 0"/>', 0.0),  # an ankle's housing
+    ],
+)
+def test_a_point_on_a_wheel_rolls_on_the_wheel(tmp_path: Path, kind: str, origin: str, found: float) -> None:
+    """A wheel is a cylinder that turns about its own axis without end; the frame at its centre is welded askew."""
+    tyre = link("tyre").replace("</link>", shape('<cylinder radius="0.08" length="0.03"/>', origin) + "</link>")
+    axle = joint("axle", "base", "tyre", kind, '<axis xyz="0 1 0"/>')
+    turned = joint("weld", "tyre", "hub", "fixed", '<origin xyz="0 0 0" rpy="0.4 1 1.5707963267948966"/>')
+    robot = load(write(tmp_path, link("base"), tyre, link("hub"), axle, turned))
+    for frame, source in (("tyre", "collision wheel"), ("hub", "collision wheel of tyre")):
+        contacts, text = resolve_contacts([ContactConfig(frame, "point")], robot)
+        assert contacts[0].radius == found
+        assert text == (f"{frame}: radius 0.08 m ({source})" if found else "")
+
+
 def test_a_link_that_is_welded_to_the_frame_s_lends_its_shape(tmp_path: Path) -> None:
     robot = foot_on(tmp_path, shape('<sphere radius="0.04"/>', '<origin xyz="0.1 0 0"/>'))
     contacts, text = resolve_contacts([ContactConfig("toe", "point")], robot)

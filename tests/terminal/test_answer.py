@@ -251,6 +251,17 @@ def test_bodies_far_off_their_file_need_a_wider_prior_and_a_line_says_which(
     assert "--prior-error" not in text(consistent, 400)
 
 
+def test_a_rod_in_the_file_is_named_where_bodies_are_far_off_it(consistent: Identification) -> None:
+    """A small error across a body without thickness is a large share: the file may be the robot's all the same."""
+    fitted = consistent.posterior
+    thin = fitted.posterior.nominal.copy()
+    thin.reshape(-1, PER_BODY)[:, INERTIAL] *= 0.3
+    thin.reshape(-1, PER_BODY)[2, INERTIAL] = [1.0, 0.0, 0.0, 0.1, 0.02, 0.0, 0.0, 0.02, 0.0, 0.0]
+    wrong = replace(fitted, posterior=replace(fitted.posterior, nominal=thin))
+    said = text(replace(consistent, posterior=wrong), 400)
+    assert f"the file is another robot's, or it has rods or plates ({fitted.body_names[2]});" in said
+
+
 def test_a_descent_that_ended_many_standard_errors_from_the_least_says_so(consistent: Identification) -> None:
     own = {x.name for x in fields(ConstrainedEstimate)}
     shared = {name: x for name, x in vars(consistent.estimate).items() if name in own}

@@ -11,9 +11,9 @@ import numpy as np
 from torchid.config.logs import tests_on_seen_samples
 from torchid.errors import format_percent, join_names
 from torchid.estimators import ConsistentEstimate, Estimate, SgdEstimate
-from torchid.estimators.posterior import NominalError
 from torchid.fitting.calibration import list_confounded
 from torchid.fitting.misfit import AT_THE_FLOOR, unexplained_joints, unexplained_torques
+from torchid.fitting.posterior import FittedPosterior
 from torchid.identifiability.confounding import TotalMass
 from torchid.log_checks.weight import MAX_MASS_ERROR
 from torchid.logs.time_range import log_title
@@ -202,7 +202,7 @@ def _attention(run: Identification, judged: ErrorComparison) -> Iterator[str]:
     yield from _undetermined(run)
     for one in list_confounded(run.extras):
         yield one.in_short
-    yield from _far_off(run.posterior.nominal_error)
+    yield from _far_off(run.posterior)
     if run.noise.suggested:
         yield f"noise: {noise_advice(run.noise.suggested)}"
 
@@ -305,11 +305,16 @@ def _unlike_joints(run: Identification) -> Iterator[str]:
         yield f"the fit leaves {named}; check sign, unit and gear there, and its encoder: torchid check"
 
 
-def _far_off(nominal: NominalError | None) -> Iterator[str]:
+def _far_off(fitted: FittedPosterior) -> Iterator[str]:
     """That bodies are further off their file than samples of what data leave open take them to be."""
+    nominal = fitted.nominal_error
     if nominal is not None and nominal.prior_is_narrow:
-        unlike = nominal.value > _ANOTHER_ROBOT
-        why = ": the model does not explain these forces, or the file is another robot's" if unlike else ""
+        causes = ["the model does not explain these forces", "the file is another robot's"]
+        if thin := [
+            name for name, is_thin in zip(fitted.body_names, fitted.posterior.thin_bodies(), strict=True) if is_thin
+        ]:
+            causes.append(f"it has rods or plates ({join_names(thin)})")
+        why = f": {', '.join(causes[:-1])}, or {causes[-1]}" if nominal.value > _ANOTHER_ROBOT else ""
         yield f"{nominal}{why}; other bodies may be as far off: torchid sample --prior-error auto"
 
 

@@ -95,8 +95,8 @@ def _balls_of_limbs(robot: Robot, shapes: CollisionShapes) -> list[str]:
         body = root = robot.links[name][0]
         while root and parents[root]:
             root = parents[root]
-        is_end = body and body not in parents and shapes.about(name) is not None
-        if is_end and not re.search(_NO_FEET, name, re.IGNORECASE):
+        shape = shapes.about(name) if body and body not in parents else None
+        if shape is not None and shape.kind == "sphere" and not re.search(_NO_FEET, name, re.IGNORECASE):
             limbs.setdefault(root, name)
     called = [name for name in limbs.values() if re.search("|".join(_FEET), name, re.IGNORECASE)]
     return list(limbs.values()) if len(limbs) > 2 else called

@@ -201,8 +201,8 @@ class ContactConfig:
     """A contact at a URDF frame: `line_axis` is the frame's axis that a line contact runs along.
 
     `radius` [m]: a point is a sphere, a line a cylinder about the frame's origin, which rolls; auto: that of the
-    collision sphere (of a line: cylinder) about this origin in the URDF, 0 without one. `normal`: of the ground, in the
-    world, where the logs do not record it (`contact_normal_world`); None for upwards.
+    collision sphere or wheel (of a line: cylinder) about this origin in the URDF, 0 without one. `normal`: of the
+    ground, in the world, where the logs do not record it (`contact_normal_world`); None for upwards.
     """
 
     frame: str

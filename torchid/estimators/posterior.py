@@ -96,16 +96,25 @@ class Posterior:
             deviations=scipy.linalg.block_diag(prior.deviations, np.eye(extras)),
         )
 
+    @property
+    def _thinnest(self) -> float:
+        """Least eigenvalue of scaled pseudo-inertias that the prior is relative to."""
+        return max(_THINNEST, 2.0 * self.conditions.margin)
+
+    def thin_bodies(self) -> np.ndarray:
+        """Whether bodies are rods, plates or points in the file, of which errors across are large shares, (L,)."""
+        free = self.free.reshape(-1, PER_BODY)[:, parameters.INERTIAL].any(axis=1)
+        return np.asarray(free & (parameters.least_eigenvalues(self.nominal, self.scale) < self._thinnest))
+
     def _metric(self) -> Array:
         """Parameters (12 L,) whose pseudo-inertias the prior is relative to: the nominal ones, none of them singular.
 
         Bodies that cannot exist, or are thinner than the conditions allow, have their least eigenvalues raised.
         """
         scaled = (self.nominal / self.scale).reshape(-1, PER_BODY)
-        least = max(_THINNEST, 2.0 * self.conditions.margin)
         values, vectors = np.linalg.eigh(parameters.pseudo_inertia(scaled))
-        thin = values[:, 0] < least
-        raised = (vectors * np.maximum(values, least)[:, None]) @ np.swapaxes(vectors, 1, 2)
+        thin = values[:, 0] < self._thinnest
+        raised = (vectors * np.maximum(values, self._thinnest)[:, None]) @ np.swapaxes(vectors, 1, 2)
         scaled[thin, parameters.INERTIAL] = parameters.from_pseudo_inertia(raised[thin])
         return scaled.flatten() * self.scale
 

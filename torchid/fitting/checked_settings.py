@@ -225,7 +225,7 @@ def _require_floor(contacts: tuple[Contact, ...]) -> None:
 
 
 def _rolling_shape(shapes: CollisionShapes, contact: Contact) -> RollingShape | None:
-    """The collision sphere of a point, or cylinder of a line, on which the URDF lets a contact roll; None without."""
+    """The sphere or wheel of a point, or cylinder of a line, on which the URDF lets a contact roll; None without."""
     if contact.kind == "flat":
         return None
     return shapes.about(contact.frame, contact.line_axis if contact.kind == "line" else None)

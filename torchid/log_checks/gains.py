@@ -12,6 +12,7 @@ from torchid.log_checks.findings import NOTE, SUSPICIOUS, Finding
 from torchid.log_checks.scales import MIN_BLOCK_SHARE, MIN_STANDARD_DEVIATIONS, TorqueGains
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
+from torchid.parameters import MASS, mass_com_inertia
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.predict import force_series
 from torchid.robot import Robot
@@ -60,7 +61,22 @@ def gain_and_point_findings(log: Log, fit: TorqueGains | None, robot: Robot) -> 
         advice = "give moments about the contact frame's origin, or name the sensor's own frame as the contact"
         if log.moments_about_world_origin:
             advice = "check the points of the moments, where the plates lie, and the base's position in the same world"
-        yield Finding("point", SUSPICIOUS, log.contact_wrench_field, text, advice)
+        severity = SUSPICIOUS
+        if _is_centre_of_base(log, robot, float(np.linalg.norm(fit.point))):
+            severity, advice = NOTE, f"none if its base's centre of mass may be as far off; else {advice}"
+        yield Finding("point", severity, log.contact_wrench_field, text, advice)
+
+
+def _is_centre_of_base(log: Log, robot: Robot, shift: float) -> bool:
+    """Whether the base's centre of mass explains another point of wrenches on the base alone, as of a drone's rotors.
+
+    Weight and inertia act alike on both; a centre of mass is off by less than the body's radius of gyration.
+    """
+    mass, _, inertia = mass_com_inertia(robot.nominal[0])
+    if mass <= 0.0 or any(robot.link(frame)[0] for frame in log.contact_names):
+        return False
+    gyration = np.sqrt(0.5 * np.trace(inertia) / mass)
+    return bool(shift * robot.nominal[:, MASS].sum() / mass < gyration)
 
 
 def _reference_joints(fit: TorqueGains) -> BoolArray:

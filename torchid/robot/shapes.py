@@ -1,4 +1,4 @@
-"""Shapes of the URDF: box and ellipsoid around a body, what a frame rolls on (the only module that imports trimesh)."""
+"""Shapes of the URDF: box and ellipsoid around a body (the only module that imports trimesh)."""
 
 from __future__ import annotations
 
@@ -322,71 +322,3 @@ def _largest_norm(points: Array, spread: Array) -> float:
             least = minimize_scalar(dual, bounds=(0.0, limit), method="bounded", options={"xatol": 1e-9 * limit}).fun
         reach = max(reach, float(np.sqrt(least)))
     return reach
-
-
-_MAX_OFFSET_M, _MAX_OFFSET_SHARE = 1e-3, 0.1
-"""Distance of a shape's centre or axis from the frame's origin up to which it is about the origin: either of both."""
-_MAX_ANGLE = 0.02  # rad, between a cylinder and the axis of its contact
-
-
-@dataclass(frozen=True)
-class RollingShape:
-    """A collision shape about a frame's origin: a "sphere" or "cylinder", its radius [m], and the link that has it."""
-
-    kind: str
-    radius: float
-    link: str
-
-
-class CollisionShapes:
-    """The collision spheres and cylinders of a robot's links."""
-
-    def __init__(self, robot: Robot) -> None:
-        """Read the URDF, whose other shapes do not matter here."""
-        self.robot = robot
-        self._links = {link.get("name"): link for link in parse_xml(robot.path).getroot().findall("link")}
-
-    def about(self, frame: str, axis: str | None = None) -> RollingShape | None:
-        """The shape about a frame's origin, of its own link or of one that is welded to it; None if there is none.
-
-        Of several, one of the frame's own link, then the largest, which touches the ground first.
-
-        Args:
-            frame: a link of the robot.
-            axis: x, y or z of the frame, along which a cylinder must be; None for a sphere.
-
-        Raises:
-            UnknownNameError: no such link.
-            UrdfError: a shape that is not described by numbers.
-        """
-        body, T_body_frame = self.robot.link(frame)
-        T_frame_body = np.linalg.inv(T_body_frame)
-        found: list[RollingShape] = []
-        for name in sorted(self.robot.bodies[body].links, key=lambda name: name != frame):
-            T_frame_link = T_frame_body @ self.robot.links[name][1]
-            for element in self._links[name].findall("collision"):
-                radius = self._radius_about(name, element, T_frame_link, axis)
-                if radius > 0.0:
-                    found.append(RollingShape("sphere" if axis is None else "cylinder", radius, name))
-            if found and name == frame:
-                break
-        return max(found, key=lambda shape: shape.radius, default=None)
-
-    def _radius_about(self, link: str, element: etree._Element, T_frame_link: Array, axis: str | None) -> float:
-        """Radius of a shape if it is a sphere or, with an axis, a cylinder about the frame's origin, else 0."""
-        shape = element.find(f"geometry/{'sphere' if axis is None else 'cylinder'}")
-        if shape is None:
-            return 0.0
-        path, field = self.robot.path, f"link '{link}', <collision>"
-        (radius,) = read_numbers(path, f"{field} <{shape.tag!s}", shape, "radius", 1)
-        origin, xyz, rpy = element.find("origin"), np.zeros(3), np.zeros(3)
-        if origin is not None:
-            xyz, rpy = (read_numbers(path, f"{field} <origin", origin, name, 3, "0 0 0") for name in ("xyz", "rpy"))
-        centre = T_frame_link[:3, :3] @ xyz + T_frame_link[:3, 3]
-        if axis is not None:
-            along = T_frame_link[:3, :3] @ Rotation.from_euler("xyz", rpy).as_matrix()[:, 2]
-            if np.linalg.norm(np.cross(along, np.eye(3)["xyz".index(axis)])) > _MAX_ANGLE:
-                return 0.0
-            centre = centre - along * (along @ centre)
-        is_about = np.linalg.norm(centre) <= max(_MAX_OFFSET_M, _MAX_OFFSET_SHARE * radius)
-        return float(radius) if is_about else 0.0
