@@ -38,10 +38,14 @@ def import_signal() -> ModuleType:
 
 @dataclass(frozen=True, eq=False)
 class LowPass:
-    """A zero-phase filter: the second-order sections of one pass, and how many samples each end is extended by."""
+    """A zero-phase filter: the second-order sections of one pass, and how many samples each end is extended by.
+
+    `is_flat`: below its cutoff, so that it moves no zeros of a velocity.
+    """
 
     sections: FloatArray
     padding: int
+    is_flat: bool = True
 
     @classmethod
     @cache  # takes 1 ms, and a log is filtered by the same ones over and over
@@ -55,7 +59,7 @@ class LowPass:
     def bessel(cls, cutoff_hz: float, step: float) -> LowPass:
         """A Bessel filter, arguments as of `butterworth`: of a step it leaves 0.03 % beyond 1/cutoff, that one 2 %."""
         sections = import_signal().bessel(FILTER_ORDER, cutoff_hz, fs=1.0 / step, output="sos", norm="mag")
-        return cls(sections, _padding(cutoff_hz, step))
+        return cls(sections, _padding(cutoff_hz, step), is_flat=False)
 
     def __call__(self, values: FloatArray) -> FloatArray:
         """Filter every channel of uniformly sampled values (M, ...) forward and backward, M above the padding."""
