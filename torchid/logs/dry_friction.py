@@ -160,7 +160,9 @@ def with_sign_filter(
             warn_about_file(f"joints move faster than the filter lets through: {wider}")
     step, of_sign_alone = float(np.median(np.diff(log.time))), None if wider is None else wider.low_pass
     if wider is None and cutoff is not None and timeline.low_pass is not None and not timeline.low_pass.is_flat:
-        of_sign_alone = LowPass.butterworth(cutoff, step)
+        of_sign_alone = LowPass.butterworth(
+            cutoff, float(np.median(np.diff(log.time[:MOST_SAMPLES])))
+        )  # as a wider one
     if of_sign_alone is not None:
         timeline = replace(timeline, sign_low_pass=of_sign_alone)
         derivatives = noise_of_derivatives(step, replace(timeline, low_pass=of_sign_alone))
