@@ -39,7 +39,7 @@ OFFSETS = ("sensors.set=full", "sensors.offsets={contact_force: log}")
 SGD = "estimator={name: sgd, ridge: 0.1, training: {epochs: 2, batch_size: 64}}"
 ESTIMATORS = {
     "least squares": ("estimator.ridge=0.01", "preprocessing.cutoff_hz=8"),
-    "auto, in blocks": ("estimator.ridge=auto", "preprocessing.cutoff_hz=24", "preprocessing.memory_gb=0.0001"),
+    "auto, in blocks": ("estimator.ridge=auto", "preprocessing.cutoff_hz=20", "preprocessing.memory_gb=0.0001"),
     "consistent": ("estimator.name=consistent",),
     "offsets": ("sensors={set: full, offsets: {contact_force: log}}", "preprocessing.contact_margin_s=0.01"),
     "robust": ("estimator.robust=huber", "actuators.armature=true"),

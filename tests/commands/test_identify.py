@@ -137,7 +137,7 @@ def test_metrics_json_says_what_each_log_contact_state_and_sensor_adds(run: Path
     values = found["singular_values"]
     assert values[0] / values[metrics["rank"] - 1] == pytest.approx(metrics["condition_number"])
     assert found["condition_number"] == metrics["condition_number"]
-    assert found["oversampling"] == pytest.approx(100.0 / 2.0 / (0.754 * 8.0), rel=0.01)  # 100 Hz, Bessel of 8 Hz
+    assert found["oversampling"] == pytest.approx(100.0 / 2.0 / (0.898 * 8.0), rel=0.01)  # 100 Hz, filtered at 8 Hz
     (log,) = found["logs"]
     assert (Path(log["name"]).name, log["samples"], log["rank"], log["rank_lost"]) == ("sway_train.npz", 1250, 118, 118)
     assert log["bits"] == pytest.approx(found["bits"])

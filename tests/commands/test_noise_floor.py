@@ -27,8 +27,8 @@ def test_a_run_gives_the_noise_beside_its_errors(tmp_path: Path, capsys: pytest.
     demo, run = shortened_demo(tmp_path / "demo", 400), tmp_path / "run"
     assert main(["identify", "--verbose", str(demo / "quadruped.yaml"), f"output={run}"]) == 0
     found, printed = floors(run), capsys.readouterr().out
-    assert 0.055 < found["test"]["joint_torque"] < 0.075  # 0.1 N m and 0.5 N at 0.3 m, of which the filter leaves 0.35
-    assert found["train"]["projected_residual"] == pytest.approx(0.347, abs=0.003)
+    assert 0.06 < found["test"]["joint_torque"] < 0.08  # 0.1 N m and 0.5 N at 0.3 m, of which the filter leaves 0.38
+    assert found["train"]["projected_residual"] == pytest.approx(0.38, abs=0.01)
     for value in (found["train"]["base_force"], found["test"]["base_moment"]):
         assert f"{value:.4g}" in printed
     assert printed.count("│   noise alone") == 4

@@ -205,7 +205,7 @@ def test_of_long_training_logs_every_kth_sample_is_scored(
     assert Scorer(evaluation, builder).scored(independent) == (1, len(log)), "of a log without filter all"
     monkeypatch.setattr("torchid.fitting.cross_validation.ENOUGH_SCORED", 1)
     step = Scorer(evaluation, builder).scored(blocks)[0]
-    assert step == int(log.oversampling) == 8, "the filter's band is left"
+    assert step == int(log.oversampling) == 6, "the filter's band is left"
 
     def metrics(of: TrainingScore) -> list[Metrics]:
         assert of.cross_validation is not None

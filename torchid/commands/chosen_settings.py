@@ -32,7 +32,6 @@ from torchid.fitting.separable import (
 from torchid.logs import Log
 from torchid.logs.cutoff import CutoffChoice, choose_cutoff
 from torchid.logs.dry_friction import dry_friction_by_setting, with_sign_filter
-from torchid.logs.flags import contacts_change
 from torchid.logs.log import FloatArray
 from torchid.logs.preprocess import lacks_derivatives, make_timeline
 from torchid.logs.read import files_of_recordings_kept
@@ -249,9 +248,9 @@ class WidthReader(LogReader):
     def _preprocessed(self, clean: Log) -> Log:
         log, settings = super()._preprocessed(clean), self.setup.config.preprocessing
         if settings.base_motion is None:
-            rates, has_steps = (settings.filter_hz, settings.sample_rate_hz), contacts_change(clean.contact_active)
+            rates = settings.filter_hz, settings.sample_rate_hz
             with about_file(log.source):
-                timeline = make_timeline(clean.time, lacks_derivatives(clean), *rates, has_steps=has_steps)
+                timeline = make_timeline(clean.time, lacks_derivatives(clean), *rates)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", TorchidWarning)  # said where the log was read
                 filtered = timeline and with_sign_filter(timeline, clean, log.motion_noise or SignalNoise({}))

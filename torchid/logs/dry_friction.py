@@ -137,8 +137,6 @@ def with_sign_filter(
 ) -> Timeline:
     """A timeline of a log, or of one whose start this is, with the filter of `wider_low_pass` and the noise behind it.
 
-    Else with one that is flat below the cutoff: Bessel's moves the instants at which a velocity reverses.
-
     Where joints at rest are to be found, with the velocity that they have at most: a tenth of the root mean square, as
     in `resting_share`, or three standard deviations of noise.
 
@@ -154,25 +152,21 @@ def with_sign_filter(
     Warns:
         TorchidWarning: the timeline's own filter takes off much of the joints' motion.
     """
-    wider, derivatives, cutoff = wider_low_pass(log, timeline), noise.derivatives, timeline.cutoff_hz
-    if wider is not None and wider.lost > _MUCH:
-        with about_file(log.source):
-            warn_about_file(f"joints move faster than the filter lets through: {wider}")
-    step, of_sign_alone = float(np.median(np.diff(log.time))), None if wider is None else wider.low_pass
-    if wider is None and cutoff is not None and timeline.low_pass is not None and not timeline.low_pass.is_flat:
-        of_sign_alone = LowPass.butterworth(
-            cutoff, float(np.median(np.diff(log.time[:MOST_SAMPLES])))
-        )  # as a wider one
-    if of_sign_alone is not None:
-        timeline = replace(timeline, sign_low_pass=of_sign_alone)
-        derivatives = noise_of_derivatives(step, replace(timeline, low_pass=of_sign_alone))
+    wider, derivatives = wider_low_pass(log, timeline), noise.derivatives
+    if wider is not None:
+        if wider.lost > _MUCH:
+            with about_file(log.source):
+                warn_about_file(f"joints move faster than the filter lets through: {wider}")
+        timeline = replace(timeline, sign_low_pass=wider.low_pass)
+        step = float(np.median(np.diff(log.time)))
+        derivatives = noise_of_derivatives(step, replace(timeline, low_pass=wider.low_pass))
     name, order = ("joint_position", 1) if log.joint_velocity is None else ("joint_velocity", 0)
     std, none = noise.std.get(name), np.zeros(len(log.joint_names))
     is_noisy = std is not None and bool(std.any()) and timeline.cutoff_hz is not None
     if not (is_noisy or timeline.finds_rest):
         return timeline
     of_sign = (none if std is None else std) * np.sqrt(derivatives[order, order])
-    of_position, noisy = noise.std.get("joint_position", none), of_sign > 0.0
+    of_position, step, noisy = noise.std.get("joint_position", none), float(np.median(np.diff(log.time))), of_sign > 0.0
     ratio = float(np.median(of_position[noisy] / of_sign[noisy])) if noisy.any() else 0.0
     lag = max(1, round(np.sqrt(2.0) * ratio / step))
     square = mean_square_velocity([(log.time, log.joint_position)] if parts is None else parts, lag)
@@ -245,7 +239,7 @@ class WiderLowPass:
 def wider_low_pass(log: Log, timeline: Timeline) -> WiderLowPass | None:
     """The filter of velocities that leaves their least error, of motion that is lost and noise that is left together.
 
-    None for one that is flat below the timeline's cutoff, unless a wider one is clearly better.
+    None for that of the timeline, unless a wider one is clearly better.
 
     Source: Stein's unbiased estimate of the risk (Annals of Statistics 9, 1981), of a linear filter; the noise is
     whatever is not smooth from sample to sample, quantization included, so that it is rather too large.
@@ -271,8 +265,8 @@ def wider_low_pass(log: Log, timeline: Timeline) -> WiderLowPass | None:
         values = np.diff(values, axis=0) / step
         correlation = correlation[0] / step**2 * np.array([2.0, -1.0])
     cutoffs = [cutoff * 2.0**k for k in range(1, _DOUBLINGS) if cutoff * 2.0**k < _WIDEST / step]
-    own, *wider = (LowPass.butterworth(one, step) for one in (cutoff, *cutoffs))
-    first, *errors = (_error(one, values, correlation) for one in [own, *wider])
+    wider = [LowPass.butterworth(one, step) for one in cutoffs]
+    first, *errors = (_error(one, values, correlation) for one in [low_pass, *wider])
     power = float(np.square(values).mean(axis=0).sum())
     best = int(np.argmin([first, *errors])) - 1
     if best < 0 or first - errors[best] <= _EVIDENT * power:

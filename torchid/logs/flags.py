@@ -27,11 +27,6 @@ class ContactThreshold:
     shortest_s: NotNegative = 0.0
 
 
-def contacts_change(active: BoolArray | None) -> bool:
-    """Whether any of some contacts, (N, C), stands in one sample and not in another; None: no contacts are known."""
-    return active is not None and bool((active[1:] != active[:-1]).any())
-
-
 def with_flags_by_force(log: Log, settings: ContactThreshold) -> tuple[Log, BoolArray]:
     """The log with flags by what its contacts carry in the place of what it has, and where they are certain.
 

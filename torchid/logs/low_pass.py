@@ -11,7 +11,7 @@ import numpy as np
 
 from torchid.logs.log import FloatArray
 
-#: Order of the filters, which run forward and backward: the gain at the cutoff is 1/2.
+#: Order of the Butterworth filter, which runs forward and backward: the gain at the cutoff is 1/2.
 FILTER_ORDER = 4
 #: Periods of the cutoff that are dropped at each end of a filtered log. The filter does not know what came before, and
 #: its error on an acceleration is 5 % of that signal's rms after 1 period, 2 to 3 % after 1.5, under 1 % after 2
@@ -38,28 +38,17 @@ def import_signal() -> ModuleType:
 
 @dataclass(frozen=True, eq=False)
 class LowPass:
-    """A zero-phase filter: the second-order sections of one pass, and how many samples each end is extended by.
-
-    `is_flat`: below its cutoff, so that it moves no zeros of a velocity.
-    """
+    """A zero-phase filter: the second-order sections of one pass, and how many samples each end is extended by."""
 
     sections: FloatArray
     padding: int
-    is_flat: bool = True
 
     @classmethod
     @cache  # takes 1 ms, and a log is filtered by the same ones over and over
     def butterworth(cls, cutoff_hz: float, step: float) -> LowPass:
-        """A Butterworth filter of that cutoff [Hz], for samples at steps of so many seconds: flat below the cutoff."""
+        """A Butterworth filter of that cutoff [Hz], for samples at steps of so many seconds."""
         sections = import_signal().butter(FILTER_ORDER, cutoff_hz, fs=1.0 / step, output="sos")
-        return cls(sections, _padding(cutoff_hz, step))
-
-    @classmethod
-    @cache
-    def bessel(cls, cutoff_hz: float, step: float) -> LowPass:
-        """A Bessel filter, arguments as of `butterworth`: of a step it leaves 0.03 % beyond 1/cutoff, that one 2 %."""
-        sections = import_signal().bessel(FILTER_ORDER, cutoff_hz, fs=1.0 / step, output="sos", norm="mag")
-        return cls(sections, _padding(cutoff_hz, step), is_flat=False)
+        return cls(sections, padding=max(15, math.ceil(1.0 / (cutoff_hz * step))))
 
     def __call__(self, values: FloatArray) -> FloatArray:
         """Filter every channel of uniformly sampled values (M, ...) forward and backward, M above the padding."""
@@ -95,10 +84,6 @@ class LowPass:
         """By how much amplitudes change at frequencies (K,) [1/samples], in both passes together."""
         _, response = import_signal().sosfreqz(self.sections, worN=2.0 * np.pi * cycles)
         return np.asarray(np.square(np.abs(response)))
-
-
-def _padding(cutoff_hz: float, step: float) -> int:
-    return max(15, math.ceil(1.0 / (cutoff_hz * step)))
 
 
 @cache  # takes 20 ms, and logs, or segments of one, mostly have one filter

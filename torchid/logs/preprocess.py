@@ -11,7 +11,6 @@ import numpy as np
 
 from torchid.errors import InputError, LogError, about_file
 from torchid.logs.dry_friction import channels_together, dry_friction, with_sign_filter
-from torchid.logs.flags import contacts_change
 from torchid.logs.gaps import Coverage, measure_coverage, require_no_turns, warn_of_gaps
 from torchid.logs.log import (
     CONTACT_READINGS,
@@ -57,9 +56,8 @@ def preprocess(
     angular ones from the quaternion's components (never through Euler angles). `base_linear_velocity_world` stays
     None where the log gives neither it nor a position: nothing but the acceleration enters the equations of motion.
 
-    The filter is a low-pass of order 4 run forward and backward (no lag, gain 1/2 at the cutoff) on every channel, on a
-    uniform grid: jittered time stamps are first interpolated to their median rate. It is Butterworth's, but Bessel's
-    where contacts change: forces that begin and end at once ring behind the first. Filtered logs lose
+    The filter is a Butterworth low-pass of order 4 run forward and backward (no lag, gain 1/2 at the cutoff) on every
+    channel, on a uniform grid: jittered time stamps are first interpolated to their median rate. Filtered logs lose
     2/cutoff_hz seconds at each end; logs differentiated without a filter lose 2 samples at each end, where the
     spline multiplies noise. `noise_bandwidth_hz` of a filtered log is the filter's equivalent noise bandwidth.
 
@@ -98,8 +96,7 @@ def preprocess(
     """
     with about_file(log.source):
         dry = sign_width, stribeck, finds_rest
-        has_steps = contacts_change(log.contact_active)
-        timeline = make_timeline(log.time, lacks_derivatives(log), cutoff_hz, sample_rate_hz, *dry, has_steps)
+        timeline = make_timeline(log.time, lacks_derivatives(log), cutoff_hz, sample_rate_hz, *dry)
     noise = log.motion_noise or signal_noise(log, timeline, motion_noise)
     if timeline is None:
         return replace(log, motion_noise=noise) if noise.found else log
@@ -122,12 +119,11 @@ def make_timeline(
     sign_width: float | None = None,
     stribeck: float | None = None,
     finds_rest: bool = False,
-    has_steps: bool = False,
 ) -> Timeline | None:
     """The timeline of `preprocess`; None where nothing has to be done. Raises and warns as `lay_out_timeline`."""
     if cutoff_hz is None and sample_rate_hz in (None, AUTO) and not (differentiates or finds_rest):
         return None
-    timeline = lay_out_timeline(time, cutoff_hz, sample_rate_hz, differentiates, has_steps)
+    timeline = lay_out_timeline(time, cutoff_hz, sample_rate_hz, differentiates)
     return replace(timeline, sign_width=sign_width, stribeck=stribeck, finds_rest=finds_rest)
 
 

@@ -11,7 +11,6 @@ import numpy as np
 
 from torchid.errors import LogError, about_file
 from torchid.logs.dry_friction import with_sign_filter, with_signs_of
-from torchid.logs.flags import contacts_change
 from torchid.logs.gaps import measure_coverage, warn_of_gaps
 from torchid.logs.log import BoolArray, FloatArray, Log
 from torchid.logs.low_pass import DROPPED_PERIODS
@@ -55,7 +54,7 @@ def preprocess_segments(
     Warns:
         TorchidWarning: as `preprocess`.
     """
-    rates = cutoff_hz, sample_rate_hz, sign_width, stribeck, finds_rest, contacts_change(log.contact_active)
+    rates = cutoff_hz, sample_rate_hz, sign_width, stribeck, finds_rest
     with about_file(log.source):
         whole = make_timeline(log.time, lacks_derivatives(log), *rates)
         if whole is None:

@@ -249,11 +249,7 @@ SampleRate: TypeAlias = float | Literal["auto"] | None
 
 
 def lay_out_timeline(
-    time: FloatArray,
-    cutoff_hz: float | None,
-    sample_rate_hz: SampleRate,
-    differentiates: bool,
-    has_steps: bool = False,
+    time: FloatArray, cutoff_hz: float | None, sample_rate_hz: SampleRate, differentiates: bool
 ) -> Timeline:
     """Lay out the stamps of a log that is filtered, resampled or differentiated.
 
@@ -263,7 +259,6 @@ def lay_out_timeline(
         sample_rate_hz: output's sample rate [Hz]; auto, the least that is `LOSSLESS_RATE` cutoffs and keeps every k-th
             sample, all without a filter; None for the log's own.
         differentiates: whether a derivative is missing in the log.
-        has_steps: whether contacts change, and with them forces, at once: a Bessel filter spreads them least.
 
     Raises:
         InputError: the cutoff or the sample rate does not suit the log.
@@ -284,7 +279,7 @@ def lay_out_timeline(
         _check_rate("cutoff_hz", cutoff_hz, 0.5 / step, f"half the log's median sample rate{unit}")
         if np.max(np.abs(np.diff(native) - step)) > JITTER * step:
             grid = step * np.arange(math.floor(native[-1] / step + JITTER) + 1)
-        low_pass = (LowPass.bessel if has_steps else LowPass.butterworth)(cutoff_hz, step)
+        low_pass = LowPass.butterworth(cutoff_hz, step)
         kept = _unspoiled(grid, step, cutoff_hz, low_pass.padding)
     output = None
     if sample_rate_hz == AUTO:

@@ -42,7 +42,7 @@ NOT_IN_SAMPLES = ("memory_gb", "cache_gb")
 RecordedWarning = tuple[type[Warning], str]
 """Class and text of a warning."""
 
-_SAMPLES_FORMAT = 4  # of entries
+_SAMPLES_FORMAT = 3  # of entries
 _BASE = "base."  # before the names of tensors of the base's motion
 
 
@@ -181,7 +181,7 @@ def _stored_categories() -> list[type[Warning]]:
     return out
 
 
-_FACTORS_FORMAT = 4  # of entries
+_FACTORS_FORMAT = 3  # of entries
 _PARTS = TypeAdapter(list[PackedPart])
 
 

@@ -21,10 +21,9 @@ from torchid.errors import LogError, about_file
 from torchid.logs import Columns, Log
 from torchid.logs.blocks import GIGABYTE, LogBlocks, bridge_in_blocks, count_samples_from, open_log_blocks
 from torchid.logs.dry_friction import with_sign_filter, with_signs_of
-from torchid.logs.flags import contacts_change
 from torchid.logs.gaps import Coverage, warn_of_gaps
 from torchid.logs.lazy_arrays import Filled, MappedPages, Spill, growing_array
-from torchid.logs.log import CONTACT_READINGS, NORMALS, BoolArray, FloatArray
+from torchid.logs.log import CONTACT_READINGS, NORMALS, BoolArray
 from torchid.logs.preprocess import (
     away_from_changes,
     away_from_stamps,
@@ -195,49 +194,40 @@ class LargeLog:
 
     def _in_segments(self, derived: _Derived, with_unloaded: bool) -> SegmentedLog:
         """What of a log must be known before its blocks can be worked on, which takes a pass or two over it."""
-        blocks, standing = derived.blocks, derived.standing
+        blocks, settings, standing = derived.blocks, self.settings, derived.standing
         chosen = [slice(0, len(blocks))] if standing is None else standing.segments
         longest = max(chosen, key=lambda segment: segment.stop - segment.start)
         start = blocks if standing is None else blocks.part(longest)
         first = start.read(slice(0, min(len(start), MOST_SAMPLES)))
-        contacts = None if first.contact_active is None else contacts_alone(blocks, partial(self._pieces, blocks))
-        layout = partial(self._timeline, has_steps=contacts is not None and contacts_change(contacts.contact_active))
-        whole = layout(blocks.time, lacks_derivatives(first))
+        rates = settings.filter_hz, settings.sample_rate_hz, self.sign_width, self.stribeck, self.finds_rest
+        whole = make_timeline(blocks.time, lacks_derivatives(first), *rates)
         noise = signal_noise(first, whole, self.motion_noise if standing is None else {})
         read = partial(start.read, only=("joint_position",))
         parts = ((start.time[piece], read(piece).joint_position) for piece in self._pieces(start, len(start)))
         whole = whole and with_sign_filter(whole, first, noise, parts)
         coverage = {} if whole is None else self._coverage(blocks, first, whole)
+        contacts = None if first.contact_active is None else contacts_alone(blocks, partial(self._pieces, blocks))
         air = None if contacts is None or not with_unloaded else in_the_air(contacts)
         if standing is None or whole is None:
             segments: tuple[Segment, ...] = (Segment(blocks, whole, 0, air),)
         else:
-            segments = self._segments(blocks, standing, whole, air, layout)
+            segments = self._segments(blocks, standing, whole, air)
         time = np.concatenate([segment.time for segment in segments])
         segmented = SegmentedLog(segments, coverage, time, noise=noise)
         return (
             segmented if contacts is None else replace(segmented, kept=self._kept(segmented, contacts, derived.certain))
         )
 
-    def _timeline(self, time: FloatArray, differentiates: bool, has_steps: bool) -> Timeline | None:
-        """As `make_timeline`, by the settings."""
-        settings, dry = self.settings, (self.sign_width, self.stribeck, self.finds_rest)
-        return make_timeline(time, differentiates, settings.filter_hz, settings.sample_rate_hz, *dry, has_steps)
-
     def _segments(
-        self,
-        blocks: LogBlocks,
-        standing: PoseSegments,
-        whole: Timeline,
-        air: BoolArray | None,
-        layout: Callable[[FloatArray, bool], Timeline | None],
+        self, blocks: LogBlocks, standing: PoseSegments, whole: Timeline, air: BoolArray | None
     ) -> tuple[Segment, ...]:
         """The segments of a log with a pose that are long enough, each with its timeline; warns of the others."""
-        out, first = list[Segment](), 0
+        out, first, settings = list[Segment](), 0, self.settings
         usable = long_segments(blocks.time, standing.segments, whole)
         for segment in usable:
             part = blocks.part(segment)
-            timeline = layout(part.time, True)
+            rates = settings.filter_hz, settings.sample_rate_hz, self.sign_width, self.stribeck, self.finds_rest
+            timeline = make_timeline(part.time, True, *rates)
             if timeline is not None:
                 timeline = with_signs_of(timeline, whole)
             out.append(Segment(part, timeline, first, None if air is None else air[segment]))
