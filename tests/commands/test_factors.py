@@ -52,7 +52,8 @@ def assert_same(logs: Identification, factors: Identification) -> None:
     assert one.rank == other.rank
     assert one.rows == other.rows
     assert [x.extra.label for x in logs.extras] == [x.extra.label for x in factors.extras]
-    assert all(abs(x.value - y.value) < SAME * x.extra.size for x, y in zip(logs.extras, factors.extras, strict=True))
+    for x, y in zip(logs.extras, factors.extras, strict=True):  # rounding grows as errors do by what confounds them
+        assert abs(x.value - y.value) < SAME * x.extra.size * max(x.inflation, 1.0), x.extra.label
     assert logs.validation is not None
     assert factors.validation is not None
     assert logs.validation.folds == factors.validation.folds > 1
