@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -24,8 +25,7 @@ from torchid.parallel import one_thread
 from torchid.parameters import Array
 from torchid.problem import Batch, LinearProblem, MiniBatches
 
-_BLOCKS, _EVERY = 20, 4  # blocks of samples; one in four is held out to choose the weight of a residual module
-_FEWEST = 2  # blocks for a standard error
+_BLOCKS, _EVERY, _FEWEST = 20, 4, 2  # of samples; one of how many is held out to weigh a residual module; for an error
 _SMALLER = "a smaller lr"
 _BETTER = 1e-5  # least relative decrease that counts as an improvement
 _DIVERGED = 1e6  # times the loss at the nominal parameters, or that of the stated noise if that is larger
@@ -75,8 +75,8 @@ class SgdEstimate(ConstrainedEstimate):
     residual: ResidualEffect | None
 
     def _headline(self) -> str:
-        from_least = "" if self.unconstrained is None else f", {self.deviation:.2g} standard errors from least squares"
-        return f"{super()._headline()}{from_least}"
+        off = "" if self.unconstrained is None else f", {self.deviation:.2g} standard errors from least squares"
+        return super()._headline() + off
 
 
 class Trainer:
@@ -190,7 +190,7 @@ class Trainer:
         with np.errstate(over="ignore", invalid="ignore"):
             self._require_converging(self._objective(phi))  # after the last step: losses are those before it
         self._require_converging(0.0 if held_out is None else held_out)
-        if not all(bool(x.isfinite().all()) for group in self._trained for x in group):
+        if not all(bool(x.isfinite().all()) for x in chain(*self._trained)):
             self._require_converging(float("nan"))  # of a module, in the last step
         self._unfreeze()
         step_schedule(self.schedule, losses["total"] if held_out is None else held_out)
@@ -346,16 +346,13 @@ class Trainer:
 
     def _unfreeze(self) -> None:
         """Unfreeze all: another trainer may use the residual module next."""
-        for group in self._trained:
-            for x in group:
-                x.requires_grad_(True)
+        for x in chain(*self._trained):
+            x.requires_grad_(True)
 
     def _require_converging(self, loss: float) -> None:
         if not loss <= _DIVERGED * max(1.0, self.problem.cost(self.problem.nominal) / max(self.problem.rows, 1)):
-            rate = float(self.optimizer.param_groups[0]["lr"])
-            found = (
-                f"a loss of {loss:.3g} in epoch {self.epoch}, with {self.settings.optimizer['name']} at lr {rate:.3g}"
-            )
+            name, rate = self.settings.optimizer["name"], float(self.optimizer.param_groups[0]["lr"])
+            found = f"a loss of {loss:.3g} in epoch {self.epoch}, with {name} at lr {rate:.3g}"
             raise InputError("estimator", "training", found, _SMALLER)
 
     def _steps(self) -> Iterator[tuple[Callable[[], Iterable[tuple[Batch, int]]], int]]:
@@ -378,7 +375,7 @@ class Trainer:
                 (share * part.total()).backward()
                 terms = terms.plus(part, share)
             if self.batches.share[1] > 1:
-                terms = add_up(terms, [x for group in self._trained for x in group])
+                terms = add_up(terms, list(chain(*self._trained)))
             if not OPTIMIZERS[self.settings.optimizer["name"]].full_batch:
                 for group in self.optimizer.param_groups:
                     nn.utils.clip_grad_norm_(group["params"], self.settings.clip)
@@ -394,11 +391,10 @@ class Trainer:
 
 
 def _learnable(settings: Sgd, problem: LinearProblem) -> LearnableParameters:
-    learnable: LearnableParameters = FreeParameters(problem)
-    damping = settings.damping
+    learnable: LearnableParameters
     if settings.consistency == "log_cholesky":
-        learnable = LogCholeskyParameters(problem, settings.margin)
+        learnable, damping = LogCholeskyParameters(problem, settings.margin), settings.damping
     else:
-        damping += settings.penalties.curvature
+        learnable, damping = FreeParameters(problem), settings.damping + settings.penalties.curvature
     learnable.precondition(problem, settings.ridge, damping)
     return learnable
