@@ -315,12 +315,8 @@ def check_limb_sensors(
 
 def _contacts_beyond(robot: Robot, contacts: Sequence[Contact], name: str) -> list[int]:
     """Numbers of the contacts on bodies beyond a sensor."""
-
-    def is_beyond(body: int) -> bool:
-        joint = robot.bodies[body].joint
-        return joint is not None and (joint.name == name or is_beyond(robot.bodies[body].parent))
-
-    return [number for number, contact in enumerate(contacts) if is_beyond(robot.links[contact.frame][0])]
+    above = ([robot.bodies[x].joint for x in robot.bodies_to(robot.links[contact.frame][0])] for contact in contacts)
+    return [number for number, joints in enumerate(above) if any(x is not None and x.name == name for x in joints)]
 
 
 def _turned_sensor(measured: FloatArray, model: FloatArray) -> str | None:

@@ -174,12 +174,7 @@ def same_poses(log: Log, other: Log, robot: Robot, links: Sequence[str]) -> bool
     """Whether some links have the same poses in the base in two logs: joints beside or beyond them do not count."""
     if log.joint_position is other.joint_position and log.joint_names == other.joint_names:
         return True
-    moved = set[int]()
-    for link in links:
-        body = robot.links[link][0] if link in robot.links else 0
-        while body > 0:
-            moved.add(body - 1)
-            body = robot.bodies[body].parent
+    moved = {body - 1 for link in links if link in robot.links for body in robot.bodies_to(robot.links[link][0])}
     joints = np.unique(np.nonzero(robot.joint_map[0][sorted(moved)])[1])  # those that others follow among them
     names = [robot.joint_names[joint] for joint in joints]
     if not set(names) <= set(log.joint_names) & set(other.joint_names):

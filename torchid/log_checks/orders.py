@@ -130,20 +130,21 @@ def other_orders(names: Sequence[str], robot: Robot | None) -> Iterator[tuple[st
 
 def joints_of_limb(robot: Robot, frame: str) -> list[str]:
     """The joints between the base and a link, from the base on."""
-    body, found = robot.links[frame][0], list[str]()
-    while body > 0:
-        joint = robot.bodies[body].joint
-        found += [] if joint is None else [joint.name]
-        body = robot.bodies[body].parent
-    return found[::-1]
+    joints = (robot.bodies[body].joint for body in robot.bodies_to(robot.links[frame][0]))
+    return [joint.name for joint in joints if joint is not None]
 
 
 def exchanged_pairs(names: Sequence[str], some: Collection[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
     """The names with any two exchanged, one of them at least among `some`."""
     for one, other in itertools.combinations(names, 2):
         if one in some or other in some:
-            partner = {one: other, other: one}
-            yield f"{one} and {other} exchanged", tuple(partner.get(name, name) for name in names)
+            yield _with_exchanged(names, one, other)
+
+
+def _with_exchanged(names: Sequence[str], one: str, other: str) -> tuple[str, tuple[str, ...]]:
+    """The names with two exchanged, and what is."""
+    partner = {one: other, other: one}
+    return f"{one} and {other} exchanged", tuple(partner.get(name, name) for name in names)
 
 
 def exchanged_in_limbs(names: Sequence[str], robot: Robot | None) -> Iterator[tuple[str, tuple[str, ...]]]:
@@ -156,7 +157,5 @@ def exchanged_in_limbs(names: Sequence[str], robot: Robot | None) -> Iterator[tu
             joint = robot.bodies[above].joint
             if joint is not None and joint.name in names:
                 apart += 1
-                partner = {body.joint.name: joint.name, joint.name: body.joint.name}
-                permuted = tuple(partner.get(name, name) for name in names)
-                yield f"{joint.name} and {body.joint.name} exchanged", permuted
+                yield _with_exchanged(names, joint.name, body.joint.name)
             above = robot.bodies[above].parent

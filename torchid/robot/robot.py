@@ -175,6 +175,14 @@ class Robot:
             for parent in range(len(self.bodies))
         )
 
+    def bodies_to(self, body: int) -> list[int]:
+        """Bodies from the base on, without it, to one, which is the last."""
+        found = list[int]()
+        while body > 0:
+            found.append(body)
+            body = self.bodies[body].parent
+        return found[::-1]
+
     @property
     def massless(self) -> tuple[str, ...]:
         """Bodies without mass or inertia: their inertial parameters are not fitted."""
@@ -293,25 +301,23 @@ def load_robot(
             found = "none, so that its base is fixed to the world"
             raise UrdfError(path, "<freejoint>", found, "robot.fixed_base: true, or a free joint of the base's body")
     welded = weld_positions(path, joints, weld if isinstance(weld, Mapping) else dict.fromkeys(weld, 0.0))
+    by_name = {link.name: link for link in links}
     with during("reading", path):
         tree = build_tree(path, links, weld_joints(joints, welded), base_link, ft_joints)
-        by_name = {link.name: link for link in links}
         nominal = nominal_parameters(path, tree, by_name)
         massless = ~np.any(nominal[:, parameters.INERTIAL], axis=1)
         if massless.all():
             raise UrdfError(path, "<inertial>", "no link has mass", "at least one link with mass > 0")
         bodies = _bodies(tree, massless)
         _warn_of_massless_ends(path, bodies)
-        body_of = {name: body for name, (body, _) in tree.links.items()}
-        beyond = links_beyond(joints, welded, body_of, tree.names)
+        beyond = links_beyond(joints, welded, {name: body for name, (body, _) in tree.links.items()}, tree.names)
         carried = {name: link_parameters(by_name[name], tree.links[name][1]) for name in beyond}
         kinds = {joint.name: joint.type for joint in joints if joint.name in welded}
         chain = build_chain(tree)
         held, closed = (welded, carried, kinds), loops_of_file(path)
         robot = Robot(path, tree.names[0], fixed_base, bodies, tree.links, nominal, chain, *held, base_tilt)
     validate_loops([*loops, *closed], robot.links)
-    motorless = passive_joints(joints, passive, robot.joint_names)
-    return replace(robot, loops=(*loops, *closed), passive=motorless)
+    return replace(robot, loops=(*loops, *closed), passive=passive_joints(joints, passive, robot.joint_names))
 
 
 def _bodies(tree: BodyTree, massless: np.ndarray) -> tuple[Body, ...]:
