@@ -10,7 +10,7 @@ import torch
 from synthetic import UR5
 
 import torchid
-from torchid.fitting.armature import UnfittedArmature, unfitted_armature
+from torchid.fitting.armature import RotorInertia, UnfittedArmature, unfitted_armature
 from torchid.fitting.delay import UnfittedDelay
 from torchid.fitting.misfit import Misfit
 from torchid.parameters import FRICTION
@@ -43,9 +43,8 @@ def left_over(seed: int, rotor: float = 0.0, spring: float = 0.0, **terms: bool)
 def test_rotors_show_and_their_absence_or_springs_do_not(seed: int) -> None:
     found = left_over(seed, ARMATURE)
     assert found is not None
-    assert set(found.joints) >= {"elbow_joint", "wrist_1_joint", "wrist_2_joint", "wrist_3_joint"}
-    away = (np.array(found.values) - ARMATURE) / np.array(found.standard_errors)
-    assert np.abs(away).max() < 4.0
+    assert {x.joint for x in found.found} >= {"elbow_joint", "wrist_1_joint", "wrist_2_joint", "wrist_3_joint"}
+    assert max(abs(x.value - ARMATURE) / x.standard_error for x in found.found) < 4.0
     for nothing in (left_over(seed), left_over(seed, spring=SPRING)):
         assert nothing is not None
         assert not nothing.significant
@@ -53,7 +52,7 @@ def test_rotors_show_and_their_absence_or_springs_do_not(seed: int) -> None:
 
 
 def test_torques_that_are_late_and_forces_without_noise_show_no_rotors() -> None:
-    rotors = UnfittedArmature(("knee", "slide"), (0.3, 2.0), (0.01, 0.2), ("kg m^2", "kg"))
+    rotors = UnfittedArmature((RotorInertia("knee", 0.3, 0.01, "kg m^2"), RotorInertia("slide", 2.0, 0.2, "kg")))
     shown = Misfit(1.0, 1.0, None, None, (), armature=rotors)
     assert not shown.explained
     assert str(shown) == (

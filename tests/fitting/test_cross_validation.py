@@ -16,7 +16,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 import torchid
 from torchid.cli import main
 from torchid.config import load_config
-from torchid.fitting.cross_validation import RidgeChoice, Scorer, TrainingScore, fit_without_folds
+from torchid.fitting.cross_validation import RidgeChoice, Scorer, TrainingScore, calibrations_without_folds
 from torchid.fitting.experiment import Experiment, set_up, with_estimated_noise
 from torchid.logs import read_log
 from torchid.logs.preprocess import preprocess
@@ -184,7 +184,7 @@ def test_of_long_training_logs_every_kth_sample_is_scored(
     builder, evaluation = experiment.builder(experiment.sensors), experiment.evaluation()
     fitter, blocks = experiment.fitter(builder, experiment.conditions()), split_into_folds([log], builder)
     fit = fitter.fit(compress_in_blocks(blocks, builder))
-    compared, without = experiment.calibrations(fit, builder), fit_without_folds(fit, fitter)
+    compared, without = experiment.calibrations(fit, builder), calibrations_without_folds(fit, fitter)
     parts = merge_states(fit.parts, builder)
 
     def score(most: int) -> TrainingScore:

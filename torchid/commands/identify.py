@@ -25,18 +25,18 @@ from torchid.estimators import Conditions, Estimate, Violation, violations
 from torchid.estimators.conditions import term_violations
 from torchid.fitting.armature import UnfittedArmature, unfitted_armature
 from torchid.fitting.calibration import Calibration, Comparison, warn_of_confounded, warn_of_disagreement
-from torchid.fitting.cross_validation import CrossValidation, Scorer, fit_without_folds
+from torchid.fitting.cross_validation import CrossValidation, Scorer, calibrations_without_folds
 from torchid.fitting.delay import UnfittedDelay, unfitted_delay
 from torchid.fitting.factor_files import FactorFile
 from torchid.fitting.fit import Fit, LogFitter
-from torchid.fitting.misfit import misfit, resting_joints, unfitted_friction
+from torchid.fitting.misfit import Misfit, misfit, resting_joints, unfitted_friction
 from torchid.fitting.posterior import fitted_posterior
 from torchid.fitting.robust import RobustSummary, fit_robustly
 from torchid.identifiability.confounding import TotalMass
 from torchid.identifiability.contributions import Contributions, contributions
 from torchid.parallel import one_thread
 from torchid.parameters import PER_BODY, Array
-from torchid.problem import Evaluation, ExtraTerms, LinearProblem, Metrics, Samples
+from torchid.problem import Evaluation, LinearProblem, Metrics, Samples
 from torchid.problem.compressed_log import Block
 from torchid.problem.contact_state import ContactState, state_name
 from torchid.problem.metrics import LOG_SETS
@@ -133,25 +133,18 @@ def _identify(
         alone = _by_state(fitter, whole)
         added = distributed.from_first(partial(_contributions, ready, whole, problem, bars), "contributions")
     with clock("evaluate"):
-        without_folds = fit_without_folds(fit, fitter, experiment.loss)
+        without_folds = calibrations_without_folds(fit, fitter, experiment.loss)
         scorer, of_blocks = Scorer(evaluation, builder), merge_states(fit.parts, builder)
         scores = _scores(scorer, logs["test"], blocks, of_blocks, compared, without_folds, bars)
         traces = distributed.from_first(lambda: [trace_forces(evaluation, log, compared) for log in shown], "traces")
-        of_actuators = distributed.from_first(partial(_unfitted, logs["train"], fitter, experiment.terms), "actuators")
+        left = _misfit(ready, fit)
     run = Identification(
         experiment=experiment,
         estimate=fit.estimate,
         extras=fit.extras,
         noise=ready.noise,
         motion_noise=fit.assembly.noise,
-        misfit=misfit(
-            fit.estimate,
-            ready.noise,
-            blocks,
-            fit.jackknife,
-            unfitted_friction(problem, experiment.robot),
-            *of_actuators,
-        ),
+        misfit=left,
         resting=resting_joints(problem, experiment.robot, builder, logs["train"]),
         at_rest=[name for name in LOG_SETS if is_at_rest(logs[name])],
         robust=solved.robust,
@@ -180,11 +173,17 @@ def _identify(
     return replace(run, suspected=suspected_mistake(run, checked)), solved.training, begun
 
 
-def _unfitted(
-    logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms
-) -> tuple[UnfittedDelay | None, UnfittedArmature | None]:
-    """What of joints' actuators was not fitted, and shows in the logs."""
-    return unfitted_delay(logs, fitter, terms), unfitted_armature(logs, fitter, terms)
+def _misfit(ready: PreparedData, fit: Fit) -> Misfit:
+    """What a fit leaves of the forces, and what of joints' friction and actuators was not fitted."""
+    experiment, train = ready.experiment, ready.logs["train"]
+
+    def unfitted() -> tuple[UnfittedDelay | None, UnfittedArmature | None]:
+        found = train, ready.fitter, experiment.terms
+        return unfitted_delay(*found), unfitted_armature(*found)
+
+    friction = unfitted_friction(fit.assembly.problem, experiment.robot)
+    actuators = distributed.from_first(unfitted, "actuators")
+    return misfit(fit.estimate, ready.noise, ready.blocks, fit.jackknife, friction, *actuators)
 
 
 def _begin_figures(ready: PreparedData, fit: Fit, forces: Sequence[ForceSeries], stack: ExitStack) -> list[Drawing]:

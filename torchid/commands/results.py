@@ -292,7 +292,7 @@ def _misfit_document(misfit: Misfit) -> dict[str, object]:
         "standard_error_growth": misfit.error_growth,
         "unfitted_delay": misfit.delay.value if misfit.delay is not None and misfit.delay.significant else None,
         "unfitted_friction": None if misfit.friction is None else misfit.friction.ratio,
-        "unfitted_armature": None if armature is None else dict(zip(armature.joints, armature.values, strict=True)),
+        "unfitted_armature": None if armature is None else {x.joint: x.value for x in armature.found},
     }
 
 

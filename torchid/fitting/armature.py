@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from torchid.errors import join_names
 from torchid.estimators import LeastSquares
@@ -17,35 +18,35 @@ _RIDGE = 1e-6  # as of a delay: the data determine some parameters badly
 _NAMED_JOINTS = 2
 
 
+class RotorInertia(NamedTuple):
+    """Reflected rotor inertia of a joint, in its unit (kg m^2, or kg of one that slides)."""
+
+    joint: str
+    value: float
+    standard_error: float
+    unit: str
+
+    def __str__(self) -> str:
+        return f"{self.joint} {self.value:.2g} ± {self.standard_error:.1g} {self.unit}"
+
+
 @dataclass(frozen=True)
 class UnfittedArmature:
     """Reflected rotor inertia beyond the robot file's that was not fitted.
 
-    Attributes:
-        joints: of which it is there for certain, those that show it most clearly first.
-        values: of it, each in its unit; `standard_errors`: of these.
-        units: kg m^2, or kg of joints that slide.
+    `found`: of joints in which it is there for certain, the clearest first.
     """
 
-    joints: tuple[str, ...]
-    values: tuple[float, ...]
-    standard_errors: tuple[float, ...]
-    units: tuple[str, ...]
+    found: tuple[RotorInertia, ...]
 
     @property
     def significant(self) -> bool:
         """Whether chance would show as much of one joint in fewer than one of ten thousand fits."""
-        return bool(self.joints)
+        return bool(self.found)
 
     def __str__(self) -> str:
         """Of which joints it is most certain, and what finds it."""
-        shown = [
-            f"{joint} {value:.2g} ± {error:.1g} {unit}"
-            for joint, value, error, unit in zip(
-                self.joints, self.values, self.standard_errors, self.units, strict=True
-            )
-        ]
-        named = join_names(shown, _NAMED_JOINTS)
+        named = join_names([str(one) for one in self.found], _NAMED_JOINTS)
         return f"torques go with accelerations as rotors would make them ({named}; actuators.armature: true)"
 
 
@@ -72,12 +73,9 @@ def unfitted_armature(logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTe
     estimator = LeastSquares(_RIDGE, rank_tolerance=fitter.estimator.rank_tolerance)
     fit = replace(fitter, builder=builder, estimator=estimator).fit(compress_in_blocks(some, builder))
     in_file = dict(zip(robot.joint_names, robot.armature.tolist(), strict=True))
-    beyond = {
-        one.extra.name: (one.value - in_file[one.extra.name], one.standard_error, one.extra.unit)
-        for one in fit.extras
-        if one.extra.what == "armature" and one.separable
-    }
-    clear = {joint: found for joint, found in beyond.items() if found[0] > _SURELY * found[1]}
-    order = sorted(clear, key=lambda joint: -clear[joint][0] / max(clear[joint][1], 1e-300))
-    values, errors, units = (tuple(clear[joint][k] for joint in order) for k in range(3))
-    return UnfittedArmature(tuple(order), values, errors, units)  # type: ignore[arg-type]
+    found = []
+    for one in fit.extras:
+        beyond = one.value - in_file.get(one.extra.name, 0.0)
+        if one.extra.what == "armature" and one.separable and beyond > _SURELY * one.standard_error:
+            found.append(RotorInertia(one.extra.name, beyond, one.standard_error, one.extra.unit))
+    return UnfittedArmature(tuple(sorted(found, key=lambda x: x.standard_error / x.value)))

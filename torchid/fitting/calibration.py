@@ -160,12 +160,15 @@ def calibrations(
         builder: of their rows.
         loss: as in `Calibration`.
     """
-    nominal = {(x.log, x.extra.label): x.nominal_value for x in fit.extras}
-    identified = {(x.log, x.extra.label): x.value for x in fit.extras}
-    return Comparison(
-        Calibration(robot=robot, builder=builder, phi=robot.nominal.flatten(), values=nominal, loss=loss),
-        Calibration(robot=robot, builder=builder, phi=fit.estimate.phi, values=identified, loss=loss),
-    )
+    return calibrations_at(fit.assembly, Minimizer(fit.estimate.phi, fit.estimate.psi), robot, builder, loss)
+
+
+def calibrations_at(
+    assembly: Assembly, minimizer: Minimizer, robot: Robot, builder: RowBuilder, loss: RobustLoss | None = None
+) -> Comparison[Calibration]:
+    """As `calibrations`, of what an estimator has found; arguments as of `calibration_at`."""
+    pair = Minimizer(assembly.problem.nominal), minimizer
+    return Comparison(*(calibration_at(assembly, one, robot, builder, loss) for one in pair))
 
 
 def calibration_at(

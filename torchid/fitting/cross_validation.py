@@ -11,7 +11,7 @@ import numpy as np
 from torchid import distributed
 from torchid.errors import LogError, TorchidWarning
 from torchid.estimators.least_squares import Minimizer
-from torchid.fitting.calibration import Calibration, Comparison, calibration_at
+from torchid.fitting.calibration import Calibration, Comparison, calibration_at, calibrations_at
 from torchid.fitting.fit import BatchEstimator, Fit, LogFitter, LogProblem
 from torchid.fitting.residual_squares import ResidualSquares, residuals_of_samples, sum_residuals, with_all_readings
 from torchid.fitting.robust import RobustLoss
@@ -97,7 +97,7 @@ def cross_validate(
     builder = fitter.builder
     blocks = split_into_folds(logs, builder)
     problem = fitter.build_problem(compress_in_folds(blocks, builder))  # scatter between blocks is not needed
-    compared = fit_without_folds(problem, fitter, loss)
+    compared = calibrations_without_folds(problem, fitter, loss)
     if not compared:
         raise _too_few(logs)
     scorer = Scorer(Evaluation(fitter.robot, builder.contacts, str(builder.device), terms), builder)
@@ -106,7 +106,7 @@ def cross_validate(
 
 
 @one_thread()
-def fit_without_folds(
+def calibrations_without_folds(
     fit: Fit | LogProblem, fitter: LogFitter, loss: RobustLoss | None = None
 ) -> list[Comparison[Calibration]]:
     """For every fold of a fit, in order, nominal parameters and those of all others; none where there is only one.
@@ -128,11 +128,8 @@ def fit_without_folds(
             assembly = fitter.assemble(rest, fit.assembly.reading_noise)
             return assembly, fitter.estimator.minimize(assembly.problem)
 
-    def at(assembly: Assembly, found: Minimizer) -> Calibration:
-        return calibration_at(assembly, found, fitter.robot, fitter.builder, loss)
-
     solved = share_between_processes(folds, without, thread_count())
-    return [Comparison(at(one, Minimizer(one.problem.nominal)), at(one, found)) for one, found in solved]
+    return [calibrations_at(assembly, found, fitter.robot, fitter.builder, loss) for assembly, found in solved]
 
 
 @one_thread()
