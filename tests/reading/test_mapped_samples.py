@@ -7,14 +7,17 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from demo import shortened_demo
 from large import tensors
+from repository import DEMO
 
 from torchid.config import load_config
 from torchid.fitting.experiment import set_up
-from torchid.problem import Samples
+from torchid.logs import preprocess, read_log
+from torchid.problem import Samples, bind_log
 from torchid.problem.chunks import map_chunks
 from torchid.problem.contact_state import ContactState
 from torchid.reading.cache import FOLDER
@@ -83,3 +86,15 @@ def test_mapped_samples_that_are_sent_to_another_process_are_in_its_memory(tmp_p
     there.pages.release()
     for name, x in tensors(there).items():
         assert torch.equal(x.nan_to_num(), tensors(log)[name].nan_to_num()), name
+
+
+def test_tensors_share_the_arrays_of_a_log_but_for_read_only_ones() -> None:
+    """Columns of a table may be read-only, which torch warns of where tensors share them."""
+    setup = set_up(load_config(DEMO / "quadruped.yaml"))
+    log = preprocess(read_log(DEMO / "sway_train.npz"))
+    fixed = replace(log, time=log.time.copy())
+    fixed.time.setflags(write=False)
+    shared, copied = (bind_log(x, setup.robot, setup.contacts) for x in (log, fixed))
+    assert np.shares_memory(shared.time.numpy(), log.time)
+    assert not np.shares_memory(copied.time.numpy(), fixed.time)
+    assert np.array_equal(copied.time.numpy(), fixed.time)

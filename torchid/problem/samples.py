@@ -224,6 +224,7 @@ def bind_log(log: Log, robot: Robot, contacts: Sequence[Contact], required: Sens
         UnknownNameError: a joint or contact that the robot does not have.
         LogError: a missing joint, contact, motion or force.
     """
+    log = _with_writable_arrays(log)
     order = joint_order(log, robot)
     position, velocity, acceleration = (_joints(log, name, order) for name in _JOINT_FIELDS)
     log_joints.require_closed_loops(log.source, position, robot)
@@ -265,6 +266,12 @@ def bind_log(log: Log, robot: Robot, contacts: Sequence[Contact], required: Sens
         log_joints.require_limb_sensors(log, robot, required)
         require_forces(samples, robot, contacts, required)
     return samples
+
+
+def _with_writable_arrays(log: Log) -> Log:
+    """The log with copies of arrays that are read-only, as columns of a table may be: tensors cannot share these."""
+    fixed = {name: x.copy() for name, x in log.arrays().items() if not x.flags.writeable}
+    return replace(log, **fixed) if fixed else log  # type: ignore[arg-type]
 
 
 def _contact_normals(
