@@ -26,11 +26,13 @@ from matplotlib.ticker import FuncFormatter
 from torchid.distributed import join_launched, leave_launched, share_work
 from torchid.report.figure_style import save_figure
 
+CASTERS = tuple(f"caster_{end}_{side}_2_link" for end in ("front", "back") for side in ("left", "right"))
 ROBOTS = (
     Case("Bolt", "bolt_description/robots/bolt.urdf", ("FL_FOOT", "FR_FOOT"), "point"),
     *CASES,
     Case("Talos", "talos_data/robots/talos_reduced.urdf", ("left_sole_link", "right_sole_link"), "flat"),
     Case("Centauro", "centauro_description/urdf/centauro.urdf", tuple(f"wheel_{k}" for k in range(1, 5)), "point"),
+    Case("TIAGo dual", "tiago_description/robots/tiago_dual.urdf", CASTERS, "point"),
 )
 
 
