@@ -255,8 +255,56 @@ def test_entities_that_multiply_are_never_expanded(tmp_path: Path) -> None:
         assert "XML: not well-formed" in refusal(path)
 
 
-def test_a_robot_without_any_mass_is_refused(tmp_path: Path) -> None:
-    assert "no link has mass" in refusal(write(tmp_path, link("base", ""), link("arm", ""), HINGE))
+def test_a_robot_without_any_mass_is_refused_with_a_guess_that_is_taken(tmp_path: Path) -> None:
+    text = refusal(write(tmp_path, link("base", ""), link("arm", ""), HINGE))
+    assert "no link has mass" in text
+    guess = text[text.index("<inertial><mass") :]
+    assert load_robot(write(tmp_path, link("base", guess), link("arm", guess), HINGE)).nominal[:, 0].tolist() == [1, 1]
+
+
+XACRO = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
+
+
+@pytest.mark.parametrize("declared", [XACRO, ""], ids=["declared", "undeclared"])
+@pytest.mark.parametrize(
+    "element",
+    ['<xacro:include filename="leg.xacro"/>', "<xacro:leg/>", f"<link name='x'><xacro:box/>{INERTIAL}</link>"],
+)
+def test_xacro_that_is_not_expanded_is_refused(tmp_path: Path, element: str, declared: str) -> None:
+    path = write(tmp_path, BASE, ARM, element, HINGE)
+    path.write_text(path.read_text().replace("<robot ", f"<robot {declared} "))
+    assert "xacro that is not expanded, in line 1; accepted: the URDF that `xacro" in refusal(path)
+
+
+def test_a_namespace_that_xacro_leaves_behind_is_no_xacro(tmp_path: Path) -> None:
+    path = write(tmp_path, *TREE, "<!-- <xacro:include/> -->")
+    path.write_text(path.read_text().replace("<robot ", f"<robot {XACRO} "))
+    assert load_robot(path).joint_names == ("elbow",)
+
+
+def floating(world: str) -> tuple[str, ...]:
+    return (world, *TREE, joint("root", "world", "base", "floating", ""))
+
+
+@pytest.mark.parametrize(
+    "world", [link("world", ""), link("world", inertial("0", **dict.fromkeys(("ixx", "iyy", "izz"), "0")))]
+)
+def test_a_root_without_mass_below_a_floating_joint_is_the_world(tmp_path: Path, world: str) -> None:
+    robot = load_robot(write(tmp_path, *floating(world)))
+    assert (robot.base_link, robot.joint_names, tuple(robot.links)) == ("base", ("elbow",), ("base", "arm"))
+    assert b'type="floating"' in identified_urdf(robot, robot.nominal)  # simulators take it for the free joint
+
+
+@pytest.mark.parametrize(
+    "elements",
+    [
+        floating(link("world")),
+        (*floating(link("world", "")), link("camera"), joint("mount", "world", "camera", "fixed")),
+    ],
+    ids=["a root with mass", "a root with another joint"],
+)
+def test_any_other_floating_joint_is_refused(tmp_path: Path, elements: tuple[str, ...]) -> None:
+    assert "joint 'root': type 'floating'" in refusal(write(tmp_path, *elements))
 
 
 def test_what_carries_no_kinematics_is_not_read(tmp_path: Path) -> None:

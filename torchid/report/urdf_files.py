@@ -40,7 +40,7 @@ def identified_urdf(robot: Robot, phi: Array, full_mesh_paths: bool = False) -> 
         TorchidWarning: inconsistent bodies, or negative friction, which simulators (and `load_robot`) refuse; meshes
             that are not found.
     """
-    tree = parse_xml(robot.path)
+    tree = parse_xml(robot.path, with_world=True)
     drop_repeated_origins(tree.getroot())
     links = {link.get("name"): link for link in tree.getroot().findall("link")}
     joints = {joint.get("name"): joint for joint in tree.getroot().findall("joint")}

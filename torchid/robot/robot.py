@@ -51,6 +51,12 @@ if TYPE_CHECKING:
     from pytorch_kinematics import Chain
 
 
+_FIRST_GUESS = (
+    "a guess in each link that moves, of its mass [kg] and of the inertia of a ball of its size [kg m^2]: <inertial>"
+    '<mass value="1"/><inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial>'
+)
+
+
 @dataclass(frozen=True)
 class Body:
     """One rigid body: a URDF link, the links welded to it, and the joint that moves it (None for the base)."""
@@ -307,7 +313,7 @@ def load_robot(
         nominal = nominal_parameters(path, tree, by_name)
         massless = ~np.any(nominal[:, parameters.INERTIAL], axis=1)
         if massless.all():
-            raise UrdfError(path, "<inertial>", "no link has mass", "at least one link with mass > 0")
+            raise UrdfError(path, "<inertial>", "no link has mass", _FIRST_GUESS)
         bodies = _bodies(tree, massless)
         _warn_of_massless_ends(path, bodies)
         beyond = links_beyond(joints, welded, {name: body for name, (body, _) in tree.links.items()}, tree.names)

@@ -39,8 +39,13 @@ _NUMBERS = {"xyz": 3, "rpy": 3} | dict.fromkeys(_SCALARS, 1)  # count of numbers
 _DECIMAL = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|inf(inity)?|nan)", re.ASCII | re.IGNORECASE)
 
 
-def parse_xml(path: Path) -> etree._ElementTree:
+def parse_xml(path: Path, with_world: bool = False) -> etree._ElementTree:
     """The XML tree of a URDF, or the one that says the same as an MJCF file, see `torchid.robot.mjcf`.
+
+    Args:
+        path: the file.
+        with_world: whether a URDF keeps a link without mass whose only joint is a floating one to its child, and that
+            joint: they are the world, not the robot.
 
     Raises:
         UrdfError: the file is missing, or is neither; or an MJCF robot is refused.
@@ -48,10 +53,26 @@ def parse_xml(path: Path) -> etree._ElementTree:
     """
     tree = read_xml(path)
     if tree.getroot().tag != "mujoco":
+        if not with_world:
+            _drop_world(tree.getroot())
         return tree
     from torchid.robot.mjcf import urdf_document  # needs an extra
 
     return urdf_document(path)
+
+
+def _drop_world(root: etree._Element) -> None:
+    """Drop a link without mass whose only joint is a floating one to its child, and that joint."""
+    ends = Counter(end.get("link") for end in root.iterfind("joint/*") if end.tag in ("parent", "child"))
+    for joint in root.findall("joint[@type='floating']"):
+        parent = joint.find("parent")
+        name = None if parent is None else parent.get("link")
+        link = next((link for link in root.findall("link") if link.get("name") == name), None)
+        if link is None or ends[name] > 1:
+            continue
+        if not any(mass.get("value", "").strip("+-.0 ") for mass in link.iterfind("inertial/mass")):
+            root.remove(link)
+            root.remove(joint)
 
 
 def has_fixed_base(path: Path) -> bool:
@@ -107,7 +128,7 @@ def read_urdf(path: Path) -> tuple[list[Link], list[TreeJoint]]:
     Raises:
         UrdfError: names missing or duplicate, references broken, joint types other than revolute, continuous,
             prismatic and fixed, numbers missing, not finite or beyond `MAX_NUMBER`, mass negative, more than
-            `MAX_LINKS` links.
+            `MAX_LINKS` links, xacro that is not expanded.
     """
     root = _read_elements(path)
     _check_names(path, root)
@@ -129,7 +150,8 @@ def read_urdf(path: Path) -> tuple[list[Link], list[TreeJoint]]:
 
 def _read_elements(path: Path) -> etree._Element:
     """The URDF's XML, reduced to the elements in `_KEPT`."""
-    drop_prefixed(root := parse_xml(path).getroot())
+    _refuse_xacro(path, root := parse_xml(path).getroot())
+    drop_prefixed(root)
     for tag in ("link", "joint"):
         count = len(root.findall(tag))
         if count > MAX_LINKS:
@@ -141,6 +163,15 @@ def _read_elements(path: Path) -> etree._Element:
             copy = etree.SubElement(stripped, str(element.tag), dict(element.attrib))
             copy.extend([child for child in element if child.tag in kept])
     return stripped
+
+
+def _refuse_xacro(path: Path, root: etree._Element) -> None:
+    """Refuse elements of xacro, in whose place links and joints would stand."""
+    for element in root.iter(etree.Element):
+        name = f"{element.prefix}:{etree.QName(element).localname}" if element.prefix else str(element.tag)
+        if name.startswith("xacro:"):
+            found = f"xacro that is not expanded, in line {element.sourceline}"
+            raise UrdfError(path, f"<{excerpt(name)}>", found, "the URDF that `xacro FILE.urdf.xacro` prints")
 
 
 def _check_names(path: Path, root: etree._Element) -> None:
