@@ -174,6 +174,13 @@ def _redirect_to_null(stream: object) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())  # type: ignore[attr-defined]
 
 
+def open_closed_streams() -> None:
+    """Let the null device take the place of standard output and error where this process was started without them."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w", encoding="utf-8"))
+
+
 @contextmanager
 def plain_streams() -> Iterator[None]:
     """Escape control characters in all text that is written to standard output and error."""

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NoReturn, TypeAlias
 
 from torchid import __version__
-from torchid.boundary import importing, plain_streams, run_distributed, run_guarded
+from torchid.boundary import importing, open_closed_streams, plain_streams, run_distributed, run_guarded
 from torchid.commands import EXPORT_FORMATS, SAMPLE_FORMATS
 from torchid.distributed import end_process, is_launched_first, share_work
 from torchid.errors import ConfigError, during
@@ -43,6 +43,7 @@ _SHARED = ("identify", "compress", "evaluate", "analyze")
 
 def run() -> NoReturn:
     """Run the command of the command line as a process of its own, which then ends at once: in order takes 0.3 s."""
+    open_closed_streams()
     end_process(main())
 
 

@@ -25,7 +25,7 @@ from torchid.commands.folder import (
     refuse_inputs,
     require_replaceable,
 )
-from torchid.commands.manifest import MANIFEST, read_manifest
+from torchid.commands.manifest import MANIFEST, FolderKind, read_manifest
 from torchid.commands.training import Training
 from torchid.errors import ConfigError, TorchidWarning
 
@@ -296,6 +296,15 @@ def test_the_end_of_a_training_takes_and_removes_what_is_its_own(tmp_path: Path)
         training.remove_checkpoint()
     left = {"notes.txt", "events.out.tfevents.mine", "more", "more/checkpoint.pt"}
     assert set(everything(training.folder)) == left
+
+
+@pytest.mark.parametrize("kind", [RUN, TRAINING], ids=["run", "training"])
+def test_a_manifest_does_not_make_files_of_any_name_torchids(tmp_path: Path, kind: FolderKind) -> None:
+    with new_folder(folder := tmp_path / "run", kind=kind, growing=["*"]) as new:
+        write(new, {"config.yaml": "x"})
+    write(folder, {"notes.txt": "mine"})
+    with pytest.raises(ConfigError, match="holds notes.txt, which torchid did not write"):
+        require_replaceable(folder, kind)
 
 
 def test_a_training_does_not_begin_where_somebody_keeps_notes(place: Path, tmp_path: Path, server: Commands) -> None:

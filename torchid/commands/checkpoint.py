@@ -14,11 +14,10 @@ from typing import Any
 
 import torch
 
+from torchid.commands.folder import CHECKPOINT
 from torchid.config.yaml_text import check_yaml
 from torchid.errors import InputError, excerpt
 from torchid.guards import MAX_STATE, check_regular
-
-CHECKPOINT = "checkpoint.pt"
 
 _ACCEPTED = "a checkpoint that torchid wrote"
 _DIGEST = "digest"

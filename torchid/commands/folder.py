@@ -13,10 +13,10 @@ from torchid.commands.manifest import MANIFEST, FolderContents, FolderKind, insp
 from torchid.errors import ConfigError, current_file, excerpt, join_names
 from torchid.staging import CAN_LOCK, NEW, OLD, interrupts_deferred, leftovers, note_written, staging_folder, try_lock
 
-EVENTS = "events.out.tfevents*"
+CHECKPOINT, EVENTS = "checkpoint.pt", "events.out.tfevents*"
 EVALUATION = FolderKind("an evaluation", replace="--overwrite")
 RUN = FolderKind("a run", "evaluation", EVALUATION)
-TRAINING = FolderKind("a training", result=False)
+TRAINING = FolderKind("a training", result=False, growing=(CHECKPOINT, f".{CHECKPOINT}", EVENTS))
 SIMULATION = FolderKind("a simulation")
 ANALYSIS = FolderKind("an analysis")
 STUDY = FolderKind("a study")

@@ -32,6 +32,7 @@ class FolderKind:
         inner_kind: their kind.
         result: whether it is what a command answers with, not a state on the way there.
         replace: what lets its command replace one that exists: a key of the experiment file, or an option.
+        growing: patterns of names of files in it that may be written on after its manifest.
     """
 
     name: str
@@ -39,6 +40,7 @@ class FolderKind:
     inner_kind: FolderKind | None = None
     result: bool = True
     replace: str = "overwrite=true"
+    growing: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ class Manifest:
         kind: name of the kind of folder.
         folder: its name.
         files: size [bytes] and SHA-256 of each file, by its path in the folder, with slashes.
-        growing: patterns of names of files that were still being written, which have no checksum.
+        growing: patterns of names of files that were still being written, which have no checksum, if its kind has such.
     """
 
     kind: str
@@ -174,10 +176,14 @@ def _look(top: Path, relative: str, manifest: Manifest, kind: FolderKind, conten
         elif inner in manifest.files and stat.S_ISREG(mode):
             same = _is(path, *manifest.files[inner])
             contents.own.append(path) if same else contents.changed.append(excerpt(inner))
-        elif stat.S_ISREG(mode) and not relative and any(fnmatchcase(name, x) for x in manifest.growing):
+        elif stat.S_ISREG(mode) and not relative and _grows(name, manifest.growing) and _grows(name, kind.growing):
             contents.own.append(path)
         elif inner != MANIFEST:
             contents.foreign.append(excerpt(inner))
+
+
+def _grows(name: str, patterns: Sequence[str]) -> bool:
+    return any(fnmatchcase(name, pattern) for pattern in patterns)
 
 
 def _look_into(top: Path, relative: str, manifest: Manifest, kind: FolderKind, contents: FolderContents) -> None:

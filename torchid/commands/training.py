@@ -20,8 +20,9 @@ import yaml
 from rich.progress import Progress
 
 from torchid import distributed, parameters
-from torchid.commands.checkpoint import CHECKPOINT, load_checkpoint, refusing_damage, save_checkpoint
+from torchid.commands.checkpoint import load_checkpoint, refusing_damage, save_checkpoint
 from torchid.commands.folder import (
+    CHECKPOINT,
     EVENTS,
     TRAINING,
     check_free,
