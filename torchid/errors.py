@@ -67,7 +67,7 @@ class UnknownNameError(InputError, KeyError):
     def __init__(self, source: object, field: str, name: str, valid: Iterable[str], what: str = "") -> None:
         """Take the name and the valid ones; `what` describes a name that is known, but not valid here."""
         self.name, self.valid, self.what = name, tuple(valid), what
-        found = f"'{name}', {what}" if what else f"unknown name '{name}'"
+        found = f"'{name}', {what}" if what else f"unknown name '{excerpt(name)}'"
         super().__init__(source, field, found, _nearest_names(name, self.valid))
 
     def __reduce__(self) -> tuple[object, ...]:

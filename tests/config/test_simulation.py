@@ -235,5 +235,7 @@ def test_a_file_that_is_no_simulation_is_named(file: Path) -> None:
         load_simulation(file)
     with pytest.raises(ConfigError, match="accepted: a mapping with robot, feet, motions, output"):
         load(file, "- a\n- b\n")
+    with pytest.raises(ConfigError, match="YAML: text, <robot .* characters\\); accepted: a mapping with robot"):
+        load(file, f"<robot name='arm'>{'<link/>' * 9}</robot>")
     with pytest.raises(ConfigError, match=r"'feet=\[{frame: l_sole}, {frame: r_sole}\]'"):
         load(file, LEAST, "feet[0].frame=l_sole")

@@ -19,7 +19,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import TypeAdapter, ValidationError
 
-from torchid.config.yaml_text import check_text, check_yaml, explain_syntax
+from torchid.config.yaml_text import check_text, check_yaml, explain_syntax, is_one_text
 from torchid.errors import ConfigError, UnknownNameError, about_file, during, excerpt, is_plain
 from torchid.guards import MAX_DEPTH, MAX_YAML, read_bytes
 from torchid.logs import Log
@@ -143,7 +143,7 @@ def _read(kind: FileKind[T], path: Path) -> Settings:
     try:
         text = read_bytes(path, MAX_YAML).decode()
         check_yaml(text)
-        loaded = _container(OmegaConf.create(text))
+        loaded = text if is_one_text(text) else _container(OmegaConf.create(text))
     except OSError as error:
         raise ConfigError(path, "file", f"cannot be read ({error.strerror})", f"a YAML {kind.name} file") from error
     except yaml.MarkedYAMLError as error:
@@ -151,7 +151,8 @@ def _read(kind: FileKind[T], path: Path) -> Settings:
     except _NO_YAML as error:
         raise _no_settings(kind, path, f"not readable: {_why(error)}", "a YAML mapping") from error
     if not isinstance(loaded, dict):
-        raise _no_settings(kind, path, f"a {type(loaded).__name__}", f"a mapping with {kind.keys}")
+        found = f"text, {excerpt(text.strip(), 40)}" if loaded is text else "a list"
+        raise _no_settings(kind, path, found, f"a mapping with {kind.keys}")
     return loaded
 
 

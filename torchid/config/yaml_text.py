@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import islice
+
 import yaml
 
 from torchid.errors import excerpt, is_plain
@@ -68,6 +70,12 @@ def check_yaml(text: str) -> None:
             count.add(1)
             if event.anchor is not None:
                 count.anchored[event.anchor] = 1
+
+
+def is_one_text(text: str) -> bool:
+    """Whether YAML is a single text rather than a mapping or a list, as an XML file is."""
+    events = yaml.parse(text, Loader=_LOADER)
+    return isinstance(next(islice(events, 2, None), None), yaml.ScalarEvent)  # behind stream's and document's start
 
 
 def _check_tag(event: yaml.Event) -> None:
