@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -35,6 +37,25 @@ def test_a_joint_that_mimics_another_is_no_actuator(small: Robot) -> None:
     document = parameters_export(small, small.nominal, joints)["joints"]
     assert document["slide"]["armature"] == pytest.approx(0.3)
     assert set(document) == {"hinge", "slide", "branch"}
+
+
+def test_isaac_lab_keeps_what_was_not_identified(small: Robot) -> None:
+    """It takes 0 for a joint that a mapping of an actuator does not name, and the asset's value without a mapping."""
+    phi = np.zeros_like(small.nominal)
+    phi[1, parameters.VISCOUS] = 0.2
+    joints = joint_parameters(small, phi, FittedJoints({"slide": 0.0, "branch": 0.3}))
+    given: dict[str, Any] = {}
+    exec(
+        isaaclab_text(joints, "a run").replace("from isaaclab.actuators import", "ImplicitActuatorCfg = dict #"), given
+    )
+    actuators = [x for name, x in given.items() if name.startswith("IDENTIFIED_ACTUATORS")]
+    assert [x["joint_names_expr"] for x in actuators] == [["hinge"], ["slide", "branch"]]
+    assert [{k: x for k, x in one.items() if isinstance(x, dict)} for one in actuators] == [
+        {"viscous_friction": {"hinge": 0.2}},
+        {"armature": {"slide": 0.0, "branch": 0.3}},
+    ]
+    document = parameters_export(small, phi, joints)["joints"]
+    assert [x["armature"] for x in document.values()] == [None, 0.0, 0.3]
 
 
 def test_what_no_row_depends_on_is_not_exported(small: Robot) -> None:

@@ -146,6 +146,14 @@ def test_bodies_that_cannot_exist_are_counted_with_what_to_do(consistent: Identi
     assert "cannot exist" not in text(consistent)
 
 
+def test_a_file_that_simulators_refuse_is_not_said_to_be_taken(consistent: Identification) -> None:
+    phi = consistent.phi.copy()
+    phi[3, 1:10] = 0.0  # a point mass at the axis that moves it, which breaks no condition
+    said = " ".join(text(replace(consistent, estimate=replace(consistent.estimate, phi=phi.flatten()))).split())
+    assert "all 13 can exist, but simulators refuse their file: " in said
+    assert "simulators take them" not in said
+
+
 def test_a_total_mass_that_contradicts_the_urdf_needs_attention(consistent: Identification) -> None:
     assert "weigh the robot" not in text(consistent)
     light = replace(consistent, mass=replace(consistent.mass, value=0.4 * consistent.mass.nominal))

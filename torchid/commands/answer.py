@@ -165,6 +165,8 @@ def _bodies_text(run: Identification) -> str:
         ends = massless_ends(robot, run.phi)
         if ends:
             return f"all that have mass can exist; MuJoCo refuses joints that move none: {join_names(ends)}"
+        if run.refused:
+            return f"all {count} can exist, but simulators refuse their file: {run.refused}"
         return f"all {count} can exist, and simulators take them"
     which = f"{len(names)} of {count}" if names else "all together"
     advice = "; estimator.name=consistent finds the best that can" if type(run.estimate) is Estimate else ""

@@ -13,7 +13,7 @@ from torchid.config import inputs_of
 from torchid.errors import ConfigError, InputError, TorchidWarning, during, join_names, warn
 from torchid.parameters import PER_BODY, Array
 from torchid.report import FittedJoints, identified_robot, identified_urdf
-from torchid.report.robot_files import isaaclab_text, joint_parameters, parameters_export
+from torchid.report.robot_files import isaaclab_text, joint_parameters, parameters_export, refused_by_simulators
 from torchid.robot import Robot
 from torchid.robot.xml_files import is_mjcf
 from torchid.staging import atomic_file
@@ -72,18 +72,20 @@ def robot_text(form: str, robot: Robot, phi: Array, fitted: FittedJoints, folder
         most = max(joint.stribeck for joint in joints)
         warn(f"{form.upper()}: has no Stribeck friction, which {join_names(at_rest)} have, up to {most:.3g} N m (N): "
              "its friction at rest is Coulomb's alone; --format isaaclab or json says it")  # fmt: skip
+    if form == "mjcf" and not is_mjcf(robot.path):
+        return _mjcf_of_urdf(robot, phi, fitted).decode()
+    if refused := refused_by_simulators(robot, phi, fitted):
+        warn(f"{form.upper()}: simulators refuse it: {refused}")
     if form == "mjcf":
-        return _mjcf(robot, phi, fitted).decode()
+        return identified_robot(robot, phi, fitted).decode()
     lost = [joint.name for joint in joints if joint.armature]
     if lost:
         warn(f"URDF: has no armature, which {join_names(lost)} have: --format mjcf or isaaclab says it")
     return identified_urdf(robot, phi).decode()
 
 
-def _mjcf(robot: Robot, phi: Array, fitted: FittedJoints) -> bytes:
-    """The robot's MJCF file, or a model made of its URDF, with meshes if MuJoCo takes them."""
-    if is_mjcf(robot.path):
-        return identified_robot(robot, phi, fitted)
+def _mjcf_of_urdf(robot: Robot, phi: Array, fitted: FittedJoints) -> bytes:
+    """A model made of the robot's URDF, with meshes if MuJoCo takes them."""
     from torchid.report.mjcf_files import mjcf_of_urdf, require_loadable
 
     springs = fitted.springs(robot, "MJCF")

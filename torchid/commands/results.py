@@ -39,6 +39,7 @@ from torchid.problem.metrics import LOG_SETS, WorseThanNominal, describe_worse, 
 from torchid.problem.noise_gram import NoiseShares
 from torchid.report import FittedJoints, identified_name, identified_robot, identified_urdf, parameters_document
 from torchid.report.forces import ForceSeries, LogForces
+from torchid.report.robot_files import refused_by_simulators
 
 if TYPE_CHECKING:
     pass
@@ -186,6 +187,11 @@ class Identification:
     def fitted_joints(self) -> FittedJoints:
         """What was fitted of joints beside friction."""
         return FittedJoints.of((x.extra, x.value) for x in self.extras)
+
+    @cached_property
+    def refused(self) -> str:
+        """Why simulators refuse the robot's file with the identified parameters, "" if they take it."""
+        return refused_by_simulators(self.experiment.robot, self.phi, self.fitted_joints)
 
     @property
     def phi(self) -> Array:

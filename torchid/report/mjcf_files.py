@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from torchid import parameters
 from torchid.errors import InputError, join_names, warn
 from torchid.parameters import Array
-from torchid.report.urdf_files import mass_bounds, warn_if_inconsistent, without_links_beyond_welds
+from torchid.report.urdf_files import mass_bounds, share_with_links_beyond_welds, warn_if_inconsistent
 from torchid.robot import Robot
 from torchid.robot.mjcf_model import MjcfModel, body_elements, mujoco_error, parse_model
 from torchid.robot.tree import Mimic, joint_origin, link_parameters, resolve_mimics
@@ -49,7 +49,7 @@ def identified_mjcf(
     elements = body_elements(root)
     number = {name: i for i, name in enumerate(model.bodies)}
     explicit = _state_inertias(root, model)
-    rest = without_links_beyond_welds(robot, phi)
+    rest, beyond = share_with_links_beyond_welds(robot, phi)
     moving = np.array([[body.name != model.bodies[0]] for body in robot.bodies])  # the world has no inertia there
     warn_if_inconsistent(robot, moving * rest, NAME)
     written = set[int]()
@@ -59,6 +59,9 @@ def identified_mjcf(
         for name in (link for link in body.links if link in number and link not in robot.links_beyond_welds):
             _set_inertial(elements[number[name]][0], values if name == body.name else np.zeros(parameters.PER_BODY))
             written.add(number[name])
+    for name, values in beyond.items():
+        _set_inertial(elements[number[name]][0], values)
+        written.add(number[name])
     for i in range(1, model.model.nbody) if explicit else ():
         if i not in written:
             _set_inertial(elements[i][0], model.inertial(i))
@@ -155,7 +158,7 @@ def _armature_of_mimics(robot: Robot) -> dict[str, float]:
 
 def require_loadable(text: bytes, source: Path) -> None:
     """Make sure that MuJoCo takes a model. Raises InputError: it does not."""
-    if found := mujoco_error(text):
+    if found := mujoco_error(text, source.parent):
         raise InputError(source, "MJCF", f"MuJoCo refuses it: {found}", "a robot that MuJoCo can simulate")
 
 
@@ -183,7 +186,7 @@ def mjcf_of_urdf(
     Warns:
         TorchidWarning: meshes that are not found or that MuJoCo does not read, or bodies that it will refuse.
     """
-    model = _Model(robot, without_links_beyond_welds(robot, phi), armature, springs or {}, meshes)
+    model = _Model(robot, phi, armature, springs or {}, meshes)
     warn_if_inconsistent(robot, model.phi, "MJCF")
     if model.left_out:
         names = join_names(list(dict.fromkeys(model.left_out)))
@@ -205,7 +208,8 @@ class _Model:
         springs: Mapping[str, tuple[float, float]],
         meshes: bool,
     ) -> None:
-        self.robot, self.phi, self.armature, self.springs, self.meshes = robot, phi, armature, springs, meshes
+        self.robot, self.armature, self.springs, self.meshes = robot, armature, springs, meshes
+        self.phi, self._beyond = share_with_links_beyond_welds(robot, phi)
         self.left_out: list[str] = []
         links, joints = read_urdf(robot.path)
         self._links, self._joints = {link.name: link for link in links}, joints
@@ -213,7 +217,7 @@ class _Model:
         self._limits = position_limits(robot.path)
         mimics = resolve_mimics(robot.path, joints)
         self.root = etree.Element("mujoco", model=robot.path.stem)
-        rules = {"angle": "radian", "inertiafromgeom": "false", "autolimits": "true"} | mass_bounds(robot, phi)
+        rules = {"angle": "radian", "inertiafromgeom": "false", "autolimits": "true"} | mass_bounds(robot, self.phi)
         etree.SubElement(self.root, "compiler", rules)
         self._assets = etree.SubElement(self.root, "asset")
         world = etree.SubElement(self.root, "worldbody")
@@ -243,7 +247,7 @@ class _Model:
         """Parameters (12,) of a link, those of its body if that has its name; None of one without mass."""
         number = self.robot.links[link][0]
         if link in self.robot.links_beyond_welds:
-            values = link_parameters(self._links[link], np.eye(4))
+            values = self._beyond.get(link, link_parameters(self._links[link], np.eye(4)))
         elif self.robot.bodies[number].name == link:
             values = self.phi[number]
         else:

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 
 from torchid import parameters
-from torchid.errors import join_names, warn
+from torchid.errors import InputError, TorchidWarning, join_names, warn
 from torchid.parameters import Array
 from torchid.problem.extras import Extra
-from torchid.report.urdf_files import identified_urdf
+from torchid.report.urdf_files import identified_urdf, links_that_are_no_bodies, massless_ends
 from torchid.robot import Robot
 from torchid.robot.xml_files import is_mjcf
 
@@ -93,6 +94,19 @@ def identified_robot(robot: Robot, phi: Array, fitted: FittedJoints) -> bytes:
     return identified_mjcf(robot, phi, fitted.armature, fitted.springs(robot, identified_name(robot)))
 
 
+def refused_by_simulators(robot: Robot, phi: Array, fitted: FittedJoints) -> str:
+    """What MuJoCo says against `identified_robot`, "" if it takes it; where it is not installed, what it would say."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", TorchidWarning)  # said where the file is written
+        text = identified_robot(robot, phi, fitted)
+    try:
+        from torchid.robot.mjcf_model import mujoco_error  # needs an extra
+    except InputError:
+        refused = [*massless_ends(robot, phi), *links_that_are_no_bodies(robot, phi)]
+        return f"no inertia that a body could have: {join_names(refused)}" if refused else ""
+    return mujoco_error(text, robot.path.parent)
+
+
 _UNITS = {
     "revolute": ("kg m^2", "N m", "N m s/rad", "N m", "rad/s"),
     "prismatic": ("kg", "N", "N s/m", "N", "m/s"),
@@ -106,7 +120,7 @@ class JointParameters:
     Attributes:
         name: of the joint.
         kind: "revolute" or "prismatic".
-        armature: reflected rotor inertia [kg m^2 or kg].
+        armature: reflected rotor inertia [kg m^2 or kg]; None where it was not fitted and the robot's file has none.
         coulomb: torque or force of dry friction, at any velocity [N m or N].
         viscous: friction over velocity [N m s/rad or N s/m].
         stribeck: what dry friction at rest is beyond that [N m or N].
@@ -115,11 +129,18 @@ class JointParameters:
 
     name: str
     kind: str
-    armature: float
+    armature: float | None
     coulomb: float
     viscous: float
     stribeck: float
     stribeck_velocity: float | None
+
+    def for_isaaclab(self) -> dict[str, float]:
+        """What an actuator of Isaac Lab says, without what was neither identified nor in the robot's file."""
+        friction = {"friction": self.coulomb + self.stribeck, "dynamic_friction": self.coulomb}
+        friction |= {"viscous_friction": self.viscous}
+        known = {} if self.armature is None else {"armature": self.armature}
+        return known | {name: value for name, value in friction.items() if value}
 
 
 def joint_parameters(robot: Robot, phi: Array, fitted: FittedJoints) -> list[JointParameters]:
@@ -138,7 +159,7 @@ def joint_parameters(robot: Robot, phi: Array, fitted: FittedJoints) -> list[Joi
         JointParameters(
             name=name,
             kind="prismatic" if name in robot.sliding else "revolute",
-            armature=float(fitted.armature.get(name, robot.armature[k])),
+            armature=fitted.armature.get(name, float(robot.armature[k]) or None),
             coulomb=float(coulomb[k]),
             viscous=float(viscous[k]),
             stribeck=float(fitted.stribeck.get(name, 0.0)),
@@ -151,33 +172,39 @@ def joint_parameters(robot: Robot, phi: Array, fitted: FittedJoints) -> list[Joi
 def isaaclab_text(joints: Sequence[JointParameters], source: str) -> str:
     """Python text of an `ImplicitActuatorCfg` with all independent joints by name.
 
+    Joints of which other parameters are known have one of their own, as Isaac Lab takes 0 for a joint that a mapping
+    does not name, and keeps what the asset has where there is no mapping.
+
     Args:
         joints: from `joint_parameters`.
         source: what they come from, for the first line.
     """
-
-    def entries(value: Callable[[JointParameters], float]) -> str:
-        return "".join(f"        {_pattern(joint)}: {value(joint)!r},\n" for joint in joints)
-
-    names = "".join(f"        {_pattern(joint)},\n" for joint in joints)
+    groups: dict[tuple[str, ...], list[JointParameters]] = {}
+    for joint in joints:
+        groups.setdefault(tuple(joint.for_isaaclab()), []).append(joint)
+    numbered = enumerate(groups.items(), start=1)
     return (
         f'"""Actuators identified by torchid: {_plain(source)}.\n\n'
         "friction: of joints at rest [N m or N]: an effort from Isaac Sim 5.0 on, a coefficient without unit before.\n"
         "dynamic_friction: Coulomb friction, that of joints that move [N m or N], from Isaac Sim 5.0 on.\n"
         "viscous_friction: [N m s/rad or N s/m], from Isaac Sim 5.0 on; before, leave it out and add its numbers to\n"
         "damping. stiffness, damping: the gains of your controller; with 0 and 0 the joints take efforts.\n"
+        "What was not identified is left out: the asset's value stays.\n"
         '"""\n\n'
-        "from isaaclab.actuators import ImplicitActuatorCfg\n\n"
-        "IDENTIFIED_ACTUATORS = ImplicitActuatorCfg(\n"
-        f"    joint_names_expr=[\n{names}    ],\n"
-        "    stiffness=0.0,\n"
-        "    damping=0.0,\n"
-        f"    armature={{\n{entries(lambda joint: joint.armature)}    }},\n"
-        f"    friction={{\n{entries(lambda joint: joint.coulomb + joint.stribeck)}    }},\n"
-        f"    dynamic_friction={{\n{entries(lambda joint: joint.coulomb)}    }},\n"
-        f"    viscous_friction={{\n{entries(lambda joint: joint.viscous)}    }},\n"
-        ")\n"
-    )
+        "from isaaclab.actuators import ImplicitActuatorCfg\n"
+    ) + "".join(_actuator(f"IDENTIFIED_ACTUATORS{f'_{k}' * (k > 1)}", keys, group) for k, (keys, group) in numbered)
+
+
+def _actuator(name: str, keys: Sequence[str], joints: Sequence[JointParameters]) -> str:
+    """One actuator of joints of which the same parameters are known."""
+
+    def entries(key: str) -> str:
+        return "".join(f"        {_pattern(joint)}: {joint.for_isaaclab()[key]!r},\n" for joint in joints)
+
+    names = "".join(f"        {_pattern(joint)},\n" for joint in joints)
+    known = "".join(f"    {key}={{\n{entries(key)}    }},\n" for key in keys)
+    gains = "    stiffness=0.0,\n    damping=0.0,\n"
+    return f"\n{name} = ImplicitActuatorCfg(\n    joint_names_expr=[\n{names}    ],\n{gains}{known})\n"
 
 
 def parameters_export(robot: Robot, phi: Array, joints: Sequence[JointParameters]) -> dict[str, Any]:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
+import scipy.linalg
 from lxml import etree
 
 from torchid import parameters
@@ -16,6 +18,9 @@ from torchid.robot.urdf import MeshError, drop_repeated_origins, mesh_path, pars
 from torchid.robot.xml_files import is_mjcf, plain_urdf
 
 _ROUNDING = 1e-12  # of a body's mass: below it the link that gives it its name has none
+_LEAST_SHARE = (
+    0.01  # of a body, that every link has which a joint moves in a simulator and for which nothing else is left
+)
 
 MUJOCO_MESHES = (".stl", ".obj", ".msh")
 """Extensions of the meshes that MuJoCo reads of a URDF."""
@@ -28,8 +33,8 @@ def identified_urdf(robot: Robot, phi: Array, full_mesh_paths: bool = False) -> 
     """The URDF with parameters `phi`, (L, 12).
 
     The inertia of a body is that of the link with its name; links welded to it have none. Links beyond a joint that
-    the experiment welds keep the URDF's, and the rest of the body's is written. Of an MJCF robot it is the URDF that
-    says the same of bodies, joints and friction.
+    the experiment welds have their part of it, see `share_with_links_beyond_welds`. Of an MJCF robot it is the URDF
+    that says the same of bodies, joints and friction.
 
     Args:
         robot: the robot.
@@ -44,7 +49,7 @@ def identified_urdf(robot: Robot, phi: Array, full_mesh_paths: bool = False) -> 
     drop_repeated_origins(tree.getroot())
     links = {link.get("name"): link for link in tree.getroot().findall("link")}
     joints = {joint.get("name"): joint for joint in tree.getroot().findall("joint")}
-    phi = without_links_beyond_welds(robot, phi)
+    phi, beyond = share_with_links_beyond_welds(robot, phi)
     warn_if_inconsistent(robot, phi)
     for body, values in zip(robot.bodies, phi, strict=True):
         if body.joint is not None and body.joint.kind != "fixed":
@@ -52,6 +57,8 @@ def identified_urdf(robot: Robot, phi: Array, full_mesh_paths: bool = False) -> 
         if not body.massless or values[parameters.INERTIAL].any():
             for name in (link for link in body.links if link not in robot.links_beyond_welds):
                 _set_inertial(links[name], values if name == body.name and values[parameters.MASS] else None)
+    for name, values in beyond.items():
+        _set_inertial(links[name], values)
     bound_massless_links(tree.getroot(), robot, phi)
     if is_mjcf(robot.path):
         plain_urdf(tree.getroot())
@@ -61,14 +68,62 @@ def identified_urdf(robot: Robot, phi: Array, full_mesh_paths: bool = False) -> 
     return etree.tostring(tree, xml_declaration=True, encoding="utf-8")
 
 
-def without_links_beyond_welds(robot: Robot, phi: Array) -> Array:
-    """Parameters (L, 12) of the bodies without what links beyond welded joints have in the URDF."""
-    rest = phi.copy()
-    for name, inertial in robot.links_beyond_welds.items():
-        rest[robot.links[name][0], parameters.INERTIAL] -= inertial
-    rounding = np.abs(rest[:, parameters.MASS]) <= _ROUNDING * np.abs(phi[:, parameters.MASS])
-    rest[rounding, parameters.INERTIAL] = 0.0
-    return rest
+def share_with_links_beyond_welds(robot: Robot, phi: Array) -> tuple[Array, dict[str, Array]]:
+    """What a file has of bodies that the experiment's welds made of several, in which joints move again.
+
+    Links beyond the welds keep what the robot's file has, and the link that names the body has the rest. Where that
+    leaves a link that is no body, all are parts of the body that was identified: those without an inertia of their own
+    of its shape, the others as their file has them but for their size.
+
+    Returns:
+        Parameters of the bodies without links beyond welds, (L, 12), and those of the latter that change, (10,), in
+        their own frames.
+    """
+    rest, changed = phi.copy(), dict[str, Array]()
+    for number in sorted({robot.links[name][0] for name in robot.links_beyond_welds}):
+        whole = phi[number, parameters.INERTIAL]
+        before = {name: x for name, x in robot.links_beyond_welds.items() if robot.links[name][0] == number}
+        own = whole - np.sum(list(before.values()), axis=0)
+        if abs(own[parameters.MASS]) <= _ROUNDING * abs(whole[parameters.MASS]):
+            own = np.zeros_like(own)
+        empty = [name for name, x in before.items() if not _is_body(x, name in robot.moved_beyond_welds)]
+        if (empty or not _is_body(own, False)) and parameters.consistency_margin(whole) > 0.0:
+            parts = _parts(whole, before, empty)
+            own = whole - np.sum(list(parts.values()), axis=0)
+            T_link_body = {name: np.asarray(np.linalg.inv(robot.links[name][1]), np.float64) for name in parts}
+            changed |= {n: parameters.change_of_frame(T_link_body[n]) @ x for n, x in parts.items() if x.any()}
+        rest[number, parameters.INERTIAL] = own
+    return rest, changed
+
+
+def links_that_are_no_bodies(robot: Robot, phi: Array) -> list[str]:
+    """Names of links that simulators refuse in a file with parameters (L, 12)."""
+    rest, changed = share_with_links_beyond_welds(robot, phi)
+    beyond = {name: (x, name in robot.moved_beyond_welds) for name, x in (robot.links_beyond_welds | changed).items()}
+    bodies = {
+        body.name: (x, bool(x.any()) and body.joint is not None and body.joint.kind != "fixed")
+        for body, x in zip(robot.bodies, rest[:, parameters.INERTIAL], strict=True)
+    }
+    return [name for name, (values, moves) in (bodies | beyond).items() if not _is_body(values, moves)]
+
+
+def _is_body(values: Array, moves: bool) -> bool:
+    """Whether simulators take the parameters (10,) of a link, which may be zero unless a joint moves it."""
+    if not values.any():
+        return not moves
+    if values[parameters.MASS] <= 0.0 or parameters.consistency_margin(values) < parameters.POSSIBLE_MARGIN:
+        return False
+    return not moves or np.linalg.eigvalsh(parameters.mass_com_inertia(values)[2])[0] > SMALLEST
+
+
+def _parts(whole: Array, links: Mapping[str, Array], empty: Sequence[str]) -> dict[str, Array]:
+    """Parts (10,) of a body for links of it, which leave at least `_LEAST_SHARE` of it in every direction."""
+    others = {name: x for name, x in links.items() if name not in empty}
+    total = np.sum([*others.values(), np.zeros_like(whole)], axis=0)
+    share = scipy.linalg.eigh(*map(parameters.pseudo_inertia, (total, whole)), eigvals_only=True)[-1]
+    scale = min(1.0, (1.0 - 2.0 * _LEAST_SHARE) / max(share, _LEAST_SHARE))
+    shares = {name: _LEAST_SHARE / len(empty) * whole for name in empty}
+    return shares | {name: scale * x for name, x in others.items()}
 
 
 def warn_if_inconsistent(robot: Robot, phi: Array, file: str = "identified.urdf") -> None:

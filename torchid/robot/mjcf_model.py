@@ -340,10 +340,12 @@ def pose(position: Array, quat_wxyz: Array) -> Array:
     return T
 
 
-def mujoco_error(text: bytes) -> str:
-    """What MuJoCo says against a model, "" if it takes it."""
+def mujoco_error(text: bytes, folder: Path) -> str:
+    """What MuJoCo says against a model whose files lie relative to a folder, "" if it takes it."""
     try:
-        mujoco.MjModel.from_xml_string(text.decode())
+        spec = mujoco.MjSpec.from_string(text.decode())
+        spec.modelfiledir = str(folder.absolute())
+        spec.compile()
     except ValueError as error:
         return excerpt(" ".join(str(error).split()), 300)
     return ""

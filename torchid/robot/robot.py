@@ -44,7 +44,7 @@ from torchid.robot.tree import (
     link_poses,
     nominal_parameters,
 )
-from torchid.robot.urdf import has_fixed_base, read_urdf
+from torchid.robot.urdf import MOVING_TYPES, has_fixed_base, read_urdf
 from torchid.robot.xml_files import file_kind
 
 if TYPE_CHECKING:
@@ -77,7 +77,8 @@ class Robot:
     `nominal`, (L, 12), holds the URDF's parameters in the order of `torchid.parameters`. `links[name]` is the index of
     the body that carries a URDF link and the link's pose in that body's link frame, (4, 4) [m]. `welded[name]` is the
     position [rad or m] at which a joint of the URDF is held; `links_beyond_welds[name]`, (10,), are the URDF's inertial
-    parameters, in its body's link frame, of a link that such a joint carries.
+    parameters, in its body's link frame, of a link that such a joint carries; `moved_beyond_welds` are those that some
+    joint of the file moves.
     Of an MJCF robot, links and joints are those of `torchid.robot.mjcf.urdf_document`.
     `kind_of_welded` has such joints' types. `base_tilt`: rotation [rad] about the base link's x and y axes from the
     base whose motion logs record to this one. `loops`: pairs of frames that the tree's joints must keep together.
@@ -93,6 +94,7 @@ class Robot:
     chain: Chain = field(repr=False)
     welded: dict[str, float] = field(default_factory=dict)
     links_beyond_welds: dict[str, Array] = field(default_factory=dict, repr=False)
+    moved_beyond_welds: tuple[str, ...] = field(default=(), repr=False)
     kind_of_welded: dict[str, str] = field(default_factory=dict, repr=False)
     base_tilt: tuple[float, float] = (0.0, 0.0)
     loops: tuple[Loop, ...] = ()
@@ -320,7 +322,8 @@ def load_robot(
         carried = {name: link_parameters(by_name[name], tree.links[name][1]) for name in beyond}
         kinds = {joint.name: joint.type for joint in joints if joint.name in welded}
         chain = build_chain(tree)
-        held, closed = (welded, carried, kinds), loops_of_file(path)
+        moved = tuple(joint.child for joint in joints if joint.type in MOVING_TYPES and joint.child in carried)
+        held, closed = (welded, carried, moved, kinds), loops_of_file(path)
         robot = Robot(path, tree.names[0], fixed_base, bodies, tree.links, nominal, chain, *held, base_tilt)
     validate_loops([*loops, *closed], robot.links)
     return replace(robot, loops=(*loops, *closed), passive=passive_joints(joints, passive, robot.joint_names))
