@@ -72,6 +72,21 @@ def test_factors_elsewhere_give_the_fit_of_factors_here(fleet: Path, tmp_path: P
     assert (tmp_path / "again" / "parameters.json").read_bytes() == here
 
 
+def test_uses_of_a_run_fetch_nothing(fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Somebody else's run folder may name any URL."""
+    run = tmp_path / "run"
+    assert main(["identify", str(fleet / "experiment.yaml"), f"output={run}", f"logs.train=[{BUCKET}/*.factor]"]) == 0
+    monkeypatch.setattr(remote, "_file_system", lambda path: pytest.fail(f"{path} was asked for"))
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    for url in config["logs"]["train"][0], "https://elsewhere.org/*.factor":
+        config["logs"]["train"] = [url]
+        (run / "config.yaml").write_text(yaml.safe_dump(config))
+        log = str(fleet / "sway_test.npz")
+        assert main(["evaluate", str(run), "--log", log, "--output", str(tmp_path / "out"), "--overwrite"]) == 0
+        assert main(["export", str(run), "--format", "json", "--output", str(tmp_path / "x.json"), "--overwrite"]) == 0
+        assert main(["report", str(run)]) == 0
+
+
 def test_a_library_call_takes_a_url(fleet: Path) -> None:
     name = "sway_test.factor"
     here, there = torchid.read_factors(fleet / "factors" / name), torchid.read_factors(f"{BUCKET}/{name}")

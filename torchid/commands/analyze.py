@@ -127,8 +127,6 @@ def analyze(config: AnalyzeConfig) -> Analysis:
     Raises:
         InputError: whatever does not fit; nothing has been written then.
     """
-    if config.logs is not None:
-        config.logs.require_samples("analyze")
     output = None if config.output is None else _analysis_folder(config.output)
     if output is not None:
         distributed.from_first(partial(check_free, output, config.overwrite, ANALYSIS, inputs_of(config)), "output")

@@ -105,11 +105,10 @@ def check_experiment(
     Raises:
         InputError: whatever in the file does not fit the robot, or a log that cannot be read.
     """
-    config = load_analysis(path, overrides, sections)
+    config = load_analysis(path, overrides, sections, "check")
     with about_file(path or current_file()):
         if config.logs is None:
             raise ConfigError.at_field("logs", "missing", "logs to check")
-        config.logs.require_samples("check")
         setup = set_up_robot(config)
         required = None if config.sensors.empty else setup.sensors_of(config.sensors)
     files = [*config.logs.train, *config.logs.validation, *config.logs.test]

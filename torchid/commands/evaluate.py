@@ -189,7 +189,7 @@ def read_run(folder: Path, device: str | None = None) -> FittedRun:
     """
     require_run(folder)
     settings, found = folder / _SETTINGS, folder / "parameters.json"
-    config = load_config(settings, [f"device={device}"] if device else [])
+    config = load_config(settings, [f"device={device}"] if device else [], reads_logs=False)
     with about_file(settings):
         experiment, usual, explained = _with_own_metrics(set_up(config), folder / _METRICS)
     shared = Comparison(read_shared_extras(found, "nominal_value"), read_shared_extras(found, "value"))

@@ -201,7 +201,10 @@ _ANALYSIS = FileKind(**(vars(_EXPERIMENT) | {"settings": AnalyzeConfig, "keys": 
 
 
 def load_config(
-    path: str | Path | None, overrides: Sequence[str] = (), sections: Mapping[str, object] | None = None
+    path: str | Path | None,
+    overrides: Sequence[str] = (),
+    sections: Mapping[str, object] | None = None,
+    reads_logs: bool = True,
 ) -> ExperimentConfig:
     """Read and check an experiment file, or the same from Python.
 
@@ -209,6 +212,7 @@ def load_config(
         path: the YAML file; paths in it are relative to it, but `output` to the working directory. None: there is none.
         overrides: `key.subkey=value`, the value in YAML; paths in them are relative to the working directory.
         sections: values by key, which override likewise; or all, where there is no file.
+        reads_logs: whether its logs will be read; if not, they need not be there, and nobody looks.
 
     Raises:
         ConfigError: unreadable file, a value of the wrong kind, a missing key.
@@ -224,13 +228,20 @@ def load_config(
         validate_keys(config.estimator)
         _check_extras(config)
         _check_threshold(config.preprocessing)
-        return dataclasses.replace(config, logs=_checked_logs(config, config.logs))
+        return dataclasses.replace(config, logs=_checked_logs(config, config.logs)) if reads_logs else config
 
 
 def load_analysis(
-    path: str | Path | None, overrides: Sequence[str] = (), sections: Mapping[str, object] | None = None
+    path: str | Path | None,
+    overrides: Sequence[str] = (),
+    sections: Mapping[str, object] | None = None,
+    command: str = "analyze",
 ) -> AnalyzeConfig:
-    """Read an experiment file for `torchid analyze`: as `load_config`, but logs and sensors may be left out."""
+    """Read an experiment file for a command that needs samples: as `load_config`, but logs may be left out, or sensors.
+
+    Raises:
+        ConfigError: as `load_config`, or factors of logs.
+    """
     config, about = _loaded(_ANALYSIS, path, overrides, sections)
     with about:
         require_one_file(config.robot)
@@ -241,6 +252,7 @@ def load_analysis(
         for name, choice in config.analysis.compare.items():
             validate_choice(f"analysis.compare.{name}", choice)
         if config.logs is not None:
+            config.logs.require_samples(command)
             return dataclasses.replace(config, logs=_checked_logs(config, config.logs))
         if config.analysis.compare:
             found = "set, without logs to predict accuracy from"
