@@ -218,6 +218,14 @@ def test_a_pose_that_arrives_at_half_the_rate_and_irregularly_is_held(quantum: f
     assert not checked.rejected.any()
 
 
+def test_a_joint_that_rests_before_and_after_its_only_motion_is_not_held() -> None:
+    log = moving()
+    part = slice(600, 1400)
+    rests = np.clip(np.arange(2000), part.start, part.stop - 1)
+    once = changed(log, "joint_position", lambda q: q.__setitem__((slice(None), 1), q[rests, 1]))
+    assert not found(check(once), "held")
+
+
 def test_a_joint_that_is_sent_at_a_lower_rate_than_the_others_is_named() -> None:
     log = moving()
     held = changed(log, "joint_position", lambda q: q.__setitem__((slice(None), 1), q[np.arange(2000) // 5 * 5, 1]))

@@ -248,9 +248,9 @@ def _mean_hold(values: FloatArray, repeated: BoolArray) -> float:
     if float(np.mean(repeated)) <= MIN_REPEATED_SHARE:
         return 0.0
     changes = np.flatnonzero(~repeated)
-    if len(changes) < NEIGHBOUR_STEPS:
-        return 0.0
     lengths = np.diff(changes)
+    if len(changes) < NEIGHBOUR_STEPS or not (lengths > 1).any():  # all repeats lie before its motion or behind it
+        return 0.0
     quanta = np.array([_estimate_resolution(column) for column in values.T])
     after = changes[1:][lengths > 1]
     sizes = np.abs(values[after + 1] - values[after])
