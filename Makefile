@@ -8,17 +8,19 @@ FAST := tests/config tests/logs tests/proposals tests/robot tests/regressor test
 SLOW := tests/logs/test_bags.py tests/logs/test_bag_messages.py tests/logs/test_bag_stamps.py tests/logs/test_mutations.py \
 	tests/regressor/test_oracle.py tests/robot/test_shapes.py \
 	tests/problem/test_rows.py::test_fast_rows_are_the_plain_ones_whatever_is_measured_touches_and_however_frames_are_turned
+SIM := tests/simulation tests/robot tests/report tests/commands/test_mjcf_runs.py tests/commands/test_replay.py \
+	tests/commands/test_closed_loops.py
 TESTS ?= tests
 
-.PHONY: demo test test-fast coverage site clean
+.PHONY: demo test test-oldest-mujoco test-fast coverage site clean
 
 demo: .venv/ready
 	.venv/bin/torchid demo overwrite=true
 
 # One worker by core, each with one thread: with as many threads as cores in each, they wait for one another.
-test test-fast coverage: export OMP_NUM_THREADS = 1
+test test-oldest-mujoco test-fast coverage: export OMP_NUM_THREADS = 1
 # Many tests run commands in processes of their own, which import what was compiled once.
-test test-fast coverage: export PYTHONDONTWRITEBYTECODE =
+test test-oldest-mujoco test-fast coverage: export PYTHONDONTWRITEBYTECODE =
 
 test: .venv/ready-for-tests
 	.venv/bin/ruff check torchid scripts tests
@@ -26,6 +28,11 @@ test: .venv/ready-for-tests
 	.venv/bin/mypy
 	.venv/bin/lint-imports
 	.venv/bin/pytest -n auto --dist loadfile
+
+# What simulates, with the oldest MuJoCo that the extra [sim] takes, in place of the newest.
+test-oldest-mujoco: .venv/ready-for-tests
+	$(PIP) install -q --no-deps --upgrade --target .venv/oldest-mujoco mujoco==3.3.7
+	PYTHONPATH=.venv/oldest-mujoco .venv/bin/pytest -n auto --dist loadfile $(SIM)
 
 test-fast: .venv/ready-for-tests
 	.venv/bin/pytest -n auto --dist loadfile $(FAST) $(SLOW:%=--deselect=%)

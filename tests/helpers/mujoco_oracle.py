@@ -12,6 +12,10 @@ from synthetic import Array
 
 from torchid.robot import Robot
 
+IS_MUJOCO_3 = mujoco.__version__.startswith("3.")
+INERTIA_ROUNDING = 1e-6 if IS_MUJOCO_3 else 0.0
+"""Share of an inertia, in addition to that of double precision: MuJoCo 3 iterates less for the principal axes."""
+
 
 def mujoco_model(path: Path, robot: Robot) -> mujoco.MjModel:
     """A URDF as MuJoCo reads it, in free flight unless the base is fixed, without contacts and soft constraints."""

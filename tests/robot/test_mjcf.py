@@ -13,6 +13,7 @@ pytest.importorskip("mujoco", reason="MuJoCo is not installed")
 
 import mujoco
 from lxml import etree
+from mujoco_oracle import INERTIA_ROUNDING, IS_MUJOCO_3
 from survey_mjcf import States, difference, mujoco_forces, survey, torchid_forces
 
 from torchid.errors import InputError, TorchidWarning, UrdfError
@@ -67,8 +68,8 @@ def test_inverse_dynamics_are_those_of_mujoco_and_what_is_written_is_what_is_rea
     assert found.robot is not None, found.refusal
     assert found.robot.nv == velocities
     assert found.inverse_dynamics < 1e-13
-    assert found.read_again < 1e-13
-    assert found.written < 1e-13
+    assert found.read_again < 1e-13 + INERTIA_ROUNDING
+    assert found.written < 1e-13 + INERTIA_ROUNDING
 
 
 @pytest.mark.parametrize("text", [BOLTED, TIED], ids=["joints", "a tendon"])
@@ -165,10 +166,13 @@ REFUSED = {
     "fluid": (BODY.format("", HINGE.format(""), '<option\n density="1000"/>'), "<option>, line 4: density 1000"),
     "damped base": (
         BODY.format("", '<joint type="free" damping="1"/>', ""),
-        "<joint>, line 3: damping 1 0 0 of a free",
+        f"<joint>, line 3: damping 1{' 0 0' * (not IS_MUJOCO_3)} of a free",
     ),
     "no joint": (BODY.format("", "", ""), "<joint>: none"),
-    "polynomial": (BODY.format("", HINGE.format(' damping="1 2"'), ""), "<joint> 'j', line 3: damping 1 2 0"),
+    "polynomial": (
+        BODY.format("", HINGE.format(' damping="1 2"'), ""),
+        "attribute 'damping' has too much data" if IS_MUJOCO_3 else "<joint> 'j', line 3: damping 1 2 0",
+    ),
     "unknown": (BODY.format("", "<jiont/>", ""), "MJCF: MuJoCo refuses it"),
 }
 

@@ -64,6 +64,8 @@ def identified_urdf(robot: Robot, phi: Array, full_mesh_paths: bool = False) -> 
         plain_urdf(tree.getroot())
     elif full_mesh_paths:
         resolve_meshes(tree.getroot(), robot.path, "identified.urdf")
+        if tree.find("link/collision/geometry/mesh") is not None:
+            _set_compiler(tree.getroot(), {"strippath": "false"})  # MuJoCo 3 drops the folders of meshes
     etree.indent(tree)
     return etree.tostring(tree, xml_declaration=True, encoding="utf-8")
 
@@ -187,8 +189,12 @@ def bound_massless_links(root: etree._Element, robot: Robot, phi: Array) -> None
         robot: whose bodies are bounded.
         phi: parameters that the file has, (L, 12).
     """
-    bounds = mass_bounds(robot, phi)
-    if not bounds:
+    _set_compiler(root, mass_bounds(robot, phi))
+
+
+def _set_compiler(root: etree._Element, attributes: Mapping[str, str]) -> None:
+    """Give attributes to MuJoCo's `<compiler>` in a URDF, which no other program reads; those that it has stay."""
+    if not attributes:
         return
     extension = root.find("mujoco")
     if extension is None:
@@ -197,7 +203,7 @@ def bound_massless_links(root: etree._Element, robot: Robot, phi: Array) -> None
     compiler = extension.find("compiler")
     if compiler is None:
         compiler = etree.SubElement(extension, "compiler")
-    for name, value in bounds.items():
+    for name, value in attributes.items():
         compiler.set(name, compiler.get(name, value))
 
 

@@ -86,12 +86,12 @@ def _check_transmissions(model: MjcfModel) -> None:
     for tendon in model.spec.tendons:
         for name in ("stiffness", "damping", "frictionloss", "armature"):
             if np.any(getattr(tendon, name)):
-                tag = _tendon_tag(tendon)
+                tag = _tendon_tag(model.model, tendon.id)
                 accepted = "tendons without stiffness, damping, frictionloss and armature"
                 model.refuse(tendon, tag, tendon.name, f"a tendon with {name}", accepted)
     for actuator in model.spec.actuators:
         for name in ("armature", "damping"):
-            if np.any(getattr(actuator, name)):
+            if np.any(getattr(actuator, name, 0.0)):  # MuJoCo has them since 3.5
                 accepted = f"{name} of the joint, or none"
                 model.refuse(
                     actuator, _actuator_tag(model, actuator), actuator.name, f"{name} of an actuator", accepted
@@ -208,10 +208,10 @@ def equality_kind(equality: Any) -> str:
     return str(equality.type.name).removeprefix("mjEQ_").lower()
 
 
-def _tendon_tag(tendon: Any) -> str:
-    """Tag of a tendon."""
-    first = next(iter(tendon.path), None)
-    return "fixed" if first is not None and first.type.name == "mjWRAP_JOINT" else "spatial"
+def _tendon_tag(model: mujoco.MjModel, tendon: int) -> str:
+    """Tag of a tendon, by its number."""
+    first = int(model.wrap_type[model.tendon_adr[tendon]])
+    return "fixed" if first == int(mujoco.mjtWrap.mjWRAP_JOINT) else "spatial"
 
 
 def _actuator_tag(model: MjcfModel, actuator: Any) -> str:

@@ -174,7 +174,10 @@ class Plant:
     @property
     def inertia(self) -> Array:
         """Joint-space inertia matrix (nv, nv)."""
-        mujoco.mj_fullM(self.model, self.data, self._M)
+        if hasattr(self.data, "qM"):  # MuJoCo before 3.11
+            mujoco.mj_fullM(self.model, self._M, self.data.qM)
+        else:
+            mujoco.mj_fullM(self.model, self.data, self._M)
         return self._M
 
     @property
