@@ -15,6 +15,7 @@ from repository import SHARED
 
 from torchid.log_checks import NOTE, REJECTED, SUSPICIOUS
 from torchid.log_checks.check import check, repair_log
+from torchid.log_checks.findings import widen_mask
 from torchid.log_checks.spikes import find_jumps
 from torchid.logs import Log, read_log
 
@@ -216,6 +217,13 @@ def test_a_pose_that_arrives_at_half_the_rate_and_irregularly_is_held(quantum: f
     checked = check(log)
     assert "every 2 samples" in only(checked, "held", "base_position_world").found
     assert not checked.rejected.any()
+
+
+def test_a_mask_is_widened_by_any_distance() -> None:
+    where = np.zeros(80, bool)
+    where[3] = True
+    assert widen_mask(where, 10**15).all()
+    np.testing.assert_array_equal(np.flatnonzero(widen_mask(where, 2)), np.arange(1, 6))
 
 
 def test_a_joint_that_rests_before_and_after_its_only_motion_is_not_held() -> None:

@@ -164,6 +164,10 @@ REFUSED = {
     "gravcomp": (BODY.format(' gravcomp="1"', HINGE.format(""), ""), "<body> 'b', line 3: gravcomp 1"),
     "locked": (BODY.format("", HINGE.format(' damping="1e13"'), ""), "<joint> 'j', line 3: damping 1e+13"),
     "fluid": (BODY.format("", HINGE.format(""), '<option\n density="1000"/>'), "<option>, line 4: density 1000"),
+    "NaN": (
+        BODY.format("", HINGE.format("") + '\n<inertial pos="nan 0 0" mass="1" diaginertia="1 1 1"/>', ""),
+        "<inertial>, line 4: a number that is not finite",
+    ),
     "damped base": (
         BODY.format("", '<joint type="free" damping="1"/>', ""),
         f"<joint>, line 3: damping 1{' 0 0' * (not IS_MUJOCO_3)} of a free",

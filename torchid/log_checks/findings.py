@@ -148,6 +148,7 @@ def finite_median(values: FloatArray) -> FloatArray:
 
 def widen_mask(where: BoolArray, distance: int) -> BoolArray:
     """Which samples are within `distance` samples of the mask (N,)."""
+    distance = min(distance, len(where))
     padded = np.concatenate([np.zeros(distance + 1, np.intp), np.cumsum(where)])
     padded = np.concatenate([padded, np.full(distance, padded[-1])])
     return np.asarray(padded[2 * distance + 1 :] > padded[: -2 * distance - 1])

@@ -28,6 +28,10 @@ def check_model(model: MjcfModel) -> None:
         TorchidWarning: the model's gravity is not the Earth's, which is used.
     """
     spec, members = model.spec, {model.bodies[i] for i in model.members}
+    for element in model.text.root.iter("inertial"):  # MuJoCo takes a NaN for an attribute that is not there
+        if any(word.lower().lstrip("+-") in ("nan", "inf") for x in element.attrib.values() for word in x.split()):
+            field = f"<inertial>, line {element.sourceline}"
+            raise UrdfError(model.path, field, "a number that is not finite", "finite numbers")
     for body in spec.bodies:
         if body.id in model.members:
             _check_body(model, body)
