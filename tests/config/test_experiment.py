@@ -104,7 +104,9 @@ def test_every_key_of_the_file_arrives(file: Path) -> None:
     for name in ALL.keys() - {"robot", "logs", "output"}:
         expected = ALL[name]
         if name == "contacts":
-            expected = [{"line_axis": "y", "radius": "auto", "normal": None} | contact for contact in expected]
+            expected = [
+                {"line_axis": "y", "radius": "auto", "centre": "auto", "normal": None} | contact for contact in expected
+            ]
         if name == "estimator":
             expected = dataclasses.asdict(EstimatorConfig()) | expected
         if name == "preprocessing":
@@ -349,7 +351,10 @@ def test_a_value_of_the_wrong_kind_is_refused_by_its_place(file: Path, settings:
         ("contacts=[{frame: a, type: line, line_axis: [x]}]", "contacts.0.line_axis: found ['x']; accepted: 'x', 'y'"),
         ("contacts=[{frame: [a], type: line}]", "contacts.0.frame: found ['a']; accepted: the name of a frame of"),
         ("contacts=[{type: line}]", "contacts.0.frame: missing; accepted: the name of a frame of the robot"),
-        ("contacts=[[a]]", "contacts.0: found ['a']; accepted: a mapping with frame, type, line_axis, radius, normal"),
+        (
+            "contacts=[[a]]",
+            "contacts.0: found ['a']; accepted: a mapping with frame, type, line_axis, radius, centre",
+        ),
         (
             "sensors={contact_wrenches: {a: fn}}",
             "sensors.contact_wrenches.a: found 'fn'; accepted: a list of components: [fx, fy, fz], or [fn] for a force",

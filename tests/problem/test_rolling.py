@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from lxml import etree
 from random_samples import random_samples, sensor_set
 from raw_logs import log_refusal, write_arrays
 from refusals import refused
@@ -17,8 +18,10 @@ from synthetic import ANYMAL, PANDA, SOLO12, Array, load
 
 import torchid
 from torchid.errors import LogError, SensorError
+from torchid.identifiability.structure import standing_states
 from torchid.logs import Log, preprocess, read_log, write_log
 from torchid.problem import ExtraTerms, RowBuilder, bind_log, compress
+from torchid.problem.base_pose import feet_poses
 from torchid.problem.sampled_rows import SampledRows
 from torchid.sensing import Contact
 
@@ -254,3 +257,35 @@ def test_what_rolls_needs_the_orientation_of_the_base() -> None:
 def test_a_contact_that_cannot_be_is_refused(wrong: dict[str, Any], message: str) -> None:
     with pytest.raises(SensorError, match=message):
         Contact(**{"frame": "a", "kind": "point"} | wrong)
+
+
+# ------------------------------------------------------------------------------------------- centres beside the frame
+
+
+def test_a_ball_beside_a_frame_is_one_about_a_link_welded_at_its_centre(tmp_path: Path) -> None:
+    root = etree.parse(str(ANYMAL)).getroot()
+    for contact in BALLS:
+        etree.SubElement(root, "link", name=f"{contact.frame}_ball")
+        weld = etree.SubElement(root, "joint", name=f"{contact.frame}_weld", type="fixed")
+        etree.SubElement(weld, "parent", link=contact.frame)
+        etree.SubElement(weld, "child", link=f"{contact.frame}_ball")
+        etree.SubElement(weld, "origin", xyz="0.01 -0.005 0.023")
+    (tmp_path / "balls.urdf").write_bytes(etree.tostring(root))
+    robot = load(tmp_path / "balls.urdf")
+    beside = [replace(contact, centre=(0.01, -0.005, 0.023)) for contact in BALLS]
+    welded = [replace(contact, frame=f"{contact.frame}_ball") for contact in BALLS]
+    grams, jacobians, states = [], [], []
+    for contacts in (beside, welded, BALLS):
+        samples, (q, _, _) = random_samples(robot, contacts, 40, 0, states=4)
+        factor = compress([samples], RowBuilder(robot, contacts, sensor_set("joints", robot, contacts))).triangle()
+        grams.append(factor.T @ factor)
+        frame = contacts[0].frame, 0.04, None, contacts[0].centre
+        jacobians.append(torchid.FrameJacobian(robot, *frame)(torch.from_numpy(q)))
+        states.append(standing_states(robot, contacts, (True,) * 4, 5, np.random.default_rng(0))[2])
+    for found in (grams, jacobians, states):
+        torch.testing.assert_close(found[0], found[1], rtol=1e-9, atol=1e-9)
+        assert not torch.allclose(found[0], found[2])
+    log = a_log()
+    log = replace(log, joint_names=robot.joint_names, contact_names=tuple(contact.frame for contact in BALLS))
+    poses = [list(feet_poses(log, robot, contacts).values()) for contacts in (beside, welded)]
+    np.testing.assert_allclose(poses[0], poses[1], atol=1e-12)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from synthetic import ANYMAL, ROBOTS, SOLO12, load
+from synthetic import ROBOTS, load
 from urdfs import joint, link, write
 
 from torchid.config.robot import ContactConfig
@@ -34,14 +34,34 @@ def test_the_feet_of_a_real_quadruped_roll_on_their_spheres(frame: str, radius: 
     urdf = next(path for path in ROBOTS.rglob("go1.urdf"))
     contacts, text = resolve_contacts([ContactConfig(frame, "point")], load(urdf))
     assert contacts[0].radius == radius
-    assert text == f"{frame}: radius 0.02 m (collision sphere)"
+    assert text == f"{frame}: ball of radius 20 mm, from the collision sphere"
 
 
-def test_feet_without_a_sphere_about_their_frame_are_points() -> None:
-    """ANYmal's spheres are about another point than the frames of its feet; Solo's feet are meshes."""
-    for urdf, frame in ((ANYMAL, "LF_FOOT"), (SOLO12, "FL_FOOT")):
-        contacts, text = resolve_contacts([ContactConfig(frame, "point")], load(urdf))
-        assert (contacts[0].radius, text) == (0.0, "")
+@pytest.mark.parametrize(
+    ("urdf", "frame", "radius", "centre", "text"),
+    [
+        ("anymal.urdf", "LF_FOOT", 0.031, (0.0, 0.0, 0.02325), "31 mm about [0, 0, 23] mm, from the collision sphere"),
+        ("anymal-kinova.urdf", "RH_FOOT", 0.031, (0.0, 0.0, 0.02325), "31 mm about [0, 0, 23] mm, from"),
+        ("go2.urdf", "FL_foot", 0.022, (-0.002, 0.0, 0.0), "about [-2.1, 0.1, -0.24] mm, from the mesh foot_convex"),
+        ("solo12.urdf", "FL_FOOT", 0.016, (0.0, 0.0, 0.0), "from the mesh solo_foot.stl"),
+    ],
+)  # fmt: skip
+def test_balls_beside_the_frame_and_ends_of_meshes_are_taken(
+    urdf: str, frame: str, radius: float, centre: tuple[float, ...], text: str
+) -> None:
+    """Go2's own description has a sphere of 22 mm 2 mm behind the frame beside this mesh."""
+    robot = load(next(path for path in sorted(ROBOTS.rglob(urdf)) if "anymal_b" in str(path) or "anymal" not in urdf))
+    contacts, found = resolve_contacts([ContactConfig(frame, "point")], robot)
+    assert abs(contacts[0].radius - radius) < 1.2e-3
+    np.testing.assert_allclose(contacts[0].centre, centre, atol=1e-3)
+    assert text in found
+
+
+def test_no_ball_is_seen_in_a_sole_or_a_shank() -> None:
+    for urdf, frame in (("talos_full_v2.urdf", "left_sole_link"), ("icub.urdf", "l_foot"), ("go2.urdf", "FL_calf")):
+        contacts, text = resolve_contacts([ContactConfig(frame, "point")], load(next(ROBOTS.rglob(urdf))))
+        assert contacts[0].radius == 0.0
+        assert text == f"{frame}: radius 0: no sphere found in the URDF; state contacts[].radius if it rolls"
 
 
 @pytest.mark.parametrize(
@@ -49,7 +69,9 @@ def test_feet_without_a_sphere_about_their_frame_are_points() -> None:
     [
         ([shape('<sphere radius="0.03"/>')], "point", 0.03),
         ([shape('<sphere radius="0.03"/>', '<origin xyz="0.0025 0 0"/>')], "point", 0.03),
-        ([shape('<sphere radius="0.03"/>', '<origin xyz="0.0035 0 0"/>')], "point", 0.0),
+        ([shape('<sphere radius="0.03"/>', '<origin xyz="0.07 0 0"/>')], "point", 0.03),
+        ([shape('<sphere radius="0.03"/>', '<origin xyz="0.07 0 0"/>')] * 2, "point", 0.0),
+        ([shape('<sphere radius="0.05"/>', '<origin xyz="1 0 0"/>'), shape('<sphere radius="0.03"/>')], "point", 0.03),
         ([shape('<sphere radius="0.005"/>', '<origin xyz="0 0 0.0009"/>')], "point", 0.005),
         ([shape('<sphere radius="0.02"/>'), shape('<sphere radius="0.03"/>')], "point", 0.03),
         ([shape('<box size="1 1 1"/>')], "point", 0.0),
@@ -67,7 +89,7 @@ def test_a_shape_about_the_origin_is_taken_and_no_other(
 ) -> None:
     contacts, text = resolve_contacts([ContactConfig("foot", kind)], foot_on(tmp_path, *shapes))
     assert contacts[0].radius == radius
-    assert bool(text) == bool(radius)
+    assert ("radius 0:" in text, text == "") == (kind != "flat" and not radius, kind == "flat")
 
 
 @pytest.mark.parametrize(
@@ -86,16 +108,18 @@ def test_a_point_on_a_wheel_rolls_on_the_wheel(tmp_path: Path, kind: str, origin
     axle = joint("axle", "base", "tyre", kind, '<axis xyz="0 1 0"/>')
     turned = joint("weld", "tyre", "hub", "fixed", '<origin xyz="0 0 0" rpy="0.4 1 1.5707963267948966"/>')
     robot = load(write(tmp_path, link("base"), tyre, link("hub"), axle, turned))
-    for frame, source in (("tyre", "collision wheel"), ("hub", "collision wheel of tyre")):
+    for frame, source in (("tyre", "the collision wheel"), ("hub", "the collision wheel of tyre")):
         contacts, text = resolve_contacts([ContactConfig(frame, "point")], robot)
         assert contacts[0].radius == found
-        assert text == (f"{frame}: radius 0.08 m ({source})" if found else "")
+        assert text.startswith(
+            f"{frame}: ball of radius 80 mm, from {source}" if found else f"{frame}: radius 0: no sph"
+        )
 
 
 def test_a_link_that_is_welded_to_the_frame_s_lends_its_shape(tmp_path: Path) -> None:
     robot = foot_on(tmp_path, shape('<sphere radius="0.04"/>', '<origin xyz="0.1 0 0"/>'))
     contacts, text = resolve_contacts([ContactConfig("toe", "point")], robot)
-    assert (contacts[0].radius, text) == (0.04, "toe: radius 0.04 m (collision sphere of foot)")
+    assert (contacts[0].radius, text) == (0.04, "toe: ball of radius 40 mm, from the collision sphere of foot")
 
 
 def test_what_the_file_states_counts_more_than_the_urdf(tmp_path: Path) -> None:
@@ -104,13 +128,17 @@ def test_what_the_file_states_counts_more_than_the_urdf(tmp_path: Path) -> None:
     assert (contacts[0].radius, text) == (0.0, "")
     contacts, text = resolve_contacts([ContactConfig("foot", "point", radius=0.05, normal=[0.0, 3.0, 4.0])], robot)
     assert contacts[0].normal == (0.0, 0.6, 0.8)
-    assert text == "foot: radius 0.05 m (contacts, normal [0, 0.6, 0.8])"
+    assert text == "foot: ball of radius 50 mm, normal [0, 0.6, 0.8], as stated"
+    contacts, text = resolve_contacts([ContactConfig("foot", "point", centre=[0.01, 0.0, 0.0])], robot)
+    assert (contacts[0].radius, contacts[0].centre) == (0.04, (0.01, 0.0, 0.0))
 
 
 def test_what_no_contact_can_have_is_refused_in_one_line(tmp_path: Path) -> None:
     robot = foot_on(tmp_path, shape('<sphere radius="0.04"/>'))
     with pytest.raises(ConfigError, match=r"contacts\[0\].radius: 0.1 of a flat contact; accepted: type point \(a sph"):
         resolve_contacts([ContactConfig("foot", "flat", radius=0.1)], robot)
+    with pytest.raises(ConfigError, match=r"contacts\[0\].centre: \[0, 0, 0.1\]; accepted: three numbers \[m\] in"):
+        resolve_contacts([ContactConfig("foot", "flat", centre=[0.0, 0.0, 0.1])], robot)
     for radius in ("no number", "-0.1"):
         robot = foot_on(tmp_path, shape(f'<sphere radius="{radius}"/>'))
         with pytest.raises(UrdfError, match=f"<sphere radius>: '{radius}'; accepted: 1 decimal number of at least 0"):

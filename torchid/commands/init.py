@@ -32,9 +32,10 @@ from torchid.commands.init_proposals import (
     without_rolling,
 )
 from torchid.config.log_reading import PreprocessingConfig
+from torchid.config.robot import ContactConfig
 from torchid.config.yaml_text import inline_yaml, yaml_lines
 from torchid.errors import ConfigError, InputError, LogError, about_file, excerpt, format_count, join_names
-from torchid.fitting.checked_settings import is_along_base
+from torchid.fitting.checked_settings import is_along_base, resolve_contacts
 from torchid.logs import Columns, Log, Topics
 from torchid.logs.containers import LogKind, atomic_output, existing_log_kind
 from torchid.logs.log import VARIANTS
@@ -52,6 +53,7 @@ from torchid.reading.log_reader import memory_needed
 from torchid.robot import Robot, load_robot
 from torchid.robot.urdf import has_fixed_base
 from torchid.robot.xml_files import is_mjcf
+from torchid.settings import AUTO
 
 _FORCES = ("joint_torque", "contact_wrench_local", "contact_wrench_world", "contact_force_normal", "ft_wrench")
 _POSE = ("base_quat_wxyz", "base_quat_xyzw")
@@ -271,6 +273,9 @@ def _describe(
             "contacts: from names or balls of links; point where there is a ball or more than two"
             + balls * any(contact.radius == 0.0 for contact in contacts)
         )
+    settings = [ContactConfig(x.frame, x.type, radius=AUTO if x.radius is None else x.radius) for x in contacts]
+    rolling = resolve_contacts(settings, robot)[1]
+    out.guessed += [f"contacts: {rolling}"] * bool(rolling)
     if _is_fixed(contacts, fields) and not robot.fixed_base:
         out.guessed.append("robot.fixed_base: true, as there is neither a foot nor a motion of the base")
     if held := held_joints(robot, proposal.lacking):

@@ -57,6 +57,10 @@ def guess_contacts(robot: Robot, stated: Sequence[str], texts: Sequence[str]) ->
     Those that the log names, in one of its texts, count before all others.
     """
     shapes = CollisionShapes(robot)
+
+    def is_ball(name: str) -> bool:
+        return shapes.about(name, meshes=False) is not None
+
     inner = {body.parent for body in robot.bodies}
     texts = [text.lower() for text in texts if not re.search(_IN_LIMBS, text, re.IGNORECASE)]
     named = [name for name in robot.links if any(within(name.lower()).search(text) for text in texts)]
@@ -68,7 +72,10 @@ def guess_contacts(robot: Robot, stated: Sequence[str], texts: Sequence[str]) ->
             if body and body not in inner and is_foot and not re.search(_ON_FEET, name, re.IGNORECASE):
                 by_body.setdefault(body, []).append(name)
         frames = [
-            min(names, key=lambda name: (shapes.about(name) is None, "sole" not in name.lower(), len(name)))
+            min(
+                names,
+                key=lambda name: (not is_ball(name), "sole" not in name.lower(), len(name)),
+            )
             for names in by_body.values()
         ]
         if len(frames) > 1:
@@ -95,7 +102,7 @@ def _balls_of_limbs(robot: Robot, shapes: CollisionShapes) -> list[str]:
         body = root = robot.links[name][0]
         while root and parents[root]:
             root = parents[root]
-        shape = shapes.about(name) if body and body not in parents else None
+        shape = shapes.about(name, meshes=False) if body and body not in parents else None
         if shape is not None and shape.kind == "sphere" and not re.search(_NO_FEET, name, re.IGNORECASE):
             limbs.setdefault(root, name)
     called = [name for name in limbs.values() if re.search("|".join(_FEET), name, re.IGNORECASE)]

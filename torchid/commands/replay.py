@@ -388,7 +388,7 @@ def _feet(contacts: Sequence[Contact], urdf: Path) -> tuple[Foot, ...]:
     feet = []
     for contact in contacts:
         if contact.kind == "point":
-            feet.append(point_foot(contact.frame, contact.radius))
+            feet.append(point_foot(contact.frame, contact.radius, contact.centre))
             continue
         try:
             feet += find_feet([FootConfig(frame=contact.frame)], urdf)

@@ -252,6 +252,7 @@ def _metrics_document(run: Identification) -> dict[str, object]:
         "parameters": int(estimate.phi.size),
         "condition_number": estimate.condition_number if estimate.rank else None,
         "samples": run.samples,
+        "contacts": run.experiment.rolling,
         "evaluated_samples": dict(run.evaluated),
         "excluded_samples": run.excluded,
         **({"factors": [_factor_entry(one) for one in run.factors]} if run.factors else {}),

@@ -201,14 +201,16 @@ class ContactConfig:
     """A contact at a URDF frame: `line_axis` is the frame's axis that a line contact runs along.
 
     `radius` [m]: a point is a sphere, a line a cylinder about the frame's origin, which rolls; auto: that of the
-    collision sphere or wheel (of a line: cylinder) about this origin in the URDF, 0 without one. `normal`: of the
-    ground, in the world, where the logs do not record it (`contact_normal_world`); None for upwards.
+    collision sphere or wheel or the ball at the end of a mesh (of a line: the cylinder) in the URDF, 0 without one.
+    `centre` [m]: of the sphere in the frame; auto: of the shape whose radius is taken, else the origin. `normal`: of
+    the ground, in the world, where the logs do not record it (`contact_normal_world`); None for upwards.
     """
 
     frame: str
     type: Literal["point", "line", "flat"]
     line_axis: Literal["x", "y", "z"] = "y"
     radius: NotNegativeOrAuto = AUTO
+    centre: Annotated[list[Number], Field(min_length=3, max_length=3)] | Literal["auto"] = AUTO
     normal: Annotated[list[float] | None, PlainValidator(_normal)] = None
 
 

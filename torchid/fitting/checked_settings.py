@@ -144,34 +144,50 @@ def _angle_to_base(robot: Robot, link: str) -> float:
 
 
 def resolve_contacts(settings: Sequence[ContactConfig], robot: Robot) -> tuple[tuple[Contact, ...], str]:
-    """The contacts of a robot, and which of them roll on what, "" if none does.
+    """The contacts of a robot, and on what they roll by what source, "" where nothing rolls or could.
 
     Raises:
         UnknownNameError: a frame that the URDF does not have.
         SensorError: a frame named twice.
-        ConfigError: a radius of a flat contact, a normal of no length.
+        ConfigError: a radius of a flat contact, a centre of another contact than a point, a normal of no length.
         UrdfError: a collision shape that is not described by numbers.
     """
     contacts = validate_contacts(robot, [Contact(c.frame, c.type, c.line_axis) for c in settings])
     out: list[Contact] = []
-    sources: list[str] = []
+    frames: dict[str, list[str]] = {}
     shapes: CollisionShapes | None = None
     for index, (contact, given) in enumerate(zip(contacts, settings, strict=True)):
-        x, y, z = UP if given.normal is None else given.normal
-        try:
-            contact = replace(contact, normal=(x, y, z), radius=0.0 if given.radius == "auto" else given.radius)
-        except SensorError as error:
-            raise ConfigError.at_field(f"contacts[{index}].{error.field}", error.found, error.accepted) from error
-        source = f"contacts[{index}].radius"
+        shape = None
         if given.radius == "auto" and contact.kind != "flat":
             shapes = shapes or CollisionShapes(robot)
-            shape = _rolling_shape(shapes, contact)
-            if shape is not None:
-                contact = replace(contact, radius=shape.radius)
-                source = f"collision {shape.kind}" + (f" of {shape.link}" if shape.link != contact.frame else "")
+            shape = shapes.about(contact.frame, contact.rolling_axis)
+        found = RollingShape("point", 0.0, contact.frame) if shape is None else shape
+        x, y, z = UP if given.normal is None else given.normal
+        a, b, c = found.centre if given.centre == "auto" else given.centre
+        radius = found.radius if given.radius == "auto" else given.radius
+        try:
+            contact = replace(contact, normal=(x, y, z), radius=radius, centre=(a, b, c))
+        except SensorError as error:
+            raise ConfigError.at_field(f"contacts[{index}].{error.field}", error.found, error.accepted) from error
         out.append(contact)
-        sources.append(source)
-    return tuple(out), _describe(out, sources)
+        if contact.kind != "flat" and (contact.radius or given.radius == "auto"):
+            frames.setdefault(_rolling_text(contact, shape, given.radius == "auto"), []).append(contact.frame)
+    return tuple(out), "; ".join(f"{', '.join(names)}: {text}" for text, names in frames.items())
+
+
+def _rolling_text(contact: Contact, shape: RollingShape | None, is_auto: bool) -> str:
+    """On what a contact rolls, and from where that is known."""
+    if is_auto and shape is None:
+        missing = "sphere" if contact.kind == "point" else "cylinder along the line"
+        return f"radius 0: no {missing} found in the URDF; state contacts[].radius if it rolls"
+    text = f"{'ball' if contact.kind == 'point' else 'cylinder'} of radius {1e3 * contact.radius:.3g} mm"
+    if any(contact.centre):
+        text += f" about {join_numbers(float(f'{1e3 * x:.2g}') for x in contact.centre)} mm"
+    text += "" if contact.normal == UP else f", normal {join_numbers(contact.normal)}"
+    if shape is None:
+        return f"{text}, as stated"
+    source = f"the mesh {shape.file}" if shape.file else f"the collision {shape.kind}"
+    return f"{text}, from {source}" + (f" of {shape.link}" if shape.link != contact.frame else "")
 
 
 def with_scalar_sensors(contacts: Sequence[Contact], sensors: ChoiceConfig) -> tuple[Contact, ...]:
@@ -222,21 +238,3 @@ def _require_floor(contacts: tuple[Contact, ...]) -> None:
             found = f"{join_numbers(contact.normal)}, but contacts[0] has {join_numbers(contacts[0].normal)}"
             accepted = "one floor for all contacts, or preprocessing.base_motion: null"
             raise ConfigError.at_field(f"contacts[{index}].normal", found, accepted)
-
-
-def _rolling_shape(shapes: CollisionShapes, contact: Contact) -> RollingShape | None:
-    """The sphere or wheel of a point, or cylinder of a line, on which the URDF lets a contact roll; None without."""
-    if contact.kind == "flat":
-        return None
-    return shapes.about(contact.frame, contact.line_axis if contact.kind == "line" else None)
-
-
-def _describe(contacts: Sequence[Contact], sources: Sequence[str]) -> str:
-    """The contacts that roll by radius and normal, with where the radius is stated."""
-    frames: dict[str, list[str]] = {}
-    for contact, source in zip(contacts, sources, strict=True):
-        if contact.radius:
-            tilted = "" if contact.normal == UP else f", normal {join_numbers(contact.normal)}"
-            text = f"{contact.radius:g} m ({source.partition('[')[0]}{tilted})"
-            frames.setdefault(text, []).append(contact.frame)
-    return "; ".join(f"{', '.join(names)}: radius {text}" for text, names in frames.items())

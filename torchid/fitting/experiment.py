@@ -278,7 +278,10 @@ def set_up_robot(config: ExperimentConfig | AnalyzeConfig) -> RobotSetup:
         require_maps_of(robot, config.logs)
     contacts, rolling = resolve_contacts(config.contacts, robot)
     contacts = suited_to_preprocessing(with_scalar_sensors(contacts, config.sensors), config, robot)
-    stated = [replace(c, radius=contact.radius) for c, contact in zip(config.contacts, contacts, strict=True)]
+    stated = [
+        replace(c, radius=contact.radius, centre=list(contact.centre) if any(contact.centre) else c.centre)
+        for c, contact in zip(config.contacts, contacts, strict=True)
+    ]
     setup = RobotSetup(config=replace(config, contacts=stated), robot=robot, contacts=contacts, rolling=rolling)
     check_scale_groups(setup.terms, robot, contacts)
     stated_noise(config.sensors.noise, robot)

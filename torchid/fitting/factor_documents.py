@@ -146,6 +146,8 @@ def _contact_text(contact: Contact) -> str:
     kind = f"line along {contact.line_axis}" if contact.kind == "line" else contact.kind
     if contact.radius:  # a factor of a contact that does not roll stays what it was
         kind += f", radius {contact.radius!r} m, normal {', '.join(map(repr, contact.normal))}"
+    if any(contact.centre):
+        kind += f", centre {', '.join(map(repr, contact.centre))} m"
     if contact.along_normal:
         kind += f", read along {', '.join(map(repr, contact.normal))}"
     return f"{contact.frame} ({kind})"

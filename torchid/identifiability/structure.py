@@ -134,9 +134,9 @@ def standing_states(
     q, v, a = _random_states(robot, 2 * count, rng)
     constrained = [contact for contact, active in zip(contacts, state, strict=True) if active]
     rows = [
-        FrameJacobian(robot, contact.frame, contact.radius, contact.rolling_axis)(q, q.new_tensor(contact.normal))[
-            :, list(contact.components), : robot.nv
-        ]
+        FrameJacobian(robot, contact.frame, contact.radius, contact.rolling_axis, contact.centre)(
+            q, q.new_tensor(contact.normal)
+        )[:, list(contact.components), : robot.nv]
         for contact in constrained
     ]
     if robot.loops:
@@ -241,7 +241,7 @@ def _drift(robot: Robot, constrained: Sequence[Contact], q: Tensor, v: Tensor) -
     states = body_states(tree, motion, joint_motion(tree, motion))
     rows = []
     for contact in constrained:
-        node, T_joint_frame = tree.frame(robot, contact.frame)
+        node, T_joint_frame = tree.frame(robot, contact.frame, contact.centre)
         normal = q.new_tensor(contact.normal).expand(len(q), 3)
         if not robot.fixed_base:
             normal = (rotation_matrix(q[:, 3:7]).mT @ normal[..., None])[..., 0]

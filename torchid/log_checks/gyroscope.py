@@ -78,12 +78,12 @@ def _turning(
         parts.append((vector[where], np.gradient(vector, log.time, axis=0)[where], omega[where]))
 
     for index, foot in enumerate(feet):
-        T = poses[foot.frame].numpy()
+        T = foot.pose(poses[foot.frame].numpy())
         if foot.kind == "flat":
             for axis in range(3):
                 add(_AXIS_LENGTH_M * T[:, :3, axis], foot)
         for other in feet[index + 1 :]:
-            add(T[:, :3, 3] - poses[other.frame].numpy()[:, :3, 3], foot, other)
+            add(T[:, :3, 3] - other.pose(poses[other.frame].numpy())[:, :3, 3], foot, other)
     if not parts:
         return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3))
     vectors, rates, read = (np.concatenate(part) for part in zip(*parts, strict=True))

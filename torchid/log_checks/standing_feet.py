@@ -170,7 +170,7 @@ def _pose_findings(log: Log, contacts: Sequence[Contact], slip: float, poses: Li
         return
     feet = [c for c in contacts if c.frame in log.contact_names and c.frame in poses]
     stances = [
-        (poses[c.frame].numpy()[stance, :3, 3], _rolled(log, c, poses[c.frame].numpy())[stance], stance)
+        (c.pose(poses[c.frame].numpy())[stance, :3, 3], _rolled(log, c, poses[c.frame].numpy())[stance], stance)
         for c in feet
         for stance in _stances(log, log.contact_active[:, log.contact_names.index(c.frame)])
     ]
@@ -254,7 +254,7 @@ def measure_foot_slip(
     rolled = {c.frame: _rolled(log, c, poses[c.frame].numpy()) for c in feet}
     parts: list[tuple[float, float, int]] = []
     for i, foot in enumerate(feet):
-        T = poses[foot.frame].numpy()
+        T = foot.pose(poses[foot.frame].numpy())
         if foot.kind == "flat":
             for axis in range(3):
                 parts += _stance_motion(log, T[:, :3, axis], active[foot.frame], 1.0)
@@ -262,7 +262,7 @@ def measure_foot_slip(
             origin = log.base_position_world - rolled[foot.frame]
             parts += _stance_motion(log, T[:, :3, 3], active[foot.frame], _LENGTH_UNIT_M, origin)
         for second in feet[i + 1 :]:
-            between = T[:, :3, 3] - poses[second.frame].numpy()[:, :3, 3]
+            between = T[:, :3, 3] - second.pose(poses[second.frame].numpy())[:, :3, 3]
             apart = rolled[second.frame] - rolled[foot.frame]
             parts += _stance_motion(log, between, active[foot.frame] & active[second.frame], _LENGTH_UNIT_M, apart)
     world, base, samples = np.array(parts).reshape(-1, 3).sum(axis=0) if parts else (0.0, 0.0, 0)

@@ -293,9 +293,9 @@ def require_floor_normals(
 
 
 def feet_poses(log: Log, robot: Robot, contacts: Sequence[Contact]) -> dict[str, FloatArray]:
-    """Poses (N, 4, 4) of the contacts' frames in the base."""
+    """Poses (N, 4, 4) of the contacts' frames in the base, their origins at the contacts' centres."""
     position, parts = log.joint_position[:, joint_order(log, robot)], []
     for start in range(0, len(log), _POSES_TOGETHER):
         poses = robot.link_poses(torch.from_numpy(position[start : start + _POSES_TOGETHER]))
-        parts.append({contact.frame: poses[contact.frame].numpy() for contact in contacts})
+        parts.append({contact.frame: contact.pose(poses[contact.frame].numpy()) for contact in contacts})
     return {frame: np.concatenate([part[frame] for part in parts]) for frame in parts[0]}

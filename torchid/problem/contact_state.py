@@ -164,7 +164,7 @@ class ContactStateLayouts:
         self.columns = columns
         self.contacts = tuple(contacts)
         self.sensors = sensors
-        self.frames = [columns.tree.frame(robot, contact.frame) for contact in contacts]
+        self.frames = [columns.tree.frame(robot, contact.frame, contact.centre) for contact in contacts]
         self._measured = measured_components(self.contacts, sensors)
         self._loops = LoopLayouts(robot)
         self.dof_std = sensors.noise.dof_std(robot.n, robot.n_dofs)

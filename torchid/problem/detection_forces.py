@@ -142,7 +142,8 @@ class _Balance:
         maps, normals = [], []
         for contact in self.contacts:
             normal = torch.tensor(contact.normal, dtype=torch.float64)
-            J = FrameJacobian(self.robot, contact.frame, contact.radius, contact.rolling_axis)(q, normal).numpy()
+            jacobian = FrameJacobian(self.robot, contact.frame, contact.radius, contact.rolling_axis, contact.centre)
+            J = jacobian(q, normal).numpy()
             maps.append(J[:, list(contact.components), :n][:, :, self.rows])
             in_base = rotation.swapaxes(1, 2) @ np.array(contact.normal)
             normals.append((J[:, :3, :3] @ in_base[..., None])[..., 0])  # which turns the base's axes into the frame's

@@ -273,7 +273,14 @@ class FrameJacobian(nn.Module):
     at c.
     """
 
-    def __init__(self, robot: Robot, frame: str, radius: float = 0.0, axis: str | None = None) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        frame: str,
+        radius: float = 0.0,
+        axis: str | None = None,
+        centre: Sequence[float] = (0.0, 0.0, 0.0),
+    ) -> None:
         """Build the constants.
 
         Args:
@@ -281,13 +288,14 @@ class FrameJacobian(nn.Module):
             frame: name of a URDF link.
             radius: of the sphere or cylinder [m].
             axis: x, y or z, along which the cylinder is; None for a sphere.
+            centre: c in the frame, (3,) [m].
 
         Raises:
             UnknownNameError: the URDF has no such link.
         """
         super().__init__()
         self.tree = KinematicTree(robot)
-        self._body, T_joint_frame = self.tree.frame(robot, frame)
+        self._body, T_joint_frame = self.tree.frame(robot, frame, centre)
         unit_wrenches = wrench_transform(T_joint_frame).T
         self.register_buffer("unit_wrenches", torch.tensor(unit_wrenches.copy()), persistent=False)
         self._joints = range(robot.n_dofs)

@@ -235,15 +235,19 @@ class KinematicTree(nn.Module):
         """Share (...) of its friction at rest that Stribeck friction has at velocities (...) [rad/s or m/s]."""
         return self.coulomb_sign(velocity) * torch.exp(-((velocity / (self.stribeck or torch.inf)) ** 2))
 
-    def frame(self, robot: Robot, link: str) -> tuple[int, Array]:
+    def frame(self, robot: Robot, link: str, origin: Sequence[float] = (0.0, 0.0, 0.0)) -> tuple[int, Array]:
         """Node that carries a URDF link of the robot, and the link's pose, (4, 4) [m], in the node's joint frame.
+
+        `origin`: (3,) [m], a point of the link that counts as its origin.
 
         Raises:
             UnknownNameError: the URDF has no such link.
         """
         body, T_body_link = robot.link(link)
         node = self.node_of[body]
-        return node, self.T_joint_link[node] @ T_body_link
+        T = self.T_joint_link[node] @ T_body_link
+        T[:3, 3] += T[:3, :3] @ np.array(origin)
+        return node, T
 
     def path(self, body: int) -> list[int]:
         """Nodes whose joints move node `body`, from the base outward, including itself, without the base."""

@@ -1,96 +1,152 @@
-"""What a frame rolls on: spheres, cylinders and wheels among the URDF's collision shapes."""
+"""What a frame rolls on: spheres, cylinders, wheels and ends of meshes among the URDF's collision shapes."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import PurePosixPath
 
 import numpy as np
-from lxml import etree
-from scipy.spatial.transform import Rotation
 
 from torchid.parameters import Array
 from torchid.robot.robot import Robot
-from torchid.robot.shapes import read_numbers
-from torchid.robot.urdf import parse_xml
+from torchid.robot.shapes import Meshes, Shape, read_shape
+from torchid.robot.urdf import MeshError, parse_xml
 
 _MAX_OFFSET_M, _MAX_OFFSET_SHARE = 1e-3, 0.1
-"""Distance of a shape's centre or axis from the frame's origin up to which it is about the origin: either of both."""
+"""Distance of a cylinder's axis or a wheel's centre from the frame's origin up to which it is about it: either."""
 _MAX_ANGLE = 0.02  # rad, between a cylinder and the axis of its contact or joint
+_END_SHARES = (0.5, 0.3, 0.2, 0.1)  # of a mesh's length, the end that may be a ball; the first that is one counts
+_MAX_MISFIT_SHARE = 0.05  # of the radius, rms and at the lowest point; the end of Go2's foot misses a ball by 0.036
+_MIN_DEPTH_SHARE = 0.15  # of the radius: less of a ball is a sole, and a foot that turns by 30 degrees leaves it
+_MAX_BREADTH_SHARE = 1.1  # of the mesh's longest edge, the diameter
+_FEWEST_CORNERS = 8
 
 
 @dataclass(frozen=True)
 class RollingShape:
-    """A collision shape about a frame's origin: a "sphere", "cylinder" or "wheel", its radius [m], and its link."""
+    """A "sphere", "cylinder", "wheel" or "mesh" that rolls: its radius [m], link, and centre (3,) [m] in the frame.
+
+    `file`: of a mesh, its name.
+    """
 
     kind: str
     radius: float
     link: str
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    file: str = ""
 
 
 class CollisionShapes:
-    """The collision spheres and cylinders of a robot's links."""
+    """The collision spheres, cylinders and meshes of a robot's links."""
 
     def __init__(self, robot: Robot) -> None:
         """Read the URDF, whose other shapes do not matter here."""
-        self.robot = robot
+        self.robot, self._meshes = robot, Meshes(robot.path)
         self._links = {link.get("name"): link for link in parse_xml(robot.path).getroot().findall("link")}
 
-    def about(self, frame: str, axis: str | None = None) -> RollingShape | None:
-        """The shape about a frame's origin, of its own link or of one that is welded to it; None if there is none.
+    def about(self, frame: str, axis: str | None = None, meshes: bool = True) -> RollingShape | None:
+        """What a frame rolls on, of its own link or of one that is welded to it; None if there is nothing.
 
-        Of several, one of the frame's own link, then the largest, which touches the ground first. Where a point has no
-        sphere, a wheel: a cylinder that turns about its own axis without end. While upright it touches the ground
-        where a sphere of its radius does.
+        Of several spheres that the frame's origin lies in one of the frame's own link, then the largest, which touches
+        the ground first; else the only sphere of the frame's own link. Where a point has no sphere, a wheel: a cylinder
+        that turns about its own axis without end. While upright it touches the ground where a sphere of its radius
+        does. Where it has neither, a ball that is the end of a mesh, see `fit_end`, chosen as spheres are.
 
         Args:
             frame: a link of the robot.
-            axis: x, y or z of the frame, along which a cylinder must be; None for a sphere or a wheel.
+            axis: x, y or z of the frame, along which a cylinder must be; None for a sphere, a wheel or a mesh.
+            meshes: whether to look at meshes.
 
         Raises:
             UnknownNameError: no such link.
             UrdfError: a shape that is not described by numbers.
         """
         body, T_body_frame = self.robot.link(frame)
+        T_frame_body, joint = np.linalg.inv(T_body_frame), self.robot.bodies[body].joint
         if axis is not None:
-            return self._largest("cylinder", frame, np.eye(3)["xyz".index(axis)])
-        sphere, joint = self._largest("sphere", frame), self.robot.bodies[body].joint
-        if sphere is not None or joint is None or not joint.continuous:
-            return sphere
-        return self._largest("wheel", frame, (joint.T_joint_link[:3, :3] @ T_body_frame[:3, :3]).T @ joint.axis)
+            along = np.eye(3)["xyz".index(axis)]
+            return _choose(self._all(frame, "cylinder", lambda shape: _cylinder(shape, along, slides=True)), frame)
+        ball = _choose(self._all(frame, "sphere", lambda shape: (shape.points[0], _radius(shape))), frame)
+        if ball is None and joint is not None and joint.continuous:
+            along = T_frame_body[:3, :3] @ joint.T_joint_link[:3, :3].T @ joint.axis
+            wheel = _choose(self._all(frame, "cylinder", lambda shape: _cylinder(shape, along, slides=False)), frame)
+            ball = None if wheel is None else replace(wheel, kind="wheel")
+        if ball is None and meshes:
+            hinge: Array = np.array(T_frame_body)[:3, 3]
+            if joint is not None:
+                hinge = (T_frame_body @ np.linalg.inv(joint.T_joint_link))[:3, 3]
+            ball = _choose(self._all(frame, "mesh", lambda shape: fit_end(shape.points, hinge)), frame)
+        return ball
 
-    def _largest(self, kind: str, frame: str, axis: Array | None = None) -> RollingShape | None:
-        """The largest shape of a kind about a frame's origin, along a unit vector (3,) in the frame."""
+    def _all(self, frame: str, kind: str, measure: Callable[[Shape], tuple[Array, float] | None]) -> list[RollingShape]:
+        """What rolls among shapes of a kind; `measure`: centre (3,) and radius [m] of one in the frame, or None."""
         body, T_body_frame = self.robot.link(frame)
-        T_frame_body = np.linalg.inv(T_body_frame)
-        found: list[RollingShape] = []
-        for name in sorted(self.robot.bodies[body].links, key=lambda name: name != frame):
-            T_frame_link = T_frame_body @ self.robot.links[name][1]
-            for element in self._links[name].findall("collision"):
-                radius = self._radius_about(kind, name, element, T_frame_link, axis)
-                if radius > 0.0:
-                    found.append(RollingShape(kind, radius, name))
-            if found and name == frame:
-                break
-        return max(found, key=lambda shape: shape.radius, default=None)
+        found = []
+        for link in sorted(self.robot.bodies[body].links, key=lambda name: name != frame):
+            T_frame_link = np.linalg.inv(T_body_frame) @ self.robot.links[link][1]
+            for element in self._links[link].findall("collision"):
+                tag = element.find(f"geometry/{kind}")
+                if tag is None:
+                    continue
+                try:
+                    shape = read_shape(self._meshes, f"link '{link}', <collision>", element).moved(T_frame_link)
+                except MeshError:
+                    continue
+                measured = measure(shape)
+                if measured is not None and measured[1] > 0.0:
+                    (x, y, z), radius = measured[0].tolist(), measured[1]
+                    file = PurePosixPath(str(tag.get("filename", ""))).name
+                    found.append(RollingShape(kind, radius, link, (x, y, z), file))
+        return found
 
-    def _radius_about(
-        self, kind: str, link: str, element: etree._Element, T_frame_link: Array, axis: Array | None
-    ) -> float:
-        """Radius of a shape if it is of a kind, about the frame's origin and along an axis, else 0."""
-        shape = element.find(f"geometry/{'sphere' if kind == 'sphere' else 'cylinder'}")
-        if shape is None:
-            return 0.0
-        path, field = self.robot.path, f"link '{link}', <collision>"
-        (radius,) = read_numbers(path, f"{field} <{shape.tag!s}", shape, "radius", 1)
-        origin, xyz, rpy = element.find("origin"), np.zeros(3), np.zeros(3)
-        if origin is not None:
-            xyz, rpy = (read_numbers(path, f"{field} <origin", origin, name, 3, "0 0 0") for name in ("xyz", "rpy"))
-        centre = T_frame_link[:3, :3] @ xyz + T_frame_link[:3, 3]
-        if axis is not None:
-            along = T_frame_link[:3, :3] @ Rotation.from_euler("xyz", rpy).as_matrix()[:, 2]
-            if np.linalg.norm(np.cross(along, axis)) > _MAX_ANGLE:
-                return 0.0
-            if kind == "cylinder":  # a line is as long as its contact; a wheel, narrow, stands on its middle
-                centre = centre - along * (along @ centre)
-        is_about = np.linalg.norm(centre) <= max(_MAX_OFFSET_M, _MAX_OFFSET_SHARE * radius)
-        return float(radius) if is_about else 0.0
+
+def _choose(found: list[RollingShape], frame: str) -> RollingShape | None:
+    """Of shapes that the frame's origin lies in the largest, of its own link first; else its own link's only one."""
+    own = [shape for shape in found if shape.link == frame]
+    for some in (own, found):
+        if around := [shape for shape in some if np.linalg.norm(shape.centre) <= shape.radius]:
+            return max(around, key=lambda shape: shape.radius)
+    return own[0] if len(own) == 1 else None
+
+
+def _radius(shape: Shape) -> float:
+    return float(np.linalg.norm(shape.spread, 2))
+
+
+def _cylinder(shape: Shape, along: Array, slides: bool) -> tuple[Array, float] | None:
+    """Origin and radius of a cylinder about the origin along a unit vector (3,), anywhere along it if it `slides`."""
+    axis, centre, radius = shape.axes[:, 2], shape.points.mean(axis=0), _radius(shape)
+    if slides:  # a line is as long as its contact; a wheel, narrow, stands on its middle
+        centre = centre - axis * (axis @ centre)
+    is_about = np.linalg.norm(centre) <= max(_MAX_OFFSET_M, _MAX_OFFSET_SHARE * radius)
+    return (np.zeros(3), radius) if is_about and np.linalg.norm(np.cross(axis, along)) <= _MAX_ANGLE else None
+
+
+def fit_end(points: Array, hinge: Array) -> tuple[Array, float] | None:
+    """Centre (3,) and radius [m] of the ball that fits the end of a mesh by least squares, None if none does.
+
+    Args:
+        points: corners of the mesh, (N, 3) [m].
+        hinge: where its limb begins, (3,) [m]; the end is the part that is farthest from it.
+    """
+    away = points.mean(axis=0) - hinge
+    depth = points @ away / max(float(np.linalg.norm(away)), np.finfo(float).tiny)
+    longest = np.ptp(points, axis=0).max()
+    for share in _END_SHARES:
+        end = np.unique(points[depth >= depth.max() - share * np.ptp(depth)], axis=0)
+        if len(end) < _FEWEST_CORNERS:
+            break
+        solved, *_ = np.linalg.lstsq(np.column_stack([2.0 * end, np.ones(len(end))]), (end**2).sum(axis=1))
+        centre = solved[:3]
+        radius = float(np.sqrt(solved[3] + centre @ centre))
+        misfit = np.linalg.norm(end - centre, axis=1) - radius
+        lowest = depth.max() - centre @ away / np.linalg.norm(away) - radius
+        is_ball = max(np.sqrt(np.mean(misfit**2)), abs(lowest)) <= _MAX_MISFIT_SHARE * radius
+        if (
+            is_ball
+            and share * np.ptp(depth) >= _MIN_DEPTH_SHARE * radius
+            and 2.0 * radius <= _MAX_BREADTH_SHARE * longest
+        ):
+            return centre, radius
+    return None

@@ -49,17 +49,17 @@ class Extent:
 
 
 @dataclass(frozen=True)
-class _Shape:
+class Shape:
     """Convex hull of `points`, (N, 3), widened by `spread @ u`, (3, 3), for all |u| <= 1 [m]; and its own axes."""
 
     points: Array
     spread: Array
     axes: Array
 
-    def moved(self, T: Array) -> _Shape:
+    def moved(self, T: Array) -> Shape:
         """Expressed in another frame; `T`, (4, 4) [m], is the pose of this one in it."""
         R = T[:3, :3]
-        return _Shape(self.points @ R.T + T[:3, 3], R @ self.spread, R @ self.axes)
+        return Shape(self.points @ R.T + T[:3, 3], R @ self.spread, R @ self.axes)
 
 
 def body_extents(robot: Robot, prefer: ShapeKind = "visual", bodies: Iterable[int] | None = None) -> dict[int, Extent]:
@@ -89,7 +89,7 @@ def body_extents(robot: Robot, prefer: ShapeKind = "visual", bodies: Iterable[in
     chosen = [i for i, body in enumerate(robot.bodies) if not body.massless] if bodies is None else bodies
     extents: dict[int, Extent] = {}
     shapeless, unreadable, reasons = [], [], []
-    meshes = _Meshes(robot.path)
+    meshes = Meshes(robot.path)
     for index in chosen:
         body, shapes, inertia_boxes = robot.bodies[index], [], []
         try:
@@ -120,7 +120,7 @@ def _warn_without_extent(path: Path, what: str, bodies: list[str], reasons: list
         warn(message)
 
 
-def _link_shapes(meshes: _Meshes, link: etree._Element, prefer: ShapeKind) -> list[_Shape]:
+def _link_shapes(meshes: Meshes, link: etree._Element, prefer: ShapeKind) -> list[Shape]:
     other = "visual" if prefer == "collision" else "collision"
     for tag in (prefer, other):
         elements = link.findall(tag)
@@ -128,12 +128,12 @@ def _link_shapes(meshes: _Meshes, link: etree._Element, prefer: ShapeKind) -> li
             field = f"link '{link.get('name')}', <{tag}>"
             if len(elements) > MAX_SHAPES:
                 raise UrdfError(meshes.urdf, field, f"{len(elements)} of them", f"at most {MAX_SHAPES}")
-            return [_shape(meshes, field, element) for element in elements]
+            return [read_shape(meshes, field, element) for element in elements]
     return []
 
 
-def _shape(meshes: _Meshes, field: str, element: etree._Element) -> _Shape:
-    """A shape in its link's frame."""
+def read_shape(meshes: Meshes, field: str, element: etree._Element) -> Shape:
+    """A shape in its link's frame; `field` names it in messages. Raises MeshError, or UrdfError as `body_extents`."""
     path = meshes.urdf
     geometry = element.find("geometry")
     tags = [] if geometry is None else [child for child in geometry if isinstance(child.tag, str)]  # and no comments
@@ -145,10 +145,10 @@ def _shape(meshes: _Meshes, field: str, element: etree._Element) -> _Shape:
     if origin is not None:
         rpy, xyz = (read_numbers(path, f"{field} <origin", origin, name, 3, "0 0 0") for name in ("rpy", "xyz"))
         T[:3, :3], T[:3, 3] = Rotation.from_euler("xyz", rpy).as_matrix(), xyz
-    return _Shape(points, spread, np.eye(3)).moved(T)
+    return Shape(points, spread, np.eye(3)).moved(T)
 
 
-def _points_and_spread(meshes: _Meshes, field: str, shape: etree._Element) -> tuple[Array, Array]:
+def _points_and_spread(meshes: Meshes, field: str, shape: etree._Element) -> tuple[Array, Array]:
     """Points (N, 3) and spread (3, 3) of a shape in its own frame."""
     path = meshes.urdf
     if shape.tag == "box":
@@ -182,7 +182,7 @@ def read_numbers(path: Path, field: str, element: etree._Element, name: str, cou
     return values
 
 
-class _Meshes:
+class Meshes:
     """The meshes that a URDF names, each read once."""
 
     def __init__(self, urdf: Path) -> None:
@@ -253,16 +253,16 @@ def _require_vertices(filename: str, vertices: object) -> Array:
     return points
 
 
-def _inertia_box(inertial: Inertial) -> _Shape:
+def _inertia_box(inertial: Inertial) -> Shape:
     """The uniform box that has a link's inertia."""
     inertia, T = np.asarray(inertial.inertia), np.eye(4) if inertial.origin is None else inertial.origin
     spread = (0.5 * np.trace(inertia) * np.eye(3) - inertia) / inertial.mass
     values, axes = np.linalg.eigh(spread)
     corners = _CORNERS * np.sqrt(3.0 * np.maximum(values, 0.0))
-    return _Shape(corners @ axes.T, np.zeros((3, 3)), axes).moved(T)
+    return Shape(corners @ axes.T, np.zeros((3, 3)), axes).moved(T)
 
 
-def _extent(shapes: list[_Shape]) -> Extent | None:
+def _extent(shapes: list[Shape]) -> Extent | None:
     """Extent of one body's shapes; None if they are a single point."""
     points, spreads = np.concatenate([shape.points for shape in shapes]), np.stack([shape.spread for shape in shapes])
     of_point = np.repeat(np.arange(len(shapes)), [len(shape.points) for shape in shapes])

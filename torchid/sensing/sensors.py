@@ -40,6 +40,7 @@ class Contact:
     `line_axis`: the ground acts at c - radius n, n being `normal`, (3,), a unit vector in the world that points away
     from the ground (of a cylinder its part across the axis). Readings are wrenches at c all the same; of a line's
     force, the part along the axis then counts as acting at c, since moments across the axis are free.
+    `centre`, (3,) [m]: c of a point in the frame, where a ball's centre lies beside the frame's origin.
 
     `along_normal`: the contact has a scalar sensor, which reads the force along `normal` alone, "fn". The axes of its
     force are then the ground's, fz that along the normal and fx and fy across it, instead of the frame's.
@@ -51,13 +52,14 @@ class Contact:
     radius: float = 0.0
     normal: tuple[float, float, float] = UP
     along_normal: bool = False
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         """Validate all, and give the normal unit length.
 
         Raises:
-            SensorError: an unknown kind or line axis, a radius that is negative or a flat contact's, a normal of no
-                length.
+            SensorError: an unknown kind or line axis, a radius that is negative or a flat contact's, a centre of
+                another contact than a point, a normal of no length.
         """
         if self.kind not in CONTACT_TYPES:
             raise SensorError(f"contact '{self.frame}'", "type", f"'{self.kind}'", ", ".join(CONTACT_TYPES))
@@ -68,6 +70,9 @@ class Contact:
         if self.radius and self.kind == "flat":
             accepted = "type point (a sphere) or line (a cylinder), or radius 0"
             raise SensorError(f"contact '{self.frame}'", "radius", f"{self.radius:g} of a flat contact", accepted)
+        if len(self.centre) != 3 or not np.isfinite(self.centre).all() or self.kind != "point" and any(self.centre):
+            accepted = "three numbers [m] in the frame of a point"
+            raise SensorError(f"contact '{self.frame}'", "centre", join_numbers(self.centre), accepted)
         length = float(np.linalg.norm(self.normal))
         if len(self.normal) != 3 or not 0.0 < length < np.inf:
             raise SensorError(
@@ -90,6 +95,12 @@ class Contact:
     def rolling_axis(self) -> str | None:
         """Axis of the frame about which a line rolls; None for a point, whose sphere has none."""
         return self.line_axis if self.kind == "line" else None
+
+    def pose(self, frame_pose: Array) -> Array:
+        """Poses (..., 4, 4) of the frame, its origin moved to the contact's centre."""
+        moved = frame_pose.copy()
+        moved[..., :3, 3] += moved[..., :3, :3] @ np.array(self.centre)
+        return moved
 
     def component_name(self, k: int) -> str:
         """Name of a component that its sensors measure, by index in `WRENCH_COMPONENTS`."""

@@ -56,9 +56,9 @@ class Foot:
         return 6 if form_polygon(np.array(self.points)) else 3
 
 
-def point_foot(frame: str, radius: float = 0.0) -> Foot:
-    """A foot that is one sphere about the origin of its frame, of a radius [m], or a point."""
-    return Foot(frame, ((0.0, 0.0, 0.0),), (max(radius, _RADIUS),))
+def point_foot(frame: str, radius: float = 0.0, centre: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Foot:
+    """A foot that is one sphere of a radius about a point of its frame [m], or that point."""
+    return Foot(frame, (centre,), (max(radius, _RADIUS),))
 
 
 def find_feet(settings: list[FootConfig], urdf: Path) -> tuple[Foot, ...]:

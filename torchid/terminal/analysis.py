@@ -46,7 +46,7 @@ def analysis_lines(analysis: Analysis, width: int) -> list[str]:
     else:
         lines += _scenario_lines(scenarios, width)
     if analysis.setup.rolling:
-        lines += labelled("rolling", analysis.setup.rolling, width, _TEXT_LINES)
+        lines += labelled("contacts", analysis.setup.rolling, width, 1)
     attention = list(_attention(analysis, scenarios))
     for one in attention[:_MOST_ATTENTION]:
         lines += labelled("attention", one, width, _TEXT_LINES)

@@ -32,7 +32,7 @@ def print_checks(checked: Sequence[Checked], written: Sequence[str | None]) -> N
 def check_lines(checked: Sequence[Checked], written: Sequence[str | None], width: int) -> list[str]:
     """The answer, in lines of at most so many columns, but for names that are longer; see `print_checks`."""
     head = wrap_words(_headline(checked), width)
-    rolling = labelled("rolling", checked[0].rolling, width, _TEXT_LINES) if checked and checked[0].rolling else []
+    rolling = labelled("contacts", checked[0].rolling, width, _TEXT_LINES) if checked and checked[0].rolling else []
     skipped = _skipped_lines(checked, _TEXT_LINES, width)
     files = [f"{'written to':{LABEL}}{name}" for name in written if name]
     room = LINES - len([*head, *rolling, *skipped, *files])

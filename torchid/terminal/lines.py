@@ -98,9 +98,9 @@ def error_lines(errors: Sequence[tuple[str, float, float, float | None]], width:
 
 
 def print_rolling(rolling: str) -> None:
-    """Print which feet roll on which radius, if any do."""
+    """Print which feet roll on what, and from where that is known."""
     if rolling:
-        print_labelled("rolling", rolling)
+        print_labelled("contacts", rolling)
 
 
 def print_noise(noise: NoiseSummary) -> None:
