@@ -39,6 +39,8 @@ _REGULAR = 0.1  # of the least singular value of a loop Jacobian where it is lar
 _LEAST_SHARE = 0.01  # of the way to a random posture, to which a path is cut short
 _SAMPLES_PER_COLUMN = 2  # per state: a sample gives at least one row, and some directions are rarely excited
 _WEIGHTLESS = (0.0, 0.0, 0.0)
+_SOLE_STEPS, _SOLE_STEP = 30, 1.0  # that turn soles along the ground, and the longest of them [rad]
+_SOLE_RTOL = 1e-3  # of singular values of these steps: two of three directions of each sole count
 _AT_REST = 1e-10  # a projected velocity below this share of the drawn one is rounding and has no sign
 
 
@@ -90,8 +92,9 @@ def standing_samples(
 ) -> Samples:
     """Random samples that satisfy the constraints of a contact state; forces are zeros.
 
-    Positions are unconstrained: the ground differs between samples, with any slope under every foot. The rank is an
-    upper bound of that on one ground. A fixed base stands as the robot's.
+    The ground differs between samples: points and lines stand on any slope, flat feet of a floating base stand along
+    their contacts' normals, so that gravity never turns in their frames on a level floor. The rank is an upper bound of
+    that on one ground. A fixed base stands as the robot's.
 
     Args:
         robot: the robot.
@@ -126,13 +129,17 @@ def standing_states(
     J_C has the rows of the components that active contacts can exert: a point contact fixes its frame's origin, a flat
     one the whole frame, a line contact all but the rotation about itself; with a radius, they roll. Twice as many
     states are drawn, and those nearest to a singular J_C are dropped: accelerations are unbounded there. Loops are
-    closed, and have rows too.
+    closed, and have rows too. Of flat feet the frames' axes that are nearest to upward at joint positions of 0 are
+    along the normals, but for robots with loops.
 
     Raises:
         UrdfError: loops that close nowhere.
     """
     q, v, a = _random_states(robot, 2 * count, rng)
     constrained = [contact for contact, active in zip(contacts, state, strict=True) if active]
+    soles = [contact for contact in constrained if contact.kind == "flat"]
+    if soles and not robot.fixed_base and not robot.loops:
+        q = _stand_on_soles(robot, soles, q)
     rows = [
         FrameJacobian(robot, contact.frame, contact.radius, contact.rolling_axis, contact.centre)(
             q, q.new_tensor(contact.normal)
@@ -217,6 +224,30 @@ def closed_postures(robot: Robot, postures: Array) -> Array:
         out[left[kept]] = q[kept]
         left, share = left[~kept], share / 2.0
     return np.asarray(out.numpy())
+
+
+def _stand_on_soles(robot: Robot, soles: Sequence[Contact], q: Tensor) -> Tensor:
+    """Coordinates (B', n + 7) near others (B, n + 7) at which flat feet stand along their contacts' normals.
+
+    Newton's steps on the base's orientation and the joints; of postures from which they do not lead there none is left.
+    """
+    jacobians = [FrameJacobian(robot, contact.frame) for contact in soles]
+    rest = q.new_tensor([0.0] * 6 + [1.0] + [0.0] * robot.n)[None]
+    upward = [J(rest)[0, :3, 2] for J in jacobians]  # of the base's z axis in the frames
+    axes = [torch.where(up.abs() == up.abs().max(), up.sign(), 0.0) for up in upward]
+    for _ in range(_SOLE_STEPS):
+        rows, wanted = [], []
+        for contact, jacobian, axis in zip(soles, jacobians, axes, strict=True):
+            J, normal = jacobian(q), q.new_tensor(contact.normal)
+            normals = (J[:, :3, :3] @ (rotation_matrix(q[:, 3:7]).mT @ normal)[..., None])[..., 0]
+            rows.append(torch.linalg.cross(normals[..., None], J[:, 3:, : robot.nv], dim=1))
+            wanted.append(axis - normals)
+        missing = torch.cat(wanted, dim=1)
+        step = (torch.linalg.pinv(torch.cat(rows, dim=1), rtol=_SOLE_RTOL) @ missing[..., None])[..., 0]
+        step = step * (_SOLE_STEP / step.norm(dim=1, keepdim=True).clamp(min=_SOLE_STEP))
+        turned = Rotation.from_quat(q[:, 3:7].numpy()) * Rotation.from_rotvec(step[:, 3:6].numpy())
+        q = torch.cat([q[:, :3], torch.from_numpy(turned.as_quat()), q[:, 7:] + step[:, 6:]], dim=1)
+    return q[missing.abs().amax(1) < KINEMATIC_TOLERANCE]
 
 
 def _in_null_space(x: Tensor, inverse: Tensor, J: Tensor) -> Tensor:
