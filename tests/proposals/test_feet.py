@@ -114,6 +114,17 @@ def test_one_force_of_each_foot_by_french_sides_is_a_flag_above_a_threshold() ->
     assert 0.0 < entry["above"] < 0.2 * WEIGHT
 
 
+@pytest.mark.parametrize("order", [1, -1])
+@pytest.mark.parametrize(("force", "flag"), [("foot_force_{}", "contact_{}"), ("force_pied_{}", "contact_pied_{}")])
+def test_recorded_flags_count_before_a_threshold_of_forces(force: str, flag: str, order: int) -> None:
+    names = ("avg", "avd", "arg", "ard") if "pied" in force else LEGS
+    forces = {force.format(x): swinging(k) for k, x in enumerate(names)}
+    flags = {flag.format(x): (swinging(k) > 0.1 * WEIGHT).astype(int) for k, x in enumerate(names)}
+    entry = proposed(QUADRUPED, dict([*forces.items(), *flags.items()][::order])).columns["contact_active"]
+    assert "above" not in entry
+    assert "force" not in str(entry)
+
+
 def test_feet_without_names_are_in_the_order_of_the_legs_in_a_list_of_joints() -> None:
     legs = ("FL", "FR", "RL", "RR")
     forces = np.stack([swinging(k) for k in range(4)], axis=1)

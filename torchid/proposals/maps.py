@@ -25,6 +25,7 @@ from torchid.proposals.numbers import (
     UnitProposer,
     are_states,
     gravity_share,
+    is_flags,
     step_of_stamps,
     threshold,
     unit_of_step,
@@ -91,7 +92,7 @@ class _Proposer:
         self.match.look_at(families, more)
         if named := self.match.named_joints:
             self.out.lacking = [name for name in self.joints if name not in named]
-        families = sorted(families, key=self._lacks_gravity)
+        families = sorted(families, key=lambda one: (self._lacks_gravity(one), not self._has_flags(one)))
         of_force = (one for one in families if self._lacks_gravity(one) < 0.0)
         self.force = next((side_by_side(self.sample, one.columns) for one in of_force), None)
         split, of_limbs = self._place_parts(numeric), self._place_limbs(numeric)
@@ -152,6 +153,10 @@ class _Proposer:
             return 0.0
         values = side_by_side(self.sample, family.columns)
         return -gravity_share(values) if values.shape[1:] == (3,) and values.dtype.kind in "fiu" else 0.0
+
+    def _has_flags(self, family: Family) -> bool:
+        """Whether a family is recorded flags of contacts, which count before a threshold of forces."""
+        return family.proposed == "contact_active" and is_flags(side_by_side(self.sample, family.columns))
 
     def _settle_contacts(self, used: list[Family]) -> list[Family]:
         """The families in use without moments of contacts that have no force; flags by forces where none are."""
@@ -271,7 +276,8 @@ class _Proposer:
     def _place_feet(self, columns: Sequence[str]) -> set[str]:
         """Columns of forces and flags of feet that the file names by their sides, which have become entries."""
         taken = set[str]()
-        for one in find_foot_readings(self.sample, columns, self.robot):
+        found = find_foot_readings(self.sample, columns, self.robot)
+        for one in sorted(found, key=lambda one: not is_flags(side_by_side(self.sample, one.family.columns))):
             known, entry = {*self.given, *self.out.columns}, one.family.entry
             if one.part == "normal":
                 placed = "contact_active" not in known and self._add_threshold(one.family, entry)
@@ -345,7 +351,7 @@ class _Proposer:
             text = f"'{excerpt(family.columns[0])}' has numbers of states, which nothing in the file explains: not used"
             self._note("contact_active", text)
             return False
-        if not np.isin(values, (0, 1)).all():
+        if not is_flags(values):
             entry["above"] = threshold(values)
             self.out.notes["contact_active"] = "threshold, from the readings in the air and their range"
         return True

@@ -371,6 +371,11 @@ def gravity_share(readings: Any) -> float:
         return float(np.square(constant).sum() / size.sum())
 
 
+def is_flags(values: Any) -> bool:
+    """Whether numbers are zeros and ones, or truth values."""
+    return bool(np.isin(values, (0, 1)).all())
+
+
 def are_states(values: Any) -> bool:
     """Whether numbers are those of a few states, counted from 1: of which of them a foot touches nobody knows."""
     found = np.unique(np.asarray(values, dtype=float))
