@@ -159,6 +159,7 @@ def test_every_key_of_preprocessing_that_changes_samples_changes_their_name(demo
         "contacts.0.type=flat",
         "contacts.0={type: line, line_axis: x}",
         "contacts.0={type: point, radius: 0.02}",
+        "contacts.0={type: point, centre: [0, 0, 0.02]}",
         "contacts.0={type: point, normal: [0, 0.1, 1]}",
         "logs.topics.joint_states=/joints",
         "logs.topics.low_state={topic: /lowstate, joints: [front_left_hip]}",
@@ -166,7 +167,7 @@ def test_every_key_of_preprocessing_that_changes_samples_changes_their_name(demo
 )
 def test_robot_contacts_and_topics_change_the_name_of_samples(demo: Path, tmp_path: Path, other: str) -> None:
     assert len(fields(RobotConfig)) == 8, "urdf and mjcf, base_link, fixed_base, weld, base_tilt, loops, passive"
-    assert {x.name for x in fields(ContactConfig)} == {"frame", "type", "line_axis", "radius", "normal"}
+    assert {x.name for x in fields(ContactConfig)} == {"frame", "type", "line_axis", "radius", "centre", "normal"}
     document = yaml.safe_load(demo.read_text())
     key, _, value = other.partition("=")
     if key.startswith("contacts"):

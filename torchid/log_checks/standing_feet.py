@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -37,8 +38,10 @@ MAX_UNEXPLAINED_SLIP_SHARE = 0.6
 #: Motion of standing feet from which on one of them is named, if the others leave less than this share of it: a zero of
 #: 0.3 rad in one joint of a hexapod's 18 makes 0.07 to 0.1, of a humanoid's knee 0.07; without its foot 0.01 are left.
 MIN_SINGLE_SHARE, MAX_OTHERS_SHARE = 0.05, 0.25
-#: Motion of standing feet from which on it is asked whether they roll on other radii, and the radius to begin with.
-MIN_ROLLING_SHARE, _TRIAL_RADIUS_M = 0.02, 0.01
+#: Windows in which the radius is fitted that feet roll on, and the fewest; passes of the fit, whose weights follow.
+_ROLLING_WINDOW_S, _FEWEST_WINDOWS, _PASSES = 0.5, 10, 20
+#: Difference of a radius that is a finding, as a share and in standard errors: 22 and 31 mm that creep show 16 and 25.
+_RADIUS_SHARE, _RADIUS_ERRORS = 0.4, 5.0
 #: Unknowns of a base's pose that are of one kind, how large they usually are [m, rad, s], and their weight in the fit.
 _POSE_UNKNOWNS = {"offset": slice(0, 3), "lag": slice(6, 7), "turn": slice(3, 6), "all": slice(0, 7)}
 _POSE_SIZE, _POSE_PRIOR_SHARE = np.array([0.3, 0.3, 0.3, 0.5, 0.5, 0.5, 0.1]), 1e-3
@@ -71,7 +74,7 @@ def check_standing_feet(
     if slip is None:
         yield Skipped(_STANDING_FEET_CHECK, "no orientation of the base, or no stance above which the base moves")
         return
-    radius = list(_radius_findings(log, robot, contacts, slip, poses))
+    radius = list(_radius_findings(log, robot, contacts, poses))
     yield from radius
     other_pose = iter(()) if radius or derived or poses is None else _pose_findings(log, contacts, slip, poses)
     single = None if radius or derived else _single_foot(log, robot, contacts, slip, poses)
@@ -211,31 +214,47 @@ def _pose_finding(x: FloatArray, slip: float, left: float) -> Finding:
     return Finding("frame", SUSPICIOUS, "base_quat_xyzw", text, advice)
 
 
-def _radius_findings(
-    log: Log, robot: Robot, contacts: Sequence[Contact], slip: float, poses: LinkPoses | None
-) -> Iterator[Finding]:
-    """A finding about feet that roll on other radii than stated: the square of their slip is quadratic in these."""
+def _radius_findings(log: Log, robot: Robot, contacts: Sequence[Contact], poses: LinkPoses | None) -> Iterator[Finding]:
+    """A finding about feet that roll on another radius than stated, by more than feet that creep make of it."""
     points = [c for c in contacts if c.kind == "point" and c.frame in log.contact_names and c.frame in robot.links]
-    if slip < MIN_ROLLING_SHARE or not points:
+    windows = [] if poses is None or log.base_quat_xyzw is None else list(_rolling_windows(log, points, poses))
+    if len(windows) < _FEWEST_WINDOWS:
         return
-    usual = max(c.radius for c in points) or _TRIAL_RADIUS_M
-    unit = {c.frame: c.radius or usual for c in points}
-
-    def squared_slip(factor: float) -> float:
-        trial = [replace(c, radius=factor * unit[c.frame]) if c.frame in unit else c for c in contacts]
-        return (measure_foot_slip(log, robot, trial, poses) or 0.0) ** 2
-
-    none, once, twice = map(squared_slip, (0.0, 1.0, 2.0))
-    curvature = 0.5 * (none + twice) - once
-    factor = 0.25 * (none - twice) / curvature + 1.0 if curvature > 0.0 else 0.0
-    least = float(np.sqrt(squared_slip(factor))) if factor > 0.0 else slip
-    if least < MAX_SLIP_RESIDUAL_SHARE * slip:
-        found = ", ".join(f"{factor * radius:.3g}" for radius in sorted(set(unit.values())))
-        stated = ", ".join(f"{radius:.3g}" for radius in sorted({c.radius for c in points}))
-        text = f"standing feet move {format_percent(slip)} % as much as the base above them if they roll on a radius of"
-        text += f" {stated} m, {format_percent(least)} % on {found} m"
-        advice = f"contacts: [{{frame: {points[0].frame}, type: point, radius: {found}}}, ...], if the feet are balls"
+    squares, products, unit = np.array(windows).T
+    weight, radius = np.ones(len(windows)), 0.0
+    for _ in range(_PASSES):
+        radius = float((weight * products).sum() / max((weight * unit).sum(), np.finfo(float).tiny))
+        left = np.maximum(squares - 2.0 * radius * products + radius**2 * unit, 0.0)
+        weight = 1.0 / np.maximum(left, max(float(np.median(left)), np.finfo(float).tiny))
+    error = np.linalg.norm(weight * (products - radius * unit)) / max((weight * unit).sum(), np.finfo(float).tiny)
+    stated = float(np.mean([c.radius for c in points]))
+    if radius > 0.0 and abs(radius - stated) > max(_RADIUS_SHARE * max(radius, stated), _RADIUS_ERRORS * error):
+        text = f"standing feet move as balls of {1e3 * radius:.3g} mm (± {1e3 * error:.1g}) that roll, stated are"
+        text += f" {1e3 * stated:.3g} mm; feet that creep seem smaller"
+        advice = (
+            f"contacts: [{{frame: {points[0].frame}, type: point, radius: {radius:.3g}}}, ...], if the feet are balls"
+        )
         yield Finding("radius", SUSPICIOUS, "contact_names", text, advice, tuple(c.frame for c in points))
+
+
+def _rolling_windows(log: Log, points: Sequence[Contact], poses: LinkPoses) -> Iterator[tuple[float, float, float]]:
+    """Mean squares, in short windows, of how vectors between standing points move, beside how unit balls would roll.
+
+    Mean square of the first [m^2], mean product [m], mean square of the second: the vectors move by the radius times
+    the second where feet roll, see `measure_foot_slip`.
+    """
+    quat, active = np.asarray(log.base_quat_xyzw), np.asarray(log.contact_active)
+    frames = [poses[c.frame].numpy() for c in points]
+    places = [rotate_to_world(quat, c.pose(T)[:, :3, 3]) for c, T in zip(points, frames, strict=True)]
+    rolls = [_rolled(log, replace(c, radius=1.0), T) for c, T in zip(points, frames, strict=True)]
+    flags = [active[:, log.contact_names.index(c.frame)] for c in points]
+    length = max(4, round(_ROLLING_WINDOW_S / median_step(log)))
+    for i, j in combinations(range(len(points)), 2):
+        for stance in _stances(log, flags[i] & flags[j]):
+            for start in range(stance.start, stance.stop - length // 2, length):
+                own = slice(start, min(start + length, stance.stop))
+                moved, rolled = ((x[i] - x[j])[own] - (x[i] - x[j])[own].mean(axis=0) for x in (places, rolls))
+                yield float((moved**2).mean()), float((moved * rolled).mean()), float((rolled**2).mean())
 
 
 def measure_foot_slip(
