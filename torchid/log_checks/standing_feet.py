@@ -30,6 +30,7 @@ from torchid.logs.quaternion import rotate_to_world
 from torchid.problem.floor_pose import rolled_distance
 from torchid.robot import Robot
 from torchid.sensing import Contact
+from torchid.sensing.sensors import join_numbers
 
 #: Motion of standing feet over that of the base above them. Soft soles and rolling feet have 0.05 to 0.2.
 MAX_SLIP_SHARE = 0.3
@@ -223,17 +224,17 @@ def _radius_findings(log: Log, robot: Robot, contacts: Sequence[Contact], poses:
     squares, products, unit = np.array(windows).T
     weight, radius = np.ones(len(windows)), 0.0
     for _ in range(_PASSES):
-        radius = float((weight * products).sum() / max((weight * unit).sum(), np.finfo(float).tiny))
+        radius = float(weight @ products / max(weight @ unit, np.finfo(float).tiny))
         left = np.maximum(squares - 2.0 * radius * products + radius**2 * unit, 0.0)
         weight = 1.0 / np.maximum(left, max(float(np.median(left)), np.finfo(float).tiny))
-    error = np.linalg.norm(weight * (products - radius * unit)) / max((weight * unit).sum(), np.finfo(float).tiny)
+    error = np.linalg.norm(weight * (products - radius * unit)) / max(weight @ unit, np.finfo(float).tiny)
     stated = float(np.mean([c.radius for c in points]))
     if radius > 0.0 and abs(radius - stated) > max(_RADIUS_SHARE * max(radius, stated), _RADIUS_ERRORS * error):
         text = f"standing feet move as balls of {1e3 * radius:.3g} mm (± {1e3 * error:.1g}) that roll, stated are"
         text += f" {1e3 * stated:.3g} mm; feet that creep seem smaller"
-        advice = (
-            f"contacts: [{{frame: {points[0].frame}, type: point, radius: {radius:.3g}}}, ...], if the feet are balls"
-        )
+        centre = f", centre: {join_numbers(points[0].centre)}" if any(points[0].centre) else ""
+        entry = f"{{frame: {points[0].frame}, type: point, radius: {radius:.3g}{centre}}}"
+        advice = f"contacts: [{entry}, ...], if the feet are balls"
         yield Finding("radius", SUSPICIOUS, "contact_names", text, advice, tuple(c.frame for c in points))
 
 

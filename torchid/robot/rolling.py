@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 
@@ -19,8 +20,7 @@ _MAX_ANGLE = 0.02  # rad, between a cylinder and the axis of its contact or join
 _END_SHARES = (0.5, 0.3, 0.2, 0.1)  # of a mesh's length, the end that may be a ball; the first that is one counts
 _MAX_MISFIT_SHARE = 0.05  # of the radius, rms and at the lowest point; the end of Go2's foot misses a ball by 0.036
 _MIN_DEPTH_SHARE = 0.15  # of the radius: less of a ball is a sole, and a foot that turns by 30 degrees leaves it
-_MAX_BREADTH_SHARE = 1.1  # of the mesh's longest edge, the diameter
-_FEWEST_CORNERS = 8
+_MAX_BREADTH_SHARE, _FEWEST_CORNERS = 1.1, 8  # diameter over the mesh's longest edge; corners of the end
 
 
 @dataclass(frozen=True)
@@ -67,15 +67,16 @@ class CollisionShapes:
         if axis is not None:
             along = np.eye(3)["xyz".index(axis)]
             return _choose(self._all(frame, "cylinder", lambda shape: _cylinder(shape, along, slides=True)), frame)
-        ball = _choose(self._all(frame, "sphere", lambda shape: (shape.points[0], _radius(shape))), frame)
+        ball = _choose(
+            self._all(frame, "sphere", lambda shape: (shape.points[0], float(np.linalg.norm(shape.spread, 2)))), frame
+        )
         if ball is None and joint is not None and joint.continuous:
             along = T_frame_body[:3, :3] @ joint.T_joint_link[:3, :3].T @ joint.axis
             wheel = _choose(self._all(frame, "cylinder", lambda shape: _cylinder(shape, along, slides=False)), frame)
             ball = None if wheel is None else replace(wheel, kind="wheel")
         if ball is None and meshes:
-            hinge: Array = np.array(T_frame_body)[:3, 3]
-            if joint is not None:
-                hinge = (T_frame_body @ np.linalg.inv(joint.T_joint_link))[:3, 3]
+            T_link_joint = np.eye(4) if joint is None else np.linalg.inv(joint.T_joint_link)
+            hinge = np.asarray(T_frame_body @ T_link_joint, dtype=np.float64)[:3, 3]
             ball = _choose(self._all(frame, "mesh", lambda shape: fit_end(shape.points, hinge)), frame)
         return ball
 
@@ -86,18 +87,14 @@ class CollisionShapes:
         for link in sorted(self.robot.bodies[body].links, key=lambda name: name != frame):
             T_frame_link = np.linalg.inv(T_body_frame) @ self.robot.links[link][1]
             for element in self._links[link].findall("collision"):
-                tag = element.find(f"geometry/{kind}")
-                if tag is None:
+                if (tag := element.find(f"geometry/{kind}")) is None:
                     continue
-                try:
+                with suppress(MeshError):
                     shape = read_shape(self._meshes, f"link '{link}', <collision>", element).moved(T_frame_link)
-                except MeshError:
-                    continue
-                measured = measure(shape)
-                if measured is not None and measured[1] > 0.0:
-                    (x, y, z), radius = measured[0].tolist(), measured[1]
-                    file = PurePosixPath(str(tag.get("filename", ""))).name
-                    found.append(RollingShape(kind, radius, link, (x, y, z), file))
+                    if (measured := measure(shape)) is not None and measured[1] > 0.0:
+                        x, y, z = measured[0].tolist()
+                        file = PurePosixPath(str(tag.get("filename", ""))).name
+                        found.append(RollingShape(kind, measured[1], link, (x, y, z), file))
         return found
 
 
@@ -110,13 +107,9 @@ def _choose(found: list[RollingShape], frame: str) -> RollingShape | None:
     return own[0] if len(own) == 1 else None
 
 
-def _radius(shape: Shape) -> float:
-    return float(np.linalg.norm(shape.spread, 2))
-
-
 def _cylinder(shape: Shape, along: Array, slides: bool) -> tuple[Array, float] | None:
     """Origin and radius of a cylinder about the origin along a unit vector (3,), anywhere along it if it `slides`."""
-    axis, centre, radius = shape.axes[:, 2], shape.points.mean(axis=0), _radius(shape)
+    axis, centre, radius = shape.axes[:, 2], shape.points.mean(axis=0), float(np.linalg.norm(shape.spread, 2))
     if slides:  # a line is as long as its contact; a wheel, narrow, stands on its middle
         centre = centre - axis * (axis @ centre)
     is_about = np.linalg.norm(centre) <= max(_MAX_OFFSET_M, _MAX_OFFSET_SHARE * radius)
@@ -131,22 +124,18 @@ def fit_end(points: Array, hinge: Array) -> tuple[Array, float] | None:
         hinge: where its limb begins, (3,) [m]; the end is the part that is farthest from it.
     """
     away = points.mean(axis=0) - hinge
-    depth = points @ away / max(float(np.linalg.norm(away)), np.finfo(float).tiny)
-    longest = np.ptp(points, axis=0).max()
+    away /= max(float(np.linalg.norm(away)), np.finfo(float).tiny)
+    depth, longest = points @ away, np.ptp(points, axis=0).max()
     for share in _END_SHARES:
         end = np.unique(points[depth >= depth.max() - share * np.ptp(depth)], axis=0)
         if len(end) < _FEWEST_CORNERS:
             break
         solved, *_ = np.linalg.lstsq(np.column_stack([2.0 * end, np.ones(len(end))]), (end**2).sum(axis=1))
         centre = solved[:3]
-        radius = float(np.sqrt(solved[3] + centre @ centre))
-        misfit = np.linalg.norm(end - centre, axis=1) - radius
-        lowest = depth.max() - centre @ away / np.linalg.norm(away) - radius
-        is_ball = max(np.sqrt(np.mean(misfit**2)), abs(lowest)) <= _MAX_MISFIT_SHARE * radius
-        if (
-            is_ball
-            and share * np.ptp(depth) >= _MIN_DEPTH_SHARE * radius
-            and 2.0 * radius <= _MAX_BREADTH_SHARE * longest
-        ):
+        radius = float(np.sqrt(max(solved[3] + centre @ centre, 0.0)))
+        rms = np.sqrt(np.mean((np.linalg.norm(end - centre, axis=1) - radius) ** 2))
+        is_ball = max(rms, abs(depth.max() - centre @ away - radius)) <= _MAX_MISFIT_SHARE * radius
+        is_deep = share * np.ptp(depth) >= _MIN_DEPTH_SHARE * radius
+        if is_ball and is_deep and 2.0 * radius <= _MAX_BREADTH_SHARE * longest:
             return centre, radius
     return None
