@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import sysconfig
 import warnings
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -176,6 +177,7 @@ class TrueRobot:
         phi: true parameters, (L, 12), friction included.
         armature: (n,) [kg m^2].
         foot_of_geom: foot by number of the geometry.
+        dry: whether MuJoCo itself has the friction of the joints, which then stick; else it is a torque on them.
     """
 
     legged: Legged
@@ -184,6 +186,7 @@ class TrueRobot:
     phi: Array
     armature: Array
     foot_of_geom: Mapping[int, int]
+    dry: bool = False
 
     @property
     def friction(self) -> Array:
@@ -232,6 +235,17 @@ class TrueRobot:
         model.dof_armature[6:] = scale * rng.uniform(*legged.armature, robot.n)
         mujoco.mj_setConst(model, mujoco.MjData(model))
         return cls(legged, robot, model, phi, model.dof_armature[6:].copy(), foot_of_geom)
+
+
+def with_dry_friction(true: TrueRobot, integrator: str, time_constant: float) -> TrueRobot:
+    """The robot with joints that stick, on a floor of another softness [s]; "implicitfast", "implicit" or "euler"."""
+    model = copy.deepcopy(true.model)
+    model.dof_frictionloss[6:], model.dof_damping[6:] = true.friction.T
+    model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+    model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
+    model.geom_solref[:, 0] = time_constant
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return replace(true, model=model, dry=True)
 
 
 def _strength(model: Any) -> Array:

@@ -78,7 +78,8 @@ def simulated(true: TrueRobot, reference: Reference, seconds: float, name: str =
         mujoco.mj_step1(model, data)
         v = data.qvel[6:]
         torque = ahead[i] + p * (wanted_q[i] - data.qpos[7:]) + d * (wanted_v[i] - v)
-        data.qfrc_applied[6:] = torque - coulomb * np.tanh(v / FRICTION_WIDTH) - viscous * v
+        friction = 0.0 if true.dry else coulomb * np.tanh(v / FRICTION_WIDTH) + viscous * v
+        data.qfrc_applied[6:] = torque - friction
         number = (i - first) // every if i >= first and (i - first) % every == 0 else None
         if number is not None:
             record.state(number, data, torque)
@@ -114,6 +115,7 @@ def _inverse_dynamics(true: TrueRobot, motion: Motion) -> _Forces:
     """Forces along a motion; those of the ground have the least sum of squares, feet that are not ready taking less."""
     model = copy.deepcopy(true.model)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    model.dof_damping[:] = 0.0
     data, spheres = mujoco.MjData(model), list(true.foot_of_geom.items())
     feet, nv = [foot for _, foot in spheres], model.nv
     bodies = [int(model.geom_bodyid[geom]) for geom, _ in spheres]

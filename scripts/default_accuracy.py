@@ -1,0 +1,59 @@
+"""Robots whose truth is known: how good is what `torchid init` and `torchid identify` find without an edit?
+
+    python scripts/default_accuracy.py make --seed 1 --output robots            # all robots; or --robots panda go2_walk
+    python scripts/default_accuracy.py judge robots                             # defaults
+    python scripts/default_accuracy.py judge robots -- estimator.ridge=0.1      # other settings
+    python scripts/default_accuracy.py best robots                              # the best of a grid, the truth in hand
+
+`make` writes a folder for each robot: `robot.urdf`, whose bodies are some 20 % off the true ones (`true.urdf`),
+`log.csv` and `other.csv`, another motion, with the flaws of real logs, and `truth.json`. `judge` fits `log.csv` and
+compares with the truth: forces along the unseen motion as sensors without noise read them, up to 20 Hz; joint torques
+of the rigid bodies in random states, by limb; masses. Needs the extra `[oracle]`.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from defaults.judging import judge_all, print_results, search_all
+from defaults.making import make
+from defaults.robots import CASES
+
+from torchid.boundary import run_guarded
+
+
+def run(options: argparse.Namespace) -> None:
+    """Make, judge or search."""
+    if options.command == "make":
+        for name in options.robots or CASES:
+            truth = make(name, options.seed, options.output)
+            print(f"{name}: {truth['total_mass']:.2f} kg, {truth['simulator']}, {truth['seconds']:.0f} s", flush=True)
+        return
+    folders = [options.folder / name for name in CASES if (options.folder / name / "truth.json").is_file()]
+    folders = [one for one in folders if not options.robots or one.name in options.robots]
+    work = judge_all if options.command == "judge" else search_all
+    print_results(work(folders, options.overrides, options.work or options.folder), options.json)
+
+
+def main() -> int:
+    """Read the arguments."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(dest="command", required=True)
+    maker = commands.add_parser("make")
+    maker.add_argument("--seed", type=int, default=1)
+    maker.add_argument("--output", type=Path, required=True)
+    maker.add_argument("--robots", nargs="+", choices=list(CASES))
+    for name in ("judge", "best"):
+        judge = commands.add_parser(name)
+        judge.add_argument("folder", type=Path)
+        judge.add_argument("overrides", nargs="*", help="behind --: key=value of the experiment file")
+        judge.add_argument("--robots", nargs="+", choices=list(CASES))
+        judge.add_argument("--json", type=Path, help="results as JSON")
+        judge.add_argument("--work", type=Path, help="where runs are written, by default beside the robots")
+    options = parser.parse_args()
+    return run_guarded("default_accuracy", lambda: run(options))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

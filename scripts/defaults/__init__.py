@@ -1,0 +1,1 @@
+"""Simulated robots whose truth is known, their flawed logs, and what torchid's defaults make of them."""
