@@ -21,6 +21,7 @@ from defaults.making import make
 from defaults.robots import CASES
 
 from torchid.boundary import run_guarded
+from torchid.errors import InputError
 
 
 def run(options: argparse.Namespace) -> None:
@@ -32,6 +33,8 @@ def run(options: argparse.Namespace) -> None:
         return
     folders = [options.folder / name for name in CASES if (options.folder / name / "truth.json").is_file()]
     folders = [one for one in folders if not options.robots or one.name in options.robots]
+    if not folders:
+        raise InputError("arguments", "folder", f"no robot in {options.folder}", "a folder that make has written")
     work = judge_all if options.command == "judge" else search_all
     print_results(work(folders, options.overrides, options.work or options.folder), options.json)
 

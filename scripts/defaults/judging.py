@@ -37,6 +37,7 @@ class Result:
         status: of `identify`, with no edit.
         edited: whether the robot's edit was stated, as no edit ended in an error.
         headline: the first line of the answer, or the last one of the error.
+        least: errors of the true robot itself on the unseen motion, joints' torques, as `score.torque`.
         terms: settings that the fit has.
         own: errors of joint torques on the unseen log by `torchid evaluate`, of the URDF and identified [N m].
     """
@@ -48,6 +49,7 @@ class Result:
     seconds: float
     truth: Mapping[str, Any]
     score: Score | None = None
+    least: float | None = None
     terms: str = ""
     mass: tuple[float | None, float | None] | None = None
     own: tuple[float | None, float | None] | None = None
@@ -93,7 +95,7 @@ def judge(folder: Path, overrides: Sequence[str], work: Path) -> Result:
     seconds = time.perf_counter() - began
     lines = (done.stderr if done.returncode else done.stdout).strip().splitlines()
     headline = " ".join(_first_sentence(lines) if done.returncode == 0 else lines[-1:])
-    result = Result(folder.name, status, edited, headline, seconds, truth.known)
+    result = Result(folder.name, status, edited, headline, seconds, truth.known, least=truth.best_known().torque)
     if done.returncode:
         return result
     run = work / "runs" / folder.name
@@ -253,6 +255,7 @@ def _block(result: Result) -> str:
         lines.append(f"{result.robot:12}{torque:>13}{force:>13}{limb:>7.2f}{score.mass:>7.2f}{links:>13} {mass:>17}")
     said = [f"exit {result.status}{', with its edit' * result.edited}, {result.seconds:.0f} s: {result.headline}"]
     said += [result.terms] * bool(result.terms)
+    said.append(f"the true robot leaves {100 * (result.least or 0.0):.1f} % of the torques")
     if result.own is not None:
         said.append("other.csv by evaluate, identified and URDF: {1} and {0} N m".format(*map(_short, result.own)))
     if result.best is not None and score is not None:

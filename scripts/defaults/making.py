@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -15,14 +16,16 @@ from defaults.held import simulated as simulated_held
 from defaults.models import Model
 from defaults.robots import CASES, Case, Held
 from defaults.sensors import Drawn, record, write_table
-from defaults.truth import write_given, write_true
+from defaults.truth import state_friction, write_given, write_true
 from defaults.walking import true_robot, walked
+from torchid.errors import InputError
 from torchid.logs import Log
 from torchid.parameters import Array
 from torchid.robot import load_robot
 
 _SHARE = 0.2  # by which bodies are off
 _TRUTH_HZ = 500.0
+_TRIALS = 6
 _FIELDS = (
     "time",
     "joint_position",
@@ -38,15 +41,22 @@ _FIELDS = (
 )
 
 
-def make(name: str, seed: int, output: Path) -> dict[str, object]:
-    """Write the folder of a robot; the same seed writes the same. Returns the truth."""
-    began, case, folder = time.perf_counter(), CASES[name], output / name
+def make(name: str, seed: int, output: Path, cases: Mapping[str, Case] = CASES) -> dict[str, object]:
+    """Write the folder of a robot; the same seed writes the same. Returns the truth.
+
+    Raises:
+        InputError: its URDF is not installed.
+    """
+    began, case, folder = time.perf_counter(), cases[name], output / name
+    if isinstance(case.urdf, Path) and not case.urdf.is_file():
+        raise InputError("arguments", "--robots", f"{name}, no {case.urdf}", "the package example-robot-data installed")
     folder.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
     given = write_given(case.urdf, folder)
     masses = write_true(given, rng, _SHARE, case.payload)
     draw = int(rng.integers(2**31))
     logs, friction, armature = (_held if isinstance(case.moves, Held) else _on_feet)(case, folder, draw)
+    state_friction(folder / "true.urdf", logs[0].joint_names, friction)
     joints, floating = logs[0].joint_names, not isinstance(case.moves, Held)
     model = Model.of(folder / "true.urdf", joints, floating)
     states = model.configuration(np.asarray(logs[0].joint_position)[:: len(logs[0]) // 20])
@@ -108,9 +118,22 @@ def _held(case: Case, folder: Path, seed: int) -> tuple[list[Log], Array, Array]
 
 
 def _on_feet(case: Case, folder: Path, seed: int) -> tuple[list[Log], Array, Array]:
+    """Both logs, friction (n, 2) and armature (n,), of the first of some motions in which the robot does not fall.
+
+    Raises:
+        ValueError: it falls in all of them.
+    """
     assert not isinstance(case.moves, Held)
     true = true_robot(case.moves, folder / "true.urdf", seed, case.integrator, case.floor)
-    logs = [walked(true, seconds, seed + k, unseen=bool(k)) for k, seconds in enumerate(case.seconds)]
+    logs = []
+    for k, seconds in enumerate(case.seconds):
+        for trial in range(_TRIALS):
+            try:
+                logs.append(walked(true, seconds, seed + 2 * trial + k, unseen=bool(k)))
+                break
+            except ValueError:
+                if trial == _TRIALS - 1:
+                    raise
     return logs, true.friction, true.armature
 
 

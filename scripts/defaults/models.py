@@ -35,7 +35,7 @@ class Model:
         model = pin.buildModelFromUrdf(str(urdf), *([pin.JointModelFreeFlyer()] * floating))
         own = {"universe", "root_joint", *joints}
         held = [model.getJointId(name) for name in model.names if name not in own]
-        model = pin.buildReducedModel(model, held, pin.neutral(model))
+        model = pin.buildReducedModel(model, held, pin.neutral(model)) if held else model
         index = np.array([model.joints[model.getJointId(name)].idx_v for name in joints])
         return cls(model, tuple(joints), floating, index)
 

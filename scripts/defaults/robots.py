@@ -141,8 +141,8 @@ _BIPED = Legged(
     Path(__file__).parents[2] / "configs/biped.urdf",
     ("l_sole", "r_sole"),
     "flat",
-    ((-0.06, 0.04, 0.005), (-0.06, -0.04, 0.005), (0.12, 0.04, 0.005), (0.12, -0.04, 0.005)),
-    0.005,
+    ((-0.11, 0.05, 0.01), (-0.11, -0.05, 0.01), (0.11, 0.05, 0.01), (0.11, -0.05, 0.01)),
+    0.01,
     {
         f"{leg}_{name}": x
         for leg in "lr"
@@ -267,6 +267,7 @@ CASES: dict[str, Case] = {
         G1,
         Flaws(torque_noise=0.03, delay=(0.002, 0.006), encoder=2e-4, velocity=0.04),
         integrator="implicitfast",
+        floor=0.004,
         payload=Payload("torso_link", (1.0, 3.0), 0.1),
         imu="imu_in_pelvis",
         rate=250.0,

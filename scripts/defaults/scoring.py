@@ -136,6 +136,16 @@ class Truth:
         self._masses = self.model.masses()
         self.given = self._errors(self.folder / "robot.urdf", Terms())
 
+    def best_known(self) -> Score:
+        """The true robot's own errors: what gains of the torques leave, and joints that stick."""
+        terms = {"armature": self.known["armature"], "torque_offset": self.known["offset"]}
+        extras = [
+            {"what": kind, "name": name, "component": None, "value": value}
+            for kind, values in terms.items()
+            for name, value in zip(self.joints, values, strict=True)
+        ]
+        return self.score(self.folder / "true.urdf", Terms(extras))
+
     def score(self, urdf: Path, terms: Terms) -> Score:
         """Compare a URDF and fitted terms with the truth."""
         found, given = self._errors(urdf, terms), self.given

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.signal import lfilter
+from scipy.signal import butter, lfilter, sosfilt
 from scipy.spatial.transform import Rotation
 
 from torchid.logs import Log
@@ -90,8 +90,8 @@ class Drawn:
         for j, (hz, damping, size, ratio) in enumerate(self.mode.T):
             pole = np.exp((-damping + 1j * np.sqrt(1.0 - damping**2)) * 2.0 * np.pi * hz * step)
             shape = [1.0, -2.0 * pole.real, abs(pole) ** 2]
-            place = lfilter([0.0, 1.0], shape, strokes[:, j])
-            place -= place.mean()
+            fast = sosfilt(butter(2, 2.0 * hz * step / 3.0, "high", output="sos"), strokes[:, j])
+            place = lfilter([0.0, 1.0], shape, fast)  # it rings, but does not yield to slow forces
             place *= size / (place.std() * (2.0 * np.pi * hz) ** 2)
             out[:, :, j] = place, np.gradient(place, step), ratio * (2.0 * np.pi * hz) ** 2 * place
         return out[0], out[1], out[2]

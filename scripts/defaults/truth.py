@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from torchid.parameters import Array
 
 ROBOTS = Path(sysconfig.get_path("purelib")) / "cmeel.prefix/share/example-robot-data"
-_LIGHT = 1e-3  # kg: what weighs less is there to please simulators
+_LIGHT = 1e-3  # kg: what weighs less is there to please simulators, and has impossible inertias
 _LEAST = 1e-3  # of a body's largest second moment: true bodies are no discs or rods, which some URDFs have
 _ENTRIES = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
 
@@ -73,7 +73,10 @@ def write_true(given: Path, rng: np.random.Generator, share: float, payload: Pay
     for link in root.findall("link"):
         name, inertial = str(link.get("name")), link.find("inertial")
         loaded = payload is not None and payload.link == name
-        if inertial is None or (float(inertial.find("mass").get("value")) < _LIGHT and not loaded):
+        if inertial is None:
+            continue
+        if float(inertial.find("mass").get("value")) < _LIGHT and not loaded:
+            link.remove(inertial)
             continue
         mass, com, inertia = _unlike(*_read(inertial), rng, share)
         if loaded and payload is not None:
@@ -82,6 +85,18 @@ def write_true(given: Path, rng: np.random.Generator, share: float, payload: Pay
         masses[name] = mass
     (given.parent / "true.urdf").write_bytes(etree.tostring(root))
     return masses
+
+
+def state_friction(urdf: Path, joints: Sequence[str], friction: Array) -> None:
+    """Write Coulomb and viscous friction (n, 2) of joints into a URDF."""
+    root = etree.parse(str(urdf)).getroot()
+    for joint in root.findall("joint"):
+        if joint.get("name") in joints:
+            for old in joint.findall("dynamics"):
+                joint.remove(old)
+            coulomb, viscous = friction[joints.index(joint.get("name"))]
+            etree.SubElement(joint, "dynamics", friction=repr(float(coulomb)), damping=repr(float(viscous)))
+    urdf.write_bytes(etree.tostring(root))
 
 
 def _unlike(
