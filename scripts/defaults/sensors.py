@@ -7,15 +7,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.signal import butter, lfilter, sosfilt
+from scipy.signal import butter, lfilter, sosfilt, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
 from torchid.logs import Log
 from torchid.parameters import Array
 
 _GRAVITY = np.array([0.0, 0.0, -9.81])
-RINGING = {"none": 0.0, "mild": 0.4, "strong": 2.5}
-"""Accelerations of the structure that rings, as shares of those of the joints, rms."""
+RINGING = {"none": 0.0, "mild": 0.25, "strong": 1.0}
+"""Accelerations of the structure that rings, as shares of those of the joints below 10 Hz, rms."""
+_MOTION_HZ = 10.0
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,9 @@ class Drawn:
         assert torque is not None
         assert acceleration is not None
         n = torque.shape[1]
-        size = RINGING[flaws.ringing] * rng.uniform(0.6, 1.4, n) * np.sqrt(np.mean(acceleration**2, axis=0))
+        low_pass = butter(2, 2.0 * _MOTION_HZ * (log.time[1] - log.time[0]), output="sos")
+        moved = np.sqrt(np.mean(sosfiltfilt(low_pass, acceleration, axis=0) ** 2, axis=0))
+        size = RINGING[flaws.ringing] * rng.uniform(0.6, 1.4, n) * moved
         ratio = inertia * rng.uniform(0.3, 2.0, n) * rng.choice([-1.0, 1.0], n)
         mode = np.stack([rng.uniform(*flaws.band, n), rng.uniform(0.01, 0.05, n), size, ratio])
         return cls(
