@@ -191,8 +191,16 @@ def search(folder: Path, overrides: Sequence[str], work: Path) -> tuple[float, s
     cutoff = least((f"preprocessing.cutoff_hz={hz}", ridge, *terms) for hz in _CUTOFFS)[0]
     ridge = least((cutoff, f"estimator.ridge={x}", *terms) for x in _RIDGES)[1]
     alternatives = [terms, (), (*terms, "actuators.sign_width=auto"), tuple(x for x in terms if "stiction" not in x)]
+    alternatives += [(*terms, f"contacts={_rolling(truth)}")] * bool(truth.known["ball"])
     best = least((cutoff, ridge, *one) for one in dict.fromkeys(alternatives))
     return (tried[best], " ".join(best)) if tried[best] < float("inf") else None
+
+
+def _rolling(truth: Truth) -> str:
+    """Contacts of balls with their radius, about the frames' origins."""
+    radius = truth.known["ball"]["radius"]
+    entries = (f"{{frame: {foot}, type: point, radius: {radius}}}" for foot in truth.known["feet"])
+    return f"[{', '.join(entries)}]"
 
 
 def _right_terms(truth: Truth) -> tuple[str, ...]:

@@ -71,6 +71,7 @@ def make(name: str, seed: int, output: Path, cases: Mapping[str, Case] = CASES) 
         "held": not floating,
         "edit": list(case.edit),
         "feet": list(logs[0].contact_names),
+        "ball": _ball(case),
         "simulator": "inverse dynamics" if case.integrator is None else f"MuJoCo, {case.integrator}",
         "total_mass": sum(masses.values()),
         "link_masses": masses,
@@ -86,6 +87,14 @@ def make(name: str, seed: int, output: Path, cases: Mapping[str, Case] = CASES) 
     }
     (folder / "truth.json").write_text(json.dumps(truth, indent=1))
     return truth | {"seconds": time.perf_counter() - began}
+
+
+def _ball(case: Case) -> dict[str, object] | None:
+    """Radius and centre of the balls that point feet are, in their frames."""
+    moves = case.moves
+    if isinstance(moves, Held) or moves.kind != "point":
+        return None
+    return {"radius": moves.radius, "centre": list(moves.points[0])}
 
 
 def _held(case: Case, folder: Path, seed: int) -> tuple[list[Log], Array, Array]:
