@@ -147,11 +147,8 @@ def _first_sentence(lines: Sequence[str]) -> list[str]:
 
 
 def _terms(parameters: Mapping[str, Any], config: Mapping[str, Any]) -> Terms:
-    train = {None, *(one["log"] for one in parameters["extras"])}
-    extras = [one for one in parameters["extras"] if one["log"] in train]
     width, stribeck = (config["actuators"].get(key) for key in ("sign_width", "stribeck"))
-    numbers = [x if isinstance(x, float) else None for x in (width, stribeck)]
-    return Terms(extras, *numbers)
+    return Terms(parameters["extras"], *(x if isinstance(x, float) else None for x in (width, stribeck)))
 
 
 def describe_terms(config: Mapping[str, Any]) -> str:

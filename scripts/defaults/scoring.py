@@ -20,7 +20,7 @@ CUTOFF_HZ = 20.0
 """Errors of forces count up to here, whatever the cutoff of a fit was."""
 _STATES = 300
 _LIGHT = 1e-3  # kg: bodies without mass of their own
-_WITHOUT_COLUMN = ("delay", "delayed")  # of the fit alone: they shift the log
+_WITHOUT_COLUMN = ("delay", "torque of a delay")  # of the fit alone: they shift the log
 
 
 @dataclass(frozen=True)
