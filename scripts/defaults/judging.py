@@ -19,7 +19,7 @@ from typing import Any
 
 import yaml
 
-from defaults.scoring import Score, Terms, Truth
+from defaults.scoring import Score, Terms, Truth, median_mass_error
 from torchid.commands.identify import identify
 from torchid.config import load_config
 from torchid.errors import TorchidError
@@ -188,7 +188,8 @@ def search(folder: Path, overrides: Sequence[str], work: Path) -> tuple[float, s
     cutoff = least((f"preprocessing.cutoff_hz={hz}", ridge, *terms) for hz in _CUTOFFS)[0]
     ridge = least((cutoff, f"estimator.ridge={x}", *terms) for x in _RIDGES)[1]
     alternatives = [terms, (), (*terms, "actuators.sign_width=auto"), tuple(x for x in terms if "stiction" not in x)]
-    alternatives += [(*terms, f"contacts={_rolling(truth)}")] * bool(truth.known["ball"])
+    if truth.known["ball"]:
+        alternatives.append((*terms, f"contacts={_rolling(truth)}"))
     best = least((cutoff, ridge, *one) for one in dict.fromkeys(alternatives))
     return (tried[best], " ".join(best)) if tried[best] < float("inf") else None
 
@@ -238,6 +239,9 @@ def print_results(results: Iterable[Result], file: Path | None) -> None:
             file.write_text(json.dumps([one.as_dict() for one in every], indent=1))
     failing = sum(bool(one.failures()) for one in every)
     print(f"{failing} of {len(every)} robots with failures")
+    if scores := [one.score for one in every if one.score is not None]:
+        pooled = median_mass_error(scores)
+        print(f"masses of all links of robots that were fitted: median error {pooled:.2f} x the URDF's")
 
 
 def _short(x: float | None, decimals: int = 3) -> str:

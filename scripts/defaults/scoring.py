@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -76,8 +76,7 @@ class Score:
         force, urdf_force: of the base.
         joints: of each joint over the URDF's error.
         limbs: rigid-body torques in random states over the URDF's error, by limb.
-        mass: median error of the links' masses over the URDF's.
-        heaviest, lightest: links' masses over the true ones, with the link's joint.
+        masses: of each link, identified and the URDF's, over the true one, by its joint.
     """
 
     torque: float
@@ -86,9 +85,22 @@ class Score:
     urdf_force: float | None
     joints: dict[str, float]
     limbs: dict[str, float]
-    mass: float
-    heaviest: tuple[float, str]
-    lightest: tuple[float, str]
+    masses: dict[str, tuple[float, float]]
+
+    @property
+    def mass(self) -> float:
+        """Median error of the links' masses over the URDF's."""
+        return median_mass_error([self])
+
+    @property
+    def heaviest(self) -> tuple[float, str]:
+        """Largest mass of a link over its true one, and the link's joint."""
+        return max((found, name) for name, (found, _) in self.masses.items())
+
+    @property
+    def lightest(self) -> tuple[float, str]:
+        """The least."""
+        return min((found, name) for name, (found, _) in self.masses.items())
 
     @property
     def both(self) -> float:
@@ -101,6 +113,12 @@ class Score:
     def as_dict(self) -> dict[str, Any]:
         """As JSON has it."""
         return asdict(self)
+
+
+def median_mass_error(scores: Iterable[Score]) -> float:
+    """Median error of the masses of all links over that of the URDFs'."""
+    off = np.abs(np.array([pair for one in scores for pair in one.masses.values()]) - 1.0)
+    return float(np.median(off[:, 0]) / np.median(off[:, 1]))
 
 
 @dataclass
@@ -157,7 +175,6 @@ class Truth:
         }
         bodies, names = self._masses > _LIGHT, np.array(self.model.bodies)
         ratio, before = (x.masses[bodies] / self._masses[bodies] for x in (found, given))
-        names = names[bodies]
         force: list[float | None] = [None, None]
         if base:
             weight = _rms(self._filtered(self._ground[:, :3]))
@@ -172,9 +189,7 @@ class Truth:
                 for k, name in enumerate(self.joints)
             },
             limbs=limbs,
-            mass=float(np.median(np.abs(ratio - 1.0)) / np.median(np.abs(before - 1.0))),
-            heaviest=(float(ratio.max()), str(names[ratio.argmax()])),
-            lightest=(float(ratio.min()), str(names[ratio.argmin()])),
+            masses={str(name): (float(x), float(y)) for name, x, y in zip(names[bodies], ratio, before, strict=True)},
         )
 
     def _errors(self, urdf: Path, terms: Terms) -> _Errors:
