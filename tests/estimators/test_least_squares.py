@@ -77,6 +77,18 @@ def test_a_ridge_solves_its_normal_equations(seed: int, ridge: float) -> None:
     np.testing.assert_allclose(change, step, rtol=0.0, atol=rounding)
 
 
+@few
+@given(seed=seeds, rank=st.integers(1, 8))
+def test_a_batch_of_ridges_has_the_solution_of_each(seed: int, rank: int) -> None:
+    problem, ridges = random_problem(np.random.default_rng(seed), 20, rank, 8), [0.0, 1e-4, 1.0, 1e3]
+    U, values, Vh = np.linalg.svd(problem.A * problem.scale, full_matrices=False)
+    along = (U.T @ (problem.b - problem.A @ problem.nominal))[:rank]
+    for ridge, phi in zip(ridges, LeastSquares().minimize_all(problem, ridges), strict=True):
+        step = Vh[:rank].T @ (values[:rank] / (values[:rank] ** 2 + problem.rows * ridge) * along)
+        np.testing.assert_allclose((phi - problem.nominal) / problem.scale, step, rtol=0.0, atol=1e-10)
+        np.testing.assert_array_equal(phi, LeastSquares(ridge).minimize(problem).phi)
+
+
 def test_a_vanishing_ridge_has_least_norm_and_a_larger_one_smaller_steps() -> None:
     problem = random_problem(np.random.default_rng(0), 20, 5, 8)
     free, nearly = LeastSquares().solve(problem), LeastSquares(1e-8).solve(problem)

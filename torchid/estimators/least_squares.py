@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from torchid.errors import InputError
 from torchid.estimators.posterior import nominal_spread
@@ -16,7 +17,7 @@ from torchid.parallel import one_thread
 from torchid.parameters import Array
 from torchid.problem import LinearProblem
 from torchid.reprs import short_repr
-from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, numerical_rank
+from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, relative_tolerance
 from torchid.settings import NotNegative, Tolerance, validate_settings
 
 IDENTIFIED, PRIOR, COMBINED = "identified", "dominated by the prior", "only in combination"
@@ -201,7 +202,8 @@ class Regularized:
 class LeastSquares(Regularized):
     """min ||A phi - b||^2 / rows + ridge ||(phi - nominal) / scale||^2.
 
-    With `ridge` 0 the minimizer whose scaled deviation from the nominal parameters has the least norm.
+    With `ridge` 0 the minimizer whose scaled deviation from the nominal parameters has the least norm. Solved by
+    `torch.linalg.lstsq` with LAPACK's gelsd, whose rank and singular values the estimate has; a ridge is P more rows.
     """
 
     @report_rounding("least_squares")
@@ -212,16 +214,26 @@ class LeastSquares(Regularized):
         Raises:
             InputError: a decomposition failed.
         """
-        return Minimizer(_moved(problem, self._gain(problem)))
+        return Minimizer(self.minimize_all(problem, [self.ridge])[0])
 
-    def _gain(self, problem: LinearProblem) -> Array:
-        """What takes residuals at the nominal parameters to deviations of the free ones in their scale, (P', R)."""
-        return self._decomposition(problem).inverse(self.ridge * problem.rows)
+    @report_rounding("least_squares")
+    @one_thread()
+    def minimize_all(self, problem: LinearProblem, ridges: Sequence[float]) -> Array:
+        """The parameters with each of K ridges, (K, P), by one batch of least-squares problems.
 
-    def _decomposition(self, problem: LinearProblem) -> _Decomposition:
+        Raises:
+            InputError: a decomposition failed.
+        """
+        misfit = torch.from_numpy(problem.b - problem.A @ problem.nominal)
+        moves = self._inverse(problem).solve(problem.rows * np.asarray(ridges), misfit[:, None])[..., 0]
+        phi = np.tile(problem.nominal, (len(ridges), 1))
+        phi[:, problem.free] += problem.scale[problem.free] * moves.numpy()
+        return phi
+
+    def _inverse(self, problem: LinearProblem) -> _Inverse:
         """Of the free, scaled columns, which all ridges have in common."""
-        key = "decomposition", self.rank_tolerance
-        return problem.shared(key, lambda: _Decomposition.of(problem, self.rank_tolerance))
+        key = "inverse", self.rank_tolerance
+        return problem.shared(key, lambda: _Inverse.of(problem, self.rank_tolerance))
 
     @report_rounding("least_squares")
     @one_thread()  # twice as fast as two on some hundred columns
@@ -237,11 +249,10 @@ class LeastSquares(Regularized):
             InputError: a decomposition failed.
         """
         free, scale = problem.free, problem.scale[problem.free]
-        A, gain = problem.A[:, free] * scale, self._gain(problem)
-        decomposition = self._decomposition(problem)
-        values, rank, pinv = decomposition.values, decomposition.rank, decomposition.inverse()
-        null_share = np.linalg.norm(np.eye(A.shape[1]) - pinv @ A, axis=1)  # of each parameter in the null space
-        phi = _moved(problem, gain)
+        inverse, phi = self._inverse(problem), self.minimize(problem).phi
+        A, values, rank = inverse.A.numpy(), inverse.values.numpy(), inverse.rank
+        gain = inverse.solve(np.array([problem.rows * self.ridge]), torch.eye(len(A), dtype=torch.float64))[0].numpy()
+        null_share = np.linalg.norm(np.eye(A.shape[1]) - inverse.row_space.numpy(), axis=1)  # of each in the null space
         cost = problem.cost(phi)
         noise = np.sqrt(problem.oversampling) * residual_std(cost, problem.rows, rank, problem.oversampling)
         observable, identifiable = np.zeros(len(phi), dtype=bool), np.zeros(len(phi), dtype=bool)
@@ -274,30 +285,39 @@ class LeastSquares(Regularized):
         )
 
 
-def _moved(problem: LinearProblem, gain: Array) -> Array:
-    """Parameters (P,) by what takes residuals at the nominal ones to deviations of the free ones."""
-    phi = problem.nominal.copy()
-    phi[problem.free] += problem.scale[problem.free] * (gain @ (problem.b - problem.A @ problem.nominal))
-    return phi
-
-
 @dataclass(frozen=True)
-class _Decomposition:
-    """Singular value decomposition of columns (R, P): (R, K), (K,) and (K, P), of which `rank` values are not zero."""
+class _Inverse:
+    """What `torch.linalg.lstsq` says of columns A, (R, P): their pseudoinverse, singular values and numerical rank.
 
-    U: Array
-    values: Array
-    Vh: Array
+    `row_space`: (P, P), the projector to what the rows determine.
+    """
+
+    A: Tensor
+    pseudoinverse: Tensor
+    row_space: Tensor
+    values: Tensor
     rank: int
 
     @classmethod
-    def of(cls, problem: LinearProblem, tolerance: float) -> _Decomposition:
-        A = problem.A[:, problem.free] * problem.scale[problem.free]
-        U, values, Vh = np.linalg.svd(A, full_matrices=False)
-        return cls(U, values, Vh, numerical_rank(values, tolerance, A.shape))
+    def of(cls, problem: LinearProblem, tolerance: float) -> _Inverse:
+        A = torch.from_numpy(problem.A[:, problem.free] * problem.scale[problem.free])
+        unit = torch.eye(len(A), dtype=A.dtype)
+        if not A.numel():  # LAPACK takes no empty matrix
+            return cls(A, A.mT, A.mT @ A, A.new_zeros(0), 0)
+        found = torch.linalg.lstsq(A, unit, rcond=relative_tolerance(tolerance, A.shape), driver="gelsd")
+        return cls(A, found.solution, found.solution @ A, found.singular_values, int(found.rank))
 
-    def inverse(self, weight: float = 0.0) -> Array:
-        """The matrix, (P, R), that takes b to the minimizer of ||A x - b||^2 + weight ||x||^2, of least norm for 0."""
-        values = self.values[: self.rank]
-        damped = values[:, None] / (np.square(values) + weight)[:, None]
-        return np.asarray(self.Vh[: self.rank].T @ (damped * self.U[:, : self.rank].T))
+    def solve(self, weights: Array, B: Tensor) -> Tensor:
+        """Minimizers X of ||A X - B||^2 + weight ||X||^2 for each of K weights, (K, P, M), of least norm for 0.
+
+        A weight stands in P more rows, below those of A that its numerical rank leaves.
+        """
+        out = (self.pseudoinverse @ B).repeat(len(weights), 1, 1)
+        damped = np.flatnonzero(weights)
+        if len(damped) and self.rank:
+            unit = torch.eye(self.A.shape[1], dtype=B.dtype)
+            below = torch.from_numpy(np.sqrt(weights[damped]))[:, None, None] * unit
+            rows = torch.cat([(self.A @ self.row_space).expand(len(damped), -1, -1), below], dim=1)
+            target = torch.cat([B, B.new_zeros(len(unit), B.shape[1])]).expand(len(damped), -1, -1)
+            out[damped] = torch.linalg.lstsq(rows, target, driver="gelsd").solution
+        return out
