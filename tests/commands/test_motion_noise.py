@@ -62,9 +62,13 @@ def test_a_run_says_how_much_was_noise_and_gives_more_to_what_is_small(
     assert stated["motion_noise"]["largest"] == pytest.approx(found["motion_noise"]["largest"], rel=0.2)
 
 
-def test_a_descent_sees_samples_as_they_are(demo: Path, tmp_path: Path) -> None:
-    metrics, _ = identified(demo, tmp_path / "run", "estimator.name=sgd", "estimator.training.epochs=2")
-    assert metrics["motion_noise"] == {"combinations": 0, "largest": 0.0, "lost": 0}
+def test_a_descent_takes_it_off_as_well(demo: Path, tmp_path: Path) -> None:
+    plain, _ = identified(demo, tmp_path / "plain", "estimator.ridge=0.01")
+    metrics, _ = identified(
+        demo, tmp_path / "run", "estimator.name=sgd", "estimator.ridge=0.01", "estimator.training.epochs=2"
+    )
+    assert metrics["motion_noise"] == plain["motion_noise"]
+    assert metrics["solution"]["objective"] == pytest.approx(plain["solution"]["objective"], rel=1e-6)
 
 
 def test_robust_fits_take_it_off_as_well(demo: Path, tmp_path: Path) -> None:

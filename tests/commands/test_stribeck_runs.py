@@ -144,7 +144,6 @@ def test_a_replay_moves_as_the_log_with_it_and_not_without(folder: Path) -> None
         (["actuators.stribeck=fast"], "actuators.stribeck: found 'fast'; accepted: auto, null, or a number"),
         (["actuators.stribeck=true"], "actuators.stribeck: found True; accepted: auto, null, or a number"),
         (["estimator.friction=false"], "actuators.stribeck: set, but estimator.friction: false leaves"),
-        (["estimator.name=sgd"], "actuators.stribeck: set, which sgd has not"),
     ],
 )
 def test_mistakes_are_answered_in_a_line(

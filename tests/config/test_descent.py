@@ -33,6 +33,7 @@ DESCENT: dict[str, Any] = {
         "patience": 2,
         "clip": 3.0,
         "damping": 0.5,
+        "finish": 3,
         "seed": 11,
         "evaluate_every": 4,
         "checkpoint_seconds": 1.5,
@@ -56,7 +57,7 @@ def test_a_descent_has_the_documented_defaults(file: Path) -> None:
         **{"eigenvalue": 10.0, "log_det": 0.0, "mass": 10.0, "friction": 10.0}
     }
     assert dataclasses.asdict(estimator.training) == {
-        **{"epochs": 200, "batch_size": 256, "patience": None, "clip": 1.0, "damping": 1.0, "seed": 0},
+        **{"epochs": 200, "batch_size": 256, "patience": None, "clip": 1.0, "damping": 1.0, "seed": 0, "finish": 40},
         **{"optimizer": {"name": "Adam"}, "schedule": {"name": "CosineAnnealingLR"}},
         **{"evaluate_every": 10, "checkpoint_seconds": 5.0},
     }
@@ -75,9 +76,10 @@ def test_every_key_of_a_descent_arrives_and_reads_back_as_itself(file: Path, tmp
 def test_every_key_of_a_descent_is_that_of_its_estimator(file: Path) -> None:
     settings = descent_settings(load(file, held_out(**DESCENT)))
     training = DESCENT["training"]
-    for key in ("ridge", "rank_tolerance", "margin", "consistency"):
+    for key in ("ridge", "rank_tolerance", "consistency"):
         assert getattr(settings, key) == DESCENT[key]
-    for key in ("epochs", "patience", "clip", "damping", "optimizer", "schedule"):
+    assert settings.conditions.margin == DESCENT["margin"]
+    for key in ("finish", "epochs", "patience", "clip", "damping", "optimizer", "schedule"):
         assert getattr(settings, key) == training[key]
     assert vars(settings.penalties) == DESCENT["penalties"]
 
@@ -104,13 +106,11 @@ def test_options_of_an_optimizer_may_be_written_as_people_write_them(file: Path,
         ({"name": "least_squares", "training": {"epochs": 3}}, "training", "sgd"),
         ({"name": "least_squares", "consistency": "penalties"}, "consistency", "sgd"),
         ({"name": "least_squares", "penalties": {"mass": 1.0}}, "penalties", "sgd"),
-        ({"name": "least_squares", "com_inside": "box"}, "com_inside", "consistent"),
-        ({"name": "sgd", "total_mass": 50.0}, "total_mass", "least_squares or consistent"),
+        ({"name": "least_squares", "com_inside": "box"}, "com_inside", "consistent or sgd"),
+        ({"name": "least_squares", "prior": "entropic"}, "prior", "consistent or sgd"),
         ({"name": "consistent", "consistency": "penalties"}, "consistency", "sgd"),
         ({"name": "consistent", "training": {"seed": 3}}, "training", "sgd"),
-        ({"name": "sgd", "prior": "entropic"}, "prior", "consistent"),
         ({"name": "sgd", "certify": True}, "certify", "consistent"),
-        ({"name": "sgd", "com_inside": "box"}, "com_inside", "consistent"),
     ],
     ids=lambda value: value["name"] if isinstance(value, dict) else value,
 )
@@ -123,6 +123,19 @@ def test_a_key_of_another_estimator_is_refused_by_those_that_have_it(
         f"estimator.{key}",
         f"set, which {estimator['name']} has not; accepted: name: {having}, or no such key",
     )
+
+
+@pytest.mark.parametrize(
+    "setting", [{"prior": "pullback"}, {"com_inside": "box"}, {"symmetry": {"left": "l_", "right": "r_"}}]
+)
+def test_conditions_are_refused_where_violations_are_only_penalized(file: Path, setting: dict[str, Any]) -> None:
+    estimator = {"name": "sgd", "consistency": "penalties"} | setting
+    found = "set, which consistency: penalties has not; accepted: consistency: log_cholesky, or no such key"
+    assert_wrong_value(
+        lambda: load(file, changed(estimator=estimator)), file, f"estimator.{next(iter(setting))}", found
+    )
+    (key, value), taken = next(iter(setting.items())), load(file, changed(estimator={"name": "sgd"} | setting))
+    assert getattr(taken.estimator, key) == (value if isinstance(value, str) else taken.estimator.symmetry)
 
 
 def test_penalties_of_bodies_that_are_possible_anyway_are_refused(file: Path) -> None:

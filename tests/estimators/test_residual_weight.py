@@ -106,7 +106,7 @@ def fitted(friction_in_model: bool, kind: str | None, weight: float | None, epoc
     """With "any force", "by joint", or no module."""
     w = truth(friction_in_model).world
     module = None if kind is None else Network(w.robot.n, kind == "by joint")
-    settings = Sgd(RIDGE, epochs=epochs, residual_lr=0.01, residual_weight=weight)
+    settings = Sgd(RIDGE, epochs=epochs, residual_lr=0.01, residual_weight=weight, finish=None)
     return Trainer(settings, w.problem, w.batches, residual=module).run()
 
 

@@ -16,8 +16,6 @@ from unknowns import Fit, fit
 from urdfs import BASE, inertial, joint, link, write
 from welded import SENSORS, machine
 
-from torchid.config import load_config
-from torchid.errors import ConfigError
 from torchid.identifiability.confounding import INFLATION_LIMIT, total_mass
 from torchid.logs import Log
 from torchid.logs.preprocess import preprocess
@@ -277,14 +275,3 @@ def test_a_filter_that_smears_the_switching_of_contacts_leaves_offsets_exact(rec
     for x in told:
         shift = x.value - before.values[x.log, x.extra.label]
         assert shift == pytest.approx(true[x.extra.label], rel=1e-7, abs=1e-7), x.extra.label
-
-
-def test_a_descent_refuses_unknowns_beside_the_parameters_in_one_line(tmp_path: Path) -> None:
-    path = tmp_path / "experiment.yaml"
-    path.write_text(
-        "robot: {urdf: a.urdf}\nlogs: {train: [a.npz]}\nsensors: {set: full, offsets: log}\n"
-        "estimator: {name: sgd}\noutput: out\n"
-    )
-    with pytest.raises(ConfigError, match="sensors.offsets: set, which sgd has not; accepted: ") as caught:
-        load_config(path)
-    assert "\n" not in str(caught.value)

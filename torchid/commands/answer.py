@@ -90,7 +90,6 @@ class ErrorComparison:
 
 
 _LARGER_THAN_MEASURED = 1.05  # errors over the measured, of sensors that any fit of their limb explains better
-_FAR_FROM_LEAST = 3.0  # standard errors by noise, rms; those that are printed count the scatter of blocks, too
 _MUCH_MORE = 1.5  # residuals of bodies that can exist over the least: 1.001 of honest logs, 1.9 to 30 with a unit wrong
 _EXACT = 1e-3  # of what the nominal parameters leave: signals without noise, of which a solver's tolerance is left
 _CLEAR_ERRORS = 4.0  # standard errors of a total mass from which on it is not the URDF's
@@ -179,7 +178,7 @@ def _attention(run: Identification, judged: ErrorComparison) -> Iterator[str]:
         yield ADVICE
     if run.suspected:
         yield f"torchid check finds in {run.suspected}"
-    if isinstance(run.estimate, SgdEstimate) and run.estimate.deviation > _FAR_FROM_LEAST:
+    if isinstance(run.estimate, SgdEstimate) and not run.estimate.converged:
         yield _unfinished(run.estimate)
     yield from list(_unlike_sensors(judged.identified)) or _unlike_torques(run)
     yield from _computed(judged)
@@ -260,13 +259,9 @@ def _driving(run: Identification) -> Iterator[str]:
 
 
 def _unfinished(estimate: SgdEstimate) -> str:
-    """That a descent ended far from where least squares, whose standard errors it has, would end."""
-    objective = estimate.objective / (estimate.unconstrained or estimate.objective)
-    return (
-        f"the descent has not converged: its objective is {objective:.3g} times the least, its parameters are off by"
-        f" {estimate.deviation:.2g} standard errors, which are those of least squares; more estimator.training.epochs,"
-        " optimizer LBFGS, or estimator.name=consistent"
-    )
+    """How far above the least objective under the same conditions a descent ended."""
+    above = "" if estimate.excess is None else f": {100.0 * estimate.excess:.2g} % above the optimum"
+    return f"not converged{above}; more estimator.training.epochs, or estimator.name=consistent"
 
 
 def _unlike_sensors(identified: Metrics) -> Iterator[str]:

@@ -103,7 +103,9 @@ def _solved(
         def evaluate(phi: Array) -> dict[str, Metrics]:
             return {name: evaluation.metrics(logs[name], phi[None])[0] for name in LOG_SETS if logs[name]}
 
-        solve = partial(training.run, builder=fitter.builder, logs=logs, evaluate=evaluate, bars=bars, resume=resume)
+        solve = partial(
+            training.run, ready.parts, fitter=fitter, logs=logs, evaluate=evaluate, bars=bars, resume=resume
+        )
     fit = fitter.fit(ready.parts, solve)
     fit, robust = _robust(fit, ready, bars)
     mass = require_plausible(fit, checked, logs["train"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 
 from rich.progress import Progress
@@ -145,8 +145,6 @@ def _read(experiment: Experiment, bars: Progress) -> tuple[LogReader, dict[str, 
         for name, paths in files.items()
     }
     check_read(logs)
-    if experiment.config.estimator.name == "sgd":  # it sees samples one by one, not what noise adds on average
-        logs["train"] = [replace(log, motion_noise=None) for log in logs["train"]]
     return reader, logs
 
 

@@ -34,13 +34,16 @@ from torchid.commands.folder import (
 from torchid.commands.manifest import Manifest, inspect_folder, read_manifest
 from torchid.config import ExperimentConfig, dump_config, inputs_of
 from torchid.errors import ConfigError, InputError, SensorError, warn
-from torchid.estimators import Epoch, Estimate, Sgd, SgdEstimate, Trainer
+from torchid.estimators import Conditions, Epoch, Estimate, Sgd, SgdEstimate, Trainer
 from torchid.estimators.least_squares import IDENTIFIED
 from torchid.estimators.optimizers import OPTIMIZERS
 from torchid.fitting.experiment import Experiment
+from torchid.fitting.fit import LogFitter
 from torchid.parameters import PARAMETERS, Array
-from torchid.problem import LinearProblem, Metrics, MiniBatches, RowBuilder, Samples
+from torchid.problem import LinearProblem, Metrics, MiniBatches, Samples, TriangularFactor, assemble, compress_parts
+from torchid.problem.elimination import Assembly
 from torchid.problem.linear import parameter_scale
+from torchid.problem.parts import Part
 from torchid.robot import Robot
 
 if TYPE_CHECKING:
@@ -98,13 +101,14 @@ class Training:
         config = experiment.config
         self.config, self.robot = config, experiment.robot
         self.folder = None if config.output is None else training_folder(config.output)
-        self.settings = descent_settings(config)
+        self.settings = descent_settings(config, experiment.conditions())
         self._text, self._saved = dump_config(config), 0
 
     def run(
         self,
+        parts: Sequence[Part],
         problem: LinearProblem,
-        builder: RowBuilder,
+        fitter: LogFitter,
         logs: Mapping[str, Sequence[Samples]],
         evaluate: Evaluate,
         bars: Progress,
@@ -113,8 +117,9 @@ class Training:
         """Train until finished; what is interrupted can be resumed.
 
         Args:
-            problem: compressed training logs, with what is free.
-            builder: of their rows.
+            parts: the training logs, compressed.
+            problem: that they pose, with what is free.
+            fitter: of their rows.
             logs: "train" and "validation".
             evaluate: metrics on sets of logs, of one parameter vector (12 L,).
             bars: for the progress.
@@ -126,11 +131,14 @@ class Training:
             KeyboardInterrupt: says how to go on.
         """
         training = self.config.estimator.training
-        train, held_out = (
-            MiniBatches(logs[name], builder, training.batch_size, training.seed, share=self._share())
-            for name in ("train", "validation")
-        )
-        trainer = Trainer(self.settings, problem, train, held_out if held_out.samples else None)
+        builder, (size, seed, share) = fitter.builder, (training.batch_size, training.seed, self._share())
+        sampled = sampled_rows(fitter, parts)
+        train = MiniBatches(logs["train"], builder, size, seed, share=share, assembly=sampled)
+        held_out = None
+        if logs["validation"]:  # with the extra parameters that fit these logs best
+            own = sampled_rows(fitter, compress_parts(logs["validation"], builder))
+            held_out = MiniBatches(logs["validation"], builder, size, seed, share=share, assembly=own)
+        trainer = Trainer(self.settings, problem, train, held_out, data=sampled.problem)
         if not trainer.closed_form.rank:
             raise SensorError.at_field("sensors", "no parameter is in reach of them", "other sensors or contacts")
         state = distributed.from_first(partial(self._prepare, trainer, resume), "checkpoint")
@@ -259,13 +267,26 @@ class Training:
             raise
 
 
-def descent_settings(config: ExperimentConfig) -> Sgd:
+def sampled_rows(fitter: LogFitter, parts: Sequence[Part]) -> Assembly:
+    """The problem of the rows of samples alone: no corrections for noise, known masses or readings in the air."""
+    plain = []
+    for part in parts:
+        if not part.unloaded:
+            factor = part.factor
+            bare = TriangularFactor.from_blocks(factor.columns, factor.rows, factor.independent_rows, factor.blocks)
+            plain.append(replace(part, factor=bare))
+    assembly = assemble(plain, fitter.builder, fitter.robot, fitter.friction)
+    frozen = np.zeros(assembly.problem.free.shape, dtype=bool) if fitter.frozen is None else fitter.frozen
+    return replace(assembly, problem=replace(assembly.problem, free=assembly.problem.free & ~frozen))
+
+
+def descent_settings(config: ExperimentConfig, conditions: Conditions | None = None) -> Sgd:
     """What an experiment file says of a descent.
 
     Raises:
         InputError: an optimizer or schedule that torch does not have or that does not take its options.
     """
-    settings = config.estimator.sgd
+    settings = config.estimator.sgd(conditions or Conditions(margin=config.estimator.margin))
     try:
         settings.try_out()
     except InputError as error:

@@ -180,10 +180,9 @@ class EstimatorConfig(_ConditionsConfig, _FitConfig):
         """Least squares with these settings."""
         return self._settings(LeastSquares)
 
-    @property
-    def sgd(self) -> Sgd:
+    def sgd(self, conditions: Conditions) -> Sgd:
         """A descent with these settings."""
-        return self._settings(Sgd)
+        return self._settings(Sgd, conditions=conditions)
 
     def consistent(self, conditions: Conditions) -> Consistent:
         """A consistent fit with these settings. Raises InputError: the certified method without Clarabel."""
@@ -207,12 +206,17 @@ def validate_keys(estimator: EstimatorConfig) -> None:
         if estimator.name not in having and value != getattr(defaults, key):
             found = f"set, which {estimator.name} has not"
             raise ConfigError.at_field(f"estimator.{key}", found, f"name: {' or '.join(having)}, or no such key")
+    if estimator.name == "sgd" and estimator.consistency == "penalties":
+        for key in (*_fields(_ConditionsConfig), "prior"):
+            if key not in ("margin", "com_shapes") and getattr(estimator, key) != getattr(defaults, key):
+                found = "set, which consistency: penalties has not"
+                raise ConfigError.at_field(f"estimator.{key}", found, "consistency: log_cholesky, or no such key")
     if estimator.consistency != "penalties" and estimator.penalties != defaults.penalties:
         found = f"set, which consistency: {estimator.consistency} has not"
         raise ConfigError.at_field("estimator.penalties", found, "consistency: penalties, or no such key")
 
 
-_OF_BATCH_FITS = {"robust", "total_mass", "masses"}
+_OF_BATCH_FITS = {"robust"}
 
 
 def _estimators_with(key: str) -> list[str]:

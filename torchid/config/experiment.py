@@ -308,12 +308,6 @@ def _check_extras(config: _Common) -> None:
     if config.preprocessing.zero_in_air and twice:
         found = "set together with preprocessing.zero_in_air, which subtracts the same"
         raise ConfigError.at_field(f"sensors.offsets.{twice[0]}", found, "one of the two")
-    unknowns = {f"actuators.{name}": x is True for name, x in vars(actuators).items() if name != "stiction"}
-    unknowns["actuators.stribeck"] = actuators.stribeck is not None
-    unknowns |= {f"sensors.{name}": bool(getattr(sensors, name)) for name in ("offsets", "scales")}
-    for field, is_set in unknowns.items():
-        if is_set and config.estimator.name == "sgd":
-            raise ConfigError.at_field(field, "set, which sgd has not", "estimator.name: least_squares or consistent")
 
 
 def _checked_logs(config: _Common, logs: LogsConfig) -> LogsConfig:

@@ -19,7 +19,7 @@ _LEAST_EIGENVALUE = 1e-3  # above the margin: initial one of a body whose nomina
 
 
 class LearnableParameters(nn.Module, ABC):
-    """phi, (12 L,), as a function of `raw`, which is 0 at the nominal parameters.
+    """phi, (12 L,), and M terms, if the problem has any, as a function of `raw`, which is 0 at the nominal parameters.
 
     In the units of `raw` the compressed problem's Hessian is near the identity: phi is a function of
     `preconditioner @ raw`.
@@ -28,6 +28,7 @@ class LearnableParameters(nn.Module, ABC):
     nominal: Tensor
     scale: Tensor
     free: Tensor
+    terms: Tensor
     preconditioner: Tensor
 
     def __init__(self, problem: LinearProblem, size: int) -> None:
@@ -41,16 +42,27 @@ class LearnableParameters(nn.Module, ABC):
         self.register_buffer("nominal", torch.from_numpy(problem.nominal.copy()))
         self.register_buffer("scale", torch.from_numpy(problem.scale.copy()))
         self.register_buffer("free", torch.from_numpy(problem.free.copy()))
-        self.register_buffer("preconditioner", torch.eye(size, dtype=torch.float64))
-        self.raw = nn.Parameter(torch.zeros(size, dtype=torch.float64))
+        terms = np.zeros(0) if problem.terms is None else problem.terms.size
+        self.register_buffer("terms", torch.from_numpy(terms.copy()), persistent=bool(len(terms)))
+        self.register_buffer("preconditioner", torch.eye(size + len(terms), dtype=torch.float64))
+        self.raw = nn.Parameter(torch.zeros(size + len(terms), dtype=torch.float64))
 
     @abstractmethod
     def constrained(self, u: Tensor) -> Tensor:
-        """phi, (12 L,), at `preconditioner @ raw`, (size,)."""
+        """phi, (12 L,), at the first `size` entries of `preconditioner @ raw`."""
+
+    def _with_terms(self, u: Tensor) -> Tensor:
+        count = len(u) - len(self.terms)
+        return torch.cat([self.constrained(u[:count]), self.terms * u[count:]])
 
     def forward(self) -> Tensor:
-        """phi, (12 L,)."""
-        return self.constrained(self.preconditioner @ self.raw)
+        """Phi and terms, (12 L + M,)."""
+        return self._with_terms(self.preconditioner @ self.raw)
+
+    def deviations(self, values: Tensor) -> Tensor:
+        """What `forward` gives as deviations of the free parameters, and the terms, in units of their scale."""
+        scaled = (values[: len(self.free)] - self.nominal) / self.scale
+        return torch.cat([scaled[self.free], values[len(self.free) :] / self.terms])
 
     @one_thread()  # on a busy machine two took up to 1.4 s instead of 3 ms
     def precondition(self, problem: LinearProblem, ridge: float, damping: float) -> None:
@@ -61,16 +73,23 @@ class LearnableParameters(nn.Module, ABC):
         damping, steps along directions that the data hardly excite would be too long.
         """
         start = torch.zeros_like(self.raw)
-        slopes = torch.autograd.functional.jacobian(self.constrained, start, vectorize=True).cpu()
-        data = torch.from_numpy(problem.A) @ slopes
-        prior = slopes / self.scale.cpu()[:, None]
+        slopes = torch.autograd.functional.jacobian(self._with_terms, start, vectorize=True).cpu()
+        data = torch.from_numpy(problem.A) @ slopes[: len(self.free)]
+        if problem.terms is not None:
+            data = torch.cat([data, torch.from_numpy(np.hstack([problem.terms.C, problem.terms.D])) @ slopes])
+        prior = slopes[: len(self.free)] / self.scale.cpu()[:, None]
         hessian = 2.0 * (data.T @ data / max(problem.rows, 1) + ridge * prior.T @ prior)
-        values, vectors = torch.linalg.eigh(hessian)
-        self.preconditioner.copy_(vectors @ ((values.clamp_min(0.0) + damping).rsqrt()[:, None] * vectors.T))
+        self.preconditioner.copy_(precondition_by(hessian, damping))
 
     def by_body(self, phi: Tensor) -> Tensor:
         """Parameters in units of their scale, (L, 12)."""
-        return (phi / self.scale).unflatten(0, (-1, PER_BODY))
+        return (phi[: len(self.free)] / self.scale).unflatten(0, (-1, PER_BODY))
+
+
+def precondition_by(hessian: Tensor, damping: float) -> Tensor:
+    """(H + damping I)^(-1/2) of a symmetric matrix, (n, n), whose negative eigenvalues are rounding."""
+    values, vectors = torch.linalg.eigh(hessian)
+    return vectors @ ((values.clamp_min(0.0) + damping).rsqrt()[:, None] * vectors.T)
 
 
 class FreeParameters(LearnableParameters):

@@ -28,6 +28,7 @@ class WeightChoice:
         losses: of each, the held-out mean squared whitened residual.
         standard_error: of the least loss, over blocks of time.
         alone: the held-out loss of rigid bodies without the module.
+        alone_converged: whether their descent had converged: only then is a smaller loss the module's gain.
     """
 
     weight: float
@@ -35,6 +36,12 @@ class WeightChoice:
     losses: tuple[float, ...]
     standard_error: float
     alone: float
+    alone_converged: bool = True
+
+    @property
+    def gain(self) -> float | None:
+        """Share of the loss of rigid bodies alone that the module takes away; None where that has not converged."""
+        return 1.0 - self.losses[self.candidates.index(self.weight)] / self.alone if self.alone_converged else None
 
 
 def choose_weight(candidates: Sequence[float], losses: Array, alone: float) -> WeightChoice:

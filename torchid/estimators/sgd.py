@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -13,12 +13,15 @@ from torch import Tensor, nn
 
 from torchid import distributed, parameters
 from torchid.estimators.conditions import Conditions
+from torchid.estimators.conic_formulation import Prior, build_conic_problem
+from torchid.estimators.conic_loss import ConicLoss
+from torchid.estimators.conic_problem import ConicProblem
 from torchid.estimators.learnable import LearnableParameters
 from torchid.estimators.least_squares import Regularized
 from torchid.estimators.optimizers import try_out
 from torchid.problem import Batch, LinearProblem, MiniBatches
 from torchid.reprs import short_repr
-from torchid.settings import BelowOne, Count, NamedClass, NotNegative, Positive, validate_settings
+from torchid.settings import Count, NamedClass, NotNegative, Positive, validate_settings
 
 Consistency = Literal["log_cholesky", "penalties"]
 ResidualMode = Literal["joint", "parameters_first", "alternating"]
@@ -65,6 +68,8 @@ class TrainingSettings:
         patience: epochs without a better loss on the held-out logs after which training stops; None: never.
         clip: largest norm of a gradient.
         damping: of the preconditioner, in units of the mean squared whitened residual per squared scale.
+        finish: rounds of L-BFGS on all samples after the last epoch, at most; None: none. Without held-out logs only,
+            whose least loss is what to stop at.
     """
 
     epochs: Count = 200
@@ -73,6 +78,7 @@ class TrainingSettings:
     patience: Count | None = None
     clip: Positive = 1.0
     damping: Positive = 1.0
+    finish: Count | None = 40
 
     def try_out(self) -> None:
         """Test optimizer and schedule on a parabola, so that invalid options fail before any work.
@@ -88,12 +94,10 @@ class TrainingSettings:
 class Sgd(TrainingSettings, Regularized):
     """min of the mean squared whitened residual + ridge * prior + penalties, one mini-batch at a time.
 
-    The prior is that of `LeastSquares`, ||(phi - nominal) / scale||^2.
-
     Attributes:
-        consistency: "log_cholesky", parameters are physically consistent in every step; "penalties", violations are
-            penalized.
-        margin: least eigenvalue of every body's scaled pseudo-inertia, enforced or penalized.
+        consistency: "log_cholesky", parameters are physically consistent in every step, and meet all conditions at the
+            end; "penalties", violations of the margin and of friction are penalized, and there are no other conditions.
+        prior, conditions: as in `Consistent`.
         penalties: their weights, for "penalties".
         residual: how a residual module is trained: "joint", with the parameters; "parameters_first", after them, in the
             second half of the epochs; "alternating", in every other epoch.
@@ -103,13 +107,32 @@ class Sgd(TrainingSettings, Regularized):
     """
 
     consistency: Consistency = "log_cholesky"
-    margin: BelowOne = Conditions.margin
+    prior: Prior = "euclidean"
+    conditions: Conditions = field(default_factory=Conditions)
     penalties: PenaltyWeights = field(default_factory=PenaltyWeights)
     residual: ResidualMode = "joint"
     residual_lr: Positive | None = None
     residual_weight: NotNegative | None = None
 
     __repr__ = short_repr
+
+    def conic_problem(self, problem: LinearProblem) -> ConicProblem:
+        """Objective and conditions for the compressed samples, but for what penalties are in place of."""
+        conic, terms = build_conic_problem(problem, self.conditions, self.ridge, self.prior), problem.terms
+        if self.consistency == "penalties":
+            signs = {one.name for one in terms.conditions} if terms else set()
+            rows = np.array([name in signs for name in conic.names[len(conic.F0) :]], dtype=bool)
+            conic = replace(conic, G=conic.G[rows], h=conic.h[rows])
+        return conic
+
+    def conic_loss(self, problem: LinearProblem, data: bool = True) -> ConicLoss:
+        """The same as a loss; for mini-batches, without `data`, the prior alone, and softer conditions."""
+        conic, terms = self.conic_problem(problem), problem.terms
+        hessian = conic.hessian
+        if not data:
+            rows = min(len(problem.A) + (len(terms.C) if terms else 0), len(conic.linear))
+            conic = replace(conic, root=conic.root[rows:], target=conic.target[rows:], constant=0.0)
+        return ConicLoss(conic, len(problem.free_bodies()), hessian, 10.0 if data else 1.0)
 
 
 def pseudo_inertias(scaled: Tensor) -> Tensor:
@@ -194,7 +217,9 @@ class Loss(nn.Module):
         batches: MiniBatches,
         learnable: LearnableParameters,
         residual: nn.Module | None,
+        data: LinearProblem | None = None,
     ) -> None:
+        """Arguments as of `Trainer`, with the parameters to learn."""
         super().__init__()
         self.settings = settings
         self.learnable, self.residual = learnable, residual
@@ -202,6 +227,8 @@ class Loss(nn.Module):
         self._columns = batches.columns
         self._per_row = batches.samples / max(problem.rows, 1)
         self._processes = batches.share[1]
+        self.conic = settings.conic_loss(problem, data=False).to(batches.columns.device)
+        self._beside = None if data is None else _difference(problem, data, batches.columns.device)
         self.register_buffer(
             "_bodies", torch.from_numpy(problem.free_bodies()).to(batches.columns.device), persistent=False
         )
@@ -214,16 +241,20 @@ class Loss(nn.Module):
             size: samples that all processes have in it, if they share it; their terms add up to those of the batch.
         """
         settings, phi = self.settings, self.learnable()
+        y = self.learnable.deviations(phi)
         rigid, other = self.forces(batch, phi)
         share, of_one = self._per_row / (size or len(batch)), 1.0 / self._processes
         misfit = (rigid if other is None else rigid + other) - batch.f
         losses = {"data": share * misfit.square().sum()}
+        if self._beside is not None:
+            losses["beside"] = of_one * self._beside(phi)
         if settings.ridge:
-            deviation = (phi - self.learnable.nominal) / self.learnable.scale
-            losses["prior"] = of_one * settings.ridge * deviation.square().sum()
+            losses["prior"] = of_one * self.conic.objective(y)
+        if len(self.conic.G) or len(self.conic.E) or len(self.conic.F0):
+            losses["conditions"] = of_one * self.conic.penalty(y)
         if settings.consistency == "penalties":
             scaled, bodies = self.learnable.by_body(phi), self.get_buffer("_bodies")
-            terms = penalties(scaled, bodies, settings.margin, settings.penalties)
+            terms = penalties(scaled, bodies, settings.conditions.margin, settings.penalties)
             losses |= {name: of_one * x for name, x in terms.items()}
         forces = {"rigid_body": rigid, "measured": batch.f}
         if other is not None:
@@ -231,6 +262,11 @@ class Loss(nn.Module):
             if self.residual_weight:
                 losses["residual"] = self.residual_weight * share * other.square().sum()
         return LossTerms(losses, {name: x.detach().square().sum() for name, x in forces.items()})
+
+    def update_conditions(self) -> None:
+        """Move the multipliers of the conditions to the current parameters, at the end of an epoch."""
+        with torch.no_grad():
+            self.conic.update(self.learnable.deviations(self.learnable()))
 
     def forces(self, batch: Batch, phi: Tensor) -> tuple[Tensor, Tensor | None]:
         """Whitened projected forces, (B, n_rows), of parameters (12 L,) and of the residual module."""
@@ -243,9 +279,12 @@ class Loss(nn.Module):
         return rigid, (batch.W.mT @ r[..., None])[..., 0]
 
     @torch.no_grad()
-    def mean_square(self, batches: MiniBatches) -> float:
-        """Mean squared whitened residual over all rows of some logs, with the module in evaluation mode."""
-        total, rows, phi = 0.0, 0, self.learnable()
+    def mean_square(self, batches: MiniBatches, phi: Tensor | None = None) -> float:
+        """Mean squared whitened residual over all rows of some logs, with the module in evaluation mode.
+
+        `phi`: parameters and terms; None for those that are learned.
+        """
+        total, rows, phi = 0.0, 0, self.learnable() if phi is None else phi
         with self.evaluating():
             for batch in batches.chunks():
                 rigid, other = self.forces(batch, phi)
@@ -264,6 +303,21 @@ class Loss(nn.Module):
             yield
         finally:
             self.train(training)
+
+
+def _difference(problem: LinearProblem, data: LinearProblem, device: torch.device) -> Callable[[Tensor], Tensor]:
+    """Mean square that a problem has beside that of the samples alone, as of known masses, at parameters and terms."""
+
+    def quadratic(one: LinearProblem) -> tuple[Tensor, Tensor]:
+        A, b, terms = one.A, one.b, one.terms
+        if terms is not None:
+            A = np.block([[A, np.zeros((len(A), len(terms.size)))], [terms.C, terms.D]])
+            b = np.append(b, terms.z)
+        return torch.from_numpy(A).to(device), torch.from_numpy(b).to(device)
+
+    (A, b), (C, d) = quadratic(problem), quadratic(data)
+    rest = problem.residual - data.residual
+    return lambda x: ((A @ x - b).square().sum() - (C @ x - d).square().sum() + rest) / max(problem.rows, 1)
 
 
 def validate_state(saved: Mapping[str, Any], new: Mapping[str, Any], epochs: int) -> None:

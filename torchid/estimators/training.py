@@ -16,8 +16,9 @@ from torch import Tensor, nn
 
 from torchid import parameters
 from torchid.errors import InputError
+from torchid.estimators.finish import excess, finish
 from torchid.estimators.learnable import FreeParameters, LearnableParameters, LogCholeskyParameters
-from torchid.estimators.least_squares import ConstrainedEstimate, report_rounding
+from torchid.estimators.least_squares import ConstrainedEstimate, Minimizer, report_rounding
 from torchid.estimators.optimizers import OPTIMIZERS, make_optimizer, make_schedule, step_schedule
 from torchid.estimators.residual import CANDIDATE_WEIGHTS, ResidualEffect, WeightChoice, choose_weight, residual_effect
 from torchid.estimators.sgd import Loss, LossTerms, Sgd, add_up, validate_state
@@ -26,6 +27,8 @@ from torchid.parameters import Array
 from torchid.problem import Batch, LinearProblem, MiniBatches
 
 _BLOCKS, _EVERY, _FEWEST = 20, 4, 2  # of samples; one of how many is held out to weigh a residual module; for an error
+CONVERGED = 0.01
+"""Share of the least objective that one of a converged descent is above it at most."""
 _SMALLER = "a smaller lr"
 _BETTER = 1e-5  # least relative decrease that counts as an improvement
 _DIVERGED = 1e6  # times the loss at the nominal parameters, or that of the stated noise if that is larger
@@ -68,11 +71,19 @@ class SgdEstimate(ConstrainedEstimate):
         epochs: number of epochs run.
         best_epoch: the epoch of these parameters.
         residual: effect of the residual module, None without one.
+        excess: of the objective, penalties included, over the least one under the same conditions, as a share of this;
+            None with a residual module.
     """
 
     epochs: int
     best_epoch: int
     residual: ResidualEffect | None
+    excess: float | None = None
+
+    @property
+    def converged(self) -> bool:
+        """Whether the objective is known to be at most `CONVERGED` above the least one."""
+        return self.excess is not None and self.excess <= CONVERGED
 
     def _headline(self) -> str:
         off = "" if self.unconstrained is None else f", {self.deviation:.2g} standard errors from least squares"
@@ -94,6 +105,7 @@ class Trainer:
         batches: MiniBatches,
         held_out: MiniBatches | None = None,
         residual: nn.Module | None = None,
+        data: LinearProblem | None = None,
     ) -> None:
         """Start at the nominal parameters.
 
@@ -105,9 +117,11 @@ class Trainer:
             held_out: of logs for early stopping.
             residual: any module r(q, v, a) -> (B, n_rows) [N, N m], on the device of the batches, whose output adds to
                 K phi; arguments as in `Batch`.
+            data: the problem of the batches' rows alone, where `problem` has more, as known masses; None if it is that.
 
         Raises:
-            InputError: an optimizer or a schedule that does not work with its options.
+            InputError: an optimizer or a schedule that does not work with its options; conditions that exclude each
+                other.
         """
         if batches.share[1] > 1 and (residual is not None or OPTIMIZERS[settings.optimizer["name"]].full_batch):
             found = f"a share of {batches.share[1]}, with a residual module or {settings.optimizer['name']}"
@@ -116,8 +130,9 @@ class Trainer:
         self.settings, self.problem, self.batches, self.held_out = settings, problem, batches, held_out
         self._least_squares = settings.least_squares
         self.closed_form = self._least_squares.solve(problem)
-        device = batches.columns.device
-        self.loss = Loss(settings, problem, batches, _learnable(settings, problem).to(device), residual)
+        self._conic, self._data, device = settings.conic_problem(problem), data, batches.columns.device
+        self._least = self._conic.unconstrained
+        self.loss = Loss(settings, problem, batches, _learnable(settings, problem).to(device), residual, data)
         self._trained: list[list[nn.Parameter]] = [[self.loss.learnable.raw]]
         if residual is not None:
             self._trained.append([x for x in residual.parameters() if x.requires_grad])
@@ -186,13 +201,14 @@ class Trainer:
             elapsed = time.perf_counter() - start
             held_out = None if self.held_out is None else self.loss.mean_square(self.held_out)
         losses["total"] = sum(losses.values())
-        phi, size = self.phi(), squares.pop("measured")
+        found, size = self._minimizer(), squares.pop("measured")
         with np.errstate(over="ignore", invalid="ignore"):
-            self._require_converging(self._objective(phi))  # after the last step: losses are those before it
+            self._require_converging(self._objective(found))  # after the last step: losses are those before it
         self._require_converging(0.0 if held_out is None else held_out)
         if not all(bool(x.isfinite().all()) for x in chain(*self._trained)):
             self._require_converging(float("nan"))  # of a module, in the last step
         self._unfreeze()
+        self.loss.update_conditions()
         step_schedule(self.schedule, losses["total"] if held_out is None else held_out)
         if held_out is None or held_out < self.best_loss * (1.0 - _BETTER):
             self.best_epoch, self.best_loss = self.epoch, losses["total"] if held_out is None else held_out
@@ -201,9 +217,9 @@ class Trainer:
             number=self.epoch,
             losses=losses,
             held_out=held_out,
-            objective=self._objective(phi),
-            closed_form=self._objective(self.closed_form.phi),
-            distance=self.problem.prediction_distance(phi, self.closed_form.phi),
+            objective=self._objective(found),
+            closed_form=self._least or 0.0,
+            distance=self.problem.prediction_distance(found.phi, self.closed_form.phi),
             shares={name: float(np.sqrt(x / size)) if size else 0.0 for name, x in squares.items()},
             learning_rate=rate,
             samples_per_second=self.batches.samples / elapsed,
@@ -227,20 +243,25 @@ class Trainer:
             raise InputError("estimator", "residual_weight", found, "a number, or longer logs")
         with torch.random.fork_rng():
             without_module = self._trial(train, None, 0.0, self.settings.epochs)
-            without_module.run()
+            alone = without_module.run()
             start = without_module.loss.learnable.state_dict()
             losses = [self._trial_losses(train, weight, start, blocks) for weight in CANDIDATE_WEIGHTS]
         if not np.isfinite(losses).any():
             raise InputError("estimator", "training", "a loss that diverges with every residual_weight", _SMALLER)
-        loss_without = float(np.mean([without_module.loss.mean_square(block) for block in blocks]))
-        self.weight_choice = choose_weight(CANDIDATE_WEIGHTS, np.array(losses), loss_without)
+        values = torch.from_numpy(np.append(alone.phi, [] if alone.psi is None else alone.psi))
+        values = values.to(self.batches.columns.device)
+        loss_without = float(np.mean([without_module.loss.mean_square(block, values) for block in blocks]))
+        choice = choose_weight(CANDIDATE_WEIGHTS, np.array(losses), loss_without)
+        self.weight_choice = replace(choice, alone_converged=alone.converged)
         self.loss.residual_weight = self.weight_choice.weight
         return self.weight_choice
 
     def _trial(self, train: MiniBatches, residual: nn.Module | None, weight: float, epochs: int) -> Trainer:
         """A trainer on some of the samples."""
         settings = replace(self.settings, residual_weight=weight, epochs=epochs, patience=None)
-        return Trainer(settings, self.problem.fraction(train.samples / self.batches.samples), train, residual=residual)
+        share = train.samples / self.batches.samples
+        data = None if self._data is None else self._data.fraction(share)
+        return Trainer(settings, self.problem.fraction(share), train, residual=residual, data=data)
 
     def _trial_losses(
         self, train: MiniBatches, weight: float, start: Mapping[str, Tensor], blocks: Sequence[MiniBatches]
@@ -257,25 +278,35 @@ class Trainer:
 
     def phi(self) -> Array:
         """The current parameters, (12 L,)."""
+        return self._minimizer().phi
+
+    def _minimizer(self) -> Minimizer:
         with torch.no_grad():
-            return np.array(self.loss.learnable().cpu().numpy(), dtype=np.float64)
+            values = np.array(self.loss.learnable().cpu().numpy(), dtype=np.float64)
+        phi, psi = np.split(values, [len(self.problem.nominal)])
+        return Minimizer(phi, None if self.problem.terms is None else psi)
 
     def estimate(self) -> SgdEstimate:
         """The parameters, and residual module, of least held-out loss; without held-out logs the last ones.
 
-        Statistics are those of least squares with the same ridge.
+        After the last epoch, without held-out logs or a module, L-BFGS goes on from there on all samples. Statistics
+        are those of least squares with the same ridge.
         """
         self.loss.load_state_dict(self._best)
-        plain, phi = self.closed_form, self.phi()
+        plain, found = self.closed_form, self._minimizer()
+        if self.finished and self.held_out is None and self.loss.residual is None and self.settings.finish:
+            found = finish(self.settings, self.problem, found)
+        phi, psi = found
         return SgdEstimate(
-            **(vars(plain) | {"phi": phi, "cost": self.problem.cost(phi)}),
-            objective=self._objective(phi),
-            unconstrained=self._objective(plain.phi),
+            **(vars(plain) | {"phi": phi, "psi": psi, "cost": self.problem.cost(phi, psi)}),
+            objective=self._objective(found),
+            unconstrained=self._least,
             distance=self.problem.prediction_distance(phi, plain.phi),
             eigenvalues=parameters.least_eigenvalues(phi, self.problem.scale),
             epochs=self.epoch,
             best_epoch=self.best_epoch,
             residual=residual_effect(self.loss, self.problem, self.batches, self._least_squares, self.weight_choice),
+            excess=None if self.loss.residual is not None else excess(self.settings, self.problem, found),
         )
 
     def state_dict(self) -> dict[str, Any]:
@@ -326,9 +357,15 @@ class Trainer:
     def _snapshot(self) -> dict[str, Tensor]:
         return {name: x.detach().clone() for name, x in self.loss.state_dict().items()}
 
-    def _objective(self, phi: Array) -> float:
-        deviation = (phi - self.problem.nominal) / self.problem.scale
-        return self.problem.cost(phi) / max(self.problem.rows, 1) + self.settings.ridge * float(deviation @ deviation)
+    def _deviations(self, found: Minimizer) -> Array:
+        free, terms = self.problem.free, self.problem.terms
+        y = ((found.phi - self.problem.nominal) / self.problem.scale)[free]
+        return y if terms is None or found.psi is None else np.append(y, found.psi / terms.size)
+
+    def _objective(self, found: Minimizer) -> float:
+        """Mean squared whitened residual plus prior."""
+        y = self._deviations(found)
+        return self._conic.objective(np.asarray(np.linalg.solve(self._conic.deviations, y), dtype=np.float64))
 
     def _freeze(self) -> None:
         """Freeze the parameters or the residual module if they are not trained in this epoch."""
@@ -393,7 +430,7 @@ class Trainer:
 def _learnable(settings: Sgd, problem: LinearProblem) -> LearnableParameters:
     learnable: LearnableParameters
     if settings.consistency == "log_cholesky":
-        learnable, damping = LogCholeskyParameters(problem, settings.margin), settings.damping
+        learnable, damping = LogCholeskyParameters(problem, settings.conditions.margin), settings.damping
     else:
         learnable, damping = FreeParameters(problem), settings.damping + settings.penalties.curvature
     learnable.precondition(problem, settings.ridge, damping)

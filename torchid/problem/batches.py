@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 
+import numpy as np
 import torch
+from scipy.linalg import block_diag
 from torch import Tensor
 
 from torchid.parallel import one_thread
 from torchid.parameters import Array
 from torchid.problem.chunks import chunks_by_state
 from torchid.problem.contact_state import ContactState
+from torchid.problem.elimination import Assembly
 from torchid.problem.predict import predict_forces, with_payload_columns
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
@@ -71,6 +74,7 @@ class MiniBatches:
         seed: int = 0,
         memory: int = _MEMORY,
         share: tuple[int, int] = (0, 1),
+        assembly: Assembly | None = None,
     ) -> None:
         """Assign the samples to chunks.
 
@@ -82,13 +86,18 @@ class MiniBatches:
             memory: bytes of rows to cache; the others are computed again in each epoch.
             share: number of this process, and of all that share every batch: it takes every so-many-th sample of
                 a chunk, and batches hold what is in them of these.
+            assembly: from `assemble`, of these logs: their extra parameters are the best for the parameters of the
+                bodies, as in its problem, whose `terms` have columns of their own, last.
         """
         if batch_size < 1:
             raise ValueError(f"batch_size: found {batch_size}; accepted: at least 1")
-        if builder.extras:
-            raise ValueError("builder: found extra terms; accepted: one without")
-        self.builder, self.batch_size, self.seed = builder, batch_size, seed
-        self.columns = torch.from_numpy(builder.columns.parameter_map).to(builder.device)
+        if builder.extras and assembly is None:
+            raise ValueError("builder: found extra terms; accepted: one without, or an assembly")
+        self.builder, self.batch_size, self.seed, self.assembly = builder, batch_size, seed, assembly
+        terms = None if assembly is None else assembly.problem.terms
+        identity = np.eye(0 if terms is None else len(terms.size))
+        self.columns = torch.from_numpy(block_diag(builder.columns.parameter_map, identity)).to(builder.device)
+        self._eliminated = {log.source: self._elimination(log.source) for log in logs} if builder.extras else {}
         self.samples = sum(map(len, logs))
         self._logs, self._memory = tuple(logs), memory
         self.share = share
@@ -122,7 +131,7 @@ class MiniBatches:
 
     def like(self, *logs: Samples) -> MiniBatches:
         """Mini-batches of other samples, with the same settings."""
-        return MiniBatches(logs, self.builder, self.batch_size, self.seed, self._memory, self.share)
+        return MiniBatches(logs, self.builder, self.batch_size, self.seed, self._memory, self.share, self.assembly)
 
     def epoch(self, number: int) -> Iterator[Batch]:
         """All samples in the order of an epoch, numbered from 1."""
@@ -189,4 +198,31 @@ class MiniBatches:
     def _batch(self, samples: Samples, state: ContactState) -> Batch:
         """Rows of samples that share a contact state."""
         rows, W = self.builder.rows_by_sample(samples, state)
+        if self._eliminated:
+            rows = rows @ self._eliminated[samples.source]
         return Batch(rows[..., :-1], rows[..., -1], W, *samples.coordinates())
+
+    def _elimination(self, source: str) -> Tensor:
+        """What takes rows of a log with its extra parameters, (width + 1,), to those without, right-hand side last.
+
+        Extra parameters are psi = inverse (z - C x), as in `Elimination`; terms that conditions bound are columns.
+        """
+        if self.assembly is None:
+            raise ValueError("assembly: found None; accepted: one that eliminates the extra parameters")
+        parameter_map, kept = self.builder.columns.parameter_map, len(self.columns)
+        one = np.eye(1, kept + 1, kept)
+        x = np.pad(np.linalg.pinv(parameter_map), ((0, 0), (0, kept + 1 - len(parameter_map))))
+        values: dict[str, Array] = {}
+        for own in sorted(self.assembly.eliminations, key=lambda elimination: elimination.log):  # "" of all logs first
+            if own.log not in ("", source):
+                continue
+            if own.log or self.assembly.problem.terms is None:
+                psi = own.inverse @ (own.z[:, None] * one - own.C @ x)
+            else:
+                psi = np.eye(len(own.extras), kept + 1, len(parameter_map))
+            x = x if own.log else np.vstack([x, psi])
+            values |= {extra.label: row for extra, row in zip(own.extras, psi, strict=True)}
+        extras = np.array([values[extra.label] for extra in self.builder.extras])
+        extras[:, -1] *= -1.0  # of the right-hand side
+        out = np.vstack([np.eye(len(parameter_map), kept + 1), extras, one])
+        return torch.from_numpy(out).to(self.builder.device)
