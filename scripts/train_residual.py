@@ -2,6 +2,8 @@
 
     python scripts/train_residual.py                                     # on the log that comes with torchid
     python scripts/train_residual.py my.yaml estimator.friction=false    # another log; friction is left to the networks
+    python scripts/train_residual.py --output runs/learned               # a run folder with the networks, and then
+    torchid evaluate runs/learned --log other.npz
     python scripts/train_residual.py --device cuda                       # on a GPU
 
 The regularization weight of the networks is chosen by held-out blocks of the training logs, unless --weight is given.
@@ -21,11 +23,12 @@ import torch
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
-from torch import Tensor, nn
 
 import torchid
+from torchid import JointNetworks, RigidPlusResidual
 from torchid.boundary import run_guarded
 from torchid.commands.chosen_settings import with_chosen_settings
+from torchid.commands.identify import identify
 from torchid.commands.run_figures import hyperparameters
 from torchid.config import load_config
 from torchid.errors import ConfigError, about_file
@@ -39,24 +42,6 @@ from torchid.report.tensorboard import RunEvents
 DEMO = Path(torchid.__file__).parent / "demo" / "quadruped.yaml"
 
 
-class JointNetworks(nn.Module):
-    """r(q, v, a): a small network for every joint's torque, from that joint's own motion; no force on the base."""
-
-    def __init__(self, n: int, hidden: int = 16) -> None:
-        """Start with zero force."""
-        super().__init__()
-        self.n = n
-        self.weight = nn.Parameter(torch.randn(n, hidden, 3, dtype=torch.float64))
-        self.bias = nn.Parameter(torch.randn(n, hidden, dtype=torch.float64))
-        self.out = nn.Parameter(torch.zeros(n, hidden, dtype=torch.float64))
-
-    def forward(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
-        """Generalized forces, (B, nv) [N m]."""
-        motion = torch.stack([q[:, -self.n :], v[:, -self.n :], 0.1 * a[:, -self.n :]], dim=2)  # (B, n, 3)
-        features = torch.tanh((self.weight @ motion[..., None])[..., 0] + self.bias)  # (B, n, hidden)
-        return nn.functional.pad((features * self.out).sum(2), (v.shape[1] - self.n, 0))
-
-
 def main() -> int:
     """Train without and with the networks, and print their effect."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -66,6 +51,7 @@ def main() -> int:
     parser.add_argument("--epochs", type=int, default=100, help="passes over the training logs")
     parser.add_argument("--weight", type=float, help="of the networks' force in the loss; chosen if not given")
     parser.add_argument("--curves", type=Path, default=Path("runs/residual"), help="new folder for TensorBoard")
+    parser.add_argument("--output", type=Path, help="new folder for the fit with the networks beside it")
     parser.add_argument("--device", help="where to compute, by default what the file says: cpu, cuda, cuda:0, ...")
     options = parser.parse_args()
     return run_guarded("train_residual", lambda: compare(options))
@@ -93,7 +79,8 @@ def compare(options: argparse.Namespace) -> None:
     table = Table(title="rms of the projected residual, in standard deviations of the stated sensor noise")
     for name in ("", "training logs", "unseen logs", "share of rigid bodies", "share of networks"):
         table.add_column(name, justify="right" if name else "left")
-    for name, networks in (("rigid bodies alone", None), ("with networks", JointNetworks(robot.n).to(config.device))):
+    beside = JointNetworks(robot.n).to(config.device)
+    for name, networks in (("rigid bodies alone", None), ("with networks", beside)):
         trainer = Trainer(settings, problem, MiniBatches(train, builder), residual=networks)
         with RunEvents(options.curves / name.replace(" ", "_")) as events:
             events.write_layout([], [])
@@ -107,7 +94,12 @@ def compare(options: argparse.Namespace) -> None:
         shares = (f"{100.0 * epoch.shares.get(of, 0.0):.3g} %" for of in ("rigid_body", "residual"))
         table.add_row(name, f"{seen:.3f}", f"{unseen:.3f}", *shares)
     Console(width=100).print(table)
-    print_effect(trainer.estimate().residual, robot.body_names)
+    estimate = trainer.estimate()
+    print_effect(estimate.residual, robot.body_names)
+    if options.output is not None:
+        learned = RigidPlusResidual(robot, estimate.phi, beside.cpu())
+        identify(replace(config, output=None)).write(options.output, learned=learned)
+        print(f"written to {options.output}: torchid evaluate takes the networks up")
 
 
 def print_effect(effect: ResidualEffect | None, bodies: Sequence[str]) -> None:
@@ -115,7 +107,9 @@ def print_effect(effect: ResidualEffect | None, bodies: Sequence[str]) -> None:
     if effect is None:
         return
     if effect.choice is not None:
-        print(f"residual weight {effect.weight:g}, by blocks of the training logs")
+        gain = effect.choice.gain
+        by = "not converged without the networks" if gain is None else f"{100.0 * gain:.3g} % less loss than without"
+        print(f"residual weight {effect.weight:g}, by blocks of the training logs: {by}")
     for name, share in effect.shares.items():
         print(f"{name.replace('_', ' ')}: the networks give {100.0 * share:.3g} %, rms {effect.rms[name]:.3g}")
     print(f"rigid bodies can explain {100.0 * effect.rigid_share:.3g} % of the networks' force")

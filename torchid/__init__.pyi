@@ -61,6 +61,10 @@ from .fitting.fit import (
     LogFitter,
     frozen_parameters,
 )
+from .fitting.learned import (
+    JointNetworks,
+    RigidPlusResidual,
+)
 from .fitting.noise import (
     estimate_noise,
 )
@@ -162,6 +166,7 @@ __all__ = [
     "FactorFile",
     "FittedPosterior",
     "FrameJacobian",
+    "JointNetworks",
     "LeastSquares",
     "LinearProblem",
     "Log",
@@ -174,6 +179,7 @@ __all__ = [
     "PosteriorSampler",
     "Projection",
     "Regressor",
+    "RigidPlusResidual",
     "Robot",
     "RobustLoss",
     "RowBuilder",

@@ -24,6 +24,7 @@ from torchid.fitting.calibration import Calibration, Comparison
 from torchid.fitting.checked_settings import stated_noise
 from torchid.fitting.cross_validation import Scorer
 from torchid.fitting.experiment import Experiment, require_device, set_up, with_estimated_noise
+from torchid.fitting.learned import RESIDUAL, RigidPlusResidual
 from torchid.guards import MAX_JSON, MAX_YAML, read_bytes
 from torchid.logs.time_range import log_title, split_range
 from torchid.parallel import one_thread
@@ -64,6 +65,7 @@ class EvaluatedRun:
         usual: errors on the own logs of the run, by group of rows, the larger of train and test.
         explained: whether the model explains the forces that the run was fitted to.
         output: the folder that they were written to, if any.
+        with_residual: errors of joint torques with the learned module of the run, by the name of a log.
     """
 
     metrics: dict[str, Comparison[Metrics]]
@@ -74,6 +76,7 @@ class EvaluatedRun:
     usual: Mapping[str, float] = field(default_factory=dict)
     explained: bool = True
     output: Path | None = None
+    with_residual: Mapping[str, Metrics] = field(default_factory=dict)
 
     __repr__ = short_repr
 
@@ -114,6 +117,11 @@ class EvaluatedRun:
         }
         for name, count in self.excluded.items():
             document[name]["excluded_samples"] = count
+        for name, errors in self.with_residual.items():
+            rms = {group: errors.rms_of(group) for group in ("joint_torque", WHITENED)}
+            document[name]["with_residual"] = {f"{group}_rms": x for group, x in rms.items()} | {
+                "joint_torque_rms_by_joint": errors.by_joint_rms
+            }
         return document
 
 
@@ -128,6 +136,7 @@ class FittedRun:
     calibrations: Comparison[Calibration]
     usual: Mapping[str, float] = field(default_factory=dict)
     explained: bool = True
+    learned: RigidPlusResidual | None = None
 
 
 @one_thread()
@@ -194,7 +203,10 @@ def read_run(folder: Path, device: str | None = None) -> FittedRun:
         experiment, usual, explained = _with_own_metrics(set_up(config), folder / _METRICS)
     shared = Comparison(read_shared_extras(found, "nominal_value"), read_shared_extras(found, "value"))
     calibrations = _calibrations(experiment, read_parameters(found, experiment.robot), shared)
-    return FittedRun(experiment=experiment, calibrations=calibrations, usual=usual, explained=explained)
+    learned = RigidPlusResidual.load(folder / RESIDUAL, experiment.robot) if (folder / RESIDUAL).is_file() else None
+    return FittedRun(
+        experiment=experiment, calibrations=calibrations, usual=usual, explained=explained, learned=learned
+    )
 
 
 @one_thread()
@@ -226,10 +238,14 @@ def _evaluate(fitted: FittedRun, logs: Sequence[str | Path], folder: Path | None
     samples = reader.read([Path(log) for log in logs], None, lambda _: bars.advance(reading))
     evaluating = bars.add_task("evaluating", total=sum(map(len, samples)))
     scorer = Scorer(evaluation, compared.identified.builder)
-    metrics = {}
+    metrics, with_residual, learned = {}, {}, fitted.learned
     for log in samples:
         pair = scorer.score_logs([log], compared, lambda n: bars.advance(evaluating, n))
         metrics[split_range(log.source).name] = pair
+        if learned is not None:
+            own = replace(compared.identified, phi=learned.phi.numpy())
+            freed = [learned.without_residual(log)]
+            with_residual[split_range(log.source).name] = scorer.score_logs(freed, Comparison(own, own)).identified
         if not any(x is not None for x in pair.identified.rms.values()):
             warn(f"{log.source}: neither joint torques nor contact wrenches to compare predictions with")
     excluded = {split_range(path).name: count for path, count in reader.excluded.items()}
@@ -242,6 +258,7 @@ def _evaluate(fitted: FittedRun, logs: Sequence[str | Path], folder: Path | None
         at_rest=[split_range(log.source).name for log in samples if is_at_rest([log])],
         usual=fitted.usual,
         explained=fitted.explained,
+        with_residual=with_residual,
     )
 
 

@@ -45,6 +45,8 @@ def export(run: str | Path, form: str, output: str | Path | None = None, overwri
     fitted = read_run(folder)
     if target is not None:
         check_free_file(target, "--output", overwrite, [folder, *inputs_of(fitted.experiment.config)])
+    if fitted.learned is not None:
+        warn(f"{form}: bodies and friction alone; the learned module goes by torch.export of torchid.RigidPlusResidual")
     robot, identified = fitted.experiment.robot, fitted.calibrations.identified
     joints = FittedJoints.of(identified.of_joints, identified.builder.tree.stribeck)
     text = robot_text(form, robot, identified.phi.reshape(-1, PER_BODY), joints, folder)

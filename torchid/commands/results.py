@@ -24,6 +24,7 @@ from torchid.fitting.calibration import Comparison, list_confounded
 from torchid.fitting.cross_validation import CrossValidation, RidgeChoice
 from torchid.fitting.experiment import Experiment
 from torchid.fitting.factor_files import FactorFile
+from torchid.fitting.learned import RESIDUAL, RigidPlusResidual
 from torchid.fitting.misfit import Misfit
 from torchid.fitting.noise import NoiseSummary
 from torchid.fitting.posterior import POSTERIOR, FittedPosterior, write_posterior
@@ -157,14 +158,14 @@ class Identification:
             new.write_bytes(identified_urdf(self.experiment.robot, self.phi))
         return path
 
-    def write(self, output: str | Path, overwrite: bool = False) -> Path:
-        """Write the run folder that `torchid identify` writes.
+    def write(self, output: str | Path, overwrite: bool = False, learned: RigidPlusResidual | None = None) -> Path:
+        """Write the run folder that `torchid identify` writes, and what was learned beside, which `evaluate` takes up.
 
         Raises:
             ConfigError: the folder exists and may not be replaced.
         """
         check_free(path := Path(output).absolute(), overwrite, RUN, inputs_of(self.experiment.config))
-        write_run(self, path, overwrite)
+        write_run(self, path, overwrite, learned=learned)
         return path
 
     def violations_by_name(self) -> list[dict[str, object]]:
@@ -205,6 +206,7 @@ def write_run(
     overwrite: bool = False,
     training: Training | None = None,
     begun: Sequence[Drawing] = (),
+    learned: RigidPlusResidual | None = None,
 ) -> None:
     """Write the run folder.
 
@@ -214,6 +216,7 @@ def write_run(
         overwrite: whether a run that stands there may be replaced.
         training: whose curves go into the folder, and whose checkpoint is then no longer needed.
         begun: figures that are being drawn.
+        learned: a module beside the rigid bodies, with its parameters of these.
 
     Raises:
         ConfigError: the folder exists and may not be replaced.
@@ -225,6 +228,8 @@ def write_run(
         (folder / "config.yaml").write_text(dump_config(config))
         write_json(folder / "parameters.json", parameters_document(robot, run.estimate, run.by_state, run.extras))
         write_json(folder / "metrics.json", _metrics_document(run))
+        if learned is not None:
+            learned.save(folder / RESIDUAL)
         write_posterior(folder / POSTERIOR, run.posterior)
         (folder / identified_name(robot)).write_bytes(identified_robot(robot, run.phi, run.fitted_joints))
         write_json(folder / DATA, report_document(run))
@@ -347,5 +352,6 @@ def _solution_document(estimate: Estimate) -> dict[str, object] | None:
         "active",
         "epochs",
         "best_epoch",
+        "excess",
     )
     return {name: getattr(estimate, name) for name in names if hasattr(estimate, name)}

@@ -9,7 +9,7 @@ from torchid.commands.evaluate import EvaluatedRun
 from torchid.commands.sample import DrawnSamples
 from torchid.errors import format_count
 from torchid.parameters import COULOMB, MASS, PARAMETERS, PER_BODY, Array
-from torchid.problem.metrics import describe_worse, worse_than_nominal
+from torchid.problem.metrics import WHITENED, describe_worse, group_name, worse_than_nominal
 from torchid.report.parameter_files import table_of_draws
 from torchid.report.tables import error_tables, print_tables, terminal_width
 from torchid.terminal.lines import LABEL, column_lines, error_lines, labelled, wrap_words
@@ -44,6 +44,11 @@ def evaluation_lines(evaluated: EvaluatedRun, width: int) -> list[str]:
         lines.append(f"and {len(judged) - MOST_LOGS} logs that are predicted better than these: --verbose")
     if len(judged) == 1:
         lines += error_lines(judged[0].shown_errors(), width, of)
+    for name, errors in evaluated.with_residual.items():
+        without = evaluated.metrics[name].identified
+        pairs = [(x, errors.rms_of(x), without.rms_of(x)) for x in ("joint_torque", WHITENED)]
+        said = [f"{group_name(x)} {a:.3g}, without it {b:.3g}" for x, a, b in pairs if a is not None and b is not None]
+        lines += wrap_words(f"{name} with the learned module: {'; '.join(said)}", width, "  ")
     if (far := evaluated.far_off()) is not None:
         lines += labelled("attention", far, width, _ATTENTION_LINES)
     left_out = sum(evaluated.excluded.values())
