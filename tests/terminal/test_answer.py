@@ -270,19 +270,14 @@ def test_a_rod_in_the_file_is_named_where_bodies_are_far_off_it(consistent: Iden
     assert f"the file is another robot's, or it has rods or plates ({fitted.body_names[2]});" in said
 
 
-def test_a_descent_that_ended_many_standard_errors_from_the_least_says_so(consistent: Identification) -> None:
+def test_a_descent_that_ended_above_the_optimum_says_so(consistent: Identification) -> None:
     own = {x.name for x in fields(ConstrainedEstimate)}
     shared = {name: x for name, x in vars(consistent.estimate).items() if name in own}
-    least = consistent.estimate.cost / consistent.estimate.rows
-    noise = consistent.estimate.oversampling * consistent.estimate.residual_std**2 / consistent.estimate.rows
-    for deviation, told in ((1.0, False), (5.0, True)):
-        away = least + deviation**2 * consistent.estimate.rank * noise
-        descent = {"objective": away, "unconstrained": least, "epochs": 9, "best_epoch": 9, "residual": None}
-        estimate = SgdEstimate(**shared | descent)
-        assert estimate.deviation == pytest.approx(deviation)
-        said = text(replace(consistent, estimate=estimate), 400)
-        assert ("attention     the descent has not converged" in said) is told
-        assert ("off by 5 standard errors" in said) is told
+    for excess, told in ((0.002, False), (0.29, True), (None, True)):
+        descent = {"epochs": 9, "best_epoch": 9, "residual": None, "excess": excess}
+        said = text(replace(consistent, estimate=SgdEstimate(**shared | descent)), 400)
+        assert ("attention     not converged" in said) is told
+        assert ("not converged: 29 % above the optimum" in said) is (excess == 0.29)
 
 
 def test_intervals_that_count_noise_alone_say_so(consistent: Identification) -> None:
