@@ -63,7 +63,7 @@ def test_a_run_says_how_much_was_noise_and_gives_more_to_what_is_small(
 
 
 def test_a_descent_takes_it_off_as_well(demo: Path, tmp_path: Path) -> None:
-    plain, _ = identified(demo, tmp_path / "plain", "estimator.ridge=0.01")
+    plain, _ = identified(demo, tmp_path / "plain", "estimator.name=consistent", "estimator.ridge=0.01")
     metrics, _ = identified(
         demo, tmp_path / "run", "estimator.name=sgd", "estimator.ridge=0.01", "estimator.training.epochs=2"
     )

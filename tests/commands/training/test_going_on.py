@@ -91,7 +91,15 @@ def identified(run: Path) -> list[tuple[str, str]]:
 def test_curves_say_everything_by_epoch_and_show_train_and_unseen_logs(run: Path) -> None:
     events, robot = events_in(run), torchid.load_robot(DEMO / "quadruped.urdf")
     by_epoch = [
-        *("loss/total", "loss/data", "loss/prior", "loss_held_out/data", "share_of_force/rigid_body"),
+        *(
+            "loss/total",
+            "loss/data",
+            "loss/prior",
+            "loss/beside",
+            "loss/conditions",
+            "loss_held_out/data",
+            "share_of_force/rigid_body",
+        ),
         *("optimum/objective_above_least", "optimum/distance"),
         *("training/learning_rate", "training/samples_per_second"),
     ]
@@ -119,7 +127,8 @@ def test_curves_say_everything_by_epoch_and_show_train_and_unseen_logs(run: Path
         unseen = tag in ("loss_held_out/data", "training_error_relative_test/nullspace")  # little, after 240 samples
         assert values[-1] < (0.97 if unseen else 0.9) * values[0], tag
     total = [event.value for event in events.Scalars("loss/total")]
-    parts = zip(*([event.value for event in events.Scalars(f"loss/{term}")] for term in ("data", "prior")), strict=True)
+    terms = ("data", "prior", "beside", "conditions")
+    parts = zip(*([event.value for event in events.Scalars(f"loss/{term}")] for term in terms), strict=True)
     assert total == pytest.approx([sum(pair) for pair in parts], rel=1e-6)
     figures = ("forces", "errors", "parameters", "identifiability", "contributions")
     assert set(events.Tags()["images"]) == {f"figure_{k}_{name}" for k, name in enumerate(figures, 1)}
