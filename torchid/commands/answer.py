@@ -260,8 +260,8 @@ def _driving(run: Identification) -> Iterator[str]:
 
 def _unfinished(estimate: SgdEstimate) -> str:
     """How far above the least objective under the same conditions a descent ended."""
-    above = "" if estimate.excess is None else f": {100.0 * estimate.excess:.2g} % above the optimum"
-    return f"not converged{above}; more estimator.training.epochs, or estimator.name=consistent"
+    share = "an unknown" if estimate.excess is None else f"{100.0 * estimate.excess:.2g}"
+    return f"not converged: {share} % above the optimum; more estimator.training.epochs, or estimator.name=consistent"
 
 
 def _unlike_sensors(identified: Metrics) -> Iterator[str]:
