@@ -25,6 +25,7 @@ _DAMPING = 0.01  # of these, over the objective
 _RESTORATIONS, _RESTORED, _FLAT = 5, 1e-4, 1e-6  # their number, most of the objective that they cost, least slope
 _SETTLED, _MET = 1e-9, 1e-10  # relative decrease of the objective in a round, violation of a condition
 _RESOLVED = 1e-7  # relative change of the objective in a round, below which line searches end in its rounding
+_ASTRAY = 1e-3  # relative change of the objective in a round of steps without a search that is not taken
 _FROM_BORDER = 1e-3  # least root of an eigenvalue or of friction at the start: at 0 its gradient is none
 
 
@@ -118,8 +119,12 @@ def finish(settings: Sgd, problem: LinearProblem, start: Minimizer) -> Minimizer
             return value
 
         optimizer.step(closure)
-        roots.move((P @ raw).detach())
-        y, value = roots.deviations(still), float(conic.objective(roots.deviations(still)))
+        moved = (P @ raw).detach()
+        y, value = roots.deviations(moved), float(conic.objective(roots.deviations(moved)))
+        if not search and not abs(value - before) <= _ASTRAY * abs(before):
+            value = before
+            break  # steps without a search went astray
+        roots.move(moved)
         if conic.update(y) <= _MET and abs(before - value) <= _SETTLED * abs(value):
             break
         if abs(before - value) <= _RESOLVED * abs(value):
