@@ -11,7 +11,6 @@ from torchid.errors import InputError
 from torchid.logs import Log
 from torchid.logs.cutoff import choose_cutoff
 from torchid.logs.low_pass import DROPPED_PERIODS
-from torchid.problem.compression import LEAST_PER_FOLD
 
 _MOTION = ("joint_position", "base_quat_xyzw", "base_position_world", *("imu_specific_force", "imu_angular_velocity"))
 _BRIDGED_S = 0.05
@@ -19,10 +18,7 @@ _BRIDGED_S = 0.05
 _MANY = 100_000
 """Samples that a fit works on for about a second; of more, no more are kept than a filter leaves information in."""
 _TESTED = 0.2  # of a log, or of its recordings
-_FEWEST_FOLDS = 2
-_FOLD_MARGIN = 1.1  # more samples than folds need, as their number is known once they are filtered
 _LEAST_TEST = 1.5  # of what a filter spoils at both ends: a third of a test is left
-_RIDGE = 1e-3  # where nothing can be left out to choose it by
 
 
 @dataclass(frozen=True)
@@ -31,13 +27,11 @@ class Split:
 
     Attributes:
         train, test: its parts that are fitted and held back, as behind its name.
-        ridge: auto, where there are enough samples to leave some out.
         guessed, missing: why not, and what a filter leaves nothing of, in words; "" where all is as usual.
     """
 
     train: tuple[str, ...] = (f"[:{1.0 - _TESTED:.0%}]",)
     test: tuple[str, ...] = (f"[{1.0 - _TESTED:.0%}:]",)
-    ridge: str | float = "auto"
     guessed: str = ""
     missing: str = ""
 
@@ -57,23 +51,19 @@ def split_logs(logs: Sequence[Log], base_is_derived: bool = False) -> Split:
         return Split()
     lengths = [float(log.time[-1] - log.time[0]) for log in logs]
     spoiled = 0.0 if cutoff_hz is None else 2.0 * DROPPED_PERIODS / cutoff_hz
-    independent_hz = sum(map(len, logs)) / sum(lengths) if cutoff_hz is None else 2.0 * cutoff_hz
-    folded = _FOLD_MARGIN * _FEWEST_FOLDS * LEAST_PER_FOLD / independent_hz
     filtered = "" if cutoff_hz is None else f" (the filter of {cutoff_hz:g} Hz spoils {spoiled:.2g} s)"
     if len(logs) > 1:
-        return _split_recordings(lengths, spoiled, folded, filtered)
+        return _split_recordings(lengths, spoiled, filtered)
     (length,) = lengths
-    if _TESTED * length >= _LEAST_TEST * spoiled and (1.0 - _TESTED) * length >= spoiled + folded:
+    if _TESTED * length >= _LEAST_TEST * spoiled:
         return Split()
     if length <= spoiled:
-        return Split(("",), (), _RIDGE, missing=f"motion: {length:.2g} s are too short for a fit{filtered}")
+        return Split(("",), (), missing=f"motion: {length:.2g} s are too short for a fit{filtered}")
     guessed = f"logs.test: none, as {length:.2g} s are too short for a part to be held back{filtered}"
-    if length >= spoiled + folded:
-        return Split(("",), (), guessed=guessed)
-    return Split(("",), (), _RIDGE, f"{guessed}, or to choose the ridge by ({_RIDGE:g})")
+    return Split(("",), (), guessed)
 
 
-def _split_recordings(lengths: Sequence[float], spoiled: float, folded: float, filtered: str) -> Split:
+def _split_recordings(lengths: Sequence[float], spoiled: float, filtered: str) -> Split:
     """The split of recordings of some lengths [s] that follow one another: the last fifth of them is held back.
 
     Those of which a filter leaves next to nothing are left out.
@@ -84,12 +74,11 @@ def _split_recordings(lengths: Sequence[float], spoiled: float, folded: float, f
         guessed += f"; {len(lengths) - len(long)} of them left out as too short{filtered}"
     if not long:
         text = f"motion: {len(lengths)} recordings of {max(lengths):.2g} s at most are too short for a fit{filtered}"
-        return Split(_numbered(list(range(len(lengths)))), (), _RIDGE, missing=text)
+        return Split(_numbered(list(range(len(lengths)))), (), missing=text)
     held = max(1, round(_TESTED * len(long))) if len(long) > 1 else 0
     train, test = long[: len(long) - held], long[len(long) - held :]
     guessed += f"; the last {held} held back as test" * (held > 1) + "; the last held back as test" * (held == 1)
-    is_enough = sum(lengths[number] - spoiled for number in train) >= folded
-    return Split(_numbered(train), _numbered(test), "auto" if is_enough else _RIDGE, guessed)
+    return Split(_numbered(train), _numbered(test), guessed)
 
 
 def _numbered(numbers: Sequence[int]) -> tuple[str, ...]:

@@ -115,10 +115,10 @@ Solver = TypeVar("Solver", LeastSquares, Consistent, Sgd)
 class _FitConfig:
     """What is fitted and how, whatever the estimator.
 
-    `ridge`: auto, the one that predicts left-out blocks of the training logs best, one_standard_error, the largest that
-    predicts them within one standard error of the best; `friction: false` leaves friction at the URDF's values,
-    `frozen` bodies keep all of theirs; `robust` weighs outliers down in a batch fit. `total_mass` and `masses` of
-    bodies by name are known, as from a scale.
+    `ridge`: auto, `torchid.fitting.left_out.RIDGE` of the mean squared residual, or more where that predicts left-out
+    blocks better; one_standard_error, the largest that predicts them within one standard error of the best.
+    `friction: false` leaves friction at the URDF's values, `frozen` bodies keep all of theirs; `robust` weighs outliers
+    down in a batch fit. `total_mass` and `masses` of bodies by name are known, as from a scale.
     """
 
     name: Literal["least_squares", "consistent", "sgd"] = "consistent"
@@ -168,7 +168,7 @@ class EstimatorConfig(_ConditionsConfig, _FitConfig):
     @property
     def ridge_rule(self) -> RidgeRule:
         """Which ridge the data choose, if they do."""
-        return "least" if self.ridge == AUTO else "one_standard_error"
+        return "auto" if self.ridge == AUTO else "one_standard_error"
 
     @property
     def numeric_ridge(self) -> float:

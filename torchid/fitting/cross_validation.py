@@ -29,6 +29,9 @@ from torchid.settings import RidgeRule
 RIDGES = tuple(float(f"1e{power}") for power in range(-7, 2))
 """Ridges that are tried, in decades: finer steps change predictions by less than their spread over the folds."""
 
+STRONGER = (1.0, 10.0, 100.0)
+"""Multiples of the ridge by the size of the residuals that are tried."""
+
 MOST_SCORED, ENOUGH_SCORED = 100_000, 10_000
 """Samples of training logs, evenly spread, that errors of forces are computed of at most, and that are enough of them.
 Of a filtered log one in `oversampling` has the whole band of the errors' squares, and so their mean: one in 6 of
@@ -52,26 +55,20 @@ class CrossValidation:
 class RidgeChoice:
     """A ridge, and mean squares of whitened residuals on held-out folds by ridge; errors of differences from the best.
 
-    `rule`: what was taken, the ridge with the least mean square or the largest within one standard error of it.
+    `rule`: which of those within one standard error of the least mean square was taken, the smallest or the largest.
     """
 
     ridge: float
     tried: tuple[float, ...]
     mean_square: tuple[float, ...]
     standard_error: tuple[float, ...]
-    rule: RidgeRule = "least"
-
-    @property
-    def end(self) -> str:
-        """The "largest" or "smallest", if it is that and errors fall towards it beyond chance, by over a percent."""
-        at = self.tried.index(self.ridge)
-        name, beside = {0: ("smallest", 1), len(self.tried) - 1: ("largest", at - 1)}.get(at, ("", at))
-        gain = self.mean_square[beside] - self.mean_square[at]
-        return name if gain > max(self.standard_error[beside], 0.01 * self.mean_square[at]) else ""
+    rule: RidgeRule = "auto"
 
     def __str__(self) -> str:
-        within = "" if self.rule == "least" else ", the largest within one standard error of the best"
-        return f"{self.ridge:g}{within}, chosen by cross-validation on blocks of the training logs"
+        if self.rule == "one_standard_error":
+            return f"{self.ridge:g}, the largest within one standard error of the best on left-out blocks"
+        stronger = "" if self.ridge == self.tried[0] else "; left-out blocks ask for more than usual"
+        return f"{self.ridge:g}, by the size of the residuals{stronger}"
 
 
 @one_thread()
@@ -140,12 +137,12 @@ def choose_ridge(
     estimators: Sequence[BatchEstimator],
     loss: RobustLoss | None = None,
     done: Callable[[int], None] | None = None,
-    rule: RidgeRule = "least",
+    rule: RidgeRule = "auto",
 ) -> RidgeChoice:
-    """The ridge with the least error on held-out folds, or the largest within one standard error of it.
+    """The smallest ridge, or the largest, within one standard error of the least error on held-out folds.
 
-    The second (Hastie, Tibshirani, Friedman, "The Elements of Statistical Learning", 7.10; here with the standard error
-    of the difference, fold by fold) was worse on some logs, better on one whose unseen motion was faster::
+    Source: Hastie, Tibshirani, Friedman, "The Elements of Statistical Learning", 7.10; here with the standard error of
+    the difference, fold by fold::
 
         blocks = torchid.split_into_folds(logs, builder)
         parts = torchid.compress_parts(blocks, builder)
@@ -182,7 +179,8 @@ def choose_ridge(
     means = squares.mean(axis=0)
     best, ridges = int(means.argmin()), tuple(float(estimator.ridge) for estimator in estimators)
     error = (squares - squares[:, [best]]).std(axis=0, ddof=1) / np.sqrt(len(folds))
-    taken = best if rule == "least" else int(np.flatnonzero(means - means.min() <= error)[-1])
+    near = np.flatnonzero(means - means.min() <= error)
+    taken = int(near[-1] if rule == "one_standard_error" else near[0])
     return RidgeChoice(ridges[taken], ridges, tuple(means.tolist()), tuple(error.tolist()), rule)
 
 

@@ -317,7 +317,7 @@ def ridge_figure(choice: RidgeChoice, of: str = "URDF") -> Figure:
         at = float(mean[list(choice.tried).index(choice.ridge)])
         (marker,) = axes.plot(choice.ridge, at, "D", color=NOMINAL_COLOR, markersize=8, markerfacecolor="none")
         handles.append(marker)
-        what = "chosen" if choice.rule == "least" else "chosen, the largest of these"
+        what = "chosen" if choice.rule == "auto" else "chosen, the largest of these"
         labels.append(f"{what}: {choice.ridge:g}, {at:.4g}")
     axes.set_xticks(tried[shown], [decade(ridge) for ridge in tried[shown]])
     axes.minorticks_off()
