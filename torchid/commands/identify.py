@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 
+import numpy as np
 from rich.progress import Progress
 
 from torchid import distributed
@@ -23,16 +24,15 @@ from torchid.config import ExperimentConfig, inputs_of
 from torchid.errors import NumericalWarning, warn_about_file
 from torchid.estimators import Conditions, Estimate, Violation, violations
 from torchid.estimators.conditions import term_violations
-from torchid.fitting.armature import UnfittedArmature, unfitted_armature
 from torchid.fitting.calibration import Calibration, Comparison, warn_of_confounded, warn_of_disagreement
 from torchid.fitting.cross_validation import CrossValidation, Scorer, calibrations_without_folds
-from torchid.fitting.delay import UnfittedDelay, unfitted_delay
 from torchid.fitting.factor_files import FactorFile
 from torchid.fitting.fit import Fit, LogFitter
-from torchid.fitting.misfit import Misfit, misfit, resting_joints, unfitted_friction
+from torchid.fitting.left_out import gain_deviations
+from torchid.fitting.misfit import misfit, resting_joints, unfitted_friction
 from torchid.fitting.posterior import fitted_posterior
 from torchid.fitting.robust import RobustSummary, fit_robustly
-from torchid.identifiability.confounding import TotalMass
+from torchid.identifiability.confounding import TotalMass, mass_weights
 from torchid.identifiability.contributions import Contributions, contributions
 from torchid.parallel import one_thread
 from torchid.parameters import PER_BODY, Array
@@ -108,8 +108,12 @@ def _solved(
         )
     fit = fitter.fit(ready.parts, solve)
     fit, robust = _robust(fit, ready, bars)
-    mass = require_plausible(fit, checked, logs["train"])
-    warn_of_confounded(fit.extras)
+    terms, gain = experiment.terms, experiment.config.sensors.gain_error
+    gains = distributed.from_first(partial(gain_deviations, logs["train"], fitter, terms, gain), "gains")
+    fit = replace(fit, estimate=replace(fit.estimate, gain_error=np.linalg.norm(gains, axis=0)))
+    of_mass = float(np.linalg.norm(gains @ mass_weights(len(experiment.robot.bodies))))
+    mass = require_plausible(fit, checked, logs["train"], of_mass)
+    warn_of_confounded([one for one in fit.extras if one.extra.what not in ready.choices.adopted_terms])
     warn_of_disagreement(fit, fitter)
     return _Solved(fit, robust, training, mass)
 
@@ -139,7 +143,8 @@ def _identify(
         scorer, of_blocks = Scorer(evaluation, builder), merge_states(fit.parts, builder)
         scores = _scores(scorer, logs["test"], blocks, of_blocks, compared, without_folds, bars)
         traces = distributed.from_first(lambda: [trace_forces(evaluation, log, compared) for log in shown], "traces")
-        left = _misfit(ready, fit)
+        friction = unfitted_friction(problem, experiment.robot)
+        left = misfit(fit.estimate, ready.noise, blocks, fit.jackknife, friction)
     run = Identification(
         experiment=experiment,
         estimate=fit.estimate,
@@ -173,19 +178,6 @@ def _identify(
     ready.blocks = blocks = []
     require_not_worse(run.worse, run.metrics["train"].identified, checked)
     return replace(run, suspected=suspected_mistake(run, checked)), solved.training, begun
-
-
-def _misfit(ready: PreparedData, fit: Fit) -> Misfit:
-    """What a fit leaves of the forces, and what of joints' friction and actuators was not fitted."""
-    experiment, train = ready.experiment, ready.logs["train"]
-
-    def unfitted() -> tuple[UnfittedDelay | None, UnfittedArmature | None]:
-        found = train, ready.fitter, experiment.terms
-        return unfitted_delay(*found), unfitted_armature(*found)
-
-    friction = unfitted_friction(fit.assembly.problem, experiment.robot)
-    actuators = distributed.from_first(unfitted, "actuators")
-    return misfit(fit.estimate, ready.noise, ready.blocks, fit.jackknife, friction, *actuators)
 
 
 def _begin_figures(ready: PreparedData, fit: Fit, forces: Sequence[ForceSeries], stack: ExitStack) -> list[Drawing]:

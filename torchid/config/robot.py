@@ -305,11 +305,13 @@ class SensorsConfig(ChoiceConfig):
 
     `offsets` and `scales` say which channels have an unknown one, constant over a `log` or over `all`; a scope alone is
     short for every kind of channel. `scales` may have groups of joints or frames, by names or patterns, that share one.
+    `gain_error`: standard deviation of the gain of each torque sensor that standard errors count, 0.02 for 2 %.
     """
 
     noise: NoiseConfig = dataclasses.field(default_factory=NoiseConfig)
     offsets: Scopes = dataclasses.field(default_factory=dict)
     scales: Scales = dataclasses.field(default_factory=dict)
+    gain_error: NotNegative = 0.02
     on_base_lost: Literal["error", "warn"] = "error"
 
 

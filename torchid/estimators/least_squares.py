@@ -50,6 +50,7 @@ class Estimate:
             there are too few.
         kept_error: (P,), standard errors by what a ridge keeps of the error of the nominal parameters, which counts as
             large where data do not determine it as where they do (`nominal_spread`); None without a ridge.
+        gain_error: (P,), standard errors by errors of the gain of the torque sensors; None where these do not count.
         psi: (M,), values of the `terms` of the problem where conditions bound them, None where they are the best fit.
     """
 
@@ -67,6 +68,7 @@ class Estimate:
     oversampling: float
     block_error: Array | None = field(default=None, kw_only=True)
     kept_error: Array | None = field(default=None, kw_only=True)
+    gain_error: Array | None = field(default=None, kw_only=True)
     psi: Array | None = field(default=None, kw_only=True)
 
     __repr__ = short_repr
@@ -77,13 +79,17 @@ class Estimate:
 
     @property
     def standard_error(self) -> Array:
-        """The larger of `noise_error` and `block_error`, with `kept_error`, (P,); NaN where data do not determine it.
+        """The larger of `noise_error` and `block_error`, with `kept_error` and `gain_error`, (P,).
+
+        NaN where data do not determine it.
 
         Source: by the mean squared error of a biased estimate 95 % of intervals hold the truth on average over
         parameters (Nychka, Journal of the American Statistical Association 83, 1988, of smoothing splines).
         """
         out = self.noise_error if self.block_error is None else np.maximum(self.noise_error, self.block_error)
-        return out if self.kept_error is None else np.hypot(out, self.kept_error)
+        for more in (self.kept_error, self.gain_error):
+            out = out if more is None else np.hypot(out, more)
+        return out
 
     @property
     def residual_std(self) -> float:

@@ -200,7 +200,11 @@ class TotalMass:
 
 
 def total_mass(
-    assembly: Assembly, estimate: Estimate, rank_tolerance: float = RANK_TOLERANCE, block_error: float = 0.0
+    assembly: Assembly,
+    estimate: Estimate,
+    rank_tolerance: float = RANK_TOLERANCE,
+    block_error: float = 0.0,
+    gain_error: float = 0.0,
 ) -> TotalMass:
     """The total mass of estimated parameters, with a standard error without regularization.
 
@@ -209,6 +213,7 @@ def total_mass(
         estimate: of its problem.
         rank_tolerance: as in `LeastSquares`.
         block_error: standard error by the scatter between blocks of the logs, which counts if it is the larger.
+        gain_error: standard error by errors of the sensors' gain.
     """
     weights = mass_weights(len(estimate.phi) // parameters.PER_BODY)
     known = assembly.problem, assembly.if_known
@@ -222,7 +227,7 @@ def total_mass(
     value, nominal = (float(weights @ phi) for phi in (estimate.phi, assembly.problem.nominal))
     if assembly.scaled_by is not None:
         return TotalMass(np.inf, False, value, nominal)
-    return TotalMass(max(error, block_error), separable, value, nominal)
+    return TotalMass(float(np.hypot(max(error, block_error), gain_error)), separable, value, nominal)
 
 
 def mass_weights(bodies: int) -> Array:

@@ -58,7 +58,7 @@ def parameters_document(
 def _by_body(robot: Robot, estimate: Estimate, **columns: np.ndarray) -> list[dict[str, Any]]:
     """Columns (12 L,) and the statistics of the estimate, by body and parameter."""
     columns |= {name: getattr(estimate, name) for name in ("standard_error", "identifiable", "data_share", "verdict")}
-    parts = {"block_error": estimate.block_error, "kept_error": estimate.kept_error}
+    parts = {name: getattr(estimate, name) for name in ("block_error", "kept_error", "gain_error")}
     known = {name: x for name, x in parts.items() if x is not None}
     if known:  # else the standard error is that by noise
         columns |= {"noise_error": estimate.noise_error} | known
