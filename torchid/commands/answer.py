@@ -11,6 +11,7 @@ import numpy as np
 from torchid.config.logs import tests_on_seen_samples
 from torchid.errors import format_percent, join_names
 from torchid.estimators import ConsistentEstimate, Estimate, SgdEstimate
+from torchid.estimators.least_squares import IDENTIFIED
 from torchid.fitting.calibration import list_confounded
 from torchid.fitting.misfit import AT_THE_FLOOR, unexplained_joints, unexplained_torques
 from torchid.fitting.posterior import FittedPosterior
@@ -19,7 +20,15 @@ from torchid.log_checks.weight import MAX_MASS_ERROR
 from torchid.logs.time_range import log_title
 from torchid.parameters import COULOMB, PER_BODY
 from torchid.problem import Metrics
-from torchid.problem.metrics import ADVICE, DECISIVE_GROUPS, ERROR_GROUPS, LIMB_GROUPS, describe_worse, group_name
+from torchid.problem.metrics import (
+    ADVICE,
+    DECISIVE_GROUPS,
+    ERROR_GROUPS,
+    LIMB_GROUPS,
+    compare_parts,
+    describe_worse,
+    group_name,
+)
 from torchid.report.tables import noise_advice
 from torchid.report.urdf_files import massless_ends
 from torchid.reprs import decimal
@@ -75,10 +84,14 @@ class ErrorComparison:
         known = [after / floor for _, _, after, floor in self.errors() if floor]
         floor = ", as near as the sensors' noise allows" if known and max(known) < AT_THE_FLOOR else ""
         if unexplained:
-            floor = f", {'and' if verdict == _NO_BETTER else 'but'} the model does not explain {unexplained}"
+            return f"The model does not explain {unexplained}: errors of {shares} of the {self.of}'s on {self.text}"
+        better, parts, worse = compare_parts(self.nominal, self.identified)
         if self.at_rest:
             judged = f"errors of {shares} of the {self.of}'s{floor}; inertia and friction are not judged"
             return f"At rest alone, as nothing moves in {self.text}: {judged}"
+        if worse:
+            where = f"better in {better} of {parts} joints and base axes, worse in {join_names(worse, 1)}"
+            return f"Mixed, against the {self.of} on {self.text}: {where}"
         words, part = verdict.removesuffix(_IN_PART), _IN_PART * verdict.endswith(_IN_PART)
         return f"{words} than the {self.of}{part} on {self.text}: errors of {shares} of the {self.of}'s{floor}"
 
@@ -93,6 +106,7 @@ _LARGER_THAN_MEASURED = 1.05  # errors over the measured, of sensors that any fi
 _MUCH_MORE = 1.5  # residuals of bodies that can exist over the least: 1.001 of honest logs, 1.9 to 30 with a unit wrong
 _EXACT = 1e-3  # of what the nominal parameters leave: signals without noise, of which a solver's tolerance is left
 _CLEAR_ERRORS = 4.0  # standard errors of a total mass from which on it is not the URDF's
+_HEAVY = 2.0  # times the mass in the robot's file
 _COMPUTED = 1e-3  # of the measured, to which no file predicts what a real robot does: friction alone is more
 _ANOTHER_ROBOT = 1.0  # of each body that data determine: no file of the same robot is off by so much
 
@@ -108,6 +122,7 @@ class Answer:
         total_mass: with its standard error, beside the URDF's.
         bodies: whether all can exist.
         attention: what the user should look at, the most urgent first.
+        terms: of the actuators that the logs have chosen, "" where they chose none of their own.
     """
 
     headline: str
@@ -115,6 +130,7 @@ class Answer:
     total_mass: str
     bodies: str
     attention: list[str]
+    terms: str = ""
 
 
 def answer(run: Identification) -> Answer:
@@ -123,10 +139,18 @@ def answer(run: Identification) -> Answer:
     return Answer(
         headline=_headline(run, judged),
         errors=judged.shown_errors(),
-        total_mass=f"{run.mass} ({run.experiment.robot.format}: {decimal(run.mass.nominal)} kg)",
+        total_mass=_total_mass(run),
         bodies=_bodies_text(run),
         attention=list(_attention(run, judged)),
+        terms=run.choices.adopted,
     )
+
+
+def _total_mass(run: Identification) -> str:
+    gain, of = run.experiment.config.sensors.gain_error, run.experiment.robot.format
+    counted = run.mass.determined and run.estimate.gain_error is not None and run.estimate.gain_error.any()
+    gains = f"; ± counts gain errors of {100.0 * gain:g} %" if counted else ""
+    return f"{run.mass} ({of}: {decimal(run.mass.nominal)} kg{gains})"
 
 
 def _judge(run: Identification) -> ErrorComparison:
@@ -148,9 +172,7 @@ def _judge(run: Identification) -> ErrorComparison:
 def _headline(run: Identification, judged: ErrorComparison) -> str:
     if run.worse:
         return f"WORSE THAN {judged.of}: {describe_worse(run.worse, judged.of)}"
-    explained = run.misfit.explained and not any(
-        (*_unlike_sensors(judged.identified), *_unlike_torques(run), *_unlike_joints(run))
-    )
+    explained = not any((*_unlike_sensors(judged.identified), *_unlike_torques(run), *_unlike_joints(run)))
     return judged.headline("" if explained else "these forces")
 
 
@@ -189,6 +211,7 @@ def _attention(run: Identification, judged: ErrorComparison) -> Iterator[str]:
     yield from _impossible(run)
     yield from _driving(run)
     yield from _unlike_joints(run)
+    yield from _heavy(run)
     if not run.misfit.explained:
         why = run.misfit.in_short
         yield f"friction, compliance or contacts are missing, or a sensor is wrong (torchid check): {why}"
@@ -201,7 +224,7 @@ def _attention(run: Identification, judged: ErrorComparison) -> Iterator[str]:
         yield f"whether the model explains these forces is not known: {reason}; state sensors.noise, or record more"
     yield from _noise_alone(run)
     yield from _undetermined(run)
-    for one in list_confounded(run.extras):
+    for one in list_confounded([x for x in run.extras if x.extra.what not in run.choices.adopted_terms]):
         yield one.in_short
     yield from _far_off(run.posterior)
     if run.noise.suggested:
@@ -236,8 +259,19 @@ def _undetermined(run: Identification) -> Iterator[str]:
     what = "these data do not determine the total mass"
     if away:
         nominal = f"{decimal(run.mass.nominal)} kg by the {run.experiment.robot.format}"
-        what += f", and the fit lets it be {decimal(run.mass.value)} kg ({nominal}): estimator.ridge=one_standard_error"
+        what += f", and the fit lets it be {decimal(run.mass.value)} kg ({nominal})"
     yield f"{what}; weigh the robot: estimator.total_mass"
+
+
+def _heavy(run: Identification) -> Iterator[str]:
+    """Bodies beyond `_HEAVY` times their mass in the robot's file, which their own interval does not exclude."""
+    robot, estimate = run.experiment.robot, run.estimate
+    mass, error = (x.reshape(-1, PER_BODY)[:, 0] for x in (estimate.phi, estimate.standard_error))
+    nominal = robot.nominal[:, 0]
+    known = (estimate.verdict.reshape(-1, PER_BODY)[:, 0] == IDENTIFIED) & (mass - nominal > 2.0 * error)
+    for body in np.flatnonzero((mass > _HEAVY * nominal) & (nominal > 0.0) & ~known).tolist():
+        times = f"{mass[body] / nominal[body]:.2g} times the {robot.format}'s {decimal(nominal[body])} kg"
+        yield f"{robot.body_names[body]} weighs {times}, which the data do not determine: raise estimator.ridge"
 
 
 def _impossible(run: Identification) -> Iterator[str]:

@@ -270,6 +270,26 @@ class Evaluation:
         )
 
 
+def compare_parts(nominal: Metrics, identified: Metrics) -> tuple[int, int, list[str]]:
+    """Of joints and axes of the base: how many are predicted better, of how many, and those that are clearly worse."""
+    pairs = {
+        name: (before, identified.by_joint_rms.get(name), identified.by_joint_relative.get(name))
+        for name, before in nominal.by_joint_rms.items()
+    }
+    for group in ("base_force", "base_moment"):
+        after, share = identified.by_axis_rms.get(group, {}), identified.by_axis_relative.get(group, {})
+        for axis, before in nominal.by_axis_rms.get(group, {}).items():
+            pairs[f"{group_name(group)} {axis}"] = before, after.get(axis), share.get(axis)
+    known = {name: (x, y, share) for name, (x, y, share) in pairs.items() if x is not None and y is not None}
+    worse = [f"{name} ({y / x:.2g} times)" for name, (x, y, share) in known.items() if x and _is_worse(x, y, share)]
+    return sum(y < x for x, y, _ in known.values()), len(known), worse
+
+
+def _is_worse(before: float, after: float, share: float | None) -> bool:
+    """Whether an error is clearly larger than before; `share`: of the measured, of the one after."""
+    return after > _CLEARLY * before and after - before > _MATTERS * (after / share if share else 0.0)
+
+
 def worse_than_nominal(sets: Mapping[str, tuple[Metrics, Metrics]]) -> list[WorseThanNominal]:
     """Groups of rows where identified parameters are clearly worse; `sets`: nominal and identified metrics by logs."""
     worse = []
@@ -278,9 +298,7 @@ def worse_than_nominal(sets: Mapping[str, tuple[Metrics, Metrics]]) -> list[Wors
             before, after = nominal.rms_of(group), identified.rms_of(group)
             if before is None or after is None:
                 continue
-            share = identified.relative_of(group)
-            measured = after / share if share else 0.0
-            if after > _CLEARLY * before and after - before > _MATTERS * measured:
+            if _is_worse(before, after, identified.relative_of(group)):
                 worse.append(WorseThanNominal(logs, group, before, after))
     return worse
 

@@ -76,6 +76,7 @@ def answer_lines(run: Identification, width: int, last: Sequence[tuple[str, str]
     lines = [*wrap_words(said.headline, width), *error_lines(said.errors, width, run.experiment.robot.format), ""]
     lines += labelled("total mass", said.total_mass, width, _TEXT_LINES)
     lines += labelled("bodies", said.bodies, width, _TEXT_LINES)
+    lines += labelled("terms", said.terms, width, 1) if said.terms else []
     lines += labelled("contacts", run.experiment.rolling, width, _TEXT_LINES) if run.experiment.rolling else []
     for one, most in zip(said.attention, (_ATTENTION_LINES, *[_TEXT_LINES] * (_MOST_ATTENTION - 1)), strict=False):
         lines += labelled("attention", one, width, most)

@@ -65,8 +65,8 @@ def print_all_errors(evaluated: EvaluatedRun) -> None:
 
 def _sentence(one: ErrorComparison, explained: bool) -> str:
     worse = worse_than_nominal({one.text: (one.nominal, one.identified)})
-    unexplained = "" if explained else "the run's own logs"
-    return f"WORSE THAN {one.of}: {describe_worse(worse, one.of)}" if worse else one.headline(unexplained)
+    own = "" if explained else "; residuals of the run's own logs are not noise alone"
+    return f"WORSE THAN {one.of}: {describe_worse(worse, one.of)}" if worse else f"{one.headline()}{own}"
 
 
 def _worst(one: ErrorComparison) -> float:
