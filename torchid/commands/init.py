@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -10,6 +11,9 @@ from functools import partial
 from pathlib import Path
 from textwrap import fill
 
+import yaml
+
+from torchid.commands.chosen_settings import needs_these_torques
 from torchid.commands.folder import check_free_file
 from torchid.commands.init_files import log_in_folder, named_apart
 from torchid.commands.init_logs import Split, keys_for_gaps, keys_for_length, split_logs
@@ -31,11 +35,22 @@ from torchid.commands.init_proposals import (
     welded_at,
     without_rolling,
 )
+from torchid.config import load_config
 from torchid.config.log_reading import PreprocessingConfig
 from torchid.config.robot import ContactConfig
 from torchid.config.yaml_text import inline_yaml, yaml_lines
-from torchid.errors import ConfigError, InputError, LogError, about_file, excerpt, format_count, join_names
+from torchid.errors import (
+    ConfigError,
+    InputError,
+    LogError,
+    TorchidWarning,
+    about_file,
+    excerpt,
+    format_count,
+    join_names,
+)
 from torchid.fitting.checked_settings import is_along_base, resolve_contacts
+from torchid.fitting.experiment import set_up
 from torchid.logs import Columns, Log, Topics
 from torchid.logs.containers import LogKind, atomic_output, existing_log_kind
 from torchid.logs.log import VARIANTS
@@ -128,7 +143,13 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> InitReport:
     limbs = list(proposal.columns.get("ft_wrenches", ())) or read_sensors(robot, logs)
     torques = measured_torques(robot, logs)
     sensors = proposed_sensors(fields, limbs, contacts, torques)
-    text = _text(robot, urdf, path, target, contacts, fields, proposal, gaps, split, sensors)
+    write = partial(_text, robot, urdf, path, fields=fields, proposal=proposal, gaps=gaps, split=split)
+    text = write(target, contacts, sensors=sensors)
+    if logs and "base_motion" in _from_feet(robot, contacts, fields):
+        here = Path("experiment.yaml")
+        if not _explains(write(here, contacts, sensors=sensors)) and _explains(write(here, [], sensors=sensors)):
+            contacts, text = [], write(target, [], sensors=sensors)
+            out.guessed.append(_HELD)
     _describe(out, robot, contacts, fields, proposal)
     _describe_log(out, read, fields)
     out.guessed += of_folder
@@ -139,6 +160,19 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> InitReport:
     with atomic_output(target) as new:
         new.write_text(text, encoding="utf-8")
     return out
+
+
+def _explains(experiment: str) -> bool:
+    """Whether the robot file's bodies need about the torques of a log, as an experiment file reads it."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", TorchidWarning)
+        return needs_these_torques(set_up(load_config(None, sections=yaml.safe_load(experiment))))
+
+
+_HELD = (
+    "robot.fixed_base: true, as torques are those of legs on a held base, not of feet that carry the robot; "
+    "if it stands, name its feet under contacts instead"
+)
 
 
 def _of_columns(files: Sequence[Path], robot: Robot) -> tuple[list[GuessedContact], set[str], MapProposal]:
@@ -276,7 +310,7 @@ def _describe(
     settings = [ContactConfig(x.frame, x.type, radius=AUTO if x.radius is None else x.radius) for x in contacts]
     rolling = resolve_contacts(settings, robot)[1]
     out.guessed += [f"contacts: {rolling}"] * bool(rolling)
-    if _is_fixed(contacts, fields) and not robot.fixed_base:
+    if _is_fixed(contacts, fields) and not robot.fixed_base and _HELD not in out.guessed:
         out.guessed.append("robot.fixed_base: true, as there is neither a foot nor a motion of the base")
     if held := held_joints(robot, proposal.lacking):
         out.guessed.append(f"robot.weld: {_WELDED}: {join_names(held)}")
@@ -382,9 +416,11 @@ def _text(
     lines += [f"# {' and '.join(from_feet)}: not recorded"] if from_feet else []
     lines += [f"# {key}: {why}" for key, (_, why) in gaps.items()]
     stated = {key: value for key, (value, _) in gaps.items()}
-    lines += yaml_lines("preprocessing", {"cutoff_hz": "auto"} | from_feet | stated)
+    margin = {"contact_margin_s": "auto"} if contacts and "contact_active" in fields else {}
+    lines += yaml_lines("preprocessing", {"cutoff_hz": "auto"} | margin | from_feet | stated)
     lines += yaml_lines("sensors", sensors)
-    lines += yaml_lines("estimator", {"name": "consistent", "ridge": split.ridge})
+    lines += ["# actuators: chosen by the log (armature, delay, offsets, ...); true, false or a number fixes one"]
+    lines += yaml_lines("estimator", {"name": "consistent", "ridge": "auto"})
     lines += yaml_lines("output", f"runs/{output.stem}")
     return "\n".join(lines) + "\n"
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from functools import cached_property, partial
 from itertools import islice
 
@@ -12,7 +13,9 @@ from rich.progress import Progress
 
 from torchid import parameters
 from torchid.commands.check import LogSegment, segments_to_check
+from torchid.commands.chosen_settings import is_near_nominal, needs_these_torques
 from torchid.commands.results import Identification
+from torchid.config import ExperimentConfig
 from torchid.config.logs import LogsConfig
 from torchid.errors import (
     ImplausibleFitError,
@@ -23,32 +26,30 @@ from torchid.errors import (
     warn_about_file,
 )
 from torchid.estimators import LeastSquares, SgdEstimate
-from torchid.fitting.experiment import RobotSetup
+from torchid.fitting.experiment import RobotSetup, set_up
 from torchid.fitting.fit import Fit
-from torchid.fitting.misfit import beyond_models, unexplained_joints, unexplained_torques
+from torchid.fitting.misfit import beyond_models, force_gain, unexplained_joints, unexplained_torques
 from torchid.identifiability.confounding import ExtraEstimate, TotalMass, estimate_extras, total_mass
 from torchid.log_checks import Finding
 from torchid.log_checks.check import check
 from torchid.log_checks.findings import SEVERITIES
 from torchid.log_checks.lag_and_tilt import check_tilt
 from torchid.log_checks.model import NominalModel
-from torchid.parallel import can_fork, one_thread, share_between_forks, thread_count
+from torchid.parallel import can_fork, share_between_forks, thread_count
 from torchid.parameters import GRAVITY, PARAMETERS, PER_BODY, Array
 from torchid.problem import LinearProblem, Samples
 from torchid.problem.metrics import ADVICE, Metrics, WorseThanNominal, describe_worse
 from torchid.reading.log_reader import apply_contact_settings, setup_of_log
 from torchid.robot import Robot
-from torchid.rounding import is_significant
 
 LARGEST_FACTOR = 10.0
 """Factor that no model of a robot is off by: units are by a thousand, a gear by 50 to 160."""
 
-_CLEAR = 0.5  # correlation of forces of the URDF's bodies with the measured ones, from which on their factor is clear
 _GENERAL = ("forces", "weight")  # findings that say that something is off rather than what
 _PART = 0.05  # share of a log's samples from which on a finding may be the reason
 _USUAL = (
     "torques or wrenches of the opposite sign, a world whose z axis points down, flags of other contacts, a quaternion "
-    "in another order, another unit, or masses in the {of} that are no masses"
+    "in another order, another unit, a cutoff_hz above the motion (auto finds one), or masses in the {of} that are none"
 )
 
 
@@ -105,13 +106,16 @@ def _large_findings(of: tuple[RobotSetup, LogSegment]) -> list[Finding]:
     return [one for one in severe if one.mask(len(checked.log)).mean() > _PART]
 
 
-def require_plausible(fit: Fit, logs: TrainingLogs, samples: Sequence[Samples] = ()) -> TotalMass:
+def require_plausible(
+    fit: Fit, logs: TrainingLogs, samples: Sequence[Samples] = (), gain_error: float = 0.0
+) -> TotalMass:
     """Refuse a fit that no robot can have produced, and warn of residuals far above the stated noise.
 
     Args:
         fit: the fit.
         logs: that it is of.
         samples: of these, to look for the tilt of a bolted base in.
+        gain_error: standard error of the total mass by errors of the sensors' gain [kg].
 
     Returns:
         How well the total mass is known.
@@ -136,8 +140,12 @@ def require_plausible(fit: Fit, logs: TrainingLogs, samples: Sequence[Samples] =
     if fit.assembly.homogeneous:
         by_data_alone = estimate_extras(fit.assembly, by_data, setup.robot.body_names, tolerance)
         _require_scales(by_data_alone, bool(setup.contacts))
-    mass, mass_by_data = (total_mass(fit.assembly, x, tolerance, block_error) for x in (estimate, by_data))
+    mass, mass_by_data = (total_mass(fit.assembly, x, tolerance, block_error, gain_error) for x in (estimate, by_data))
     reason = implausibility(fit.assembly.data or fit.assembly.problem, estimate.phi, mass_by_data, setup.robot)
+    if _is_held(setup, force_gain(fit.assembly.if_known)):
+        found = "torques are those of limbs on a held base, not of feet that carry the robot"
+        accepted = "robot.fixed_base: true, without contacts and preprocessing.base_motion"
+        raise ImplausibleFitError.at_field("preprocessing.base_motion", found, accepted)
     unexplained = None  # a descent that is not finished leaves much that a model explains
     if not isinstance(estimate, SgdEstimate):
         unexplained = beyond_models(estimate, fit.assembly.problem, fit.assembly.forces, setup.noise_stated)
@@ -165,6 +173,16 @@ def _advice(text: str, setup: RobotSetup) -> str:
     if setup.contacts or setup.robot.fixed_base or "under contacts" in text:
         return text
     return f"name under contacts what touches the ground, or robot.fixed_base: true if the base stands still; or {text}"
+
+
+def _is_held(setup: RobotSetup, gain: float | None) -> bool:
+    """Whether a base whose motion is that of the feet is held instead, as the torques say; `gain`: as it is fitted."""
+    config = setup.config
+    if config.preprocessing.base_motion is None or not isinstance(config, ExperimentConfig) or is_near_nominal(gain):
+        return False
+    read = replace(config.preprocessing, base_motion=None, detect_contacts=None, contact_threshold=None, max_slip=None)
+    held = replace(config, robot=replace(config.robot, fixed_base=True), contacts=[], preprocessing=read)
+    return needs_these_torques(set_up(held))
 
 
 def _warn_of_tilt(samples: Sequence[Samples], setup: RobotSetup) -> None:
@@ -275,27 +293,6 @@ def implausibility(problem: LinearProblem, phi: Array, mass: TotalMass, robot: R
 def is_implausible_factor(ratio: float) -> bool:
     """Whether no model of a robot is off by this factor."""
     return not 1.0 / LARGEST_FACTOR <= ratio <= LARGEST_FACTOR
-
-
-@one_thread()
-def force_gain(problem: LinearProblem) -> float | None:
-    """The factor of the forces that nominal bodies need which fits best, None if it is not clear.
-
-    Friction is whatever fits. Unlike a total mass it is there for arms as well, and does not depend on the estimator.
-    """
-    inertial = np.zeros((len(problem.nominal) // PER_BODY, PER_BODY), dtype=bool)
-    inertial[:, parameters.INERTIAL] = True
-    chosen = inertial.flatten()
-    needed = problem.A[:, chosen] @ problem.nominal[chosen]
-    free, fixed = ~chosen & problem.free, ~chosen & ~problem.free
-    measured = problem.b - problem.A[:, fixed] @ problem.nominal[fixed]
-    U, values, _ = np.linalg.svd(problem.A[:, free] * problem.scale[free], full_matrices=False)
-    friction = U[:, is_significant(values)]
-    needed, measured = (x - friction @ (friction.T @ x) for x in (needed, measured))
-    size = np.linalg.norm(needed) * np.sqrt(measured @ measured + problem.residual)
-    if not size > 0.0 or abs(needed @ measured) < _CLEAR * size:
-        return None
-    return float(needed @ measured / (needed @ needed))
 
 
 def _sign_note(ratio: float) -> str:
