@@ -32,7 +32,7 @@ test: .venv/ready-for-tests
 # What simulates, with the oldest MuJoCo that the extra [sim] takes, in place of the newest.
 test-oldest-mujoco: .venv/ready-for-tests
 	$(PIP) install -q --no-deps --upgrade --target .venv/oldest-mujoco mujoco==3.3.7
-	PYTHONPATH=.venv/oldest-mujoco .venv/bin/pytest -n auto --dist loadfile $(SIM)
+	PYTHONPATH=$(CURDIR)/.venv/oldest-mujoco .venv/bin/pytest -n auto --dist loadfile $(SIM)
 
 test-fast: .venv/ready-for-tests
 	.venv/bin/pytest -n auto --dist loadfile $(FAST) $(SLOW:%=--deselect=%)

@@ -63,19 +63,25 @@ PositiveOrAuto = Annotated[
 NumberOrAuto = Annotated[float | Literal["auto"] | None, _number_or((AUTO, None), Number, "auto, null, or a number")]
 """A number, one that the data choose, or none."""
 NotNegative = Annotated[Number, Field(ge=0.0)]
+BoolOrAuto = Annotated[bool | Literal["auto"], _number_or((AUTO,), bool, "true, false, or auto")]
+"""A switch, or one that the data set."""
 NotNegativeOrAuto = Annotated[
     float | Literal["auto"], _number_or((AUTO,), NotNegative, "auto, or a number of at least 0")
 ]
 """A number that is not negative, or one that the data choose."""
+NotNegativeAutoOrNone = Annotated[
+    float | Literal["auto"] | None, _number_or((AUTO, None), NotNegative, "auto, null, or a number of at least 0")
+]
+"""A number that is not negative, one that the data choose, or none."""
 Ridge = Annotated[
     float | Literal["auto", "one_standard_error"],
     _number_or((AUTO, "one_standard_error"), NotNegative, "auto, one_standard_error, or a number of at least 0"),
 ]
-"""A ridge, or how cross-validation chooses one."""
+"""A ridge, or how one is chosen."""
 FileName = Annotated[str, AfterValidator(_file_name)]
 Device = Annotated[str, AfterValidator(_torch_device)]
-RidgeRule = Literal["least", "one_standard_error"]
-"""Which ridge is chosen: that of the least error, or the largest whose error is within one standard error of it."""
+RidgeRule = Literal["auto", "one_standard_error"]
+"""Which ridge is chosen: the first unless a larger one predicts better, or the largest within one standard error."""
 BelowOne = Annotated[Number, Field(ge=0.0, lt=1.0)]
 Tolerance = Annotated[Number, Field(gt=0.0, lt=1.0)]
 Count = Annotated[int, BeforeValidator(_not_bool), Field(ge=1)]

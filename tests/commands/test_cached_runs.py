@@ -54,8 +54,10 @@ def _new_files(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Experiment file of the demo, shortened."""
-    return shortened_demo(tmp_path_factory.mktemp("cache") / "demo", 150) / "quadruped.yaml"
+    """Experiment file of the demo, shortened, with all terms stated: logs are read anew to choose them."""
+    file = shortened_demo(tmp_path_factory.mktemp("cache") / "demo", 150) / "quadruped.yaml"
+    file.write_text(file.read_text() + f"actuators: {ActuatorsConfig.without_terms()}".replace("None", "null"))
+    return file
 
 
 @pytest.fixture(scope="module")

@@ -127,7 +127,6 @@ def test_a_heavier_robot_has_torques_of_larger_scale_in_proportion(world: tuple[
             "estimator={name: consistent, masses: {trunk: 3}, bounds: {trunk: {m: [1, 4]}}}",
             "estimator.masses.trunk: a mass, beside estimator.bounds.trunk.m; accepted: one of the two",
         ),
-        ("estimator={name: sgd, total_mass: 12}", "estimator.total_mass: set, which sgd has not"),
     ],
 )
 def test_a_mass_that_cannot_be_is_refused_in_one_line(

@@ -67,7 +67,18 @@ def test_a_run_finds_it_beside_a_delay_and_an_evaluation_predicts_with_it(folder
     assert [x["value"] for x in extras if x["what"] == "stribeck"] == pytest.approx(AT_REST, rel=0.1)
 
     without = folder / "without"
-    assert main(["identify", str(folder / "experiment.yaml"), "actuators.stribeck=null", f"output={without}"]) == 0
+    assert (
+        main(
+            [
+                "identify",
+                str(folder / "experiment.yaml"),
+                "actuators.stribeck=null",
+                "actuators.stiction=false",
+                f"output={without}",
+            ]
+        )
+        == 0
+    )
     assert _rms(run, folder / "new.npz") < 0.3 * _rms(without, folder / "new.npz")
 
 
@@ -127,7 +138,7 @@ def test_a_replay_moves_as_the_log_with_it_and_not_without(folder: Path) -> None
     drifts = []
     for run in ("run", "without_replay"):
         if run != "run":
-            settings = ["actuators.stribeck=null", f"output={folder / run}"]
+            settings = ["actuators.stribeck=null", "actuators.stiction=false", f"output={folder / run}"]
             assert main(["identify", str(folder / "experiment.yaml"), *settings]) == 0
         out = folder / f"replay_{run}"
         words = ["--log", str(folder / "new.npz"), "--samples", "2", "--window", "0.1", "--output", str(out)]

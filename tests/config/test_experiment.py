@@ -13,6 +13,7 @@ from refusals import assert_unknown_key, assert_wrong_value
 
 from torchid.config import dump_config, load_config
 from torchid.config.estimator import EstimatorConfig
+from torchid.config.experiment import ActuatorsConfig
 from torchid.config.log_reading import PreprocessingConfig
 from torchid.errors import ConfigError, InputError
 
@@ -111,6 +112,10 @@ def test_every_key_of_the_file_arrives(file: Path) -> None:
             expected = dataclasses.asdict(EstimatorConfig()) | expected
         if name == "preprocessing":
             expected = dataclasses.asdict(PreprocessingConfig()) | expected
+        if name == "sensors":
+            expected = {"gain_error": 0.02} | expected
+        if name == "actuators":
+            expected = dataclasses.asdict(ActuatorsConfig()) | expected
         assert config[name] == expected
     assert config["robot"]["base_link"] == "pelvis"
     assert config["robot"]["fixed_base"] is True
@@ -313,7 +318,7 @@ def test_a_value_of_the_wrong_kind_is_refused_by_its_place(file: Path, settings:
         ("estimator.robust=true", "estimator.robust: found True; accepted: huber, tukey, or a mapping"),
         ("estimator.robust=cauchy", "estimator.robust: found 'cauchy'; accepted: huber, tukey, or a mapping"),
         ("analysis.compare.a=3", "analysis.compare.a: found 3; accepted: full, contacts, joints, or a mapping"),
-        ("preprocessing.contact_margin_s=50ms", "contact_margin_s: found '50ms'; accepted: a number"),
+        ("preprocessing.contact_margin_s=50ms", "contact_margin_s: found '50ms'; accepted: auto, null, or a number"),
         (
             "actuators.sign_width=wide",
             "actuators.sign_width: found 'wide'; accepted: auto, null, or a number",

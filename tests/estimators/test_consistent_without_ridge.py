@@ -261,7 +261,7 @@ def test_linear_algebra_that_fails_is_one_line(
     def fails(*arguments: object) -> None:
         raise np.linalg.LinAlgError("SVD did not converge")
 
-    where = "least_squares._Decomposition.of" if isinstance(estimator, LeastSquares) else "consistent._solve"
+    where = "least_squares._Inverse.of" if isinstance(estimator, LeastSquares) else "consistent._solve"
     monkeypatch.setattr(f"torchid.estimators.{where}", fails)
     with pytest.raises(InputError, match="^estimator: name: .*failed numerically .SVD did not converge.; accepted: "):
         estimator.solve(problem)

@@ -15,7 +15,7 @@ from repository import DEMO
 from torchid.config import load_config
 from torchid.errors import LogError, TorchidWarning
 from torchid.estimators import Conditions, Consistent, LeastSquares
-from torchid.fitting.delay import EARLIEST, LATEST, DelayChoice, choose_delay, unfitted_delay
+from torchid.fitting.delay import EARLIEST, LATEST, DelayChoice, choose_delay
 from torchid.fitting.experiment import set_up
 from torchid.fitting.fit import LogFitter
 from torchid.logs import Log, preprocess, read_log
@@ -65,27 +65,6 @@ def test_a_delay_beyond_those_that_are_tried_is_said_to_be_at_their_end(beyond: 
         found = chosen(recorded(beyond))
     assert found.found == end
     assert "an end of what is tried: the best may lie beyond" in str(found)
-
-
-def test_a_delay_that_nobody_fits_is_told_from_none() -> None:
-    for delay, seeds in ((0.0, range(10)), (DELAY, range(2)), (-DELAY, range(2))):
-        for seed in seeds:
-            log = preprocess(recorded(delay, NOISE, seed), 30.0)
-            found = looked_for(unfitted_delay, log)
-            assert found is not None
-            assert found.significant == (delay != 0.0)
-            assert abs(found.value - delay) < 0.1 * abs(delay) + 4.0 * found.standard_error
-            assert str(found).startswith("torques are ")
-            assert (" late " in str(found)) == (found.value < 0.0), "of the motion"
-    assert looked_for(unfitted_delay, recorded(seconds=0.07)) is None
-
-
-def test_a_delay_beyond_those_that_are_tried_has_no_standard_error() -> None:
-    """Torques 30 ms late are no 20 ± 0.1 ms late; a look that nobody asked for warns of no setting."""
-    found = looked_for(unfitted_delay, preprocess(recorded(1.5 * EARLIEST, NOISE), 30.0))
-    assert found is not None
-    assert found.significant
-    assert str(found) == "torques are 20 ms late or more: are they stamped by the clock of the positions?"
 
 
 def test_it_is_found_beside_armatures_springs_offsets_and_scales() -> None:

@@ -96,7 +96,7 @@ def setup(tmp_path_factory: pytest.TempPathFactory) -> RobotSetup:
     oracle.perturb(rng, 0.2)
     log = make_log(oracle, [(foot, 3) for foot in FEET], STATES, SAMPLES, rng, tilt=0.1)
     file = tmp_path_factory.mktemp("noise") / "experiment.yaml"
-    contacts = ", ".join(f"{{frame: {foot}, type: point}}" for foot in FEET)
+    contacts = ", ".join(f"{{frame: {foot}, type: point, radius: 0}}" for foot in FEET)
     file.write_text(
         f"robot: {{urdf: {SOLO12}}}\ncontacts: [{contacts}]\nlogs: {{train: [{file}]}}\nsensors: full\noutput: out\n"
     )

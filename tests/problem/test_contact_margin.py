@@ -38,7 +38,7 @@ def slipping(folder: Path, slip: float) -> tuple[Path, Array]:
     near = (np.abs(log.time[:, None] - edges) <= slip).any(axis=1)
     log.joint_torque[near] += 20.0
     write_log(log, folder / "steps.h5")
-    contacts = [{"frame": foot, "type": "point"} for foot in FEET]
+    contacts = [{"frame": foot, "type": "point", "radius": 0} for foot in FEET]
     settings = {
         "robot": {"urdf": str(SOLO12)},
         "contacts": contacts,

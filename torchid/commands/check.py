@@ -181,7 +181,9 @@ def segments_to_check(path: Path, logs: LogsConfig, settings: PreprocessingConfi
     yield from recorded_segments(path, logs, settings)
 
 
-def recorded_segments(path: Path, logs: LogsConfig, settings: PreprocessingConfig) -> Iterator[LogSegment]:
+def recorded_segments(
+    path: Path, logs: LogsConfig, settings: PreprocessingConfig, allow_gaps: bool = True
+) -> Iterator[LogSegment]:
     """As `segments_to_check`, of a log of any size."""
     if settings.bridge_gaps_s is not None or not has_blocks(path, logs.columns):
         log = _read_with_gaps(path, logs, settings)
@@ -190,7 +192,7 @@ def recorded_segments(path: Path, logs: LogsConfig, settings: PreprocessingConfi
         return
     with open_log_blocks(path, None, logs.columns, settings.needs_flags) as blocks:
         for segment in _segments(len(blocks)):
-            log = blocks.read(segment, allow_gaps=True)
+            log = blocks.read(segment, allow_gaps=allow_gaps)
             yield LogSegment(log, _segment_name(path, segment, len(blocks)), len(blocks))
 
 

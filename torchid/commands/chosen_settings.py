@@ -2,24 +2,38 @@
 
 from __future__ import annotations
 
+import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-import torch
 from rich.progress import Progress
 
 from torchid import distributed
 from torchid.commands.check import recorded_segments
-from torchid.errors import TorchidWarning, about_file, join_names, warn_about_file
+from torchid.errors import InputError, TorchidWarning, join_names
 from torchid.estimators import Conditions
 from torchid.fitting.cross_validation import RidgeChoice
 from torchid.fitting.delay import DelayChoice, choose_delay
 from torchid.fitting.experiment import Experiment, RobotSetup, S
 from torchid.fitting.fit import LogFitter
+from torchid.fitting.left_out import (
+    TERMS,
+    Evidence,
+    Reading,
+    TermsChoice,
+    block_edges,
+    choose_terms,
+    compress_reading,
+    thinned,
+    widest,
+    with_terms,
+)
+from torchid.fitting.misfit import force_gain
 from torchid.fitting.noise import recorded_sensors
 from torchid.fitting.separable import (
     SignWidthChoice,
@@ -31,25 +45,19 @@ from torchid.fitting.separable import (
 )
 from torchid.logs import Log
 from torchid.logs.cutoff import CutoffChoice, choose_cutoff
-from torchid.logs.dry_friction import dry_friction_by_setting, with_sign_filter
-from torchid.logs.log import FloatArray
-from torchid.logs.preprocess import lacks_derivatives, make_timeline
+from torchid.logs.low_pass import DROPPED_PERIODS
 from torchid.logs.read import files_of_recordings_kept
-from torchid.logs.signal_noise import SignalNoise
 from torchid.logs.timeline import LOSSLESS_RATE
-from torchid.problem import ExtraTerms, RowBuilder, Samples
+from torchid.parameters import Array
+from torchid.problem import RowBuilder, Samples
 from torchid.problem.compressed_log import Block
-from torchid.problem.log_joints import columns_in_order, joint_order
+from torchid.problem.compression import compress_parts
 from torchid.problem.parts import Part
-from torchid.reading.log_reader import LogReader
+from torchid.reading.log_reader import LogReader, memory_needed
 from torchid.sensing import SensorSet
 from torchid.settings import AUTO
 
 Chosen = TypeVar("Chosen")
-_UNFILTERED = (
-    "actuators.delay: auto without a filter: noise between samples is smaller than at them, which draws the delay to "
-    "half a step; accepted: a preprocessing.cutoff_hz, or auto"
-)
 
 
 @dataclass(frozen=True)
@@ -63,16 +71,36 @@ class SampleRates:
         return f"{join_names(list(rates))}: every k-th sample at {LOSSLESS_RATE:g} cutoffs or more"
 
 
-@dataclass(frozen=True)
+@dataclass
 class Choices:
     """How settings were chosen, in the order in which they are; None for what the experiment states."""
 
     cutoff: CutoffChoice | None = None
+    contact_margin: DataChoice | None = None
+    stiction: DataChoice | None = None
     base_tilt: TiltChoice | None = None
     sign_width: SignWidthChoice | None = None
+    terms: TermsChoice | None = None
     delay: DelayChoice | None = None
     stribeck: StribeckChoice | None = None
     sample_rate: SampleRates | None = None
+
+    @property
+    def adopted_terms(self) -> list[str]:
+        """Kinds of extra parameters that the logs have added."""
+        return [] if self.terms is None else [*self.terms.adopted]
+
+    @property
+    def adopted(self) -> str:
+        """What the logs have added to the model, and what nearly, in one line; "" for nothing."""
+        named = [] if self.terms is None else [str(self.terms)]
+        if self.stiction is not None and self.stiction.value:
+            named.append("samples at rest left out")
+        if self.sign_width is not None and self.sign_width.width is not None:
+            named.append(f"Coulomb friction over {self.sign_width.width:.2g} rad/s")
+        if self.delay is not None and self.delay.delay:
+            named.append(f"torques {1e3 * self.delay.delay:.3g} ms late")
+        return "; ".join(one for one in named if one != "none")
 
     def by_name(self) -> dict[str, object]:
         """The same by name, in words."""
@@ -88,36 +116,211 @@ def with_chosen_settings(setup: S, bars: Progress) -> tuple[S, Choices]:
 
     Raises:
         InputError: logs that cannot be read, or lack what is needed.
-
-    Warns:
-        TorchidWarning: a delay is to be found in logs that are not filtered.
     """
-    if setup.config.logs is None:
+    if setup.config.logs is None or setup.config.logs.compressed:
         return setup, Choices()
-    cutoff = tilt = width = delay = stribeck = None
-    if setup.config.preprocessing.cutoff_hz == AUTO:
-        cutoff = _chosen("cutoff", partial(_cutoff, setup), bars)
-        settings = replace(setup.config.preprocessing, cutoff_hz=cutoff.cutoff_hz)
-        setup = replace(setup, config=replace(setup.config, preprocessing=settings))
+    choices, trials = Choices(), _Trials()
+    setup = _with_chosen_data(setup, choices, trials, bars)
+    setup = _with_chosen_terms(setup, choices, trials, bars)
+    return _with_actuators(setup, **setup.config.actuators.known), choices
+
+
+def _with_chosen_data(setup: S, choices: Choices, trials: _Trials, bars: Progress) -> S:
+    """The setup with the band and the samples that are fitted, and the tilt of the base."""
+    finds_cutoff, shortest = setup.config.preprocessing.cutoff_hz == AUTO, 0.0
+    if finds_cutoff:
+        choices.cutoff, shortest = _chosen("cutoff", partial(_cutoff_of_motion, setup), bars)
+        setup = _with_preprocessing(setup, cutoff_hz=choices.cutoff.cutoff_hz)
+    if setup.config.preprocessing.contact_margin_s == AUTO:
+        margins = {margin: _with_preprocessing(setup, contact_margin_s=margin) for margin in MARGINS}
+        choices.contact_margin = _chosen("margin of contacts", partial(_narrowest_needed, trials, margins), bars)
+        setup = _with_preprocessing(setup, contact_margin_s=choices.contact_margin.value)
+    actuators = setup.config.actuators
+    if actuators.stiction == AUTO and actuators.stribeck is None and trials.measures_torques(setup):
+        rest = {value: _with_actuators(setup, stiction=value) for value in (False, True)}
+        choices.stiction = _chosen("samples at rest", partial(_narrowest_needed, trials, rest), bars)
+        setup = _with_actuators(setup, stiction=bool(choices.stiction.value))
+    if finds_cutoff and choices.cutoff is not None and choices.cutoff.cutoff_hz is not None:
+        choices.cutoff = _chosen("cutoff", partial(_cutoff, setup, trials, choices.cutoff, shortest), bars)
+        setup = _with_preprocessing(setup, cutoff_hz=choices.cutoff.cutoff_hz)
     if setup.config.robot.base_tilt == AUTO:
-        tilt = _chosen("base tilt", partial(_base_tilt, setup), bars)
+        choices.base_tilt = tilt = _chosen("base tilt", lambda: choose_base_tilt(*trials.whole(setup)), bars)
         stated = replace(setup.config.robot, base_tilt=tilt.tilt)
         robot = replace(setup.robot, base_tilt=tilt.tilt)
         setup = replace(setup, robot=robot, config=replace(setup.config, robot=stated))
-    reader = WidthReader(setup)
-    if setup.config.actuators.sign_width == AUTO:
-        width = _chosen("sign width", partial(choose_sign_width, partial(_logs_of, setup, reader, "sign_width")), bars)
-        setup = _with_actuators(setup, sign_width=width.width)
+    return setup
+
+
+def _with_chosen_terms(setup: S, choices: Choices, trials: _Trials, bars: Progress) -> S:
+    """The setup with the terms of actuators that are fitted, and their numbers."""
+    if setup.config.actuators.sign_width == AUTO and setup.config.estimator.friction and trials.measures_torques(setup):
+        choices.sign_width = _chosen("sign width", partial(_sign_width, setup, trials), bars)
+        setup = _with_actuators(setup, sign_width=choices.sign_width.width)
+    if candidates := trials.candidates(setup):
+        choices.terms = _chosen("terms of actuators", partial(trials.choose_terms, setup), bars)
+        adopted = choices.terms.adopted
+        setup = _with_actuators(setup, **{name: name in adopted for name in candidates if name != "delay"})
+        if "delay" in adopted:
+            choices.delay = _chosen("delay of torques", partial(_delay, setup, trials), bars)
     if setup.config.actuators.delay == AUTO:
-        if cutoff is None and setup.config.preprocessing.cutoff_hz is None:
-            warn_about_file(_UNFILTERED)
-        delay = _chosen("delay of torques", partial(_delay, setup, reader), bars)
-        setup = _with_actuators(setup, delay=delay.delay)
+        setup = _with_actuators(setup, delay=choices.delay.delay if choices.delay else 0.0)
     if setup.config.actuators.stribeck == AUTO:
-        reader = WidthReader(setup) if setup.config.actuators.known_delay and delay else reader
-        stribeck = _chosen("Stribeck velocity", partial(_stribeck, setup, reader), bars)
-        setup = _with_actuators(setup, stribeck=stribeck.velocity)
-    return setup, Choices(cutoff, tilt, width, delay, stribeck)
+        choices.stribeck = _chosen("Stribeck velocity", partial(_stribeck, setup, trials), bars)
+        setup = _with_actuators(setup, stribeck=choices.stribeck.velocity)
+    return setup
+
+
+MARGINS = (None, 0.03, 0.06)
+"""Times around changes of contact without which fits are tried [s]."""
+
+MOST_TRIED = 20_000
+"""Samples of a log that settings are chosen with."""
+
+_OCTAVES, _LOWEST_HZ = 8, 2.5  # of cutoffs that are tried, and the lowest: nobody moves slower to be identified
+_PERIODS = 12.0 * DROPPED_PERIODS  # of a cutoff in the shortest log, at least: of a fourth held back a third is left
+_TRIED_WIDTHS = (0.01, 0.1)  # [rad/s or m/s]: where neither predicts better than the sign, no width is looked for
+
+
+@dataclass(frozen=True)
+class DataChoice:
+    """Which data are fitted: a value of a setting that leaves some out, "" for its unit, and what was tried."""
+
+    value: float | bool | None
+    tried: tuple[float | bool | None, ...]
+
+    def __str__(self) -> str:
+        """The value, and why."""
+        if self.value == self.tried[0]:
+            return f"{_in_words(self.value)}: a fit without these samples predicts left-out blocks no better"
+        return f"{_in_words(self.value)}: a fit to all samples predicts left-out blocks worse"
+
+
+def _in_words(value: float | bool | None) -> str:
+    if value is None or isinstance(value, bool):
+        return {None: "none", False: "counted", True: "left out"}[value]
+    return f"{value:g} s"
+
+
+class _Trials:
+    """Readings of the training logs with different settings, in the same blocks."""
+
+    def __init__(self) -> None:
+        self._recorded: dict[Path, Log] = {}
+        self._edges: dict[str, Array] | None = None
+        self._noise: Mapping[str, Any] | None = None  # of the last reading that estimated it
+
+    @staticmethod
+    def measures_torques(setup: RobotSetup) -> bool:
+        """Whether any joint's torque is measured."""
+        return not isinstance(setup, Experiment) or bool(setup.sensors.torque[: setup.robot.n].any())
+
+    def candidates(self, setup: RobotSetup) -> list[str]:
+        """Terms that the logs are to choose."""
+        config = setup.config
+        if not self.measures_torques(setup):
+            return []
+        auto = [name for name in TERMS if getattr(config.actuators, name) == AUTO]
+        unfit = {"torque_offset"} if "joint_torque" in config.sensors.offsets else set[str]()
+        if config.preprocessing.filter_hz is None or any(
+            map(_is_large(setup), config.logs.train if config.logs else ())
+        ):
+            unfit.add("delay")
+        return [name for name in auto if name not in unfit]
+
+    def kinds(self, setup: RobotSetup) -> list[str]:
+        """Kinds of all extra parameters of a trial: those that are stated, and the candidates."""
+        stated = [name for name, x in setup.config.actuators.known.items() if x is True]
+        return [*stated, "stribeck", "offset", "scale", *self.candidates(setup)]
+
+    def reading(self, setup: RobotSetup, estimate_noise: bool = False) -> Reading:
+        """The logs with all terms that are stated or may be chosen. Raises InputError: as `LogReader.read`."""
+        names = self.candidates(setup)
+        setup = _with_actuators(setup, **{name: True for name in names if name != "delay"})
+        logs, fitter = self.logs_and_fitter(setup, estimate_noise)
+        self._edges = self._edges or block_edges(logs)
+        terms = replace(setup.terms, delays=int("delay" in names))
+        return compress_reading(logs, self._edges, with_terms(fitter, terms))
+
+    def logs_and_fitter(self, setup: RobotSetup, estimate_noise: bool = False) -> tuple[list[Samples], LogFitter]:
+        """Some samples of the logs, and a fitter of their rows, weighted with noise that may be of a reading before."""
+        logs, sensors = self._read(setup)
+        logs = thinned(logs)
+        if estimate_noise or self._noise is None:
+            self._noise = setup.estimate_noise(logs, sensors, suggest=False).known
+        setup = replace(setup, estimated_noise=self._noise)
+        builder = setup.builder(replace(sensors, noise=setup.noise))
+        return logs, setup.fitter(builder, Conditions(names=setup.robot.body_names))
+
+    def whole(self, setup: RobotSetup, **actuators: Any) -> tuple[list[Samples], LogFitter]:
+        """All samples, and a fitter of their rows as they are weighted now, with these settings of actuators."""
+        setup = _with_actuators(setup, **actuators)
+        logs, sensors = self._read(setup)
+        return logs, setup.fitter(setup.builder(sensors), Conditions(names=setup.robot.body_names))
+
+    def _read(self, setup: RobotSetup) -> tuple[list[Samples], SensorSet]:
+        """The logs and the sensors of their rows, all that were recorded where the setup states none."""
+        sensors, files = setup.sensors if isinstance(setup, Experiment) else None, setup.config.logs
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", TorchidWarning)  # said where the logs are read for the fit
+            logs = _TrialReader(setup, self._recorded).read(files.train if files else [], sensors)
+        return logs, sensors or recorded_sensors(setup.robot, setup.contacts, logs, setup.noise)
+
+    def choose_terms(self, setup: RobotSetup) -> TermsChoice:
+        """Terms of actuators by the error on left-out blocks."""
+        fixed = [kind for kind in self.kinds(setup) if kind not in (names := self.candidates(setup))]
+        return choose_terms(self.reading(setup), names, fixed)
+
+
+def needs_these_torques(setup: RobotSetup) -> bool:
+    """Whether the bodies of the robot's file need about the forces of the logs; False for logs that cannot be read."""
+    try:
+        setup = _with_actuators(setup, **setup.config.actuators.without_terms())
+        setup = _with_preprocessing(setup, cutoff_hz=_cutoff_of_motion(setup)[0].cutoff_hz, contact_margin_s=None)
+        logs, fitter = _Trials().logs_and_fitter(setup)
+        gain = force_gain(fitter.build_problem(compress_parts(logs, fitter.builder)).assembly.problem)
+    except InputError:
+        return False
+    return is_near_nominal(gain)
+
+
+def is_near_nominal(gain: float | None) -> bool:
+    """Whether a factor of forces, None for none that is clear, is one of another mass, gear or current: up to three."""
+    return gain is not None and 1.0 / _LARGEST_GAIN < gain < _LARGEST_GAIN
+
+
+_LARGEST_GAIN = 3.0
+
+
+class _TrialReader(LogReader):
+    """Reads logs once for all settings, of those larger than `MOST_TRIED` samples the middle."""
+
+    def __init__(self, setup: RobotSetup, recorded: dict[Path, Log]) -> None:
+        super().__init__(setup)
+        self._kept = recorded
+
+    def _together(self, path: Path) -> float:
+        return 0.0
+
+    def _takes_blocks(self, path: Path, gigabytes: float) -> bool:
+        return False
+
+    def _recorded(self, path: Path) -> Log:
+        files = self.setup.config.logs
+        if path not in self._kept and files is not None:
+            if _is_large(self.setup)(path):
+                settings = self.setup.config.preprocessing
+                log = next(recorded_segments(path, files, settings, settings.exclude_rejected)).log
+            else:
+                log = super()._recorded(path)
+            rest = max(len(log) - MOST_TRIED, 0)
+            self._kept[path] = log.select(slice(rest // 2, len(log) - rest + rest // 2)) if rest else log
+        return self._kept[path]
+
+
+def _is_large(setup: RobotSetup) -> Callable[[Path], bool]:
+    """Whether a log is larger than the memory that it may take."""
+    limit = setup.config.preprocessing.memory_gb
+    return lambda path: memory_needed(path, limit) > limit
 
 
 def with_sample_rates(choices: Choices, setup: RobotSetup, logs: Sequence[Samples]) -> Choices:
@@ -136,44 +339,66 @@ def _chosen(name: str, choose: Callable[[], Chosen], bars: Progress) -> Chosen:
     return choice
 
 
-def _cutoff(setup: RobotSetup) -> CutoffChoice:
-    """By the middle of each training log."""
+def _cutoff(setup: RobotSetup, trials: _Trials, limit: CutoffChoice, shortest: float) -> CutoffChoice:
+    """The widest band that the model predicts, up to a limit; `shortest`: how long the shortest log is [s]."""
+    widest_hz, lowest_hz = setup.config.preprocessing.filter_hz or 0.0, max(_LOWEST_HZ, _PERIODS / shortest)
+    tried = [widest_hz / 2**k for k in range(_OCTAVES) if not k or widest_hz / 2**k >= lowest_hz]
+    setups = {cutoff: _with_preprocessing(setup, cutoff_hz=cutoff) for cutoff in tried}
+    found = _narrowest_needed(trials, setups, estimate_noise=True).value
+    return limit if found == tried[0] else replace(limit, cutoff_hz=float(f"{found:.2g}"), limit_hz=limit.cutoff_hz)
+
+
+def _narrowest_needed(trials: _Trials, setups: Mapping[Any, RobotSetup], estimate_noise: bool = False) -> DataChoice:
+    """Of settings that leave ever more out, the first whose fit predicts what the others keep as well as theirs."""
+    readings: list[Reading] = []
+    kinds = trials.kinds(next(iter(setups.values())))
+    for one in setups.values():
+        try:
+            readings.append(trials.reading(one, estimate_noise))
+        except InputError:  # nothing is left
+            if not readings:
+                raise
+            break
+    return DataChoice([*setups][widest(readings, kinds)], tuple(setups))
+
+
+def _sign_width(setup: RobotSetup, trials: _Trials) -> SignWidthChoice:
+    """The width with which left-out blocks are predicted best; none where a trial does no better than the sign."""
+    kinds = trials.kinds(setup)
+
+    def read(width: float | None) -> Reading:
+        return trials.reading(_with_actuators(setup, sign_width=width))
+
+    sign, *others = map(read, (None, *_TRIED_WIDTHS))
+    if not any(Evidence.of(sign.left_out(kinds), one.left_out(kinds)).adopted for one in others):
+        return SignWidthChoice(None, (None,), (1.0,))
+    return choose_sign_width(lambda width: math.sqrt(read(width).noise_variance / sign.noise_variance))
+
+
+def _cutoff_of_motion(setup: RobotSetup) -> tuple[CutoffChoice, float]:
+    """By the middle of each training log, and how long the shortest of them is [s]."""
     settings, files = setup.config.preprocessing, setup.config.logs
     if files is None:
-        return CutoffChoice(None, by_noise=False)
+        return CutoffChoice(None, by_noise=False), 0.0
     with files_of_recordings_kept():
         logs = [next(recorded_segments(path, files, settings)).log for path in files.train]
     stated, from_feet = setup.config.sensors.noise.motion, settings.base_motion is not None
     rate = None if settings.sample_rate_hz == AUTO else settings.sample_rate_hz
-    return choose_cutoff(logs, stated, rate, base_is_derived=from_feet)
+    shortest = min(float(log.time[-1] - log.time[0]) for log in logs)
+    return choose_cutoff(logs, stated, rate, base_is_derived=from_feet), shortest
 
 
-def _base_tilt(setup: RobotSetup) -> TiltChoice:
-    return choose_base_tilt(*_logs_and_fitter(setup, WidthReader(setup)))
+def _delay(setup: RobotSetup, trials: _Trials) -> DelayChoice:
+    return choose_delay(*trials.whole(setup), setup.terms)
 
 
-def _delay(setup: RobotSetup, reader: WidthReader) -> DelayChoice:
-    return choose_delay(*_logs_and_fitter(setup, reader), setup.terms)
+def _stribeck(setup: RobotSetup, trials: _Trials) -> StribeckChoice:
+    return choose_stribeck(lambda velocity: trials.whole(setup, stribeck=velocity), setup.terms)
 
 
-def _stribeck(setup: RobotSetup, reader: WidthReader) -> StribeckChoice:
-    return choose_stribeck(partial(_logs_of, setup, reader, "stribeck"), setup.terms)
-
-
-def _logs_of(
-    setup: RobotSetup, reader: WidthReader, name: str, value: float | None
-) -> tuple[Sequence[Samples], LogFitter]:
-    """As `_logs_and_fitter`, with a value of one of the settings of actuators."""
-    return _logs_and_fitter(_with_actuators(setup, **{name: value}), reader)
-
-
-def _logs_and_fitter(setup: RobotSetup, reader: WidthReader) -> tuple[Sequence[Samples], LogFitter]:
-    """The training logs, and a fitter of their rows."""
-    sensors = setup.sensors if isinstance(setup, Experiment) else None
-    logs = reader.logs(setup.terms, sensors)
-    if sensors is None:
-        sensors = recorded_sensors(setup.robot, setup.contacts, logs, setup.noise)
-    return logs, setup.fitter(setup.builder(sensors), Conditions(names=setup.robot.body_names))
+def _with_preprocessing(setup: S, **stated: Any) -> S:
+    config = setup.config
+    return replace(setup, config=replace(config, preprocessing=replace(config.preprocessing, **stated)))
 
 
 def _with_actuators(setup: S, **stated: Any) -> S:
@@ -199,61 +424,3 @@ def with_ridge(
     bars.update(bar, total=1, completed=1)
     chosen = replace(config, estimator=replace(config.estimator, ridge=choice.ridge))
     return replace(experiment, config=chosen), choice
-
-
-@dataclass(frozen=True)
-class _Directions:
-    """What the filter makes of a log's dry friction, by the width of its sign and the Stribeck velocity.
-
-    `stamps`: (K,) of the preprocessed log [s]; `order`: columns of the robot's joints.
-    """
-
-    stamps: FloatArray
-    order: list[int]
-    by_setting: Callable[[float | None, float | None], dict[str, FloatArray]]
-
-    def applied(self, samples: Samples, terms: ExtraTerms) -> Samples:
-        """Some of the samples, with those of the terms."""
-        at = np.searchsorted(self.stamps, samples.time.numpy())
-        fields: dict[str, Any] = {"direction": None, "stribeck": None}
-        for name, found in self.by_setting(terms.sign_width, terms.stribeck).items():
-            fields[name.removeprefix("joint_")] = torch.from_numpy(columns_in_order(found[at], self.order))
-        return replace(samples, **fields)
-
-
-class WidthReader(LogReader):
-    """Reads logs that fit into memory once for all widths and Stribeck velocities.
-
-    Others are read anew for each, since the filter comes after friction.
-
-    So are logs whose base moves as the feet say: they are filtered in segments.
-    """
-
-    def __init__(self, setup: RobotSetup) -> None:
-        super().__init__(setup)
-        self._directions: dict[str, _Directions] = {}
-        self._logs: list[Samples] | None = None
-
-    def logs(self, terms: ExtraTerms, required: SensorSet | None) -> list[Samples]:
-        """The training logs as `read` gives them with the dry friction of terms; with the same `required` each time."""
-        files, actuators = self.setup.config.logs, self.setup.config.actuators
-        if self._logs is None or len(self._directions) < len(self._logs):
-            own: dict[str, Any] = {"sign_width": terms.sign_width, "stribeck": terms.stribeck}
-            config = replace(self.setup.config, actuators=replace(actuators, **own))
-            self.setup, self._directions = replace(self.setup, config=config), {}
-            self._logs = self.read(files.train if files else [], required)
-            return self._logs
-        return [self._directions[log.source].applied(log, terms) for log in self._logs]
-
-    def _preprocessed(self, clean: Log) -> Log:
-        log, settings = super()._preprocessed(clean), self.setup.config.preprocessing
-        if settings.base_motion is None:
-            rates = settings.filter_hz, settings.sample_rate_hz
-            with about_file(log.source):
-                timeline = make_timeline(clean.time, lacks_derivatives(clean), *rates)
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", TorchidWarning)  # said where the log was read
-                filtered = timeline and with_sign_filter(timeline, clean, log.motion_noise or SignalNoise({}))
-            by_setting = dry_friction_by_setting(clean, filtered) if filtered else (lambda *_: {})
-            self._directions[log.source] = _Directions(log.time, joint_order(log, self.setup.robot), by_setting)
-        return log

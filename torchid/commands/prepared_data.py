@@ -120,7 +120,7 @@ def _data_of_factors(experiment: Experiment, clock: Stopwatch, bars: Progress) -
         reading = bars.add_task("reading factors", total=len(experiment.config.logs.train))
         fleet = read_fleet(experiment, lambda _: bars.advance(reading))
         require_base(fleet.states, experiment.config.sensors.on_base_lost, experiment.contacts)
-        reader, logs = _read(experiment, bars)
+        reader, logs = _read(fleet.experiment, bars)
     with clock("compress"):
         builder = fleet.experiment.builder(fleet.experiment.sensors)
         blocks = fold_compressed([one.log for one in fleet.files], builder)

@@ -295,16 +295,13 @@ def _metrics_document(run: Identification) -> dict[str, object]:
 
 def _misfit_document(misfit: Misfit) -> dict[str, object]:
     """What the fit leaves of the forces."""
-    armature = misfit.armature
     return {
         "explained": misfit.explained,
         "message": str(misfit),
         "expected_residual_std": misfit.expected,
         "lack_of_fit": misfit.lack_of_fit,
         "standard_error_growth": misfit.error_growth,
-        "unfitted_delay": misfit.delay.value if misfit.delay is not None and misfit.delay.significant else None,
         "unfitted_friction": None if misfit.friction is None else misfit.friction.ratio,
-        "unfitted_armature": None if armature is None else {x.joint: x.value for x in armature.found},
     }
 
 

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -37,7 +37,18 @@ from torchid.errors import ConfigError, about_file
 from torchid.logs.column_map import check_columns
 from torchid.logs.containers import FACTORS
 from torchid.logs.ros_topics import check_topics
-from torchid.settings import STRICT, Device, FileName, Name, NumberOrAuto, Positive, PositiveOrAuto, Seed
+from torchid.settings import (
+    AUTO,
+    STRICT,
+    BoolOrAuto,
+    Device,
+    FileName,
+    Name,
+    NumberOrAuto,
+    Positive,
+    PositiveOrAuto,
+    Seed,
+)
 
 Scenarios = dict[FileName, Annotated[list[list[str]], Field(min_length=1)]]
 
@@ -91,21 +102,36 @@ class ActuatorsConfig:
     auto, with the velocity that leaves least, or without such friction where the logs do not determine it.
     `delay` [s]: joint torques act so much later than recorded or commanded; auto, the delay that leaves least.
     `stiction`: where a joint rests, friction is whatever holds it, so that its torque counts as unmeasured.
+
+    auto: as blocks of the training logs that a fit has not seen are predicted better (`torchid.fitting.left_out`).
     """
 
-    armature: bool = False
-    torque_offset: bool = False
-    asymmetric_coulomb: bool = False
+    armature: BoolOrAuto = AUTO
+    torque_offset: BoolOrAuto = AUTO
+    asymmetric_coulomb: BoolOrAuto = AUTO
     stribeck: PositiveOrAuto = None
-    stiffness: bool = False
-    sign_width: PositiveOrAuto = None
-    delay: NumberOrAuto = None
-    stiction: bool = False
+    stiffness: BoolOrAuto = AUTO
+    sign_width: PositiveOrAuto = AUTO
+    delay: NumberOrAuto = AUTO
+    stiction: BoolOrAuto = AUTO
 
     @property
     def known_delay(self) -> float:
         """The delay [s], 0 where there is none, or it has not been chosen."""
         return 0.0 if self.delay is None or isinstance(self.delay, str) else self.delay
+
+    @property
+    def known(self) -> dict[str, Any]:
+        """All terms by name, none where logs have not chosen yet."""
+        none = ActuatorsConfig.without_terms()
+        return {name: none[name] if x == AUTO else x for name, x in vars(self).items()}
+
+    @staticmethod
+    def without_terms() -> dict[str, Any]:
+        """What each key is without its term."""
+        return dict.fromkeys(("stribeck", "sign_width", "delay")) | dict.fromkeys(
+            ("armature", "torque_offset", "asymmetric_coulomb", "stiffness", "stiction"), False
+        )
 
 
 @dataclass(config=STRICT, frozen=True)
@@ -295,7 +321,7 @@ def _check_threshold(settings: PreprocessingConfig) -> None:
 def _check_extras(config: _Common) -> None:
     """Refuse the same extra parameter under two keys, and extra parameters for a descent, which has none."""
     actuators, sensors = config.actuators, config.sensors
-    if actuators.torque_offset and "joint_torque" in sensors.offsets:
+    if actuators.torque_offset is True and "joint_torque" in sensors.offsets:
         found = "set together with sensors.offsets.joint_torque, which is the same"
         raise ConfigError.at_field("actuators.torque_offset", found, "one of the two")
     if actuators.stribeck is not None and not config.estimator.friction:
@@ -344,9 +370,7 @@ def _check_factors(config: _Common, logs: LogsConfig) -> None:
             config.preprocessing.cutoff_hz == "auto",
             "the number that compress printed",
         ),
-        ("actuators.sign_width", "auto", config.actuators.sign_width == "auto", "the width that compress printed"),
         ("actuators.stribeck", "auto", config.actuators.stribeck == "auto", "the velocity that compress printed"),
-        ("actuators.delay", "auto", config.actuators.delay == "auto", "the delay that compress printed"),
         ("robot.base_tilt", "auto", config.robot.base_tilt == "auto", "the tilt that compress printed"),
         (
             "preprocessing.exclude_rejected",

@@ -19,7 +19,7 @@ from torchid.logs.flags import ContactThreshold
 from torchid.logs.ros_topics import check_topics
 from torchid.logs.unitree import JOINT_ORDERS
 from torchid.problem.contact_detection import DetectionConfig
-from torchid.settings import STRICT, NotNegative, Positive, PositiveOrAuto
+from torchid.settings import AUTO, STRICT, NotNegative, NotNegativeAutoOrNone, Positive, PositiveOrAuto
 
 
 def _switch(value: object) -> object:
@@ -41,7 +41,8 @@ class PreprocessingConfig:
     `cutoff_hz`: auto, one that the motion of the training logs and its noise ask for, see `choose_cutoff`.
     `sample_rate_hz`: auto, every k-th sample of a log that is filtered, see `lay_out_timeline`.
     `bridge_gaps_s`: gaps (NaN) of at most so long [s] are filled before anything else is done; None leaves them.
-    `contact_margin_s`: samples that are dropped before and after each change of contact [s], None for none.
+    `contact_margin_s`: samples that are dropped before and after each change of contact [s], None for none;
+    auto, as many as make the fit worse where feet stand (`torchid.fitting.left_out`).
     `detect_contacts`: true, or its settings, for contact flags from joint torques (`DetectionConfig`) in the place of
     recorded ones.
     `contact_threshold`: a force [N], or its settings, for contact flags from forces (`ContactThreshold`) likewise.
@@ -57,7 +58,7 @@ class PreprocessingConfig:
     cutoff_hz: PositiveOrAuto = None
     sample_rate_hz: PositiveOrAuto = None
     bridge_gaps_s: Positive | None = None
-    contact_margin_s: NotNegative | None = None
+    contact_margin_s: NotNegativeAutoOrNone = None
     detect_contacts: Annotated[DetectionConfig | None, BeforeValidator(_switch)] = None
     contact_threshold: Annotated[ContactThreshold | None, BeforeValidator(_threshold)] = None
     zero_in_air: bool = False
@@ -80,7 +81,8 @@ class PreprocessingConfig:
     @property
     def margin_s(self) -> float | None:
         """Samples that are dropped before and after each change of contact [s], None for none."""
-        margins = [self.contact_margin_s, None if self.detect_contacts is None else self.detect_contacts.margin_s]
+        stated = None if self.contact_margin_s == AUTO else self.contact_margin_s
+        margins = [stated, None if self.detect_contacts is None else self.detect_contacts.margin_s]
         return max((margin for margin in margins if margin is not None), default=None)
 
     @property

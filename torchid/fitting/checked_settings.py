@@ -22,6 +22,7 @@ from torchid.problem.floor_pose import FEWEST_POINTS, points_of
 from torchid.robot import CollisionShapes, Robot, RollingShape, require_payloads
 from torchid.sensing import Contact, SensorSet, validate_contacts
 from torchid.sensing.sensors import NORMAL_FORCE, UP, join_numbers
+from torchid.settings import AUTO
 
 
 def check_scale_groups(terms: ExtraTerms, robot: Robot, contacts: Sequence[Contact]) -> None:
@@ -89,7 +90,8 @@ def check_terms(
                 what = f"whose {kind} is not measured"
                 raise UnknownNameError.at_field(f"sensors.scales.{kind}", pattern, measured[kind], what)
     for name, value in vars(actuators).items():
-        if value and "joint_torque" not in measured:
+        unset = value == AUTO and name != "stribeck"  # what logs choose by default
+        if value and not unset and "joint_torque" not in measured:
             accepted = "joint torques among the sensors, or no such key"
             raise ConfigError.at_field(f"actuators.{name}", "set, but no joint torque is measured", accepted)
 

@@ -31,9 +31,6 @@ EARLIEST, LATEST = -0.02, 0.06
 _FEW, _MANY = 1000, 5000  # samples of all logs, evenly spaced, to try delays, and to find the best
 _TRIED, _AROUND, _PASSES = 17, 0.005, 4  # delays that are tried; [s] to both sides of the best of them; looks there
 _WIDE, _NARROW = 24, 16  # delays whose torques make up those of all between: 80 ms to 1e-6 up to 50 Hz, 20 ms to 100 Hz
-_LONGEST = 20_000  # samples of a log, at most, that a spline of torques is drawn through for a look
-_SLOPE = 4  # delays whose torques make up the slope at none
-_SURELY = 4.0  # standard errors of a delay that is there
 _SAME = 1e-5  # [s]: scales of torques are those of torques that are as near as this
 _RIDGE = 1e-6  # the residual is smooth in the delay where the data determine some parameters badly
 _STEPS, _SETTLED = 8, 1e-2  # Gauss-Newton steps, and standard errors below which one ends them
@@ -129,59 +126,6 @@ def _search(logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms) -> De
 def _is_at_end(delay: float) -> bool:
     """Whether no delay beyond was tried, so that its standard error says nothing."""
     return delay in (EARLIEST, LATEST)
-
-
-@dataclass(frozen=True)
-class UnfittedDelay:
-    """A delay of joint torques that was not fitted.
-
-    `value`: by how much later than stamped torques act [s]; `standard_error`: of it [s], infinite where it is
-    confounded with other parameters.
-    """
-
-    value: float
-    standard_error: float
-
-    @property
-    def significant(self) -> bool:
-        """Whether chance would show as much in fewer than one of ten thousand fits."""
-        return abs(self.value) > _SURELY * self.standard_error
-
-    def __str__(self) -> str:
-        """By how much torques are late or early, and what finds it."""
-        size, error = 1e3 * abs(self.value), 1e3 * self.standard_error
-        when = "late" if self.value < 0.0 else "early"
-        if _is_at_end(self.value):
-            return f"torques are {size:.2g} ms {when} or more: are they stamped by the clock of the positions?"
-        return f"torques are {size:.2g} ± {error:.1g} ms {when} (actuators.delay: auto)"
-
-
-def unfitted_delay(logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms) -> UnfittedDelay | None:
-    """The delay that a fit without one leaves in the residuals; None where no torque of the logs tells.
-
-    One step from none by least squares, and `choose_delay` only where that is significant: without conditions, a
-    negative armature with a delay may be a spring.
-
-    Args: as of `choose_delay`.
-    """
-    if not fitter.builder.sensors.torque[: fitter.robot.n].any():
-        return None
-    middles = [log[max(0, (len(log) - _LONGEST) // 2) :][:_LONGEST] for log in logs]
-    try:
-        some = _torques(middles, fitter, _MANY)
-    except LogError:  # too short
-        return None
-    plain = replace(fitter, estimator=LeastSquares(_RIDGE, rank_tolerance=fitter.estimator.rank_tolerance))
-    near = _Delays(some, plain, terms, (-_AROUND, _AROUND), 0.0, _SLOPE, in_blocks=True)
-    term = next((x for x in near.fit_in_blocks(0.0).extras if x.extra.what == DELAY), None)
-    if term is None:  # no row has a torque
-        return None
-    first = UnfittedDelay(term.value, term.standard_error if term.separable else np.inf)
-    if not first.significant:
-        return first
-    choice = _search(middles, fitter, terms)
-    error = np.inf if choice.standard_error is None or choice.confounded_with else choice.standard_error
-    return UnfittedDelay(choice.found, error)
 
 
 def _choice(best: float, term: ExtraEstimate, left: float, undelayed: float) -> DelayChoice:

@@ -39,10 +39,10 @@ from torchid.problem import RowBuilder
 from torchid.problem.blocks import block_spans
 from torchid.problem.compressed_log import CompressedLog, piece_spans
 from torchid.problem.compression import FOLDS
-from torchid.problem.extras import NoiseGroups, noise_key
+from torchid.problem.extras import ACTUATORS, NoiseGroups, in_words, noise_key
 from torchid.reprs import short_repr
 from torchid.robot.payloads import Payload
-from torchid.settings import STRICT, NotNegative, Number
+from torchid.settings import AUTO, STRICT, NotNegative, Number
 from torchid.staging import atomic_file
 
 FORMAT = 3
@@ -319,7 +319,10 @@ def row_model(experiment: Experiment, builder: RowBuilder) -> RowModel:
     settings = vars(experiment.config.preprocessing)
     model = RowModel.of(experiment.robot, builder, {name: x for name, x in settings.items() if name not in _APART})
     actuators = experiment.config.actuators
-    known: dict[str, Value] = {"actuators.delay": actuators.known_delay, "actuators.stiction": actuators.stiction}
+    known: dict[str, Value] = {
+        "actuators.delay": actuators.known_delay,
+        "actuators.stiction": actuators.known["stiction"],
+    }
     added: dict[str, Value] = {name: x for name, x in known.items() if x}  # a factor without stays what it was
     return replace(model, settings=model.settings | added) if added else model
 
@@ -353,10 +356,12 @@ def read_fleet(experiment: Experiment, on_read: Callable[[Path], None] | None = 
         ConfigError: the experiment states other noise.
     """
     paths = experiment.config.logs.train
-    model = row_model(experiment, experiment.builder(experiment.sensors))
     files: list[FactorFile] = []
     for path in paths:
         one = read_factors(path)
+        if not files:
+            experiment = _with_choices_of(one.model, experiment)
+            model = row_model(experiment, experiment.builder(experiment.sensors))
         require_same_rows(path, one.model, model, _THE_EXPERIMENT)
         files.append(one)
         require_same_noise(path, one.model, files[0].model, paths[0])
@@ -369,6 +374,22 @@ def read_fleet(experiment: Experiment, on_read: Callable[[Path], None] | None = 
     listed = [GroupNoise(name, groups.unit(name), origins.get(name, "stated"), x, None) for name, x in used.items()]
     summary = NoiseSummary(noise, listed, {}, 0)
     return Fleet(with_noise(experiment, summary), files, summary, merge_state_reports(one.states for one in files))
+
+
+def _with_choices_of(model: RowModel, experiment: Experiment) -> Experiment:
+    """The experiment with what `torchid compress` has chosen where it leaves that to the logs."""
+    settings, config = model.settings, experiment.config
+    labels = settings.get("actuators")
+    kinds = {label.partition(" of ")[0] for label in labels} if isinstance(labels, list) else set[str]()
+    found: dict[str, Any] = {name: in_words(name) in kinds for name in ACTUATORS if name != "stribeck"}
+    found |= {name: settings.get(f"actuators.{name}") for name in ("sign_width", "delay", "stiction")}
+    known = config.actuators.known
+    chosen = {name: x or known[name] for name, x in found.items() if vars(config.actuators)[name] == AUTO}
+    config = replace(config, actuators=replace(config.actuators, **chosen))
+    if config.preprocessing.contact_margin_s == AUTO:
+        margin: Any = settings.get("preprocessing.contact_margin_s")
+        config = replace(config, preprocessing=replace(config.preprocessing, contact_margin_s=margin))
+    return replace(experiment, config=config)
 
 
 def _require_different_logs(paths: Sequence[Path], files: Sequence[FactorFile]) -> None:

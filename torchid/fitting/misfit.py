@@ -11,10 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtri
 
+from torchid import parameters
 from torchid.estimators import Estimate
 from torchid.estimators.least_squares import residual_std
-from torchid.fitting.armature import UnfittedArmature
-from torchid.fitting.delay import UnfittedDelay
 from torchid.fitting.noise import GroupNoise, NoiseSummary
 from torchid.identifiability.jackknife import Jackknife
 from torchid.logs.dry_friction import OFTEN, resting_share
@@ -53,9 +52,7 @@ class Misfit:
             that by noise, None likewise.
         groups: of readings and base rows that exceed their noise most.
         friction: that was not fitted, None where all of it was.
-        delay: of joint torques that was not fitted, None where it was, or nothing tells.
         share: residual over that of the nominal parameters, None where these leave nothing.
-        armature: that was not fitted, None likewise.
     """
 
     residual: float
@@ -65,8 +62,6 @@ class Misfit:
     groups: tuple[GroupNoise, ...]
     friction: UnfittedFriction | None = None
     share: float | None = None
-    delay: UnfittedDelay | None = None
-    armature: UnfittedArmature | None = None
 
     @property
     def alike(self) -> bool:
@@ -82,17 +77,12 @@ class Misfit:
     def explained(self) -> bool:
         """Whether noise may be all that the model leaves."""
         much = self.expected is not None and self.residual > _MUCH * self.expected
-        return not (much or self.alike or any(one is not None and one.significant for one in self._unfitted))
+        return not (much or self.alike or (self.friction is not None and self.friction.significant))
 
     @property
     def _is_rounding(self) -> bool:
         """Whether rounding is all that is left."""
         return self.share is not None and self.share < _EXACT
-
-    @property
-    def _unfitted(self) -> tuple[UnfittedFriction | UnfittedDelay | UnfittedArmature | None, ...]:
-        late = self.delay is not None and self.delay.significant  # torques then go with accelerations, too
-        return self.friction, self.delay, None if late or self._is_rounding else self.armature
 
     def _reasons(self) -> list[str]:
         """Why noise cannot be all that the model leaves, none where it may be."""
@@ -103,8 +93,7 @@ class Misfit:
             reasons.append(
                 f"residuals are correlated in time, between blocks {self.lack_of_fit:.2g} times noise's variance"
             )
-        reasons += [str(one) for one in self._unfitted if one is not None and one.significant]
-        return reasons
+        return reasons + [str(self.friction)] * (self.friction is not None and self.friction.significant)
 
     @property
     def in_short(self) -> str:
@@ -133,8 +122,6 @@ def misfit(
     logs: Sequence[Block],
     jackknife: Jackknife | None,
     friction: UnfittedFriction | None,
-    delay: UnfittedDelay | None = None,
-    armature: UnfittedArmature | None = None,
 ) -> Misfit:
     """What a fit leaves of the forces.
 
@@ -144,8 +131,6 @@ def misfit(
         logs: these logs.
         jackknife: of the estimate over blocks of them.
         friction: that was not fitted.
-        delay: of joint torques that was not fitted.
-        armature: that was not fitted.
     """
     left = np.average([log.noise_left for log in logs], weights=[len(log) for log in logs])
     stated = any(one.origin == "stated" for one in noise.groups)
@@ -163,8 +148,6 @@ def misfit(
         groups=tuple(sorted(beyond, key=lambda one: -excess[one.group])),
         friction=friction,
         share=float(np.sqrt(estimate.cost / estimate.nominal_cost)) if estimate.nominal_cost > 0.0 else None,
-        delay=delay,
-        armature=armature,
     )
 
 
@@ -188,6 +171,30 @@ def beyond_models(
     if share > _SHARE:
         return f"no rigid-body model explains {100.0 * share:.3g} % of the weighted forces"
     return None
+
+
+_CLEAR = 0.5  # correlation of forces of the URDF's bodies with the measured ones, from which on their factor is clear
+
+
+@one_thread()
+def force_gain(problem: LinearProblem) -> float | None:
+    """The factor of the forces that nominal bodies need which fits best, None if it is not clear.
+
+    Friction is whatever fits. Unlike a total mass it is there for arms as well, and does not depend on the estimator.
+    """
+    inertial = np.zeros((len(problem.nominal) // PER_BODY, PER_BODY), dtype=bool)
+    inertial[:, parameters.INERTIAL] = True
+    chosen = inertial.flatten()
+    needed = problem.A[:, chosen] @ problem.nominal[chosen]
+    free, fixed = ~chosen & problem.free, ~chosen & ~problem.free
+    measured = problem.b - problem.A[:, fixed] @ problem.nominal[fixed]
+    U, values, _ = np.linalg.svd(problem.A[:, free] * problem.scale[free], full_matrices=False)
+    friction = U[:, is_significant(values)]
+    needed, measured = (x - friction @ (friction.T @ x) for x in (needed, measured))
+    size = np.linalg.norm(needed) * np.sqrt(measured @ measured + problem.residual)
+    if not size > 0.0 or abs(needed @ measured) < _CLEAR * size:
+        return None
+    return float(needed @ measured / (needed @ needed))
 
 
 def unexplained_torques(fitted: Metrics, sensors: SensorSet | None = None) -> str:

@@ -11,7 +11,6 @@ from statistics import NormalDist
 from typing import Any
 
 import numpy as np
-import torch
 from scipy.optimize import minimize, minimize_scalar
 
 from torchid.errors import warn
@@ -23,7 +22,6 @@ from torchid.parameters import Array
 from torchid.problem import ExtraTerms, RowBuilder, Samples, compress_parts
 from torchid.problem.compression import compress_in_blocks
 from torchid.problem.extras import DELAYED, dof_extra_column
-from torchid.problem.sampled_rows import SampledRows
 
 LARGEST_TILT = 0.3
 """Largest tilt about each axis that is tried [rad]: more is another frame than was meant."""
@@ -38,7 +36,6 @@ _CHANCE = 0.025  # that friction at rest of any joint seems to be beyond Coulomb
 _QUANTILE = 1.96  # standard errors from the middle to the end of a 95 % interval
 _WIDTH_SETTLED, _STRIBECK_SETTLED = 1e-3, 1e-4  # of the logarithm, to base 10
 _WIDTH_DIGITS = 4
-_AT_ONCE = 1024  # samples: fewer lose to dispatch
 _TILT_RIDGE = 1e-6  # the residual is smooth in the tilt where the data determine some parameters badly
 _TILT_SAMPLES = 2000  # of all logs, evenly spaced
 _TILT_SETTLED = 1e-6  # of the residual's square
@@ -51,7 +48,7 @@ class SignWidthChoice:
     Attributes:
         width: [rad/s or m/s]; None for the sign, to which no width is worth preferring.
         tried: (W,) widths, the sign last.
-        residual: (W,) standard deviation of whitened residuals of their fits [1].
+        residual: (W,) standard deviation of the residuals of their fits, over that with the sign [1].
     """
 
     width: float | None
@@ -61,43 +58,21 @@ class SignWidthChoice:
     def __str__(self) -> str:
         """The width, and what it is for."""
         if self.width is None:
-            return "none: Coulomb friction with tanh(velocity / width) explains no more than with the sign"
-        least, sign = min(self.residual), self.residual[-1]
-        return f"{self.width:g} rad/s (m/s), chosen by the residual: {least:.3g}, {sign:.3g} with the sign"
+            return "none: Coulomb friction with tanh(velocity / width) predicts left-out blocks no better"
+        return f"{self.width:g} rad/s (m/s), which leaves {min(self.residual):.3g} of the residual with the sign"
 
 
-def choose_sign_width(
-    logs_and_fitter: Callable[[float | None], tuple[Sequence[Samples], LogFitter]],
-) -> SignWidthChoice:
-    """The width [rad/s or m/s] whose fit of a sample of the logs leaves least.
+def choose_sign_width(residual: Callable[[float | None], float]) -> SignWidthChoice:
+    """The width [rad/s or m/s] whose fit leaves least.
 
     All other parameters are linear, and fitted anew for each width: separable least squares (Golub and Pereyra, 1973).
 
     Args:
-        logs_and_fitter: bound training logs, preprocessed with a width, and a fitter with rows of that width; None for
-            the sign.
+        residual: standard deviation of the residuals with a width, over that with the sign (None).
     """
-    of_one: list[SampledRows] = []  # rows of the logs with a direction of 1, from which those of any others follow
-
-    def sampled(logs: Sequence[Samples], builder: RowBuilder) -> SampledRows:
-        if any(extra.what in ("asymmetric_coulomb", "stribeck") for extra in builder.extras):  # of the width, too
-            return SampledRows(logs, builder, _AT_ONCE)
-        if not of_one:
-            ones = [replace(log, direction=torch.ones_like(log.joint_velocity)) for log in logs]
-            of_one.append(SampledRows(ones, builder, _AT_ONCE))
-        return of_one[0].with_directions(logs, builder)
-
-    def left(width: float | None) -> float:
-        logs, fitter = logs_and_fitter(width)
-        rows = sampled(logs, fitter.builder)
-        estimator = LeastSquares(rank_tolerance=fitter.estimator.rank_tolerance)
-        problem = fitter.build_problem(rows.compress(np.ones(len(rows.groups)))).assembly.problem
-        return estimator.solve(problem).residual_std
-
-    found = _search(left, _WIDTHS, _WIDTH_SETTLED)
-    width, sign = min(found, key=lambda one: found[one]), found[None]
-    gains = found[width] < (1.0 - _GAIN) * sign
-    chosen = float(f"{width:.{_WIDTH_DIGITS}g}") if gains and width is not None else None
+    found = _search(residual, _WIDTHS, _WIDTH_SETTLED)
+    width = min(found, key=lambda one: found[one])
+    chosen = None if width is None else float(f"{width:.{_WIDTH_DIGITS}g}")
     return SignWidthChoice(chosen, tuple(found), tuple(found.values()))
 
 

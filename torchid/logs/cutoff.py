@@ -60,14 +60,18 @@ class CutoffChoice:
     Attributes:
         cutoff_hz: [Hz]; None: nothing is derived, and nothing filtered.
         by_noise: whether noise of the motion was found; else it is the usual one.
+        limit_hz: the cutoff by noise and motion alone, where a fit to a narrower band predicts better; else None.
         motion_hz: below which 99 % of the power of the motion's accelerations lie [Hz], None without noise.
     """
 
     cutoff_hz: float | None
     by_noise: bool
     motion_hz: float | None = None
+    limit_hz: float | None = None
 
     def __str__(self) -> str:
+        if self.limit_hz is not None:
+            return f"{self.cutoff_hz:g} Hz: a fit to more, up to {self.limit_hz:g} Hz, predicts this band worse"
         if self.cutoff_hz is None:
             return "none: accelerations were recorded"
         if self.by_noise:

@@ -105,17 +105,6 @@ def _rests(known: FloatArray, are_positions: bool, speed: FloatArray, timeline: 
     return out
 
 
-def dry_friction_by_setting(
-    log: Log, timeline: Timeline
-) -> Callable[[float | None, float | None], dict[str, FloatArray]]:
-    """`joint_direction` and `joint_stribeck` of the preprocessed log by `sign_width` and `stribeck` of `preprocess`."""
-    name = "joint_position" if log.joint_velocity is None else "joint_velocity"
-    signs = timeline if timeline.sign_low_pass is None else replace(timeline, low_pass=timeline.sign_low_pass)
-    smoothed = {name: signs.smooth(getattr(log, name))}
-    own = replace(timeline, sign_low_pass=None)
-    return lambda width, stribeck: dry_friction(log, smoothed, replace(own, sign_width=width, stribeck=stribeck))
-
-
 _FEWEST = 100  # samples
 _DOUBLINGS = 8  # of the cutoff
 _MUCH = 0.05  # share of the velocities' power that is worth a warning

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass, replace
 from itertools import chain
 
@@ -24,7 +23,6 @@ from torchid.problem.noise_gram import noise_of_reading
 from torchid.problem.parts import Part
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
-from torchid.regressor.kinematics import joint_motion
 from torchid.sensing.sensors import measured_components
 
 _SAMPLES, _BYTES, _CHUNK = 1000, 2**27, 256  # rows in memory: 1000 samples give a standard deviation to 2 to 3 %
@@ -105,24 +103,6 @@ class SampledRows:
         elsewhere = any(isinstance(log, LogOfOtherProcess) for log in logs)
         if any(distributed.all_gather(elsewhere, "logs that others have")):
             self.chunks = list(chain.from_iterable(distributed.all_gather(self.chunks, "samples for the noise")))
-
-    def with_directions(self, logs: Sequence[Samples], builder: RowBuilder) -> SampledRows:
-        """The rows of samples that differ in what Coulomb friction goes with alone, in a fifth of the time.
-
-        Args:
-            logs: those that these rows are of, all here and with a direction of 1, but with another.
-            builder: of the rows, with the same columns.
-        """
-        out, tree = copy(self), builder.tree
-        columns = [builder.columns.friction(node) for node in range(1, tree.n_nodes)]
-        of_one = torch.sign(tree.joint_map[1:, : tree.n]).sum(1).cpu()  # a mimic joint may turn the other way
-        out.builder, out.chunks = builder, []
-        for chunk, (samples, _) in zip(self.chunks, _random_chunks(logs, *self._drawn), strict=True):
-            direction = joint_motion(tree, samples.to(builder.device).motion()).direction[1:].cpu().double()
-            rows = chunk.rows.clone()
-            rows[..., columns] *= (direction * of_one[:, None]).T[:, None]
-            out.chunks.append(replace(chunk, rows=rows))
-        return out
 
     @property
     def reference_std(self) -> Array:

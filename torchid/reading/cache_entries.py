@@ -77,10 +77,10 @@ def content_of_setup(setup: RobotSetup) -> dict[str, Any]:
         "unloaded": fits_contact_offsets(setup),
         "preprocessing": settings,
         "motion_noise": config.sensors.noise.motion,
-        "sign_width": config.actuators.sign_width,
+        "sign_width": config.actuators.known["sign_width"],
         "delay": config.actuators.known_delay,
         **({} if config.actuators.stribeck is None else {"stribeck": config.actuators.stribeck}),
-        **({"stiction": True} if config.actuators.stiction else {}),
+        **({"stiction": True} if config.actuators.known["stiction"] else {}),
         "topics": topics,
         "columns": json.dumps(columns),  # as text: the order of names in it is that of the log
     }

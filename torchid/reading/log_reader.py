@@ -113,19 +113,10 @@ class LogReader:
 
     def _small(self, path: Path, required: SensorSet | None) -> Samples:
         """A log that fits into memory."""
-        settings, files = self.setup.config.preprocessing, self.setup.config.logs
+        settings = self.setup.config.preprocessing
         if self._takes_blocks(path, log_bytes(path, GIGABYTE * _WHOLE_GB) / GIGABYTE):
             return self._large_log(path, required, None).samples(fits_contact_offsets(self.setup))
-        topics, columns = (None, None) if files is None else (files.topics, files.columns)
-        allow_gaps, bridge_gaps_s = settings.exclude_rejected, settings.bridge_gaps_s
-        read = read_log(
-            path,
-            topics,
-            allow_gaps=allow_gaps,
-            columns=columns,
-            bridge_gaps_s=bridge_gaps_s,
-            needs_flags=settings.needs_flags,
-        )
+        read = self._recorded(path)
         own = setup_of_log(self.setup, path)
         acting = with_delayed_torques(without_welded_joints(read, own.robot), self.setup.config.actuators.known_delay)
         recorded, certain = apply_contact_settings(with_loop_joints(acting, own.robot), own)
@@ -154,11 +145,24 @@ class LogReader:
         require_kept(kept, path, slip is not None)
         return samples[torch.from_numpy(np.flatnonzero(kept))]
 
+    def _recorded(self, path: Path) -> Log:
+        """A log as it is in its file."""
+        settings, files = self.setup.config.preprocessing, self.setup.config.logs
+        topics, columns = (None, None) if files is None else (files.topics, files.columns)
+        return read_log(
+            path,
+            topics,
+            allow_gaps=settings.exclude_rejected,
+            columns=columns,
+            bridge_gaps_s=settings.bridge_gaps_s,
+            needs_flags=settings.needs_flags,
+        )
+
     def _preprocessed(self, clean: Log) -> Log:
         """A log as recorded, filtered, differentiated and resampled."""
         settings = self.setup.config.preprocessing
         rates, terms = (settings.filter_hz, settings.sample_rate_hz), self.setup.terms
-        dry, finds_rest = (terms.sign_width, terms.stribeck), self.setup.config.actuators.stiction
+        dry, finds_rest = (terms.sign_width, terms.stribeck), self.setup.config.actuators.known["stiction"]
         if settings.base_motion is None:
             return preprocess(clean, *rates, self._stated, *dry, finds_rest)
         return preprocess_with_pose(clean, self.setup.robot, self.setup.contacts, *rates, *dry, finds_rest)
@@ -219,7 +223,7 @@ class LogReader:
             motion_noise=self._stated,
             sign_width=setup.terms.sign_width,
             stribeck=setup.terms.stribeck,
-            finds_rest=setup.config.actuators.stiction,
+            finds_rest=setup.config.actuators.known["stiction"],
             columns=None if setup.config.logs is None else setup.config.logs.columns,
             loaded=setup_of_log(setup, path).robot,
         )

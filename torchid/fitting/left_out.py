@@ -1,0 +1,343 @@
+"""Choices by the error on left-out blocks of the training logs: terms of the model, and which data to fit.
+
+A term of the model is columns of the rows, a band or a set of samples is a reading of the same logs. Both are judged by
+one score: squares of whitened residuals on left-out blocks, compared block by block.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from scipy.special import stdtrit  # scipy.stats takes 0.2 s to import
+
+from torchid.fitting.fit import LogFitter
+from torchid.parallel import one_thread
+from torchid.parameters import Array
+from torchid.problem import ExtraTerms, RowBuilder, Samples
+from torchid.problem.compression import compress_spans
+from torchid.problem.elimination import column_prior
+from torchid.problem.extras import DELAYED, Extra, in_words
+from torchid.problem.linear import PRIOR_DEVIATION, parameter_scale
+from torchid.reprs import short_repr
+
+TERMS = ("armature", "torque_offset", "delay", "stiffness", "asymmetric_coulomb")
+"""Terms of actuators that logs choose, the more usual first: of two that explain the same the first is kept."""
+
+RIDGE = 0.1
+"""Weight of the prior in the mean squared residual: what the model lacks does not average out in a longer log.
+
+Of 1e-3, 1e-2, 0.1 and 1 the one that predicts strangers' logs best, or within 3 % of the best (`docs/estimators.md`).
+"""
+
+SAMPLES = 6000
+"""Samples of all logs, evenly spaced, that choices are made with."""
+
+_BLOCKS, _FOLDS = 20, 5
+_CHANCE = 0.005  # that a block-by-block difference of nothing seems to be one
+_GAIN = 0.1  # decrease of the squared error, at least: gains 2 % off let springs and offsets reach 0.05 where none are
+_OF_TERMS = 0.01  # weight of the prior where terms are chosen: with more, those would make up for bodies
+_WORSE = 0.1  # increase of the product of squared errors of two readings that fitting the wider one may cost
+_EXACT = 1e-12  # share of the squared forces below which residuals are rounding
+_WEAK = 1e-3  # weight of the prior of extra parameters, by that of bodies
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Training logs, read in one way, as Gram matrices of their rows by block.
+
+    Attributes:
+        grams: (G, width + 1, width + 1), right-hand side last.
+        rows: (G,), their number.
+        oversampling: of these, on average, as in `Samples`.
+        nominal: (width,), parameters in the columns, 0 for extra ones.
+        spread: (width, P), deviations in the columns per unit of the prior.
+        extras: of the last columns.
+    """
+
+    grams: Array
+    rows: Array
+    oversampling: float
+    nominal: Array
+    spread: Array
+    extras: tuple[Extra, ...]
+
+    __repr__ = short_repr
+
+    @cached_property
+    def noise_variance(self) -> float:
+        """Mean squared residual of the best fit with all terms, whatever rows are weighted with."""
+        x = self._solve(self.grams.sum(0), 1e-6 * self.rows.sum(), range(len(self.extras)))
+        return max(float(x @ self.grams.sum(0) @ x), 0.0) / max(float(self.rows.sum()), 1.0)
+
+    def _normal(self, gram: Array, weight: float, fitted: Collection[int]) -> tuple[Array, Array]:
+        """What is fitted in the columns, (width, D), and the normal matrix with the weighted prior."""
+        count = len(self.nominal) - len(self.extras)
+        unit = np.zeros((len(self.nominal), len(fitted)))
+        for k, number in enumerate(fitted):
+            unit[count + number, k] = self.extras[number].size
+        columns = np.hstack([self.spread, unit])
+        prior = np.repeat([weight, _WEAK * weight], [self.spread.shape[1], len(fitted)])
+        normal = columns.T @ gram[:-1, :-1] @ columns
+        normal[np.diag_indices_from(normal)] += prior + (np.finfo(float).eps * np.trace(normal) or 1.0)
+        return columns, normal
+
+    def _solve(self, gram: Array, weight: float, fitted: Collection[int]) -> Array:
+        """Parameters in the columns and -1, (width + 1,), that minimize squares plus the weighted prior."""
+        columns, normal = self._normal(gram, weight, fitted)
+        right = columns.T @ (gram[:-1, -1] - gram[:-1, :-1] @ self.nominal)
+        return np.append(self.nominal + columns @ np.linalg.solve(normal, right), -1.0)
+
+    def by_scales(self, ridge: float) -> Array:
+        """Change of the bodies' parameters per unit of each scale of a sensor, (J, P), in units of the prior."""
+        scales = [k for k, extra in enumerate(self.extras) if extra.what == "scale"]
+        others = [k for k in range(len(self.extras)) if k not in scales]
+        gram, count = self.grams.sum(0), len(self.nominal) - len(self.extras)
+        columns, normal = self._normal(gram, ridge * float(self.rows.sum()), others)
+        at = [count + k for k in scales]
+        return np.asarray(-np.linalg.solve(normal, columns.T @ gram[:-1, at])[: self.spread.shape[1]].T)
+
+    @one_thread()
+    def left_out(self, terms: Collection[str], judged: Reading | None = None, ridge: float = RIDGE) -> Array:
+        """Squared residuals of each block of `judged`, (G,), at parameters fitted to the other blocks of this reading.
+
+        Args:
+            terms: kinds of the extra parameters that are fitted; others are 0.
+            judged: another reading of the same blocks, of the same columns; None for this one.
+            ridge: weight of the prior in the mean squared residual.
+        """
+        judged = judged or self
+        fitted = [number for number, extra in enumerate(self.extras) if kind_of(extra) in terms]
+        squares, at_floor = np.empty(len(judged.rows)), _EXACT * judged.grams[:, -1, -1].sum() / len(judged.rows)
+        for fold in range(_FOLDS):
+            kept = np.arange(len(self.rows)) % _FOLDS != fold
+            weight = ridge * self.noise_variance * self.rows[kept].sum()
+            x = self._solve(self.grams[kept].sum(0), weight, fitted)
+            for block in range(fold, len(judged.rows), _FOLDS):
+                squares[block] = max(float(x @ judged.grams[block] @ x), at_floor)
+        return squares
+
+    def unexplained(self, terms: Collection[str]) -> float:
+        """What a fit leaves of the forces of left-out blocks (rms over rms)."""
+        return math.sqrt(float(self.left_out(terms).sum()) / max(float(self.grams[:, -1, -1].sum()), 1e-300))
+
+
+@one_thread()
+def gain_deviations(logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms, gain: float) -> Array:
+    """Deviations of the parameters by a standard error of the gain of each joint torque sensor, (J, 12 L).
+
+    None, (0, 12 L), where no torque is measured, or scales of torques are fitted.
+
+    Args:
+        logs: training logs.
+        fitter: of their rows.
+        terms: extra parameters of these.
+        gain: standard deviation of the gains, 0.02 for 2 %.
+    """
+    robot, count = fitter.robot, fitter.robot.nominal.size
+    if not (gain and len(logs) and fitter.builder.sensors.torque[: robot.n].any()) or "joint_torque" in terms.scales:
+        return np.zeros((0, count))
+    wide = with_terms(fitter, replace(terms, scales={**terms.scales, "joint_torque": "all"}))
+    some = thinned(logs)
+    reading = compress_reading(some, {log.source: log.time.numpy()[[0, -1]] for log in some}, wide)
+    free = np.ones(count, dtype=bool) if fitter.frozen is None else ~fitter.frozen
+    out = np.zeros((len(wide.builder.extras) - len(fitter.builder.extras), count))
+    out[:, free] = gain * reading.by_scales(fitter.estimator.ridge) * parameter_scale(robot.nominal).flatten()[free]
+    return out
+
+
+def kind_of(extra: Extra) -> str:
+    """The kind of an extra parameter, one of `TERMS` if logs may choose it."""
+    return "delay" if extra.what == DELAYED else extra.what
+
+
+@one_thread()
+def compress_reading(logs: Sequence[Samples], edges: Mapping[str, Array], fitter: LogFitter) -> Reading:
+    """The Gram matrices of logs in blocks.
+
+    Args:
+        logs: thinned (`thinned`).
+        edges: times between which the blocks of each log lie [s], by its source (`block_edges`).
+        fitter: of their rows.
+    """
+    builder, robot = fitter.builder, fitter.robot
+    spans = [list(zip(*_ends(log, edges[log.source]), strict=True)) for log in logs]
+    first = dict(zip(edges, np.cumsum([0, *(len(x) - 1 for x in edges.values())]).tolist(), strict=False))
+    count = sum(len(x) - 1 for x in edges.values())
+    grams, rows = np.zeros((count, builder.width + 1, builder.width + 1)), np.zeros(count)
+    for part in compress_spans(logs, spans, builder):
+        block = first[part.source] + part.block
+        rows[block] += part.factor.rows
+        for support, x in part.factor.blocks.items():
+            at, own = [*support, builder.width], x.cpu().double().numpy()
+            grams[block][np.ix_(at, at)] += own.T @ own
+    prior = column_prior(builder, robot, fitter.friction)
+    free = np.ones(prior.spread.shape[1], dtype=bool) if fitter.frozen is None else ~fitter.frozen
+    nominal, spread = np.zeros(builder.width), np.zeros((builder.width, int(free.sum())))
+    nominal[: builder.columns.count] = prior.nominal
+    in_file = {"armature": robot.armature, "stiffness": robot.stiffness}  # of an MJCF robot
+    for number, extra in enumerate(builder.extras, builder.columns.count):
+        nominal[number] = in_file[extra.what][extra.dof] if extra.what in in_file else 0.0
+    spread[: builder.columns.count] = prior.spread[:, free] / PRIOR_DEVIATION
+    oversampling = sum(map(len, logs)) / sum(len(log) / log.oversampling for log in logs)
+    of_logs = [k for k, extra in enumerate(builder.extras, builder.columns.count) if extra.per_log]
+    rest = [k for k in range(builder.width) if k not in of_logs]
+    grams = np.array([_eliminated(gram, of_logs, [*rest, builder.width]) for gram in grams])
+    shared = tuple(extra for extra in builder.extras if not extra.per_log)
+    return Reading(grams, rows, oversampling, nominal[rest], spread[rest], shared)
+
+
+def _eliminated(gram: Array, own: Sequence[int], rest: Sequence[int]) -> Array:
+    """What is left of a Gram matrix where unknowns of its log alone are at their best."""
+    across = gram[np.ix_(own, rest)]
+    return np.asarray(gram[np.ix_(rest, rest)] - across.T @ np.linalg.pinv(gram[np.ix_(own, own)]) @ across)
+
+
+def thinned(logs: Sequence[Samples]) -> list[Samples]:
+    """About `SAMPLES` of all logs, evenly spaced, with the rate of the torques as the column of a delay."""
+    step, out = max(1, sum(map(len, logs)) // SAMPLES), []
+    for log in logs:
+        some: dict[str, object] = {"folder": None, "motion_noise": None}
+        if log.torque is not None and len(log) > 1:
+            rate = np.gradient(log.torque.numpy(), log.time.numpy(), axis=0)[:, : log.joint_velocity.shape[1]]
+            some["delayed_torque"] = torch.from_numpy(rate)[:, None]
+        thin = replace(log, **some).every(step)  # type: ignore[arg-type]
+        out.append(replace(thin, oversampling=max(1.0, log.oversampling / step)))
+    return out
+
+
+def block_edges(logs: Sequence[Samples]) -> dict[str, Array]:
+    """Times between which the blocks of each log lie [s], by its source: `_BLOCKS` in all, at least."""
+    total = max(sum(map(len, logs)), 1)
+    counts = (max(1, round(_BLOCKS * len(log) / total)) for log in logs)
+    ends = (
+        np.linspace(0, len(log) - 1, count + 1).round().astype(int) for log, count in zip(logs, counts, strict=True)
+    )
+    return {log.source: log.time.numpy()[at] for log, at in zip(logs, ends, strict=True)}
+
+
+def _ends(log: Samples, edges: Array) -> tuple[list[int], list[int]]:
+    """First sample of each block of a log, and where it ends."""
+    inner = np.searchsorted(log.time.numpy(), edges[1:-1]).tolist()
+    return [0, *inner], [*inner, len(log)]
+
+
+def with_terms(fitter: LogFitter, terms: ExtraTerms) -> LogFitter:
+    """A fitter of rows with other extra parameters."""
+    of = fitter.builder
+    return replace(fitter, builder=RowBuilder(fitter.robot, of.contacts, of.sensors, terms).to(of.device))
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """By how much one way of fitting predicts left-out blocks better than another.
+
+    Attributes:
+        gain: mean decrease of the logarithm of the squared error, over blocks.
+        significance: the same over its standard error.
+        blocks: their number.
+    """
+
+    gain: float
+    significance: float
+    blocks: int
+
+    @classmethod
+    def of(cls, without: Array, better: Array) -> Evidence:
+        """From squares by block, (G,) each; blocks without rows do not count."""
+        there = (without > 0.0) & (better > 0.0)
+        gains = np.log(without[there] / better[there])
+        if len(gains) < 3 or not gains.any():
+            return cls(0.0, 0.0, len(gains))
+        error = float(gains.std(ddof=1)) / math.sqrt(len(gains))
+        return cls(float(gains.mean()), float(gains.mean()) / max(error, 1e-300), len(gains))
+
+    @property
+    def certain(self) -> bool:
+        """Whether chance shows as much in fewer than `_CHANCE` of all cases."""
+        return self.blocks > 2 and self.significance > float(stdtrit(self.blocks - 1, 1.0 - _CHANCE))
+
+    @property
+    def adopted(self) -> bool:
+        """Whether the gain is certain, and no trifle."""
+        return self.certain and self.gain > _GAIN
+
+    def __str__(self) -> str:
+        return f"{100.0 * math.expm1(-0.5 * self.gain):+.2g} %"  # of the error itself
+
+
+@dataclass(frozen=True)
+class TermsChoice:
+    """Terms of actuators that left-out blocks ask for, and what each is worth there.
+
+    `adopted`: by name, the evidence against a fit without it. `rejected`: likewise, that for a fit with it as well.
+    """
+
+    adopted: Mapping[str, Evidence]
+    rejected: Mapping[str, Evidence]
+
+    def __str__(self) -> str:
+        named = [f"{in_words(name)} (error on left-out blocks {one})" for name, one in self.adopted.items()]
+        near = [f"{in_words(name)} ({one})" for name, one in self.rejected.items() if one.certain and one.gain > 0.0]
+        return (", ".join(named) or "none") + (f"; near misses: {', '.join(near)}" if near else "")
+
+
+def choose_terms(reading: Reading, candidates: Sequence[str], fixed: Collection[str] = ()) -> TermsChoice:
+    """The terms without which left-out blocks are predicted worse; the least useful one is dropped after another.
+
+    Elimination from all terms, not addition to none: one that is missing hides another (a delay hides rotor inertia).
+
+    Args:
+        reading: with the columns of all terms.
+        candidates: among `TERMS`.
+        fixed: kinds of extra parameters that are fitted in any case.
+    """
+    squares: dict[frozenset[str], Array] = {}
+
+    def left(terms: Collection[str]) -> Array:
+        key = frozenset(terms)
+        if key not in squares:
+            squares[key] = reading.left_out({*terms, *fixed}, None, _OF_TERMS)
+        return squares[key]
+
+    chosen = [name for name in TERMS if name in candidates]
+    adopted: dict[str, Evidence] = {}
+    while chosen:
+        adopted = {name: Evidence.of(left({*chosen} - {name}), left(chosen)) for name in chosen}
+        needless = [name for name in chosen if not adopted[name].adopted]
+        if not needless:
+            break
+        chosen.remove(min(reversed(needless), key=lambda name: round(adopted[name].gain, 3)))
+        adopted = {}
+    others = [name for name in candidates if name not in chosen]
+    rejected = {name: Evidence.of(left(chosen), left([*chosen, name])) for name in others}
+    return TermsChoice(adopted, rejected)
+
+
+def widest(readings: Sequence[Reading], terms: Collection[str]) -> int:
+    """Of readings, each part of the one before, the first whose fit no later one's fit outdoes.
+
+    One outdoes another if it predicts left-out blocks of both readings clearly better, as the product of their squared
+    errors says: what disturbs a wider band, or the samples beside touch-downs, spoils a fit for data that are free of
+    it, and such a fit gains little where the disturbance is.
+
+    Args:
+        readings: of the same blocks, the widest first.
+        terms: kinds of the extra parameters that are fitted.
+    """
+    # a filter that takes off twice the noise also makes twice as many samples say the same: the prior weighs alike
+    ridges = [RIDGE * one.oversampling / readings[0].oversampling for one in readings]
+    own = [one.left_out(terms, None, ridge) for one, ridge in zip(readings, ridges, strict=True)]
+    for number, one in enumerate(readings[:-1]):
+        for other in range(number + 1, len(readings)):
+            here, there = one.left_out(terms, readings[other], ridges[number]), readings[other]
+            of_both = Evidence.of(own[number] * here, own[other] * there.left_out(terms, one, ridges[other]))
+            if of_both.certain and of_both.gain > _WORSE:
+                break
+        else:
+            return number
+    return len(readings) - 1
