@@ -17,12 +17,17 @@ from shared_work import differences, run_all
 from synthetic import Oracle
 from walking import MACHINES, recorded, robot_of, truth
 
+from torchid.config.experiment import ActuatorsConfig
 from torchid.logs import Log, write_log
 from torchid.robot import Payload
 
 MACHINE = MACHINES["quadruped"]
 BAG = Payload("trunk", 5.0, (0.05, 0.02, 0.1), (0.02, 0.003, -0.002, 0.03, 0.001, 0.025))
-ONE = ("logs.test=[]",)
+TERMS = f"actuators={ActuatorsConfig.without_terms()}".replace("None", "null")  # parts choose others than the whole
+ONE = (
+    TERMS,
+    "logs.test=[]",
+)
 RUNS = {
     "without a load": ("walk.yaml", ONE),
     "with a load": ("loaded.yaml", ONE),

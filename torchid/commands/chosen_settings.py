@@ -178,6 +178,7 @@ MOST_TRIED = 20_000
 
 _OCTAVES, _LOWEST_HZ = 8, 2.5  # of cutoffs that are tried, and the lowest: nobody moves slower to be identified
 _PERIODS = 12.0 * DROPPED_PERIODS  # of a cutoff in the shortest log, at least: of a fourth held back a third is left
+_WIDTH_GAIN = 0.05  # decrease of the squared error that a width is worth: no body can make up for it
 _TRIED_WIDTHS = (0.01, 0.1)  # [rad/s or m/s]: where neither predicts better than the sign, no width is looked for
 
 
@@ -370,7 +371,8 @@ def _sign_width(setup: RobotSetup, trials: _Trials) -> SignWidthChoice:
         return trials.reading(_with_actuators(setup, sign_width=width))
 
     sign, *others = map(read, (None, *_TRIED_WIDTHS))
-    if not any(Evidence.of(sign.left_out(kinds), one.left_out(kinds)).adopted for one in others):
+    found = [Evidence.of(sign.left_out(kinds), one.left_out(kinds)) for one in others]
+    if not any(one.certain and one.gain > _WIDTH_GAIN for one in found):
         return SignWidthChoice(None, (None,), (1.0,))
     return choose_sign_width(lambda width: math.sqrt(read(width).noise_variance / sign.noise_variance))
 

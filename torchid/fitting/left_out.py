@@ -38,6 +38,7 @@ SAMPLES = 6000
 """Samples of all logs, evenly spaced, that choices are made with."""
 
 _BLOCKS, _FOLDS = 20, 5
+_LEAST_PER_BLOCK = 10  # independent samples
 _CHANCE = 0.005  # that a block-by-block difference of nothing seems to be one
 _GAIN = 0.1  # decrease of the squared error, at least: gains 2 % off let springs and offsets reach 0.05 where none are
 _OF_TERMS = 0.01  # weight of the prior where terms are chosen: with more, those would make up for bodies
@@ -71,7 +72,7 @@ class Reading:
     @cached_property
     def noise_variance(self) -> float:
         """Mean squared residual of the best fit with all terms, whatever rows are weighted with."""
-        x = self._solve(self.grams.sum(0), 1e-6 * self.rows.sum(), range(len(self.extras)))
+        x = self._solve(self.grams.sum(0), 1e-9 * self.rows.sum(), range(len(self.extras)))
         return max(float(x @ self.grams.sum(0) @ x), 0.0) / max(float(self.rows.sum()), 1.0)
 
     def _normal(self, gram: Array, weight: float, fitted: Collection[int]) -> tuple[Array, Array]:
@@ -211,9 +212,10 @@ def thinned(logs: Sequence[Samples]) -> list[Samples]:
 
 
 def block_edges(logs: Sequence[Samples]) -> dict[str, Array]:
-    """Times between which the blocks of each log lie [s], by its source: `_BLOCKS` in all, at least."""
-    total = max(sum(map(len, logs)), 1)
-    counts = (max(1, round(_BLOCKS * len(log) / total)) for log in logs)
+    """Times between which the blocks of each log lie [s], by its source: some `_BLOCKS` in all, fewer of short logs."""
+    total, independent = max(sum(map(len, logs)), 1), sum(len(log) / log.oversampling for log in logs)
+    blocks = min(_BLOCKS, int(independent / _LEAST_PER_BLOCK))
+    counts = (max(1, round(blocks * len(log) / total)) for log in logs)
     ends = (
         np.linspace(0, len(log) - 1, count + 1).round().astype(int) for log, count in zip(logs, counts, strict=True)
     )
