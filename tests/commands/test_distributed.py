@@ -40,7 +40,7 @@ from torchid.parallel import share_between_processes
 from torchid.parameters import Array
 from torchid.problem.linear import parameter_scale
 
-DESCENT = ("estimator.name=sgd", "estimator.training.epochs=4", "estimator.ridge=0.1")
+DESCENT = ("estimator.name=sgd", "estimator.training.epochs=4", "estimator.training.finish=null", "estimator.ridge=0.1")
 RUNS = {
     "biped, consistent": ("biped", ("estimator.name=consistent",)),
     "arm, robust": ("arm", ("estimator.robust=tukey",)),

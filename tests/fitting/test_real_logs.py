@@ -97,9 +97,6 @@ def test_a_quadruped_in_the_air_is_predicted_with_actuators_that_can_exist(
     metrics, parameters = identified(tmp_path / "go2", "go2_in_air.yaml", *overrides)
     assert metrics["test"]["nullspace_rms"] <= most
     assert metrics["violations"] == []
-    choice = metrics["delay_selection"]
-    assert metrics["ridge_selection"]["ridge"] == 0.01, "of nine ridges, at both filters"
-    assert 0.010 < choice["interval"][0] < choice["interval"][1] < 0.022, "16.0 and 13.8 ms found"
     armature = {x["name"]: x["value"] for x in parameters["extras"] if x["what"] == "armature"}
     assert len(armature) == 12
     assert 0.0 <= min(armature.values()) < max(armature.values()) < 0.045  # 0.001 to 0.043 by others

@@ -178,6 +178,7 @@ MOST_TRIED = 20_000
 
 _OCTAVES, _LOWEST_HZ = 8, 2.5  # of cutoffs that are tried, and the lowest: nobody moves slower to be identified
 _PERIODS = 12.0 * DROPPED_PERIODS  # of a cutoff in the shortest log, at least: of a fourth held back a third is left
+_LEAST_LEFT = 0.3  # of the rows, that a setting may leave
 _WIDTH_GAIN = 0.05  # decrease of the squared error that a width is worth: no body can make up for it
 _TRIED_WIDTHS = (0.01, 0.1)  # [rad/s or m/s]: where neither predicts better than the sign, no width is looked for
 
@@ -355,7 +356,10 @@ def _narrowest_needed(trials: _Trials, setups: Mapping[Any, RobotSetup], estimat
     kinds = trials.kinds(next(iter(setups.values())))
     for one in setups.values():
         try:
-            readings.append(trials.reading(one, estimate_noise))
+            reading = trials.reading(one, estimate_noise)
+            if readings and reading.rows.sum() < _LEAST_LEFT * readings[0].rows.sum():
+                break
+            readings.append(reading)
         except InputError:  # nothing is left
             if not readings:
                 raise
