@@ -102,7 +102,7 @@ def changed(folder: Path, change: Callable[[dict[str, Any]], None], samples: int
         (
             exchanged_legs,
             ["sensors.set=full", "sensors.noise={}", RIDGE],
-            ("the fit leaves 8", "% of the joint torques; torchid check finds in train.npz: joint_torque: front and"),
+            ("the fit leaves ", "% of the joint torques; torchid check finds in train.npz: joint_torque: front and"),
         ),
         (reversed_wrenches, ["sensors.set=contacts", RIDGE], ("opposite sign", "contact_wrench_local: all reversed")),
         (downward_world, ["sensors.set=joints", RIDGE], ("total mass is -", "opposite sign")),
