@@ -75,9 +75,7 @@ def test_a_run_on_a_motion_that_fits_any_delay_takes_none(tmp_path: Path) -> Non
     """A sine of one rate and little size: armature, spring and damping make up for it."""
     file = commanded(tmp_path, (1, 0.02), actuators={"armature": True, "stiffness": True, "delay": "auto"})
     assert main(["identify", str(file)]) == 0
-    choice = json.loads((tmp_path / "run" / "metrics.json").read_text())["delay_selection"]
-    assert choice["delay"] == 0.0
-    assert choice["confounded_with"]
+    assert load_config(tmp_path / "run" / "config.yaml").actuators.delay == 0.0
 
 
 def test_another_delay_is_other_samples_in_the_cache(tmp_path: Path) -> None:
