@@ -27,7 +27,7 @@ from torchid.problem import ExtraTerms, Samples, bind_log
 from torchid.problem.compression import compress_parts
 
 NOISE, STEP = 0.3, 0.01  # N m, s
-WIDE = ExtraTerms(armature=True, torque_offset=True, asymmetric_coulomb=True, stiffness=True, delays=1)
+WIDE = ExtraTerms(armature=True, torque_offset=True, asymmetric_coulomb=True, stiffness=True, slope=True)
 ARM = torchid.load_robot(UR5, fixed_base=True)
 
 

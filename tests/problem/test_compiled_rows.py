@@ -210,7 +210,7 @@ def test_a_known_payload_and_smooth_friction_are_in_the_rows() -> None:
 @pytest.mark.parametrize("sensors", ["joints", "mixed"])
 def test_extra_parameters_of_joints_are_in_the_rows(sensors: str) -> None:
     actuators = dict.fromkeys(("armature", "stiffness", "asymmetric_coulomb", "torque_offset"), True)
-    terms = ExtraTerms(**actuators, scales={"joint_torque": (("front_*",), ("rear_*",))}, stribeck=0.1, delay=True)
+    terms = ExtraTerms(**actuators, scales={"joint_torque": (("front_*",), ("rear_*",))}, stribeck=0.1, slope=True)
     plain, fast = builders(QUADRUPED, POINTS, sensor_set(sensors, QUADRUPED, POINTS), terms)
     samples = random_samples(QUADRUPED, POINTS, 300, 8, states=3)[0]
     assert assert_same_rows(plain, fast, samples) == len(list(chunks_by_state(samples)))

@@ -240,7 +240,7 @@ class _Trials:
         setup = _with_actuators(setup, **{name: True for name in names if name != "delay"})
         logs, fitter = self.logs_and_fitter(setup, estimate_noise)
         self._edges = self._edges or block_edges(logs)
-        terms = replace(setup.terms, delays=int("delay" in names))
+        terms = replace(setup.terms, slope="delay" in names)
         return compress_reading(logs, self._edges, with_terms(fitter, terms))
 
     def logs_and_fitter(self, setup: RobotSetup, estimate_noise: bool = False) -> tuple[list[Samples], LogFitter]:

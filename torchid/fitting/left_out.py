@@ -21,7 +21,7 @@ from torchid.parameters import Array
 from torchid.problem import ExtraTerms, RowBuilder, Samples
 from torchid.problem.compression import compress_spans
 from torchid.problem.elimination import column_prior
-from torchid.problem.extras import DELAYED, Extra, in_words
+from torchid.problem.extras import SLOPE, Extra, in_words
 from torchid.problem.linear import PRIOR_DEVIATION, parameter_scale
 from torchid.reprs import short_repr
 
@@ -153,7 +153,7 @@ def gain_deviations(logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerm
 
 def kind_of(extra: Extra) -> str:
     """The kind of an extra parameter, one of `TERMS` if logs may choose it."""
-    return "delay" if extra.what == DELAYED else extra.what
+    return "delay" if extra.what == SLOPE else extra.what
 
 
 @one_thread()
@@ -205,7 +205,7 @@ def thinned(logs: Sequence[Samples]) -> list[Samples]:
         some: dict[str, object] = {"folder": None, "motion_noise": None}
         if log.torque is not None and len(log) > 1:
             rate = np.gradient(log.torque.numpy(), log.time.numpy(), axis=0)[:, : log.joint_velocity.shape[1]]
-            some["delayed_torque"] = torch.from_numpy(rate)[:, None]
+            some["slope"] = torch.from_numpy(rate)
         thin = replace(log, **some).every(step)  # type: ignore[arg-type]
         out.append(replace(thin, oversampling=max(1.0, log.oversampling / step)))
     return out

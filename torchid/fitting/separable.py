@@ -21,7 +21,7 @@ from torchid.parallel import share_between_forks, thread_count
 from torchid.parameters import Array
 from torchid.problem import ExtraTerms, RowBuilder, Samples, compress_parts
 from torchid.problem.compression import compress_in_blocks
-from torchid.problem.extras import DELAYED, dof_extra_column
+from torchid.problem.extras import SLOPE, dof_extra_column
 
 LARGEST_TILT = 0.3
 """Largest tilt about each axis that is tried [rad]: more is another frame than was meant."""
@@ -165,7 +165,7 @@ def choose_stribeck(
     found = _search(left, _STRIBECK, _STRIBECK_SETTLED)
     best = min((value for value in found if value is not None), key=lambda one: found[one])
     unknown = _with_logarithm(some, best, terms)
-    term, at_rest = unknown[DELAYED][0], unknown["stribeck"]
+    term, at_rest = unknown[SLOPE][0], unknown["stribeck"]
     reach = _QUANTILE * term.standard_error
     interval = (best * np.exp(-reach), best * np.exp(reach)) if np.isfinite(reach) else None
     choice = StribeckChoice(
@@ -188,20 +188,20 @@ def choose_stribeck(
 def _with_logarithm(
     some: Callable[[float], tuple[list[Samples], LogFitter]], velocity: float, terms: ExtraTerms
 ) -> dict[str, list[ExtraEstimate]]:
-    """Friction at rest, and `DELAYED`, how far the logarithm of a Stribeck velocity is off, beside all parameters."""
+    """Friction at rest, and `SLOPE`, how far the logarithm of a Stribeck velocity is off, beside all parameters."""
     (before, low), (logs, fitter), (after, high) = (some(velocity * np.exp(x)) for x in (-_STEP, 0.0, _STEP))
-    of, slopes = fitter.builder, [log.joint_velocity.new_zeros(len(log), 1, fitter.robot.n) for log in logs]
+    of, slopes = fitter.builder, [log.joint_velocity.new_zeros(len(log), fitter.robot.n) for log in logs]
     for extra, value in ((x.extra, x.value) for x in fitter.fit(compress_parts(logs, of)).extras):
         if extra.what == "stribeck" and extra.dof is not None:
             for slope, *ends in zip(slopes, before, after, strict=True):
                 trees = low.builder.tree, high.builder.tree
                 less, more = (dof_extra_column(extra, extra.dof, *one) for one in zip(ends, trees, strict=True))
-                slope[:, 0, extra.dof] = value * (more - less) / (2.0 * _STEP)
-    further = replace(terms, stribeck=velocity, delays=1)  # whose column is a given torque
+                slope[:, extra.dof] = value * (more - less) / (2.0 * _STEP)
+    further = replace(terms, stribeck=velocity, slope=True)
     fitter = replace(fitter, builder=RowBuilder(fitter.robot, of.contacts, of.sensors, further).to(of.device))
-    sloped = [replace(log, delayed_torque=slope) for log, slope in zip(logs, slopes, strict=True)]
+    sloped = [replace(log, slope=slope) for log, slope in zip(logs, slopes, strict=True)]
     found = fitter.fit(compress_in_blocks(sloped, fitter.builder)).extras
-    return {what: [x for x in found if x.extra.what == what] for what in ("stribeck", DELAYED)}
+    return {what: [x for x in found if x.extra.what == what] for what in ("stribeck", SLOPE)}
 
 
 @dataclass(frozen=True)

@@ -35,9 +35,9 @@ ACTUATORS = {
 }
 """Extra parameters of joints rather than sensors: their unit, and the size of a plausible value in it."""
 
-DELAY, DELAYED, _DELAY_SIZE = "delay", "torque of a delay", 0.005
-"""Extra parameters of a search for the delay of all joint torques, which no fit has: the delay, of a plausible size,
-and those whose columns are the torques of several delays, which that of any is worked out of."""
+SLOPE = "slope"
+"""Kind of the further unknown of a search, which no fit has: how far a setting is off, such as a delay, to first order.
+"""
 
 ScaleGroups = Sequence[Sequence[str]]
 """Groups of sensors that share a scale of all logs: patterns of the names of joints or frames, as `fits` has them."""
@@ -64,8 +64,7 @@ class ExtraTerms:
     sign(v) exp(-(v / v_s)^2) (Armstrong-Hélouvry, Dupont and Canudas de Wit, "A survey of models, analysis tools and
     compensation methods for the control of machines with friction", 1994, with an exponent of 2).
 
-    `delay` and `delays` are those of a search, see `torchid.fitting.delay`: how much later than recorded all joint
-    torques act, to first order, and the number of `delayed_torque` that samples have.
+    `slope`: one further unknown of a search, see `torchid.fitting.delay`, whose column is the `slope` of the samples.
     """
 
     offsets: Mapping[str, str] = field(default_factory=dict)
@@ -76,8 +75,7 @@ class ExtraTerms:
     stribeck: float | None = None
     stiffness: bool = False
     sign_width: float | None = None
-    delay: bool = False
-    delays: int = 0
+    slope: bool = False
 
     __repr__ = short_repr
 
@@ -91,7 +89,7 @@ class Extra:
     """One extra parameter.
 
     Attributes:
-        what: "offset", "scale" (less 1), one of `ACTUATORS`, `DELAY` or `DELAYED`.
+        what: "offset", "scale" (less 1), one of `ACTUATORS`, or `SLOPE`.
         name: of the joint or the sensor's frame, or the patterns of a group; `component`: of its wrench, "" of a joint
             torque, "force" or "moment" for a group of sensors.
         unit: of the unknown.
@@ -99,7 +97,6 @@ class Extra:
         per_log: whether every log has its own.
         dofs: indices in the robot's `dof_names`, more than one of a group, or
         contacts: index among the contacts, and component along the axes that the log has the wrench in.
-        number: of a delay.
     """
 
     what: str
@@ -110,7 +107,6 @@ class Extra:
     per_log: bool
     dofs: tuple[int, ...] = ()
     contacts: tuple[tuple[int, int], ...] = ()
-    number: int = 0
 
     @property
     def dof(self) -> int | None:
@@ -158,10 +154,9 @@ def list_extras(robot: Robot, contacts: Sequence[Contact], sensors: SensorSet, t
             without = robot.is_passive if what in _OF_MOTORS else np.zeros_like(robot.is_passive)
             measured = np.flatnonzero((sensors.torque & ~without)[: robot.n]).tolist()
             extras += [Extra(what, robot.joint_names[dof], "", unit, size, False, (dof,)) for dof in measured]
-    motors = tuple(np.flatnonzero((sensors.torque & ~robot.is_passive)[: robot.n]).tolist())
-    if terms.delay:
-        extras.append(Extra(DELAY, "joint torques", "", "s", _DELAY_SIZE, False, motors))
-    extras += [Extra(DELAYED, str(k), "", "1", 1.0, False, motors, (), k) for k in range(terms.delays)]
+    if terms.slope:
+        motors = tuple(np.flatnonzero((sensors.torque & ~robot.is_passive)[: robot.n]).tolist())
+        extras.append(Extra(SLOPE, "joint torques", "", "1", 1.0, False, motors))
     return tuple(extras)
 
 
@@ -289,8 +284,8 @@ def dof_extra_column(extra: Extra, dof: int, samples: Samples, tree: KinematicTr
     if extra.what == "scale":
         reading = samples.torque
         return samples.time.new_full((len(samples),), torch.nan) if reading is None else -reading[:, dof]
-    if extra.what == DELAYED and samples.delayed_torque is not None:
-        return samples.delayed_torque[:, extra.number, dof]
+    if extra.what == SLOPE and samples.slope is not None:
+        return samples.slope[:, dof]
     if extra.what == "armature":
         return samples.joint_acceleration[:, dof]
     if extra.what == "stiffness":

@@ -65,7 +65,7 @@ class Samples:
         pages: of files that the tensors are mapped to; None for those in memory.
         payload: (12 L,), what the robot carried beside its own parameters, see `payload_parameters`; None for nothing.
         resting: (N, n) bool, joints whose torque counts as unmeasured, as they rest (`Log.joint_rests`); None for none.
-        delayed_torque: (N, D, n), joint torques of D delays, in a search for the best; None otherwise.
+        slope: (N, n), change of the joint torques by a further unknown of a search; None otherwise.
     """
 
     source: str
@@ -90,7 +90,7 @@ class Samples:
     motion_noise: MotionNoise | None = None
     payload: Array | None = None
     pages: MappedPages | None = field(default=None, repr=False, compare=False)
-    delayed_torque: Tensor | None = None
+    slope: Tensor | None = None
     noise_share: float | None = None
     stribeck: Tensor | None = None
     blocks: Tensor | None = None
