@@ -378,7 +378,12 @@ def _sign_width(setup: RobotSetup, trials: _Trials) -> SignWidthChoice:
     found = [Evidence.of(sign.left_out(kinds), one.left_out(kinds)) for one in others]
     if not any(one.certain and one.gain > _WIDTH_GAIN for one in found):
         return SignWidthChoice(None, (None,), (1.0,))
-    return choose_sign_width(lambda width: math.sqrt(read(width).noise_variance / sign.noise_variance))
+
+    def tried(width: float | None) -> tuple[float, Array]:
+        reading = read(width)
+        return math.sqrt(reading.noise_variance), reading.left_out(kinds)
+
+    return choose_sign_width(tried)
 
 
 def _cutoff_of_motion(setup: RobotSetup) -> tuple[CutoffChoice, float]:

@@ -43,7 +43,7 @@ _CHANCE = 0.005  # that a block-by-block difference of nothing seems to be one
 _GAIN = 0.1  # decrease of the squared error, at least: gains 2 % off let springs and offsets reach 0.05 where none are
 _OF_TERMS = 0.01  # weight of the prior where terms are chosen: with more, those would make up for bodies
 _WORSE = 0.1  # increase of the product of squared errors of two readings that fitting the wider one may cost
-_EXACT = 1e-12  # share of the squared forces below which residuals are rounding
+_EXACT = 1e-14  # share of the squared forces below which residuals are rounding
 _WEAK = 1e-3  # weight of the prior of extra parameters, by that of bodies
 
 

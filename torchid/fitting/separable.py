@@ -16,6 +16,7 @@ from scipy.optimize import minimize, minimize_scalar
 from torchid.errors import warn
 from torchid.estimators import LeastSquares
 from torchid.fitting.fit import LogFitter
+from torchid.fitting.left_out import Evidence
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.parallel import share_between_forks, thread_count
 from torchid.parameters import Array
@@ -27,7 +28,7 @@ LARGEST_TILT = 0.3
 """Largest tilt about each axis that is tried [rad]: more is another frame than was meant."""
 
 _GAIN = 1e-3  # of the residual, by which a value has to beat none
-_WIDTHS = tuple(10.0 ** np.arange(-3.0, 0.25, 0.5))
+_WIDTHS = tuple(10.0 ** np.arange(-2.0, 0.25, 0.25))  # [rad/s or m/s]
 _STRIBECK = tuple(10.0 ** np.arange(-2.0, 1.25, 0.25))  # [rad/s or m/s]
 _STRIBECK_SAMPLES = 5000  # of all logs, evenly spaced
 _RIDGE = 1e-6  # the residual is smooth in the velocity where the data determine some parameters badly
@@ -59,38 +60,38 @@ class SignWidthChoice:
         """The width, and what it is for."""
         if self.width is None:
             return "none: Coulomb friction with tanh(velocity / width) predicts left-out blocks no better"
-        return f"{self.width:g} rad/s (m/s), which leaves {min(self.residual):.3g} of the residual with the sign"
+        return f"{self.width:g} rad/s (m/s); the best width leaves {min(self.residual):.3g} of the residual"
 
 
-def choose_sign_width(residual: Callable[[float | None], float]) -> SignWidthChoice:
-    """The width [rad/s or m/s] whose fit leaves least.
+def choose_sign_width(read: Callable[[float | None], tuple[float, Array]]) -> SignWidthChoice:
+    """The narrowest width [rad/s or m/s] that predicts left-out blocks as well as the one whose fit leaves least.
 
-    All other parameters are linear, and fitted anew for each width: separable least squares (Golub and Pereyra, 1973).
+    A wider one of the same error would make up for friction elsewhere. All other parameters are linear, and fitted anew
+    for each width: separable least squares (Golub and Pereyra, 1973).
 
     Args:
-        residual: standard deviation of the residuals with a width, over that with the sign (None).
+        read: standard deviation of the residuals with a width, None for the sign, and squared errors on blocks that are
+            left out of the fit, (G,).
     """
-    found = _search(residual, _WIDTHS, _WIDTH_SETTLED)
-    width = min(found, key=lambda one: found[one])
+    tried = (None, *_WIDTHS)
+    found = dict(zip(tried, share_between_forks(tried, read, thread_count()), strict=True))
+    left = {width: residual for width, (residual, _) in found.items()}
+    best = min(left, key=lambda width: left[width])
+    width = next(one for one in tried if not Evidence.of(found[one][1], found[best][1]).certain)
+    if width == best and width is not None:  # no other does as well
+        width, left[width] = _best_beside(width, _WIDTHS, lambda one: read(one)[0], _WIDTH_SETTLED)
     chosen = None if width is None else float(f"{width:.{_WIDTH_DIGITS}g}")
-    return SignWidthChoice(chosen, tuple(found), tuple(found.values()))
+    return SignWidthChoice(chosen, tuple(left), tuple(one / left[None] for one in left.values()))
 
 
-def _search(left: Callable[[float | None], float], first: Sequence[float], settled: float) -> dict[float | None, float]:
-    """What is left with some values, with those between the neighbours of the best of them, and with none, the last."""
-    found: dict[float | None, float] = {first[0]: left(first[0])}  # reads the logs, which forks then have
-    *rest, none = share_between_forks([*first[1:], None], left, thread_count())
-    found |= dict(zip(first[1:], rest, strict=True))
-    best = int(np.argmin(list(found.values())))
-    between = np.log10([first[max(best - 1, 0)], first[min(best + 1, len(first) - 1)]])
-
-    def tried(logarithm: float) -> float:
-        value = 10.0**logarithm
-        found[value] = left(value)
-        return found[value]
-
-    minimize_scalar(tried, bounds=between, method="bounded", options={"xatol": settled})
-    return {**found, None: none}
+def _best_beside(
+    best: float, tried: Sequence[float], left: Callable[[float], float], settled: float
+) -> tuple[float, float]:
+    """The value between the neighbours of the best one that leaves least, and what it leaves."""
+    k = tried.index(best)
+    between = np.log10([tried[max(k - 1, 0)], tried[min(k + 1, len(tried) - 1)]])
+    found = minimize_scalar(lambda x: left(10.0**x), bounds=between, method="bounded", options={"xatol": settled})
+    return 10.0 ** float(found.x), float(found.fun)
 
 
 @dataclass(frozen=True)
@@ -162,8 +163,9 @@ def choose_stribeck(
         problem = fitter.build_problem(compress_parts(logs, fitter.builder)).assembly.problem
         return fitter.estimator.solve(problem).residual_std
 
-    found = _search(left, _STRIBECK, _STRIBECK_SETTLED)
-    best = min((value for value in found if value is not None), key=lambda one: found[one])
+    first = left(None)  # reads the logs, which forks then have
+    tried = dict(zip(_STRIBECK, share_between_forks(_STRIBECK, left, thread_count()), strict=True))
+    best, residual = _best_beside(min(tried, key=lambda one: tried[one]), _STRIBECK, left, _STRIBECK_SETTLED)
     unknown = _with_logarithm(some, best, terms)
     term, at_rest = unknown[SLOPE][0], unknown["stribeck"]
     reach = _QUANTILE * term.standard_error
@@ -176,8 +178,8 @@ def choose_stribeck(
         interval=interval,
         inflation=term.inflation if np.isfinite(term.inflation) else None,
         confounded_with=() if term.separable else term.confounded_with or ("other parameters",),
-        residual=found[best],
-        coulomb_residual=found[None],
+        residual=residual,
+        coulomb_residual=first,
     )
     known = interval is not None and interval[0] > _STRIBECK[0] and interval[1] < _STRIBECK[-1]
     return (
