@@ -131,15 +131,15 @@ def _with_chosen_data(setup: S, choices: Choices, trials: _Trials, bars: Progres
     if finds_cutoff:
         choices.cutoff, shortest = _chosen("cutoff", partial(_cutoff_of_motion, setup), bars)
         setup = _with_preprocessing(setup, cutoff_hz=choices.cutoff.cutoff_hz)
-    if setup.config.preprocessing.contact_margin_s == AUTO:
-        margins = {margin: _with_preprocessing(setup, contact_margin_s=margin) for margin in MARGINS}
-        choices.contact_margin = _chosen("margin of contacts", partial(_narrowest_needed, trials, margins), bars)
-        setup = _with_preprocessing(setup, contact_margin_s=choices.contact_margin.value)
     actuators = setup.config.actuators
     if actuators.stiction == AUTO and actuators.stribeck is None and trials.measures_torques(setup):
         rest = {value: _with_actuators(setup, stiction=value) for value in (False, True)}
         choices.stiction = _chosen("samples at rest", partial(_narrowest_needed, trials, rest), bars)
         setup = _with_actuators(setup, stiction=bool(choices.stiction.value))
+    if setup.config.preprocessing.contact_margin_s == AUTO:
+        margins = {margin: _with_preprocessing(setup, contact_margin_s=margin) for margin in MARGINS}
+        choices.contact_margin = _chosen("margin of contacts", partial(_narrowest_needed, trials, margins), bars)
+        setup = _with_preprocessing(setup, contact_margin_s=choices.contact_margin.value)
     if finds_cutoff and choices.cutoff is not None and choices.cutoff.cutoff_hz is not None:
         choices.cutoff = _chosen("cutoff", partial(_cutoff, setup, trials, choices.cutoff, shortest), bars)
         setup = _with_preprocessing(setup, cutoff_hz=choices.cutoff.cutoff_hz)
