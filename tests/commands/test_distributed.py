@@ -40,11 +40,13 @@ from torchid.parallel import share_between_processes
 from torchid.parameters import Array
 from torchid.problem.linear import parameter_scale
 
-DESCENT = ("estimator.name=sgd", "estimator.training.epochs=4", "estimator.training.finish=null", "estimator.ridge=0.1")
+FINISHED = ("estimator.name=sgd", "estimator.training.epochs=4", "estimator.ridge=0.1")
+DESCENT = (*FINISHED, "estimator.training.finish=null")
 RUNS = {
     "biped, consistent": ("biped", ("estimator.name=consistent",)),
     "arm, robust": ("arm", ("estimator.robust=tukey",)),
     "quadruped, descent": ("quadruped", DESCENT),
+    "quadruped, descent to its end": ("quadruped", FINISHED),
     "short": ("short", ()),
 }
 BY_FOUR = ("arm, robust", "quadruped, descent", "short")

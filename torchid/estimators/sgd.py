@@ -68,8 +68,8 @@ class TrainingSettings:
         patience: epochs without a better loss on the held-out logs after which training stops; None: never.
         clip: largest norm of a gradient.
         damping: of the preconditioner, in units of the mean squared whitened residual per squared scale.
-        finish: rounds of L-BFGS on all samples after the last epoch, at most; None: none. Without held-out logs only,
-            whose least loss is what to stop at.
+        finish: after the last epoch, take the parameters of the least objective on all samples; None: do not. With
+            "penalties", the most rounds of L-BFGS. Without held-out logs only, whose least loss is what to stop at.
     """
 
     epochs: Count = 200

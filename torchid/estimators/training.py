@@ -289,7 +289,7 @@ class Trainer:
     def estimate(self) -> SgdEstimate:
         """The parameters, and residual module, of least held-out loss; without held-out logs the last ones.
 
-        After the last epoch, without held-out logs or a module, L-BFGS goes on from there on all samples. Statistics
+        After the last epoch, without held-out logs or a module, those of the least objective on all samples. Statistics
         are those of least squares with the same ridge.
         """
         self.loss.load_state_dict(self._best)
