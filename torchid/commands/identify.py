@@ -21,7 +21,7 @@ from torchid.commands.results import Identification, write_run
 from torchid.commands.run_figures import Drawing, drawing, figures_left, fit_figures
 from torchid.commands.training import Training, require_trainable, training_folder
 from torchid.config import ExperimentConfig, inputs_of
-from torchid.errors import NumericalWarning, warn_about_file
+from torchid.errors import ConfigError, NumericalWarning, warn_about_file
 from torchid.estimators import Conditions, Estimate, Violation, violations
 from torchid.estimators.conditions import term_violations
 from torchid.fitting.calibration import Calibration, Comparison, warn_of_confounded, warn_of_disagreement
@@ -34,6 +34,7 @@ from torchid.fitting.posterior import fitted_posterior
 from torchid.fitting.robust import RobustSummary, fit_robustly
 from torchid.identifiability.confounding import TotalMass, mass_weights
 from torchid.identifiability.contributions import Contributions, contributions
+from torchid.identifiability.jackknife import LEAST_BLOCKS
 from torchid.parallel import one_thread
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Evaluation, LinearProblem, Metrics, Samples
@@ -115,6 +116,9 @@ def _solved(
     mass = require_plausible(fit, checked, logs["train"], of_mass)
     warn_of_confounded([one for one in fit.extras if one.extra.what not in ready.choices.adopted_terms])
     warn_of_disagreement(fit, fitter)
+    if experiment.sensors.task_weights is not None and fit.jackknife is None:  # the only errors that know of weights
+        found = f"set, of logs of fewer than {LEAST_BLOCKS} blocks, whose scatter intervals come from"
+        raise ConfigError.at_field("estimator.task_weights", found, "longer logs, or no such key")
     return _Solved(fit, robust, training, mass)
 
 

@@ -17,7 +17,7 @@ from torchid.config import ExperimentConfig
 from torchid.errors import format_count
 from torchid.estimators import Conditions
 from torchid.fitting.cross_validation import RidgeChoice
-from torchid.fitting.experiment import Experiment, set_up, with_noise
+from torchid.fitting.experiment import Experiment, set_up, with_noise, with_task_weights
 from torchid.fitting.factor_files import FactorFile, read_fleet
 from torchid.fitting.fit import LogFitter
 from torchid.fitting.noise import NoiseSummary
@@ -104,7 +104,7 @@ def _data_of_logs(experiment: Experiment, clock: Stopwatch, bars: Progress) -> C
         states = state_reports(logs["train"], experiment.builder(experiment.sensors))
         require_base(states, experiment.config.sensors.on_base_lost, experiment.contacts)
         noise = distributed.from_first(partial(experiment.estimate_noise, logs["train"], experiment.sensors), "noise")
-        experiment = with_noise(experiment, noise)
+        experiment = with_task_weights(with_noise(experiment, noise), logs["train"])
     reader.release()
     with clock("compress"):
         builder = experiment.builder(experiment.sensors)

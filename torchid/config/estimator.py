@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_args
 from pydantic import BeforeValidator, Field
 from pydantic.dataclasses import dataclass
 
+from torchid.config.robot import PerAxis, PerJoint
 from torchid.errors import ConfigError
 from torchid.estimators import Conditions, Consistent, LeastSquares, PenaltyWeights, Sgd, TrainingSettings
 from torchid.estimators.conditions import EnclosureKind
@@ -112,13 +113,23 @@ Solver = TypeVar("Solver", LeastSquares, Consistent, Sgd)
 
 
 @dataclass(config=STRICT, frozen=True)
+class TaskWeightsConfig:
+    """How much errors of joint torques, and of the base along its own axes, count in the fit; None for 1."""
+
+    joint_torque: PerJoint | None = None
+    base_force: PerAxis | None = None
+    base_moment: PerAxis | None = None
+
+
+@dataclass(config=STRICT, frozen=True)
 class _FitConfig:
     """What is fitted and how, whatever the estimator.
 
     `ridge`: auto, `torchid.fitting.left_out.RIDGE` of the mean squared residual, or more where that predicts left-out
     blocks better; one_standard_error, the largest that predicts them within one standard error of the best.
     `friction: false` leaves friction at the URDF's values, `frozen` bodies keep all of theirs; `robust` weighs outliers
-    down in a batch fit. `total_mass` and `masses` of bodies by name are known, as from a scale.
+    down in a batch fit, `task_weights` say which errors count most. `total_mass` and `masses` of bodies by name are
+    known, as from a scale.
     """
 
     name: Literal["least_squares", "consistent", "sgd"] = "consistent"
@@ -127,6 +138,7 @@ class _FitConfig:
     friction: bool = True
     frozen: list[str] = dataclasses.field(default_factory=list)
     robust: Robust | None = None
+    task_weights: TaskWeightsConfig = dataclasses.field(default_factory=TaskWeightsConfig)
     total_mass: Annotated[MassConfig | None, BeforeValidator(_mass)] = None
     masses: dict[str, Mass] = dataclasses.field(default_factory=dict)
 

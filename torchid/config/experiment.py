@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from torchid.config.estimator import MASS_ACCEPTED, ROBUST_ACCEPTED, EstimatorConfig, validate_keys
+from torchid.config.estimator import MASS_ACCEPTED, ROBUST_ACCEPTED, EstimatorConfig, TaskWeightsConfig, validate_keys
 from torchid.config.log_reading import MAPS_ACCEPTED, PreprocessingConfig
 from torchid.config.logs import SETS, LogsConfig, entries_spelled_out, resolve_logs
 from torchid.config.robot import (
@@ -364,6 +364,7 @@ def _check_factors(config: _Common, logs: LogsConfig) -> None:
     unfit = (
         ("estimator.name", "sgd", config.estimator.name == "sgd", "least_squares or consistent"),
         ("estimator.robust", "set", config.estimator.robust is not None, "null"),
+        ("estimator.task_weights", "set", config.estimator.task_weights != TaskWeightsConfig(), "no such key"),
         (
             "preprocessing.cutoff_hz",
             "auto",

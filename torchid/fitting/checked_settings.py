@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 
 from torchid.config import AnalyzeConfig, ExperimentConfig
+from torchid.config.estimator import TaskWeightsConfig
 from torchid.config.logs import LogsConfig
 from torchid.config.robot import ChoiceConfig, ContactConfig, NoiseConfig
 from torchid.errors import ConfigError, SensorError, UnknownNameError, format_count
 from torchid.logs.column_entries import for_all
 from torchid.logs.column_map import fits, require_names, values_of_all
 from torchid.logs.ros_topics import Topics, require_joints
+from torchid.parameters import Array
 from torchid.problem import ExtraTerms
 from torchid.problem.base_pose import FEET
 from torchid.problem.extras import CHANNELS, ScaleGroups, measured_channels
@@ -60,6 +62,24 @@ def stated_noise(config: NoiseConfig, robot: Robot) -> dict[str, Any]:
         key, names = "sensors.noise.joint_torque", robot.joint_names
         stated["joint_torque"] = tuple(values_of_all(key, "noise", for_all(torque), "joint", names))
     return stated
+
+
+def task_weights(config: TaskWeightsConfig, robot: Robot) -> Array | None:
+    """Task weights as `SensorSet` has them; None if all are alike, as only their ratios count.
+
+    Raises:
+        UnknownNameError: a pattern that no joint fits.
+        ConfigError: a joint without a weight, where others have one, or with two; an axis of a fixed base.
+    """
+    key, names = "estimator.task_weights", robot.joint_names
+    of_base = [x for x in (config.base_force, config.base_moment) if x is not None]
+    if robot.fixed_base and of_base:
+        raise ConfigError.at_field(key, "axes of the base, which is fixed", "joint_torque alone")
+    base = [np.broadcast_to(1.0 if x is None else x, 3) for x in (config.base_force, config.base_moment)]
+    torque = for_all(1.0 if config.joint_torque is None else config.joint_torque)
+    joints = values_of_all(f"{key}.joint_torque", "weight", torque, "joint", names)
+    weights = np.concatenate([*(() if robot.fixed_base else base), joints, np.ones(robot.n_dofs - robot.n)])
+    return None if np.ptp(weights) == 0.0 else weights
 
 
 def check_terms(

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 
+from torchid import distributed
 from torchid.config import AnalyzeConfig, ExperimentConfig
 from torchid.config.estimator import EstimatorConfig
 from torchid.config.robot import ChoiceConfig, require_kind
@@ -23,12 +24,13 @@ from torchid.fitting.checked_settings import (
     resolve_contacts,
     stated_noise,
     suited_to_preprocessing,
+    task_weights,
     with_scalar_sensors,
 )
 from torchid.fitting.cross_validation import RIDGES, STRONGER, RidgeChoice, choose_ridge
 from torchid.fitting.fit import Fit, LogFitter, frozen_parameters
 from torchid.fitting.left_out import RIDGE
-from torchid.fitting.noise import NoiseSummary, estimate_noise, recorded_sensors
+from torchid.fitting.noise import NoiseSummary, estimate_noise, mean_noise_square, recorded_sensors
 from torchid.fitting.prior_knowledge import conditions_from, known_masses
 from torchid.fitting.robust import RobustLoss
 from torchid.log_checks.model import Declared
@@ -250,6 +252,16 @@ def with_estimated_noise(setup: S, estimated: Mapping[str, Any], any_stated: boo
     return known
 
 
+def with_task_weights(experiment: Experiment, logs: Sequence[Samples]) -> Experiment:
+    """The experiment, its rows weighted by control task too, by a factor at which noise alone leaves them 1."""
+    weights = task_weights(experiment.config.estimator.task_weights, experiment.robot)
+    if weights is None:
+        return experiment
+    sensors = replace(experiment.sensors, task_weights=weights)
+    size = distributed.from_first(lambda: mean_noise_square(logs, experiment.builder(sensors)), "task weights")
+    return replace(experiment, sensors=replace(sensors, task_weights=weights / np.sqrt(size)))
+
+
 def require_device(device: str) -> None:
     """Refuse a device that this machine has not; it is not connected to: forks, which read logs, could not be made."""
     kind, _, index = device.partition(":")
@@ -302,6 +314,7 @@ def set_up(config: ExperimentConfig) -> Experiment:
     setup = set_up_robot(config)
     sensors = setup.sensors_of(config.sensors)
     config = replace(config, contacts=setup.config.contacts)
+    task_weights(config.estimator.task_weights, setup.robot)  # wrong names are told before logs are read
     experiment = Experiment(**vars(setup) | {"config": config}, sensors=sensors)
     check_terms(experiment.terms, config.actuators, setup.robot, setup.contacts, sensors)
     return experiment

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchid.estimators import LeastSquares
 from torchid.fitting.fit import LogFitter
 from torchid.parameters import Array
-from torchid.problem import Samples
+from torchid.problem import RowBuilder, Samples
 from torchid.problem.extras import noise_key
 from torchid.problem.noise import GroupVariances, VarianceComponentEstimator, fitted_directions
 from torchid.problem.sampled_rows import LogOfOtherProcess, SampledRows, noise_of_sensors
@@ -128,6 +128,12 @@ def estimate_noise(
     groups = _listed(rows, tied, used, free)
     noise = builder.noise_groups.noise(kept | {one.group: one.used for one in groups}, guess)
     return NoiseSummary(noise, groups, _suggested(rows, tied, free), passes)
+
+
+def mean_noise_square(logs: Sequence[Samples], builder: RowBuilder) -> float:
+    """Mean square that the builder's noise leaves rows of a sample of the logs: 1 but for task weights."""
+    noise = [chunk.sources.square().sum(1) for chunk in SampledRows(logs, builder).chunks]
+    return float(sum(x.sum() for x in noise) / max(sum(x.count_nonzero() for x in noise), 1))
 
 
 def recorded_sensors(

@@ -98,15 +98,15 @@ def _is_worth_forking(samples: int) -> bool:
 def choose_kernels(builder: RowBuilder, samples: int) -> None:
     """Let a builder use compiled kernels for so many samples, if these pay and can be had, else torch's operators.
 
-    Extra parameters of contact sensors are left to torch. Kernels need Numba (extra `[fast]`) that suits the installed
-    NumPy, and a place on disk where it may keep them.
+    Extra parameters of contact sensors, and task weights, are left to torch. Kernels need Numba (extra `[fast]`) that
+    suits the installed NumPy, and a place on disk where it may keep them.
 
     Warns:
         TorchidWarning: Numba is there, but not these.
     """
     plain = builder.device.type == "cpu" and builder.tree.ancestors.dtype == torch.float64
-    of_contacts = any(extra.contacts for extra in builder.extras)
-    if not plain or of_contacts or samples < _WORTH_LOADING or find_spec("numba") is None:
+    plain = plain and builder.task_weights is None and not any(extra.contacts for extra in builder.extras)
+    if not plain or samples < _WORTH_LOADING or find_spec("numba") is None:
         builder.compiled = None
     elif builder.compiled is None:
         try:

@@ -299,8 +299,8 @@ class ProjectedForces:
     """Generalized forces V_x V_x^T f of a log, rows as in K, with what a fit predicts of them [N, N m].
 
     `measured`, (N, n_rows), as recorded: predictions have offsets and scales. `predicted`, (M, N, n_rows). `noise`,
-    (N, n_rows): standard deviation that the noise of the readings gives the measured. NaN where readings lack, and in
-    rows that no reading is of.
+    (N, n_rows): standard deviation that the noise of the readings gives the measured. NaN where readings lack, in rows
+    that no reading is of, and of all noise under task weights.
     """
 
     measured: Array
@@ -331,4 +331,6 @@ def projected_forces(builder: RowBuilder, samples: Samples, phi: torch.Tensor) -
             measured[where] = forces[..., 0].cpu().numpy()
             predicted[:, where] = forces[..., 1:].permute(2, 0, 1).cpu().numpy()
             noise[where] = (back.square().sum(2) * chunk.noise_left).sqrt().cpu().numpy()
+            if builder.task_weights is not None:
+                noise[where] = np.nan  # rows are white in other units
     return ProjectedForces(measured, predicted, noise)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -47,8 +48,11 @@ class RowBuilder(nn.Module):
     `frames`: node of each contact, and the pose of the contact frame in the node's joint frame, (4, 4) [m]. `width`:
     number of columns, those of the bodies' parameters and one for each of `extras`. `workspaces`: of passes over rows.
     `noise_sources`: of `noise_groups`, the group of each base row and of each measured force. `compiled`: kernels that
-    `blocks` takes its rows from, see `torchid.problem.chunks.map_chunks`; None for torch's.
+    `blocks` takes its rows from, see `torchid.problem.chunks.map_chunks`; None for torch's. `task_weights`: of the
+    rows of K, (n_rows,); None for all alike.
     """
+
+    task_weights: Tensor | None
 
     def __init__(
         self, robot: Robot, contacts: Sequence[Contact], sensors: SensorSet, terms: ExtraTerms | None = None
@@ -76,6 +80,9 @@ class RowBuilder(nn.Module):
         self.frames = self._layouts.frames
         self.width = self.columns.count + len(self.extras)
         self.dof_std = self._layouts.dof_std
+        weights = sensors.task_weights
+        own = None if weights is None else torch.from_numpy(weights)
+        self.register_buffer("task_weights", own, persistent=False)
         self.workspaces = Workspaces()
         self.compiled: CompiledRows | None = None
 
@@ -197,10 +204,25 @@ class RowBuilder(nn.Module):
     def whitened_bases(
         self, layout: ContactStateLayout, rows: ContactRows, measured: Tensor, kinematics: ChunkKinematics
     ) -> Iterator[tuple[Tensor | slice, Tensor]]:
-        """W, (base rows + coupled joints, r, B'), of contact rows with the samples it belongs to, grouped by rank."""
+        """W, (base rows + coupled joints, r, B'), of contact rows with the samples it belongs to, grouped by rank.
+
+        Task weights D multiply the errors K phi - f: with W' the basis of unmeasured rows A_x D, W = D W' keeps them
+        out and W W^T = D W' W'^T D, so that the sum of squares is the least over all unmeasured forces x of
+        (K phi - f - A_x^T x)^T D S^-1 D (K phi - f - A_x^T x), S being the covariance of the noise.
+
+        Source: Mistry, Schaal, Yamane 2009, IV-E; weighted least squares under nuisance parameters.
+        """
         rotation, resting = kinematics.rotation_world_base, self.coupled_at_rest(layout, kinematics)
-        axes = self.noise_axes(rotation, self.sensors.noise)
-        return whitened_bases(layout, rows, measured, axes, self.tree.index(layout.blocks.order), resting)
+        axes, order = self.noise_axes(rotation, self.sensors.noise), self.tree.index(layout.blocks.order)
+        if self.task_weights is None:
+            yield from whitened_bases(layout, rows, measured, axes, order, resting)
+            return
+        base = self.tree.base_rows
+        D = self.task_weights[self.tree.index([*range(base), *(base + joint for joint in layout.coupled_joints)])]
+        parts = zip(rows.unmeasured, rows.unmeasured_columns, strict=True)
+        weighted = replace(rows, unmeasured=[part * D[columns, None] for part, columns in parts])
+        for index, W in whitened_bases(layout, weighted, measured, axes, order, resting):
+            yield index, W * D[:, None, None]
 
     def coupled_at_rest(self, layout: ContactStateLayout, kinematics: ChunkKinematics) -> Tensor | None:
         """Which coupled joints and readings in limbs have torques that count as unmeasured, (k, B); None for none."""
@@ -294,7 +316,8 @@ class RowBuilder(nn.Module):
     def _uncoupled_weight(self, joint: int, dynamics: ChunkDynamics) -> Tensor:
         """W of an uncoupled joint, (B,) [1 / N m]."""
         screw_axes, resting = dynamics.screw_axes, dynamics.resting
-        weight = screw_axes.new_full(screw_axes.shape[-1:], 1.0 / self._layouts.dof_std[joint])
+        weighted = 1.0 if self.task_weights is None else float(self.task_weights[self.tree.base_rows + joint])
+        weight = screw_axes.new_full(screw_axes.shape[-1:], weighted / self._layouts.dof_std[joint])
         return weight if resting is None or joint >= len(resting) else weight.masked_fill_(resting[joint], 0.0)
 
     def _coupled_rows(

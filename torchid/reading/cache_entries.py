@@ -201,6 +201,7 @@ def factors_key(experiment: Experiment, builder: RowBuilder, samples: Sequence[s
             "samples": list(samples),
             "sensors": [sensors.torque.tolist(), sensors.wrench.tolist()],
             "noise": vars(sensors.noise),
+            "weights": None if sensors.task_weights is None else sensors.task_weights.tolist(),
             "terms": vars(experiment.terms),
             "blocks": [[sources.index(block.source), len(block), block.fold] for block in blocks],
             "motion_noise": [block.motion_noise is not None for block in blocks],

@@ -215,11 +215,15 @@ class SensorSet:
 
     `torque`, (n + 6 F,) bool, by the robot's `dof_names`: joint torques, then wrenches of sensors in limbs; `wrench`,
     (C, 6) bool, by contacts and `WRENCH_COMPONENTS`.
+
+    `task_weights`, (n_rows,) > 0: how much errors of the generalized forces, those of a floating base along its own
+    axes first, count in a fit, beside their noise; None for all alike.
     """
 
     torque: np.ndarray
     wrench: np.ndarray
     noise: SensorNoise = field(default_factory=SensorNoise)
+    task_weights: Array | None = None
 
     __repr__ = short_repr
 
