@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from synthetic import ANYMAL, Oracle, load, make_log
+from synthetic import ANYMAL, UR5, Oracle, load, make_log
 
 from torchid.errors import BaseLostError, BaseLostWarning, SensorError, UnknownNameError, about_file
 from torchid.identifiability.base_parameters import (
@@ -20,6 +20,7 @@ from torchid.identifiability.base_parameters import (
 )
 from torchid.problem import RowBuilder, bind_log
 from torchid.sensing import Contact, SensorNoise, SensorSet, chosen_sensors, named_sensors, validate_contacts
+from torchid.sensing.sensors import minimized_errors
 
 FEET = [Contact(f"{leg}_FOOT", "point") for leg in ("LF", "RF", "LH", "RH")]
 JOINTS = ("hip", "knee", "ankle")
@@ -33,6 +34,29 @@ def test_a_contact_pushes_only_as_its_kind_can() -> None:
         moments = tuple(f"m{other}" for other in "xyz" if other != axis)
         assert Contact("foot", "line", axis).component_names == ("fx", "fy", "fz", *moments)
     assert Contact("foot", "line") == Contact("foot", "line", "y")
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("full", "errors of joint torques and base forces"),
+        ("contacts", "errors of base forces that no joint torque can make"),
+        ("joints", "errors of joint torques and base forces that no contact force can make"),
+    ],
+)
+def test_a_set_says_what_errors_it_minimizes(name: str, says: str) -> None:
+    robot = load(ANYMAL)
+    assert minimized_errors(robot, FEET, named_sensors(name, robot.n, len(FEET))) == says
+
+
+def test_what_is_unmeasured_of_some_sensors_is_named() -> None:
+    robot = load(ANYMAL)
+    sensors = chosen_sensors(robot.joint_names, FEET, robot.joint_names[2:], {"LF_FOOT": ["fx", "fy", "fz"]})
+    hidden = f"torque of {', '.join(robot.joint_names[:2])} or unmeasured force at RF_FOOT, LH_FOOT, RH_FOOT"
+    says = f"errors of joint torques and base forces that no {hidden} can make"
+    assert minimized_errors(robot, FEET, sensors) == says
+    arm = load(UR5, fixed_base=True)
+    assert minimized_errors(arm, [], named_sensors("joints", arm.n, 0)) == "errors of joint torques"
 
 
 def test_contacts_of_the_robot_pass_unchanged() -> None:

@@ -380,7 +380,8 @@ def test_all_tables_are_printed_when_asked_for_and_nothing_when_asked_to_be_quie
     assert printed["--quiet"] == ""
     assert len(printed[None].splitlines()) <= LINES
     assert printed[None].splitlines()[-1] == f"written to    {tmp_path / 'None'}"
-    for title in ("Contact states", "What each log", "Parameters:", "Noise that weights the rows", "condition     "):
+    titles = "Contact states", "What each log", "Parameters:", "Noise that weights the rows", "condition ", "minimized "
+    for title in titles:
         assert title in printed["--verbose"]
         assert title not in printed[None]
     assert printed["--verbose"].splitlines()[0] == printed[None].splitlines()[0]

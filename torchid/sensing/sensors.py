@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from torchid.errors import SensorError, UnknownNameError
+from torchid.errors import SensorError, UnknownNameError, join_names
 from torchid.parameters import WRENCH_COMPONENTS, Array
 from torchid.reprs import short_repr
 from torchid.robot import Robot
@@ -343,3 +343,23 @@ def recorded_components(contacts: Sequence[Contact], sensors: SensorSet, in_worl
     whole = measured.reshape(-1, 2, 3).any(axis=2)
     turned = np.array([not contact.along_normal for contact in contacts], dtype=bool)[:, None]
     return np.where(turned, np.repeat(whole, 3, axis=1), measured)
+
+
+_NAMED = 3
+
+
+def minimized_errors(robot: Robot, contacts: Sequence[Contact], sensors: SensorSet) -> str:
+    """What a fit with some sensors minimizes, in words: errors of which forces, and what they are free of."""
+    torque, possible = sensors.torque[: robot.n], [list(contact.components) for contact in contacts]
+    lacking = [not sensors.wrench[k, own].all() for k, own in enumerate(possible)]
+    rows = ["joint torques"] * bool(torque.any()) + ["base forces"] * (not robot.fixed_base)
+    rows += ["wrenches in limbs"] * bool(sensors.torque[robot.n :].any())
+    makers = ["force in a closed loop"] * bool(robot.loops)
+    if not torque.all():
+        without = [name for name, measured in zip(robot.joint_names, torque, strict=True) if not measured]
+        makers.append(f"torque of {join_names(without, _NAMED)}" if torque.any() else "joint torque")
+    if any(lacking):
+        frames = [contact.frame for contact, lacks in zip(contacts, lacking, strict=True) if lacks]
+        some = measured_components(contacts, sensors).any()
+        makers.append(f"unmeasured force at {join_names(frames, _NAMED)}" if some else "contact force")
+    return f"errors of {' and '.join(rows)}" + f" that no {' or '.join(makers)} can make" * bool(makers)

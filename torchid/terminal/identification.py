@@ -33,6 +33,7 @@ from torchid.report.tables import (
 )
 from torchid.reprs import decimal
 from torchid.robot import Robot
+from torchid.sensing.sensors import minimized_errors
 from torchid.terminal.lines import (
     CUT,
     LABEL,
@@ -215,6 +216,9 @@ def _print_fit(run: Identification) -> None:
     """Print the key figures, one per line."""
     estimate, robot = run.estimate, run.experiment.robot
     print_rolling(run.experiment.rolling)
+    sensors = run.experiment.sensors
+    weighted = "" if sensors.task_weights is None else ", weighted by estimator.task_weights"
+    print_labelled("minimized", minimized_errors(robot, run.experiment.contacts, sensors) + weighted)
     print_labelled("parameters", f"{estimate.rank} independent combinations of {int(estimate.phi.size)} identified")
     print_labelled("condition", f"{estimate.condition_number:.3g}")
     rest = "" if run.misfit.expected is None else f"; {run.misfit.expected:.3g} are left by noise alone"
