@@ -52,6 +52,7 @@ def test_a_run_folder_holds_what_it_promises(run: Path) -> None:
         "identified",
         "events",
         "forces",
+        "pressure",
         "errors",
         "identifiability",
         "contributions",
@@ -121,7 +122,11 @@ def test_metrics_json_has_the_documented_fields(run: Path) -> None:
     groups += ("base_force_rms_by_axis", "base_moment_rms_by_axis")
     for name in ("train", "test"):
         every = (*groups, "projected_residual")
-        assert set(metrics[name]) == {*every, *(f"{group}_relative" for group in every)}
+        known = {*every, *(f"{group}_relative" for group in every), "centre_of_pressure_rms"}
+        assert set(metrics[name]) == known
+        assert (
+            0.0 < metrics[name]["centre_of_pressure_rms"] < 0.2 * metrics[f"{name}_nominal"]["centre_of_pressure_rms"]
+        )
         assert metrics["base_force_rms_of_variation"][name] > metrics[name]["base_force_rms_relative"]
         assert len(metrics[name]["joint_torque_rms_by_joint"]) == 12
         joints = list(metrics[name]["joint_torque_rms_by_joint"].values())
@@ -166,7 +171,7 @@ def test_tensorboard_shows_train_and_test_before_and_after(run: Path) -> None:
         (urdf,), (identified,) = map(events.Scalars, tags)
         assert urdf.step == identified.step == 1  # points, which no smoothing changes
         assert identified.value < urdf.value
-    figures = ("forces", "errors", "parameters", "identifiability", "contributions", "ridge")
+    figures = ("forces", "pressure", "errors", "parameters", "identifiability", "contributions", "ridge")
     assert set(events.Tags()["images"]) == {f"figure_{k}_{name}" for k, name in enumerate(figures, 1)}
     assert min(events.Tags()["scalars"]).startswith("error_relative_"), "which TensorBoard shows first"
     text = events.Tensors("answer/text_summary")[0].tensor_proto.string_val[0].decode()

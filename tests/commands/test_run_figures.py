@@ -14,7 +14,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from torchid.cli import main
 from torchid.report.figure_style import save_figure
 
-_RUN = ("forces", "errors", "parameters", "identifiability", "contributions")
+_RUN = ("forces", "pressure", "errors", "parameters", "identifiability", "contributions")
 
 
 @pytest.mark.usefixtures("figures")
@@ -24,7 +24,8 @@ def test_each_figure_of_a_run_and_of_an_evaluation_is_drawn(tmp_path: Path) -> N
     assert main(["identify", str(demo / "quadruped.yaml"), f"output={run}"]) == 0
     assert main(["evaluate", str(run), "--log", str(demo / "sway_test.npz")]) == 0
     (evaluation,) = (folder for folder in (run / "evaluation").iterdir() if folder.is_dir())
-    for path in (*(run / f"{name}.png" for name in _RUN), evaluation / "forces.png", evaluation / "errors.png"):
+    of_log = (evaluation / f"{name}.png" for name in ("forces", "pressure", "errors"))
+    for path in (*(run / f"{name}.png" for name in _RUN), *of_log):
         picture = np.rint(255.0 * imread(path)[..., :3])
         assert min(picture.shape[:2]) > 200
         assert len(np.unique(picture @ [65536.0, 256.0, 1.0])) > 5, "colours of lines, letters and their smooth edges"
@@ -45,7 +46,7 @@ def test_figures_for_print_come_from_all_commands_and_tensorboard_keeps_its_pict
     assert main(["analyze", experiment, f"output={tmp_path / 'other'}", *given]) == 0
     written = list(tmp_path.rglob("*.pdf"))
     assert {path.stem for path in written} == {*_RUN, "drift", "sensors-logs", "accuracy"}
-    assert len(written) == len(_RUN) + 5
+    assert len(written) == len(_RUN) + 6
     for path in written:
         assert path.read_bytes().startswith(_BEGINS["pdf"])
     assert not list(tmp_path.rglob("*.png"))

@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from torchid.report import figure_style
 
 FIGURES = (
-    *("draw_forces", "error_figure", "parameter_figure", "identifiability_figure", "contribution_figure"),
-    *("extra_figure", "ridge_figure", "tree_figure", "accuracy_figure"),
+    *("force_figure", "error_figure", "parameter_figure", "identifiability_figure", "contribution_figure"),
+    *("pressure_figure", "extra_figure", "ridge_figure", "tree_figure", "accuracy_figure"),
 )
 PAGE, EVENTS = "write_page", "write_events"
 _WHITE = Figure(figsize=(1.0, 1.0))

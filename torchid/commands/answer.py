@@ -25,6 +25,7 @@ from torchid.problem.metrics import (
     DECISIVE_GROUPS,
     ERROR_GROUPS,
     LIMB_GROUPS,
+    PRESSURE,
     compare_parts,
     describe_worse,
     group_name,
@@ -98,7 +99,7 @@ class ErrorComparison:
     def shown_errors(self) -> list[tuple[str, float, float, float | None]]:
         """Errors that a user should see, by the words for their group, with units."""
         few = len(list(self.errors())) < _FEW_GROUPS  # no joint of its own, as all legs stand: their projection
-        errors = self.errors(tuple(ERROR_GROUPS) if few else DECISIVE_GROUPS)
+        errors = self.errors((*(ERROR_GROUPS if few else DECISIVE_GROUPS), PRESSURE))
         return [(self.identified.label(group), before, after, floor) for group, before, after, floor in errors]
 
 

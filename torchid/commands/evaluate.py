@@ -16,7 +16,7 @@ from rich.progress import Progress
 from torchid import distributed
 from torchid.commands.folder import EVALUATION, RUN, check_free, new_folder, refuse_link, write_json
 from torchid.commands.results import Identification
-from torchid.commands.run_figures import draw_forces
+from torchid.commands.run_figures import force_figures
 from torchid.config import load_config
 from torchid.config.robot import NoiseConfig
 from torchid.errors import ConfigError, about_file, during, warn
@@ -33,7 +33,7 @@ from torchid.problem import Evaluation, Metrics, Samples
 from torchid.problem.contact_state import state_name
 from torchid.problem.metrics import DECISIVE_GROUPS, WHITENED, describe_errors, group_name
 from torchid.problem.motion_noise import is_at_rest
-from torchid.problem.predict import at_motors, force_series, noise_series, projected_forces
+from torchid.problem.predict import at_motors, force_series, noise_series, pressure_series, projected_forces
 from torchid.reading.log_reader import LogReader
 from torchid.report.figure_style import save_figures
 from torchid.report.figures import error_figure
@@ -284,7 +284,7 @@ def _write(evaluated: EvaluatedRun, output: Path, config: Path, form: str, overw
         (new / "config.yaml").write_bytes(read_bytes(config, MAX_YAML))
         write_json(new / "metrics.json", evaluated.to_dict())
         figures = {
-            **({"forces": draw_forces(evaluated.forces, evaluated.robot)} if evaluated.forces.known else {}),
+            **{name: draw() for name, draw in force_figures(evaluated.forces, evaluated.robot).items()},
             "errors": error_figure(evaluated.metrics, evaluated.robot.format),
         }
         save_figures(figures, new, form)
@@ -366,7 +366,11 @@ def compare_forces(
         predicted.append(forces)
     nominal = predicted[0] + np.nan_to_num(measured[1] - measured[0])  # NaN: not measured
     noise = None if evaluation.noise is None else noise_series(evaluation.builder, part, evaluation.noise)
-    return ForceSeries(log_title(samples.source), part.time.numpy(), measured[1], nominal, predicted[1], noise)
+    forces = measured[1], nominal, predicted[1]
+    pressure = None
+    if evaluation.robot.base_rows:
+        pressure = pressure_series(evaluation.builder, part, np.stack(forces)[..., :6], evaluation.least_carried)
+    return ForceSeries(log_title(samples.source), part.time.numpy(), *forces, noise, pressure)
 
 
 def trace_forces(evaluation: Evaluation, samples: Samples, compared: Comparison[Calibration]) -> LogForces:

@@ -25,7 +25,7 @@ from torchid.problem import Metrics
 from torchid.problem.metrics import LOG_SETS
 from torchid.report.figure_style import Drawn, draw_for
 from torchid.report.figures import contribution_figure, error_figure, identifiability_figure, ridge_figure
-from torchid.report.forces import ForceSeries, force_figure
+from torchid.report.forces import ForceSeries, force_figure, pressure_figure
 from torchid.report.parameter_figures import extra_figure, parameter_figure
 from torchid.report.tables import table_text, verdict_counts_table
 from torchid.robot import Robot
@@ -49,8 +49,8 @@ def fit_figures(
     """Those that a fit alone gives, in the order in which they are to be seen."""
     kinds = {body.joint.kind for body in robot.bodies if body.joint is not None}
     figures = Figures()
-    if forces is not None and forces.known:
-        figures["forces"] = partial(draw_forces, forces, robot)
+    if forces is not None:
+        figures |= force_figures(forces, robot)
     figures |= {
         "parameters": partial(parameter_figure, robot.body_names, robot.nominal, estimate, kinds, robot.format),
         "identifiability": partial(identifiability_figure, robot.body_names, estimate),
@@ -66,16 +66,21 @@ def all_figures(run: Identification) -> Figures:
     """Those of a run, in the order in which they are to be seen."""
     robot = run.experiment.robot
     of_fit = fit_figures(robot, run.estimate, run.extras, run.ridge, run.forces)
-    figures = {name: of_fit.pop(name) for name in ("forces",) if name in of_fit}
+    figures: Figures = {name: of_fit.pop(name) for name in ("forces", "pressure") if name in of_fit}
     figures["errors"] = partial(error_figure, run.metrics, robot.format)
     figures |= {name: of_fit.pop(name) for name in ("parameters", "identifiability")}
     figures["contributions"] = partial(contribution_figure, _bits(run.contributions))
     return figures | of_fit
 
 
-def draw_forces(series: ForceSeries, robot: Robot) -> Figure:
-    """The figure of forces of a log's first samples."""
-    return force_figure(series, robot.dof_names, robot.base_rows, robot.sliding, robot.format)
+def force_figures(series: ForceSeries, robot: Robot) -> Figures:
+    """Those of forces of a log's first samples, as far as these are measured."""
+    figures, args = Figures(), (robot.dof_names, robot.base_rows, robot.sliding, robot.format)
+    if series.known:
+        figures["forces"] = partial(force_figure, series, *args)
+    if series.pressure is not None and np.isfinite(series.pressure[0]).any():
+        figures["pressure"] = partial(pressure_figure, series, robot.format)
+    return figures
 
 
 def _bits(contributions: Contributions) -> dict[str, list[tuple[str, float]]]:

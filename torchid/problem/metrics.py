@@ -9,12 +9,19 @@ import numpy as np
 import torch
 
 from torchid.errors import format_percent, join_names
-from torchid.parameters import Array
+from torchid.parameters import GRAVITY, MASS, Array
 from torchid.problem.chunk_dynamics import ChunkKinematics
 from torchid.problem.chunks import ProgressCallback, map_chunks
 from torchid.problem.contact_state import ContactState
 from torchid.problem.extras import ExtraTerms
-from torchid.problem.predict import measured_and_predicted_forces, null_space_components, reading_variance
+from torchid.problem.predict import (
+    GeneralizedForces,
+    centre_of_pressure,
+    ground_below,
+    measured_and_predicted_forces,
+    null_space_components,
+    reading_variance,
+)
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.robot import Robot
@@ -91,7 +98,11 @@ IN_AIR = "limbs in the air"  # whose joint torques alone count where no contact 
 LIMB_GROUPS = {"ft_force": "force in limbs [N]", "ft_moment": "moment in limbs [N m]"}
 """Groups of readings of force/torque sensors in limbs."""
 
-_LABELS = ERROR_GROUPS | LIMB_GROUPS
+PRESSURE = "centre_of_pressure"
+PRESSURE_GROUP = {PRESSURE: "centre of pressure [m]"}
+"""The point where the ground's forces meet the ground, where they carry a tenth of the weight or more."""
+
+_LABELS = ERROR_GROUPS | LIMB_GROUPS | PRESSURE_GROUP
 
 LOG_SETS = ("train", "test")
 """Sets of logs that errors are given for."""
@@ -108,6 +119,7 @@ ADVICE = (
 )
 """Advice for parameters that predict worse than the nominal ones."""
 
+_CARRIES = 0.1  # of the weight in the robot's file: with less force on the ground its point says nothing
 _NOISE_SAMPLES = 64  # of a chunk, for the noise of its measured forces
 _CLEARLY = 1.05  # ratio of errors above which one is worse
 _MATTERS = 1e-3  # of the measured rms: smaller differences, as on data without noise, do not count
@@ -117,7 +129,8 @@ _MATTERS = 1e-3  # of the measured rms: smaller differences, as on data without 
 class Metrics:
     """Errors of one parameter vector on some logs; None where the logs cannot give a figure.
 
-    `rms` and `relative` by group of `ERROR_GROUPS`, the last in units of the stated noise; `by_joint_rms` and
+    `rms` and `relative` by group of `ERROR_GROUPS`, the last in units of the stated noise, `rms` also of `PRESSURE`
+    where contact forces are measured and carry a tenth of the weight; `by_joint_rms` and
     `by_joint_relative` by joint. Relative means rms of the error over
     rms of what was measured. `rms` of "joint_torque" is the mean over joints of their rms, relative to the same mean of
     the measured. `base_force_of_variation` is relative to the rms of the measured base force about its mean, which is
@@ -175,6 +188,7 @@ class Metrics:
                 out[f"{group}_{suffix}"] = groups[group]
                 if group == "joint_torque":
                     out[f"joint_torque_{suffix.replace('rms', 'rms_by_joint')}"] = joints
+        out[f"{PRESSURE}_rms"] = self.rms.get(PRESSURE)
         return out | {WHITENED: self.rms.get(WHITENED), f"{WHITENED}_relative": self.relative.get(WHITENED)}
 
 
@@ -197,6 +211,11 @@ class Evaluation:
         self.robot, self.noise = robot, noise
         sensors = named_sensors("joints", robot.n, len(contacts), ft=len(robot.ft_names))
         self.builder = RowBuilder(robot, contacts, sensors, actuators).to(device)
+
+    @property
+    def least_carried(self) -> float:
+        """Force on the ground from which on it has a centre of pressure [N]."""
+        return _CARRIES * GRAVITY * float(self.robot.nominal[:, MASS].sum())
 
     def metrics(self, logs: Sequence[Samples], phi: Array, progress: ProgressCallback | None = None) -> list[Metrics]:
         """One `Metrics` per row of `phi` (M, 12 L), over all samples of the logs together.
@@ -224,6 +243,9 @@ class Evaluation:
                 errors = kinematics.without_rest(errors, base)
                 for total, error in zip(sums, builder.motors.of(builder.tree, kinematics, errors), strict=True):
                     total.rows.add(error)
+                pressure = self._pressure_errors(forces, samples, state, kinematics)
+                for total, off in zip(sums[1:], pressure, strict=False):
+                    total.pressure.add(off[:, None])
                 vectors = torch.cat([forces.torque[None], forces.predicted - forces.torque])
                 if self.noise is not None:
                     sums[0].noise.merge(self._noise_sums(samples, state, kinematics, self.noise))
@@ -235,6 +257,17 @@ class Evaluation:
         loaded = [replace(log, unloaded=None) for log in logs]
         parts = map_chunks(loaded, builder, sum_chunks, progress=progress)
         return [ForceSums.total(same) for same in zip(*parts, strict=True)]
+
+    def _pressure_errors(
+        self, forces: GeneralizedForces, samples: Samples, state: ContactState, kinematics: ChunkKinematics
+    ) -> torch.Tensor:
+        """Distances (M, B) [m] of predicted centres of pressure from the measured one, NaN where it is undefined."""
+        if not self.robot.base_rows or not any(state):
+            return samples.time.new_empty(0, len(samples))
+        normal, height = ground_below(self.builder, samples, state, kinematics)
+        wrench = torch.cat([forces.measured[None], forces.predicted])[..., :6]
+        at = centre_of_pressure(wrench, normal, height, self.least_carried)
+        return torch.linalg.vector_norm(at[1:] - at[0], dim=-1)
 
     def _noise_sums(
         self, samples: Samples, state: ContactState, kinematics: ChunkKinematics, noise: SensorNoise
@@ -250,13 +283,14 @@ class Evaluation:
         """Metrics from sums of squares."""
         base, n = self.robot.base_rows, self.robot.n
         rms, size = errors.rms(base, n), measured.rms(base, n)
+        pressure = finite_or_none(errors.pressure.pooled(slice(None)))
         joints = slice(base, base + n)
         by_joint, joint_size = errors.rows.rms(joints), measured.rows.rms(joints)
         groups = ERROR_GROUPS if errors.whitened.count.any() else ROW_GROUPS
         names, limbs = self.robot.joint_names, LIMB_GROUPS if self.robot.ft_names else {}
         axes, axis_size = errors.rows_by_axis(base, n), measured.rows_by_axis(base, n)
         return Metrics(
-            {group: finite_or_none(rms[group]) for group in groups},
+            {group: finite_or_none(rms[group]) for group in groups} | ({PRESSURE: pressure} if pressure else {}),
             {group: _ratio(rms[group], size[group]) for group in groups},
             {name: finite_or_none(x) for name, x in zip(names, by_joint, strict=True)},
             {name: _ratio(x, y) for name, x, y in zip(names, by_joint, joint_size, strict=True)},
@@ -346,13 +380,15 @@ class ForceSums:
     """Sums of squares of generalized forces or their errors: of rows, and inside the contacts' null space.
 
     `whitened`: of the rows of a fit, V_x^T f of its sensors in units of their noise. `noise` of rows: what the noise of
-    readings adds to the measured forces; `whitened_noise`: to the rows of a fit. `contact_forces`: whether one
+    readings adds to the measured forces; `whitened_noise`: to the rows of a fit. `pressure`: distances of centres of
+    pressure. `contact_forces`: whether one
     that was not measured enters joint rows, which do not count, and whether a measured one enters rows that do.
     """
 
     def __init__(self, n_rows: int) -> None:
         self.rows, self.projected, self.whitened = SumsOfSquares(n_rows), SumsOfSquares(1), SumsOfSquares(1)
         self.noise, self.whitened_noise = SumsOfSquares(n_rows), SumsOfSquares(1)
+        self.pressure = SumsOfSquares(1)
         self.contact_forces = np.zeros(2, dtype=bool)
 
     @classmethod
@@ -360,7 +396,7 @@ class ForceSums:
         """Sums over all parts."""
         out = cls(len(parts[0].rows.squares))
         for part in parts:
-            for name in ("rows", "projected", "whitened", "noise", "whitened_noise"):
+            for name in ("rows", "projected", "whitened", "noise", "whitened_noise", "pressure"):
                 getattr(out, name).merge(getattr(part, name))
             out.contact_forces |= part.contact_forces
         return out

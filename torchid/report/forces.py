@@ -34,6 +34,7 @@ class ForceSeries:
     """Forces of one log for plotting: `measured`, `nominal`, `identified`, (N, n_rows) each, NaN where unknown.
 
     `noise`, (N, n_rows): standard deviation that the noise of the readings gives the measured; None where unknown.
+    `pressure`, (3, N, 2) [m]: centres of pressure of the same three, from `pressure_series`; None of a fixed base.
     """
 
     source: str
@@ -42,6 +43,7 @@ class ForceSeries:
     nominal: Array
     identified: Array
     noise: Array | None = None
+    pressure: Array | None = None
 
     @property
     def known(self) -> bool:
@@ -81,6 +83,35 @@ def force_figure(
     shown = f" ({len(rows)} of {known} rows, the largest)" if len(rows) < known else ""
     gaps = "; gaps: forces without a sensor act" if np.isnan(series.measured[:, rows]).any() else ""
     title = f"Generalized forces{shown}, {series.source}, and errors: predicted - measured{gaps}"
+    figure.suptitle(title, x=0.01, ha="left")
+    return figure
+
+
+@matplotlib.rc_context(STYLE)
+def pressure_figure(series: ForceSeries, of: str = "URDF") -> Figure:
+    """Centres of pressure [m] over time, and beside them how far predicted ones are from the measured one.
+
+    `of` is what the nominal parameters are from.
+    """
+    series, since = _from_its_start(series)
+    figure = Figure(figsize=(12.0, 4.4), layout="constrained")
+    axes = figure.subplots(2, 2, sharex=True, width_ratios=(3, 2))
+    at = np.full((3, len(series.time), 2), np.nan) if series.pressure is None else series.pressure
+    labels = "measured", f"predicted, {of}", "predicted, identified"
+    lines = [*zip(labels, (MEASURED_COLOR, NOMINAL_COLOR, IDENTIFIED_COLOR), strict=True)]
+    for k, name in enumerate(("along the base's x axis", "to its left")):
+        for (label, color), values, width in zip(lines, at, (1.6, 1.0, 1.0), strict=True):
+            axes[k, 0].plot(series.time, values[:, k], color=color, linewidth=width, label=label)
+        for (_, color), values in zip(lines[1:], at[1:], strict=True):
+            axes[k, 1].plot(series.time, values[:, k] - at[0, :, k], color=color, linewidth=0.8)
+        axes[k, 0].set_title(f"{name}, from below the base link's origin", loc="left", fontsize=9)
+        axes[k, 0].set_ylabel("[m]")
+        error = _rms(at[2, :, k] - at[0, :, k])
+        axes[k, 1].set_title(f"identified: rms {np.nan if error is None else error:.3g} [m]", loc="left", fontsize=9)
+    for axis in axes[-1]:
+        axis.set_xlabel(f"time{since} [s]")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    title = f"Centre of pressure on the ground, {series.source}, and errors: predicted - measured"
     figure.suptitle(title, x=0.01, ha="left")
     return figure
 

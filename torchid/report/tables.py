@@ -28,7 +28,7 @@ from torchid.kernels import compiling_announced
 from torchid.logs.time_range import log_title
 from torchid.parameters import PARAMETERS, PER_BODY
 from torchid.problem import Metrics
-from torchid.problem.metrics import ERROR_GROUPS, IN_AIR, LIMB_GROUPS
+from torchid.problem.metrics import ERROR_GROUPS, IN_AIR, LIMB_GROUPS, PRESSURE, PRESSURE_GROUP
 
 WIDTH = 100
 """Columns of what is printed, at most."""
@@ -89,7 +89,8 @@ def _error_table(columns: Mapping[str, Comparison[Metrics]], of: str) -> Table:
     for name in columns:
         for parameter_set in (of, "identified"):
             table.add_column(Text(f"{name}\n{parameter_set}"), justify="right", overflow="fold")
-    limbs = LIMB_GROUPS if any(pair.identified.limb_rms for pair in columns.values()) else {}
+    limbs = dict(LIMB_GROUPS) if any(pair.identified.limb_rms for pair in columns.values()) else {}
+    limbs |= PRESSURE_GROUP if any(PRESSURE in pair.identified.rms for pair in columns.values()) else {}
     for group, label in (ERROR_GROUPS | limbs).items():
         errors = [_error_cell(m, group) for pair in columns.values() for m in pair]
         table.add_row(Text(label), *errors)

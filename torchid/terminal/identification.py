@@ -18,7 +18,7 @@ from torchid.estimators.least_squares import COMBINED, FIXED, IDENTIFIED, PRIOR,
 from torchid.fitting.cross_validation import CrossValidation
 from torchid.fitting.misfit import Misfit
 from torchid.parameters import PARAMETERS, PER_BODY, Array
-from torchid.problem.metrics import DECISIVE_GROUPS, describe_errors
+from torchid.problem.metrics import DECISIVE_GROUPS, PRESSURE, describe_errors, group_name
 from torchid.report.tables import (
     contribution_table,
     error_tables,
@@ -86,6 +86,8 @@ def answer_lines(run: Identification, width: int, last: Sequence[tuple[str, str]
     output = run.experiment.config.output
     end = [] if output is None else [f"{'written to':{LABEL}}{output}"]
     end += [line for one in last for line in labelled(*one, width, _TEXT_LINES)]
+    if len(lines) + len(end) > LINES:
+        lines = [line for line in lines if not line.startswith(group_name(PRESSURE))]
     bodies = _body_lines(run.experiment.robot, run.estimate, LINES - len(lines) - len(end) - 1, width)
     return [*lines, *(["", *bodies] if bodies else []), *end]
 

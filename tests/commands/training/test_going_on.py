@@ -47,7 +47,7 @@ pytestmark = pytest.mark.usefixtures("events")
 
 def test_the_run_folder_is_that_of_any_run_and_nothing_is_left_beside_it(run: Path) -> None:
     names = {"events" if path.name.startswith("events") else path.name for path in run.iterdir()}
-    figures = {"forces.png", "errors.png", "parameters.png", "identifiability.png", "contributions.png"}
+    figures = {"forces.png", "pressure.png", "errors.png", "parameters.png", "identifiability.png", "contributions.png"}
     results = {"config.yaml", "parameters.json", "metrics.json", "identified.urdf", "manifest.json"}
     results |= {"report.json", "posterior.npz"}
     assert names == {"events", *results, *figures}
@@ -60,7 +60,8 @@ def test_metrics_and_parameters_are_those_of_the_best_epoch(run: Path) -> None:
     groups = ("joint_torque_rms", "joint_torque_rms_by_joint", "base_force_rms", "base_moment_rms", "nullspace_rms")
     groups += ("base_force_rms_by_axis", "base_moment_rms_by_axis", "projected_residual")
     for name in ("train", "test"):
-        assert set(metrics[name]) == {*groups, *(f"{group}_relative" for group in groups)}
+        known = {*groups, *(f"{group}_relative" for group in groups), "centre_of_pressure_rms"}
+        assert set(metrics[name]) == known
         for group in ("joint_torque_rms", "base_force_rms", "base_moment_rms", "nullspace_rms"):
             assert metrics[name][group] < metrics[f"{name}_nominal"][group]
     held_out = {event.step: event.value for event in events_in(run).Scalars("loss_held_out/data")}
@@ -130,7 +131,7 @@ def test_curves_say_everything_by_epoch_and_show_train_and_unseen_logs(run: Path
     terms = ("data", "prior", "beside", "conditions")
     parts = zip(*([event.value for event in events.Scalars(f"loss/{term}")] for term in terms), strict=True)
     assert total == pytest.approx([sum(pair) for pair in parts], rel=1e-6)
-    figures = ("forces", "errors", "parameters", "identifiability", "contributions")
+    figures = ("forces", "pressure", "errors", "parameters", "identifiability", "contributions")
     assert set(events.Tags()["images"]) == {f"figure_{k}_{name}" for k, name in enumerate(figures, 1)}
     (text,) = events.Tensors("config/text_summary")
     assert b"checkpoint_seconds: 0" in text.tensor_proto.string_val[0]
