@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +20,7 @@ from torchid.commands.sensor_set_accuracy import accuracies
 from torchid.config import AnalyzeConfig, dump_config, inputs_of
 from torchid.errors import ConfigError, UnknownNameError, during, join_names, warn
 from torchid.fitting.experiment import RobotSetup, set_up_robot, with_noise
+from torchid.fitting.left_out import Evidence, leave_sensors_out
 from torchid.fitting.misfit import unmeasured_at_rest
 from torchid.identifiability.base_parameters import BaseParameters, base_parameters
 from torchid.parallel import can_fork, in_forks, one_thread, thread_count, threads_at_most
@@ -31,6 +32,7 @@ from torchid.problem.elimination import free_parameters
 from torchid.problem.linear import parameter_scale
 from torchid.reading.log_reader import LogReader, check_read
 from torchid.report.analysis import (
+    ALL_OF,
     SetAccuracy,
     accuracy_figure,
     base_parameters_document,
@@ -44,7 +46,7 @@ from torchid.report.tables import progress_bars
 from torchid.reprs import short_repr
 from torchid.sensing import Contact, SensorSet
 from torchid.sensing.sensors import NORMAL_FORCE, measured_components
-from torchid.sensor_planning.demands import count_channels, sensor_set
+from torchid.sensor_planning.demands import candidates, contained_candidates, count_channels, sensor_set
 from torchid.sensor_planning.observability import BaseObservability
 from torchid.sensor_planning.planner import (
     PlanningProblem,
@@ -91,7 +93,8 @@ class Analysis:
     """Results by scenario, the accuracy of sensor sets on logs, and the folder that they were written to, if any.
 
     Of processes that share the work, the first alone has the scenarios: to look for sensors is the work of one.
-    `resting`: share of the training logs' torques that count as unmeasured, as joints rest, if any does.
+    `resting`: share of the training logs' torques that count as unmeasured, as joints rest, if any does. `without`:
+    what leaving each sensor of the file out is worth to the prediction of the others, see `leave_sensors_out`.
     """
 
     setup: RobotSetup
@@ -99,6 +102,7 @@ class Analysis:
     accuracies: dict[str, SetAccuracy]
     output: Path | None
     resting: float | None = None
+    without: Mapping[str, Evidence] = field(default_factory=dict)
 
     __repr__ = short_repr
 
@@ -117,7 +121,9 @@ class Analysis:
                 "base_parameters": base_parameters_document(scenario.base, names),
             }
         accuracy = {name: one.as_dict() for name, one in self.accuracies.items()} or None
-        return {"scenarios": scenarios, "accuracy": accuracy, "resting_share": self.resting}
+        without = {name: asdict(one) for name, one in self.without.items()} or None
+        document = {"scenarios": scenarios, "accuracy": accuracy, "resting_share": self.resting}
+        return document | {"sensors_left_out": without}
 
 
 @one_thread()
@@ -171,11 +177,34 @@ def analyze(config: AnalyzeConfig) -> Analysis:
                 bars.add_task("comparing sensor sets", total=None)
                 found = [*compared_early(), *compared_later(), {} if later else compare(left)]
         compared = {name: share[name] for name in sets for share in found if name in share}
-        analysis = Analysis(setup, tuple(results), compared, output, unmeasured_at_rest(train))
+        without = distributed.from_first(partial(_leave_out, request, train), "sensors left out")
+        analysis = Analysis(setup, tuple(results), compared, output, unmeasured_at_rest(train), without)
         if output is not None:
             bars.add_task("writing", total=None)
             distributed.from_first(partial(_write_analysis, analysis, output, config.overwrite), "analysis folder")
     return analysis
+
+
+def _leave_out(request: AnalysisRequest, train: Sequence[Samples]) -> dict[str, Evidence]:
+    """What leaving out each sensor of the file, or all of a kind, is worth to the prediction of the others."""
+    setup, sensors = request.setup, request.proposed
+    if sensors is None or not train:
+        return {}
+    robot, contacts = setup.robot, setup.contacts
+    own = contained_candidates(contacts, sensors, candidates(robot, contacts, ft_sensors=robot.ft_names))
+    dropped = {one.name: [one] for one in own}
+    kinds = {one.kind: [other for other in own if other.kind == one.kind] for one in own}
+    dropped |= {f"{ALL_OF}{kind}": some for kind, some in kinds.items() if 1 < len(some) < len(own)}
+    sets = {}
+    for name, some in dropped.items():
+        torque, wrench = sensors.torque.copy(), sensors.wrench.copy()
+        for one in some:
+            torque[list(one.dofs)] = False
+            if one.contact is not None:
+                wrench[one.contact] = False
+        if (torque & ~robot.is_passive).any() or wrench.any():
+            sets[name] = replace(sensors, torque=torque, wrench=wrench)
+    return leave_sensors_out(train, setup.fitter(setup.builder(sensors), setup.conditions()), setup.terms, sets)
 
 
 def _plan_label(name: str) -> str:

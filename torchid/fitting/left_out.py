@@ -24,6 +24,7 @@ from torchid.problem.elimination import column_prior
 from torchid.problem.extras import SLOPE, Extra, in_words
 from torchid.problem.linear import PRIOR_DEVIATION, parameter_scale
 from torchid.reprs import short_repr
+from torchid.sensing import SensorSet
 
 TERMS = ("armature", "torque_offset", "delay", "stiffness", "asymmetric_coulomb")
 """Terms of actuators that logs choose, the more usual first: of two that explain the same the first is kept."""
@@ -121,6 +122,15 @@ class Reading:
             for block in range(fold, len(judged.rows), _FOLDS):
                 squares[block] = max(float(x @ judged.grams[block] @ x), at_floor)
         return squares
+
+    def in_columns_of(self, other: Reading) -> Reading:
+        """The same rows in the columns of a reading that has all extra parameters of this one, and more."""
+        count, labels = len(other.nominal) - len(other.extras), [extra.label for extra in other.extras]
+        own = (count + labels.index(extra.label) for extra in self.extras)
+        at = np.array([*range(count), *own, len(other.nominal)])
+        grams = np.zeros((len(self.rows), *other.grams.shape[1:]))
+        grams[:, at[:, None], at] = self.grams
+        return replace(other, grams=grams, rows=self.rows)
 
     def unexplained(self, terms: Collection[str]) -> float:
         """What a fit leaves of the forces of left-out blocks (rms over rms)."""
@@ -270,6 +280,34 @@ class Evidence:
 
     def __str__(self) -> str:
         return f"{100.0 * math.expm1(-0.5 * self.gain):+.2g} %"  # of the error itself
+
+
+@one_thread()
+def leave_sensors_out(
+    logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms, sets: Mapping[str, SensorSet]
+) -> dict[str, Evidence]:
+    """By how much better a fit with fewer sensors predicts the left-out rows of these than a fit with all does.
+
+    Both are judged by the same rows, those that need none of the sensors left out: where they gain by leaving a sensor
+    out, it contradicts the others.
+
+    Args:
+        logs: bound training logs.
+        fitter: of the rows of all sensors.
+        terms: extra parameters of these.
+        sets: parts of these sensors, by name.
+
+    Source: sensors that make predictions worse, Mistry, Schaal, Yamane 2009, IV-E; the score is that of `choose_terms`.
+    """
+    some, of, out = thinned(logs), fitter.builder, dict[str, Evidence]()
+    edges = block_edges(some)
+    whole = compress_reading(some, edges, fitter)
+    kinds = {kind_of(extra) for extra in whole.extras}
+    for name, sensors in sets.items():
+        builder = RowBuilder(fitter.robot, of.contacts, sensors, terms).to(of.device)
+        fewer = compress_reading(some, edges, replace(fitter, builder=builder)).in_columns_of(whole)
+        out[name] = Evidence.of(whole.left_out(kinds, fewer), fewer.left_out(kinds))
+    return out
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from torchid.errors import format_count, format_percent
+from torchid.fitting.left_out import Evidence
 from torchid.identifiability.base_parameters import BaseParameters, format_base_parameters, unobservable_parameters
 from torchid.identifiability.information import ExpectedErrors
 from torchid.problem import Metrics
@@ -306,6 +307,26 @@ def confounded_messages(sets: Mapping[str, SetAccuracy], in_short: bool = False)
         for message in found.advice if in_short else found.confounded:
             names.setdefault(message, []).append(name)
     return [f"{', '.join(of)}: {message}" for message, of in names.items()]
+
+
+ALL_OF = "all sensors of kind "
+"""What names of all sensors of a kind begin with."""
+
+
+def left_out_table(without: Mapping[str, Evidence]) -> Table:
+    """Change of the error of the other sensors' rows on left-out blocks by leaving a sensor out, the best first."""
+    table = _table("Each sensor left out: error of the others on left-out blocks", "without", "change", "certain")
+    for name, one in sorted(without.items(), key=lambda pair: -pair[1].gain):
+        table.add_row(Text(name), str(one), "yes" if one.certain else "no")
+    return table
+
+
+def contradicting_messages(without: Mapping[str, Evidence]) -> list[str]:
+    """Sensors that make predictions of the others worse, the worst first, then whole kinds of them."""
+    worse = sorted((name.startswith(ALL_OF), -one.gain, name) for name, one in without.items() if one.adopted)
+    smaller = [(name, format_percent(-np.expm1(0.5 * loss))) for _, loss, name in worse]
+    advice = "check gain, axes and offset: torchid check"
+    return [f"without {name} errors of the others are {share} % smaller; {advice}" for name, share in smaller]
 
 
 def _number(x: float | None) -> str:

@@ -16,8 +16,10 @@ from torchid.report.analysis import (
     branch_table,
     candidate_names,
     confounded_messages,
+    contradicting_messages,
     describe_losses,
     describe_singular_postures,
+    left_out_table,
     observability_table,
     removal_table,
     resting_message,
@@ -67,6 +69,8 @@ def print_analysis_tables(analysis: Analysis) -> None:
         print_tables(accuracy_table(analysis.accuracies))
         for message in confounded_messages(analysis.accuracies):
             print_labelled("confounded", message)
+    if analysis.without:
+        print_tables(left_out_table(analysis.without))
     print(f"{'written to':{LABEL}}{analysis.output}")
 
 
@@ -175,6 +179,7 @@ def _attention(analysis: Analysis, scenarios: Sequence[ScenarioAnalysis]) -> Ite
             if found is not None and found.rank < one.base.rank:
                 what = f"the logs determine {found.rank} of {one.base.rank} combinations"
                 yield f"{what}: record motion that differs more, of all joints and of the base"
+    yield from contradicting_messages(analysis.without)
     yield from confounded_messages(analysis.accuracies, in_short=True)
     for one in scenarios:
         yield from named(one, describe_singular_postures(_judged_states(one), beyond_logs=False))

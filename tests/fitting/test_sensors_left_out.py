@@ -1,0 +1,73 @@
+"""Which sensors make predictions of the others worse, by fits that leave them and blocks of the log out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from synthetic import Oracle, make_log
+
+import torchid
+from torchid.fitting.left_out import Evidence, block_edges, compress_reading, kind_of, leave_sensors_out, thinned
+from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log
+from torchid.report.analysis import ALL_OF, contradicting_messages
+from torchid.sensing import SensorNoise, SensorSet, named_sensors
+
+ROBOT = torchid.load_robot(Path(torchid.__file__).parent / "demo" / "quadruped.urdf")
+FEET = [torchid.Contact(f"{end}_{side}_foot", "point") for end in ("front", "rear") for side in ("left", "right")]
+NOISE = SensorNoise(joint_torque=0.1, contact_force=0.5, base_force=0.5, base_moment=0.1)
+FULL = named_sensors("full", ROBOT.n, len(FEET), NOISE)
+
+
+def walk(gain: float) -> Samples:
+    """A log with noise in which the second foot reads `gain` times its force."""
+    rng = np.random.default_rng(0)
+    oracle = Oracle.of(ROBOT)
+    oracle.perturb(rng, 0.1)
+    walks = [[True] * 4, [True, False, False, True], [False, True, True, False]]
+    log = make_log(oracle, [(foot.frame, 3) for foot in FEET], walks, 400, rng, tilt=0.2)
+    force = log.contact_wrench_local + 0.5 * rng.normal(size=log.contact_wrench_local.shape)
+    force[:, 1] *= gain
+    torque = log.joint_torque + 0.1 * rng.normal(size=log.joint_torque.shape)
+    return bind_log(replace(log, joint_torque=torque, contact_wrench_local=force), ROBOT, FEET)
+
+
+def without_foot(number: int) -> SensorSet:
+    wrench = FULL.wrench.copy()
+    wrench[number] = False
+    return replace(FULL, wrench=wrench)
+
+
+def fitter_of(terms: ExtraTerms, sensors: SensorSet = FULL) -> torchid.LogFitter:
+    builder = RowBuilder(ROBOT, FEET, sensors, terms)
+    return torchid.LogFitter(robot=ROBOT, builder=builder, estimator=torchid.LeastSquares(ridge=1e-3))
+
+
+@pytest.mark.parametrize("terms", [ExtraTerms(), ExtraTerms(offsets={"contact_force": "all"})], ids=["", "offsets"])
+def test_the_foot_that_reads_too_much_is_found_and_no_other(terms: ExtraTerms) -> None:
+    sets = {foot.frame: without_foot(number) for number, foot in enumerate(FEET)}
+    sets[f"{ALL_OF}contact"] = named_sensors("joints", ROBOT.n, len(FEET), NOISE)
+    found = leave_sensors_out([walk(1.3)], fitter_of(terms), terms, sets)
+    assert [name for name in sets if found[name].adopted] == [FEET[1].frame, f"{ALL_OF}contact"]
+    first, kind = contradicting_messages(found)
+    assert first.startswith(f"without {FEET[1].frame} errors of the others are ")
+    assert kind.startswith(f"without {ALL_OF}contact ")
+    clean = leave_sensors_out([walk(1.0)], fitter_of(terms), terms, sets)
+    assert not any(one.adopted for one in clean.values())
+    assert not contradicting_messages(clean)
+
+
+def test_both_fits_are_judged_by_the_same_rows() -> None:
+    """Of the smaller set, whose rows are as they are by themselves, in columns that have its unknowns elsewhere."""
+    terms, logs = ExtraTerms(offsets={"contact_force": "all"}, armature=True), thinned([walk(1.3)])
+    edges = block_edges(logs)
+    whole, alone = (compress_reading(logs, edges, fitter_of(terms, one)) for one in (FULL, without_foot(1)))
+    fewer, kinds = alone.in_columns_of(whole), {kind_of(extra) for extra in whole.extras}
+    assert len(whole.extras) > len(alone.extras)
+    np.testing.assert_array_equal(fewer.rows, alone.rows)
+    np.testing.assert_allclose(fewer.left_out(kinds), alone.left_out(kinds), rtol=1e-6)
+    by_hand = Evidence.of(whole.left_out(kinds, fewer), fewer.left_out(kinds))
+    sets = {"foot": without_foot(1)}
+    assert leave_sensors_out([walk(1.3)], fitter_of(terms), terms, sets)["foot"] == by_hand
