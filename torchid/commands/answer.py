@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -17,6 +17,7 @@ from torchid.fitting.misfit import AT_THE_FLOOR, unexplained_joints, unexplained
 from torchid.fitting.posterior import FittedPosterior
 from torchid.identifiability.confounding import TotalMass
 from torchid.log_checks.weight import MAX_MASS_ERROR
+from torchid.logs.column_map import values_by_name
 from torchid.logs.time_range import log_title
 from torchid.parameters import COULOMB, PER_BODY
 from torchid.problem import Metrics
@@ -109,6 +110,7 @@ _EXACT = 1e-3  # of what the nominal parameters leave: signals without noise, of
 _CLEAR_ERRORS = 4.0  # standard errors of a total mass from which on it is not the URDF's
 _HEAVY = 2.0  # times the mass in the robot's file
 _COMPUTED = 1e-3  # of the measured, to which no file predicts what a real robot does: friction alone is more
+_ALIKE, _DIFFERENT, _SAME_STEP = 0.2, 1.5, 0.1  # of armatures over kd, relative; of gains; of a step, relative
 _ANOTHER_ROBOT = 1.0  # of each body that data determine: no file of the same robot is off by so much
 
 
@@ -225,11 +227,42 @@ def _attention(run: Identification, judged: ErrorComparison) -> Iterator[str]:
         yield f"whether the model explains these forces is not known: {reason}; state sensors.noise, or record more"
     yield from _noise_alone(run)
     yield from _undetermined(run)
+    yield from _implicit(run)
     for one in list_confounded([x for x in run.extras if x.extra.what not in run.choices.adopted_terms]):
         yield one.in_short
     yield from _far_off(run.posterior)
     if run.noise.suggested:
         yield f"noise: {noise_advice(run.noise.suggested)}"
+
+
+def _implicit(run: Identification) -> Iterator[str]:
+    """That armatures are those which a simulator's implicit integration of a PD law adds, where its kd is stated."""
+    logs, robot = run.experiment.config.logs, run.experiment.robot
+    torque = logs.columns.joint_torque if logs.columns else None
+    if run.forces is None or torque is None or torque.pd is None or torque.pd.kd is None:
+        return
+    kd = values_by_name("logs.columns.joint_torque.pd.kd", torque.pd.kd.value, robot.joint_names)
+    known = dict(zip(robot.joint_names, robot.armature.tolist(), strict=True))
+    found = {x.extra.name: x.value - known[x.extra.name] for x in run.extras if x.extra.what == "armature"}
+    if step := implicit_step(kd, found, float(np.median(np.diff(run.forces.time)))):
+        said = f"armatures are {1e3 * step:.2g} ms times the stated kd"
+        yield f"{said}: no rotors, but what a simulator with an implicit PD law adds, its step times kd"
+
+
+def implicit_step(kd: Mapping[str, float], armatures: Mapping[str, float], step: float) -> float | None:
+    """The time [s] by which armatures [kg m^2] are the gains kd [N m s/rad] times it; None for a coincidence.
+
+    It is none where gains differ and armatures go with them, or where the time is the step of the samples.
+    Source: MuJoCo's integrators, (M + h kd) a = f for a damping of kd and a step of h.
+    """
+    gains = np.array([gain for name, gain in kd.items() if gain > 0.0 and name in armatures])
+    if not len(gains):
+        return None
+    times = np.array([armatures[name] / gain for name, gain in kd.items() if gain > 0.0 and name in armatures])
+    common = float(np.median(times))
+    alike = common > 0.0 and bool((np.abs(times / common - 1.0) < _ALIKE).all())
+    known = gains.max() > _DIFFERENT * gains.min() or abs(common / step - 1.0) < _SAME_STEP
+    return common if alike and known else None
 
 
 def _noise_alone(run: Identification) -> Iterator[str]:
