@@ -79,7 +79,8 @@ def force_figures(series: ForceSeries, robot: Robot) -> Figures:
     if series.known:
         figures["forces"] = partial(force_figure, series, *args)
     if series.pressure is not None and np.isfinite(series.pressure[0]).any():
-        figures["pressure"] = partial(pressure_figure, series, robot.format)
+        points = ForceSeries(series.source, series.time, *series.pressure)
+        figures["pressure"] = partial(pressure_figure, points, robot.format)
     return figures
 
 

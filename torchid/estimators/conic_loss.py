@@ -121,15 +121,11 @@ class ConicLoss(nn.Module):
 
     @torch.no_grad()
     def curvature(self, y: Tensor) -> Tensor:
-        """Second derivative of objective and penalty at y, (n, n), blocks that are violated as a whole."""
+        """Second derivative of the quadratic and of rows at y, (n, n)."""
         active = torch.where(self.of_rows > self.G @ y - self.h, self.row_weight, 0.0)
-        hessian = self.root.T @ self.root + self.G.T @ (active[:, None] * self.G) + self.stiffness * self.E.T @ self.E
-        violated = torch.linalg.eigvalsh(self.of_blocks - self._soft_blocks(y))[:, -1] > 0.0
-        _add_blocks(hessian, self.F, self.variables, torch.where(violated, self.block_weight, 0.0))
-        blocks = _blocks(self.weighted_start, self.weighted_slopes, self.log_det_variables, y)
-        whitening = torch.linalg.inv(torch.linalg.cholesky_ex(blocks).L)[:, None]
-        relative = whitening @ self.weighted_slopes @ whitening.mT
-        return 2.0 * _add_blocks(hessian, relative, self.log_det_variables, 0.5 * self.log_det_weight)
+        return 2.0 * (
+            self.root.T @ self.root + self.G.T @ (active[:, None] * self.G) + self.stiffness * self.E.T @ self.E
+        )
 
     def _soft_blocks(self, y: Tensor) -> Tensor:
         return _blocks(self.F0, self.F, self.variables, y)
@@ -137,10 +133,3 @@ class ConicLoss(nn.Module):
 
 def _blocks(F0: Tensor, F: Tensor, variables: Tensor, y: Tensor) -> Tensor:
     return F0 + (y[variables][..., None, None] * F).sum(1)
-
-
-def _add_blocks(hessian: Tensor, F: Tensor, variables: Tensor, weights: Tensor) -> Tensor:
-    """Add the Gram matrices of slopes (K, 10, 4, 4), each with a weight."""
-    flat = F.flatten(2)
-    at = variables[:, :, None].expand(-1, -1, variables.shape[1])
-    return hessian.index_put_((at, at.mT), weights[:, None, None] * (flat @ flat.mT), accumulate=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 
 import numpy as np
+import scipy.optimize
 import torch
 from torch import Tensor
 
@@ -16,14 +17,12 @@ from torchid.estimators.learnable import precondition_by
 from torchid.estimators.least_squares import Minimizer
 from torchid.estimators.sgd import Sgd, penalties
 from torchid.parallel import one_thread
-from torchid.parameters import PER_BODY
+from torchid.parameters import PER_BODY, Array
 from torchid.problem import LinearProblem
 
-_STEPS = 20  # of L-BFGS between preconditioners
+_STEPS = {"maxiter": 20, "maxcor": 20, "ftol": 0.0, "gtol": 0.0}  # of L-BFGS between preconditioners
 _DAMPING = 0.01  # of these, over the objective
 _SETTLED, _MET = 1e-9, 1e-10  # relative decrease of the objective in a round, violation of a condition
-_RESOLVED = 1e-7  # relative change of the objective in a round, below which line searches end in its rounding
-_ASTRAY = 1e-3  # relative change of the objective in a round of steps without a search that is not taken
 
 
 @one_thread()
@@ -44,38 +43,21 @@ def finish(settings: Sgd, problem: LinearProblem, start: Minimizer) -> Minimizer
         return exact.minimize(problem)
     conic, y = settings.conic_loss(problem), _deviations(problem, start)
     before = np.inf
-    search: str | None = "strong_wolfe"
     for _ in range(settings.finish or 0):
         damping = _DAMPING * max(float(conic.objective(y)), 1e-12) + settings.penalties.curvature
         P = precondition_by(conic.curvature(y), damping)
-        raw = torch.zeros_like(y, requires_grad=True)
-        optimizer = torch.optim.LBFGS(
-            [raw],
-            max_iter=_STEPS,
-            history_size=_STEPS,
-            tolerance_grad=0.0,
-            tolerance_change=0.0,
-            line_search_fn=search,
-        )
 
-        def closure(
-            raw: Tensor = raw, y: Tensor = y, P: Tensor = P, optimizer: torch.optim.Optimizer = optimizer
-        ) -> Tensor:
-            optimizer.zero_grad()
-            value = _penalized(settings, problem, conic, y + P @ raw)
-            value.backward()
-            return value
+        def loss(moved: Array, y: Tensor = y, P: Tensor = P) -> tuple[float, Array]:
+            u = torch.from_numpy(moved).requires_grad_()
+            value = _penalized(settings, problem, conic, y + P @ u)
+            (gradient,) = torch.autograd.grad(value, u)
+            return value.item(), gradient.numpy()
 
-        optimizer.step(closure)
-        moved = (y + P @ raw).detach()
-        value = float(conic.objective(moved))
-        if not search and not abs(value - before) <= _ASTRAY * abs(before):
-            break  # steps without a search went astray
-        y = moved
+        moved = scipy.optimize.minimize(loss, np.zeros(len(y)), jac=True, method="L-BFGS-B", options=_STEPS).x
+        y = y + P @ torch.from_numpy(moved)
+        value = float(conic.objective(y))
         if conic.update(y) <= _MET and abs(before - value) <= _SETTLED * abs(value):
             break
-        if abs(before - value) <= _RESOLVED * abs(value):
-            search = None  # values of the loss no longer tell steps apart, but gradients do
         before = value
     moves, terms = np.split(y.numpy(), [int(problem.free.sum())])
     phi = problem.nominal.copy()

@@ -71,14 +71,13 @@ def task_weights(config: TaskWeightsConfig, robot: Robot) -> Array | None:
         UnknownNameError: a pattern that no joint fits.
         ConfigError: a joint without a weight, where others have one, or with two; an axis of a fixed base.
     """
-    key, names = "estimator.task_weights", robot.joint_names
-    of_base = [x for x in (config.base_force, config.base_moment) if x is not None]
-    if robot.fixed_base and of_base:
+    key, base = "estimator.task_weights", (config.base_force, config.base_moment)
+    if robot.fixed_base and any(x is not None for x in base):
         raise ConfigError.at_field(key, "axes of the base, which is fixed", "joint_torque alone")
-    base = [np.broadcast_to(1.0 if x is None else x, 3) for x in (config.base_force, config.base_moment)]
     torque = for_all(1.0 if config.joint_torque is None else config.joint_torque)
-    joints = values_of_all(f"{key}.joint_torque", "weight", torque, "joint", names)
-    weights = np.concatenate([*(() if robot.fixed_base else base), joints, np.ones(robot.n_dofs - robot.n)])
+    joints = values_of_all(f"{key}.joint_torque", "weight", torque, "joint", robot.joint_names)
+    of_base = [np.ones(robot.base_rows // 2) * (1.0 if x is None else x) for x in base]
+    weights = np.concatenate([*of_base, joints, np.ones(robot.n_dofs - robot.n)])
     return None if np.ptp(weights) == 0.0 else weights
 
 

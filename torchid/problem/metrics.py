@@ -15,11 +15,9 @@ from torchid.problem.chunks import ProgressCallback, map_chunks
 from torchid.problem.contact_state import ContactState
 from torchid.problem.extras import ExtraTerms
 from torchid.problem.predict import (
-    GeneralizedForces,
-    centre_of_pressure,
-    ground_below,
     measured_and_predicted_forces,
     null_space_components,
+    pressure_centres,
     reading_variance,
 )
 from torchid.problem.rows import RowBuilder
@@ -243,9 +241,11 @@ class Evaluation:
                 errors = kinematics.without_rest(errors, base)
                 for total, error in zip(sums, builder.motors.of(builder.tree, kinematics, errors), strict=True):
                     total.rows.add(error)
-                pressure = self._pressure_errors(forces, samples, state, kinematics)
-                for total, off in zip(sums[1:], pressure, strict=False):
-                    total.pressure.add(off[:, None])
+                if base:
+                    wrench = torch.cat([forces.measured[None], forces.predicted])[..., :base]
+                    at = pressure_centres(builder, samples, state, kinematics, wrench, self.least_carried)
+                    for total, off in zip(sums[1:], torch.linalg.vector_norm(at[1:] - at[0], dim=-1), strict=True):
+                        total.pressure.add(off[:, None])
                 vectors = torch.cat([forces.torque[None], forces.predicted - forces.torque])
                 if self.noise is not None:
                     sums[0].noise.merge(self._noise_sums(samples, state, kinematics, self.noise))
@@ -257,17 +257,6 @@ class Evaluation:
         loaded = [replace(log, unloaded=None) for log in logs]
         parts = map_chunks(loaded, builder, sum_chunks, progress=progress)
         return [ForceSums.total(same) for same in zip(*parts, strict=True)]
-
-    def _pressure_errors(
-        self, forces: GeneralizedForces, samples: Samples, state: ContactState, kinematics: ChunkKinematics
-    ) -> torch.Tensor:
-        """Distances (M, B) [m] of predicted centres of pressure from the measured one, NaN where it is undefined."""
-        if not self.robot.base_rows or not any(state):
-            return samples.time.new_empty(0, len(samples))
-        normal, height = ground_below(self.builder, samples, state, kinematics)
-        wrench = torch.cat([forces.measured[None], forces.predicted])[..., :6]
-        at = centre_of_pressure(wrench, normal, height, self.least_carried)
-        return torch.linalg.vector_norm(at[1:] - at[0], dim=-1)
 
     def _noise_sums(
         self, samples: Samples, state: ContactState, kinematics: ChunkKinematics, noise: SensorNoise

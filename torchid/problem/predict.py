@@ -236,34 +236,11 @@ def force_series(builder: RowBuilder, samples: Samples, phi: Array) -> tuple[Arr
     return measured, predicted
 
 
-def ground_below(
-    builder: RowBuilder, samples: Samples, state: ContactState, kinematics: ChunkKinematics
-) -> tuple[Tensor, Tensor]:
-    """The plane that active contacts stand on: its normal in base axes, (B, 3), and the height of the base above, (B,).
-
-    Means over the contacts [m], on stairs those of a plane between them. NaN without a contact or an attitude.
-    """
-    active, rotation = [k for k, touches in enumerate(state) if touches], kinematics.rotation_world_base
-    if rotation is None or not active:
-        return samples.time.new_full((len(samples), 3), torch.nan), torch.full_like(samples.time, torch.nan)
-    contacts, states = [builder.contacts[k] for k in active], kinematics.states
-    normals = samples.time.new_tensor([contact.normal for contact in contacts])
-    if samples.contact_normal is not None:
-        normals = samples.contact_normal[:, active]
-    normals = normals @ rotation
-    radii = samples.time.new_tensor([contact.radius for contact in contacts])
-    frames = [(node, samples.time.new_tensor(T[:3, 3])) for node, T in (builder.frames[k] for k in active)]
-    points = [states.position[:, node] + point @ states.rotation[:, :, node] for node, point in frames]
-    soles = torch.stack(points).permute(2, 0, 1) - radii[:, None] * normals
-    normal = torch.nn.functional.normalize(normals.mean(1), dim=1)
-    return normal, -(soles @ normal[..., None]).mean((1, 2))
-
-
 def centre_of_pressure(wrench: Tensor, normal: Tensor, height: Tensor, least: float = 0.0) -> Tensor:
-    """Where a wrench (..., B, 6) at the base origin meets the plane of `ground_below`, (..., B, 3) [m] from the origin.
+    """Where a wrench (..., B, 6) at the base origin meets the ground, (..., B, 3) [m] from that origin.
 
-    About this point its moment is along the normal: p = (n x M - h F) / (n F). Undefined, NaN, where the force along n
-    is at most `least` [N].
+    The ground's normal n, (B, 3), is in base axes, the base's height above it h, (B,). About the point p the moment is
+    along n: p = (n x M - h F) / (n F). Undefined, NaN, where the force along n is at most `least` [N].
 
     Source: Sardain, Bessonnet, "Forces acting on a biped robot. Center of pressure - zero moment point", 2004.
     """
@@ -273,21 +250,32 @@ def centre_of_pressure(wrench: Tensor, normal: Tensor, height: Tensor, least: fl
     return (across - height[:, None] * force) / carried.where(carried > least, torch.nan)
 
 
-def pressure_series(builder: RowBuilder, samples: Samples, wrenches: Array, least: float) -> Array:
-    """Centres of pressure of wrenches (M, N, 6) of a log, (M, N, 2) [m]: along the base's x axis, and to its left.
+def pressure_centres(
+    builder: RowBuilder, samples: Samples, state: ContactState, at: ChunkKinematics, wrench: Tensor, least: float
+) -> Tensor:
+    """`centre_of_pressure` of wrenches (M, B, 6) on the mean plane of active contacts; NaN without any, or attitude."""
+    active, rotation = [k for k, touches in enumerate(state) if touches], at.rotation_world_base
+    if rotation is None or not active:
+        return torch.full_like(wrench[..., :3], torch.nan)
+    contacts, states = [builder.contacts[k] for k in active], at.states
+    normals = wrench.new_tensor([contact.normal for contact in contacts])
+    normals = (normals if samples.contact_normal is None else samples.contact_normal[:, active]) @ rotation
+    radii = wrench.new_tensor([contact.radius for contact in contacts])
+    frames = [(node, wrench.new_tensor(T[:3, 3])) for node, T in (builder.frames[k] for k in active)]
+    points = [states.position[:, node] + point @ states.rotation[:, :, node] for node, point in frames]
+    soles = torch.stack(points).permute(2, 0, 1) - radii[:, None] * normals
+    normal = torch.nn.functional.normalize(normals.mean(1), dim=1)
+    return centre_of_pressure(wrench, normal, -(soles @ normal[..., None]).mean((1, 2)), least)
 
-    `least`: as of `centre_of_pressure`.
-    """
-    out = np.empty((*wrenches.shape[:2], 2))
+
+def pressure_series(builder: RowBuilder, samples: Samples, wrenches: Array, least: float) -> Array:
+    """`pressure_centres` of wrenches (M, N, 6) of a log in its order, (M, N, 3) [m]."""
+    out = np.empty((*wrenches.shape[:2], 3))
     with torch.no_grad(), one_thread():
         for state, index in chunks_by_state(samples):
-            chunk = samples[index].to(builder.device)
-            normal, height = ground_below(builder, chunk, state, builder.kinematics(chunk))
-            where = index if isinstance(index, slice) else index.numpy()
-            at = centre_of_pressure(torch.from_numpy(wrenches[:, where]).to(normal), normal, height, least)
-            ahead = torch.nn.functional.normalize(normal.new_tensor([1.0, 0.0, 0.0]) - normal[:, :1] * normal, dim=1)
-            axes = torch.stack([ahead, torch.linalg.cross(normal, ahead)], dim=1)
-            out[:, where] = (at[..., None, :] * axes).sum(-1).cpu().numpy()
+            chunk, where = samples[index].to(builder.device), index if isinstance(index, slice) else index.numpy()
+            wrench, kinematics = torch.from_numpy(wrenches[:, where]).to(chunk.time), builder.kinematics(chunk)
+            out[:, where] = pressure_centres(builder, chunk, state, kinematics, wrench, least).cpu().numpy()
     return out
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -34,7 +34,7 @@ class ForceSeries:
     """Forces of one log for plotting: `measured`, `nominal`, `identified`, (N, n_rows) each, NaN where unknown.
 
     `noise`, (N, n_rows): standard deviation that the noise of the readings gives the measured; None where unknown.
-    `pressure`, (3, N, 2) [m]: centres of pressure of the same three, from `pressure_series`; None of a fixed base.
+    `pressure`, (3, N, 3) [m]: centres of pressure of the same three, from `pressure_series`; None of a fixed base.
     """
 
     source: str
@@ -51,7 +51,6 @@ class ForceSeries:
         return bool(np.isfinite(self.measured).any())
 
 
-@matplotlib.rc_context(STYLE)
 def force_figure(
     series: ForceSeries, dof_names: Sequence[str], base_rows: int, sliding: Collection[str] = (), of: str = "URDF"
 ) -> Figure:
@@ -60,15 +59,24 @@ def force_figure(
     `dof_names`, `base_rows` and `sliding` are those of the robot, `of` is what its nominal parameters are from.
     """
     rows = largest_rows(series, base_rows)
+    known = int(np.isfinite(series.measured).any(axis=0).sum())
+    shown = f" ({len(rows)} of {known} rows, the largest)" if len(rows) < known else ""
+    names = {row: name_row(row, base_rows, dof_names, sliding) for row in rows}
+    gaps = "; gaps: forces without a sensor act" if np.isnan(series.measured[:, rows]).any() else ""
+    return _figure(series, names, f"Generalized forces{shown}, {series.source}", of, gaps)
+
+
+@matplotlib.rc_context(STYLE)
+def _figure(series: ForceSeries, rows: Mapping[int, tuple[str, str]], title: str, of: str, gaps: str = "") -> Figure:
+    """Some rows over time, by name and unit, and their errors."""
     series, since = _from_its_start(series)
     figure = Figure(figsize=(12.0, 1.7 * max(len(rows), 1) + 0.8), layout="constrained")
     axes = figure.subplots(max(len(rows), 1), 2, sharex=True, squeeze=False, width_ratios=(3, 2))
-    for (forces, errors), row in zip(axes, rows, strict=False):
+    for (forces, errors), (row, (name, unit)) in zip(axes, rows.items(), strict=False):
         forces.plot(series.time, series.measured[:, row], color=MEASURED_COLOR, linewidth=1.6, label="measured")
         forces.plot(series.time, series.nominal[:, row], color=NOMINAL_COLOR, linewidth=1.0, label=f"predicted, {of}")
         label = "predicted, identified"
         forces.plot(series.time, series.identified[:, row], color=IDENTIFIED_COLOR, linewidth=1.0, label=label)
-        name, unit = name_row(row, base_rows, dof_names, sliding)
         forces.set_title(name, loc="left", fontsize=9)
         forces.set_ylabel(f"[{unit}]")
         _draw_errors(errors, series, row, f"[{unit}]")
@@ -79,41 +87,14 @@ def force_figure(
         axis.set_xlabel(f"time{since} [s]")
     if len(series.time) and 0.0 <= series.time[0] < _NEAR_0 * series.time[-1]:
         axes[0, 0].set_xlim(left=0.0)
-    known = int(np.isfinite(series.measured).any(axis=0).sum())
-    shown = f" ({len(rows)} of {known} rows, the largest)" if len(rows) < known else ""
-    gaps = "; gaps: forces without a sensor act" if np.isnan(series.measured[:, rows]).any() else ""
-    title = f"Generalized forces{shown}, {series.source}, and errors: predicted - measured{gaps}"
-    figure.suptitle(title, x=0.01, ha="left")
+    figure.suptitle(f"{title}, and errors: predicted - measured{gaps}", x=0.01, ha="left")
     return figure
 
 
-@matplotlib.rc_context(STYLE)
-def pressure_figure(series: ForceSeries, of: str = "URDF") -> Figure:
-    """Centres of pressure [m] over time, and beside them how far predicted ones are from the measured one.
-
-    `of` is what the nominal parameters are from.
-    """
-    series, since = _from_its_start(series)
-    figure = Figure(figsize=(12.0, 4.4), layout="constrained")
-    axes = figure.subplots(2, 2, sharex=True, width_ratios=(3, 2))
-    at = np.full((3, len(series.time), 2), np.nan) if series.pressure is None else series.pressure
-    labels = "measured", f"predicted, {of}", "predicted, identified"
-    lines = [*zip(labels, (MEASURED_COLOR, NOMINAL_COLOR, IDENTIFIED_COLOR), strict=True)]
-    for k, name in enumerate(("along the base's x axis", "to its left")):
-        for (label, color), values, width in zip(lines, at, (1.6, 1.0, 1.0), strict=True):
-            axes[k, 0].plot(series.time, values[:, k], color=color, linewidth=width, label=label)
-        for (_, color), values in zip(lines[1:], at[1:], strict=True):
-            axes[k, 1].plot(series.time, values[:, k] - at[0, :, k], color=color, linewidth=0.8)
-        axes[k, 0].set_title(f"{name}, from below the base link's origin", loc="left", fontsize=9)
-        axes[k, 0].set_ylabel("[m]")
-        error = _rms(at[2, :, k] - at[0, :, k])
-        axes[k, 1].set_title(f"identified: rms {np.nan if error is None else error:.3g} [m]", loc="left", fontsize=9)
-    for axis in axes[-1]:
-        axis.set_xlabel(f"time{since} [s]")
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
-    title = f"Centre of pressure on the ground, {series.source}, and errors: predicted - measured"
-    figure.suptitle(title, x=0.01, ha="left")
-    return figure
+def pressure_figure(points: ForceSeries, of: str = "URDF") -> Figure:
+    """As `force_figure`, of centres of pressure from the base link's origin in the place of forces."""
+    rows = {0: ("along the base's x axis", "m"), 1: ("along its y axis", "m")}
+    return _figure(points, rows, f"Centre of pressure from the base link's origin, {points.source}", of)
 
 
 def _from_its_start(series: ForceSeries) -> tuple[ForceSeries, str]:

@@ -345,21 +345,15 @@ def recorded_components(contacts: Sequence[Contact], sensors: SensorSet, in_worl
     return np.where(turned, np.repeat(whole, 3, axis=1), measured)
 
 
-_NAMED = 3
-
-
 def minimized_errors(robot: Robot, contacts: Sequence[Contact], sensors: SensorSet) -> str:
     """What a fit with some sensors minimizes, in words: errors of which forces, and what they are free of."""
-    torque, possible = sensors.torque[: robot.n], [list(contact.components) for contact in contacts]
-    lacking = [not sensors.wrench[k, own].all() for k, own in enumerate(possible)]
+    torque, measured = sensors.torque[: robot.n], measured_components(contacts, sensors)
     rows = ["joint torques"] * bool(torque.any()) + ["base forces"] * (not robot.fixed_base)
     rows += ["wrenches in limbs"] * bool(sensors.torque[robot.n :].any())
     makers = ["force in a closed loop"] * bool(robot.loops)
     if not torque.all():
-        without = [name for name, measured in zip(robot.joint_names, torque, strict=True) if not measured]
-        makers.append(f"torque of {join_names(without, _NAMED)}" if torque.any() else "joint torque")
-    if any(lacking):
-        frames = [contact.frame for contact, lacks in zip(contacts, lacking, strict=True) if lacks]
-        some = measured_components(contacts, sensors).any()
-        makers.append(f"unmeasured force at {join_names(frames, _NAMED)}" if some else "contact force")
+        lacking = [name for name, known in zip(robot.joint_names, torque, strict=True) if not known]
+        makers.append(f"torque of {join_names(lacking)}" if torque.any() else "joint torque")
+    if frames := [x.frame for x, own in zip(contacts, measured, strict=True) if own.sum() < len(x.components)]:
+        makers.append(f"unmeasured force at {join_names(frames)}" if measured.any() else "contact force")
     return f"errors of {' and '.join(rows)}" + f" that no {' or '.join(makers)} can make" * bool(makers)
