@@ -245,8 +245,7 @@ def _implicit(run: Identification) -> Iterator[str]:
     known = dict(zip(robot.joint_names, robot.armature.tolist(), strict=True))
     found = {x.extra.name: x.value - known[x.extra.name] for x in run.extras if x.extra.what == "armature"}
     if step := implicit_step(kd, found, float(np.median(np.diff(run.forces.time)))):
-        said = f"armatures are {1e3 * step:.2g} ms times the stated kd"
-        yield f"{said}: no rotors, but what a simulator with an implicit PD law adds, its step times kd"
+        yield f"armatures are {1e3 * step:.2g} ms times the stated kd: no rotors, but a simulator's implicit PD law"
 
 
 def implicit_step(kd: Mapping[str, float], armatures: Mapping[str, float], step: float) -> float | None:
