@@ -44,6 +44,7 @@ from torchid.fitting.separable import (
     choose_sign_width,
     choose_stribeck,
 )
+from torchid.log_checks.frozen import new_poses
 from torchid.logs import Log
 from torchid.logs.cutoff import CutoffChoice, choose_cutoff
 from torchid.logs.low_pass import DROPPED_PERIODS
@@ -408,6 +409,7 @@ def _cutoff_of_motion(setup: RobotSetup) -> tuple[CutoffChoice, float]:
     stated, from_feet = setup.config.sensors.noise.motion, settings.base_motion is not None
     rate = None if settings.sample_rate_hz == AUTO else settings.sample_rate_hz
     shortest = min(float(log.time[-1] - log.time[0]) for log in logs)
+    logs = [new_poses(log) for log in logs]  # whose rate bounds the band, not that of a file which repeats them
     return choose_cutoff(logs, stated, rate, base_is_derived=from_feet), shortest
 
 
