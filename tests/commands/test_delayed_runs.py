@@ -61,7 +61,7 @@ def test_a_run_finds_the_delay_of_a_pd_law_and_an_evaluation_predicts_with_it(
     assert json.loads((tmp_path / "without" / "metrics.json").read_text())["delay_selection"] is None
 
 
-@pytest.mark.filterwarnings("ignore:.*no rigid-body model", "ignore:.*stated sensor noise")
+@pytest.mark.filterwarnings("ignore:.*stated sensor noise")
 def test_no_delay_is_looked_for_in_logs_without_a_filter(tmp_path: Path) -> None:
     """White noise between samples is smaller than at them, which would draw it to half a step."""
     file, found = commanded(tmp_path, preprocessing={}), []

@@ -16,6 +16,7 @@ import torchid
 from torchid.commands.answer import answer
 from torchid.errors import ImplausibleFitError
 from torchid.fitting.misfit import unexplained_joints
+from torchid.log_checks import SUSPICIOUS, Checked, Finding
 from torchid.logs import Log, write_log
 from torchid.problem import Metrics
 
@@ -31,13 +32,15 @@ def of_joint(field: str, change: Callable[[np.ndarray], np.ndarray]) -> Log:
     return replace(log, **{field: values})
 
 
-def identified(log: Log, folder: Path) -> torchid.Identification:
+def identified(
+    log: Log, folder: Path, cutoff_hz: float = 10.0, noise: dict[str, float] | None = None
+) -> torchid.Identification:
     write_log(log, folder / "arm.npz")
     return torchid.identify(
         robot={"urdf": str(ARM.urdf), "fixed_base": True},
         logs=[str(folder / "arm.npz")],
-        preprocessing={"cutoff_hz": 10},
-        sensors="joints",
+        preprocessing={"cutoff_hz": cutoff_hz},
+        sensors={"set": "joints", "noise": noise or {}},
         estimator={"name": "least_squares", "ridge": 1e-4},
         output=None,
     )
@@ -66,6 +69,40 @@ def test_the_zero_of_an_encoder_is_named_beside_the_parameters(tmp_path: Path) -
 def test_the_gear_of_one_joint_is_named_though_masses_make_up_for_a_part_of_it(tmp_path: Path) -> None:
     run = identified(of_joint("joint_torque", lambda torque: 2.0 * torque), tmp_path)
     assert any(f"joint_torque: {NAME}: factors that fit" in one for one in answer(run).attention)
+
+
+def of_random_torques() -> Log:
+    log = case_of(ARM, "contacts").log
+    return replace(log, joint_torque=10.0 * np.random.default_rng(0).normal(size=log.joint_position.shape))
+
+
+def test_a_fit_that_leaves_most_of_the_forces_is_refused_whether_or_not_a_mistake_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = of_random_torques()
+    with pytest.raises(ImplausibleFitError, match=r"the fit leaves .* of the weighted forces; accepted: data and URDF"):
+        identified(log, tmp_path)
+    band = Finding("dead band", SUSPICIOUS, "joint_torque", "reads 0", "switch the dead band off")
+    late = Finding("delay", SUSPICIOUS, "joint_torque", "30 ms late", "shift them")
+    for finding, named in ((band, "accepted: data and URDF"), (late, "joint_torque: 30 ms late; accepted: shift them")):
+        of_all = Checked(log, log, (finding,), ())
+        monkeypatch.setattr("torchid.commands.plausibility.check", lambda *_, found=of_all: found)
+        with pytest.raises(ImplausibleFitError, match=named):
+            identified(log, tmp_path)
+
+
+def test_forces_that_are_stated_to_be_noise_are_not_refused(tmp_path: Path) -> None:
+    run = identified(of_random_torques(), tmp_path, noise={"joint_torque": 10.0})
+    assert run.metrics["train"].identified.relative["joint_torque"] > 0.9
+
+
+def test_a_refusal_names_the_band_that_a_fit_predicts(tmp_path: Path) -> None:
+    log = case_of(ARM, "contacts").log
+    noise = 1e-3 * np.random.default_rng(0).normal(size=log.joint_position.shape)
+    with pytest.raises(
+        ImplausibleFitError, match=r"preprocessing.cutoff_hz=\d.* up to 40 Hz, predicts this band worse"
+    ):
+        identified(replace(log, joint_position=log.joint_position + noise), tmp_path, cutoff_hz=40.0)
 
 
 def metrics_by_joint(left: float, floor: float | None) -> Metrics:

@@ -15,6 +15,7 @@ from torchid.fitting.left_out import (
     TERMS,
     Evidence,
     Reading,
+    TermsChoice,
     block_edges,
     choose_terms,
     compress_reading,
@@ -83,6 +84,14 @@ def test_terms_of_actuators_are_adopted_where_they_are_and_not_where_they_are_no
     assert not nothing.adopted
     assert {*nothing.rejected} == {*TERMS}
     assert str(nothing).startswith("none")
+
+
+def test_adopted_terms_are_listed_with_what_each_is_worth() -> None:
+    one, other = Evidence(0.4, 9.0, 20), Evidence(0.05, 9.0, 20)
+    text = "torque offset -18 %, armature -18 % (error on left-out blocks)"
+    assert str(TermsChoice({"torque_offset": one, "armature": one}, {})) == text
+    near = str(TermsChoice({"armature": one}, {"stiffness": other}))
+    assert near == "armature -18 %; near misses: stiffness -2.5 % (error on left-out blocks)"
 
 
 def test_a_term_that_is_stated_is_fitted_beside_the_candidates() -> None:

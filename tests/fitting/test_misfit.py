@@ -15,7 +15,14 @@ from synthetic import UR5
 import torchid
 from torchid.cli import main
 from torchid.config.experiment import ActuatorsConfig
-from torchid.fitting.misfit import Misfit, UnfittedFriction, beyond_models, resting_joints, unfitted_friction
+from torchid.fitting.misfit import (
+    Misfit,
+    UnfittedFriction,
+    beyond_noise,
+    resting_joints,
+    unexplained_forces,
+    unfitted_friction,
+)
 from torchid.fitting.noise import GroupNoise
 from torchid.parameters import FRICTION
 from torchid.problem import ExtraTerms, LinearProblem, bind_log
@@ -186,12 +193,20 @@ def test_stated_noise_explains_logs_that_are_resampled_after_the_filter(tmp_path
         assert error == pytest.approx(floor, rel=0.15), logs
 
 
-def test_only_noise_that_was_stated_makes_a_large_residual_unlike_any_model() -> None:
+def test_a_residual_far_above_the_noise_need_not_be_most_of_the_forces() -> None:
     rng = np.random.default_rng(0)
     A, forces = rng.normal(size=(200, 4)), np.full(4, 100.0)
     problem = LinearProblem(
         A, A @ forces + 8.0 * rng.normal(size=200), 0.0, 200, np.zeros(4), np.ones(4), np.ones(4, bool)
     )
     estimate = torchid.LeastSquares(ridge=0.0).solve(problem)
-    assert "times the stated sensor noise" in (beyond_models(estimate, problem) or "")
-    assert beyond_models(estimate, problem, noise_stated=False) is None
+    assert "times the stated sensor noise" in beyond_noise(estimate)
+    assert unexplained_forces(estimate, problem) == ""
+
+
+def test_noise_that_is_stated_is_not_what_a_model_should_explain() -> None:
+    A, noise = np.random.default_rng(0).normal(size=(200, 4)), np.random.default_rng(1).normal(size=200)
+    problem = LinearProblem(A, noise, 0.0, 200, np.zeros(4), np.ones(4), np.ones(4, bool))
+    estimate = torchid.LeastSquares(ridge=0.0).solve(problem)
+    assert unexplained_forces(estimate, problem) == ""
+    assert "the fit leaves 9" in unexplained_forces(estimate, problem, noise_stated=False)

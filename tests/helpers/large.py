@@ -55,6 +55,7 @@ def experiment(folder: Path, fields: Fields, suffix: str = ".npz") -> Path:
     text = (DEMO / "quadruped.yaml").read_text().replace("quadruped.urdf", str(DEMO / "quadruped.urdf"))
     logs = "logs: {train: [sway_train.npz], test: [sway_test.npz]}"
     assert logs in text
+    text = text.replace("joint_torque: 0.1, contact_force: 0.5", "joint_torque: 10.0, contact_force: 20.0")  # as it is
     (folder / "run.yaml").write_text(text.replace(logs, f"logs: {{train: [log{suffix}]}}"))
     return folder / "run.yaml"
 

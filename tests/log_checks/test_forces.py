@@ -25,6 +25,7 @@ from walking import MACHINES, robot_of
 from torchid.commands.check import check_experiment
 from torchid.log_checks import NOTE, REJECTED, SUSPICIOUS, Checked, scales
 from torchid.log_checks.check import check
+from torchid.log_checks.deviation import DeviationRows
 from torchid.log_checks.model import NominalModel, bind_some_samples, preprocess_pieces
 from torchid.logs import Log, read_log
 from torchid.logs.preprocess import preprocess
@@ -303,6 +304,16 @@ def test_rows_are_laid_out_anew_where_other_torques_are_known() -> None:
         for one, part in ((model, log), (model, fewer), (NominalModel(robot, CONTACTS), fewer))
     )
     assert found.misfit == expected.misfit != whole.misfit
+
+
+def test_of_foot_sensors_alone_no_rows_but_the_base_s_are_compared() -> None:
+    case = case_of(MACHINES["biped"], "contacts")
+    model = NominalModel(robot_of(case.machine), case.machine.contacts)
+    samples = bind_some_samples(preprocess_pieces(case.log, CUTOFF), model.robot, model.contacts, 150)
+    rows = value(DeviationRows.of(samples, model))
+    ((W, equations, columns, target),) = rows.parts
+    assert W.shape[2] == equations.shape[1] == columns.shape[1] == target.shape[1] == 6
+    assert equations.all()
 
 
 def test_a_unit_that_leaves_a_third_of_the_misfit_may_be_another_robot() -> None:

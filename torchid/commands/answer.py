@@ -13,7 +13,7 @@ from torchid.errors import format_percent, join_names
 from torchid.estimators import ConsistentEstimate, Estimate, SgdEstimate
 from torchid.estimators.least_squares import IDENTIFIED
 from torchid.fitting.calibration import list_confounded
-from torchid.fitting.misfit import AT_THE_FLOOR, unexplained_joints, unexplained_torques
+from torchid.fitting.misfit import AT_THE_FLOOR, unexplained_joints
 from torchid.fitting.posterior import FittedPosterior
 from torchid.identifiability.confounding import TotalMass
 from torchid.log_checks.weight import MAX_MASS_ERROR
@@ -175,7 +175,7 @@ def _judge(run: Identification) -> ErrorComparison:
 def _headline(run: Identification, judged: ErrorComparison) -> str:
     if run.worse:
         return f"WORSE THAN {judged.of}: {describe_worse(run.worse, judged.of)}"
-    explained = not any((*_unlike_sensors(judged.identified), *_unlike_torques(run), *_unlike_joints(run)))
+    explained = not any((*_unlike_sensors(judged.identified), *_unlike_joints(run)))
     return judged.headline("" if explained else "these forces")
 
 
@@ -205,7 +205,7 @@ def _attention(run: Identification, judged: ErrorComparison) -> Iterator[str]:
         yield f"torchid check finds in {run.suspected}"
     if isinstance(run.estimate, SgdEstimate) and not run.estimate.converged:
         yield _unfinished(run.estimate)
-    yield from list(_unlike_sensors(judged.identified)) or _unlike_torques(run)
+    yield from _unlike_sensors(judged.identified)
     yield from _computed(judged)
     impossible = [one.term for one in run.violations if one.term is not None]
     if impossible:
@@ -302,9 +302,11 @@ def _heavy(run: Identification) -> Iterator[str]:
     mass, error = (x.reshape(-1, PER_BODY)[:, 0] for x in (estimate.phi, estimate.standard_error))
     nominal = robot.nominal[:, 0]
     known = (estimate.verdict.reshape(-1, PER_BODY)[:, 0] == IDENTIFIED) & (mass - nominal > 2.0 * error)
-    for body in np.flatnonzero((mass > _HEAVY * nominal) & (nominal > 0.0) & ~known).tolist():
-        times = f"{mass[body] / nominal[body]:.2g} times the {robot.format}'s {decimal(nominal[body])} kg"
-        yield f"{robot.body_names[body]} weighs {times}, which the data do not determine: raise estimator.ridge"
+    heavy = np.flatnonzero((mass > _HEAVY * nominal) & (nominal > 0.0) & ~known)
+    ratio = mass[heavy] / nominal[heavy]
+    if named := [f"{robot.body_names[heavy[k]]} {ratio[k]:.2g} times" for k in np.argsort(-ratio)]:
+        why = f"which the data do not determine: an estimator.ridge above {run.experiment.config.estimator.ridge}"
+        yield f"{join_names(named, _FEW_NAMED)} the {robot.format}'s mass, {why}"
 
 
 def _impossible(run: Identification) -> Iterator[str]:
@@ -352,12 +354,6 @@ def _computed(judged: ErrorComparison) -> Iterator[str]:
     if shares and max(shares) < _COMPUTED:
         to = f"to {format_percent(max(shares))} %"
         yield f"the {judged.of} predicts these forces {to}: were they computed from it, or commanded, not measured?"
-
-
-def _unlike_torques(run: Identification) -> Iterator[str]:
-    """That the fit itself leaves most of the joint torques that it was of."""
-    if found := unexplained_torques(run.metrics["train"].identified, run.experiment.sensors):
-        yield f"{found}; check signs, units and order of torques and joints: torchid check"
 
 
 def _unlike_joints(run: Identification) -> Iterator[str]:

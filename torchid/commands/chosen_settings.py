@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -43,6 +44,7 @@ from torchid.fitting.separable import (
     choose_sign_width,
     choose_stribeck,
 )
+from torchid.log_checks.frozen import new_poses
 from torchid.logs import Log
 from torchid.logs.cutoff import CutoffChoice, choose_cutoff
 from torchid.logs.low_pass import DROPPED_PERIODS
@@ -285,6 +287,17 @@ def needs_these_torques(setup: RobotSetup) -> bool:
     return is_near_nominal(gain)
 
 
+def lower_cutoff(setup: RobotSetup) -> CutoffChoice | None:
+    """The band that a fit predicts, None where it is not narrower than the one that is fitted, or not known."""
+    files, cutoff = setup.config.logs, setup.config.preprocessing.filter_hz
+    if files is None or files.compressed or cutoff is None:
+        return None
+    with suppress(InputError):
+        found = _cutoff(setup, _Trials(), CutoffChoice(cutoff, by_noise=False), _cutoff_of_motion(setup)[1])
+        return None if found.limit_hz is None else found
+    return None
+
+
 def is_near_nominal(gain: float | None) -> bool:
     """Whether a factor of forces, None for none that is clear, is one of another mass, gear or current: up to three."""
     return gain is not None and 1.0 / _LARGEST_GAIN < gain < _LARGEST_GAIN
@@ -396,6 +409,7 @@ def _cutoff_of_motion(setup: RobotSetup) -> tuple[CutoffChoice, float]:
     stated, from_feet = setup.config.sensors.noise.motion, settings.base_motion is not None
     rate = None if settings.sample_rate_hz == AUTO else settings.sample_rate_hz
     shortest = min(float(log.time[-1] - log.time[0]) for log in logs)
+    logs = [new_poses(log) for log in logs]  # whose rate bounds the band, not that of a file which repeats them
     return choose_cutoff(logs, stated, rate, base_is_derived=from_feet), shortest
 
 

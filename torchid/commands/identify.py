@@ -180,7 +180,7 @@ def _identify(
     )
     logs.clear()  # checks of a log and figures need room, too
     ready.blocks = blocks = []
-    require_not_worse(run.worse, run.metrics["train"].identified, checked)
+    require_not_worse(run.worse, run.metrics["train"].identified, experiment.sensors, checked)
     return replace(run, suspected=suspected_mistake(run, checked)), solved.training, begun
 
 

@@ -13,7 +13,7 @@ from rich.progress import Progress
 
 from torchid import parameters
 from torchid.commands.check import LogSegment, segments_to_check
-from torchid.commands.chosen_settings import is_near_nominal, needs_these_torques
+from torchid.commands.chosen_settings import is_near_nominal, lower_cutoff, needs_these_torques
 from torchid.commands.results import Identification
 from torchid.config import ExperimentConfig
 from torchid.config.logs import LogsConfig
@@ -28,7 +28,13 @@ from torchid.errors import (
 from torchid.estimators import LeastSquares, SgdEstimate
 from torchid.fitting.experiment import RobotSetup, set_up
 from torchid.fitting.fit import Fit
-from torchid.fitting.misfit import beyond_models, force_gain, unexplained_joints, unexplained_torques
+from torchid.fitting.misfit import (
+    beyond_noise,
+    force_gain,
+    unexplained_forces,
+    unexplained_joints,
+    unexplained_torques,
+)
 from torchid.identifiability.confounding import ExtraEstimate, TotalMass, estimate_extras, total_mass
 from torchid.log_checks import Finding
 from torchid.log_checks.check import check
@@ -41,15 +47,19 @@ from torchid.problem import LinearProblem, Samples
 from torchid.problem.metrics import ADVICE, Metrics, WorseThanNominal, describe_worse
 from torchid.reading.log_reader import apply_contact_settings, setup_of_log
 from torchid.robot import Robot
+from torchid.sensing import SensorSet
 
 LARGEST_FACTOR = 10.0
 """Factor that no model of a robot is off by: units are by a thousand, a gear by 50 to 160."""
 
-_GENERAL = ("forces", "weight")  # findings that say that something is off rather than what
+_GENERAL = "weight"  # a finding that says that something is off rather than what
 _PART = 0.05  # share of a log's samples from which on a finding may be the reason
+#: Findings that say how a signal was recorded, which need not be why forces are not explained, or that they are not.
+_NO_REASONS = ("dead band", "forces", "frozen", "gap", "held", "saturated", "spike", "step")
 _USUAL = (
     "torques or wrenches of the opposite sign, a world whose z axis points down, flags of other contacts, a quaternion "
-    "in another order, another unit, a cutoff_hz above the motion (auto finds one), or masses in the {of} that are none"
+    "in another order, another unit, rotors or a delay that actuators leave out, masses in the {of} that are none, or "
+    "noise (sensors.noise)"
 )
 
 
@@ -62,7 +72,7 @@ class TrainingLogs:
 
     @cached_property
     def finding(self) -> tuple[str, Finding] | None:
-        """The most severe finding on a large part of a segment of a log, and the segment; None without any.
+        """The most severe reason on a large part of a segment of a log, and the segment; None without any.
 
         Nothing after a segment that is rejected as a whole is looked at, nor are logs larger than memory.
         """
@@ -74,6 +84,25 @@ class TrainingLogs:
         found = list(self._findings(files, partial(self._bars.advance, task)))
         self._bars.update(task, completed=total)
         return min(found, key=lambda pair: _order(pair[1]), default=None)
+
+    def doubt(self, reason: str, refused: bool) -> str:
+        """Refuse a fit, for a reason in any case or where a log cannot be used; else what the checks find, in words.
+
+        Raises:
+            ImplausibleFitError: names the reason, and the mistake that the checks find.
+        """
+        log, one = self.finding or ("", None)
+        found = "" if one is None else f"; torchid check finds in {log}: {one.field}: {one.found}"
+        if refused or (one is not None and one.rejects_all):
+            accepted = self._usual() if one is None else one.advice
+            raise ImplausibleFitError.at_field("logs", f"{reason}{found}", _advice(accepted, self.setup))
+        return found if one is None else f"{found}; {one.advice}"
+
+    def _usual(self) -> str:
+        """What to look for where no mistake is found, with a narrower band that the model predicts, if there is one."""
+        of, lower = self.setup.robot.format, lower_cutoff(self.setup)
+        named = "" if lower is None else f"preprocessing.cutoff_hz={lower}; or "
+        return f"{named}data and {of} that fit each other; usual reasons: {_USUAL.format(of=of)}"
 
     def _findings(self, files: LogsConfig, done: Callable[[float], None]) -> Iterator[tuple[str, Finding]]:
         """Findings on large parts of segments; `done` is called with the share of each in its log in percent."""
@@ -94,7 +123,7 @@ class TrainingLogs:
 
 
 def _large_findings(of: tuple[RobotSetup, LogSegment]) -> list[Finding]:
-    """Findings on a large part of a segment of a log, none where its contacts cannot be settled."""
+    """Reasons on a large part of a segment of a log, none where its contacts cannot be settled."""
     setup, segment = of
     settings = setup.config.preprocessing
     try:
@@ -103,13 +132,14 @@ def _large_findings(of: tuple[RobotSetup, LogSegment]) -> list[Finding]:
         return []
     checked = check(flagged, setup.robot, setup.contacts, settings.filter_hz, settings.derived, setup.declared)
     severe = [one for one in checked.findings if one.severity in SEVERITIES[:2]]
-    return [one for one in severe if one.mask(len(checked.log)).mean() > _PART]
+    reasons = [one for one in severe if one.rejects_all or one.name not in _NO_REASONS]
+    return [one for one in reasons if one.mask(len(checked.log)).mean() > _PART]
 
 
 def require_plausible(
     fit: Fit, logs: TrainingLogs, samples: Sequence[Samples] = (), gain_error: float = 0.0
 ) -> TotalMass:
-    """Refuse a fit that no robot can have produced, and warn of residuals far above the stated noise.
+    """Refuse a fit that no robot can have produced, or that leaves most of the forces; warn of far more than noise.
 
     Args:
         fit: the fit.
@@ -122,11 +152,12 @@ def require_plausible(
 
     Raises:
         SensorError: no parameter is in reach of the sensors.
-        ImplausibleFitError: forces that are all 0, parameters that no robot has, forces that no parameters explain in a
-            log that the checks reject, or scales that neither the data nor a known mass determines.
+        ImplausibleFitError: forces that are all 0, parameters that no robot has, forces most of which no parameters
+            explain, residuals far above the stated noise in a log that the checks reject, or scales that neither the
+            data nor a known mass determines.
 
     Warns:
-        NumericalWarning: forces that no parameters explain, for whatever reason.
+        NumericalWarning: residuals far above the stated noise.
         TorchidWarning: a bolted base that is tilted, which masses make up for in part.
     """
     estimate, setup = fit.estimate, logs.setup
@@ -146,25 +177,17 @@ def require_plausible(
         found = "torques are those of limbs on a held base, not of feet that carry the robot"
         accepted = "robot.fixed_base: true, without contacts and preprocessing.base_motion"
         raise ImplausibleFitError.at_field("preprocessing.base_motion", found, accepted)
-    unexplained = None  # a descent that is not finished leaves much that a model explains
-    if not isinstance(estimate, SgdEstimate):
-        unexplained = beyond_models(estimate, fit.assembly.problem, fit.assembly.forces, setup.noise_stated)
-    if reason is None and unexplained is None:
+    beyond = ""
+    if not isinstance(estimate, SgdEstimate):  # a descent that is not finished leaves much that a model explains
+        reason = reason or unexplained_forces(estimate, fit.assembly.problem, fit.assembly.forces, setup.noise_stated)
+        beyond = beyond_noise(estimate) if setup.noise_stated else ""
+    if reason:
+        logs.doubt(reason, refused=True)
+    if beyond:
+        advice = "; check units, frames, quaternion order and contact_active, or state the noise that there is"
+        warn_about_file(f"{beyond}{logs.doubt(beyond, refused=False) or advice}", NumericalWarning)
+    else:
         _warn_of_tilt(samples, setup)
-        return mass
-    log, finding = logs.finding or (None, None)
-    if finding is not None and (reason is not None or finding.rejects_all):
-        checks = f"{log}: {finding.field}: {finding.found}"
-        raise ImplausibleFitError.at_field(
-            "logs", f"{reason or unexplained}; torchid check finds in {checks}", _advice(finding.advice, setup)
-        )
-    if reason is not None:
-        of = setup.robot.format
-        accepted = f"data and {of} that fit each other; usual reasons: {_USUAL.format(of=of)}"
-        raise ImplausibleFitError.at_field("logs", reason, _advice(accepted, setup))
-    named = "" if finding is None else f"; torchid check finds in {log}: {finding.field}: {finding.found}"
-    advice = "check units, frames, quaternion order and contact_active, or state the noise that there is"
-    warn_about_file(f"{unexplained}{named}; {advice}", NumericalWarning)
     return mass
 
 
@@ -213,32 +236,25 @@ def _require_scales(by_data: Sequence[ExtraEstimate], has_contacts: bool) -> Non
         raise ImplausibleFitError.at_field("sensors.scales", found, accepted)
 
 
-def require_not_worse(worse: list[WorseThanNominal], fitted: Metrics, logs: TrainingLogs) -> None:
-    """Refuse a fit that predicts worse than the URDF, or leaves most of the torques, if the checks reject a log.
+def require_not_worse(worse: list[WorseThanNominal], fitted: Metrics, sensors: SensorSet, logs: TrainingLogs) -> None:
+    """Refuse a fit that leaves most of the torques, or predicts worse than the URDF and the checks reject a log.
 
     Args:
         worse: groups of rows that the URDF predicts better.
         fitted: errors of the fit on the training logs.
+        sensors: of the fit.
         logs: these.
 
     Raises:
-        ImplausibleFitError: the parameters of a log that is not usable.
+        ImplausibleFitError: torques that are not explained, or the parameters of a log that is not usable.
 
     Warns:
         NumericalWarning: the URDF's parameters predict better, for whatever reason.
     """
-    message, unexplained = describe_worse(worse, logs.setup.robot.format), unexplained_torques(fitted)
-    if message is None and not unexplained:
-        return
-    log, finding = logs.finding or (None, None)
-    if finding is not None and finding.rejects_all:
-        found = f"{message or unexplained}; torchid check finds in {log}: {finding.field}"
-        raise ImplausibleFitError.at_field("logs", f"{found}: {finding.found}", finding.advice)
-    if message is not None and finding is not None:
-        found = f"{message}; torchid check finds in {log}: {finding.field}: {finding.found}"
-        warn_about_file(f"{found}; {finding.advice}", NumericalWarning)
-    elif message is not None:
-        warn_about_file(f"{message}; {ADVICE}", NumericalWarning)
+    if unexplained := unexplained_torques(fitted, sensors):
+        logs.doubt(unexplained, refused=True)
+    if message := describe_worse(worse, logs.setup.robot.format):
+        warn_about_file(f"{message}{logs.doubt(message, refused=False) or f'; {ADVICE}'}", NumericalWarning)
 
 
 def suspected_mistake(run: Identification, logs: TrainingLogs) -> str:
@@ -260,14 +276,13 @@ def suspected_mistake(run: Identification, logs: TrainingLogs) -> str:
     joints = unexplained_joints(fitted) if run.experiment.robot.fixed_base else []
     if not is_far_off and not joints:
         return ""
-    log, finding = logs.finding or (None, None)
-    if finding is None or not finding.whole:  # some samples are no reason for parameters
+    if logs.finding is None or not logs.finding[1].whole:  # some samples are no reason for parameters
         return ""
-    found = f"{log}: {finding.field}: {finding.found}"
-    if is_far_off and not run.misfit.explained and finding.rejects_all:
-        reason = f"{nominal}, and the model does not explain these forces"
-        raise ImplausibleFitError.at_field("logs", f"{reason}; torchid check finds in {found}", finding.advice)
-    return f"{found}; {finding.advice}"
+    reason = f"{nominal}, and the model does not explain these forces"
+    if is_far_off and not run.misfit.explained:
+        logs.doubt(reason, refused=False)
+    log, finding = logs.finding
+    return f"{log}: {finding.field}: {finding.found}; {finding.advice}"
 
 
 def implausibility(problem: LinearProblem, phi: Array, mass: TotalMass, robot: Robot) -> str | None:
@@ -325,4 +340,4 @@ def _reach(robot: Robot) -> float:
 
 
 def _order(finding: Finding) -> tuple[int, bool, bool]:
-    return SEVERITIES.index(finding.severity), not finding.whole, finding.name in _GENERAL
+    return SEVERITIES.index(finding.severity), not finding.whole, finding.name == _GENERAL

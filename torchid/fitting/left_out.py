@@ -321,9 +321,10 @@ class TermsChoice:
     rejected: Mapping[str, Evidence]
 
     def __str__(self) -> str:
-        named = [f"{in_words(name)} (error on left-out blocks {one})" for name, one in self.adopted.items()]
-        near = [f"{in_words(name)} ({one})" for name, one in self.rejected.items() if one.certain and one.gain > 0.0]
-        return (", ".join(named) or "none") + (f"; near misses: {', '.join(near)}" if near else "")
+        near = {name: one for name, one in self.rejected.items() if one.certain and one.gain > 0.0}
+        named, misses = (", ".join(f"{in_words(name)} {one}" for name, one in x.items()) for x in (self.adopted, near))
+        of = " (error on left-out blocks)" * bool(named or misses)
+        return (named or "none") + (f"; near misses: {misses}" if misses else "") + of
 
 
 def choose_terms(reading: Reading, candidates: Sequence[str], fixed: Collection[str] = ()) -> TermsChoice:

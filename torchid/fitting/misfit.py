@@ -151,10 +151,17 @@ def misfit(
     )
 
 
-def beyond_models(
+def beyond_noise(estimate: Estimate) -> str:
+    """That a fit leaves far more than the stated noise, far more than a `Misfit` says; "" where it does not."""
+    left = _residual(estimate)
+    found = f"forces differ from any rigid-body model by {left:.3g} times the stated sensor noise"
+    return found if left > _UNEXPLAINED else ""
+
+
+def unexplained_forces(
     estimate: Estimate, problem: LinearProblem, forces: float = 0.0, noise_stated: bool = True
-) -> str | None:
-    """Why forces are not those of any robot with noise, in words; None if they may be. Far more than a `Misfit`.
+) -> str:
+    """That a fit leaves most of the weighted forces, and no stated noise makes them; "" where it does not.
 
     Args:
         estimate: of a fit, which may be far from the best.
@@ -163,14 +170,15 @@ def beyond_models(
         noise_stated: whether a user has stated noise. One that is estimated is that of most readings: a lift that
             carries 200 N beside wrists of 0.05 N m leaves many times as much.
     """
-    left = np.sqrt(estimate.cost / max(estimate.rows, 1))
-    if noise_stated and left > _UNEXPLAINED:
-        return f"forces differ from any rigid-body model by {left:.3g} times the stated sensor noise"
     forces = max(problem.cost(np.zeros_like(estimate.phi)), forces, np.finfo(float).tiny)
     share = np.sqrt(estimate.cost / forces)
-    if share > _SHARE:
-        return f"no rigid-body model explains {100.0 * share:.3g} % of the weighted forces"
-    return None
+    if share <= _SHARE or (noise_stated and _residual(estimate) <= _MUCH):
+        return ""
+    return f"the fit leaves {100.0 * share:.3g} % of the weighted forces"
+
+
+def _residual(estimate: Estimate) -> float:
+    return float(np.sqrt(estimate.cost / max(estimate.rows, 1)))
 
 
 _CLEAR = 0.5  # correlation of forces of the URDF's bodies with the measured ones, from which on their factor is clear
@@ -210,7 +218,8 @@ def unexplained_torques(fitted: Metrics, sensors: SensorSet | None = None) -> st
         groups.remove("joint_torque")
     if sensors is not None and not sensors.torque.any():
         groups.clear()
-    beyond = (one for one in groups if (fitted.rms_of(one) or 0.0) > AT_THE_FLOOR * (fitted.noise.get(one) or 0.0))
+    noise = AT_THE_FLOOR * (fitted.noise.get("joint_torque") or 0.0)  # as large where projected on orthonormal axes
+    beyond = (one for one in groups if (fitted.rms_of(one) or 0.0) > noise)
     share = max((fitted.relative_of(one) or 0.0 for one in beyond), default=0.0)
     return f"the fit leaves {100.0 * share:.3g} % of the joint torques" if share > _SHARE else ""
 

@@ -79,8 +79,8 @@ class DeviationRows:
     Attributes:
         builder: of the rows.
         samples: that they are of.
-        parts: of each of the samples, bases W (N, n_rows, n_rows), which rows are not zero, columns (N, n_rows, P),
-            those of offsets of torques last, and what the nominal parameters leave (N, n_rows).
+        parts: of each of the samples, bases W (N, n_rows, r), which of the r rows are not zero, columns (N, r, P),
+            those of offsets of torques last, and what the nominal parameters leave (N, r).
     """
 
     builder: RowBuilder

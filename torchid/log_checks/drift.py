@@ -60,7 +60,7 @@ def _slopes(filtered: FilteredLog) -> tuple[FloatArray, FloatArray]:
     W, _, K, target = (np.concatenate([part[k] for part in rows.parts]) for k in range(4))
     time = np.concatenate([part.time.numpy() for part in samples])
     base, blocks = rows.builder.tree.base_rows, np.array_split(np.argsort(time, kind="stable"), _BLOCKS)
-    steady = W[:, base : base + n].transpose(0, 2, 1)  # (N, n_rows, n)
+    steady = W[:, base : base + n].transpose(0, 2, 1)  # (N, r, n)
     K = K[..., : K.shape[2] - n]  # without constants of the whole log
     count, H, g = K.shape[2], [], []
     for number, block in enumerate(blocks):

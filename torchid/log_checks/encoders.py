@@ -177,7 +177,7 @@ class _FreeTorques:
         A, b = K[fitted].reshape(-1, K.shape[2]), target[fitted].reshape(-1)
         x = np.linalg.solve(A.T @ A + CORRELATED_SAMPLES * np.eye(A.shape[1]), A.T @ b)
         left = target - K @ x
-        columns = W[:, base : base + model.robot.n]  # (N, n, n_rows)
+        columns = W[:, base : base + model.robot.n]  # (N, n, r)
         size = np.square(columns).sum(axis=2)
         along = np.einsum("njr,nr->nj", columns, left)
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -17,6 +17,7 @@ from torchid.log_checks.findings import (
     ChannelGroup,
     Finding,
     Span,
+    channel_groups,
     channel_unit,
     finite_median,
     neighbours_of,
@@ -263,6 +264,16 @@ def _mean_hold(values: FloatArray, repeated: BoolArray) -> float:
         return typical
     mean = float(lengths.mean())
     return mean if lengths[lengths > _MIN_REST_HOLDS * mean].sum() <= _MAX_REST_SHARE * lengths.sum() else 0.0
+
+
+def new_poses(log: Log) -> Log:
+    """The log at samples with new positions, of joints or else of the base, where these are held at a lower rate."""
+    for group in channel_groups(log, ("joint_position", "base_quat_xyzw")):
+        together = (np.diff(group.values, axis=0) == 0.0).all(axis=1) & group.joined
+        changing = group.values[:, np.ptp(group.values, axis=0) > 0.0]
+        if changing.size and _mean_hold(changing, together):
+            return log.select(np.append(group.samples[0], group.samples[1:][~together]))
+    return log
 
 
 def _estimate_resolution(values: FloatArray) -> float:

@@ -101,18 +101,20 @@ def prior_columns(builder: RowBuilder, robot: Robot, samples: Sequence[Samples])
 
 @torch.no_grad()
 def rows_with_bases(builder: RowBuilder, samples: Samples) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Whitened rows (N, n_rows, columns + 1), their bases W (N, n_rows, n_rows), and which rows are not zero."""
+    """Whitened rows (N, r, columns + 1) that some sample has, their bases W (N, n_rows, r), and which are not zero."""
     n_rows = builder.tree.n_rows
     rows, W = np.zeros((len(samples), n_rows, builder.width + 1)), np.zeros((len(samples), n_rows, n_rows))
     with one_thread():
         for state, index in chunks_by_state(samples):
             numbers = index if isinstance(index, slice) else index.numpy()
             rows[numbers], W[numbers] = (x.numpy() for x in builder.rows_by_sample(samples[index], state))
-    return rows, W, np.asarray(np.abs(W).any(axis=1))
+    equations = np.asarray(np.abs(W).any(axis=1))
+    kept = equations.any(axis=0)
+    return rows[:, kept], W[:, :, kept], equations[:, kept]
 
 
 def accumulate_blocks(parts: Sequence[tuple[FloatArray, FloatArray, BoolArray]]) -> NormalEquations:
-    """Normal equations of parts of a log: K (N, n_rows, P), Y (N, n_rows, k) and which rows are not zero."""
+    """Normal equations of parts of a log: K (N, r, P), Y (N, r, k) and which rows are not zero."""
     K, Y, equations = (np.concatenate(part) for part in zip(*parts, strict=True))
     products = []
     for block in np.array_split(np.arange(len(K)), TIME_BLOCKS):
@@ -215,7 +217,7 @@ def deviation_columns(
     prior: FloatArray,
     armature: float = _JOINT_TERM_SCALE,
 ) -> FloatArray:
-    """Columns (N, n_rows, P) of what may differ from the URDF: parameters, friction, armature, last offsets of torques.
+    """Columns (N, r, P) of what may differ from the URDF: parameters, friction, armature, last offsets of torques.
 
     Args:
         builder: of the rows.
