@@ -234,7 +234,8 @@ class _Trials:
     def kinds(self, setup: RobotSetup) -> list[str]:
         """Kinds of all extra parameters of a trial: those that are stated, and the candidates."""
         stated = [name for name, x in setup.config.actuators.known.items() if x is True]
-        return [*stated, "stribeck", "offset", "scale", *self.candidates(setup)]
+        stated += ["scale"] if setup.terms.scales else []
+        return [*stated, "stribeck", "offset", *self.candidates(setup)]
 
     def reading(self, setup: RobotSetup, estimate_noise: bool = False) -> Reading:
         """The logs with all terms that are stated or may be chosen. Raises InputError: as `LogReader.read`."""
@@ -242,8 +243,12 @@ class _Trials:
         setup = _with_actuators(setup, **{name: True for name in names if name != "delay"})
         logs, fitter = self.logs_and_fitter(setup, estimate_noise)
         self._edges = self._edges or block_edges(logs)
-        terms = replace(setup.terms, slope="delay" in names)
-        return compress_reading(logs, self._edges, with_terms(fitter, terms))
+        terms, gain = replace(setup.terms, slope="delay" in names), setup.config.sensors.gain_error
+        if gain and self.measures_torques(setup) and "joint_torque" not in terms.scales:
+            terms = replace(terms, scales={**terms.scales, "joint_torque": "all"})
+        else:
+            gain = 0.0
+        return compress_reading(logs, self._edges, with_terms(fitter, terms), gain)
 
     def logs_and_fitter(self, setup: RobotSetup, estimate_noise: bool = False) -> tuple[list[Samples], LogFitter]:
         """Some samples of the logs, and a fitter of their rows, weighted with noise that may be of a reading before."""

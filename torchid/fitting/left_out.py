@@ -46,6 +46,7 @@ _OF_TERMS = 0.01  # weight of the prior where terms are chosen: with more, those
 _WORSE = 0.1  # increase of the product of squared errors of two readings that fitting the wider one may cost
 _EXACT = 1e-14  # share of the squared forces below which residuals are rounding
 _WEAK = 1e-3  # weight of the prior of extra parameters, by that of bodies
+_BODIES = 0.2  # deviation of bodies from their file that costs as much as a standard deviation of a gain
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,8 @@ class Reading:
         nominal: (width,), parameters in the columns, 0 for extra ones.
         spread: (width, P), deviations in the columns per unit of the prior.
         extras: of the last columns.
+        gain: standard deviation of the gains of the torque sensors, about their mean, which a fit with "scale" among
+            its terms allows for; 0: scales are as free as other extra parameters.
     """
 
     grams: Array
@@ -67,13 +70,15 @@ class Reading:
     nominal: Array
     spread: Array
     extras: tuple[Extra, ...]
+    gain: float = 0.0
 
     __repr__ = short_repr
 
     @cached_property
     def noise_variance(self) -> float:
         """Mean squared residual of the best fit with all terms, whatever rows are weighted with."""
-        x = self._solve(self.grams.sum(0), 1e-9 * self.rows.sum(), range(len(self.extras)))
+        terms = [k for k, extra in enumerate(self.extras) if not (self.gain and extra.what == "scale")]
+        x = self._solve(self.grams.sum(0), 1e-9 * self.rows.sum(), terms)
         return max(float(x @ self.grams.sum(0) @ x), 0.0) / max(float(self.rows.sum()), 1.0)
 
     def _normal(self, gram: Array, weight: float, fitted: Collection[int]) -> tuple[Array, Array]:
@@ -82,8 +87,13 @@ class Reading:
         unit = np.zeros((len(self.nominal), len(fitted)))
         for k, number in enumerate(fitted):
             unit[count + number, k] = self.extras[number].size
-        columns = np.hstack([self.spread, unit])
         prior = np.repeat([weight, _WEAK * weight], [self.spread.shape[1], len(fitted)])
+        gains = [k for k, number in enumerate(fitted) if self.gain and self.extras[number].what == "scale"]
+        if gains:  # one that all share is another robot's mass
+            at = np.add(count, [*fitted])[gains]
+            unit[np.ix_(at, gains)] = self.gain / _BODIES * (np.eye(len(gains)) - 1.0 / len(gains))
+            prior[self.spread.shape[1] + np.array(gains)] = weight
+        columns = np.hstack([self.spread, unit])
         normal = columns.T @ gram[:-1, :-1] @ columns
         normal[np.diag_indices_from(normal)] += prior + (np.finfo(float).eps * np.trace(normal) or 1.0)
         return columns, normal
@@ -167,13 +177,16 @@ def kind_of(extra: Extra) -> str:
 
 
 @one_thread()
-def compress_reading(logs: Sequence[Samples], edges: Mapping[str, Array], fitter: LogFitter) -> Reading:
+def compress_reading(
+    logs: Sequence[Samples], edges: Mapping[str, Array], fitter: LogFitter, gain: float = 0.0
+) -> Reading:
     """The Gram matrices of logs in blocks.
 
     Args:
         logs: thinned (`thinned`).
         edges: times between which the blocks of each log lie [s], by its source (`block_edges`).
         fitter: of their rows.
+        gain: as in `Reading`.
     """
     builder, robot = fitter.builder, fitter.robot
     spans = [list(zip(*_ends(log, edges[log.source]), strict=True)) for log in logs]
@@ -199,7 +212,7 @@ def compress_reading(logs: Sequence[Samples], edges: Mapping[str, Array], fitter
     rest = [k for k in range(builder.width) if k not in of_logs]
     grams = np.array([_eliminated(gram, of_logs, [*rest, builder.width]) for gram in grams])
     shared = tuple(extra for extra in builder.extras if not extra.per_log)
-    return Reading(grams, rows, oversampling, nominal[rest], spread[rest], shared)
+    return Reading(grams, rows, oversampling, nominal[rest], spread[rest], shared, gain)
 
 
 def _eliminated(gram: Array, own: Sequence[int], rest: Sequence[int]) -> Array:
@@ -331,6 +344,7 @@ def choose_terms(reading: Reading, candidates: Sequence[str], fixed: Collection[
     """The terms without which left-out blocks are predicted worse; the least useful one is dropped after another.
 
     Elimination from all terms, not addition to none: one that is missing hides another (a delay hides rotor inertia).
+    Dropped is also what errors of the sensors' gains explain: a spring, for joints that move little.
 
     Args:
         reading: with the columns of all terms.
@@ -345,11 +359,16 @@ def choose_terms(reading: Reading, candidates: Sequence[str], fixed: Collection[
             squares[key] = reading.left_out({*terms, *fixed}, None, _OF_TERMS)
         return squares[key]
 
+    def is_needed(name: str, beside: Collection[str] = ()) -> Evidence:
+        return Evidence.of(left({*chosen, *beside} - {name}), left({*chosen, *beside}))
+
     chosen = [name for name in TERMS if name in candidates]
     adopted: dict[str, Evidence] = {}
     while chosen:
-        adopted = {name: Evidence.of(left({*chosen} - {name}), left(chosen)) for name in chosen}
+        adopted = {name: is_needed(name) for name in chosen}
         needless = [name for name in chosen if not adopted[name].adopted]
+        if reading.gain and not needless:
+            needless = [name for name in chosen if is_needed(name, {"scale"}).gain < _GAIN]
         if not needless:
             break
         chosen.remove(min(reversed(needless), key=lambda name: round(adopted[name].gain, 3)))
