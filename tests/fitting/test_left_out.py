@@ -40,8 +40,13 @@ def recorded(
     late: float = 0.0,
     ringing: float = 0.0,
     encoder: float = 2e-5,
+    gains: float = 0.0,
+    reach: float = 1.0,
 ) -> torchid.Log:
-    """The log of an arm whose bodies are up to 20 % off its URDF; `ringing` at 30 Hz is in no model [rad/s^2]."""
+    """The log of an arm whose bodies are up to 20 % off its URDF; `ringing` at 30 Hz is in no model [rad/s^2].
+
+    `gains`: standard deviation of those of the torque sensors. `reach`: of the motion.
+    """
     rng, t = np.random.default_rng(seed), np.arange(3000) * STEP
     pace, phase, size = (rng.uniform(*ends, (3, ARM.n)) for ends in ((1.0, 7.0), (0.0, 6.0), (0.1, 0.35)))
 
@@ -51,9 +56,11 @@ def recorded(
 
     phi = ARM.nominal * rng.uniform(0.8, 1.2, (len(ARM.bodies), 1))
     phi[1:, FRICTION] = rng.uniform(0.2, 1.0, (ARM.n, 2))
+    size *= reach
     q, v, a = motion(t - late)
     torque = torchid.Regressor(ARM)(*map(torch.from_numpy, (q, v, a))).numpy() @ phi.flatten()
     torque += rotor * a + spring * q + offset + NOISE * rng.normal(size=q.shape)
+    torque *= 1.0 + gains * rng.normal(size=ARM.n)
     shaken = ringing * np.sin(2.0 * np.pi * 30.0 * t)[:, None] / (2.0 * np.pi * 30.0) ** 2
     seen = motion(t)[0] + shaken + encoder * rng.normal(size=q.shape)
     return torchid.Log("arm.npz", t, ARM.joint_names, seen, joint_torque=torque)
@@ -69,9 +76,10 @@ def bound(log: torchid.Log, cutoff_hz: float = 15.0) -> Samples:
     return bind_log(torchid.preprocess(log, cutoff_hz=cutoff_hz), ARM, [])
 
 
-def reading(log: torchid.Log, cutoff_hz: float = 15.0) -> Reading:
-    some = thinned([bound(log, cutoff_hz)])
-    return compress_reading(some, block_edges([bound(log)]), fitter_of(WIDE))
+def reading(log: torchid.Log, cutoff_hz: float = 15.0, gain: float = 0.0) -> Reading:
+    some, terms = thinned([bound(log, cutoff_hz)]), WIDE
+    terms = replace(terms, scales={"joint_torque": "all"}) if gain else terms
+    return compress_reading(some, block_edges([bound(log)]), fitter_of(terms), gain)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -84,6 +92,15 @@ def test_terms_of_actuators_are_adopted_where_they_are_and_not_where_they_are_no
     assert not nothing.adopted
     assert {*nothing.rejected} == {*TERMS}
     assert str(nothing).startswith("none")
+
+
+def test_a_term_that_errors_of_gains_explain_is_not_adopted() -> None:
+    """Torques of the weight change with the position as those of a spring do, and are 5 % off here."""
+    log = recorded(3, gains=0.05, reach=0.3)
+    assert choose_terms(reading(log), TERMS).adopted
+    assert not choose_terms(reading(log, gain=0.05), TERMS).adopted
+    there = recorded(3, rotor=0.3, gains=0.05)
+    assert set(choose_terms(reading(there, gain=0.05), TERMS).adopted) == {"armature"}
 
 
 def test_adopted_terms_are_listed_with_what_each_is_worth() -> None:

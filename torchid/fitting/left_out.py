@@ -88,11 +88,11 @@ class Reading:
         for k, number in enumerate(fitted):
             unit[count + number, k] = self.extras[number].size
         prior = np.repeat([weight, _WEAK * weight], [self.spread.shape[1], len(fitted)])
-        gains = [k for k, number in enumerate(fitted) if self.gain and self.extras[number].what == "scale"]
-        if gains:  # one that all share is another robot's mass
-            at = np.add(count, [*fitted])[gains]
-            unit[np.ix_(at, gains)] = self.gain / _BODIES * (np.eye(len(gains)) - 1.0 / len(gains))
-            prior[self.spread.shape[1] + np.array(gains)] = weight
+        gains = np.array([bool(self.gain) and self.extras[number].what == "scale" for number in fitted], dtype=bool)
+        if gains.any():  # one that all share is another robot's mass
+            own = np.eye(gains.sum()) - 1.0 / gains.sum()
+            unit[np.ix_(count + np.array([*fitted])[gains], gains)] = self.gain / _BODIES * own
+            prior[self.spread.shape[1] :][gains] = weight
         columns = np.hstack([self.spread, unit])
         normal = columns.T @ gram[:-1, :-1] @ columns
         normal[np.diag_indices_from(normal)] += prior + (np.finfo(float).eps * np.trace(normal) or 1.0)
