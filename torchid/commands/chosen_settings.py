@@ -78,6 +78,7 @@ class Choices:
     """How settings were chosen, in the order in which they are; None for what the experiment states."""
 
     cutoff: CutoffChoice | None = None
+    radius: RadiusChoice | None = None
     contact_margin: DataChoice | None = None
     stiction: DataChoice | None = None
     base_tilt: TiltChoice | None = None
@@ -133,6 +134,9 @@ def _with_chosen_data(setup: S, choices: Choices, trials: _Trials, bars: Progres
     if finds_cutoff:
         choices.cutoff, shortest = _chosen("cutoff", partial(_cutoff_of_motion, setup), bars)
         setup = _with_preprocessing(setup, cutoff_hz=choices.cutoff.cutoff_hz)
+    if setup.open_radii:
+        choices.radius = _chosen("radius of feet", partial(_radius, setup, trials), bars)
+        setup = setup if choices.radius.radius is None else _with_radius(setup, choices.radius.radius)
     actuators = setup.config.actuators
     if actuators.stiction == AUTO and actuators.stribeck is None and trials.measures_torques(setup):
         rest = {value: _with_actuators(setup, stiction=value) for value in (False, True)}
@@ -178,6 +182,7 @@ MARGINS = (None, 0.03, 0.06)
 MOST_TRIED = 20_000
 """Samples of a log that settings are chosen with."""
 
+_RADII = (0.0, 0.015, 0.03, 0.045)  # [m] of balls about the frames of feet
 _OCTAVES, _LOWEST_HZ = 8, 2.5  # of cutoffs that are tried, and the lowest: nobody moves slower to be identified
 _PERIODS = 12.0 * DROPPED_PERIODS  # of a cutoff in the shortest log, at least: of a fourth held back a third is left
 _LEAST_LEFT = 0.3  # of the rows, that a setting may leave
@@ -203,6 +208,22 @@ def _in_words(value: float | bool | None) -> str:
     if value is None or isinstance(value, bool):
         return {None: "none", False: "counted", True: "left out"}[value]
     return f"{value:g} s"
+
+
+@dataclass(frozen=True)
+class RadiusChoice:
+    """A radius of feet that are balls about their frames [m]; None where what the robot's file has predicts as well.
+
+    `evidence`: for the radius, against what the file has.
+    """
+
+    radius: float | None
+    evidence: Evidence
+
+    def __str__(self) -> str:
+        if self.radius is None:
+            return "of the robot's file: balls about the frames of the feet predict left-out blocks no better"
+        return f"balls of {1e3 * self.radius:.3g} mm about the frames (error on left-out blocks {self.evidence})"
 
 
 class _Trials:
@@ -383,6 +404,36 @@ def _narrowest_needed(trials: _Trials, setups: Mapping[Any, RobotSetup], estimat
                 raise
             break
     return DataChoice([*setups][widest(readings, kinds)], tuple(setups))
+
+
+def _radius(setup: RobotSetup, trials: _Trials) -> RadiusChoice:
+    """The radius of balls about the frames of feet that predicts left-out blocks best, to second order in it."""
+    kinds = trials.kinds(setup)
+
+    def left(radius: float, estimate_noise: bool = False) -> Array:
+        return trials.reading(_with_radius(setup, radius), estimate_noise).left_out(kinds)
+
+    own, tried = trials.reading(setup).left_out(kinds), [left(radius) for radius in _RADII]
+    a, b, _ = np.polyfit(_RADII, [-Evidence.of(own, one).gain for one in tried], 2)
+    best, evidence = float(f"{-0.5 * b / a:.3g}") if a > 0.0 else 0.0, Evidence(0.0, 0.0, 0)
+    if _RADII[0] < best < _RADII[-1]:
+        evidence = Evidence.of(own, left(best))
+    if not evidence.adopted:
+        return RadiusChoice(None, evidence)
+    left(best, estimate_noise=True)  # which other choices are made with
+    return RadiusChoice(best, evidence)
+
+
+def _with_radius(setup: S, radius: float) -> S:
+    """The setup whose feet of open radius are balls about their frames [m]."""
+    contacts = tuple(
+        replace(x, radius=radius, centre=(0.0, 0.0, 0.0)) if x.frame in setup.open_radii else x for x in setup.contacts
+    )
+    stated = [
+        replace(x, radius=radius, centre=[0.0] * 3) if x.frame in setup.open_radii else x for x in setup.config.contacts
+    ]
+    text = f"{join_names(sorted(setup.open_radii))}: ball of radius {1e3 * radius:.3g} mm, by the logs"
+    return replace(setup, contacts=contacts, config=replace(setup.config, contacts=stated), rolling=text)
 
 
 def _sign_width(setup: RobotSetup, trials: _Trials) -> SignWidthChoice:

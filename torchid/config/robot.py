@@ -201,7 +201,8 @@ class ContactConfig:
     """A contact at a URDF frame: `line_axis` is the frame's axis that a line contact runs along.
 
     `radius` [m]: a point is a sphere, a line a cylinder about the frame's origin, which rolls; auto: that of the
-    collision sphere or wheel or the ball at the end of a mesh (of a line: the cylinder) in the URDF, 0 without one.
+    collision sphere or wheel or the ball at the end of a mesh (of a line: the cylinder) in the URDF, 0 without one; but
+    for points a ball about the origin if that predicts the training logs clearly better.
     `centre` [m]: of the sphere in the frame; auto: of the shape whose radius is taken, else the origin. `normal`: of
     the ground, in the world, where the logs do not record it (`contact_normal_world`); None for upwards.
     """

@@ -55,6 +55,7 @@ class RobotSetup:
         robot: the robot.
         contacts: the contacts in use.
         rolling: what the contacts that roll roll on, and where that is stated, "" if none does.
+        open_radii: frames of points whose radius the settings leave open.
         estimated_noise: by field of `SensorNoise`, what logs show of the noise that is not stated (`with_noise`).
         noise_stated: whether a user has stated any noise of the forces, once others are estimated.
     """
@@ -63,6 +64,7 @@ class RobotSetup:
     robot: Robot
     contacts: tuple[Contact, ...]
     rolling: str = ""
+    open_radii: frozenset[str] = frozenset()
     estimated_noise: Mapping[str, Any] = field(default_factory=dict)
     noise_stated: bool = True
 
@@ -298,7 +300,9 @@ def set_up_robot(config: ExperimentConfig | AnalyzeConfig) -> RobotSetup:
         replace(c, radius=contact.radius, centre=list(contact.centre) if any(contact.centre) else c.centre)
         for c, contact in zip(config.contacts, contacts, strict=True)
     ]
-    setup = RobotSetup(config=replace(config, contacts=stated), robot=robot, contacts=contacts, rolling=rolling)
+    open_radii = frozenset(c.frame for c in config.contacts if c.type == "point" and c.radius == AUTO)
+    config = replace(config, contacts=stated)
+    setup = RobotSetup(config=config, robot=robot, contacts=contacts, rolling=rolling, open_radii=open_radii)
     check_scale_groups(setup.terms, robot, contacts)
     stated_noise(config.sensors.noise, robot)
     return setup

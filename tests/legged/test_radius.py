@@ -1,0 +1,48 @@
+"""The radius of feet, which a URDF need not have, by what left-out blocks of a log say."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from legged.gait import Reference
+from legged.recording import Noise, record
+from legged.robots import QUADRUPED, TrueRobot
+from legged.simulate import simulated
+from rich.progress import Progress
+
+from torchid.commands.chosen_settings import with_chosen_settings
+from torchid.config import load_config
+from torchid.fitting.experiment import set_up
+from torchid.logs import write_log
+
+SECONDS = 12.0
+
+
+@pytest.mark.parametrize("radius", [0.0, 0.025])
+def test_the_radius_of_feet_is_found_where_they_are_balls(tmp_path: Path, radius: float) -> None:
+    """Feet of the demo's robot, whose URDF has no shape for them; the recorded ones are balls or points."""
+    true = TrueRobot.unlike_its_urdf(replace(QUADRUPED, radius=radius))
+    exact = simulated(true, Reference(true, SECONDS, seed=0), SECONDS)
+    write_log(record(exact, true.robot.base_link, Noise(), np.random.default_rng(0)), tmp_path / "log.npz")
+    text = f"""
+robot: {{urdf: {QUADRUPED.urdf}}}
+contacts: [{", ".join(f"{{frame: {foot}, type: point}}" for foot in QUADRUPED.feet)}]
+logs: {{train: [{tmp_path / "log.npz"}]}}
+sensors: joints
+preprocessing: {{cutoff_hz: 15}}
+output: run
+"""
+    (tmp_path / "experiment.yaml").write_text(text)
+    setup, choices = with_chosen_settings(set_up(load_config(tmp_path / "experiment.yaml")), Progress(disable=True))
+    assert choices.radius is not None
+    if radius:
+        assert choices.radius.radius == pytest.approx(radius, abs=2e-3)
+        assert {contact.radius for contact in setup.contacts} == {choices.radius.radius}
+        assert {contact.radius for contact in setup.config.contacts} == {choices.radius.radius}
+        assert f"ball of radius {1e3 * choices.radius.radius:.3g} mm, by the logs" in setup.rolling
+    else:
+        assert choices.radius.radius is None
+        assert {contact.radius for contact in setup.contacts} == {0.0}
