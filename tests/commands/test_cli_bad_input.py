@@ -174,6 +174,14 @@ FILES: dict[str, tuple[Edit, tuple[str, ...]]] = {
         edit_config(sensors={"joint_torques": ["front_left_hop"]}),
         ("front_left_hop", "front_left_hip"),
     ),
+    "noise of a star": (
+        edit_config(sensors={"set": "joints", "noise": {"joint_torque": 1e300}}),
+        ("sensors.noise: standard deviations from 1e+300 to 1e+300; accepted: from 1e-9 to 1e6, the largest",),
+    ),
+    "noise of one joint far from the others": (
+        edit_config(sensors={"set": "joints", "noise": {"joint_torque": {"*": 1e-9, "front_left_hip": 0.1}}}),
+        ("sensors.noise: standard deviations from 1e-09 to 0.1; accepted: from 1e-9 to 1e6, the largest at most 1e7",),
+    ),
     "offset of sensors that are not there": (
         edit_config(sensors={"set": "joints", "offsets": {"joint_torque": "all", "ft_force": "log"}}),
         ("sensors.offsets.ft_force: no such sensor is measured; accepted: joint_torque, or",),
