@@ -330,6 +330,21 @@ def test_a_log_in_place_of_an_experiment_file_is_told_for_what_it_is(
     assert line.endswith(f"accepted: a YAML {kind} file")
 
 
+@pytest.mark.parametrize("command", ["identify", "analyze", "simulate", "compress"])
+def test_a_robot_in_place_of_an_experiment_file_is_told_for_what_it_is(
+    experiment: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    urdf = experiment / "quadruped.urdf"
+    short = experiment / "short.urdf"
+    short.write_text('<robot name="r"><!-- mass: 1 kg --><link name="a"/></robot>')
+    for path in (urdf, short):
+        output = ["--output", str(experiment / "factors")] * (command == "compress")
+        line = refusal([command, str(path), *output], experiment.parent, capsys)
+        assert f"{path}: YAML: text, <" in line
+        assert "accepted: a mapping with robot, " in line
+        assert len(line) < 250
+
+
 @pytest.mark.parametrize("command", ["identify", "analyze", "simulate", "check"])
 def test_a_command_without_arguments_asks_for_a_file_and_not_for_overrides(
     capsys: pytest.CaptureFixture[str], command: str
