@@ -7,12 +7,14 @@ import gc
 import logging
 import os
 import re
+import shutil
 import sys
 import threading
 import traceback
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout, suppress
+from textwrap import fill
 
 from torchid import distributed
 from torchid.errors import (
@@ -164,8 +166,13 @@ def _without_names(text: str) -> str:
 
 
 def _print_line(program: str, text: str) -> None:
+    """Print one line; on a terminal broken between words, as answers are."""
+    line = f"{program}: {one_line(text)}"
+    if sys.stderr.isatty():  # `wrap_words` would import torch, for seconds
+        width = min(shutil.get_terminal_size().columns, 100)
+        line = fill(line, width, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
     with suppress(BrokenPipeError):
-        print(f"{program}: {one_line(text)}", file=sys.stderr)
+        print(line, file=sys.stderr)
 
 
 def _redirect_to_null(stream: object) -> None:

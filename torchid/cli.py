@@ -375,8 +375,10 @@ def _check(options: argparse.Namespace) -> int:
 def _init(options: argparse.Namespace) -> None:
     with importing():
         from torchid.commands.init import init
+        from torchid.terminal.lines import print_labelled
 
-    print(init(options.urdf, options.log, options.output))
+    for label, text in init(options.urdf, options.log, options.output).lines:
+        print_labelled(label, text)
 
 
 def _convert(options: argparse.Namespace) -> None:

@@ -108,6 +108,9 @@ def beside(folder: Path, page: str) -> dict[str, Any]:
     said["network"] = _Nothing(robot.nv)
     said["fitter"] = torchid.LogFitter(robot=robot, builder=builder, estimator=torchid.LeastSquares(0.01))
     said["paths"] = ["walk.factor"]
+    if page == "simulators.md":
+        (folder / "runs" / "robot").mkdir(parents=True)
+        (folder / "runs" / "robot" / "identified.urdf").write_bytes((folder / "robot.urdf").read_bytes())
     if page == "randomization.md":
         file = shortened_demo(folder / "short", 600) / "quadruped.yaml"
         torchid.identify(file, output=folder / "runs" / "g1", estimator={"name": "consistent", "ridge": 0.001})
@@ -131,6 +134,8 @@ class _Nothing(torch.nn.Module):
 @pytest.mark.parametrize("page", sorted({x.values[0] for x in blocks("python")} - ELSEWHERE))
 def test_python_of_the_pages_runs(page: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Block after block, as a reader copies them."""
+    if page == "simulators.md":
+        pytest.importorskip("mujoco", reason="MuJoCo is not installed")
     monkeypatch.chdir(folder)
     monkeypatch.setattr(torchid, "Sgd", _two_epochs)
     for name, text in {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "0", "RANK": "0", "WORLD_SIZE": "1"}.items():
@@ -138,6 +143,12 @@ def test_python_of_the_pages_runs(page: str, folder: Path, monkeypatch: pytest.M
     said = beside(folder, page)
     for block in (x.values[1] for x in blocks("python") if x.values[0] == page):
         exec(compile(str(block), page, "exec"), said)
+    if page == "simulators.md":
+        robot, model = said["robot"], said["model"]
+        assert model.nv == robot.nv
+        assert model.body_mass.sum() == pytest.approx(robot.nominal[:, 0].sum(), rel=1e-3), (
+            "with its trunk; soles weigh 34 g"
+        )
     if torch.distributed.is_initialized():  # noqa: TID251
         torch.distributed.destroy_process_group()  # noqa: TID251
 

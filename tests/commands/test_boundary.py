@@ -242,6 +242,7 @@ def _warn_of_logs(
     terminal: bool,
     fold: bool,
     category: type[TorchidWarning] = TorchidWarning,
+    columns: int = 100,
 ) -> list[str]:
     """Lines on standard error of a command that warns."""
 
@@ -251,6 +252,7 @@ def _warn_of_logs(
 
     screen = _Terminal() if terminal else io.StringIO()
     monkeypatch.setattr(sys, "stderr", screen)
+    monkeypatch.setenv("COLUMNS", str(columns))
     assert run_guarded("torchid", command, fold_warnings=fold) == 0
     return screen.getvalue().splitlines()
 
@@ -267,6 +269,19 @@ def test_a_terminal_gets_the_first_of_alike_warnings_and_their_number_and_a_file
     first = [f"torchid: TorchidWarning: {text}" for text in (told[0], told[-3], told[-2])]
     assert lines == [*first, "torchid: and 9 warnings like these: --verbose"]
     assert _warn_of_logs(told[-3:-1], monkeypatch, terminal=True, fold=True) == first[1:]
+
+
+@pytest.mark.parametrize("columns", [30, 80, 300])
+def test_a_terminal_gets_long_lines_broken_between_words_and_a_file_gets_them_whole(
+    monkeypatch: pytest.MonkeyPatch, columns: int
+) -> None:
+    name = "a-folder/of-a-path/that-is-longer-than-the-narrowest-terminal.npz"
+    told = [f"{name}: {' '.join(['a well-worn warning that goes on'] * 9)}"]
+    (whole,) = _warn_of_logs(told, monkeypatch, terminal=False, fold=True, columns=columns)
+    lines = _warn_of_logs(told, monkeypatch, terminal=True, fold=True, columns=columns)
+    assert " ".join(line.strip() for line in lines) == whole
+    assert max(len(line) for line in lines if name not in line) <= min(columns, 100)
+    assert all(line.startswith("  ") for line in lines[1:])
 
 
 def test_a_terminal_gets_no_warning_of_what_its_answer_says_is_confounded(monkeypatch: pytest.MonkeyPatch) -> None:

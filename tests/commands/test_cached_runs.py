@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
 import subprocess
 import sys
 import warnings
+from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -263,13 +265,35 @@ def test_a_log_with_other_content_is_read_whatever_its_size_and_time_say(
 # ------------------------------------------------------------------------------------------- damage, bounds, company
 
 
+def truncate(entry: Path) -> None:
+    for path in entry.glob("*.npy"):
+        os.truncate(path, path.stat().st_size - 8)
+
+
+def forge_nan(entry: Path) -> None:
+    """Put a NaN into the last number of an array, with checksums as if it had been there from the start."""
+    path = next(path for name in ("values", "joint_position") if (path := entry / f"{name}.npy").exists())
+    array = np.load(path)
+    array[-1] = np.nan
+    np.save(path, array)
+    document = json.loads(json.loads((entry / "entry.json").read_text())["entry"])
+    document["files"][path.stem]["sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
+    text = json.dumps(document)
+    (entry / "entry.json").write_text(json.dumps({"sha256": hashlib.sha256(text.encode()).hexdigest(), "entry": text}))
+
+
 @pytest.mark.filterwarnings("ignore:identified.urdf:torchid.errors.TorchidWarning")
+@pytest.mark.parametrize("damage", [truncate, forge_nan])
 def test_a_run_with_damaged_entries_says_so_and_has_the_same_results(
-    demo: Path, plain: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    demo: Path,
+    plain: dict[str, Any],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    damage: Callable[[Path], None],
 ) -> None:
     assert main(["identify", str(demo), f"output={tmp_path / 'first'}"]) == 0
-    for path in (tmp_path / FOLDER).rglob("*.npy"):
-        os.truncate(path, path.stat().st_size - 8)
+    for path in (tmp_path / FOLDER).rglob("entry.json"):
+        damage(path.parent)
     (tmp_path / FOLDER / "checksums.json").write_text("{")
     capsys.readouterr()
     assert main(["identify", str(demo), f"output={tmp_path / 'second'}"]) == 0

@@ -174,6 +174,14 @@ FILES: dict[str, tuple[Edit, tuple[str, ...]]] = {
         edit_config(sensors={"joint_torques": ["front_left_hop"]}),
         ("front_left_hop", "front_left_hip"),
     ),
+    "noise of a star": (
+        edit_config(sensors={"set": "joints", "noise": {"joint_torque": 1e300}}),
+        ("sensors.noise: standard deviations from 1e+300 to 1e+300; accepted: from 1e-9 to 1e6, the largest",),
+    ),
+    "noise of one joint far from the others": (
+        edit_config(sensors={"set": "joints", "noise": {"joint_torque": {"*": 1e-9, "front_left_hip": 0.1}}}),
+        ("sensors.noise: standard deviations from 1e-09 to 0.1; accepted: from 1e-9 to 1e6, the largest at most 1e7",),
+    ),
     "offset of sensors that are not there": (
         edit_config(sensors={"set": "joints", "offsets": {"joint_torque": "all", "ft_force": "log"}}),
         ("sensors.offsets.ft_force: no such sensor is measured; accepted: joint_torque, or",),
@@ -320,6 +328,21 @@ def test_a_log_in_place_of_an_experiment_file_is_told_for_what_it_is(
     assert "sway_train.npz: file: a log, not a file of settings" in line
     kind = "simulation" if command == "simulate" else "experiment"
     assert line.endswith(f"accepted: a YAML {kind} file")
+
+
+@pytest.mark.parametrize("command", ["identify", "analyze", "simulate", "compress"])
+def test_a_robot_in_place_of_an_experiment_file_is_told_for_what_it_is(
+    experiment: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    urdf = experiment / "quadruped.urdf"
+    short = experiment / "short.urdf"
+    short.write_text('<robot name="r"><!-- mass: 1 kg --><link name="a"/></robot>')
+    for path in (urdf, short):
+        output = ["--output", str(experiment / "factors")] * (command == "compress")
+        line = refusal([command, str(path), *output], experiment.parent, capsys)
+        assert f"{path}: YAML: text, <" in line
+        assert "accepted: a mapping with robot, " in line
+        assert len(line) < 250
 
 
 @pytest.mark.parametrize("command", ["identify", "analyze", "simulate", "check"])

@@ -235,6 +235,10 @@ HOSTILE: dict[str, Callable[[dict[str, Any], dict[str, Any]], Any]] = {
     "contacts left out": lambda d, a: d["settings"].pop("contacts"),
     "no noise": lambda d, a: d["noise"].clear(),
     "negative noise": lambda d, a: d["noise"].update({"joint_torque.front_left_hip": -1.0}),
+    "noise of a star": lambda d, a: d["noise"].update({"base_force.x": 1e300}),
+    "noise of nothing": lambda d, a: d["noise"].update({"base_force.x": 1e-300}),
+    "noise far from the others": lambda d, a: d["noise"].update({"base_force.x": 1e6, "base_force.y": 1e-6}),
+    "noise that is NaN": lambda d, a: d["noise"].update({"base_force.x": float("nan")}),
     ONE_NOISE: lambda d, a: d.update(
         noise={"joint_torque": 0.1} | {name: x for name, x in d["noise"].items() if "joint_torque" not in name}
     ),

@@ -21,7 +21,7 @@ from torchid.logs import read_log
 from torchid.robot import load_robot
 
 SIDES = ("front_left", "front_right", "rear_left", "rear_right")
-TIAGO = ROBOTS / "tiago_description/robots/tiago_no_hand.urdf"
+ROMEO_SMALL = ROBOTS / "romeo_description/urdf/romeo_small.urdf"
 
 
 def test_a_body_without_joints_has_a_pose_and_only_columns_that_are_named_are_ignored(tmp_path: Path) -> None:
@@ -72,11 +72,11 @@ def test_an_array_of_columns_that_no_name_tells_is_ignored_by_its_own_name_and_m
 
 def test_an_inertia_that_no_body_has_is_said_once(tmp_path: Path) -> None:
     with pytest.warns(UnphysicalInertiaWarning):
-        joints = load_robot(TIAGO).joint_names
+        joints = load_robot(ROMEO_SMALL).joint_names
     motion = {f"{name}_position": np.sin(np.arange(200) / 50.0) for name in joints}
     path = save_csv(tmp_path / "x.csv", {"t": np.arange(200) / 50.0} | motion)
     with pytest.warns(UnphysicalInertiaWarning) as told:
-        init(TIAGO, path, tmp_path / "x.yaml")
+        init(ROMEO_SMALL, path, tmp_path / "x.yaml")
     assert len([one for one in told if one.category is UnphysicalInertiaWarning]) == 1
 
 

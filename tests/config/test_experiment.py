@@ -296,6 +296,11 @@ def test_an_unknown_key_is_refused_by_its_place_and_the_nearest_that_exists(
             "greater",
         ),
         (changed(sensors={"set": "full", "noise": {"base_moment": "much"}}), "sensors.noise.base_moment", "'much'"),
+        (
+            changed(sensors={"set": "full", "noise": {"joint_position": 1e300}}),
+            "sensors.noise.joint_position",
+            "less than or equal to 1000",
+        ),
         (changed(sensors={"set": "full", "on_base_lost": "ignore"}), "sensors.on_base_lost", "'ignore'"),
         (changed(estimator="least_squares"), "estimator", "'least_squares'"),
         (changed(estimator={"ridge": float("nan")}), "estimator.ridge", "nan"),

@@ -226,10 +226,13 @@ def test_a_mask_is_widened_by_any_distance() -> None:
     np.testing.assert_array_equal(np.flatnonzero(widen_mask(where, 2)), np.arange(1, 6))
 
 
-def test_a_joint_that_rests_before_and_after_its_only_motion_is_not_held() -> None:
+@pytest.mark.parametrize("repeats", [0, 1, 20])
+def test_a_joint_that_rests_before_and_after_its_only_motion_is_not_held(repeats: int) -> None:
     log = moving()
     part = slice(600, 1400)
     rests = np.clip(np.arange(2000), part.start, part.stop - 1)
+    again = 700 + 30 * np.arange(repeats)
+    rests[again] = rests[again - 1]
     once = changed(log, "joint_position", lambda q: q.__setitem__((slice(None), 1), q[rests, 1]))
     assert not found(check(once), "held")
 

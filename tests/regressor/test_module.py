@@ -70,6 +70,19 @@ def test_a_sample_does_not_see_its_batch(urdf: Path) -> None:
         assert_close(jacobian(piece[0]).numpy(), J[part].numpy(), 1e-15)
 
 
+def test_a_quaternion_of_norm_0_is_no_turn_and_has_finite_gradients(small: Robot) -> None:
+    q, v, a = tensors(*random_states(np.random.default_rng(16), small.n, 2))
+    q[0, 3:7] = torch.tensor([0.0, 0.0, 0.0, 1.0])
+    level = q.clone()
+    q[0, 3:7] = 0.0
+    K, J = Regressor(small), FrameJacobian(small, "c", radius=0.1)
+    assert torch.equal(K(q.requires_grad_(), v, a), K(level, v, a))
+    assert torch.equal(J(q), J(level))
+    (K(q, v, a).square().sum() + J(q).square().sum()).backward()
+    assert q.grad is not None
+    assert q.grad.isfinite().all()
+
+
 def test_compiled_and_exported_they_are_the_same(small: Robot) -> None:
     state, more = (tensors(*random_states(np.random.default_rng(15), small.n, samples)) for samples in (3, 7))
     K, J = Regressor(small), FrameJacobian(small, "c")

@@ -168,6 +168,26 @@ REFUSED = {
         BODY.format("", HINGE.format("") + '\n<inertial pos="nan 0 0" mass="1" diaginertia="1 1 1"/>', ""),
         "<inertial>, line 4: a number that is not finite",
     ),
+    "infinite armature": (
+        BODY.format("", HINGE.format(' armature="inf"'), ""),
+        "joint 'j', <dynamics>: a number that is not finite; accepted: finite numbers",
+    ),
+    "NaN of a spring": (
+        BODY.format("", HINGE.format(' stiffness="1" springref="nan"'), ""),
+        "joint 'j', <dynamics>: a number that is not finite; accepted: finite numbers",
+    ),
+    "a ground of gigabytes": (
+        BODY.format("", HINGE.format(""), '<asset><hfield name="h" nrow="50000" ncol="50000" size="1 1 1 1"/></asset>'),
+        "robot.xml: MJCF: MuJoCo crashes as it reads it, or needs more than 1 GiB or 10 s",
+    ),
+    "attached to itself": (
+        BODY.format(
+            "",
+            HINGE.format("") + '<attach model="m" body="b" prefix="x"/>',
+            '<asset><model name="m" file="robot.xml"/></asset>',
+        ),
+        "robot.xml: MJCF: MuJoCo crashes as it reads it, or needs more than 1 GiB or 10 s",
+    ),
     "damped base": (
         BODY.format("", '<joint type="free" damping="1"/>', ""),
         f"<joint>, line 3: damping 1{' 0 0' * (not IS_MUJOCO_3)} of a free",

@@ -48,6 +48,16 @@ def test_inertias_of_no_body_are_said_in_one_line(tmp_path: Path) -> None:
     assert message.endswith("and the inertia of tip is no body's either; used as written")
 
 
+@pytest.mark.parametrize(
+    ("mass", "ixx", "warns"), [("1e-6", "3e-6", False), ("1e-6", "0.3", True), ("0.3", "3e-6", True)]
+)
+def test_the_inertia_of_a_dummy_link_is_no_reason_to_warn(mass: str, ixx: str, warns: bool, tmp_path: Path) -> None:
+    dummy = link("mount", inertial(mass=mass, ixx=ixx, iyy="1e-6", izz="1e-6"))
+    robot, caught = warned(write(tmp_path, *TREE, dummy, joint("weld", "arm", "mount", "fixed")))
+    assert bool(caught) == warns
+    assert robot.nominal[1, 0] == pytest.approx(1.0 + float(mass), rel=1e-12), "used as written"
+
+
 def test_a_thin_plate_or_a_point_mass_is_no_reason_to_warn(tmp_path: Path) -> None:
     plate = link("base", inertial(ixx="0.05", iyy="0.05", izz="0.1"))
     point = link("arm", inertial(ixx="0", iyy="0", izz="0"))

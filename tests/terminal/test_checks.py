@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from repository import DEMO
 
 from torchid.cli import main
 from torchid.log_checks import NOTE, REJECTED, SUSPICIOUS, Checked, Finding, Skipped, Span
@@ -139,17 +140,19 @@ def test_a_terminal_gets_plain_lines_of_its_width(tmp_path: Path, monkeypatch: p
         def isatty(self) -> bool:
             return True
 
-    write_log(checked("walk").log, tmp_path / "walk.npz")
+    monkeypatch.chdir(tmp_path)
+    write_log(checked("walk").log, "walk.npz")
     monkeypatch.setenv("TERM", "xterm-256color")
     monkeypatch.setenv("NO_COLOR", "1")
     for width in (60, 90):
         monkeypatch.setenv("COLUMNS", str(width))
-        screen = Terminal()
-        monkeypatch.setattr(sys, "stdout", screen)
-        assert main(["check", str(tmp_path / "walk.npz")]) == 0
-        lines = screen.getvalue().splitlines()
-        assert "\x1b" not in screen.getvalue()
-        assert width - 15 < max(map(len, lines)) <= width
+        for command in (["check"], ["init", str(DEMO / "quadruped.urdf"), f"--output={width}.yaml"]):
+            screen = Terminal()
+            monkeypatch.setattr(sys, "stdout", screen)
+            assert main([*command, "walk.npz"]) == 0
+            lines = screen.getvalue().splitlines()
+            assert "\x1b" not in screen.getvalue()
+            assert width - 15 < max(map(len, lines)) <= width
 
 
 def test_quiet_prints_nothing_and_ends_with_the_same_status(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from textwrap import fill
 
 import yaml
 
@@ -97,10 +96,11 @@ class InitReport:
     guessed: list[str] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
 
-    def __str__(self) -> str:
+    @property
+    def lines(self) -> list[tuple[str, str]]:
+        """A word for what each text is, and the text."""
         said = [(word, text) for word in ("found", "guessed", "missing") for text in getattr(self, word)]
-        lines = [fill(f"{word:<14}{text}", 100, subsequent_indent=" " * 14) for word, text in said]
-        return "\n".join([*lines, f"written to    {self.output}; next: torchid check {self.output}"])
+        return [*said, ("written to", f"{self.output}; next: torchid check {self.output}")]
 
 
 _NO_CONTACT = (

@@ -232,11 +232,11 @@ class NoiseConfig:
     base_moment: PerAxis | None = None
     ft_force: Positive | None = None
     ft_moment: Positive | None = None
-    joint_position: NotNegative | None = None
-    joint_velocity: NotNegative | None = None
-    base_orientation: NotNegative | None = None
-    angular_velocity: NotNegative | None = None
-    specific_force: NotNegative | None = None
+    joint_position: Annotated[NotNegative, Field(le=1e3)] | None = None
+    joint_velocity: Annotated[NotNegative, Field(le=1e3)] | None = None
+    base_orientation: Annotated[NotNegative, Field(le=1e3)] | None = None
+    angular_velocity: Annotated[NotNegative, Field(le=1e3)] | None = None
+    specific_force: Annotated[NotNegative, Field(le=1e3)] | None = None
 
     @property
     def forces(self) -> dict[str, Any]:

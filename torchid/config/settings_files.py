@@ -141,9 +141,10 @@ def dump_config(settings: object) -> str:
 
 def _read(kind: FileKind[T], path: Path) -> Settings:
     try:
-        text = read_bytes(path, MAX_YAML).decode()
-        check_yaml(text)
-        loaded = text if is_one_text(text) else _container(OmegaConf.create(text))
+        loaded = text = read_bytes(path, MAX_YAML).decode()
+        if not text.lstrip().startswith("<"):  # XML, which a colon in a comment makes a mapping
+            check_yaml(text)
+            loaded = text if is_one_text(text) else _container(OmegaConf.create(text))
     except OSError as error:
         raise ConfigError(path, "file", f"cannot be read ({error.strerror})", f"a YAML {kind.name} file") from error
     except yaml.MarkedYAMLError as error:

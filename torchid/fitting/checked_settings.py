@@ -12,7 +12,7 @@ from torchid.config import AnalyzeConfig, ExperimentConfig
 from torchid.config.estimator import TaskWeightsConfig
 from torchid.config.logs import LogsConfig
 from torchid.config.robot import ChoiceConfig, ContactConfig, NoiseConfig
-from torchid.errors import ConfigError, SensorError, UnknownNameError, format_count
+from torchid.errors import ConfigError, InputError, SensorError, UnknownNameError, format_count
 from torchid.logs.column_entries import for_all
 from torchid.logs.column_map import fits, require_names, values_of_all
 from torchid.logs.ros_topics import Topics, require_joints
@@ -61,7 +61,20 @@ def stated_noise(config: NoiseConfig, robot: Robot) -> dict[str, Any]:
     if (torque := stated.get("joint_torque")) is not None:
         key, names = "sensors.noise.joint_torque", robot.joint_names
         stated["joint_torque"] = tuple(values_of_all(key, "noise", for_all(torque), "joint", names))
+    require_comparable([float(x) for group in stated.values() for x in np.ravel(group)])
     return stated
+
+
+def require_comparable(noise: Sequence[float]) -> None:
+    """Refuse standard deviations of forces by which float64 cannot weight rows.
+
+    Raises:
+        InputError: says what is accepted.
+    """
+    low, high = min(noise, default=1.0), max(noise, default=1.0)
+    if low < 1e-9 or high > min(1e6, 1e7 * low):
+        found, accepted = f"from {low:g} to {high:g}", "from 1e-9 to 1e6, the largest at most 1e7 times the smallest"
+        raise InputError.at_field("sensors.noise", f"standard deviations {found}", accepted)
 
 
 def task_weights(config: TaskWeightsConfig, robot: Robot) -> Array | None:

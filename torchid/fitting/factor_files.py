@@ -17,6 +17,7 @@ from pydantic.dataclasses import dataclass
 
 from torchid import __version__
 from torchid.errors import ConfigError, LogError, about_file, during, excerpt
+from torchid.fitting.checked_settings import require_comparable
 from torchid.fitting.experiment import Experiment, with_noise
 from torchid.fitting.factor_documents import (
     NOISE,
@@ -243,6 +244,7 @@ def _read(path: Path, container: Container) -> FactorFile:
         version = "none" if found is None else f"{excerpt(str(found))}, of another version of torchid"
         raise LogError.at_field("format", version, f"{FORMAT}, as torchid {__version__} writes it")
     description = _DESCRIPTION.validate_json(text)
+    require_comparable([*description.noise.values()])
     geometry = {name: _array(container, name, np.float64) for name in _GEOMETRY}
     log = _log(str(path), description, _array(container, "values", np.float64, 1))
     return FactorFile(

@@ -246,11 +246,9 @@ def _mean_hold(values: FloatArray, repeated: BoolArray) -> float:
     Held values repeat while the robot moves: changes after a repeat have several quanta, unlike those of a slow
     encoder, and few repeats are part of long rests.
     """
-    if float(np.mean(repeated)) <= MIN_REPEATED_SHARE:
-        return 0.0
     changes = np.flatnonzero(~repeated)
-    lengths = np.diff(changes)
-    if len(changes) < NEIGHBOUR_STEPS or not (lengths > 1).any():  # all repeats lie before its motion or behind it
+    lengths = np.diff(changes)  # what lies before the first change or behind the last is rest
+    if len(changes) < NEIGHBOUR_STEPS or len(lengths) >= (1.0 - MIN_REPEATED_SHARE) * lengths.sum():
         return 0.0
     quanta = np.array([_estimate_resolution(column) for column in values.T])
     after = changes[1:][lengths > 1]

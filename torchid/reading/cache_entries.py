@@ -34,7 +34,6 @@ from torchid.reading.cache import Cache, CacheEntry, content_key, tensor_of
 from torchid.reading.log_reader import fits_contact_offsets
 from torchid.robot import Robot
 from torchid.robot.urdf import parse_xml
-from torchid.sensing import SensorSet
 
 NOT_IN_SAMPLES = ("memory_gb", "cache_gb")
 """Keys of preprocessing that do not change what the samples of a log are that is read whole."""
@@ -42,19 +41,19 @@ NOT_IN_SAMPLES = ("memory_gb", "cache_gb")
 RecordedWarning = tuple[type[Warning], str]
 """Class and text of a warning."""
 
-_SAMPLES_FORMAT = 3  # of entries
+_SAMPLES_FORMAT = 4  # of entries
 _BASE = "base."  # before the names of tensors of the base's motion
+_MOTION = ("time", "joint_", "direction", "share", "stribeck", _BASE)  # begin the names of tensors without NaN
 
 
 @dataclass(frozen=True)
 class ReadLog:
-    """Samples of a log, the sensors whose every value is in them, how many were left out, and the warnings of reading.
+    """Samples of a log, how many were left out, and the warnings of reading.
 
     `excluded`: None where the settings leave nothing out.
     """
 
     samples: Samples
-    recorded: SensorSet
     excluded: int | None
     warned: list[RecordedWarning]
 
@@ -106,6 +105,11 @@ def named_tensors(samples: Samples) -> dict[str, Tensor]:
     return own | {_BASE + name: x for name, x in vars(samples.base).items() if isinstance(x, Tensor)}
 
 
+def blocks_of(samples: Samples) -> list[Samples]:
+    """The samples, in pieces that are small beside those of a log larger than memory."""
+    return [samples[start : start + 2**16] for start in range(0, len(samples), 2**16)]
+
+
 def samples_entry(read: ReadLog) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """The document and the arrays of an entry; axes are in the order of the strides, which come back with them."""
     samples, arrays, axes = read.samples, dict[str, NDArray[Any]](), dict[str, list[int]]()
@@ -117,7 +121,6 @@ def samples_entry(read: ReadLog) -> tuple[dict[str, Any], dict[str, NDArray[Any]
         "samples": {name: x for name, x in vars(samples).items() if isinstance(x, (bool, int, float))},
         "axes": axes,
         "motion_noise": _noise_document(samples.motion_noise),
-        "recorded": [read.recorded.torque.tolist(), read.recorded.wrench.tolist()],
         "excluded": read.excluded,
         "warnings": [
             [category.__name__, message] for category, message in read.warned if category in _stored_categories()
@@ -147,11 +150,12 @@ def samples_of_entry(entry: CacheEntry, source: str, folder: Path | None) -> Rea
     samples = Samples(
         source, base=BaseMotion(**base), folder=folder, motion_noise=noise, pages=pages, **own, **document["samples"]
     )
-    torque, wrench = (np.array(mask, dtype=bool) for mask in document["recorded"])
-    recorded = SensorSet(torque, wrench.reshape(-1, 6))
+    moving = (x for one in blocks_of(samples) for name, x in named_tensors(one).items() if name.startswith(_MOTION))
+    if not all(x.isfinite().all() for x in moving):
+        raise ValueError("a number that is not finite")
     categories = {category.__name__: category for category in _stored_categories()}
     warned = [(categories[name], _about(source, document["source"], text)) for name, text in document["warnings"]]
-    return ReadLog(samples, recorded, document["excluded"], warned)
+    return ReadLog(samples, document["excluded"], warned)
 
 
 def _noise_document(noise: MotionNoise | None) -> dict[str, Any] | None:
@@ -255,9 +259,9 @@ def _packed(parts: Sequence[Part], sources: Sequence[str]) -> tuple[dict[str, An
 def _unpacked(entry: CacheEntry, builder: RowBuilder, sources: Sequence[str]) -> list[Part]:
     """What was stored, of logs of these names; any exception where that is something else."""
     document, columns = entry.document, builder.width
-    reader = PartReader(
-        entry.arrays["values"], document["supports"], columns, len(builder.contacts), len(builder.extras)
-    )
+    if not np.isfinite(values := entry.arrays["values"]).all():
+        raise ValueError("a number that is not finite")
+    reader = PartReader(values, document["supports"], columns, len(builder.contacts), len(builder.extras))
     parts = []
     for packed, (source, fold, block, unloaded) in zip(
         _PARTS.validate_python(document["parts"]), document["of"], strict=True

@@ -23,7 +23,14 @@ from torchid.logs.table_files import is_text_table
 from torchid.logs.time_range import split_range
 from torchid.problem import Samples
 from torchid.reading.cache import FOLDER, TOKEN, Cache, Files, content_key, missing_folders, remove_empty
-from torchid.reading.cache_entries import ReadLog, RecordedWarning, content_of_setup, samples_entry, samples_of_entry
+from torchid.reading.cache_entries import (
+    ReadLog,
+    RecordedWarning,
+    blocks_of,
+    content_of_setup,
+    samples_entry,
+    samples_of_entry,
+)
 from torchid.reading.log_reader import LogReader, fits_contact_offsets, payload_of
 from torchid.reading.shared_log import on_one_machine, read_together
 from torchid.sensing import SensorSet
@@ -174,8 +181,7 @@ class CachedReader(LogReader):
         """A log as it is read without a cache; warnings go to a list."""
         with _collecting_warnings(warned):
             samples = super()._samples(path, required, together)
-        recorded = recorded_sensors(self.setup.robot, self.setup.contacts, [samples])
-        return ReadLog(samples, recorded, self.excluded.get(str(path)), warned)
+        return ReadLog(samples, self.excluded.get(str(path)), warned)
 
     # ---------------------------------------------------------------------------------------------- keys and entries
 
@@ -239,8 +245,10 @@ class CachedReader(LogReader):
 
     def _has(self, found: ReadLog, required: SensorSet) -> bool:
         """Whether every value of the required sensors was recorded."""
-        needed = recorded_components(self.setup.contacts, required, found.samples.wrench_in_world)
-        return not (required.torque & ~found.recorded.torque).any() and not (needed & ~found.recorded.wrench).any()
+        contacts = self.setup.contacts
+        recorded = recorded_sensors(self.setup.robot, contacts, blocks_of(found.samples))
+        needed = recorded_components(contacts, required, found.samples.wrench_in_world)
+        return not (required.torque & ~recorded.torque).any() and not (needed & ~recorded.wrench).any()
 
     # ------------------------------------------------------------------------------------------ several processes
 

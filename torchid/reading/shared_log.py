@@ -19,13 +19,11 @@ import torch
 
 from torchid import distributed
 from torchid.checksums import file_checksum
-from torchid.fitting.noise import recorded_sensors
 from torchid.parallel import can_fork, share_between_forks, thread_count
 from torchid.problem import Samples
 from torchid.reading.cache import Files, written_file
 from torchid.reading.cache_entries import ReadLog, RecordedWarning, named_tensors, samples_entry
 from torchid.reading.large_log import LargeLog
-from torchid.sensing import SensorSet
 
 
 def on_one_machine() -> bool:
@@ -39,12 +37,10 @@ class _Share:
     """What a process reports of its blocks.
 
     `like`: samples without any, for whatever is no tensor, and the shapes of these; None if it had no block.
-    `recorded`: sensors whose every value is in its blocks. `warned`: the first `common` of these warnings are about the
-    log as a whole. `failed`: it could not go on.
+    `warned`: the first `common` of these warnings are about the log as a whole. `failed`: it could not go on.
     """
 
     like: Samples | None
-    recorded: SensorSet | None
     warned: Sequence[RecordedWarning]
     common: int
     failed: bool
@@ -70,7 +66,7 @@ def read_together(log: LargeLog, with_unloaded: bool, folder: Path, most: float)
 
     def fill(number: int) -> _Share:
         own = partial(distributed.share_of, number=number, count=count) if forked else distributed.own_share
-        return _fill(log, with_unloaded, _Rows(folder, log, most), own, 0 if forked else None)
+        return _fill(log, with_unloaded, _Rows(folder, most), own, 0 if forked else None)
 
     own_shares = share_between_forks(range(count), fill, count)
     shares = [share for of_process in distributed.all_gather(own_shares, "blocks of a log") for share in of_process]
@@ -88,12 +84,8 @@ def read_together(log: LargeLog, with_unloaded: bool, folder: Path, most: float)
         sums = distributed.share_out(paths, _checksum, "checksums of files", sizes)
     if not all(sums) or not distributed.is_first():  # the first one moves the files to their place
         return None
-    recorded = [one.recorded for one in shares if one.recorded is not None]
-    sensors = SensorSet(
-        np.all([one.torque for one in recorded], axis=0), np.all([one.wrench for one in recorded], axis=0)
-    )
     warned = [*shares[0].warned, *(x for one in shares[1:] for x in one.warned[one.common :])]
-    document, _ = samples_entry(ReadLog(likes[0], sensors, None, warned))
+    document, _ = samples_entry(ReadLog(likes[0], None, warned))
     document["axes"] = {name: list(range(x.ndim)) for name, x in named_tensors(likes[0]).items()}
     files = {name: written_file(path, found) for name, path, found in zip(names, paths, sums, strict=True)}
     return document, files
@@ -117,7 +109,7 @@ def _fill(
         except Exception:  # noqa: B902 - all processes meet it, and say it, when they read the log
             failed = True
     warned = [(one.category, str(one.message)) for one in caught]
-    return _Share(rows.like, rows.recorded, warned, common, failed)
+    return _Share(rows.like, warned, common, failed)
 
 
 def _checksum(path: Path) -> str:
@@ -131,15 +123,14 @@ class _Rows:
     """Files of the tensors of a log's samples, into which this process writes some rows.
 
     Attributes:
-        like: as `_Share` has it; `recorded`: as well.
+        like: as `_Share` has it.
     """
 
-    def __init__(self, folder: Path, log: LargeLog, most: float) -> None:
+    def __init__(self, folder: Path, most: float) -> None:
         """No file is opened yet; together they may have so many bytes."""
-        self._folder, self._log, self._room = folder, log, most
+        self._folder, self._room = folder, most
         self._files: dict[str, tuple[BinaryIO, int]] = {}
         self.like: Samples | None = None
-        self.recorded: SensorSet | None = None
 
     def close(self) -> None:
         for file, _ in self._files.values():
@@ -156,10 +147,7 @@ class _Rows:
             rest = memoryview(rows.reshape(-1).view(np.uint8).data)
             while rest:
                 rest = rest[file.write(rest) :]
-        found = recorded_sensors(self._log.robot, self._log.contacts, [samples])
-        if self.recorded is not None:
-            found = SensorSet(found.torque & self.recorded.torque, found.wrench & self.recorded.wrench)
-        self.like, self.recorded = samples[torch.arange(0)], found  # with no memory that would be sent along
+        self.like = samples[torch.arange(0)]  # with no memory that would be sent along
 
     def _open(self, name: str, rows: np.ndarray[Any, Any], total: int) -> tuple[BinaryIO, int]:
         """The file of a tensor, as large as it will be, and where its rows begin; all processes make the same."""

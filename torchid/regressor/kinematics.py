@@ -61,7 +61,7 @@ def motion_from_state(
 
     Args:
         q: (B, 7 + n): base position in the world (3) [m], orientation as a quaternion x, y, z, w, which is
-            normalized (norm 0 gives NaN), joints; (B, n) for a fixed base.
+            normalized (norm 0 is no turn), joints; (B, n) for a fixed base.
         v: (B, nv): base linear and angular velocity in the base frame, then joints.
         a: (B, nv): d/dt of `v`.
         n: number of independent joints.
@@ -250,12 +250,13 @@ def joint_screw_axes(tree: KinematicTree, states: BodyStates) -> Tensor:
 
 
 def rotation_matrix(quat_xyzw: Tensor) -> Tensor:
-    """Rotation matrices (..., 3, 3) of quaternions (..., 4) of any norm, scalar last; NaN of norm 0.
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4) of any norm, scalar last; norm 0 is no turn.
 
     No value is looked at, for which a GPU would have to wait.
     """
     x, y, z, w = quat_xyzw.unbind(-1)
-    s = 2 / (x * x + y * y + z * z + w * w)
+    square = x * x + y * y + z * z + w * w
+    s = 2 / (square + (square == 0))
     return torch.stack(
         [
             *(1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)),

@@ -66,7 +66,7 @@ class Regressor(nn.Module):
         """Regressor at generalized coordinates.
 
         Args:
-            q: (B, n + 7), base position [m], orientation x y z w, which is normalized (norm 0 gives NaN), joints
+            q: (B, n + 7), base position [m], orientation x y z w, which is normalized (norm 0 is no turn), joints
                 [rad or m]; (B, n) for a fixed base.
             v: (B, nv), base linear and angular velocity in the base frame, joints.
             a: (B, nv), d/dt of `v`.

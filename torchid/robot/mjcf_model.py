@@ -6,10 +6,14 @@ Imports MuJoCo, an extra, for all modules that need it.
 from __future__ import annotations
 
 import copy
+import os
 import re
+import subprocess
+import sys
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -34,6 +38,16 @@ __all__ = ["MeshShape", "MjcfModel", "MjcfText", "body_elements", "mujoco_error"
 _MOST_FILES = 100
 _LONGEST_TAG = 20  # lines
 _MULTIPLYING = ("replicate", "attach", "composite", "flexcomp")
+_TRIAL = """
+import sys, mujoco
+try:
+    import resource
+    for kind, most in ((resource.RLIMIT_AS, 2**30), (resource.RLIMIT_CPU, 10), (resource.RLIMIT_CORE, 0)):
+        resource.setrlimit(kind, (most, most))
+    mujoco.MjSpec.from_file(sys.argv[1])
+except (ImportError, ValueError):
+    pass
+"""
 
 
 class MjcfText:
@@ -178,6 +192,8 @@ class MjcfModel:
     def __init__(self, path: Path) -> None:
         """Read and compile a file. Raises UrdfError: MuJoCo does not take it, or it has no joint."""
         self.path, self.text = path, MjcfText(path)
+        if next(self.text.root.iter(*_MULTIPLYING, "model", "hfield"), None) is not None:
+            _try_to_read(path, path.stat().st_mtime_ns)
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)  # of MuJoCo, about elements that it will not have for ever
@@ -330,6 +346,20 @@ class MjcfModel:
         while body > root:
             body = int(self.model.body_parentid[body])
         return body == root
+
+
+@cache
+def _try_to_read(path: Path, _: int) -> None:
+    """Let another process read a file that may stand for far more than it holds; `_`: when it was written last.
+
+    Raises:
+        UrdfError: MuJoCo crashes, or needs more than 1 GiB or 10 s.
+    """
+    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "PYTHONSAFEPATH": "1"}  # threads take address space
+    command = [sys.executable, "-c", _TRIAL, str(path)]
+    if subprocess.run(command, env=environment, stdin=subprocess.DEVNULL, capture_output=True).returncode:
+        found = "MuJoCo crashes as it reads it, or needs more than 1 GiB or 10 s"
+        raise UrdfError(path, "MJCF", found, "a smaller model: see hfield, replicate, composite, model")
 
 
 def pose(position: Array, quat_wxyz: Array) -> Array:

@@ -28,6 +28,7 @@ FT_FIELD = "force/torque sensor at a fixed joint"
 
 _TRIANGLE_TOLERANCE = 1e-3  # URDFs carry few digits: thin plates violate the inequality by rounding alone
 _ROUNDING = 1e-6  # of the largest principal inertia
+_DUMMY = 1e-4  # share of the robot's mass, and of the largest element of an inertia in it, that a dummy link is below
 _POINT = 1e-12  # [m^2]: below it the link is a point mass
 _MOVED = " (moved by its joint)"  # the frame a joint moves; the body's link frame may be offset from it
 
@@ -258,16 +259,19 @@ def nominal_parameters(path: Path, tree: BodyTree, links: dict[str, Link]) -> Ar
     """Parameters (L, 12) of the bodies, each in its link frame.
 
     Warns:
-        UnphysicalInertiaWarning: inertias of links that belong to no distribution of positive mass, in one line.
+        UnphysicalInertiaWarning: inertias of links that belong to no distribution of positive mass, in one line; not
+            of dummy links, see `_DUMMY`.
     """
     nominal = np.zeros((len(tree.names), parameters.PER_BODY))
     unphysical = dict[str, str]()
-    for name, (body, T_body_link) in tree.links.items():
-        inertial = links[name].inertial
-        if inertial is None:
-            continue
-        if what := _unphysical(inertial):
+    inertials = {name: links[name].inertial for name in tree.links if links[name].inertial is not None}
+    least_mass = _DUMMY * sum(x.mass for x in inertials.values())
+    least_inertia = _DUMMY * max((np.abs(x.inertia).max() for x in inertials.values()), default=0.0)
+    for name, inertial in inertials.items():
+        counts = inertial.mass >= least_mass or np.abs(inertial.inertia).max() >= least_inertia
+        if counts and (what := _unphysical(inertial)):
             unphysical[name] = what
+        body, T_body_link = tree.links[name]
         nominal[body, parameters.INERTIAL] += link_parameters(links[name], T_body_link)
     for body, joint in enumerate(tree.joints):
         if joint is not None:

@@ -35,7 +35,8 @@ JOINT_TYPES = (*MOVING_TYPES, "fixed")
 _KEPT = {"link": {"inertial"}, "joint": {"origin", "parent", "child", "axis", "mimic", "dynamics"}}
 _INERTIA_ATTRIBUTES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 _SCALARS = ("value", "multiplier", "offset", "damping", "friction", *_INERTIA_ATTRIBUTES)
-_NUMBERS = {"xyz": 3, "rpy": 3} | dict.fromkeys(_SCALARS, 1)  # count of numbers in an attribute
+_OF_MJCF = (f"{OWN}armature", f"{OWN}stiffness", f"{OWN}rest")
+_NUMBERS = {"xyz": 3, "rpy": 3} | dict.fromkeys((*_SCALARS, *_OF_MJCF), 1)  # count of numbers in an attribute
 _DECIMAL = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|inf(inity)?|nan)", re.ASCII | re.IGNORECASE)
 
 
