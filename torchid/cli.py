@@ -223,6 +223,7 @@ def _add_starts(commands: _Commands) -> None:
     )
     what = "file to write, a new one (default: experiment.yaml)"
     init.add_argument("--output", default="experiment.yaml", metavar="FILE", help=what)
+    init.add_argument("--total-mass", type=float, metavar="KG", help="of the robot, if it is known, as from a scale")
     init.set_defaults(command=_init)
 
 
@@ -377,7 +378,7 @@ def _init(options: argparse.Namespace) -> None:
         from torchid.commands.init import init
         from torchid.terminal.lines import print_labelled
 
-    for label, text in init(options.urdf, options.log, options.output).lines:
+    for label, text in init(options.urdf, options.log, options.output, options.total_mass).lines:
         print_labelled(label, text)
 
 

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 import yaml
+from arms import ARMS
 from dialects import DIALECTS, save_csv, with_velocity
 from refusals import refusal
 from repository import DEMO, SHARED
@@ -22,6 +26,7 @@ from torchid.config import load_config
 from torchid.errors import InputError
 from torchid.fitting.experiment import set_up
 from torchid.logs import Log, read_log, write_log
+from torchid.regressor import Regressor
 from torchid.robot import load_robot
 
 URDF = DEMO / "quadruped.urdf"
@@ -41,6 +46,34 @@ def entries(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
             yield from entries(inner, f"{key}.{name}")
         else:
             yield f"{key}.{name}".removesuffix(".column"), str(inner)
+
+
+@pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
+def test_a_robot_without_masses_and_its_weight_are_enough_to_identify_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "true.urdf").write_text(ARMS)
+    (tmp_path / "bare.urdf").write_text(re.sub(r"<inertial>.*?</inertial>", "", ARMS, flags=re.DOTALL))
+    robot, time = load_robot(tmp_path / "true.urdf", fixed_base=True), np.arange(3000) / 200.0
+    rate = 2.0 * np.pi * np.array([0.7, 1.1])
+    phase = rate * time[:, None] + np.array([0.0, 1.0])
+    state = 0.8 * np.sin(phase), 0.8 * rate * np.cos(phase), -0.8 * rate**2 * np.sin(phase)
+    K = Regressor(robot)(*map(torch.from_numpy, state)).numpy()
+    torque = K @ robot.nominal.ravel() + np.random.default_rng(0).normal(0.0, 0.01, (3000, 2))
+    names = dict(zip(("joint_position", "joint_velocity", "joint_acceleration"), state, strict=True))
+    write_log(Log("swing.npz", time, robot.joint_names, **names, joint_torque=torque), tmp_path / "swing.npz")
+    files = [str(tmp_path / name) for name in ("bare.urdf", "swing.npz", "new.yaml")]
+    line = ["init", *files[:2], "--output", files[2]]
+    assert "no link has mass; accepted: estimator.total_mass in the experiment file, torchid init --" in refusal(
+        line, tmp_path, capsys
+    )
+    assert main([*line, "--total-mass", "7"]) == 0
+    assert main(["identify", files[2], f"output={tmp_path / 'run'}", "preprocessing.cutoff_hz=5"]) == 0
+    said = "no link has mass; 7 kg are spread evenly over 3 links, as balls of water"
+    assert capsys.readouterr().err.count(said) == 2, "once in each command"
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())["test"]
+    assert metrics["joint_torque_rms_relative"] < 0.02
+    assert load_robot(tmp_path / "run" / "identified.urdf").nominal[:, 0].sum() == pytest.approx(7.0, rel=1e-6)
 
 
 @pytest.mark.parametrize("dialect", DIALECTS)

@@ -109,13 +109,14 @@ _NO_CONTACT = (
 )
 
 
-def init(urdf: str | Path, log: str | Path, output: str | Path) -> InitReport:
+def init(urdf: str | Path, log: str | Path, output: str | Path, total_mass: float | None = None) -> InitReport:
     """Write an experiment file for a robot and a log, complete or not at all.
 
     Args:
         urdf: of the robot; or its MJCF file.
         log: a table or arrays, in the log format or not, several of these or a folder of them as one log, or a bag.
         output: the file; nothing that is there is replaced.
+        total_mass: of the robot [kg], if it is known; a robot's file without any mass needs it.
 
     Raises:
         InputError: the URDF or the log cannot be read, or there is a file already.
@@ -130,7 +131,7 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> InitReport:
     files = [file.path for file in part.files]
     check_free_file(target, "--output", False, [urdf, *files])
     is_bag = existing_log_kind(path) is LogKind.BAG
-    robot = load_robot(urdf, fixed_base=has_fixed_base(Path(urdf)))
+    robot = load_robot(urdf, fixed_base=has_fixed_base(Path(urdf)), total_mass=total_mass)
     contacts, fields, proposal = _of_bag(part.file, robot) if is_bag else _of_columns(files, robot)
     out = InitReport(target)
     _state_flags(robot, contacts, fields, proposal)
@@ -143,7 +144,8 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> InitReport:
     limbs = list(proposal.columns.get("ft_wrenches", ())) or read_sensors(robot, logs)
     torques = measured_torques(robot, logs)
     sensors = proposed_sensors(fields, limbs, contacts, torques)
-    write = partial(_text, robot, urdf, path, fields=fields, proposal=proposal, gaps=gaps, split=split)
+    known = {} if total_mass is None else {"total_mass": total_mass}
+    write = partial(_text, robot, urdf, path, fields=fields, proposal=proposal, gaps=gaps, split=split, known=known)
     text = write(target, contacts, sensors=sensors)
     if logs and "base_motion" in _from_feet(robot, contacts, fields):
         here = Path("experiment.yaml")
@@ -384,6 +386,7 @@ def _text(
     gaps: dict[str, tuple[object, str]],
     split: Split,
     sensors: str | dict[str, object],
+    known: dict[str, float],
 ) -> str:
     """The experiment file, with comments."""
     from_feet = _from_feet(robot, contacts, fields)
@@ -420,7 +423,7 @@ def _text(
     lines += yaml_lines("preprocessing", {"cutoff_hz": "auto"} | margin | from_feet | stated)
     lines += yaml_lines("sensors", sensors)
     lines += ["# actuators: chosen by the log (armature, delay, offsets, ...); true, false or a number fixes one"]
-    lines += yaml_lines("estimator", {"name": "consistent", "ridge": "auto"})
+    lines += yaml_lines("estimator", {"name": "consistent", "ridge": "auto", **known})
     lines += yaml_lines("output", f"runs/{output.stem}")
     return "\n".join(lines) + "\n"
 

@@ -70,7 +70,7 @@ def settle_order(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", TorchidWarning)  # said of the robot already, and of trials
         if bolted and not robot.fixed_base:
-            robot = load_robot(robot.path, fixed_base=True)
+            robot = load_robot(robot.path, fixed_base=True, total_mass=float(robot.nominal[:, 0].sum()))
         is_other = sorted(logs[0].joint_names) == sorted(robot.joint_names) and _settle(
             proposal, logs[0], robot, contacts, detects
         )

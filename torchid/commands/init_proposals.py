@@ -146,7 +146,7 @@ def _can_be_split(robot: Robot, joint: str) -> bool:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", TorchidWarning)  # said of the whole robot
-            load_robot(robot.path, ft_joints=[joint])
+            load_robot(robot.path, ft_joints=[joint], total_mass=float(robot.nominal[:, 0].sum()))
     except InputError:
         return False
     return True

@@ -284,7 +284,8 @@ def set_up_robot(config: ExperimentConfig | AnalyzeConfig) -> RobotSetup:
         of = config.robot
         require_kind(of)
         loops, joints = [loop.loop for loop in of.loops], _ft_joints(config)
-        robot = load_robot(of.path, of.base_link, of.fixed_base, joints, of.weld, of.tilt, loops, of.passive)
+        total = None if (mass := config.estimator.total_mass) is None else mass.value
+        robot = load_robot(of.path, of.base_link, of.fixed_base, joints, of.weld, of.tilt, loops, of.passive, total)
     except UnknownNameError as error:
         if error.field != FT_FIELD:
             raise

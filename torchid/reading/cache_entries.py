@@ -71,6 +71,7 @@ def content_of_setup(setup: RobotSetup) -> dict[str, Any]:
         "format": _SAMPLES_FORMAT,
         "urdf": [config.robot.path.name, _robot_checksum(config.robot)],
         "robot": [robot.base_link, robot.fixed_base, list(robot.ft_names), robot.welded, robot.base_tilt],
+        "mass": float(robot.nominal[:, 0].sum()),  # stated, of a URDF without
         **_loops(robot),
         "contacts": [asdict(contact) for contact in setup.contacts],
         "unloaded": fits_contact_offsets(setup),

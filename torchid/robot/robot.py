@@ -43,6 +43,7 @@ from torchid.robot.tree import (
     link_parameters,
     link_poses,
     nominal_parameters,
+    spread_mass,
 )
 from torchid.robot.urdf import MOVING_TYPES, has_fixed_base, read_urdf
 from torchid.robot.xml_files import file_kind
@@ -52,7 +53,8 @@ if TYPE_CHECKING:
 
 
 _FIRST_GUESS = (
-    "a guess in each link that moves, of its mass [kg] and of the inertia of a ball of its size [kg m^2]: <inertial>"
+    "estimator.total_mass in the experiment file, torchid init --total-mass KG, or a guess in each link that moves,"
+    " of its mass [kg] and of the inertia of a ball of its size [kg m^2]: <inertial>"
     '<mass value="1"/><inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial>'
 )
 
@@ -275,6 +277,7 @@ def load_robot(
     base_tilt: tuple[float, float] = (0.0, 0.0),
     loops: Sequence[Loop] = (),
     passive: Sequence[str] | None = None,
+    total_mass: float | None = None,
 ) -> Robot:
     """Read a URDF or, by MuJoCo, an MJCF file into a `Robot`.
 
@@ -288,6 +291,7 @@ def load_robot(
             of a table that is not level, or of an IMU that is mounted askew.
         loops: closed loops beside those that an MJCF file has.
         passive: names or patterns of joints without a motor; None for those that an MJCF file with loops says are.
+        total_mass: of the robot [kg], which `spread_mass` shares out where no link of the file has mass.
 
     Raises:
         UrdfError, UnknownNameError: see `read_urdf` and `build_tree`; also when no body has mass, or when the base of
@@ -297,6 +301,7 @@ def load_robot(
         TypeError: `path` is the model of another library.
 
     Warns:
+        TorchidWarning: a mass is shared out.
         MasslessBodyWarning: a body at the end of a limb has no inertia.
         UnphysicalInertiaWarning: a link's inertia belongs to no distribution of positive mass.
     """
@@ -305,6 +310,8 @@ def load_robot(
     path = Path(path)
     with during("reading", path):
         links, joints = read_urdf(path)
+        if total_mass is not None and not any(link.inertial is not None and link.inertial.mass for link in links):
+            spread_mass(path, links, joints, total_mass)
         if not fixed_base and has_fixed_base(path):
             found = "none, so that its base is fixed to the world"
             raise UrdfError(path, "<freejoint>", found, "robot.fixed_base: true, or a free joint of the base's body")

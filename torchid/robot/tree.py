@@ -255,6 +255,25 @@ def joint_transform(joint: TreeJoint, position: float) -> Array:
     return T
 
 
+def spread_mass(path: Path, links: Sequence[Link], joints: Sequence[TreeJoint], total: float) -> None:
+    """Make the root and each link that a joint moves equal balls of water that weigh so much together [kg].
+
+    The centre of each is the mean of the origins of its link and of the joints on it. Raises UrdfError: no mass.
+    """
+    if not 0.0 < total < np.inf:
+        raise UrdfError(path, "total_mass", f"{total:g} kg", "a number greater than 0")
+    welded = {joint.child for joint in joints if joint.type == "fixed"}
+    heavy = [link for link in links if link.name not in welded]
+    mass = total / len(heavy)
+    inertia = 0.4 * mass * (mass / (1000.0 * 4.0 / 3.0 * np.pi)) ** (2.0 / 3.0) * np.eye(3)
+    for link in heavy:
+        places = [np.zeros(3), *(joint_origin(joint)[:3, 3] for joint in joints if joint.parent == link.name)]
+        T_link_ball = np.eye(4)
+        T_link_ball[:3, 3] = np.mean(places, axis=0)
+        link.inertial = Inertial(T_link_ball, mass, inertia)
+    warn(f"{path}: no link has mass; {total:g} kg are spread evenly over {len(heavy)} links, as balls of water")
+
+
 def nominal_parameters(path: Path, tree: BodyTree, links: dict[str, Link]) -> Array:
     """Parameters (L, 12) of the bodies, each in its link frame.
 
