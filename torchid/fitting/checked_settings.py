@@ -66,11 +66,7 @@ def stated_noise(config: NoiseConfig, robot: Robot) -> dict[str, Any]:
 
 
 def require_comparable(noise: Sequence[float]) -> None:
-    """Refuse standard deviations of forces by which float64 cannot weight rows.
-
-    Raises:
-        InputError: says what is accepted.
-    """
+    """Refuse standard deviations of forces by which float64 cannot weight rows. Raises InputError."""
     low, high = min(noise, default=1.0), max(noise, default=1.0)
     if low < 1e-9 or high > min(1e6, 1e7 * low):
         found, accepted = f"from {low:g} to {high:g}", "from 1e-9 to 1e6, the largest at most 1e7 times the smallest"

@@ -133,6 +133,10 @@ class Samples:
         """Share of the variance of the recorded noise that is in the samples."""
         return 1.0 / self.oversampling if self.noise_share is None else min(self.noise_share, 1.0)
 
+    def pieces(self) -> list[Samples]:
+        """The samples, in pieces that are small beside those of a log larger than memory."""
+        return [self[start : start + 2**16] for start in range(0, len(self), 2**16)]
+
     def every(self, step: int) -> Samples:
         """Every `step`-th sample from the first on; all of them, without a copy, for a step of 1."""
         return self if step == 1 else self[::step]

@@ -106,11 +106,6 @@ def named_tensors(samples: Samples) -> dict[str, Tensor]:
     return own | {_BASE + name: x for name, x in vars(samples.base).items() if isinstance(x, Tensor)}
 
 
-def blocks_of(samples: Samples) -> list[Samples]:
-    """The samples, in pieces that are small beside those of a log larger than memory."""
-    return [samples[start : start + 2**16] for start in range(0, len(samples), 2**16)]
-
-
 def samples_entry(read: ReadLog) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """The document and the arrays of an entry; axes are in the order of the strides, which come back with them."""
     samples, arrays, axes = read.samples, dict[str, NDArray[Any]](), dict[str, list[int]]()
@@ -151,7 +146,7 @@ def samples_of_entry(entry: CacheEntry, source: str, folder: Path | None) -> Rea
     samples = Samples(
         source, base=BaseMotion(**base), folder=folder, motion_noise=noise, pages=pages, **own, **document["samples"]
     )
-    moving = (x for one in blocks_of(samples) for name, x in named_tensors(one).items() if name.startswith(_MOTION))
+    moving = (x for one in samples.pieces() for name, x in named_tensors(one).items() if name.startswith(_MOTION))
     if not all(x.isfinite().all() for x in moving):
         raise ValueError("a number that is not finite")
     categories = {category.__name__: category for category in _stored_categories()}

@@ -23,14 +23,7 @@ from torchid.logs.table_files import is_text_table
 from torchid.logs.time_range import split_range
 from torchid.problem import Samples
 from torchid.reading.cache import FOLDER, TOKEN, Cache, Files, content_key, missing_folders, remove_empty
-from torchid.reading.cache_entries import (
-    ReadLog,
-    RecordedWarning,
-    blocks_of,
-    content_of_setup,
-    samples_entry,
-    samples_of_entry,
-)
+from torchid.reading.cache_entries import ReadLog, RecordedWarning, content_of_setup, samples_entry, samples_of_entry
 from torchid.reading.log_reader import LogReader, fits_contact_offsets, payload_of
 from torchid.reading.shared_log import on_one_machine, read_together
 from torchid.sensing import SensorSet
@@ -246,7 +239,7 @@ class CachedReader(LogReader):
     def _has(self, found: ReadLog, required: SensorSet) -> bool:
         """Whether every value of the required sensors was recorded."""
         contacts = self.setup.contacts
-        recorded = recorded_sensors(self.setup.robot, contacts, blocks_of(found.samples))
+        recorded = recorded_sensors(self.setup.robot, contacts, found.samples.pieces())
         needed = recorded_components(contacts, required, found.samples.wrench_in_world)
         return not (required.torque & ~recorded.torque).any() and not (needed & ~recorded.wrench).any()
 

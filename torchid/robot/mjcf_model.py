@@ -350,14 +350,9 @@ class MjcfModel:
 
 @cache
 def _try_to_read(path: Path, _: int) -> None:
-    """Let another process read a file that may stand for far more than it holds; `_`: when it was written last.
-
-    Raises:
-        UrdfError: MuJoCo crashes, or needs more than 1 GiB or 10 s.
-    """
+    """Let another process read a file that may stand for far more than it holds; `_`: when it was written last."""
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "PYTHONSAFEPATH": "1"}  # threads take address space
-    command = [sys.executable, "-c", _TRIAL, str(path)]
-    if subprocess.run(command, env=environment, stdin=subprocess.DEVNULL, capture_output=True).returncode:
+    if subprocess.run([sys.executable, "-c", _TRIAL, str(path)], env=environment, capture_output=True).returncode:
         found = "MuJoCo crashes as it reads it, or needs more than 1 GiB or 10 s"
         raise UrdfError(path, "MJCF", found, "a smaller model: see hfield, replicate, composite, model")
 
