@@ -24,7 +24,6 @@ from torchid.fitting.factor_files import FactorFile, row_model, write_factors
 from torchid.fitting.noise import NoiseSummary
 from torchid.identifiability.base_parameters import StateReport, merge_state_reports, require_base, state_reports
 from torchid.logs.containers import FACTORS, log_files
-from torchid.logs.remote import is_url
 from torchid.logs.time_range import log_title, split_range
 from torchid.parallel import one_thread
 from torchid.problem import Samples
@@ -81,7 +80,7 @@ def compress(config: ExperimentConfig, output: str | Path) -> Compression:
         InputError: whatever does not fit; nothing has been written then.
         BaseLostError: the sensors cannot see the base.
     """
-    if is_url(str(output)):
+    if "://" in str(output):
         raise ConfigError(output, "output", "a URL", "a folder on this machine, to be copied from there")
     output = Path(output)
     config.logs.require_samples("compress")

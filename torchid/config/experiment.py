@@ -203,7 +203,6 @@ _EXPERIMENT = FileKind(
     keys="robot, logs, sensors, output",
     list_example="contacts=[{frame: l_sole, type: flat}]",
     paths=("robot", "robot.urdf", "robot.mjcf", "logs", *(f"logs{name}.*{of}" for name in _LISTS for of in _FILES)),
-    urls=("logs", "logs.*", "logs.train.*"),
     outputs=("output",),
     prepare=_spelled_out,
     accepted={

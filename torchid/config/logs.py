@@ -10,13 +10,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
 from torchid.errors import ConfigError, LogError, UnknownNameError, excerpt, warn_about_file
 from torchid.logs import Columns, Topics
 from torchid.logs.containers import FACTORS, READABLE, list_bag_files
-from torchid.logs.remote import RemoteFile, as_path, list_matching
 from torchid.logs.time_range import JOINED, JOINED_ACCEPTED, LogFile, LogPart, each_recording, join_files, split_range
 from torchid.robot.payloads import INERTIA_ACCEPTED, Payload
 from torchid.settings import STRICT
@@ -52,7 +51,7 @@ class LogsConfig:
     factors of logs, from `torchid compress`, which may lie elsewhere: `s3://...`.
     """
 
-    train: Annotated[list[Annotated[Path, BeforeValidator(as_path)]], Field(min_length=1)]
+    train: Annotated[list[Path], Field(min_length=1)]
     test: list[Path] = dataclasses.field(default_factory=list)
     validation: list[Path] = dataclasses.field(default_factory=list)
     topics: Topics | None = None
@@ -315,8 +314,6 @@ def _sharing(
 
 
 def _part(field: str, path: Path) -> LogPart:
-    if isinstance(path, RemoteFile):
-        return LogPart(path, None)
     try:
         return split_range(path)
     except LogError as error:
@@ -328,8 +325,6 @@ def _matching(field: str, paths: Sequence[Path]) -> list[Path]:
     out: list[Path] = []
     paths = [one for path in paths for one in _each_recording(path)]
     for path in paths:
-        if isinstance(path, RemoteFile) and path.suffix != FACTORS:
-            raise ConfigError.at_field(field, f"{path}, by URL", f"{FACTORS} files by URL; logs on this machine")
         part = _part(field, path)
         if part.range is not None and part.file.suffix == FACTORS:
             found = f"{path}, a part of factors, which have no samples"
@@ -358,13 +353,11 @@ def _matching(field: str, paths: Sequence[Path]) -> list[Path]:
 
 def _each_recording(path: Path) -> list[Path]:
     """Paths of the recordings that a name such as `walk.npz[#0:40]` stands for; else the path itself."""
-    names = [path.name] if isinstance(path, RemoteFile) or path.exists() else each_recording(path.name)
+    names = [path.name] if path.exists() else each_recording(path.name)
     return [path] if names == [path.name] else [path.with_name(name) for name in names]
 
 
 def _listed(pattern: Path) -> Sequence[Path]:
     """All files whose names match a path with * or ? in its last part, in order; brackets stand for themselves."""
-    if isinstance(pattern, RemoteFile):
-        return list_matching(pattern)
     matching = pattern.parent.glob(pattern.name.replace("[", "[[]"))
     return sorted(file for file in matching if file.is_file() or list_bag_files(file))

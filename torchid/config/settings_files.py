@@ -24,7 +24,6 @@ from torchid.errors import ConfigError, UnknownNameError, about_file, during, ex
 from torchid.guards import MAX_DEPTH, MAX_YAML, read_bytes
 from torchid.logs import Log
 from torchid.logs.containers import READABLE
-from torchid.logs.remote import is_url
 from torchid.settings import accepted_values
 
 #: What YAML and OmegaConf raise at a value that is not what its tag or its key says.
@@ -59,7 +58,6 @@ class FileKind(Generic[T]):
             the file and nothing, then, for each override, for all before and it, and for it and nothing.
         accepted: the accepted values in messages, by key (`*` for a name from the file), where the type alone says
             too little.
-        urls: those of `paths` that may hold a URL instead.
     """
 
     settings: type[T]
@@ -70,7 +68,6 @@ class FileKind(Generic[T]):
     outputs: Sequence[str] = ()
     prepare: Callable[[Settings, Settings], Settings] = _as_is
     accepted: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    urls: Sequence[str] = ()
 
     def accepted_at(self, key: Sequence[str], otherwise: str) -> str:
         """What is accepted at a key."""
@@ -102,7 +99,7 @@ def load(kind: FileKind[T], path: Path | None, overrides: Sequence[str] = (), se
 def _load(kind: FileKind[T], path: Path | None, overrides: Sequence[str], sections: Settings) -> T:
     settings: Settings = {}
     if path is not None:
-        in_file = _absolute(_read(kind, path), kind.paths, path.resolve().parent, kind.urls)
+        in_file = _absolute(_read(kind, path), kind.paths, path.resolve().parent)
         settings = kind.prepare(_absolute(in_file, kind.outputs, Path.cwd()), {})
     for key, value in sections.items():
         try:
@@ -125,7 +122,7 @@ def _load(kind: FileKind[T], path: Path | None, overrides: Sequence[str], sectio
 
 def _from_here(kind: FileKind[T], given: Settings) -> Settings:
     """Settings with their paths relative to the working directory."""
-    return _absolute(given, (*kind.paths, *kind.outputs), Path.cwd(), kind.urls)
+    return _absolute(given, (*kind.paths, *kind.outputs), Path.cwd())
 
 
 def _merged(kind: FileKind[T], settings: Settings, given: Settings) -> Settings:
@@ -202,33 +199,31 @@ def _container(config: Any) -> Any:
     return OmegaConf.to_container(config, resolve=True)
 
 
-def _absolute(settings: Settings, keys: Sequence[str], folder: Path, urls: Sequence[str] = ()) -> Settings:
+def _absolute(settings: Settings, keys: Sequence[str], folder: Path) -> Settings:
     for key in keys:
         try:
-            settings = _absolute_at(settings, key.split("."), folder, key in urls)
+            settings = _absolute_at(settings, key.split("."), folder)
         except (RuntimeError, ValueError) as error:
             raise ConfigError.at_field(key.removesuffix(".*"), str(error), "a path") from error
     return settings
 
 
-def _absolute_at(value: Any, key: Sequence[str], folder: Path, may_be_url: bool) -> Any:
+def _absolute_at(value: Any, key: Sequence[str], folder: Path) -> Any:
     """The value with the path at a key made absolute; values of another type are left to the validation."""
     if not key:
-        return _absolute_path(value, folder, may_be_url) if isinstance(value, str) else value
+        return _absolute_path(value, folder) if isinstance(value, str) else value
     name, *rest = key
     if name == "*":
-        return [_absolute_at(item, rest, folder, may_be_url) for item in value] if isinstance(value, list) else value
+        return [_absolute_at(item, rest, folder) for item in value] if isinstance(value, list) else value
     if isinstance(value, Mapping) and name in value:
-        return {**value, name: _absolute_at(value[name], rest, folder, may_be_url)}
+        return {**value, name: _absolute_at(value[name], rest, folder)}
     return value
 
 
-def _absolute_path(value: str, folder: Path, may_be_url: bool) -> str:
+def _absolute_path(value: str, folder: Path) -> str:
     """Raises ValueError or RuntimeError (the home folder of nobody) where the value names no file."""
-    if is_url(value):
-        if not may_be_url or not is_plain(value):
-            raise ValueError(f"'{excerpt(value)}', a URL")
-        return value
+    if "://" in value:
+        raise ValueError(f"'{excerpt(value)}', a URL (download it first, with curl)")
     path = os.path.normpath(folder / Path(value).expanduser())
     names = [len(os.fsencode(name)) for name in Path(path).parts]
     too_long = max(names) > _LONGEST_NAME or sum(names) + len(names) > _LONGEST_PATH

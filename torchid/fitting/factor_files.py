@@ -34,7 +34,6 @@ from torchid.fitting.noise import GroupNoise, NoiseSummary
 from torchid.guards import MAX_ARRAYS, MAX_DESCRIPTION, MAX_LETTERS, MAX_TRIANGLES, check_unpacked_size
 from torchid.identifiability.base_parameters import StateReport, merge_state_reports
 from torchid.logs.containers import FACTORS, Container, open_npz, reader_errors_explained
-from torchid.logs.remote import RemoteFile, is_url, local_copy
 from torchid.parameters import Array
 from torchid.problem import RowBuilder
 from torchid.problem.blocks import block_spans
@@ -171,25 +170,19 @@ def read_factors(path: str | Path) -> FactorFile:
     Whether its rows are those of a builder, `require_same_rows` and `require_same_noise` say.
 
     Args:
-        path: of a file here, or the URL of one that fsspec reaches.
+        path: of the file.
 
     Raises:
         LogError: no such file, one of another format, or a damaged one.
     """
-    path = RemoteFile.at(str(path)) if is_url(str(path)) else Path(path)
+    path = Path(path)
     _require_suffix(path)
-    with local_copy(path, _ACCEPTED, MAX_ARRAYS) as file:
-        return _read_file(path, file)
-
-
-def _read_file(path: Path, file: Path) -> FactorFile:
-    """The content of a file here, called `path` in messages."""
-    if not os.path.isfile(file):
-        found = "no such file" if not os.path.lexists(file) else "no regular file"
+    if not os.path.isfile(path):
+        found = "no such file" if not os.path.lexists(path) else "no regular file"
         raise LogError(path, "file", found, _ACCEPTED)
-    with about_file(path), reader_errors_explained("file", _ACCEPTED), open_npz(file) as container:
+    with about_file(path), reader_errors_explained("file", _ACCEPTED), open_npz(path) as container:
         sizes = container.declared_bytes()
-        check_unpacked_size(path, sum(sizes.values()), file)
+        check_unpacked_size(path, sum(sizes.values()), path)
         if sum(sizes.values()) > MAX_ARRAYS or sizes.get("description", 0) > MAX_DESCRIPTION:
             raise ValueError("more bytes than a compressed log has")
         return _read(path, container)
