@@ -1,6 +1,6 @@
 """Logs: read and write the file format, filter, differentiate and resample.
 
-- the format: `log` (fields, shapes), `read`, `containers`, `arrays`, `lazy_arrays`, `time_range`, `episodes`, `remote`
+- the format: `log` (fields, shapes), `read`, `containers`, `arrays`, `lazy_arrays`, `time_range`, `episodes`
 - files of arrays: `hdf5`, `matlab`, `json_files`; of tables: `tables`, `table_files`, `table_headers`, `columns`
 - bags: `ros_read`, `ros_topics`, `ros_files`, `ros_messages`, `unitree`, `alignment`
 - maps of foreign columns: `column_map`, `column_entries`, `column_matching`, `entry_values`, `mapped_fields`, `units`,
