@@ -22,7 +22,7 @@ from torchid.problem import LinearProblem
 
 _STEPS = {"maxiter": 20, "maxcor": 20, "ftol": 0.0, "gtol": 0.0}  # of L-BFGS between preconditioners
 _DAMPING = 0.01  # of these, over the objective
-_SETTLED, _MET = 1e-9, 1e-10  # relative decrease of the objective in a round, violation of a condition
+_SETTLED, _MET = 1e-12, 1e-10  # relative decrease of the objective in a round, violation of a condition
 
 
 @one_thread()
