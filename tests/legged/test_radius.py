@@ -21,22 +21,27 @@ from torchid.logs import write_log
 SECONDS = 12.0
 
 
+def experiment(folder: Path) -> Path:
+    """A file for the log in a folder."""
+    text = f"""
+robot: {{urdf: {QUADRUPED.urdf}}}
+contacts: [{", ".join(f"{{frame: {foot}, type: point}}" for foot in QUADRUPED.feet)}]
+logs: {{train: [{folder / "log.npz"}]}}
+sensors: joints
+preprocessing: {{cutoff_hz: 15}}
+output: run
+"""
+    (folder / "experiment.yaml").write_text(text)
+    return folder / "experiment.yaml"
+
+
 @pytest.mark.parametrize("radius", [0.0, 0.025])
 def test_the_radius_of_feet_is_found_where_they_are_balls(tmp_path: Path, radius: float) -> None:
     """Feet of the demo's robot, whose URDF has no shape for them; the recorded ones are balls or points."""
     true = TrueRobot.unlike_its_urdf(replace(QUADRUPED, radius=radius))
     exact = simulated(true, Reference(true, SECONDS, seed=0), SECONDS)
     write_log(record(exact, true.robot.base_link, Noise(), np.random.default_rng(0)), tmp_path / "log.npz")
-    text = f"""
-robot: {{urdf: {QUADRUPED.urdf}}}
-contacts: [{", ".join(f"{{frame: {foot}, type: point}}" for foot in QUADRUPED.feet)}]
-logs: {{train: [{tmp_path / "log.npz"}]}}
-sensors: joints
-preprocessing: {{cutoff_hz: 15}}
-output: run
-"""
-    (tmp_path / "experiment.yaml").write_text(text)
-    setup, choices = with_chosen_settings(set_up(load_config(tmp_path / "experiment.yaml")), Progress(disable=True))
+    setup, choices = with_chosen_settings(set_up(load_config(experiment(tmp_path))), Progress(disable=True))
     assert choices.radius is not None
     if radius:
         assert choices.radius.radius == pytest.approx(radius, abs=2e-3)
@@ -46,3 +51,15 @@ output: run
     else:
         assert choices.radius.radius is None
         assert {contact.radius for contact in setup.contacts} == {0.0}
+
+
+def test_a_log_that_does_not_say_where_the_ground_is_keeps_points(tmp_path: Path) -> None:
+    """Balls need the base's orientation, which an IMU alone does not give."""
+    true = TrueRobot.unlike_its_urdf(QUADRUPED)
+    exact = simulated(true, Reference(true, 4.0, seed=0), 4.0)
+    log = record(exact, true.robot.base_link, Noise(), np.random.default_rng(0))
+    write_log(replace(log, base_quat_xyzw=None, contact_wrench_world=None), tmp_path / "log.npz")
+    setup, choices = with_chosen_settings(set_up(load_config(experiment(tmp_path))), Progress(disable=True))
+    assert choices.radius is not None
+    assert choices.radius.radius is None
+    assert {contact.radius for contact in setup.contacts} == {0.0}

@@ -413,7 +413,11 @@ def _radius(setup: RobotSetup, trials: _Trials) -> RadiusChoice:
     def left(radius: float, estimate_noise: bool = False) -> Array:
         return trials.reading(_with_radius(setup, radius), estimate_noise).left_out(kinds)
 
-    own, tried = trials.reading(setup).left_out(kinds), [left(radius) for radius in _RADII]
+    own = trials.reading(setup).left_out(kinds)
+    try:
+        tried = [left(radius) for radius in _RADII]
+    except InputError:  # the logs do not say where the ground is
+        return RadiusChoice(None, Evidence(0.0, 0.0, 0))
     a, b, _ = np.polyfit(_RADII, [-Evidence.of(own, one).gain for one in tried], 2)
     best, evidence = float(f"{-0.5 * b / a:.3g}") if a > 0.0 else 0.0, Evidence(0.0, 0.0, 0)
     if _RADII[0] < best < _RADII[-1]:
