@@ -192,7 +192,7 @@ _TRIED_WIDTHS = (0.01, 0.1)  # [rad/s or m/s]: where neither predicts better tha
 
 @dataclass(frozen=True)
 class DataChoice:
-    """Which data are fitted: a value of a setting that leaves some out, "" for its unit, and what was tried."""
+    """Which data are fitted: a value of a setting that leaves some out, and what was tried."""
 
     value: float | bool | None
     tried: tuple[float | bool | None, ...]

@@ -13,11 +13,12 @@ from torch import Tensor
 from torchid.errors import LogError, warn
 from torchid.estimators import LeastSquares
 from torchid.fitting.fit import LogFitter
+from torchid.fitting.left_out import with_terms
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.logs.segments import recorded_at_delays, unbroken_segments
 from torchid.logs.timeline import spline_degree
 from torchid.parallel import share_between_forks, thread_count
-from torchid.problem import ExtraTerms, RowBuilder, Samples
+from torchid.problem import ExtraTerms, Samples
 from torchid.problem.compression import compress_in_blocks, compress_parts
 from torchid.problem.extras import SLOPE
 
@@ -107,11 +108,9 @@ def choose_delay(logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms) 
 
 def _best(logs: Sequence[_Torques], fitter: LogFitter, terms: ExtraTerms, delay: float) -> tuple[float, ExtraEstimate]:
     """The delay that leaves least, by steps from one [s], and the term of a further one in the last fit."""
-    of = fitter.builder
-    further = RowBuilder(fitter.robot, of.contacts, of.sensors, replace(terms, slope=True)).to(of.device)
-    fitter = replace(fitter, builder=further)
+    fitter = with_terms(fitter, replace(terms, slope=True))
     for _ in range(_STEPS):
-        fit = fitter.fit(compress_in_blocks([log.by(delay) for log in logs], further))
+        fit = fitter.fit(compress_in_blocks([log.by(delay) for log in logs], fitter.builder))
         term = next(x for x in fit.extras if x.extra.what == SLOPE)
         before, delay = delay, float(np.clip(delay + term.value, EARLIEST, LATEST))
         if not np.isfinite(term.standard_error) or abs(delay - before) <= _SETTLED * term.standard_error:

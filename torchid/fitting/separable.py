@@ -16,11 +16,11 @@ from scipy.optimize import minimize, minimize_scalar
 from torchid.errors import warn
 from torchid.estimators import LeastSquares
 from torchid.fitting.fit import LogFitter
-from torchid.fitting.left_out import Evidence
+from torchid.fitting.left_out import Evidence, with_terms
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.parallel import share_between_forks, thread_count
 from torchid.parameters import Array
-from torchid.problem import ExtraTerms, RowBuilder, Samples, compress_parts
+from torchid.problem import ExtraTerms, Samples, compress_parts
 from torchid.problem.compression import compress_in_blocks
 from torchid.problem.extras import SLOPE, dof_extra_column
 
@@ -199,8 +199,7 @@ def _with_logarithm(
                 trees = low.builder.tree, high.builder.tree
                 less, more = (dof_extra_column(extra, extra.dof, *one) for one in zip(ends, trees, strict=True))
                 slope[:, extra.dof] = value * (more - less) / (2.0 * _STEP)
-    further = replace(terms, stribeck=velocity, slope=True)
-    fitter = replace(fitter, builder=RowBuilder(fitter.robot, of.contacts, of.sensors, further).to(of.device))
+    fitter = with_terms(fitter, replace(terms, stribeck=velocity, slope=True))
     sloped = [replace(log, slope=slope) for log, slope in zip(logs, slopes, strict=True)]
     found = fitter.fit(compress_in_blocks(sloped, fitter.builder)).extras
     return {what: [x for x in found if x.extra.what == what] for what in ("stribeck", SLOPE)}
