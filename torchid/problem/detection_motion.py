@@ -95,7 +95,7 @@ def bind_for_detection(known: Log, robot: Robot, contacts: Sequence[Contact]) ->
     base, rotation = _base(known, robot, contacts)
     in_limbs = torque.new_full((len(known), robot.n_dofs - robot.n), torch.nan)
     samples = Samples(
-        known.source, torch.from_numpy(known.time), position, velocity, acceleration, base,
+        known.source, torch.tensor(known.time), position, velocity, acceleration, base,
         torch.cat([torque, in_limbs], dim=1), None, False, torch.ones(len(known), len(contacts), dtype=torch.bool),
     )  # fmt: skip
     return DetectionSamples(known, samples, rotation)
