@@ -14,7 +14,6 @@ from torchid.config import load_config
 from torchid.errors import InputError
 from torchid.logs import Log, read, read_log
 from torchid.logs.read import files_of_recordings_kept
-from torchid.robot import load_robot
 
 GO2 = ROBOTS / "go2_description/urdf/go2.urdf"
 EPISODES, SAMPLES, STEP = 5, 600, 0.01
@@ -58,52 +57,11 @@ def test_an_axis_of_episodes_is_told_from_that_of_samples(tmp_path: Path, axis: 
     assert_recorded(logs_of(tmp_path / "x.npz"), np.full(EPISODES, SAMPLES))
 
 
-def test_robots_side_by_side_are_simulated_and_have_no_order_of_their_maker(tmp_path: Path) -> None:
-    """Episodes one after the other, each with its stamps, may be recordings of the robot."""
-    arrays = {"dof_pos": np.tile(Q, 2), "dof_vel": np.tile(DQ, 2), "torques": np.tile(TAU, 2)}
-    np.savez(tmp_path / "stacked.npz", t=TIME, **arrays)
-    np.savez(tmp_path / "alone.npz", t=TIME, **{name: x[0] for name, x in arrays.items()})
-    order = {}
-    for name in ("stacked", "alone"):
-        init(GO2, tmp_path / f"{name}.npz", tmp_path / f"{name}.yaml")
-        files = load_config(tmp_path / f"{name}.yaml").logs
-        assert files is not None
-        assert files.columns is not None
-        order[name] = files.columns.joint_order
-    assert order["stacked"] == list(load_robot(GO2).joint_names)
-    assert order["alone"][:3] == [f"FR_{joint}_joint" for joint in ("hip", "thigh", "calf")], "of 20 motors"
-
-
 def test_what_fills_up_stacked_episodes_is_cut_off(tmp_path: Path) -> None:
     filled = np.arange(SAMPLES) < LENGTHS[:, None]
     arrays = {"q": Q * filled[..., None], "qd": DQ * filled[..., None], "tau": TAU * filled[..., None]}
     np.savez(tmp_path / "x.npz", t=TIME * filled, episode_lengths=LENGTHS, **arrays)
     assert_recorded(logs_of(tmp_path / "x.npz"), LENGTHS)
-
-
-@pytest.mark.parametrize("filling", ["zeros", "the last sample", "NaN"])
-@pytest.mark.parametrize("axis", [0, 1])
-def test_what_fills_up_episodes_is_found_without_their_lengths(tmp_path: Path, axis: int, filling: str) -> None:
-    """Stamps of one clock are filled up, too; two joints of the last episode stand still at its end."""
-    start = SAMPLES * STEP * np.arange(EPISODES)[:, None]
-    q, dq = Q.copy(), DQ.copy()
-    q[-1, 300:, :2], dq[-1, 300:, :2] = q[-1, 300, :2], 0.0
-
-    def filled(x: np.ndarray) -> np.ndarray:
-        of_each = x.copy()
-        for one, length in zip(of_each, LENGTHS, strict=True):
-            one[length:] = {"zeros": 0.0, "NaN": np.nan, "the last sample": one[length - 1]}[filling]
-        return np.moveaxis(of_each, 0, axis)
-
-    arrays = {"q": q, "qd": dq, "tau": TAU, "t": TIME + start}
-    np.savez(tmp_path / "x.npz", **{name: filled(x) for name, x in arrays.items()})
-    logs = logs_of(tmp_path / "x.npz")
-    assert [len(log) for log in logs] == LENGTHS.tolist()
-    for number, (log, length) in enumerate(zip(logs, LENGTHS, strict=True)):
-        np.testing.assert_array_equal(log.joint_position, q[number, :length])
-        np.testing.assert_allclose(np.diff(log.time), STEP, atol=1e-12)
-    text = (tmp_path / "x.yaml").read_text()
-    assert f"{LENGTHS.sum()} of {EPISODES * SAMPLES} samples, behind which all arrays" in text
 
 
 def test_episodes_that_end_at_rest_are_not_cut(tmp_path: Path) -> None:

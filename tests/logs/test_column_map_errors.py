@@ -255,11 +255,11 @@ def test_without_a_map_all_unknown_columns_are_named_in_one_line_with_proposals(
 
 
 def test_every_unknown_column_has_its_proposal(tmp_path: Path) -> None:
-    names = ("Timestamp", "leftKneePos", "left_knee_qd", "tau[3]", "imu.gyro.x", "base_pos_x", "grf_left", "colour")
+    names = ("Timestamp", "leftKneePos", "left_knee_qd", "tau[3]", "imu.gyro.x", "base_pos_x", "contact_left", "colour")
     path = save_csv(tmp_path / "x.csv", dict.fromkeys(names, [1, 2]))
     message = refused(lambda: read_log(path), f"{path}: columns: 8 unknown: ", LogError)
     fields = ("time", "joint_position", "joint_velocity", "joint_torque", "imu_angular_velocity", "base_position_world")
-    for name, field in zip(names, (*fields, "contact_force_normal"), strict=False):
+    for name, field in zip(names, (*fields, "contact_active"), strict=False):
         assert f"'{name}' ({field}?)" in message
     assert "'colour';" in message
 

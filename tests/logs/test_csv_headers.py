@@ -76,9 +76,11 @@ def test_a_separator_at_the_end_of_rows_needs_no_entry_of_a_map(tmp_path: Path, 
     np.testing.assert_array_equal(read_log(path, columns=COLUMNS).joint_position, [[1.5], [2.5]])
 
 
-def test_rows_without_names_are_refused_and_a_bad_first_row_stays_a_row(tmp_path: Path) -> None:
+def test_rows_without_names_need_a_map_and_a_bad_first_row_stays_a_row(tmp_path: Path) -> None:
     found = log_refusal(written(tmp_path / "x.csv", PLAIN))
-    assert "header: numbers, '0.0,1.5,7.0'; accepted: the names of the columns" in found
+    assert "columns: 3 of numbers without a line of names; accepted: names of the log format, or logs.columns" in found
+    given = Columns(time="column_0", joint_position={"columns": {"a": "column_1"}}, ignore=["*"])  # type: ignore[arg-type]
+    np.testing.assert_array_equal(read_log(tmp_path / "x.csv", columns=given).joint_position[:1], [[1.5]])
     found = log_refusal(written(tmp_path / "y.csv", "time,joint_position.a\nx,y\n0.0,1.5\n"))
     assert "column 'time': 'x' in row 2" in found
 

@@ -1,107 +1,87 @@
-"""Names of recordings against those of a robot: spellings, limbs, and what is not to be confused."""
+"""What names of columns mean: words for quantities, units behind them, and names of a robot spelled otherwise."""
 
 from __future__ import annotations
 
 import pytest
 
-from torchid.logs.name_matching import limbs, match_joints, match_names, propose_field, spelled
-
-FEET = ("LF_FOOT", "RF_FOOT", "LH_FOOT", "RH_FOOT")
-
-
-@pytest.mark.parametrize(
-    ("names", "texts", "expected"),
-    [
-        (FEET, ["/contact/lf_foot", "/contact/rh_foot"], ["LF_FOOT", "RH_FOOT"]),
-        (FEET, ["front_left", "hind_right"], ["LF_FOOT", "RH_FOOT"]),
-        (("l_sole", "r_sole"), ["/right/wrench", "/left/wrench"], ["r_sole", "l_sole"]),
-        (("l_sole", "r_sole"), ["left_foot_sensor /ft/1", "right_foot_sensor /ft/0"], ["l_sole", "r_sole"]),
-        (("left_sole_link", "right_sole_link"), ["LeftFootF", "RightFootF"], ["left_sole_link", "right_sole_link"]),
-        (("l_sole", "r_sole"), ["left_heel", "left_toe"], []),
-        (("l_sole", "r_sole"), ["/battery", "/temperature"], []),
-        (("FL_foot", "FR_foot"), ["left", "right"], []),
-    ],
-)  # fmt: skip
-def test_texts_mean_the_name_they_contain_or_that_of_the_same_limb_alone(
-    names: tuple[str, ...], texts: list[str], expected: list[str]
-) -> None:
-    assert match_names(texts, names, "contact") == dict(zip(texts, expected, strict=False))
-
-
-def test_limbs_are_words_and_letters_of_their_own() -> None:
-    assert limbs("LH_FOOT") == limbs("left_hind") == limbs("RearLeftLeg") == {"l", "b"}
-    assert limbs("l_sole") == limbs("LeftFoot") == {"l"}
-    assert limbs("lower_roll_link") == limbs("frame") == set()
-
-
-@pytest.mark.parametrize(
-    ("stem", "column", "found"),
-    [
-        ("left_hip_pitch", "LeftHipPitch.Position", True),
-        ("left_hip_pitch", "q_left-hip-pitch", True),
-        ("LF_HAA", "q_lf_haa", True),
-        ("LHipYaw", "l_hip_yaw_vel", True),
-        ("hip", "q_ship", False),
-        ("joint1", "joint_12", False),
-        ("hip", "hips", False),
-    ],
-)
-def test_a_spelling_is_found_whole(stem: str, column: str, found: bool) -> None:
-    assert bool(spelled(stem).search(column)) == found
-
-
-def test_stamps_of_simulink_are_a_log_s_and_torques_out_of_a_motor_are_none() -> None:
-    assert propose_field("out/tout") == propose_field("tout") == "time"
-    assert propose_field("tau_out") == "joint_torque"
-    assert [propose_field(x) for x in ("J_1", "hip_phi", "dtau_J")] == ["joint_position", "joint_position", ""]
-    assert [propose_field(x) for x in ("hip_dphi", "micros", "imu_q0")] == ["joint_velocity", "time", "base_quat_wxyz"]
-
-
-def test_fields_that_differ_in_what_they_are_of_are_not_alike() -> None:
-    assert propose_field("imu/linear_acceleration") == "imu_specific_force"
-    assert propose_field("imu_angular_velocty") == "imu_angular_velocity"
-    assert propose_field("joint_torqe") == "joint_torque"
-
-
-@pytest.mark.parametrize(
-    ("joints", "texts", "expected"),
-    [
-        (["FL_hip_joint", "FR_hip_joint"], ["fr_hip", "fl_hip"], ["FR_hip_joint", "FL_hip_joint"]),
-        (["LF_HAA", "RF_HAA"], ["robot/lf_haa_joint", "robot/rf_haa_joint"], ["LF_HAA", "RF_HAA"]),
-        (["left_hip_pitch_joint", "left_hip_yaw_joint"], ["LeftHipYaw"], ["left_hip_yaw_joint"]),
-        (["l_knee", "r_knee"], ["left_knee", "right_knee"], ["l_knee", "r_knee"]),
-        (["panda_joint1", "panda_joint2"], ["joint2", "joint1"], ["panda_joint2", "panda_joint1"]),
-        (["l_knee", "l_knee_2"], ["l_knee"], ["l_knee"]),
-        (["arm_knee", "leg_knee"], ["knee"], []),
-        (["hip"], ["a_hip", "b_hip"], []),
-        (["l_hip"], ["r_hip", "l_ship", "hip", "joint"], []),
-    ],
-)
-def test_joints_are_told_by_their_words_and_limbs_and_doubtful_ones_by_none(
-    joints: list[str], texts: list[str], expected: list[str]
-) -> None:
-    assert match_joints(texts, joints) == dict(zip(texts, expected, strict=False))
-
-
-def test_an_angular_velocity_of_the_body_is_no_linear_one() -> None:
-    assert propose_field("base_ang_vel_body").startswith("base_angular_velocity")
-    assert propose_field("base/v_world").startswith("base_linear_velocity")
-    assert propose_field("velBody").startswith("base_linear_velocity")
+from torchid.logs.name_matching import propose_field
+from torchid.logs.units import quantities_with, split_unit, unit_factor
+from torchid.proposals.names import exchange_affixes, find_spelling
 
 
 @pytest.mark.parametrize(
     ("field", "spelled"),
     [
-        ("joint_velocity", "dq qd qdot q_dot q.dot QDot dqdt dq/dt dq_dt dotq qdots d_q"),
-        ("joint_velocity", "theta_dot thetadot ThetaDot dtheta thDot phi_dot jvel q_vel joint_spd"),
-        ("joint_velocity", "pos_dot dpos posDot joint_position_dot angleDot joint_angular_velocity omega_joint"),
-        ("joint_acceleration", "ddq qdd qddot q_ddot q_dot_dot d2q theta_ddot ddtheta pos_ddot q_acc dof_acc"),
-        ("joint_torque", "tau trq torq joint_moment actuator_force joint_forces tau_est"),
-        ("", "q_dot_des qd_ref base_pos_dot q_d theta_dot_cmd"),
+        ("joint_position", "q qpos pos position angle joint_positions jointPosition q_actual"),
+        ("joint_velocity", "dq qd qdot q_dot qvel vel velocity speed"),
+        ("joint_acceleration", "ddq qdd qddot q_ddot qacc acc"),
+        ("joint_torque", "tau trq torque effort tau_est joint_torqe"),
+        ("time", "t time stamp timestamp header.stamp"),
+        ("imu_angular_velocity", "gyro omega angular_velocity imu_angular_velocty"),
+        ("imu_specific_force", "imu/linear_acceleration imu_acc accelerometer"),
+        ("base_position_world", "base_pos pelvis.position"),
+        ("", "q_des dq_ref tau_d tau_ext target_q note kp velocity_torque"),
     ],
 )  # fmt: skip
-def test_a_derivative_is_no_position_however_it_is_spelled(field: str, spelled: str) -> None:
-    """Alone, with a number, in front of a number and behind the name of a joint."""
-    forms = ("{}", "{}1", "{}_1", "FL_hip_{}", "{}.l_knee")
-    found = {text: propose_field(text) for name in spelled.split() for form in forms if (text := form.format(name))}
-    assert {text: of for text, of in found.items() if of != field} == {}
+def test_a_word_says_what_a_column_has(field: str, spelled: str) -> None:
+    assert {text: propose_field(text) for text in spelled.split()} == dict.fromkeys(spelled.split(), field)
+
+
+@pytest.mark.parametrize(
+    ("names", "texts", "expected"),
+    [
+        (["panda_joint1", "panda_joint2"], ["fer_joint1", "fer_joint2"], ["panda_joint1", "panda_joint2"]),
+        (["FL_hip_joint", "FR_hip_joint"], ["FR_hip", "FL_hip", "x"], ["FR_hip_joint", "FL_hip_joint"]),
+        (["l_knee", "r_knee"], ["r_knee", "gripper"], ["r_knee"]),
+        (["hip"], ["a_hip", "b_hip"], []),
+        (["l_knee", "r_knee"], ["left_knee", "right_knee"], []),
+        (["j1", "j2"], ["a1", "a2"], []),
+    ],
+)
+def test_one_prefix_or_suffix_may_stand_for_another(names: list[str], texts: list[str], expected: list[str]) -> None:
+    assert list(exchange_affixes(texts, names).values()) == expected
+
+
+def test_names_without_what_all_of_them_have_are_found_within_columns() -> None:
+    found = find_spelling(["touch_LF", "touch_RF"], ["LF_FOOT", "RF_FOOT"])
+    assert (found.names, found.suffix) == ({"LF": "LF_FOOT", "RF": "RF_FOOT"}, "_FOOT")
+    assert not find_spelling(["q_ship", "q_2"], ["hip", "joint1"]).names
+
+
+@pytest.mark.parametrize(
+    ("column", "name", "unit"),
+    [
+        ("q1 [deg]", "q1", "deg"),
+        ("t[ms]", "t", "ms"),
+        ("tau_hip (Nm)", "tau_hip", "Nm"),
+        ("Fz_N", "Fz", "N"),
+        ("time_us", "time", "us"),
+        ("pos_mm", "pos", "mm"),
+        ("vel_rad/s", "vel", "rad/s"),
+        ("vel_deg_s", "vel", "deg/s"),
+        ("a_m_per_s2", "a", "m/s2"),
+        ("acc_g", "acc", "g"),
+        ("w [rad s^-1]", "w", "rad s^-1"),
+        ("quat_w [-]", "quat_w", "-"),
+        ("angle [gon]", "angle", "gon"),
+        ("motor_state[3]", "motor_state[3]", ""),
+        ("acc[x]", "acc[x]", ""),
+        ("left_hip_pitch", "left_hip_pitch", ""),
+        ("angle_gon", "angle_gon", ""),
+    ],
+)
+def test_a_unit_is_what_brackets_hold_or_a_suffix_that_is_known(column: str, name: str, unit: str) -> None:
+    assert split_unit(column) == (name, unit)
+
+
+@pytest.mark.parametrize("unit", ["1/min", "r / min", "r/min"])
+def test_turns_per_minute_are_rpm(unit: str) -> None:
+    assert unit_factor("x", unit, ("angular velocity",)) == unit_factor("x", "rpm", ("angular velocity",))
+    assert quantities_with("Nm/min") == ()
+
+
+def test_a_unit_tells_the_field_where_the_name_says_nothing() -> None:
+    assert propose_field("LF_HAA [deg]") == "joint_position"
+    assert propose_field("LF_HAA (deg/s)") == "joint_velocity"
+    assert propose_field("LF_HAA_Nm") == "joint_torque"
+    assert propose_field("oil [degC]") == ""

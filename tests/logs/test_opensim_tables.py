@@ -14,8 +14,6 @@ from torchid.config import load_config
 from torchid.errors import InputError
 from torchid.logs import Columns, Log, read_log, write_log
 from torchid.logs.blocks import log_bytes, open_log_blocks
-from torchid.logs.name_matching import KnownRobot
-from torchid.proposals.maps import propose_map
 
 TIME = np.arange(60) / 100.0
 ANGLES = np.stack([30.0 * np.sin(3.0 * TIME), 20.0 * np.cos(2.0 * TIME)], axis=1)  # deg
@@ -70,11 +68,6 @@ def test_a_turn_of_such_angles_is_360_deg(tmp_path: Path) -> None:
     log = read(tmp_path / "x.mot", turn_from={"hip": -180, "knee": -180})
     np.testing.assert_allclose(log.joint_position[:, :2], np.radians(angles), atol=1e-13)
     np.testing.assert_array_equal(log.joint_position[:, 2], SLIDE)
-    robot = KnownRobot(["hip", "knee"], [], "leg", 100.0, "base", [], [])
-    sample = {f"angle_{name}": turned[:, 1 + k] for k, name in enumerate(robot.joints)} | {"time": TIME}
-    proposal = propose_map(sample, robot, in_degrees=list(sample))
-    assert proposal.columns["joint_position"] == {"column": "angle_{joint}", "turn_from": -180.0}
-    assert "deg, as the file's header says (inDegrees=yes)" in proposal.notes["joint_position"]
 
 
 def test_blocks_and_ranges_are_those_of_the_whole_table(tmp_path: Path) -> None:
@@ -145,7 +138,7 @@ def test_init_says_that_angles_are_in_degrees_and_reads_them_so(tmp_path: Path) 
     names = "time\tangle_hip\tangle_knee\tmoment_hip\tmoment_knee\n"
     (tmp_path / "x.mot").write_text(HEADER.format(rows=60, degrees="yes") + names + "\n".join(lines) + "\n")
     said = init(urdf, tmp_path / "x.mot", tmp_path / "x.yaml")
-    assert "joint_position: deg, as the file's header says (inDegrees=yes)" in said.guessed
+    assert "joint_position: deg, as the file's header says (inDegrees=yes)" in said.assumed
     config = load_config(tmp_path / "x.yaml")
     log = read_log(tmp_path / "x.mot", columns=config.logs.columns)
     np.testing.assert_allclose(log.joint_position, np.radians(ANGLES), rtol=1e-15)

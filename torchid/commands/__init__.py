@@ -5,7 +5,7 @@ A module for each command: `analyze`, `check` (and `convert`), `compress`, `demo
 
 - a fit: `prepared_data`, `chosen_settings`, `training`, `checkpoint`, `plausibility`
 - what `identify` returns and says: `results`, `named_results`, `answer`, `run_figures`
-- parts of `init` and `analyze`: `init_logs`, `init_proposals`, `analysis_request`, `sensor_set_accuracy`
+- parts of `init` and `analyze`: `init_logs`, `init_robot`, `analysis_request`, `sensor_set_accuracy`
 - folders: `folder`, `manifest`
 """
 

@@ -1,36 +1,29 @@
-"""`torchid init`: an experiment file from a URDF or MJCF and a log, with what was guessed beside it."""
+"""`torchid init`: an experiment file from a robot and a log, with what was assumed and what is to be filled in."""
 
 from __future__ import annotations
 
 import os
 import warnings
-from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from textwrap import wrap
 
 import yaml
 
 from torchid.commands.chosen_settings import needs_these_torques
 from torchid.commands.folder import check_free_file
-from torchid.commands.init_files import log_in_folder, named_apart
-from torchid.commands.init_logs import Split, keys_for_gaps, keys_for_length, split_logs
-from torchid.commands.init_orders import settle_order
-from torchid.commands.init_proposals import (
+from torchid.commands.init_logs import Split, keys_for_gaps, keys_for_length, log_in_folder, named_apart, split_logs
+from torchid.commands.init_robot import (
     GuessedContact,
     guess_contacts,
     held_joints,
-    hints,
-    like_torques,
     limb_sensors,
     measured_torques,
-    missing_columns,
-    notes_on_arrays,
     proposed_sensors,
     read_sensors,
     stated_contacts,
-    unreadable,
     welded_at,
     without_rolling,
 )
@@ -45,23 +38,23 @@ from torchid.errors import (
     TorchidWarning,
     about_file,
     excerpt,
-    format_count,
     join_names,
 )
 from torchid.fitting.checked_settings import is_along_base, resolve_contacts
 from torchid.fitting.experiment import set_up
 from torchid.logs import Columns, Log, Topics
+from torchid.logs.column_map import FILL_IN
 from torchid.logs.containers import LogKind, atomic_output, existing_log_kind
 from torchid.logs.log import VARIANTS
-from torchid.logs.name_matching import KnownRobot
 from torchid.logs.read import read_recordings
+from torchid.logs.table_files import is_text_table
+from torchid.logs.table_headers import read_header
+from torchid.logs.tables import sample_row_names
 from torchid.logs.time_range import split_range
 from torchid.parameters import GRAVITY
-from torchid.proposals.column_groups import MapProposal
-from torchid.proposals.episodes import find_episodes
-from torchid.proposals.file_samples import read_bag_sample, read_sample, rows_of, states_degrees, texts_in
-from torchid.proposals.maps import propose_map
-from torchid.proposals.stamps import arrays_by_stamps
+from torchid.proposals.columns import MapProposal, joined, propose_map
+from torchid.proposals.names import RobotNames
+from torchid.proposals.samples import find_episodes, read_bag_sample, read_sample, stated_names, with_samples_first
 from torchid.proposals.topics import USED_TYPES, frame_of, propose_topics
 from torchid.reading.log_reader import memory_needed
 from torchid.robot import Robot, load_robot
@@ -72,7 +65,8 @@ from torchid.settings import AUTO
 _FORCES = ("joint_torque", "contact_wrench_local", "contact_wrench_world", "contact_force_normal", "ft_wrench")
 _POSE = ("base_quat_wxyz", "base_quat_xyzw")
 _IMU = ("imu_specific_force", "imu_angular_velocity")
-_RATE = "base_angular_velocity_base"
+_WIDTH = 80  # of comments that list what has no entry
+_LISTED = 60  # lines of these
 _WHAT = {
     "columns": "names, units and orders of the file: docs/tables.md",
     "topics": "what the messages of the bag hold: docs/bags.md",
@@ -87,20 +81,23 @@ class InitReport:
     Attributes:
         output: the experiment file.
         found: what log and robot have, in words.
-        guessed: what should be compared with the robot and its manual.
+        assumed: what should be compared with the robot and its manual.
         missing: what a fit needs and was not found.
+        is_open: whether the file has entries that are to be filled in.
     """
 
     output: Path
     found: list[str] = field(default_factory=list)
-    guessed: list[str] = field(default_factory=list)
+    assumed: list[str] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
+    is_open: bool = False
 
     @property
     def lines(self) -> list[tuple[str, str]]:
         """A word for what each text is, and the text."""
-        said = [(word, text) for word in ("found", "guessed", "missing") for text in getattr(self, word)]
-        return [*said, ("written to", f"{self.output}; next: torchid check {self.output}")]
+        said = [(word, text) for word in ("found", "assumed", "missing") for text in getattr(self, word)]
+        then = f"next: fill in {FILL_IN} there" if self.is_open else f"next: torchid check {self.output}"
+        return [*said, ("written to", f"{self.output}; {then}")]
 
 
 _NO_CONTACT = (
@@ -136,8 +133,8 @@ def init(urdf: str | Path, log: str | Path, output: str | Path, total_mass: floa
     out = InitReport(target)
     _state_flags(robot, contacts, fields, proposal)
     contacts = contacts if _knows_ground(robot, contacts, fields) else without_rolling(contacts, robot)
-    bolted, detects = _is_fixed(contacts, fields), "detect_contacts" in _from_feet(robot, contacts, fields)
-    read = settle_order(proposal, partial(_try, path), robot, contacts, bolted, detects)
+    out.is_open = FILL_IN in str(proposal.columns)
+    read = [] if out.is_open else _try(path, proposal)
     logs = [] if isinstance(read, InputError) else read
     gaps = keys_for_gaps(logs) | keys_for_length(logs)
     split = split_logs(logs, "base_motion" in _from_feet(robot, contacts, fields))
@@ -151,13 +148,13 @@ def init(urdf: str | Path, log: str | Path, output: str | Path, total_mass: floa
         here = Path("experiment.yaml")
         if not _explains(write(here, contacts, sensors=sensors)) and _explains(write(here, [], sensors=sensors)):
             contacts, text = [], write(target, [], sensors=sensors)
-            out.guessed.append(_HELD)
+            out.assumed.append(_HELD)
     _describe(out, robot, contacts, fields, proposal)
     _describe_log(out, read, fields)
-    out.guessed += of_folder
-    out.guessed += [f"preprocessing.{key}: {value}, {why}" for key, (value, why) in gaps.items()]
-    out.guessed += [split.guessed] * bool(split.guessed)
-    out.guessed += ["sensors.joint_torques: those that the log has, not of all joints"] * bool(torques)
+    out.assumed += of_folder
+    out.assumed += [f"preprocessing.{key}: {value}, {why}" for key, (value, why) in gaps.items()]
+    out.assumed += [split.assumed] * bool(split.assumed)
+    out.assumed += ["sensors.joint_torques: those that the log has, not of all joints"] * bool(torques)
     out.missing += [split.missing] * bool(split.missing)
     with atomic_output(target) as new:
         new.write_text(text, encoding="utf-8")
@@ -180,37 +177,37 @@ _HELD = (
 def _of_columns(files: Sequence[Path], robot: Robot) -> tuple[list[GuessedContact], set[str], MapProposal]:
     """Contacts, fields and a map of a table or arrays, or of several that are one log."""
     samples, in_degrees, size, rows = [], set[str](), 0.0, None
+    is_table = existing_log_kind(files[0]) is LogKind.TABLE
     for file in files:
         size = memory_needed(file, PreprocessingConfig().memory_gb, size)
         if size > PreprocessingConfig().memory_gb:
             accepted = "a log of a part of the recording, whose map holds for all of it"
             raise LogError(file, "file", f"arrays of {size:.2g} GB", accepted)
         with about_file(file):
-            if (rows := rows_of(file)) is not None and len(files) > 1:
+            is_one_table = existing_log_kind(file) is LogKind.TABLE
+            if is_one_table and (rows := sample_row_names(file)) is not None and len(files) > 1:
                 accepted = "one table, joined by stamp and joint; or a column for each joint"
-                raise LogError(
-                    file, f"column '{rows.column}'", "a row for each joint, in one of several files", accepted
-                )
+                found = "a row for each joint, in one of several files"
+                raise LogError(file, f"column '{rows.column}'", found, accepted)
             samples.append(read_sample(file, rows))
-            in_degrees |= set(samples[-1]) if states_degrees(file) else set()
-    episodes = find_episodes(samples[0]) if len(files) == 1 and existing_log_kind(files[0]) is LogKind.ARRAYS else None
-    samples = [episodes.sample] if episodes else named_apart(samples, [file.name for file in files], robot)
-    sample = {name: values for of_file in reversed(samples) for name, values in of_file.items()}
-    contacts = guess_contacts(robot, stated_contacts(sample, robot), texts_in(sample))
-    clocks = arrays_by_stamps(sample) if existing_log_kind(files[0]) is LogKind.ARRAYS and len(files) == 1 else ()
-    known = replace(_known(robot, contacts), simulated=episodes is not None and "axis" in episodes.entry)
-    proposal = propose_map(sample, known, samples if len(files) > 1 else (), in_degrees, clocks)
-    fields = {*(name.partition(".")[0] for name in sample), *proposal.columns}
+            if is_one_table and is_text_table(file) and read_header(file).in_degrees:
+                in_degrees |= set(samples[-1])
+    episodes = find_episodes(samples[0]) if len(files) == 1 and not is_table else None
+    samples = [episodes.sample] if episodes else named_apart(samples, [file.name for file in files])
+    sample, turned = with_samples_first(joined(samples)) if not is_table else (joined(samples), "")
+    lists = [name for name, x in sample.items() if x is not None and x.dtype.kind not in "fiub"]
+    texts = [*sample, *(text for name in lists for text in stated_names(sample, name))]
+    contacts = guess_contacts(robot, stated_contacts(sample, robot), texts)
+    proposal = propose_map(sample, _names_of(robot, contacts), samples if len(files) > 1 else (), in_degrees)
+    if turned:
+        proposal.assumed["columns"] = turned
     if episodes is not None:
         proposal.columns = {"episodes": episodes.entry, **proposal.columns}
-        proposal.notes["episodes"] = episodes.note
+        proposal.assumed["episodes"] = episodes.note
     if rows is not None:
         proposal.columns = {"rows_of": rows.column, **proposal.columns}
-        proposal.notes["rows_of"] = "the column that names the joint of each row, as rows share stamps"
-    if "joint_position" not in fields:
-        proposal.notes |= notes_on_arrays(sample, len(robot.joint_names))
-    _add_imu_frame(robot, fields, proposal)
-    return contacts, fields, proposal
+        proposal.assumed["rows_of"] = "the column that names the joint of each row, as rows share stamps"
+    return contacts, proposal.fields, proposal
 
 
 def _of_bag(file: Path, robot: Robot) -> tuple[list[GuessedContact], set[str], MapProposal]:
@@ -218,49 +215,25 @@ def _of_bag(file: Path, robot: Robot) -> tuple[list[GuessedContact], set[str], M
     with about_file(file):
         sample = read_bag_sample(file, USED_TYPES)
     contacts = guess_contacts(robot, [], [f"{frame_of(topic)} {name}" for name, topic in sample.items()])
-    proposal = propose_topics(sample, _known(robot, contacts))
+    proposal = propose_topics(sample, _names_of(robot, contacts))
     return contacts, proposal.fields, proposal
 
 
-def _known(robot: Robot, contacts: Sequence[GuessedContact]) -> KnownRobot:
+def _names_of(robot: Robot, contacts: Sequence[GuessedContact]) -> RobotNames:
     """What the proposal of a map knows of the robot."""
-    on_base, elsewhere = ([name for name, (body, _) in robot.links.items() if bool(body) == x] for x in (False, True))
-    feet, weight = [contact.frame for contact in contacts], GRAVITY * float(robot.nominal[:, 0].sum())
-    known = robot.joint_names, feet, robot.path.stem, weight, robot.base_link, on_base, elsewhere, limb_sensors(robot)
-    moving = [body.joint.name for body in robot.bodies if body.joint is not None and body.joint.kind != "fixed"]
-    along = [link for link in on_base if is_along_base(robot, link)]
-    return KnownRobot(*known, along, robot.sliding, moving, _limbs(robot))
-
-
-def _limbs(robot: Robot) -> list[list[str]]:
-    """Independent joints along each part of the tree without branches."""
-    children, limb_of = Counter(body.parent for body in robot.bodies), dict[int, list[str]]()
-    for number, body in enumerate(robot.bodies):
-        own = limb_of.get(body.parent) if body.parent and children[body.parent] == 1 else None
-        limb_of[number] = [] if own is None else own
-        limb_of[number] += [body.joint.name] if body.joint and body.joint.name in robot.joint_names else []
-    return list({id(limb): limb for limb in limb_of.values() if limb}.values())
-
-
-def _add_imu_frame(robot: Robot, fields: set[str], proposal: MapProposal) -> None:
-    if not set(_IMU) & fields or "imu_frame" in fields:
-        return
-    if _IMU[0] in fields and _IMU[1] not in fields and (rate := proposal.columns.pop(_RATE, None)):
-        proposal.columns[_IMU[1]] = rate
-        fields ^= {_RATE, _IMU[1]}
-    if not set(_IMU) <= fields:  # one alone is of no use
-        for name in set(_IMU) & set(proposal.columns):
-            proposal.leave_out(name)
-            fields.discard(name)
-        return
-    named = [name for name, (body, _) in robot.links.items() if body == 0 and "imu" in name.lower()]
-    frame = min(named, key=len, default=robot.base_link)
-    proposal.columns = {"imu_frame": frame, **proposal.columns}
-    others = [name for name, (body, _) in robot.links.items() if body and "imu" in name.lower()]
-    moving = f"; not {join_names(others)}, beyond a joint" if others else ""
-    why = "from its name" if named else f"the base link, as no link of it is called imu{moving}"
-    proposal.notes["imu_frame"] = why
-    fields.add("imu_frame")
+    on_base = [name for name, (body, _) in robot.links.items() if not body]
+    return RobotNames(
+        joints=robot.joint_names,
+        feet=[contact.frame for contact in contacts],
+        name=robot.path.stem,
+        weight=GRAVITY * float(robot.nominal[:, 0].sum()),
+        base_link=robot.base_link,
+        on_base=on_base,
+        elsewhere=[name for name in robot.links if name not in on_base],
+        along_base=[link for link in on_base if is_along_base(robot, link)],
+        slides=robot.sliding,
+        limb_sensors=limb_sensors(robot),
+    )
 
 
 def _is_fixed(contacts: Sequence[GuessedContact], fields: set[str]) -> bool:
@@ -293,38 +266,29 @@ def _state_flags(robot: Robot, contacts: Sequence[GuessedContact], fields: set[s
         always = [contact.frame for contact in contacts]
         is_map = proposal.key == "columns"
         proposal.columns["contact_active"] = {"always": always} if is_map else dict.fromkeys(always, True)
-        proposal.notes["contact_active"] = "every foot touches throughout, as nothing recorded says otherwise"
+        proposal.assumed["contact_active"] = "every foot touches throughout, as nothing recorded says otherwise"
 
 
 def _describe(
     out: InitReport, robot: Robot, contacts: Sequence[GuessedContact], fields: set[str], proposal: MapProposal
 ) -> None:
-    """What was found, guessed and missed, in lines."""
-    what = proposal.key.removesuffix("s")
-    _describe_found(out, robot, contacts, fields, proposal)
-    out.guessed += [f"{key}: {note}" for key, note in proposal.notes.items()]
+    """What was found, assumed and missed, in lines."""
+    _describe_map(out, robot, contacts, fields, proposal)
     if contacts:
         balls = "; radius 0, as no orientation says where the ground is that balls roll on"
-        out.guessed.append(
+        out.assumed.append(
             "contacts: from names or balls of links; point where there is a ball or more than two"
             + balls * any(contact.radius == 0.0 for contact in contacts)
         )
     settings = [ContactConfig(x.frame, x.type, radius=AUTO if x.radius is None else x.radius) for x in contacts]
     rolling = resolve_contacts(settings, robot)[1]
-    out.guessed += [f"contacts: {rolling}"] * bool(rolling)
-    if _is_fixed(contacts, fields) and not robot.fixed_base and _HELD not in out.guessed:
-        out.guessed.append("robot.fixed_base: true, as there is neither a foot nor a motion of the base")
+    out.assumed += [f"contacts: {rolling}"] * bool(rolling)
+    if _is_fixed(contacts, fields) and not robot.fixed_base and _HELD not in out.assumed:
+        out.assumed.append("robot.fixed_base: true, as there is neither a foot nor a motion of the base")
     if held := held_joints(robot, proposal.lacking):
-        out.guessed.append(f"robot.weld: {_WELDED}: {join_names(held)}")
-    if proposal.left_out:
-        out.guessed.append(f"{format_count(len(proposal.left_out), what)} not needed: {join_names(proposal.left_out)}")
-    out.missing += missing_columns(len(robot.joint_names), fields, proposal.partial, what)
-    if not set(_FORCES) & fields:
-        out.missing.append("forces: neither joint torques nor contact wrenches")
+        out.assumed.append(f"robot.weld: {_WELDED}: {join_names(held)}")
     if not contacts and not robot.fixed_base and not _is_fixed(contacts, fields):
         out.missing.append(_NO_CONTACT)
-    out.missing += [*unreadable(proposal.not_numbers, fields)]
-    out.missing += hints(proposal.left_out, fields, robot.joint_names, what, proposal.like_torques)
     from_feet = _from_feet(robot, contacts, fields)
     if contacts and "contact_active" not in fields:
         instead = "detected from joint torques" if "detect_contacts" in from_feet else "set to touch throughout"
@@ -335,17 +299,26 @@ def _describe(
         out.missing.append(f"motion of the base: {lacks}{instead}")
 
 
-def _describe_found(
+def _describe_map(
     out: InitReport, robot: Robot, contacts: Sequence[GuessedContact], fields: set[str], proposal: MapProposal
 ) -> None:
     """The robot, and what of a map there is."""
     frames = join_names([contact.frame for contact in contacts])
     out.found.append(f"{len(robot.joint_names)} joints" + f", contacts {frames}" * bool(contacts))
-    no_fields = ("_order", "_name", "ignore", "episodes")
-    of_map = [name for name in proposal.columns if name in fields and not name.endswith(no_fields)]
-    known = list(proposal.columns) if proposal.key == "topics" else of_map
-    if known:
+    no_fields = ("_order", "_name", "ignore", "episodes", "rows_of")
+    if known := [x for x, entry in proposal.columns.items() if not x.endswith(no_fields) and FILL_IN not in str(entry)]:
         out.found.append(f"{proposal.key} of {', '.join(known)}")
+    open_keys = [key for key, entry in proposal.columns.items() if FILL_IN in str(entry)]
+    out.missing += [f"{key}: to be filled in, {proposal.assumed.get(key, FILL_IN)}" for key in open_keys]
+    out.assumed += [f"{key}: {note}" for key, note in proposal.assumed.items() if key not in open_keys]
+    if "ignore" in proposal.columns or (proposal.key == "topics" and proposal.listed):
+        what = f"{proposal.key} without an entry are listed in the file: {join_names(proposal.listed)}"
+        out.assumed.append(what)
+    if proposal.perhaps:
+        keys = join_names(list(dict.fromkeys(key for key, _, _ in proposal.perhaps)))
+        out.missing.append(f"{keys}: not sure, as comments in the file; take out the mark of what is right")
+    if not set(_FORCES) & fields and "joint_torque" not in open_keys:
+        out.missing.append("forces: neither joint torques nor contact wrenches")
 
 
 def _try(path: Path, proposal: MapProposal) -> list[Log] | InputError:
@@ -364,6 +337,8 @@ def _describe_log(out: InitReport, read: list[Log] | InputError, fields: set[str
         out.missing.append(
             f"the log is not read with this file yet: {read.field}: {read.found}; accepted: {read.accepted}"
         )
+        return
+    if not read:
         return
     recorded = {name: variant for variant, name in VARIANTS.items() if variant in fields}
     has = [recorded.get(name, name) for name, array in read[0].arrays().items() if array.size]
@@ -394,11 +369,12 @@ def _text(
     own |= {"fixed_base": True} if robot.fixed_base or _is_fixed(contacts, fields) else {}
     own |= {"weld": weld} if (weld := welded_at(robot, held_joints(robot, proposal.lacking))) else {}
     names = f"{excerpt(log.name)} and {excerpt(robot.path.name)}"
-    lines = [f"# {names}, by torchid init; what is marked as guessed should be checked"]
+    to_fill_in = f", fill in {FILL_IN}" * (FILL_IN in str(proposal.columns))
+    lines = [f"# {names}, by torchid init; check what is assumed{to_fill_in}"]
     lines += yaml_lines("robot", own)
-    lines += [f"  # guessed: weld: {_WELDED}"] * bool(weld)
+    lines += [f"  # assumed: weld: {_WELDED}"] * bool(weld)
     if contacts:
-        lines.append("contacts:  # guessed: from names of links")
+        lines.append("contacts:  # assumed: from names of links")
         lines += [f"  - {inline_yaml(contact.entry)}" for contact in contacts]
     name = _relative(log, output)
     train, test = ([""], []) if split_range(log).range is not None else (split.train, split.test)
@@ -407,15 +383,11 @@ def _text(
     if proposal.columns:
         lines.append(f"  {proposal.key}:  # {_WHAT[proposal.key]}")
         for key, value in proposal.columns.items():
-            note = proposal.notes.get(key, "")
-            lines += [f"    # guessed: {note}"] if note else []
+            note = proposal.assumed.get(key, "")
+            verb = "fill in" if FILL_IN in str(value) else "assumed"
+            lines += [f"    # {verb}: {note}"] if note else []
             lines += [f"    {line}" for line in yaml_lines(key, value)]
-        remark, entries = like_torques(proposal.like_torques)
-        lines += [
-            f"    # {line}"
-            for line in [remark, *(x for one in entries for x in yaml_lines("joint_torque", one))]
-            if line
-        ]
+    lines += _comments(proposal)
     lines += [f"# {' and '.join(from_feet)}: not recorded"] if from_feet else []
     lines += [f"# {key}: {why}" for key, (_, why) in gaps.items()]
     stated = {key: value for key, (value, _) in gaps.items()}
@@ -426,6 +398,26 @@ def _text(
     lines += yaml_lines("estimator", {"name": "consistent", "ridge": "auto", **known})
     lines += yaml_lines("output", f"runs/{output.stem}")
     return "\n".join(lines) + "\n"
+
+
+def _comments(proposal: MapProposal) -> list[str]:
+    """Entries that are not sure, and what has no entry, as comments."""
+    out = []
+    for key, entry, why in proposal.perhaps:
+        instead = f", in place of {FILL_IN}" * (key in proposal.columns)
+        out += wrap(f"perhaps{instead}, {why}:", _WIDTH, initial_indent="    # ", subsequent_indent="    # ")
+        out += [f"    # {line}" for line in yaml_lines(key, entry)]
+    if proposal.listed:
+        what = "columns" if proposal.key == "columns" else "topics"
+        where = ", which ignore leaves out" * ("ignore" in proposal.columns)
+        out.append(f"    # {what} without an entry{where}:")
+    for text in proposal.listed[:_LISTED]:
+        out += wrap(text, _WIDTH, initial_indent="    #   ", subsequent_indent="    #     ", break_on_hyphens=False)
+    more = len(proposal.listed) - _LISTED
+    out += [f"    #   and {more} more"] * (more > 0)
+    if proposal.hint:
+        out += wrap(proposal.hint, _WIDTH, initial_indent="    # ", subsequent_indent="    #   ")
+    return out
 
 
 def _relative(path: Path, output: Path) -> str:

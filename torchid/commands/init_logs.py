@@ -1,16 +1,24 @@
-"""How `torchid init` has a log used: its recordings, what is held back of them, gaps and samples."""
+"""How `torchid init` has a log used: files that are one log, its recordings, what is held back of them, and gaps."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
-from torchid.errors import InputError
+from torchid.errors import InputError, LogError, format_count, join_names
 from torchid.logs import Log
+from torchid.logs.column_entries import OF_FILE
+from torchid.logs.columns import is_column
+from torchid.logs.containers import ARRAYS, TABLES, list_bag_files
 from torchid.logs.cutoff import choose_cutoff
 from torchid.logs.low_pass import DROPPED_PERIODS
+from torchid.logs.name_matching import propose_field
+from torchid.logs.time_range import JOINED
+from torchid.proposals.samples import FileSample, increases, numbers_of, read_sample
 
 _MOTION = ("joint_position", "base_quat_xyzw", "base_position_world", *("imu_specific_force", "imu_angular_velocity"))
 _BRIDGED_S = 0.05
@@ -19,6 +27,60 @@ _MANY = 100_000
 """Samples that a fit works on for about a second; of more, no more are kept than a filter leaves information in."""
 _TESTED = 0.2  # of a log, or of its recordings
 _LEAST_TEST = 1.5  # of what a filter spoils at both ends: a third of a test is left
+_FILES = 64  # in a folder
+_AS_ONE = "numpy.savez('{0}.npz', **{{x.stem: numpy.load(x) for x in pathlib.Path('{0}').glob('*.npy')}})"
+
+
+def log_in_folder(path: Path) -> tuple[Path, list[str]]:
+    """The name of a log; of a folder of tables and arrays that of its files with stamps as one log, and a note.
+
+    The file with most stamps in the same time comes first, as its stamps are those of the log.
+
+    Raises:
+        LogError: a folder that has none, or too many files.
+    """
+    if not path.is_dir() or list_bag_files(path):
+        return path, []
+    files = sorted(file for file in path.iterdir() if file.suffix.lower() in (*TABLES, *ARRAYS) and file.is_file())
+    if len(files) > _FILES:
+        raise LogError(path, "file", f"a folder of {len(files)} logs", f"at most {_FILES}, the files of one log")
+    if (single := sorted(path.glob("*.npy"))) and not files:
+        found = f"{len(single)} arrays in files of their own, {join_names([file.name for file in single])}"
+        raise LogError(path, "file", found, f"one file of all: {_AS_ONE.format(path.name)}")
+    steps = {file: step for file in files if (step := _step_of(file)) is not None}
+    if not steps:
+        accepted = "a folder of tables or arrays that have stamps, or one recorded by ROS 2; or name the files of a log"
+        found = f"a folder, {format_count(len(files), 'log')} without stamps and fields"
+        raise LogError(path, "file", found, accepted)
+    used = sorted(steps, key=lambda file: steps[file])
+    others = [file.name for file in files if file not in steps]
+    note = f"logs: {format_count(len(used), 'file')} of the folder as one log, the fastest first"
+    note += f"; without {join_names(others)}, which have no stamps or no field" * bool(others)
+    return path / JOINED.join(file.name for file in used), [note]
+
+
+def _step_of(file: Path) -> float | None:
+    """The median step of a file's stamps, in their unit; None where it has none, or nothing else that is in a log."""
+    try:
+        sample = read_sample(file)
+    except InputError:
+        return None
+    stamps = [name for name, x in sample.items() if propose_field(name) == "time" and increases(x)]
+    if not stamps or not {propose_field(name) for name in sample} - {"", "time"}:
+        return None
+    return float(np.median(np.diff(numbers_of(sample, stamps[:1])[:, 0])))
+
+
+def named_apart(samples: Sequence[FileSample], files: Sequence[str]) -> list[FileSample]:
+    """Columns of several files, those that others have too with the name of the file before them, but for stamps."""
+    often = Counter(name for sample in samples for name in sample)
+    again = {name for name, n in often.items() if n > 1 and not is_column(name) and propose_field(name) != "time"}
+    if len(set(files)) < len(files):
+        return list(samples)
+    return [
+        {f"{file}{OF_FILE}{name}" if name in again else name: x for name, x in sample.items()}
+        for file, sample in zip(files, samples, strict=True)
+    ]
 
 
 @dataclass(frozen=True)
@@ -27,12 +89,12 @@ class Split:
 
     Attributes:
         train, test: its parts that are fitted and held back, as behind its name.
-        guessed, missing: why not, and what a filter leaves nothing of, in words; "" where all is as usual.
+        assumed, missing: why not, and what a filter leaves nothing of, in words; "" where all is as usual.
     """
 
     train: tuple[str, ...] = (f"[:{1.0 - _TESTED:.0%}]",)
     test: tuple[str, ...] = (f"[{1.0 - _TESTED:.0%}:]",)
-    guessed: str = ""
+    assumed: str = ""
     missing: str = ""
 
 
@@ -59,8 +121,8 @@ def split_logs(logs: Sequence[Log], base_is_derived: bool = False) -> Split:
         return Split()
     if length <= spoiled:
         return Split(("",), (), missing=f"motion: {length:.2g} s are too short for a fit{filtered}")
-    guessed = f"logs.test: none, as {length:.2g} s are too short for a part to be held back{filtered}"
-    return Split(("",), (), guessed)
+    assumed = f"logs.test: none, as {length:.2g} s are too short for a part to be held back{filtered}"
+    return Split(("",), (), assumed)
 
 
 def _split_recordings(lengths: Sequence[float], spoiled: float, filtered: str) -> Split:
@@ -69,16 +131,16 @@ def _split_recordings(lengths: Sequence[float], spoiled: float, filtered: str) -
     Those of which a filter leaves next to nothing are left out.
     """
     long = [number for number, length in enumerate(lengths) if length >= _LEAST_TEST * spoiled]
-    guessed = f"logs: {len(lengths)} recordings one after the other, as stamps begin anew"
+    assumed = f"logs: {len(lengths)} recordings one after the other, as stamps begin anew"
     if len(long) < len(lengths):
-        guessed += f"; {len(lengths) - len(long)} of them left out as too short{filtered}"
+        assumed += f"; {len(lengths) - len(long)} of them left out as too short{filtered}"
     if not long:
         text = f"motion: {len(lengths)} recordings of {max(lengths):.2g} s at most are too short for a fit{filtered}"
         return Split(_numbered(list(range(len(lengths)))), (), missing=text)
     held = max(1, round(_TESTED * len(long))) if len(long) > 1 else 0
     train, test = long[: len(long) - held], long[len(long) - held :]
-    guessed += f"; the last {held} held back as test" * (held > 1) + "; the last held back as test" * (held == 1)
-    return Split(_numbered(train), _numbered(test), guessed)
+    assumed += f"; the last {held} held back as test" * (held > 1) + "; the last held back as test" * (held == 1)
+    return Split(_numbered(train), _numbered(test), assumed)
 
 
 def _numbered(numbers: Sequence[int]) -> tuple[str, ...]:

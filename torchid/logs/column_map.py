@@ -43,6 +43,8 @@ from torchid.logs.unitree import order_by_name, require_joints_of, robot_with_or
 from torchid.logs.units import quantities_of, unit_factor
 from torchid.settings import STRICT, Name
 
+FILL_IN = "FILL_IN"
+"""What `torchid init` writes where a person has to say something."""
 _X = TypeVar("_X")
 _XYZ, _RPY = ("x", "y", "z"), ("roll", "pitch", "yaw")
 #: `{joint}`, `{index}`, `{index:02}`, `{axis}`, `{AXIS}`.
@@ -344,6 +346,9 @@ def _check_part(part: EntryPart) -> None:
         raise ConfigError.at_field(key, "column and columns together", "one of the two")
     _check_order(f"{key}.order", entry.order)
     for text in (entry.column, *entry.columns.values()):
+        if text == FILL_IN:
+            accepted = "a name of a column, or a pattern; torchid init lists what the file has below its map"
+            raise ConfigError.at_field(key, f"{FILL_IN}, which is to be filled in", accepted)
         _check_pattern(key, part, text or "")
     if entry.columns and part.components and not part.kind and set(entry.columns) != set(part.components):
         found = f"components {', '.join(entry.columns)}"

@@ -76,7 +76,8 @@ def read_header(path: Path) -> TextHeader:
 
     Names are in the first line with as many cells as the first row that is mostly numbers. Lines above are remarks, a
     line of units may follow, or more names where that line has some twice. A column without a name is called
-    `unnamed_0` by its place. In OpenSim's tables all that is below the line `endheader`.
+    `unnamed_0` by its place; where there is no line of names, all are called `column_0`, ... In OpenSim's tables all
+    that is below the line `endheader`.
 
     Raises:
         LogError: no names, or a line that is too long.
@@ -90,7 +91,9 @@ def read_header(path: Path) -> TextHeader:
     texts = [line.decode(encoding, "replace").removeprefix("\ufeff").rstrip("\r\n") for line in lines]
     row = next((number for number, text in enumerate(texts) if _is_row(text)), len(texts))
     named = _named(texts, row)
-    _require_names(path, lines, texts, named, row)
+    _require_names(path, lines, texts, named, row, is_opensim)
+    if named == row:
+        return _without_names(texts, row, above, b"".join(lines[row:]) + rest, encoding)
     first = next((number for number in range(named + 1, row) if not _COMMENT.match(texts[number])), min(row, named + 1))
     title = _COMMENT.sub("", texts[named])
     separator = _separator(path, title, "".join(texts[row : row + 1]), is_opensim)
@@ -142,15 +145,31 @@ def _opensim_lines(path: Path, stream: BinaryIO) -> tuple[int, bool]:
     raise LogError(path, "header", f"no line {_END}", f"OpenSim's lines up to {_END}, then the names of the columns")
 
 
-def _require_names(path: Path, lines: Sequence[bytes], texts: Sequence[str], named: int, row: int) -> None:
-    """LogError where the line with names, by its number and that of the first row, has none."""
+def _without_names(texts: Sequence[str], row: int, above: int, rows: bytes, encoding: str) -> TextHeader:
+    """The header of a table of numbers alone, whose columns are `column_0`, ... by their place.
+
+    A first line that counts the columns, as pandas writes it, is no row.
+    """
+    separator = _most_used(texts[row])
+    cells = [cell.strip() for cell in _cells(texts[row], separator)]
+    is_open = len(cells) > 1 and not cells[-1]
+    names = [f"column_{k}" for k in range(len(cells))]
+    counts = len(cells) > 1 and cells == [str(k) for k in range(len(cells))]
+    mark = "," if separator != "," and _DECIMAL_COMMA.search(rows) else "."
+    return TextHeader(names, above + row + counts, separator, mark, False, {}, (), is_open, False, encoding)
+
+
+def _require_names(
+    path: Path, lines: Sequence[bytes], texts: Sequence[str], named: int, row: int, is_opensim: bool
+) -> None:
+    """LogError where the line with names, by its number and that of the first row, has none that can be read."""
     if lines and any(b"\0" in line for line in lines[: row + 1]):
         lines[named].decode()  # raises of UTF-16
     if not lines or not texts[named].strip():
         raise LogError(path, "header", "an empty line", "the names of the columns")
     if len(lines[named]) == BLOCK:
         raise LogError(path, "header", f"a line of at least {BLOCK} bytes", "the names of the columns")
-    if named == row:
+    if named == row and is_opensim:
         raise LogError(path, "header", f"numbers, '{excerpt(texts[row])}'", "the names of the columns")
 
 

@@ -10,9 +10,7 @@ hold the messages' definitions.
 
 from __future__ import annotations
 
-import re
-from collections import defaultdict
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import ConfigError, LogError, format_count
-from torchid.logs.name_matching import KnownRobot
 from torchid.logs.quaternion import require_unit
 
 if TYPE_CHECKING:
@@ -100,50 +97,10 @@ def order_by_name(kind: str, order: object) -> object:
     return [*robot.joints, *[None] * (MOTORS[robot.message] - len(robot.joints))]
 
 
-def names_by_number(order: Sequence[str] | str) -> list[str]:
-    """Joints of an order that a map states, without those that the robot has not."""
-    return list(JOINT_ORDERS[order].names) if isinstance(order, str) else list(order)
-
-
 def suitable_orders(joints: Collection[str], robot: str = "") -> list[str]:
     """Robots whose joints a URDF has, those with most of them first, then one that a text names."""
     fitting = [name for name, order in JOINT_ORDERS.items() if set(order.names) <= set(joints)]
     return sorted(fitting, key=lambda name: (-len(JOINT_ORDERS[name].names), name not in robot))
-
-
-def usual_order(kind: str, robot: KnownRobot, count: int) -> tuple[list[str | None] | list[str] | str, str]:
-    """The order of numbers that joints or feet probably have, or the name of the robot that has it; and whose that is.
-
-    Args:
-        kind: joint or contact.
-        robot: whose names they are.
-        count: of the numbers.
-    """
-    names = robot.joints if kind == "joint" else robot.feet
-    if robot.simulated and count == len(names):
-        return list(names), "as in the robot's file, though some simulators sort joints by depth or by name"
-    for name in suitable_orders(robot.joints, robot.name) if kind == "joint" else ():
-        order = JOINT_ORDERS[name]
-        is_whole = set(order.names) == set(names) or count < len(names)
-        if is_whole and count >= len(order.joints):
-            return name, f"that of {name}, whose joints the robot has"
-    if kind == "joint" and count == len(robot.moving) > len(names):
-        return [x if x in names else None for x in robot.moving], "as in the robot's file, with those that mimic others"
-    if kind == "joint" and count < len(names):
-        return numbered_joints(names, count), "names that differ in a number"
-    is_alike = any("thigh" in joint or "calf" in joint for joint in robot.joints)
-    if names and is_alike and all(name.partition("_")[0] in _LEGS for name in names):
-        return sorted(names, key=lambda name: _LEGS.index(name.partition("_")[0])), "as Unitree numbers legs"
-    return list(names), "as in the robot's file"
-
-
-def numbered_joints(joints: Sequence[str], count: int) -> list[str]:
-    """Joints whose names differ in a number alone, if that are so many; all but those of hands likewise; else none."""
-    alike = defaultdict[str, list[str]](list)
-    for name in joints:
-        alike[re.sub(r"\d+", "#", name)].append(name)
-    without = [name for name in joints if not re.search(r"finger|gripper|hand|thumb", name, re.IGNORECASE)]
-    return next((names for names in (*alike.values(), without) if len(names) == count), [])
 
 
 def require_joints_of(field: str, robot: str, joints: Collection[str]) -> None:

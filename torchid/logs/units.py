@@ -44,8 +44,8 @@ _SPELLINGS = {
     "°": "deg", "µ": "u", "μ": "u", "²": "2", "⁻": "-", "kgf": "kg", "radians": "rad", "milliseconds": "ms",
     "microseconds": "us", "nanoseconds": "ns", "seconds": "s", "sec": "s", "dps": "deg/s",
 }  # fmt: skip
-_DEGREES = re.compile(r"(?<![A-Za-z])([Dd]egrees?|[Dd]egrés|[Gg]ra(dos|di|us)|Grad)(?![A-Za-z])")  # 1 grad is 0.9
-_PER_MINUTE = re.compile(r"(U|r|tr|giri|1) ?/ ?min", re.IGNORECASE)
+_DEGREES = re.compile(r"(?<![A-Za-z])[Dd]egrees?(?![A-Za-z])")
+_PER_MINUTE = re.compile(r"(r|1) ?/ ?min", re.IGNORECASE)
 _MARKS = re.compile(r"[ ·.*^]")
 _POWERS = {"s-1": "/s", "s-2": "/s2", "/s/s": "/s2", "N-m": "Nm", "nm": "Nm"}
 _BRACKETS = re.compile(r"(.*?)\s*(?:\[([^\[\]{}]*)\]|\(([^(){}]*)\))\s*")

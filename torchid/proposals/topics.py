@@ -1,30 +1,34 @@
-"""A proposed map of the topics of a bag, from their types, names and some of their messages."""
+"""A map of the topics of a bag, by their types, exact names and frames; what is not sure is listed for a person."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from torchid.errors import format_count
+from torchid.errors import join_names
+from torchid.logs.column_map import FILL_IN
 from torchid.logs.log import NORM_TOLERANCE
-from torchid.logs.name_matching import KnownRobot, is_desired, match_joints, match_names, spelled
+from torchid.logs.name_matching import is_measured, words_of
 from torchid.logs.ros_messages import ContactFlag, Imu, JointStates, NormalForce, Odometry, Wrench
-from torchid.logs.unitree import JOINT_ORDERS, LowState, suitable_orders, usual_order
-from torchid.proposals.column_groups import MapProposal
-from torchid.proposals.file_samples import TopicSample
-from torchid.proposals.numbers import threshold
+from torchid.logs.unitree import JOINT_ORDERS, LowState, suitable_orders
+from torchid.proposals.columns import MapProposal
+from torchid.proposals.names import RobotNames, exchange_affixes, find_spelling, within
+from torchid.proposals.samples import TopicSample
+from torchid.rounding import STD_PER_MAD
 
 _DECODERS = (JointStates, LowState, Imu, Odometry, Wrench, NormalForce, ContactFlag)
 USED_TYPES: frozenset[str] = frozenset(name for decoder in _DECODERS for name in decoder.types)
 """Types of messages that a map of topics may have."""
 
-_EFFORT = {"velocity": "joint_velocity", "effort": "joint_torque"}
 _LOW_RATE = "/lf/"
+_AIR = 0.1  # of the way from the lowest to the highest reading: of a foot in the air
+_SHARES = (0.05, 0.2)  # of that way, a threshold of contact: least and most
+_NOISE = 4.0  # standard deviations of readings in the air that it is above them
 
 
-def propose_topics(sample: Mapping[str, TopicSample], robot: KnownRobot) -> MapProposal:
+def propose_topics(sample: Mapping[str, TopicSample], robot: RobotNames) -> MapProposal:
     """Sort the topics of a bag into `logs.topics`.
 
     Args:
@@ -34,12 +38,8 @@ def propose_topics(sample: Mapping[str, TopicSample], robot: KnownRobot) -> MapP
     return _Proposer(sample, robot).propose()
 
 
-_Joints = tuple[str, list[str], list[str]]
-"""Topic, names of joints in some of its messages, and fields of a log that these give beside positions."""
-
-
 class _Proposer:
-    def __init__(self, topics: Mapping[str, TopicSample], robot: KnownRobot) -> None:
+    def __init__(self, topics: Mapping[str, TopicSample], robot: RobotNames) -> None:
         self.topics, self.robot = topics, robot
         self.out = MapProposal(key="topics")
         self.used: set[str] = set()
@@ -48,32 +48,38 @@ class _Proposer:
     def propose(self) -> MapProposal:
         self._place_joints()
         self._place_imu()
-        self._place_low_state()
+        if "joint_states" not in self.out.columns:
+            self._place_low_state()
         if not {"joint_states", "low_state"} & set(self.out.columns):
-            self.out.columns = {"joint_states": "TOPIC", **self.out.columns}
-            states = next(
-                (f"; {name} is a LowState, but of another robot than the URDF" for name in self._of(LowState.types)), ""
-            )
-            self.out.notes["joint_states"] = (
-                f"nothing, as no topic has the robot's joints{states}: name one in place of TOPIC"
-            )
+            self.out.columns = {"joint_states": FILL_IN, **self.out.columns}
+            self.out.fields |= {"time", "joint_position", "joint_torque"}
+            self.out.hint = f"joints of the robot: {', '.join(self.robot.joints)}"
+            self.out.assumed["joint_states"] = "a topic below: {topic: /NAME, names: {its joint: the robot's, ...}}"
         self._place_odometry()
-        self._add_orientation()
+        self._place_orientation()
         self._place_limb_sensors()
-        self._place_by_contact(Wrench, "contact_wrenches", frame_of, "contact_wrench_local")
-        self._place_by_contact(NormalForce, "contact_force_normal", lambda _: "", "contact_force_normal")
-        self._place_arrays()
-        self._place_by_contact(ContactFlag, "contact_active", lambda _: "", "contact_active")
+        self._place_by_contact("contact_wrenches", Wrench.types, "contact_wrench_local")
+        self._place_by_contact("contact_force_normal", NormalForce.numbers, "contact_force_normal")
+        self._place_by_contact("contact_active", ContactFlag.types, "contact_active")
         self._complete_flags()
-        self.out.left_out = [f"{name} ({topic.type})" for name, topic in self.topics.items() if name not in self.used]
+        self.out.listed = [self._line(name) for name in self.topics if name not in self.used]
         return self.out
+
+    def _line(self, name: str) -> str:
+        """A topic, its type and what its messages are of, in words."""
+        topic, more = self.topics[name], ""
+        if topic.type in JointStates.types and topic.messages:
+            more = f": joints {join_names(list(topic.messages[0].name))}"
+        elif frame := frame_of(topic):
+            more = f": of {frame}"
+        return f"{name} ({topic.type}){more}"
 
     def _of(self, types: Sequence[str]) -> dict[str, TopicSample]:
         """Topics with messages of some types that hold what was measured, those with most messages first."""
         fitting = {
             name: topic
             for name, topic in self.topics.items()
-            if topic.type in types and topic.messages and name not in self.used and not is_desired(name)
+            if topic.type in types and topic.messages and name not in self.used and is_measured(words_of(name))
         }
         return dict(sorted(fitting.items(), key=lambda pair: (_LOW_RATE in pair[0], -pair[1].count)))
 
@@ -85,85 +91,68 @@ class _Proposer:
     # --------------------------------------------------------------------------------------------------- joints, base
 
     def _place_joints(self) -> None:
-        """Joint states with most of the robot's joints, then most of their efforts, then others; the rest is welded."""
-        sources, found = self._joint_sources(), list[tuple[str, dict[str, Any]]]()
-        placed, fields = set[str](), set[str]()
-        while (best := self._best_joints(sources, placed)) is not None:
-            name, _, parts = source = best
-            matched = self._joints_in(source, placed)
-            found.append((name, self._joint_entry(source, matched, [x for x in sources if x[0] == name])))
-            placed |= set(matched.values())
-            fields |= set(parts)
-        if not found:
+        """Joint states with most of the robot's joints first, then those of others; the rest is welded."""
+        placed, entries = set[str](), list[tuple[str, dict[str, Any]]]()
+        sources = dict[tuple[str, tuple[str, ...]], Any]()
+        for name, topic in self._of(JointStates.types).items():
+            for message in topic.messages[:50]:
+                sources.setdefault((name, tuple(message.name)), message)
+        while sources:
+            fresh = {
+                key: {text: x for text, x in exchange_affixes(key[1], self.robot.joints).items() if x not in placed}
+                for key in sources
+            }
+            best = max(fresh, key=lambda key: (len(fresh[key]), len(sources[key].effort)))
+            if not fresh[best]:
+                break
+            several = len({names for name, names in sources if name == best[0]}) > 1 or bool(entries)
+            entries.append((best[0], self._joint_entry(best, fresh[best], several)))
+            placed |= set(fresh[best].values())
+            message = sources.pop(best)
+            self.out.fields |= {"joint_velocity"} if len(message.velocity) else set()
+            self.out.fields |= {"joint_torque"} if len(message.effort) else set()
+        if not entries:
             return
-        complete = {"joint_position"} if self._has_most(placed) else set()
-        self.out.lacking = [x for x in self.robot.joints if complete and x not in placed]
-        (topic, first), *others = found
-        self._add("joint_states", topic, first, *complete, *fields)
+        self.out.lacking = [x for x in self.robot.joints if x not in placed]
+        (chosen, first), *others = entries
+        self._add("joint_states", chosen, first, "joint_position")
         if others:
             self.out.columns["other_joint_states"] = [entry if len(entry) > 1 else name for name, entry in others]
-            self.out.notes["other_joint_states"] = "joints that the messages of joint_states lack"
+            self.out.assumed["other_joint_states"] = "joints that the messages of joint_states lack"
             self.used |= {name for name, _ in others}
 
-    def _joint_sources(self) -> list[_Joints]:
-        """Topics of joint states with the joints of their messages, each set of these for itself, and their fields."""
-        out = dict[tuple[str, tuple[str, ...]], _Joints]()
-        for topic, sample in self._of(JointStates.types).items():
-            for message in sample.messages[:50]:
-                fields = [field for part, field in _EFFORT.items() if len(getattr(message, part))]
-                out.setdefault((topic, tuple(sorted(message.name))), (topic, list(message.name), fields))
-        return list(out.values())
-
-    def _joints_in(self, source: _Joints, placed: Collection[str]) -> dict[str, str]:
-        """Joints of the robot that no other source has, by their names in one."""
-        every = match_joints(source[1], self.robot.joints)
-        is_ours = set(self.robot.joints) & set(source[1]) or self._has_most(every.values())
-        return {text: joint for text, joint in every.items() if is_ours and joint not in placed}
-
-    def _best_joints(self, sources: Sequence[_Joints], placed: Collection[str]) -> _Joints | None:
-        """The source with most joints that none has yet."""
-        scores = [len(self._joints_in(x, placed)) + 0.1 * len(x[2]) for x in sources if self._joints_in(x, placed)]
-        left = [x for x in sources if self._joints_in(x, placed)]
-        return left[scores.index(max(scores))] if left else None
-
-    def _joint_entry(self, source: _Joints, matched: Mapping[str, str], of_topic: Sequence[_Joints]) -> dict[str, Any]:
-        """The entry of some joints by their names in the messages of a topic, with notes; `of_topic`: its sources."""
-        topic, named, _ = source
+    def _joint_entry(
+        self, source: tuple[str, tuple[str, ...]], matched: Mapping[str, str], several: bool
+    ) -> dict[str, Any]:
+        topic, named = source
         entry: dict[str, Any] = {"topic": topic}
-        notes = list[str]()
-        if len(named) > len(matched):
-            notes.append(f"those of the robot among the {len(named)} joints of its messages")
-        if len(named) > len(matched) or len(of_topic) > 1:
+        if len(named) > len(matched) or several:
             entry["joints"] = [joint for joint in self.robot.joints if joint in matched.values()]
         if called := {text: joint for text, joint in matched.items() if text != joint}:
             entry["names"] = called
-            notes.append(f"names of {format_count(len(called), 'joint')}, which the messages spell otherwise")
-        if notes:
-            self.out.notes.setdefault("joint_states", "; ".join(notes))
+            self.out.assumed.setdefault("joint_states", "one prefix or suffix of the names for another")
         return entry
-
-    def _has_most(self, matched: Collection[str]) -> bool:
-        """Whether most of the robot's joints are among some."""
-        return 2 * len(matched) >= max(len(self.robot.joints), 1)
 
     def _place_low_state(self) -> None:
         """The state of a robot of Unitree, if the URDF has its joints."""
-        if "joint_states" in self.out.columns:
-            return
         for name, topic in self._of(LowState.types).items():
-            robot = self._robot_of(topic)
-            if not robot:
+            if not (robot := self._robot_of(topic)):
                 continue
             entry: dict[str, Any] = {"topic": name, "robot": robot}
             same = [x for x in JOINT_ORDERS if JOINT_ORDERS[x] == JOINT_ORDERS[robot]]
             alike = f"; {', '.join(same)} have one order" if len(same) > 1 else ""
-            self.out.notes["low_state"] = f"{robot}, as the robot's file has its joints{alike}"
+            self.out.assumed["low_state"] = f"{robot}, as the robot's file has its joints{alike}"
             self._add("low_state", name, entry, "joint_position", "joint_velocity", "joint_torque")
             if "imu" not in self.out.columns:
-                entry["frame"] = self._imu_frame()
+                entry["frame"], _ = self.robot.imu_frame()
                 self.out.fields |= {"imu_specific_force", "imu_angular_velocity"}
-                self.out.notes["low_state"] += f"; its IMU at {entry['frame']}"
-            self._add_feet(robot, topic, entry)
+                self.out.assumed["low_state"] += f"; its IMU at {entry['frame']}"
+            feet = JOINT_ORDERS[robot].feet
+            readings = np.array([message.foot_force for message in topic.messages]) if feet else np.zeros(1)
+            if set(feet) == set(self.robot.feet) and np.ptp(readings) > 0:
+                entry["above"] = threshold(readings)
+                self.out.fields.add("contact_active")
+                self.out.assumed["low_state"] += "; above, from the range of the readings"
             return
 
     def _robot_of(self, topic: TopicSample) -> str:
@@ -177,54 +166,40 @@ class _Proposer:
                 return robot
         return ""
 
-    def _add_feet(self, robot: str, topic: TopicSample, entry: dict[str, Any]) -> None:
-        """A threshold of the foot sensors, where they read something."""
-        feet = JOINT_ORDERS[robot].feet
-        readings = np.array([message.foot_force for message in topic.messages]) if feet else np.zeros(1)
-        if set(feet) == set(self.robot.feet) and np.ptp(readings) > 0:
-            entry["above"] = threshold(readings)
-            self.out.fields.add("contact_active")
-            self.out.notes["low_state"] += "; above, from the range of the readings"
-
-    def _imu_frame(self) -> str:
-        """The link of the base that is called IMU, else the base link."""
-        named = [name for name in self.robot.on_base if "imu" in name.lower()]
-        return min(named, key=len, default=self.robot.base_link)
-
     def _place_imu(self) -> None:
         """The IMU whose frame is on the base, else the first that is not said to be of something else."""
-        found = {name: frame_of(topic) for name, topic in self._of(Imu.types).items()}
-        found = {name: frame for name, frame in found.items() if frame not in self.robot.elsewhere}
-        on_base = [name for name, frame in found.items() if frame in self.robot.on_base]
-        if on_base:
-            named = [name for name in on_base if "imu" in name.lower() or "imu" in found[name].lower()]
-            name = (named or on_base)[0]
-            self._add("imu", name, {"topic": name, "frame": found[name]}, "imu_specific_force", "imu_angular_velocity")
-        elif found:
-            name, frame = next(iter(found)), self._imu_frame()
-            stated = f"'{found[name]}', which is no link of the base" if found[name] else "no frame_id"
-            self.out.notes["imu"] = f"its frame, as the messages have {stated}"
-            self._add("imu", name, {"topic": name, "frame": frame}, "imu_specific_force", "imu_angular_velocity")
+        frames = {name: frame_of(topic) for name, topic in self._of(Imu.types).items()}
+        frames = {name: frame for name, frame in frames.items() if frame not in self.robot.elsewhere}
+        on_base = [name for name, frame in frames.items() if frame in self.robot.on_base]
+        if not frames:
+            return
+        named = [name for name in on_base if "imu" in f"{name} {frames[name]}".lower()]
+        name = (named or on_base or list(frames))[0]
+        frame = frames[name]
+        if not on_base:
+            stated = f"'{frame}', which is no link of the base" if frame else "no frame_id"
+            self.out.assumed["imu"] = f"its frame, as the messages have {stated}"
+            frame, _ = self.robot.imu_frame()
+        self._add("imu", name, {"topic": name, "frame": frame}, "imu_specific_force", "imu_angular_velocity")
 
     def _place_odometry(self) -> None:
         """The pose of the base link, or of what its frame is called."""
-        found = {name: frame_of(topic) for name, topic in self._of(Odometry.types).items()}
-        ours = [name for name, frame in found.items() if frame in (self.robot.base_link, "")]
-        if not found:
+        frames = {name: frame_of(topic) for name, topic in self._of(Odometry.types).items()}
+        if not frames:
             return
-        name = (ours or list(found))[0]
+        ours = [name for name, frame in frames.items() if frame in (self.robot.base_link, "")]
+        name = (ours or list(frames))[0]
         entry: dict[str, Any] = {"topic": name}
-        if found[name] == self.robot.base_link:
-            entry["frame"] = found[name]
-        elif found[name]:
-            self.out.notes["odometry"] = f"of '{found[name]}', taken to be the base link"
-        twists = np.array([_twist(message) for message in self.topics[name].messages])
-        fields = ["base_position_world", "base_quat_xyzw"]
-        if not twists.any():
+        if frames[name] == self.robot.base_link:
+            entry["frame"] = frames[name]
+        elif frames[name]:
+            self.out.assumed["odometry"] = f"of '{frames[name]}', taken to be the base link"
+        twists = [message.twist.twist for message in self.topics[name].messages]
+        if not any(getattr(part, axis) for twist in twists for part in (twist.linear, twist.angular) for axis in "xyz"):
             entry["twist"] = "none"
-        self._add("odometry", name, entry, *fields)
+        self._add("odometry", name, entry, "base_position_world", "base_quat_xyzw")
 
-    def _add_orientation(self) -> None:
+    def _place_orientation(self) -> None:
         """That of the IMU, where nothing else says how the base is turned and messages do."""
         entry = self.out.columns.get("imu", {})
         if "base_quat_xyzw" in self.out.fields or entry.get("frame") not in self.robot.along_base:
@@ -236,7 +211,7 @@ class _Proposer:
             entry["orientation"] = True
             self.out.fields.add("base_quat_xyzw")
             what = "orientation: the IMU's, an estimate of its own, is that of the base"
-            self.out.notes["imu"] = "; ".join(filter(None, (self.out.notes.get("imu"), what)))
+            self.out.assumed["imu"] = "; ".join(filter(None, (self.out.assumed.get("imu"), what)))
 
     # ----------------------------------------------------------------------------------------------- limbs, contacts
 
@@ -245,56 +220,39 @@ class _Proposer:
         entries: dict[str, Any] = {}
         for name, topic in self._of(Wrench.types).items():
             frame = frame_of(topic)
-            texts = {joint: (joint.removesuffix("_joint"), child) for joint, child in self.robot.limb_sensors.items()}
-            exact = [joint for joint, child in self.robot.limb_sensors.items() if child == frame]
-            named = [joint for joint in texts if any(spelled(x).search(f"{frame} {name}") for x in texts[joint])]
-            found = [joint for joint in exact or named if joint not in entries]
-            if frame in self.robot.feet or len(found) != 1:
+            if frame in self.robot.feet:
                 continue
-            entries[found[0]] = {"topic": name, "frame": frame} if exact else name
-            self.used.add(name)
+            sensors = {joint: child for joint, child in self.robot.limb_sensors.items() if joint not in entries}
+            exact = [joint for joint, child in sensors.items() if child == frame]
+            texts = {joint: (joint.removesuffix("_joint"), child) for joint, child in sensors.items()}
+            named = [joint for joint in texts if any(within(x).search(name) for x in texts[joint])]
+            if len(joints := exact or named) == 1:
+                entries[joints[0]] = {"topic": name, "frame": frame} if exact else name
+                self.used.add(name)
         if entries:
             self.out.columns["ft_wrenches"] = entries
-            self.out.notes["ft_wrenches"] = "by names; what the parent side exerts on the child side, else sign: -1"
+            self.out.assumed["ft_wrenches"] = "what the parent side exerts on the child side, else sign: -1"
             self.out.fields.add("ft_wrench")
 
-    def _place_by_contact(self, decoder: Any, key: str, frame_of: Callable[[TopicSample], str], field: str) -> None:
-        """Topics of a type that names of contacts stand in, or in their frames."""
-        types = decoder.numbers if decoder is NormalForce else decoder.types
+    def _place_by_contact(self, key: str, types: Sequence[str], field: str) -> None:
+        """Topics of some types whose frames are contacts, or that name these."""
         topics = self._of(types)
-        texts = {f"{frame_of(topic)} {name}".strip(): name for name, topic in topics.items()}
-        matched = match_names(list(texts), self.robot.feet, "contact")
-        if not matched:
-            return
-        entries = {}
-        for text, foot in sorted(matched.items(), key=lambda pair: self.robot.feet.index(pair[1])):
-            name = texts[text]
-            frame = frame_of(topics[name])
-            entries[foot] = name
-            if frame not in ("", foot):
-                self.out.notes[key] = "by names; frames of messages are others, taken to be those of the contacts"
-            self.used.add(name)
-            if decoder is not ContactFlag:
-                self.readings += [_reading(message) for message in topics[name].messages]
-        self.out.columns[key] = entries
-        self.out.notes.setdefault(key, "by names" + "; in N" * (decoder is NormalForce))
-        self.out.fields.add(field)
-
-    def _place_arrays(self) -> None:
-        """An array with a number for each foot."""
-        feet = list(self.robot.feet)
-        for name, topic in self._of(NormalForce.arrays).items():
-            lengths = {len(message.data) for message in topic.messages}
-            if lengths != {len(feet)} or not feet or "contact_force_normal" in self.out.columns:
+        spelling = find_spelling([f"{name} {frame_of(topic)}" for name, topic in topics.items()], self.robot.feet)
+        entries = dict[str, str]()
+        for name, topic in topics.items():
+            frame = frame_of(topic)
+            stems = [x for x in spelling.names if within(x).search(name)]
+            foot = frame if frame in self.robot.feet else spelling.names[max(stems, key=len)] if stems else ""
+            if not foot or foot in entries:
                 continue
-            order, how = usual_order("contact", self.robot, len(feet))
-            self.out.columns["contact_force_normal"] = {
-                foot: {"topic": name, "index": index} for index, foot in enumerate(order)
-            }
-            self.out.notes["contact_force_normal"] = f"in N; order {how}; compare it with the manual of the robot"
-            self.out.fields.add("contact_force_normal")
+            entries[foot] = name
             self.used.add(name)
-            self.readings += [float(x) for message in topic.messages for x in message.data]
+            if frame not in ("", foot):
+                self.out.assumed[key] = "frames of messages are others, taken to be those of the contacts"
+            self.readings += [_reading(message) for message in topic.messages if key != "contact_active"]
+        if entries:
+            self.out.columns[key] = {foot: entries[foot] for foot in self.robot.feet if foot in entries}
+            self.out.fields.add(field)
 
     def _complete_flags(self) -> None:
         """Say of every contact when it touches, if something is said of any."""
@@ -305,13 +263,36 @@ class _Proposer:
             flagged |= set(self.robot.feet)
         if read - flagged:
             columns["contact_force_threshold"] = max(threshold(np.abs(self.readings)), 1e-3)
-            self.out.notes["contact_force_threshold"] = "from the range of the readings"
+            self.out.assumed["contact_force_threshold"] = "from the range of the readings"
         unsaid = [foot for foot in self.robot.feet if foot not in read | flagged]
         if unsaid and (read or flagged):
             columns["contact_active"] = columns.get("contact_active", {}) | dict.fromkeys(unsaid, True)
-            self.out.notes["contact_active"] = f"{', '.join(unsaid)} touching throughout, as no topic says otherwise"
+            self.out.assumed["contact_active"] = f"{', '.join(unsaid)} touching throughout, as no topic says otherwise"
         if read or flagged:
             self.out.fields.add("contact_active")
+
+
+def threshold(readings: Any) -> float:
+    """A reading above which a contact is probably active, in two digits.
+
+    As low as the readings in the air allow: a foot that is taken to be in the air while it carries some weight
+    falsifies the fit, one that is taken to stand in the air costs samples only.
+
+    Args:
+        readings: (N, C) of the sensors of C contacts, or all of them.
+    """
+    values = np.asarray(readings, dtype=float)
+    if not np.isfinite(values).any():
+        return 0.0
+    low, high = np.percentile(values[np.isfinite(values)], (2, 98))
+    least, most = (low + share * (high - low) for share in _SHARES)
+    above = [least]
+    for column in values.reshape(len(values), -1).T if values.ndim > 1 else [values]:
+        air = column[column < low + _AIR * (high - low)]
+        if len(air):  # its median, as a foot that lands or lifts off passes through
+            middle = np.median(air)
+            above.append(float(middle + _NOISE * STD_PER_MAD * np.median(np.abs(air - middle))))
+    return float(f"{min(max(above), most):.2g}")
 
 
 def frame_of(topic: TopicSample) -> str:
@@ -319,11 +300,6 @@ def frame_of(topic: TopicSample) -> str:
     message = topic.messages[0] if topic.messages else None
     frame = getattr(message, "child_frame_id", "") or getattr(getattr(message, "header", None), "frame_id", "")
     return str(frame).removeprefix("/")
-
-
-def _twist(message: Any) -> list[float]:
-    twist = message.twist.twist
-    return [getattr(part, axis) for part in (twist.linear, twist.angular) for axis in "xyz"]
 
 
 def _reading(message: Any) -> float:

@@ -1,23 +1,22 @@
-"""What `torchid init` proposes for contacts and sensors, with hints at what it did not find."""
+"""What `torchid init` proposes for the contacts, welds and sensors of a robot, by names in its file and in the log."""
 
 from __future__ import annotations
 
 import math
 import re
 import warnings
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
-from torchid.errors import InputError, TorchidWarning, excerpt, format_count, join_names
+from torchid.errors import InputError, TorchidWarning
 from torchid.logs import Log
 from torchid.logs.log import FORCE_NORMAL, WRENCHES
-from torchid.logs.name_matching import OF_PLATES, is_current, is_desired, propose_field, within
 from torchid.parameters import WRENCH_COMPONENTS
-from torchid.proposals.column_groups import Family
-from torchid.proposals.file_samples import FileSample, stated_names
+from torchid.proposals.names import within
+from torchid.proposals.samples import FileSample, stated_names
 from torchid.robot import CollisionShapes, Robot, load_robot
 from torchid.robot.urdf import fixed_joints, position_limits
 
@@ -44,7 +43,7 @@ class GuessedContact:
         return {key: value for key, value in vars(self).items() if value is not None}
 
 
-def stated_contacts(sample: Any, robot: Robot) -> list[str]:
+def stated_contacts(sample: FileSample, robot: Robot) -> list[str]:
     """Contacts that a log in the format names, as far as the robot has them."""
     names = stated_names(sample, "contact_names")
     names += [name.split(".")[1] for name in sample if re.fullmatch(r"contact_active\.[^.]+", name)]
@@ -181,130 +180,3 @@ def proposed_sensors(
     if not limbs:
         return named
     return of_limbs | ({"set": named} if wrench or torque else {})
-
-
-_LIKE_TORQUES = "of these no name says what they are; uncomment one of torques [N m]"
-_LIKE_CURRENTS = (
-    'currents of motors: put in N m/A for KT and gears for GEAR, numbers, or by joint {"*": 9, "*_knee": 12}'
-)
-
-
-def like_torques(families: Sequence[Family]) -> tuple[str, list[dict[str, object]]]:
-    """What to do with columns that may be torques, or currents of motors, "" without any; and entries of these."""
-    currents = any(family.is_current for family in families)
-    entries = [family.counted_entry for family in families]
-    if currents:
-        for entry, family in zip(entries, families, strict=True):
-            entry |= {"unit": family.unit} if family.unit not in ("", "A") else {}
-            entry |= {"torque_constant": "KT", "gear_ratio": "GEAR"}
-        entries = [{"current": entry} for entry in entries]
-    return (_LIKE_CURRENTS if currents else _LIKE_TORQUES if families else ""), entries
-
-
-# ---------------------------------------------------------------------------------------------------------------- hints
-
-_OTHER_FILE = "; if another file has it: torchid init ROBOT 'FILE + FILE@SECONDS', docs/logs.md"
-_LIMB_SENSOR = re.compile(r"(?<![a-z])(ft|loadcell|load_cell)(?![a-z]).*[xyz]$|(?<![a-z])fts?(?![a-z])", re.IGNORECASE)
-_EULER = re.compile(r"(?<![a-z])(roll|pitch|yaw|rpy|euler)(?![a-z])", re.IGNORECASE)
-_AS_ANGLES = "base_quat_wxyz: {rpy: ...}"
-_STEP = re.compile(r"(dt|time_?step|sample_?rate|fps|rate_?hz|freq\w*)", re.IGNORECASE)
-
-
-def missing_columns(joints: int, fields: Collection[str], partial: Mapping[str, Sequence[str]], what: str) -> list[str]:
-    """What stamps and fields of joints lack, in words.
-
-    Args:
-        joints: how many the robot has.
-        fields: of the log.
-        partial: by field, joints that have columns of other fields alone.
-        what: column or topic.
-    """
-    partial = {name: of for name, of in partial.items() if name not in fields}
-    out = [f"{name}: no {what} of numbers of {join_names(of)}, but of all others" for name, of in partial.items()]
-    for name in ("time", "joint_position") if joints else ("time",):
-        if name not in {*fields, *partial}:
-            of_joints = f", of most of {joints} joints" * (name != "time")
-            out.append(f"{name}: no {what}s that look like it{of_joints}{_OTHER_FILE * (what == 'column')}")
-    return out
-
-
-def hints(
-    left_out: Sequence[str], fields: Collection[str], joints: Sequence[str], what: str, like_torques: Sequence[Family]
-) -> list[str]:
-    """What columns or topics that are left out may hold of the fields that are missing.
-
-    Args:
-        left_out: their names.
-        fields: of the log.
-        joints: of the robot.
-        what: column or topic.
-        like_torques: columns of which there is one for each joint.
-    """
-    out = []
-    measured = [name for name in left_out if not is_desired(name)]
-    if plates := [name for name in left_out if propose_field(name) in OF_PLATES]:
-        unknown = "without which foot stands on which and where each lies (docs/tables.md, Force plates)"
-        out.append(f"contact_wrench_world: {join_names(plates)} may be readings of force plates, {unknown}")
-    positions = [name for name in measured if propose_field(name) == "joint_position"]
-    if joints and "joint_position" not in fields and len(positions) > 2:
-        names = f"those of this robot are {join_names(joints)}"
-        out.append(
-            f"joint_position: {format_count(len(positions), what)} like '{excerpt(positions[0])}' may be of other"
-            f" joints; {names}: is it the one that was recorded?"
-        )
-    out += _torque_hint([] if "joint_torque" in fields else measured, what, like_torques)
-    if not {"ft_wrench", *WRENCHES} & set(fields) and (sensors := [x for x in measured if _LIMB_SENSOR.search(x)]):
-        where = "contact_wrench_local of the foot's frame, or ft_wrench of a fixed joint in the limb"
-        out.append(f"forces at the feet: {_like(sensors)} may be force/torque sensors: {where} (docs/sensors.md)")
-    if "time" not in fields and (steps := [name for name in left_out if _STEP.fullmatch(name)]):
-        out.append(f"time: '{steps[0]}' may be the step or the rate of the stamps, which have to be in the file")
-    if not {"base_quat_wxyz", "base_quat_xyzw"} & set(fields) and (angles := [x for x in measured if _EULER.search(x)]):
-        out.append(f"base_quat: {_like(angles)} may be angles of the base; give all three as {_AS_ANGLES}")
-    return out
-
-
-def unreadable(not_numbers: Sequence[str], fields: Collection[str]) -> list[str]:
-    """Columns that are called like fields that are missing, and are no numbers."""
-    named: dict[str, list[str]] = {}
-    for name in not_numbers:
-        if (field := propose_field(name)) not in ("", *fields):
-            named.setdefault(field, []).append(name)
-    why = "by name, but no numbers: text, or lists of several lengths"
-    return [f"{field}: {_like(names)} {why}" for field, names in named.items()]
-
-
-def _torque_hint(measured: Sequence[str], what: str, like_torques: Sequence[Family]) -> list[str]:
-    """What may be torques, or currents of motors, of a log without torques that has columns that are left out."""
-    each = join_names([_like(one.columns) for one in like_torques])
-    if any(one.is_current for one in like_torques):
-        return [f"joint_torque: {each} may be currents of motors; put torque constants and gear ratios in the file"]
-    if like_torques:
-        return [f"joint_torque: no {what} says that it is one; {each} have one of each joint: see the file"]
-    currents = [name for name in measured if is_current(name)]
-    more = "of some joints: joint_torque.current needs one of each (docs/tables.md)"
-    return [f"joint_torque: {_like(currents)} may be currents of motors, {more}"] if currents else []
-
-
-def notes_on_arrays(sample: FileSample, joints: int) -> dict[str, str]:
-    """What arrays of a file without joint positions may be that no map takes as they are, by key.
-
-    Args:
-        sample: from `read_sample`.
-        joints: of the robot.
-    """
-    out: dict[str, str] = {}
-    for name, values in sample.items():
-        if values is None or values.ndim != 2 or values.dtype.kind not in "fiu":
-            continue
-        shape, width = f"'{excerpt(name)}' has shape {values.shape}", values.shape[1]
-        lists = {other: x for other, x in sample.items() if x is not None and x.dtype.kind not in "fiub"}
-        texts = (other for other, x in lists.items() if x.shape == (width,))
-        if (listed := next(texts, None)) is not None:
-            out["columns"] = f"{shape}; if '{excerpt(listed)}' names its columns, save both as a table, CSV or Parquet"
-        elif len(values) == joints < width:
-            out["joint_position"] = f"{shape}; if its columns are the samples, save it transposed, (N, {joints})"
-    return out
-
-
-def _like(names: Sequence[str]) -> str:
-    return f"'{excerpt(names[0])}'" + (f" and {len(names) - 1} more" if len(names) > 1 else "")

@@ -1,0 +1,206 @@
+"""Some of what a file holds, from which a map is proposed: columns, arrays, episodes of these, messages of topics."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchid.errors import TorchidError, excerpt
+from torchid.logs.arrays import TRANSPOSED, fields_of_records, require_plain
+from torchid.logs.containers import LogKind, existing_log_kind, list_bag_files, open_container, reader_errors_explained
+from torchid.logs.episodes import flat, groups_of, in_groups
+from torchid.logs.name_matching import propose_field
+from torchid.logs.ros_messages import make_deserializer
+from torchid.logs.ros_read import list_channels, open_bag_file
+from torchid.logs.tables import RowNames, sample_table
+
+FileSample = Mapping[str, NDArray[Any] | None]
+"""Columns of a table or arrays with some of their rows, some of them names; None for what is neither."""
+
+_NAMES = 300  # elements of a list of names
+_SORTED = 0.9  # of the steps of stamps, forwards
+_JUMP = 1.0  # [rad or m] from sample to sample: a turn that an encoder jumps by
+
+
+def read_sample(path: Path, rows: RowNames | None = None) -> FileSample:
+    """The columns of a table or the arrays of a file, with some of the rows of tables; `rows` as from `rows_of`.
+
+    Raises:
+        LogError: it cannot be read, or is a bag.
+    """
+    if existing_log_kind(path) is LogKind.TABLE:
+        return sample_table(path, rows)
+    out: dict[str, NDArray[Any] | None] = {}
+    with open_container(path) as container:
+        for name in container.declared_bytes():
+            with reader_errors_explained(name, "a plain array of numbers, truth values or text"):
+                array = container.load(name)
+            for part, values in fields_of_records(name, array):
+                is_list = values.ndim == 1 and len(values) <= _NAMES
+                is_plain = values.dtype.kind in "fiub" or (is_list and values.dtype.kind in "SU")
+                out[part] = values if is_plain else None
+        if out and not any(x is not None for x in out.values()):
+            require_plain(name, array)
+    return out
+
+
+def stated_names(sample: FileSample, name: str) -> list[str]:
+    """The texts of an array of names."""
+    stated = sample.get(name)
+    names = [] if stated is None else np.ravel(stated).tolist()
+    return [x.decode(errors="replace") if isinstance(x, bytes) else str(x) for x in names]
+
+
+def numbers_of(sample: FileSample, columns: Sequence[str]) -> NDArray[np.float64]:
+    """Numbers (N, k) of columns or of an array; all in one column where these have not as many rows."""
+    arrays = [np.asarray(x, dtype=float) for column in columns if (x := sample[column]) is not None]
+    flat_ones = [x.reshape(len(x), -1) if x.ndim else x.reshape(1, 1) for x in arrays]
+    if len({len(x) for x in flat_ones}) == 1:
+        return np.concatenate(flat_ones, axis=1)
+    return np.concatenate([np.zeros(0), *map(np.ravel, flat_ones)])[:, None]
+
+
+def increases(values: NDArray[Any] | None, strictly: bool = True) -> bool:
+    """Whether numbers (N,) or (N, 1) are stamps: of a clock that goes forwards nearly throughout, if not `strictly`."""
+    if (
+        values is None
+        or values.dtype.kind not in "fiu"
+        or values.size != max(values.shape, default=0)
+        or values.size < 3
+    ):
+        return False
+    steps = np.diff(np.ravel(values))
+    return bool((steps > 0).mean() > _SORTED if strictly else (steps >= 0).mean() > _SORTED and (steps > 0).any())
+
+
+def slope_fit(position: NDArray[Any], velocity: NDArray[Any]) -> tuple[float, float]:
+    """How alike velocities (N, ...) are to the steps of positions (a correlation), and the time between samples."""
+    steps = np.diff(position.astype(float), axis=0)
+    mean = 0.5 * (velocity[1:] + velocity[:-1]).astype(float)
+    steps = np.where(np.abs(steps) > _JUMP, np.nan, steps)
+    with np.errstate(all="ignore"):
+        both, of_steps, of_mean = (np.nansum(x) for x in (steps * mean, steps**2, mean**2 + 0.0 * steps))
+    if not of_steps > 0.0 or not of_mean > 0.0:
+        return 0.0, 0.0
+    return float(both / np.sqrt(of_steps * of_mean)), float(both / of_mean)
+
+
+def with_samples_first(sample: FileSample) -> tuple[FileSample, str]:
+    """Arrays with a row for each sample, those that were transposed for it by the name `NAME.T`; and a note.
+
+    Nothing is transposed that has as many rows as there are stamps.
+    """
+    stamps = (x.size for name, x in sample.items() if x is not None and propose_field(name) == "time" and increases(x))
+    count = next(stamps, 0)
+    matrices = {name: x for name, x in sample.items() if x is not None and x.ndim == 2 and x.dtype.kind in "fiub"}
+    turned = [name for name, x in matrices.items() if x.shape[1] == count != x.shape[0] and x.shape[0] > 1]
+    if not turned:
+        return sample, ""
+    others = {name: x for name, x in sample.items() if name not in turned}
+    note = f"the columns of '{excerpt(turned[0])}' are the {count} samples: .T transposes them"
+    return others | {f"{name}{TRANSPOSED}": matrices[name].T for name in turned}, note
+
+
+# ------------------------------------------------------------------------------------------------------- episodes
+
+_EPISODES = re.compile(r"((?:demo|episode|ep|traj|trajectory|trial|run|rollout)[^A-Za-z0-9/]?)\d+(?=/)", re.IGNORECASE)
+_LENGTHS = re.compile(r"(\w*_)?(lengths?|lens?)", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class FoundEpisodes:
+    """Episodes of a file: the entry of a map, the first of them as a sample, and what was assumed."""
+
+    entry: dict[str, Any]
+    sample: FileSample
+    note: str
+
+
+def find_episodes(sample: FileSample) -> FoundEpisodes | None:
+    """Episodes in groups called `demo_0`, ..., or stacked in arrays of joints with three axes; None without any."""
+    groups = dict.fromkeys(name[: m.start(1)] + m[1] + "*" for name in sample for m in _EPISODES.finditer(name))
+    for pattern in groups:
+        parts = groups_of(sample, pattern)
+        first = {inner: sample[names[0]] for inner, names in parts.items() if len(names) > 1}
+        if any(propose_field(inner).startswith("joint_") for inner in first):
+            others = {name: x for name, x in sample.items() if not in_groups(pattern).fullmatch(name)}
+            return FoundEpisodes({"groups": pattern}, others | first, "a recording in each group")
+    of_joints = {
+        name: x
+        for name, x in sample.items()
+        if x is not None and x.ndim == 3 and propose_field(name).startswith("joint_")
+    }
+    name = next((x for x in of_joints if propose_field(x) == "joint_position"), next(iter(of_joints), ""))
+    if not name or any(x is not None and x.ndim == 2 and len(x) == len(of_joints[name]) for x in _of_joints(sample)):
+        return None
+    shape = of_joints[name].shape[:2]
+    steps = [
+        np.nanmedian(np.abs(np.diff(of_joints[name].astype(float), axis=k))) if shape[k] > 1 else np.inf for k in (0, 1)
+    ]
+    axis = int(steps[1] > steps[0])
+    count, samples = shape[axis], shape[1 - axis]
+    lengths = next((x for x, y in sample.items() if _LENGTHS.fullmatch(x) and y is not None and y.size == count), "")
+    shown = None if not lengths else np.ravel(sample[lengths]).astype(int)[:1]  # type: ignore[arg-type]
+
+    def first_of(x: NDArray[Any]) -> NDArray[Any]:
+        if x.shape[:2] == shape:
+            first = np.take(x, [0], axis=axis)
+            return flat(first, (first.shape[0], first.shape[1]), axis, shown)
+        is_clock = x.size == samples != count and x.ndim < 3
+        return x.ravel()[: None if shown is None else shown[0]] if is_clock else x
+
+    taken = {name: x if x is None or x.dtype.kind not in "fiub" else first_of(x) for name, x in sample.items()}
+    entry = {"axis": axis} | ({"lengths": lengths} if lengths else {})
+    axes = "(episodes, samples, ...)" if axis == 0 else "(samples, episodes, ...)"
+    return FoundEpisodes(entry, taken, f"{count} recordings side by side, arrays {axes}, as samples change little")
+
+
+def _of_joints(sample: FileSample) -> list[NDArray[Any] | None]:
+    return [x for name, x in sample.items() if propose_field(name).startswith("joint_")]
+
+
+# --------------------------------------------------------------------------------------------------------- topics
+
+_MESSAGES = 500  # of a topic that are looked at, spread over all of the bag
+
+
+@dataclass
+class TopicSample:
+    """A topic, and some of its messages where their type is known: in the order of receipt, `count` in all."""
+
+    type: str
+    messages: list[Any] = field(default_factory=list)
+    count: int = 0
+
+
+def read_bag_sample(path: Path, types: Collection[str]) -> dict[str, TopicSample]:
+    """Every topic of a bag, and messages of those that have one of some types. Raises LogError: the bag is damaged."""
+    files = list_bag_files(path)
+    channels = list_channels(files)
+    raw: dict[str, list[bytes]] = {name: [] for name, channel in channels.items() if channel.type in types}
+    counts, steps = dict.fromkeys(channels, 0), dict.fromkeys(channels, 1)
+    for file in files:
+        with open_bag_file(file) as opened:
+            for record in opened.records(raw.keys()):
+                name = record.topic
+                if counts[name] % steps[name] == 0:
+                    raw[name].append(record.data)
+                    if len(raw[name]) > 2 * _MESSAGES:
+                        raw[name], steps[name] = raw[name][::2], 2 * steps[name]
+                counts[name] += 1
+    out = {}
+    with open_bag_file(files[0]):  # whose errors are those of deserializing, too
+        for name, channel in channels.items():
+            try:
+                make = make_deserializer(name, channel)
+                messages = [make(data) for data in raw.get(name, [])]
+            except TorchidError:  # a serialization of others, which may be on a topic that nobody needs
+                messages = []
+            out[name] = TopicSample(channel.type, messages, counts[name])
+    return out
