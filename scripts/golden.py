@@ -6,7 +6,7 @@
     python scripts/golden.py compare before after --within 1e-9       # of the largest number of the same list
 
 Each folder has the `parameters.json` and `metrics.json` of each experiment. Experiments on data that is not there are
-left out. Logs of the biped are simulated once, beside the results, which takes a minute. Needs the extra `[sim]`.
+left out. Logs of the biped are simulated once, beside the results, which takes a minute. Needs the extras `[sim]` and `[oracle]`.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import os
 import shutil
 import subprocess
 import sys
+import sysconfig
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,7 @@ _DESCENT = ("estimator.name=sgd", "estimator.training.epochs=4", "estimator.ridg
 _OFFSETS = ("sensors.set=full", "sensors.offsets={contact_force: all, joint_torque: log}")
 DATA = {"person": "human_squats", "arm": "kuka_lwr4", "go2_in_air": "go2_in_air"}
 """Configurations of logs that others recorded, by experiment."""
+_GO2 = "cmeel.prefix/share/example-robot-data/robots/go2_description/urdf/go2.urdf"  # of the extra `[oracle]`
 
 RESULTS = ("parameters.json", "metrics.json")
 _TIMES = ("seconds", "version", "files", "log", "source")  # keys of what may differ between two runs
@@ -57,6 +59,8 @@ def experiments(folder: Path, data: Path | None) -> dict[str, list[str]]:
     for name, key in DATA.items():
         if data is not None and (data / key).is_dir():
             out[name] = [str(CONFIGS / f"{key}.yaml")]
+    if "go2_in_air" in out:
+        out["go2_in_air"].append(f"robot.urdf={Path(sysconfig.get_path('purelib')) / _GO2}")
     return out
 
 
