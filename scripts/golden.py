@@ -6,7 +6,8 @@
     python scripts/golden.py compare before after --within 1e-9       # of the largest number of the same list
 
 Each folder has the `parameters.json` and `metrics.json` of each experiment. Experiments on data that is not there are
-left out. Logs of the biped are simulated once, beside the results, which takes a minute. Needs the extras `[sim]` and `[oracle]`.
+left out. Logs of the biped are simulated once, beside the results, which takes a minute. Needs the extras `[sim]`
+and `[oracle]`.
 """
 
 from __future__ import annotations
