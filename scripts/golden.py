@@ -89,9 +89,7 @@ def run(options: argparse.Namespace) -> None:
 def _torchid(arguments: list[str], processes: int = 1) -> None:
     """A command in a process of its own, or in several, whose output is shown if it fails."""
     start = ["-m", "torch.distributed.run", f"--nproc-per-node={processes}"] if processes > 1 else []
-    command = [sys.executable, *start, "-m", "torchid", *arguments, "preprocessing.cache_gb=0"]
-    if arguments[0] != "identify":
-        command.pop()
+    command = [sys.executable, *start, "-m", "torchid", *arguments]
     done = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
     if done.returncode:
         raise InputError("torchid", " ".join(arguments[:2]), done.stderr.strip()[-500:], "a run without an error")

@@ -20,7 +20,7 @@ from torchid.logs import Log, write_log
 from torchid.reading.log_reader import LogReader
 
 FEW = "preprocessing.sample_rate_hz=auto"
-AUTO = ["preprocessing={cutoff_hz: auto, cache_gb: 0}", "sensors.noise={joint_position: 1e-4}", "estimator.ridge=0.01"]
+AUTO = ["preprocessing.cutoff_hz=auto", "sensors.noise={joint_position: 1e-4}", "estimator.ridge=0.01"]
 AUTO += [f"logs.train=[{json.dumps(str(DEMO / 'sway_train.npz[:6]'))}]"]
 FILE = str(DEMO / "quadruped.yaml")
 

@@ -17,7 +17,6 @@ from dialects import DIALECTS, save_csv, with_velocity
 from refusals import refusal
 from repository import DEMO, SHARED
 from synthetic import ANYMAL, G1, PANDA, ROBOTS, SOLO12
-from trainings import trust_new_files
 from welded import machine
 
 from torchid.cli import main
@@ -110,10 +109,7 @@ def test_names_alone_give_the_log_where_the_file_has_them(tmp_path: Path, dialec
     np.testing.assert_allclose(log.joint_position[:, order], recorded().joint_position, rtol=1e-9)
 
 
-def test_a_recording_is_identified_without_an_edit_where_names_say_everything(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    trust_new_files(monkeypatch)
+def test_a_recording_is_identified_without_an_edit_where_names_say_everything(tmp_path: Path) -> None:
     name, _, write = DIALECTS["groups"]
     init(URDF, write(tmp_path / name, recorded()), tmp_path / "new.yaml")
     more = ("estimator={name: least_squares, ridge: 0.01}", "preprocessing.cutoff_hz=8", "sensors=joints")

@@ -31,7 +31,7 @@ WIDTHS = (60, 80, 100, 120)
 
 
 def run_demo(folder: Path, *settings: str) -> Identification:
-    more = [*settings, f"output={folder / 'run'}", "preprocessing.cache_gb=0"]
+    more = [*settings, f"output={folder / 'run'}"]
     return identify(load_config(DEMO / "quadruped.yaml", more), False)
 
 

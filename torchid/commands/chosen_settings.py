@@ -20,7 +20,7 @@ from torchid.errors import InputError, TorchidWarning, join_names
 from torchid.estimators import Conditions
 from torchid.fitting.cross_validation import RidgeChoice
 from torchid.fitting.delay import DelayChoice, choose_delay
-from torchid.fitting.experiment import Experiment, RobotSetup, S
+from torchid.fitting.experiment import Experiment, RobotSetup, S, with_radius
 from torchid.fitting.fit import LogFitter
 from torchid.fitting.left_out import (
     TERMS,
@@ -136,7 +136,7 @@ def _with_chosen_data(setup: S, choices: Choices, trials: _Trials, bars: Progres
         setup = _with_preprocessing(setup, cutoff_hz=choices.cutoff.cutoff_hz)
     if setup.open_radii:
         choices.radius = _chosen("radius of feet", partial(_radius, setup, trials), bars)
-        setup = setup if choices.radius.radius is None else _with_radius(setup, choices.radius.radius)
+        setup = setup if choices.radius.radius is None else with_radius(setup, choices.radius.radius)
     actuators = setup.config.actuators
     if actuators.stiction == AUTO and actuators.stribeck is None and trials.measures_torques(setup):
         rest = {value: _with_actuators(setup, stiction=value) for value in (False, True)}
@@ -411,7 +411,7 @@ def _radius(setup: RobotSetup, trials: _Trials) -> RadiusChoice:
     kinds = trials.kinds(setup)
 
     def left(radius: float, estimate_noise: bool = False) -> Array:
-        return trials.reading(_with_radius(setup, radius), estimate_noise).left_out(kinds)
+        return trials.reading(with_radius(setup, radius), estimate_noise).left_out(kinds)
 
     own = trials.reading(setup).left_out(kinds)
     try:
@@ -426,18 +426,6 @@ def _radius(setup: RobotSetup, trials: _Trials) -> RadiusChoice:
         return RadiusChoice(None, evidence)
     left(best, estimate_noise=True)  # which other choices are made with
     return RadiusChoice(best, evidence)
-
-
-def _with_radius(setup: S, radius: float) -> S:
-    """The setup whose feet of open radius are balls about their frames [m]."""
-    contacts = tuple(
-        replace(x, radius=radius, centre=(0.0, 0.0, 0.0)) if x.frame in setup.open_radii else x for x in setup.contacts
-    )
-    stated = [
-        replace(x, radius=radius, centre=[0.0] * 3) if x.frame in setup.open_radii else x for x in setup.config.contacts
-    ]
-    text = f"{join_names(sorted(setup.open_radii))}: ball of radius {1e3 * radius:.3g} mm, by the logs"
-    return replace(setup, contacts=contacts, config=replace(setup.config, contacts=stated), rolling=text)
 
 
 def _sign_width(setup: RobotSetup, trials: _Trials) -> SignWidthChoice:

@@ -56,7 +56,7 @@ def identify(config: ExperimentConfig, resume: bool = False) -> Identification:
         resume: go on with a training that was interrupted.
 
     Raises:
-        InputError: whatever does not fit; nothing but samples in the cache has been written then.
+        InputError: whatever does not fit; nothing has been written then.
         BaseLostError: the sensors cannot see the base.
         KeyboardInterrupt: a training was interrupted; the message says how it can go on.
     """
@@ -176,7 +176,6 @@ def _identify(
         choices=with_sample_rates(ready.choices, experiment, logs["train"]),
         forces=next(iter(forces), None),
         traces=next(iter(traces), None),
-        reused=ready.reused,
     )
     logs.clear()  # checks of a log and figures need room, too
     ready.blocks = blocks = []

@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from torchid.checksums import file_checksum
 from torchid.commands.answer import answer
 from torchid.commands.check import check_experiment
 from torchid.commands.folder import RUN, refuse_link
-from torchid.commands.manifest import read_manifest
+from torchid.commands.manifest import file_checksum, read_manifest
 from torchid.errors import ConfigError, InputError, during, excerpt, warn
 from torchid.guards import MAX_JSON, MAX_YAML, read_bytes
 from torchid.report.forces import traces_document

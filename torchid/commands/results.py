@@ -81,7 +81,6 @@ class Identification:
         choices: how other settings were chosen, if they were.
         forces: of the first samples of a log, as measured and as predicted; None where there are but factors.
         traces: of all of that log.
-        reused: what an earlier run has left in the cache, in words.
         suspected: what the checks find in its training logs if it is doubtful, in words.
     """
 
@@ -111,7 +110,6 @@ class Identification:
     choices: Choices
     forces: ForceSeries | None
     traces: LogForces | None
-    reused: Sequence[str] = ()
     suspected: str = ""
 
     def __getitem__(self, name: str) -> BodyEstimate:

@@ -14,7 +14,7 @@ from torchid import distributed
 from torchid.config import AnalyzeConfig, ExperimentConfig
 from torchid.config.estimator import EstimatorConfig
 from torchid.config.robot import ChoiceConfig, require_kind
-from torchid.errors import ConfigError, LogError, TorchidWarning, UnknownNameError
+from torchid.errors import ConfigError, LogError, TorchidWarning, UnknownNameError, join_names
 from torchid.estimators import Conditions, Consistent, LeastSquares
 from torchid.fitting.calibration import Calibration, Comparison, calibrations
 from torchid.fitting.checked_settings import (
@@ -252,6 +252,18 @@ def with_estimated_noise(setup: S, estimated: Mapping[str, Any], any_stated: boo
     if isinstance(known, Experiment):
         return replace(known, sensors=replace(known.sensors, noise=known.noise))
     return known
+
+
+def with_radius(setup: S, radius: float) -> S:
+    """The setup whose feet of open radius are balls about their frames [m]."""
+    contacts = tuple(
+        replace(x, radius=radius, centre=(0.0, 0.0, 0.0)) if x.frame in setup.open_radii else x for x in setup.contacts
+    )
+    stated = [
+        replace(x, radius=radius, centre=[0.0] * 3) if x.frame in setup.open_radii else x for x in setup.config.contacts
+    ]
+    text = f"{join_names(sorted(setup.open_radii))}: ball of radius {1e3 * radius:.3g} mm, by the logs"
+    return replace(setup, contacts=contacts, config=replace(setup.config, contacts=stated), rolling=text)
 
 
 def with_task_weights(experiment: Experiment, logs: Sequence[Samples]) -> Experiment:

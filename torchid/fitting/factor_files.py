@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, field, replace
 from dataclasses import dataclass as plain_dataclass
@@ -18,7 +19,7 @@ from pydantic.dataclasses import dataclass
 from torchid import __version__
 from torchid.errors import ConfigError, LogError, about_file, during, excerpt
 from torchid.fitting.checked_settings import require_comparable
-from torchid.fitting.experiment import Experiment, with_noise
+from torchid.fitting.experiment import Experiment, with_noise, with_radius
 from torchid.fitting.factor_documents import (
     NOISE,
     PackedPart,
@@ -304,7 +305,6 @@ _APART = (
     "max_slip",
     "exclude_rejected",
     "memory_gb",
-    "cache_gb",
 )
 """Keys of preprocessing that do not change what a row is."""
 
@@ -355,7 +355,8 @@ def read_fleet(experiment: Experiment, on_read: Callable[[Path], None] | None = 
     for path in paths:
         one = read_factors(path)
         if not files:
-            experiment = _with_choices_of(one.model, experiment)
+            with about_file(path), reader_errors_explained("settings", _ACCEPTED):
+                experiment = with_choices_of(one.model, experiment)
             model = row_model(experiment, experiment.builder(experiment.sensors))
         require_same_rows(path, one.model, model, _THE_EXPERIMENT)
         files.append(one)
@@ -371,20 +372,46 @@ def read_fleet(experiment: Experiment, on_read: Callable[[Path], None] | None = 
     return Fleet(with_noise(experiment, summary), files, summary, merge_state_reports(one.states for one in files))
 
 
-def _with_choices_of(model: RowModel, experiment: Experiment) -> Experiment:
+def with_choices_of(model: RowModel, experiment: Experiment) -> Experiment:
     """The experiment with what `torchid compress` has chosen where it leaves that to the logs."""
     settings, config = model.settings, experiment.config
     labels = settings.get("actuators")
     kinds = {label.partition(" of ")[0] for label in labels} if isinstance(labels, list) else set[str]()
     found: dict[str, Any] = {name: in_words(name) in kinds for name in ACTUATORS if name != "stribeck"}
-    found |= {name: settings.get(f"actuators.{name}") for name in ("sign_width", "delay", "stiction")}
+    found |= {name: settings.get(f"actuators.{name}") for name in ("sign_width", "delay", "stiction", "stribeck")}
     known = config.actuators.known
     chosen = {name: x or known[name] for name, x in found.items() if vars(config.actuators)[name] == AUTO}
-    config = replace(config, actuators=replace(config.actuators, **chosen))
-    if config.preprocessing.contact_margin_s == AUTO:
-        margin: Any = settings.get("preprocessing.contact_margin_s")
-        config = replace(config, preprocessing=replace(config.preprocessing, contact_margin_s=margin))
-    return replace(experiment, config=config)
+    read: dict[str, Any] = {
+        name: settings.get(f"preprocessing.{name}")
+        for name in ("cutoff_hz", "contact_margin_s")
+        if getattr(config.preprocessing, name) == AUTO
+    }
+    config = replace(
+        config,
+        actuators=replace(config.actuators, **chosen),
+        preprocessing=replace(config.preprocessing, **read),
+    )
+    robot = experiment.robot
+    if config.robot.base_tilt == AUTO:
+        angles = _numbers(settings.get("robot.base_tilt", "0.0, 0.0"))
+        tilt = (angles[0], angles[1])
+        config = replace(config, robot=replace(config.robot, base_tilt=tilt))
+        robot = replace(robot, base_tilt=tilt)
+    return _with_radius_of(settings.get("contacts"), replace(experiment, config=config, robot=robot))
+
+
+def _with_radius_of(contacts: Value, experiment: Experiment) -> Experiment:
+    """The experiment with the radius of feet that the logs have chosen, if they have: another than the robot's file."""
+    is_open = {contact.frame for contact in experiment.contacts if contact.frame in experiment.open_radii}
+    texts = [text.partition(" (point, radius ") for text in contacts] if isinstance(contacts, list) else []
+    found = {_numbers(text)[0] for frame, _, text in texts if frame in is_open and text}
+    stated = {contact.radius for contact in experiment.contacts if contact.frame in is_open}
+    return with_radius(experiment, *found) if len(found) == 1 and found != stated else experiment
+
+
+def _numbers(text: Value) -> list[float]:
+    """Numbers in a text, in their order."""
+    return [float(number) for number in re.findall(r"-?\d+(?:\.\d+)?(?:e-?\d+)?", str(text))]
 
 
 def _require_different_logs(paths: Sequence[Path], files: Sequence[FactorFile]) -> None:

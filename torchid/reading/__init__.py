@@ -1,6 +1,4 @@
-"""From log files to samples of a robot: whole, in blocks where they are larger than memory, or out of a cache.
+"""From log files to samples of a robot: whole, or in blocks where they are larger than memory.
 
 - a log: `log_reader`; larger than memory `large_log`, in segments `segmented_log`
-- the cache of samples and factors: `cached_reader`, `cache_entries`, `cache`
-- several processes that read one log together: `shared_log`
 """

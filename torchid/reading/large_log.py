@@ -56,7 +56,7 @@ from torchid.problem.derived_blocks import (
 )
 from torchid.problem.log_joints import distances_from_welds, warn_of_moving_welds
 from torchid.problem.samples import require_forces
-from torchid.reading.segmented_log import RecordedBlock, Segment, SegmentedLog, in_the_air, require_kept, row_numbers
+from torchid.reading.segmented_log import RecordedBlock, Segment, SegmentedLog, in_the_air, require_kept
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
 
@@ -125,24 +125,6 @@ class LargeLog:
             TorchidWarning: as `preprocess` would.
         """
         stored = _Stored(str(self.path), self.folder)
-        self.each_block(stored.add, with_unloaded)
-        return stored.samples()
-
-    def each_block(
-        self,
-        add: Callable[[Samples, int, int], None],
-        with_unloaded: bool = True,
-        own: Callable[[Sequence[int]], slice] = lambda _: slice(None),
-        threads: int | None = None,
-    ) -> None:
-        """Read, preprocess and bind some successive blocks of the log; which ones makes no difference to their samples.
-
-        Args:
-            add: called with the samples of each block, the number of the first of them, and how many the log has.
-            with_unloaded: as in `samples`.
-            own: which of the log's blocks, from the numbers of their samples; all by default.
-            threads: that work on blocks, 0 for this one alone; by default as many as torch would use.
-        """
         needs_flags = self.settings.needs_flags
         with about_file(self.path), open_log_blocks(self.path, self.folder, self.columns, needs_flags) as opened:
             recorded = opened.about_world_origin()
@@ -150,22 +132,19 @@ class LargeLog:
             recorded = bridge_in_blocks(recorded, self.settings.bridge_gaps_s, parts)
             self._check_welds(recorded)
             segmented = self._in_segments(self._derived(recorded), with_unloaded)
-            pieces, kept = list(segmented.pieces(self._step(recorded, len(segmented.time)))), segmented.kept
-            mine = pieces[own([piece.stop - piece.start for _, piece in pieces])]
-            row, total = row_numbers(kept, mine[0][1].start if mine else 0, len(segmented.time))
-            if mine:
-                mine[0][0].follow_signs(mine[0][1].start, max(SPLINE_BLOCK, int(BLOCK_GB * GIGABYTE / 32)))
-            threads = thread_count() if threads is None else threads
-            threads = 0 if self.folder is not None else threads  # on a disk because memory is short
-            read = (segment.read(piece) for segment, piece in mine)
+            count = len(segmented.time)
+            kept = segmented.kept
+            total = count if kept is None else int(np.count_nonzero(kept))
+            read = (segment.read(piece) for segment, piece in segmented.pieces(self._step(recorded, count)))
+            threads = 0 if self.folder is not None else thread_count()  # on a disk because memory is short
             with closing(_in_threads(partial(self._bound, segmented), read, threads)) as bound:
                 for piece, samples in bound:
                     if segmented.longest.in_the_air is None:
                         samples = replace(samples, unloaded=None)
                     if kept is not None:
                         samples = samples[torch.from_numpy(np.flatnonzero(kept[piece]))]
-                    add(replace(samples, oversampling=segmented.oversampling, folder=self.folder), row, total)
-                    row += len(samples)
+                    stored.add(replace(samples, oversampling=segmented.oversampling, folder=self.folder), total)
+        return stored.samples()
 
     def _derived(self, recorded: LogBlocks) -> _Derived:
         """The log with what is worked out of its other fields, each of which takes passes over it."""
@@ -352,7 +331,7 @@ class _Stored:
         self._spills: dict[tuple[str, bool], Spill | Filled] = {}
         self._like: Samples | None = None  # the last block, for whatever is no tensor
 
-    def add(self, samples: Samples, _: int, total: int) -> None:
+    def add(self, samples: Samples, total: int) -> None:
         """Add the next of so many samples."""
         for part, of_base in ((samples, False), (samples.base, True)):
             for name, x in vars(part).items():

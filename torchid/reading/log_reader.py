@@ -100,9 +100,6 @@ class LogReader:
                 on_read(path)
         return logs
 
-    def release(self) -> None:
-        """Take pages of files that samples are mapped to out of memory; they come back where they are used."""
-
     def _together(self, path: Path) -> float:
         """What a log takes in memory with those before it [GB]."""
         return memory_needed(path, self.setup.config.preprocessing.memory_gb, self._held)

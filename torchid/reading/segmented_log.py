@@ -7,8 +7,6 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
-import numpy as np
-
 from torchid.errors import LogError
 from torchid.logs import Log
 from torchid.logs.blocks import LogBlocks
@@ -61,13 +59,6 @@ class Segment:
         if self.in_the_air is not None and only is None:
             log = replace(log, contact_unloaded=unloaded_readings(log, self.in_the_air[samples]))
         return RecordedBlock(piece, log, part)
-
-    def follow_signs(self, start: int, step: int) -> None:
-        """Read quaternions up to a sample of the preprocessed log, whose signs go on from those, so many at a time."""
-        names = tuple(name for name in ("base_quat_xyzw", "base_quat_wxyz") if name in self.blocks.fields)
-        end = 0 if start == self.first else self._part(start, start + 1)[0].start
-        for first in range(0, end, step) if names else ():
-            self.blocks.read(slice(first, min(first + step, end)), only=names)
 
     def _part(self, first: int, last: int) -> tuple[slice, Timeline | None]:
         """As `Timeline.part`, of samples of the preprocessed log."""
@@ -130,8 +121,3 @@ def require_kept(kept: BoolArray, source: str | Path, checked_for_slip: bool) ->
         found = f"{found} in which no contact slips"
         accepted = "a larger preprocessing.max_slip, or a smaller contact_margin_s"
     raise LogError(source, "contact_active", found, accepted)
-
-
-def row_numbers(kept: BoolArray | None, start: int, count: int) -> tuple[int, int]:
-    """Which of the samples that are kept (N,) comes first from a number on, and how many there are of so many."""
-    return (start, count) if kept is None else (int(kept[:start].sum()), int(np.count_nonzero(kept)))

@@ -202,8 +202,6 @@ def print_details(run: Identification) -> None:
     _print_fit(run)
     timed = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in run.seconds.items())
     print_labelled("time", f"{run.samples} samples: {timed}")
-    if run.reused:
-        print_labelled("from cache", ", ".join(run.reused))
     print(f"written to    {run.experiment.config.output}")
 
 
