@@ -73,35 +73,25 @@ class LogReader:
         Raises:
             LogError: a file that cannot be read, or does not fit the robot.
         """
+        logs = list[Samples]()
         with files_of_recordings_kept():
-            logs = self._each(paths, required, on_read)
+            for path in paths:
+                together = self._together(path)
+                is_bag = existing_log_kind(path) is LogKind.BAG
+                if together > self.setup.config.preprocessing.memory_gb and not is_bag:
+                    logs.append(self._large(path, required, together))
+                else:
+                    logs.append(self._small(path, required))
+                    self._held = together + (logs[-1].nbytes / GIGABYTE if is_bag else 0.0)
+                if on_read is not None:
+                    on_read(path)
         names = distributed.broadcast([log.source for log in logs], "names of the logs")  # they may lie elsewhere there
         added = [payload_of(self.setup, path) for path in paths]
         return [replace(log, source=name, payload=x) for log, name, x in zip(logs, names, added, strict=True)]
 
-    def _each(
-        self, paths: Sequence[Path], required: SensorSet | None, on_read: Callable[[Path], None] | None
-    ) -> list[Samples]:
-        """The samples of log files, one after the other."""
-        limit, logs = self.setup.config.preprocessing.memory_gb, list[Samples]()
-        for path in paths:
-            together = self._together(path)
-            bag = existing_log_kind(path) is LogKind.BAG
-            large = together > limit and not bag
-            logs.append(self._samples(path, required, together if large else None))
-            if not large:
-                self._held = together + (logs[-1].nbytes / GIGABYTE if bag else 0.0)
-            if on_read is not None:
-                on_read(path)
-        return logs
-
     def _together(self, path: Path) -> float:
         """What a log takes in memory with those before it [GB]."""
         return memory_needed(path, self.setup.config.preprocessing.memory_gb, self._held)
-
-    def _samples(self, path: Path, required: SensorSet | None, together: float | None) -> Samples:
-        """The samples of a log; `together`: what it takes with those before it [GB], if that is too much."""
-        return self._small(path, required) if together is None else self._large(path, required, together)
 
     def _small(self, path: Path, required: SensorSet | None) -> Samples:
         """A log that fits into memory."""
