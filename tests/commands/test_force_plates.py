@@ -154,7 +154,7 @@ def arrays(folder: Path) -> Path:
 def test_a_map_of_plates_is_read_block_by_block_as_a_whole(
     write: Callable[[Path], Path], columns: str, cutoff: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("torchid.reading.large_log.SPLINE_BLOCK", 256)
+    monkeypatch.setattr("torchid.reading.log_steps.SPLINE_BLOCK", 256)
     file = experiment(tmp_path, write(tmp_path).name, columns)
     whole, large = (samples_of(file, f"preprocessing.cutoff_hz={cutoff}", *more) for more in ((), (SMALL,)))
     assert is_on_disk(large)

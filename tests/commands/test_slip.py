@@ -95,7 +95,7 @@ def test_blocks_of_a_long_log_lose_the_samples_that_the_whole_log_loses(
     whole, line = read()
     assert len(whole) < len(samples_of(file, *settings, "preprocessing.max_slip=null")) - 50
     monkeypatch.setattr("torchid.reading.log_reader._WHOLE_GB", 0.0)
-    monkeypatch.setattr("torchid.reading.large_log.BLOCK_GB", 1e-4)
+    monkeypatch.setattr("torchid.reading.log_steps.BLOCK_GB", 1e-4)
     for more in ((), (SMALL,)):
         blocks, of_blocks = read(*more)
         assert is_on_disk(blocks) == bool(more)

@@ -404,9 +404,9 @@ def _with_radius_of(contacts: Value, experiment: Experiment) -> Experiment:
     """The experiment with the radius of feet that the logs have chosen, if they have: another than the robot's file."""
     is_open = {contact.frame for contact in experiment.contacts if contact.frame in experiment.open_radii}
     texts = [text.partition(" (point, radius ") for text in contacts] if isinstance(contacts, list) else []
-    found = {_numbers(text)[0] for frame, _, text in texts if frame in is_open and text}
+    radii = {_numbers(text)[0] for frame, _, text in texts if frame in is_open and text}
     stated = {contact.radius for contact in experiment.contacts if contact.frame in is_open}
-    return with_radius(experiment, *found) if len(found) == 1 and found != stated else experiment
+    return with_radius(experiment, *radii) if len(radii) == 1 and radii != stated else experiment
 
 
 def _numbers(text: Value) -> list[float]:
