@@ -21,7 +21,8 @@ from thinned import each_once
 from walking import robot_of
 
 from torchid.errors import LogError, TorchidWarning, UnknownNameError
-from torchid.logs import Log, preprocess
+from torchid.logs import Log
+from torchid.logs.preprocess import preprocess
 from torchid.logs.blocks import LogBlocks
 from torchid.logs.preprocess import DERIVATIVE_CHAINS
 from torchid.problem import bind_log
