@@ -19,7 +19,7 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
@@ -41,7 +41,7 @@ LIMITS = "TORCHID_READ_LIMITS"
 _MAX_HEADER = 2**28  # bytes of JSON in an answer
 _ANSWER_SECONDS = 6.0  # without an answer, per second of processor time that is allowed
 _POLL_SECONDS = 0.5
-_STREAM_BATCH = 256  # values that are sent together
+_BYTES_OF_GROUP, _BYTES_OF_VALUE = 2**20, 100  # of values that are sent together; of each, beside its content
 _LENGTH = struct.Struct("<Q")
 _COMMAND = "import sys; sys.path[:] = {!r}; from torchid.reader import serve; serve()"
 _ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}  # threads take memory
@@ -344,13 +344,8 @@ class _Server:
             yield "value", getattr(self._opened, request["call"])(*request["args"])
             return
         else:
-            batch = []
-            for value in getattr(self._opened, request["stream"])(*request["args"]):
-                batch.append(value)
-                if len(batch) == _STREAM_BATCH:
-                    yield "values", batch
-                    batch = []
-            yield "values", batch
+            for values in _together(getattr(self._opened, request["stream"])(*request["args"])):
+                yield "values", values
             return
         yield "value", None
 
@@ -361,6 +356,19 @@ class _Server:
         for buffer in buffers:
             self._stream.write(buffer)
         self._stream.flush()
+
+
+def _together(values: Iterable[Any]) -> Iterator[list[Any]]:
+    """Values in groups of about so many bytes."""
+    group, size = list[Any](), 0
+    for value in values:
+        group.append(value)
+        parts = value if isinstance(value, tuple) else (value,)
+        size += _BYTES_OF_VALUE + sum(len(part) for part in parts if isinstance(part, bytes))
+        if size > _BYTES_OF_GROUP:
+            yield group
+            group, size = [], 0
+    yield group
 
 
 def _limit(memory: int, seconds: int) -> None:

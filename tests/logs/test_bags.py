@@ -28,7 +28,6 @@ from bags import (
     write_bag,
     write_folder,
 )
-from raw_logs import without_package
 
 from torchid.config import dump_config, load_config
 from torchid.errors import ConfigError, LogError, TorchidWarning, UnknownNameError

@@ -22,9 +22,8 @@ from walking import robot_of
 
 from torchid.errors import LogError, TorchidWarning, UnknownNameError
 from torchid.logs import Log
-from torchid.logs.preprocess import preprocess
 from torchid.logs.blocks import LogBlocks
-from torchid.logs.preprocess import DERIVATIVE_CHAINS
+from torchid.logs.preprocess import DERIVATIVE_CHAINS, preprocess
 from torchid.problem import bind_log
 from torchid.problem.base_pose import LogWithPose, base_pose_from_feet, preprocess_with_pose
 from torchid.problem.derived_blocks import base_pose_in_blocks

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import LogError, TorchidError, during, excerpt
-from torchid.guards import MAX_ARRAYS, check_fields, check_names
+from torchid.guards import MAX_ARRAYS, check_fields, check_names, check_unpacked_size
 from torchid.logs.hdf5 import Hdf5, import_h5py, save_hdf5
 from torchid.logs.json_files import JsonDocument
 from torchid.logs.lazy_arrays import Computed, LazyArray, Spill
@@ -175,6 +175,7 @@ def open_container(path: Path, whole: bool = True) -> Iterator[Container]:
             total = sum(container.declared_bytes().values())
         if whole and total > MAX_ARRAYS:
             raise LogError(path, "file", f"arrays of {total} bytes", f"at most {MAX_ARRAYS} bytes in all")
+        check_unpacked_size(path, total)
         yield container
 
 

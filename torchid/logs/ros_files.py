@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torchid.guards import require_plain_name
+from torchid.guards import check_unpacked_size, require_plain_name
 from torchid.reader import RemoteObject
 
 
@@ -39,8 +39,8 @@ class Record:
 class BagFile:
     """An open file of a bag."""
 
-    def __init__(self, opened: RemoteObject) -> None:
-        self._opened = opened
+    def __init__(self, path: Path, opened: RemoteObject) -> None:
+        self._path, self._opened = path, opened
 
     def channels(self) -> list[BagChannel]:
         """All topics, possibly with duplicates."""
@@ -48,7 +48,12 @@ class BagFile:
 
     def records(self, topics: Collection[str]) -> Iterator[Record]:
         """The messages of some topics, in any order."""
-        return (Record(*record) for record in self._opened.stream("records", list(topics)))
+        size = 0
+        for record in self._opened.stream("records", list(topics)):
+            out = Record(*record)
+            size += len(out.data)
+            check_unpacked_size(self._path, size)
+            yield out
 
 
 @contextmanager

@@ -205,7 +205,7 @@ def open_bag_file(path: Path) -> Iterator[BagFile]:
         raise LogError(path, "file", found, how_to_install("ros"))
     accepted = f"a complete {path.suffix.lower()} file of ROS messages"
     with reader_errors_explained("file", accepted), open_apart(serve_bag, path) as opened:
-        yield BagFile(opened)
+        yield BagFile(path, opened)
 
 
 def _listed(channels: Mapping[str, BagChannel]) -> str:
