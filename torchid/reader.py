@@ -7,6 +7,7 @@ closed. Where the system knows no such limits (`resource` is missing), files are
 
 from __future__ import annotations
 
+import ast
 import atexit
 import json
 import math
@@ -226,11 +227,11 @@ def _error(module: str, name: str, text: str, args: list[Any]) -> Exception:
 def _encode(value: Any, buffers: list[Any]) -> Any:
     """A value as JSON; bytes, and those of arrays, are added to the buffers."""
     if isinstance(value, np.ndarray):
-        if value.dtype.hasobject or value.dtype.kind == "V":
+        if value.dtype.hasobject:
             return {"object": value.shape}
         array = np.asarray(value, order="C")
         buffers.append(array.reshape(-1).view(np.uint8).data if array.size else b"")
-        return {"array": array.dtype.str, "shape": array.shape}
+        return {"array": repr(np.lib.format.dtype_to_descr(array.dtype)), "shape": array.shape}
     if isinstance(value, bytes):
         buffers.append(value)
         return {"bytes": len(value)}
@@ -252,7 +253,8 @@ def _decode(tree: Any, stream: BinaryIO) -> Any:
         return bytes(_read_exactly(stream, bytearray(tree["bytes"])))
     if "object" in tree:
         return np.broadcast_to(np.array(None, dtype=object), tree["object"])
-    return _array(np.dtype(tree["array"]), tuple(tree["shape"]), stream)
+    dtype = np.lib.format.descr_to_dtype(ast.literal_eval(tree["array"]))
+    return _array(dtype, tuple(tree["shape"]), stream)
 
 
 def _array(dtype: np.dtype[Any], shape: tuple[int, ...], stream: BinaryIO) -> NDArray[Any]:

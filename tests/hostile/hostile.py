@@ -94,6 +94,8 @@ class _Watch:
             pass  # which changes nothing
         elif event in _CHANGES and not self._may(*_with_folder(event, arguments)):
             self.events.append(f"{event} {arguments[0]}")
+        elif event == "subprocess.Popen" and "torchid.reader" in str(arguments[1]):
+            pass  # the process that reads
         elif event in _RUNS or event in _CALLS:
             self.events.append(f"{event} {arguments[:2]}")
 

@@ -284,7 +284,7 @@ def test_a_long_text_in_every_row_of_a_parquet_file_is_kept_once(tmp_path: Path)
 
 def test_without_pyarrow_the_message_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = save(tmp_path / "x.csv", columns())
-    without_package("pyarrow", monkeypatch)
+    without_package("pyarrow", monkeypatch, tmp_path)
     assert "pip install '.[tables]'" in log_refusal(path)
     with pytest.raises(LogError, match="pyarrow is not installed"):
         write_log(Log("x", np.zeros(1), (), np.zeros((1, 0))), tmp_path / "y.parquet")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import math
 import os
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.lib.format import descr_to_dtype, dtype_to_descr
 from numpy.typing import NDArray
 
 from torchid.errors import LogError, TorchidError, during, excerpt
@@ -202,7 +204,7 @@ class _Remote:
             array: NDArray[Any] = self._opened.call("rows", name, rows.start, rows.stop)
             return array
 
-        return Computed(tuple(shape), np.dtype(dtype), rows_of)
+        return Computed(tuple(shape), descr_to_dtype(ast.literal_eval(dtype)), rows_of)
 
 
 class _Served:
@@ -215,8 +217,7 @@ class _Served:
     def lazy(self, name: str, folder: str | None) -> tuple[tuple[int, ...], str | None]:
         """Shape and type of an array, None where it is to be loaded."""
         array = self._lazy[name] = self._container.lazy(name, None if folder is None else Path(folder))
-        plain = array.shape and not array.dtype.hasobject and array.dtype.kind != "V"
-        return array.shape, array.dtype.str if plain else None
+        return array.shape, None if array.dtype.hasobject or not array.shape else repr(dtype_to_descr(array.dtype))
 
     def rows(self, name: str, start: int, stop: int) -> NDArray[Any]:
         """Some rows of an array that is read where it is sliced."""
