@@ -40,7 +40,7 @@ LIMITS = "TORCHID_READ_LIMITS"
 """Environment variable: a factor of both limits."""
 
 _MAX_HEADER = 2**28  # bytes of JSON in an answer
-_ANSWER_SECONDS = 6.0  # without an answer, per second of processor time that is allowed
+_ANSWER_SECONDS = 20.0  # without an answer, per second of processor time that is allowed
 _POLL_SECONDS = 0.5
 _BYTES_OF_GROUP, _BYTES_OF_VALUE = 2**20, 100  # of values that are sent together; of each, beside its content
 _LENGTH = struct.Struct("<Q")
@@ -80,7 +80,10 @@ def open_apart(opener: Opener, path: Path) -> Iterator[RemoteObject]:
         check_regular(path)
     except OSError as error:
         raise LogError(path, "file", str(error.strerror), "a regular file") from error
-    reader = _take()
+    try:
+        reader = _take()
+    except OSError as error:
+        raise LogError(path, "file", f"Python does not start to read it ({error})", "one that may be run") from error
     try:
         reader.open(opener, path)
         yield RemoteObject(reader)
@@ -90,7 +93,8 @@ def open_apart(opener: Opener, path: Path) -> Iterator[RemoteObject]:
 
 def warm_up() -> None:
     """Start a process that reads, for it to be ready when there is something to read."""
-    _idle.append(_take())
+    with suppress(OSError):  # which whoever reads will tell
+        _idle.append(_take())
 
 
 _idle: list[_Reader] = []
