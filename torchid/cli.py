@@ -39,6 +39,7 @@ _SHELLS = ("bash", "zsh")
 _Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 _SHARED = ("identify", "compress", "evaluate", "analyze")
 """By the processes that torchrun has started; the first runs all others."""
+_WITHOUT_LOGS = ("export", "simulate", "sample")
 
 
 def run() -> NoReturn:
@@ -68,6 +69,10 @@ def _command(options: argparse.Namespace) -> int | None:
     target = getattr(options, "file", getattr(options, "run", getattr(options, "source", "")))
     if options.name not in _SHARED and not is_launched_first():
         return 0
+    if options.name not in _WITHOUT_LOGS:
+        from torchid.reader import warm_up
+
+        warm_up()  # while torch is imported
     with share_work() if options.name in _SHARED else nullcontext(), during(options.name, target):
         status: int | None = options.command(options)
         return status

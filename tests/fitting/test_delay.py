@@ -18,7 +18,8 @@ from torchid.estimators import Conditions, Consistent, LeastSquares
 from torchid.fitting.delay import EARLIEST, LATEST, DelayChoice, choose_delay
 from torchid.fitting.experiment import set_up
 from torchid.fitting.fit import LogFitter
-from torchid.logs import Log, preprocess, read_log
+from torchid.logs import Log, read_log
+from torchid.logs.preprocess import preprocess
 from torchid.logs.segments import with_delayed_torques
 from torchid.problem import ExtraTerms, RowBuilder, bind_log
 from torchid.sensing import SensorNoise, named_sensors

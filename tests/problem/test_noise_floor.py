@@ -15,7 +15,8 @@ from torchid.config import load_config
 from torchid.fitting.calibration import Calibration
 from torchid.fitting.experiment import set_up
 from torchid.fitting.residual_squares import sum_residuals
-from torchid.logs import preprocess, read_log
+from torchid.logs import read_log
+from torchid.logs.preprocess import preprocess
 from torchid.parameters import Array
 from torchid.problem import Samples, bind_log, compress_parts
 from torchid.problem.metrics import Evaluation

@@ -19,7 +19,8 @@ from synthetic import ANYMAL, PANDA, SOLO12, Array, load
 import torchid
 from torchid.errors import LogError, SensorError
 from torchid.identifiability.structure import standing_states
-from torchid.logs import Log, preprocess, read_log, write_log
+from torchid.logs import Log, read_log, write_log
+from torchid.logs.preprocess import preprocess
 from torchid.problem import ExtraTerms, RowBuilder, bind_log, compress
 from torchid.problem.base_pose import feet_poses
 from torchid.problem.sampled_rows import SampledRows

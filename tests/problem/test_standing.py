@@ -22,9 +22,9 @@ from walking import robot_of
 
 from torchid.config.log_reading import PreprocessingConfig
 from torchid.errors import LogError, TorchidWarning, UnknownNameError
-from torchid.logs import Log, preprocess
+from torchid.logs import Log
 from torchid.logs.blocks import LogBlocks
-from torchid.logs.preprocess import DERIVATIVE_CHAINS
+from torchid.logs.preprocess import DERIVATIVE_CHAINS, preprocess
 from torchid.problem import Samples, bind_log
 from torchid.problem.base_pose import LogWithPose, base_pose_from_feet
 from torchid.problem.derived_blocks import base_pose_in_blocks

@@ -16,7 +16,8 @@ from repository import DEMO
 
 from torchid.config import load_config
 from torchid.fitting.experiment import set_up
-from torchid.logs import preprocess, read_log
+from torchid.logs import read_log
+from torchid.logs.preprocess import preprocess
 from torchid.problem import Samples, bind_log
 from torchid.problem.chunks import map_chunks
 from torchid.problem.contact_state import ContactState
