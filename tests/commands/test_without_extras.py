@@ -9,7 +9,7 @@ import sys
 import pytest
 from demo import shortened_demo
 
-EXTRAS = ("mujoco", "h5py", "pyarrow", "rosbags", "mcap", "plotly", "jinja2", "clarabel", "cvxpy", "pinocchio")
+EXTRAS = ("mujoco", "h5py", "pyarrow", "rosbags", "mcap", "plotly", "jinja2", "cvxpy", "pinocchio")
 WORKING = (
     "identify mine/quadruped.yaml output=run",
     "evaluate run --log mine/sway_test.npz --output evaluated",

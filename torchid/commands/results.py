@@ -342,7 +342,6 @@ def _solution_document(estimate: Estimate) -> dict[str, object] | None:
         "unconstrained",
         "distance",
         "gap",
-        "certified_gap",
         "steps",
         "active",
         "epochs",
