@@ -231,10 +231,10 @@ def write_run(
         write_posterior(folder / POSTERIOR, run.posterior)
         (folder / identified_name(robot)).write_bytes(identified_robot(robot, run.phi, run.fitted_joints))
         write_json(folder / DATA, report_document(run))
-        write_page(folder, output)
         if training is not None:
             training.copy_curves(folder)
         write_events(run, folder, lambda: write_figures(folder, config.figures.format, order, [*begun, rest]))
+        write_page(folder, output)
     if training is not None:
         training.remove_checkpoint()
 
