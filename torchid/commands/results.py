@@ -80,7 +80,7 @@ class Identification:
         ridge: how it was chosen, if it was.
         choices: how other settings were chosen, if they were.
         forces: of the first samples of a log, as measured and as predicted; None where there are but factors.
-        traces: of all of that log.
+        traces: of all of that log, in the rows of the fit.
         suspected: what the checks find in its training logs if it is doubtful, in words.
     """
 

@@ -150,21 +150,17 @@ def name_row(row: int, base_rows: int, dof_names: Sequence[str], sliding: Collec
     return name, "N" if name in sliding or name.endswith((".fx", ".fy", ".fz")) else "N m"
 
 
-def largest_rows(series: ForceSeries, base_rows: int) -> list[int]:
-    """Numbers of the rows to plot, the largest by rms of the measured force."""
+def _largest(
+    series: ForceSeries, dof_names: Sequence[str], base_rows: int, sliding: Collection[str]
+) -> dict[int, tuple[str, str]]:
+    """Names and units of the rows to plot, the largest by rms of the measured force."""
     size = np.sqrt(np.nanmean(np.square(np.nan_to_num(series.measured)), axis=0))
     size[~np.isfinite(series.measured).any(axis=0)] = -1.0
     base = [max(rows, key=lambda row: size[row]) for rows in (range(3), range(3, 6))] if base_rows else []
     base = [row for row in base if size[row] >= 0.0]
     joints = sorted((row for row in range(base_rows, len(size)) if size[row] >= 0.0), key=lambda row: -size[row])
-    return base + sorted(joints[: _MOST_ROWS - len(base)])
-
-
-def _largest(
-    series: ForceSeries, dof_names: Sequence[str], base_rows: int, sliding: Collection[str]
-) -> dict[int, tuple[str, str]]:
-    """Names and units of the rows to plot."""
-    return {row: name_row(row, base_rows, dof_names, sliding) for row in largest_rows(series, base_rows)}
+    shown = base + sorted(joints[: _MOST_ROWS - len(base)])
+    return {row: name_row(row, base_rows, dof_names, sliding) for row in shown}
 
 
 @dataclass(frozen=True)
