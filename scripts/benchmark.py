@@ -2,7 +2,7 @@
 
     python scripts/benchmark.py [--samples 262144] [--repeats 5] [--device cuda]
 
-Needs the packages pin and example-robot-data (extra `[oracle]`) and Clarabel (extra `[certified]`). Pipelines
+Needs the packages pin and example-robot-data (extra `[oracle]`). Pipelines
 start from the arrays of a log and end with parameters. Sensors are `joints` (torques measured, contact forces not); all
 feet are in contact in two thirds of the samples. Consistent parameters are timed on noisy data of Solo12 that were
 generated with other, physically consistent parameters.
@@ -213,8 +213,7 @@ def measure_consistent(count: int, repeats: int, device: torch.device) -> dict[s
     bench = replace(bench, samples=torques_of(bench.robot, case, bench.samples, phi.flatten(), noise))
     estimators: dict[str, LeastSquares | Consistent] = {
         "least squares": LeastSquares(1e-4),
-        "consistent, barrier": Consistent(1e-4),
-        "consistent, certified": Consistent(1e-4, method="certified"),
+        "consistent": Consistent(1e-4),
     }
     pipelines = {name: (partial(bench.fit, estimator), 10**6) for name, estimator in estimators.items()}
     return medians(pipelines, repeats, device)

@@ -151,7 +151,7 @@ def test_a_run_of_factors_says_what_it_can(fleet: Path, tmp_path: Path, capsys: 
     printed = capsys.readouterr().out
     assert "What each log and contact state adds" in printed
     assert {path.name.split(".")[0] for path in output.glob("*.png")} == {
-        "errors", "parameters", "identifiability", "contributions"
+        "errors", "parameters", "identifiability", "inertia", "contributions"
     }, "no figure of forces, which takes samples"  # fmt: skip
     metrics = json.loads((output / "metrics.json").read_text())
     assert metrics["train"][WHITENED] > 0.0

@@ -49,7 +49,6 @@ FAR_OFF = 5.0
 """Times the error on the run's own logs from which on a log is not one of the same robot, moving otherwise."""
 _SAMPLES = 3000
 _TRACED = 10_000  # of a whole log: the rows of the fit take 0.1 ms each
-_SERIES = ("measured", "nominal", "identified", "noise")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -349,17 +348,15 @@ def _usual(documents: Sequence[Mapping[str, object]]) -> dict[str, float]:
     return usual
 
 
-def compare_forces(
-    evaluation: Evaluation, samples: Samples, compared: Comparison[Calibration], chosen: slice = slice(_SAMPLES)
-) -> ForceSeries:
-    """Forces of chosen samples of a log: nominal, identified, and measured as the latter calibrates it.
+def compare_forces(evaluation: Evaluation, samples: Samples, compared: Comparison[Calibration]) -> ForceSeries:
+    """Forces of the first samples of a log: nominal, identified, and measured as the latter calibrates it.
 
     Each prediction is as far from what was measured as from readings that are calibrated for it.
     """
     measured, predicted = [], []
     for one in compared:
         (read,) = one.calibrate([samples])
-        part = read[chosen]
+        part = read[:_SAMPLES]
         series = force_series(evaluation.builder, part, one.parameters(evaluation)[None])
         readings, forces = at_motors(evaluation.builder, part, np.stack([series[0], *series[1]]))
         measured.append(readings)
@@ -374,21 +371,23 @@ def compare_forces(
 
 
 def trace_forces(evaluation: Evaluation, samples: Samples, compared: Comparison[Calibration]) -> LogForces:
-    """Forces of a whole log as recorded, and in the rows of the fit; of a long log every k-th sample."""
+    """Forces of a whole log in the rows of the fit; of a long log every k-th sample."""
     step = max(1, -(-len(samples) // _TRACED))
-    recorded = compare_forces(evaluation, samples, compared, slice(None, None, step))
     part, builder = samples.every(step), compared.identified.builder
     projected = projected_forces(builder, part, torch.stack([one.columns(builder, samples) for one in compared]))
     present = list(dict.fromkeys(map(tuple, part.active.tolist())))
     names = {state: state_name(builder.contacts, state) for state in present}
     rate = 1.0 / float(samples.time.diff().median()) if len(samples) > 1 else np.nan
     return LogForces(
-        recorded=recorded,
-        projected=replace(
-            recorded, **dict(zip(_SERIES, (projected.measured, *projected.predicted, projected.noise), strict=True))
+        projected=ForceSeries(
+            source=log_title(samples.source),
+            time=part.time.numpy(),
+            measured=projected.measured,
+            nominal=projected.predicted[0],
+            identified=projected.predicted[1],
+            noise=projected.noise,
         ),
         states=tuple(names.values()),
         state=np.array([present.index(tuple(active)) for active in part.active.tolist()]),
-        step=step,
         bandwidth=0.5 * rate / max(samples.oversampling, step),
     )

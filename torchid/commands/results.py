@@ -80,7 +80,7 @@ class Identification:
         ridge: how it was chosen, if it was.
         choices: how other settings were chosen, if they were.
         forces: of the first samples of a log, as measured and as predicted; None where there are but factors.
-        traces: of all of that log.
+        traces: of all of that log, in the rows of the fit.
         suspected: what the checks find in its training logs if it is doubtful, in words.
     """
 
@@ -231,10 +231,10 @@ def write_run(
         write_posterior(folder / POSTERIOR, run.posterior)
         (folder / identified_name(robot)).write_bytes(identified_robot(robot, run.phi, run.fitted_joints))
         write_json(folder / DATA, report_document(run))
-        write_page(folder, output)
         if training is not None:
             training.copy_curves(folder)
         write_events(run, folder, lambda: write_figures(folder, config.figures.format, order, [*begun, rest]))
+        write_page(folder, output)
     if training is not None:
         training.remove_checkpoint()
 
@@ -342,7 +342,6 @@ def _solution_document(estimate: Estimate) -> dict[str, object] | None:
         "unconstrained",
         "distance",
         "gap",
-        "certified_gap",
         "steps",
         "active",
         "epochs",

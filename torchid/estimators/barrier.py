@@ -17,7 +17,7 @@ from torchid.parameters import Array
 
 _SHRINK = 0.02  # of the barrier's weight from stage to stage
 _STAGE_CENTRED = 0.25  # squared Newton decrement at which a full step ends a stage
-_STEPS, _STAGES = 200, 40
+_STEPS = 200  # Newton steps of a stage, and of the path of primal and dual
 _GOOD_SLACK = 1e-6  # of a starting point, at which phase I stops
 _LEAST_SLACK = 1e-9  # of a starting point that is accepted if phase I finds no better one
 _MOST_SLACK = 0.01  # bound of the slack in phase I
@@ -26,17 +26,13 @@ _SHORTEST = 1e-6  # least share of a step: below, rounding decides about feasibi
 
 
 @one_thread()
-def find_strictly_feasible(problem: ConicProblem, patience: int = _STEPS * _STAGES) -> tuple[Array, int]:
+def find_strictly_feasible(problem: ConicProblem) -> tuple[Array, int]:
     """A strictly feasible x, (n,), near 0 where possible, and the Newton steps it took to find (phase I).
-
-    Args:
-        problem: with the conditions to meet.
-        patience: largest number of Newton steps.
 
     Raises:
         InputError: there is none; names the condition that is violated most.
     """
-    x = problem.E.T @ problem.e if problem.start is None else problem.start
+    x = problem.E.T @ problem.e
     worst = float(problem.slack(x).min(initial=np.inf))
     if worst > _GOOD_SLACK:
         return x, 0
@@ -44,8 +40,8 @@ def find_strictly_feasible(problem: ConicProblem, patience: int = _STEPS * _STAG
     if problem.slack(inside).min() > _GOOD_SLACK:
         return inside, 0
     z, kappa, steps = np.append(x, 1.0 - worst), 1.0, 0
-    while kappa * (problem.degree + 1) > 0.1 * _LEAST_SLACK and steps < patience:
-        z, taken = _CentralPath(_phase_one(problem, kappa)).centre(z, kappa, patience - steps)
+    while kappa * (problem.degree + 1) > 0.1 * _LEAST_SLACK:
+        z, taken = _CentralPath(_phase_one(problem, kappa)).centre(z, kappa)
         steps += taken
         if problem.slack(z[:-1]).min() > _GOOD_SLACK:
             return z[:-1], steps
@@ -82,7 +78,6 @@ def _phase_one(problem: ConicProblem, kappa: float) -> ConicProblem:
     n, blocks, rows = len(problem.linear), len(problem.F0), len(problem.h)
     return replace(
         problem,
-        start=None,
         root=np.sqrt(0.5 * kappa) * np.hstack([problem.deviations, np.zeros((n, 1))]),
         target=np.zeros(n),
         linear=np.eye(n + 1)[n],
@@ -134,12 +129,11 @@ class _CentralPath(ConicTensors):
         super().__init__(problem)
         self.null_space = torch.from_numpy(problem.null_space)
 
-    def centre(self, start: Array, kappa: float, patience: int) -> tuple[Array, int]:
+    def centre(self, start: Array, kappa: float) -> tuple[Array, int]:
         """The path at barrier weight `kappa` from a strictly feasible `start`, (n,): its point, and the steps."""
         x, N = torch.from_numpy(start), self.null_space
         factors = self.feasible_factors(x)
-        most = min(_STEPS, patience)
-        for steps in range(1, most + 1):
+        for steps in range(1, _STEPS + 1):
             root, slack = factors
             quadratic_gradient = torch.from_numpy(self.problem.gradient(x.numpy()))
             half_whitened = torch.linalg.solve_triangular(root[:, None], self.F, upper=False)
@@ -149,7 +143,7 @@ class _CentralPath(ConicTensors):
             gradient, hessian = self._derivatives(quadratic_gradient, whitened, slack, kappa)
             move = -(N @ damped_inverse(N.T @ hessian @ N)(N.T @ gradient))
             decrement = float(-gradient @ move) / kappa
-            if decrement <= _STAGE_CENTRED or steps == most:
+            if decrement <= _STAGE_CENTRED or steps == _STEPS:
                 break
             change = (move[self.variables, None, None] * whitened).sum(1)  # of the blocks, relative
             rates = torch.cat([torch.linalg.eigvalsh(change).ravel(), self.G @ move / slack]).numpy()
@@ -245,10 +239,11 @@ def solve_barrier(problem: ConicProblem, tolerance: float = 1e-9) -> Solution:
         x = point.x.numpy()
         objective, last = problem.objective(x), after is None or count == _STEPS
         scale = max(objective, problem.floor)
-        if not last and point.complementarity > _CENTRED * max(tolerance, _ACCURATE) * scale:
-            continue  # the gap takes as long as a step
+        far = point.complementarity > _CENTRED * max(tolerance, _ACCURATE) * scale
+        if far and not last and not problem.weights.any():
+            continue  # the gap takes as long as a step; with small log-determinants rounding may leave none later on
         gap = problem.gap(x, *path.multipliers(point))
-        worse = worse + 1 if gap >= best.gap else 0
+        worse = worse + 1 if gap >= best.gap and not far else 0
         if worse > _PATIENCE:
             break  # rounding errors exceed the progress
         if gap < best.gap:

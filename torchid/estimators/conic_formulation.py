@@ -156,7 +156,7 @@ def _compressed(problem: LinearProblem, x: _Variables, prior: Array) -> tuple[Ar
 
 
 def _floor(problem: LinearProblem, ridge: float) -> float:
-    """The objective that counts as 0: Clarabel's accuracy with an entropic prior is 1e-10 of the ridge."""
+    """The objective that counts as 0, to which gaps are relative below."""
     data = (float(problem.b @ problem.b) + problem.residual) / max(problem.rows, 1)
     return max(_FLOOR_OF_DATA * data, _FLOOR_OF_RIDGE * ridge) or 1.0
 

@@ -14,7 +14,7 @@ from torchid.parameters import Array
 EQUAL_WITHIN = 1e-9
 """Numbers closer than this share of their scale count as equal."""
 
-SEARCH_RADIUS = 1e3
+_SEARCH_RADIUS = 1e3
 """Radius, in scales of the parameters, within which a gap is valid along directions that the data do not determine."""
 
 
@@ -26,7 +26,7 @@ class Solution:
         x: (n,).
         objective: at x.
         gap: duality gap, which bounds how far the objective is above the least one.
-        steps: Newton steps, or iterations of the conic solver.
+        steps: Newton steps.
     """
 
     x: Array
@@ -63,7 +63,6 @@ class ConicProblem:
         floor: > 0, the objective that counts as 0: below, gaps are relative to this.
         deviations: (n, n): `deviations @ x` is the deviation of the parameters from nominal, in units of their scale,
             and then the terms of the problem in units of their size.
-        start: (n,), a strictly feasible point; None where none is known.
     """
 
     root: Array
@@ -81,7 +80,6 @@ class ConicProblem:
     names: tuple[str, ...]
     floor: float
     deviations: Array
-    start: Array | None = None
 
     @property
     def degree(self) -> int:
@@ -138,7 +136,7 @@ class ConicProblem:
         return float(value)
 
     def gap(self, x: Array, Z: Array, y: Array) -> float:
-        """Objective at x less the dual objective: no feasible point within `SEARCH_RADIUS` is better by more.
+        """Objective at x less the dual objective: no feasible point within `_SEARCH_RADIUS` is better by more.
 
         Whatever the multipliers, weak duality holds, so that this bounds the error of any solver.
 
@@ -157,12 +155,12 @@ class ConicProblem:
         if step is None:
             values, vectors = self._stiffness_modes(multiplier_slopes)
             modes = vectors.T @ (self.null_space.T @ residual)
-            balanced = np.abs(modes) <= 2.0 * SEARCH_RADIUS * values
+            balanced = np.abs(modes) <= 2.0 * _SEARCH_RADIUS * values
             lengths = modes[balanced] / np.maximum(values[balanced], np.finfo(float).tiny)
             step = -self.null_space @ (vectors[:, balanced] @ lengths)
         multiplier_change = np.einsum("kv,kvij->kij", step[self.variables], multiplier_slopes)
         unbalanced = self.null_space.T @ (residual + self.hessian @ step + self._gathered(multiplier_change))
-        gap = 0.5 * step @ self.hessian @ step + y @ (self.G @ x - self.h) + SEARCH_RADIUS * np.abs(unbalanced).sum()
+        gap = 0.5 * step @ self.hessian @ step + y @ (self.G @ x - self.h) + _SEARCH_RADIUS * np.abs(unbalanced).sum()
         products = blocks @ (Z - multiplier_change)
         gap += np.trace(products[~weighted], axis1=1, axis2=2).sum()
         weights = self.weights[weighted, None]
@@ -176,7 +174,7 @@ class ConicProblem:
         if self._stiffness_root is None:
             return None
         lengths = scipy.linalg.cho_solve((self._stiffness_root, True), self.null_space.T @ residual)
-        return -self.null_space @ lengths if np.linalg.norm(lengths) <= 2.0 * SEARCH_RADIUS else None
+        return -self.null_space @ lengths if np.linalg.norm(lengths) <= 2.0 * _SEARCH_RADIUS else None
 
     @cached_property
     def _stiffness_root(self) -> Array | None:

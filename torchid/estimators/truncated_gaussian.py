@@ -167,7 +167,6 @@ class _Split:
             E=conic.E[:, self.near],
             names=tuple(name for name, keep in zip(conic.names, kept, strict=True) if keep),
             deviations=conic.deviations[:, self.near],
-            start=None,
         )
         return problem, gaussian.marginal(self.near, self.blocks, self.rows)
 

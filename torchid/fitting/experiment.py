@@ -359,9 +359,6 @@ def batch_estimator(settings: EstimatorConfig, conditions: Conditions) -> LeastS
     Args:
         settings: of the estimator.
         conditions: from `conditions_from`.
-
-    Raises:
-        InputError: the certified method without Clarabel.
     """
     if settings.name == "least_squares":
         return settings.least_squares

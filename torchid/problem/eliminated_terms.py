@@ -96,7 +96,3 @@ class EliminatedTerms:
     def scaled(self, root: float) -> EliminatedTerms:
         """The same with rows times a number."""
         return replace(self, C=root * self.C, D=root * self.D, z=root * self.z)
-
-    def without_rows(self) -> EliminatedTerms:
-        """The same with conditions alone."""
-        return replace(self, C=self.C[:0], D=self.D[:0], z=self.z[:0])

@@ -1,4 +1,4 @@
-"""Figures of what was identified: of every body, beside the URDF's; of offsets, scales and terms of actuators."""
+"""Figures of what was identified: of every body, beside the URDF's, its inertia; of offsets, scales and actuators."""
 
 from __future__ import annotations
 
@@ -7,9 +7,12 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 
 import matplotlib
 import numpy as np
+import torch
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Ellipse, Patch
 
 from torchid import parameters
 from torchid.estimators import Estimate
@@ -18,6 +21,7 @@ from torchid.identifiability.confounding import ExtraEstimate
 from torchid.logs.time_range import log_title
 from torchid.parameters import INERTIAL, PARAMETERS, PER_BODY, Array
 from torchid.report.figure_style import CATEGORY_COLORS, IDENTIFIED_COLOR, MEASURED_COLOR, NOMINAL_COLOR, STYLE
+from torchid.robot import Robot
 
 INTERVAL = 1.96
 """Standard errors on either side of a 95 % interval."""
@@ -190,3 +194,73 @@ def _leave_room(axis: Axes, extras: Sequence[ExtraEstimate], rows: Sequence[str]
             place = 0.005 if left_side else 0.995, rows.index(x.extra.label)
             where = axis.get_yaxis_transform()
             axis.text(*place, text, transform=where, ha="left" if left_side else "right", va="bottom", fontsize=7)
+
+
+# ----------------------------------------------------------------------------------------------- ellipsoids of inertia
+
+
+@matplotlib.rc_context(STYLE)
+def inertia_figure(robot: Robot, phi: Array) -> Figure:
+    """Uniform ellipsoids with the inertia of the bodies, from the side and from the front of the base.
+
+    At zero joint positions; lines join the origins of the link frames.
+
+    Args:
+        robot: with its nominal parameters.
+        phi: (L, 12), identified.
+    """
+    poses = robot.link_poses(torch.zeros(1, robot.n, dtype=torch.float64))
+    frames = [poses[name][0].numpy() for name in robot.body_names]
+    kinds = ((robot.nominal, NOMINAL_COLOR, robot.format), (phi, IDENTIFIED_COLOR, "identified"))
+    figure = Figure(figsize=(11.0, 5.0), layout="constrained")
+    views = ((0, "from the side"), (1, "from the front"))
+    for axis, (across, title) in zip(figure.subplots(1, len(views)), views, strict=True):
+        plane = [across, 2]
+        for bodies, color, _ in kinds:
+            for body, frame in zip(bodies, frames, strict=True):
+                ellipsoid = equivalent_ellipsoid(body)
+                if ellipsoid is not None:
+                    axis.add_patch(_outline(*ellipsoid, frame, plane, color))
+        for body, link in enumerate(robot.bodies):
+            ends = np.array([frames[k][plane, 3] for k in (body, max(link.parent, 0))])
+            axis.plot(*ends.T, color=MEASURED_COLOR, linewidth=0.8)
+        axis.set_aspect("equal", adjustable="datalim")
+        axis.set_title(title, loc="left", fontsize=9)
+        axis.set_xlabel(f"{'xy'[across]} [m]")
+        axis.set_ylabel("z [m]")
+    handles = [Patch(facecolor=color, alpha=0.4, edgecolor=color, label=label) for _, color, label in kinds]
+    figure.legend(handles=handles, loc="outside upper right", ncols=2)
+    bad = [name for name, x in zip(robot.body_names, phi, strict=True) if x.any() and equivalent_ellipsoid(x) is None]
+    missing = f"\nnot drawn, as no body has their inertia: {', '.join(bad)}" if bad else ""
+    figure.suptitle(f"Ellipsoids of inertia in the frame of {robot.base_link}{missing}", x=0.01, ha="left")
+    return figure
+
+
+def _outline(center: Array, semi_axes: Array, T_base_link: Array, plane: Sequence[int], color: str) -> Ellipse:
+    """The projection of an ellipsoid of a link frame to a coordinate plane of the base's."""
+    axes = (T_base_link[:3, :3] @ semi_axes)[plane]  # (2, 3)
+    squares, directions = np.linalg.eigh(axes @ axes.T)
+    width, height = 2.0 * np.sqrt(np.maximum(squares, 0.0))
+    middle = (T_base_link[:3, :3] @ center + T_base_link[:3, 3])[plane]
+    angle = np.degrees(np.arctan2(directions[1, 0], directions[0, 0]))
+    face = to_rgba(color, 0.25)
+    return Ellipse((middle[0], middle[1]), width, height, angle=angle, facecolor=face, edgecolor=color, linewidth=0.8)
+
+
+def equivalent_ellipsoid(phi: Array) -> tuple[Array, Array] | None:
+    """Centre (3,) and semi-axes, columns of (3, 3) [m], of the uniform ellipsoid with a body's mass and inertia.
+
+    Its second moment about the centre of mass is a fifth of the mass times the squared semi-axes.
+
+    Args:
+        phi: (>= 10,), in the link frame.
+
+    Returns:
+        None where no distribution of positive mass has them, or without mass.
+    """
+    if phi[parameters.MASS] <= 0.0 or parameters.consistency_margin(phi) < parameters.POSSIBLE_MARGIN:
+        return None
+    mass, center, inertia = parameters.mass_com_inertia(phi)
+    second_moment = 0.5 * np.trace(inertia) * np.eye(3) - inertia
+    eigenvalues, axes = np.linalg.eigh(second_moment)
+    return center, axes * np.sqrt(5.0 * np.maximum(eigenvalues, 0.0) / mass)

@@ -248,8 +248,6 @@ def _print_conditions(run: Identification) -> None:
         print_labelled("objective", f"{100.0 * estimate.relative_increase:.3g} % above the least without conditions")
     if isinstance(estimate, ConsistentEstimate) and estimate.active:
         print_labelled("at bounds", f"{len(estimate.active)}: {join_names(estimate.active, _NAMED)}")
-    if isinstance(estimate, ConsistentEstimate) and estimate.certified_gap is not None:
-        print_labelled("certified", f"objective within {estimate.certified_gap:.1g} of the other method's")
 
 
 def _print_choices(choices: Mapping[str, object]) -> None:
