@@ -33,7 +33,7 @@ from torchid import errors
 from torchid.errors import InputError, LogError, TorchidWarning, about_file, current_file, warn
 from torchid.guards import MAX_ARRAYS, check_regular
 
-MEMORY_BYTES, PROCESSOR_SECONDS, FREE_BYTES = 2**30, 10, 10_000_000
+MEMORY_BYTES, PROCESSOR_SECONDS, FREE_BYTES = 3 * 2**28, 10, 10_000_000
 """What reading may take of memory and of processor time, of files below so many bytes; more in proportion above."""
 
 LIMITS = "TORCHID_READ_LIMITS"
@@ -220,7 +220,7 @@ def _error(module: str, name: str, text: str, args: list[Any]) -> Exception:
         known = getattr(import_module(module), name)
         if issubclass(known, InputError):
             return known(*args)
-    if name == "MemoryError":
+    if name.endswith("MemoryError"):
         return LogError.at_field("file", "reading it needs more memory than it may take", _accepted())
     return type(name, (Exception,), {})(text)
 
