@@ -44,6 +44,7 @@ _ANSWER_SECONDS = 20.0  # without an answer, per second of processor time that i
 _POLL_SECONDS = 0.5
 _BYTES_OF_GROUP, _BYTES_OF_VALUE = 2**20, 100  # of values that are sent together; of each, beside its content
 _LENGTH = struct.Struct("<Q")
+_TO_JSON = json.JSONEncoder().encode
 _COMMAND = "import sys; sys.path[:] = {!r}; from torchid.reader import serve; serve()"
 _ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}  # threads take memory
 
@@ -98,14 +99,19 @@ def warm_up() -> None:
 
 
 _idle: list[_Reader] = []
+_of_parent: list[_Reader] = []  # of a fork's: it ends them
 
 
 def _take() -> _Reader:
     """A process that has nothing to do, of those of this process: a fork has none."""
     while _idle:
         reader = _idle.pop()
-        if reader.is_usable:
+        if not reader.is_own:
+            _of_parent.append(reader)
+        elif reader.is_running:
             return reader
+        else:
+            reader.end()
     return _Reader()
 
 
@@ -127,8 +133,13 @@ class _Reader:
         )
 
     @property
-    def is_usable(self) -> bool:
-        return self._owner == os.getpid() and self._process.poll() is None
+    def is_own(self) -> bool:
+        """Whether this process has started it."""
+        return self._owner == os.getpid()
+
+    @property
+    def is_running(self) -> bool:
+        return self._process.poll() is None
 
     def open(self, opener: Opener, path: Path) -> None:
         times = max(1.0, path.stat().st_size / FREE_BYTES) * _factor()
@@ -144,15 +155,18 @@ class _Reader:
 
     def close(self) -> None:
         """Leave the process to others, unless it has not said all that it was asked for."""
-        with suppress(Exception):
+        try:
             self.ask({"close": True})
+        except BaseException as error:
+            self.end()
+            if not isinstance(error, Exception):
+                raise
+        else:
             _idle.append(self)
-            return
-        self.end()
 
     def end(self) -> None:
         """End the process."""
-        if self._owner != os.getpid():
+        if not self.is_own:
             return
         self._process.kill()
         self._process.wait()
@@ -183,7 +197,7 @@ class _Reader:
     def _send(self, request: dict[str, Any]) -> None:
         assert self._process.stdin is not None  # noqa: S101
         with suppress(BrokenPipeError):  # whose cause the answer tells
-            self._process.stdin.write(json.dumps(request).encode() + b"\n")
+            self._process.stdin.write(_TO_JSON(request).encode() + b"\n")
 
     def _receive(self) -> tuple[str, Any]:
         """Kind and value of the next answer. Raises LogError: the process has ended, or says nothing."""
@@ -368,7 +382,7 @@ class _Server:
 
     def _send(self, kind: str, value: Any) -> None:
         buffers = list[Any]()
-        header = json.dumps([kind, _encode(value, buffers)]).encode()
+        header = _TO_JSON([kind, _encode(value, buffers)]).encode()
         self._stream.write(_LENGTH.pack(len(header)) + header)
         for buffer in buffers:
             self._stream.write(buffer)
