@@ -112,14 +112,12 @@ from .problem import (
     compress_parts,
     linear_problem,
 )
-from .problem.compressed_log import (
+from .problem.compression import (
     CompressedLog,
+    compress_in_blocks,
     compress_log,
     fold_compressed,
     merge_blocks,
-)
-from .problem.compression import (
-    compress_in_blocks,
     split_into_folds,
 )
 from .regressor import (

@@ -18,8 +18,7 @@ from torchid.estimators import Consistent, LeastSquares
 from torchid.estimators.conditions import term_violations
 from torchid.estimators.conic_problem import Prior
 from torchid.problem import LinearProblem
-from torchid.problem.eliminated_terms import EliminatedTerms, SignCondition
-from torchid.problem.linear import parameter_scale
+from torchid.problem.linear import EliminatedTerms, SignCondition, parameter_scale
 
 SIZE = 0.3
 

@@ -13,8 +13,7 @@ from torchid.estimators import Conditions, Consistent, Mirror
 from torchid.estimators.conic_problem import Prior
 from torchid.parameters import MASS, PER_BODY
 from torchid.problem import LinearProblem
-from torchid.problem.eliminated_terms import EliminatedTerms, SignCondition
-from torchid.problem.linear import parameter_scale
+from torchid.problem.linear import EliminatedTerms, SignCondition, parameter_scale
 
 BASE, FAR = 0, 2  # bodies
 COULOMB = 10  # number of a friction parameter

@@ -52,9 +52,7 @@ from torchid.logs.read import files_of_recordings_kept
 from torchid.logs.timeline import LOSSLESS_RATE
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples
-from torchid.problem.compressed_log import Block
-from torchid.problem.compression import compress_parts
-from torchid.problem.parts import Part
+from torchid.problem.compression import Block, Part, compress_parts
 from torchid.reading.log_reader import LogReader, memory_needed
 from torchid.sensing import SensorSet
 from torchid.settings import AUTO

@@ -38,11 +38,10 @@ from torchid.identifiability.jackknife import LEAST_BLOCKS
 from torchid.parallel import one_thread
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Evaluation, LinearProblem, Metrics, Samples
-from torchid.problem.compressed_log import Block
+from torchid.problem.compression import Block, Part, merge_folds, merge_states
 from torchid.problem.contact_state import ContactState, state_name
 from torchid.problem.metrics import LOG_SETS
 from torchid.problem.motion_noise import is_at_rest
-from torchid.problem.parts import Part, merge_folds, merge_states
 from torchid.report.forces import ForceSeries
 from torchid.report.tables import progress_bars
 

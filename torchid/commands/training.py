@@ -41,9 +41,9 @@ from torchid.fitting.experiment import Experiment
 from torchid.fitting.fit import LogFitter
 from torchid.parameters import PARAMETERS, Array
 from torchid.problem import LinearProblem, Metrics, MiniBatches, Samples, TriangularFactor, assemble, compress_parts
+from torchid.problem.compression import Part
 from torchid.problem.elimination import Assembly
 from torchid.problem.linear import parameter_scale
-from torchid.problem.parts import Part
 from torchid.robot import Robot
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from torchid.estimators.least_squares import ConstrainedEstimate, Minimizer, Reg
 from torchid.parallel import one_thread
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import LinearProblem
-from torchid.problem.eliminated_terms import AT_BOUND
+from torchid.problem.linear import AT_BOUND
 from torchid.reprs import short_repr
 from torchid.rounding import relative_tolerance
 

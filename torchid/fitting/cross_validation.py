@@ -19,11 +19,9 @@ from torchid.parallel import one_thread, share_between_processes, thread_count
 from torchid.parameters import Array
 from torchid.problem import Evaluation, ExtraTerms, Metrics, RowBuilder, Samples
 from torchid.problem.chunks import ProgressCallback
-from torchid.problem.compressed_log import Block
-from torchid.problem.compression import compress_in_folds, split_into_folds
+from torchid.problem.compression import Block, Part, compress_in_folds, merge_states, split_into_folds
 from torchid.problem.elimination import Assembly
 from torchid.problem.metrics import ForceSums
-from torchid.problem.parts import Part, merge_states
 from torchid.settings import RidgeRule
 
 RIDGES = tuple(float(f"1e{power}") for power in range(-7, 2))

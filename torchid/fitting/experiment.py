@@ -35,9 +35,8 @@ from torchid.fitting.prior_knowledge import conditions_from, known_masses
 from torchid.fitting.robust import RobustLoss
 from torchid.log_checks.model import Declared
 from torchid.problem import Evaluation, ExtraTerms, RowBuilder, Samples
-from torchid.problem.compressed_log import Block
-from torchid.problem.parts import Part, merge_states
-from torchid.problem.sampled_rows import LogOfOtherProcess
+from torchid.problem.compression import Block, Part, merge_states
+from torchid.problem.noise import LogOfOtherProcess
 from torchid.reprs import short_repr
 from torchid.robot import Robot, load_robot
 from torchid.robot.constraints import matching_joints

@@ -16,8 +16,8 @@ from torchid.errors import LogError, join_names
 from torchid.guards import MAX_LETTERS
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, TriangularFactor
-from torchid.problem.parts import Part
-from torchid.problem.sampled_rows import noise_of_sensors
+from torchid.problem.compression import Part
+from torchid.problem.noise import noise_of_sensors
 from torchid.reprs import short_repr
 from torchid.robot import Robot
 from torchid.robot.tree import BodyJoint

@@ -37,9 +37,8 @@ from torchid.identifiability.base_parameters import StateReport, merge_state_rep
 from torchid.logs.containers import FACTORS, Container, open_npz, reader_errors_explained
 from torchid.parameters import Array
 from torchid.problem import RowBuilder
-from torchid.problem.blocks import block_spans
-from torchid.problem.compressed_log import CompressedLog, piece_spans
-from torchid.problem.compression import FOLDS
+from torchid.problem.chunk_dynamics import block_spans
+from torchid.problem.compression import FOLDS, CompressedLog, piece_spans
 from torchid.problem.extras import ACTUATORS, NoiseGroups, in_words, noise_key
 from torchid.reprs import short_repr
 from torchid.robot.payloads import Payload

@@ -18,9 +18,9 @@ from torchid.identifiability.jackknife import Jackknife, jackknife_blocks
 from torchid.parallel import one_thread
 from torchid.parameters import PER_BODY
 from torchid.problem import LinearProblem, RowBuilder, assemble
+from torchid.problem.compression import Part, merge_blocks_of_folds
 from torchid.problem.elimination import Assembly
 from torchid.problem.noise_gram import scale_columns
-from torchid.problem.parts import Part, merge_blocks_of_folds
 from torchid.reprs import short_repr
 from torchid.robot import Robot
 from torchid.rounding import RANK_TOLERANCE

@@ -20,7 +20,7 @@ from torchid.logs.dry_friction import OFTEN, resting_share
 from torchid.parallel import one_thread
 from torchid.parameters import COULOMB, FRICTION, INERTIAL, PER_BODY, Array
 from torchid.problem import LinearProblem, RowBuilder, Samples
-from torchid.problem.compressed_log import Block
+from torchid.problem.compression import Block
 from torchid.problem.metrics import Metrics
 from torchid.robot import Robot
 from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, is_significant

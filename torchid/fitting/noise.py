@@ -15,8 +15,14 @@ from torchid.fitting.fit import LogFitter
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.extras import noise_key
-from torchid.problem.noise import GroupVariances, VarianceComponentEstimator, fitted_directions
-from torchid.problem.sampled_rows import LogOfOtherProcess, SampledRows, noise_of_sensors
+from torchid.problem.noise import (
+    GroupVariances,
+    LogOfOtherProcess,
+    SampledRows,
+    VarianceComponentEstimator,
+    fitted_directions,
+    noise_of_sensors,
+)
 from torchid.reprs import short_repr
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet

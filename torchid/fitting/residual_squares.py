@@ -14,10 +14,8 @@ from torchid.parallel import one_thread
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.chunk_dynamics import Workspace
 from torchid.problem.chunks import map_chunks
-from torchid.problem.compressed_log import Block
-from torchid.problem.compression import compress_unloaded
+from torchid.problem.compression import Block, Part, compress_unloaded
 from torchid.problem.contact_state import ContactState
-from torchid.problem.parts import Part
 from torchid.sensing.sensors import recorded_components
 
 

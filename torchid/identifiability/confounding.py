@@ -12,9 +12,9 @@ from torchid.estimators import Estimate
 from torchid.parallel import one_thread
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, RowBuilder
+from torchid.problem.compression import Part, merge_factors
 from torchid.problem.elimination import Assembly, Elimination
 from torchid.problem.extras import Extra
-from torchid.problem.parts import Part, merge_factors
 from torchid.reprs import decimal
 from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE
 

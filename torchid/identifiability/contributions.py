@@ -21,9 +21,9 @@ from torchid.parallel import one_thread
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, RowBuilder, Samples
 from torchid.problem.chunks import ProgressCallback
+from torchid.problem.compression import Part
 from torchid.problem.contact_state import state_name
 from torchid.problem.elimination import eliminate_columns
-from torchid.problem.parts import Part
 from torchid.rounding import RANK_TOLERANCE, numerical_rank
 
 

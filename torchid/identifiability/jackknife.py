@@ -13,8 +13,8 @@ from torchid.identifiability.confounding import ParameterCovariance, mass_weight
 from torchid.parallel import one_thread
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import RowBuilder
+from torchid.problem.compression import Part
 from torchid.problem.elimination import Assembly
-from torchid.problem.parts import Part
 
 LEAST_BLOCKS = 3
 """With fewer blocks their scatter says nothing: of two, 95 % of Student's t reach to 12.7 standard errors."""

@@ -18,9 +18,8 @@ from torchid.sensing import Contact, SensorNoise, SensorSet
 from torchid.sensing.sensors import measured_components, recorded_components
 
 if TYPE_CHECKING:
-    from torchid.problem.contact_state import ContactStateLayout
+    from torchid.problem.contact_state import ContactStateLayout, FramePoses
     from torchid.problem.samples import Samples
-    from torchid.problem.wrench_rows import FramePoses
     from torchid.regressor.tree import KinematicTree
 
 CHANNELS = ("joint_torque", "contact_force", "contact_moment", "ft_force", "ft_moment")

@@ -26,7 +26,7 @@ from torchid import distributed
 from torchid.errors import format_percent
 from torchid.parallel import one_thread
 from torchid.parameters import Array
-from torchid.problem.blocks import span_of_samples
+from torchid.problem.chunk_dynamics import span_of_samples
 from torchid.problem.chunks import ProgressCallback, chunk_size, map_chunks
 from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import TriangularFactor, gram_matrix

@@ -15,13 +15,11 @@ from torch import Tensor
 from torchid.logs.lazy_arrays import Spill
 from torchid.parallel import one_thread
 from torchid.parameters import Array
-from torchid.problem.blocks import folds_in
-from torchid.problem.chunk_dynamics import ChunkDynamics, ChunkKinematics
+from torchid.problem.chunk_dynamics import ChunkDynamics, ChunkKinematics, folds_in
 from torchid.problem.chunks import chunks_by_state
-from torchid.problem.contact_rows import leave_out_torques
 from torchid.problem.contact_state import ContactState
 from torchid.problem.extras import ACTUATORS, Extra, contact_extra_column, dof_extra_column
-from torchid.problem.rows import RowBuilder
+from torchid.problem.rows import RowBuilder, leave_out_torques
 from torchid.problem.samples import Samples
 from torchid.regressor.columns import body_wrenches
 from torchid.regressor.regressor import friction_columns, generalized_forces, joint_row
