@@ -44,7 +44,7 @@ from torchid.fitting.separable import (
     choose_sign_width,
     choose_stribeck,
 )
-from torchid.log_checks.frozen import new_poses
+from torchid.log_checks.readings import new_poses
 from torchid.logs import Log
 from torchid.logs.cutoff import CutoffChoice, choose_cutoff
 from torchid.logs.low_pass import DROPPED_PERIODS

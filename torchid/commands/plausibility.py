@@ -39,7 +39,7 @@ from torchid.identifiability.confounding import ExtraEstimate, TotalMass, estima
 from torchid.log_checks import Finding
 from torchid.log_checks.check import check
 from torchid.log_checks.findings import SEVERITIES
-from torchid.log_checks.lag_and_tilt import check_tilt
+from torchid.log_checks.lags import check_tilt
 from torchid.log_checks.model import NominalModel
 from torchid.parallel import can_fork, share_between_forks, thread_count
 from torchid.parameters import GRAVITY, PARAMETERS, PER_BODY, Array
