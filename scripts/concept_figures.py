@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 import torchid
 from torchid.boundary import run_guarded
 from torchid.commands.results import Identification
-from torchid.identifiability.structure import structural_problem
+from torchid.identifiability.base_parameters import structural_problem
 from torchid.parameters import PARAMETERS, PER_BODY, Array
 from torchid.problem.predict import force_series, null_space_part
 from torchid.reading.log_reader import LogReader

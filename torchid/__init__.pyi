@@ -47,14 +47,12 @@ from .fitting.cross_validation import (
     choose_ridge,
     cross_validate,
 )
-from .fitting.factor_documents import (
-    RowModel,
-    require_same_noise,
-    require_same_rows,
-)
 from .fitting.factor_files import (
     FactorFile,
+    RowModel,
     read_factors,
+    require_same_noise,
+    require_same_rows,
     write_factors,
 )
 from .fitting.fit import (
@@ -80,12 +78,10 @@ from .fitting.robust import (
 from .identifiability.base_parameters import (
     BaseParameters,
     base_parameters,
+    structural_problem,
 )
 from .identifiability.confounding import (
     estimate_extras,
-)
-from .identifiability.structure import (
-    structural_problem,
 )
 from .log_checks import (
     Checked,

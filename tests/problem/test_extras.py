@@ -18,8 +18,7 @@ from unknowns import Fit, fit
 from welded import CONTACTS, SENSORS, STATES
 
 from torchid.estimators import Consistent
-from torchid.identifiability.base_parameters import base_parameters
-from torchid.identifiability.structure import structural_problem
+from torchid.identifiability.base_parameters import base_parameters, structural_problem
 from torchid.logs import Log
 from torchid.problem import ExtraTerms, bind_log
 from torchid.problem.extras import ACTUATORS, CHANNELS, list_extras

@@ -13,8 +13,8 @@ from welded import CONTACTS, SENSORS, STATES, machine
 
 from torchid.config import load_config
 from torchid.fitting.calibration import Calibration
+from torchid.fitting.cross_validation import sum_residuals
 from torchid.fitting.experiment import set_up
-from torchid.fitting.residual_squares import sum_residuals
 from torchid.logs import read_log
 from torchid.logs.preprocess import preprocess
 from torchid.parameters import Array

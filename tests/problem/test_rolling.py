@@ -18,7 +18,7 @@ from synthetic import ANYMAL, PANDA, SOLO12, Array, load
 
 import torchid
 from torchid.errors import LogError, SensorError
-from torchid.identifiability.structure import standing_states
+from torchid.identifiability.base_parameters import standing_states
 from torchid.logs import Log, read_log, write_log
 from torchid.logs.preprocess import preprocess
 from torchid.problem import ExtraTerms, RowBuilder, bind_log, compress

@@ -34,8 +34,7 @@ from torchid.fitting.left_out import (
     widest,
     with_terms,
 )
-from torchid.fitting.misfit import force_gain
-from torchid.fitting.noise import recorded_sensors
+from torchid.fitting.noise import force_gain, recorded_sensors
 from torchid.fitting.separable import (
     SignWidthChoice,
     StribeckChoice,

@@ -21,9 +21,8 @@ from torchid.config import load_config
 from torchid.config.robot import NoiseConfig
 from torchid.errors import ConfigError, about_file, during, warn
 from torchid.fitting.calibration import Calibration, Comparison
-from torchid.fitting.checked_settings import stated_noise
 from torchid.fitting.cross_validation import Scorer
-from torchid.fitting.experiment import Experiment, require_device, set_up, with_estimated_noise
+from torchid.fitting.experiment import Experiment, require_device, set_up, stated_noise, with_estimated_noise
 from torchid.fitting.learned import RESIDUAL, RigidPlusResidual
 from torchid.guards import MAX_JSON, MAX_YAML, read_bytes
 from torchid.logs.time_range import log_title, split_range

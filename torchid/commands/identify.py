@@ -29,11 +29,11 @@ from torchid.fitting.cross_validation import CrossValidation, Scorer, calibratio
 from torchid.fitting.factor_files import FactorFile
 from torchid.fitting.fit import Fit, LogFitter
 from torchid.fitting.left_out import gain_deviations
-from torchid.fitting.misfit import misfit, resting_joints, unfitted_friction
+from torchid.fitting.noise import misfit, resting_joints, unfitted_friction
 from torchid.fitting.posterior import fitted_posterior
 from torchid.fitting.robust import RobustSummary, fit_robustly
 from torchid.identifiability.confounding import TotalMass, mass_weights
-from torchid.identifiability.contributions import Contributions, contributions
+from torchid.identifiability.information import Contributions, contributions
 from torchid.identifiability.jackknife import LEAST_BLOCKS
 from torchid.parallel import one_thread
 from torchid.parameters import PER_BODY, Array

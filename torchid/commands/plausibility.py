@@ -28,7 +28,7 @@ from torchid.errors import (
 from torchid.estimators import LeastSquares, SgdEstimate
 from torchid.fitting.experiment import RobotSetup, set_up
 from torchid.fitting.fit import Fit
-from torchid.fitting.misfit import (
+from torchid.fitting.noise import (
     beyond_noise,
     force_gain,
     unexplained_forces,

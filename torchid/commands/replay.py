@@ -35,7 +35,7 @@ from torchid.robot import Robot
 from torchid.robot.constraints import matching_joints
 from torchid.robot.urdf import read_urdf
 from torchid.sensing import Contact
-from torchid.simulation.constraints import Foot, JointConstraints, find_feet, point_foot
+from torchid.simulation.plant import Foot, JointConstraints, find_feet, point_foot
 from torchid.simulation.replay import Drift, Model, ReplayedLog, replay_log
 
 _ByJoint = Mapping[str, Mapping[str, float]]

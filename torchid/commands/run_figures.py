@@ -18,7 +18,7 @@ from torchid.config import ExperimentConfig, dump_config
 from torchid.estimators import ConstrainedEstimate, Estimate, SgdEstimate
 from torchid.fitting.cross_validation import RidgeChoice
 from torchid.identifiability.confounding import ExtraEstimate
-from torchid.identifiability.contributions import Contributions
+from torchid.identifiability.information import Contributions
 from torchid.logs.time_range import log_title
 from torchid.parallel import in_forks, share_between_processes, thread_count
 from torchid.parameters import PER_BODY

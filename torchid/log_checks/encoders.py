@@ -1,4 +1,7 @@
-"""Encoders that torques contradict: dead, other signs or zeros; stops, and missing gravity."""
+"""Encoders that torques contradict: dead, other signs or zeros; stops, and missing gravity.
+
+All for every URDF near the given one: masses that are 15 to 20 % off turn gravity, too, but not as another zero does.
+"""
 
 from __future__ import annotations
 

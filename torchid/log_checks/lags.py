@@ -1,4 +1,8 @@
-"""Lags, clocks at another rate, offsets of torques, tilts of gravity, and turned contact sensors."""
+"""Lags, clocks at another rate, offsets of torques, tilts of gravity, and turned contact sensors.
+
+A lag between two of them is one's as well as the other's; what both have to agree with tells. So each is taken to be
+the late one in turn, beside all URDFs near the given one, and the one that leaves least of the forces is named.
+"""
 
 from __future__ import annotations
 

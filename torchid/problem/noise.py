@@ -1,4 +1,16 @@
-"""Noise of the sensors and of the base rows from residuals of a fit, at some of the samples: variance components."""
+"""Noise of the sensors and of the base rows from residuals of a fit, at some of the samples: variance components.
+
+Every whitened, projected row mixes the noise of several sensors. But each sensor enters the rows of a sample along
+known directions, which differ between postures and contact states. The variances are those at which the expected
+covariance of the residuals equals the observed one (Rao's MINQUE, iterated, which is restricted maximum likelihood;
+Searle, Casella and McCulloch, "Variance Components", 1992, chapters 6 and 11).
+
+Logarithms of variances of sources that are alike, such as motors of one make, are normal about a common mean, neither
+of which is known: where residuals determine each, it keeps its own, and where they do not, it has that of all. How far
+they are apart is estimated too (restricted maximum likelihood of a normal random effect; Breslow and Clayton,
+"Approximate Inference in Generalized Linear Mixed Models", 1993; of variances: Smyth, "Linear Models and Empirical
+Bayes Methods", 2004).
+"""
 
 from __future__ import annotations
 

@@ -3,8 +3,7 @@
 from torchid.robot.constraints import Loop
 from torchid.robot.payloads import Payload, payload_parameters, require_payloads, with_payload
 from torchid.robot.robot import Body, Robot, load_robot
-from torchid.robot.rolling import CollisionShapes, RollingShape
-from torchid.robot.shapes import Extent, body_extents
+from torchid.robot.shapes import CollisionShapes, Extent, RollingShape, body_extents
 from torchid.robot.symmetry import MirrorPair, mirror_pairs
 
 __all__ = [

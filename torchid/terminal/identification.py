@@ -16,7 +16,7 @@ from torchid.errors import format_count, join_names
 from torchid.estimators import ConsistentEstimate, ConstrainedEstimate, Estimate, SgdEstimate
 from torchid.estimators.least_squares import COMBINED, FIXED, IDENTIFIED, PRIOR, UNOBSERVABLE
 from torchid.fitting.cross_validation import CrossValidation
-from torchid.fitting.misfit import Misfit
+from torchid.fitting.noise import Misfit
 from torchid.parameters import PARAMETERS, PER_BODY, Array
 from torchid.problem.metrics import DECISIVE_GROUPS, PRESSURE, describe_errors, group_name
 from torchid.report.tables import (
