@@ -30,8 +30,7 @@ from torchid.report.figure_style import (
     STYLE,
     save_figures,
 )
-from torchid.report.figures import identifiability_figure
-from torchid.report.parameter_figures import INTERVAL
+from torchid.report.figures import INTERVAL, identifiability_figure
 
 ROOT = Path(__file__).resolve().parents[1]
 DEMO = ROOT / "torchid" / "demo" / "quadruped.yaml"

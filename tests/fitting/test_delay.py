@@ -15,9 +15,9 @@ from repository import DEMO
 from torchid.config import load_config
 from torchid.errors import LogError, TorchidWarning
 from torchid.estimators import Conditions, Consistent, LeastSquares
-from torchid.fitting.delay import EARLIEST, LATEST, DelayChoice, choose_delay
 from torchid.fitting.experiment import set_up
 from torchid.fitting.fit import LogFitter
+from torchid.fitting.separable import EARLIEST, LATEST, DelayChoice, choose_delay
 from torchid.logs import Log, read_log
 from torchid.logs.preprocess import preprocess
 from torchid.logs.segments import with_delayed_torques

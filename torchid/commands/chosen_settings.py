@@ -19,7 +19,6 @@ from torchid.commands.check import recorded_segments
 from torchid.errors import InputError, TorchidWarning, join_names
 from torchid.estimators import Conditions
 from torchid.fitting.cross_validation import RidgeChoice
-from torchid.fitting.delay import DelayChoice, choose_delay
 from torchid.fitting.experiment import Experiment, RobotSetup, S, with_radius
 from torchid.fitting.fit import LogFitter
 from torchid.fitting.left_out import (
@@ -36,10 +35,12 @@ from torchid.fitting.left_out import (
 )
 from torchid.fitting.noise import force_gain, recorded_sensors
 from torchid.fitting.separable import (
+    DelayChoice,
     SignWidthChoice,
     StribeckChoice,
     TiltChoice,
     choose_base_tilt,
+    choose_delay,
     choose_sign_width,
     choose_stribeck,
 )

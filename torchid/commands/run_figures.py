@@ -26,9 +26,16 @@ from torchid.problem import Metrics
 from torchid.problem.contact_state import IN_THE_AIR
 from torchid.problem.metrics import LOG_SETS
 from torchid.report.figure_style import Drawn, draw_for
-from torchid.report.figures import contribution_figure, error_figure, identifiability_figure, ridge_figure
+from torchid.report.figures import (
+    contribution_figure,
+    error_figure,
+    extra_figure,
+    identifiability_figure,
+    inertia_figure,
+    parameter_figure,
+    ridge_figure,
+)
 from torchid.report.forces import ForceSeries, force_figure, pressure_figure, rows_figure, spectrum_figure
-from torchid.report.parameter_figures import extra_figure, inertia_figure, parameter_figure
 from torchid.report.tables import table_text, verdict_counts_table
 from torchid.robot import Robot
 

@@ -33,7 +33,7 @@ from torchid.problem.extras import ACTUATORS, NoiseGroups, in_words, noise_key
 from torchid.problem.noise import noise_of_sensors
 from torchid.reprs import short_repr
 from torchid.robot import Robot
-from torchid.robot.payloads import Payload
+from torchid.robot.robot import Payload
 from torchid.robot.tree import BodyJoint
 from torchid.rounding import KINEMATIC_TOLERANCE
 from torchid.sensing import Contact

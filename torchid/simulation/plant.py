@@ -17,7 +17,7 @@ from torchid.config.robot import ConstrainedRobot
 from torchid.errors import ConfigError, UnknownNameError, UrdfError
 from torchid.parameters import Array
 from torchid.robot.constraints import Loop, loops_of_file, passive_joints, weld_positions
-from torchid.robot.mjcf_model import mujoco
+from torchid.robot.mjcf import mujoco
 from torchid.robot.tree import Mimic, joint_origin, link_parameters, resolve_mimics
 from torchid.robot.urdf import TreeJoint, drop_repeated_origins, parse_xml, read_urdf
 from torchid.robot.xml_files import file_kind, is_mjcf, plain_urdf
