@@ -20,7 +20,7 @@ from torchid.boundary import run_guarded
 from torchid.commands.results import Identification
 from torchid.identifiability.base_parameters import structural_problem
 from torchid.parameters import PARAMETERS, PER_BODY, Array
-from torchid.problem.predict import force_series, null_space_part
+from torchid.problem.metrics import force_series, null_space_part
 from torchid.reading.log_reader import LogReader
 from torchid.report.figure_style import (
     IDENTIFIED_COLOR,

@@ -59,17 +59,15 @@ from .fitting.fit import (
     LogFitter,
     frozen_parameters,
 )
-from .fitting.learned import (
-    JointNetworks,
-    RigidPlusResidual,
-)
 from .fitting.noise import (
     estimate_noise,
 )
 from .fitting.posterior import (
     FittedPosterior,
+    JointNetworks,
     ParameterSamples,
     PosteriorSampler,
+    RigidPlusResidual,
 )
 from .fitting.robust import (
     RobustLoss,

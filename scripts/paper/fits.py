@@ -15,8 +15,7 @@ from torchid.problem import Evaluation, RowBuilder, Samples, TriangularFactor, l
 from torchid.problem.chunks import chunks_by_state
 from torchid.problem.compression import compress_by_state, merge_factors
 from torchid.problem.contact_state import ContactState, state_name
-from torchid.problem.metrics import BASE_ROWS
-from torchid.problem.predict import force_series, null_space_part
+from torchid.problem.metrics import BASE_ROWS, force_series, null_space_part
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from torchid.identifiability.base_parameters import base_parameters, structural_
 from torchid.logs import Log
 from torchid.problem import ExtraTerms, bind_log
 from torchid.problem.extras import ACTUATORS, CHANNELS, list_extras
-from torchid.problem.predict import calibrate_readings
+from torchid.problem.metrics import calibrate_readings
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet, chosen_sensors, named_sensors, with_ft_sensors

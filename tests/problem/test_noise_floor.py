@@ -19,8 +19,7 @@ from torchid.logs import read_log
 from torchid.logs.preprocess import preprocess
 from torchid.parameters import Array
 from torchid.problem import Samples, bind_log, compress_parts
-from torchid.problem.metrics import Evaluation
-from torchid.problem.predict import force_series, noise_series
+from torchid.problem.metrics import Evaluation, force_series, noise_series
 from torchid.robot import Robot
 from torchid.sensing import SensorNoise
 

@@ -16,7 +16,7 @@ from synthetic import ROBOTS, ROMEO, load, random_states
 
 from torchid import Regressor
 from torchid.errors import UrdfError
-from torchid.robot.constraints import weld_positions
+from torchid.robot.tree import weld_positions
 from torchid.robot.urdf import read_urdf
 from torchid.simulation.plant import JointConstraints, compile_model
 

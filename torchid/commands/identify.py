@@ -32,16 +32,15 @@ from torchid.fitting.left_out import gain_deviations
 from torchid.fitting.noise import misfit, resting_joints, unfitted_friction
 from torchid.fitting.posterior import fitted_posterior
 from torchid.fitting.robust import RobustSummary, fit_robustly
-from torchid.identifiability.confounding import TotalMass, mass_weights
+from torchid.identifiability.confounding import LEAST_BLOCKS, TotalMass, mass_weights
 from torchid.identifiability.information import Contributions, contributions
-from torchid.identifiability.jackknife import LEAST_BLOCKS
 from torchid.parallel import one_thread
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Evaluation, LinearProblem, Metrics, Samples
 from torchid.problem.compression import Block, Part, merge_folds, merge_states
 from torchid.problem.contact_state import ContactState, state_name
 from torchid.problem.metrics import LOG_SETS
-from torchid.problem.motion_noise import is_at_rest
+from torchid.problem.motion import is_at_rest
 from torchid.report.forces import ForceSeries
 from torchid.report.tables import progress_bars
 

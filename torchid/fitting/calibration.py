@@ -22,7 +22,7 @@ from torchid.problem import Evaluation, RowBuilder, Samples, assemble, compress_
 from torchid.problem.compression import Block, CompressedBlock, Part
 from torchid.problem.elimination import Assembly
 from torchid.problem.extras import ACTUATORS, Extra
-from torchid.problem.predict import calibrate_readings
+from torchid.problem.metrics import calibrate_readings
 from torchid.problem.samples import require_forces
 from torchid.reprs import short_repr
 from torchid.robot import Robot

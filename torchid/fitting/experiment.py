@@ -46,8 +46,7 @@ from torchid.problem.floor_pose import FEWEST_POINTS, points_of
 from torchid.problem.noise import LogOfOtherProcess
 from torchid.reprs import short_repr
 from torchid.robot import CollisionShapes, Robot, RollingShape, load_robot, require_payloads
-from torchid.robot.constraints import matching_joints
-from torchid.robot.tree import FT_FIELD
+from torchid.robot.tree import FT_FIELD, matching_joints
 from torchid.sensing import (
     Contact,
     SensorNoise,

@@ -18,7 +18,7 @@ from torchid import parameters
 from torchid.estimators import Estimate, LeastSquares
 from torchid.estimators.least_squares import residual_std
 from torchid.fitting.fit import LogFitter
-from torchid.identifiability.jackknife import Jackknife
+from torchid.identifiability.confounding import Jackknife
 from torchid.logs.dry_friction import OFTEN, resting_share
 from torchid.parallel import one_thread
 from torchid.parameters import COULOMB, FRICTION, INERTIAL, PER_BODY, Array

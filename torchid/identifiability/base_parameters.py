@@ -19,10 +19,10 @@ from torchid.errors import BaseLostError, BaseLostWarning, NumericalWarning, Urd
 from torchid.parallel import one_thread
 from torchid.parameters import PARAMETERS, PER_BODY, Array
 from torchid.problem import LinearProblem, RowBuilder, Samples, compress, linear_problem
-from torchid.problem.base_motion import BaseMotion
 from torchid.problem.chunks import chunks_by_state, subsample_states
 from torchid.problem.contact_state import ContactState, state_name
-from torchid.problem.predict import null_space_components
+from torchid.problem.metrics import null_space_components
+from torchid.problem.motion import BaseMotion
 from torchid.regressor import FrameJacobian, motion_from_state
 from torchid.regressor.kinematics import (
     GRAVITY_WORLD,
@@ -36,7 +36,7 @@ from torchid.regressor.loops import LoopClosures, LoopJacobian
 from torchid.regressor.regressor import contact_arms
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
-from torchid.robot.constraints import LOOPS_FIELD
+from torchid.robot.tree import LOOPS_FIELD
 from torchid.rounding import KINEMATIC_TOLERANCE, RANK_TOLERANCE, is_significant, numerical_rank
 from torchid.sensing import Contact, SensorSet
 from torchid.sensing.projection import base_rank, base_singular_values

@@ -18,8 +18,7 @@ from torchid.problem.chunks import ProgressCallback, chunks_by_state, subsample_
 from torchid.problem.compression import Part
 from torchid.problem.contact_state import ContactState, state_name
 from torchid.problem.elimination import eliminate_columns
-from torchid.problem.metrics import ROW_GROUPS, ForceSums, finite_or_none
-from torchid.problem.predict import null_space_components, predict_by_columns
+from torchid.problem.metrics import ROW_GROUPS, ForceSums, finite_or_none, null_space_components, predict_by_columns
 from torchid.problem.unloaded_sensors import unloaded_offset_equations
 from torchid.rounding import KINEMATIC_TOLERANCE, RANK_TOLERANCE, numerical_rank
 from torchid.sensing import SensorNoise

@@ -36,7 +36,7 @@ from torchid.logs.units import advise_units, units_of_ratio
 from torchid.parameters import GRAVITY, WRENCH_COMPONENTS
 from torchid.problem import RowBuilder, bind_log
 from torchid.problem.contact_slip import measure_slip
-from torchid.problem.predict import force_series
+from torchid.problem.metrics import force_series
 from torchid.robot import Robot
 from torchid.rounding import STD_PER_MAD
 from torchid.sensing import Contact, named_sensors

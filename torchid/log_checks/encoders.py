@@ -44,8 +44,8 @@ from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.segments import with_delayed_torques
 from torchid.logs.signal_noise import rough_noise
 from torchid.problem import RowBuilder, Samples, bind_log
-from torchid.problem.motion_noise import MIN_MOTION
-from torchid.problem.predict import force_series
+from torchid.problem.metrics import force_series
+from torchid.problem.motion import MIN_MOTION
 from torchid.robot import Robot
 from torchid.robot.urdf import position_limits
 from torchid.sensing import Contact

@@ -39,7 +39,7 @@ from torchid.logs import Log
 from torchid.logs.log import SHAPES, WRENCHES, FloatArray
 from torchid.logs.segments import with_delayed, with_delayed_torques
 from torchid.problem import RowBuilder, Samples
-from torchid.problem.predict import force_series
+from torchid.problem.metrics import force_series
 from torchid.regressor.kinematics import GRAVITY_WORLD
 from torchid.sensing import Contact
 

@@ -21,8 +21,8 @@ from torchid.logs.preprocess import preprocess
 from torchid.logs.signal_noise import SignalNoise
 from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log
 from torchid.problem.extras import list_extras
-from torchid.problem.motion_noise import MIN_MOTION
-from torchid.problem.predict import force_series, null_space_part
+from torchid.problem.metrics import force_series, null_space_part
+from torchid.problem.motion import MIN_MOTION
 from torchid.problem.samples import concatenate
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet, named_sensors

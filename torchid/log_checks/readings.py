@@ -32,7 +32,7 @@ from torchid.logs.log import CONTACT_READINGS, NAN_ALLOWED, WRENCHES, BoolArray,
 from torchid.logs.preprocess import lacks_derivatives
 from torchid.logs.signal_noise import rough_noise
 from torchid.logs.timeline import FEWEST_DIFFERENTIATED, LONGEST_STEP, SHORTEST_STEP
-from torchid.problem.motion_noise import MIN_MOTION, MIN_TURN_DEG
+from torchid.problem.motion import MIN_MOTION, MIN_TURN_DEG
 
 # --------------------------------------------------------------------------------------------------------------- values
 

@@ -28,7 +28,7 @@ from torchid.parameters import MASS, mass_com_inertia
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.chunks import chunks_by_state
 from torchid.problem.linear import parameter_scale
-from torchid.problem.predict import force_series
+from torchid.problem.metrics import force_series
 from torchid.robot import Robot
 
 # ---------------------------------------------------------------------- equations with a prior on the URDF's parameters

@@ -28,8 +28,8 @@ from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.quaternion import rotate_to_world
 from torchid.logs.units import advise_units, units_of_ratio
-from torchid.problem.base_motion import imu_pose
 from torchid.problem.floor_pose import rolled_distance
+from torchid.problem.motion import imu_pose
 from torchid.robot import Robot
 from torchid.sensing import Contact
 from torchid.sensing.sensors import join_numbers

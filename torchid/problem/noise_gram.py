@@ -30,7 +30,7 @@ from torchid.problem.chunk_dynamics import span_of_samples
 from torchid.problem.chunks import ProgressCallback, chunk_size, map_chunks
 from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import TriangularFactor, gram_matrix
-from torchid.problem.motion_noise import with_noise_alone
+from torchid.problem.motion import with_noise_alone
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples, concatenate
 from torchid.rounding import RANK_TOLERANCE, column_scale, is_significant

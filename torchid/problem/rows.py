@@ -11,7 +11,6 @@ import torch
 from torch import Tensor, nn
 
 from torchid.parameters import Array
-from torchid.problem.base_motion import levelled_base_axes
 from torchid.problem.chunk_dynamics import BlockRows, ChunkDynamics, ChunkKinematics, ChunkPart, Workspace, Workspaces
 from torchid.problem.contact_state import (
     ContactState,
@@ -23,6 +22,7 @@ from torchid.problem.contact_state import (
     wrenches_at_ground,
 )
 from torchid.problem.extras import ExtraTerms, KnownTorques, NoiseGroups, dof_extra_column, extra_columns, list_extras
+from torchid.problem.motion import levelled_base_axes
 from torchid.problem.row_blocks import (
     RowBlock,
     moved_rows,

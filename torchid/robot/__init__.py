@@ -1,6 +1,5 @@
 """From a URDF to a tree of bodies with nominal parameters."""
 
-from torchid.robot.constraints import Loop
 from torchid.robot.robot import (
     Body,
     MirrorPair,
@@ -13,6 +12,7 @@ from torchid.robot.robot import (
     with_payload,
 )
 from torchid.robot.shapes import CollisionShapes, Extent, RollingShape, body_extents
+from torchid.robot.tree import Loop
 
 __all__ = [
     "Body",

@@ -28,26 +28,24 @@ from torchid.errors import (
 )
 from torchid.parameters import WRENCH_COMPONENTS, Array
 from torchid.reprs import short_repr
-from torchid.robot.constraints import (
-    Loop,
-    links_beyond,
-    loops_of_file,
-    passive_joints,
-    validate_loops,
-    weld_joints,
-    weld_positions,
-)
 from torchid.robot.tree import (
     BodyJoint,
     BodyTree,
     JointGeometry,
+    Loop,
     build_chain,
     build_tree,
     joint_geometry,
     link_parameters,
     link_poses,
+    links_beyond,
+    loops_of_file,
     nominal_parameters,
+    passive_joints,
     spread_mass,
+    validate_loops,
+    weld_joints,
+    weld_positions,
 )
 from torchid.robot.urdf import MOVING_TYPES, has_fixed_base, read_urdf
 from torchid.robot.xml_files import file_kind

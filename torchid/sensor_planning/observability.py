@@ -18,7 +18,7 @@ from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.contact_state import ContactState, state_name
 from torchid.robot import Robot
-from torchid.robot.constraints import LOOPS_FIELD
+from torchid.robot.tree import LOOPS_FIELD
 from torchid.rounding import BASE_RANK_TOLERANCE
 from torchid.sensing import Contact, SensorNoise, SensorSet
 from torchid.sensing.projection import base_rank, base_singular_values

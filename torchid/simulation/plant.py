@@ -16,9 +16,17 @@ from torchid.config import FootConfig
 from torchid.config.robot import ConstrainedRobot
 from torchid.errors import ConfigError, UnknownNameError, UrdfError
 from torchid.parameters import Array
-from torchid.robot.constraints import Loop, loops_of_file, passive_joints, weld_positions
 from torchid.robot.mjcf import mujoco
-from torchid.robot.tree import Mimic, joint_origin, link_parameters, resolve_mimics
+from torchid.robot.tree import (
+    Loop,
+    Mimic,
+    joint_origin,
+    link_parameters,
+    loops_of_file,
+    passive_joints,
+    resolve_mimics,
+    weld_positions,
+)
 from torchid.robot.urdf import TreeJoint, drop_repeated_origins, parse_xml, read_urdf
 from torchid.robot.xml_files import file_kind, is_mjcf, plain_urdf
 from torchid.sensing.sensors import NORMAL_FORCE
