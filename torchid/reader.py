@@ -30,10 +30,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid import errors
-from torchid.errors import InputError, LogError, TorchidWarning, about_file, current_file, warn
+from torchid.errors import InputError, LogError, TorchidWarning, about_file, current_file, excerpt, warn
 from torchid.guards import MAX_ARRAYS, check_regular
 
-MEMORY_BYTES, PROCESSOR_SECONDS, FREE_BYTES = 2**30, 10, 10_000_000
+MEMORY_BYTES, PROCESSOR_SECONDS, FREE_BYTES = 3 * 2**28, 10, 10_000_000
 """What reading may take of memory and of processor time, of files below so many bytes; more in proportion above."""
 
 LIMITS = "TORCHID_READ_LIMITS"
@@ -131,7 +131,7 @@ class _Reader:
         return self._owner == os.getpid() and self._process.poll() is None
 
     def open(self, opener: Opener, path: Path) -> None:
-        times = max(1.0, path.stat().st_size / FREE_BYTES) * float(os.environ.get(LIMITS, 1))
+        times = max(1.0, path.stat().st_size / FREE_BYTES) * _factor()
         self._path, self._limits = path, (int(times * MEMORY_BYTES), math.ceil(times * PROCESSOR_SECONDS))
         self.ask(
             {
@@ -210,6 +210,17 @@ class _Reader:
         return LogError(self._path, "file", found, _accepted())
 
 
+def _factor() -> float:
+    text = os.environ.get(LIMITS, "1")
+    try:
+        factor = float(text)
+    except ValueError:
+        factor = 0.0
+    if not 0.0 < factor < math.inf:
+        raise InputError("environment", LIMITS, f"'{excerpt(text)}'", "a number above 0, such as 4")
+    return factor
+
+
 def _accepted() -> str:
     return f"a file that is read within the limits, or {LIMITS}=4 in the environment for four times as much"
 
@@ -220,7 +231,7 @@ def _error(module: str, name: str, text: str, args: list[Any]) -> Exception:
         known = getattr(import_module(module), name)
         if issubclass(known, InputError):
             return known(*args)
-    if name == "MemoryError":
+    if name.endswith("MemoryError"):
         return LogError.at_field("file", "reading it needs more memory than it may take", _accepted())
     return type(name, (Exception,), {})(text)
 

@@ -15,7 +15,7 @@ import openers
 import pytest
 
 from torchid import reader
-from torchid.errors import LogError, TorchidWarning, UnknownNameError, about_file
+from torchid.errors import InputError, LogError, TorchidWarning, UnknownNameError, about_file
 from torchid.reader import LIMITS, RemoteObject, open_apart
 
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits are those of Linux")
@@ -92,16 +92,24 @@ def test_a_file_that_takes_too_much_memory_is_refused_unless_more_is_allowed(
     with open_apart(openers.serve, file) as remote:
         assert remote.call("fill", 0.5) == 2**29
         with pytest.raises(LogError, match=f"more memory than it may take; accepted: .*{LIMITS}=4 in the environment"):
-            remote.call("fill", 1.5)
+            remote.call("fill", 1.25)
     monkeypatch.setenv(LIMITS, "2")
     with open_apart(openers.serve, file) as remote:
-        assert remote.call("fill", 1.5) == 3 * 2**29
+        assert remote.call("fill", 1.25) == 5 * 2**28
 
 
-def test_a_reader_that_says_nothing_is_ended(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("text", ["much", "-1", "nan", "inf", ""])
+def test_a_factor_of_the_limits_that_is_none_is_refused(file: Path, text: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(LIMITS, text)
+    line = f"environment: {LIMITS}: '{text}'; accepted: a number above 0"
+    with pytest.raises(InputError, match=line), open_apart(openers.serve, file):
+        pass
+
+
+def test_a_reader_that_says_nothing_is_ended(opened: RemoteObject, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reader, "_ANSWER_SECONDS", 0.05)
-    with open_apart(openers.serve, file) as remote, pytest.raises(LogError, match="no answer of its reader for 0.5 s"):
-        remote.call("wait")
+    with pytest.raises(LogError, match="no answer of its reader for 0.5 s"):
+        opened.call("wait")
 
 
 def test_what_is_no_regular_file_is_not_opened(tmp_path: Path) -> None:
