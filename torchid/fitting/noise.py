@@ -276,7 +276,8 @@ class Misfit:
     @property
     def alike(self) -> bool:
         """Whether residuals are correlated in time more than noise is, and are more than rounding."""
-        return self.lack_of_fit is not None and self.lack_of_fit > _ALIKE and not self._is_rounding
+        is_rounding = self.share is not None and self.share < _EXACT
+        return self.lack_of_fit is not None and self.lack_of_fit > _ALIKE and not is_rounding
 
     @property
     def judged(self) -> bool:
@@ -288,11 +289,6 @@ class Misfit:
         """Whether noise may be all that the model leaves."""
         much = self.expected is not None and self.residual > _MUCH * self.expected
         return not (much or self.alike or (self.friction is not None and self.friction.significant))
-
-    @property
-    def _is_rounding(self) -> bool:
-        """Whether rounding is all that is left."""
-        return self.share is not None and self.share < _EXACT
 
     def _reasons(self) -> list[str]:
         """Why noise cannot be all that the model leaves, none where it may be."""

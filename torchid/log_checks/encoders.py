@@ -445,15 +445,10 @@ def _reversed_joint(pieces: Sequence[Log], model: NominalModel, unexplained: flo
     for mistake in joint_mistakes(pieces[0]) if unexplained > _MIN_UNEXPLAINED else ():
         corrected = [mistake.correct(piece) for piece in pieces]
         rows = DeviationRows.of(bind_some_samples(corrected, model.robot, (), TRIAL_SAMPLES), model)
-        left = fit_deviation(rows, _nothing, 1.0)
+        left = fit_deviation(rows, lambda builder, part, _: np.zeros((len(part), builder.tree.n_rows, 1)), 1.0)
         if left is not None and left.without < least:
             best, least = mistake, left.without
     if best is None:
         return None
     text = f"{best.description}: {unexplained / max(least, 1e-9):.2g} times as much is unexplained otherwise"
     return Finding("unit, sign or frame", REJECTED, best.field, text, best.advice)
-
-
-def _nothing(builder: RowBuilder, part: Samples, number: int) -> FloatArray:
-    """Columns of no unknown."""
-    return np.zeros((len(part), builder.tree.n_rows, 1))

@@ -160,11 +160,6 @@ class TimeScale:
     at_rest: float
 
 
-def _scale_time(log: Log, factor: float) -> Log:
-    """The log with its time multiplied by a factor."""
-    return replace(log, time=log.time[0] + factor * (log.time - log.time[0]))
-
-
 def motion_cutoff_hz(log: Log) -> float | None:
     """A cutoff [Hz] from the spectrum of the joint positions, for any unit of time; None where no joint moves."""
     position = log.joint_position[: 2 * (len(log) // 2)]
@@ -191,7 +186,8 @@ def fit_time_scale(log: Log, model: NominalModel, cutoff_hz: float) -> TimeScale
     """
 
     def samples_at(factor: float) -> list[Samples]:
-        logs = preprocess_pieces(_scale_time(log, factor), cutoff_hz / factor, MAX_TRIAL_DIFFERENTIATED_SAMPLES)
+        scaled = replace(log, time=log.time[0] + factor * (log.time - log.time[0]))
+        logs = preprocess_pieces(scaled, cutoff_hz / factor, MAX_TRIAL_DIFFERENTIATED_SAMPLES)
         return bind_some_samples(logs, model.robot, model.contacts, TIME_SCALE_SAMPLES)
 
     recorded, doubled, at_rest = samples_at(1.0), samples_at(2.0), samples_at(_REST_FACTOR)

@@ -585,13 +585,9 @@ def _tendon_tag(model: mujoco.MjModel, tendon: int) -> str:
 
 def _actuator_tag(model: MjcfModel, actuator: Any) -> str:
     """Tag of an actuator, by its name."""
-    found = _actuators(model, actuator.name)
-    return next(found, "actuator")
-
-
-def _actuators(model: MjcfModel, name: str) -> Iterator[str]:
-    for section in model.text.root.iter("actuator"):
-        yield from (str(element.tag) for element in section if element.get("name", "") == name)
+    sections = model.text.root.iter("actuator")
+    named = (str(x.tag) for section in sections for x in section if x.get("name", "") == actuator.name)
+    return next(named, "actuator")
 
 
 def _numbers(values: Any) -> str:

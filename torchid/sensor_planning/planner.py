@@ -510,12 +510,11 @@ def explain_choice(choice: SensorChoice, progress: StepCallback | None = None) -
     problem, chosen, stack = choice.problem, choice.chosen, choice.problem.stack
     (progress or (lambda *_: None))("leaving sensors out", 0, 1)
 
-    def ranks_with(sensors: Sequence[Candidate]) -> tuple[int | None, int]:
-        return _base_rank(problem, sensors), stack.rank(sensors)
-
     fewer = [tuple(c for c in chosen if c is not candidate) for candidate in chosen]
     (_, full), (_, rank), *without = share_between_forks(
-        [problem.candidates, chosen, *fewer], ranks_with, thread_count()
+        [problem.candidates, chosen, *fewer],
+        lambda sensors: (_base_rank(problem, sensors), stack.rank(sensors)),
+        thread_count(),
     )
     return SensorPlan(
         **vars(choice),
