@@ -11,7 +11,7 @@ from torchid.estimators.sgd import (
     Sgd,
     TrainingSettings,
 )
-from torchid.estimators.training import Epoch, ResidualEffect, SgdEstimate, Trainer, WeightChoice
+from torchid.estimators.training import Epoch, ResidualEffect, SgdEstimate, Trainer
 
 __all__ = [
     "Conditions",
@@ -33,7 +33,6 @@ __all__ = [
     "Trainer",
     "TrainingSettings",
     "Violation",
-    "WeightChoice",
     "nearest_consistent",
     "violations",
 ]

@@ -9,7 +9,7 @@ Every check module has the same order: thresholds, public check functions, helpe
 named MIN_ or MAX_, quantity, unit: `_SHARE` and `_RATIO` are dimensionless, `_STEPS` are median steps of the log.
 """
 
-from torchid.log_checks.check import Checked, check, drop_rejected
+from torchid.log_checks.check import Checked, drop_rejected
 from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, Finding, Skipped, Span
 
-__all__ = ["REJECTED", "Checked", "Finding", "NOTE", "SUSPICIOUS", "Skipped", "Span", "check", "drop_rejected"]
+__all__ = ["REJECTED", "Checked", "Finding", "NOTE", "SUSPICIOUS", "Skipped", "Span", "drop_rejected"]

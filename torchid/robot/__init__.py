@@ -1,8 +1,6 @@
 """From a URDF to a tree of bodies with nominal parameters."""
 
 from torchid.robot.robot import (
-    Body,
-    MirrorPair,
     Payload,
     Robot,
     load_robot,
@@ -15,11 +13,9 @@ from torchid.robot.shapes import CollisionShapes, Extent, RollingShape, body_ext
 from torchid.robot.tree import Loop
 
 __all__ = [
-    "Body",
     "CollisionShapes",
     "Extent",
     "Loop",
-    "MirrorPair",
     "Payload",
     "Robot",
     "RollingShape",
