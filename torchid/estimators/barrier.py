@@ -396,7 +396,10 @@ small. With a quarter it is within 1 %, for as many passes.
 
 _RARE = 0.01  # share of draws that a condition excludes, above which it counts as near
 _DRAWS, _PASSES = 400, 6
-_CENTER_STEPS, _DONE, _ENOUGH, _SHORTEST_CENTER_STEP = 100, 1e-10, 1e-4, 1e-9  # of Newton's method
+_CENTER_STEPS = 100  # of Newton's method
+_CENTERED_DECREMENT = 1e-10  # squared, at which these end
+_SUFFICIENT_DECREASE = 1e-4  # of the objective, as a share of what its slope promises
+_SHORTEST_CENTER_STEP = 1e-9  # share of a step
 _CLOSE = 0.05  # squared decrement from which on full steps converge quadratically
 _GROWTH = 50.0  # of the quadratic from one point of the central path to the next
 
@@ -566,7 +569,7 @@ def _newton(conditions: _Conditions, x: Array, near: np.ndarray, share: float, s
         R = np.linalg.qr(J, mode="r")
         half = scipy.linalg.solve_triangular(R, gradient, trans=1)
         step, decrement, length = -N @ scipy.linalg.solve_triangular(R, half), float(half @ half), 1.0
-        if count == steps or decrement < _DONE:
+        if count == steps or decrement < _CENTERED_DECREMENT:
             break
         while (
             not _is_enough(before, after := value(x + length * step), length, decrement)
@@ -584,4 +587,4 @@ def _is_enough(before: float, after: float, length: float, decrement: float) -> 
 
     Boyd, Vandenberghe, "Convex Optimization", section 9.6.
     """
-    return after < np.inf and (decrement < _CLOSE or after <= before - _ENOUGH * length * decrement)
+    return after < np.inf and (decrement < _CLOSE or after <= before - _SUFFICIENT_DECREASE * length * decrement)

@@ -42,7 +42,7 @@ from torchid.parallel import one_thread
 from torchid.parameters import INERTIAL, PER_BODY, Array
 from torchid.problem import Batch, LinearProblem, MiniBatches
 
-_STEPS = {"maxiter": 20, "maxcor": 20, "ftol": 0.0, "gtol": 0.0}  # of L-BFGS between preconditioners
+_LBFGS_OPTIONS = {"maxiter": 20, "maxcor": 20, "ftol": 0.0, "gtol": 0.0}  # of L-BFGS between preconditioners
 _DAMPING = 0.01  # of these, over the objective
 _SETTLED, _MET = 1e-12, 1e-10  # relative decrease of the objective in a round, violation of a condition
 
@@ -75,7 +75,7 @@ def finish(settings: Sgd, problem: LinearProblem, start: Minimizer) -> Minimizer
             (gradient,) = torch.autograd.grad(value, u)
             return value.item(), gradient.numpy()
 
-        moved = scipy.optimize.minimize(loss, np.zeros(len(y)), jac=True, method="L-BFGS-B", options=_STEPS).x
+        moved = scipy.optimize.minimize(loss, np.zeros(len(y)), jac=True, method="L-BFGS-B", options=_LBFGS_OPTIONS).x
         y = y + P @ torch.from_numpy(moved)
         value = float(conic.objective(y))
         if conic.update(y) <= _MET and abs(before - value) <= _SETTLED * abs(value):

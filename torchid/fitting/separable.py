@@ -268,12 +268,14 @@ def choose_base_tilt(logs: Sequence[Samples], fitter: LogFitter) -> TiltChoice:
     return TiltChoice((x, y), float(np.sqrt(found.fun * level)), float(np.sqrt(level)))
 
 
-EARLIEST, LATEST = -0.02, 0.06
+EARLIEST_DELAY, LATEST_DELAY = -0.02, 0.06
 """Delays that are tried [s]: beyond, the stamps are those of another clock."""
 
-_FEW, _MANY = 1000, 5000  # samples of all logs, evenly spaced, to try delays, and to find the best
-_TRIED = np.linspace(EARLIEST, LATEST, 17)  # [s]
-_STEPS, _SETTLED = 8, 1e-2  # Gauss-Newton steps, and standard errors below which one ends them
+_DELAY_TRIAL_SAMPLES = 1000  # of all logs, evenly spaced, to try delays
+_DELAY_SAMPLES = 5000  # of all logs, evenly spaced, to find the best
+_TRIED_DELAYS = np.linspace(EARLIEST_DELAY, LATEST_DELAY, 17)  # [s]
+_DELAY_STEPS = 8  # of Gauss and Newton, at most
+_DELAY_SETTLED = 1e-2  # standard errors, the step at which they end
 
 
 @dataclass(frozen=True)
@@ -336,14 +338,14 @@ def choose_delay(logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms) 
     ridge = max(fitter.estimator.ridge, _RIDGE)
     fitter = replace(fitter, estimator=replace(fitter.estimator, ridge=ridge))  # type: ignore[type-var]
     plain = replace(fitter, estimator=LeastSquares(ridge, rank_tolerance=fitter.estimator.rank_tolerance))
-    few, many = (_torques(logs, fitter, most) for most in (_FEW, _MANY))
+    few, many = (_torques(logs, fitter, most) for most in (_DELAY_TRIAL_SAMPLES, _DELAY_SAMPLES))
 
     def residual(fitter: LogFitter, logs: Sequence[_Torques], delay: float) -> float:
         problem = fitter.build_problem(compress_parts([log.by(delay) for log in logs], fitter.builder))
         return fitter.estimator.solve(problem.assembly.problem).residual_std
 
-    tried = share_between_forks(_TRIED.tolist(), lambda delay: residual(plain, few, delay), thread_count())
-    best, term = _best(many, fitter, terms, float(_TRIED[int(np.argmin(tried))]))
+    tried = share_between_forks(_TRIED_DELAYS.tolist(), lambda delay: residual(plain, few, delay), thread_count())
+    best, term = _best(many, fitter, terms, float(_TRIED_DELAYS[int(np.argmin(tried))]))
     choice = _choice(best, term, residual(fitter, many, best), residual(fitter, many, 0.0))
     if not choice.confounded_with and _is_at_end(choice.found):
         warn(f"actuators.delay: {choice.found:g} s or beyond; are torques and positions stamped by the same clock?")
@@ -353,18 +355,18 @@ def choose_delay(logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms) 
 def _best(logs: Sequence[_Torques], fitter: LogFitter, terms: ExtraTerms, delay: float) -> tuple[float, ExtraEstimate]:
     """The delay that leaves least, by steps from one [s], and the term of a further one in the last fit."""
     fitter = with_terms(fitter, replace(terms, slope=True))
-    for _ in range(_STEPS):
+    for _ in range(_DELAY_STEPS):
         fit = fitter.fit(compress_in_blocks([log.by(delay) for log in logs], fitter.builder))
         term = next(x for x in fit.extras if x.extra.what == SLOPE)
-        before, delay = delay, float(np.clip(delay + term.value, EARLIEST, LATEST))
-        if not np.isfinite(term.standard_error) or abs(delay - before) <= _SETTLED * term.standard_error:
+        before, delay = delay, float(np.clip(delay + term.value, EARLIEST_DELAY, LATEST_DELAY))
+        if not np.isfinite(term.standard_error) or abs(delay - before) <= _DELAY_SETTLED * term.standard_error:
             break
     return delay, term
 
 
 def _is_at_end(delay: float) -> bool:
     """Whether no delay beyond was tried, so that its standard error says nothing."""
-    return delay in (EARLIEST, LATEST)
+    return delay in (EARLIEST_DELAY, LATEST_DELAY)
 
 
 def _choice(best: float, term: ExtraEstimate, left: float, undelayed: float) -> DelayChoice:
@@ -417,7 +419,7 @@ def _torques(logs: Sequence[Samples], fitter: LogFitter, most: int) -> list[_Tor
     dofs = torch.from_numpy(np.flatnonzero(fitter.builder.sensors.torque[: fitter.robot.n]))
     for log in logs:
         time = log.time.numpy()
-        chosen = np.flatnonzero(recorded_at_delays(time, (EARLIEST, LATEST)))[::step]
+        chosen = np.flatnonzero(recorded_at_delays(time, (EARLIEST_DELAY, LATEST_DELAY)))[::step]
         if log.torque is None or not len(chosen):
             continue
         oversampling = max(1.0, log.oversampling / step)
@@ -430,6 +432,6 @@ def _torques(logs: Sequence[Samples], fitter: LogFitter, most: int) -> list[_Tor
                 splines.append((torch.from_numpy(own), make_interp_spline(time[segment], recorded[segment], k=degree)))
         out.append(_Torques(some, dofs, splines))
     if not out:
-        found = f"auto, but none is longer than the {LATEST - EARLIEST:g} s of delays that are tried"
+        found = f"auto, but none is longer than the {LATEST_DELAY - EARLIEST_DELAY:g} s of delays that are tried"
         raise LogError(logs[0].source if logs else "logs", "actuators.delay", found, "a number [s]")
     return out
