@@ -35,8 +35,8 @@ from torchid.errors import TorchidWarning, how_to_install
 from torchid.estimators import Consistent, LeastSquares
 from torchid.parameters import FRICTION, Array, perturb_parameters
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
-from torchid.problem.base_motion import BaseMotion
 from torchid.problem.chunks import choose_kernels
+from torchid.problem.motion import BaseMotion
 from torchid.regressor import FrameJacobian, Regressor
 from torchid.robot import Robot, load_robot
 from torchid.sensing import Contact, SensorNoise, named_sensors

@@ -307,7 +307,7 @@ def _compress(options: argparse.Namespace) -> None:
 def _evaluate(options: argparse.Namespace) -> None:
     with importing():
         from torchid.commands.evaluate import evaluate
-        from torchid.terminal.runs import print_all_errors, print_evaluation
+        from torchid.terminal.identification import print_all_errors, print_evaluation
 
     evaluated = evaluate(options.run, options.log, options.device, True, options.output, options.overwrite)
     if not options.quiet:
@@ -328,7 +328,7 @@ def _replay(options: argparse.Namespace) -> None:
 def _sample(options: argparse.Namespace) -> None:
     with importing():
         from torchid.commands.sample import parse_prior_error, sample
-        from torchid.terminal.runs import print_samples
+        from torchid.terminal.identification import print_samples
 
     options.prior_error = parse_prior_error(options.prior_error)
     keys = ("run", "count", "format", "output", "prior_error", "seed", "overwrite")
@@ -366,7 +366,7 @@ def _analyze(options: argparse.Namespace) -> None:
 def _check(options: argparse.Namespace) -> int:
     with importing():
         from torchid.commands.check import check_files, check_outputs, write_check_outputs
-        from torchid.terminal.checks import print_all_findings, print_checks
+        from torchid.terminal.analysis import print_all_findings, print_checks
 
     inputs = (options.file, options.urdf, options.topics, options.columns)
     check_outputs(options.json, options.figure, options.overwrite, inputs)

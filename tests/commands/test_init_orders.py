@@ -13,7 +13,7 @@ from motions import value
 
 from torchid.commands.init import init
 from torchid.config import load_config
-from torchid.log_checks.orders import joint_orders
+from torchid.log_checks.mistakes import joint_orders
 from torchid.logs import Log, read_log
 from torchid.robot import load_robot
 

@@ -26,7 +26,7 @@ from torchid.config import load_config
 from torchid.errors import ConfigError
 from torchid.fitting.experiment import set_up
 from torchid.problem.chunks import chunks_by_state
-from torchid.problem.predict import force_series
+from torchid.problem.metrics import force_series
 from torchid.reading.log_reader import LogReader
 from torchid.report.mjcf_files import identified_mjcf, mjcf_of_urdf
 from torchid.robot import load_robot

@@ -18,7 +18,7 @@ from torchid.config import load_config
 from torchid.errors import TorchidWarning
 from torchid.fitting.experiment import set_up
 from torchid.logs import read_log, write_log
-from torchid.problem.motion_noise import MotionNoise
+from torchid.problem.motion import MotionNoise
 from torchid.reading.log_reader import LogReader
 
 

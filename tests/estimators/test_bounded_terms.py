@@ -16,10 +16,9 @@ from synthetic import Array
 from torchid import parameters
 from torchid.estimators import Consistent, LeastSquares
 from torchid.estimators.conditions import term_violations
-from torchid.estimators.conic_formulation import Prior
+from torchid.estimators.conic_problem import Prior
 from torchid.problem import LinearProblem
-from torchid.problem.eliminated_terms import EliminatedTerms, SignCondition
-from torchid.problem.linear import parameter_scale
+from torchid.problem.linear import EliminatedTerms, SignCondition, parameter_scale
 
 SIZE = 0.3
 

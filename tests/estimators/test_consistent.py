@@ -29,7 +29,7 @@ from synthetic import Array, transform
 from torchid import parameters
 from torchid.errors import InputError
 from torchid.estimators import Conditions, Consistent, LeastSquares, violations
-from torchid.estimators.conic_formulation import Prior
+from torchid.estimators.conic_problem import Prior
 from torchid.problem.linear import parameter_scale
 
 seeds = st.integers(0, 2**32 - 1)

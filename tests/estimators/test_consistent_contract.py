@@ -25,7 +25,7 @@ from scipy.optimize import nnls
 from torchid.errors import InputError, NumericalWarning
 from torchid.estimators import Conditions, Consistent, Enclosure, Mirror, violations
 from torchid.estimators.barrier import solve_barrier
-from torchid.estimators.conic_formulation import Prior, build_conic_problem
+from torchid.estimators.conic_problem import Prior, build_conic_problem
 from torchid.problem.linear import parameter_scale
 
 all_priors = pytest.mark.parametrize("prior", PRIORS)

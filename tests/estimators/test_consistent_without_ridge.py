@@ -23,8 +23,8 @@ from synthetic import Array
 from torchid import parameters
 from torchid.errors import InputError
 from torchid.estimators import Conditions, Consistent, Enclosure, LeastSquares, violations
-from torchid.estimators.conic_formulation import Prior
-from torchid.identifiability.structure import structural_problem
+from torchid.estimators.conic_problem import Prior
+from torchid.identifiability.base_parameters import structural_problem
 from torchid.problem import LinearProblem
 from torchid.problem.linear import parameter_scale
 from torchid.sensing import named_sensors

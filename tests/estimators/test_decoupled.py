@@ -10,11 +10,10 @@ from physical import PRIORS, data, random_bodies, random_reflection
 from synthetic import Array
 
 from torchid.estimators import Conditions, Consistent, Mirror
-from torchid.estimators.conic_formulation import Prior
+from torchid.estimators.conic_problem import Prior
 from torchid.parameters import MASS, PER_BODY
 from torchid.problem import LinearProblem
-from torchid.problem.eliminated_terms import EliminatedTerms, SignCondition
-from torchid.problem.linear import parameter_scale
+from torchid.problem.linear import EliminatedTerms, SignCondition, parameter_scale
 
 BASE, FAR = 0, 2  # bodies
 COULOMB = 10  # number of a friction parameter

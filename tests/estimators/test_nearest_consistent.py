@@ -26,7 +26,7 @@ from synthetic import Array
 from torchid import parameters
 from torchid.errors import InputError
 from torchid.estimators import Conditions, Mirror, nearest_consistent, violations
-from torchid.estimators.conic_formulation import Prior
+from torchid.estimators.conic_problem import Prior
 from torchid.estimators.consistent import _changeable
 from torchid.problem import LinearProblem
 

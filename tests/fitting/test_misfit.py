@@ -15,7 +15,8 @@ from synthetic import UR5
 import torchid
 from torchid.cli import main
 from torchid.config.experiment import ActuatorsConfig
-from torchid.fitting.misfit import (
+from torchid.fitting.noise import (
+    GroupNoise,
     Misfit,
     UnfittedFriction,
     beyond_noise,
@@ -23,7 +24,6 @@ from torchid.fitting.misfit import (
     unexplained_forces,
     unfitted_friction,
 )
-from torchid.fitting.noise import GroupNoise
 from torchid.parameters import FRICTION
 from torchid.problem import ExtraTerms, LinearProblem, bind_log
 

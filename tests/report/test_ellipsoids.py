@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from torchid import parameters
 from torchid.parameters import Array
-from torchid.report.parameter_figures import _outline, equivalent_ellipsoid
+from torchid.report.figures import _outline, equivalent_ellipsoid
 
 MASS, CENTER, SEMI_AXES = 3.0, np.array([0.1, -0.2, 0.4]), np.array([0.05, 0.12, 0.3])
 AXES = Rotation.from_euler("xyz", [0.3, -0.7, 1.1]).as_matrix()

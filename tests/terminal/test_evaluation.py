@@ -15,8 +15,8 @@ import torchid
 from torchid.cli import main
 from torchid.commands.evaluate import EvaluatedRun
 from torchid.problem import Metrics
+from torchid.terminal.identification import MOST_LOGS, evaluation_lines
 from torchid.terminal.lines import LINES
-from torchid.terminal.runs import MOST_LOGS, evaluation_lines
 
 LOG = str(DEMO / "sway_test.npz")
 

@@ -19,7 +19,6 @@ from torchid.commands.check import recorded_segments
 from torchid.errors import InputError, TorchidWarning, join_names
 from torchid.estimators import Conditions
 from torchid.fitting.cross_validation import RidgeChoice
-from torchid.fitting.delay import DelayChoice, choose_delay
 from torchid.fitting.experiment import Experiment, RobotSetup, S, with_radius
 from torchid.fitting.fit import LogFitter
 from torchid.fitting.left_out import (
@@ -34,17 +33,18 @@ from torchid.fitting.left_out import (
     widest,
     with_terms,
 )
-from torchid.fitting.misfit import force_gain
-from torchid.fitting.noise import recorded_sensors
+from torchid.fitting.noise import force_gain, recorded_sensors
 from torchid.fitting.separable import (
+    DelayChoice,
     SignWidthChoice,
     StribeckChoice,
     TiltChoice,
     choose_base_tilt,
+    choose_delay,
     choose_sign_width,
     choose_stribeck,
 )
-from torchid.log_checks.frozen import new_poses
+from torchid.log_checks.readings import new_poses
 from torchid.logs import Log
 from torchid.logs.cutoff import CutoffChoice, choose_cutoff
 from torchid.logs.low_pass import DROPPED_PERIODS
@@ -52,9 +52,7 @@ from torchid.logs.read import files_of_recordings_kept
 from torchid.logs.timeline import LOSSLESS_RATE
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples
-from torchid.problem.compressed_log import Block
-from torchid.problem.compression import compress_parts
-from torchid.problem.parts import Part
+from torchid.problem.compression import Block, Part, compress_parts
 from torchid.reading.log_reader import LogReader, memory_needed
 from torchid.sensing import SensorSet
 from torchid.settings import AUTO

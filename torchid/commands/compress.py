@@ -27,8 +27,8 @@ from torchid.logs.containers import FACTORS, log_files
 from torchid.logs.time_range import log_title, split_range
 from torchid.parallel import one_thread
 from torchid.problem import Samples
-from torchid.problem.compressed_log import compress_log
-from torchid.problem.sampled_rows import LogOfOtherProcess
+from torchid.problem.compression import compress_log
+from torchid.problem.noise import LogOfOtherProcess
 from torchid.reading.log_reader import LogReader
 from torchid.report.tables import progress_bars
 

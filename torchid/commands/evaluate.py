@@ -21,19 +21,27 @@ from torchid.config import load_config
 from torchid.config.robot import NoiseConfig
 from torchid.errors import ConfigError, about_file, during, warn
 from torchid.fitting.calibration import Calibration, Comparison
-from torchid.fitting.checked_settings import stated_noise
 from torchid.fitting.cross_validation import Scorer
-from torchid.fitting.experiment import Experiment, require_device, set_up, with_estimated_noise
-from torchid.fitting.learned import RESIDUAL, RigidPlusResidual
+from torchid.fitting.experiment import Experiment, require_device, set_up, stated_noise, with_estimated_noise
+from torchid.fitting.posterior import RESIDUAL, RigidPlusResidual
 from torchid.guards import MAX_JSON, MAX_YAML, read_bytes
 from torchid.logs.time_range import log_title, split_range
 from torchid.parallel import one_thread
 from torchid.parameters import Array
 from torchid.problem import Evaluation, Metrics, Samples
 from torchid.problem.contact_state import state_name
-from torchid.problem.metrics import DECISIVE_GROUPS, WHITENED, describe_errors, group_name
-from torchid.problem.motion_noise import is_at_rest
-from torchid.problem.predict import at_motors, force_series, noise_series, pressure_series, projected_forces
+from torchid.problem.metrics import (
+    DECISIVE_GROUPS,
+    WHITENED,
+    at_motors,
+    describe_errors,
+    force_series,
+    group_name,
+    noise_series,
+    pressure_series,
+    projected_forces,
+)
+from torchid.problem.motion import is_at_rest
 from torchid.reading.log_reader import LogReader
 from torchid.report.figure_style import save_figures
 from torchid.report.figures import error_figure

@@ -11,10 +11,10 @@ import numpy as np
 from torchid.commands.init_proposals import GuessedContact
 from torchid.config.robot import ContactConfig
 from torchid.errors import InputError, TorchidWarning, join_names
-from torchid.fitting.checked_settings import resolve_contacts
+from torchid.fitting.experiment import resolve_contacts
 from torchid.log_checks.forces import MAX_FORCE_RESIDUAL_SHARE, MAX_MISFIT
+from torchid.log_checks.mistakes import joint_orders
 from torchid.log_checks.model import NominalModel, bind_some_samples, default_cutoff_hz, preprocess_pieces
-from torchid.log_checks.orders import joint_orders
 from torchid.logs import Log
 from torchid.logs.name_matching import limb_and_words
 from torchid.logs.unitree import JOINT_ORDERS, suitable_orders

@@ -22,9 +22,7 @@ from torchid.fitting.fit import LogFitter
 from torchid.fitting.noise import NoiseSummary
 from torchid.identifiability.base_parameters import StateReport, require_base, state_reports
 from torchid.problem import RowBuilder, Samples
-from torchid.problem.compressed_log import Block, fold_compressed, merge_blocks
-from torchid.problem.compression import compress_in_blocks, split_into_folds
-from torchid.problem.parts import Part
+from torchid.problem.compression import Block, Part, compress_in_blocks, fold_compressed, merge_blocks, split_into_folds
 from torchid.reading.log_reader import LogReader, check_read
 
 

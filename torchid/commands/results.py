@@ -24,14 +24,12 @@ from torchid.fitting.calibration import Comparison, list_confounded
 from torchid.fitting.cross_validation import CrossValidation, RidgeChoice
 from torchid.fitting.experiment import Experiment
 from torchid.fitting.factor_files import FactorFile
-from torchid.fitting.learned import RESIDUAL, RigidPlusResidual
-from torchid.fitting.misfit import Misfit
-from torchid.fitting.noise import NoiseSummary
-from torchid.fitting.posterior import POSTERIOR, FittedPosterior, write_posterior
+from torchid.fitting.noise import Misfit, NoiseSummary
+from torchid.fitting.posterior import POSTERIOR, RESIDUAL, FittedPosterior, RigidPlusResidual, write_posterior
 from torchid.fitting.robust import RobustSummary
 from torchid.identifiability.base_parameters import StateReport
 from torchid.identifiability.confounding import ExtraEstimate, TotalMass
-from torchid.identifiability.contributions import Contributions
+from torchid.identifiability.information import Contributions
 from torchid.logs.containers import atomic_output
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Metrics

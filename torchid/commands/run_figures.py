@@ -18,7 +18,7 @@ from torchid.config import ExperimentConfig, dump_config
 from torchid.estimators import ConstrainedEstimate, Estimate, SgdEstimate
 from torchid.fitting.cross_validation import RidgeChoice
 from torchid.identifiability.confounding import ExtraEstimate
-from torchid.identifiability.contributions import Contributions
+from torchid.identifiability.information import Contributions
 from torchid.logs.time_range import log_title
 from torchid.parallel import in_forks, share_between_processes, thread_count
 from torchid.parameters import PER_BODY
@@ -26,9 +26,16 @@ from torchid.problem import Metrics
 from torchid.problem.contact_state import IN_THE_AIR
 from torchid.problem.metrics import LOG_SETS
 from torchid.report.figure_style import Drawn, draw_for
-from torchid.report.figures import contribution_figure, error_figure, identifiability_figure, ridge_figure
+from torchid.report.figures import (
+    contribution_figure,
+    error_figure,
+    extra_figure,
+    identifiability_figure,
+    inertia_figure,
+    parameter_figure,
+    ridge_figure,
+)
 from torchid.report.forces import ForceSeries, force_figure, pressure_figure, rows_figure, spectrum_figure
-from torchid.report.parameter_figures import extra_figure, inertia_figure, parameter_figure
 from torchid.report.tables import table_text, verdict_counts_table
 from torchid.robot import Robot
 

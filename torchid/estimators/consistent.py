@@ -9,13 +9,12 @@ import numpy as np
 from torchid import parameters
 from torchid.estimators.barrier import solve_barrier
 from torchid.estimators.conditions import Conditions, validate_parameters, violations
-from torchid.estimators.conic_formulation import Prior, build_conic_problem
-from torchid.estimators.conic_problem import ConicProblem, Solution
+from torchid.estimators.conic_problem import ConicProblem, Prior, Solution, build_conic_problem
 from torchid.estimators.least_squares import ConstrainedEstimate, Minimizer, Regularized, report_rounding
 from torchid.parallel import one_thread
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import LinearProblem
-from torchid.problem.eliminated_terms import AT_BOUND
+from torchid.problem.linear import AT_BOUND
 from torchid.reprs import short_repr
 from torchid.rounding import relative_tolerance
 

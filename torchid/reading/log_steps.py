@@ -49,7 +49,6 @@ from torchid.logs.signal_noise import MOST_SAMPLES, SignalNoise, signal_noise, w
 from torchid.logs.timeline import SPLINE_BLOCK, Timeline
 from torchid.parallel import one_thread, thread_count
 from torchid.problem import Samples, bind_log
-from torchid.problem.base_motion import BaseMotion
 from torchid.problem.base_pose import PoseSegments, warn_of_pose
 from torchid.problem.contact_slip import (
     away_from_own_changes,
@@ -68,6 +67,7 @@ from torchid.problem.derived_blocks import (
     zero_in_blocks,
 )
 from torchid.problem.log_joints import distances_from_welds, warn_of_moving_welds
+from torchid.problem.motion import BaseMotion
 from torchid.problem.samples import oversampling
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet

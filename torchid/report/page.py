@@ -13,7 +13,7 @@ from torchid import __version__
 from torchid.errors import escape
 from torchid.logs.time_range import log_title
 from torchid.parameters import PARAMETERS
-from torchid.report.parameter_figures import INTERVAL
+from torchid.report.figures import INTERVAL
 
 FIGURES = {
     "forces": "generalized forces over time, measured and predicted",
