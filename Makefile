@@ -49,7 +49,7 @@ clean:
 .venv/ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
 	$(PIP) install -q -c constraints.txt torch
-	$(PIP) install -q -c constraints.txt -e '.[report,tables]'
+	$(PIP) install -q -c constraints.txt -e '.[tables]'
 	touch $@
 
 .venv/ready-for-tests: .venv/ready

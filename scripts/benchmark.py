@@ -2,7 +2,7 @@
 
     python scripts/benchmark.py [--samples 262144] [--repeats 5] [--device cuda]
 
-Needs the packages pin and example-robot-data (extra `[oracle]`) and Clarabel (extra `[certified]`). Pipelines
+Needs the packages pin and example-robot-data (extra `[oracle]`). Pipelines
 start from the arrays of a log and end with parameters. Sensors are `joints` (torques measured, contact forces not); all
 feet are in contact in two thirds of the samples. Consistent parameters are timed on noisy data of Solo12 that were
 generated with other, physically consistent parameters.
@@ -35,8 +35,8 @@ from torchid.errors import TorchidWarning, how_to_install
 from torchid.estimators import Consistent, LeastSquares
 from torchid.parameters import FRICTION, Array, perturb_parameters
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
-from torchid.problem.base_motion import BaseMotion
 from torchid.problem.chunks import choose_kernels
+from torchid.problem.motion import BaseMotion
 from torchid.regressor import FrameJacobian, Regressor
 from torchid.robot import Robot, load_robot
 from torchid.sensing import Contact, SensorNoise, named_sensors
@@ -213,8 +213,7 @@ def measure_consistent(count: int, repeats: int, device: torch.device) -> dict[s
     bench = replace(bench, samples=torques_of(bench.robot, case, bench.samples, phi.flatten(), noise))
     estimators: dict[str, LeastSquares | Consistent] = {
         "least squares": LeastSquares(1e-4),
-        "consistent, barrier": Consistent(1e-4),
-        "consistent, certified": Consistent(1e-4, method="certified"),
+        "consistent": Consistent(1e-4),
     }
     pipelines = {name: (partial(bench.fit, estimator), 10**6) for name, estimator in estimators.items()}
     return medians(pipelines, repeats, device)

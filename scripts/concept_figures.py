@@ -18,9 +18,9 @@ from matplotlib.figure import Figure
 import torchid
 from torchid.boundary import run_guarded
 from torchid.commands.results import Identification
-from torchid.identifiability.structure import structural_problem
+from torchid.identifiability.base_parameters import structural_problem
 from torchid.parameters import PARAMETERS, PER_BODY, Array
-from torchid.problem.predict import force_series, null_space_part
+from torchid.problem.metrics import force_series, null_space_part
 from torchid.reading.log_reader import LogReader
 from torchid.report.figure_style import (
     IDENTIFIED_COLOR,
@@ -30,8 +30,7 @@ from torchid.report.figure_style import (
     STYLE,
     save_figures,
 )
-from torchid.report.figures import identifiability_figure
-from torchid.report.parameter_figures import INTERVAL
+from torchid.report.figures import INTERVAL, identifiability_figure
 
 ROOT = Path(__file__).resolve().parents[1]
 DEMO = ROOT / "torchid" / "demo" / "quadruped.yaml"

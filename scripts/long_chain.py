@@ -1,6 +1,6 @@
 """A Gaussian cut off by conditions, sampled by long chains of another kind: hit-and-run with exact chords, in NumPy.
 
-It shares nothing with `torchid.estimators.elliptical_slice` but the conic problem: no Gaussian of a barrier, no
+It shares nothing with `torchid.estimators.truncated_gaussian` but the conic problem: no Gaussian of a barrier, no
 ellipses, no rejection. Each step draws from the exact distribution along a line through the state (Smith, "Efficient
 Monte Carlo procedures for generating points uniformly distributed over bounded regions", Operations Research 1984).
 """

@@ -31,7 +31,7 @@ from torchid.errors import TorchidWarning
 from torchid.estimators import Conditions
 from torchid.estimators.posterior import Posterior, whitened_rows
 from torchid.estimators.truncated_gaussian import TruncatedGaussian
-from torchid.identifiability.structure import structural_samples
+from torchid.identifiability.base_parameters import structural_samples
 from torchid.parallel import one_thread
 from torchid.parameters import FRICTION, Array, perturb_parameters
 from torchid.problem import RowBuilder, compress, linear_problem

@@ -27,7 +27,7 @@ from torchid.errors import TorchidWarning
 from torchid.parameters import FRICTION, INERTIA, Array, perturb_parameters
 from torchid.report.mjcf_files import identified_mjcf
 from torchid.robot import Robot
-from torchid.robot.mjcf_model import MjcfModel
+from torchid.robot.mjcf import MjcfModel
 from torchid.robot.urdf import has_fixed_base, parse_xml
 
 _STATES = 5

@@ -47,31 +47,27 @@ from .fitting.cross_validation import (
     choose_ridge,
     cross_validate,
 )
-from .fitting.factor_documents import (
-    RowModel,
-    require_same_noise,
-    require_same_rows,
-)
 from .fitting.factor_files import (
     FactorFile,
+    RowModel,
     read_factors,
+    require_same_noise,
+    require_same_rows,
     write_factors,
 )
 from .fitting.fit import (
     LogFitter,
     frozen_parameters,
 )
-from .fitting.learned import (
-    JointNetworks,
-    RigidPlusResidual,
-)
 from .fitting.noise import (
     estimate_noise,
 )
 from .fitting.posterior import (
     FittedPosterior,
+    JointNetworks,
     ParameterSamples,
     PosteriorSampler,
+    RigidPlusResidual,
 )
 from .fitting.robust import (
     RobustLoss,
@@ -80,12 +76,10 @@ from .fitting.robust import (
 from .identifiability.base_parameters import (
     BaseParameters,
     base_parameters,
+    structural_problem,
 )
 from .identifiability.confounding import (
     estimate_extras,
-)
-from .identifiability.structure import (
-    structural_problem,
 )
 from .log_checks import (
     Checked,
@@ -112,14 +106,12 @@ from .problem import (
     compress_parts,
     linear_problem,
 )
-from .problem.compressed_log import (
+from .problem.compression import (
     CompressedLog,
+    compress_in_blocks,
     compress_log,
     fold_compressed,
     merge_blocks,
-)
-from .problem.compression import (
-    compress_in_blocks,
     split_into_folds,
 )
 from .regressor import (

@@ -46,8 +46,8 @@ def identify(file: StrPath | None = None, /, *, resume: bool = False, **sections
         file: experiment file; None: the keywords say all.
         resume: go on with a training that was interrupted.
         sections: by the keys of an experiment file and with its values, which they override as those of the command
-            line do; paths are relative to the working directory. With an `output` a run folder is written, and the
-            cache beside it; `output=None` writes nothing though the file names one.
+            line do; paths are relative to the working directory. With an `output` a run folder is written;
+            `output=None` writes nothing though the file names one.
 
     Raises:
         InputError: whatever does not fit; the message names the file, or the function where there is none.

@@ -22,7 +22,7 @@ _EVALUATE = "predict the forces of further logs with the parameters of a run"
 _REPLAY = "drive the robot in MuJoCo with the torques of a log, and say how far it drifts (extra [sim])"
 _EXPORT = "write the identified parameters of a run for a simulator: MJCF, URDF, Isaac Lab's actuators, or JSON"
 _SAMPLE = "draw robots from what the logs of a run leave open, for domain randomization"
-_REPORT = "make report.html of a run anew, with what the checks of its logs find (extra [report])"
+_REPORT = "make report.html of a run anew, with what the checks of its logs find"
 _ANALYZE = "say what sensors and motion can determine, and find the smallest sensor set"
 _INIT = "write an experiment file for a robot and a log; what is not sure is listed, to be filled in"
 _DEMO = "identify the demo's quadruped, or copy the examples that ship with torchid"
@@ -39,6 +39,7 @@ _SHELLS = ("bash", "zsh")
 _Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 _SHARED = ("identify", "compress", "evaluate", "analyze")
 """By the processes that torchrun has started; the first runs all others."""
+_WITHOUT_LOGS = ("export", "simulate", "sample")
 
 
 def run() -> NoReturn:
@@ -68,6 +69,10 @@ def _command(options: argparse.Namespace) -> int | None:
     target = getattr(options, "file", getattr(options, "run", getattr(options, "source", "")))
     if options.name not in _SHARED and not is_launched_first():
         return 0
+    if options.name not in _WITHOUT_LOGS:
+        from torchid.reader import warm_up
+
+        warm_up()  # while torch is imported
     with share_work() if options.name in _SHARED else nullcontext(), during(options.name, target):
         status: int | None = options.command(options)
         return status
@@ -302,7 +307,7 @@ def _compress(options: argparse.Namespace) -> None:
 def _evaluate(options: argparse.Namespace) -> None:
     with importing():
         from torchid.commands.evaluate import evaluate
-        from torchid.terminal.runs import print_all_errors, print_evaluation
+        from torchid.terminal.identification import print_all_errors, print_evaluation
 
     evaluated = evaluate(options.run, options.log, options.device, True, options.output, options.overwrite)
     if not options.quiet:
@@ -323,7 +328,7 @@ def _replay(options: argparse.Namespace) -> None:
 def _sample(options: argparse.Namespace) -> None:
     with importing():
         from torchid.commands.sample import parse_prior_error, sample
-        from torchid.terminal.runs import print_samples
+        from torchid.terminal.identification import print_samples
 
     options.prior_error = parse_prior_error(options.prior_error)
     keys = ("run", "count", "format", "output", "prior_error", "seed", "overwrite")
@@ -361,7 +366,7 @@ def _analyze(options: argparse.Namespace) -> None:
 def _check(options: argparse.Namespace) -> int:
     with importing():
         from torchid.commands.check import check_files, check_outputs, write_check_outputs
-        from torchid.terminal.checks import print_all_findings, print_checks
+        from torchid.terminal.analysis import print_all_findings, print_checks
 
     inputs = (options.file, options.urdf, options.topics, options.columns)
     check_outputs(options.json, options.figure, options.overwrite, inputs)

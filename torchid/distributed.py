@@ -16,7 +16,7 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import timedelta
-from itertools import accumulate, chain
+from itertools import accumulate
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from torchid.errors import InputError, TorchidError
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from torch.distributed import ProcessGroup
 
 T = TypeVar("T")
-Result = TypeVar("Result")
 
 _LAUNCHED = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")  # torchrun sets them
 #: For one exchange: processes wait for the slowest. Failures are told, and the death of a process ends its connections.
@@ -164,38 +163,14 @@ def require_same(value: object, about: str) -> None:
 
 
 def own_share(sizes: Sequence[int]) -> slice:
-    """The successive pieces, of these sizes, that this process works on; those of all processes are about equal."""
-    return share_of(sizes, rank(), world_size())
-
-
-def share_of(sizes: Sequence[int], number: int, count: int) -> slice:
-    """The successive pieces, of these sizes, that one of so many works on; all have about as much.
+    """The successive pieces, of these sizes, that this process works on; those of all processes are about equal.
 
     Successive, as pieces of one log and contact state reduce to one result.
     """
+    number, count = rank(), world_size()
     total, ends = max(sum(sizes), 1), list(accumulate(sizes))
     owners = [min(int(count * (end - size / 2) / total), count - 1) for size, end in zip(sizes, ends, strict=True)]
     return slice(owners.index(number), len(owners) - owners[::-1].index(number)) if number in owners else slice(0)
-
-
-def share_out(items: Sequence[T], compute: Callable[[T], Result], about: str, sizes: Sequence[int]) -> list[Result]:
-    """What a function makes of each of some items, in their order, each item the work of one process alone.
-
-    Results are those of one process to the last bit, where sharing the samples of each would round otherwise.
-
-    Args:
-        items: the same number in all processes.
-        compute: whose passes over samples a process makes alone; what it returns pickles.
-        about: as for `all_gather`.
-        sizes: how much work each item is.
-
-    Raises:
-        Exception: what `compute` raises, in any process.
-    """
-    own = items[own_share(sizes)]
-    with apart():
-        results = [compute(item) for item in own]
-    return list(chain.from_iterable(all_gather(results, about)))
 
 
 @contextmanager

@@ -36,27 +36,11 @@ MAX_ARRAYS = 2**34
 MAX_FIELDS, MAX_NAMES = 200, 10_000
 #: Datasets and groups of an HDF5 file, where each episode has a group of the same ones: listing one takes 0.1 ms.
 MAX_DATASETS = 20_000
-#: Bytes of a JSON document, of whose numbers each takes some 32 bytes until it is in an array.
-MAX_DOCUMENT = 2**28
 #: Columns of a table: a humanoid with every sensor has about 500. Entries of the lists of a schema: the schema is read
 #: before its columns are counted, and also lists groups of rows.
 MAX_COLUMNS, MAX_SCHEMA = 20_000, 2**16
 #: Numbers in each list of a column of lists, which are columns then.
 MAX_LIST = 1000
-#: Chunks of an HDF5 dataset in addition to those that the file has room for: the library takes 400 bytes for every
-#: chunk that is read, stored or not. The index of a stored chunk takes at least 40 bytes.
-MAX_CHUNKS, CHUNK_BYTES = 10_000, 40
-
-# ----------------------------------------------------------------------------------------------------------- bags
-
-#: Bytes of one record: an image of a camera has a few million, a chunk of messages little more.
-MAX_RECORD = 2**28
-#: Records that are allowed for any bag (5 us each), and bytes of the file per further record; the same for messages of
-#: the topics in use (20 us each). A message of 20 joints has 700 bytes, a third when compressed.
-FREE_RECORDS, RECORD_BYTES = 500_000, 20
-FREE_MESSAGES, MESSAGE_BYTES = 200_000, 40
-#: Topics of a bag: a humanoid's has 200.
-MAX_TOPICS = 10_000
 
 # -------------------------------------------------------------------------------------------------------- factors
 
@@ -157,34 +141,3 @@ def require_plain_name(text: str) -> str:
     if len(text) > MAX_LETTERS or not is_plain(text):
         raise ValueError(f"a name of {len(text)} characters: {excerpt(text)}")
     return text
-
-
-class Budget:
-    """Remaining bytes, records and messages of a log file that is unpacked chunk by chunk."""
-
-    def __init__(self, size: int) -> None:
-        self._bytes = max_unpacked_bytes(size)
-        self._records = FREE_RECORDS + size // RECORD_BYTES
-        self._messages = FREE_MESSAGES + size // MESSAGE_BYTES
-
-    def next_chunk_bytes(self) -> int:
-        """Largest size of the next chunk."""
-        return min(self._bytes, MAX_RECORD)
-
-    def spend_bytes(self, count: int) -> None:
-        """Count a chunk of `count` bytes; ValueError where the limit is exceeded."""
-        self._bytes -= count
-        if self._bytes < 0:
-            raise ValueError("chunks that expand to more bytes than a file of this size may hold")
-
-    def spend_record(self) -> None:
-        """Count a record; ValueError where the limit is exceeded."""
-        self._records -= 1
-        if self._records < 0:
-            raise ValueError("more records than a file of this size may have")
-
-    def spend_message(self) -> None:
-        """Count a message of a topic in use; ValueError where the limit is exceeded."""
-        self._messages -= 1
-        if self._messages < 0:
-            raise ValueError("more messages than a file of this size may have")

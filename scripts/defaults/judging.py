@@ -122,7 +122,7 @@ def _initiated(folder: Path, work: Path) -> Path:
 def _identified(experiment: Path, overrides: Sequence[str]) -> subprocess.CompletedProcess[str]:
     run = experiment.parent / "runs" / experiment.stem
     shutil.rmtree(run, ignore_errors=True)
-    return _torchid("identify", experiment, f"output={run}", "preprocessing.cache_gb=0", *overrides)
+    return _torchid("identify", experiment, f"output={run}", *overrides)
 
 
 def _evaluated(run: Path, folder: Path) -> tuple[float | None, float | None]:

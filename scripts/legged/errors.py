@@ -8,8 +8,7 @@ from functools import cache
 import numpy as np
 
 from legged.robots import Legged, TrueRobot, nominal_robot
-from torchid.identifiability.base_parameters import BaseParameters, base_parameters
-from torchid.identifiability.structure import structural_problem
+from torchid.identifiability.base_parameters import BaseParameters, base_parameters, structural_problem
 from torchid.parameters import PER_BODY, Array
 from torchid.sensing import named_sensors
 

@@ -18,8 +18,7 @@ from torchid.errors import TorchidWarning
 from torchid.estimators import LeastSquares
 from torchid.estimators.least_squares import IDENTIFIED
 from torchid.fitting.fit import Fit, LogFitter
-from torchid.fitting.misfit import misfit, unfitted_friction
-from torchid.fitting.noise import estimate_noise
+from torchid.fitting.noise import estimate_noise, misfit, unfitted_friction
 from torchid.fitting.robust import RobustLoss, fit_robustly
 from torchid.identifiability.confounding import ParameterCovariance, total_mass
 from torchid.logs import Log

@@ -13,11 +13,9 @@ from torchid.fitting.prior_knowledge import conditions_from
 from torchid.parameters import Array
 from torchid.problem import Evaluation, RowBuilder, Samples, TriangularFactor, linear_problem
 from torchid.problem.chunks import chunks_by_state
-from torchid.problem.compression import compress_by_state
+from torchid.problem.compression import compress_by_state, merge_factors
 from torchid.problem.contact_state import ContactState, state_name
-from torchid.problem.metrics import BASE_ROWS
-from torchid.problem.parts import merge_factors
-from torchid.problem.predict import force_series, null_space_part
+from torchid.problem.metrics import BASE_ROWS, force_series, null_space_part
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,9 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -47,6 +49,14 @@ class _Outcome:
     shown: list[Series]
 
 
+def _shared(items: Sequence[Any], compute: Callable[[Any], Any], about: str) -> list[Any]:
+    """What a function makes of each of some items, in their order, each item the work of one process alone."""
+    share = items[distributed.own_share([1] * len(items))]
+    with distributed.apart():
+        results = [compute(item) for item in share]
+    return list(chain.from_iterable(distributed.all_gather(results, about)))
+
+
 class Reproduction:
     """Runs a study; processes that share the work each take some draws, with the results of one process."""
 
@@ -77,7 +87,7 @@ class Reproduction:
             InputError: the robot falls.
         """
         cases = conditions(self.study.simulation)
-        exact = distributed.share_out((False, True), self._simulated, "simulation", sizes=(1, 1))
+        exact = _shared((False, True), self._simulated, "simulation")
         draws = [(case, number) for case in cases for number in range(self._draws(case))]
         share = draws[distributed.own_share([1] * len(draws))]
         with progress_bars() as bars:
@@ -90,7 +100,7 @@ class Reproduction:
                 done()
                 return outcome
 
-            outcomes = distributed.share_out(draws, examine, "draws", sizes=[1] * len(draws))
+            outcomes = _shared(draws, examine, "draws")
         records, found, shown = (
             [x for one in outcomes for x in getattr(one, part)] for part in ("records", "ranks", "shown")
         )

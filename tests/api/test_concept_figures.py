@@ -12,7 +12,7 @@ from script_calls import script
 import torchid
 from torchid.commands.results import Identification
 from torchid.parameters import COULOMB, PER_BODY, VISCOUS
-from torchid.report.parameter_figures import INTERVAL
+from torchid.report.figures import INTERVAL
 
 
 @pytest.fixture(scope="module")

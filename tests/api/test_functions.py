@@ -56,7 +56,7 @@ def result(demo: Path) -> torchid.Identification:
 @pytest.fixture(scope="module")
 def folder(demo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     output = tmp_path_factory.mktemp("runs") / "demo"
-    assert main(["identify", str(demo / "quadruped.yaml"), f"output={output}", "preprocessing.cache_gb=0"]) == 0
+    assert main(["identify", str(demo / "quadruped.yaml"), f"output={output}"]) == 0
     return output
 
 
@@ -102,7 +102,7 @@ def test_a_descent_without_an_output_leaves_nothing_and_ends_where_it_does_with_
     descent = {"name": "sgd", "ridge": 0.1, "training": {"epochs": 2}}
     silent = torchid.identify(demo / "quadruped.yaml", estimator=descent, output=None)
     assert names_in(tmp_path) == []
-    written = torchid.identify(demo / "quadruped.yaml", estimator=descent, output="run", preprocessing={"cache_gb": 0})
+    written = torchid.identify(demo / "quadruped.yaml", estimator=descent, output="run")
     assert names_in(tmp_path) == ["run"]
     np.testing.assert_array_equal(silent.phi, written.phi)
 

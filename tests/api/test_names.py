@@ -17,7 +17,7 @@ from repository import ROOT
 
 import torchid
 
-LARGE = ("torch", "numpy", "scipy", "matplotlib", "rich", "pydantic", "tensorboard", "trimesh", "omegaconf")
+LARGE = ("torch", "numpy", "scipy", "matplotlib", "rich", "pydantic", "tensorboard", "trimesh")
 STUB = ROOT / "torchid" / "__init__.pyi"
 SCRIPT = """
 import torchid

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from refusals import refusal, refused
+from refusals import refused
 from repository import DEMO
 from synthetic import UR5, load
 
@@ -20,7 +20,7 @@ from torchid.logs import Log, write_log
 from torchid.reading.log_reader import LogReader
 
 FEW = "preprocessing.sample_rate_hz=auto"
-AUTO = ["preprocessing={cutoff_hz: auto, cache_gb: 0}", "sensors.noise={joint_position: 1e-4}", "estimator.ridge=0.01"]
+AUTO = ["preprocessing.cutoff_hz=auto", "sensors.noise={joint_position: 1e-4}", "estimator.ridge=0.01"]
 AUTO += [f"logs.train=[{json.dumps(str(DEMO / 'sway_train.npz[:6]'))}]"]
 FILE = str(DEMO / "quadruped.yaml")
 
@@ -84,16 +84,12 @@ def test_poses_that_are_held_have_the_band_of_their_own_rate(tmp_path: Path, noi
     assert 0.7 * at_most < found[1] <= at_most
 
 
-def test_factors_are_made_with_a_number_and_fitted_without_auto(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_factors_keep_the_cutoff_that_the_logs_have_chosen(run: Path, tmp_path: Path) -> None:
     assert main(["compress", FILE, *AUTO, "--output", str(tmp_path / "factors")]) == 0
-    number = load_config(run / "config.yaml").preprocessing.cutoff_hz
     settings = [f"logs.train=[{tmp_path / 'factors' / '*.factor'}]", f"output={tmp_path / 'run'}"]
-    capsys.readouterr()
-    text = refusal(["identify", FILE, *AUTO, *settings], tmp_path, capsys)
-    assert "preprocessing.cutoff_hz: auto, but logs.train names factors" in text
-    assert main(["identify", FILE, *AUTO, *settings, f"preprocessing.cutoff_hz={number}"]) == 0
+    assert main(["identify", FILE, *AUTO, *settings]) == 0
+    chosen = [load_config(folder / "config.yaml").preprocessing.cutoff_hz for folder in (run, tmp_path / "run")]
+    assert chosen[0] == chosen[1]
 
 
 def test_logs_are_checked_before_a_cutoff_is_chosen_and_analyzed_with_it(tmp_path: Path) -> None:

@@ -45,7 +45,7 @@ def experiment(
         settings["logs"][name] = [f"{name}{suffix}"]
     settings["robot"]["urdf"] = str(DEMO / "quadruped.urdf")
     settings["estimator"]["ridge"] = 0.01
-    settings["preprocessing"] |= {"contact_margin_s": 0.02, "cache_gb": 0} | preprocessing
+    settings["preprocessing"] |= {"contact_margin_s": 0.02} | preprocessing
     settings |= {"sensors": FULL, "output": str(folder / "run")}
     (folder / "run.yaml").write_text(yaml.safe_dump(settings))
     return folder / "run.yaml"

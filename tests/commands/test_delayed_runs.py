@@ -78,16 +78,6 @@ def test_a_run_on_a_motion_that_fits_any_delay_takes_none(tmp_path: Path) -> Non
     assert load_config(tmp_path / "run" / "config.yaml").actuators.delay == 0.0
 
 
-def test_another_delay_is_other_samples_in_the_cache(tmp_path: Path) -> None:
-    file, rms = commanded(tmp_path), {}
-    for delay in (0.0, DELAY, 0.0):
-        settings = [f"actuators.delay={delay}", f"output={tmp_path / 'run'}", "overwrite=true"]
-        assert main(["identify", str(file), *settings]) == 0
-        found = json.loads((tmp_path / "run" / "metrics.json").read_text())["train"]["joint_torque_rms"]
-        assert rms.setdefault(delay, found) == found
-    assert rms[DELAY] < 0.1 * rms[0.0]
-
-
 def test_a_log_larger_than_memory_is_refused_with_a_delay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = commanded(tmp_path)
     assert main(["identify", str(file), f"actuators.delay={DELAY}", "preprocessing.memory_gb=0.00005"]) == 2

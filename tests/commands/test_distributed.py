@@ -282,42 +282,6 @@ def test_an_analysis_is_that_of_one_process(experiments: dict[str, Path], tmp_pa
         assert difference < 1e-10, where
 
 
-class Others(distributed._Group):
-    """One of some processes, whose exchanges are noted and answered with its own value."""
-
-    def __init__(self, rank: int, size: int) -> None:
-        super().__init__(None, rank, size)
-        self.about: list[str] = []
-
-    def exchange(self, about: str, value: object) -> list[object]:
-        self.about.append(about)
-        return [value]
-
-
-def test_items_are_each_the_work_of_one_process_that_shares_nothing_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:
-    def compute(item: int) -> tuple[int, int]:
-        assert distributed.all_gather(item, "inside") == [item]
-        return item, distributed.world_size()
-
-    found = []
-    for rank in range(3):
-        together = Others(rank, 3)
-        monkeypatch.setattr(distributed, "_sharing", together)
-        found += distributed.share_out(range(10, 17), compute, "items", sizes=[1, 1, 1, 1, 1, 1, 6])
-        assert together.about == ["items"]
-        assert distributed._sharing is together
-    assert found == [(item, 1) for item in range(10, 17)]
-
-
-def test_an_item_that_fails_ends_what_a_process_does_apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    together = Others(0, 2)
-    monkeypatch.setattr(distributed, "_sharing", together)
-    with pytest.raises(ZeroDivisionError):
-        distributed.share_out([0, 0], lambda item: 1 / item, "items", sizes=[1, 1])
-    assert distributed._sharing is together
-    assert not together.about
-
-
 def share_items(folder: Path) -> int:
     """What each of two processes does: shares items, one of which has something to say and one fails; writes what."""
 

@@ -156,7 +156,7 @@ def test_the_width_of_the_sign_is_found(run: Run) -> None:
 
 
 def test_friction_that_reverses_at_once_is_given_no_width(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    settings = ["actuators.sign_width=auto", "preprocessing.cache_gb=0"]
+    settings = ["actuators.sign_width=auto"]
     settings += [f"output={tmp_path / 'run'}"]
     file = shortened_demo(tmp_path / "demo", 600) / "quadruped.yaml"
     assert main(["identify", "--verbose", str(file), *settings]) == 0

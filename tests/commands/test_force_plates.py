@@ -20,17 +20,11 @@ from repository import SHARED
 from scipy.spatial.transform import Rotation
 from simulated import BIPED, feet_of
 from thinned import slow_but
-from trainings import trust_new_files
 
 from torchid.cli import main
 from torchid.logs import Log, read_log, write_log
 
 MOTION = "motion.npz + plates.csv"
-
-
-@pytest.fixture(autouse=True)
-def _new_files(monkeypatch: pytest.MonkeyPatch) -> None:
-    trust_new_files(monkeypatch)
 
 
 def experiment(folder: Path, log: str, columns: str | None = None, **preprocessing: Any) -> Path:
@@ -64,9 +58,7 @@ def expected(tmp_path_factory: pytest.TempPathFactory) -> tuple[np.ndarray, dict
     """What wrenches at the soles give."""
     folder = tmp_path_factory.mktemp("soles")
     write_log(walk(), folder / "walk.npz")
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        trust_new_files(monkeypatch)
-        return identified(experiment(folder, "walk.npz"))
+    return identified(experiment(folder, "walk.npz"))
 
 
 def recorded(folder: Path, laboratory: str, log: Log) -> str:
@@ -162,7 +154,7 @@ def arrays(folder: Path) -> Path:
 def test_a_map_of_plates_is_read_block_by_block_as_a_whole(
     write: Callable[[Path], Path], columns: str, cutoff: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("torchid.reading.large_log.SPLINE_BLOCK", 256)
+    monkeypatch.setattr("torchid.reading.log_steps.SPLINE_BLOCK", 256)
     file = experiment(tmp_path, write(tmp_path).name, columns)
     whole, large = (samples_of(file, f"preprocessing.cutoff_hz={cutoff}", *more) for more in ((), (SMALL,)))
     assert is_on_disk(large)

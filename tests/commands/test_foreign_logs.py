@@ -13,24 +13,16 @@ from demo import FAST_ESTIMATOR
 from dialects import DIALECTS, with_velocity
 from refusals import refusal
 from repository import DEMO
-from trainings import trust_new_files
 
 from torchid.cli import main
 from torchid.config import dump_config, load_config
 from torchid.fitting.experiment import set_up
 from torchid.logs import Log, read_log, write_log
-from torchid.reading.cache import content_key
-from torchid.reading.cache_entries import content_of_setup
 from torchid.reading.log_reader import LogReader
 
 SAMPLES = 300
 PARQUET, PD, MOTORS = "nested names", "PD law", "motor numbers in degrees"
 SMALL = "preprocessing.memory_gb=0.0001"
-
-
-@pytest.fixture(autouse=True)
-def _new_files(monkeypatch: pytest.MonkeyPatch) -> None:
-    trust_new_files(monkeypatch)
 
 
 def recorded(name: str) -> Log:
@@ -67,9 +59,7 @@ def identified(folder: Path, dialect: str | None, *overrides: str) -> tuple[dict
 @pytest.fixture(scope="module")
 def expected(tmp_path_factory: pytest.TempPathFactory) -> dict[str, float]:
     """What the log in the format gives."""
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        trust_new_files(monkeypatch)
-        return identified(tmp_path_factory.mktemp("format") / "x", None)[0]
+    return identified(tmp_path_factory.mktemp("format") / "x", None)[0]
 
 
 def assert_same(found: dict[str, float], expected: dict[str, float]) -> None:
@@ -132,38 +122,6 @@ def test_check_of_an_experiment_reads_its_logs_by_the_map(tmp_path: Path, capsys
     out = capsys.readouterr().out
     assert " of 2 logs " in out
     assert "motors" not in out
-
-
-CHANGES = (
-    "logs.columns.time.unit=us",
-    "logs.columns.joint_torque.scale={'*': 2}",
-    "logs.columns.joint_position.first_index=0",
-    "logs.columns.contact_active.above=30.0",
-    "logs.columns.contact_order=[front_left_foot, front_right_foot, rear_right_foot, rear_left_foot]",
-    "logs.columns.ignore=[note]",
-)
-
-
-@pytest.mark.parametrize("change", CHANGES)
-def test_the_map_is_part_of_the_name_of_cached_samples(tmp_path: Path, change: str) -> None:
-    file = experiment(tmp_path, MOTORS)
-
-    def name(*overrides: str) -> str:
-        return content_key(content_of_setup(set_up(load_config(file, overrides))))
-
-    assert name() == name()
-    assert name(change) != name()
-
-
-def test_the_order_of_names_in_a_map_is_part_of_the_name_of_cached_samples(tmp_path: Path) -> None:
-    names = []
-    for feet in (["front_left_foot", "front_right_foot"], ["front_right_foot", "front_left_foot"]):
-        file = experiment(tmp_path, MOTORS)
-        settings = yaml.safe_load(file.read_text())
-        settings["logs"]["columns"]["contact_active"] = {"columns": {foot: f"c_{foot}" for foot in feet}}
-        file.write_text(yaml.safe_dump(settings, sort_keys=False))
-        names.append(content_key(content_of_setup(set_up(load_config(file)))))
-    assert names[0] != names[1]
 
 
 @pytest.mark.parametrize("dialect", [MOTORS, PD, PARQUET, "groups"])

@@ -16,6 +16,7 @@ import yaml
 from demo import FAST_ESTIMATOR
 from loadable import assert_loads
 from repository import CONFIGS, DEMO, SHARED
+from run_figures import OF_A_RUN
 from run_folders import names_in
 from synthetic import Oracle, random_states
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -53,8 +54,11 @@ def test_a_run_folder_holds_what_it_promises(run: Path) -> None:
         "events",
         "forces",
         "pressure",
+        "rows",
+        "spectra",
         "errors",
         "identifiability",
+        "inertia",
         "contributions",
     }
     assert names_in(run.parent) == [run.name], "temporary folders left behind"
@@ -171,8 +175,8 @@ def test_tensorboard_shows_train_and_test_before_and_after(run: Path) -> None:
         (urdf,), (identified,) = map(events.Scalars, tags)
         assert urdf.step == identified.step == 1  # points, which no smoothing changes
         assert identified.value < urdf.value
-    figures = ("forces", "pressure", "errors", "parameters", "identifiability", "contributions", "ridge")
-    assert set(events.Tags()["images"]) == {f"figure_{k}_{name}" for k, name in enumerate(figures, 1)}
+    names = enumerate((*OF_A_RUN, "ridge"), 1)
+    assert set(events.Tags()["images"]) == {f"figure_{k}_{name}" for k, name in names}
     assert min(events.Tags()["scalars"]).startswith("error_relative_"), "which TensorBoard shows first"
     text = events.Tensors("answer/text_summary")[0].tensor_proto.string_val[0].decode()
     assert "Much better than the URDF on unseen motion" in text

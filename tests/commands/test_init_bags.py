@@ -99,7 +99,7 @@ def test_a_go2s_orientation_lets_its_feet_roll_and_turned_frames_are_refused(tmp
     log = moving(GO2, 200)
     turns = Rotation.from_rotvec(0.1 * np.sin(np.arange(200)[:, None] / 40.0 + np.arange(3))).as_quat()
     balls = ", ".join(f"{{frame: {foot}, type: point, radius: 0.022}}" for foot in sorted(FEET))
-    overrides = ["preprocessing.cutoff_hz=20", "preprocessing.cache_gb=0", f"contacts=[{balls}]"]
+    overrides = ["preprocessing.cutoff_hz=20", f"contacts=[{balls}]"]
     read = []
     for name, quats in (("set", np.roll(turns, 1, axis=1)), ("unset", None)):
         path = tmp_path / f"{name}.mcap"

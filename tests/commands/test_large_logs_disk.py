@@ -16,6 +16,7 @@ from typing import Any
 
 import h5py
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import torch
 from bags import entries_of, parsed, topics_of, write_bag
@@ -38,7 +39,7 @@ from torchid.logs import read_log
 from torchid.logs.blocks import log_bytes, open_log_blocks
 from torchid.logs.lazy_arrays import Spill, SpillError
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
-from torchid.problem.predict import calibrate_readings
+from torchid.problem.metrics import calibrate_readings
 from torchid.reading.log_reader import LogReader
 
 IDENTIFY = ("estimator.ridge=0.001", "sensors=joints")
@@ -82,7 +83,7 @@ def recalibrated(file: Path, terms: str, *more: str) -> tuple[Samples, Samples]:
 def test_calibrated_readings_of_a_large_log_stay_on_the_disk_and_those_of_a_small_one_in_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("torchid.problem.predict._ROWS", 700)
+    monkeypatch.setattr("torchid.problem.metrics._ROWS", 700)
     file, both = experiment(tmp_path, recorded(3_000)), "{joint_torque: log, contact_force: all}"
     (raw, whole), (_, large) = (recalibrated(file, both, *more) for more in ((), (SMALL, f"output={tmp_path / 'run'}")))
     assert (file_of(whole.torque), file_of(whole.wrench)) == ("", "")
@@ -117,10 +118,10 @@ def made_in(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def test_a_table_takes_one_file_for_each_field_however_many_batches_it_is_read_in(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, made_in: list[str]
+    tmp_path: Path, made_in: list[str]
 ) -> None:
     experiment(tmp_path, recorded(2_000), ".parquet")
-    monkeypatch.setattr("torchid.logs.table_files._ROWS", 100)
+    pq.write_table(pq.read_table(tmp_path / "log.parquet"), tmp_path / "log.parquet", row_group_size=100)
     with open_log_blocks(tmp_path / "log.parquet", tmp_path) as blocks:
         assert len(blocks) == 2_000
         assert len(made_in) == 1 + len(blocks.fields), "time too"
@@ -267,7 +268,7 @@ def links(folder: Path) -> list[str]:
 READ = """
 import json, scipy.signal, sys, threading, time, torch
 from torchid.config import load_config
-from torchid.problem.predict import calibrate_readings
+from torchid.problem.metrics import calibrate_readings
 from torchid.fitting.experiment import set_up
 from torchid.reading.log_reader import LogReader
 def used():

@@ -14,7 +14,6 @@ import torch
 import yaml
 from demo import shortened_demo
 from large import assert_same, tensors
-from trainings import trust_new_files
 
 from torchid.cli import main
 from torchid.commands.compress import compress
@@ -24,15 +23,9 @@ from torchid.fitting.experiment import set_up
 from torchid.fitting.factor_files import read_factors
 from torchid.logs import read_log, write_log
 from torchid.problem import Samples
-from torchid.reading.cached_reader import CachedReader, open_cache
 from torchid.reading.log_reader import LogReader
 
 FEET = [f"{leg}_foot" for leg in ("front_left", "front_right", "rear_left", "rear_right")]
-
-
-@pytest.fixture(autouse=True)
-def _new_files(monkeypatch: pytest.MonkeyPatch) -> None:
-    trust_new_files(monkeypatch)
 
 
 @pytest.fixture(scope="module")
@@ -89,18 +82,13 @@ def identified(demo: Path, out: Path, logs: dict[str, list[Any]], *overrides: st
     return found
 
 
-def test_a_run_on_parts_is_that_on_files_of_them(
-    demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_on_parts_is_that_on_files_of_them(demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(demo)
     parts = {"train": ["sway_train.npz[:7]"], "test": ["sway_train.npz[7:]"]}
     of_parts = identified(demo, tmp_path / "parts", parts)
     of_files = identified(demo, tmp_path / "files", {"train": ["first.npz"], "test": ["last.npz"]})
     for key in ("train", "test", "cross_validation", "samples", "rank"):
         assert of_parts[key] == of_files[key], key
-    again = identified(demo, tmp_path / "again", parts)  # from the cache
-    assert "samples of 2 logs" in capsys.readouterr().out
-    assert again["test"] == of_parts["test"]
     assert main(["evaluate", str(tmp_path / "parts"), "--log", "sway_train.npz[7:]"]) == 0
     evaluated = json.loads((tmp_path / "parts/evaluation/sway_train[7:]/metrics.json").read_text())
     for name, value in evaluated["sway_train[7:]"]["identified"].items():
@@ -136,22 +124,6 @@ def test_parts_that_turn_out_to_overlap_are_warned_of_or_refused(demo: Path, tmp
     assert any("sway_train.npz[-8:] is fitted on as well" in str(one.message) for one in caught)
     with pytest.raises(ConfigError, match="logs.train: .* share samples"):
         analyzed('["sway_train.npz[:6]", "sway_train.npz[-8:]"]', "[]")
-
-
-def test_the_cache_tells_parts_apart(demo: Path, tmp_path: Path) -> None:
-    def reader() -> CachedReader:
-        setup = set_up(load_config(demo / "quadruped.yaml", [f"output={tmp_path / 'run'}"]))
-        cache = open_cache(setup)
-        assert cache is not None
-        return CachedReader(setup, cache)
-
-    paths = [demo / f"sway_train.npz{text}" for text in ("", "[:7]", "[7:]", "[:7.01]")]
-    first, second = reader(), reader()
-    lengths = [len(x) for x in first.read(paths, None)]
-    assert not first.reused
-    assert [len(x) for x in second.read(paths, None)] == lengths
-    assert len({*second.keys.values()}) == len(set(lengths)) == 4
-    assert second.reused == {*map(str, paths)}
 
 
 def test_parts_are_compressed_to_files_of_their_own(demo: Path, tmp_path: Path) -> None:

@@ -12,15 +12,13 @@ from bags import entries_of, topics_of, write_bag
 from dialects import ORDER, with_velocity
 from low_states import TOPIC, float32, low_states
 from repository import DEMO
-from trainings import trust_new_files
 
 from torchid.cli import main
 from torchid.logs import read_log, write_log
 
 
 @pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
-def test_a_fit_is_that_on_the_same_log_in_the_format(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    trust_new_files(monkeypatch)
+def test_a_fit_is_that_on_the_same_log_in_the_format(tmp_path: Path) -> None:
     log = float32(with_velocity(read_log(DEMO / "sway_train.npz").select(slice(0, 300))))
     others = [entry for entry in entries_of(log) if entry[0] not in ("/joint_states", "/imu")]
     path = write_bag(tmp_path / "x.mcap", sorted([*low_states(log, ORDER), *others], key=lambda entry: entry[1]))

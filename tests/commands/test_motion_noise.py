@@ -12,20 +12,14 @@ import numpy as np
 import pytest
 import torch
 from demo import shortened_demo
-from trainings import trust_new_files
 
 from torchid.cli import main
 from torchid.config import load_config
 from torchid.errors import TorchidWarning
 from torchid.fitting.experiment import set_up
 from torchid.logs import read_log, write_log
-from torchid.problem.motion_noise import MotionNoise
+from torchid.problem.motion import MotionNoise
 from torchid.reading.log_reader import LogReader
-
-
-@pytest.fixture(autouse=True)
-def _new_files(monkeypatch: pytest.MonkeyPatch) -> None:
-    trust_new_files(monkeypatch)
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +34,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def identified(demo: Path, out: Path, *overrides: str) -> tuple[dict[str, Any], dict[str, Any]]:
     """Metrics and parameters of a run on the noisy log."""
-    more = (f"logs.train=[{demo / 'noisy.npz'}]", "preprocessing.cache_gb=0", *overrides)
+    more = (f"logs.train=[{demo / 'noisy.npz'}]", *overrides)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", TorchidWarning)
         assert main(["identify", "--verbose", str(demo / "quadruped.yaml"), f"output={out}", *more]) == 0

@@ -76,10 +76,10 @@ def test_whoever_does_not_say_so_has_scales_that_nothing_tells_and_names_them(
 
 
 def test_all_ways_to_read_agree(world: tuple[Path, float], tmp_path: Path) -> None:
-    """Block by block, from files of factors, from the cache and in an evaluation."""
+    """Block by block, from files of factors, and in an evaluation."""
     file, _ = world
-    for name, more in (("whole", ()), ("again", ()), ("disk", ("preprocessing.memory_gb=1e-5",))):
-        identified(file, tmp_path / name, "preprocessing.cache_gb=1", *more)
+    for name, more in (("whole", ()), ("disk", ("preprocessing.memory_gb=1e-5",))):
+        identified(file, tmp_path / name, *more)
     factors = tmp_path / "factors"
     assert main(["compress", str(file), "--output", str(factors)]) == 0
     assert read_factors(factors / "a.factor").payloads == []
@@ -89,22 +89,11 @@ def test_all_ways_to_read_agree(world: tuple[Path, float], tmp_path: Path) -> No
     fleet = file.with_name("fleet.yaml")
     fleet.write_text(yaml.safe_dump(settings))
     identified(fleet, tmp_path / "fleet")
-    for name in ("again", "disk", "fleet"):
+    for name in ("disk", "fleet"):
         np.testing.assert_allclose(phi(tmp_path / name), phi(tmp_path / "whole"), atol=1e-8)
     assert main(["evaluate", str(tmp_path / "whole"), "--log", str(file.parent / "new.npz")]) == 0
     found = json.loads((tmp_path / "whole/evaluation/new/metrics.json").read_text())["new"]
     assert found["identified"]["joint_torque_rms"] < 1e-9
-
-
-def test_a_payload_is_part_of_what_the_cache_goes_by(world: tuple[Path, float], tmp_path: Path) -> None:
-    file, _ = world
-    _, with_bag = identified(file, tmp_path / "bag", "preprocessing.cache_gb=1")
-    lighter = dict(GIVEN, mass=4.5)
-    logs = {"train": ["a.npz", {"file": "b.npz", "payload": lighter}], "test": []}
-    other = file.with_name("lighter.yaml")
-    other.write_text(yaml.safe_dump(yaml.safe_load(file.read_text()) | {"logs": logs}))
-    _, with_less = identified(other, tmp_path / "less", "preprocessing.cache_gb=1", "preprocessing.cutoff_hz=null")
-    assert np.abs(np.array(with_bag) - with_less).max() > 0.1
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,7 @@ RUNS = {
     "without a load": ("walk.yaml", ONE),
     "with a load": ("loaded.yaml", ONE),
     "with one that is not stated": ("not_stated.yaml", ONE),
-    "in blocks": ("loaded.yaml", (*ONE, SMALL, "preprocessing.cache_gb=1")),
+    "in blocks": ("loaded.yaml", (*ONE, SMALL)),
     "detected": ("loaded.yaml", (*ONE, SMALL, "preprocessing.detect_contacts=true")),
 }
 
@@ -67,7 +67,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Path]:
             "robot": {"urdf": str(DEMO / "quadruped.urdf")},
             "contacts": [{"frame": foot, "type": "point"} for foot in MACHINE.feet],
             "logs": {"train": [entry]},
-            "preprocessing": {"cutoff_hz": 15, "cache_gb": 0, "base_motion": "contacts"},
+            "preprocessing": {"cutoff_hz": 15, "base_motion": "contacts"},
             "sensors": {"set": "joints", "noise": {"joint_torque": 0.1}},
             "estimator": {"name": "least_squares", "ridge": 1e-3},
         }

@@ -17,7 +17,7 @@ from torchid.commands.sample import sample
 from torchid.errors import ConfigError
 from torchid.fitting.posterior import POSTERIOR
 from torchid.parameters import consistency_margin
-from torchid.terminal.runs import sample_lines
+from torchid.terminal.identification import sample_lines
 
 pytestmark = pytest.mark.filterwarnings("ignore:identified:torchid.errors.TorchidWarning")
 

@@ -52,15 +52,14 @@ def test_the_scale_of_a_type_of_motors_is_found_and_a_new_log_predicted_with_it(
     assert json.loads(written.read_text())["new"]["identified"]["nullspace_rms"] < 1e-7
 
 
-def test_factors_the_cache_and_large_logs_have_it_as_well(file: Path, tmp_path: Path) -> None:
+def test_factors_and_large_logs_have_it_as_well(file: Path, tmp_path: Path) -> None:
     found = {}
-    assert main(["identify", str(file), f"output={tmp_path / 'again'}"]) == 0
     assert main(["identify", str(file), f"output={tmp_path / 'blocks'}", "preprocessing.memory_gb=0.0001"]) == 0
     files = compressed(file, tmp_path)
     assert len(files) == 2
     more = (f"logs.train={json.dumps(files)}",)
     assert main(["identify", str(file), f"output={tmp_path / 'factored'}", *more]) == 0
-    for name in ("again", "blocks", "factored"):
+    for name in ("blocks", "factored"):
         (scale,) = document(tmp_path / name, "parameters")["extras"]
         found[name] = scale["value"]
     assert found == pytest.approx(dict.fromkeys(found, HIP_SCALE - 1.0), rel=EXACT)

@@ -16,7 +16,6 @@ from legged.robots import GO2
 from motions import value
 from refusals import refused
 from repository import SHARED
-from trainings import trust_new_files
 from walking import MACHINES, recorded, truth
 
 from torchid.cli import main
@@ -26,7 +25,6 @@ from torchid.errors import ConfigError, InputError, TorchidWarning
 from torchid.fitting.experiment import set_up
 from torchid.logs import Log, write_log
 from torchid.problem.contact_detection import DetectionConfig
-from torchid.reading.cached_reader import CachedReader, open_cache
 from torchid.reading.log_reader import LogReader
 
 MACHINE = MACHINES["quadruped"]
@@ -55,7 +53,7 @@ def written(tmp_path: Path, logs: tuple[Log, Log]) -> Written:
             "robot": {"urdf": str(DEMO / "quadruped.urdf")},
             "contacts": FEET,
             "logs": {"train": ["train.npz"], "test": ["test.npz"]},
-            "preprocessing": {"cutoff_hz": 15, "cache_gb": 0} | preprocessing,
+            "preprocessing": {"cutoff_hz": 15} | preprocessing,
             "sensors": "joints",
             "estimator": {"name": "least_squares", "ridge": 1e-3},
             "output": str(tmp_path / "run"),
@@ -142,26 +140,6 @@ def test_a_log_that_would_be_read_in_blocks_is_taken_whole(written: Written, mon
     monkeypatch.setattr("torchid.reading.log_reader._WHOLE_GB", 0.0)
     (other,) = LogReader(setup).read(setup.config.logs.train, setup.sensors)
     np.testing.assert_array_equal(value(one.base.specific_force), value(other.base.specific_force))
-
-
-def test_cached_samples_of_one_setting_are_not_those_of_the_other(
-    written: Written, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    trust_new_files(monkeypatch)
-    file, override = written(lambda log: log, cache_gb=1), "preprocessing.base_motion=contacts"
-
-    def read(*more: str) -> np.ndarray:
-        setup = set_up(load_config(file, more))
-        cache = open_cache(setup)
-        assert cache is not None
-        (samples,) = CachedReader(setup, cache).read(setup.config.logs.train, setup.sensors)
-        return np.asarray(value(samples.base.specific_force))
-
-    one, two = read(), read(override)
-    assert not np.array_equal(one, two)
-    monkeypatch.setattr("torchid.reading.log_reader.read_log", None)
-    np.testing.assert_array_equal(read(override), two)
-    np.testing.assert_array_equal(read(), one)
 
 
 # ---------------------------------------------------------------------------------------------------- detected contacts

@@ -15,7 +15,7 @@ from walking import MACHINES
 import torchid
 from torchid.commands.answer import answer
 from torchid.errors import ImplausibleFitError
-from torchid.fitting.misfit import unexplained_joints
+from torchid.fitting.noise import unexplained_joints
 from torchid.log_checks import SUSPICIOUS, Checked, Finding
 from torchid.logs import Log, write_log
 from torchid.problem import Metrics

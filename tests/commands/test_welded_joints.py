@@ -61,7 +61,6 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
         write_log(_without(log), folder / f"fixed_{name}")
     settings = yaml.safe_load((DEMO / "quadruped.yaml").read_text())
     settings |= {"robot": {"urdf": "moving.urdf", "weld": {KNEE: HELD}}, "logs": {"train": [_TRAIN], "test": [_TEST]}}
-    settings["preprocessing"]["cache_gb"] = 0
     settings["estimator"]["ridge"] = 0.01
     settings["sensors"]["set"] = "full"  # without the knee's torque, forces of four feet hide the base
     (folder / "experiment.yaml").write_text(yaml.safe_dump(settings))

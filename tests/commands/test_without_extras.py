@@ -9,12 +9,13 @@ import sys
 import pytest
 from demo import shortened_demo
 
-EXTRAS = ("mujoco", "h5py", "pyarrow", "rosbags", "mcap", "plotly", "jinja2", "clarabel", "cvxpy", "pinocchio")
+EXTRAS = ("mujoco", "h5py", "pyarrow", "rosbags", "mcap", "cvxpy", "pinocchio")
 WORKING = (
     "identify mine/quadruped.yaml output=run",
     "evaluate run --log mine/sway_test.npz --output evaluated",
     "sample run --count 50 --output samples.npz",
     "check mine/quadruped.yaml",
+    "report run",
     "analyze mine/quadruped.yaml",
     "compress mine/quadruped.yaml --output factors",
     "export run --format urdf --output exported",
@@ -24,7 +25,6 @@ WORKING = (
 REFUSED = {
     "replay run --log mine/sway_test.npz": "[sim]",
     "simulate mine/quadruped.yaml": "[sim]",
-    "report run": "[report]",
     "convert mine/sway_test.npz log.csv": "[tables]",
     "convert mine/sway_test.npz log.h5": "[hdf5]",
 }

@@ -110,7 +110,6 @@ def test_options_of_an_optimizer_may_be_written_as_people_write_them(file: Path,
         ({"name": "least_squares", "prior": "entropic"}, "prior", "consistent or sgd"),
         ({"name": "consistent", "consistency": "penalties"}, "consistency", "sgd"),
         ({"name": "consistent", "training": {"seed": 3}}, "training", "sgd"),
-        ({"name": "sgd", "certify": True}, "certify", "consistent"),
     ],
     ids=lambda value: value["name"] if isinstance(value, dict) else value,
 )

@@ -330,7 +330,6 @@ def test_a_value_of_the_wrong_kind_is_refused_by_its_place(file: Path, settings:
         ),
         ("actuators.delay=short", "actuators.delay: found 'short'; accepted: auto, null, or a number"),
         ("actuators.delay=true", "actuators.delay: found True; accepted: auto, null, or a number"),
-        ("preprocessing.cache_gb=-1", "preprocessing.cache_gb: found -1; accepted: greater than or equal to 0"),
         ("robot.base_tilt=[0.1]", "robot.base_tilt: found [0.1]; accepted: auto, null, or two angles [rad]"),
         ("robot.base_tilt=level", "robot.base_tilt: found 'level'; accepted: auto, null, or two angles [rad]"),
         ("estimator.training.epochs=2.5", "estimator.training.epochs: found 2.5; accepted: a whole number"),

@@ -1,4 +1,4 @@
-"""Consistent estimates: two solvers agree, nothing allowed is better, priors are what they say."""
+"""Consistent estimates: a conic solver agrees, nothing allowed is better, priors are what they say."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from conic_reference import least_objective
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from physical import (
-    METHODS,
     PRIORS,
     active_case,
     as_good_as_none,
@@ -29,46 +29,42 @@ from synthetic import Array, transform
 from torchid import parameters
 from torchid.errors import InputError
 from torchid.estimators import Conditions, Consistent, LeastSquares, violations
-from torchid.estimators.consistent import Method, Prior
+from torchid.estimators.conic_problem import Prior
 from torchid.problem.linear import parameter_scale
 
 seeds = st.integers(0, 2**32 - 1)
 few = settings(max_examples=10, deadline=None, derandomize=True)
-both = pytest.mark.parametrize("method", METHODS)
 all_priors = pytest.mark.parametrize("prior", PRIORS)
 
 
-# ------------------------------------------------------------------------------------------------------- two solvers
+# ----------------------------------------------------------------------------------------------------- the reference
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=60, deadline=None, derandomize=True)
 @given(seed=seeds, prior=st.sampled_from(PRIORS))
 @example(seed=3628799, prior="euclidean")  # one row that the nominal parameters happen to explain: an optimum of 1e-15
 @example(seed=3628799, prior="entropic")
-def test_both_solvers_find_the_same_optimum_and_meet_every_condition(seed: int, prior: Prior) -> None:
+def test_it_is_the_optimum_of_the_reference_and_meets_every_condition(seed: int, prior: Prior) -> None:
     rng = np.random.default_rng(seed)
     case = random_case(rng)
     ridge = 10.0 ** rng.uniform(-6.0, -1.0)
-    fast, sure = (Consistent(ridge, prior, case.conditions, method).solve(case.problem) for method in METHODS)
+    estimate = Consistent(ridge, prior, case.conditions).solve(case.problem)
     floor = as_good_as_none(ridge, case.problem)
-    assert fast.objective == pytest.approx(sure.objective, rel=1e-6, abs=1e-6 * floor)
-    for estimate, outside in ((fast, 1e-12), (sure, 1e-7)):  # Clarabel's iterates end up to 1e-8 outside
-        phi = estimate.phi.reshape(case.truth.shape)
-        assert violations(phi, case.scale, case.conditions, max(outside, 1e-9)) == []
-        off = [violation.condition for violation in violations(phi, case.scale, case.conditions)]
-        assert not [condition for condition in off if "mirror" in condition or "total" in condition]
-        least = least_eigenvalues(phi, case.scale)
-        assert (least >= case.conditions.margin - outside).all()
-        np.testing.assert_allclose(estimate.eigenvalues, least, rtol=0.0, atol=1e-12)
-        value = objective(prior, ridge, case.problem, phi)
-        assert estimate.objective == pytest.approx(value, rel=1e-7, abs=1e-7 * floor)
-        assert (estimate.unconstrained is None) == (prior == "entropic")
-        assert estimate.unconstrained is None or estimate.objective >= estimate.unconstrained * (1.0 - 1e-7)
-        accuracy = 1e-9 if estimate is fast else 1e-6
-        assert 0.0 <= estimate.gap <= accuracy * max(estimate.objective, floor)
-    outside_gains = 1e-8 * max(sure.objective, floor)
-    assert fast.objective - sure.objective <= fast.gap + outside_gains
-    assert sure.objective - fast.objective <= sure.gap + outside_gains
+    optimum = least_objective(case.problem, case.conditions, prior, ridge)
+    assert estimate.objective <= optimum + 1e-6 * max(optimum, floor)
+    assert estimate.objective >= optimum - 1e-4 * max(optimum, floor)  # of which the reference's inaccuracy is a part
+    phi = estimate.phi.reshape(case.truth.shape)
+    assert violations(phi, case.scale, case.conditions, 1e-9) == []
+    off = [violation.condition for violation in violations(phi, case.scale, case.conditions)]
+    assert not [condition for condition in off if "mirror" in condition or "total" in condition]
+    least = least_eigenvalues(phi, case.scale)
+    assert (least >= case.conditions.margin - 1e-12).all()
+    np.testing.assert_allclose(estimate.eigenvalues, least, rtol=0.0, atol=1e-12)
+    value = objective(prior, ridge, case.problem, phi)
+    assert estimate.objective == pytest.approx(value, rel=1e-7, abs=1e-7 * floor)
+    assert (estimate.unconstrained is None) == (prior == "entropic")
+    assert estimate.unconstrained is None or estimate.objective >= estimate.unconstrained * (1.0 - 1e-7)
+    assert 0.0 <= estimate.gap <= 1e-9 * max(estimate.objective, floor)
 
 
 @pytest.mark.parametrize("prior", PRIORS)
@@ -77,23 +73,9 @@ def test_a_quadruped_takes_few_steps(prior: Prior) -> None:
     problem, scale = active_case(5, bodies=13, rows=156)
     problem = replace(problem, A=100.0 * problem.A, b=100.0 * problem.b)
     conditions = Conditions(total_mass=float(problem.nominal[::12].sum()))
-    estimate = Consistent(1e-4, prior, conditions, certify=True).solve(problem)
+    estimate = Consistent(1e-4, prior, conditions).solve(problem)
     assert estimate.steps < 40
-    assert estimate.certified_gap is not None
-    assert estimate.certified_gap < 1e-6
     assert violations(estimate.phi.reshape(scale.shape), scale, conditions) == []
-
-
-@all_priors
-def test_the_gap_between_the_solvers_is_stated_when_asked_for(prior: Prior) -> None:
-    problem, _ = active_case(1)
-    for method in METHODS:
-        estimate = Consistent(1e-2, prior, method=method, certify=True).solve(problem)
-        other = Consistent(1e-2, prior, method=METHODS[method == "barrier"]).solve(problem)
-        expected = abs(estimate.objective - other.objective) / estimate.objective
-        assert estimate.certified_gap == pytest.approx(expected, abs=1e-12)
-        assert other.certified_gap is None
-        assert expected < 1e-6
 
 
 # --------------------------------------------------------------------------------------------------------- optimality
@@ -159,8 +141,7 @@ def test_a_general_optimizer_finds_nothing_better(seed: int, prior: Prior) -> No
 
 @few
 @given(seed=seeds)
-@both
-def test_without_active_conditions_it_is_least_squares(method: Method, seed: int) -> None:
+def test_without_active_conditions_it_is_least_squares(seed: int) -> None:
     rng = np.random.default_rng(seed)
     nominal = random_bodies(rng, 2)
     nominal[:, 10:] = 1.0
@@ -169,7 +150,7 @@ def test_without_active_conditions_it_is_least_squares(method: Method, seed: int
     plain = LeastSquares(ridge := 1e-3).solve(problem)
     least = float(least_eigenvalues(plain.phi.reshape(nominal.shape), scale).min())
     assume(least > 1e-4)
-    estimate = Consistent(ridge, "euclidean", Conditions(0.5 * least), method).solve(problem)
+    estimate = Consistent(ridge, "euclidean", Conditions(0.5 * least)).solve(problem)
     np.testing.assert_allclose(estimate.phi / problem.scale, plain.phi / problem.scale, rtol=0.0, atol=1e-7)
     assert estimate.unconstrained == pytest.approx(estimate.objective, rel=1e-7)
     assert estimate.increase == pytest.approx(0.0, abs=1e-7 * estimate.objective)
@@ -179,12 +160,11 @@ def test_without_active_conditions_it_is_least_squares(method: Method, seed: int
 
 
 @all_priors
-@both
-def test_what_the_conditions_cost_is_stated(method: Method, prior: Prior) -> None:
+def test_what_the_conditions_cost_is_stated(prior: Prior) -> None:
     """Against the least objective without conditions, found by a general optimizer."""
     problem, scale = active_case(1, bodies=1, rows=9)
     nominal = problem.nominal.reshape(scale.shape)
-    estimate = Consistent(1e-2, prior, method=method).solve(problem)
+    estimate = Consistent(1e-2, prior).solve(problem)
     if prior == "entropic":  # whose domain is a condition
         assert estimate.unconstrained is None
         assert estimate.increase is None
@@ -199,14 +179,13 @@ def test_what_the_conditions_cost_is_stated(method: Method, prior: Prior) -> Non
 
 @pytest.mark.parametrize("ridge", [0.0, 1e-10])
 @pytest.mark.parametrize("rows", [10, 40])
-@both
-def test_noise_free_data_of_a_real_robot_are_explained(method: Method, rows: int, ridge: float) -> None:
+def test_noise_free_data_of_a_real_robot_are_explained(rows: int, ridge: float) -> None:
     rng = np.random.default_rng(6)
     nominal = random_bodies(rng, 2)
     truth = parameters.perturb_parameters(nominal, 0.2, rng)
     truth[:, 10:] += 0.1
     problem = data(rng, nominal, truth, parameter_scale(nominal), rows, 10.0, 0.0)
-    estimate = Consistent(ridge, conditions=Conditions(1e-4), method=method).solve(problem)
+    estimate = Consistent(ridge, conditions=Conditions(1e-4)).solve(problem)
     np.testing.assert_allclose(problem.A @ estimate.phi, problem.b, rtol=0.0, atol=1e-6 * np.abs(problem.b).max())
     assert np.isfinite(estimate.phi).all()
     if rows > truth.size:
@@ -215,14 +194,13 @@ def test_noise_free_data_of_a_real_robot_are_explained(method: Method, rows: int
 
 
 @all_priors
-@both
-def test_data_that_the_nominal_parameters_explain_leave_them(method: Method, prior: Prior) -> None:
+def test_data_that_the_nominal_parameters_explain_leave_them(prior: Prior) -> None:
     """An optimum of zero, without a pull, at which nothing is relative to the objective."""
     rng = np.random.default_rng(11)
     nominal = random_bodies(rng, 2)
     nominal[:, 10:] = 0.3
     problem = data(rng, nominal, nominal, parameter_scale(nominal), 40, 10.0, 0.0)
-    estimate = Consistent(0.0, prior, method=method, certify=True).solve(problem)
+    estimate = Consistent(0.0, prior).solve(problem)
     np.testing.assert_allclose(estimate.phi / problem.scale, problem.nominal / problem.scale, rtol=0.0, atol=1e-6)
     assert abs(estimate.objective) < 1e-12
 
@@ -231,12 +209,11 @@ def test_data_that_the_nominal_parameters_explain_leave_them(method: Method, pri
 
 
 @all_priors
-@both
-def test_with_nothing_seen_the_nominal_bodies_stay(prior: Prior, method: Method) -> None:
+def test_with_nothing_seen_the_nominal_bodies_stay(prior: Prior) -> None:
     nominal = random_bodies(np.random.default_rng(7), 2)
     nominal[:, 10:] = 0.3
     problem = nothing_seen(nominal)
-    estimate = Consistent(1e-3, prior, method=method, certify=True).solve(problem)
+    estimate = Consistent(1e-3, prior).solve(problem)
     np.testing.assert_allclose((estimate.phi - problem.nominal) / problem.scale, 0.0, atol=1e-4)
     assert abs(estimate.objective) < 1e-9
 
@@ -262,11 +239,10 @@ def test_frames_and_units_do_not_matter_to_the_priors_of_matter(prior: Prior, se
 
 
 @pytest.mark.parametrize("prior", ["pullback", "entropic"])
-@both
-def test_a_prior_of_matter_refuses_nominal_bodies_that_do_not_exist(prior: Prior, method: Method) -> None:
+def test_a_prior_of_matter_refuses_nominal_bodies_that_do_not_exist(prior: Prior) -> None:
     problem, _ = active_case(0, bodies=1)
     for worst in (-0.1, 0.0):  # broken triangle inequality; a plate
         inertia = np.diag([1.0, 1.0, 2.0 - worst])
         nominal = np.append(parameters.inertial_vector(1.0, np.zeros(3), inertia), [0.0, 0.0])
         with pytest.raises(InputError, match="body 0"):
-            Consistent(1e-2, prior, method=method).solve(replace(problem, nominal=nominal))
+            Consistent(1e-2, prior).solve(replace(problem, nominal=nominal))

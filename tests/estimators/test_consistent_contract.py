@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
+from conic_reference import least_objective
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from physical import (
-    METHODS,
     PRIORS,
     active_case,
     nothing_seen,
@@ -22,18 +20,14 @@ from physical import (
     random_points,
     random_reflection,
 )
-from repository import ROOT
 from scipy.optimize import nnls
 
 from torchid.errors import InputError, NumericalWarning
-from torchid.estimators import Conditions, Consistent, Enclosure, Mirror, certified, violations
+from torchid.estimators import Conditions, Consistent, Enclosure, Mirror, violations
 from torchid.estimators.barrier import solve_barrier
-from torchid.estimators.conic_formulation import build_conic_problem
-from torchid.estimators.conic_problem import Solution
-from torchid.estimators.consistent import Method, Prior
+from torchid.estimators.conic_problem import Prior, build_conic_problem
 from torchid.problem.linear import parameter_scale
 
-both = pytest.mark.parametrize("method", METHODS)
 all_priors = pytest.mark.parametrize("prior", PRIORS)
 
 # ------------------------------------------------------------------------------------------------------- contradictions
@@ -70,8 +64,7 @@ def contradictions() -> dict[str, tuple[Conditions, np.ndarray, str]]:
 
 
 @pytest.mark.parametrize("name", contradictions())
-@both
-def test_conditions_that_exclude_each_other_are_refused_soon(method: Method, name: str) -> None:
+def test_conditions_that_exclude_each_other_are_refused_soon(name: str) -> None:
     conditions, free, named = contradictions()[name]
     nominal = random_bodies(np.random.default_rng(8), 2)
     problem = nothing_seen(nominal, free)
@@ -80,7 +73,7 @@ def test_conditions_that_exclude_each_other_are_refused_soon(method: Method, nam
         problem = replace(problem, nominal=nominal.ravel())
     started = time.process_time()
     with pytest.raises(InputError, match=named):
-        Consistent(1e-3, conditions=conditions, method=method).solve(problem)
+        Consistent(1e-3, conditions=conditions).solve(problem)
     assert time.process_time() - started < 5.0
 
 
@@ -95,23 +88,21 @@ def test_a_start_far_from_what_the_conditions_allow_finds_it() -> None:
         )
         conditions = Conditions(enclosures=enclosures)
         problem = nothing_seen(nominal)
-        fast, sure = (Consistent(1e-3, conditions=conditions, method=method).solve(problem) for method in METHODS)
-        assert violations(fast.phi.reshape(2, 12), problem.scale.reshape(2, 12), conditions) == []
-        assert fast.objective == pytest.approx(sure.objective, rel=1e-6)
+        estimate = Consistent(1e-3, conditions=conditions).solve(problem)
+        assert violations(estimate.phi.reshape(2, 12), problem.scale.reshape(2, 12), conditions) == []
+        assert estimate.objective == pytest.approx(least_objective(problem, conditions, "euclidean", 1e-3), rel=1e-6)
 
 
-@both
-def test_bounds_that_meet_hold_a_number(method: Method) -> None:
+def test_bounds_that_meet_hold_a_number() -> None:
     """The known mass of one body."""
     problem, scale = active_case(2)
     lower, upper = np.full(scale.shape, -np.inf), np.full(scale.shape, np.inf)
     lower[0, 0] = upper[0, 0] = 1.25 * problem.nominal[0]
-    estimate = Consistent(1e-3, conditions=Conditions(lower=lower, upper=upper), method=method).solve(problem)
+    estimate = Consistent(1e-3, conditions=Conditions(lower=lower, upper=upper)).solve(problem)
     assert estimate.phi[0] == pytest.approx(lower[0, 0], rel=1e-7)
 
 
-@both
-def test_what_equalities_settle_needs_no_room(method: Method) -> None:
+def test_what_equalities_settle_needs_no_room() -> None:
     """A barrier has no inside where a bound is met with equality: friction at its least, a body that is an image."""
     rng = np.random.default_rng(13)
     mass, place = random_points(rng)
@@ -120,16 +111,15 @@ def test_what_equalities_settle_needs_no_room(method: Method) -> None:
     free = np.ones(24, dtype=bool)
     free[12:] = False  # held, without friction
     problem = replace(active_case(13)[0], nominal=nominal.ravel(), scale=parameter_scale(nominal).ravel(), free=free)
-    estimate = Consistent(1e-3, conditions=Conditions(1e-6, mirrors=(Mirror(0, 1, S),)), method=method).solve(problem)
+    estimate = Consistent(1e-3, conditions=Conditions(1e-6, mirrors=(Mirror(0, 1, S),))).solve(problem)
     np.testing.assert_allclose(estimate.phi / problem.scale, problem.nominal / problem.scale, rtol=0.0, atol=1e-9)
 
 
-@both
-def test_a_body_can_be_symmetric(method: Method) -> None:
+def test_a_body_can_be_symmetric() -> None:
     problem, scale = active_case(3, bodies=1)
     S = np.diag([1.0, -1.0, 1.0])
     conditions = Conditions(mirrors=(Mirror(0, 0, S),))
-    phi = Consistent(1e-3, conditions=conditions, method=method).solve(problem).phi.reshape(scale.shape)
+    phi = Consistent(1e-3, conditions=conditions).solve(problem).phi.reshape(scale.shape)
     np.testing.assert_allclose((phi / scale)[0, [2, 5, 8]], 0.0, atol=1e-9)  # what changes its sign
     assert violations(phi, scale, conditions, 1e-7) == []
 
@@ -158,7 +148,7 @@ def test_no_multipliers_claim_a_gap_that_is_too_small(seed: int, prior: Prior) -
             assert gap >= conic.objective(x) - best.objective - 1e-12
 
 
-def test_multipliers_that_push_where_the_data_say_nothing_certify_nothing() -> None:
+def test_multipliers_that_push_where_the_data_say_nothing_prove_nothing() -> None:
     """Data on the mass alone, and the multiplier of a face of the box that its centre of mass lies on."""
     nominal = random_bodies(np.random.default_rng(14), 1)
     box = Enclosure(0, "box", nominal[0, 1:4] / nominal[0, 0], np.eye(3), np.full(3, 0.1))
@@ -182,30 +172,12 @@ def test_a_gap_is_as_small_as_was_asked_for_and_true(prior: Prior, tolerance: fl
     assert rough.steps < best.steps
 
 
-@both
-def test_a_solver_that_stops_short_says_so(method: Method, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_solver_that_stops_short_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     problem, _ = active_case(4)
-    if method == "barrier":
-        monkeypatch.setattr("torchid.estimators.barrier._STEPS", 2)
-    else:
-        run = certified._run
-        monkeypatch.setattr(certified, "_run", lambda program, _: run(program, 1e-2))
+    monkeypatch.setattr("torchid.estimators.barrier._STEPS", 2)
     with pytest.warns(NumericalWarning, match="stopped at a gap of"):
-        estimate = Consistent(1e-3, method=method).solve(problem)
+        estimate = Consistent(1e-3).solve(problem)
     assert estimate.gap > 1e-6 * estimate.objective
-
-
-def test_a_conic_solver_that_ends_outside_the_conditions_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    problem, _ = active_case(4)
-    solve = certified._solve
-
-    def outside(*arguments: Any) -> Solution:
-        found = solve(*arguments)
-        return replace(found, x=1.1 * found.x)
-
-    monkeypatch.setattr(certified, "_solve", outside)
-    with pytest.warns(NumericalWarning, match="outside the conditions"):
-        Consistent(1e-3, method="certified").solve(problem)
 
 
 def test_outside_the_domain_of_an_entropic_prior_nothing_is_an_objective() -> None:
@@ -219,55 +191,35 @@ def test_outside_the_domain_of_an_entropic_prior_nothing_is_an_objective() -> No
 
 
 @all_priors
-@both
-def test_what_is_not_free_is_taken_into_account(method: Method, prior: Prior) -> None:
+def test_what_is_not_free_is_taken_into_account(prior: Prior) -> None:
     problem, scale = active_case(9, bodies=3, rows=30)
     nominal, free = problem.nominal.reshape(3, 12).copy(), np.ones((3, 12), dtype=bool)
     nominal[2, :10], free[2, :10], free[1], free[0, 10] = 0.0, False, False, False  # no mass; held; no friction
     problem = replace(problem, nominal=nominal.ravel(), free=free.ravel())
-    estimate = Consistent(1e-2, prior, method=method).solve(problem)
+    estimate = Consistent(1e-2, prior).solve(problem)
     assert np.isnan(estimate.eigenvalues).tolist() == [False, False, True]
     only = replace(
         problem, A=problem.A[:, :12], b=problem.b - problem.A[:, 12:] @ problem.nominal[12:], free=problem.free[:12],
         nominal=problem.nominal[:12], scale=problem.scale[:12],
     )  # fmt: skip
     without = replace(problem, free=np.where(np.arange(36) < 12, problem.free, False))
-    alone, held = (Consistent(1e-2, prior, method=method).solve(p) for p in (only, without))
+    alone, held = (Consistent(1e-2, prior).solve(p) for p in (only, without))
     np.testing.assert_allclose(
         alone.phi / only.scale, held.phi[:12] / only.scale, rtol=0.0, atol=1e-5
     )  # sqrt(gap / ridge)
 
 
 @all_priors
-@both
-def test_friction_alone_can_be_free(method: Method, prior: Prior) -> None:
+def test_friction_alone_can_be_free(prior: Prior) -> None:
     problem, _ = active_case(0)
     free = np.arange(24) % 12 >= 10
-    estimate = Consistent(1e-6, prior, method=method).solve(replace(problem, free=free))
+    estimate = Consistent(1e-6, prior).solve(replace(problem, free=free))
     A, b = problem.A[:, free], problem.b - problem.A[:, ~free] @ problem.nominal[~free]
     weight = np.sqrt(1e-6 * problem.rows)
     stacked, right = np.vstack([A, weight * np.eye(4)]), np.append(b, weight * problem.nominal[free])
     np.testing.assert_allclose(estimate.phi[free], nnls(stacked, right)[0], rtol=0.0, atol=1e-6)
 
 
-@pytest.mark.parametrize("change", [{"method": "sdp"}, {"prior": "riemannian"}])
-def test_an_unknown_method_or_prior_is_refused(change: dict[str, str]) -> None:
+def test_an_unknown_prior_is_refused() -> None:
     with pytest.raises(ValueError, match="accepted"):
-        Consistent(**change)
-
-
-@pytest.mark.parametrize("change", [{"method": "certified"}, {"certify": True}], ids=str)
-def test_without_clarabel_the_certified_method_is_refused_before_any_work(
-    change: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("torchid.estimators.consistent.find_spec", lambda _: None)
-    with pytest.raises(InputError, match="needs Clarabel, which is not installed; accepted: pip install"):
-        Consistent(**change)
-    assert Consistent().method == "barrier"
-
-
-def test_a_conic_solution_needs_no_modelling_language(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "cvxpy", None)  # to import it is an error
-    problem, _ = active_case(0)
-    assert np.isfinite(Consistent(1e-6, method="certified").solve(problem).phi).all()
-    assert not [path for path in (ROOT / "torchid").rglob("*.py") if "cvxpy" in path.read_text()]
+        Consistent(prior="riemannian")

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import warnings
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 
-import cvxpy as cp
 import numpy as np
 import pytest
-from conic_reference import least_misfit, least_prior
+from conic_reference import least_misfit, least_objective, least_prior
 from contact_states import BOTH, FLIGHT, LEFT, RIGHT, biped
 from physical import (
-    METHODS,
     PRIORS,
     active_case,
     as_good_as_none,
@@ -25,50 +22,32 @@ from synthetic import Array
 
 from torchid import parameters
 from torchid.errors import InputError
-from torchid.estimators import Conditions, Consistent, ConsistentEstimate, Enclosure, LeastSquares, violations
-from torchid.estimators.consistent import Method, Prior
-from torchid.identifiability.structure import structural_problem
+from torchid.estimators import Conditions, Consistent, Enclosure, LeastSquares, violations
+from torchid.estimators.conic_problem import Prior
+from torchid.identifiability.base_parameters import structural_problem
 from torchid.problem import LinearProblem
 from torchid.problem.linear import parameter_scale
 from torchid.sensing import named_sensors
 
 RANK = 1e-10  # what counts as determined
-both = pytest.mark.parametrize("method", METHODS)
 all_priors = pytest.mark.parametrize("prior", PRIORS)
 
 
-@dataclass(frozen=True)
-class Fit:
-    """An estimate without ridge, and whether it was said that no limit exists."""
-
-    estimate: ConsistentEstimate
-    unbounded: bool
-
-
-def fit(problem: LinearProblem, conditions: Conditions, prior: Prior, method: Method) -> Fit:
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        estimate = Consistent(0.0, prior, conditions, method).solve(problem)
-    return Fit(estimate, any("keeps decreasing" in str(warning.message) for warning in caught))
-
-
-def check(problem: LinearProblem, conditions: Conditions, prior: Prior, method: Method, accuracy: float) -> Fit:
+def check(problem: LinearProblem, conditions: Conditions, prior: Prior, accuracy: float) -> None:
     """Least misfit, least prior among all that predict the same, conditions met, and nothing out of bounds."""
-    found = fit(problem, conditions, prior, method)
-    phi, scale, nominal = (x.reshape(-1, 12) for x in (found.estimate.phi, problem.scale, problem.nominal))
+    estimate = Consistent(0.0, prior, conditions).solve(problem)
+    phi, scale, nominal = (x.reshape(-1, 12) for x in (estimate.phi, problem.scale, problem.nominal))
     assert violations(phi, scale, conditions, 1e-7) == []
     floor = as_good_as_none(0.0, problem)
-    assert found.estimate.objective == pytest.approx(problem.cost(found.estimate.phi) / problem.rows, abs=1e-3 * floor)
+    misfit = problem.cost(estimate.phi) / problem.rows
+    assert estimate.objective == pytest.approx(misfit, rel=1e-5, abs=1e-3 * floor)  # and the part of the least ridge
     least = least_misfit(problem, conditions)
-    excess = (found.estimate.objective - least) / max(least, floor)
-    if not found.unbounded:
-        assert excess < 1e-6
+    assert (misfit - least) / max(least, floor) < 1e-6
     bodies = problem.free.reshape(-1, 12)[:, 0]
     value = prior_value(prior, phi[bodies], nominal[bodies], scale[bodies])
-    alike = least_prior(problem, conditions, prior, found.estimate.phi, RANK)
+    alike = least_prior(problem, conditions, prior, estimate.phi, RANK)
     assert value <= alike * (1.0 + accuracy) + accuracy
     assert np.abs((phi - nominal) / scale).max() < 1e3  # what data determine may be far away
-    return found
 
 
 # ---------------------------------------------------------------------------------------------- random and structural
@@ -76,38 +55,16 @@ def check(problem: LinearProblem, conditions: Conditions, prior: Prior, method: 
 
 @pytest.mark.parametrize("seed", [1, 3, 10])
 @all_priors
-@both
-def test_random_problems_have_the_least_misfit_and_of_all_with_it_the_least_prior(
-    method: Method, prior: Prior, seed: int
-) -> None:
+def test_random_problems_have_the_least_misfit_and_of_all_with_it_the_least_prior(prior: Prior, seed: int) -> None:
     case = random_case(np.random.default_rng(seed))
-    assert not check(case.problem, case.conditions, prior, method, 1e-6).unbounded
-
-
-@pytest.mark.slow
-@all_priors
-@both
-def test_two_hundred_random_problems(method: Method, prior: Prior) -> None:
-    """None ends in an error, and 19 of 20 agree with the reference.
-
-    What is left: limits that lie beyond a thousand scales; feasible sets without interior, on which the reference moves
-    by as much between two calls as it differs, or finds nothing; the certified method's prior on those sets.
-    """
-    unlike = []
-    for seed in range(200):
-        case = random_case(np.random.default_rng(seed))
-        try:
-            check(case.problem, case.conditions, prior, method, 1e-3)
-        except (AssertionError, cp.SolverError, RuntimeWarning) as error:
-            unlike.append((seed, str(error)[:80]))
-    assert len(unlike) <= 15, unlike
+    check(case.problem, case.conditions, prior, 1e-6)
 
 
 STATES = ([BOTH], [LEFT], [RIGHT], [FLIGHT], [LEFT, RIGHT], [BOTH, LEFT], [BOTH, LEFT, RIGHT])
 
 
 @cache
-def structural(name: str, states: int, sensors: str, friction: bool, noise: float) -> LinearProblem:
+def structural(name: str, states: int, sensors: str, friction: bool) -> LinearProblem:
     """All that sensors can see in some contact states, of bodies 20 % off their URDF."""
     robot, contacts = biped(name)
     problem = structural_problem(robot, contacts, named_sensors(sensors, robot.n, 2), STATES[states], friction)
@@ -115,26 +72,24 @@ def structural(name: str, states: int, sensors: str, friction: bool, noise: floa
     truth = parameters.perturb_parameters(robot.nominal, 0.2, rng)
     truth[:, parameters.FRICTION] = rng.uniform(0.0, 0.5, (len(truth), 2)) if friction else 0.0
     phi = np.where(problem.free, truth.ravel(), problem.nominal)
-    error = noise * rng.normal(size=len(problem.b))
-    return replace(problem, b=problem.A @ phi + error, residual=noise**2 * (problem.rows - len(error)))
+    return replace(problem, b=problem.A @ phi, residual=0.0)
 
 
-def check_structural(problem: LinearProblem, prior: Prior, method: Method) -> None:
+def check_structural(problem: LinearProblem, prior: Prior) -> None:
     """Bodies whose truth is a fifth of a scale from nominal: no mass is absurd, and no parameter is beyond belief."""
-    found = fit(problem, Conditions(), prior, method)
-    phi, scale = (x.reshape(-1, 12) for x in (found.estimate.phi, problem.scale))
+    estimate = Consistent(0.0, prior).solve(problem)
+    phi, scale = (x.reshape(-1, 12) for x in (estimate.phi, problem.scale))
     assert violations(phi, scale, Conditions(), 1e-7) == []
-    assert np.abs((found.estimate.phi - problem.nominal) / problem.scale).max() < 10.0
-    total, nominal = (float(x[::12].sum()) for x in (found.estimate.phi, problem.nominal))
+    assert np.abs((estimate.phi - problem.nominal) / problem.scale).max() < 1.0
+    total, nominal = (float(x[::12].sum()) for x in (estimate.phi, problem.nominal))
     assert total == pytest.approx(nominal, rel=0.5)
-    assert found.estimate.objective <= problem.cost(problem.nominal) / problem.rows
+    assert estimate.objective <= 1e-6 * problem.cost(problem.nominal) / problem.rows
 
 
-@pytest.mark.parametrize("noise", [0.0, 1.0])
-def test_joint_torques_of_a_standing_biped(noise: float) -> None:
-    problem = structural("biped", 0, "joints", False, noise)
+def test_joint_torques_of_a_standing_biped() -> None:
+    problem = structural("biped", 0, "joints", False)
     assert LeastSquares().solve(problem).rank < problem.free.sum()
-    check_structural(problem, "euclidean", "barrier")
+    check_structural(problem, "euclidean")
 
 
 @pytest.mark.slow
@@ -142,13 +97,9 @@ def test_joint_torques_of_a_standing_biped(noise: float) -> None:
 @pytest.mark.parametrize("sensors", ["full", "joints"])
 @pytest.mark.parametrize("states", range(len(STATES)))
 @pytest.mark.parametrize("name", ["biped", "G1"])
-@pytest.mark.parametrize("noise", [0.0, 1.0])
 @all_priors
-@both
-def test_fifty_six_structural_problems(
-    method: Method, prior: Prior, noise: float, name: str, states: int, sensors: str, friction: bool
-) -> None:
-    check_structural(structural(name, states, sensors, friction, noise), prior, method)
+def test_fifty_six_structural_problems(prior: Prior, name: str, states: int, sensors: str, friction: bool) -> None:
+    check_structural(structural(name, states, sensors, friction), prior)
 
 
 # ------------------------------------------------------------------------------------------------------- known answers
@@ -164,45 +115,24 @@ def mass_alone(mass: float) -> tuple[LinearProblem, Array]:
     return LinearProblem(row, np.array([mass]), 0.0, 1, nominal.ravel(), scale.ravel(), free), nominal
 
 
-@both
-def test_without_active_conditions_it_is_least_squares_of_least_norm(method: Method) -> None:
+def test_without_active_conditions_it_is_least_squares_of_least_norm() -> None:
     problem, nominal = mass_alone(1.0)
     problem = replace(problem, b=np.array([1.01 * nominal[:, 0].sum()]))
-    found = fit(problem, Conditions(1e-6), "euclidean", method)
+    estimate = Consistent(0.0, conditions=Conditions(1e-6)).solve(problem)
     plain = LeastSquares().solve(problem)
-    off = (found.estimate.phi - plain.phi) / problem.scale
+    off = (estimate.phi - plain.phi) / problem.scale
     np.testing.assert_allclose(off, 0.0, atol=1e-6)
-    assert found.estimate.increase == pytest.approx(0.0, abs=1e-12)
-    assert not found.unbounded
+    assert estimate.increase == pytest.approx(0.0, abs=1e-12)
 
 
 @all_priors
-@both
-def test_a_total_mass_that_no_body_can_have_brings_the_least_mass(method: Method, prior: Prior) -> None:
+def test_a_total_mass_that_no_body_can_have_brings_the_least_mass(prior: Prior) -> None:
     """Data of mass 0: each body's least mass is the margin, where its first moments must vanish: no room is left."""
     problem, nominal = mass_alone(0.0)
-    found = fit(problem, Conditions(1e-2), prior, method)
+    estimate = Consistent(0.0, prior, Conditions(1e-2)).solve(problem)
     least = 1e-2 * nominal[:, 0].sum()
-    assert found.estimate.phi[::12].sum() == pytest.approx(least, rel=1e-3)
-    assert np.abs((found.estimate.phi - problem.nominal) / problem.scale).max() < 2.0
-    assert not found.unbounded
-
-
-@both
-def test_where_no_parameters_have_the_least_misfit_it_says_so_and_stays_near(method: Method) -> None:
-    """A mass below the margin and a first moment of 1: inertias could grow for ever to come nearer to both."""
-    nominal = random_bodies(np.random.default_rng(2), 1)
-    scale = parameter_scale(nominal)
-    A = 10.0 * np.repeat(np.eye(12)[:2], 50, axis=0) / scale
-    b = A @ (np.array([-0.3, 1.0, *np.zeros(10)]) * scale[0]) + np.random.default_rng(3).normal(size=100)
-    problem = LinearProblem(A, b, 0.0, 100, nominal.ravel(), scale.ravel(), np.ones(12, dtype=bool))
-    found = fit(problem, Conditions(), "euclidean", method)
-    assert found.unbounded
-    assert (
-        np.abs((found.estimate.phi - problem.nominal) / problem.scale).max() < 500.0
-    )  # 1e4 and more on the way to the least
-    least = least_misfit(problem, Conditions())
-    assert found.estimate.objective == pytest.approx(least * (1.0 + 2 / 98), rel=5e-3)  # discrepancy principle
+    assert estimate.phi[::12].sum() == pytest.approx(least, rel=1e-3)
+    assert np.abs((estimate.phi - problem.nominal) / problem.scale).max() < 2.0
 
 
 @all_priors
@@ -214,8 +144,8 @@ def test_exact_data_of_bodies_without_friction_are_explained(prior: Prior) -> No
     truth = parameters.perturb_parameters(nominal, 0.1, rng)
     truth[:, 10:] = 0.0
     problem = data(rng, nominal, truth, parameter_scale(nominal), 40, 10.0, 0.0)
-    found = fit(problem, Conditions(1e-5), prior, "barrier")
-    np.testing.assert_allclose((found.estimate.phi - truth.ravel()) / problem.scale, 0.0, atol=1e-5)
+    estimate = Consistent(0.0, prior, Conditions(1e-5)).solve(problem)
+    np.testing.assert_allclose((estimate.phi - truth.ravel()) / problem.scale, 0.0, atol=1e-5)
 
 
 @all_priors
@@ -225,7 +155,7 @@ def test_a_total_mass_and_a_box_are_kept(prior: Prior) -> None:
     nominal = problem.nominal.reshape(scale.shape)
     box = Enclosure(0, "box", nominal[0, 1:4] / nominal[0, 0], np.eye(3), np.full(3, 0.05))
     conditions = Conditions(total_mass=float(nominal[:, 0].sum()), enclosures=(box,))
-    check(problem, conditions, prior, "barrier", 1e-3)
+    check(problem, conditions, prior, 1e-3)
 
 
 # ------------------------------------------------------------------------------------------------ flat bodies, rounding
@@ -244,8 +174,8 @@ def test_priors_of_matter_from_bodies_that_are_nearly_flat(prior: Prior) -> None
     nominal[:, 10:] = 0.2
     truth = parameters.perturb_parameters(nominal, 0.2, rng)
     problem = data(rng, nominal, truth, parameter_scale(nominal), 18, 30.0, 1e-2)
-    fast, sure = (Consistent(1e-2, prior, Conditions(0.0), method).solve(problem) for method in METHODS)
-    assert fast.objective == pytest.approx(sure.objective, rel=1e-6)
+    fast = Consistent(1e-2, prior, Conditions(0.0)).solve(problem)
+    assert fast.objective == pytest.approx(least_objective(problem, Conditions(0.0), prior, 1e-2), rel=1e-6)
     assert fast.gap <= 1e-6 * fast.objective
     without = Consistent(0.0, prior, Conditions(0.0)).solve(problem)
     assert without.objective <= fast.objective

@@ -22,7 +22,7 @@ from torchid.estimators import (
     SgdEstimate,
     Trainer,
 )
-from torchid.estimators.consistent import Method, Prior
+from torchid.estimators.conic_problem import Prior
 from torchid.estimators.least_squares import FIXED, VERDICTS
 from torchid.problem import Batch, LinearProblem
 from torchid.problem.linear import parameter_scale
@@ -195,59 +195,33 @@ class TestLeastSquares(EstimatorContract):
 
 
 class ConsistentContract(EstimatorContract):
-    """Each prior with each solver."""
+    """Each prior."""
 
     kind = ConsistentEstimate
     prior: Prior = "euclidean"
-    method: Method = "barrier"
 
     def solve(self, problem: LinearProblem, ridge: float = RIDGE) -> Estimate:
         """With the usual margin alone."""
-        return Consistent(ridge, self.prior, method=self.method).solve(problem)
+        return Consistent(ridge, self.prior).solve(problem)
 
 
-class TestBarrierEuclidean(ConsistentContract):
+class TestConsistentEuclidean(ConsistentContract):
     """The default."""
 
 
-class TestBarrierPullback(ConsistentContract):
+class TestConsistentPullback(ConsistentContract):
     """Lee, Wensing, Park 2020."""
 
     prior = "pullback"
 
 
-class TestBarrierEntropic(ConsistentContract):
+class TestConsistentEntropic(ConsistentContract):
     """Lee, Park 2018."""
 
     prior = "entropic"
 
 
-class TestCertifiedEuclidean(ConsistentContract):
-    """By Clarabel, to its accuracy; 3e-6 was found."""
-
-    method = "certified"
-    accuracy = 1e-5
-
-
-class TestCertifiedPullback(ConsistentContract):
-    """By Clarabel; 2e-7 was found."""
-
-    prior = "pullback"
-    method = "certified"
-    accuracy = 1e-6
-
-
-class TestCertifiedEntropic(ConsistentContract):
-    """By Clarabel; 5e-6 was found where the prior is all there is."""
-
-    prior = "entropic"
-    method = "certified"
-    accuracy = 2e-5
-
-
-@pytest.mark.parametrize(
-    "estimator", [LeastSquares(), LeastSquares(RIDGE), Consistent(), Consistent(RIDGE), Consistent(RIDGE, certify=True)]
-)
+@pytest.mark.parametrize("estimator", [LeastSquares(), LeastSquares(RIDGE), Consistent(), Consistent(RIDGE)])
 def test_the_parameters_alone_are_those_of_the_estimate_to_the_last_bit(estimator: LeastSquares | Consistent) -> None:
     alone, estimate = estimator.minimize(usual_problem()), estimator.solve(usual_problem())
     assert np.array_equal(alone.phi, estimate.phi)

@@ -13,8 +13,8 @@ from synthetic import UR5, load
 from thinned import slow_but
 
 from torchid.estimators import Conditions, Consistent, PenaltyWeights, Sgd, Trainer, violations
-from torchid.estimators.finish import excess, finish
 from torchid.estimators.least_squares import Minimizer
+from torchid.estimators.training import excess, finish
 from torchid.problem import ExtraTerms, MiniBatches, RowBuilder, assemble, compress_parts
 from torchid.sensing import SensorNoise, named_sensors
 

@@ -14,7 +14,7 @@ from torch.optim.lr_scheduler import LRScheduler
 
 from torchid.errors import InputError, UnknownNameError
 from torchid.estimators import Sgd, Trainer
-from torchid.estimators.optimizers import make_optimizer, make_schedule, optimizer_names, schedule_names, step_schedule
+from torchid.estimators.sgd import make_optimizer, make_schedule, optimizer_names, schedule_names, step_schedule
 
 REFUSED = {"SparseAdam", "Muon"}  # the latter since torch 2.9
 EPOCHS_OF = {"LBFGS": 3, "ASGD": 40, "Rprop": 40}

@@ -13,7 +13,7 @@ from synthetic import Array
 from thinned import slow_but
 
 from torchid.estimators import Conditions, LeastSquares, violations
-from torchid.estimators.barrier_gaussian import barrier_gaussian
+from torchid.estimators.barrier import barrier_gaussian
 from torchid.estimators.conic_problem import ConicProblem
 from torchid.estimators.posterior import Posterior, whitened_rows
 from torchid.estimators.truncated_gaussian import TruncatedGaussian

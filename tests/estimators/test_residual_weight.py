@@ -16,7 +16,7 @@ from torchid import parameters
 from torchid.config import load_config
 from torchid.errors import InputError
 from torchid.estimators import LeastSquares, Sgd, SgdEstimate, Trainer
-from torchid.estimators.residual import CANDIDATE_WEIGHTS, choose_weight
+from torchid.estimators.training import CANDIDATE_WEIGHTS, choose_weight
 from torchid.fitting.experiment import set_up
 from torchid.problem import MiniBatches, RowBuilder, Samples, compress, linear_problem
 from torchid.reading.log_reader import LogReader

@@ -20,7 +20,7 @@ from torchid import parameters
 from torchid.commands.checkpoint import load_checkpoint, save_checkpoint
 from torchid.errors import InputError
 from torchid.estimators import Epoch, LeastSquares, Sgd, SgdEstimate, Trainer
-from torchid.estimators.optimizers import optimizer_names
+from torchid.estimators.sgd import optimizer_names
 from torchid.problem import MiniBatches
 
 RIDGE, MARGIN = 0.001, 1e-4

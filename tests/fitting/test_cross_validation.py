@@ -38,9 +38,17 @@ from torchid.problem import (
     linear_problem,
 )
 from torchid.problem.chunks import chunks_by_state, map_chunks
-from torchid.problem.compression import FOLDS, compress_in_blocks, compress_in_folds, cut_into_blocks, split_into_folds
+from torchid.problem.compression import (
+    FOLDS,
+    compress_in_blocks,
+    compress_in_folds,
+    cut_into_blocks,
+    merge_blocks_of_folds,
+    merge_folds,
+    merge_states,
+    split_into_folds,
+)
 from torchid.problem.metrics import ROW_GROUPS, WHITENED, Evaluation, ForceSums, describe_worse, worse_than_nominal
-from torchid.problem.parts import merge_blocks_of_folds, merge_folds, merge_states
 from torchid.report.figures import ridge_figure
 from torchid.sensing import Contact, SensorNoise, named_sensors
 

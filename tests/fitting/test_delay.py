@@ -15,10 +15,11 @@ from repository import DEMO
 from torchid.config import load_config
 from torchid.errors import LogError, TorchidWarning
 from torchid.estimators import Conditions, Consistent, LeastSquares
-from torchid.fitting.delay import EARLIEST, LATEST, DelayChoice, choose_delay
 from torchid.fitting.experiment import set_up
 from torchid.fitting.fit import LogFitter
-from torchid.logs import Log, preprocess, read_log
+from torchid.fitting.separable import EARLIEST_DELAY, LATEST_DELAY, DelayChoice, choose_delay
+from torchid.logs import Log, read_log
+from torchid.logs.preprocess import preprocess
 from torchid.logs.segments import with_delayed_torques
 from torchid.problem import ExtraTerms, RowBuilder, bind_log
 from torchid.sensing import SensorNoise, named_sensors
@@ -58,9 +59,9 @@ def test_a_delay_of_a_part_of_a_step_is_found_to_a_microsecond(
     assert f"{1e3 * delay:.3g} ±" in str(found)
 
 
-@pytest.mark.parametrize("beyond", [EARLIEST - 0.003, LATEST + 0.003])
+@pytest.mark.parametrize("beyond", [EARLIEST_DELAY - 0.003, LATEST_DELAY + 0.003])
 def test_a_delay_beyond_those_that_are_tried_is_said_to_be_at_their_end(beyond: float) -> None:
-    end = min(max(beyond, EARLIEST), LATEST)
+    end = min(max(beyond, EARLIEST_DELAY), LATEST_DELAY)
     with pytest.warns(TorchidWarning, match=f"{end:g} s or beyond; are torques and positions stamped by the same"):
         found = chosen(recorded(beyond))
     assert found.found == end
@@ -108,7 +109,7 @@ def test_no_delay_is_none_and_one_that_a_single_sine_cannot_tell_is_named() -> N
 
 
 def test_logs_that_are_too_short_for_the_delays_that_are_tried_are_refused() -> None:
-    with pytest.raises(LogError, match=f"none is longer than the {LATEST - EARLIEST:g} s"):
+    with pytest.raises(LogError, match=f"none is longer than the {LATEST_DELAY - EARLIEST_DELAY:g} s"):
         chosen(recorded(seconds=0.07))
 
 

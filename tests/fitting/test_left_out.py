@@ -101,6 +101,8 @@ def test_a_term_that_errors_of_gains_explain_is_not_adopted() -> None:
     assert not choose_terms(reading(log, gain=0.05), TERMS).adopted
     there = recorded(3, rotor=0.3, gains=0.05)
     assert set(choose_terms(reading(there, gain=0.05), TERMS).adopted) == {"armature"}
+    hidden = recorded(6, rotor=0.05, gains=0.05, reach=0.3)  # by these errors
+    assert set(choose_terms(reading(hidden, gain=0.05), TERMS).adopted) == {"armature"}
 
 
 def test_adopted_terms_are_listed_with_what_each_is_worth() -> None:

@@ -15,7 +15,8 @@ from synthetic import UR5
 import torchid
 from torchid.cli import main
 from torchid.config.experiment import ActuatorsConfig
-from torchid.fitting.misfit import (
+from torchid.fitting.noise import (
+    GroupNoise,
     Misfit,
     UnfittedFriction,
     beyond_noise,
@@ -23,7 +24,6 @@ from torchid.fitting.misfit import (
     unexplained_forces,
     unfitted_friction,
 )
-from torchid.fitting.noise import GroupNoise
 from torchid.parameters import FRICTION
 from torchid.problem import ExtraTerms, LinearProblem, bind_log
 
@@ -159,7 +159,7 @@ def test_friction_that_the_model_lacks_is_said_before_all_else(
             f"estimator.friction={fitted}",
             f"actuators={ActuatorsConfig.without_terms()}".replace("None", "null"),
         ]
-        assert main([*command, "preprocessing.cache_gb=0", "estimator.ridge=0.001"]) == 0
+        assert main([*command, "estimator.ridge=0.001"]) == 0
         told[fitted] = json.loads((run / "metrics.json").read_text()), capsys.readouterr().out
     good, lacking = told["true"][0]["misfit"], told["false"][0]["misfit"]
     assert good["explained"]
@@ -185,7 +185,7 @@ def test_stated_noise_explains_logs_that_are_resampled_after_the_filter(tmp_path
         f"output={tmp_path / 'run'}",
         "estimator.ridge=0.001",
     ]
-    assert main([*command, "preprocessing.cache_gb=0", "preprocessing.sample_rate_hz=40"]) == 0
+    assert main([*command, "preprocessing.sample_rate_hz=40"]) == 0
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert metrics["residual_std"] == pytest.approx(metrics["misfit"]["expected_residual_std"], rel=0.05)
     for logs in ("train", "test"):

@@ -22,8 +22,8 @@ from torchid.fitting.fit import LogFitter
 from torchid.fitting.noise import NoiseSummary, recorded_sensors
 from torchid.parameters import MASS, PER_BODY
 from torchid.problem import RowBuilder, Samples, bind_log, compress_parts
-from torchid.problem.base_motion import levelled_base_axes
 from torchid.problem.extras import NoiseGroups
+from torchid.problem.motion import levelled_base_axes
 from torchid.rounding import MAD_PER_STD, STD_PER_MAD
 from torchid.sensing import SensorNoise
 from torchid.sensing.projection import whitened_null_space

@@ -15,10 +15,9 @@ from torchid.fitting.fit import LogFitter
 from torchid.logs import Log
 from torchid.parameters import FRICTION, perturb_parameters
 from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log
-from torchid.problem.compression import compress_in_blocks, compress_parts, split_into_folds
+from torchid.problem.compression import compress_in_blocks, compress_parts, merge_factors, split_into_folds
+from torchid.problem.noise import SampledRows
 from torchid.problem.noise_gram import scale_columns
-from torchid.problem.parts import merge_factors
-from torchid.problem.sampled_rows import SampledRows
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, named_sensors
 

@@ -12,8 +12,8 @@ from synthetic import SOLO12, Oracle, load, make_log
 
 from torchid.config import load_config
 from torchid.fitting.calibration import Calibration
+from torchid.fitting.cross_validation import residuals_of_samples, sum_residuals, with_all_readings
 from torchid.fitting.experiment import set_up
-from torchid.fitting.residual_squares import residuals_of_samples, sum_residuals, with_all_readings
 from torchid.logs import read_log
 from torchid.logs.preprocess import preprocess
 from torchid.problem import RowBuilder, bind_log, compress_parts

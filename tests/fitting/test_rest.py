@@ -12,7 +12,8 @@ from synthetic import Array
 
 from torchid.estimators import LeastSquares
 from torchid.fitting.fit import Fit, LogFitter
-from torchid.logs import Log, preprocess
+from torchid.logs import Log
+from torchid.logs.preprocess import preprocess
 from torchid.parameters import COULOMB, PER_BODY, VISCOUS
 from torchid.problem import RowBuilder, bind_log
 from torchid.problem.compression import compress_in_blocks

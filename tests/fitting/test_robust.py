@@ -25,7 +25,7 @@ from torchid.fitting.fit import Fit, LogFitter
 from torchid.fitting.robust import TUNING, Reweighting, RobustLoss, RobustSummary, fit_robustly
 from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log, compress_parts
 from torchid.problem.chunk_dynamics import ChunkDynamics, Workspace
-from torchid.problem.parts import Part
+from torchid.problem.compression import Part
 from torchid.robot import Robot
 from torchid.sensing import SensorNoise, named_sensors
 

@@ -13,8 +13,9 @@ from stribeck import AT_REST, NOISE, recorded
 from torchid.estimators import Conditions, Consistent, LeastSquares
 from torchid.fitting.fit import LogFitter
 from torchid.fitting.separable import StribeckChoice, choose_stribeck
-from torchid.logs import Log, preprocess
+from torchid.logs import Log
 from torchid.logs.dry_friction import mean_stribeck
+from torchid.logs.preprocess import preprocess
 from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log
 from torchid.problem.compression import compress_in_blocks
 from torchid.sensing import SensorNoise, named_sensors

@@ -1,4 +1,4 @@
-"""Least misfit and least prior by a second formulation: matrices of matter, second-order cones, Clarabel."""
+"""Least objective, misfit and prior by a second formulation: matrices of matter, second-order cones, Clarabel."""
 
 from __future__ import annotations
 
@@ -19,17 +19,19 @@ ACCURACY = {"tol_gap_abs": 1e-11, "tol_gap_rel": 1e-11, "tol_feas": 1e-11}
 class Bodies:
     """Bodies as pseudo-inertias J (4, 4) in units of their scale, and friction."""
 
-    def __init__(self, problem: LinearProblem, conditions: Conditions, relative: bool = False) -> None:
-        """`relative`: with the nominal bodies' pseudo-inertias L L^T as units, J = L M L^T of a variable M."""
+    def __init__(self, problem: LinearProblem, conditions: Conditions, units: Array | None = None) -> None:
+        """`units`: parameters (12 L,) whose pseudo-inertias L L^T are units, J = L M L^T of a variable M."""
         self.scale = problem.scale.reshape(-1, 12)
         self.nominal = problem.nominal.reshape(-1, 12)
         free = problem.free.reshape(-1, 12)
         self.M = [cp.Variable((4, 4), symmetric=True) if row[0] else None for row in free]
         scaled = self.nominal / self.scale
         roots = [
-            np.linalg.cholesky(pseudo(z)) if relative and row[0] else np.eye(4)
-            for z, row in zip(scaled, free, strict=True)
+            np.linalg.cholesky(pseudo(z)) if units is not None and row[0] else np.eye(4)
+            for z, row in zip((scaled if units is None else units.reshape(-1, 12) / self.scale), free, strict=True)
         ]
+        inverse = [np.linalg.inv(L) for L in roots]
+        self.M_nominal = [W @ pseudo(z) @ W.T for W, z in zip(inverse, scaled, strict=True)]
         self.J = [None if M is None else L @ M @ L.T for L, M in zip(roots, self.M, strict=True)]
         self.friction = cp.Variable((len(free), 2))
         self.held: list[Any] = []
@@ -81,15 +83,16 @@ class Bodies:
         return sum(pseudo(unit) * self.phi[body][k] for k, unit in enumerate(np.eye(12)[:10]))
 
     def prior(self, name: str) -> Any:
-        """Of all free bodies; those of matter where bodies are `relative`."""
+        """Of all free bodies; those of matter where bodies have `units`."""
         if name == "euclidean":
             return sum(
                 cp.sum_squares(z - nominal / scale)
                 for z, nominal, scale in zip(self.scaled, self.nominal, self.scale, strict=True)
             )
         value = cp.sum_squares(self.friction - (self.nominal / self.scale)[:, 10:])
-        for M in (M for M in self.M if M is not None):
-            value += cp.sum_squares(M - np.eye(4)) if name == "pullback" else cp.trace(M) - 4.0 - cp.log_det(M)
+        for M, nominal in zip(self.M, self.M_nominal, strict=True):
+            if M is not None:
+                value += cp.sum_squares(M - nominal) if name == "pullback" else cp.trace(M) - 4.0 - cp.log_det(M)
         return value
 
 
@@ -102,18 +105,32 @@ def _solved(objective: Any, held: list[Any]) -> float:
     return float(programme.value)
 
 
+def least_objective(
+    problem: LinearProblem, conditions: Conditions, prior: str, ridge: float, reference: Array | None = None
+) -> float:
+    """Least mean square of the residual and ridge times prior under the conditions; `reference` for the pull-back."""
+    units = problem.nominal if reference is None else reference
+    bodies = Bodies(problem, conditions, None if prior == "euclidean" else units)
+    size = max(float(problem.b @ problem.b + problem.residual) / problem.rows, ridge, 1e-300)
+    A, b = (x / np.sqrt(problem.rows * size) for x in (problem.A * problem.scale, problem.b))
+    misfit = cp.sum_squares(A @ cp.hstack(bodies.scaled) - b)
+    if problem.terms is not None:
+        C, D, z = (x / np.sqrt(problem.rows * size) for x in (problem.terms.C, problem.terms.D, problem.terms.z))
+        phi, psi = cp.hstack(bodies.phi), cp.Variable(len(problem.terms.size))
+        misfit += cp.sum_squares(C @ phi + D @ psi - z)
+        bodies.held += [one.terms @ psi + one.parameters @ phi >= 0.0 for one in problem.terms.conditions]
+    least = _solved(misfit + ridge / size * bodies.prior(prior) if ridge else misfit, bodies.held)
+    return least * size + problem.residual / problem.rows
+
+
 def least_misfit(problem: LinearProblem, conditions: Conditions) -> float:
     """Least mean square of the residual under the conditions."""
-    bodies = Bodies(problem, conditions)
-    size = max(float(problem.b @ problem.b + problem.residual) / problem.rows, 1e-300)
-    A, b = (x / np.sqrt(problem.rows * size) for x in (problem.A * problem.scale, problem.b))
-    least = _solved(cp.sum_squares(A @ cp.hstack(bodies.scaled) - b), bodies.held)
-    return least * size + problem.residual / problem.rows
+    return least_objective(problem, conditions, "euclidean", 0.0)
 
 
 def least_prior(problem: LinearProblem, conditions: Conditions, prior: str, phi: Array, tolerance: float) -> float:
     """Least prior of all parameters that predict what `phi`, (12 L,), does and meet the conditions."""
-    bodies = Bodies(problem, conditions, relative=prior != "euclidean")
+    bodies = Bodies(problem, conditions, None if prior == "euclidean" else problem.nominal)
     A = problem.A * problem.scale
     _, values, right = np.linalg.svd(A[:, problem.free], full_matrices=False)
     seen = np.zeros((int((values > tolerance * values[0]).sum()), len(problem.free)))

@@ -16,7 +16,7 @@ from torchid import parameters
 from torchid.config import load_config
 from torchid.fitting.experiment import set_up
 from torchid.problem import LinearProblem, MiniBatches, RowBuilder, Samples, compress, linear_problem
-from torchid.problem.base_motion import BaseMotion
+from torchid.problem.motion import BaseMotion
 from torchid.reading.log_reader import LogReader
 from torchid.regressor import Regressor
 from torchid.robot import Robot

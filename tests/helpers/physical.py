@@ -10,12 +10,11 @@ from synthetic import Array
 
 from torchid import parameters
 from torchid.estimators import Conditions, Enclosure, Mirror
-from torchid.estimators.consistent import Method, Prior
+from torchid.estimators.conic_problem import Prior
 from torchid.problem import LinearProblem
 from torchid.problem.linear import parameter_scale
 
 PRIORS: tuple[Prior, ...] = ("euclidean", "pullback", "entropic")
-METHODS: tuple[Method, ...] = ("barrier", "certified")
 
 
 def of_points(mass: Array, place: Array) -> Array:

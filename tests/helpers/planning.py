@@ -20,7 +20,7 @@ from torchid.problem.contact_state import ContactState
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet
 from torchid.sensing.projection import base_rank, base_singular_values, null_space
-from torchid.sensor_planning.demands import Candidate, candidates, sensor_set
+from torchid.sensor_planning.observability import Candidate, candidates, sensor_set
 
 RANDOM = "random"  # an axis
 NOISE = SensorNoise(joint_torque=0.7, contact_force=3.0, contact_moment=0.4, base_force=5.0, base_moment=1.0)

@@ -9,7 +9,7 @@ import torch
 from synthetic import Array, random_states
 
 from torchid.problem import Samples
-from torchid.problem.base_motion import BaseMotion
+from torchid.problem.motion import BaseMotion
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet, named_sensors
 

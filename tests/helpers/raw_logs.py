@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from refusals import refused
 
+from torchid import reader
 from torchid.errors import LogError
 from torchid.logs import read_log
 
@@ -35,8 +36,11 @@ def log_refusal(path: Path) -> str:
     return message
 
 
-def without_package(package: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As if a package were not installed."""
+def without_package(package: str, monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
+    """As if a package were not installed, here and in processes that read; `folder`: an empty one."""
+    (folder / f"{package}.py").write_text(f"raise ImportError(name={package!r})")
+    monkeypatch.syspath_prepend(folder)
+    monkeypatch.setattr(reader, "_idle", [])
     load = builtins.__import__
 
     def absent(name: str, *args: Any, **kwargs: Any) -> Any:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,16 +9,11 @@ import pytest
 
 from torchid.cli import main
 from torchid.errors import ConfigError, InputError, UnknownNameError
-from torchid.reading.cache import FOLDER
 
 
 def files_in(folder: Path) -> dict[str, bytes]:
-    """All files with what is in them, and all folders, without what runs keep for later ones."""
-
-    def is_kept(path: Path) -> bool:
-        return FOLDER in path.relative_to(folder).parts or (path.is_dir() and os.listdir(path) == [FOLDER])
-
-    paths = [path for path in sorted(folder.rglob("*")) if not is_kept(path)]
+    """All files with what is in them, and all folders."""
+    paths = sorted(folder.rglob("*"))
     return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else b"" for path in paths}
 
 

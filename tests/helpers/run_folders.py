@@ -10,7 +10,6 @@ from torchid.commands.folder import (
     EVALUATION,
     new_folder,
 )
-from torchid.reading.cache import FOLDER
 
 Add = Callable[[Path], None]
 
@@ -42,10 +41,5 @@ def everything(folder: Path) -> dict[str, tuple[bytes, str]]:
 
 
 def names_in(folder: Path) -> list[str]:
-    """What is in a folder, but for what runs keep there for later ones."""
-    return sorted(path.name for path in folder.iterdir() if path.name != FOLDER)
-
-
-def keys_in(folder: Path) -> set[str]:
-    """Names of the entries of the cache that runs keep there."""
-    return {path.name for path in (folder / FOLDER).iterdir() if path.is_dir()}
+    """What is in a folder."""
+    return sorted(path.name for path in folder.iterdir())

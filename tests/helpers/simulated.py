@@ -20,7 +20,7 @@ from torchid.config import FootConfig, MotionConfig, SimulationConfig, StepsConf
 from torchid.config.simulation import SimulatedRobotConfig, WaveConfig
 from torchid.logs import Log
 from torchid.problem import Evaluation, bind_log
-from torchid.problem.predict import force_series
+from torchid.problem.metrics import force_series
 from torchid.robot import load_robot
 from torchid.simulation import Stability
 

@@ -23,11 +23,6 @@ EVALUATED = sorted({*range(0, EPOCHS + 1, EVERY), EPOCHS})
 BY_EPOCH = list(range(1, EPOCHS + 1))
 
 
-def trust_new_files(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A cache that trusts files that have just been written."""
-    monkeypatch.setattr("torchid.reading.cache._YOUNG", -1.0)
-
-
 def command(experiment: Path, output: Path, *more: str) -> list[str]:
     return ["identify", str(experiment / "experiment.yaml"), f"output={output}", *more]
 

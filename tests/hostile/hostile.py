@@ -19,7 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from torchid.errors import BaseLostError, InputError, TorchidWarning, is_plain
+from torchid.reader import LIMITS
 
+os.environ.setdefault(LIMITS, "0.4")  # of which cases are that know no end
 SECONDS, WAITING = 5.0, 30.0  # of work, which other processes do not prolong; and until a case that waits is given up
 BYTES = 2**30
 LONGEST_LINE = 3000
@@ -94,6 +96,8 @@ class _Watch:
             pass  # which changes nothing
         elif event in _CHANGES and not self._may(*_with_folder(event, arguments)):
             self.events.append(f"{event} {arguments[0]}")
+        elif event == "subprocess.Popen" and "torchid.reader" in str(arguments[1]):
+            pass  # the process that reads
         elif event in _RUNS or event in _CALLS:
             self.events.append(f"{event} {arguments[:2]}")
 

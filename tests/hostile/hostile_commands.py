@@ -16,7 +16,6 @@ from run_figures import EVENTS, PAGE, draw
 from shared_work import become
 
 from torchid.cli import main
-from torchid.report import page
 
 _LATE = [
     *("h5py", "jinja2", "scipy.signal", "torch._dynamo", "torchid.estimators.training", "torchid.report.tensorboard"),
@@ -42,7 +41,6 @@ class Commands:
     def __init__(self) -> None:
         for name in _LATE:
             import_module(name)
-        page._library()  # compressed once for all children
         "x".encode("cp437")  # which zipfile loads late
         self._said: dict[int, int] = {}
 

@@ -236,10 +236,8 @@ def _cells(depth: int) -> bytes:
 CASES: dict[str, Callable[[Path], None]] = {
     "h5 of chunks of one number": _tiny_chunks,
     "h5 of a chunk that holds 2 GB": _chunk(pressed(2000)),
-    "h5 of a chunk that holds 16 bytes": _chunk(zlib.compress(bytes(16))),
     "h5 of a chunk that is cut off": _chunk(zlib.compress(np.random.default_rng(0).bytes(16 * N))[:300]),
     "h5 of a chunk without bytes": _chunk(b"\0"),
-    "h5 of a chunk that holds 16 bytes, by LZF": _chunk(b"\x0f" + bytes(16), compression="lzf"),
     "h5 of a chunk that holds too much, by LZF": _chunk((b"\x00\x00" + b"\xe0\xff\x00" * 10**6), compression="lzf"),
     "h5 of a chunk that was pressed twice": _twice_pressed,
     "h5 of names in one large chunk": _chunks_of_text,

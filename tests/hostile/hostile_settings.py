@@ -190,7 +190,7 @@ DOCUMENTS: dict[str, str | bytes] = {
     "a tag that runs, in a key": "!!python/object/apply:os.system ['touch pwned']: 1",
     "a tag that runs, in a list": "[!!python/object/apply:subprocess.Popen [['touch', 'pwned']]]",
     "a tag that makes": "robot: !!python/object:torchid.config.robot.RobotConfig {urdf: a}",
-    "a tag of omegaconf's": "a: !!python/object/apply:pathlib.PosixPath [a, b]",
+    "a tag that makes a path": "a: !!python/object/apply:pathlib.PosixPath [a, b]",
     "binary": f"output: !!binary {base64.b64encode(bytes(3000)).decode()}",
     "a word for a mapping": "robot: x\nlogs: y\nsensors: 3\noutput: z\n",
     "a list for everything": "\n".join(f"{key}: [1]" for key in BASE),

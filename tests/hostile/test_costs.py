@@ -8,7 +8,7 @@ import pytest
 from hostile import examined
 from hostile_costs import CASES, SLOW, costs
 
-from torchid.guards import FREE_MESSAGES, MAX_GROWTH, MAX_SMALL, Budget, max_unpacked_bytes
+from torchid.guards import MAX_GROWTH, MAX_SMALL, max_unpacked_bytes
 from torchid.logs import Topics, read_log
 from torchid.robot import body_extents, load_robot
 
@@ -38,15 +38,3 @@ def test_a_file_may_come_to_more_the_larger_it_is() -> None:
     assert most == sorted(most)
     assert most[0] == MAX_SMALL
     assert most[4] == MAX_GROWTH * 10**7
-
-
-def test_a_budget_is_spent_once() -> None:
-    budget = Budget(100)
-    budget.spend_bytes(MAX_SMALL)
-    assert budget.next_chunk_bytes() == 0
-    with pytest.raises(ValueError, match="more bytes"):
-        budget.spend_bytes(1)
-    for _ in range(FREE_MESSAGES + 2):
-        budget.spend_message()
-    with pytest.raises(ValueError, match="more messages"):
-        budget.spend_message()

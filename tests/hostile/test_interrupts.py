@@ -17,7 +17,6 @@ from refusals import files_in
 from run_folders import names_in
 from thinned import slow_but
 
-from torchid.reading.cache import FOLDER
 from torchid.staging import NEW, staging_folder
 
 if TYPE_CHECKING:
@@ -64,8 +63,9 @@ def content(made: Path) -> set[str]:
 
 def hidden(out: Path) -> list[str]:
     """Temporary files and folders, wherever they are."""
-    kept = (".checkpoint.pt", FOLDER)
-    found = (path for path in out.rglob(".*") if path.name not in kept and out / "run.training" not in path.parents)
+    found = (
+        path for path in out.rglob(".*") if path.name != ".checkpoint.pt" and out / "run.training" not in path.parents
+    )
     return sorted(str(path.relative_to(out)) for path in found)
 
 

@@ -23,10 +23,10 @@ from torchid.identifiability.base_parameters import (
     base_parameters,
     format_base_parameters,
     rank_and_gap,
+    structural_problem,
     structural_rank,
     unobservable_parameters,
 )
-from torchid.identifiability.structure import structural_problem
 from torchid.parallel import one_thread
 from torchid.problem import LinearProblem
 from torchid.regressor import Regressor

@@ -13,10 +13,16 @@ from synthetic import SOLO12, UR5, Array, Oracle, load, make_log
 from torchid import parameters
 from torchid.estimators import LeastSquares
 from torchid.estimators.least_squares import VERDICTS
-from torchid.identifiability.contributions import Contributions, SensorContribution, contributions
-from torchid.identifiability.information import InformationGain, prior_directions, sensor_information
+from torchid.identifiability.information import (
+    Contributions,
+    InformationGain,
+    SensorContribution,
+    contributions,
+    prior_directions,
+    sensor_information,
+)
 from torchid.problem import ExtraTerms, LinearProblem, RowBuilder, Samples, assemble, bind_log, compress, compress_parts
-from torchid.problem.parts import Part, merge_factors
+from torchid.problem.compression import Part, merge_factors
 from torchid.report.tables import contribution_table, table_text, verdict_table
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet, chosen_sensors, named_sensors

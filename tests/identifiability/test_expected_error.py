@@ -11,8 +11,8 @@ from synthetic import SOLO12, load
 from thinned import each_once
 
 from torchid.estimators import LeastSquares
+from torchid.identifiability.base_parameters import structural_samples
 from torchid.identifiability.information import error_directions, expected_errors
-from torchid.identifiability.structure import structural_samples
 from torchid.problem import Evaluation, LinearProblem, RowBuilder, Samples, compress, linear_problem
 from torchid.problem.metrics import ROW_GROUPS
 from torchid.robot import Robot

@@ -14,10 +14,10 @@ from true_robots import true_parameters
 
 from torchid.estimators import LeastSquares
 from torchid.fitting.fit import LogFitter
-from torchid.identifiability import jackknife
+from torchid.identifiability import confounding
 from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log, compress_parts, compression
 from torchid.problem.compression import compress_in_blocks, split_into_folds
-from torchid.problem.motion_noise import MotionNoise
+from torchid.problem.motion import MotionNoise
 from torchid.sensing import SensorNoise, named_sensors
 
 NOISE = 0.3
@@ -44,7 +44,7 @@ def noisy(samples: Samples, noise: Array) -> Samples:
 
 @pytest.mark.parametrize("ridge", [0.0, 0.01])
 def test_deviations_are_those_of_leaving_each_block_out(monkeypatch: pytest.MonkeyPatch, ridge: float) -> None:
-    monkeypatch.setattr(jackknife, "_LEVERAGE", 1.0)
+    monkeypatch.setattr(confounding, "_LEVERAGE", 1.0)
     samples, fitter, true, rng = scene(200)
     exact = noisy(samples, NOISE * rng.normal(size=(len(samples), 12)))
     fitter = replace(fitter, estimator=LeastSquares(ridge))
@@ -164,14 +164,14 @@ def test_neighbours_of_very_many_blocks_count_as_one(monkeypatch: pytest.MonkeyP
     log = noisy(samples, NOISE * rng.normal(size=(len(samples), 12)))
     parts = compress_in_blocks(split_into_folds([log], fitter.builder), fitter.builder)
     all_blocks = fitter.fit(parts).jackknife
-    monkeypatch.setattr(jackknife, "MOST_BLOCKS", 10)
+    monkeypatch.setattr(confounding, "MOST_BLOCKS", 10)
     fewer = fitter.fit(parts[::-1]).jackknife  # whatever order threads leave them in
     assert all_blocks is not None
     assert fewer is not None
     assert (all_blocks.blocks, fewer.blocks) == (20, 10)
     ratio = fewer.error[fewer.error > 0.0] / all_blocks.error[fewer.error > 0.0]
     assert 0.7 < np.median(ratio) < 1.5
-    groups = jackknife._numbered(parts)
+    groups = confounding._numbered(parts)
     assert [groups["synthetic.npz", fold, block] for fold in range(5) for block in range(4)] == [
         n // 2 for n in range(20)
     ]

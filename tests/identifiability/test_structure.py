@@ -16,15 +16,13 @@ from torchid import parameters
 from torchid.identifiability.base_parameters import (
     BaseParameters,
     base_parameters,
-    structural_rank,
-    unobservable_parameters,
-)
-from torchid.identifiability.structure import (
     random_postures,
     standing_samples,
     standing_states,
     structural_problem,
+    structural_rank,
     structural_samples,
+    unobservable_parameters,
 )
 from torchid.problem.contact_state import ContactState
 from torchid.regressor import FrameJacobian, motion_from_state

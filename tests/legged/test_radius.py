@@ -16,6 +16,7 @@ from rich.progress import Progress
 from torchid.commands.chosen_settings import with_chosen_settings
 from torchid.config import load_config
 from torchid.fitting.experiment import set_up
+from torchid.fitting.factor_files import row_model, with_choices_of
 from torchid.logs import write_log
 
 SECONDS = 12.0
@@ -51,6 +52,10 @@ def test_the_radius_of_feet_is_found_where_they_are_balls(tmp_path: Path, radius
     else:
         assert choices.radius.radius is None
         assert {contact.radius for contact in setup.contacts} == {0.0}
+    model = row_model(setup, setup.builder(setup.sensors))  # what a file of factors keeps of it
+    again = with_choices_of(model, set_up(load_config(experiment(tmp_path))))
+    assert again.contacts == setup.contacts
+    assert row_model(again, again.builder(again.sensors)).settings == model.settings
 
 
 def test_a_log_that_does_not_say_where_the_ground_is_keeps_points(tmp_path: Path) -> None:

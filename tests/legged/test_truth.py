@@ -20,7 +20,7 @@ from walkers import INSTALLED, WALKERS
 from torchid.logs import Log
 from torchid.logs.preprocess import preprocess
 from torchid.problem import Evaluation, ExtraTerms, bind_log
-from torchid.problem.predict import force_series
+from torchid.problem.metrics import force_series
 from torchid.sensing import Contact
 
 SECONDS = 1.6

@@ -15,8 +15,8 @@ from thinned import each_once
 from walking import MACHINES, robot_of
 
 from torchid.log_checks import REJECTED, SUSPICIOUS
+from torchid.log_checks.encoders import fit_zeros
 from torchid.log_checks.model import NominalModel, bind_some_samples, preprocess_pieces
-from torchid.log_checks.zeros import fit_zeros
 from torchid.logs import Log
 from torchid.regressor import Regressor
 

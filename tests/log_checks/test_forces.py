@@ -25,8 +25,8 @@ from walking import MACHINES, robot_of
 from torchid.commands.check import check_experiment
 from torchid.log_checks import NOTE, REJECTED, SUSPICIOUS, Checked, scales
 from torchid.log_checks.check import check
-from torchid.log_checks.deviation import DeviationRows
 from torchid.log_checks.model import NominalModel, bind_some_samples, preprocess_pieces
+from torchid.log_checks.scales import DeviationRows
 from torchid.logs import Log, read_log
 from torchid.logs.preprocess import preprocess
 from torchid.parameters import GRAVITY, VISCOUS

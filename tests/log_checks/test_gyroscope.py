@@ -12,7 +12,7 @@ from motions import value
 from walking import MACHINES, robot_of
 
 from torchid.log_checks import REJECTED, SUSPICIOUS, Finding, Skipped
-from torchid.log_checks.gyroscope import check_gyroscope
+from torchid.log_checks.standing_feet import check_gyroscope
 from torchid.logs import Log
 
 Array = np.ndarray

@@ -20,12 +20,12 @@ from walking import MACHINES
 from torchid.commands.identify import identify
 from torchid.config import load_config
 from torchid.log_checks import NOTE, SUSPICIOUS, Checked
-from torchid.log_checks.frozen import check_excitation, check_rest, check_still_base
+from torchid.log_checks.readings import check_excitation, check_rest, check_still_base
 from torchid.logs import Log, write_log
 from torchid.logs.preprocess import preprocess
 from torchid.logs.segments import with_delayed, with_delayed_torques
 from torchid.problem import bind_log
-from torchid.problem.motion_noise import is_at_rest
+from torchid.problem.motion import is_at_rest
 
 VECTORS = ("base_position_world", "base_linear_velocity_world", "base_linear_acceleration_world")
 

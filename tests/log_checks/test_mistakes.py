@@ -20,12 +20,11 @@ from thinned import SLOW
 from walking import MACHINES, robot_of, truth
 
 from torchid.log_checks import NOTE, REJECTED, SUSPICIOUS, Finding, Skipped
-from torchid.log_checks.mistakes import joint_mistakes, possible_mistakes
+from torchid.log_checks.contacts import check_accelerometer
+from torchid.log_checks.mistakes import exchanged_names, joint_mistakes, possible_mistakes
 from torchid.log_checks.model import NominalModel, bind_some_samples, preprocess_pieces
-from torchid.log_checks.orders import exchanged_names
 from torchid.log_checks.scales import fit_time_scale, fit_torque_gains, motion_cutoff_hz
 from torchid.log_checks.standing_feet import measure_foot_slip
-from torchid.log_checks.weight import check_accelerometer
 from torchid.logs import Log
 from torchid.logs.preprocess import preprocess
 from torchid.regressor import Regressor

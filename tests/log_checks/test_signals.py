@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from torchid.log_checks import NOTE, REJECTED, SUSPICIOUS, Checked, Finding
 from torchid.log_checks.check import check
+from torchid.log_checks.contacts import check_weight
 from torchid.log_checks.motion import check_angle_unit, compare_derivative
-from torchid.log_checks.weight import check_weight
 from torchid.logs import Log, read_log, write_log
 from torchid.logs.quaternion import angular_velocity_base
 from torchid.robot import load_robot

@@ -13,8 +13,7 @@ from thinned import slow_but
 
 from torchid.log_checks import NOTE, REJECTED
 from torchid.log_checks.check import check
-from torchid.log_checks.model import ModelFit
-from torchid.log_checks.torque_fit import TorqueFit
+from torchid.log_checks.model import ModelFit, TorqueFit
 from torchid.logs import Log
 from torchid.logs.units import UNITS, other_units, units_of_derivative_ratio, units_of_ratio
 

@@ -28,7 +28,6 @@ from bags import (
     write_bag,
     write_folder,
 )
-from raw_logs import without_package
 
 from torchid.config import dump_config, load_config
 from torchid.errors import ConfigError, LogError, TorchidWarning, UnknownNameError
@@ -111,14 +110,6 @@ def test_topics_that_are_not_there_or_carry_something_else_are_named(tmp_path: P
         read_messages(path, entries, contact_wrenches={"l_sole": "/wrench/l_sole"})
     with pytest.raises(ConfigError, match=r"contact_active.l_sole: not one of topic and always"):
         read_messages(path, entries, contact_active={"l_sole": {}})
-
-
-def test_without_rosbags_the_message_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write_bag(tmp_path / "x.mcap", joints_at(STAMPS))
-    without_package("rosbags", monkeypatch)
-    monkeypatch.delitem(sys.modules, "torchid.logs.ros_files", raising=False)
-    with pytest.raises(LogError, match=r"rosbags is not installed; accepted: pip install '.\[ros\]'"):
-        read_log(path, parsed({"joint_states": "/joint_states"}))
 
 
 @pytest.mark.parametrize(

@@ -277,7 +277,7 @@ def test_pickled_objects_are_refused(tmp_path: Path) -> None:
 def test_without_h5py_the_message_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_arrays(tmp_path / "x.h5", changed())
     log = read_log(path)
-    without_package("h5py", monkeypatch)
+    without_package("h5py", monkeypatch, tmp_path)
     line = "HDF5, but h5py is not installed; accepted: a .npz file, or pip install '.[hdf5]' in the clone of torchid"
     assert log_refusal(path) == f"{path}: file: {line}"
     with pytest.raises(LogError, match="h5py is not installed"):

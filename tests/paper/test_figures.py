@@ -17,8 +17,7 @@ from synthetic import load
 from torchid.logs import read_log
 from torchid.logs.preprocess import preprocess
 from torchid.problem import Evaluation, Metrics, Samples, bind_log
-from torchid.problem.metrics import BASE_ROWS, ROW_GROUPS
-from torchid.problem.predict import force_series, null_space_part
+from torchid.problem.metrics import BASE_ROWS, ROW_GROUPS, force_series, null_space_part
 from torchid.report.tables import table_text
 from torchid.sensing import Contact
 

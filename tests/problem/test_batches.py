@@ -15,7 +15,7 @@ from synthetic import DRONE, G1, PANDA, TALOS_FULL, Array, load
 from torch import Tensor
 
 from torchid.problem import Batch, MiniBatches, RowBuilder, Samples, compress, linear_problem
-from torchid.problem.base_motion import BaseMotion
+from torchid.problem.motion import BaseMotion
 from torchid.regressor import FrameJacobian, Regressor
 from torchid.robot import Robot
 from torchid.sensing import Contact

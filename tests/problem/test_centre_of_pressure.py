@@ -14,9 +14,8 @@ from scipy.spatial.transform import Rotation
 import torchid
 from torchid.parameters import PER_BODY
 from torchid.problem import Evaluation, Samples
-from torchid.problem.base_motion import BaseMotion
-from torchid.problem.metrics import PRESSURE
-from torchid.problem.predict import centre_of_pressure
+from torchid.problem.metrics import PRESSURE, centre_of_pressure
+from torchid.problem.motion import BaseMotion
 
 ROBOT = torchid.load_robot(Path(torchid.__file__).parent / "demo" / "quadruped.urdf")
 FEET = [torchid.Contact(f"{end}_{side}_foot", "point") for end in ("front", "rear") for side in ("left", "right")]

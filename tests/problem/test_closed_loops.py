@@ -17,11 +17,11 @@ from synthetic import Array
 from torchid import parameters
 from torchid.errors import LogError
 from torchid.estimators import Estimate, LeastSquares
-from torchid.identifiability.structure import standing_states
+from torchid.identifiability.base_parameters import standing_states
 from torchid.problem import Evaluation, RowBuilder, Samples, bind_log, compress, linear_problem
 from torchid.problem.chunks import chunks_by_state
 from torchid.problem.linear import parameter_scale
-from torchid.problem.predict import at_motors, force_series, null_space_part
+from torchid.problem.metrics import at_motors, force_series, null_space_part
 from torchid.regressor import FrameJacobian, LoopJacobian, Regressor
 from torchid.regressor.loops import LoopClosures
 from torchid.sensing import Projection, SensorSet, named_sensors

@@ -14,10 +14,19 @@ from walking import MACHINES, recorded, robot_of, truth
 
 from torchid.logs.preprocess import preprocess
 from torchid.problem import ExtraTerms, RowBuilder, Samples, TriangularFactor, bind_log, compress_parts
-from torchid.problem.blocks import block_spans
-from torchid.problem.compressed_log import compress_log, fold_compressed, merge_blocks, piece_spans
-from torchid.problem.compression import FOLDS, LEAST_PER_FOLD, split_into_folds
-from torchid.problem.parts import Part, merge_folds, merge_states
+from torchid.problem.chunk_dynamics import block_spans
+from torchid.problem.compression import (
+    FOLDS,
+    LEAST_PER_FOLD,
+    Part,
+    compress_log,
+    fold_compressed,
+    merge_blocks,
+    merge_folds,
+    merge_states,
+    piece_spans,
+    split_into_folds,
+)
 from torchid.sensing import named_sensors
 
 

@@ -22,10 +22,9 @@ from welded import CONTACTS, SENSORS, machine
 
 from torchid.problem import ExtraTerms, RowBuilder, Samples
 from torchid.problem.chunks import chunks_by_state
-from torchid.problem.compression import _compress_chunks
+from torchid.problem.compression import Part, _compress_chunks
 from torchid.problem.contact_state import ContactState
 from torchid.problem.extras import CHANNELS
-from torchid.problem.parts import Part
 from torchid.sensing import Contact, SensorSet, with_ft_sensors
 
 DECISION = "sensing/projection.py, any_suspect: _local_scalar_dense (a number)"

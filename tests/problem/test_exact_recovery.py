@@ -30,7 +30,7 @@ from torchid.estimators import Estimate, LeastSquares
 from torchid.identifiability.base_parameters import require_base, state_reports
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
 from torchid.problem.linear import parameter_scale
-from torchid.problem.predict import force_series
+from torchid.problem.metrics import force_series
 from torchid.sensing import SensorSet, chosen_sensors, named_sensors
 
 

@@ -18,12 +18,11 @@ from unknowns import Fit, fit
 from welded import CONTACTS, SENSORS, STATES
 
 from torchid.estimators import Consistent
-from torchid.identifiability.base_parameters import base_parameters
-from torchid.identifiability.structure import structural_problem
+from torchid.identifiability.base_parameters import base_parameters, structural_problem
 from torchid.logs import Log
 from torchid.problem import ExtraTerms, bind_log
 from torchid.problem.extras import ACTUATORS, CHANNELS, list_extras
-from torchid.problem.predict import calibrate_readings
+from torchid.problem.metrics import calibrate_readings
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet, chosen_sensors, named_sensors, with_ft_sensors

@@ -14,7 +14,7 @@ from welded import CONTACTS, STATES, machine
 
 from torchid.logs import Log
 from torchid.problem import Evaluation, bind_log
-from torchid.problem.predict import force_series
+from torchid.problem.metrics import force_series
 from torchid.robot import Robot
 
 

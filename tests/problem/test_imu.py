@@ -21,7 +21,7 @@ from torchid.errors import InputError, LogError, UnknownNameError
 from torchid.logs import Log
 from torchid.logs.preprocess import preprocess
 from torchid.problem import Samples, bind_log
-from torchid.problem.base_motion import base_motion
+from torchid.problem.motion import base_motion
 from torchid.regressor import Regressor
 from torchid.robot import Robot
 from torchid.sensing import Contact

@@ -13,7 +13,7 @@ URDF = DEMO / "quadruped.urdf"
 FIT = """
 import json, os, sys, torch, torchid
 from torchid.problem import Samples
-from torchid.problem.base_motion import BaseMotion
+from torchid.problem.motion import BaseMotion
 for count in map(int, sys.argv[2:]):
     if not (child := os.fork()):  # which has nothing to import
         break

@@ -13,8 +13,7 @@ from synthetic import Array, Oracle, load, make_log
 from welded import CONTACTS, SENSORS, STATES, machine
 
 from torchid.problem import bind_log
-from torchid.problem.metrics import Evaluation
-from torchid.problem.predict import force_series
+from torchid.problem.metrics import Evaluation, force_series
 
 
 def rms(x: Array) -> float:

@@ -18,7 +18,7 @@ from torchid.errors import TorchidWarning
 from torchid.logs import Log
 from torchid.logs.preprocess import preprocess
 from torchid.problem import Samples, bind_log
-from torchid.problem.motion_noise import MIN_MOTION, MIN_TURN_DEG, MotionNoise, is_at_rest
+from torchid.problem.motion import MIN_MOTION, MIN_TURN_DEG, MotionNoise, is_at_rest
 from torchid.robot import Robot
 
 RATE, COUNT = 500.0, 20_000
@@ -149,7 +149,7 @@ def test_a_robot_is_at_rest_unless_a_joint_travels_or_its_base_turns_or_is_shake
 
 
 def test_sides_look_random(robot: Robot) -> None:
-    from torchid.problem.motion_noise import _sides
+    from torchid.problem.motion import _sides
 
     sides = _sides(torch.from_numpy(TIME), 200)
     assert set(sides.unique().tolist()) == {-1.0, 1.0}

@@ -13,13 +13,13 @@ from welded import CONTACTS, SENSORS, STATES, machine
 
 from torchid.config import load_config
 from torchid.fitting.calibration import Calibration
+from torchid.fitting.cross_validation import sum_residuals
 from torchid.fitting.experiment import set_up
-from torchid.fitting.residual_squares import sum_residuals
-from torchid.logs import preprocess, read_log
+from torchid.logs import read_log
+from torchid.logs.preprocess import preprocess
 from torchid.parameters import Array
 from torchid.problem import Samples, bind_log, compress_parts
-from torchid.problem.metrics import Evaluation
-from torchid.problem.predict import force_series, noise_series
+from torchid.problem.metrics import Evaluation, force_series, noise_series
 from torchid.robot import Robot
 from torchid.sensing import SensorNoise
 

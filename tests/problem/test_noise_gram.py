@@ -17,13 +17,11 @@ import torchid
 from torchid.estimators import LeastSquares
 from torchid.fitting.fit import LogFitter
 from torchid.problem import ExtraTerms, RowBuilder, Samples, TriangularFactor, assemble, compress, compress_parts
-from torchid.problem.base_motion import BaseMotion
-from torchid.problem.compression import compress_in_blocks, split_into_folds
+from torchid.problem.compression import compress_in_blocks, merge_factors, split_into_folds
 from torchid.problem.elimination import column_prior, free_parameters
 from torchid.problem.linear import parameter_scale
-from torchid.problem.motion_noise import MotionNoise
+from torchid.problem.motion import BaseMotion, MotionNoise
 from torchid.problem.noise_gram import LEAST_SIGNAL, ColumnPrior, NoiseShares, corrected_triangle
-from torchid.problem.parts import merge_factors
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, named_sensors
 

@@ -25,7 +25,8 @@ from true_robots import true_parameters
 from unknowns import fit
 
 from torchid.errors import LogError, SensorError, UnknownNameError
-from torchid.logs import Log, preprocess, read_log, write_log
+from torchid.logs import Log, read_log, write_log
+from torchid.logs.preprocess import preprocess
 from torchid.problem import Evaluation, ExtraTerms, RowBuilder, bind_log, compress_parts
 from torchid.problem.unloaded_sensors import unloaded_offset_equations
 from torchid.sensing import Contact, SensorSet, chosen_sensors, named_sensors

@@ -15,7 +15,7 @@ from torchid.errors import ConfigError, UnknownNameError
 from torchid.estimators import LeastSquares
 from torchid.parameters import INERTIA_AXES, INERTIAL
 from torchid.problem import RowBuilder, bind_log, compress, linear_problem
-from torchid.problem.predict import force_series
+from torchid.problem.metrics import force_series
 from torchid.robot import Payload, Robot, payload_parameters, with_payload
 from torchid.sensing import Contact, named_sensors
 

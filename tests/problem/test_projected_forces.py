@@ -11,7 +11,7 @@ from torchid.config import load_config
 from torchid.fitting.experiment import Experiment, set_up
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.chunks import chunks_by_state
-from torchid.problem.predict import force_series, null_space_part, projected_forces
+from torchid.problem.metrics import force_series, null_space_part, projected_forces
 from torchid.reading.log_reader import LogReader
 from torchid.sensing.projection import null_space
 

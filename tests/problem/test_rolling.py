@@ -18,11 +18,12 @@ from synthetic import ANYMAL, PANDA, SOLO12, Array, load
 
 import torchid
 from torchid.errors import LogError, SensorError
-from torchid.identifiability.structure import standing_states
-from torchid.logs import Log, preprocess, read_log, write_log
+from torchid.identifiability.base_parameters import standing_states
+from torchid.logs import Log, read_log, write_log
+from torchid.logs.preprocess import preprocess
 from torchid.problem import ExtraTerms, RowBuilder, bind_log, compress
 from torchid.problem.base_pose import feet_poses
-from torchid.problem.sampled_rows import SampledRows
+from torchid.problem.noise import SampledRows
 from torchid.sensing import Contact
 
 ASKEW = (0.3, -0.2, 0.8)

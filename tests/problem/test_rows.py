@@ -18,7 +18,7 @@ from random_samples import NOISE, random_samples, sensor_set
 from synthetic import G1, PANDA, SOLO12, Array, load
 
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
-from torchid.problem.predict import force_series
+from torchid.problem.metrics import force_series
 from torchid.regressor import FrameJacobian, Regressor
 from torchid.robot import Robot
 from torchid.sensing import Contact, Projection, SensorSet, named_sensors

@@ -27,7 +27,7 @@ from welded import CONTACTS, SENSORS, machine
 from torchid.logs import Log
 from torchid.problem import RowBuilder, bind_log, compress, linear_problem
 from torchid.problem.chunks import chunks_by_state
-from torchid.problem.predict import force_series
+from torchid.problem.metrics import force_series
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet
 

@@ -22,7 +22,7 @@ import torchid
 from torchid.identifiability.base_parameters import merge_state_reports, state_reports
 from torchid.problem import RowBuilder, compress
 from torchid.problem.chunks import chunks_by_state
-from torchid.problem.predict import predict_by_columns, predict_forces
+from torchid.problem.metrics import predict_by_columns, predict_forces
 
 ROBOT = torchid.load_robot(Path(torchid.__file__).parent / "demo" / "quadruped.urdf")
 FEET = [torchid.Contact(f"{end}_{side}_foot", "point") for end in ("front", "rear") for side in ("left", "right")]

@@ -18,7 +18,7 @@ from torchid.estimators import Consistent, LeastSquares
 from torchid.logs import Log
 from torchid.problem import ExtraTerms, bind_log
 from torchid.problem.extras import CHANNELS, list_extras
-from torchid.problem.predict import calibrate_readings
+from torchid.problem.metrics import calibrate_readings
 from torchid.regressor.tree import KinematicTree
 from torchid.sensing import SensorSet, named_sensors, with_ft_sensors
 

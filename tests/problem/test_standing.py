@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -20,13 +20,16 @@ from synthetic import Array
 from thinned import each_once
 from walking import robot_of
 
+from torchid.config.log_reading import PreprocessingConfig
 from torchid.errors import LogError, TorchidWarning, UnknownNameError
-from torchid.logs import Log, preprocess
+from torchid.logs import Log
 from torchid.logs.blocks import LogBlocks
-from torchid.logs.preprocess import DERIVATIVE_CHAINS
-from torchid.problem import bind_log
-from torchid.problem.base_pose import LogWithPose, base_pose_from_feet, preprocess_with_pose
+from torchid.logs.preprocess import DERIVATIVE_CHAINS, preprocess
+from torchid.problem import Samples, bind_log
+from torchid.problem.base_pose import LogWithPose, base_pose_from_feet
 from torchid.problem.derived_blocks import base_pose_in_blocks
+from torchid.reading.log_steps import LogSteps
+from torchid.robot import Robot
 from torchid.sensing import Contact
 
 LEVEL = (0.0, 0.0, 1.0)
@@ -206,6 +209,14 @@ def test_what_was_recorded_of_the_base_is_not_used() -> None:
 # ---------------------------------------------------------------------------------------------------------- derivatives
 
 
+def with_pose(
+    log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: float | None = None, rate_hz: float | None = None
+) -> Samples:
+    """Samples of a log with the motion of the base from the feet that stand."""
+    settings = PreprocessingConfig(cutoff_hz=cutoff_hz, sample_rate_hz=rate_hz, base_motion="contacts")
+    return LogSteps(Path(log.source), settings, robot, contacts, None, None).samples_of(log, np.ones(len(log), bool))
+
+
 @pytest.mark.parametrize("name", ["quadruped", "humanoid"])
 @pytest.mark.parametrize("normal", [LEVEL, ASKEW], ids=["level", "askew"])
 @pytest.mark.parametrize("rates", [(None, None), (12.0, None), (12.0, 60.0)], ids=["as is", "filtered", "resampled"])
@@ -215,7 +226,7 @@ def test_its_derivatives_are_those_of_a_measured_pose(
     case = stance(name, normal, 0.0, ((1, 50, 90),))
     robot, contacts = robot_of(case.machine), case.contacts()
     measured = bind_log(preprocess(case.measured, *rates), robot, contacts)
-    derived = bind_log(preprocess_with_pose(case.log, robot, contacts, *rates), robot, contacts)
+    derived = with_pose(case.log, robot, contacts, *rates)
     np.testing.assert_array_equal(derived.time, measured.time)
     np.testing.assert_array_equal(derived.joint_acceleration, measured.joint_acceleration)
     for field in MOTION:
@@ -227,10 +238,7 @@ def test_a_floor_whose_slope_is_not_stated_tilts_gravity_by_that_slope() -> None
     case = stance("quadruped", AHEAD)
     robot = robot_of(case.machine)
     level = tuple(replace(contact, normal=LEVEL) for contact in case.contacts())
-    forces = [
-        value(bind_log(preprocess_with_pose(case.log, robot, c, None, None), robot, c).base.specific_force).numpy()
-        for c in (case.contacts(), level)
-    ]
+    forces = [value(with_pose(case.log, robot, c).base.specific_force).numpy() for c in (case.contacts(), level)]
     angle = np.arccos((forces[0] * forces[1]).sum(axis=1) / np.prod(np.linalg.norm(forces, axis=2), axis=0))
     assert abs(np.median(angle) - 0.15) < 0.02
 
@@ -248,15 +256,15 @@ def test_nothing_is_differentiated_across_samples_with_too_few_feet(rates: tuple
     case = stance("quadruped")
     robot, contacts, log = robot_of(case.machine), case.contacts(), with_gap(case)
     with pytest.warns(TorchidWarning, match=r"20 of 160 samples left out.* \(too few feet stand: 20\)") as caught:
-        whole = preprocess_with_pose(log, robot, contacts, *rates)
+        whole = with_pose(log, robot, contacts, *rates)
     assert len(caught) == 1
     assert not ((whole.time > log.time[69]) & (whole.time < log.time[90])).any()
-    parts = [preprocess_with_pose(log.select(x), robot, contacts, *rates) for x in (slice(0, 70), slice(90, None))]
+    parts = [with_pose(log.select(x), robot, contacts, *rates) for x in (slice(0, 70), slice(90, None))]
     assert len(whole) == sum(map(len, parts))
-    for name in ("time", "joint_acceleration", "base_angular_acceleration_base"):
+    for name in ("time", "joint_acceleration"):
         together = np.concatenate([value(getattr(part, name)) for part in parts])
         np.testing.assert_allclose(getattr(whole, name), together, rtol=0.0, atol=1e-9, err_msg=name)
-    forces = [value(bind_log(x, robot, contacts).base.specific_force).numpy() for x in (whole, *parts)]
+    forces = [value(x.base.specific_force).numpy() for x in (whole, *parts)]
     np.testing.assert_allclose(forces[0], np.concatenate(forces[1:]), rtol=0.0, atol=1e-9)
 
 
@@ -265,12 +273,12 @@ def test_segments_too_short_for_the_filter_are_dropped_and_counted() -> None:
     robot, contacts = robot_of(case.machine), case.contacts()
     log = without(without(with_gap(case), 0, slice(100, 103)), 3, slice(100, 103))
     with pytest.warns(TorchidWarning, match=r"33 of 160 .*feet stand: 23, segments too short to differentiate: 10"):
-        whole = preprocess_with_pose(log, robot, contacts, 12.0, None)
+        whole = with_pose(log, robot, contacts, 12.0)
     assert not ((whole.time > log.time[69]) & (whole.time < log.time[103])).any()
     with pytest.warns(TorchidWarning, match="23 of 160"):
-        assert ((unfiltered := preprocess_with_pose(log, robot, contacts, None, None)).time < log.time[100]).sum() > 66
+        assert ((unfiltered := with_pose(log, robot, contacts)).time < log.time[100]).sum() > 66
     assert len(unfiltered) == 160 - 23 - 3 * 4
-    message = refused(lambda: preprocess_with_pose(log, robot, contacts, 4.0, None), "quadruped: time: segments of at")
+    message = refused(lambda: with_pose(log, robot, contacts, 4.0), "quadruped: time: segments of at")
     assert "more than 1 s" in message
 
 
@@ -354,7 +362,7 @@ def test_feet_that_are_not_on_one_floor_are_warned_of() -> None:
     bent = case.log.joint_position.copy()
     bent[:, list(robot.joint_names).index("front_left_knee")] += 0.4
     with pytest.warns(TorchidWarning, match=r"feet that stand are \d+ mm \(rms\) off one floor; check joint zeros"):
-        preprocess_with_pose(replace(case.log, joint_position=bent), robot, contacts, None, None)
+        with_pose(replace(case.log, joint_position=bent), robot, contacts)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        preprocess_with_pose(case.log, robot, contacts, None, None)
+        with_pose(case.log, robot, contacts)

@@ -9,7 +9,7 @@ from repository import CONFIGS
 import torchid
 from torchid import parameters
 from torchid.estimators.least_squares import IDENTIFIED, UNOBSERVABLE
-from torchid.identifiability.structure import structural_samples
+from torchid.identifiability.base_parameters import structural_samples
 from torchid.problem import RowBuilder, compress, linear_problem
 from torchid.sensing import Contact, named_sensors
 

@@ -20,7 +20,7 @@ from torchid.logs import Log
 from torchid.logs.preprocess import UNLOADED_MARGIN_S, find_unloaded, preprocess
 from torchid.parameters import WRENCH_COMPONENTS
 from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log, compress_parts
-from torchid.problem.parts import Part
+from torchid.problem.compression import Part
 from torchid.problem.unloaded_sensors import unloaded_offset_equations
 from torchid.sensing import SensorNoise, named_sensors
 

@@ -12,8 +12,7 @@ from synthetic import SOLO12, load
 from threadpoolctl import threadpool_info
 
 from torchid.estimators import Consistent, consistent
-from torchid.estimators.conic_formulation import build_conic_problem
-from torchid.estimators.conic_problem import ConicProblem
+from torchid.estimators.conic_problem import ConicProblem, build_conic_problem
 from torchid.parallel import one_thread, run_in_workers, thread_count
 from torchid.problem import RowBuilder, compress, linear_problem
 from torchid.problem.chunks import chunks_by_state, worker_count

@@ -57,7 +57,7 @@ def test_blocks_give_the_samples_of_the_whole_log(tmp_path: Path, name: str, jit
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Logs in memory are read in blocks however short they are."""
     monkeypatch.setattr("torchid.reading.log_reader._WHOLE_GB", 0.0)
-    monkeypatch.setattr("torchid.reading.large_log.BLOCK_GB", 1e-4)
+    monkeypatch.setattr("torchid.reading.log_steps.BLOCK_GB", 1e-4)
 
 
 @pytest.mark.parametrize(("name", "threads"), each_once([*SETTINGS], [3, 1]))

@@ -52,7 +52,7 @@ def written(
         "robot": {"urdf": str(DEMO / "quadruped.urdf")},
         "contacts": [{"frame": name, "type": "point", "radius": radius, "normal": normal} for name in MACHINE.feet],
         "logs": {"train": [log]},
-        "preprocessing": {"cutoff_hz": 15, "cache_gb": 0} | more,
+        "preprocessing": {"cutoff_hz": 15} | more,
         "sensors": "joints",
         "output": str(folder / "run"),
     }

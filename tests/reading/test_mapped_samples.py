@@ -1,4 +1,4 @@
-"""Samples of the cache that are mapped to its files."""
+"""Samples of logs larger than memory, which are mapped to temporary files."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 import torch
 from demo import shortened_demo
-from large import tensors
+from large import SMALL, tensors
 from repository import DEMO
 
 from torchid.config import load_config
 from torchid.fitting.experiment import set_up
-from torchid.logs import preprocess, read_log
+from torchid.logs import read_log
+from torchid.logs.preprocess import preprocess
 from torchid.problem import Samples, bind_log
 from torchid.problem.chunks import map_chunks
 from torchid.problem.contact_state import ContactState
-from torchid.reading.cache import FOLDER
-from torchid.reading.cached_reader import open_reader
+from torchid.reading.log_reader import LogReader
 
 
 @pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
@@ -29,16 +29,16 @@ def test_a_pass_over_mapped_samples_lets_go_of_their_pages_and_finds_the_same_nu
     tmp_path: Path,
 ) -> None:
     demo = shortened_demo(tmp_path / "demo", 300) / "quadruped.yaml"
-    config = load_config(demo, [f"output={tmp_path / 'run'}"])
+    config = load_config(demo, [f"output={tmp_path / 'run'}", SMALL])
     setup = set_up(config)
-    [log] = open_reader(setup).read(config.logs.train, setup.sensors)
+    [log] = LogReader(setup).read(config.logs.train, setup.sensors)
     before = {name: x.clone() for name, x in tensors(log).items()}
-    assert mapped_kilobytes(tmp_path / FOLDER) > 0
+    assert mapped_kilobytes(tmp_path) > 0
     builder, seen = setup.builder(setup.sensors), []
 
     def look(chunks: Iterator[tuple[Samples, ContactState]]) -> None:
         for samples, _ in chunks:
-            seen.append((mapped_kilobytes(tmp_path / FOLDER), samples.joint_position.sum()))  # reads a page
+            seen.append((mapped_kilobytes(tmp_path), samples.joint_position.sum()))  # reads a page
 
     in_one_state = replace(log, active=torch.ones_like(log.active))  # whose chunks are not copied
     map_chunks([in_one_state], builder, look, chunk=-(-len(log) // 6), threads=1)
@@ -61,16 +61,15 @@ def mapped_kilobytes(folder: Path) -> int:
 @pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
 def test_samples_far_apart_are_taken_from_files_without_their_pages_staying_in_memory(tmp_path: Path) -> None:
     demo = shortened_demo(tmp_path / "demo", 300) / "quadruped.yaml"
-    config = load_config(demo, [f"output={tmp_path / 'run'}"])
+    config = load_config(demo, [f"output={tmp_path / 'run'}", SMALL])
     setup = set_up(config)
-    reader = open_reader(setup)
-    [log] = reader.read(config.logs.train, setup.sensors)
+    [log] = LogReader(setup).read(config.logs.train, setup.sensors)
     near, far = torch.arange(0, len(log), 2), torch.arange(0, len(log), 30)
     expected = {name: x[far].nan_to_num() for name, x in tensors(log).items()}
     assert log[near].pages is log.pages
-    reader.release()
+    log.pages.release()
     for chosen in (log[far], log.every(30)):
-        assert mapped_kilobytes(tmp_path / FOLDER) == 0
+        assert mapped_kilobytes(tmp_path) == 0
         assert chosen.pages is None
         for name, x in tensors(chosen).items():
             assert torch.equal(x.nan_to_num(), expected[name]), name
@@ -79,9 +78,9 @@ def test_samples_far_apart_are_taken_from_files_without_their_pages_staying_in_m
 @pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
 def test_mapped_samples_that_are_sent_to_another_process_are_in_its_memory(tmp_path: Path) -> None:
     demo = shortened_demo(tmp_path / "demo", 300) / "quadruped.yaml"
-    config = load_config(demo, [f"output={tmp_path / 'run'}"])
+    config = load_config(demo, [f"output={tmp_path / 'run'}", SMALL])
     setup = set_up(config)
-    [log] = open_reader(setup).read(config.logs.train, setup.sensors)
+    [log] = LogReader(setup).read(config.logs.train, setup.sensors)
     there = pickle.loads(pickle.dumps(log))  # noqa: S301 - what was just written
     there.pages.release()
     for name, x in tensors(there).items():

@@ -21,7 +21,7 @@ from torchid.estimators import LeastSquares
 from torchid.identifiability.base_parameters import state_reports
 from torchid.parameters import WRENCH_COMPONENTS
 from torchid.problem import RowBuilder, Samples, bind_log, compress, linear_problem
-from torchid.problem.predict import force_series
+from torchid.problem.metrics import force_series
 from torchid.regressor import FrameJacobian
 from torchid.robot import Robot, load_robot
 from torchid.sensing import SensorSet, chosen_sensors, named_sensors, with_ft_sensors

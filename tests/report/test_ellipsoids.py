@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from torchid import parameters
 from torchid.parameters import Array
-from torchid.report.page_figures import TRIANGLES, ellipsoid_points, equivalent_ellipsoid
+from torchid.report.figures import _outline, equivalent_ellipsoid
 
 MASS, CENTER, SEMI_AXES = 3.0, np.array([0.1, -0.2, 0.4]), np.array([0.05, 0.12, 0.3])
 AXES = Rotation.from_euler("xyz", [0.3, -0.7, 1.1]).as_matrix()
@@ -29,22 +29,21 @@ def test_a_uniform_ellipsoid_is_its_own() -> None:
     np.testing.assert_allclose(semi_axes @ semi_axes.T, AXES @ np.diag(SEMI_AXES**2) @ AXES.T, atol=1e-12)
 
 
-def test_its_vertices_lie_on_it_in_the_frame_of_the_base() -> None:
+@pytest.mark.parametrize("plane", [[0, 2], [1, 2]])
+def test_its_outline_is_what_one_sees_from_a_side(plane: list[int]) -> None:
+    """In each direction of the plane it reaches as far as the ellipsoid, turned and moved to the base's frame."""
     found = equivalent_ellipsoid(solid())
     assert found is not None
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = Rotation.from_euler("zyx", [1.0, 0.2, -0.4]).as_matrix(), [1.0, 2.0, 3.0]
-    points = ellipsoid_points(*found, pose)
-    local = ((points - pose[:3, 3]) @ pose[:3, :3] - CENTER) @ AXES / SEMI_AXES
-    np.testing.assert_allclose(np.linalg.norm(local, axis=1), 1.0, atol=1e-12)
-
-
-def test_its_triangles_close_the_surface() -> None:
-    """Each edge of a closed surface is in two triangles; V - E + F = 2 on a sphere."""
-    edges = np.sort(np.concatenate([TRIANGLES[:, pair] for pair in ([0, 1], [1, 2], [2, 0])]), axis=1)
-    unique, counts = np.unique(edges, axis=0, return_counts=True)
-    assert (counts == 2).all()
-    assert TRIANGLES.max() + 1 - len(unique) + len(TRIANGLES) == 2
+    outline = _outline(*found, pose, plane, "#000000")
+    np.testing.assert_allclose(outline.center, (pose[:3, :3] @ CENTER + pose[:3, 3])[plane], atol=1e-12)
+    axes = (pose[:3, :3] @ AXES @ np.diag(SEMI_AXES))[plane]
+    for angle in np.linspace(0.0, np.pi, 7):
+        direction = np.array([np.cos(angle), np.sin(angle)])
+        turned = angle - np.radians(outline.angle)
+        reach = 0.5 * np.hypot(outline.width * np.cos(turned), outline.height * np.sin(turned))
+        assert reach == pytest.approx(np.linalg.norm(direction @ axes), rel=1e-12)
 
 
 @pytest.mark.parametrize("change", [(parameters.MASS, -1.0), (4, 10.0)], ids=["mass below 0", "Ixx > Iyy + Izz"])

@@ -19,7 +19,7 @@ from torchid.fitting.calibration import warn_of_confounded
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.problem.extras import Extra
 from torchid.report.figure_style import STYLE, save_figure
-from torchid.report.parameter_figures import extra_figure
+from torchid.report.figures import extra_figure
 from torchid.report.tables import extra_table
 
 

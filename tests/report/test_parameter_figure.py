@@ -13,7 +13,7 @@ from physical import random_bodies
 
 from torchid.estimators.least_squares import COMBINED, FIXED, IDENTIFIED
 from torchid.parameters import PARAMETERS
-from torchid.report.parameter_figures import parameter_figure
+from torchid.report.figures import parameter_figure
 
 COULOMB, VISCOUS = PARAMETERS.index("fc"), PARAMETERS.index("fv")
 NAMES = ["trunk", *(f"front_left_joint_number_{k}_link" for k in range(29))]

@@ -86,7 +86,7 @@ def test_a_file_that_simulators_refuse_is_known_with_mujoco_and_without(
     assert refused_by_simulators(robot, robot.nominal, FittedJoints()) == ""
     if not installed:
         monkeypatch.setitem(sys.modules, "mujoco", None)
-        monkeypatch.delitem(sys.modules, "torchid.robot.mjcf_model")
+        monkeypatch.delitem(sys.modules, "torchid.robot.mjcf")
     assert refused_by_simulators(robot, robot.nominal, FittedJoints()) == ""
     point = robot.nominal.copy()
     point[1, 1:10] = 0.0  # a point mass at the axis that moves it

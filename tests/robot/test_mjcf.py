@@ -19,8 +19,7 @@ from survey_mjcf import States, difference, mujoco_forces, survey, torchid_force
 from torchid.errors import InputError, TorchidWarning, UrdfError
 from torchid.report import FittedJoints, identified_robot, identified_urdf
 from torchid.robot import Robot, load_robot
-from torchid.robot.mjcf import roll_pitch_yaw
-from torchid.robot.mjcf_model import MjcfModel
+from torchid.robot.mjcf import MjcfModel, roll_pitch_yaw
 
 FREE = """<mujoco><compiler angle="degree" autolimits="true"/>
 <default><joint armature="0.02" damping="0.3" frictionloss="0.1"/>

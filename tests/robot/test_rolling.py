@@ -13,7 +13,7 @@ from urdfs import joint, link, write
 
 from torchid.config.robot import ContactConfig
 from torchid.errors import ConfigError, UrdfError
-from torchid.fitting.checked_settings import resolve_contacts
+from torchid.fitting.experiment import resolve_contacts
 from torchid.problem.floor_pose import rolled_distance
 
 

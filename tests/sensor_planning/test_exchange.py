@@ -7,10 +7,10 @@ from functools import cache
 import pytest
 from synthetic import SOLO12, load
 
-from torchid.identifiability.structure import structural_problem, structural_samples
+from torchid.identifiability.base_parameters import structural_problem, structural_samples
 from torchid.sensing import Contact, SensorNoise
-from torchid.sensor_planning.demands import Candidate, candidates, demands, sensor_set
-from torchid.sensor_planning.ranking import SetRanking, improve_by_exchange, rank_sets
+from torchid.sensor_planning.observability import Candidate, candidates, demands, sensor_set
+from torchid.sensor_planning.planner import SetRanking, improve_by_exchange, rank_sets
 from torchid.sensor_planning.search import DemandGroup, all_minimal_sets, demand_groups
 
 FEET = tuple(Contact(f"{leg}_FOOT", "point") for leg in ("FL", "FR", "HL", "HR"))

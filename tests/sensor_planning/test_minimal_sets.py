@@ -16,7 +16,7 @@ from synthetic import G1, load
 
 from torchid.errors import SensorError
 from torchid.sensing import Contact
-from torchid.sensor_planning.demands import candidates, demands
+from torchid.sensor_planning.observability import candidates, demands
 from torchid.sensor_planning.search import all_minimal_sets, bound_cost, cheapest_set, demand_groups, inequalities
 
 machines = pytest.mark.parametrize("name", MACHINES)

@@ -11,20 +11,19 @@ from planning import NOISE, RANDOM, SIX, Machine, bits, minimal_of, sees_the_bas
 from synthetic import G1, SOLO12, load
 
 from torchid.errors import SensorError, UnknownNameError
-from torchid.identifiability.structure import structural_samples
+from torchid.identifiability.base_parameters import structural_samples
 from torchid.problem.linear import parameter_scale
 from torchid.sensing import Contact, chosen_sensors, named_sensors
-from torchid.sensor_planning.demands import (
+from torchid.sensor_planning.observability import (
     Candidate,
+    assess_sensors,
     candidates,
     count_channels,
     demands,
     sensor_set,
     with_scalar_candidates,
 )
-from torchid.sensor_planning.observability import assess_sensors
-from torchid.sensor_planning.planner import PlanningProblem, plan_sensors
-from torchid.sensor_planning.ranking import SetRanking
+from torchid.sensor_planning.planner import PlanningProblem, SetRanking, plan_sensors
 from torchid.sensor_planning.search import all_minimal_sets, cheapest_set, demand_groups
 
 FEET = tuple(Contact(f"{leg}_FOOT", "point") for leg in ("FL", "FR", "HL", "HR"))

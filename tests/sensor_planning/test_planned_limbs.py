@@ -14,10 +14,8 @@ from torchid import parameters
 from torchid.errors import UnknownNameError
 from torchid.robot import Robot
 from torchid.sensing import Contact, named_sensors, with_ft_sensors
-from torchid.sensor_planning.demands import candidates, contained_candidates, demands, sensor_set
-from torchid.sensor_planning.observability import assess_sensors
-from torchid.sensor_planning.planner import PlanningProblem, plan_sensors
-from torchid.sensor_planning.ranking import MotionStack, irredundant_set
+from torchid.sensor_planning.observability import assess_sensors, candidates, contained_candidates, demands, sensor_set
+from torchid.sensor_planning.planner import MotionStack, PlanningProblem, irredundant_set, plan_sensors
 
 LEG = Machine(
     {"leg": ("base", (RANDOM, RANDOM, RANDOM, "weld", RANDOM, RANDOM)), "arm": ("base", (RANDOM, "weld"))},

@@ -13,13 +13,11 @@ from thinned import slow_but
 from true_robots import KINDS, Kind, World, driving, fit, predicted, stepping, unseen, world, worst
 
 from torchid import parameters
-from torchid.identifiability.structure import standing_samples, standing_states, structural_problem
+from torchid.identifiability.base_parameters import standing_samples, standing_states, structural_problem
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
 from torchid.regressor import FrameJacobian
-from torchid.sensor_planning.demands import Candidate, candidates, sensor_set
-from torchid.sensor_planning.observability import assess_sensors
-from torchid.sensor_planning.planner import PlanningProblem, SensorPlan, plan_sensors
-from torchid.sensor_planning.ranking import MotionStack, irredundant_set
+from torchid.sensor_planning.observability import Candidate, assess_sensors, candidates, sensor_set
+from torchid.sensor_planning.planner import MotionStack, PlanningProblem, SensorPlan, irredundant_set, plan_sensors
 
 EXACT = 1e-8
 PER_STATE = 250

@@ -13,7 +13,7 @@ from planning import MACHINES, Machine, sees_the_base, states_of, tried
 from synthetic import ANYMAL, G1, PANDA, SOLO12, Oracle, load, random_states
 
 from torchid.errors import SensorError, UnknownNameError
-from torchid.identifiability.structure import random_postures
+from torchid.identifiability.base_parameters import random_postures
 from torchid.parameters import Array
 from torchid.problem import RowBuilder
 from torchid.problem.contact_state import ContactState
@@ -21,14 +21,18 @@ from torchid.report.analysis import describe_singular_postures
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet, named_sensors
 from torchid.sensing.projection import null_space
-from torchid.sensor_planning.demands import Candidate, candidates, contained_candidates, demands, sensor_set
 from torchid.sensor_planning.observability import (
     BaseObservability,
+    Candidate,
     LostBase,
     PostureSummary,
     assess_sensors,
     base_values,
+    candidates,
+    contained_candidates,
+    demands,
     describe_wrench,
+    sensor_set,
     simple_wrench_basis,
 )
 from torchid.sensor_planning.planner import branches, contact_requirements

@@ -7,13 +7,13 @@ import pytest
 from planning import NOISE, bits
 from synthetic import G1, PANDA, SOLO12, load
 
-from torchid.identifiability.structure import structural_samples
+from torchid.identifiability.base_parameters import structural_samples
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
 from torchid.robot import Robot
 from torchid.sensing import Contact
-from torchid.sensor_planning.demands import Candidate, candidates, sensor_set
-from torchid.sensor_planning.ranking import SetRanking, rank_sets
+from torchid.sensor_planning.observability import Candidate, candidates, sensor_set
+from torchid.sensor_planning.planner import SetRanking, rank_sets
 
 FEET = tuple(Contact(f"{leg}_FOOT", "point") for leg in ("FL", "FR", "HL", "HR"))
 SOLES = (Contact("left_ankle_roll_link", "flat"), Contact("right_ankle_roll_link", "line"))

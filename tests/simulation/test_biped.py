@@ -14,8 +14,7 @@ from synthetic import Array, load
 from torchid import parameters
 from torchid.config import FootConfig
 from torchid.robot import Robot
-from torchid.simulation.constraints import find_feet
-from torchid.simulation.plant import Plant
+from torchid.simulation.plant import Plant, find_feet
 
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 """Swaps left and right; acts on poses and pseudo-inertias alike."""

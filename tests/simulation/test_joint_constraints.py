@@ -23,8 +23,7 @@ from torchid.robot import load_robot
 from torchid.robot.urdf import read_urdf
 from torchid.sensing import Contact, named_sensors
 from torchid.simulation import set_up_simulation
-from torchid.simulation.constraints import JointConstraints
-from torchid.simulation.plant import Plant
+from torchid.simulation.plant import JointConstraints, Plant
 from torchid.simulation.replay import Model, ReplayedLog, replay_log
 
 TIMES = np.array([0.1, 0.2])

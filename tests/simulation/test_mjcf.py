@@ -16,7 +16,7 @@ from torchid.config.simulation import SimulatedRobotConfig
 from torchid.errors import InputError
 from torchid.logs import read_log
 from torchid.problem import Evaluation, bind_log
-from torchid.problem.predict import force_series
+from torchid.problem.metrics import force_series
 from torchid.report.mjcf_files import mjcf_of_urdf
 from torchid.robot import load_robot
 from torchid.sensing import Contact

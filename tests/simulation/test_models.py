@@ -16,10 +16,9 @@ from synthetic import ROBOTS, ROMEO, load, random_states
 
 from torchid import Regressor
 from torchid.errors import UrdfError
-from torchid.robot.constraints import weld_positions
+from torchid.robot.tree import weld_positions
 from torchid.robot.urdf import read_urdf
-from torchid.simulation.constraints import JointConstraints
-from torchid.simulation.plant import compile_model
+from torchid.simulation.plant import JointConstraints, compile_model
 
 LINKWISE_REFUSED = (
     "go1_description/urdf/go1.urdf",

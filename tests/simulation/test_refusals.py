@@ -195,7 +195,7 @@ def test_without_mujoco_a_simulation_says_how_to_install_it(
     folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in list(sys.modules):
-        if name.startswith("torchid.simulation") or name in ("torchid.commands.simulate", "torchid.robot.mjcf_model"):
+        if name.startswith("torchid.simulation") or name in ("torchid.commands.simulate", "torchid.robot.mjcf"):
             monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "mujoco", None)
     line = refusal(["simulate", str(folder / "sim.yaml")], folder, capsys)

@@ -13,7 +13,7 @@ from repository import DEMO
 from scipy.spatial.transform import Rotation
 
 from torchid.errors import InputError, LogError
-from torchid.simulation.constraints import point_foot
+from torchid.simulation.plant import point_foot
 from torchid.simulation.replay import Drift, Model, ReplayedLog, replay_log
 
 RATE, SECONDS = 1000.0, 1.2

@@ -19,8 +19,7 @@ from torchid.config import FootConfig, MotionConfig, load_config
 from torchid.config.robot import ContactConfig
 from torchid.config.simulation import SimulatedRobotConfig, WaveConfig
 from torchid.estimators import LeastSquares
-from torchid.fitting.checked_settings import resolve_contacts
-from torchid.fitting.experiment import set_up
+from torchid.fitting.experiment import resolve_contacts, set_up
 from torchid.log_checks.findings import Finding
 from torchid.log_checks.standing_feet import check_standing_feet
 from torchid.logs import Log, write_log

@@ -18,7 +18,7 @@ from torchid.cli import main
 from torchid.config import FootConfig, dump_config, load_simulation
 from torchid.report.tables import stability_table, table_text
 from torchid.simulation import Stability
-from torchid.simulation.constraints import find_feet
+from torchid.simulation.plant import find_feet
 
 MOTIONS = (*SQUATS, *SWAYS, UNSEEN)
 ALONE = SQUATS[-1]

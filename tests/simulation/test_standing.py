@@ -37,7 +37,7 @@ from torchid.config.simulation import WaveConfig
 from torchid.errors import InputError, UrdfError
 from torchid.logs import read_log
 from torchid.simulation import set_up_simulation
-from torchid.simulation.constraints import find_feet
+from torchid.simulation.plant import find_feet
 
 THRESHOLD = 30.0  # N, from which on the shipped simulation counts a foot as standing
 

@@ -18,7 +18,7 @@ from torchid.commands.results import Identification
 from torchid.config import load_config
 from torchid.estimators import SgdEstimate
 from torchid.estimators.least_squares import COMBINED, IDENTIFIED, ConstrainedEstimate
-from torchid.fitting.misfit import unexplained_torques
+from torchid.fitting.noise import unexplained_torques
 from torchid.parameters import COULOMB, FRICTION, INERTIAL, PER_BODY
 from torchid.problem import Metrics
 from torchid.problem.metrics import DECISIVE_GROUPS, LIMB_GROUPS, WHITENED, WorseThanNominal
@@ -31,7 +31,7 @@ WIDTHS = (60, 80, 100, 120)
 
 
 def run_demo(folder: Path, *settings: str) -> Identification:
-    more = [*settings, f"output={folder / 'run'}", "preprocessing.cache_gb=0"]
+    more = [*settings, f"output={folder / 'run'}"]
     return identify(load_config(DEMO / "quadruped.yaml", more), False)
 
 

@@ -15,7 +15,7 @@ from repository import DEMO
 from torchid.cli import main
 from torchid.log_checks import NOTE, REJECTED, SUSPICIOUS, Checked, Finding, Skipped, Span
 from torchid.logs import Log, write_log
-from torchid.terminal.checks import check_lines
+from torchid.terminal.analysis import check_lines
 from torchid.terminal.lines import LINES
 
 LONG = "front_left_limb_of_a_robot_with_names_that_fill_a_whole_line_of_any_terminal"

@@ -15,8 +15,8 @@ import torchid
 from torchid.cli import main
 from torchid.commands.evaluate import EvaluatedRun
 from torchid.problem import Metrics
+from torchid.terminal.identification import MOST_LOGS, evaluation_lines
 from torchid.terminal.lines import LINES
-from torchid.terminal.runs import MOST_LOGS, evaluation_lines
 
 LOG = str(DEMO / "sway_test.npz")
 
@@ -24,7 +24,7 @@ LOG = str(DEMO / "sway_test.npz")
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     output = tmp_path_factory.mktemp("evaluated") / "run"
-    more = ["estimator.ridge=0.01", "preprocessing.cache_gb=0"]
+    more = ["estimator.ridge=0.01"]
     assert main(["identify", "-q", str(DEMO / "quadruped.yaml"), f"output={output}", *more]) == 0
     return output
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from torchid.errors import ConfigError, SensorError, UnknownNameError
 from torchid.fitting.experiment import RobotSetup
 from torchid.sensing import SensorSet
-from torchid.sensor_planning.demands import Candidate, candidates
+from torchid.sensor_planning.observability import Candidate, candidates
 
 
 @dataclass(frozen=True, kw_only=True)

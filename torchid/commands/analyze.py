@@ -21,7 +21,7 @@ from torchid.config import AnalyzeConfig, dump_config, inputs_of
 from torchid.errors import ConfigError, UnknownNameError, during, join_names, warn
 from torchid.fitting.experiment import RobotSetup, set_up_robot, with_noise
 from torchid.fitting.left_out import Evidence, leave_sensors_out
-from torchid.fitting.misfit import unmeasured_at_rest
+from torchid.fitting.noise import unmeasured_at_rest
 from torchid.identifiability.base_parameters import BaseParameters, base_parameters
 from torchid.parallel import can_fork, in_forks, one_thread, thread_count, threads_at_most
 from torchid.parameters import WRENCH_COMPONENTS
@@ -46,8 +46,13 @@ from torchid.report.tables import progress_bars
 from torchid.reprs import short_repr
 from torchid.sensing import Contact, SensorSet
 from torchid.sensing.sensors import NORMAL_FORCE, measured_components
-from torchid.sensor_planning.demands import candidates, contained_candidates, count_channels, sensor_set
-from torchid.sensor_planning.observability import BaseObservability
+from torchid.sensor_planning.observability import (
+    BaseObservability,
+    candidates,
+    contained_candidates,
+    count_channels,
+    sensor_set,
+)
 from torchid.sensor_planning.planner import (
     PlanningProblem,
     SensorChoice,

@@ -13,10 +13,10 @@ from torchid.errors import format_percent, join_names
 from torchid.estimators import ConsistentEstimate, Estimate, SgdEstimate
 from torchid.estimators.least_squares import IDENTIFIED
 from torchid.fitting.calibration import list_confounded
-from torchid.fitting.misfit import AT_THE_FLOOR, unexplained_joints
+from torchid.fitting.noise import AT_THE_FLOOR, unexplained_joints
 from torchid.fitting.posterior import FittedPosterior
 from torchid.identifiability.confounding import TotalMass
-from torchid.log_checks.weight import MAX_MASS_ERROR
+from torchid.log_checks.contacts import MAX_MASS_ERROR
 from torchid.logs.column_map import values_by_name
 from torchid.logs.time_range import log_title
 from torchid.parameters import COULOMB, PER_BODY

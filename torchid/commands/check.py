@@ -17,8 +17,7 @@ from torchid.config.log_reading import PreprocessingConfig, load_columns, load_t
 from torchid.config.logs import LogsConfig
 from torchid.config.robot import ContactConfig
 from torchid.errors import ConfigError, LogError, about_file, current_file, format_count
-from torchid.fitting.checked_settings import resolve_contacts
-from torchid.fitting.experiment import set_up_robot
+from torchid.fitting.experiment import resolve_contacts, set_up_robot
 from torchid.log_checks import Checked
 from torchid.log_checks.check import check
 from torchid.logs import Columns, Log, Topics, read_log, write_log

@@ -19,8 +19,7 @@ from torchid.commands.check import recorded_segments
 from torchid.errors import InputError, TorchidWarning, join_names
 from torchid.estimators import Conditions
 from torchid.fitting.cross_validation import RidgeChoice
-from torchid.fitting.delay import DelayChoice, choose_delay
-from torchid.fitting.experiment import Experiment, RobotSetup, S
+from torchid.fitting.experiment import Experiment, RobotSetup, S, with_radius
 from torchid.fitting.fit import LogFitter
 from torchid.fitting.left_out import (
     TERMS,
@@ -34,17 +33,18 @@ from torchid.fitting.left_out import (
     widest,
     with_terms,
 )
-from torchid.fitting.misfit import force_gain
-from torchid.fitting.noise import recorded_sensors
+from torchid.fitting.noise import force_gain, recorded_sensors
 from torchid.fitting.separable import (
+    DelayChoice,
     SignWidthChoice,
     StribeckChoice,
     TiltChoice,
     choose_base_tilt,
+    choose_delay,
     choose_sign_width,
     choose_stribeck,
 )
-from torchid.log_checks.frozen import new_poses
+from torchid.log_checks.readings import new_poses
 from torchid.logs import Log
 from torchid.logs.cutoff import CutoffChoice, choose_cutoff
 from torchid.logs.low_pass import DROPPED_PERIODS
@@ -52,9 +52,7 @@ from torchid.logs.read import files_of_recordings_kept
 from torchid.logs.timeline import LOSSLESS_RATE
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples
-from torchid.problem.compressed_log import Block
-from torchid.problem.compression import compress_parts
-from torchid.problem.parts import Part
+from torchid.problem.compression import Block, Part, compress_parts
 from torchid.reading.log_reader import LogReader, memory_needed
 from torchid.sensing import SensorSet
 from torchid.settings import AUTO
@@ -136,7 +134,7 @@ def _with_chosen_data(setup: S, choices: Choices, trials: _Trials, bars: Progres
         setup = _with_preprocessing(setup, cutoff_hz=choices.cutoff.cutoff_hz)
     if setup.open_radii:
         choices.radius = _chosen("radius of feet", partial(_radius, setup, trials), bars)
-        setup = setup if choices.radius.radius is None else _with_radius(setup, choices.radius.radius)
+        setup = setup if choices.radius.radius is None else with_radius(setup, choices.radius.radius)
     actuators = setup.config.actuators
     if actuators.stiction == AUTO and actuators.stribeck is None and trials.measures_torques(setup):
         rest = {value: _with_actuators(setup, stiction=value) for value in (False, True)}
@@ -411,7 +409,7 @@ def _radius(setup: RobotSetup, trials: _Trials) -> RadiusChoice:
     kinds = trials.kinds(setup)
 
     def left(radius: float, estimate_noise: bool = False) -> Array:
-        return trials.reading(_with_radius(setup, radius), estimate_noise).left_out(kinds)
+        return trials.reading(with_radius(setup, radius), estimate_noise).left_out(kinds)
 
     own = trials.reading(setup).left_out(kinds)
     try:
@@ -426,18 +424,6 @@ def _radius(setup: RobotSetup, trials: _Trials) -> RadiusChoice:
         return RadiusChoice(None, evidence)
     left(best, estimate_noise=True)  # which other choices are made with
     return RadiusChoice(best, evidence)
-
-
-def _with_radius(setup: S, radius: float) -> S:
-    """The setup whose feet of open radius are balls about their frames [m]."""
-    contacts = tuple(
-        replace(x, radius=radius, centre=(0.0, 0.0, 0.0)) if x.frame in setup.open_radii else x for x in setup.contacts
-    )
-    stated = [
-        replace(x, radius=radius, centre=[0.0] * 3) if x.frame in setup.open_radii else x for x in setup.config.contacts
-    ]
-    text = f"{join_names(sorted(setup.open_radii))}: ball of radius {1e3 * radius:.3g} mm, by the logs"
-    return replace(setup, contacts=contacts, config=replace(setup.config, contacts=stated), rolling=text)
 
 
 def _sign_width(setup: RobotSetup, trials: _Trials) -> SignWidthChoice:

@@ -14,9 +14,9 @@ from pathlib import Path
 from rich.progress import Progress
 
 from torchid import distributed
-from torchid.checksums import file_checksum
 from torchid.commands.chosen_settings import Choices, with_chosen_settings
 from torchid.commands.folder import COMPRESSED, check_free, new_folder
+from torchid.commands.manifest import file_checksum
 from torchid.config import ExperimentConfig, inputs_of
 from torchid.errors import ConfigError, during, excerpt
 from torchid.fitting.experiment import Experiment, set_up, with_noise
@@ -27,8 +27,8 @@ from torchid.logs.containers import FACTORS, log_files
 from torchid.logs.time_range import log_title, split_range
 from torchid.parallel import one_thread
 from torchid.problem import Samples
-from torchid.problem.compressed_log import compress_log
-from torchid.problem.sampled_rows import LogOfOtherProcess
+from torchid.problem.compression import compress_log
+from torchid.problem.noise import LogOfOtherProcess
 from torchid.reading.log_reader import LogReader
 from torchid.report.tables import progress_bars
 

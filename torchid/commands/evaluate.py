@@ -21,19 +21,27 @@ from torchid.config import load_config
 from torchid.config.robot import NoiseConfig
 from torchid.errors import ConfigError, about_file, during, warn
 from torchid.fitting.calibration import Calibration, Comparison
-from torchid.fitting.checked_settings import stated_noise
 from torchid.fitting.cross_validation import Scorer
-from torchid.fitting.experiment import Experiment, require_device, set_up, with_estimated_noise
-from torchid.fitting.learned import RESIDUAL, RigidPlusResidual
+from torchid.fitting.experiment import Experiment, require_device, set_up, stated_noise, with_estimated_noise
+from torchid.fitting.posterior import RESIDUAL, RigidPlusResidual
 from torchid.guards import MAX_JSON, MAX_YAML, read_bytes
 from torchid.logs.time_range import log_title, split_range
 from torchid.parallel import one_thread
 from torchid.parameters import Array
 from torchid.problem import Evaluation, Metrics, Samples
 from torchid.problem.contact_state import state_name
-from torchid.problem.metrics import DECISIVE_GROUPS, WHITENED, describe_errors, group_name
-from torchid.problem.motion_noise import is_at_rest
-from torchid.problem.predict import at_motors, force_series, noise_series, pressure_series, projected_forces
+from torchid.problem.metrics import (
+    DECISIVE_GROUPS,
+    WHITENED,
+    at_motors,
+    describe_errors,
+    force_series,
+    group_name,
+    noise_series,
+    pressure_series,
+    projected_forces,
+)
+from torchid.problem.motion import is_at_rest
 from torchid.reading.log_reader import LogReader
 from torchid.report.figure_style import save_figures
 from torchid.report.figures import error_figure
@@ -49,7 +57,6 @@ FAR_OFF = 5.0
 """Times the error on the run's own logs from which on a log is not one of the same robot, moving otherwise."""
 _SAMPLES = 3000
 _TRACED = 10_000  # of a whole log: the rows of the fit take 0.1 ms each
-_SERIES = ("measured", "nominal", "identified", "noise")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -349,17 +356,15 @@ def _usual(documents: Sequence[Mapping[str, object]]) -> dict[str, float]:
     return usual
 
 
-def compare_forces(
-    evaluation: Evaluation, samples: Samples, compared: Comparison[Calibration], chosen: slice = slice(_SAMPLES)
-) -> ForceSeries:
-    """Forces of chosen samples of a log: nominal, identified, and measured as the latter calibrates it.
+def compare_forces(evaluation: Evaluation, samples: Samples, compared: Comparison[Calibration]) -> ForceSeries:
+    """Forces of the first samples of a log: nominal, identified, and measured as the latter calibrates it.
 
     Each prediction is as far from what was measured as from readings that are calibrated for it.
     """
     measured, predicted = [], []
     for one in compared:
         (read,) = one.calibrate([samples])
-        part = read[chosen]
+        part = read[:_SAMPLES]
         series = force_series(evaluation.builder, part, one.parameters(evaluation)[None])
         readings, forces = at_motors(evaluation.builder, part, np.stack([series[0], *series[1]]))
         measured.append(readings)
@@ -374,21 +379,23 @@ def compare_forces(
 
 
 def trace_forces(evaluation: Evaluation, samples: Samples, compared: Comparison[Calibration]) -> LogForces:
-    """Forces of a whole log as recorded, and in the rows of the fit; of a long log every k-th sample."""
+    """Forces of a whole log in the rows of the fit; of a long log every k-th sample."""
     step = max(1, -(-len(samples) // _TRACED))
-    recorded = compare_forces(evaluation, samples, compared, slice(None, None, step))
     part, builder = samples.every(step), compared.identified.builder
     projected = projected_forces(builder, part, torch.stack([one.columns(builder, samples) for one in compared]))
     present = list(dict.fromkeys(map(tuple, part.active.tolist())))
     names = {state: state_name(builder.contacts, state) for state in present}
     rate = 1.0 / float(samples.time.diff().median()) if len(samples) > 1 else np.nan
     return LogForces(
-        recorded=recorded,
-        projected=replace(
-            recorded, **dict(zip(_SERIES, (projected.measured, *projected.predicted, projected.noise), strict=True))
+        projected=ForceSeries(
+            source=log_title(samples.source),
+            time=part.time.numpy(),
+            measured=projected.measured,
+            nominal=projected.predicted[0],
+            identified=projected.predicted[1],
+            noise=projected.noise,
         ),
         states=tuple(names.values()),
         state=np.array([present.index(tuple(active)) for active in part.active.tolist()]),
-        step=step,
         bandwidth=0.5 * rate / max(samples.oversampling, step),
     )

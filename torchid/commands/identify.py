@@ -29,20 +29,18 @@ from torchid.fitting.cross_validation import CrossValidation, Scorer, calibratio
 from torchid.fitting.factor_files import FactorFile
 from torchid.fitting.fit import Fit, LogFitter
 from torchid.fitting.left_out import gain_deviations
-from torchid.fitting.misfit import misfit, resting_joints, unfitted_friction
+from torchid.fitting.noise import misfit, resting_joints, unfitted_friction
 from torchid.fitting.posterior import fitted_posterior
 from torchid.fitting.robust import RobustSummary, fit_robustly
-from torchid.identifiability.confounding import TotalMass, mass_weights
-from torchid.identifiability.contributions import Contributions, contributions
-from torchid.identifiability.jackknife import LEAST_BLOCKS
+from torchid.identifiability.confounding import LEAST_BLOCKS, TotalMass, mass_weights
+from torchid.identifiability.information import Contributions, contributions
 from torchid.parallel import one_thread
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Evaluation, LinearProblem, Metrics, Samples
-from torchid.problem.compressed_log import Block
+from torchid.problem.compression import Block, Part, merge_folds, merge_states
 from torchid.problem.contact_state import ContactState, state_name
 from torchid.problem.metrics import LOG_SETS
-from torchid.problem.motion_noise import is_at_rest
-from torchid.problem.parts import Part, merge_folds, merge_states
+from torchid.problem.motion import is_at_rest
 from torchid.report.forces import ForceSeries
 from torchid.report.tables import progress_bars
 
@@ -56,7 +54,7 @@ def identify(config: ExperimentConfig, resume: bool = False) -> Identification:
         resume: go on with a training that was interrupted.
 
     Raises:
-        InputError: whatever does not fit; nothing but samples in the cache has been written then.
+        InputError: whatever does not fit; nothing has been written then.
         BaseLostError: the sensors cannot see the base.
         KeyboardInterrupt: a training was interrupted; the message says how it can go on.
     """
@@ -176,7 +174,6 @@ def _identify(
         choices=with_sample_rates(ready.choices, experiment, logs["train"]),
         forces=next(iter(forces), None),
         traces=next(iter(traces), None),
-        reused=ready.reused,
     )
     logs.clear()  # checks of a log and figures need room, too
     ready.blocks = blocks = []

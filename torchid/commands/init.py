@@ -40,8 +40,7 @@ from torchid.errors import (
     excerpt,
     join_names,
 )
-from torchid.fitting.checked_settings import is_along_base, resolve_contacts
-from torchid.fitting.experiment import set_up
+from torchid.fitting.experiment import is_along_base, resolve_contacts, set_up
 from torchid.logs import Columns, Log, Topics
 from torchid.logs.column_map import FILL_IN
 from torchid.logs.containers import LogKind, atomic_output, existing_log_kind

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import stat
@@ -13,13 +14,23 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from torchid.checksums import file_checksum
 from torchid.errors import excerpt
 from torchid.staging import atomic_file, is_leftover, remove_leftover
 
 MANIFEST = "manifest.json"
 
+_BLOCK = 2**20  # bytes of a file that are read at a time
 _LARGEST = 2**24  # bytes of a manifest: those of 100 000 files
+
+
+def file_checksum(*paths: Path) -> str:
+    """SHA-256 of a file, or of several one after the other."""
+    digest = hashlib.sha256()
+    for path in paths:
+        with path.open("rb") as file:
+            while block := file.read(_BLOCK):
+                digest.update(block)
+    return digest.hexdigest()
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from torchid.errors import (
 from torchid.estimators import LeastSquares, SgdEstimate
 from torchid.fitting.experiment import RobotSetup, set_up
 from torchid.fitting.fit import Fit
-from torchid.fitting.misfit import (
+from torchid.fitting.noise import (
     beyond_noise,
     force_gain,
     unexplained_forces,
@@ -39,7 +39,7 @@ from torchid.identifiability.confounding import ExtraEstimate, TotalMass, estima
 from torchid.log_checks import Finding
 from torchid.log_checks.check import check
 from torchid.log_checks.findings import SEVERITIES
-from torchid.log_checks.lag_and_tilt import check_tilt
+from torchid.log_checks.lags import check_tilt
 from torchid.log_checks.model import NominalModel
 from torchid.parallel import can_fork, share_between_forks, thread_count
 from torchid.parameters import GRAVITY, PARAMETERS, PER_BODY, Array

@@ -14,7 +14,6 @@ from torchid import distributed
 from torchid.commands.chosen_settings import Choices, with_chosen_settings, with_ridge
 from torchid.commands.training import descent_settings
 from torchid.config import ExperimentConfig
-from torchid.errors import format_count
 from torchid.estimators import Conditions
 from torchid.fitting.cross_validation import RidgeChoice
 from torchid.fitting.experiment import Experiment, set_up, with_noise, with_task_weights
@@ -23,11 +22,7 @@ from torchid.fitting.fit import LogFitter
 from torchid.fitting.noise import NoiseSummary
 from torchid.identifiability.base_parameters import StateReport, require_base, state_reports
 from torchid.problem import RowBuilder, Samples
-from torchid.problem.compressed_log import Block, fold_compressed, merge_blocks
-from torchid.problem.compression import compress_in_blocks, split_into_folds
-from torchid.problem.parts import Part
-from torchid.reading.cache_entries import cached_parts, factors_key
-from torchid.reading.cached_reader import CachedReader, open_reader
+from torchid.problem.compression import Block, Part, compress_in_blocks, fold_compressed, merge_blocks, split_into_folds
 from torchid.reading.log_reader import LogReader, check_read
 
 
@@ -50,7 +45,7 @@ class CompressedData:
     """Training logs in folds, or factors of them, with the noise of their weights, and compressed; test logs.
 
     `experiment`: with that noise, and what the logs have chosen. `factors`: files that the training logs come from, if
-    they do. `reused`: what an earlier run has left in the cache, in words.
+    they do.
     """
 
     experiment: Experiment
@@ -62,7 +57,6 @@ class CompressedData:
     builder: RowBuilder
     blocks: Sequence[Block]
     parts: list[Part]
-    reused: list[str]
     choices: Choices
 
 
@@ -99,19 +93,18 @@ def _data_of_logs(experiment: Experiment, clock: Stopwatch, bars: Progress) -> C
     with clock("settings"):
         experiment, choices = with_chosen_settings(experiment, bars)
     with clock("read"):
-        reader, logs = _read(experiment, bars)
+        logs, excluded = _read(experiment, bars)
     with clock("noise"):
         states = state_reports(logs["train"], experiment.builder(experiment.sensors))
         require_base(states, experiment.config.sensors.on_base_lost, experiment.contacts)
         noise = distributed.from_first(partial(experiment.estimate_noise, logs["train"], experiment.sensors), "noise")
         experiment = with_task_weights(with_noise(experiment, noise), logs["train"])
-    reader.release()
     with clock("compress"):
         builder = experiment.builder(experiment.sensors)
         blocks = split_into_folds(logs["train"], builder)
-        parts, there = _compressed(experiment, reader, builder, blocks, bars)
-    reused = [*_reused(reader), *(["factors"] if there else [])]
-    return CompressedData(experiment, logs, [], reader.excluded, states, noise, builder, blocks, parts, reused, choices)
+        streaming = bars.add_task("streaming samples", total=sum(map(len, logs["train"])))
+        parts = compress_in_blocks(blocks, builder, progress=partial(bars.advance, streaming))
+    return CompressedData(experiment, logs, [], excluded, states, noise, builder, blocks, parts, choices)
 
 
 def _data_of_factors(experiment: Experiment, clock: Stopwatch, bars: Progress) -> CompressedData:
@@ -120,22 +113,32 @@ def _data_of_factors(experiment: Experiment, clock: Stopwatch, bars: Progress) -
         reading = bars.add_task("reading factors", total=len(experiment.config.logs.train))
         fleet = read_fleet(experiment, lambda _: bars.advance(reading))
         require_base(fleet.states, experiment.config.sensors.on_base_lost, experiment.contacts)
-        reader, logs = _read(fleet.experiment, bars)
+        logs, _ = _read(fleet.experiment, bars)
     with clock("compress"):
         builder = fleet.experiment.builder(fleet.experiment.sensors)
         blocks = fold_compressed([one.log for one in fleet.files], builder)
         parts = merge_blocks(blocks, builder)
     excluded = {one.log.source: one.excluded for one in fleet.files if one.excluded}
-    same = (fleet.states, fleet.noise, builder, blocks, parts, _reused(reader), Choices())
-    return CompressedData(fleet.experiment, logs, fleet.files, excluded, *same)
+    return CompressedData(
+        experiment=fleet.experiment,
+        logs=logs,
+        factors=fleet.files,
+        excluded=excluded,
+        states=fleet.states,
+        noise=fleet.noise,
+        builder=builder,
+        blocks=blocks,
+        parts=parts,
+        choices=Choices(),
+    )
 
 
-def _read(experiment: Experiment, bars: Progress) -> tuple[LogReader, dict[str, list[Samples]]]:
-    """What has read the logs, and these by use; those of which there are but factors are left out.
+def _read(experiment: Experiment, bars: Progress) -> tuple[dict[str, list[Samples]], dict[str, int]]:
+    """Logs by use but for those of which there are factors, and how many samples of each were left out as rejected.
 
     Those that are trained on, or decide when to stop, have every sensor of the set.
     """
-    reader, settings = open_reader(experiment), experiment.config.logs
+    reader, settings = LogReader(experiment), experiment.config.logs
     files = {name: getattr(settings, name) for name in ("train", "validation", "test")}
     if settings.compressed:
         files["train"] = []
@@ -145,31 +148,4 @@ def _read(experiment: Experiment, bars: Progress) -> tuple[LogReader, dict[str, 
         for name, paths in files.items()
     }
     check_read(logs)
-    return reader, logs
-
-
-def _reused(reader: LogReader) -> list[str]:
-    """What a reader has found in its cache, in words."""
-    count = len(reader.reused) if isinstance(reader, CachedReader) else 0
-    return [f"samples of {format_count(count, 'log')}"] if count else []
-
-
-def _compressed(
-    experiment: Experiment, reader: LogReader, builder: RowBuilder, train: Sequence[Samples], bars: Progress
-) -> tuple[list[Part], bool]:
-    """The compressed training logs, and whether they were in the cache."""
-    streaming = bars.add_task("streaming samples", total=sum(map(len, train)))
-
-    def compute() -> list[Part]:
-        return compress_in_blocks(train, builder, progress=partial(bars.advance, streaming))
-
-    keys = reader.keys if isinstance(reader, CachedReader) else {}
-    paths = [str(path) for path in experiment.config.logs.train]
-    if not isinstance(reader, CachedReader) or not all(
-        distributed.all_gather(keys.keys() >= {*paths}, "logs in the cache")
-    ):
-        return compute(), False
-    key = factors_key(experiment, builder, [keys[path] for path in paths], train)
-    parts, there = cached_parts(reader.cache, key, builder, train, compute)
-    bars.update(streaming, completed=sum(map(len, train)))
-    return parts, there
+    return logs, reader.excluded

@@ -32,10 +32,10 @@ from torchid.report.figures import drift_figure
 from torchid.report.tables import progress_bars
 from torchid.reprs import short_repr
 from torchid.robot import Robot
-from torchid.robot.constraints import matching_joints
+from torchid.robot.tree import matching_joints
 from torchid.robot.urdf import read_urdf
 from torchid.sensing import Contact
-from torchid.simulation.constraints import Foot, JointConstraints, find_feet, point_foot
+from torchid.simulation.plant import Foot, JointConstraints, find_feet, point_foot
 from torchid.simulation.replay import Drift, Model, ReplayedLog, replay_log
 
 _ByJoint = Mapping[str, Mapping[str, float]]

@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import json
+from base64 import b64encode
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import torch
-
-from torchid.checksums import file_checksum
 from torchid.commands.answer import answer
 from torchid.commands.check import check_experiment
 from torchid.commands.folder import RUN, refuse_link
-from torchid.commands.manifest import read_manifest
-from torchid.errors import ConfigError, InputError, during, excerpt, warn
+from torchid.commands.manifest import file_checksum, read_manifest
+from torchid.errors import ConfigError, InputError, during, excerpt
 from torchid.guards import MAX_JSON, MAX_YAML, read_bytes
-from torchid.report.forces import traces_document
 from torchid.report.log_checks import log_check_document
-from torchid.report.page import RunFiles, page_text, require_page, versions
-from torchid.robot import Robot
+from torchid.report.page import FIGURES, RunFiles, page_text, versions
 from torchid.staging import atomic_file
 
 if TYPE_CHECKING:
@@ -33,20 +29,12 @@ _WRITTEN = "a folder that this version of torchid identify wrote"
 
 def report_document(run: Identification) -> dict[str, Any]:
     """What `report.json` holds: what the page of a run shows and no other file of its folder has."""
-    robot, forces = run.experiment.robot, run.traces
+    robot = run.experiment.robot
     return {
         "answer": asdict(answer(run)),
         "robot": {"name": robot.path.name, "base": robot.base_link, "joints": robot.n, "format": robot.format},
-        "bodies": {"parents": [max(body.parent, 0) for body in robot.bodies], "poses": _zero_poses(robot)},
-        "forces": None if forces is None else traces_document(forces, robot.base_rows, robot.dof_names, robot.sliding),
         "versions": versions(),
     }
-
-
-def _zero_poses(robot: Robot) -> list[list[list[float]]]:
-    """Poses of the bodies' link frames in the base's at zero joint positions."""
-    poses = robot.link_poses(torch.zeros(1, robot.n, dtype=torch.float64))
-    return [poses[name][0].tolist() for name in robot.body_names]
 
 
 def write_page(folder: Path, output: Path) -> None:
@@ -55,15 +43,7 @@ def write_page(folder: Path, output: Path) -> None:
     Args:
         folder: with its files.
         output: that the folder will be.
-
-    Warns:
-        TorchidWarning: the libraries of a page are not installed.
     """
-    try:
-        require_page()
-    except InputError as error:
-        warn(f"no {PAGE} is written: {error.found}; {error.accepted}")
-        return
     asked = f"torchid report {output} checks the logs and lists here what it finds."
     (folder / PAGE).write_text(page_text(replace(_read(folder), name=output.name, not_checked=asked)))
 
@@ -72,10 +52,9 @@ def report(run: str | Path) -> Path:
     """Make the page of a finished run anew, with the findings of the checks of its logs; the path of the page.
 
     Raises:
-        InputError: the folder is no run, its page has been edited, or the libraries of a page are not installed.
+        InputError: the folder is no run, or its page has been edited.
     """
     folder = Path(run)
-    require_page()
     refuse_link(folder)
     manifest = read_manifest(folder)
     if manifest is None or manifest.kind != RUN.name:
@@ -96,8 +75,6 @@ def _made(files: RunFiles, folder: Path) -> str:
     """The page of files that somebody may have changed. Raises InputError: they are not what a page needs."""
     try:
         return page_text(files)
-    except InputError:
-        raise
     except (LookupError, TypeError, ValueError, AttributeError) as error:
         found = f"not what a page needs ({excerpt(str(error))})"
         raise InputError(folder, ", ".join(_JSON), found, _WRITTEN) from error
@@ -112,7 +89,19 @@ def _read(folder: Path) -> RunFiles:
         parameters=parameters,
         metrics=metrics,
         report=data,
+        figures=_figures(folder),
     )
+
+
+def _figures(folder: Path) -> dict[str, str]:
+    """The figures of a run that a browser shows, as URLs that hold them."""
+    out = {}
+    for suffix, kind in ((".svg", "image/svg+xml"), (".png", "image/png")):
+        for path in (folder / f"{name}{suffix}" for name in FIGURES):
+            if path.is_file():
+                with during("reading", path):
+                    out[path.stem] = f"data:{kind};base64,{b64encode(read_bytes(path, MAX_JSON)).decode()}"
+    return out
 
 
 def _document(folder: Path, name: str) -> dict[str, Any]:

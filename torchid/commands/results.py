@@ -24,14 +24,12 @@ from torchid.fitting.calibration import Comparison, list_confounded
 from torchid.fitting.cross_validation import CrossValidation, RidgeChoice
 from torchid.fitting.experiment import Experiment
 from torchid.fitting.factor_files import FactorFile
-from torchid.fitting.learned import RESIDUAL, RigidPlusResidual
-from torchid.fitting.misfit import Misfit
-from torchid.fitting.noise import NoiseSummary
-from torchid.fitting.posterior import POSTERIOR, FittedPosterior, write_posterior
+from torchid.fitting.noise import Misfit, NoiseSummary
+from torchid.fitting.posterior import POSTERIOR, RESIDUAL, FittedPosterior, RigidPlusResidual, write_posterior
 from torchid.fitting.robust import RobustSummary
 from torchid.identifiability.base_parameters import StateReport
 from torchid.identifiability.confounding import ExtraEstimate, TotalMass
-from torchid.identifiability.contributions import Contributions
+from torchid.identifiability.information import Contributions
 from torchid.logs.containers import atomic_output
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Metrics
@@ -80,8 +78,7 @@ class Identification:
         ridge: how it was chosen, if it was.
         choices: how other settings were chosen, if they were.
         forces: of the first samples of a log, as measured and as predicted; None where there are but factors.
-        traces: of all of that log.
-        reused: what an earlier run has left in the cache, in words.
+        traces: of all of that log, in the rows of the fit.
         suspected: what the checks find in its training logs if it is doubtful, in words.
     """
 
@@ -111,7 +108,6 @@ class Identification:
     choices: Choices
     forces: ForceSeries | None
     traces: LogForces | None
-    reused: Sequence[str] = ()
     suspected: str = ""
 
     def __getitem__(self, name: str) -> BodyEstimate:
@@ -233,10 +229,10 @@ def write_run(
         write_posterior(folder / POSTERIOR, run.posterior)
         (folder / identified_name(robot)).write_bytes(identified_robot(robot, run.phi, run.fitted_joints))
         write_json(folder / DATA, report_document(run))
-        write_page(folder, output)
         if training is not None:
             training.copy_curves(folder)
         write_events(run, folder, lambda: write_figures(folder, config.figures.format, order, [*begun, rest]))
+        write_page(folder, output)
     if training is not None:
         training.remove_checkpoint()
 
@@ -344,7 +340,6 @@ def _solution_document(estimate: Estimate) -> dict[str, object] | None:
         "unconstrained",
         "distance",
         "gap",
-        "certified_gap",
         "steps",
         "active",
         "epochs",

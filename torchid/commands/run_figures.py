@@ -18,15 +18,24 @@ from torchid.config import ExperimentConfig, dump_config
 from torchid.estimators import ConstrainedEstimate, Estimate, SgdEstimate
 from torchid.fitting.cross_validation import RidgeChoice
 from torchid.identifiability.confounding import ExtraEstimate
-from torchid.identifiability.contributions import Contributions
+from torchid.identifiability.information import Contributions
 from torchid.logs.time_range import log_title
 from torchid.parallel import in_forks, share_between_processes, thread_count
+from torchid.parameters import PER_BODY
 from torchid.problem import Metrics
+from torchid.problem.contact_state import IN_THE_AIR
 from torchid.problem.metrics import LOG_SETS
 from torchid.report.figure_style import Drawn, draw_for
-from torchid.report.figures import contribution_figure, error_figure, identifiability_figure, ridge_figure
-from torchid.report.forces import ForceSeries, force_figure, pressure_figure
-from torchid.report.parameter_figures import extra_figure, parameter_figure
+from torchid.report.figures import (
+    contribution_figure,
+    error_figure,
+    extra_figure,
+    identifiability_figure,
+    inertia_figure,
+    parameter_figure,
+    ridge_figure,
+)
+from torchid.report.forces import ForceSeries, force_figure, pressure_figure, rows_figure, spectrum_figure
 from torchid.report.tables import table_text, verdict_counts_table
 from torchid.robot import Robot
 
@@ -54,6 +63,7 @@ def fit_figures(
     figures |= {
         "parameters": partial(parameter_figure, robot.body_names, robot.nominal, estimate, kinds, robot.format),
         "identifiability": partial(identifiability_figure, robot.body_names, estimate),
+        "inertia": partial(inertia_figure, robot, estimate.phi.reshape(-1, PER_BODY)),
     }
     if extras:
         figures["extras"] = partial(extra_figure, extras)
@@ -67,8 +77,13 @@ def all_figures(run: Identification) -> Figures:
     robot = run.experiment.robot
     of_fit = fit_figures(robot, run.estimate, run.extras, run.ridge, run.forces)
     figures: Figures = {name: of_fit.pop(name) for name in ("forces", "pressure") if name in of_fit}
+    if run.traces is not None:
+        args = run.traces, robot.dof_names, robot.base_rows, robot.sliding, robot.format
+        if "forces" not in figures or run.traces.states != (IN_THE_AIR,):  # else the same once more
+            figures["rows"] = partial(rows_figure, *args)
+        figures["spectra"] = partial(spectrum_figure, *args)
     figures["errors"] = partial(error_figure, run.metrics, robot.format)
-    figures |= {name: of_fit.pop(name) for name in ("parameters", "identifiability")}
+    figures |= {name: of_fit.pop(name) for name in ("parameters", "identifiability", "inertia")}
     figures["contributions"] = partial(contribution_figure, _bits(run.contributions))
     return figures | of_fit
 

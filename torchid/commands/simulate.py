@@ -24,7 +24,7 @@ from torchid.report import FittedJoints, identified_robot
 from torchid.report.tables import progress_bars
 from torchid.robot import Robot, load_robot
 from torchid.simulation import LEAD_S, Stability, sensor_log, set_up_simulation
-from torchid.simulation.constraints import find_feet
+from torchid.simulation.plant import find_feet
 
 _POLL_S = 0.2
 START = "spawn"

@@ -36,14 +36,14 @@ from torchid.config import ExperimentConfig, dump_config, inputs_of
 from torchid.errors import ConfigError, InputError, SensorError, warn
 from torchid.estimators import Conditions, Epoch, Estimate, Sgd, SgdEstimate, Trainer
 from torchid.estimators.least_squares import IDENTIFIED
-from torchid.estimators.optimizers import OPTIMIZERS
+from torchid.estimators.sgd import OPTIMIZERS
 from torchid.fitting.experiment import Experiment
 from torchid.fitting.fit import LogFitter
 from torchid.parameters import PARAMETERS, Array
 from torchid.problem import LinearProblem, Metrics, MiniBatches, Samples, TriangularFactor, assemble, compress_parts
+from torchid.problem.compression import Part
 from torchid.problem.elimination import Assembly
 from torchid.problem.linear import parameter_scale
-from torchid.problem.parts import Part
 from torchid.robot import Robot
 
 if TYPE_CHECKING:

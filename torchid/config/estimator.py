@@ -12,8 +12,7 @@ from torchid.config.robot import PerAxis, PerJoint
 from torchid.errors import ConfigError
 from torchid.estimators import Conditions, Consistent, LeastSquares, PenaltyWeights, Sgd, TrainingSettings
 from torchid.estimators.conditions import EnclosureKind
-from torchid.estimators.conic_formulation import Prior
-from torchid.estimators.consistent import Method
+from torchid.estimators.conic_problem import Prior
 from torchid.estimators.sgd import Consistency
 from torchid.settings import (
     AUTO,
@@ -166,8 +165,6 @@ class EstimatorConfig(_ConditionsConfig, _FitConfig):
     """
 
     prior: Prior = Consistent.prior
-    method: Method = Consistent.method
-    certify: bool = Consistent.certify
     consistency: Consistency = Sgd.consistency
     penalties: PenaltyWeights = dataclasses.field(default_factory=PenaltyWeights)
     training: TrainingConfig = dataclasses.field(default_factory=TrainingConfig)
@@ -197,7 +194,7 @@ class EstimatorConfig(_ConditionsConfig, _FitConfig):
         return self._settings(Sgd, conditions=conditions)
 
     def consistent(self, conditions: Conditions) -> Consistent:
-        """A consistent fit with these settings. Raises InputError: the certified method without Clarabel."""
+        """A consistent fit with these settings."""
         return self._settings(Consistent, conditions=conditions)
 
     def _settings(self, estimator: type[Solver], **given: Any) -> Solver:

@@ -365,14 +365,6 @@ def _check_factors(config: _Common, logs: LogsConfig) -> None:
         ("estimator.robust", "set", config.estimator.robust is not None, "null"),
         ("estimator.task_weights", "set", config.estimator.task_weights != TaskWeightsConfig(), "no such key"),
         (
-            "preprocessing.cutoff_hz",
-            "auto",
-            config.preprocessing.cutoff_hz == "auto",
-            "the number that compress printed",
-        ),
-        ("actuators.stribeck", "auto", config.actuators.stribeck == "auto", "the velocity that compress printed"),
-        ("robot.base_tilt", "auto", config.robot.base_tilt == "auto", "the tilt that compress printed"),
-        (
             "preprocessing.exclude_rejected",
             "true",
             config.preprocessing.exclude_rejected,

@@ -19,7 +19,7 @@ from torchid.logs.flags import ContactThreshold
 from torchid.logs.ros_topics import check_topics
 from torchid.logs.unitree import JOINT_ORDERS
 from torchid.problem.contact_detection import DetectionConfig
-from torchid.settings import AUTO, STRICT, NotNegative, NotNegativeAutoOrNone, Positive, PositiveOrAuto
+from torchid.settings import AUTO, STRICT, NotNegativeAutoOrNone, Positive, PositiveOrAuto
 
 
 def _switch(value: object) -> object:
@@ -52,7 +52,6 @@ class PreprocessingConfig:
     noise of each contact's velocity; None keeps all.
     `exclude_rejected`: leave out the samples that `torchid check` rejects.
     `memory_gb`: a log whose arrays take more [GB] is read block by block, and its samples are kept on the disk.
-    `cache_gb`: room [GB] for samples and factors that later runs of `identify` find beside the output; 0 for none.
     """
 
     cutoff_hz: PositiveOrAuto = None
@@ -66,7 +65,6 @@ class PreprocessingConfig:
     max_slip: PositiveOrAuto = None
     exclude_rejected: bool = False
     memory_gb: Positive = 2.0
-    cache_gb: NotNegative = 2.0
 
     @property
     def filter_hz(self) -> float | None:

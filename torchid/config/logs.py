@@ -17,7 +17,7 @@ from torchid.errors import ConfigError, LogError, UnknownNameError, excerpt, war
 from torchid.logs import Columns, Topics
 from torchid.logs.containers import FACTORS, READABLE, list_bag_files
 from torchid.logs.time_range import JOINED, JOINED_ACCEPTED, LogFile, LogPart, each_recording, join_files, split_range
-from torchid.robot.payloads import INERTIA_ACCEPTED, Payload
+from torchid.robot.robot import INERTIA_ACCEPTED, Payload
 from torchid.settings import STRICT
 
 SETS = ("train", "test", "validation")

@@ -13,7 +13,7 @@ from pydantic.dataclasses import dataclass
 from torchid.errors import ConfigError
 from torchid.logs.signal_noise import STATED_FIELDS
 from torchid.problem.extras import CHANNELS
-from torchid.robot.constraints import MAX_ANGLE, MAX_GAP, Loop
+from torchid.robot.tree import MAX_ANGLE, MAX_GAP, Loop
 from torchid.robot.xml_files import is_mjcf
 from torchid.settings import AUTO, STRICT, Name, NotNegative, NotNegativeOrAuto, Number, Positive
 

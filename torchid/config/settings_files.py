@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
@@ -15,23 +16,19 @@ from typing import Any, Generic, Literal, TypedDict, TypeVar, Union, get_args, g
 
 import numpy as np
 import yaml
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 from pydantic import TypeAdapter, ValidationError
 
-from torchid.config.yaml_text import check_text, check_yaml, explain_syntax, is_one_text
+from torchid.config.yaml_text import check_text, check_yaml, explain_syntax, is_one_text, load_yaml
 from torchid.errors import ConfigError, UnknownNameError, about_file, during, excerpt, is_plain
 from torchid.guards import MAX_DEPTH, MAX_YAML, read_bytes
 from torchid.logs import Log
 from torchid.logs.containers import READABLE
 from torchid.settings import accepted_values
 
-#: What YAML and OmegaConf raise at a value that is not what its tag or its key says.
-_NO_YAML = (
-    OmegaConfBaseException, yaml.YAMLError, ValueError, TypeError, AssertionError, AttributeError, LookupError,
-    ArithmeticError, RecursionError,
-)  # fmt: skip
+#: What YAML raises at a value that is not what its tag or its key says.
+_NO_YAML = (yaml.YAMLError, ValueError, TypeError, AttributeError, LookupError, ArithmeticError, RecursionError)
 _LONGEST = 300  # characters of another package's message that a message of ours repeats
+_KEY = re.compile(r"[^.\[\]]+(\.[^.\[\]]+|\[[^.\[\]]+\])*")
 _LONGEST_NAME, _LONGEST_PATH = 255, 4095  # bytes, of file systems
 
 T = TypeVar("T")
@@ -104,14 +101,14 @@ def _load(kind: FileKind[T], path: Path | None, overrides: Sequence[str], sectio
     for key, value in sections.items():
         try:
             settings = _merged(kind, settings, _from_here(kind, {key: value}))
-        except (OmegaConfBaseException, TypeError) as error:
+        except TypeError as error:
             raise ConfigError.at_field(key, f"found {_repr(value)}", f"what a YAML {kind.name} file takes") from error
     for text in overrides:
         with about_file("command line"):
             given = _from_here(kind, _parsed(text))
         try:
             settings = _merged(kind, settings, given)
-        except (OmegaConfBaseException, TypeError) as error:
+        except TypeError as error:
             accepted = f"key.subkey=value, a list as a whole: '{kind.list_example}'"
             raise ConfigError("command line", excerpt(text), "does not fit the file", accepted) from error
     try:
@@ -126,8 +123,18 @@ def _from_here(kind: FileKind[T], given: Settings) -> Settings:
 
 
 def _merged(kind: FileKind[T], settings: Settings, given: Settings) -> Settings:
-    prepared = kind.prepare(given, {})
-    out: Settings = _container(OmegaConf.merge(_cleared(kind.prepare(settings, given), prepared), prepared))
+    return _added(kind.prepare(settings, given), kind.prepare(given, {}))
+
+
+def _added(settings: Settings, given: Settings) -> Settings:
+    """The settings with those that are given; TypeError where these name items of a list."""
+    out = dict(settings)
+    for key, value in given.items():
+        before = out.get(key)
+        if isinstance(value, dict) and isinstance(before, list):
+            raise TypeError(key)
+        adds = isinstance(value, dict) and isinstance(before, dict) and bool(value)
+        out[key] = _added(before, value) if adds else value  # type: ignore[arg-type]
     return out
 
 
@@ -141,7 +148,7 @@ def _read(kind: FileKind[T], path: Path) -> Settings:
         loaded = text = read_bytes(path, MAX_YAML).decode()
         if not text.lstrip().startswith("<"):  # XML, which a colon in a comment makes a mapping
             check_yaml(text)
-            loaded = text if is_one_text(text) else _container(OmegaConf.create(text))
+            loaded = text if is_one_text(text) else load_yaml(text)
     except OSError as error:
         raise ConfigError(path, "file", f"cannot be read ({error.strerror})", f"a YAML {kind.name} file") from error
     except yaml.MarkedYAMLError as error:
@@ -164,7 +171,7 @@ def _why(error: Exception) -> str:
     """The cause of an error in reading YAML, in the words of its reader where these are made for users."""
     if isinstance(error, UnicodeDecodeError):
         return "no text"
-    spoken = isinstance(error, (OmegaConfBaseException, yaml.YAMLError, ValueError))
+    spoken = isinstance(error, (yaml.YAMLError, ValueError))
     return excerpt(str(error) if spoken else f"{type(error).__name__}: {error}", _LONGEST)
 
 
@@ -177,26 +184,16 @@ def _parsed(text: str) -> Settings:
         check_yaml(value)
         if key.count(".") + key.count("[") > MAX_DEPTH:
             raise ValueError(f"nested more than {MAX_DEPTH} deep")
-        return _container(OmegaConf.from_dotlist([text]))
+        if not _KEY.fullmatch(key):
+            raise ValueError(f"'{excerpt(key)}', no key")
+        settings = load_yaml(value)
+        for name in reversed(re.split(r"[.\[]", key.replace("]", ""))):
+            settings = {name: settings}
+        return settings
     except yaml.MarkedYAMLError as error:
         raise ConfigError.at_field(excerpt(text), *explain_syntax(error, value, "key.subkey=value")) from error
     except _NO_YAML as error:
         raise ConfigError.at_field(excerpt(text), _why(error), "key.subkey=value, in YAML") from error
-
-
-def _cleared(settings: Settings, given: Settings) -> Settings:
-    """The settings without what stands in mappings that are given empty, which a merge would leave as they are."""
-    out = dict(settings)
-    for key, value in given.items():
-        if value == {} and isinstance(out.get(key), dict):
-            out[key] = {}
-        elif isinstance(value, dict) and isinstance(out.get(key), dict):
-            out[key] = _cleared(out[key], value)
-    return out
-
-
-def _container(config: Any) -> Any:
-    return OmegaConf.to_container(config, resolve=True)
 
 
 def _absolute(settings: Settings, keys: Sequence[str], folder: Path) -> Settings:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from itertools import islice
+from typing import Any
 
 import yaml
 
@@ -11,6 +13,10 @@ from torchid.guards import MAX_DEPTH, MAX_NODES, MAX_TEXT, MAX_YAML
 
 _LOADER: type = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _TAG = "tag:yaml.org,2002:"
+_FLOAT = re.compile(
+    r"[-+]?([0-9][0-9_]*\.[0-9_]*([eE][-+]?[0-9]+)?|[0-9][0-9_]*[eE][-+]?[0-9]+|\.[0-9_]+([eE][-+]?[0-9]+)?"
+    r"|\.(inf|Inf|INF))$|\.(nan|NaN|NAN)$"
+)
 #: Tags that settings may have; others make dates, sets or bytes, which no key accepts.
 _KINDS = ("str", "int", "float", "bool", "null", "map", "seq", "merge")
 _NUMBERS = ("int", "float", "bool", "null")
@@ -70,6 +76,33 @@ def check_yaml(text: str) -> None:
             count.add(1)
             if event.anchor is not None:
                 count.anchored[event.anchor] = 1
+
+
+class _SettingsLoader(_LOADER):  # type: ignore[misc]
+    """YAML with the numbers of version 1.2 (1e-3), without dates, and each key once in a mapping."""
+
+    yaml_implicit_resolvers = {  # noqa: RUF012
+        first: [(tag, pattern) for tag, pattern in found if tag not in (f"{_TAG}timestamp", f"{_TAG}float")]
+        for first, found in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        keys = set()
+        for key_node, _ in node.value:
+            key = (key_node.tag, key_node.value) if isinstance(key_node, yaml.ScalarNode) else key_node
+            if key in keys:
+                problem = f"found duplicate key {excerpt(str(key_node.value))}"
+                raise yaml.constructor.ConstructorError(None, None, problem, key_node.start_mark)
+            keys.add(key)
+        return super().construct_mapping(node, deep)
+
+
+_SettingsLoader.add_implicit_resolver(f"{_TAG}float", _FLOAT, list("-+0123456789."))
+
+
+def load_yaml(text: str) -> Any:
+    """The value of a YAML text, whose bounds `check_yaml` has checked. Raises yaml.YAMLError, ValueError, TypeError."""
+    return yaml.load(text, Loader=_SettingsLoader)
 
 
 def is_one_text(text: str) -> bool:

@@ -2,11 +2,16 @@
 
 from torchid.estimators.conditions import Conditions, Enclosure, Mirror, Violation, violations
 from torchid.estimators.consistent import Consistent, ConsistentEstimate, nearest_consistent
-from torchid.estimators.learnable import FreeParameters, LearnableParameters, LogCholeskyParameters
 from torchid.estimators.least_squares import ConstrainedEstimate, Estimate, LeastSquares
-from torchid.estimators.residual import ResidualEffect, WeightChoice
-from torchid.estimators.sgd import PenaltyWeights, Sgd, TrainingSettings
-from torchid.estimators.training import Epoch, SgdEstimate, Trainer
+from torchid.estimators.sgd import (
+    FreeParameters,
+    LearnableParameters,
+    LogCholeskyParameters,
+    PenaltyWeights,
+    Sgd,
+    TrainingSettings,
+)
+from torchid.estimators.training import Epoch, ResidualEffect, SgdEstimate, Trainer
 
 __all__ = [
     "Conditions",
@@ -28,7 +33,6 @@ __all__ = [
     "Trainer",
     "TrainingSettings",
     "Violation",
-    "WeightChoice",
     "nearest_consistent",
     "violations",
 ]

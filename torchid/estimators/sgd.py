@@ -1,7 +1,11 @@
-"""Mini-batch descent: settings, penalties, loss, and the check of a saved state."""
+"""Mini-batch descent: optimizers, learnable parameters, settings, penalties, loss, and the check of a saved state."""
 
 from __future__ import annotations
 
+import inspect
+import re
+import warnings
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -10,18 +14,350 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.optim import Optimizer, lr_scheduler
+from torch.optim.lr_scheduler import LRScheduler, ReduceLROnPlateau
 
 from torchid import distributed, parameters
+from torchid.errors import InputError, UnknownNameError
 from torchid.estimators.conditions import Conditions
-from torchid.estimators.conic_formulation import Prior, build_conic_problem
-from torchid.estimators.conic_loss import ConicLoss
-from torchid.estimators.conic_problem import ConicProblem
-from torchid.estimators.learnable import LearnableParameters
+from torchid.estimators.conic_problem import ConicLoss, ConicProblem, Prior, build_conic_problem
 from torchid.estimators.least_squares import Regularized
-from torchid.estimators.optimizers import try_out
+from torchid.parallel import one_thread
+from torchid.parameters import PER_BODY
 from torchid.problem import Batch, LinearProblem, MiniBatches
 from torchid.reprs import short_repr
 from torchid.settings import Count, NamedClass, NotNegative, Positive, validate_settings
+
+Group = dict[str, Any]
+
+_WHOLE_RUN = ("T_max", "total_steps")  # lengths that are the number of epochs unless given
+_UNSUITED = {"SparseAdam": "takes sparse gradients alone", "Muon": "takes matrices alone"}
+_FAILURES = (ArithmeticError, AssertionError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
+"""What torch's classes raise at options that they do not accept."""
+
+
+@dataclass(frozen=True)
+class OptimizerUse:
+    """How an optimizer of torch is used for the preconditioned parameters.
+
+    Attributes:
+        defaults: of options that are not given. Torch's own are for unknown curvature; that of the preconditioned
+            parameters is near one.
+        alone: further defaults if no option is given.
+        full_batch: whether every step takes all samples, so that an epoch is one step: a line search or a memory of
+            signs compares gradients between steps, which differ randomly between mini-batches. Gradients are then not
+            clipped.
+    """
+
+    defaults: Mapping[str, Any] = field(default_factory=dict)
+    alone: Mapping[str, Any] = field(default_factory=dict)
+    full_batch: bool = False
+
+
+OPTIMIZERS: dict[str, OptimizerUse] = {
+    "ASGD": OptimizerUse({"lr": 1.0}),
+    "Adadelta": OptimizerUse({"lr": 30.0}),
+    "Adafactor": OptimizerUse({"lr": 0.1, "eps": (None, 1.0)}),  # steps count in units of the second, not of parameters
+    "Adagrad": OptimizerUse({"lr": 0.5}),
+    "Adam": OptimizerUse({"lr": 0.05}),
+    "AdamW": OptimizerUse({"lr": 0.05}),
+    "Adamax": OptimizerUse({"lr": 0.3}),
+    "LBFGS": OptimizerUse({"line_search_fn": "strong_wolfe"}, full_batch=True),
+    "NAdam": OptimizerUse({"lr": 0.1}),
+    "RAdam": OptimizerUse({"lr": 0.3}),
+    "RMSprop": OptimizerUse({"lr": 0.05}),
+    "Rprop": OptimizerUse({"lr": 0.2}, full_batch=True),
+    "SGD": OptimizerUse({"lr": 0.5}, {"momentum": 0.9, "nesterov": True}),
+}
+"""The supported optimizers: those that converge to the closed form (figures in docs/measurements.md)."""
+
+
+def optimizer_names() -> list[str]:
+    """Names of the classes in `torch.optim` that are supported: those in `OPTIMIZERS` that this torch has."""
+    return sorted(name for name, _ in _classes(torch.optim, Optimizer) if name in OPTIMIZERS)
+
+
+def schedule_names() -> list[str]:
+    """Names of the classes in `torch.optim.lr_scheduler`."""
+    return sorted(name for name, _ in _classes(lr_scheduler, LRScheduler))
+
+
+def make_optimizer(chosen: Mapping[str, Any], groups: Sequence[Group]) -> Optimizer:
+    """An optimizer of parameter groups.
+
+    Args:
+        chosen: its name, and options; those that are not given are as in `OPTIMIZERS`.
+        groups: of parameters, as torch takes them.
+
+    Raises:
+        UnknownNameError: no class of `torch.optim`, or one that is not supported.
+        InputError: an option it does not take.
+    """
+    name, options = _split(chosen)
+    cls = dict(_classes(torch.optim, Optimizer)).get(name)
+    if cls is not None and name not in OPTIMIZERS:
+        accepted = ", ".join(optimizer_names())
+        raise InputError("estimator", f"optimizer {name}", _UNSUITED.get(name, "not supported"), accepted)
+    if cls is None:
+        raise _unknown("optimizer", name, optimizer_names())
+    if name == "LBFGS" and len(groups) > 1:  # it takes one group
+        if any("lr" in group for group in groups):
+            raise InputError(
+                "estimator", "residual_lr", "set, but LBFGS has one lr for all", "None, or another optimizer"
+            )
+        groups = [{"params": [x for group in groups for x in group["params"]]}]
+    use = OPTIMIZERS[name]
+    try:
+        return cls(list(groups), **{**use.defaults, **(options or use.alone)})
+    except _FAILURES as error:
+        raise InputError("estimator", f"optimizer {name}", _short(error), _accepted(cls)) from error
+
+
+def make_schedule(chosen: Mapping[str, Any] | None, optimizer: Optimizer, epochs: int) -> LRScheduler | None:
+    """A schedule that is stepped once per epoch.
+
+    Args:
+        chosen: its name, and options, of which `T_max` and `total_steps` are `epochs` unless given; None for none.
+        optimizer: whose learning rate it sets.
+        epochs: of the whole run.
+
+    Raises:
+        UnknownNameError: `torch.optim.lr_scheduler` has no such class.
+        InputError: an option it does not take, or one that a settings file cannot express.
+    """
+    if chosen is None:
+        return None
+    name, options = _split(chosen)
+    cls = dict(_classes(lr_scheduler, LRScheduler)).get(name)
+    if cls is None:
+        raise _unknown("schedule", name, schedule_names())
+    lengths = {key: epochs for key in _WHOLE_RUN if key in inspect.signature(cls).parameters}
+    try:
+        return cls(optimizer, **{**lengths, **options})
+    except _FAILURES as error:
+        raise InputError("estimator", f"schedule {name}", _short(error), _accepted(cls)) from error
+
+
+def step_schedule(schedule: LRScheduler | None, loss: float) -> None:
+    """End an epoch whose loss was `loss`."""
+    if isinstance(schedule, ReduceLROnPlateau):
+        schedule.step(loss)
+    elif schedule is not None:
+        schedule.step()
+
+
+def try_out(optimizer: Mapping[str, Any], schedule: Mapping[str, Any] | None, epochs: int) -> None:
+    """Take two steps on a parabola and run the schedule through all epochs, so that invalid options fail early.
+
+    Arguments as of `make_optimizer` and `make_schedule`.
+
+    Raises:
+        UnknownNameError: a name that torch does not have.
+        InputError: options, or a kind of optimizer, that do not work here.
+    """
+    x = torch.nn.Parameter(torch.ones(3, dtype=torch.float64))
+    trial = make_optimizer(optimizer, [{"params": [x]}])
+    trial_schedule = make_schedule(schedule, trial, epochs)
+
+    def loss() -> torch.Tensor:
+        trial.zero_grad()
+        value = x.square().sum()
+        value.backward()
+        return value
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            for _ in range(2):
+                trial.step(loss)  # type: ignore[arg-type]  # torch's own documentation returns a tensor
+    except _FAILURES as error:
+        found = f"cannot take a step: {_short(error)}"
+        raise InputError("estimator", f"optimizer {optimizer['name']}", found, "other options") from error
+    try:
+        for _ in range(epochs):
+            step_schedule(trial_schedule, 1.0)
+    except _FAILURES as error:
+        found, name = f"fails within {epochs} epochs: {_short(error)}", (schedule or {}).get("name")
+        raise InputError("estimator", f"schedule {name}", found, "other options, or another schedule") from error
+
+
+def _split(chosen: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
+    options = dict(chosen)
+    return options.pop("name"), options
+
+
+def _classes(module: Any, base: type) -> list[tuple[str, Any]]:
+    members = inspect.getmembers(module, inspect.isclass)
+    return [(name, x) for name, x in members if issubclass(x, base) and x is not base and not name.startswith("_")]
+
+
+def _unknown(field: str, name: str, names: Sequence[str]) -> UnknownNameError:
+    """Error for an unknown name; it suggests one that differs in case only (difflib does not match `sgd` to SGD)."""
+    same = [known for known in names if known.lower() == name.lower()]
+    return UnknownNameError("estimator", field, name, same or names)
+
+
+def _accepted(cls: Any) -> str:
+    options = [name for name in inspect.signature(cls).parameters if name not in ("params", "optimizer")]
+    return f"options {', '.join(options)}"
+
+
+def _short(error: Exception) -> str:
+    text = str(error.args[0] if error.args else error)  # a KeyError's own text is a repr
+    first = (text.splitlines() or [""])[0]
+    return re.sub(r"\w+\.__init__\(\)", "", first).strip() or type(error).__name__
+
+
+_LEAST_FRICTION = 0.01  # of its scale: initial friction if the URDF has none, since a softplus is never 0
+_LEAST_EIGENVALUE = 1e-3  # above the margin: initial one of a body whose nominal eigenvalue is smaller
+
+
+class LearnableParameters(nn.Module, ABC):
+    """phi, (12 L,), and M terms, if the problem has any, as a function of `raw`, which is 0 at the nominal parameters.
+
+    In the units of `raw` the compressed problem's Hessian is near the identity: phi is a function of
+    `preconditioner @ raw`.
+    """
+
+    nominal: Tensor
+    scale: Tensor
+    free: Tensor
+    terms: Tensor
+    preconditioner: Tensor
+
+    def __init__(self, problem: LinearProblem, size: int) -> None:
+        """Start at the nominal parameters, without a preconditioner.
+
+        Args:
+            problem: its nominal parameters, scale and free parameters are used.
+            size: of `raw`.
+        """
+        super().__init__()
+        self.register_buffer("nominal", torch.from_numpy(problem.nominal.copy()))
+        self.register_buffer("scale", torch.from_numpy(problem.scale.copy()))
+        self.register_buffer("free", torch.from_numpy(problem.free.copy()))
+        terms = np.zeros(0) if problem.terms is None else problem.terms.size
+        self.register_buffer("terms", torch.from_numpy(terms.copy()), persistent=bool(len(terms)))
+        self.register_buffer("preconditioner", torch.eye(size + len(terms), dtype=torch.float64))
+        self.raw = nn.Parameter(torch.zeros(size + len(terms), dtype=torch.float64))
+
+    @abstractmethod
+    def constrained(self, u: Tensor) -> Tensor:
+        """phi, (12 L,), at the first `size` entries of `preconditioner @ raw`."""
+
+    def _with_terms(self, u: Tensor) -> Tensor:
+        count = len(u) - len(self.terms)
+        return torch.cat([self.constrained(u[:count]), self.terms * u[count:]])
+
+    def forward(self) -> Tensor:
+        """Phi and terms, (12 L + M,)."""
+        return self._with_terms(self.preconditioner @ self.raw)
+
+    def deviations(self, values: Tensor) -> Tensor:
+        """What `forward` gives as deviations of the free parameters, and the terms, in units of their scale."""
+        scaled = (values[: len(self.free)] - self.nominal) / self.scale
+        return torch.cat([scaled[self.free], values[len(self.free) :] / self.terms])
+
+    @one_thread()  # on a busy machine two took up to 1.4 s instead of 3 ms
+    def precondition(self, problem: LinearProblem, ridge: float, damping: float) -> None:
+        """Set the preconditioner to (H + damping I)^(-1/2).
+
+        H is the Gauss-Newton Hessian at the nominal parameters of the mean squared residual plus ridge, in the
+        variables of `constrained`. Without it first-order methods need some 1e10 steps at condition number 1e5. Without
+        damping, steps along directions that the data hardly excite would be too long.
+        """
+        start = torch.zeros_like(self.raw)
+        slopes = torch.autograd.functional.jacobian(self._with_terms, start, vectorize=True).cpu()
+        data = torch.from_numpy(problem.A) @ slopes[: len(self.free)]
+        if problem.terms is not None:
+            data = torch.cat([data, torch.from_numpy(np.hstack([problem.terms.C, problem.terms.D])) @ slopes])
+        prior = slopes[: len(self.free)] / self.scale.cpu()[:, None]
+        hessian = 2.0 * (data.T @ data / max(problem.rows, 1) + ridge * prior.T @ prior)
+        self.preconditioner.copy_(precondition_by(hessian, damping))
+
+    def by_body(self, phi: Tensor) -> Tensor:
+        """Parameters in units of their scale, (L, 12)."""
+        return (phi[: len(self.free)] / self.scale).unflatten(0, (-1, PER_BODY))
+
+
+def precondition_by(hessian: Tensor, damping: float) -> Tensor:
+    """(H + damping I)^(-1/2) of a symmetric matrix, (n, n), whose negative eigenvalues are rounding."""
+    values, vectors = torch.linalg.eigh(hessian)
+    return vectors @ ((values.clamp_min(0.0) + damping).rsqrt()[:, None] * vectors.T)
+
+
+class FreeParameters(LearnableParameters):
+    """Any phi, an affine function of `raw`."""
+
+    def __init__(self, problem: LinearProblem) -> None:
+        super().__init__(problem, int(problem.free.sum()))
+
+    def constrained(self, u: Tensor) -> Tensor:
+        """Nominal parameters (P,) plus `u`, of the free ones (F,), in units of the scale."""
+        return self.nominal.masked_scatter(self.free, self.nominal[self.free] + self.scale[self.free] * u)
+
+
+class LogCholeskyParameters(LearnableParameters):
+    """Only physically consistent phi: scaled pseudo-inertias above a margin, positive friction.
+
+    J = margin I + R R^T with R = R_0 M, where R_0 is the Cholesky factor at the nominal parameters and M is lower
+    triangular with the logarithms of its diagonal and its other entries as coordinates, so that M is the identity where
+    they are 0. Friction is a softplus.
+
+    Source: Rucker, Wensing, "Smooth parameterization of rigid-body inertia", RA-L 2022.
+    """
+
+    root: Tensor
+    friction_start: Tensor
+
+    def __init__(self, problem: LinearProblem, margin: float = Conditions.margin) -> None:
+        """Start at the nominal parameters, with eigenvalues raised above the margin.
+
+        Args:
+            problem: the problem.
+            margin: least eigenvalue of every free body's scaled pseudo-inertia.
+
+        Raises:
+            ValueError: inertial parameters that are not free body by body.
+        """
+        free = problem.free.reshape(-1, PER_BODY)
+        bodies = problem.free_bodies()
+        super().__init__(problem, parameters.INERTIAL.stop * len(bodies) + int(free[:, parameters.FRICTION].sum()))
+        self.margin = margin
+        scaled = (problem.nominal / problem.scale).reshape(-1, PER_BODY)
+        values, vectors = np.linalg.eigh(parameters.pseudo_inertia(scaled[bodies]))
+        above = np.maximum(values - margin, _LEAST_EIGENVALUE)
+        nominal = torch.from_numpy((vectors * above[:, None]) @ vectors.transpose(0, 2, 1))
+        self.register_buffer("root", torch.linalg.cholesky(nominal))
+        self.register_buffer(
+            "_from_pseudo", torch.from_numpy(np.linalg.pinv(parameters.PSEUDO_BASIS.reshape(-1, 16).T))
+        )
+        rows, columns = np.tril_indices(4)
+        self.register_buffer("_rows", torch.from_numpy(rows))
+        self.register_buffer("_columns", torch.from_numpy(columns))
+        moving = np.zeros(free.shape, dtype=bool)
+        moving[bodies, parameters.INERTIAL] = True
+        self.register_buffer("_inertial", torch.from_numpy(moving.ravel()))
+        self.register_buffer("_frictional", torch.from_numpy((free & ~moving).ravel()))
+        start = np.maximum(scaled.ravel()[(free & ~moving).ravel()], _LEAST_FRICTION)
+        self.register_buffer("friction_start", torch.from_numpy(start + np.log(-np.expm1(-start))))
+
+    def constrained(self, u: Tensor) -> Tensor:
+        """Parameters of the bodies with log-Cholesky coordinates `u`, ten by body, then friction."""
+        bodies = len(self.root)
+        coordinates = u[: parameters.INERTIAL.stop * bodies].reshape(bodies, parameters.INERTIAL.stop)
+        rows, columns = self.get_buffer("_rows"), self.get_buffer("_columns")
+        entries = torch.where(rows == columns, coordinates.exp(), coordinates)
+        M = entries.new_zeros(bodies, 4, 4)
+        M[:, rows, columns] = entries
+        R = self.root @ M
+        J = R @ R.mT + self.margin * torch.eye(4, dtype=u.dtype, device=u.device)
+        ten = J.flatten(1) @ self.get_buffer("_from_pseudo").T
+        friction = nn.functional.softplus(u[parameters.INERTIAL.stop * bodies :] + self.friction_start)
+        inertial, frictional = self.get_buffer("_inertial"), self.get_buffer("_frictional")
+        phi = self.nominal.masked_scatter(inertial, ten.flatten() * self.scale[inertial])
+        return phi.masked_scatter(frictional, friction * self.scale[frictional])
+
 
 Consistency = Literal["log_cholesky", "penalties"]
 ResidualMode = Literal["joint", "parameters_first", "alternating"]

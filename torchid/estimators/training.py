@@ -1,9 +1,10 @@
-"""Mini-batch descent, epoch by epoch, with a state that can be saved and resumed."""
+"""Mini-batch descent, epoch by epoch, with a state that can be saved and resumed; its end on all samples at once."""
 
 from __future__ import annotations
 
 import copy
 import time
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -11,20 +12,274 @@ from itertools import chain
 from typing import Any
 
 import numpy as np
+import scipy.optimize
 import torch
 from torch import Tensor, nn
 
 from torchid import parameters
-from torchid.errors import InputError
-from torchid.estimators.finish import excess, finish
-from torchid.estimators.learnable import FreeParameters, LearnableParameters, LogCholeskyParameters
-from torchid.estimators.least_squares import ConstrainedEstimate, Minimizer, report_rounding
-from torchid.estimators.optimizers import OPTIMIZERS, make_optimizer, make_schedule, step_schedule
-from torchid.estimators.residual import CANDIDATE_WEIGHTS, ResidualEffect, WeightChoice, choose_weight, residual_effect
-from torchid.estimators.sgd import Loss, LossTerms, Sgd, add_up, validate_state
+from torchid.errors import InputError, NumericalWarning
+from torchid.estimators.barrier import solve_barrier
+from torchid.estimators.conic_problem import ConicLoss
+from torchid.estimators.consistent import Consistent
+from torchid.estimators.least_squares import ConstrainedEstimate, LeastSquares, Minimizer, report_rounding
+from torchid.estimators.sgd import (
+    OPTIMIZERS,
+    FreeParameters,
+    LearnableParameters,
+    LogCholeskyParameters,
+    Loss,
+    LossTerms,
+    Sgd,
+    add_up,
+    make_optimizer,
+    make_schedule,
+    penalties,
+    precondition_by,
+    step_schedule,
+    validate_state,
+)
 from torchid.parallel import one_thread
-from torchid.parameters import Array
+from torchid.parameters import INERTIAL, PER_BODY, Array
 from torchid.problem import Batch, LinearProblem, MiniBatches
+
+_LBFGS_OPTIONS = {"maxiter": 20, "maxcor": 20, "ftol": 0.0, "gtol": 0.0}  # of L-BFGS between preconditioners
+_DAMPING = 0.01  # of these, over the objective
+_SETTLED, _MET = 1e-12, 1e-10  # relative decrease of the objective in a round, violation of a condition
+
+
+@one_thread()
+def finish(settings: Sgd, problem: LinearProblem, start: Minimizer) -> Minimizer:
+    """Minimize the objective of a descent.
+
+    Possible bodies have one minimizer, which the interior-point method computes wherever the descent ended. Descents
+    do not reach it: at the border of what is possible, coordinates such as J = R R^T bend faster than they converge,
+    so that 800 steps of L-BFGS left a quadruped 0.1 of a parameter's scale away, elsewhere with every rounding.
+
+    Args:
+        settings: of the descent; with penalties, `finish` rounds of L-BFGS are taken at most.
+        problem: the compressed samples.
+        start: where it ended.
+    """
+    if settings.consistency == "log_cholesky":
+        exact = Consistent(settings.ridge, settings.prior, settings.conditions, rank_tolerance=settings.rank_tolerance)
+        return exact.minimize(problem)
+    conic, y = settings.conic_loss(problem), _deviations(problem, start)
+    before = np.inf
+    for _ in range(settings.finish or 0):
+        damping = _DAMPING * max(float(conic.objective(y)), 1e-12) + settings.penalties.curvature
+        P = precondition_by(conic.curvature(y), damping)
+
+        def loss(moved: Array, y: Tensor = y, P: Tensor = P) -> tuple[float, Array]:
+            u = torch.from_numpy(moved).requires_grad_()
+            value = _penalized(settings, problem, conic, y + P @ u)
+            (gradient,) = torch.autograd.grad(value, u)
+            return value.item(), gradient.numpy()
+
+        moved = scipy.optimize.minimize(loss, np.zeros(len(y)), jac=True, method="L-BFGS-B", options=_LBFGS_OPTIONS).x
+        y = y + P @ torch.from_numpy(moved)
+        value = float(conic.objective(y))
+        if conic.update(y) <= _MET and abs(before - value) <= _SETTLED * abs(value):
+            break
+        before = value
+    moves, terms = np.split(y.numpy(), [int(problem.free.sum())])
+    phi = problem.nominal.copy()
+    phi[problem.free] += problem.scale[problem.free] * moves
+    return Minimizer(phi, None if problem.terms is None else terms * problem.terms.size)
+
+
+def _deviations(problem: LinearProblem, found: Minimizer) -> Tensor:
+    """Deviations of the free parameters and terms in units of their scale, (n,)."""
+    y = ((found.phi - problem.nominal) / problem.scale)[problem.free]
+    if problem.terms is not None:
+        y = np.append(y, np.zeros_like(problem.terms.size) if found.psi is None else found.psi / problem.terms.size)
+    return torch.from_numpy(y)
+
+
+def _penalized(settings: Sgd, problem: LinearProblem, conic: ConicLoss, y: Tensor) -> Tensor:
+    """Objective, conditions and penalties at deviations (n,)."""
+    free, nominal = torch.from_numpy(problem.free), torch.from_numpy(problem.nominal / problem.scale)
+    by_body = nominal.masked_scatter(free, nominal[free] + y[: int(free.sum())]).unflatten(0, (-1, PER_BODY))
+    bodies = torch.from_numpy(problem.free_bodies())
+    value = conic.objective(y) + conic.penalty(y)
+    terms = penalties(by_body, bodies, settings.conditions.margin, settings.penalties)
+    return value + torch.stack([value * 0.0, *terms.values()]).sum()
+
+
+def excess(settings: Sgd, problem: LinearProblem, found: Minimizer) -> float:
+    """How far the objective of a minimizer is above the least one at most, as a share of that or of what counts as 0.
+
+    Where bodies are possible the least one is that of the interior-point method. With penalties, which only add to the
+    quadratic, it is at least what this promises along the gradient.
+    """
+    problem_of_cones, conic = settings.conic_problem(problem), settings.conic_loss(problem)
+    y = _deviations(problem, found)
+    if settings.consistency == "log_cholesky":
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NumericalWarning)  # of its gap, which counts below
+            best = solve_barrier(problem_of_cones)
+        value = float(conic.objective(y))
+        least = best.objective - (best.gap if np.isfinite(best.gap) else 0.0)
+    else:
+        y.requires_grad_()
+        loss = _penalized(settings, problem, conic, y)
+        (gradient,) = torch.autograd.grad(loss, y)
+        hessian = 2.0 * conic.root.T @ conic.root
+        value = loss.item()
+        least = value - 0.5 * float(gradient @ torch.linalg.pinv(hessian, hermitian=True) @ gradient)
+    return (value - least) / max(least, problem_of_cones.floor)
+
+
+CANDIDATE_WEIGHTS = (10.0, 1.0, 0.1, 0.01, 0.001, 0.0)
+"""Candidate weights: a module that can fit any force fits the share 1 / (1 + weight) of the residual."""
+
+
+@dataclass(frozen=True)
+class WeightChoice:
+    """The weight of a residual module, chosen by its predictions of held-out samples.
+
+    Attributes:
+        weight: the largest whose held-out loss is at most one standard error above the least.
+        candidates: weights that were tried, descending.
+        losses: of each, the held-out mean squared whitened residual.
+        standard_error: of the least loss, over blocks of time.
+        alone: the held-out loss of rigid bodies without the module.
+        alone_converged: whether their descent had converged: only then is a smaller loss the module's gain.
+    """
+
+    weight: float
+    candidates: tuple[float, ...]
+    losses: tuple[float, ...]
+    standard_error: float
+    alone: float
+    alone_converged: bool = True
+
+    @property
+    def gain(self) -> float | None:
+        """Share of the loss of rigid bodies alone that the module takes away; None where that has not converged."""
+        return 1.0 - self.losses[self.candidates.index(self.weight)] / self.alone if self.alone_converged else None
+
+
+def choose_weight(candidates: Sequence[float], losses: Array, alone: float) -> WeightChoice:
+    """The largest weight that is not significantly worse than the best: the one-standard-error rule.
+
+    Args:
+        candidates: W weights.
+        losses: (W, blocks) held-out losses, at least two blocks; infinite where the descent diverged.
+        alone: held-out loss without the module.
+
+    Source: Breiman, Friedman, Olshen, Stone, "Classification and Regression Trees", 1984, section 3.4.3.
+    """
+    means = losses.mean(axis=1)
+    best = int(np.argmin(means))
+    error = float(losses[best].std(ddof=1) / np.sqrt(losses.shape[1]))
+    good = [weight for weight, mean in zip(candidates, means, strict=True) if mean <= means[best] + error]
+    return WeightChoice(max(good), tuple(candidates), tuple(means.tolist()), error, alone)
+
+
+@dataclass(frozen=True)
+class ResidualEffect:
+    """Effect of a residual module on force and parameters, on the training samples.
+
+    Attributes:
+        weight: under which it was trained.
+        choice: how the weight was chosen, None if it was given.
+        rms: of the module's force by group, "base_force" [N], "base_moment" [N m], "joint_torque" [N m, N] and
+            "limb_wrench" [N, N m].
+        shares: by group, that rms over the rms of the whole force, rigid bodies and module together.
+        rigid_share: rms of the part of the module's projected whitened force that rigid bodies can explain, over the
+            rms of all of it.
+        moved: (12 L,), change of the parameters by the module: the least squares estimate on the force less the
+            module's part, minus that on the whole force.
+        moved_scaled: (L,), the largest of each body's ten inertial parameters, in units of their scale.
+        moved_errors: (L,), likewise in standard errors of the parameters that the data determine, NaN without any.
+    """
+
+    weight: float
+    choice: WeightChoice | None
+    rms: dict[str, float]
+    shares: dict[str, float]
+    rigid_share: float
+    moved: Array
+    moved_scaled: Array
+    moved_errors: Array
+
+
+def residual_effect(
+    loss: Loss, problem: LinearProblem, batches: MiniBatches, estimator: LeastSquares, choice: WeightChoice | None
+) -> ResidualEffect | None:
+    """Effect of a loss's residual module; None without a module.
+
+    Args:
+        loss: with the current parameters and module.
+        problem: the compressed samples.
+        batches: the samples.
+        estimator: for the estimates with and without the module's part.
+        choice: how the weight was chosen.
+    """
+    if loss.residual is None:
+        return None
+    with loss.evaluating(), torch.no_grad():
+        gradient, square = _correlation(loss, batches)
+        rms, shares = _by_group(loss.residual, loss.learnable().cpu().numpy(), batches)
+    free = problem.free
+    explained = np.linalg.lstsq(problem.A[:, free].T, gradient[free], rcond=None)[
+        0
+    ]  # A^T explained = sum of K^T W W^T r
+    plain, without_module = (estimator.solve(x) for x in (problem, replace(problem, b=problem.b - explained)))
+    moved = without_module.phi - plain.phi
+    with np.errstate(divide="ignore", invalid="ignore"):
+        errors = np.abs(moved) / np.where(plain.standard_error > 0.0, plain.standard_error, np.nan)
+    return ResidualEffect(
+        weight=loss.residual_weight or 0.0,
+        choice=choice,
+        rms=rms,
+        shares=shares,
+        rigid_share=float(np.linalg.norm(explained) / np.sqrt(square)) if square else 0.0,
+        moved=moved,
+        moved_scaled=_largest(np.abs(moved) / problem.scale),
+        moved_errors=_largest(errors),
+    )
+
+
+def _correlation(loss: Loss, batches: MiniBatches) -> tuple[Array, float]:
+    """K^T r over all whitened projected rows, (12 L,), and the sum of squares of r, the module's force."""
+    phi = loss.learnable()
+    total, square = torch.zeros_like(phi), 0.0
+    for batch in batches.chunks():
+        force = loss.forces(batch, phi)[1]
+        if force is not None:
+            total += batches.columns.T @ torch.einsum("bij,bi->j", batch.K, force)
+            square += float(force.square().sum())
+    return total.cpu().numpy(), square
+
+
+def _by_group(module: nn.Module, phi: Array, batches: MiniBatches) -> tuple[dict[str, float], dict[str, float]]:
+    """Rms of a module's force by group, and its share of the rms of the whole."""
+    base_rows = batches.builder.tree.base_rows
+    own: dict[str, float] = {}
+    whole: dict[str, float] = {}
+    for (q, v, a), rigid in batches.generalized_forces(phi):
+        force = module(q, v, a)
+        for name, rows in _groups(base_rows, v.shape[1], rigid.shape[1]).items():
+            per_row = 1.0 / (batches.samples * (rows.stop - rows.start))
+            for sums, part in ((own, force), (whole, rigid + force)):
+                sums[name] = sums.get(name, 0.0) + per_row * float(part[:, rows].square().sum())
+    shares = {name: float(np.sqrt(own[name] / x)) if x else 0.0 for name, x in whole.items()}
+    return {name: float(np.sqrt(x)) for name, x in own.items()}, shares
+
+
+def _groups(base_rows: int, nv: int, rows: int) -> dict[str, slice]:
+    """Rows by group, without empty groups."""
+    base = {"base_force": slice(0, 3), "base_moment": slice(3, 6)} if base_rows else {}
+    groups = base | {"joint_torque": slice(base_rows, nv), "limb_wrench": slice(nv, rows)}
+    return {name: rows for name, rows in groups.items() if rows.stop > rows.start}
+
+
+def _largest(x: Array) -> Array:
+    """Largest of each body's ten inertial entries, (L,), of (12 L,); NaN if all are."""
+    by_body = x.reshape(-1, PER_BODY)[:, INERTIAL]
+    return np.where(np.isnan(by_body).all(axis=1), np.nan, np.nan_to_num(by_body).max(axis=1))
+
 
 _BLOCKS, _EVERY, _FEWEST = 20, 4, 2  # of samples; one of how many is held out to weigh a residual module; for an error
 CONVERGED = 0.01

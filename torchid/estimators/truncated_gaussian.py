@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,14 +11,398 @@ import scipy.linalg
 import torch
 from torch import Tensor
 
-from torchid.estimators.barrier_gaussian import BarrierGaussian, barrier_gaussian
+from torchid.errors import NumericalWarning, warn
+from torchid.estimators.barrier import CURVATURE, ENTRY_WEIGHTS, UPPER, BarrierGaussian, barrier_gaussian
 from torchid.estimators.conic_problem import ConicProblem
-from torchid.estimators.elliptical_slice import EllipticalSlice, inside
-from torchid.parallel import run_in_workers
+from torchid.parallel import one_thread, run_in_workers
 from torchid.parameters import Array
 from torchid.problem.chunks import worker_count
 
-_CHAINS, _BATCHES = 512, 2  # chains of a batch, which one thread works on, and batches at most
+_CHAINS = 512  # that find out how many passes make a state new
+_TRIES = (3, 6, 15)  # on an ellipse, at once, after which a chain stays where it is; each halves the arc
+_INSIDE = 1e-12  # least pivot of a block and slack of a row, relative to the mean's: above what rounding can hide
+_ALIKE = 0.25  # correlation of a coordinate with what it was, in all chains, below which states count as new
+_MOST_WHOLE, _MOST_APART, _MOST = 5, 8, 200  # passes after which each kind of moves counts as too slow
+_BURN_IN = 4  # times as many passes as make states new, before the first is used
+_SHRINK, _SHRINKS = 0.8, 200  # of draws from the Gaussian that are outside, towards its mean
+_TAIL = 30.0  # standard deviations, from which on a normal tail is exponential, to a thousandth of its length
+_DIAGONAL = tuple(np.flatnonzero(UPPER[0] == UPPER[1]).tolist())
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Variables that move together: `spread @ y`, y of unit variance where all others are fixed.
+
+    `basis`: (n, d), orthonormal columns of the Gaussian's root; `change`: of the entries of the blocks, 10 for each of
+    them, and of the rows.
+    """
+
+    variables: Tensor
+    spread: Tensor
+    basis: Tensor
+    change: Tensor
+    blocks: Tensor
+    rows: Tensor
+
+
+@dataclass(frozen=True)
+class _Bounded:
+    """A variable that bounds alone concern.
+
+    `end`: a bound, relative to the mean; `other`: on the other side, None where there is none; `spread`: standard
+    deviation where all others are fixed, negative if `end` is an upper bound; `kept`, `pull`: then the centre is
+    `kept * x + pull`, less what the others make of it.
+    """
+
+    variable: int
+    end: float
+    other: float | None
+    spread: float
+    kept: float
+    pull: float
+
+    @classmethod
+    def of(cls, variable: int, gaussian: BarrierGaussian, precision: float) -> _Bounded:
+        """Of a Gaussian whose own precision, without barriers, is that where all others are fixed."""
+        slopes, near = gaussian.rows[:, variable], gaussian.near[len(gaussian.blocks) :]
+        low = float(max((_INSIDE - 1.0) / slopes[slopes > 0.0], default=-math.inf))
+        high = float(min((_INSIDE - 1.0) / slopes[slopes < 0.0], default=math.inf))
+        deviation, kept = precision**-0.5, 1.0 + CURVATURE * float(np.square(slopes[near]).sum()) / precision
+        pull = -float(slopes[near].sum()) / precision
+        if low == -math.inf:
+            return cls(variable, high, None, -deviation, kept, pull)
+        return cls(variable, low, high if high < math.inf else None, deviation, kept, pull)
+
+    def draw(self, centre: Tensor, uniform: Tensor) -> Tensor:
+        """From the normal distribution around a centre, cut off by the bounds, (B,)."""
+        low = (self.end - centre) / self.spread
+        high = None if self.other is None else (self.other - centre) / self.spread
+        drawn = torch.add(centre, _truncated_normal(low, high, uniform), alpha=self.spread)
+        return drawn.clamp(self.end, self.other) if self.spread > 0.0 else drawn.clamp(max=self.end)
+
+
+@dataclass
+class _State:
+    """Points of B chains, all relative to the mean: x (n, B), root @ x, entries of blocks (K, 10, B), rows (M, B)."""
+
+    x: Tensor
+    whitened: Tensor
+    blocks: Tensor
+    rows: Tensor
+
+
+class EllipticalSlice(torch.nn.Module):
+    """Draws from exp(-objective / 2) of a conic problem, within its conditions.
+
+    An ellipse through the state and a draw from the Gaussian has that Gaussian's density all along, so that a point of
+    it needs only to meet the conditions, and to be likely enough by what the density has beside the Gaussian
+    (`BarrierGaussian`): the arc is cut down until one does. Where conditions are far, all variables together move so.
+    Else friction, which bounds of its own concern, is drawn exactly, one by one, and the rest moves while it is fixed;
+    and where bodies are near their conditions, two bodies at a time, which few of these concern. Which moves it takes,
+    and how many passes of them make a state new, is measured once, on a first set of chains.
+
+    Source: Murray, Adams, MacKay, "Elliptical slice sampling", AISTATS 2010; with a Gaussian of one's own choice:
+    Nishihara, Murray, Adams, "Parallel MCMC with generalized elliptical slice sampling", JMLR 2014.
+    """
+
+    mean: Tensor
+    root: Tensor
+    directions: Tensor
+    block_variables: Tensor
+    block_changes: Tensor
+    row_changes: Tensor
+    near: Tensor
+    alone_columns: Tensor
+    alone_weights: Tensor
+    weights: Tensor
+    unit: Tensor
+
+    def __init__(self, conic: ConicProblem, gaussian: BarrierGaussian, owners: np.ndarray) -> None:
+        """Prepare.
+
+        Args:
+            conic: the problem, without log-determinants in its objective.
+            gaussian: that stands for it.
+            owners: (n,) int, to which body each variable belongs.
+
+        Warns:
+            NumericalWarning: states stay alike for too long, so that draws will be correlated.
+        """
+        super().__init__()
+        alone = _bounded_alone(conic, gaussian)
+        gaussian = replace(gaussian, root=_triangular_from(gaussian.root, alone))
+        arrays = {
+            "mean": gaussian.mean,
+            "root": gaussian.root,
+            "directions": gaussian.directions,
+            "block_variables": conic.variables,
+            "block_changes": np.take_along_axis(gaussian.blocks, conic.variables[:, None], axis=2),
+            "row_changes": gaussian.rows,
+            "near": gaussian.near.astype(np.float64),
+            "weights": ENTRY_WEIGHTS[:, None],
+            "unit": (UPPER[0] == UPPER[1]).astype(np.float64)[:, None],
+        }
+        for name, array in arrays.items():
+            self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(array)))
+        precision = np.square(conic.root[:, alone]).sum(axis=0)
+        self.alone = [_Bounded.of(int(v), gaussian, float(p)) for v, p in zip(alone, precision, strict=True)]
+        by_alone = np.ascontiguousarray(gaussian.root[: len(alone), alone].T)
+        self.register_buffer("alone_columns", torch.from_numpy(by_alone))
+        self.register_buffer("alone_weights", torch.from_numpy(by_alone / precision[:, None]))
+        self._groups = 0
+        self._add_group(gaussian, conic.E, np.setdiff1d(np.arange(len(gaussian.mean)), alone))
+        for variables in _pairs(gaussian, owners):
+            self._add_group(gaussian, conic.E, variables)
+        self.moves, self.passes = "whole", 1
+        self._measure()
+
+    def _add_group(self, gaussian: BarrierGaussian, E: Array, variables: np.ndarray) -> None:
+        _, values, Vt = np.linalg.svd(E[:, variables])
+        basis = Vt[int((values > 1e-10).sum()) :].T  # of what equalities leave them
+        if not basis.shape[1]:
+            return
+        Q, R = np.linalg.qr(gaussian.root[:, variables] @ basis)
+        spread = basis @ np.linalg.inv(R)
+        blocks = np.flatnonzero(gaussian.blocks[:, :, variables].any(axis=(1, 2)))
+        rows = np.flatnonzero(gaussian.rows[:, variables].any(axis=1))
+        of_blocks = gaussian.blocks[blocks][:, :, variables].reshape(-1, len(variables))
+        change = np.concatenate([of_blocks, gaussian.rows[rows][:, variables]]) @ spread
+        for name, array in zip(_Group.__annotations__, (variables, spread, Q, change, blocks, rows), strict=True):
+            self.register_buffer(f"{name}_{self._groups}", torch.from_numpy(np.ascontiguousarray(array)))
+        self._groups += 1
+
+    def states(self, chains: int, generator: torch.Generator) -> Iterator[Tensor]:
+        """Points x of so many chains, (n, chains), on the device of the module, again and again, new ones each time."""
+        state = self._start(chains, generator)
+        for _ in range(_BURN_IN * self.passes):
+            self._pass(state, generator)
+        while True:
+            yield self.mean[:, None] + state.x
+            for _ in range(self.passes):
+                self._pass(state, generator)
+
+    @one_thread()
+    @torch.no_grad()
+    def _measure(self) -> None:
+        """Find out which moves it takes, and how many, until states are new."""
+        generator = torch.Generator().manual_seed(0)
+        kinds = [("whole", _MOST_WHOLE), *([("apart", _MOST_APART)] if len(self.alone) else []), ("pairs", _MOST)]
+        for self.moves, most in kinds:
+            state = self._start(_CHAINS, generator)
+            for _ in range(2):
+                self._pass(state, generator)
+            first = _standardized(state.x)
+            for self.passes in range(1, most + 1):
+                self._pass(state, generator)
+                alike = float((first * _standardized(state.x)).mean(dim=1).max()) if len(state.x) else 0.0
+                if alike <= _ALIKE:
+                    return
+        message = f"estimator: after {_MOST} passes states of the sampler are still correlated by {alike:.2g}"
+        warn(f"{message}; samples are of too little variety", NumericalWarning)
+
+    def _start(self, chains: int, generator: torch.Generator | None) -> _State:
+        """Draws from the Gaussian, those outside of the conditions moved to the mean until they are inside."""
+        size = (self.directions.shape[1], chains)
+        x = self.directions @ torch.randn(size, dtype=torch.float64, device=self.mean.device, generator=generator)
+        state = self._at(x)
+        share = x.new_ones(chains)
+        for _ in range(_SHRINKS):
+            fits = inside(state.blocks + self.unit, state.rows)
+            if bool(fits.all()):
+                return state
+            share = torch.where(fits, share, _SHRINK * share)
+            state = self._at(x * share)
+        return self._at(torch.zeros_like(x))
+
+    def _at(self, x: Tensor) -> _State:
+        return _State(x, self.root @ x if self.moves != "whole" else x, *self._changes(x))
+
+    def _changes(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Of the entries of blocks, (K, 10, B), and of rows, (M, B), by x, (n, B)."""
+        return self.block_changes @ x[self.block_variables], self.row_changes @ x
+
+    def _pass(self, state: _State, generator: torch.Generator | None) -> None:
+        """One move of all variables, together, or one part after the other while the others rest."""
+        if self.moves != "whole":
+            for number in range(1) if self.moves == "apart" else range(1, self._groups):
+                self._move_group(state, self._group(number), generator)
+            self._move_alone(state, generator)
+        if self.moves != "apart":
+            self._move_all(state, generator)
+
+    def _group(self, number: int) -> _Group:
+        return _Group(*(getattr(self, f"{name}_{number}") for name in _Group.__annotations__))
+
+    def _move_group(self, state: _State, group: _Group, generator: torch.Generator | None) -> None:
+        centre = -(group.basis.T @ state.whitened)  # of y, which is 0 at the state
+        drawn = torch.randn(centre.shape, dtype=torch.float64, device=centre.device, generator=generator)
+        blocks, rows = state.blocks[group.blocks], state.rows[group.rows]
+        near = self.near[: len(state.blocks)][group.blocks], self.near[len(state.blocks) :][group.rows]
+        cut = 10 * len(blocks)
+        now = torch.cat([blocks.flatten(0, 1), rows])
+        along, across = group.change @ centre, group.change @ drawn
+        angle = self._angle((now, along, across), cut, near, generator)
+        versed, sine = 1.0 - torch.cos(angle), torch.sin(angle)
+        y, changed = centre * versed + drawn * sine, along * versed + across * sine
+        state.x[group.variables] += group.spread @ y
+        state.whitened += group.basis @ y
+        state.blocks[group.blocks] += changed[:cut].view(-1, 10, changed.shape[1])
+        state.rows[group.rows] += changed[cut:]
+
+    def _move_alone(self, state: _State, generator: torch.Generator | None) -> None:
+        """Draw each variable that only bounds of its own concern from its exact distribution with all others fixed."""
+        size = (len(self.alone), state.x.shape[1])
+        uniform = 1.0 - torch.rand(size, dtype=state.x.dtype, device=state.x.device, generator=generator)  # never 0
+        for number, one in enumerate(self.alone):
+            x, above = state.x[one.variable], state.whitened[: number + 1]  # the columns are zero below
+            weights, column = self.alone_weights[number, : number + 1], self.alone_columns[number, : number + 1]
+            centre = torch.addmv(x, above.T, weights, beta=one.kept, alpha=-1.0).add_(one.pull)
+            drawn = one.draw(centre, uniform[number])
+            above.addr_(column, drawn - x)
+            x.copy_(drawn)
+        if self.alone:
+            state.rows = self.row_changes @ state.x
+
+    def _move_all(self, state: _State, generator: torch.Generator | None) -> None:
+        size = (self.directions.shape[1], state.x.shape[1])
+        drawn = torch.randn(size, dtype=torch.float64, device=self.mean.device, generator=generator)
+        x = self.directions @ drawn
+        blocks, rows = self._changes(x)
+        now, across = (torch.cat([b.flatten(0, 1), r]) for b, r in ((state.blocks, state.rows), (blocks, rows)))
+        near = self.near[: len(blocks)], self.near[len(blocks) :]
+        angle = self._angle((now, -now, across), 10 * len(blocks), near, generator)
+        cosine, sine = torch.cos(angle), torch.sin(angle)
+        for old, new in ((state.x, x), (state.blocks, blocks), (state.rows, rows)):
+            old.mul_(cosine).addcmul_(new, sine)
+        if self.moves != "whole":
+            state.whitened = self.root @ state.x
+
+    def _angle(
+        self,
+        ellipse: tuple[Tensor, Tensor, Tensor],
+        cut: int,
+        near: tuple[Tensor, Tensor],
+        generator: torch.Generator | None,
+    ) -> Tensor:
+        """Angles of the next states on ellipses, (B,), 0 where `_TRIES` have found none.
+
+        Args:
+            ellipse: entries of blocks and then rows, (10 K + M, B), at the state, by 1 - cos and by sin of the angle.
+            cut: 10 K.
+            near: which blocks and rows the Gaussian has barriers for.
+            generator: of random numbers.
+        """
+        now, along, across = ellipse
+        uniform = _uniform(now, generator)
+        level = self._excess(now, cut, near) + torch.log(uniform())
+        angle = 2.0 * math.pi * uniform()
+        least, most = angle - 2.0 * math.pi, angle
+        out, left = torch.zeros_like(angle), torch.arange(len(angle), device=angle.device)
+        for count in _TRIES:
+            tried = angle.new_empty(count, len(angle))
+            for number in range(count):  # as if all before had failed, so that these need not be known to have
+                tried[number] = angle
+                least, most = torch.where(angle < 0.0, angle, least), torch.where(angle < 0.0, most, angle)
+                angle = torch.lerp(least, most, _uniform(now, generator)())
+            versed, sine = 1.0 - torch.cos(tried), torch.sin(tried)
+            there = (now[:, None] + along[:, None] * versed + across[:, None] * sine).flatten(1)
+            fits = inside(there[:cut].view(-1, 10, there.shape[1]) + self.unit, there[cut:])
+            fits &= self._excess(there, cut, near) >= level.repeat(count)
+            failed = (~fits).view(count, -1).to(torch.int64).cumprod(0).sum(0)  # before the first that fits
+            found = torch.nonzero(failed < count)[:, 0]
+            out[left[found]] = tried[failed[found], found]
+            rest = torch.nonzero(failed == count)[:, 0]
+            if not len(rest):
+                break
+            left, level, angle, least, most = (x[rest] for x in (left, level, angle, least, most))
+            now, along, across = (x.index_select(1, rest) for x in (now, along, across))
+        return out
+
+    def _excess(self, entries: Tensor, cut: int, near: tuple[Tensor, Tensor]) -> Tensor:
+        """Logarithm of the density over that of the Gaussian, up to a constant, (B,).
+
+        With E = J^-1/2 F_k J^-1/2 - 1 of a block that has a barrier it is ||E||^2 / 2 - tr E, and likewise of a row.
+        """
+        blocks, rows = entries[:cut].view(-1, 10, entries.shape[1]), entries[cut:]
+        of_blocks = 0.5 * CURVATURE * (self.weights * blocks.square()).sum(1) - blocks[:, _DIAGONAL].sum(1)
+        return near[0] @ of_blocks + near[1] @ (0.5 * CURVATURE * rows.square() - rows)
+
+
+def _uniform(like: Tensor, generator: torch.Generator | None) -> Callable[[], Tensor]:
+    """Draws of uniform numbers, one for each column."""
+    return lambda: torch.rand(like.shape[1], dtype=like.dtype, device=like.device, generator=generator)
+
+
+def inside(blocks: Tensor, rows: Tensor) -> Tensor:
+    """Where all blocks, (K, 10, B), are positive definite, and all rows, (M, B), above -1: (B,) bool."""
+    a, b, c, d, e, f, g, h, i, j = blocks.unbind(1)  # rows a b c d, e f g, h i, j of the upper triangle
+    first = 1.0 / a
+    e, f, g = e - b * b * first, f - b * c * first, g - b * d * first
+    h, i, j = h - c * c * first, i - c * d * first, j - d * d * first
+    second = 1.0 / e
+    h, i, j = h - f * f * second, i - f * g * second, j - g * g * second
+    last = j - i * i / h
+    pivots = torch.minimum(torch.minimum(a, e), torch.minimum(h, last))  # NaN where one before is 0
+    return (pivots > _INSIDE).all(0) & (rows > _INSIDE - 1.0).all(0)
+
+
+def _truncated_normal(low: Tensor, high: Tensor | None, uniform: Tensor) -> Tensor:
+    """Standard normal numbers above `low`, below `high`, far into the tails, from uniform ones above 0, all (B,)."""
+    if high is None:
+        tail = low - torch.log(uniform) / low
+        return torch.where(low > _TAIL, tail, -torch.special.ndtri(uniform * _above(low)))
+    flipped = low + high < 0.0
+    near, far = torch.where(flipped, -high, low), torch.where(flipped, -low, high)  # the one nearer to 0 first
+    body = -torch.special.ndtri(_above(far) + uniform * (_above(near) - _above(far)))
+    tail = near - torch.log1p(-uniform * -torch.expm1(-near * (far - near))) / near
+    drawn = torch.where(near > _TAIL, tail, body)
+    return torch.where(flipped, -drawn, drawn)
+
+
+def _above(x: Tensor) -> Tensor:
+    """How often a standard normal number is larger; torch's own is 0 from 8.3 on."""
+    return 0.5 * torch.erfc(x / math.sqrt(2.0))
+
+
+def _bounded_alone(conic: ConicProblem, gaussian: BarrierGaussian) -> np.ndarray:
+    """Variables that only rows of their own concern, one of which is near: friction, most often."""
+    of_rows, alone = conic.G != 0.0, np.ones(len(conic.linear), dtype=bool)
+    alone[conic.variables.ravel()] = False
+    alone &= ~conic.E.any(axis=0) & ~of_rows[of_rows.sum(axis=1) > 1].any(axis=0)
+    return np.flatnonzero(alone & of_rows[gaussian.near[len(conic.F0) :]].any(axis=0))
+
+
+def _triangular_from(root: Array, first: np.ndarray) -> Array:
+    """Another root of the same matrix, whose columns of some variables are zero below as many rows."""
+    order = np.concatenate([first, np.setdiff1d(np.arange(root.shape[1]), first)])
+    out = np.empty_like(root)
+    out[:, order] = np.linalg.qr(root[:, order], mode="r")
+    return out
+
+
+def _standardized(x: Tensor) -> Tensor:
+    """Coordinates (n, B) with mean 0 and variance 1 over the chains; those that do not move are 0."""
+    centred = x - x.mean(dim=1, keepdim=True)
+    deviation = centred.square().mean(dim=1, keepdim=True).sqrt()
+    return torch.where(deviation > 0.0, centred / deviation, 0.0)
+
+
+def _pairs(gaussian: BarrierGaussian, owners: np.ndarray) -> list[np.ndarray]:
+    """Variables of pairs of bodies that are most correlated: those of the tree that spans all bodies best."""
+    bodies = np.unique(owners)
+    deviation = np.linalg.norm(gaussian.directions, axis=1)
+    scaled = gaussian.directions / np.where(deviation > 0.0, deviation, 1.0)[:, None]
+    member = (owners[:, None] == bodies).astype(np.float64)
+    together = member.T @ np.square(scaled @ scaled.T) @ member
+    inside, outside, pairs = [0], list(range(1, len(bodies))), []
+    while outside:
+        row, column = np.unravel_index(int(together[np.ix_(inside, outside)].argmax()), (len(inside), len(outside)))
+        pairs.append((inside[row], outside[column]))
+        inside.append(outside.pop(int(column)))
+    return [np.flatnonzero(np.isin(owners, bodies[list(pair)])) for pair in pairs]
+
+
+_BATCH_CHAINS, _BATCHES = 512, 2  # chains of a batch, which one thread works on, and batches at most
 
 
 class TruncatedGaussian(torch.nn.Module):
@@ -83,7 +468,7 @@ class TruncatedGaussian(torch.nn.Module):
             count: number of them.
             generator: of random numbers, on that device; None for torch's own.
         """
-        device, batches = self.mean.device, max(1, min(_BATCHES, count // _CHAINS))
+        device, batches = self.mean.device, max(1, min(_BATCHES, count // _BATCH_CHAINS))
         seeds = torch.randint(2**62, (batches,), generator=generator, device=device).tolist()
         counts = [count * (k + 1) // batches - count * k // batches for k in range(batches)]
         tasks = list(enumerate(zip(counts, seeds, strict=True)))
@@ -95,7 +480,7 @@ class TruncatedGaussian(torch.nn.Module):
     def _batch(self, count: int, seed: int) -> Tensor:
         """Points (n, count)."""
         generator, found, out = torch.Generator(self.mean.device).manual_seed(seed), 0, []
-        for near in self._states(min(count, _CHAINS), generator):
+        for near in self._states(min(count, _BATCH_CHAINS), generator):
             out.append(self._completed(near, generator))
             found += out[-1].shape[1]
             if found >= count:
@@ -167,7 +552,6 @@ class _Split:
             E=conic.E[:, self.near],
             names=tuple(name for name, keep in zip(conic.names, kept, strict=True) if keep),
             deviations=conic.deviations[:, self.near],
-            start=None,
         )
         return problem, gaussian.marginal(self.near, self.blocks, self.rows)
 

@@ -19,11 +19,10 @@ from torchid.fitting.robust import RobustLoss, fit_extras_robustly
 from torchid.identifiability.confounding import ExtraEstimate, disagreements, estimate_extras
 from torchid.parameters import Array
 from torchid.problem import Evaluation, RowBuilder, Samples, assemble, compress_parts
-from torchid.problem.compressed_log import Block, CompressedBlock
+from torchid.problem.compression import Block, CompressedBlock, Part
 from torchid.problem.elimination import Assembly
 from torchid.problem.extras import ACTUATORS, Extra
-from torchid.problem.parts import Part
-from torchid.problem.predict import calibrate_readings
+from torchid.problem.metrics import calibrate_readings
 from torchid.problem.samples import require_forces
 from torchid.reprs import short_repr
 from torchid.robot import Robot

@@ -13,14 +13,19 @@ from torchid.errors import UnknownNameError
 from torchid.estimators import Estimate, LeastSquares
 from torchid.estimators.least_squares import Minimizer
 from torchid.fitting.prior_knowledge import TOTAL, KnownMass, with_known_masses
-from torchid.identifiability.confounding import ExtraEstimate, estimate_extras, mass_weights
-from torchid.identifiability.jackknife import Jackknife, jackknife_blocks
+from torchid.identifiability.confounding import (
+    ExtraEstimate,
+    Jackknife,
+    estimate_extras,
+    jackknife_blocks,
+    mass_weights,
+)
 from torchid.parallel import one_thread
 from torchid.parameters import PER_BODY
 from torchid.problem import LinearProblem, RowBuilder, assemble
+from torchid.problem.compression import Part, merge_blocks_of_folds
 from torchid.problem.elimination import Assembly
 from torchid.problem.noise_gram import scale_columns
-from torchid.problem.parts import Part, merge_blocks_of_folds
 from torchid.reprs import short_repr
 from torchid.robot import Robot
 from torchid.rounding import RANK_TOLERANCE

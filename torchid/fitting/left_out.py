@@ -344,7 +344,8 @@ def choose_terms(reading: Reading, candidates: Sequence[str], fixed: Collection[
     """The terms without which left-out blocks are predicted worse; the least useful one is dropped after another.
 
     Elimination from all terms, not addition to none: one that is missing hides another (a delay hides rotor inertia).
-    Dropped is also what errors of the sensors' gains explain: a spring, for joints that move little.
+    What a term is worth is judged where errors of the sensors' gains are fitted as well: these look like a spring at
+    joints that move little, and hide rotor inertia. Whether that is chance is judged with these errors and without.
 
     Args:
         reading: with the columns of all terms.
@@ -359,16 +360,15 @@ def choose_terms(reading: Reading, candidates: Sequence[str], fixed: Collection[
             squares[key] = reading.left_out({*terms, *fixed}, None, _OF_TERMS)
         return squares[key]
 
-    def is_needed(name: str, beside: Collection[str] = ()) -> Evidence:
-        return Evidence.of(left({*chosen, *beside} - {name}), left({*chosen, *beside}))
+    def is_needed(name: str) -> Evidence:
+        alone, with_gains = (Evidence.of(left({*x} - {name}), left(x)) for x in (chosen, [*chosen, "scale"]))
+        return replace(with_gains, significance=max(alone.significance, with_gains.significance))
 
     chosen = [name for name in TERMS if name in candidates]
     adopted: dict[str, Evidence] = {}
     while chosen:
         adopted = {name: is_needed(name) for name in chosen}
         needless = [name for name in chosen if not adopted[name].adopted]
-        if reading.gain and not needless:
-            needless = [name for name in chosen if is_needed(name, {"scale"}).gain < _GAIN]
         if not needless:
             break
         chosen.remove(min(reversed(needless), key=lambda name: round(adopted[name].gain, 3)))

@@ -1,4 +1,7 @@
-"""The noise that rows are weighted with: as stated, and estimated from the residuals of a fit where it is not."""
+"""The noise that rows are weighted with, stated or estimated, and whether a fit leaves more than it.
+
+Friction that was not fitted is what it lacks most often: `unfitted_friction` tells it from other residuals.
+"""
 
 from __future__ import annotations
 
@@ -8,17 +11,32 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.special import chdtri
 from torch import Tensor
 
-from torchid.estimators import LeastSquares
+from torchid import parameters
+from torchid.estimators import Estimate, LeastSquares
+from torchid.estimators.least_squares import residual_std
 from torchid.fitting.fit import LogFitter
-from torchid.parameters import Array
-from torchid.problem import RowBuilder, Samples
+from torchid.identifiability.confounding import Jackknife
+from torchid.logs.dry_friction import OFTEN, resting_share
+from torchid.parallel import one_thread
+from torchid.parameters import COULOMB, FRICTION, INERTIAL, PER_BODY, Array
+from torchid.problem import LinearProblem, RowBuilder, Samples
+from torchid.problem.compression import Block
 from torchid.problem.extras import noise_key
-from torchid.problem.noise import GroupVariances, VarianceComponentEstimator, fitted_directions
-from torchid.problem.sampled_rows import LogOfOtherProcess, SampledRows, noise_of_sensors
+from torchid.problem.metrics import Metrics
+from torchid.problem.noise import (
+    GroupVariances,
+    LogOfOtherProcess,
+    SampledRows,
+    VarianceComponentEstimator,
+    fitted_directions,
+    noise_of_sensors,
+)
 from torchid.reprs import short_repr
 from torchid.robot import Robot
+from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, is_significant
 from torchid.sensing import Contact, SensorNoise, SensorSet
 
 _SETTLED = 0.05  # change of the deviation along any group's directions: weights 10 % off cost 0.2 % of efficiency
@@ -216,3 +234,342 @@ def _suggested(rows: SampledRows, tied: Sequence[str], free: GroupVariances) -> 
     keys = dict.fromkeys(map(noise_key, tied))
     whole = [key for key in keys if all(name in known for name in tied if noise_key(name) == key)]
     return groups.settings({key: getattr(shown, key) for key in whole})
+
+
+_MUCH = 1.5  # times the residual that noise leaves; stated noise is seldom known better
+_ALIKE = 2.0  # times the blocks' part of the residuals if these were noise, which alone gives 0.8 to 1.3
+_EXACT = 1e-6  # of what the nominal parameters leave: signals without noise, of which rounding is left
+_NAMED = 3
+
+_UNEXPLAINED = 5.0  # residual in units of the stated noise; recorded logs with honest noise figures stay below 2
+_SHARE = 0.5  # and of the weighted forces, where the noise was estimated to be as large; recorded logs stay below 0.35
+_JOINT_SHARE = 0.4  # of the torque of one joint: a gear of half the ratio leaves 0.5
+_SMALL_SHARE = 0.05  # of the torques of all joints: what flexibility, filters and friction's shape leave of any
+AT_THE_FLOOR = 1.3
+"""Errors up to which noise of the readings may be all that is left, over what it leaves."""
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """What a fit leaves of the forces, and what noise alone would leave.
+
+    Attributes:
+        residual: standard deviation of the whitened residuals.
+        expected: the same if the stated noise and the filter were all there is; None where no noise is stated, as
+            residuals say what noise there is.
+        lack_of_fit: as `Jackknife` has it, None where blocks are too few.
+        error_growth: median over the identified parameters of the standard error by the scatter between blocks over
+            that by noise, None likewise.
+        groups: of readings and base rows that exceed their noise most.
+        friction: that was not fitted, None where all of it was.
+        share: residual over that of the nominal parameters, None where these leave nothing.
+    """
+
+    residual: float
+    expected: float | None
+    lack_of_fit: float | None
+    error_growth: float | None
+    groups: tuple[GroupNoise, ...]
+    friction: UnfittedFriction | None = None
+    share: float | None = None
+
+    @property
+    def alike(self) -> bool:
+        """Whether residuals are correlated in time more than noise is, and are more than rounding."""
+        is_rounding = self.share is not None and self.share < _EXACT
+        return self.lack_of_fit is not None and self.lack_of_fit > _ALIKE and not is_rounding
+
+    @property
+    def judged(self) -> bool:
+        """Whether residuals could have shown that the model is wrong: by stated noise, or from block to block."""
+        return self.expected is not None or self.lack_of_fit is not None
+
+    @property
+    def explained(self) -> bool:
+        """Whether noise may be all that the model leaves."""
+        much = self.expected is not None and self.residual > _MUCH * self.expected
+        return not (much or self.alike or (self.friction is not None and self.friction.significant))
+
+    def _reasons(self) -> list[str]:
+        """Why noise cannot be all that the model leaves, none where it may be."""
+        reasons = []
+        if self.expected is not None and self.residual > _MUCH * self.expected:
+            reasons.append(f"residuals are {self.residual / self.expected:.2g} times what the stated noise leaves")
+        if self.alike:
+            reasons.append(
+                f"residuals are correlated in time, between blocks {self.lack_of_fit:.2g} times noise's variance"
+            )
+        return reasons + [str(self.friction)] * (self.friction is not None and self.friction.significant)
+
+    @property
+    def in_short(self) -> str:
+        """The first reason and the readings that show it most, "" where the model explains the forces."""
+        where = f", most in {self.groups[0].group}" if self.groups else ""
+        return "".join(f"{reason}{where}" for reason in self._reasons()[:1])
+
+    def __str__(self) -> str:
+        """In words, "" where the model explains the forces."""
+        reasons = self._reasons()
+        if not reasons:
+            return ""
+        share = self.expected or 1.0
+        shown = [
+            f"{one.group} {one.residual:.2g} {one.unit} where {share * one.used:.2g} are expected"
+            for one in self.groups
+            if one.residual is not None
+        ]
+        where = f"; most in {', '.join(shown[:_NAMED])}" if shown else ""
+        return f"{' and '.join(reasons)}{where}"
+
+
+def misfit(
+    estimate: Estimate,
+    noise: NoiseSummary,
+    logs: Sequence[Block],
+    jackknife: Jackknife | None,
+    friction: UnfittedFriction | None,
+) -> Misfit:
+    """What a fit leaves of the forces.
+
+    Args:
+        estimate: of the training logs.
+        noise: that rows were weighted with.
+        logs: these logs.
+        jackknife: of the estimate over blocks of them.
+        friction: that was not fitted.
+    """
+    left = np.average([log.noise_left for log in logs], weights=[len(log) for log in logs])
+    stated = any(one.origin == "stated" for one in noise.groups)
+    expected = float(np.sqrt(left)) if stated else None
+    excess = {one.group: (one.residual or 0.0) / ((expected or 1.0) * one.used) for one in noise.groups}
+    beyond = [one for one in noise.groups if excess[one.group] > _MUCH and (one.origin == "stated" or not stated)]
+    growth = None
+    if estimate.block_error is not None and (known := estimate.verdict == "identified").any():
+        growth = float(np.median(estimate.block_error[known] / np.maximum(estimate.noise_error[known], 1e-300)))
+    return Misfit(
+        residual=estimate.residual_std,
+        expected=expected,
+        lack_of_fit=None if jackknife is None else jackknife.lack_of_fit,
+        error_growth=growth,
+        groups=tuple(sorted(beyond, key=lambda one: -excess[one.group])),
+        friction=friction,
+        share=float(np.sqrt(estimate.cost / estimate.nominal_cost)) if estimate.nominal_cost > 0.0 else None,
+    )
+
+
+def beyond_noise(estimate: Estimate) -> str:
+    """That a fit leaves far more than the stated noise, far more than a `Misfit` says; "" where it does not."""
+    left = _residual(estimate)
+    found = f"forces differ from any rigid-body model by {left:.3g} times the stated sensor noise"
+    return found if left > _UNEXPLAINED else ""
+
+
+def unexplained_forces(
+    estimate: Estimate, problem: LinearProblem, forces: float = 0.0, noise_stated: bool = True
+) -> str:
+    """That a fit leaves most of the weighted forces, and no stated noise makes them; "" where it does not.
+
+    Args:
+        estimate: of a fit, which may be far from the best.
+        problem: that was solved.
+        forces: squared norm of the weighted forces, if offsets and scales that were eliminated have taken some of it.
+        noise_stated: whether a user has stated noise. One that is estimated is that of most readings: a lift that
+            carries 200 N beside wrists of 0.05 N m leaves many times as much.
+    """
+    forces = max(problem.cost(np.zeros_like(estimate.phi)), forces, np.finfo(float).tiny)
+    share = np.sqrt(estimate.cost / forces)
+    if share <= _SHARE or (noise_stated and _residual(estimate) <= _MUCH):
+        return ""
+    return f"the fit leaves {100.0 * share:.3g} % of the weighted forces"
+
+
+def _residual(estimate: Estimate) -> float:
+    return float(np.sqrt(estimate.cost / max(estimate.rows, 1)))
+
+
+_CLEAR = 0.5  # correlation of forces of the URDF's bodies with the measured ones, from which on their factor is clear
+
+
+@one_thread()
+def force_gain(problem: LinearProblem) -> float | None:
+    """The factor of the forces that nominal bodies need which fits best, None if it is not clear.
+
+    Friction is whatever fits. Unlike a total mass it is there for arms as well, and does not depend on the estimator.
+    """
+    inertial = np.zeros((len(problem.nominal) // PER_BODY, PER_BODY), dtype=bool)
+    inertial[:, parameters.INERTIAL] = True
+    chosen = inertial.flatten()
+    needed = problem.A[:, chosen] @ problem.nominal[chosen]
+    free, fixed = ~chosen & problem.free, ~chosen & ~problem.free
+    measured = problem.b - problem.A[:, fixed] @ problem.nominal[fixed]
+    U, values, _ = np.linalg.svd(problem.A[:, free] * problem.scale[free], full_matrices=False)
+    friction = U[:, is_significant(values)]
+    needed, measured = (x - friction @ (friction.T @ x) for x in (needed, measured))
+    size = np.linalg.norm(needed) * np.sqrt(measured @ measured + problem.residual)
+    if not size > 0.0 or abs(needed @ measured) < _CLEAR * size:
+        return None
+    return float(needed @ measured / (needed @ needed))
+
+
+def unexplained_torques(fitted: Metrics, sensors: SensorSet | None = None) -> str:
+    """That a fit leaves most of the joint torques, however well it explains other forces; "" where it does not.
+
+    Of all torques, or of what no contact has a part in. Noise of the readings, where it is known, explains what it may.
+    Where the `sensors` of the fit are given, of what they read alone: nothing where they read no torque, as friction is
+    not fitted then, and without any wrench what no contact has a part in.
+    """
+    groups = ["joint_torque", "nullspace"]
+    unread = sensors is not None and sensors.wrench.size > 0 and not sensors.wrench.any()
+    if fitted.limbs_in_air or unread:
+        groups.remove("joint_torque")
+    if sensors is not None and not sensors.torque.any():
+        groups.clear()
+    noise = AT_THE_FLOOR * (fitted.noise.get("joint_torque") or 0.0)  # as large where projected on orthonormal axes
+    beyond = (one for one in groups if (fitted.rms_of(one) or 0.0) > noise)
+    share = max((fitted.relative_of(one) or 0.0 for one in beyond), default=0.0)
+    return f"the fit leaves {100.0 * share:.3g} % of the joint torques" if share > _SHARE else ""
+
+
+def unexplained_joints(fitted: Metrics) -> list[str]:
+    """Joints of whose torque a fit leaves a large part that is no small force, nor the noise of readings where known.
+
+    Noise that is estimated from residuals takes a joint that the model does not explain for a noisy one.
+    """
+    torques = {
+        name: (error, error / share)
+        for name, error in fitted.by_joint_rms.items()
+        if error is not None and (share := fitted.by_joint_relative.get(name))
+    }
+    size = np.sqrt(np.mean([measured**2 for _, measured in torques.values()])) if torques else 0.0
+    least = max(_SMALL_SHARE * size, AT_THE_FLOOR * (fitted.noise.get("joint_torque") or 0.0))
+    return [name for name, (error, measured) in torques.items() if error > max(_JOINT_SHARE * measured, least)]
+
+
+_LEVEL = 1e-3  # share of fits without such friction that show some
+_FRICTION_RATIO = 2.0  # times the squares that it would explain of noise, at least: noise is not known better
+_UNITS = {"prismatic": ("N", "N s/m")}
+_ROTARY = ("N m", "N m s/rad")
+_NAMED_JOINTS = 2
+
+
+@dataclass(frozen=True)
+class UnfittedFriction:
+    """What friction that was not fitted would explain of the residuals.
+
+    Attributes:
+        joints: that it was not fitted of, those whose forces show it most clearly first.
+        values: friction beyond the nominal one, (len(joints), 2), Coulomb and viscous.
+        units: of both, by joint.
+        ratio: squares that it explains over those that it would explain of noise; about 1 without friction.
+        combinations: of its parameters that the rows tell from all that was fitted.
+    """
+
+    joints: tuple[str, ...]
+    values: Array
+    units: tuple[tuple[str, str], ...]
+    ratio: float
+    combinations: int
+
+    @property
+    def significant(self) -> bool:
+        """Whether noise would explain as much in fewer than one of a thousand fits.
+
+        Source: the F test of linear hypotheses, of many degrees of freedom of noise.
+        """
+        if not self.combinations:
+            return False
+        return self.ratio > max(_FRICTION_RATIO, float(chdtri(self.combinations, _LEVEL)) / self.combinations)
+
+    def __str__(self) -> str:
+        """How much it explains, and of which joints most."""
+        shown = [
+            f"{joint} {coulomb:.2g} {units[0]} and {viscous:.2g} {units[1]}"
+            for joint, (coulomb, viscous), units in zip(self.joints, self.values, self.units, strict=True)
+        ]
+        named = ", ".join(shown[:_NAMED_JOINTS])
+        return f"friction, which is not fitted, explains {self.ratio:.2g} times as much as it would of noise ({named})"
+
+
+@one_thread()
+def unfitted_friction(problem: LinearProblem, robot: Robot) -> UnfittedFriction | None:
+    """The friction that a fit of a problem has left nominal and its rows show; None where no row shows any.
+
+    Friction of joints whose bodies are frozen is not meant to be found.
+
+    Args:
+        problem: of a fit.
+        robot: with the joints.
+    """
+    joints = {body: part.joint for body, part in enumerate(robot.bodies) if part.joint is not None}
+    free, A = problem.free.reshape(-1, PER_BODY), problem.A.reshape(len(problem.A), -1, PER_BODY)[:, :, FRICTION]
+    bodies = [body for body in joints if free[body, INERTIAL].any() and not free[body, FRICTION].any()]
+    bodies = [body for body in bodies if A[:, body].any(axis=0).all()]
+    if not bodies:
+        return None
+    columns = A[:, bodies].reshape(len(A), -1)
+    size = np.linalg.norm(columns, axis=0)
+    U, values, _ = np.linalg.svd(problem.A[:, problem.free] * problem.scale[problem.free], full_matrices=False)
+    U = U[:, is_significant(values, RANK_TOLERANCE)]
+    rows = np.column_stack([columns / size, problem.b - problem.A @ problem.nominal])
+    rows -= U @ (U.T @ rows)
+    V, values, Wh = np.linalg.svd(rows[:, :-1], full_matrices=False)
+    kept = values > UNOBSERVABLE_SHARE
+    explained, rank = V[:, kept].T @ rows[:, -1], int(kept.sum())
+    left = rows[:, -1] - V[:, kept] @ explained
+    cost = float(left @ left) + problem.residual
+    noise = problem.oversampling * residual_std(cost, problem.rows, U.shape[1] + rank, problem.oversampling) ** 2
+    inverse = Wh[kept].T / values[kept]
+    found, deviation = inverse @ explained, np.maximum(np.linalg.norm(inverse, axis=1), np.finfo(float).tiny)
+    order = np.argsort(-np.square(found / deviation).reshape(-1, 2).sum(axis=1))
+    shown = [joints[bodies[index]] for index in order]
+    return UnfittedFriction(
+        joints=tuple(joint.name for joint in shown),
+        values=(found / size).reshape(-1, 2)[order],
+        units=tuple(_UNITS.get(joint.kind, _ROTARY) for joint in shown),
+        ratio=float(explained @ explained) / max(rank * noise, np.finfo(float).tiny),
+        combinations=rank,
+    )
+
+
+_MOST_SAMPLES = 50_000  # evenly spaced
+
+
+def unmeasured_at_rest(logs: Sequence[Samples]) -> float | None:
+    """Share of the joint torques of some logs that count as unmeasured, as joints rest; None where none does."""
+    flags = [log.resting for log in logs if log.resting is not None and log.resting.numel()]
+    return float(sum(one.sum() for one in flags)) / sum(one.numel() for one in flags) if flags else None
+
+
+def resting_joints(
+    problem: LinearProblem, robot: Robot, builder: RowBuilder, logs: Sequence[Samples]
+) -> dict[str, float]:
+    """Share of the time that joints are at rest, of those that rest more than motion does, the most first.
+
+    Of joints whose torque is measured and whose Coulomb friction is fitted with the sign of their velocity: one that
+    sticks has any friction up to that. Where torques of joints at rest count as unmeasured, it is the share of samples
+    in which they do.
+
+    Args:
+        problem: of the fit.
+        robot: with the joints.
+        builder: of the rows of the fit.
+        logs: that were fitted.
+    """
+    count = sum(map(len, logs))
+    taken = any(log.resting is not None for log in logs)
+    if (builder.tree.sign_width is not None and not taken) or not count or not robot.n:
+        return {}
+    step = max(1, count // _MOST_SAMPLES)
+    thin = [log.every(step) for log in logs]
+    flags = [log.resting.cpu().numpy() for log in thin if log.resting is not None]
+    if flags:
+        share = np.concatenate(flags).mean(axis=0)
+    else:
+        share = resting_share(np.concatenate([log.joint_velocity.cpu().numpy() for log in thin]))
+        directions = [log.joint_velocity if log.direction is None else log.direction for log in thin]
+        still = ~np.any([x.cpu().numpy().any(axis=0) for x in directions], axis=0)
+        share[still] = 1.0  # by the noise of their velocity
+    is_free = problem.free.reshape(-1, PER_BODY)[1:, COULOMB]
+    fitted = builder.sensors.torque[: robot.n] & (is_free @ (robot.joint_map[0] != 0.0))
+    order = [joint for joint in np.argsort(-share, kind="stable").tolist() if fitted[joint] and share[joint] > OFTEN]
+    return {robot.joint_names[joint]: float(share[joint]) for joint in order}

@@ -21,9 +21,16 @@ from torchid.parallel import one_thread
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples, compress_parts
 from torchid.problem.chunks import ProgressCallback
-from torchid.problem.compression import add_noise_gram, compress_in_blocks, cut_into_blocks, noise_gram_by_part
+from torchid.problem.compression import (
+    Part,
+    PartKey,
+    add_noise_gram,
+    compress_in_blocks,
+    cut_into_blocks,
+    merge_factors,
+    noise_gram_by_part,
+)
 from torchid.problem.noise_gram import NoiseGram, noise_gram_of_share
-from torchid.problem.parts import Part, PartKey, merge_factors
 from torchid.problem.row_compressor import RowWeighting
 from torchid.problem.samples import concatenate
 from torchid.rounding import MAD_PER_STD

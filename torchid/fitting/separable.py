@@ -1,4 +1,4 @@
-"""Settings on which rows depend nonlinearly, by separable least squares: each value with a linear fit of all the rest.
+"""Settings on which rows depend nonlinearly, by separable least squares: each value with a linear fit of the rest.
 
 Source: Golub and Pereyra, "The differentiation of pseudo-inverses and nonlinear least squares problems", 1973.
 """
@@ -11,13 +11,18 @@ from statistics import NormalDist
 from typing import Any
 
 import numpy as np
+import torch
+from scipy.interpolate import BSpline, make_interp_spline
 from scipy.optimize import minimize, minimize_scalar
+from torch import Tensor
 
-from torchid.errors import warn
+from torchid.errors import LogError, warn
 from torchid.estimators import LeastSquares
 from torchid.fitting.fit import LogFitter
 from torchid.fitting.left_out import Evidence, with_terms
 from torchid.identifiability.confounding import ExtraEstimate
+from torchid.logs.segments import recorded_at_delays, unbroken_segments
+from torchid.logs.timeline import spline_degree
 from torchid.parallel import share_between_forks, thread_count
 from torchid.parameters import Array
 from torchid.problem import ExtraTerms, Samples, compress_parts
@@ -31,13 +36,12 @@ _GAIN = 1e-3  # of the residual, by which a value has to beat none
 _WIDTHS = tuple(10.0 ** np.arange(-2.0, 0.25, 0.25))  # [rad/s or m/s]
 _STRIBECK = tuple(10.0 ** np.arange(-2.0, 1.25, 0.25))  # [rad/s or m/s]
 _STRIBECK_SAMPLES = 5000  # of all logs, evenly spaced
-_RIDGE = 1e-6  # the residual is smooth in the velocity where the data determine some parameters badly
+_RIDGE = 1e-6  # the residual is smooth in the setting where the data determine some parameters badly
 _STEP = 1e-3  # of the logarithm of the velocity, of differences
 _CHANCE = 0.025  # that friction at rest of any joint seems to be beyond Coulomb friction
 _QUANTILE = 1.96  # standard errors from the middle to the end of a 95 % interval
 _WIDTH_SETTLED, _STRIBECK_SETTLED = 1e-3, 1e-4  # of the logarithm, to base 10
 _WIDTH_DIGITS = 4
-_TILT_RIDGE = 1e-6  # the residual is smooth in the tilt where the data determine some parameters badly
 _TILT_SAMPLES = 2000  # of all logs, evenly spaced
 _TILT_SETTLED = 1e-6  # of the residual's square
 
@@ -241,7 +245,7 @@ def choose_base_tilt(logs: Sequence[Samples], fitter: LogFitter) -> TiltChoice:
     """
     step = max(1, sum(map(len, logs)) // _TILT_SAMPLES)
     logs = [log.every(step) for log in logs]
-    estimator = LeastSquares(_TILT_RIDGE, rank_tolerance=fitter.estimator.rank_tolerance)
+    estimator = LeastSquares(_RIDGE, rank_tolerance=fitter.estimator.rank_tolerance)
 
     def left(tilt: Array) -> float:
         tilted = [replace(log, base=log.base.tilted(tilt, len(log))) for log in logs]
@@ -262,3 +266,172 @@ def choose_base_tilt(logs: Sequence[Samples], fitter: LogFitter) -> TiltChoice:
         warn(f"robot.base_tilt: {LARGEST_TILT:g} rad or more; is the base's orientation that of another frame?")
     x, y = (float(f"{angle:.4g}") for angle in found.x) if gains else (0.0, 0.0)
     return TiltChoice((x, y), float(np.sqrt(found.fun * level)), float(np.sqrt(level)))
+
+
+EARLIEST_DELAY, LATEST_DELAY = -0.02, 0.06
+"""Delays that are tried [s]: beyond, the stamps are those of another clock."""
+
+_DELAY_TRIAL_SAMPLES = 1000  # of all logs, evenly spaced, to try delays
+_DELAY_SAMPLES = 5000  # of all logs, evenly spaced, to find the best
+_TRIED_DELAYS = np.linspace(EARLIEST_DELAY, LATEST_DELAY, 17)  # [s]
+_DELAY_STEPS = 8  # of Gauss and Newton, at most
+_DELAY_SETTLED = 1e-2  # standard errors, the step at which they end
+
+
+@dataclass(frozen=True)
+class DelayChoice:
+    """A delay, and what fits with it and with none leave.
+
+    Attributes:
+        delay: [s]; 0 where the best does not differ significantly from none, or is confounded with other parameters.
+        found: the best [s], which it is otherwise.
+        standard_error: of it [s], and interval of 95 % [s]; None where the data do not determine it.
+        inflation: of its standard error by not knowing all other parameters, None likewise.
+        confounded_with: names of other parameters that it is confounded with, empty if with none.
+        residual, undelayed_residual: standard deviation of whitened residuals with the best and with none [1].
+    """
+
+    delay: float
+    found: float
+    standard_error: float | None
+    interval: tuple[float, float] | None
+    inflation: float | None
+    confounded_with: tuple[str, ...]
+    residual: float
+    undelayed_residual: float
+
+    def __str__(self) -> str:
+        """The delay with its standard error, and what it is for."""
+        best, left = f"{1e3 * self.found:.3g}", f"residual {self.residual:.4g}, {self.undelayed_residual:.4g} without"
+        left += "; an end of what is tried: the best may lie beyond" * _is_at_end(self.found)
+        if self.confounded_with:
+            return f"none: any, such as {best} ms, is confounded with {', '.join(self.confounded_with)} ({left})"
+        if self.standard_error is None or self.interval is None:
+            return f"none: the data do not determine it ({left})"
+        best = f"{best} ± {1e3 * self.standard_error:.2g} ms"
+        if not self.delay:
+            return f"none: {best} does not differ significantly from none ({left})"
+        low, high = (1e3 * x for x in self.interval)
+        return f"{best} of joint torques (95 %: {low:.3g} to {high:.3g} ms), chosen by the residual: {left}"
+
+
+def choose_delay(logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms) -> DelayChoice:
+    """The delay whose fit of the logs leaves least: torques that act are those recorded so much earlier.
+
+    Everything else is linear, and fitted anew for each delay: separable least squares (Golub and Pereyra, 1973). From
+    the best of some delays, steps are those of Gauss and Newton with the delay as one more unknown (Kaufman, 1975),
+    whose standard error is that of the delay. Physical conditions of the estimator hold throughout: a negative armature
+    would explain a delay. Torques are splines between samples, so that the delay can be a part of a step.
+
+    Args:
+        logs: bound training logs, read without a delay and low-pass filtered: between samples of those that are not,
+            noise is smaller, which the fit would prefer.
+        fitter: of their rows.
+        terms: extra parameters of these.
+
+    Raises:
+        LogError: the logs are too short.
+
+    Warns:
+        TorchidWarning: the best delay is at an end of those that are tried.
+    """
+    ridge = max(fitter.estimator.ridge, _RIDGE)
+    fitter = replace(fitter, estimator=replace(fitter.estimator, ridge=ridge))  # type: ignore[type-var]
+    plain = replace(fitter, estimator=LeastSquares(ridge, rank_tolerance=fitter.estimator.rank_tolerance))
+    few, many = (_torques(logs, fitter, most) for most in (_DELAY_TRIAL_SAMPLES, _DELAY_SAMPLES))
+
+    def residual(fitter: LogFitter, logs: Sequence[_Torques], delay: float) -> float:
+        problem = fitter.build_problem(compress_parts([log.by(delay) for log in logs], fitter.builder))
+        return fitter.estimator.solve(problem.assembly.problem).residual_std
+
+    tried = share_between_forks(_TRIED_DELAYS.tolist(), lambda delay: residual(plain, few, delay), thread_count())
+    best, term = _best(many, fitter, terms, float(_TRIED_DELAYS[int(np.argmin(tried))]))
+    choice = _choice(best, term, residual(fitter, many, best), residual(fitter, many, 0.0))
+    if not choice.confounded_with and _is_at_end(choice.found):
+        warn(f"actuators.delay: {choice.found:g} s or beyond; are torques and positions stamped by the same clock?")
+    return choice
+
+
+def _best(logs: Sequence[_Torques], fitter: LogFitter, terms: ExtraTerms, delay: float) -> tuple[float, ExtraEstimate]:
+    """The delay that leaves least, by steps from one [s], and the term of a further one in the last fit."""
+    fitter = with_terms(fitter, replace(terms, slope=True))
+    for _ in range(_DELAY_STEPS):
+        fit = fitter.fit(compress_in_blocks([log.by(delay) for log in logs], fitter.builder))
+        term = next(x for x in fit.extras if x.extra.what == SLOPE)
+        before, delay = delay, float(np.clip(delay + term.value, EARLIEST_DELAY, LATEST_DELAY))
+        if not np.isfinite(term.standard_error) or abs(delay - before) <= _DELAY_SETTLED * term.standard_error:
+            break
+    return delay, term
+
+
+def _is_at_end(delay: float) -> bool:
+    """Whether no delay beyond was tried, so that its standard error says nothing."""
+    return delay in (EARLIEST_DELAY, LATEST_DELAY)
+
+
+def _choice(best: float, term: ExtraEstimate, left: float, undelayed: float) -> DelayChoice:
+    """The choice of the best delay, with the term of the last fit."""
+    reach = _QUANTILE * term.standard_error
+    confounded = () if term.separable else term.confounded_with or ("other parameters",)
+    known = bool(np.isfinite(reach))
+    return DelayChoice(
+        delay=0.0 if confounded or not abs(best) > reach else float(f"{best:.4g}"),
+        found=best,
+        standard_error=term.standard_error if known else None,
+        interval=(best - reach, best + reach) if known else None,
+        inflation=term.inflation if np.isfinite(term.inflation) else None,
+        confounded_with=confounded,
+        residual=left,
+        undelayed_residual=undelayed,
+    )
+
+
+@dataclass(frozen=True)
+class _Torques:
+    """Some samples of a log, whose measured joint torques can be taken from any time around.
+
+    `dofs`: of these torques; `splines`: through them, each for some of the samples.
+    """
+
+    samples: Samples
+    dofs: Tensor
+    splines: list[tuple[Tensor, BSpline]]
+
+    def by(self, delay: float) -> Samples:
+        """The samples with torques of a delay [s], whose slope is what a further delay takes off."""
+        samples = self.samples
+        torque = samples.time.new_zeros(len(samples), 0) if samples.torque is None else samples.torque.clone()
+        slope = torch.zeros_like(torque)
+        for own, spline in self.splines:
+            time = samples.time[own].numpy() - delay
+            torque[own[:, None], self.dofs] = torch.from_numpy(spline(time))
+            slope[own[:, None], self.dofs] = torch.from_numpy(spline(time, 1))
+        return replace(samples, torque=torque, slope=slope)
+
+
+def _torques(logs: Sequence[Samples], fitter: LogFitter, most: int) -> list[_Torques]:
+    """About so many samples of all logs, evenly spaced, with their torques.
+
+    Raises:
+        LogError: the logs are too short for the delays that are tried.
+    """
+    step, out = max(1, sum(map(len, logs)) // most), list[_Torques]()
+    dofs = torch.from_numpy(np.flatnonzero(fitter.builder.sensors.torque[: fitter.robot.n]))
+    for log in logs:
+        time = log.time.numpy()
+        chosen = np.flatnonzero(recorded_at_delays(time, (EARLIEST_DELAY, LATEST_DELAY)))[::step]
+        if log.torque is None or not len(chosen):
+            continue
+        oversampling = max(1.0, log.oversampling / step)
+        some = replace(log[torch.from_numpy(chosen)], oversampling=oversampling, folder=None, motion_noise=None)
+        recorded, splines = log.torque[:, dofs].numpy(), list[tuple[Tensor, BSpline]]()
+        for segment in unbroken_segments(time):
+            own = np.flatnonzero((chosen >= segment.start) & (chosen < segment.stop))
+            if len(own):
+                degree = spline_degree(segment.stop - segment.start)
+                splines.append((torch.from_numpy(own), make_interp_spline(time[segment], recorded[segment], k=degree)))
+        out.append(_Torques(some, dofs, splines))
+    if not out:
+        found = f"auto, but none is longer than the {LATEST_DELAY - EARLIEST_DELAY:g} s of delays that are tried"
+        raise LogError(logs[0].source if logs else "logs", "actuators.delay", found, "a number [s]")
+    return out

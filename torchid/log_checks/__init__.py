@@ -1,17 +1,15 @@
 """Checks of a log before it is fitted: what is wrong with it, where, and what to do.
 
 - `check` calls all in their order; `findings` are what they return
-- of signals alone: `stamps`, `frozen`, `spikes`, `motion`; of contacts and feet that stand: `contacts`, `weight`,
-  `standing_feet`, `gyroscope`
-- of torques against a robot's dynamics: `forces`, which calls `mistakes`, `orders`, `exchanged`, `torque_fit`, `gains`,
-  `encoders`, `zeros`, `drift`, `lags`, `lag_and_tilt`, `scales`, `required_sensors`; what these compare with: `model`,
-  `deviation`
+- of signals alone: `readings`, `spikes`, `motion`; of contacts and feet that stand: `contacts`, `standing_feet`
+- of torques against a robot's dynamics: `forces`, which calls `mistakes`, `encoders`, `lags`, `scales`; what these
+  compare with: `model`
 
 Every check module has the same order: thresholds, public check functions, helpers in order of call. Thresholds are
 named MIN_ or MAX_, quantity, unit: `_SHARE` and `_RATIO` are dimensionless, `_STEPS` are median steps of the log.
 """
 
-from torchid.log_checks.check import Checked, check, drop_rejected
+from torchid.log_checks.check import Checked, drop_rejected
 from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, Finding, Skipped, Span
 
-__all__ = ["REJECTED", "Checked", "Finding", "NOTE", "SUSPICIOUS", "Skipped", "Span", "check", "drop_rejected"]
+__all__ = ["REJECTED", "Checked", "Finding", "NOTE", "SUSPICIOUS", "Skipped", "Span", "drop_rejected"]

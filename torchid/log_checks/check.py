@@ -14,10 +14,12 @@ import torch
 
 from torchid.errors import InputError, LogError, warn
 from torchid.log_checks.contacts import (
+    check_accelerometer,
     check_contact_flags,
     check_limb_sensors,
     check_scalar_wrenches,
     check_slip,
+    check_weight,
     subtract_contact_offsets,
 )
 from torchid.log_checks.encoders import check_single_joints, check_still_velocities
@@ -33,8 +35,6 @@ from torchid.log_checks.findings import (
     refused,
 )
 from torchid.log_checks.forces import check_forces_against_urdf
-from torchid.log_checks.frozen import check_excitation, check_repeats, check_rest, check_still_base
-from torchid.log_checks.gyroscope import check_gyroscope
 from torchid.log_checks.model import Declared
 from torchid.log_checks.motion import (
     check_angle_unit,
@@ -43,10 +43,17 @@ from torchid.log_checks.motion import (
     check_loops,
     completed,
 )
+from torchid.log_checks.readings import (
+    check_excitation,
+    check_magnitudes,
+    check_missing_values,
+    check_repeats,
+    check_rest,
+    check_still_base,
+    check_time_stamps,
+)
 from torchid.log_checks.spikes import check_jumps
-from torchid.log_checks.stamps import check_magnitudes, check_missing_values, check_time_stamps
-from torchid.log_checks.standing_feet import check_standing_feet
-from torchid.log_checks.weight import check_accelerometer, check_weight
+from torchid.log_checks.standing_feet import check_gyroscope, check_standing_feet
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.low_pass import REACH_PERIODS

@@ -1,45 +1,315 @@
-"""Measured forces against those of the URDF: signs, units and scales, and the common mistake that explains a misfit."""
+"""Measured forces against the URDF's: signs, units, scales, drift, exchanged joints, and what explains a misfit."""
 
 from __future__ import annotations
 
+import itertools
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.special import stdtr
 
 from torchid.errors import InputError
-from torchid.log_checks.deviation import MAX_LEFT, MIN_UNEXPLAINED_RATIO, DeviationRows, FilteredLog
-from torchid.log_checks.drift import check_torque_drift
 from torchid.log_checks.encoders import check_encoders, is_bolted_arm, single_zero_findings
-from torchid.log_checks.exchanged import check_exchanged_torques
 from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, UNEXPLAINED, Finding, Skipped, refused
-from torchid.log_checks.gains import common_factor_notes, common_gain_findings, gain_and_point_findings
-from torchid.log_checks.lag_and_tilt import check_lag_and_tilt, check_torque_offsets
-from torchid.log_checks.lags import without_lag
+from torchid.log_checks.lags import check_lag_and_tilt, check_torque_offsets, without_lag
 from torchid.log_checks.mistakes import Mistake, accelerometer_axes, joint_mistakes, possible_mistakes
 from torchid.log_checks.model import (
     MAX_TRIAL_DIFFERENTIATED_SAMPLES,
     TRIAL_SAMPLES,
+    UNMODELLED_FORCE_SHARE,
     Declared,
     ModelFit,
     NominalModel,
+    TorqueFit,
     bind_some_samples,
     default_cutoff_hz,
     preprocess_pieces,
+    torque_findings,
     without_friction,
 )
-from torchid.log_checks.required_sensors import check_required
-from torchid.log_checks.scales import MIN_BLOCK_SHARE, TimeScale, fit_time_scale, fit_torque_gains, motion_cutoff_hz
-from torchid.log_checks.torque_fit import TorqueFit, torque_findings
+from torchid.log_checks.scales import (
+    COMPARED_SAMPLES,
+    CORRELATED_SAMPLES,
+    MAX_LEFT,
+    MIN_BLOCK_SHARE,
+    MIN_UNEXPLAINED_RATIO,
+    TIME_BLOCKS,
+    DeviationRows,
+    FilteredLog,
+    NormalEquations,
+    TimeScale,
+    accumulate_blocks,
+    common_factor_notes,
+    common_gain_findings,
+    fit_time_scale,
+    fit_torque_gains,
+    gain_and_point_findings,
+    motion_cutoff_hz,
+)
 from torchid.logs import Log
-from torchid.logs.log import WRENCHES
+from torchid.logs.log import WRENCHES, FloatArray
 from torchid.logs.segments import with_delayed_torques
+from torchid.logs.signal_noise import rough_noise
+from torchid.parallel import one_thread
 from torchid.parameters import COULOMB, VISCOUS
-from torchid.problem import Samples
+from torchid.problem import RowBuilder, Samples
+from torchid.problem.chunks import subsample_states
+from torchid.problem.contact_state import state_name
+from torchid.problem.samples import require_forces
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
+from torchid.sensing.projection import base_rank, base_singular_values
 from torchid.settings import AUTO
+
+#: Samples of each contact state whose rank is counted, and states that a finding names.
+_SAMPLES, _NAMED = 60, 3
+
+
+def check_required(
+    samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact], required: SensorSet, goes_on: bool
+) -> Iterator[Finding]:
+    """Findings about a log that a fit would refuse.
+
+    Args:
+        samples: some of the log.
+        robot: the robot.
+        contacts: of it.
+        required: sensors of the fit.
+        goes_on: whether it goes on where the base is lost.
+    """
+    try:
+        for part in samples:
+            require_forces(part, robot, contacts, required)
+    except InputError as error:
+        yield refused(error)
+    if not robot.fixed_base and not goes_on:
+        yield from _lost_base(samples, RowBuilder(robot, contacts, required))
+
+
+@one_thread()
+@torch.no_grad()
+def _lost_base(samples: Sequence[Samples], builder: RowBuilder) -> Iterator[Finding]:
+    """A finding about contact states in which rank(S_b V_x) is below 6 in most samples."""
+    ranks, counts = defaultdict[str, list[torch.Tensor]](list), Counter[str]()
+    for part, state, weight in subsample_states(samples, _SAMPLES):
+        name = state_name(builder.contacts, state)
+        counts[name] += round(weight * len(part))
+        for _, V in builder.null_space_bases(state, builder.kinematics(part)):
+            ranks[name].append(base_rank(base_singular_values(V)))
+    usual = {name: int(torch.cat(ranks[name]).median()) for name, _ in counts.most_common()}
+    if lost := {name: rank for name, rank in usual.items() if rank < 6}:
+        named = "; ".join(f"{name}: rank {rank} of 6" for name, rank in list(lost.items())[:_NAMED])
+        more = f"; and {len(lost) - _NAMED} contact states more" if len(lost) > _NAMED else ""
+        text = f"the base is lost, rank(S_b V_x) < 6, in contact with {named}{more}"
+        advice = "measure more (torchid analyze finds what suffices), leave such samples out, or set"
+        advice += " sensors.on_base_lost: warn"
+        yield Finding("does not fit", REJECTED, "sensors", text, advice)
+
+
+#: Blocks of time, of how many samples together: as many times those of other checks, as few are left in each block.
+_BLOCKS, _MORE_SAMPLES = 8, 4
+#: Share of logs without a drift in which one is found.
+_LEVEL = 0.01
+#: Drift over the log, over the rms of all torques, that is reported: as of offsets.
+_MIN_SHARE = 0.1
+_TINY = 1e-9
+
+
+def check_torque_drift(filtered: FilteredLog) -> Iterator[Finding]:
+    """Findings about joints whose torque drifts over the log, for logs that nothing else is wrong with.
+
+    Each joint has an unknown constant torque in each block of time, beside all URDFs near the given one. A drift is
+    told by Student's test of their slope, whose noise is how they scatter about the line: whatever the URDF, friction
+    and noise do in blocks that are alike is in it. The level is divided by the number of joints (Bonferroni).
+
+    Args:
+        filtered: the log.
+    """
+    log, robot = filtered.log, filtered.model.robot
+    if log.joint_torque is None or not np.isfinite(log.joint_torque).any():
+        return
+    with suppress(InputError):  # reported by `check_forces_against_urdf`
+        least = _MIN_SHARE * float(np.sqrt(np.nanmean(np.square(log.joint_torque))))
+        slope, deviation = _slopes(filtered)
+        known = deviation > 0.0
+        chance = 2.0 * stdtr(_BLOCKS - 2, -np.abs(slope[known]) / deviation[known])
+        for joint in np.flatnonzero(known)[chance * robot.n < _LEVEL].tolist():
+            if abs(slope[joint]) > least:
+                name, unit = robot.joint_names[joint], "N" if robot.joint_names[joint] in robot.sliding else "N m"
+                text = f"{name}: torques drift by {slope[joint]:+.2g} +- {deviation[joint]:.1g} {unit} over the log"
+                advice = "let motors warm up, or cut the log into parts with sensors.offsets: {joint_torque: log}"
+                yield Finding("drift", SUSPICIOUS, "joint_torque", text, advice, (name,))
+
+
+def _slopes(filtered: FilteredLog) -> tuple[FloatArray, FloatArray]:
+    """By how much constant torques change over the log, with standard deviations, (n,) each; 0 where unknown."""
+    robot, contacts = filtered.model.robot, filtered.model.contacts
+    samples = bind_some_samples(filtered.pieces, robot, contacts, _MORE_SAMPLES * COMPARED_SAMPLES)
+    rows, n = DeviationRows.of(samples, filtered.model), robot.n
+    if rows is None:
+        return np.zeros(n), np.zeros(n)
+    W, _, K, target = (np.concatenate([part[k] for part in rows.parts]) for k in range(4))
+    time = np.concatenate([part.time.numpy() for part in samples])
+    base, blocks = rows.builder.tree.base_rows, np.array_split(np.argsort(time, kind="stable"), _BLOCKS)
+    steady = W[:, base : base + n].transpose(0, 2, 1)  # (N, r, n)
+    K = K[..., : K.shape[2] - n]  # without constants of the whole log
+    count, H, g = K.shape[2], [], []
+    for number, block in enumerate(blocks):
+        own = np.zeros((len(block), K.shape[1], count + _BLOCKS * n))
+        own[..., :count] = K[block]
+        own[..., count + number * n :][..., :n] = steady[block]
+        A = own.reshape(-1, own.shape[2])
+        H.append(A.T @ A)
+        g.append(A.T @ target[block].reshape(-1))
+    prior = np.full(count + _BLOCKS * n, _TINY * np.trace(sum(H)) / len(H[0]))
+    prior[:count] = _MORE_SAMPLES * CORRELATED_SAMPLES
+    constant = np.linalg.solve(sum(H) + np.diag(prior), -sum(g))[count:].reshape(_BLOCKS, n)
+    middle = np.array([time[block].mean() for block in blocks])
+    at = (middle - middle.mean()) / max(float(np.ptp(time)), _TINY)
+    slope = at @ constant / (at @ at)
+    left = constant - constant.mean(axis=0) - np.outer(at, slope)
+    seen = np.array([np.square(steady[block]).sum(axis=(0, 1)) for block in blocks]).min(axis=0) > 0.0
+    deviation = np.sqrt(np.square(left).sum(axis=0) / ((_BLOCKS - 2) * (at @ at)))
+    return seen * slope, seen * deviation
+
+
+#: Share of the exchange that corrected torques still ask for: a scale or an offset of one of the two asks for others.
+_MAX_SHARE_LEFT = 0.25
+#: Readings of a torque whose noise is looked at.
+_MIN_READINGS = 20
+#: Third singular value of two joints' motions over the first, of more than one rate.
+_MIN_THIRD = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class _Exchanges:
+    """What all pairs of joints (P, 2) explain if their torques are exchanged.
+
+    Attributes:
+        pairs: numbers of the joints.
+        share: (P,) of the exchange that fits best: 1 where it is a mistake, 0 where it is none.
+        without: unexplained forces without any exchange, rms in deviations of the torques.
+        left: (P,) the same with it.
+        equations: of what the nominal parameters leave, and of the pairs.
+    """
+
+    pairs: NDArray[np.intp]
+    share: FloatArray
+    without: float
+    left: FloatArray
+    equations: NormalEquations
+
+    def gains(self, pair: int) -> FloatArray:
+        """By how much less is unexplained with one exchange, squared, by block of time, (TIME_BLOCKS,)."""
+        one, both = self.equations, [0, 1 + pair]
+        alone = replace(one, KtY=one.KtY[..., both], YtY=one.YtY[:, both][..., both])
+        by_block = (alone.unexplained(block) for block in range(TIME_BLOCKS))
+        return np.array([2.0 * G[0, 1] - G[1, 1] for G in by_block])
+
+
+def check_exchanged_torques(filtered: FilteredLog) -> Finding | None:
+    """A finding about two joints whose torques fit the model in each other's place, and only there.
+
+    Torques are compared by the model's in the null space of contacts without a sensor, beside all parameters near the
+    URDF's and friction, and relative to each joint's own, so that wrists count as much as shoulders. The exchanged log
+    decides, by its own deviations: it must leave little, and the log as recorded more. Before, those of two joints of
+    other sizes are wrong, which candidates by a deviation of all torques alike make up for.
+
+    Args:
+        filtered: the log.
+    """
+    if filtered.log.joint_torque is None or not np.isfinite(filtered.log.joint_torque).any():
+        return None
+    with suppress(InputError):  # reported by `check_forces_against_urdf`
+        robot, noise = filtered.model.robot, _noise_of_readings(filtered)
+        alike, own = filtered.rows, _rows(filtered, filtered.samples, noise)
+        tried = list[tuple[int, ...]]()
+        for rows in (alike, own):
+            found = None if rows is None else _fit_exchanges(rows, robot)
+            best = 0 if found is None else int(np.argmin(found.left))
+            if found is None or tuple(found.pairs[best]) in tried or not (found.gains(best) > 0.0).all():
+                continue
+            pair, order = found.pairs[best], np.arange(robot.n_dofs)
+            tried.append(tuple(pair))
+            if not _is_told(filtered.samples, pair):
+                continue
+            order[pair] = pair[::-1]
+            corrected = [replace(x, torque=None if x.torque is None else x.torque[:, order]) for x in filtered.samples]
+            again = _rows(filtered, corrected, noise[order[: robot.n]])
+            after = None if again is None else _fit_exchanges(again, robot)
+            if after is not None and _is_right(after, best):
+                return _finding(filtered, pair, after.left[best] / max(after.without, _TINY))
+    return None
+
+
+def _is_told(samples: Sequence[Samples], pair: NDArray[np.intp]) -> bool:
+    """Whether two joints move at more than one rate: of a sine, either one's torques fit both."""
+    parts = [torch.cat([x.joint_position, x.joint_velocity, x.joint_acceleration], 1) for x in samples]
+    motion = torch.cat([x.unflatten(1, (3, -1))[..., pair.tolist()].flatten(1) for x in parts])
+    motion = motion - motion.mean(0)
+    size = torch.linalg.svdvals(motion / torch.linalg.vector_norm(motion, dim=0).clamp(min=_TINY))
+    return bool(size[2] > _MIN_THIRD * size[0])
+
+
+def _is_right(after: _Exchanges, pair: int) -> bool:
+    """Whether torques fit as they are, and not if those of a pair are exchanged."""
+    worse = after.left[pair] > MIN_UNEXPLAINED_RATIO * after.without and (after.gains(pair) < 0.0).all()
+    return bool(worse and after.without < MAX_LEFT and abs(after.share[pair]) < _MAX_SHARE_LEFT)
+
+
+def _finding(filtered: FilteredLog, pair: NDArray[np.intp], ratio: float) -> Finding:
+    first, second = (filtered.model.robot.joint_names[joint] for joint in sorted(pair))
+    text = f"{first} and {second} exchanged: {ratio:.2g} times as much of the torques is unexplained as once corrected"
+    advice = "give torques in the order of joint_names, as positions"
+    return Finding("unit, sign or frame", REJECTED, "joint_torque", text, advice, (first, second))
+
+
+def _noise_of_readings(filtered: FilteredLog) -> FloatArray:
+    """Standard deviation of each joint's torque readings from sample to sample (n,), in the robot's order."""
+    log, names = filtered.log, filtered.model.robot.joint_names
+    noise, torque = np.zeros(len(names)), np.asarray(log.joint_torque)
+    for name, column in zip(log.joint_names, torque.T, strict=True):
+        known = column[np.isfinite(column)]
+        if name in names and len(known) >= _MIN_READINGS:
+            noise[names.index(name)] = rough_noise(known[:, None]).item()
+    return noise
+
+
+def _rows(filtered: FilteredLog, samples: Sequence[Samples], noise: FloatArray) -> DeviationRows | None:
+    """Rows of torques relative to each joint's own and to the `noise` of its readings (n,)."""
+    torque = np.concatenate([x.torque[:, : len(noise)].numpy() for x in samples if x.torque is not None])
+    size = np.sqrt(np.square(np.nan_to_num(torque)).mean(axis=0))
+    return DeviationRows.of(samples, filtered.model, np.hypot(UNMODELLED_FORCE_SHARE * size, noise))
+
+
+def _fit_exchanges(rows: DeviationRows, robot: Robot) -> _Exchanges | None:
+    """All exchanges of the torques of two joints, None where fewer than two were measured."""
+    builder, n, base = rows.builder, robot.n, robot.base_rows
+    measured = (builder.sensors.torque & ~robot.is_passive)[:n]
+    pairs = np.array(list(itertools.combinations(np.flatnonzero(measured).tolist(), 2)))
+    if not len(pairs):
+        return None
+    parts = []
+    for part, (W, equations, K, target) in zip(rows.samples, rows.parts, strict=True):
+        read = builder.recorded_torque(part)[:, :n].numpy()
+        first, second = pairs.T
+        of_joints = W[:, base : base + n]
+        change = (of_joints[:, first] - of_joints[:, second]) * (read[:, second] - read[:, first])[..., None]
+        Y = np.concatenate([target[..., None], change.transpose(0, 2, 1)], axis=2)
+        parts.append((K[..., : K.shape[2] - n], Y, equations))  # without offsets, which a load at rest may be
+    normal = accumulate_blocks(parts)
+    G = normal.unexplained()
+    product, square = G[0, 1:], np.diag(G)[1:]
+    count = max(normal.rows, 1)
+    left = np.sqrt(np.maximum(G[0, 0] - 2.0 * product + square, 0.0) / count)
+    share = product / np.where(square > 0.0, square, np.inf)
+    return _Exchanges(pairs, share, float(np.sqrt(max(G[0, 0], 0.0) / count)), left, normal)
+
 
 #: Misfit above which common mistakes are tried. A URDF that is 20 % off leaves 0.05 to 0.1, one with links missing 0.3.
 MAX_MISFIT = 0.4
@@ -54,7 +324,6 @@ MAX_FORCE_RESIDUAL_SHARE = 0.5
 MAX_CLEAR_MISFIT = 0.2
 #: The same, above which it may be another factor than that of a unit: those of currents are anything.
 _MAX_UNIT_MISFIT = 0.1
-_TINY = 1e-9
 #: Factor of time that no error of inertias explains: its square is 2.25.
 MIN_TIME_FACTOR = 1.5
 #: Unexplained forces with the recorded time, or at rest, over those with the corrected time.

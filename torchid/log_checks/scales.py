@@ -1,16 +1,18 @@
-"""Scales of time and torques, and the reference point of wrenches, estimated for all URDFs near the given one."""
+"""Scales, and other unknowns that a URDF does not have, estimated for all URDFs near the given one."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
 from scipy.linalg import block_diag
 
 from torchid import parameters
-from torchid.log_checks.findings import median_step
+from torchid.errors import join_names
+from torchid.log_checks.findings import NOTE, SUSPICIOUS, Finding, median_step
 from torchid.log_checks.model import (
     MAX_TRIAL_DIFFERENTIATED_SAMPLES,
     UNMODELLED_FORCE_SHARE,
@@ -22,10 +24,11 @@ from torchid.log_checks.model import (
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.parallel import one_thread
+from torchid.parameters import MASS, mass_com_inertia
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.chunks import chunks_by_state
 from torchid.problem.linear import parameter_scale
-from torchid.problem.predict import force_series
+from torchid.problem.metrics import force_series
 from torchid.robot import Robot
 
 # ---------------------------------------------------------------------- equations with a prior on the URDF's parameters
@@ -157,11 +160,6 @@ class TimeScale:
     at_rest: float
 
 
-def _scale_time(log: Log, factor: float) -> Log:
-    """The log with its time multiplied by a factor."""
-    return replace(log, time=log.time[0] + factor * (log.time - log.time[0]))
-
-
 def motion_cutoff_hz(log: Log) -> float | None:
     """A cutoff [Hz] from the spectrum of the joint positions, for any unit of time; None where no joint moves."""
     position = log.joint_position[: 2 * (len(log) // 2)]
@@ -188,7 +186,8 @@ def fit_time_scale(log: Log, model: NominalModel, cutoff_hz: float) -> TimeScale
     """
 
     def samples_at(factor: float) -> list[Samples]:
-        logs = preprocess_pieces(_scale_time(log, factor), cutoff_hz / factor, MAX_TRIAL_DIFFERENTIATED_SAMPLES)
+        scaled = replace(log, time=log.time[0] + factor * (log.time - log.time[0]))
+        logs = preprocess_pieces(scaled, cutoff_hz / factor, MAX_TRIAL_DIFFERENTIATED_SAMPLES)
         return bind_some_samples(logs, model.robot, model.contacts, TIME_SCALE_SAMPLES)
 
     recorded, doubled, at_rest = samples_at(1.0), samples_at(2.0), samples_at(_REST_FACTOR)
@@ -381,3 +380,355 @@ def _fit_gains(
     x, reverse, variance, residual = solve(None)
     spread = np.sqrt(CORRELATED_SAMPLES * max(1.0, residual / max(equations.rows, 1)) * variance)
     return x, reverse, spread, np.array([solve(block)[0] for block in range(TIME_BLOCKS)])
+
+
+COMPARED_SAMPLES = 240
+"""Samples of a log whose forces are compared."""
+
+#: Unexplained forces without the deviation over those with it (1.2 at most in logs without a mistake), and what it may
+#: leave: more, and the forces are another robot's.
+MIN_UNEXPLAINED_RATIO, MAX_LEFT = 1.25, 1.5
+
+UnknownColumns = Callable[[RowBuilder, Samples, int], FloatArray]
+"""Change of the generalized forces that are required (N, n_rows, k) by a unit of each unknown, of samples by number."""
+
+
+@dataclass(frozen=True, eq=False)
+class FilteredLog:
+    """Some filtered samples of a log, with their rows, for all that may be wrong with it.
+
+    Attributes:
+        log: the log.
+        model: robot, contacts, and what is declared.
+        cutoff_hz: of the filter.
+    """
+
+    log: Log
+    model: NominalModel
+    cutoff_hz: float
+
+    @cached_property
+    def pieces(self) -> list[Log]:
+        """Runs of the log, filtered. Raises InputError: it cannot be filtered."""
+        return preprocess_pieces(self.log, self.cutoff_hz, MAX_TRIAL_DIFFERENTIATED_SAMPLES)
+
+    @cached_property
+    def samples(self) -> list[Samples]:
+        """Samples of them. Raises InputError: as `pieces`, or the log does not match the robot."""
+        return bind_some_samples(self.pieces, self.model.robot, self.model.contacts, COMPARED_SAMPLES)
+
+    @cached_property
+    def rows(self) -> DeviationRows | None:
+        """Rows of the samples, None where no force was measured. Raises InputError: as `samples`."""
+        return DeviationRows.of(self.samples, self.model)
+
+
+@dataclass(frozen=True, eq=False)
+class DeviationRows:
+    """Whitened rows of some samples, and columns of what may differ from the URDF in them.
+
+    Attributes:
+        builder: of the rows.
+        samples: that they are of.
+        parts: of each of the samples, bases W (N, n_rows, r), which of the r rows are not zero, columns (N, r, P),
+            those of offsets of torques last, and what the nominal parameters leave (N, r).
+    """
+
+    builder: RowBuilder
+    samples: Sequence[Samples]
+    parts: list[tuple[FloatArray, BoolArray, FloatArray, FloatArray]]
+
+    @classmethod
+    def of(
+        cls, samples: Sequence[Samples], model: NominalModel, torque_noise: FloatArray | None = None
+    ) -> DeviationRows | None:
+        """The rows of the forces that are measured, None without any; `torque_noise` as of `deviation_builder`."""
+        builder = deviation_builder(samples, model, torque_noise)
+        if builder is None:
+            return None
+        prior, parts = prior_columns(builder, model.robot, samples), []
+        nominal = builder.to_columns(model.robot.nominal.flatten()[None])[0].numpy()
+        for part in samples:
+            rows, W, equations = rows_with_bases(builder, part)
+            columns = deviation_columns(builder, rows, W, part, prior)
+            parts.append((W, equations, columns, rows[..., :-1] @ nominal - rows[..., -1]))
+        return cls(builder, samples, parts)
+
+    @cached_property
+    def unexplained(self) -> float:
+        """What the best URDF near the given one leaves of the forces, as `Deviation.without`."""
+        normal = accumulate_blocks([(K, target[..., None], equations) for _, equations, K, target in self.parts])
+        return float(np.sqrt(max(float(normal.unexplained()[0, 0]), 0.0) / max(normal.rows, 1)))
+
+
+@dataclass(frozen=True, eq=False)
+class Deviation:
+    """Unknowns beside the parameters, estimated with these.
+
+    Attributes:
+        value, spread: (k,), of the whole log, and their standard deviations.
+        blocks: (TIME_BLOCKS, k), by block of time.
+        without, left: forces that the best URDF near the given one leaves unexplained without the unknowns and with
+            them, rms in `UNMODELLED_FORCE_SHARE` of the forces.
+    """
+
+    value: FloatArray
+    spread: FloatArray
+    blocks: FloatArray
+    without: float
+    left: float
+
+    @property
+    def clear(self) -> BoolArray:
+        """Unknowns (k,) that are certain and that every block agrees on, where all explain the forces much better."""
+        return np.asarray(self.steady & self.certain & self.improves)
+
+    @property
+    def steady(self) -> BoolArray:
+        """Unknowns (k,) that every block of time agrees on."""
+        return np.asarray((self.blocks * np.sign(self.value) > MIN_BLOCK_SHARE * np.abs(self.value)).all(axis=0))
+
+    @property
+    def certain(self) -> BoolArray:
+        """Unknowns (k,) that are not 0 by their standard deviations."""
+        return np.asarray(np.abs(self.value) > MIN_STANDARD_DEVIATIONS * self.spread)
+
+    @property
+    def improves(self) -> bool:
+        """Whether all unknowns together explain the forces much better."""
+        return self.without > MIN_UNEXPLAINED_RATIO * self.left and self.left < MAX_LEFT
+
+    @property
+    def explained(self) -> float:
+        """By how much less all unknowns together leave, squared."""
+        return self.without**2 - self.left**2
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the largest unknown is."""
+        return bool(self.clear[np.argmax(np.abs(self.value))])
+
+    @property
+    def gain(self) -> str:
+        """How much better forces are explained with it."""
+        return f"{self.without / max(self.left, 1e-9):.2g} times as much is unexplained otherwise"
+
+
+@dataclass(frozen=True, eq=False)
+class UnknownEquations:
+    """Equations of unknowns by their columns, beside all that may differ from the URDF.
+
+    `normal`: of what the nominal parameters leave, and of the k unknowns, in this order.
+    """
+
+    normal: NormalEquations
+
+    @classmethod
+    def of(cls, rows: DeviationRows, columns: UnknownColumns, offsets: int = 0) -> UnknownEquations:
+        """Of all samples of the rows; see `fit_deviation`."""
+        parts = []
+        for number, (part, (W, equations, K, target)) in enumerate(zip(rows.samples, rows.parts, strict=True)):
+            projected = np.einsum("nvr,nvk->nrk", W, columns(rows.builder, part, number))
+            Y = np.concatenate([target[..., None], projected], axis=2)
+            parts.append((K[..., : K.shape[2] - offsets], Y, equations))
+        return cls(accumulate_blocks(parts))
+
+    @cached_property
+    def _products(self) -> dict[int | None, FloatArray]:
+        """Of what the parameters leave (1 + k, 1 + k), of the whole log and by block of time."""
+        return {block: self.normal.unexplained(block) for block in (None, *range(TIME_BLOCKS))}
+
+    @property
+    def unexplained_without(self) -> float:
+        """As `Deviation.without`."""
+        return self._rms(float(self._products[None][0, 0]))
+
+    def _rms(self, squares: float) -> float:
+        return float(np.sqrt(max(squares, 0.0) / max(self.normal.rows, 1)))
+
+    def with_unmodelled(self, ratio: float) -> UnknownEquations:
+        """The equations where forces that no parameters explain are `ratio` times what was presumed."""
+        one = self.normal
+        return UnknownEquations(replace(one, KtK=one.KtK / ratio**2, KtY=one.KtY / ratio**2, YtY=one.YtY / ratio**2))
+
+    def fit(self, prior_std: float, combined: FloatArray | None = None) -> Deviation:
+        """The unknowns, or those whose columns are `combined` (k, m) of them, with their prior standard deviation."""
+        map_ = np.eye(self.normal.YtY.shape[1]) if combined is None else block_diag(1.0, combined)
+
+        def solve(block: int | None) -> tuple[FloatArray, FloatArray, float]:
+            G = map_.T @ self._products[block] @ map_
+            H = G[1:, 1:] + CORRELATED_SAMPLES / prior_std**2 * np.eye(len(G) - 1)
+            x = np.linalg.solve(H, G[1:, 0])
+            left = G[0, 0] - 2.0 * G[0, 1:] @ x + x @ G[1:, 1:] @ x
+            return np.asarray(x), np.asarray(np.diag(np.linalg.inv(H))), float(left)
+
+        value, variance, squares = solve(None)
+        left = self._rms(squares)
+        spread = np.sqrt(CORRELATED_SAMPLES * max(1.0, left**2) * variance)
+        blocks = np.array([solve(block)[0] for block in range(TIME_BLOCKS)])
+        return Deviation(value, spread, blocks, self.unexplained_without, left)
+
+
+def fit_deviation(
+    rows: DeviationRows | None, columns: UnknownColumns, prior_std: float, offsets: int = 0
+) -> Deviation | None:
+    """Unknowns by their columns, beside parameters, friction, armature and all but so many `offsets` of torques."""
+    return None if rows is None else UnknownEquations.of(rows, columns, offsets).fit(prior_std)
+
+
+#: Gain of a torque relative to the other joints, and shift of a wrench's point, that are reported: errors of gears and
+#: calibrations are smaller.
+MIN_GAIN_RATIO, MIN_POINT_SHIFT_M = 1.15, 0.03
+#: The same of all torques alike where contact forces do not say what the robot weighs: masses may be off by a fifth.
+MIN_COMMON_GAIN_RATIO = 1.3
+#: Share of a factor of all torques that every block of time must show: alone it has hardly more than the prior at 1.
+MIN_COMMON_BLOCK_SHARE = 0.3
+#: Gains with a smaller standard deviation are the reference for all others, if there are enough of them.
+_MAX_REFERENCE_SPREAD, _MIN_REFERENCE_JOINTS = 0.1, 3
+#: Of a factor of all torques that is noted: its size in standard deviations, how far the factor of a joint may be from
+#: it in its own, and how many joints must have it.
+_MIN_NOTED_DEVIATIONS, _MAX_DEVIATIONS_FROM_COMMON, _MIN_NOTED_JOINTS = 3.0, 2.0, 2
+#: Share of what factors of all joints together explain that the common one explains; their prior standard deviation.
+_MIN_EXPLAINED_SHARE, _FACTOR_PRIOR_STD = 0.5, 1.0
+
+
+def gain_and_point_findings(log: Log, fit: TorqueGains | None, robot: Robot) -> Iterator[Finding]:
+    """Findings about torques with another gain and wrenches about another point."""
+    if fit is None:
+        return
+    m = len(fit.joints)
+    spread, blocks = fit.spread[:m], fit.blocks[:, :m]
+    yield from common_gain_findings(fit, robot)
+    of = _reference_joints(fit)
+    reference, of_reverse = (float(np.median(x[of])) if of.any() else 1.0 for x in (fit.gain, fit.reverse))
+    relative = fit.gain / reference
+    off = np.abs(fit.gain) > MIN_STANDARD_DEVIATIONS * spread  # readings of nothing have no factor
+    off &= _is_beyond(relative, fit.reverse / of_reverse, MIN_GAIN_RATIO)
+    references = np.median(blocks[:, of], axis=1, keepdims=True) if of.any() else 1.0
+    off &= _is_certain(relative - 1.0, spread / reference, blocks / references - 1.0)
+    if off.any() and m > 1:
+        names = [robot.joint_names[joint] for joint in fit.joints[off]]
+        gains = join_names([f"{gain:.3g} +- {std:.2g}" for gain, std in zip(relative[off], spread[off], strict=True)])
+        text = f"{join_names(names)}: factors that fit the {robot.format} best, relative to the other joints: {gains}"
+        advice = f"check gear ratios, torque constants and units, and the {robot.format}'s friction and inertias there"
+        advice += f", or set sensors.scales: {{joint_torque: [[{', '.join(names)}]]}}"
+        yield Finding("scale", SUSPICIOUS, "joint_torque", text, advice, tuple(names))
+    shifted = _is_certain(fit.point, fit.spread[m:], fit.blocks[:, m:]) & (np.abs(fit.point) > MIN_POINT_SHIFT_M)
+    if shifted.any():
+        point = ", ".join(f"{1e3 * x:.0f}" for x in fit.point)
+        text = f"forces and moments fit the {robot.format} about a point {point} mm from the contact frames' origins"
+        advice = "give moments about the contact frame's origin, or name the sensor's own frame as the contact"
+        if log.moments_about_world_origin:
+            advice = "check the points of the moments, where the plates lie, and the base's position in the same world"
+        severity = SUSPICIOUS
+        if _is_centre_of_base(log, robot, float(np.linalg.norm(fit.point))):
+            severity, advice = NOTE, f"none if its base's centre of mass may be as far off; else {advice}"
+        yield Finding("point", severity, log.contact_wrench_field, text, advice)
+
+
+def _is_centre_of_base(log: Log, robot: Robot, shift: float) -> bool:
+    """Whether the base's centre of mass explains another point of wrenches on the base alone, as of a drone's rotors.
+
+    Weight and inertia act alike on both; a centre of mass is off by less than the body's radius of gyration.
+    """
+    mass, _, inertia = mass_com_inertia(robot.nominal[0])
+    if mass <= 0.0 or any(robot.link(frame)[0] for frame in log.contact_names):
+        return False
+    gyration = np.sqrt(0.5 * np.trace(inertia) / mass)
+    return bool(shift * robot.nominal[:, MASS].sum() / mass < gyration)
+
+
+def _reference_joints(fit: TorqueGains) -> BoolArray:
+    """Joints (m,) whose factors are the reference for all others, none if too few are known.
+
+    Those that the URDF's masses agree with, if there are any, however many have another factor: motors of one type are
+    wrong alike. Else all of them, as the URDF may weigh too much or too little.
+    """
+    known, right = _known_and_right_joints(fit)
+    return right if right.any() else known & (known.sum() >= _MIN_REFERENCE_JOINTS)
+
+
+def _known_and_right_joints(fit: TorqueGains) -> tuple[BoolArray, BoolArray]:
+    """Joints (m,) whose factors are known, and those of them whose factors are 1 within what a URDF is off by."""
+    known = fit.spread[: len(fit.gain)] < _MAX_REFERENCE_SPREAD * np.maximum(np.abs(fit.gain), 1.0)
+    known &= _agree(fit.gain, fit.reverse)
+    least = _least_common_ratio(fit)
+    is_off = _is_beyond(fit.gain, fit.gain, least) | _is_beyond(fit.reverse, fit.reverse, least)
+    return known, known & ~is_off
+
+
+def _least_common_ratio(fit: TorqueGains) -> float:
+    """Factor of all torques alike that is no error of the URDF's masses."""
+    return MIN_GAIN_RATIO if fit.common is not None and fit.common.is_weighed else MIN_COMMON_GAIN_RATIO
+
+
+def common_gain_findings(of_joints: TorqueGains, robot: Robot) -> Iterator[Finding]:
+    """A finding about all torques times a common factor."""
+    fit = of_joints.common
+    if fit is None or _known_and_right_joints(of_joints)[1].any() or not _agree(fit.gain, fit.reverse):
+        return
+    if not _is_beyond(fit.gain, fit.reverse, _least_common_ratio(of_joints)):
+        return
+    value, agreeing = np.array([fit.gain - 1.0]), fit.blocks[:, None] - 1.0
+    if _is_certain(value, np.array([fit.spread]), agreeing, MIN_COMMON_BLOCK_SHARE).all():
+        text = f"all torques: the factor that fits the {robot.format} best is {fit.gain:.3g} +- {fit.spread:.2g}"
+        advice = (
+            f"check units, gear ratios and torque constants, whether the {robot.format}'s masses and contact forces "
+            "are right, or set sensors.scales: {joint_torque: all}"
+        )
+        yield Finding("scale", SUSPICIOUS, "joint_torque", text, advice)
+
+
+def common_factor_notes(filtered: FilteredLog) -> Iterator[Finding]:
+    """A note about a bolted arm's torques that are all the URDF's times one factor, which its masses may make up.
+
+    Not by how torques fit the URDF, but by how the URDF fits them, beside all URDFs near it: what no parameters explain
+    is in the torques, and makes the former too small.
+
+    Args:
+        filtered: a log that nothing else is wrong with.
+    """
+    rows, robot = filtered.rows, filtered.model.robot
+    if rows is None or filtered.log.joint_torque is None:
+        return
+    nominal = robot.nominal.flatten()[None]
+
+    def columns(builder: RowBuilder, part: Samples, number: int) -> FloatArray:
+        required = np.asarray(force_series(builder, part, nominal)[1][0])
+        return -required[..., None] * np.eye(robot.n)
+
+    equations = UnknownEquations.of(rows, columns)
+    common, each = equations.fit(_FACTOR_PRIOR_STD, np.ones((robot.n, 1))), equations.fit(_FACTOR_PRIOR_STD)
+    factor, spread = 1.0 + float(common.value[0]), float(common.spread[0])
+    known = each.spread < _MAX_REFERENCE_SPREAD
+    apart = np.abs(each.value - common.value) > _MAX_DEVIATIONS_FROM_COMMON * each.spread
+    agree = known.sum() >= _MIN_NOTED_JOINTS and not (known & apart).any()
+    most = common.explained > _MIN_EXPLAINED_SHARE * each.explained
+    certain = abs(factor - 1.0) > _MIN_NOTED_DEVIATIONS * spread and bool(common.steady[0])
+    if agree and most and certain and _is_beyond(factor, factor, MIN_GAIN_RATIO):
+        text = f"all torques are {factor:.3g} +- {spread:.1g} times what the {robot.format} needs: a wrong torque"
+        text += f" constant, gear ratio, or masses of the {robot.format}, which no log tells apart"
+        advice = f"none if the {robot.format}'s masses may have this error; else check torque constants and gear ratios"
+        yield Finding("scale", NOTE, "joint_torque", text, advice)
+
+
+def _agree(one: FloatArray | float, other: FloatArray | float) -> BoolArray:
+    """Whether factors by either regression are the same, within what is reported of a factor."""
+    return np.asarray(np.abs(other) < MIN_COMMON_GAIN_RATIO * np.abs(one))
+
+
+def _is_beyond(one: FloatArray | float, other: FloatArray | float, ratio: float) -> BoolArray:
+    """Whether factors by either regression are both larger than a ratio, or both smaller than its inverse."""
+    low, high = np.minimum(one, other), np.maximum(one, other)
+    return np.asarray((low > ratio) | (high < 1.0 / ratio))
+
+
+def _is_certain(
+    value: FloatArray,
+    spread: FloatArray,
+    blocks: FloatArray,
+    share: float = MIN_BLOCK_SHARE,
+) -> BoolArray:
+    """Which values (k,) are not 0, by their standard deviations (k,) and their estimates by block (BLOCKS, k)."""
+    agree = (blocks * np.sign(value) > share * np.abs(value)).all(axis=0)
+    return np.asarray((np.abs(value) > MIN_STANDARD_DEVIATIONS * spread) & agree)

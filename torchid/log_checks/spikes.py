@@ -79,7 +79,8 @@ _Jumps = list[tuple[str, Jump]]
 def check_jumps(log: Log, groups: Iterable[ChannelGroup]) -> Iterator[Finding]:
     """Findings about jumps in all channels."""
     candidates = [(group, [_channel_jumps(group, column) for column in range(len(group.names))]) for group in groups]
-    impacts = _near_contact_changes(log) | _near_load_changes(log, candidates)
+    impact_s = max(_IMPACT_S, MAX_SPIKE_SAMPLES * median_step(log))
+    impacts = near_contact_changes(log, log.time, impact_s) | _near_load_changes(log, candidates)
     jumps: dict[str, _Jumps] = {}
     for group, by_column in candidates:
         in_field = jumps.setdefault(group.field, [])
@@ -119,11 +120,6 @@ def _channel_jumps(group: ChannelGroup, column: int) -> list[Jump]:
     if group.field in POSITION_FIELDS:
         longest = max(longest, int(MAX_SHORT_SIDE_SHARE * len(values)))
     return find_jumps(values, group.elapsed, group.piece, longest)
-
-
-def _near_contact_changes(log: Log) -> BoolArray:
-    """Samples near a change of any contact, (N,)."""
-    return near_contact_changes(log, log.time, max(_IMPACT_S, MAX_SPIKE_SAMPLES * median_step(log)))
 
 
 def _near_load_changes(log: Log, candidates: Iterable[tuple[ChannelGroup, list[list[Jump]]]]) -> BoolArray:

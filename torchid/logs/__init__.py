@@ -9,10 +9,24 @@
   `dry_friction`, `signal_noise`; of logs larger than memory `blocks`
 """
 
-from torchid.logs.column_map import Columns
-from torchid.logs.log import Log
-from torchid.logs.preprocess import preprocess
-from torchid.logs.read import read_log, write_log
-from torchid.logs.ros_topics import Topics
+from typing import TYPE_CHECKING
 
-__all__ = ["Columns", "Log", "Topics", "preprocess", "read_log", "write_log"]
+import lazy_loader  # type: ignore[import-untyped]
+
+if TYPE_CHECKING:
+    from torchid.logs.column_map import Columns
+    from torchid.logs.log import Log
+    from torchid.logs.read import read_log, write_log
+    from torchid.logs.ros_topics import Topics
+
+__all__ = ["Columns", "Log", "Topics", "read_log", "write_log"]
+
+__getattr__, __dir__, _ = lazy_loader.attach(  # a process that only opens files needs none of these
+    __name__,
+    submod_attrs={
+        "column_map": ["Columns"],
+        "log": ["Log"],
+        "read": ["read_log", "write_log"],
+        "ros_topics": ["Topics"],
+    },
+)

@@ -6,7 +6,7 @@ import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -134,12 +134,12 @@ class LogBlocks:
         return LogBlocks(self.source, self.names, self.time[samples], fields)
 
     def replaced(
-        self, fields: Mapping[str, LazyArray | None], names: Mapping[str, NDArray[Any]] | None = None
+        self, fields: Mapping[str, LazyArray | None], names: Mapping[str, NDArray[Any] | None] | None = None
     ) -> LogBlocks:
-        """The log with other fields, None for none, and other arrays of text."""
-        kept = {name: array for name, array in self.fields.items() if name not in fields}
-        changed = {name: array for name, array in fields.items() if array is not None}
-        return LogBlocks(self.source, {**self.names, **(names or {})}, self.time, kept | changed)
+        """The log with other fields and arrays of text, None for none."""
+        arrays = {name: array for name, array in {**self.fields, **fields}.items() if array is not None}
+        texts = {name: array for name, array in {**self.names, **(names or {})}.items() if array is not None}
+        return LogBlocks(self.source, texts, self.time, arrays)
 
     def read(self, samples: slice, only: tuple[str, ...] | None = None, allow_gaps: bool = False) -> Log:
         """Some samples as a log, or only the fields `only` of them with positions of 0; `allow_gaps` as of `read_log`.
@@ -199,6 +199,41 @@ class LogBlocks:
             if samples.start <= index + 1 and place < len(quat) and quat[place] @ before < 0.0:
                 quat *= -1.0
         self._last = samples.start + len(quat) - 1, quat[-1].copy()
+
+
+class LogInMemory(LogBlocks):
+    """A log that was read whole, as one that is read in blocks; its values are not checked again.
+
+    Attributes:
+        log: the log.
+    """
+
+    def __init__(self, log: Log) -> None:
+        """Of the arrays of the log, which are not copied."""
+        names = {name: np.array(getattr(log, name), dtype=np.str_) for name in NAME_FIELDS if getattr(log, name)}
+        fields: dict[str, LazyArray] = {name: array for name, array in log.arrays().items() if name != "time"}
+        super().__init__(log.source, names, log.time, fields)
+        self.log = log
+
+    def part(self, samples: slice) -> LogInMemory:
+        """As `LogBlocks.part`."""
+        return LogInMemory(self.log.select(samples))
+
+    def replaced(
+        self, fields: Mapping[str, LazyArray | None], names: Mapping[str, NDArray[Any] | None] | None = None
+    ) -> LogInMemory:
+        """As `LogBlocks.replaced`."""
+        changed: dict[str, Any] = {name: x if x is None else np.asarray(x[:]) for name, x in fields.items()}
+        changed |= {name: "" if x is None else tuple(x.tolist()) for name, x in (names or {}).items()}
+        return LogInMemory(replace(self.log, **changed))
+
+    def read(self, samples: slice, only: tuple[str, ...] | None = None, allow_gaps: bool = False) -> Log:
+        """As `LogBlocks.read`, with all positions."""
+        chosen = self.log if samples == slice(0, len(self)) else self.log.select(samples)
+        if only is None:
+            return chosen
+        missing: dict[str, Any] = dict.fromkeys(self.fields.keys() - {*only, "joint_position"})
+        return replace(chosen, **missing)
 
 
 @contextmanager

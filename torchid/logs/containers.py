@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import math
 import os
@@ -14,15 +15,17 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.lib.format import descr_to_dtype, dtype_to_descr
 from numpy.typing import NDArray
 
 from torchid.errors import LogError, TorchidError, during, excerpt
 from torchid.guards import MAX_ARRAYS, check_fields, check_names, check_unpacked_size
 from torchid.logs.hdf5 import Hdf5, import_h5py, save_hdf5
 from torchid.logs.json_files import JsonDocument
-from torchid.logs.lazy_arrays import LazyArray, Spill
+from torchid.logs.lazy_arrays import Computed, LazyArray, Spill
 from torchid.logs.matlab import MatFile, byte_order
 from torchid.logs.time_range import split_range
+from torchid.reader import RemoteObject, open_apart
 from torchid.staging import atomic_file
 
 # --------------------------------------------------------------------------------------------------- kinds of log files
@@ -170,21 +173,73 @@ def open_container(path: Path, whole: bool = True) -> Iterator[Container]:
     }
     with contextlib.ExitStack() as stack:
         with reader_errors_explained("file", kind.get(suffix, "a complete HDF5 file")):
-            container: Container
-            if suffix == ".npz":
-                container = stack.enter_context(open_npz(path))
-            elif suffix == ".mat" and byte_order(path):
-                container = MatFile(path)
-            elif suffix == ".json":
-                container = JsonDocument(path)
-            else:
-                h5py = import_h5py(path)
-                container = Hdf5(stack.enter_context(h5py.File(path, "r")), h5py, path.stat().st_size)
+            container = _Remote(stack.enter_context(open_apart(_served, path)))
             total = sum(container.declared_bytes().values())
         if whole and total > MAX_ARRAYS:
             raise LogError(path, "file", f"arrays of {total} bytes", f"at most {MAX_ARRAYS} bytes in all")
         check_unpacked_size(path, total)
         yield container
+
+
+class _Remote:
+    """A container that another process reads."""
+
+    def __init__(self, opened: RemoteObject) -> None:
+        self._opened = opened
+
+    def declared_bytes(self) -> dict[str, int]:
+        sizes: dict[str, int] = self._opened.call("declared_bytes")
+        return sizes
+
+    def load(self, name: str) -> NDArray[Any]:
+        array: NDArray[Any] = self._opened.call("load", name)
+        return array
+
+    def lazy(self, name: str, folder: Path | None) -> LazyArray:
+        shape, dtype = self._opened.call("lazy", name, None if folder is None else os.fspath(folder.absolute()))
+        if dtype is None:
+            return self.load(name)
+
+        def rows_of(rows: slice) -> NDArray[Any]:
+            array: NDArray[Any] = self._opened.call("rows", name, rows.start, rows.stop)
+            return array
+
+        return Computed(tuple(shape), descr_to_dtype(ast.literal_eval(dtype)), rows_of)
+
+
+class _Served:
+    """The same container in the process that reads it."""
+
+    def __init__(self, container: Container) -> None:
+        self.declared_bytes, self.load = container.declared_bytes, container.load
+        self._container, self._lazy = container, dict[str, LazyArray]()
+
+    def lazy(self, name: str, folder: str | None) -> tuple[tuple[int, ...], str | None]:
+        """Shape and type of an array, None where it is to be loaded."""
+        array = self._lazy[name] = self._container.lazy(name, None if folder is None else Path(folder))
+        return array.shape, None if array.dtype.hasobject or not array.shape else repr(dtype_to_descr(array.dtype))
+
+    def rows(self, name: str, start: int, stop: int) -> NDArray[Any]:
+        """Some rows of an array that is read where it is sliced."""
+        return np.asarray(self._lazy[name][start:stop])
+
+
+@contextlib.contextmanager
+def _served(path: Path) -> Iterator[_Served]:
+    """Open a container in the process that reads it."""
+    suffix = path.suffix.lower()
+    with contextlib.ExitStack() as stack:
+        container: Container
+        if suffix == ".mat" and byte_order(path):
+            container = MatFile(path)
+        elif suffix == ".json":
+            container = JsonDocument(path)
+        elif suffix in (".mat", *_WRITTEN[1:]):
+            h5py = import_h5py(path)
+            container = Hdf5(stack.enter_context(h5py.File(path, "r")), h5py)
+        else:
+            container = _Npz(stack.enter_context(zipfile.ZipFile(path)))
+        yield _Served(container)
 
 
 @contextlib.contextmanager
@@ -216,27 +271,17 @@ def save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 # --------------------------------------------------------------------------------------------------- the container .npz
 
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-#: Bytes that are unpacked at a time, and bytes at the end of a file that contain the entries of a log's directory.
-_PIECE_BYTES, _DIRECTORY_BYTES = 2**22, 2**20
-#: First bytes of a directory entry.
-_ENTRY = b"PK\x01\x02"
+#: Bytes that are unpacked at a time.
+_PIECE_BYTES = 2**22
 #: Of an entry, before its name; its last two numbers are the lengths of the name and of the extra fields.
 _LOCAL_HEADER = struct.Struct("<26xHH")
-
-
-def _open_archive(path: Path) -> zipfile.ZipFile:
-    """Open a zip archive; ValueError if it has too many entries, for which `zipfile` takes seconds."""
-    with path.open("rb") as stream:
-        stream.seek(max(0, path.stat().st_size - _DIRECTORY_BYTES))
-        check_fields((), stream.read().count(_ENTRY))
-    return zipfile.ZipFile(path)
 
 
 @contextlib.contextmanager
 def open_npz(path: Path) -> Iterator[Container]:
     """Open a .npz archive of any name; any exception where it is damaged or is none."""
-    with _open_archive(path) as archive:
-        yield _Npz(archive)
+    with open_apart(_served, path) as opened:
+        yield _Remote(opened)
 
 
 class _Npz:

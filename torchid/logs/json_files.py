@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import LogError, excerpt
-from torchid.guards import MAX_COLUMNS, MAX_DOCUMENT, MAX_LETTERS, MAX_NAMES, check_fields
+from torchid.guards import MAX_COLUMNS, MAX_LETTERS, MAX_NAMES, check_fields
 from torchid.logs.lazy_arrays import ArraysInMemory
 
 _LINE = 2**22  # bytes, at most
@@ -31,11 +31,7 @@ class JsonDocument(ArraysInMemory):
     """The arrays of a document, read whole; `group/name` of those in objects, and of records in lists."""
 
     def __init__(self, path: Path) -> None:
-        """Read a file; LogError for one that is too large, ValueError where it is damaged or holds no object."""
-        size = path.stat().st_size
-        if size > MAX_DOCUMENT:
-            accepted = f"at most {MAX_DOCUMENT} bytes, or .jsonl with a record in each line"
-            raise LogError(path, "file", f"a JSON document of {size} bytes", accepted)
+        """Read a file; ValueError where it is damaged or holds no object."""
         document = _read(path.read_text(encoding="utf-8-sig"))
         if not isinstance(document, dict) and not _are_records(document):
             raise ValueError(f"a {type(document).__name__}, no object of arrays and no list of records")

@@ -30,7 +30,7 @@ _FILTERED_AT_ONCE = 2**16
 
 @cache
 def import_signal() -> ModuleType:
-    """`scipy.signal`: it takes 0.1 s, which runs that find their samples in a cache, or draw nothing, need not."""
+    """`scipy.signal`: it takes 0.1 s, which runs that neither filter nor draw need not."""
     from scipy import signal
 
     return signal

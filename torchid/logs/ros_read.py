@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from torchid.errors import LogError, UnknownNameError, how_to_install, join_name
 from torchid.logs.alignment import Series
 from torchid.logs.containers import list_bag_files, reader_errors_explained
 from torchid.logs.log import FloatArray
+from torchid.logs.ros_files import BagChannel, BagFile, serve_bag
 from torchid.logs.ros_messages import (
     ContactFlag,
     Decoder,
@@ -41,9 +42,7 @@ from torchid.logs.ros_topics import (
     check_topics,
 )
 from torchid.logs.unitree import LowState
-
-if TYPE_CHECKING:
-    from torchid.logs.ros_files import BagChannel, BagFile
+from torchid.reader import open_apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,19 +200,12 @@ def open_bag_file(path: Path) -> Iterator[BagFile]:
     Raises:
         LogError: it is damaged, also where this shows in later reads; or its reader is not installed.
     """
-    suffix = path.suffix.lower()
-    try:
-        # imported here: the libraries are an optional extra
-        from torchid.logs.ros_files import McapFile, Ros1File, SqliteFile
-    except ImportError as error:
-        absent = [name for name in _PACKAGES if name == error.name or find_spec(name) is None]
-        found = f"a bag, but {' and '.join(absent) or error.name} {'are' if len(absent) > 1 else 'is'} not installed"
-        raise LogError(path, "file", found, how_to_install("ros")) from error
-
-    readers: dict[str, Callable[[Path], BagFile]] = {".bag": Ros1File, ".mcap": McapFile, ".db3": SqliteFile}
-    accepted = f"a complete {suffix} file of ROS messages"
-    with reader_errors_explained("file", accepted), closing(readers[suffix](path)) as file:
-        yield file
+    if absent := [name for name in _PACKAGES if find_spec(name) is None]:
+        found = f"a bag, but {' and '.join(absent)} {'are' if len(absent) > 1 else 'is'} not installed"
+        raise LogError(path, "file", found, how_to_install("ros"))
+    accepted = f"a complete {path.suffix.lower()} file of ROS messages"
+    with reader_errors_explained("file", accepted), open_apart(serve_bag, path) as opened:
+        yield BagFile(path, opened)
 
 
 def _listed(channels: Mapping[str, BagChannel]) -> str:

@@ -1,86 +1,17 @@
-"""Segments of a log without a break: preprocessed each by itself, and joint torques that act later than recorded."""
+"""Segments of a log without a break, and joint torques that act later than recorded."""
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from torchid.errors import LogError, about_file
-from torchid.logs.dry_friction import with_sign_filter, with_signs_of
-from torchid.logs.gaps import measure_coverage, warn_of_gaps
+from torchid.errors import LogError
 from torchid.logs.log import BoolArray, FloatArray, Log
 from torchid.logs.low_pass import DROPPED_PERIODS
-from torchid.logs.preprocess import (
-    gapless_fields,
-    lacks_derivatives,
-    make_timeline,
-    move_to_timeline,
-    unloaded_readings,
-)
-from torchid.logs.signal_noise import signal_noise, warn_of_noisy_accelerations
-from torchid.logs.timeline import FEWEST_DIFFERENTIATED, LONGEST_STEP, SampleRate, Timeline, spline_derivatives
-
-
-def preprocess_segments(
-    log: Log,
-    segments: Sequence[slice],
-    cutoff_hz: float | None,
-    sample_rate_hz: SampleRate,
-    sign_width: float | None = None,
-    stribeck: float | None = None,
-    finds_rest: bool = False,
-) -> tuple[Log, int]:
-    """As `preprocess`, of segments of a log without what is between them.
-
-    Args:
-        log: as recorded; between segments fields may be NaN that have no gaps else.
-        segments: of its samples.
-        cutoff_hz: as of `preprocess`.
-        sample_rate_hz: likewise.
-        sign_width: likewise.
-        stribeck: likewise.
-        finds_rest: likewise.
-
-    Returns:
-        One log of all segments, and how many samples were in segments too short for the filter or for derivatives.
-
-    Raises:
-        InputError: as `preprocess`, or all segments are too short.
-
-    Warns:
-        TorchidWarning: as `preprocess`.
-    """
-    rates = cutoff_hz, sample_rate_hz, sign_width, stribeck, finds_rest
-    with about_file(log.source):
-        whole = make_timeline(log.time, lacks_derivatives(log), *rates)
-        if whole is None:
-            return _joined([log.select(segment) for segment in segments]), 0
-        usable = long_segments(log.time, segments, whole)
-    coverage = {name: measure_coverage(log, name) for name in gapless_fields(log, whole)}
-    for name, found_of in coverage.items():
-        warn_of_gaps(log, name, found_of)
-    log = dataclasses.replace(log, contact_unloaded=unloaded_readings(log))
-    parts = []
-    longest_of = max(usable, key=lambda segment: segment.stop - segment.start)
-    longest = log.select(longest_of)
-    noise = signal_noise(longest, whole)
-    whole = with_sign_filter(whole, longest, noise)
-    for segment in usable:
-        part = log.select(segment)
-        with about_file(log.source):
-            timeline = make_timeline(part.time, True, *rates)
-        if timeline is None:
-            raise ValueError("nothing to derive")
-        timeline = with_signs_of(timeline, whole)
-        parts.append(move_to_timeline(part, timeline, coverage))
-        if segment is longest_of:
-            with about_file(log.source):
-                warn_of_noisy_accelerations(part, parts[-1], timeline, noise)
-    return _joined(parts), count_samples(segments) - count_samples(usable)
+from torchid.logs.timeline import FEWEST_DIFFERENTIATED, LONGEST_STEP, Timeline, spline_derivatives
 
 
 def long_segments(time: FloatArray, segments: Sequence[slice], whole: Timeline) -> list[slice]:
@@ -117,16 +48,6 @@ def _is_long_enough(time: FloatArray, segment: slice, whole: Timeline) -> bool:
     left = time[segment.stop - 1] - time[segment.start] - 2.0 * DROPPED_PERIODS / whole.cutoff_hz
     wanted = step * (whole.kept.step or 1) if whole.output is None else float(np.median(np.diff(whole.output)))
     return bool(left > 2.0 * max(step, wanted) and count > 2 * whole.low_pass.padding)
-
-
-def _joined(logs: Sequence[Log]) -> Log:
-    """Logs of one recording as one."""
-    changed: dict[str, Any] = {}
-    for name, first in vars(logs[0]).items():
-        if isinstance(first, np.ndarray):
-            changed[name] = np.concatenate([getattr(log, name) for log in logs])
-    bandwidths = [log.noise_bandwidth_hz for log in logs if log.noise_bandwidth_hz is not None]
-    return dataclasses.replace(logs[0], **changed, noise_bandwidth_hz=min(bandwidths, default=None))
 
 
 def with_delayed_torques(log: Log, delay: float) -> Log:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from torchid.logs.columns import TEXT_COLUMN, check_header, is_number, is_stamp
 from torchid.logs.containers import JSON_LINES, TEXT_TABLES
 from torchid.logs.json_files import JsonColumns, read_json_lines
 from torchid.logs.table_headers import BLOCK, NestedColumns, TextHeader, read_header
+from torchid.reader import RemoteObject, open_apart
 
 #: Rows that are converted at a time; lines of JSON.
 _ROWS, _LINES = 2**16, 2**12
@@ -45,6 +47,81 @@ def import_pyarrow(path: Path) -> Any:
     return pyarrow
 
 
+class TableFile:
+    """A table that another process reads."""
+
+    def __init__(self, pa: Any, opened: RemoteObject) -> None:
+        self._pa, self._opened = pa, opened
+
+    def column_names(self) -> tuple[list[str], bool]:
+        """The columns, and whether angles are in degrees by what the file says."""
+        names, in_degrees = self._opened.call("column_names")
+        return names, in_degrees
+
+    def read_rows(self, sources: Collection[str], texts: Collection[str], only: bool, whole: bool) -> Iterator[Any]:
+        """Batches of rows of some columns, see `_read_rows`."""
+        for packed in self._opened.stream("read_rows", list(sources), list(texts), only, whole):
+            yield from self._unpacked(packed).to_batches()
+
+    def sample_rows(self) -> tuple[list[str], Any]:
+        """The columns, and the first rows; LogError where there are none."""
+        names, packed = self._opened.call("sample_rows")
+        return names, self._unpacked(packed).combine_chunks().to_batches()[0]
+
+    def whole_table(self) -> Any:
+        """All columns and rows as they are, with columns that are in others apart."""
+        return self._unpacked(self._opened.call("whole_table"))
+
+    def count_bytes(self) -> int:
+        """Bytes of the numbers, without reading them."""
+        return int(self._opened.call("count_bytes"))
+
+    def _unpacked(self, packed: bytes) -> Any:
+        return self._pa.ipc.open_stream(packed).read_all()
+
+
+@contextmanager
+def open_table(pa: Any, path: Path) -> Iterator[TableFile]:
+    """Open a table in another process."""
+    with open_apart(_serve_table, path) as opened:
+        yield TableFile(pa, opened)
+
+
+@contextmanager
+def _serve_table(path: Path) -> Iterator[_Served]:
+    yield _Served(path)
+
+
+class _Served:
+    """A table in the process that reads it; rows are streams of Arrow's format."""
+
+    def __init__(self, path: Path) -> None:
+        self._pa, self._path = import_pyarrow(path), path
+
+    def column_names(self) -> tuple[list[str], bool]:
+        return _column_names(self._pa, self._path)
+
+    def read_rows(self, *args: Any) -> Iterator[bytes]:
+        return map(self._packed, _read_rows(self._pa, self._path, *args))
+
+    def sample_rows(self) -> tuple[list[str], bytes]:
+        names, batch = _sample_rows(self._pa, self._path)
+        return names, self._packed(batch)
+
+    def whole_table(self) -> bytes:
+        return self._packed(_whole_table(self._pa, self._path))
+
+    def count_bytes(self) -> int:
+        return _count_bytes(self._pa, self._path)
+
+    def _packed(self, rows: Any) -> bytes:
+        sink = self._pa.BufferOutputStream()
+        with self._pa.ipc.new_stream(sink, rows.schema) as writer:
+            writer.write(rows)
+        packed: bytes = sink.getvalue().to_pybytes()
+        return packed
+
+
 def is_text_table(path: Path) -> bool:
     """Whether a table is of text with a line of names."""
     return path.suffix.lower() in TEXT_TABLES
@@ -54,7 +131,7 @@ def _is_json(path: Path) -> bool:
     return path.suffix.lower() in JSON_LINES
 
 
-def column_names(pa: Any, path: Path) -> tuple[list[str], bool]:
+def _column_names(pa: Any, path: Path) -> tuple[list[str], bool]:
     """The columns of a table, and whether its angles are in degrees by what it says."""
     if is_text_table(path):
         header = read_header(path)
@@ -67,7 +144,7 @@ def column_names(pa: Any, path: Path) -> tuple[list[str], bool]:
         return NestedColumns(pa, file).names, False
 
 
-def read_rows(
+def _read_rows(
     pa: Any, path: Path, sources: Collection[str], texts: Collection[str], only: bool, whole: bool
 ) -> Iterator[Any]:
     """Batches of rows of some columns of a table.
@@ -87,7 +164,7 @@ def read_rows(
     return read(pa, path, sources, texts, only, whole)
 
 
-def sample_rows(pa: Any, path: Path) -> tuple[list[str], Any]:
+def _sample_rows(pa: Any, path: Path) -> tuple[list[str], Any]:
     """The columns of a table, and its first rows; LogError where it has none."""
     read = _sample_csv if is_text_table(path) else _sample_json if _is_json(path) else _sample_parquet
     names, batch = read(pa, path)
@@ -96,7 +173,7 @@ def sample_rows(pa: Any, path: Path) -> tuple[list[str], Any]:
     return names, batch
 
 
-def whole_table(pa: Any, path: Path) -> Any:
+def _whole_table(pa: Any, path: Path) -> Any:
     """All columns and rows of a table as they are, with columns that are in others apart."""
     if _is_json(path):
         blocks = list(read_json_lines(path, _LINES, partial(check_size, path, whole=True)))
@@ -118,7 +195,7 @@ def whole_table(pa: Any, path: Path) -> Any:
     return table
 
 
-def count_bytes(pa: Any, path: Path) -> int:
+def _count_bytes(pa: Any, path: Path) -> int:
     """Bytes of a table's numbers, without reading them."""
     if is_text_table(path) or _is_json(path):
         columns = len(read_header(path).texts if is_text_table(path) else _first_lines(path))

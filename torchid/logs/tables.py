@@ -34,12 +34,8 @@ from torchid.logs.mapped_fields import MappedFields, map_table
 from torchid.logs.name_matching import propose_field
 from torchid.logs.table_files import (
     check_size,
-    column_names,
-    count_bytes,
     import_pyarrow,
-    read_rows,
-    sample_rows,
-    whole_table,
+    open_table,
     write_table,
 )
 from torchid.logs.units import IN_DEGREES, quantities_of
@@ -77,10 +73,10 @@ def sample_table(path: Path, rows: RowNames | None = None) -> dict[str, NDArray[
         LogError: the file cannot be read, or has no rows.
     """
     pa = import_pyarrow(path)
-    with _complete(path):
+    with _complete(path), open_table(pa, path) as table:
         if rows is not None:
-            return {**_wide(pa, path, whole_table(pa, path), rows)}
-        names, batch = sample_rows(pa, path)
+            return {**_wide(pa, path, table.whole_table(), rows)}
+        names, batch = table.sample_rows()
         columns = dict(zip(batch.schema.names, batch.columns, strict=True))
         read = {name: x for name, x in columns.items() if is_number(pa, x.type) or is_stamp(pa, x.type)}
         texts = {name: x for name, x in columns.items() if pa.types.is_string(x.type) or pa.types.is_dictionary(x.type)}
@@ -92,15 +88,15 @@ def sample_table(path: Path, rows: RowNames | None = None) -> dict[str, NDArray[
 def sample_row_names(path: Path) -> RowNames | None:
     """What names the joint of each row, of a table with a row for each joint and stamp; None of other tables."""
     pa = import_pyarrow(path)
-    with _complete(path):
-        return find_row_names(pa, sample_rows(pa, path)[1])
+    with _complete(path), open_table(pa, path) as table:
+        return find_row_names(pa, table.sample_rows()[1])
 
 
 def table_size(path: Path) -> int:
     """Bytes of a table's numbers, without reading them. Raises LogError: the file cannot be read."""
     pa = import_pyarrow(path)
-    with _complete(path):
-        return count_bytes(pa, path)
+    with _complete(path), open_table(pa, path) as table:
+        return table.count_bytes()
 
 
 def table_blocks(path: Path, columns: Columns | None = None) -> Iterator[dict[str, NDArray[Any]]]:
@@ -194,19 +190,20 @@ def _wide(pa: Any, path: Path, table: Any, rows: RowNames) -> dict[str, NDArray[
 
 def _batches(pa: Any, path: Path, columns: Columns | None, whole: bool = True) -> Iterator[tuple[_Layout, Any]]:
     """The layout of a table, first with None, then with each batch of rows."""
-    if columns is not None and columns.rows_of is not None:
-        table = whole_table(pa, path)
-        wide = _wide(pa, path, table, row_names_in_map(columns, table.column_names))
-        layout = _layout(list(wide), columns)
+    with open_table(pa, path) as table:
+        if columns is not None and columns.rows_of is not None:
+            rows = table.whole_table()
+            wide = _wide(pa, path, rows, row_names_in_map(columns, rows.column_names))
+            layout = _layout(list(wide), columns)
+            yield layout, None
+            yield layout, pa.RecordBatch.from_pydict({name: pa.array(wide[name]) for name in layout.sources})
+            return
+        names, in_degrees = table.column_names()
+        layout = _layout(names, columns, in_degrees)
         yield layout, None
-        yield layout, pa.RecordBatch.from_pydict({name: pa.array(wide[name]) for name in layout.sources})
-        return
-    names, in_degrees = column_names(pa, path)
-    layout = _layout(names, columns, in_degrees)
-    yield layout, None
-    texts = {TEXT_COLUMN, *layout.flags}
-    for batch in read_rows(pa, path, layout.sources, texts, columns is not None, whole):
-        yield layout, batch
+        texts = {TEXT_COLUMN, *layout.flags}
+        for batch in table.read_rows(layout.sources, texts, columns is not None, whole):
+            yield layout, batch
 
 
 ROWS_OF = "rows_of"

@@ -1,13 +1,13 @@
 """From bound logs to a compressed linear problem.
 
-- a log bound to a robot: `samples`, `log_joints`, `base_motion`, `motion_noise`
+- a log bound to a robot: `samples`, `log_joints`, `motion`
 - contacts, from forces and motion: `contact_detection`, `detection_motion`, `detection_forces`, `contact_slip`,
   `unloaded_sensors`; the base's pose from feet: `base_pose`, `floor_pose`; both block by block: `derived_blocks`
-- rows: `rows`, `contact_state`, `contact_rows`, `row_blocks`, `wrench_rows`, `extras`, `chunk_dynamics`; compiled
-  `compiled_rows`; in mini-batches `batches`; of some samples `sampled_rows`
-- factors: `chunks`, `blocks`, `compression`, `parts`, `row_compressor`, `compressed_log`, `noise_gram`
-- the problem: `linear`, `elimination`, `eliminated_terms`, `noise`
-- predictions of its parameters: `predict`, `metrics`
+- rows: `rows`, `contact_state`, `row_blocks`, `extras`, `chunk_dynamics`; compiled `compiled_rows`; in mini-batches
+  `batches`
+- factors: `chunks`, `compression`, `row_compressor`, `noise_gram`
+- the problem: `linear`, `elimination`, `noise`
+- predictions of its parameters: `metrics`
 """
 
 from torchid.problem.batches import Batch, MiniBatches

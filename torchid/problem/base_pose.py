@@ -15,8 +15,6 @@ from torchid.errors import LogError, about_file, warn
 from torchid.logs import Log
 from torchid.logs.log import NORMALS, BoolArray, FloatArray
 from torchid.logs.quaternion import make_sign_continuous
-from torchid.logs.segments import preprocess_segments
-from torchid.logs.timeline import SampleRate
 from torchid.problem.floor_pose import (
     FEWEST_POINTS,
     Footholds,
@@ -66,41 +64,6 @@ class LogWithPose(PoseSegments):
     """
 
     log: Log
-
-
-def preprocess_with_pose(
-    log: Log,
-    robot: Robot,
-    contacts: Sequence[Contact],
-    cutoff_hz: float | None,
-    sample_rate_hz: SampleRate,
-    sign_width: float | None = None,
-    stribeck: float | None = None,
-    finds_rest: bool = False,
-) -> Log:
-    """As `preprocess`, with the motion of the base from the feet that stand; samples with too few of them are left out.
-
-    Args:
-        log: as recorded.
-        robot: the robot.
-        contacts: its feet.
-        cutoff_hz: as of `preprocess`.
-        sample_rate_hz: likewise.
-        sign_width: likewise.
-        stribeck: likewise.
-        finds_rest: likewise.
-
-    Raises:
-        InputError: as `base_pose_from_feet` and `preprocess`, or no segment is long enough for the filter.
-
-    Warns:
-        TorchidWarning: as `preprocess`; number of samples left out, with the reasons; feet that are not on one floor.
-    """
-    standing = base_pose_from_feet(log, robot, contacts)
-    dry = sign_width, stribeck, finds_rest
-    out, too_short = preprocess_segments(standing.log, standing.segments, cutoff_hz, sample_rate_hz, *dry)
-    warn_of_pose(log.source, len(log), standing, too_short)
-    return out
 
 
 def warn_of_pose(source: str, count: int, standing: PoseSegments, too_short: int) -> None:

@@ -15,7 +15,7 @@ from torchid.parameters import Array
 from torchid.problem.chunks import chunks_by_state
 from torchid.problem.contact_state import ContactState
 from torchid.problem.elimination import Assembly
-from torchid.problem.predict import predict_forces, with_payload_columns
+from torchid.problem.metrics import predict_forces, with_payload_columns
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 

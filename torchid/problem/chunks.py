@@ -16,7 +16,7 @@ import torch
 from torchid import distributed
 from torchid.errors import excerpt, warn
 from torchid.parallel import can_fork, one_thread, run_in_workers, share_between_forks, thread_count
-from torchid.problem.blocks import are_of_one_log, join_pieces
+from torchid.problem.chunk_dynamics import are_of_one_log, join_pieces
 from torchid.problem.contact_state import ContactState
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples

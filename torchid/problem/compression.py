@@ -1,18 +1,21 @@
-"""Streaming logs into triangular factors, chunk by chunk, by contact state and by folds for cross-validation."""
+"""Streaming logs into triangular factors, by contact state and by folds: of several logs, or one by one."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import chain
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchid import distributed
-from torchid.problem.blocks import (
+from torchid.parallel import one_thread
+from torchid.problem.chunk_dynamics import (
     BlockRows,
+    Workspace,
     block_spans,
     blocks_in,
     cut_logs,
@@ -20,16 +23,96 @@ from torchid.problem.blocks import (
     rows_of_samples,
     span_of_samples,
 )
-from torchid.problem.chunk_dynamics import Workspace
 from torchid.problem.chunks import ProgressCallback, chunks_by_state, map_chunks, worker_count
 from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import TriangularFactor
 from torchid.problem.noise_gram import NoiseGram, estimate_noise_gram
-from torchid.problem.parts import Part, PartKey, merge_factors, merge_parts
 from torchid.problem.row_compressor import RowCompressor, RowWeighting
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.problem.unloaded_sensors import unloaded_offset_equations
+from torchid.reprs import short_repr
+
+PartKey = tuple[str, ContactState, int, int, bool]  # source, state, fold, block, unloaded
+
+
+@dataclass
+class Part:
+    """Compressed rows of one log (named by `source`) in one contact state, one fold and one block of it.
+
+    Equations of unloaded contact sensors are in parts of their own, `unloaded`, which count no samples. `masked`:
+    indices of extras that are offsets without such an equation, because their readings in the air are masked.
+    """
+
+    source: str
+    state: ContactState
+    factor: TriangularFactor
+    samples: int
+    fold: int = 0
+    block: int = 0
+    unloaded: bool = False
+    masked: set[int] = field(default_factory=set)
+
+    __repr__ = short_repr
+
+    @property
+    def key(self) -> PartKey:
+        """Which rows it has."""
+        return self.source, self.state, self.fold, self.block, self.unloaded
+
+
+@one_thread()
+def merge_parts(of_workers: Iterable[list[Part]]) -> list[Part]:
+    """The parts of all workers, those of one log, contact state and fold merged, on the CPU."""
+    total: dict[PartKey, list[Part]] = {}
+    for part in chain.from_iterable(of_workers):
+        part.factor = part.factor.to_cpu()
+        total.setdefault(part.key, []).append(part)
+    for first, *others in total.values():
+        first.samples += sum(part.samples for part in others)
+        first.masked = first.masked.union(*(part.masked for part in others))
+        first.factor.merge(*(part.factor for part in others))
+    return [first for first, *_ in total.values()]
+
+
+@one_thread()
+def merge_factors(factors: Iterable[TriangularFactor], builder: RowBuilder) -> TriangularFactor:
+    """One factor of the rows of several."""
+    out = TriangularFactor(builder.width)
+    out.merge(*factors)
+    return out
+
+
+def merge_states(parts: Sequence[Part], builder: RowBuilder) -> list[Part]:
+    """Parts with the contact states of each log and fold merged; offset equations of unloaded sensors stay apart."""
+    return merge_by_key(parts, [(part.source, part.fold, part.unloaded) for part in parts], builder)
+
+
+def merge_folds(parts: Sequence[Part], builder: RowBuilder) -> list[Part]:
+    """Parts with the folds of each log and contact state merged; offset equations of unloaded sensors stay apart."""
+    return merge_by_key(parts, [(part.source, part.state, part.unloaded) for part in parts], builder)
+
+
+def merge_blocks_of_folds(parts: Sequence[Part], builder: RowBuilder) -> list[Part]:
+    """Parts with the blocks of each log, contact state and fold merged."""
+    if not any(part.block for part in parts):
+        return list(parts)
+    keys = [(part.source, part.state, part.fold, part.unloaded) for part in parts]
+    return [replace(part, block=0) for part in merge_by_key(parts, keys, builder)]
+
+
+@one_thread()
+def merge_by_key(parts: Sequence[Part], keys: Sequence[tuple[object, ...]], builder: RowBuilder) -> list[Part]:
+    """One part for each key, with whatever else of the first; the factors of the parts stay as they are."""
+    alike: dict[tuple[object, ...], list[Part]] = {}
+    for part, key in zip(parts, keys, strict=True):
+        alike.setdefault(key, []).append(part)
+    out = []
+    for own in alike.values():
+        factor, masked = merge_factors((part.factor for part in own), builder), set().union(*(x.masked for x in own))
+        out.append(replace(own[0], factor=factor, samples=sum(part.samples for part in own), masked=masked))
+    return out
+
 
 FOLDS = 5
 """Number of cross-validation folds of the training samples."""
@@ -348,3 +431,156 @@ def fold_count(independent: float, states: int, builder: RowBuilder) -> int:
 def _most_factors(states: int, builder: RowBuilder) -> int:
     """Number of factors of each of some contact states that there is memory for."""
     return _MEMORY // (8 * (builder.width + 1) ** 2 * max(states, 1) * worker_count(builder.device))
+
+
+SampleSpan = tuple[int, int]
+"""First of some successive samples of a log, and the end."""
+
+
+@dataclass(frozen=True)
+class CompressedLog:
+    """Factors of a log, in pieces that make up as many blocks as a fit with other logs may cut it into.
+
+    Blocks are those of `split_into_folds`: one for a log among many, several for a long one. Factors of pieces merge
+    into those of blocks. Equations of readings in the air do not, as they come from means over whole blocks: they are
+    there for every block of every number of blocks. No fit needs a contact state of a piece: a piece has all of them in
+    one factor, and each contact state has one of the whole log, which takes a fraction of the room.
+
+    Attributes:
+        source: name of the log.
+        samples: their number.
+        oversampling: of the samples, as `Samples` has it.
+        noise_left: likewise.
+        blocks: their largest number.
+        pieces: a factor of each of `piece_spans`, all contact states together, in time.
+        by_state: a factor of each contact state of the whole log.
+        unloaded: equations of readings in the air, by the block that they are of.
+    """
+
+    source: str
+    samples: int
+    oversampling: float
+    noise_left: float
+    blocks: int
+    pieces: list[Part]
+    by_state: list[Part]
+    unloaded: dict[SampleSpan, list[Part]]
+
+    __repr__ = short_repr
+
+    def _headline(self) -> str:
+        return f"{self.rows} equations of {self.samples} samples, up to {self.blocks} blocks"
+
+    def __len__(self) -> int:
+        return self.samples
+
+    @property
+    def rows(self) -> int:
+        """Number of equations, without those of readings in the air."""
+        return sum(part.factor.rows for part in self.pieces)
+
+    def block(self, start: int, stop: int, fold: int) -> CompressedBlock:
+        """A block of the log."""
+        spans = piece_spans(self.samples, self.blocks)
+        pieces = zip(spans, self.pieces, strict=True)
+        loaded = [part for (first, last), part in pieces if start <= first and last <= stop]
+        loaded, unloaded = (
+            [replace(part, fold=fold) for part in parts] for parts in (loaded, self.unloaded.get((start, stop), []))
+        )
+        loaded = [replace(part, block=number) for number, part in enumerate(loaded)]
+        return CompressedBlock(self.source, fold, stop - start, self.noise_left, [*loaded, *unloaded])
+
+
+@dataclass(frozen=True)
+class CompressedBlock:
+    """A block of a compressed log in a fold, which stands in for its samples.
+
+    Attributes:
+        source: name of the log.
+        fold: number of the fold.
+        samples: their number.
+        noise_left: as `Samples` has it.
+        parts: one with all contact states, whose own state means nothing, and equations of readings in the air.
+    """
+
+    source: str
+    fold: int
+    samples: int
+    noise_left: float
+    parts: list[Part]
+
+    def __len__(self) -> int:
+        return self.samples
+
+
+Block = Samples | CompressedBlock
+"""Samples of one log in one fold, or what they compress to."""
+
+
+def piece_spans(samples: int, blocks: int) -> list[SampleSpan]:
+    """Pieces of a log that make up the blocks of every number of blocks up to a largest one."""
+    ends = sorted({end for count in range(1, blocks + 1) for span in block_spans(samples, count) for end in span})
+    return list(zip(ends, ends[1:], strict=False))
+
+
+def compress_log(log: Samples, builder: RowBuilder, progress: ProgressCallback | None = None) -> CompressedLog:
+    """Compress one log for later fits with others.
+
+    As `split_into_folds` and `compress_parts` do for logs that are all there::
+
+        compressed = [torchid.compress_log(log, builder) for log in logs]
+        blocks = torchid.fold_compressed(compressed, builder)
+        fit = fitter.fit(torchid.merge_blocks(blocks, builder))
+
+    Args:
+        log: a bound log.
+        builder: of its rows.
+        progress: called with the number of samples done.
+    """
+    states = {state for state, _ in chunks_by_state(log)}
+    folds = round(len(log) / log.oversampling / LEAST_PER_FOLD)  # rounded, as its share of the folds of a fit is
+    blocks = fold_count(LEAST_PER_FOLD * folds, len(states), builder)
+    parts = compress_spans([log], [piece_spans(len(log), blocks)], builder, progress)
+    unloaded: dict[SampleSpan, list[Part]] = {}
+    for count in range(1, blocks + 1):
+        spans = block_spans(len(log), count)
+        for part in _compact(compress_unloaded(_cut(log, spans), builder)):
+            unloaded.setdefault(spans[part.fold], []).append(part)
+    pieces = merge_by_key(sorted(parts, key=lambda part: part.block), sorted((part.block,) for part in parts), builder)
+    by_state = merge_by_key(parts, [(part.state,) for part in parts], builder)
+    return CompressedLog(
+        log.source, len(log), log.oversampling, log.noise_left, blocks, _compact(pieces), _compact(by_state), unloaded
+    )
+
+
+def fold_compressed(logs: Sequence[CompressedLog], builder: RowBuilder) -> list[CompressedBlock]:
+    """The logs, in order, in blocks with folds: those that `split_into_folds` makes of their samples.
+
+    Args:
+        logs: compressed logs, of different names.
+        builder: of their rows.
+    """
+    count = fold_count(
+        sum(len(log) / log.oversampling for log in logs), sum(len(log.by_state) for log in logs), builder
+    )
+    layout = lay_out_folds([len(log) for log in logs], count, [log.blocks for log in logs])
+    return [log.block(*block) for log, blocks in zip(logs, layout, strict=True) for block in blocks]
+
+
+def merge_blocks(blocks: Sequence[CompressedBlock], builder: RowBuilder) -> list[Part]:
+    """The factors of all blocks, as `LogFitter.fit` takes them; readings in the air merged for each log and fold."""
+    parts = [part for block in blocks for part in block.parts]
+    loaded = [part for part in parts if not part.unloaded]
+    unloaded = [part for part in parts if part.unloaded]
+    keys = [(part.source, part.state, part.fold) for part in unloaded]
+    return [*loaded, *merge_by_key(unloaded, keys, builder)]
+
+
+@one_thread()
+def _compact(parts: Sequence[Part]) -> list[Part]:
+    return [replace(part, factor=part.factor.compact()) for part in parts]
+
+
+def _cut(log: Samples, spans: Sequence[SampleSpan]) -> list[Samples]:
+    """The samples of each span, with its number as their fold."""
+    return [replace(log if len(spans) == 1 else log[start:stop], fold=k) for k, (start, stop) in enumerate(spans)]

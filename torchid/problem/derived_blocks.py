@@ -184,10 +184,8 @@ def base_pose_in_blocks(
     _skip(quats, len(blocks) - length, 4)
     _skip(positions, len(blocks) - length, 3)
     fields: dict[str, Any] = {name: None for name in (*motion_fields(blocks), NORMALS) if not name.startswith("joint_")}
-    names = {name: array for name, array in blocks.names.items() if name != "imu_frame"}
     fields |= {"base_quat_xyzw": quats.array(), "base_position_world": positions.array()}
-    stood = blocks.replaced(fields)
-    return LogBlocks(stood.source, names, stood.time, stood.fields), found
+    return blocks.replaced(fields, {"imu_frame": None}), found
 
 
 def _skip(grows: Filled | Spill, count: int, width: int) -> None:

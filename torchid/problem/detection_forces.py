@@ -17,7 +17,7 @@ from torchid.problem.detection_motion import DetectionSamples
 from torchid.problem.elimination import assemble
 from torchid.problem.extras import ExtraTerms
 from torchid.problem.linear import PRIOR_DEVIATION, LinearProblem
-from torchid.problem.predict import force_series
+from torchid.problem.metrics import force_series
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples, concatenate
 from torchid.regressor import FrameJacobian

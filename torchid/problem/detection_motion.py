@@ -17,10 +17,10 @@ from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import preprocess
 from torchid.logs.timeline import JITTER
-from torchid.problem.base_motion import BaseMotion, base_motion
 from torchid.problem.base_pose import base_pose_from_feet
 from torchid.problem.floor_pose import levelled
 from torchid.problem.log_joints import joint_order
+from torchid.problem.motion import BaseMotion, base_motion
 from torchid.problem.samples import Samples
 from torchid.regressor.kinematics import GRAVITY_WORLD
 from torchid.robot import Robot

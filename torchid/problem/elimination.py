@@ -10,11 +10,17 @@ import numpy as np
 from torchid import parameters
 from torchid.parallel import one_thread
 from torchid.parameters import PER_BODY, Array
-from torchid.problem.eliminated_terms import EliminatedTerms, SignCondition
+from torchid.problem.compression import Part, merge_factors
 from torchid.problem.extras import Extra
-from torchid.problem.linear import PRIOR_DEVIATION, LinearProblem, TriangularFactor, parameter_scale
+from torchid.problem.linear import (
+    PRIOR_DEVIATION,
+    EliminatedTerms,
+    LinearProblem,
+    SignCondition,
+    TriangularFactor,
+    parameter_scale,
+)
 from torchid.problem.noise_gram import ColumnPrior, NoiseShares, corrected_triangle, scale_columns
-from torchid.problem.parts import Part, merge_factors
 from torchid.problem.rows import RowBuilder
 from torchid.robot import Robot
 from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, column_scale, is_significant

@@ -18,9 +18,8 @@ from torchid.sensing import Contact, SensorNoise, SensorSet
 from torchid.sensing.sensors import measured_components, recorded_components
 
 if TYPE_CHECKING:
-    from torchid.problem.contact_state import ContactStateLayout
+    from torchid.problem.contact_state import ContactStateLayout, FramePoses
     from torchid.problem.samples import Samples
-    from torchid.problem.wrench_rows import FramePoses
     from torchid.regressor.tree import KinematicTree
 
 CHANNELS = ("joint_torque", "contact_force", "contact_moment", "ft_force", "ft_moment")
@@ -64,7 +63,7 @@ class ExtraTerms:
     sign(v) exp(-(v / v_s)^2) (Armstrong-Hélouvry, Dupont and Canudas de Wit, "A survey of models, analysis tools and
     compensation methods for the control of machines with friction", 1994, with an exponent of 2).
 
-    `slope`: one further unknown of a search, see `torchid.fitting.delay`, whose column is the `slope` of the samples.
+    `slope`: one further unknown of a search, see `torchid.fitting.separable`; its column is the `slope` of the samples.
     """
 
     offsets: Mapping[str, str] = field(default_factory=dict)

@@ -17,7 +17,7 @@ from torchid.logs.time_range import log_title
 from torchid.parameters import Array
 from torchid.regressor.loops import LoopClosures
 from torchid.robot import Loop, Robot
-from torchid.robot.constraints import LOOPS_FIELD
+from torchid.robot.tree import LOOPS_FIELD
 from torchid.sensing import SensorSet
 
 _LISTED = 6

@@ -26,11 +26,11 @@ from torchid import distributed
 from torchid.errors import format_percent
 from torchid.parallel import one_thread
 from torchid.parameters import Array
-from torchid.problem.blocks import span_of_samples
+from torchid.problem.chunk_dynamics import span_of_samples
 from torchid.problem.chunks import ProgressCallback, chunk_size, map_chunks
 from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import TriangularFactor, gram_matrix
-from torchid.problem.motion_noise import with_noise_alone
+from torchid.problem.motion import with_noise_alone
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples, concatenate
 from torchid.rounding import RANK_TOLERANCE, column_scale, is_significant

@@ -18,9 +18,15 @@ from torchid.logs.log import FORCE_NORMAL, FloatArray, normalize_normals
 from torchid.logs.preprocess import unloaded_readings
 from torchid.parameters import WRENCH_COMPONENTS, Array
 from torchid.problem import log_joints
-from torchid.problem.base_motion import BaseMotion, base_motion, imu_pose, position_for_moments
 from torchid.problem.log_joints import columns_in_order, joint_order, recorded_torques
-from torchid.problem.motion_noise import MotionNoise, bind_motion_noise
+from torchid.problem.motion import (
+    BaseMotion,
+    MotionNoise,
+    base_motion,
+    bind_motion_noise,
+    imu_pose,
+    position_for_moments,
+)
 from torchid.regressor import Motion
 from torchid.regressor.kinematics import GRAVITY_WORLD, rotation_matrix
 from torchid.reprs import short_repr

@@ -78,19 +78,15 @@ def unloaded_offset_equations(builder: RowBuilder, samples: Samples) -> Iterator
         y = y[torch.isfinite(y)]
         if len(y) < LEAST_READINGS:
             continue
-        if _is_masked(y):
+        if _are_masked(len(y), int((y > 0.0).sum()), int((y < 0.0).sum())):
             yield UnloadedOffsetEquation(number, None, masked=True)
         else:
             mean, deviation = _robust_mean(y, noise[axis], samples.oversampling)
             yield UnloadedOffsetEquation(number, scales.get(extra.contact), False, mean, deviation)
 
 
-def _is_masked(y: Tensor) -> bool:
-    """Whether readings (M,) in the air are masked or clamped, not measured: many are exactly 0, and few of one sign."""
-    return _are_masked(len(y), int((y > 0.0).sum()), int((y < 0.0).sum()))
-
-
 def _are_masked(count: int, above: int, below: int) -> bool:
+    """Whether readings in the air are masked or clamped, not measured: many are exactly 0, and few of one sign."""
     zero = count - above - below
     return zero > _MASKED_SHARE * count and min(above, below) < _ONE_SIDED * count
 

@@ -8,34 +8,29 @@ from pathlib import Path
 from tempfile import gettempdir
 
 import numpy as np
-import torch
 
 from torchid import distributed
 from torchid.config.logs import require_apart
 from torchid.errors import ConfigError, LogError
 from torchid.fitting.experiment import RobotSetup, S
-from torchid.log_checks import Checked, drop_rejected
+from torchid.log_checks import drop_rejected
 from torchid.log_checks.check import check
 from torchid.log_checks.spikes import warn_of_steps
 from torchid.logs import Log, read_log
 from torchid.logs.blocks import GIGABYTE, has_blocks, log_bytes
 from torchid.logs.containers import LogKind, existing_log_kind
 from torchid.logs.flags import with_flags_by_force
-from torchid.logs.log import BoolArray, FloatArray
-from torchid.logs.preprocess import away_from_changes, away_from_stamps, preprocess
+from torchid.logs.log import BoolArray
 from torchid.logs.read import files_of_recordings_kept
 from torchid.logs.segments import with_delayed_torques
 from torchid.logs.time_range import LogPart, split_range
 from torchid.parameters import Array
-from torchid.problem import Samples, bind_log
-from torchid.problem.base_pose import preprocess_with_pose
+from torchid.problem import Samples
 from torchid.problem.contact_detection import with_detected_contacts
-from torchid.problem.contact_slip import measure_slip, warn_of_slip
 from torchid.problem.log_joints import with_loop_joints, without_welded_joints
 from torchid.problem.unloaded_sensors import zero_in_air
-from torchid.reading.large_log import BLOCK_GB, LargeLog
-from torchid.reading.segmented_log import require_kept
-from torchid.robot import Robot, payload_parameters, with_payload
+from torchid.reading.log_steps import BLOCK_GB, LogSteps
+from torchid.robot import payload_parameters, with_payload
 from torchid.sensing import SensorSet
 
 _WHOLE_GB = 2.0 * BLOCK_GB  # recorded arrays that are taken whole: no block is worth its neighbourhood
@@ -78,72 +73,49 @@ class LogReader:
         Raises:
             LogError: a file that cannot be read, or does not fit the robot.
         """
+        logs = list[Samples]()
         with files_of_recordings_kept():
-            logs = self._each(paths, required, on_read)
+            for path in paths:
+                together = self._together(path)
+                is_bag = existing_log_kind(path) is LogKind.BAG
+                if together > self.setup.config.preprocessing.memory_gb and not is_bag:
+                    logs.append(self._large(path, required, together))
+                else:
+                    logs.append(self._small(path, required))
+                    self._held = together + (logs[-1].nbytes / GIGABYTE if is_bag else 0.0)
+                if on_read is not None:
+                    on_read(path)
         names = distributed.broadcast([log.source for log in logs], "names of the logs")  # they may lie elsewhere there
         added = [payload_of(self.setup, path) for path in paths]
         return [replace(log, source=name, payload=x) for log, name, x in zip(logs, names, added, strict=True)]
-
-    def _each(
-        self, paths: Sequence[Path], required: SensorSet | None, on_read: Callable[[Path], None] | None
-    ) -> list[Samples]:
-        """The samples of log files, one after the other."""
-        limit, logs = self.setup.config.preprocessing.memory_gb, list[Samples]()
-        for path in paths:
-            together = self._together(path)
-            bag = existing_log_kind(path) is LogKind.BAG
-            large = together > limit and not bag
-            logs.append(self._samples(path, required, together if large else None))
-            if not large:
-                self._held = together + (logs[-1].nbytes / GIGABYTE if bag else 0.0)
-            if on_read is not None:
-                on_read(path)
-        return logs
-
-    def release(self) -> None:
-        """Take pages of files that samples are mapped to out of memory; they come back where they are used."""
 
     def _together(self, path: Path) -> float:
         """What a log takes in memory with those before it [GB]."""
         return memory_needed(path, self.setup.config.preprocessing.memory_gb, self._held)
 
-    def _samples(self, path: Path, required: SensorSet | None, together: float | None) -> Samples:
-        """The samples of a log; `together`: what it takes with those before it [GB], if that is too much."""
-        return self._small(path, required) if together is None else self._large(path, required, together)
-
     def _small(self, path: Path, required: SensorSet | None) -> Samples:
         """A log that fits into memory."""
         settings = self.setup.config.preprocessing
         if self._takes_blocks(path, log_bytes(path, GIGABYTE * _WHOLE_GB) / GIGABYTE):
-            return self._large_log(path, required, None).samples(fits_contact_offsets(self.setup))
+            return self._steps(path, required, None).samples(fits_contact_offsets(self.setup))
         read = self._recorded(path)
         own = setup_of_log(self.setup, path)
         acting = with_delayed_torques(without_welded_joints(read, own.robot), self.setup.config.actuators.known_delay)
         recorded, certain = apply_contact_settings(with_loop_joints(acting, own.robot), own)
-        checked = self._checked(recorded, own.robot)
-        if checked is None:
+        steps = self._steps(path, required, None)
+        with_unloaded = fits_contact_offsets(self.setup)
+        if not settings.exclude_rejected:
             warn_of_steps(recorded)
-        clean = recorded if checked is None else checked.repaired
-        log = self._preprocessed(clean)
-        samples = bind_log(log, self.setup.robot, self.setup.contacts, required)
-        slip = self._slipping(log, samples, recorded)
-        if not fits_contact_offsets(self.setup):
-            samples = replace(samples, unloaded=None)
-        if checked is not None:
-            count = len(samples)
-            samples = drop_rejected(samples, checked, settings.filter_hz, derived=log is not clean)
-            self.excluded[str(path)] = count - len(samples)
-        kept = None if slip is None else np.isin(samples.time.numpy(), slip, invert=True)
-        if settings.margin_s is not None and settings.detect_contacts is None:
-            away = away_from_changes(recorded, samples.time.numpy(), settings.margin_s)
-            kept = away if kept is None else kept if away is None else kept & away
-        if not certain.all():
-            away = away_from_stamps(samples.time.numpy(), recorded.time[~certain], settings.margin_s or 0.0)
-            kept = away if kept is None else kept & away
-        if kept is None or kept.all():
-            return samples
-        require_kept(kept, path, slip is not None)
-        return samples[torch.from_numpy(np.flatnonzero(kept))]
+            return steps.samples_of(recorded, certain, with_unloaded)
+        declared = replace(self.setup.declared, delay=0.0)  # the log has been read with it
+        checked = check(recorded, own.robot, self.setup.contacts, settings.filter_hz, settings.derived, declared)
+
+        def drop(samples: Samples, derived: bool) -> Samples:
+            usable = drop_rejected(samples, checked, settings.filter_hz, derived)
+            self.excluded[str(path)] = len(samples) - len(usable)
+            return usable
+
+        return steps.samples_of(recorded, certain, with_unloaded, checked.repaired, drop)
 
     def _recorded(self, path: Path) -> Log:
         """A log as it is in its file."""
@@ -158,30 +130,6 @@ class LogReader:
             needs_flags=settings.needs_flags,
         )
 
-    def _preprocessed(self, clean: Log) -> Log:
-        """A log as recorded, filtered, differentiated and resampled."""
-        settings = self.setup.config.preprocessing
-        rates, terms = (settings.filter_hz, settings.sample_rate_hz), self.setup.terms
-        dry, finds_rest = (terms.sign_width, terms.stribeck), self.setup.config.actuators.known["stiction"]
-        if settings.base_motion is None:
-            return preprocess(clean, *rates, self._stated, *dry, finds_rest)
-        return preprocess_with_pose(clean, self.setup.robot, self.setup.contacts, *rates, *dry, finds_rest)
-
-    def _slipping(self, log: Log, samples: Samples, recorded: Log) -> FloatArray | None:
-        """Stamps of samples in which a contact slips; None where all are kept.
-
-        Warns:
-            TorchidWarning: there are some, or nothing says whether there are.
-        """
-        settings, setup = self.setup.config.preprocessing, self.setup
-        if settings.max_slip is None or not setup.contacts:
-            return None
-        derived = settings.base_motion is not None
-        rest = setup.robot, setup.contacts, settings.slip_limit, settings.filter_hz, derived
-        slip = measure_slip(log, samples, recorded, *rest)
-        warn_of_slip(slip, log.source)
-        return np.asarray(samples.time.numpy()[slip.slips.any(axis=1)])
-
     def _large(self, path: Path, required: SensorSet | None, together: float) -> Samples:
         """A log that does not, with those before it [GB]."""
         settings = self.setup.config.preprocessing
@@ -195,7 +143,7 @@ class LogReader:
         if settings.exclude_rejected:
             accepted = f"{needed}, or parts of the logs that torchid check passes"
             raise LogError(path, "preprocessing.exclude_rejected", f"set for {arrays}", accepted)
-        return self._large_log(path, required, self.folder).samples(fits_contact_offsets(self.setup))
+        return self._steps(path, required, self.folder).samples(fits_contact_offsets(self.setup))
 
     def _takes_blocks(self, path: Path, gigabytes: float) -> bool:
         """Whether a log with so much in arrays is read block by block even if there is memory for it.
@@ -209,36 +157,24 @@ class LogReader:
         whole = settings.exclude_rejected or settings.derived or filled or delayed or joined
         return gigabytes > _WHOLE_GB and not whole and not self.setup.robot.loops
 
-    def _large_log(self, path: Path, required: SensorSet | None, folder: Path | None) -> LargeLog:
-        """A log that is read block by block."""
+    def _steps(self, path: Path, required: SensorSet | None, folder: Path | None) -> LogSteps:
+        """The steps from the log to samples."""
         setup = self.setup
         settings = setup.config.preprocessing
-        return LargeLog(
+        return LogSteps(
             path,
             settings,
             setup.robot,
             setup.contacts,
             required,
             folder,
-            motion_noise=self._stated,
+            motion_noise=setup.config.sensors.noise.motion,
             sign_width=setup.terms.sign_width,
             stribeck=setup.terms.stribeck,
             finds_rest=setup.config.actuators.known["stiction"],
             columns=None if setup.config.logs is None else setup.config.logs.columns,
             loaded=setup_of_log(setup, path).robot,
         )
-
-    @property
-    def _stated(self) -> dict[str, float]:
-        return self.setup.config.sensors.noise.motion
-
-    def _checked(self, log: Log, robot: Robot) -> Checked | None:
-        """What the checks of a log say, if rejected samples are to be left out."""
-        settings = self.setup.config.preprocessing
-        if not settings.exclude_rejected:
-            return None
-        declared = replace(self.setup.declared, delay=0.0)  # the log has been read with it
-        return check(log, robot, self.setup.contacts, settings.filter_hz, settings.derived, declared)
 
 
 def apply_contact_settings(log: Log, setup: RobotSetup) -> tuple[Log, BoolArray]:

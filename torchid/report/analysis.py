@@ -21,8 +21,7 @@ from torchid.problem import Metrics
 from torchid.problem.metrics import ROW_GROUPS, group_name
 from torchid.report.figure_style import IDENTIFIED_COLOR, MEASURED_COLOR, NOISE_COLOR, STYLE, label_decades
 from torchid.rounding import BASE_RANK_TOLERANCE
-from torchid.sensor_planning.demands import Candidate
-from torchid.sensor_planning.observability import BaseObservability, LostBase, PostureSummary
+from torchid.sensor_planning.observability import BaseObservability, Candidate, LostBase, PostureSummary
 from torchid.sensor_planning.planner import PartPlan, SensorPlan
 
 #: Columns of text.

@@ -1,21 +1,30 @@
-"""Measured and predicted forces: as a figure, with errors against the noise, and in few points for a page."""
+"""Measured and predicted forces over time, with errors against the noise, and the spectra of these errors."""
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from matplotlib.ticker import NullFormatter
 
 from torchid.logs.low_pass import import_signal
 from torchid.parameters import Array
 from torchid.problem.metrics import BASE_ROWS
-from torchid.report.figure_style import IDENTIFIED_COLOR, MEASURED_COLOR, NOMINAL_COLOR, STYLE
+from torchid.report.figure_style import (
+    CATEGORY_COLORS,
+    IDENTIFIED_COLOR,
+    MEASURED_COLOR,
+    NOISE_COLOR,
+    NOMINAL_COLOR,
+    STYLE,
+    decade_formatter,
+    label_decades,
+)
 
 _NOISE = "0.8"
 _MOST_ROWS = 6
@@ -24,6 +33,7 @@ _OF_A_CLOCK = 100.0  # times as long as a log lasts: stamps that say when it was
 _SHOWN = 1.6  # errors are shown up to so many times the largest of the identified ones, or of the noise
 _BINS = 1000  # of an envelope, each a minimum and a maximum
 _MOST_SPANS = 300  # of contact states
+_NAMED_STATES = 11  # in the legend
 _GAP = 5.0  # median steps that are a gap
 _SHORTEST, _LONGEST = 64, 1024  # samples of a window of a spectrum
 _BEYOND = 2.0  # frequencies are shown up to so many times the band of the noise
@@ -58,31 +68,41 @@ def force_figure(
 
     `dof_names`, `base_rows` and `sliding` are those of the robot, `of` is what its nominal parameters are from.
     """
-    rows = largest_rows(series, base_rows)
+    names = _largest(series, dof_names, base_rows, sliding)
     known = int(np.isfinite(series.measured).any(axis=0).sum())
-    shown = f" ({len(rows)} of {known} rows, the largest)" if len(rows) < known else ""
-    names = {row: name_row(row, base_rows, dof_names, sliding) for row in rows}
-    gaps = "; gaps: forces without a sensor act" if np.isnan(series.measured[:, rows]).any() else ""
+    shown = f" ({len(names)} of {known} rows, the largest)" if len(names) < known else ""
+    gaps = "; gaps: forces without a sensor act" if np.isnan(series.measured[:, list(names)]).any() else ""
     return _figure(series, names, f"Generalized forces{shown}, {series.source}", of, gaps)
 
 
 @matplotlib.rc_context(STYLE)
-def _figure(series: ForceSeries, rows: Mapping[int, tuple[str, str]], title: str, of: str, gaps: str = "") -> Figure:
-    """Some rows over time, by name and unit, and their errors."""
+def _figure(
+    series: ForceSeries,
+    rows: Mapping[int, tuple[str, str]],
+    title: str,
+    of: str,
+    gaps: str = "",
+    states: Sequence[Patch] = (),
+) -> Figure:
+    """Some rows over time, by name and unit, and their errors; `states` are further marks of the legend."""
     series, since = _from_its_start(series)
+    thin = _Thinned(series.time)
     figure = Figure(figsize=(12.0, 1.7 * max(len(rows), 1) + 0.8), layout="constrained")
     axes = figure.subplots(max(len(rows), 1), 2, sharex=True, squeeze=False, width_ratios=(3, 2))
     for (forces, errors), (row, (name, unit)) in zip(axes, rows.items(), strict=False):
-        forces.plot(series.time, series.measured[:, row], color=MEASURED_COLOR, linewidth=1.6, label="measured")
-        forces.plot(series.time, series.nominal[:, row], color=NOMINAL_COLOR, linewidth=1.0, label=f"predicted, {of}")
-        label = "predicted, identified"
-        forces.plot(series.time, series.identified[:, row], color=IDENTIFIED_COLOR, linewidth=1.0, label=label)
+        for values, color, width, label in (
+            (series.measured, MEASURED_COLOR, 1.6, "measured"),
+            (series.nominal, NOMINAL_COLOR, 1.0, f"predicted, {of}"),
+            (series.identified, IDENTIFIED_COLOR, 1.0, "predicted, identified"),
+        ):
+            forces.plot(thin.time, thin(values[:, row]), color=color, linewidth=width, label=label)
         forces.set_title(name, loc="left", fontsize=9)
         forces.set_ylabel(f"[{unit}]")
-        _draw_errors(errors, series, row, f"[{unit}]")
+        _draw_errors(errors, series, row, thin, f"[{unit}]")
     if rows:
         handles, labels = (a + b for a, b in zip(*(x.get_legend_handles_labels() for x in axes[0]), strict=True))
-        figure.legend(handles, labels, loc="outside lower center", ncols=4)
+        labels += [str(patch.get_label()) for patch in states]
+        figure.legend([*handles, *states], labels, loc="outside lower center", ncols=3 if states else 4)
     for axis in axes[-1]:
         axis.set_xlabel(f"time{since} [s]")
     if len(series.time) and 0.0 <= series.time[0] < _NEAR_0 * series.time[-1]:
@@ -104,7 +124,7 @@ def _from_its_start(series: ForceSeries) -> tuple[ForceSeries, str]:
     return replace(series, time=series.time - series.time[0]), " since the first sample"
 
 
-def _draw_errors(axis: Axes, series: ForceSeries, row: int, unit: str) -> None:
+def _draw_errors(axis: Axes, series: ForceSeries, row: int, thin: _Thinned, unit: str) -> None:
     """Errors of both predictions, with the noise of the readings as a band of two standard deviations."""
     nominal, identified = (x[:, row] - series.measured[:, row] for x in (series.nominal, series.identified))
     largest = float(np.nanmax(np.abs(identified), initial=0.0))
@@ -112,15 +132,14 @@ def _draw_errors(axis: Axes, series: ForceSeries, row: int, unit: str) -> None:
     if series.noise is not None and np.isfinite(series.noise[:, row]).any():
         std = series.noise[:, row]
         label = "± 2 standard deviations of the readings' noise"
-        axis.fill_between(series.time, -2.0 * std, 2.0 * std, color=_NOISE, linewidth=0, label=label)
+        axis.fill_between(thin.time, -2.0 * thin(std), 2.0 * thin(std), color=_NOISE, linewidth=0, label=label)
         largest = max(largest, float(2.0 * np.nanmax(std)))
-        text = f", noise alone {np.sqrt(np.nanmean(std**2)):.3g}"
-    axis.plot(series.time, nominal, color=NOMINAL_COLOR, linewidth=0.8)
-    axis.plot(series.time, identified, color=IDENTIFIED_COLOR, linewidth=0.8)
+        text = f", noise alone {_rms(std):.3g}"
+    axis.plot(thin.time, thin(nominal), color=NOMINAL_COLOR, linewidth=0.8)
+    axis.plot(thin.time, thin(identified), color=IDENTIFIED_COLOR, linewidth=0.8)
     if largest > 0.0:
         axis.set_ylim(-_SHOWN * largest, _SHOWN * largest)
-    rms = np.sqrt(np.nanmean(np.square(identified))) if np.isfinite(identified).any() else np.nan
-    axis.set_title(f"identified: rms {rms:.3g}{text} {unit}", loc="left", fontsize=9)
+    axis.set_title(f"identified: rms {_rms(identified):.3g}{text} {unit}", loc="left", fontsize=9)
 
 
 def name_row(row: int, base_rows: int, dof_names: Sequence[str], sliding: Collection[str]) -> tuple[str, str]:
@@ -131,90 +150,96 @@ def name_row(row: int, base_rows: int, dof_names: Sequence[str], sliding: Collec
     return name, "N" if name in sliding or name.endswith((".fx", ".fy", ".fz")) else "N m"
 
 
-def largest_rows(series: ForceSeries, base_rows: int) -> list[int]:
-    """Numbers of the rows to plot, the largest by rms of the measured force."""
+def _largest(
+    series: ForceSeries, dof_names: Sequence[str], base_rows: int, sliding: Collection[str]
+) -> dict[int, tuple[str, str]]:
+    """Names and units of the rows to plot, the largest by rms of the measured force."""
     size = np.sqrt(np.nanmean(np.square(np.nan_to_num(series.measured)), axis=0))
     size[~np.isfinite(series.measured).any(axis=0)] = -1.0
     base = [max(rows, key=lambda row: size[row]) for rows in (range(3), range(3, 6))] if base_rows else []
     base = [row for row in base if size[row] >= 0.0]
     joints = sorted((row for row in range(base_rows, len(size)) if size[row] >= 0.0), key=lambda row: -size[row])
-    return base + sorted(joints[: _MOST_ROWS - len(base)])
+    shown = base + sorted(joints[: _MOST_ROWS - len(base)])
+    return {row: name_row(row, base_rows, dof_names, sliding) for row in shown}
 
 
 @dataclass(frozen=True)
 class LogForces:
-    """Forces of a log from its first to its last sample.
+    """Forces in the rows of the fit, from the first to the last sample of a log.
 
     Attributes:
-        recorded: as the sensors read them.
-        projected: in the rows of the fit, where nothing unmeasured is left; its noise is that of the fit's weights.
+        projected: what no unmeasured force reaches; its noise is that of the fit's weights.
         states: names of the contact states.
         state: (N,), number of each sample's.
-        step: every so many samples of the log are here.
         bandwidth: up to which frequency there is noise [Hz].
     """
 
-    recorded: ForceSeries
     projected: ForceSeries
     states: tuple[str, ...]
     state: np.ndarray
-    step: int
     bandwidth: float
 
 
-def traces_document(
-    forces: LogForces, base_rows: int, dof_names: Sequence[str], sliding: Collection[str] = ()
-) -> dict[str, Any]:
-    """The largest rows, thinned to what a figure can show, for JSON; time is from the first sample [s].
-
-    Args:
-        forces: of a log.
-        base_rows: of the robot.
-        dof_names: likewise.
-        sliding: likewise.
-    """
-    time = forces.recorded.time - forces.recorded.time[0]
-    thin = _Thinned(time)
-    kinds = {"recorded": forces.recorded, "projected": forces.projected}
-    panels = {
-        kind: [
-            {"row": row} | dict(zip(("name", "unit"), name_row(row, base_rows, dof_names, sliding), strict=True))
-            | _panel(series, row, thin) | {"spectrum": _spectrum(series, row, time, forces.bandwidth)}
-            for row in largest_rows(series, base_rows)
-        ]
-        for kind, series in kinds.items()
-    }  # fmt: skip
-    return {
-        "source": forces.recorded.source,
-        "samples": len(time),
-        "step": forces.step,
-        "seconds": float(time[-1]),
-        "time": packed(thin.time),
-        "states": {"names": list(forces.states), "spans": _spans(time, forces.state)},
-        **panels,
-    }
+def rows_figure(
+    forces: LogForces, dof_names: Sequence[str], base_rows: int, sliding: Collection[str] = (), of: str = "URDF"
+) -> Figure:
+    """As `force_figure`, in the rows of the fit over the whole log; colours behind them are contact states."""
+    series = replace(forces.projected, time=forces.projected.time - forces.projected.time[0])
+    names = _largest(series, dof_names, base_rows, sliding)
+    spans = _spans(series.time, forces.state)
+    lasted = [sum(end - start for start, end, number in spans if number == k) for k in range(len(forces.states))]
+    colored = np.argsort(lasted)[::-1][1:].tolist()  # the longest stays white
+    colors = {k: CATEGORY_COLORS[place % len(CATEGORY_COLORS)] for place, k in enumerate(colored)}
+    patches = [Patch(color=color, alpha=0.25, label=forces.states[k]) for k, color in colors.items()]
+    figure = _figure(series, names, f"Rows of the fit, {series.source}", of, states=patches[:_NAMED_STATES])
+    for axis in figure.axes:
+        for start, end, number in spans:
+            if number in colors:
+                axis.axvspan(start, end, color=colors[number], alpha=0.25, linewidth=0.0, zorder=0)
+    return figure
 
 
-def packed(values: Array) -> dict[str, str]:
-    """Numbers as Plotly's typed arrays, which may hold NaN."""
-    return {"dtype": "f4", "bdata": base64.b64encode(values.astype("<f4").tobytes()).decode()}
+@matplotlib.rc_context(STYLE)
+def spectrum_figure(
+    forces: LogForces, dof_names: Sequence[str], base_rows: int, sliding: Collection[str] = (), of: str = "URDF"
+) -> Figure:
+    """Amplitude densities of the errors in the rows of the fit, and that of the readings' noise."""
+    series = forces.projected
+    names = _largest(series, dof_names, base_rows, sliding)
+    spectra = {row: _spectrum(series, row, series.time - series.time[0], forces.bandwidth) for row in names}
+    shown = {row: spectrum for row, spectrum in spectra.items() if spectrum is not None}
+    figure = Figure(figsize=(12.0, 2.2 * -(-max(len(shown), 1) // 3) + 0.8), layout="constrained")
+    if not shown:
+        figure.suptitle("Residuals by frequency: the log has no segment that is long enough", x=0.01, ha="left")
+        return figure
+    axes = figure.subplots(-(-len(shown) // 3), min(len(shown), 3), squeeze=False).ravel()
+    for axis, (row, spectrum) in zip(axes, shown.items(), strict=False):
+        for density, color, label in (
+            (spectrum.nominal, NOMINAL_COLOR, f"predicted, {of}"),
+            (spectrum.identified, IDENTIFIED_COLOR, "predicted, identified"),
+        ):
+            axis.loglog(spectrum.frequency, density, color=color, linewidth=1.2, label=label)
+        if spectrum.noise is not None:
+            band = [spectrum.frequency[0], forces.bandwidth]
+            axis.loglog(band, [spectrum.noise] * 2, "--", color=NOISE_COLOR, label="noise of the readings")
+        name, unit = names[row]
+        axis.set_title(f"{name} [{unit}/√Hz]", loc="left", fontsize=9)
+        axis.set_xlabel("frequency [Hz]")
+        label_decades(axis.xaxis)
+        axis.yaxis.set_major_formatter(decade_formatter())
+        axis.yaxis.set_minor_formatter(NullFormatter())
+    for axis in axes[len(shown) :]:
+        axis.remove()
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    title = f"Residuals by frequency in the rows of the fit, {series.source}: above the noise lies what the model lacks"
+    figure.suptitle(title, x=0.01, ha="left")
+    return figure
 
 
-def _panel(series: ForceSeries, row: int, thin: _Thinned) -> dict[str, Any]:
-    """One row: forces and errors, with the rms of these and of the noise."""
-    measured, nominal, identified = (x[:, row] for x in (series.measured, series.nominal, series.identified))
-    known = {} if series.noise is None else {"noise": series.noise[:, row]}
-    errors = {"nominal_error": nominal - measured, "identified_error": identified - measured}
-    lines = {"measured": measured, "nominal": nominal, "identified": identified} | errors
-    return {
-        "lines": {name: packed(thin(values)) for name, values in lines.items()},
-        "rms": {name: _rms(values) for name, values in (errors | known).items()},
-    }
-
-
-def _rms(values: Array) -> float | None:
+def _rms(values: Array) -> float:
+    """Of what is known, NaN where nothing is."""
     known = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(np.square(known)))) if len(known) else None
+    return float(np.sqrt(np.mean(np.square(known)))) if len(known) else np.nan
 
 
 class _Thinned:
@@ -258,8 +283,18 @@ def _spans(time: Array, state: np.ndarray) -> list[tuple[float, float, int]]:
     return [(round(float(time[first[k]]), 4), round(float(end[k]), 4), int(state[first[k]])) for k in order]
 
 
-def _spectrum(series: ForceSeries, row: int, time: Array, bandwidth: float) -> dict[str, Any] | None:
-    """Amplitude density of both errors in the longest segment without gaps, and that of the noise; None if short."""
+@dataclass(frozen=True)
+class _Spectrum:
+    """Amplitude densities of both errors over frequency [Hz], and that of the noise."""
+
+    frequency: Array
+    nominal: Array
+    identified: Array
+    noise: float | None
+
+
+def _spectrum(series: ForceSeries, row: int, time: Array, bandwidth: float) -> _Spectrum | None:
+    """Amplitude densities in the longest segment without gaps; None if it is short."""
     errors = np.stack([series.nominal[:, row], series.identified[:, row]]) - series.measured[:, row]
     segment = _longest_segment(time, np.asarray(np.isfinite(errors).all(axis=0)))
     count = segment.stop - segment.start
@@ -269,14 +304,9 @@ def _spectrum(series: ForceSeries, row: int, time: Array, bandwidth: float) -> d
     window = int(np.clip(count // 4, _SHORTEST, _LONGEST))
     frequency, density = import_signal().welch(errors[:, segment], rate, nperseg=window)
     shown = (frequency > 0.0) & (frequency <= _BEYOND * bandwidth)
-    noise = None if series.noise is None else _rms(series.noise[segment, row])
-    return {
-        "frequency": packed(frequency[shown]),
-        "nominal": packed(np.sqrt(density[0, shown])),
-        "identified": packed(np.sqrt(density[1, shown])),
-        "noise": None if noise is None else noise / float(np.sqrt(bandwidth)),
-        "band": [float(frequency[1]), bandwidth],
-    }
+    noise = None if series.noise is None else _rms(series.noise[segment, row]) / float(np.sqrt(bandwidth))
+    nominal, identified = np.sqrt(density[:, shown])
+    return _Spectrum(frequency[shown], nominal, identified, noise if noise and np.isfinite(noise) else None)
 
 
 def _longest_segment(time: Array, known: np.ndarray) -> slice:

@@ -100,7 +100,7 @@ def refused_by_simulators(robot: Robot, phi: Array, fitted: FittedJoints) -> str
         warnings.simplefilter("ignore", TorchidWarning)  # said where the file is written
         text = identified_robot(robot, phi, fitted)
     try:
-        from torchid.robot.mjcf_model import mujoco_error  # needs an extra
+        from torchid.robot.mjcf import mujoco_error  # needs an extra
     except InputError:
         refused = [*massless_ends(robot, phi), *links_that_are_no_bodies(robot, phi)]
         return f"no inertia that a body could have: {join_names(refused)}" if refused else ""

@@ -23,7 +23,7 @@ from torchid.estimators import Estimate
 from torchid.estimators.least_squares import COMBINED, FIXED, IDENTIFIED, PRIOR, UNOBSERVABLE
 from torchid.fitting.calibration import Comparison
 from torchid.identifiability.confounding import ExtraEstimate
-from torchid.identifiability.contributions import Contribution, Contributions, PartContribution
+from torchid.identifiability.information import Contribution, Contributions, PartContribution
 from torchid.kernels import compiling_announced
 from torchid.logs.time_range import log_title
 from torchid.parameters import PARAMETERS, PER_BODY

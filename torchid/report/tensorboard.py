@@ -18,7 +18,7 @@ from torchid.fitting.cross_validation import RidgeChoice
 from torchid.identifiability.information import InformationGain
 from torchid.problem import Metrics
 from torchid.problem.metrics import ERROR_GROUPS, LOG_SETS, ROW_GROUPS
-from torchid.report.parameter_figures import INTERVAL
+from torchid.report.figures import INTERVAL
 
 _RGBA = 4  # colour space in Summary.Image
 _NOMINAL = "_nominal"  # ends the names of charts of the nominal parameters

@@ -146,7 +146,7 @@ class SensorNoise:
     `base_force` and `base_moment` are the errors of the base rows that are no force sensor's (differentiated motion,
     soft contacts): without them a base row in flight, where no sensor contributes noise, would count as exact. By
     default they are one contact sensor's noise, and so are those of force/torque sensors in limbs. Three numbers are
-    for the axes x, y, z of the levelled base, see `torchid.problem.base_motion.levelled_base_axes`. `joint_torque`, in
+    for the axes x, y, z of the levelled base, see `torchid.problem.motion.levelled_base_axes`. `joint_torque`, in
     N of a joint that slides, may have a number for each joint, as estimates do. The defaults are
     rough, for library users and as the start of the estimation in `torchid.problem.noise`.
     """

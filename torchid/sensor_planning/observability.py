@@ -1,32 +1,350 @@
-"""Observability of the base with a sensor set: rank(S_b V_x) per contact state, what is lost, why, and remedies."""
+"""Candidate sensors, what contacts demand of them, and observability of the base with a sensor set."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 import torch
 
-from torchid.identifiability.structure import random_postures, resting_samples
+from torchid.errors import SensorError, UnknownNameError, UrdfError
+from torchid.identifiability.base_parameters import closed_postures, random_postures, resting_samples
 from torchid.parallel import one_thread
 from torchid.parameters import Array
-from torchid.problem import RowBuilder
+from torchid.problem import RowBuilder, Samples
 from torchid.problem.contact_state import ContactState, state_name
 from torchid.robot import Robot
+from torchid.robot.tree import LOOPS_FIELD
 from torchid.rounding import BASE_RANK_TOLERANCE
-from torchid.sensing import Contact, SensorSet
+from torchid.sensing import Contact, SensorNoise, SensorSet
 from torchid.sensing.projection import base_rank, base_singular_values
-from torchid.sensor_planning.demands import (
-    Candidate,
-    Demand,
-    candidates,
-    contained_candidates,
-    demands,
-    orthonormal_basis,
-    with_scalar_candidates,
-)
+from torchid.sensing.sensors import NORMAL_FORCE, NORMAL_INDEX, measured_components
+
+SENSOR_KINDS = ("joint_torque", "contact", "normal_force", "ft_sensor")
+PER = ("device", "axis", "none")
+SPAN_TOLERANCE = 1e-6
+"""A share of unit vectors below this counts as zero, as in the rank of S_b V_x that this predicts.
+
+Axes that a URDF's rounded angles (1.5708) tilt by 4e-6 from parallel count as independent in both.
+"""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A sensor that may be chosen.
+
+    `kind`: one of `SENSOR_KINDS`. `dofs`: indices in the robot's `dof_names` that a torque sensor, or a force/torque
+    sensor in a limb, measures. `contact`: index of the contact, and `components`, in `WRENCH_COMPONENTS`, of a sensor
+    there; that of a scalar sensor is the one along the ground's normal of a contact with such axes, see
+    `with_scalar_candidates`.
+    `name`: the joint; the contact's frame for a whole device, "l_sole.fx" for one axis of it, "l_sole.fn" for a scalar
+    sensor.
+    """
+
+    name: str
+    kind: str
+    cost: float
+    dofs: tuple[int, ...] = ()
+    contact: int | None = None
+    components: tuple[int, ...] = ()
+
+    @property
+    def channels(self) -> int:
+        """Number of measured components."""
+        return len(self.readings)
+
+    @property
+    def readings(self) -> tuple[tuple[int | None, int], ...]:
+        """What it measures: None and an index in `dof_names`, or the contact and a component."""
+        return (*((None, dof) for dof in self.dofs), *((self.contact, k) for k in self.components))
+
+
+def count_channels(chosen: Iterable[Candidate]) -> int:
+    """Number of measured components of some candidates together."""
+    return len({channel for candidate in chosen for channel in candidate.readings})
+
+
+def total_cost(chosen: Iterable[Candidate]) -> float:
+    """Total cost of some candidates."""
+    return sum(candidate.cost for candidate in chosen)
+
+
+def candidates(
+    robot: Robot,
+    contacts: Sequence[Contact],
+    joint_torques: Sequence[str] | None = None,
+    per: str = "device",
+    costs: Mapping[str, float] | None = None,
+    ft_sensors: Sequence[str] = (),
+    normal_forces: Sequence[str] = (),
+) -> tuple[Candidate, ...]:
+    """All candidate sensors: joint torques in the robot's order, then the contacts', then those in limbs.
+
+    Args:
+        robot: the robot.
+        contacts: all contacts; a sensor measures the components that its contact can exert.
+        joint_torques: joints that can carry a torque sensor; None for all with a motor.
+        per: "device", one force/torque sensor per contact, "axis", one candidate per component, or "none" at contacts.
+            In limbs, too, a candidate per component with "axis".
+        costs: by name of a candidate, or by kind and then per channel; 1 per channel by default.
+        ft_sensors: fixed joints that can carry a force/torque sensor, among those that the robot was loaded with.
+        normal_forces: frames of contacts that can carry a scalar sensor of the force along the ground's normal, beside
+            a device or alone.
+
+    Raises:
+        UnknownNameError: a joint, a contact, or a name in `costs`, that does not exist.
+        SensorError: `per` is not in `PER`, or "axis" with scalar sensors; a cost is not a positive number.
+    """
+    if per not in PER:
+        raise SensorError("sensors", "candidates.per", f"'{per}'", ", ".join(PER))
+    driven = [name for name in robot.joint_names if name not in robot.passive]  # the torque of others is known
+    chosen = driven if joint_torques is None else joint_torques
+    for name in chosen:
+        if name not in driven:
+            what = "a joint without a motor" if name in robot.passive else ""
+            raise UnknownNameError("sensors", "candidates.joint_torques", name, driven, what)
+    offered = [
+        Candidate(name, "joint_torque", 1.0, dofs=(j,)) for j, name in enumerate(robot.joint_names) if name in chosen
+    ]
+    limbs = _in_limbs(robot, ft_sensors, per == "axis")
+    return _with_costs([*offered, *_at_contacts(contacts, per, normal_forces), *limbs], costs or {})
+
+
+def _at_contacts(contacts: Sequence[Contact], per: str, normal_forces: Sequence[str]) -> list[Candidate]:
+    """Sensors of contacts, as devices or axis by axis, and scalar ones."""
+    frames, offered = [contact.frame for contact in contacts], []
+    for name in normal_forces:
+        if name not in frames:
+            raise UnknownNameError("sensors", "candidates.normal_forces", name, frames)
+    if normal_forces and per == "axis":
+        found = f"{', '.join(normal_forces)}, beside single axes of the contacts' frames"
+        raise SensorError("sensors", "candidates.normal_forces", found, "candidates.contacts: device or none")
+    for index, contact in enumerate(contacts):
+        if per == "device":
+            components = tuple(contact.components)
+            offered.append(Candidate(contact.frame, "contact", 1.0, contact=index, components=components))
+        elif per == "axis":
+            names = [(f"{contact.frame}.{contact.component_name(k)}", k) for k in contact.components]
+            offered += [Candidate(name, "contact", 1.0, contact=index, components=(k,)) for name, k in names]
+        if contact.frame in normal_forces:
+            name = f"{contact.frame}.{NORMAL_FORCE}"
+            offered.append(Candidate(name, "normal_force", 1.0, contact=index, components=(NORMAL_INDEX,)))
+    return offered
+
+
+def _in_limbs(robot: Robot, names: Sequence[str], by_axis: bool) -> list[Candidate]:
+    """Force/torque sensors at fixed joints, as devices or axis by axis."""
+    offered = []
+    for name in names:
+        if name not in robot.ft_names:
+            raise UnknownNameError("sensors", "candidates.ft_sensors", name, robot.ft_names)
+        first = robot.n + 6 * robot.ft_names.index(name)
+        if by_axis:
+            offered += [Candidate(robot.dof_names[k], "ft_sensor", 1.0, dofs=(k,)) for k in range(first, first + 6)]
+        else:
+            offered.append(Candidate(name, "ft_sensor", 1.0, dofs=tuple(range(first, first + 6))))
+    return offered
+
+
+def _with_costs(offered: Sequence[Candidate], costs: Mapping[str, float]) -> tuple[Candidate, ...]:
+    names = [*SENSOR_KINDS, *(candidate.name for candidate in offered)]
+    for name, cost in costs.items():
+        if name not in names:
+            raise UnknownNameError("sensors", "costs", name, names)
+        if not (math.isfinite(cost) and cost > 0.0):
+            raise SensorError("sensors", f"costs.{name}", str(cost), "a positive number")
+    prices = [costs.get(c.name, c.channels * costs.get(c.kind, 1.0)) for c in offered]
+    return tuple(replace(c, cost=float(price)) for c, price in zip(offered, prices, strict=True))
+
+
+def with_scalar_candidates(
+    contacts: Sequence[Contact], candidates: Iterable[Candidate], sensors: SensorSet | None = None
+) -> tuple[Contact, ...]:
+    """The contacts, those at which there are candidates of kind "normal_force" with the ground's axes.
+
+    Readings of all components are the same along any axes. A contact of which the sensors read some along its frame's
+    axes keeps these: it cannot have a scalar sensor beside them.
+    """
+    along = {candidate.contact for candidate in candidates if candidate.kind == "normal_force"}
+    if sensors is not None:
+        measured = measured_components(contacts, sensors)
+        along -= {c for c, contact in enumerate(contacts) if 0 < measured[c].sum() < len(contact.components)}
+    return tuple(replace(x, along_normal=True) if c in along else x for c, x in enumerate(contacts))
+
+
+def sensor_set(
+    robot: Robot, contacts: Sequence[Contact], chosen: Iterable[Candidate], noise: SensorNoise | None = None
+) -> SensorSet:
+    """The sensor set that consists of some candidates; torques of joints without a motor are known."""
+    torque, wrench = robot.is_passive.copy(), np.zeros((len(contacts), 6), dtype=bool)
+    for candidate in chosen:
+        torque[list(candidate.dofs)] = True
+        if candidate.contact is not None:
+            wrench[candidate.contact, list(candidate.components)] = True
+    return SensorSet(torque, wrench, noise or SensorNoise())
+
+
+def contained_candidates(
+    contacts: Sequence[Contact], sensors: SensorSet, candidates: Sequence[Candidate]
+) -> tuple[Candidate, ...]:
+    """The candidates that a sensor set contains: those whose components are all measured."""
+    wrench = measured_components(contacts, sensors)
+    return tuple(
+        c
+        for c in candidates
+        if sensors.torque[list(c.dofs)].all() and (c.contact is None or wrench[c.contact, list(c.components)].all())
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Demand:
+    """Demand of a group of contacts at one posture: sensors whose vectors span the target.
+
+    Attributes:
+        contacts: indices of the group's contacts, ascending; `frames`: their names.
+        joints: indices of the independent joints between the base and the contacts, ascending.
+        rows: (k,) the contact that each row of J belongs to.
+        target: (k, d) orthonormal basis of range(J_b).
+        vectors: (k, w) unit vectors of every candidate that acts on the group; others, and those without a lever arm,
+            are absent.
+    """
+
+    contacts: tuple[int, ...]
+    frames: tuple[str, ...]
+    joints: tuple[int, ...]
+    rows: tuple[int, ...]
+    target: Array
+    vectors: Mapping[Candidate, Array]
+
+    def stacked(self, chosen: Iterable[Candidate]) -> Array:
+        """All vectors of some candidates, (k, w)."""
+        return np.hstack([np.zeros((len(self.rows), 0)), *(self.vectors[c] for c in chosen if c in self.vectors)])
+
+    def missing(self, chosen: Iterable[Candidate]) -> int:
+        """Dimensions of the target outside the span of some candidates; 0 if they meet the demand."""
+        return int(self.unreached(orthonormal_basis(self.stacked(chosen))))
+
+    def unreached(self, basis: Array) -> Array:
+        """Dimensions of the target outside the span of orthonormal (or zero) columns (..., k, r), int (...)."""
+        return np.asarray(
+            (np.linalg.svd(orthogonal_part(self.target, basis), compute_uv=False) > BASE_RANK_TOLERANCE).sum(-1)
+        )
+
+    def gains(self, basis: Array) -> dict[Candidate, int]:
+        """Dimensions that each candidate adds to a span (k, r)."""
+        values = ((c, np.linalg.svd(orthogonal_part(x, basis), compute_uv=False)) for c, x in self.vectors.items())
+        return {candidate: int((s > BASE_RANK_TOLERANCE).sum()) for candidate, s in values}
+
+
+def orthonormal_basis(vectors: Array) -> Array:
+    """Orthonormal basis of the span of unit columns, (..., k, w) to (..., k, min(k, w)), padded with zero columns."""
+    U, values, _ = np.linalg.svd(vectors, full_matrices=False)
+    return U * (values > BASE_RANK_TOLERANCE * values[..., :1])[..., None, :]
+
+
+def orthogonal_part(vectors: Array, basis: Array) -> Array:
+    """The part of vectors (k, w) that is orthogonal to a span (..., k, r): (..., k, w)."""
+    return vectors - basis @ (np.swapaxes(basis, -1, -2) @ vectors)
+
+
+def span_basis(vectors: Array) -> Array:
+    """Orthonormal basis (k, r) of the span of parts of unit vectors (k, w), without negligible ones."""
+    U, values, _ = np.linalg.svd(vectors, full_matrices=False)
+    return U[:, values > BASE_RANK_TOLERANCE]
+
+
+def demands(
+    robot: Robot,
+    contacts: Sequence[Contact],
+    states: Iterable[ContactState],
+    candidates: Sequence[Candidate],
+    seed: int = 0,
+    joint_position: Array | None = None,
+) -> list[Demand]:
+    """Demands of some contact states, each group of contacts once; none for a fixed base.
+
+    Args:
+        robot: the robot.
+        contacts: all contacts.
+        states: contact states.
+        candidates: sensors to choose from.
+        seed: of the random posture, at which ranks are those of almost every posture.
+        joint_position: (n,), another posture instead, or one near it with closed loops [rad or m].
+
+    Raises:
+        UrdfError: loops whose motors do not determine how they move.
+    """
+    if robot.fixed_base:
+        return []
+    if joint_position is None:
+        joint_position = random_postures(robot, 1, np.random.default_rng(seed))[0]
+    elif robot.loops:
+        joint_position = closed_postures(robot, joint_position[None])[0]
+    builder = RowBuilder(robot, contacts, sensor_set(robot, contacts, ()))
+    linking = {*range(robot.n), *(dof for candidate in candidates for dof in candidate.dofs)}
+    J = _jacobian(builder, resting_samples(joint_position[None], (False,) * len(contacts)), robot)
+    above = [linking & builder.motors.above(builder.columns.joints_above(body)) for body, _ in builder.frames]
+    groups = dict.fromkeys(group for state in states for group in _groups(above, state))
+    joints = {group: sorted(set().union(*(above[index] for index in group)) & set(range(robot.n))) for group in groups}
+    return [_demand(group, tuple(joints[group]), contacts, J, candidates) for group in groups]
+
+
+def _jacobian(builder: RowBuilder, posture: Samples, robot: Robot) -> Array:
+    """Jacobians (C, 6, n_rows) of all contacts at a posture, by the motion of motors where there are loops."""
+    J = builder.contact_jacobian(posture).permute(1, 2, 0, 3)
+    by_motors = builder.motors.of(builder.tree, builder.kinematics(posture), J)[:, :, 0].numpy()
+    by_motors[..., [robot.base_rows + dof for dof in builder.motors.passive]] = 0.0
+    if np.isnan(by_motors).any():
+        found = "loops in which motors do not determine how the other joints move"
+        raise UrdfError(robot.path, LOOPS_FIELD, found, "as many motors as a loop has motions, to plan sensors")
+    return np.asarray(by_motors)
+
+
+def _groups(above: Sequence[AbstractSet[int]], state: ContactState) -> list[tuple[int, ...]]:
+    """Active contacts, grouped by shared joints; `above`: joints between the base and each contact."""
+    active = [index for index, in_contact in enumerate(state) if in_contact]
+    return [tuple(active[k] for k in group) for group in connected_groups([above[index] for index in active])]
+
+
+def connected_groups(sets: Sequence[AbstractSet[Hashable]]) -> list[tuple[int, ...]]:
+    """Indices of sets that are linked by common members, ascending; an empty set is a group of its own."""
+    groups: list[tuple[list[int], set[Hashable]]] = []
+    for index, members in enumerate(sets):
+        linked = [group for group in groups if group[1] & members]
+        groups = [group for group in groups if not group[1] & members]
+        indices = sorted([index, *(k for group in linked for k in group[0])])
+        groups.append((indices, set(members).union(*(group[1] for group in linked))))
+    return sorted(tuple(indices) for indices, _ in groups)
+
+
+def _demand(
+    group: tuple[int, ...],
+    joints: tuple[int, ...],
+    contacts: Sequence[Contact],
+    J: Array,
+    candidates: Sequence[Candidate],
+) -> Demand:
+    """Demand of a group, from the Jacobians of all contacts, (C, 6, n_rows)."""
+    rows = [(index, k) for index in group for k in contacts[index].components]
+    J_group = np.stack([J[row] for row in rows])
+    J_group /= np.linalg.norm(J_group[:, :6])
+    vectors = {}
+    for candidate in candidates:
+        if candidate.dofs:
+            x = J_group[:, [6 + dof for dof in candidate.dofs]]
+            length = np.linalg.norm(x, axis=0)
+            if (length > BASE_RANK_TOLERANCE).any():
+                vectors[candidate] = x[:, length > BASE_RANK_TOLERANCE] / length[length > BASE_RANK_TOLERANCE]
+        elif candidate.contact in group:
+            measured_rows = [rows.index((candidate.contact, k)) for k in candidate.components]
+            vectors[candidate] = np.eye(len(rows))[:, measured_rows]
+    frames = tuple(contacts[index].frame for index in group)
+    return Demand(group, frames, joints, tuple(index for index, _ in rows), span_basis(J_group[:, :6]), vectors)
+
 
 _ZERO = 1e-5  # share of a unit vector that counts as zero
 _CHUNK = 1024

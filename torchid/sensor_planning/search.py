@@ -15,7 +15,7 @@ from scipy.optimize import Bounds, LinearConstraint, milp
 from torchid.errors import SensorError
 from torchid.parallel import one_thread
 from torchid.parameters import Array
-from torchid.sensor_planning.demands import (
+from torchid.sensor_planning.observability import (
     SPAN_TOLERANCE,
     Candidate,
     Demand,
@@ -53,7 +53,7 @@ def cheapest_set(
     """The cheapest set of candidates that meets every demand.
 
     Args:
-        demands: from `torchid.sensor_planning.demands.demands`.
+        demands: from `torchid.sensor_planning.observability.demands`.
         candidates: to choose from.
         keep: in the set, needed or not.
         exclude: not in the set.

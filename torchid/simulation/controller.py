@@ -12,8 +12,7 @@ from torchid.config import MotionConfig, StepsConfig
 from torchid.errors import InputError, UnknownNameError
 from torchid.logs.log import BoolArray
 from torchid.parameters import Array
-from torchid.simulation.constraints import Foot, rotation_error
-from torchid.simulation.plant import FootMotion, Plant
+from torchid.simulation.plant import Foot, FootMotion, Plant, rotation_error
 
 _STIFFNESS, _DAMPING = 100.0, 20.0  # 1/s^2, 1/s: errors decay within half a second, without overshoot
 _CREEP, _FOOT_DAMPING = 100.0, 20.0  # 1/s^2, 1/s, of a foot that stands: friction holds it, but lets it creep

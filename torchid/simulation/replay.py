@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from torchid.errors import InputError, LogError
 from torchid.parameters import Array
 from torchid.regressor.kinematics import GRAVITY_WORLD
-from torchid.simulation.constraints import Followers, Foot, JointConstraints
-from torchid.simulation.plant import compile_model, foot_site
+from torchid.simulation.plant import Followers, Foot, JointConstraints, compile_model, foot_site
 
 _PHYSICS_HZ = 1000.0
 # Rates of decay by damping [1/s] from _PHYSICS_HZ on are for an implicit integrator: Runge and Kutta's would diverge.

@@ -18,9 +18,8 @@ from torchid.logs.log import BoolArray
 from torchid.parameters import Array
 from torchid.problem.floor_pose import rolled_distance
 from torchid.sensing.sensors import NORMAL_INDEX
-from torchid.simulation.constraints import Foot, find_feet, form_polygon
 from torchid.simulation.controller import Controller, ReferenceMotion, Stance, find_stance
-from torchid.simulation.plant import Plant
+from torchid.simulation.plant import Foot, Plant, find_feet, form_polygon
 
 _REPORT_S = 0.25  # simulated seconds between two checks of whether the robot stands
 

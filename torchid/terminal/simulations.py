@@ -1,6 +1,6 @@
 """What commands that simulate a robot print: `simulate` of how it stood, `replay` of how far it drifts from a log.
 
-Apart from `terminal/runs.py`, whose commands need no MuJoCo.
+Apart from `terminal/identification.py`, whose commands need no MuJoCo.
 """
 
 from __future__ import annotations

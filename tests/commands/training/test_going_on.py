@@ -16,6 +16,7 @@ import pytest
 import torch
 from hostile_commands import Commands
 from repository import DEMO
+from run_figures import OF_A_RUN
 from run_folders import names_in
 from tensorboard.plugins.custom_scalar import layout_pb2
 from thinned import slow_but
@@ -47,7 +48,20 @@ pytestmark = pytest.mark.usefixtures("events")
 
 def test_the_run_folder_is_that_of_any_run_and_nothing_is_left_beside_it(run: Path) -> None:
     names = {"events" if path.name.startswith("events") else path.name for path in run.iterdir()}
-    figures = {"forces.png", "pressure.png", "errors.png", "parameters.png", "identifiability.png", "contributions.png"}
+    figures = {
+        f"{name}.png"
+        for name in (
+            "forces",
+            "pressure",
+            "rows",
+            "spectra",
+            "errors",
+            "parameters",
+            "identifiability",
+            "inertia",
+            "contributions",
+        )
+    }
     results = {"config.yaml", "parameters.json", "metrics.json", "identified.urdf", "manifest.json"}
     results |= {"report.json", "posterior.npz"}
     assert names == {"events", *results, *figures}
@@ -131,8 +145,7 @@ def test_curves_say_everything_by_epoch_and_show_train_and_unseen_logs(run: Path
     terms = ("data", "prior", "beside", "conditions")
     parts = zip(*([event.value for event in events.Scalars(f"loss/{term}")] for term in terms), strict=True)
     assert total == pytest.approx([sum(pair) for pair in parts], rel=1e-6)
-    figures = ("forces", "pressure", "errors", "parameters", "identifiability", "contributions")
-    assert set(events.Tags()["images"]) == {f"figure_{k}_{name}" for k, name in enumerate(figures, 1)}
+    assert set(events.Tags()["images"]) == {f"figure_{k}_{name}" for k, name in enumerate(OF_A_RUN, 1)}
     (text,) = events.Tensors("config/text_summary")
     assert b"checkpoint_seconds: 0" in text.tensor_proto.string_val[0]
 

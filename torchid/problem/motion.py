@@ -1,9 +1,9 @@
-"""Noise in the motion of bound samples, samples with more of it, and whether anything moves."""
+"""Motion of the base, from its pose or from an IMU anywhere on it, and noise in the motion of bound samples."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -13,13 +13,194 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from torchid.errors import LogError, UnknownNameError
 from torchid.logs import Log
+from torchid.logs.log import POINTS
 from torchid.logs.signal_noise import SignalNoise
 from torchid.parameters import GRAVITY, Array
+from torchid.regressor import motion_from_state
+from torchid.regressor.kinematics import GRAVITY_WORLD, rotation_matrix
+from torchid.robot import Robot
+from torchid.sensing import Contact
 
 if TYPE_CHECKING:
     from torchid.problem.samples import Samples
     from torchid.sensing import SensorNoise
+
+
+_POSE_FIELDS = (
+    "base_quat_xyzw",
+    "base_angular_velocity_base",
+    "base_angular_acceleration_base",
+    "base_linear_acceleration_world",
+)
+_IMU_FIELDS = ("imu_specific_force", "imu_angular_velocity", "imu_angular_acceleration")
+_ACCEPTED = {
+    "base_quat_xyzw": "base_quat_wxyz or base_quat_xyzw, or imu_frame, imu_specific_force and imu_angular_velocity",
+    "base_linear_acceleration_world": "base_position_world, base_linear_velocity_{world,base} or "
+    "base_linear_acceleration_{world,base}, or an IMU's readings",
+}
+
+
+@dataclass(frozen=True)
+class BaseMotion:
+    """Motion of the base at N samples, as far as the dynamics depend on it, in the base frame; None where not known.
+
+    Attributes:
+        quat_xyzw: (N, 4), rotates base to world.
+        specific_force: (N, 3), acceleration of the base origin minus gravity [m/s^2].
+        angular_velocity, angular_acceleration: (N, 3) [rad/s, rad/s^2].
+        position: (N, 3) [m], of the origin in the world; for wrenches about the world's origin alone.
+    """
+
+    quat_xyzw: Tensor | None = None
+    specific_force: Tensor | None = None
+    angular_velocity: Tensor | None = None
+    angular_acceleration: Tensor | None = None
+    position: Tensor | None = None
+
+    @classmethod
+    def from_coordinates(cls, q: Tensor, v: Tensor, a: Tensor, fixed_base: bool = False) -> BaseMotion:
+        """The base's motion in q (B, n + 7), v, a (B, n + 6), as `Regressor` takes them; empty for a fixed base."""
+        if fixed_base:
+            return cls()
+        motion = motion_from_state(q, v, a, q.shape[1] - 7)
+        return cls(
+            q[:, 3:7], motion.base_specific_force, motion.base_angular_velocity, motion.base_angular_acceleration
+        )
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> BaseMotion:
+        """The same motion with a function applied to every tensor."""
+        return BaseMotion(**{name: function(x) for name, x in vars(self).items() if x is not None})
+
+    def tilted(self, tilt: Sequence[float] | Array, count: int) -> BaseMotion:
+        """The motion of a base that is turned in the recorded one by angles about x and y [rad], a rotation vector.
+
+        `count`: of the samples, of which nothing may be known. The noise of the motion is taken to be the same.
+        """
+        if not np.any(tilt):
+            return self
+        turn = Rotation.from_rotvec([*tilt, 0.0])
+        to_tilted = torch.from_numpy(turn.as_matrix())
+        recorded = np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)) if self.quat_xyzw is None else self.quat_xyzw.numpy()
+        vectors = ("specific_force", "angular_velocity", "angular_acceleration")
+        turned = {name: x @ to_tilted for name in vectors if (x := getattr(self, name)) is not None}
+        if self.quat_xyzw is not None or not turned:
+            turned["quat_xyzw"] = torch.from_numpy((Rotation.from_quat(recorded) * turn).as_quat())
+        return replace(self, **turned)
+
+    @property
+    def rotation(self) -> Tensor | None:
+        """Rotation base to world, (N, 3, 3), if it is known."""
+        return None if self.quat_xyzw is None else rotation_matrix(self.quat_xyzw)
+
+
+def levelled_base_axes(rotation_world_base: Tensor) -> Tensor:
+    """Axes of the levelled base in the base frame, (N, 3, 3), as columns.
+
+    The smallest rotation makes the base axis nearest to the vertical exactly vertical, so that tilting mixes no noise
+    of the horizontal axes into the vertical one. The nearest axis may change where the base is tilted by 45 degrees;
+    the rotation is at most 55 degrees and thus always defined.
+
+    Args:
+        rotation_world_base: (N, 3, 3), base to world.
+    """
+    up = rotation_world_base[:, 2]  # vertical, in the base frame
+    index = up.abs().argmax(dim=1, keepdim=True)
+    nearest = torch.zeros_like(up).scatter(1, index, up.gather(1, index).sign())
+    v = torch.linalg.cross(nearest, up)
+    (x, y, z), cosine = v.unbind(1), (nearest * up).sum(1)
+    diagonal, zero = cosine[:, None, None] * torch.eye(3, dtype=up.dtype, device=up.device), torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=1).unflatten(1, (3, 3))
+    return diagonal + cross + v[:, :, None] * (v / (1.0 + cosine[:, None]))[:, None]
+
+
+def base_motion(log: Log, robot: Robot) -> BaseMotion:
+    """Motion of the robot's base in a preprocessed log; for a fixed base only its orientation.
+
+    An IMU is preferred: the dynamics depend on just what it measures, without differentiation. The orientation is kept
+    for wrenches along world axes.
+
+    Raises:
+        LogError: neither the base's motion nor IMU readings, or an IMU that is not on the base.
+        UnknownNameError: an IMU frame that the robot does not have.
+    """
+    return _recorded_base(log, robot).tilted(robot.base_tilt, len(log))
+
+
+def _recorded_base(log: Log, robot: Robot) -> BaseMotion:
+    """As `base_motion`, but of the base as it was recorded, which is that of the robot but for its tilt."""
+    quat = None if log.base_quat_xyzw is None else torch.from_numpy(log.base_quat_xyzw)
+    if robot.fixed_base:
+        return BaseMotion(quat)
+    if log.imu_frame:
+        return _from_imu(log, robot, quat)
+    missing = [name for name in _POSE_FIELDS if getattr(log, name) is None]
+    if missing or quat is None:
+        accepted = _ACCEPTED.get(missing[0], f"{missing[0]}, or a log passed through preprocess()")
+        raise LogError(log.source, missing[0], "missing, though the base floats", accepted)
+    _, omega, alpha, acceleration = (torch.from_numpy(getattr(log, name)) for name in _POSE_FIELDS)
+    force = acceleration - acceleration.new_tensor(GRAVITY_WORLD)
+    return BaseMotion(quat, (rotation_matrix(quat).mT @ force[..., None])[..., 0], omega, alpha)
+
+
+def position_for_moments(log: Log, robot: Robot, contacts: Sequence[Contact]) -> Tensor | None:
+    """Position of the base in the world, (N, 3) [m], where moments of contacts are about the world's origin; else None.
+
+    A fixed base of which no pose was recorded is the world.
+
+    Raises:
+        LogError: it was not recorded.
+    """
+    has_moments = any(max(contact.components) >= 3 and not contact.along_normal for contact in contacts)
+    if not log.moments_about_world_origin or not has_moments:
+        return None
+    if log.base_position_world is not None:
+        return torch.from_numpy(log.base_position_world)
+    if robot.fixed_base and log.base_quat_xyzw is None:
+        return torch.zeros(len(log), 3, dtype=torch.float64)
+    found = "given without base_position_world, by which moments are moved to the contact frames"
+    accepted = "base_position_world and the base's orientation in the same world, or moments about the frames' origins"
+    raise LogError(log.source, POINTS, found, accepted)
+
+
+def _links_on_base(robot: Robot) -> list[str]:
+    """Links fixed to the base, also through force/torque sensors."""
+    fixed = [0]
+    for index, body in enumerate(robot.bodies):  # parents come first
+        if body.joint is not None and body.joint.kind == "fixed" and body.parent in fixed:
+            fixed.append(index)
+    return [name for index in fixed for name in robot.bodies[index].links]
+
+
+def imu_pose(log: Log, robot: Robot) -> tuple[Rotation, Array]:
+    """Rotation of the IMU's frame into the base's, and its origin there, (3,) [m].
+
+    Raises:
+        LogError: an IMU that is not on the base.
+        UnknownNameError: a frame that the robot does not have.
+    """
+    if log.imu_frame not in robot.links:
+        raise UnknownNameError(log.source, "imu_frame", log.imu_frame, _links_on_base(robot))
+    body, T_base_imu = robot.links[log.imu_frame]
+    while (joint := robot.bodies[body].joint) is not None and joint.kind == "fixed":  # a sensor's weld does not move
+        body, T_base_imu = joint.parent, joint.T_parent_joint @ joint.T_joint_link @ T_base_imu
+    if body != 0:
+        found = f"'{log.imu_frame}', which moves with {robot.bodies[body].name}"
+        raise LogError(log.source, "imu_frame", found, f"a frame on the base: {', '.join(_links_on_base(robot)[:8])}")
+    return Rotation.from_matrix(T_base_imu[:3, :3]), T_base_imu[:3, 3]
+
+
+def _from_imu(log: Log, robot: Robot, quat: Tensor | None) -> BaseMotion:
+    """Motion of the base from that of an IMU fixed to it: rigid-body kinematics with the lever arm."""
+    rotation, arm = imu_pose(log, robot)
+    for name in _IMU_FIELDS:
+        if getattr(log, name) is None:
+            raise LogError(log.source, name, "missing", f"{name}, or a log passed through preprocess()")
+    force, omega, alpha = (rotation.apply(getattr(log, name)) for name in _IMU_FIELDS)
+    at_origin: Array = force - np.cross(alpha, arm) - np.cross(omega, np.cross(omega, arm))
+    return BaseMotion(quat, *map(torch.from_numpy, (at_origin, omega, alpha)))
+
 
 _JOINTS = ("joint_position", "joint_velocity", "joint_acceleration")
 _TURNING = ("base_quat_xyzw", "base_angular_velocity_base", "base_angular_acceleration_base")
