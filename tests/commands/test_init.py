@@ -158,7 +158,7 @@ def test_nothing_is_ever_replaced_and_nothing_half_written(tmp_path: Path, capsy
         (URDF, f"{log} + {DEMO.name}/b.csv", "a.yaml", f"looked for from the folder of the first, {DEMO}"),
         (tmp_path / "absent.urdf", log, "a.yaml", "absent.urdf"),
         (URDF, tmp_path / "bad.npz", "a.yaml", "bad.npz: file: cannot be read"),
-        (URDF, tmp_path / "x.mcap", "a.yaml", "x.mcap: file: cannot be read (ValueError: no MCAP file)"),
+        (URDF, tmp_path / "x.mcap", "a.yaml", "x.mcap: file: cannot be read (EndOfFile)"),
     ):
         message = refusal(["init", str(urdf), str(source), "--output", str(tmp_path / output)], tmp_path, capsys)
         assert found in message

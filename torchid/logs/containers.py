@@ -151,7 +151,8 @@ def reader_errors_explained(field: str, accepted: str) -> Iterator[None]:
         raise
     except Exception as error:
         text = excerpt(" ".join(str(error).split()), _MAX_QUOTED)  # some readers quote the file
-        raise LogError.at_field(field, f"cannot be read ({type(error).__name__}: {text})", accepted) from error
+        why = f"{type(error).__name__}: {text}" if text else type(error).__name__
+        raise LogError.at_field(field, f"cannot be read ({why})", accepted) from error
 
 
 @contextlib.contextmanager
