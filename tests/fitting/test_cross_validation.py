@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -296,7 +297,7 @@ def test_tensorboard_and_a_figure_have_the_error_of_every_ridge(run: Path) -> No
     for tag, values in (("mean_square", found["mean_square"]), ("standard_error", found["standard_error"])):
         curve = {one.step: one.value for one in events.Scalars(f"ridge/held_out_{tag}")}
         assert curve == pytest.approx(dict(zip(steps, values, strict=True)), rel=1e-6)
-    assert "figure_7_ridge" in events.Tags()["images"]
+    assert any(re.fullmatch(r"figure_\d+_ridge", tag) for tag in events.Tags()["images"])
     assert (run / "ridge.png").is_file()
 
 

@@ -21,7 +21,7 @@ from typing import Any
 from torchid.errors import BaseLostError, InputError, TorchidWarning, is_plain
 from torchid.reader import LIMITS
 
-os.environ.setdefault(LIMITS, "0.4")  # of which cases are that know no end
+os.environ.setdefault(LIMITS, "0.6")  # of which cases are that know no end
 SECONDS, WAITING = 5.0, 30.0  # of work, which other processes do not prolong; and until a case that waits is given up
 BYTES = 2**30
 LONGEST_LINE = 3000

@@ -20,7 +20,7 @@ from torchid.cli import main
 _LATE = [
     *("h5py", "jinja2", "scipy.signal", "torch._dynamo", "torchid.estimators.training", "torchid.report.tensorboard"),
     *(f"torchid.commands.{name}" for name in ("check", "compress", "identify")),
-    *(f"torchid.terminal.{name}" for name in ("analysis", "identification", "runs")),
+    *(f"torchid.terminal.{name}" for name in ("analysis", "identification")),
 ]
 """What commands import when they need it, and another user may not read."""
 

@@ -22,7 +22,8 @@ linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits 
 
 
 @pytest.fixture
-def file(tmp_path: Path) -> Path:
+def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.delenv(LIMITS, raising=False)
     path = tmp_path / "log.npz"
     path.write_bytes(b"x")
     return path
