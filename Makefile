@@ -3,7 +3,7 @@ PYTHON ?= python3
 PIP := .venv/bin/pip --disable-pip-version-check
 
 # Tests of single parts: no commands, descents, bags, property tests of whole rows, nor comparisons over many robots.
-FAST := tests/config tests/logs tests/proposals tests/robot tests/regressor tests/sensing tests/problem/test_rows.py \
+FAST := tests/config tests/logs tests/robot tests/regressor tests/sensing tests/problem/test_rows.py \
 	tests/estimators/test_conditions.py tests/estimators/test_least_squares.py tests/estimators/test_penalties.py
 SLOW := tests/logs/test_bags.py tests/logs/test_bag_messages.py tests/logs/test_bag_stamps.py tests/logs/test_mutations.py \
 	tests/regressor/test_oracle.py tests/robot/test_shapes.py \
