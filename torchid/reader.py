@@ -131,6 +131,8 @@ class _Reader:
         self._process = subprocess.Popen(
             command, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, bufsize=0, env=os.environ | _ENVIRONMENT
         )
+        self._requests: Any = self._process.stdin
+        self._answers: Any = self._process.stdout
 
     @property
     def is_own(self) -> bool:
@@ -170,9 +172,8 @@ class _Reader:
             return
         self._process.kill()
         self._process.wait()
-        for pipe in (self._process.stdin, self._process.stdout):
-            if pipe is not None:
-                pipe.close()
+        self._requests.close()
+        self._answers.close()
 
     def ask(self, request: dict[str, Any]) -> Any:
         (answer,) = self.ask_for_many(request)
@@ -195,20 +196,17 @@ class _Reader:
                 return
 
     def _send(self, request: dict[str, Any]) -> None:
-        assert self._process.stdin is not None  # noqa: S101
         with suppress(BrokenPipeError):  # whose cause the answer tells
-            self._process.stdin.write(_TO_JSON(request).encode() + b"\n")
+            self._requests.write(_TO_JSON(request).encode() + b"\n")
 
     def _receive(self) -> tuple[str, Any]:
         """Kind and value of the next answer. Raises LogError: the process has ended, or says nothing."""
-        assert self._process.stdout is not None  # noqa: S101
-        stream: Any = self._process.stdout
         patience = _ANSWER_SECONDS * self._limits[1] or None
-        if sys.platform != "win32" and not select.select([stream], [], [], patience)[0]:
+        if sys.platform != "win32" and not select.select([self._answers], [], [], patience)[0]:
             self.end()
             raise self._failure(f"no answer of its reader for {patience:g} s")
         try:
-            return _receive(stream)
+            return _receive(self._answers)
         except EOFError as error:
             self.end()
             raise self._failure(self._why_ended()) from error
@@ -343,6 +341,7 @@ class _Server:
         self._source = ""
 
     def answer(self, request: dict[str, Any]) -> None:
+        self._source = request.get("source", self._source)
         with warnings.catch_warnings(record=True) as caught, about_file(self._source):
             warnings.simplefilter("always", TorchidWarning)
             try:
@@ -361,12 +360,10 @@ class _Server:
 
     def _answers(self, request: dict[str, Any]) -> Iterator[tuple[str, Any]]:
         if "open" in request:
-            self._source = request["source"]
             _limit(*request["limits"])
             module, name = request["open"]
-            with about_file(self._source):
-                self._context = getattr(import_module(module), name)(Path(request["path"]))
-                self._opened = self._context.__enter__()
+            self._context = getattr(import_module(module), name)(Path(request["path"]))
+            self._opened = self._context.__enter__()
         elif "close" in request:
             if self._context is not None:
                 self._context.__exit__(None, None, None)
