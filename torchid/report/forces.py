@@ -125,20 +125,19 @@ def _from_its_start(series: ForceSeries) -> tuple[ForceSeries, str]:
 
 
 def _draw_errors(axis: Axes, series: ForceSeries, row: int, thin: _Thinned, unit: str) -> None:
-    """Errors of both predictions, with the noise of the readings as a band of two standard deviations."""
+    """Errors of both predictions; on the scale of the readings' noise, two standard deviations, where it is known."""
     nominal, identified = (x[:, row] - series.measured[:, row] for x in (series.nominal, series.identified))
-    largest = float(np.nanmax(np.abs(identified), initial=0.0))
     text = ""
     if series.noise is not None and np.isfinite(series.noise[:, row]).any():
         std = series.noise[:, row]
         label = "± 2 standard deviations of the readings' noise"
         axis.fill_between(thin.time, -2.0 * thin(std), 2.0 * thin(std), color=_NOISE, linewidth=0, label=label)
-        largest = max(largest, float(2.0 * np.nanmax(std)))
+        largest = max(float(np.nanmax(np.abs(identified), initial=0.0)), float(2.0 * np.nanmax(std)))
+        if largest > 0.0:
+            axis.set_ylim(-_SHOWN * largest, _SHOWN * largest)
         text = f", noise alone {_rms(std):.3g}"
     axis.plot(thin.time, thin(nominal), color=NOMINAL_COLOR, linewidth=0.8)
     axis.plot(thin.time, thin(identified), color=IDENTIFIED_COLOR, linewidth=0.8)
-    if largest > 0.0:
-        axis.set_ylim(-_SHOWN * largest, _SHOWN * largest)
     axis.set_title(f"identified: rms {_rms(identified):.3g}{text} {unit}", loc="left", fontsize=9)
 
 
@@ -215,8 +214,8 @@ def spectrum_figure(
     axes = figure.subplots(-(-len(shown) // 3), min(len(shown), 3), squeeze=False).ravel()
     for axis, (row, spectrum) in zip(axes, shown.items(), strict=False):
         for density, color, label in (
-            (spectrum.nominal, NOMINAL_COLOR, f"predicted, {of}"),
-            (spectrum.identified, IDENTIFIED_COLOR, "predicted, identified"),
+            (spectrum.nominal, NOMINAL_COLOR, f"error, {of}"),
+            (spectrum.identified, IDENTIFIED_COLOR, "error, identified"),
         ):
             axis.loglog(spectrum.frequency, density, color=color, linewidth=1.2, label=label)
         if spectrum.noise is not None:
