@@ -65,10 +65,6 @@ MAX_URDF, MAX_LINKS = 8 * MEBIBYTE, 300
 #: Size of a number in a URDF, in any unit: products stay within the range of float64. Slides that must not move have a
 #: damping of 1e11 in published models.
 MAX_NUMBER = 1e12
-#: Bytes of a mesh file (the largest known one has 29 MB), and of the shapes in a COLLADA file, counted per use.
-MAX_MESH, MAX_UNFOLDED = 32 * MEBIBYTE, 64 * MEBIBYTE
-#: Parts of a text mesh (trimesh takes 1 ms for each), and bytes of a line (trimesh splits long lines slowly).
-MAX_PARTS, MAX_LINE = 1000, 2**16
 #: Shapes of a link, each with axes that are tried on all others; points of all shapes of a robot, counted per use of a
 #: mesh (one of 29 MB has 1.7 million vertices, a hundredth of them on its hull); and rotations of points, 30 ns each.
 MAX_SHAPES, MAX_POINTS, MAX_AXES = 300, 10_000_000, 50_000_000

@@ -14,7 +14,8 @@ from torchid import parameters
 from torchid.errors import join_names, warn
 from torchid.parameters import Array
 from torchid.robot import Robot
-from torchid.robot.urdf import MeshError, drop_repeated_origins, mesh_path, parse_xml
+from torchid.robot.meshes import MeshError, mesh_path
+from torchid.robot.urdf import drop_repeated_origins, parse_xml
 from torchid.robot.xml_files import is_mjcf, plain_urdf
 
 _ROUNDING = 1e-12  # of a body's mass: below it the link that gives it its name has none

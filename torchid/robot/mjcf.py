@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import copy
-import os
 import re
-import subprocess
-import sys
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -17,9 +15,10 @@ from typing import Any, NoReturn
 import numpy as np
 from lxml import etree
 
-from torchid.errors import InputError, UrdfError, excerpt, how_to_install, warn
+from torchid.errors import InputError, LogError, UrdfError, excerpt, how_to_install, warn
 from torchid.guards import MAX_LINKS, MAX_NUMBER
 from torchid.parameters import GRAVITY, INERTIA_AXES, Array, inertial_vector
+from torchid.reader import open_apart
 from torchid.robot.xml_files import MJCF_WORLD, OWN, read_xml
 
 try:
@@ -34,16 +33,6 @@ mujoco.set_mju_user_warning(lambda _: None)  # MuJoCo would write a log file whe
 _MOST_FILES = 100
 _LONGEST_TAG = 20  # lines
 _MULTIPLYING = ("replicate", "attach", "composite", "flexcomp")
-_TRIAL = """
-import sys, mujoco
-try:
-    import resource
-    for kind, most in ((resource.RLIMIT_AS, 2**30), (resource.RLIMIT_CPU, 10), (resource.RLIMIT_CORE, 0)):
-        resource.setrlimit(kind, (most, most))
-    mujoco.MjSpec.from_file(sys.argv[1])
-except (ImportError, ValueError):
-    pass
-"""
 
 
 class MjcfText:
@@ -346,11 +335,24 @@ class MjcfModel:
 
 @cache
 def _try_to_read(path: Path, _: int) -> None:
-    """Let another process read a file that may stand for far more than it holds; `_`: when it was written last."""
-    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "PYTHONSAFEPATH": "1"}  # threads take address space
-    if subprocess.run([sys.executable, "-c", _TRIAL, str(path)], env=environment, capture_output=True).returncode:
-        found = "MuJoCo crashes as it reads it, or needs more than 1 GiB or 10 s"
-        raise UrdfError(path, "MJCF", found, "a smaller model: see hfield, replicate, composite, model")
+    """Let the process with limits read a file that may stand for far more than it holds; `_`: when it was written."""
+    accepted = "a smaller model: see hfield, replicate, composite, model"
+    try:
+        with open_apart(_read_mjcf, path):
+            pass
+    except LogError as error:
+        raise UrdfError(path, "MJCF", error.found, f"{accepted}; or {error.accepted}") from error
+    except Exception as error:  # noqa: B902 - C++ raises what it likes, mostly as there is no memory
+        found = f"MuJoCo fails to read it ({excerpt(str(error))})"
+        raise UrdfError(path, "MJCF", found, accepted) from error
+
+
+@contextmanager
+def _read_mjcf(path: Path) -> Iterator[None]:
+    """Read a file as MuJoCo does; what it says against one it says again to whoever reads it then."""
+    with suppress(ValueError):
+        mujoco.MjSpec.from_file(str(path))
+    yield None
 
 
 def pose(position: Array, quat_wxyz: Array) -> Array:

@@ -1,9 +1,7 @@
-"""Shapes of the URDF (the only module that imports trimesh): around a body, and what a frame rolls on."""
+"""Shapes of the URDF: around a body, and what a frame rolls on."""
 
 from __future__ import annotations
 
-import io
-import re
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -11,26 +9,21 @@ from pathlib import Path, PurePosixPath
 from typing import Literal
 
 import numpy as np
-import trimesh
 from lxml import etree
 from scipy.optimize import minimize_scalar
-from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 from yourdfpy.urdf import Inertial
 
 from torchid.errors import UrdfError, excerpt, warn
-from torchid.guards import MAX_AXES, MAX_NUMBER, MAX_POINTS, MAX_SHAPES
+from torchid.guards import MAX_AXES, MAX_NUMBER, MAX_SHAPES
 from torchid.parameters import Array
+from torchid.robot.meshes import MeshError, Meshes
 from torchid.robot.robot import Robot
-from torchid.robot.urdf import MeshError, mesh_content, parse_xml, read_urdf
+from torchid.robot.urdf import parse_xml, read_urdf
 
 ShapeKind = Literal["collision", "visual"]
 SHAPE_TAGS = ("box", "sphere", "cylinder", "capsule", "mesh")
 _CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
-_STL_HEAD, _STL_FACE = 84, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-_STL_VERTEX = re.compile(rb"\bvertex\s+(\S{1,40})\s+(\S{1,40})\s+(\S{1,40})", re.IGNORECASE)
-_SAMPLE = 20_000  # points whose convex hull is computed first
-_FEW = 0.1  # largest share of hull vertices among all points at which a mesh is replaced by its hull
 _PART = 2**16  # points that are rotated at a time
 _THINNEST = 1e-3  # least edge over the longest one: a plate or a flat mesh keeps an interior
 
@@ -181,77 +174,6 @@ def read_numbers(path: Path, field: str, element: etree._Element, name: str, cou
         accepted = f"{count} decimal number{'s' if count > 1 else ''}{'' if signed else ' of at least 0'}"
         raise UrdfError(path, f"{field} {name}>", found, accepted)
     return values
-
-
-class Meshes:
-    """The meshes that a URDF names, each read once."""
-
-    def __init__(self, urdf: Path) -> None:
-        """Start without any mesh; `urdf` is the file that names them."""
-        self.urdf, self._read, self._left = urdf, dict[str, Array | MeshError](), MAX_POINTS
-
-    def vertices(self, filename: str) -> Array:
-        """The corners (N, 3) [m] of a mesh; MeshError where it cannot be read, or all shapes have too many."""
-        if filename not in self._read:
-            try:
-                self._read[filename] = _hull_vertices(_mesh_vertices(self.urdf, filename))
-            except MeshError as error:
-                self._read[filename] = error
-        vertices = self._read[filename]
-        if isinstance(vertices, MeshError):
-            raise vertices
-        self._left -= len(vertices)
-        if self._left < 0:
-            raise MeshError(f"{excerpt(filename)}: shapes of more than {MAX_POINTS} points in all")
-        return vertices
-
-
-def _hull_vertices(points: Array) -> Array:
-    """Vertices of a mesh's convex hull, (K, 3), if they are much fewer than all its points; else all."""
-    try:
-        for sample in (points[:: max(1, len(points) // _SAMPLE)], points):
-            hull = ConvexHull(sample).vertices
-            if len(hull) > _FEW * len(sample):
-                return points
-    except QhullError:  # flat, or fewer than four
-        return points
-    return np.asarray(points[hull])
-
-
-def _mesh_vertices(urdf: Path, filename: str) -> Array:
-    """Vertices (N, 3) [m] of a mesh, in the unit that the file states, if any; other files it names are not read."""
-    kind, content = mesh_content(urdf, filename)
-    if kind == "stl":
-        return _require_vertices(filename, _stl_vertices(filename, content))
-    try:
-        with np.errstate(all="ignore"):
-            mesh = trimesh.load(io.BytesIO(content), kind, force="mesh", process=False, skip_materials=True)
-    except Exception as error:  # noqa: B902 - readers of different formats raise different errors
-        raise MeshError(f"{excerpt(filename)}: {type(error).__name__}: {excerpt(str(error))}") from error
-    units = getattr(mesh, "units", None)
-    with np.errstate(all="ignore"):  # overflow, which the check that follows refuses
-        unit = trimesh.units.unit_conversion(units, "meters") if units else 1.0
-        return _require_vertices(filename, np.asarray(getattr(mesh, "vertices", ())) * unit)
-
-
-def _stl_vertices(filename: str, content: bytes) -> np.ndarray:
-    """Corners (3 faces, 3) of an STL file, binary if its size says so, or else of text."""
-    if len(content) == _STL_HEAD + _STL_FACE.itemsize * int.from_bytes(content[80:_STL_HEAD], "little"):
-        return np.frombuffer(content, _STL_FACE, offset=_STL_HEAD)["corners"].reshape(-1, 3)
-    try:
-        return np.array(_STL_VERTEX.findall(content)).astype(np.float64).reshape(-1, 3)
-    except ValueError as error:
-        raise MeshError(f"{excerpt(filename)}: ValueError: {excerpt(str(error))}") from error
-
-
-def _require_vertices(filename: str, vertices: object) -> Array:
-    with np.errstate(invalid="ignore"):  # signalling NaN
-        points = np.asarray(vertices, dtype=np.float64)
-    if not len(points) or points.shape[1:] != (3,) or not np.isfinite(points).all():
-        raise MeshError(f"{excerpt(filename)}: no vertices")
-    if np.abs(points).max() > MAX_NUMBER:
-        raise MeshError(f"{excerpt(filename)}: vertices farther than {MAX_NUMBER:g}")
-    return points
 
 
 def _inertia_box(inertial: Inertial) -> Shape:

@@ -1,14 +1,13 @@
-"""Strict reading of a URDF and of the mesh files that it names, with limits on their size."""
+"""Strict reading of a URDF, with limits on its size."""
 
 from __future__ import annotations
 
 import io
 import math
-import os
 import re
 from collections import Counter
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,17 +16,7 @@ from lxml import etree
 from yourdfpy.urdf import Joint, Link
 
 from torchid.errors import UnknownNameError, UrdfError, excerpt, is_plain
-from torchid.guards import (
-    MAX_LETTERS,
-    MAX_LINE,
-    MAX_LINKS,
-    MAX_MESH,
-    MAX_NUMBER,
-    MAX_PARTS,
-    MAX_UNFOLDED,
-    format_bytes,
-    read_bytes,
-)
+from torchid.guards import MAX_LETTERS, MAX_LINKS, MAX_NUMBER
 from torchid.robot.xml_files import MJCF_WORLD, OWN, drop_prefixed, is_mjcf, read_xml
 
 MOVING_TYPES = ("revolute", "continuous", "prismatic")
@@ -297,136 +286,3 @@ def _check_values(path: Path, links: list[Link], joints: list[Joint]) -> None:
             raise UrdfError(path, f"{field}, <dynamics>", found, "numbers of at least 0")
         if joint.type in MOVING_TYPES and not np.linalg.norm(joint.axis) > 0.0:
             raise UrdfError(path, f"{field}, <axis>", f"'{joint.axis}'", "three numbers, not all zero")
-
-
-MESH_FORMATS = ("stl", "obj", "dae", "ply", "off")
-_PART_KEYWORD = {"obj": b"usemtl"}  # keyword that starts a part of a mesh
-_BYTES_PER_INSTANCE = 2**15  # [bytes] added for every instance of a geometry: bounds the time that loading takes
-
-
-class MeshError(Exception):
-    """A mesh file that is missing, outside the package, or cannot be read."""
-
-
-def mesh_content(urdf: Path, filename: str) -> tuple[str, bytes]:
-    """Format and content of a mesh that a URDF names, safe to give to a reader of that format.
-
-    Raises:
-        MeshError: one line that names the file.
-    """
-    path = mesh_path(urdf, filename)
-    kind = path.suffix.lower().removeprefix(".")
-    if kind not in MESH_FORMATS:
-        raise MeshError(f"{excerpt(filename)}: none of {', '.join(MESH_FORMATS)}")
-    try:
-        content = read_bytes(path, MAX_MESH)
-        if kind == "dae":
-            _check_collada(content, MAX_UNFOLDED)
-    except (OSError, ValueError, etree.XMLSyntaxError, RecursionError) as error:
-        raise MeshError(f"{excerpt(filename)}: {type(error).__name__}: {excerpt(str(error))}") from error
-    if kind in _PART_KEYWORD and content.lower().count(_PART_KEYWORD[kind]) > MAX_PARTS:
-        raise MeshError(f"{excerpt(filename)}: more than {MAX_PARTS} parts")
-    if kind == "obj" and max(map(len, content.splitlines()), default=0) > MAX_LINE:
-        raise MeshError(f"{excerpt(filename)}: a line of more than {format_bytes(MAX_LINE)}")
-    return kind, content
-
-
-def mesh_path(urdf: Path, filename: str) -> Path:
-    """The mesh file that a URDF refers to: in its package or, as `package://NAME/...`, in one beside it.
-
-    The package is the nearest folder above the URDF with a `package.xml`, or else the parent of the URDF's folder.
-    Symbolic links in it are followed: workspaces use them.
-
-    Raises:
-        MeshError: there is none.
-    """
-    if not is_plain(filename):
-        raise MeshError(f"{excerpt(filename)}: no name of a file")
-    package = _package_folder(urdf)
-    scheme, _, rest = filename.rpartition("://")
-    if scheme not in ("", "file", "package"):
-        raise MeshError(f"{excerpt(filename)}: neither a file nor in a package")
-    candidates = (
-        _paths_of_package_url(urdf, package, rest) if scheme == "package" else _paths_in_package(urdf, package, rest)
-    )
-    try:
-        file = next((path for path in candidates if path.is_file()), None)
-    except OSError as error:
-        raise MeshError(f"{excerpt(filename)}: {error.strerror}") from error
-    if file is not None:
-        return file
-    outside = scheme != "package" and not candidates
-    raise MeshError(f"{excerpt(filename)}: {f'outside {package}' if outside else 'no such file'}")
-
-
-def _package_folder(urdf: Path) -> Path:
-    folders = urdf.absolute().parents
-    marked = next((folder for folder in folders if (folder / "package.xml").is_file()), None)
-    return marked or (folders[1] if len(folders) > 2 else folders[0])  # never the root of the file system
-
-
-def _paths_in_package(urdf: Path, package: Path, name: str) -> list[Path]:
-    """Candidates for a relative path: in the URDF's folder and those above it, inside the package."""
-    folders = [folder for folder in urdf.absolute().parents if folder.is_relative_to(package)]
-    paths = [Path(os.path.normpath(folder / name)) for folder in folders]
-    return [path for path in paths if path.is_relative_to(package)]
-
-
-def _paths_of_package_url(urdf: Path, package: Path, name: str) -> list[Path]:
-    """Candidates for `package://name`: a package above the URDF, one beside its own, or its own renamed."""
-    parts = PurePosixPath(name.lstrip("/")).parts
-    if not parts or ".." in parts:
-        return []
-    above = [folder.parent for folder in urdf.absolute().parents if folder.name == parts[0]]
-    beside = [] if package.parent == package.parent.parent else [package.parent]
-    own = _paths_in_package(urdf, package, str(PurePosixPath(*parts[1:])))
-    return [*(folder.joinpath(*parts) for folder in (*above, *beside)), *own]
-
-
-def _check_collada(content: bytes, largest: int) -> None:
-    """Refuse a document type, which may declare entities, and shapes that expand to more than `largest` bytes.
-
-    Raises:
-        ValueError: a document type, a cyclic node, or shapes that are too large.
-        etree.XMLSyntaxError, RecursionError: XML that cannot be parsed.
-    """
-    first = etree.iterparse(io.BytesIO(content), events=("start",), resolve_entities=False, no_network=True)
-    _, root = next(first)  # a document type comes before the root; nothing has been expanded yet
-    if root.getroottree().docinfo.doctype:
-        raise ValueError("a document type (DOCTYPE), which may declare entities")
-    parser = etree.XMLParser(
-        resolve_entities=False, no_network=True, huge_tree=True
-    )  # large arrays, as pycollada reads
-    size = _InstancedText(etree.parse(io.BytesIO(content), parser).getroot()).size()
-    if size > largest:
-        raise ValueError(f"shapes of {size} bytes, all instances counted")
-
-
-class _InstancedText:
-    """Text size of a COLLADA document's geometries, counted once for every instance of them."""
-
-    def __init__(self, root: etree._Element) -> None:
-        self._root = root
-        self._shapes = {
-            "#" + str(shape.get("id")): sum(map(len, shape.itertext())) for shape in root.iter("{*}geometry")
-        }
-        self._nodes = {"#" + str(child.get("id")): child for child in root.iter("{*}node")}
-        self._sizes: dict[etree._Element, int] = {}
-
-    def size(self) -> int:
-        """Total over all scenes."""
-        return sum(self._size_of(scene, set()) for scene in self._root.iter("{*}visual_scene"))
-
-    def _size_of(self, node: etree._Element, ancestors: set[etree._Element]) -> int:
-        if node in ancestors:
-            raise ValueError("a node that contains itself")
-        if node not in self._sizes:
-            inner = ancestors | {node}
-            total = sum(
-                _BYTES_PER_INSTANCE + self._shapes.get(str(x.get("url")), 0)
-                for x in node.findall("{*}instance_geometry")
-            )
-            total += sum(self._size_of(child, inner) for child in node.findall("{*}node"))
-            instances = [self._nodes.get(str(x.get("url"))) for x in node.findall("{*}instance_node")]
-            self._sizes[node] = total + sum(self._size_of(child, inner) for child in instances if child is not None)
-        return self._sizes[node]
