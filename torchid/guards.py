@@ -54,8 +54,6 @@ MAX_YAML, MAX_DEPTH, MAX_NODES, MAX_TEXT = MEBIBYTE, 30, 5000, 5000
 #: Bytes of a `parameters.json`: the largest robot in ten contact states has 10 MB. Empty lists take 12 times their text
 #: in memory.
 MAX_JSON = 32 * MEBIBYTE
-#: Files in a checkpoint's archive, and values in its state: a few for each parameter group.
-MAX_STATE = 10_000
 
 # ----------------------------------------------------------------------------------------------------------- robots
 

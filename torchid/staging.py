@@ -1,12 +1,13 @@
-"""Atomic writing of results: hidden staging folders, files replaced at once, interrupts deferred meanwhile."""
+"""Results appear whole or not at all: written to a hidden folder beside their place, which a rename ends."""
 
 from __future__ import annotations
 
+import glob
 import os
 import re
-import secrets
 import shutil
 import signal
+import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -87,12 +88,31 @@ try:
 except ImportError:  # Windows: leftovers of killed processes are not removed
     fcntl = None  # type: ignore[assignment]
 
-CAN_LOCK = fcntl is not None
-
 NEW, OLD = "new", "old"  # names in a staging folder: the result, and the one that it replaces
-_LOCK = "lock"
-_NAME = re.compile(r"\..+-[0-9a-f]{8}\.torchid", re.DOTALL)
-_TRIES = 100
+_NAME = re.compile(r"\..+-[a-z0-9_]{8}\.torchid", re.DOTALL)
+
+
+def lock(path: Path, flags: int = os.O_RDONLY) -> int:
+    """Descriptor of a file or folder that no other process has locked, until it is closed or this process ends.
+
+    Args:
+        path: of the file or folder.
+        flags: with which it is opened.
+
+    Raises:
+        BlockingIOError: another process has locked it.
+        OSError: it cannot be opened, or another process has just removed it.
+    """
+    handle = os.open(path, flags | getattr(os, "O_CLOEXEC", 0), 0o644)
+    try:
+        if fcntl is not None:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if not os.path.samestat(os.fstat(handle), os.lstat(path)):
+            raise FileNotFoundError(path)
+    except OSError:
+        os.close(handle)
+        raise
+    return handle
 
 
 @contextmanager
@@ -102,30 +122,24 @@ def staging_folder(target: Path) -> Iterator[Path]:
     Raises:
         OSError: the folder cannot be made.
     """
-    folder, lock, there = target, -1, False
+    handle, folder = -1, target
     try:
         with interrupts_deferred():
-            folder, lock = _make_staging_folder(target)
-            there = True
+            while handle < 0:
+                folder = Path(tempfile.mkdtemp(".torchid", f".{target.name}-", target.parent))
+                with suppress(FileNotFoundError):  # another process took it for a leftover before it was locked
+                    handle = lock(folder) if fcntl is not None else os.open(os.devnull, os.O_RDONLY)
         yield folder
     finally:
-        try:
-            with interrupts_deferred():
-                if there:
-                    there = False
-                    _discard(folder, lock)
-        finally:
-            if there:  # Ctrl-C before it was deferred
-                _discard(folder, lock)
+        with interrupts_deferred():
+            if handle >= 0:
+                _discard(folder)
+                os.close(handle)
 
 
 @contextmanager
-def atomic_file(path: Path, result: bool = True) -> Iterator[Path]:
+def atomic_file(path: Path) -> Iterator[Path]:
     """A temporary name that becomes `path` when the block ends without an error; a link at `path` is not followed.
-
-    Args:
-        path: the file.
-        result: whether it is a result of the command, for `list_written`.
 
     Raises:
         OSError: the file cannot be written.
@@ -136,89 +150,34 @@ def atomic_file(path: Path, result: bool = True) -> Iterator[Path]:
         yield folder / NEW
         with interrupts_deferred():
             (folder / NEW).replace(path)
-            if result:
+            if not any(_NAME.fullmatch(above.name) for above in path.parents):  # a part of a result otherwise
                 note_written(path)
 
 
 def leftovers(target: Path) -> Iterator[Path]:
     """Staging folders beside `target` whose process has ended; each is removed before the next, except an `old`."""
-    prefix = f".{target.name}-"
-    with suppress(OSError):
-        for path in sorted(target.parent.iterdir()):
-            if path.name.startswith(prefix) and len(path.name) == len(prefix) + 16 and _NAME.fullmatch(path.name):
-                yield from _take_over(path)
+    for path in sorted(target.parent.glob(f".{glob.escape(target.name)}-????????.torchid")):
+        yield from take_over(path)
 
 
-def is_leftover(path: Path) -> bool:
-    """Whether a path is a staging folder whose process has ended, without an `old` in it."""
-    if not _NAME.fullmatch(path.name):
-        return False
-    return any(not os.path.lexists(folder / OLD) for folder in _take_over(path, keep=True))
-
-
-def remove_leftover(folder: Path) -> None:
-    """Remove a staging folder whose process has ended, except an `old` in it."""
-    for _ in _take_over(folder):
-        pass
-
-
-def _make_staging_folder(target: Path) -> tuple[Path, int]:
-    """A new staging folder and the descriptor of its lock; until locked, another process may remove it."""
-    for _ in range(_TRIES):
-        folder = target.with_name(f".{target.name}-{secrets.token_hex(4)}.torchid")
-        folder.mkdir()
-        if not CAN_LOCK:
-            return folder, -1
-        with suppress(FileNotFoundError):
-            lock = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-            if try_lock(lock, folder / _LOCK) is not False:
-                return folder, lock
-            os.close(lock)
-    raise FileNotFoundError(f"{target.parent}: another process removes every new folder")
-
-
-def try_lock(handle: int, path: Path) -> bool | None:
-    """Whether a descriptor now locks the file at its path; None where the file system has no locks."""
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        return os.path.samestat(os.fstat(handle), os.lstat(path))
-    except (BlockingIOError, FileNotFoundError):
-        return False
-    except OSError:
-        return None
-
-
-def _take_over(folder: Path, keep: bool = False) -> Iterator[Path]:
-    """The folder if its process has ended; removed afterwards unless `keep`."""
-    if not CAN_LOCK or folder.is_symlink() or not folder.is_dir():
+def take_over(folder: Path) -> Iterator[Path]:
+    """The folder if it is a staging folder whose process has ended; it is removed afterwards, except an `old` in it."""
+    if fcntl is None or not _NAME.fullmatch(folder.name) or folder.is_symlink() or not folder.is_dir():
         return
-    lock = -1
-    try:
-        names = set(os.listdir(folder))
-        if not names <= {_LOCK, NEW, OLD}:
-            return
-        if _LOCK in names:
-            lock = os.open(folder / _LOCK, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
-            if not try_lock(lock, folder / _LOCK):
-                return
-        yield folder
-        if not keep:
-            _discard(folder, lock)
-            lock = -1
-    except OSError:  # of another user, or taken over by another process
-        return
-    finally:
-        if lock >= 0:
-            os.close(lock)
+    with suppress(OSError):  # locked by its process, or of another user
+        handle = lock(folder)
+        try:
+            if set(os.listdir(folder)) <= {NEW, OLD}:
+                yield folder
+                _discard(folder)
+        finally:
+            os.close(handle)
 
 
-def _discard(folder: Path, lock: int) -> None:
-    """Remove a staging folder except `old`; the lock is held to the end."""
+def _discard(folder: Path) -> None:
+    """Remove a staging folder, except an `old` in it."""
     new = folder / NEW
     with suppress(OSError):
         shutil.rmtree(new, ignore_errors=True) if new.is_dir() and not new.is_symlink() else new.unlink(missing_ok=True)
     with suppress(OSError):
-        (folder / _LOCK).unlink(missing_ok=True)
         folder.rmdir()
-    if lock >= 0:
-        os.close(lock)

@@ -28,15 +28,6 @@ def test_the_projection_leaves_noise_of_forces_that_nobody_measured(run: Identif
     assert (rms[1] < 0.01 * rms[0]).all()
 
 
-def test_ranks_are_those_of_the_page(run: Identification) -> None:
-    ranks = script("concept_figures").ranks(run)
-    friction = 2 * run.experiment.robot.n
-    for found in ranks.values():
-        assert found["full"] - found["contacts"] == friction
-    assert ranks["four feet"]["joints"] == ranks["all of these"]["joints"] - 4 == 114
-    assert ranks["all of these"]["joints"] == ranks["all of these"]["full"] == 118
-
-
 def test_as_many_intervals_hold_the_truth_as_the_page_says(run: Identification) -> None:
     true = script("concept_figures").TRUE_FRICTION
     errors, phi = run.estimate.standard_error.reshape(-1, PER_BODY)[1:], run.phi[1:]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -78,12 +77,6 @@ def test_keywords_alone_find_what_the_file_finds(demo: Path, result: torchid.Ide
     np.testing.assert_array_equal(torchid.identify(**sections(demo)).phi, result.phi)
 
 
-def test_keywords_override_a_file_as_the_command_line_does() -> None:
-    by_keyword = load_config(FILE, (), {"estimator": {"ridge": 0.5}, "sensors": "full", "output": Path("x")})
-    by_override = load_config(FILE, ["estimator.ridge=0.5", "sensors=full", "output=x"])
-    assert asdict(by_keyword) == asdict(by_override)
-
-
 def test_without_an_output_nothing_is_written(
     demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, result: torchid.Identification
 ) -> None:
@@ -93,18 +86,6 @@ def test_without_an_output_nothing_is_written(
     torchid.check(demo / "quadruped.yaml")
     assert names_in(tmp_path) == []
     assert not (demo / "runs").exists()
-
-
-def test_a_descent_without_an_output_leaves_nothing_and_ends_where_it_does_with_one(
-    demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    descent = {"name": "sgd", "ridge": 0.1, "training": {"epochs": 2}}
-    silent = torchid.identify(demo / "quadruped.yaml", estimator=descent, output=None)
-    assert names_in(tmp_path) == []
-    written = torchid.identify(demo / "quadruped.yaml", estimator=descent, output="run")
-    assert names_in(tmp_path) == ["run"]
-    np.testing.assert_array_equal(silent.phi, written.phi)
 
 
 @pytest.mark.filterwarnings(UNPHYSICAL)
@@ -194,19 +175,6 @@ def test_a_result_and_its_folder_are_evaluated_alike(demo: Path, result: torchid
     assert of_result.metrics["sway_test"].identified.rms == pytest.approx(test, rel=1e-12)
 
 
-@pytest.mark.filterwarnings(UNPHYSICAL, "ignore::torchid.errors.ConfoundedWarning")
-def test_offsets_of_a_result_are_those_of_its_folder(demo: Path, tmp_path: Path) -> None:
-    offsets = {"set": "joints", "offsets": {"joint_torque": "all"}, "noise": {"joint_torque": 0.1}}
-    result = torchid.identify(
-        demo / "quadruped.yaml", sensors=offsets, estimator=FAST_ESTIMATOR, output=tmp_path / "run"
-    )
-    of_result = torchid.evaluate(result, demo / "sway_test.npz")
-    assert of_result.to_dict() == torchid.evaluate(tmp_path / "run", demo / "sway_test.npz").to_dict()
-    written = torchid.evaluate(result, demo / "sway_test.npz", write=True)
-    assert written.output == tmp_path / "run" / "evaluation" / "sway_test"
-    assert json.loads((written.output / "metrics.json").read_text()) == json.loads(json.dumps(of_result.to_dict()))
-
-
 def test_logs_are_checked_from_files_and_from_memory(demo: Path, capsys: pytest.CaptureFixture[str]) -> None:
     checked = torchid.check(demo / "quadruped.yaml")
     assert [Path(one.log.source).name for one in checked] == ["sway_train.npz", "sway_test.npz"]
@@ -280,12 +248,3 @@ def test_a_missing_keyword_is_named(result: torchid.Identification) -> None:
         torchid.check(DEMO / "sway_test.npz", robot={"base_link": "a"})
     with pytest.raises(ConfigError, match="^nowhere.yaml: file: cannot be read"):
         torchid.identify("nowhere.yaml")
-
-
-def test_an_experiment_file_takes_the_same_short_forms(tmp_path: Path) -> None:
-    settings = yaml.safe_load(FILE.read_text()) | {"robot": "quadruped.urdf", "logs": ["sway_train.npz"]}
-    (tmp_path / "demo.yaml").write_text(yaml.safe_dump(settings))
-    config = load_config(tmp_path / "demo.yaml", ["output=x"])
-    assert config.robot.urdf == tmp_path / "quadruped.urdf"
-    assert config.logs.train == [tmp_path / "sway_train.npz"]
-    assert config.logs.test == []

@@ -79,26 +79,6 @@ def test_keys_have_what_they_accept_and_their_defaults(site: Path, key: str) -> 
     assert default == {"ridge": "auto"}.get(name, "null")
 
 
-def test_every_number_of_the_file_has_a_unit() -> None:
-    """In the table, by the key's path; and no unit is that of a key that there is not."""
-    units = {}
-    for section in site_pages.keys_page().split("\n## ")[1:]:
-        key = section.split()[0]
-        for line in re.findall(r"^\| `(\w+)` \| (.*) \|$", section, re.MULTILINE):
-            cells = re.split(r"(?<!\\) \| ", line[1])
-            units[f"{key}.{line[0]}"] = (cells[0], cells[2].strip() if len(cells) > 2 else "")
-    assert site_pages._UNITS.keys() <= units.keys()
-    for key, (accepted, unit) in units.items():
-        assert bool(unit) is bool(re.search(r"number|integer", accepted)), f"{key}: {accepted}, {unit}"
-    assert units["preprocessing.cutoff_hz"][1] == "Hz"
-    assert units["estimator.total_mass.std"][1] == "kg"
-    assert units["sensors.noise.angular_velocity"][1] == "rad/s"
-    assert units["estimator.ridge"][1] == "1"
-    assert (units["robot.loops.max_gap"][1], units["robot.loops.max_angle"][1]) == ("m", "rad")
-    assert (units["actuators.delay"][1], units["actuators.sign_width"][1]) == ("s", "rad/s or m/s")
-    assert units["logs.columns.joint_torque.current.torque_constant"][1] == "N m/A"
-
-
 def test_public_names_are_described(site: Path) -> None:
     text = text_of(site / "reference" / "index.html")
     for name in ("identify", "LeastSquares", "Robot", "read_log", "RowBuilder"):

@@ -13,16 +13,10 @@ from demo import FAST_ESTIMATOR, shortened_demo
 from refusals import files_in, refusal
 from synthetic import Oracle
 
-import torchid
 from torchid.cli import main
-from torchid.commands import analyze as commands_analyze
 from torchid.commands.analyze import analyze
-from torchid.commands.sensor_set_accuracy import accuracies
 from torchid.config import load_analysis
 from torchid.errors import TorchidWarning
-from torchid.parallel import forks_allowed
-from torchid.reading.log_reader import LogReader
-from torchid.report.figures import tree_figure
 
 LEGS = ("front_left", "front_right", "rear_left", "rear_right")
 FEET = tuple(f"{leg}_foot" for leg in LEGS)
@@ -195,107 +189,13 @@ def test_a_slip_is_answered_in_one_line_and_nothing_is_written(
     assert hint in message
 
 
-COMPARED = {
-    "an unknown joint": ({"legs": {"joint_torques": ["knee"]}}, "analysis.compare.legs.joint_torques", "'knee'"),
-    "an unknown contact": ({"legs": {"contact_wrenches": {"paw": ["fx"]}}}, "analysis.compare.legs.contact", "'paw'"),
-    "a moment of a point": (
-        {"feet": {"contact_wrenches": {FEET[0]: ["mx"]}}}, f"analysis.compare.feet.contact_wrenches.{FEET[0]}", "'mx'",
-    ),
-    "the name of the proposed set": ({"proposed": "full"}, "analysis.compare.proposed", "another name"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("case", COMPARED)
-def test_a_slip_in_a_set_to_compare_is_placed_before_any_work(
-    case: str, experiment: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    compare, field, hint = COMPARED[case]
-    logs = {"train": ["sway_train.npz"]}
-    file = asked(experiment, logs=logs, sensors="joints", analysis={"compare": compare})
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(LogReader, "read", None)
-        message = refusal(["analyze", str(file)], experiment, capsys)
-    assert f"{file}: {field}" in message
-    assert hint in message
-
-
-def test_a_frozen_body_that_does_not_exist_is_looked_for_in_the_file(
-    experiment: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    logs = {"train": ["sway_train.npz"]}
-    file = asked(experiment, logs=logs, estimator={"frozen": ["tail"]}, analysis={"scenarios": {"air": [[]]}})
-    assert f"{file}: estimator.frozen" in refusal(["analyze", str(file)], experiment, capsys)
-
-
-def test_an_output_without_a_name_is_refused(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    message = refusal(["analyze", str(asked(experiment, output="/"))], experiment, capsys)
-    assert "no name for a file or folder" in message
-
-
-def test_a_robot_that_cannot_move_is_refused(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    inertial = "<mass value='1'/><inertia ixx='1' iyy='1' izz='1' ixy='0' ixz='0' iyz='0'/>"
-    stone = experiment / "stone.urdf"
-    stone.write_text(f"<robot name='stone'><link name='stone'><inertial>{inertial}</inertial></link></robot>")
-    file = asked(experiment, robot={"urdf": str(stone), "fixed_base": True}, contacts=[])
-    assert "accepted: a robot that can move" in refusal(["analyze", str(file)], experiment, capsys)
-
-
-def test_sensors_that_tell_nothing_leave_nothing_to_determine(experiment: Path) -> None:
-    robot, output = {"urdf": str(experiment / "quadruped.urdf"), "fixed_base": True}, experiment / "blind"
-    file = asked(experiment, robot=robot, sensors="contacts", analysis={"scenarios": {"air": [[]]}}, output=str(output))
-    assert main(["analyze", str(file)]) == 0
-    plan = json.loads((experiment / "blind.analysis" / "analysis.json").read_text())["scenarios"]["air"]
-    assert (plan["base_parameters"]["rank"], plan["base_parameters"]["gap"]) == (0, None)
-
-
-def test_no_two_labels_of_the_tree_lie_on_each_other(experiment: Path) -> None:
-    robot = torchid.load_robot(experiment / "quadruped.urdf")
-    contacts = [torchid.Contact(link, "point") for link in ("trunk", "front_left_shank_link", "front_left_thigh_link")]
-    (axes,) = tree_figure("", robot, [*contacts, torchid.Contact(FEET[0], "point")], [], {}, []).axes
-    places = [label.xy for label in axes.texts]
-    assert len(set(places)) == len(places) == len(robot.bodies) + 4
-
-
-def test_a_key_of_another_estimator_is_refused_without_logs_too(
-    experiment: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file = asked(experiment, estimator={"name": "least_squares", "com_inside": "box"})
-    assert "estimator.com_inside" in refusal(["analyze", str(file)], experiment, capsys)
-
-
 def test_a_bolted_robot_cannot_lose_its_base(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
     robot = {"urdf": str(experiment / "quadruped.urdf"), "fixed_base": True}
     file = asked(experiment, robot=robot, analysis={"criterion": "per_sample"})
     assert "accepted: stack" in refusal(["analyze", str(file)], experiment, capsys)
 
 
-def test_a_name_that_a_joint_and_a_contact_share_is_not_guessed_at(
-    experiment: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    urdf = experiment / "clash.urdf"
-    urdf.write_text((experiment / "quadruped.urdf").read_text().replace("front_left_foot", "front_left_knee"))
-    contacts = [{"frame": "front_left_knee", "type": "point"}]
-    file = asked(experiment, robot={"urdf": str(urdf)}, contacts=contacts, analysis={"keep": ["front_left_knee"]})
-    assert "analysis.keep" in refusal(["analyze", str(file)], experiment, capsys)
-    urdf.unlink()
-
-
-def test_what_is_planned_for_flight_is_not_compared_on_logs_of_a_robot_that_stands(experiment: Path) -> None:
-    file = asked(
-        experiment,
-        logs={"train": ["sway_train.npz"], "test": ["sway_test.npz"]},
-        analysis={"scenarios": {"air": [[]]}, "compare": {"full": "full"}},
-        output=str(experiment / "air"),
-    )
-    assert main(["analyze", str(file)]) == 0
-    answers = json.loads((experiment / "air.analysis" / "analysis.json").read_text())
-    assert list(answers["accuracy"]) == ["full"]
-    assert answers["scenarios"]["air"]["sensors"] == []
-
-
-def test_a_bolted_arm_without_contacts_is_asked_what_the_stack_of_its_log_needs(
-    experiment: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_bolted_arm_without_contacts_is_asked_what_the_stack_of_its_log_needs(experiment: Path) -> None:
     time, hz = np.arange(200)[:, None] * 0.01, 1.0 + 0.3 * np.arange(len(TORQUES))
     position, velocity = np.sin(hz * time + np.arange(len(TORQUES))), hz * np.cos(hz * time + np.arange(len(TORQUES)))
     oracle = Oracle(experiment / "quadruped.urdf", TORQUES, fixed_base=True)
@@ -323,23 +223,6 @@ def test_a_bolted_arm_without_contacts_is_asked_what_the_stack_of_its_log_needs(
     assert scenario.plan.cost < len(TORQUES)
     assert set(analysis.accuracies) == {"proposed", "sensor plan for logs"}
     assert {removal.base_rank for removal in scenario.plan.removals} == {None}
-
-    called = []
-    monkeypatch.setattr(commands_analyze, "thread_count", lambda: 2)
-    monkeypatch.setattr(commands_analyze, "accuracies", lambda *given: called.append(given) or accuracies(*given))
-    with forks_allowed(), pytest.warns(TorchidWarning):
-        beside = analyze(load_analysis(file, ["overwrite=true"]))
-    assert not called  # forks have compared all sets
-    assert list(beside.accuracies) == list(analysis.accuracies)
-    for name, one in analysis.accuracies.items():
-        found = beside.accuracies[name]
-        assert (found.channels, found.rank) == (one.channels, one.rank)
-        assert found.measured is not None
-        assert one.measured is not None
-        for group in ("joint_torque", "nullspace"):
-            assert found.expected.total[group] == pytest.approx(one.expected.total[group], rel=1e-9)
-            assert found.measured.rms[group] == pytest.approx(one.measured.rms[group], rel=1e-9)
-    assert beside.scenarios[0].plan.removals == scenario.plan.removals
 
 
 WELDS = tuple(f"{leg}_sole" for leg in LEGS)
@@ -369,29 +252,3 @@ def test_sensors_in_limbs_are_planned_named_and_drawn(experiment: Path) -> None:
     assert {check["random_postures"]["rank"] for check in answer["checks"] + answer["proposed"]} == {6}
     assert answer["exclude"] == [WELDS[0]]
     assert (folder / "sensors-all_contacts.png").stat().st_size > 10_000
-
-
-@pytest.mark.filterwarnings("ignore::torchid.errors.MasslessBodyWarning")
-def test_a_fixed_joint_that_does_not_exist_is_looked_for_in_the_file(
-    experiment: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file = asked(experiment, analysis={"candidates": {"ft_sensors": ["front_left_soul"]}}, output=str(experiment / "x"))
-    assert main(["analyze", str(file)]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith(
-        f"torchid: {file}: analysis.candidates.ft_sensors: unknown name 'front_left_soul'; accepted: "
-    )
-    assert "front_left_sole" in line
-
-
-@pytest.mark.filterwarnings("ignore::torchid.errors.MasslessBodyWarning")
-def test_a_weld_is_drawn_with_what_is_measured_in_it(experiment: Path) -> None:
-    robot = torchid.load_robot(experiment / "quadruped.urdf", ft_joints=WELDS[:2])
-    contacts = [torchid.Contact(foot, "point") for foot in FEET]
-    figure = tree_figure("", robot, contacts, [f"{WELDS[0]}.{k}" for k in ("fx", "mz")], {}, [])
-    texts = [text.get_text() for text in figure.axes[0].texts]
-    assert f"{WELDS[0]}: fx, mz" in texts
-    assert WELDS[1] in texts
-    assert "sensor in a limb" in [text.get_text() for text in figure.legends[0].get_texts()]
-    plain = tree_figure("", torchid.load_robot(experiment / "quadruped.urdf"), contacts, [], {}, [])
-    assert "sensor in a limb" not in [text.get_text() for text in plain.legends[0].get_texts()]

@@ -20,9 +20,7 @@ from rich.text import Text
 
 from torchid.boundary import run_guarded
 from torchid.cli import main
-from torchid.config.settings_files import check_yaml
-from torchid.errors import ConfigError, ConfoundedWarning, TorchidWarning, during, is_plain
-from torchid.guards import read_bytes
+from torchid.errors import ConfoundedWarning, TorchidWarning, during, is_plain
 from torchid.report.tables import print_tables, table_text, terminal_console
 
 EVIL = "a\x1b[31m\u202eb\nc\r\x07\u200b$x_{$"
@@ -67,20 +65,10 @@ def test_any_error_becomes_a_line_that_says_what_was_being_done(
     assert ("fault in torchid" in line) == any("fault" in part for part in parts)
 
 
-def test_bad_input_speaks_for_itself(capsys: pytest.CaptureFixture[str]) -> None:
-    status, line = stopped(ConfigError(EVIL, "field", f"'{EVIL}'", "names"), capsys)
-    assert (status, line.startswith("torchid: a\\x1b[31m\\u202eb c "), "reading" in line) == (2, True, False)
-
-
 def test_arguments_that_are_not_understood_are_repeated_in_plain_text(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main(["check", "x.npz", f"--{EVIL}"])
     assert all(map(is_plain, capsys.readouterr().err.split("\n")))
-
-
-def test_a_traceback_is_shown_to_who_asks(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_guarded("torchid", lambda: {}["x"], debug=True) == 1
-    assert "Traceback" in capsys.readouterr().err
 
 
 def test_whatever_is_printed_has_no_control_characters(capsys: pytest.CaptureFixture[str]) -> None:
@@ -101,19 +89,6 @@ def test_whatever_is_printed_has_no_control_characters(capsys: pytest.CaptureFix
     table = Table()
     table.add_row(Text(EVIL))
     assert all(map(is_plain, table_text(table).split("\n")))
-
-
-def test_a_terminal_keeps_its_colors(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Terminal(io.StringIO):
-        def isatty(self) -> bool:
-            return True
-
-    monkeypatch.setenv("TERM", "xterm-256color")
-    monkeypatch.delenv("NO_COLOR", raising=False)
-    screen = Terminal()
-    monkeypatch.setattr(sys, "stdout", screen)
-    assert run_guarded("torchid", lambda: terminal_console().print(Text(EVIL, style="red"))) == 0
-    assert "\x1b[31ma\\x1b[31m" in screen.getvalue()
 
 
 def test_a_thread_of_a_library_that_fails_does_not_speak_to_users(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -161,27 +136,6 @@ def test_a_reader_who_has_enough_is_not_told(
     assert capsys.readouterr().err == ""
 
 
-@pytest.mark.parametrize("value", ["!!timestamp x", "!!int ''", "!!bool x", "!!float a", "!!set {a}", "!!int 1.5"])
-def test_a_tag_that_its_value_does_not_fit_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], value: str
-) -> None:
-    (tmp_path / "x.yaml").write_text(f"device: {value}\n")
-    for arguments in (["x.yaml"], [str(tmp_path / "x.yaml")], ["x.yaml", f"device={value}"]):
-        assert main(["identify", *arguments]) == 2
-        assert capsys.readouterr().err.count("\n") == 1
-    check_yaml("a: !!int 3\nb: !!float 1\nc: !!bool yes\nd: !!str 5\ne: ! x\nf: !!map {a: 1}\n")
-
-
-@pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
-def test_names_that_look_like_formulas_are_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "$x_{$\x1b[2J\n\u202e.npz"
-    q = np.random.default_rng(0).standard_normal((30, 40))
-    np.savez(path, time=np.arange(30.0), joint_names=np.array([f"$a_{{{k}$" for k in range(40)]), joint_position=q)
-    assert main(["check", str(path), "--figure", str(tmp_path / "$y_{$.png")]) in (0, 1)
-    assert capsys.readouterr().err == ""
-    assert (tmp_path / "$y_{$.png").is_file()
-
-
 def _pipe(path: Path) -> None:
     os.mkfifo(path)
 
@@ -219,15 +173,6 @@ def test_what_has_no_end_is_not_read(
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert name in said or "no config.yaml" in said
-
-
-def test_a_file_is_read_as_far_as_it_may_be(tmp_path: Path) -> None:
-    (tmp_path / "x").write_bytes(bytes(100))
-    assert len(read_bytes(tmp_path / "x", 100)) == 100
-    with pytest.raises(ValueError, match="more than 99 bytes"):
-        read_bytes(tmp_path / "x", 99)
-    with pytest.raises(OSError, match="a folder"):
-        read_bytes(tmp_path, 99)
 
 
 class _Terminal(io.StringIO):
@@ -269,19 +214,6 @@ def test_a_terminal_gets_the_first_of_alike_warnings_and_their_number_and_a_file
     first = [f"torchid: TorchidWarning: {text}" for text in (told[0], told[-3], told[-2])]
     assert lines == [*first, "torchid: and 9 warnings like these: --verbose"]
     assert _warn_of_logs(told[-3:-1], monkeypatch, terminal=True, fold=True) == first[1:]
-
-
-@pytest.mark.parametrize("columns", [30, 80, 300])
-def test_a_terminal_gets_long_lines_broken_between_words_and_a_file_gets_them_whole(
-    monkeypatch: pytest.MonkeyPatch, columns: int
-) -> None:
-    name = "a-folder/of-a-path/that-is-longer-than-the-narrowest-terminal.npz"
-    told = [f"{name}: {' '.join(['a well-worn warning that goes on'] * 9)}"]
-    (whole,) = _warn_of_logs(told, monkeypatch, terminal=False, fold=True, columns=columns)
-    lines = _warn_of_logs(told, monkeypatch, terminal=True, fold=True, columns=columns)
-    assert " ".join(line.strip() for line in lines) == whole
-    assert max(len(line) for line in lines if name not in line) <= min(columns, 100)
-    assert all(line.startswith("  ") for line in lines[1:])
 
 
 def test_a_terminal_gets_no_warning_of_what_its_answer_says_is_confounded(monkeypatch: pytest.MonkeyPatch) -> None:

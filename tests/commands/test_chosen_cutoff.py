@@ -17,9 +17,7 @@ from torchid.config import load_config
 from torchid.errors import ConfigError
 from torchid.fitting.experiment import set_up
 from torchid.logs import Log, write_log
-from torchid.reading.log_reader import LogReader
 
-FEW = "preprocessing.sample_rate_hz=auto"
 AUTO = ["preprocessing.cutoff_hz=auto", "sensors.noise={joint_position: 1e-4}", "estimator.ridge=0.01"]
 AUTO += [f"logs.train=[{json.dumps(str(DEMO / 'sway_train.npz[:6]'))}]"]
 FILE = str(DEMO / "quadruped.yaml")
@@ -40,33 +38,6 @@ def test_a_run_keeps_the_cutoff_for_logs_that_come_later(run: Path) -> None:
     assert main(["evaluate", str(run), "--log", str(DEMO / "sway_test.npz")]) == 0
 
 
-def test_a_run_with_that_number_gives_the_same_parameters(run: Path, tmp_path: Path) -> None:
-    number = load_config(run / "config.yaml").preprocessing.cutoff_hz
-    settings = [*AUTO, f"preprocessing.cutoff_hz={number}", f"output={tmp_path / 'run'}"]
-    assert main(["identify", FILE, *settings]) == 0
-    found = [json.loads((folder / "parameters.json").read_text()) for folder in (run, tmp_path / "run")]
-    assert found[0] == found[1]
-
-
-def test_a_log_larger_than_memory_gives_the_same_cutoff(run: Path, tmp_path: Path) -> None:
-    settings = [*AUTO, "preprocessing.memory_gb=1e-4", f"output={tmp_path / 'run'}"]
-    assert main(["identify", FILE, *settings]) == 0
-    chosen = [load_config(folder / "config.yaml").preprocessing.cutoff_hz for folder in (run, tmp_path / "run")]
-    assert chosen[0] == chosen[1]
-
-
-def test_a_run_of_as_few_samples_as_the_filter_allows_is_that_of_every_k_th(tmp_path: Path) -> None:
-    rates = {"auto": FEW, "number": "preprocessing.sample_rate_hz=50"}  # of 100 Hz, for a cutoff of 8 Hz
-    for name, rate in rates.items():
-        assert main(["identify", FILE, *AUTO, "preprocessing.cutoff_hz=8", rate, f"output={tmp_path / name}"]) == 0
-    found = [json.loads((tmp_path / name / "parameters.json").read_text()) for name in rates]
-    assert found[0] == found[1]
-    chosen = [json.loads((tmp_path / name / "metrics.json").read_text())["sample_rate_selection"] for name in rates]
-    assert chosen[1] is None
-    assert list(chosen[0]["rates_hz"].values()) == pytest.approx([50.0])
-    assert main(["evaluate", str(tmp_path / "auto"), "--log", str(DEMO / "sway_test.npz")]) == 0
-
-
 @pytest.mark.parametrize(("noise", "samples"), [(0.0, 4), (1e-3, 5)])
 def test_poses_that_are_held_have_the_band_of_their_own_rate(tmp_path: Path, noise: float, samples: int) -> None:
     """As of a video in a file at 100 Hz, whose stairs are no noise, and have no harmonics of a motion."""
@@ -82,26 +53,6 @@ def test_poses_that_are_held_have_the_band_of_their_own_rate(tmp_path: Path, noi
         found.append(_cutoff_of_motion(setup)[0].cutoff_hz or np.inf)
     at_most = min(found[0], 0.2 * 100.0 / samples)
     assert 0.7 * at_most < found[1] <= at_most
-
-
-def test_factors_keep_the_cutoff_that_the_logs_have_chosen(run: Path, tmp_path: Path) -> None:
-    assert main(["compress", FILE, *AUTO, "--output", str(tmp_path / "factors")]) == 0
-    settings = [f"logs.train=[{tmp_path / 'factors' / '*.factor'}]", f"output={tmp_path / 'run'}"]
-    assert main(["identify", FILE, *AUTO, *settings]) == 0
-    chosen = [load_config(folder / "config.yaml").preprocessing.cutoff_hz for folder in (run, tmp_path / "run")]
-    assert chosen[0] == chosen[1]
-
-
-def test_logs_are_checked_before_a_cutoff_is_chosen_and_analyzed_with_it(tmp_path: Path) -> None:
-    assert main(["check", FILE, *AUTO]) == 0
-    assert main(["analyze", FILE, *AUTO, f"output={tmp_path / 'run'}"]) == 0
-    (written,) = tmp_path.rglob("config.yaml")
-    assert "auto" not in written.read_text().split("cutoff_hz:")[1].split("\n")[0]
-
-
-def test_no_log_is_read_while_nobody_has_chosen() -> None:
-    setup = set_up(load_config(FILE, AUTO))
-    assert "auto, not yet chosen" in refused(lambda: LogReader(setup), "preprocessing.cutoff_hz", ConfigError)
 
 
 def test_other_words_are_refused() -> None:

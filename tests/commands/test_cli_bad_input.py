@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +13,6 @@ from demo import shortened_demo
 from refusals import files_in, refusal
 
 from torchid.cli import main
-from torchid.config import load_config
-from torchid.fitting.experiment import set_up
-from torchid.problem.extras import list_extras
-from torchid.staging import interrupts_deferred
 
 Edit = Callable[[Path], None]
 
@@ -307,19 +302,6 @@ def test_bad_input_exits_2_with_one_line_and_writes_nothing(
         assert part in line
 
 
-def test_a_limb_sensor_is_planned_at_a_fixed_joint_only(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    override = "analysis.candidates.ft_sensors=[front_left_knee]"
-    line = refusal(["analyze", str(experiment / "quadruped.yaml"), override], experiment.parent, capsys)
-    assert "analysis.candidates.ft_sensors: 'front_left_knee', a revolute joint, not a fixed joint" in line
-
-
-@pytest.mark.parametrize("scope", ["log", "all"])
-def test_a_scope_alone_is_that_of_the_channels_that_are_measured(experiment: Path, scope: str) -> None:
-    setup = set_up(load_config(experiment / "quadruped.yaml", [f"sensors.offsets={scope}", f"sensors.scales={scope}"]))
-    extras = list_extras(setup.robot, setup.contacts, setup.sensors, setup.terms)
-    assert {x.name for x in extras} == set(setup.robot.joint_names)
-
-
 @pytest.mark.parametrize("command", ["identify", "analyze", "simulate"])
 def test_a_log_in_place_of_an_experiment_file_is_told_for_what_it_is(
     experiment: Path, capsys: pytest.CaptureFixture[str], command: str
@@ -328,21 +310,6 @@ def test_a_log_in_place_of_an_experiment_file_is_told_for_what_it_is(
     assert "sway_train.npz: file: a log, not a file of settings" in line
     kind = "simulation" if command == "simulate" else "experiment"
     assert line.endswith(f"accepted: a YAML {kind} file")
-
-
-@pytest.mark.parametrize("command", ["identify", "analyze", "simulate", "compress"])
-def test_a_robot_in_place_of_an_experiment_file_is_told_for_what_it_is(
-    experiment: Path, capsys: pytest.CaptureFixture[str], command: str
-) -> None:
-    urdf = experiment / "quadruped.urdf"
-    short = experiment / "short.urdf"
-    short.write_text('<robot name="r"><!-- mass: 1 kg --><link name="a"/></robot>')
-    for path in (urdf, short):
-        output = ["--output", str(experiment / "factors")] * (command == "compress")
-        line = refusal([command, str(path), *output], experiment.parent, capsys)
-        assert f"{path}: YAML: text, <" in line
-        assert "accepted: a mapping with robot, " in line
-        assert len(line) < 250
 
 
 @pytest.mark.parametrize("command", ["identify", "analyze", "simulate", "check"])
@@ -359,25 +326,6 @@ def test_unknown_override_names_the_nearest_key(experiment: Path, capsys: pytest
     assert "accepted: ridge" in capsys.readouterr().err
     assert main(["identify", str(experiment / "quadruped.yaml"), "estimator.ridge"]) == 2
     assert "key.subkey=value" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("override", ["contacts[0].type=flat", "contacts.0.type=flat", "sensors=[joints]"])
-def test_an_override_that_does_not_fit_the_file_is_refused(
-    experiment: Path, capsys: pytest.CaptureFixture[str], override: str
-) -> None:
-    assert main(["identify", str(experiment / "quadruped.yaml"), override]) == 2
-    assert "accepted: " in capsys.readouterr().err
-
-
-def test_evaluate_refuses_a_folder_that_is_no_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["evaluate", str(tmp_path), "--log", "x.npz"]) == 2
-    assert "config.yaml" in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_an_interrupt_that_a_loading_module_swallows_still_ends_the_command() -> None:
-    with pytest.raises(KeyboardInterrupt), interrupts_deferred(), suppress(KeyboardInterrupt):  # noqa: PT012
-        signal.raise_signal(signal.SIGINT)
 
 
 def test_an_interrupt_leaves_nothing_behind(

@@ -15,35 +15,24 @@ import yaml
 pytest.importorskip("mujoco", reason="MuJoCo is not installed")
 
 import mujoco
-from closed_loops import MODELS, LoopWorld, loop_world
+from closed_loops import LoopWorld, loop_world
 
 import torchid
 from torchid.cli import main
-from torchid.commands.replay import replay
 from torchid.config import load_config
 from torchid.errors import TorchidError
 from torchid.fitting.experiment import set_up
 from torchid.logs import Log
-from torchid.parameters import FRICTION, perturb_parameters
 from torchid.reading.log_reader import LogReader
 from torchid.regressor.loops import LoopClosures
 from torchid.report import identified_urdf
-from torchid.report.mjcf_files import identified_mjcf, mjcf_of_urdf
-from torchid.robot import Loop, Robot, load_robot
+from torchid.report.mjcf_files import mjcf_of_urdf
+from torchid.robot import Loop, load_robot
 
 LEG = "four-bar leg"
 
 
 MOTORS = ("abduction", "hip", "crank")
-
-
-def swinging_leg(folder: Path) -> Robot:
-    """The leg, bolted, with friction that MuJoCo simulates and stiff loops."""
-    text = MODELS[LEG].replace("<freejoint/>", "").replace('<option jacobian="dense"/>', '<option timestep="0.001"/>')
-    joint = '<joint damping="0.1" frictionloss="0.05" armature="0.01"/><equality solref="0.004 1"/>'
-    text = text.replace('<joint damping="0.3" armature="0.01"/>', joint)
-    (folder / "true.xml").write_text(text)
-    return load_robot(folder / "true.xml", fixed_base=True)
 
 
 def swing(path: Path, seconds: float, seed: int) -> Log:
@@ -146,30 +135,6 @@ def test_loops_that_are_none_are_refused_in_one_line(loops: Any, message: str, t
     assert "\n" not in str(caught.value)
 
 
-def test_joints_without_a_motor_are_named_or_matched(tmp_path: Path) -> None:
-    w = loop_world(LEG)
-    for passive, message in ((["knie"], "robot.passive: unknown name 'knie'"), (["z*"], "'z*' matches no joint")):
-        with pytest.raises(TorchidError, match=message.replace("*", r"\*")):
-            set_up(load_config(experiment(tmp_path, w, mjcf=str(w.path), passive=passive)))
-
-
-@pytest.mark.parametrize("command", ["identify", "check"])
-def test_a_wrong_frame_is_refused_with_how_far_the_loop_is_open(
-    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    w = loop_world(LEG)
-    file = experiment(tmp_path, w, mjcf=str(w.path), loops=[{"frames": ["crank", "abduction_end"]}])
-    text = w.path.read_text().replace(
-        '<body name="crank">', '<site name="abduction_end" pos="0 0 .1"/><body name="crank">'
-    )
-    (tmp_path / "leg.xml").write_text(text)
-    code = main([command, str(file), f"robot.mjcf={tmp_path / 'leg.xml'}"])
-    out = " ".join("".join(capsys.readouterr()).split())
-    assert "crank and abduction_end" in out
-    assert "apart by rms 100 mm, at most 100 mm" in out
-    assert code == 2 if command == "identify" else "open loop" in out
-
-
 def test_check_says_how_open_loops_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     w = loop_world(LEG)
     main(["check", str(experiment(tmp_path, w, mjcf=str(w.path))), "--verbose"])
@@ -177,39 +142,3 @@ def test_check_says_how_open_loops_are(tmp_path: Path, capsys: pytest.CaptureFix
     assert "closed loop" in out
     for part in ("pin of coupler", "and pin of shank are together up to rms", "nothing: accepted is rms"):
         assert part in out
-
-
-def test_analysis_offers_torques_of_motors_alone(tmp_path: Path) -> None:
-    w = loop_world(LEG)
-    assert main(["analyze", str(experiment(tmp_path, w, mjcf=str(w.path))), "sensors=joints"]) == 0
-    found = json.loads((tmp_path / "run.analysis" / "analysis.json").read_text())
-    candidates = [one["name"] for one in found["scenarios"]["logs"]["candidates"]]
-    assert candidates[:3] == ["abduction", "hip", "crank"]
-    assert not set(w.robot.passive) & set(candidates)
-
-
-def test_noisy_positions_and_torques_of_motors_alone_identify_a_leg_that_mujoco_moves(tmp_path: Path) -> None:
-    robot = swinging_leg(tmp_path)
-    for name, seconds, seed in (("train", 12.0, 1), ("test", 6.0, 2)):
-        torchid.write_log(swing(tmp_path / "true.xml", seconds, seed), tmp_path / f"{name}.npz")
-    nominal = perturb_parameters(robot.nominal, 0.2, np.random.default_rng(3))
-    nominal[:, FRICTION] *= 0.5
-    (tmp_path / "leg.xml").write_bytes(identified_mjcf(robot, nominal, {}))
-    settings: dict[str, Any] = {
-        "robot": {"mjcf": str(tmp_path / "leg.xml"), "fixed_base": True},
-        "logs": {key: [str(tmp_path / f"{key}.npz")] for key in ("train", "test")},
-        "sensors": "joints",
-        "preprocessing": {"cutoff_hz": 15.0},
-        "estimator": {"name": "consistent", "ridge": 1e-3},
-        "output": None,
-    }
-    found = torchid.identify(**settings)
-    before, after = found.metrics["test"]
-    assert (after.rms["joint_torque"] or 1.0) < 0.15 * (before.rms["joint_torque"] or 0.0)
-    motors = [k for k, body in enumerate(robot.bodies) if body.joint is not None and body.joint.name in MOTORS]
-    friction = found.phi.reshape(-1, 12)[motors][:, FRICTION]
-    np.testing.assert_allclose(friction, np.tile([0.05, 0.1], (len(MOTORS), 1)), rtol=0.1)
-    found.write(tmp_path / "run")
-    drift = replay(tmp_path / "run", tmp_path / "test.npz", window=0.3).at(0.3)["joints [rad]"]
-    assert drift.identified < 0.3 * drift.nominal
-    assert drift.identified < 0.02

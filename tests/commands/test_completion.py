@@ -45,11 +45,3 @@ def test_bash_completes_commands_options_and_files(
         text=True,
     )
     assert [word.rstrip("/ ") for word in ran.stdout.splitlines()] == completed
-
-
-def test_zsh_gets_a_script_of_its_own_and_another_shell_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert script("zsh", capsys).startswith("#compdef torchid\n")
-    with pytest.raises(SystemExit) as leaving:
-        main(["--print-completion", "fish"])
-    assert leaving.value.code == 2
-    assert "choose from" in capsys.readouterr().err

@@ -13,7 +13,7 @@ import pytest
 import yaml
 from demo import DEMO
 from motions import value
-from refusals import refusal, refused
+from refusals import refused
 
 from torchid.cli import main
 from torchid.commands.check import check_experiment
@@ -22,7 +22,7 @@ from torchid.errors import ConfigError
 from torchid.fitting.experiment import set_up
 from torchid.logs import Log, read_log, write_log
 from torchid.problem import Samples
-from torchid.reading.log_reader import LogReader, apply_contact_settings
+from torchid.reading.log_reader import LogReader
 
 pytestmark = pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
 TOUCH = 0.1  # [N], above which there are exactly the samples in which the simulator lets a foot touch
@@ -74,26 +74,6 @@ def test_a_fit_without_flags_is_that_with_the_same_flags(tmp_path: Path, simulat
     assert fit_of(tmp_path / "run") == simulated
 
 
-@pytest.mark.parametrize("suffix", [".npz", ".h5"])
-def test_samples_of_other_files_are_those_with_the_same_flags(tmp_path: Path, suffix: str) -> None:
-    one = samples_of(experiment(tmp_path / "one", suffix, lambda log: log))
-    other = samples_of(experiment(tmp_path / "other", suffix, contact_threshold=TOUCH))
-    for name in ("time", "active", "wrench", "torque"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
-
-
-def test_factors_and_evaluation_take_the_same_flags(tmp_path: Path, simulated: Any) -> None:
-    file = experiment(tmp_path, contact_threshold={"above": TOUCH, "below": 0.05})
-    assert main(["compress", str(file), "--output", str(tmp_path / "factors")]) == 0
-    train = f"logs.train=[{tmp_path / 'factors' / 'train.factor'}]"
-    assert main(["identify", str(file), train]) == 0
-    masses, others = (
-        [one["identified"]["m"] for one in fit["bodies"]] for fit in (fit_of(tmp_path / "run"), simulated)
-    )
-    np.testing.assert_allclose(masses, others, rtol=1e-8)
-    assert main(["evaluate", str(tmp_path / "run"), "--log", str(tmp_path / "test.npz")]) == 0
-
-
 def test_wrong_flags_are_replaced_and_not_rejected(tmp_path: Path) -> None:
     def late(log: Log) -> Log:
         return replace(log, contact_active=np.roll(value(log.contact_active), 25, axis=0))
@@ -142,22 +122,3 @@ def test_a_fit_of_zeroed_sensors_is_that_of_sensors_without_offsets(tmp_path: Pa
     assert main(["identify", str(file)]) == 0
     found, expected = parameters_of(fit_of(tmp_path / "run")), parameters_of(simulated)
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9)
-
-
-def test_flags_by_force_are_made_again_of_zeroed_forces(tmp_path: Path) -> None:
-    """By raw readings a drifted foot touches at another time; by zeroed ones as if nothing had drifted."""
-
-    def flags(log: Log, zero: bool) -> Any:
-        file = experiment(tmp_path, contact_threshold={"above": 9.0, "below": 7.0}, zero_in_air=zero)
-        return value(apply_contact_settings(unflagged(log), set_up(load_config(file)))[0].contact_active)
-
-    log = read_log(DEMO / "sway_train.npz")
-    exact, raw, zeroed = flags(log, False), flags(drifted(log, 2.0), False), flags(drifted(log, 2.0), True)
-    assert (raw != exact).sum() > 5
-    np.testing.assert_array_equal(zeroed, exact)
-
-
-def test_offsets_have_one_remedy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file = experiment(tmp_path, change=lambda log: log, zero_in_air=True)
-    line = refusal(["identify", str(file), "sensors.offsets={contact_moment: log}"], tmp_path, capsys)
-    assert "sensors.offsets.contact_moment: set together with preprocessing.zero_in_air" in line

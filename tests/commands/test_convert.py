@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -13,11 +12,10 @@ import pytest
 import yaml
 from bags import entries_of, parsed, topics_of, write_bag, write_folder
 from demo import shortened_demo
-from refusals import files_in, refusal
+from refusals import refusal
 
 from torchid.cli import main
 from torchid.logs import Log, read_log, write_log
-from torchid.logs import read as write_module
 
 TYPES = (".npz", ".h5", ".csv", ".parquet")
 BAGS = (".bag", ".mcap", ".db3")
@@ -26,12 +24,6 @@ BAGS = (".bag", ".mcap", ".db3")
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return shortened_demo(tmp_path_factory.mktemp("demo") / "demo", 300)
-
-
-@pytest.fixture(scope="module")
-def expected(demo: Path) -> dict[str, Any]:
-    """What the arrays of the demo give."""
-    return identified(demo, "npz")
 
 
 def identified(folder: Path, name: str, **logs: Any) -> dict[str, Any]:
@@ -70,30 +62,6 @@ def test_the_same_motion_gives_the_same_log_whatever_the_file(demo: Path, suffix
     again = read_log(demo / logs["train"][0], topics)
     for field, values in read_log(demo / "sway_train.npz").arrays().items():
         np.testing.assert_allclose(again.arrays()[field], values, rtol=0, atol=1e-12)
-
-
-SLOW = [
-    pytest.param(suffix, marks=pytest.mark.slow) for suffix in (".csv", ".h5", ".parquet", ".bag", ".db3", "folder")
-]
-
-
-@pytest.mark.filterwarnings("ignore:.*no stamps:torchid.errors.TorchidWarning")
-@pytest.mark.parametrize("suffix", [".mcap", *SLOW])
-def test_the_same_motion_gives_the_same_parameters_whatever_the_file(
-    demo: Path, expected: dict[str, Any], suffix: str
-) -> None:
-    logs = logs_as(demo, suffix)
-    found = identified(demo, suffix.strip("."), **logs)
-    assert found.keys() == expected.keys()
-    size = max(map(abs, expected.values()))
-    for name, value in expected.items():
-        assert abs(found[name] - value) < 1e-9 * size, name
-    if suffix == ".mcap":  # a run knows what its logs' topics hold
-        run = demo / "runs" / "mcap"
-        assert main(["evaluate", str(run), "--log", str(demo / "test.mcap")]) == 0
-        metrics = json.loads((run / "evaluation" / "test" / "metrics.json").read_text())["test"]["identified"]
-        whole = json.loads((run / "metrics.json").read_text())["test"]
-        assert metrics["joint_torque_rms"] == pytest.approx(whole["joint_torque_rms"], rel=1e-12)
 
 
 @pytest.fixture
@@ -173,32 +141,3 @@ def test_bad_input_exits_2_with_one_line_and_writes_nothing(
     (folder / "empty.yaml").write_text("robot: {urdf: a.urdf}\n")
     paths = [str(folder / x) if x.endswith(".yaml") else x for x in options]
     assert found in refusal(["convert", str(folder / source), str(folder / target), *paths], folder, capsys)
-
-
-def test_a_conversion_that_is_interrupted_leaves_nothing(
-    log: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from torchid.logs import tables as table_module
-
-    def interrupted(_: Any, path: Path, *__: Any) -> None:
-        path.write_text("half")
-        raise KeyboardInterrupt
-
-    assert write_module.save_table is table_module.save_table
-    monkeypatch.setattr("torchid.logs.table_files._save_csv", interrupted)
-    before = files_in(log.parent)
-    assert main(["convert", str(log), str(log.parent / "out.csv")]) == 1
-    assert "interrupted; nothing was written" in capsys.readouterr().err
-    assert files_in(log.parent) == before
-
-
-def test_a_full_disk_or_a_folder_that_cannot_be_written_is_told_in_one_line(
-    log: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def full(*_: Any) -> None:
-        raise OSError(28, os.strerror(28))
-
-    monkeypatch.setattr(Path, "replace", full)
-    for suffix in TYPES:
-        message = refusal(["convert", str(log), str(log.parent / f"out{suffix}")], log.parent, capsys)
-        assert "No space left on device" in message

@@ -61,26 +61,8 @@ def test_a_run_finds_the_delay_of_a_pd_law_and_an_evaluation_predicts_with_it(
     assert json.loads((tmp_path / "without" / "metrics.json").read_text())["delay_selection"] is None
 
 
-@pytest.mark.filterwarnings("ignore:.*stated sensor noise")
-def test_no_delay_is_looked_for_in_logs_without_a_filter(tmp_path: Path) -> None:
-    """White noise between samples is smaller than at them, which would draw it to half a step."""
-    file, found = commanded(tmp_path, preprocessing={}), []
-    for more in ([], ["preprocessing.cutoff_hz=40", "overwrite=true"]):
-        assert main(["identify", str(file), *more]) == 0
-        found.append(load_config(tmp_path / "run" / "config.yaml").actuators.delay)
-    assert found == [0.0, pytest.approx(DELAY, rel=0.1)]
-
-
 def test_a_run_on_a_motion_that_fits_any_delay_takes_none(tmp_path: Path) -> None:
     """A sine of one rate and little size: armature, spring and damping make up for it."""
     file = commanded(tmp_path, (1, 0.02), actuators={"armature": True, "stiffness": True, "delay": "auto"})
     assert main(["identify", str(file)]) == 0
     assert load_config(tmp_path / "run" / "config.yaml").actuators.delay == 0.0
-
-
-def test_a_log_larger_than_memory_is_refused_with_a_delay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file = commanded(tmp_path)
-    assert main(["identify", str(file), f"actuators.delay={DELAY}", "preprocessing.memory_gb=0.00005"]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "actuators.delay: set for arrays of" in line
-    assert "accepted: a preprocessing.memory_gb above" in line

@@ -35,7 +35,7 @@ from shared_work import (
 import torchid
 from torchid import distributed
 from torchid.cli import main
-from torchid.commands.checkpoint import CHECKPOINT
+from torchid.commands.folder import CHECKPOINT
 from torchid.parallel import share_between_processes
 from torchid.parameters import Array
 from torchid.problem.linear import parameter_scale

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import pytest
 from demo import shortened_demo
-from refusals import files_in, refusal
+from refusals import files_in
 
 from torchid.cli import main
-from torchid.commands.folder import EVALUATION
-from torchid.commands.manifest import read_manifest
+from torchid.commands.folder import EVALUATION, read_manifest
 
 
 @pytest.fixture(scope="module")
@@ -41,21 +40,3 @@ def test_an_evaluation_elsewhere_is_the_same_and_leaves_the_run_as_it_was(
     (usual,) = (path for path in (folder / "run" / "evaluation").iterdir() if path.is_dir())
     assert {file.name for file in usual.iterdir()} == {file.name for file in output.iterdir()}
     assert json.loads((usual / "metrics.json").read_text()) == json.loads((output / "metrics.json").read_text())
-
-
-@pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
-def test_an_evaluation_replaces_an_evaluation_alone_and_only_on_request(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    output = tmp_path / "evaluated"
-    assert main(evaluating(folder, "--output", str(output))) == 0
-    capsys.readouterr()
-    message = refusal(evaluating(folder, "--output", str(output)), tmp_path, capsys)
-    assert "not empty; accepted: a new folder, or --overwrite" in message
-    assert main(evaluating(folder, "--output", str(output), "--overwrite")) == 0
-    capsys.readouterr()
-    of_the_run = evaluating(folder, "--output", str(folder / "run"), "--overwrite")
-    assert "run" in refusal(of_the_run, folder, capsys)
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "notes.txt").write_text("keep")
-    refusal(evaluating(folder, "--output", str(tmp_path / "mine"), "--overwrite"), tmp_path, capsys)

@@ -3,28 +3,21 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
-from demo import shortened_demo
 from misread import WIDTH, World, with_actuators
-from motions import value
 from recordings import Miscalibration
-from repository import DEMO
-from synthetic import Array, Oracle, load, make_log
+from synthetic import Oracle, load, make_log
 from welded import CONTACTS, SENSORS, STATES, machine
 
 from torchid.cli import main
 from torchid.config import load_config
-from torchid.fitting.calibration import Calibration
-from torchid.fitting.experiment import set_up
-from torchid.logs import read_log, write_log
-from torchid.problem import ExtraTerms, bind_log
-from torchid.reading.log_reader import LogReader
-from torchid.report.parameter_files import read_parameters, read_shared_extras
+from torchid.logs import write_log
+from torchid.problem import ExtraTerms
 
 EXACT = 1e-7
 
@@ -153,80 +146,3 @@ def test_the_width_of_the_sign_is_found(run: Run) -> None:
     assert min(choice["residual"]) < 1e-2
     assert load_config(output / "config.yaml").actuators.sign_width == choice["width"]
     assert errors_in(found["train"])["joint_torque"] < 1e-2 * errors_in(found["train_nominal"])["joint_torque"]
-
-
-def test_friction_that_reverses_at_once_is_given_no_width(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    settings = ["actuators.sign_width=auto"]
-    settings += [f"output={tmp_path / 'run'}"]
-    file = shortened_demo(tmp_path / "demo", 600) / "quadruped.yaml"
-    assert main(["identify", "--verbose", str(file), *settings]) == 0
-    assert "sign width    none: Coulomb friction with tanh(velocity / width)" in capsys.readouterr().out
-    assert load_config(tmp_path / "run" / "config.yaml").actuators.sign_width is None
-
-
-def test_a_width_counts_where_logs_are_read_block_by_block_too() -> None:
-    """Likewise for the samples that other widths would have."""
-
-    def directions(width: float | None, memory_gb: float) -> Array:
-        settings = [f"actuators.sign_width={width or 'null'}", f"preprocessing.memory_gb={memory_gb}"]
-        setup = set_up(load_config(DEMO / "quadruped.yaml", settings))
-        (samples,) = LogReader(setup).read(setup.config.logs.train, setup.sensors)
-        assert samples.direction is not None
-        return samples.direction.numpy()
-
-    np.testing.assert_allclose(directions(0.1, 1e-6), directions(0.1, 2.0), rtol=0.0, atol=1e-9)
-    assert np.abs(directions(0.1, 2.0) - directions(None, 2.0)).max() > 0.1
-
-
-def test_a_urdf_that_is_right_has_no_errors_whatever_the_offsets(tmp_path: Path) -> None:
-    """Offsets and actuators are fitted for it too: those of the identified parameters would be held against it."""
-    file, _, _ = files(tmp_path, 0.0)
-    assert main(["identify", str(file), f"logs.train=[{tmp_path / 'first.npz'}]"]) == 0
-    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    assert max(errors_in(metrics["train_nominal"]).values()) < 1e-8
-    assert main(["evaluate", str(tmp_path / "run"), "--log", str(tmp_path / "new.npz")]) == 0
-    (written,) = (tmp_path / "run" / "evaluation").rglob("metrics.json")
-    assert max(errors_in(json.loads(written.read_text())["new"]["nominal"]).values()) < 1e-8
-
-
-def test_sensor_sets_are_compared_with_calibrated_readings_of_all_sensors(run: Run) -> None:
-    experiment = yaml.safe_load(run.file.read_text())
-    experiment["logs"]["test"] = ["new.npz"]
-    joints = list(load(experiment["robot"]["urdf"], None, False, SENSORS).joint_names)
-    compare = {
-        "torques": {"joint_torques": joints},
-        "torques and limbs": {"joint_torques": joints, "ft_sensors": list(SENSORS)},
-    }
-    experiment["analysis"] = {"scenarios": {"stand": [["sole"]]}, "compare": compare}
-    (run.folder / "analysis.yaml").write_text(yaml.safe_dump(experiment))
-    assert main(["analyze", str(run.folder / "analysis.yaml")]) == 0
-    accuracy = json.loads((run.folder / "run.analysis" / "analysis.json").read_text())["accuracy"]
-    found = {name: one["measured"] for name, one in accuracy.items()}
-    for name in ("proposed", "torques and limbs"):
-        assert max(found[name].values()) < 1e-7, found
-    assert found["torques"]["base_force"] < 0.5, "0.13; 49 as recorded: it cannot tell bodies beyond a weld from others"
-
-
-def test_outliers_do_not_move_the_offsets_of_a_new_log_where_fits_are_robust(run: Run) -> None:
-    spoilt = read_log(run.folder / "new.npz")
-    torque = value(spoilt.joint_torque).copy()
-    torque[::40] += 500.0
-    new = replace(spoilt, joint_torque=torque)
-    errors = {}
-    for robust in ("null", "tukey"):
-        experiment = set_up(load_config(run.file, [f"estimator.robust={robust}"]))
-        document = run.folder / "run" / "parameters.json"
-        shared = {("", label): x for label, x in read_shared_extras(document).items()}
-        phi = read_parameters(document, experiment.robot).ravel()
-        calibration = Calibration(
-            robot=experiment.robot,
-            builder=experiment.builder(experiment.sensors),
-            phi=phi,
-            values=shared,
-            loss=experiment.loss,
-        )
-        (read,) = calibration.calibrate([bind_log(new, experiment.robot, CONTACTS)])
-        expected = torque - run.off[str(run.folder / "new.npz")].torque
-        errors[robust] = np.abs(value(read.torque)[:, : len(expected[0])].numpy() - expected).max()
-    assert errors["null"] > 1.0
-    assert errors["tukey"] < 1e-6, errors

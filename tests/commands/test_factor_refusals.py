@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import re
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -113,10 +111,6 @@ def test_commands_that_need_samples_say_so(fleet: Path, capsys: pytest.CaptureFi
     assert f"factors of a log, where torchid {command} needs its samples; accepted: logs (.npz, " in message
 
 
-def test_factors_are_no_log(fleet: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "extension '.factor'" in refusal(["check", str(fleet / "factors" / "sway_test.factor")], fleet, capsys)
-
-
 def test_files_of_different_noise_or_of_the_same_log_are_refused(
     fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -133,15 +127,6 @@ def test_files_of_different_noise_or_of_the_same_log_are_refused(
     assert (
         f"{again}: sha256: of the same log as {first} (sway_test.npz); accepted: factors of every log once" in message
     )
-
-
-def test_logs_of_one_name_are_not_compressed_to_one_file(
-    fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    shutil.copy(fleet / "sway_test.npz", tmp_path / "sway_train.npz")
-    logs = f"logs.train=[{fleet / 'sway_train.npz'}, {tmp_path / 'sway_train.npz'}]"
-    line = ["compress", str(fleet / "logs.yaml"), logs, "--output", str(fleet / "out")]
-    assert "several logs that would become sway_train.factor" in refusal(line, fleet, capsys)
 
 
 def changed_urdf(fleet: Path, folder: Path, change: Callable[[str], str]) -> str:
@@ -179,26 +164,7 @@ def test_another_tree_is_refused_by_the_part_that_differs(
     assert "robot.urdf: contact front_left_foot (point) is " in message
 
 
-def test_robots_of_one_type_may_weigh_what_they_like(fleet: Path, tmp_path: Path) -> None:
-    heavier = changed_urdf(
-        fleet, tmp_path, lambda text: re.sub(r'<mass value="(\S+)"', r'<mass value="1\1"', text, count=1)
-    )
-    assert main(["identify", str(fleet / "experiment.yaml"), f"output={tmp_path / 'run'}", heavier]) == 0
-
-
 # -------------------------------------------------------------------------------------------------------- hostile files
-
-
-def rewritten(path: Path, target: Path, change: Callable[[dict[str, Any], dict[str, Any]], None]) -> Path:
-    """A file whose description and arrays are changed."""
-    with np.load(path) as archive:
-        arrays = dict(archive)
-    description = json.loads(arrays["description"].tobytes())
-    change(description, arrays)
-    arrays["description"] = np.frombuffer(json.dumps(description).encode(), np.uint8)
-    with target.open("wb") as stream:
-        np.savez(stream, **arrays)
-    return target
 
 
 def first_part(description: dict[str, Any]) -> dict[str, Any]:
@@ -252,21 +218,6 @@ HOSTILE: dict[str, Callable[[dict[str, Any], dict[str, Any]], Any]] = {
     "text for numbers": lambda d, a: a.update(values=np.array(["a", "b"])),
     "objects": lambda d, a: a.update(values=np.array([{}], dtype=object)),
 }
-
-
-@pytest.mark.parametrize("case", HOSTILE)
-def test_hostile_files_are_refused_in_one_line(
-    fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], case: str
-) -> None:
-    path = rewritten(fleet / "factors" / "sway_train.factor", tmp_path / "bad.factor", HOSTILE[case])
-    message = refusal(["identify", str(fleet / "experiment.yaml"), f"logs.train=[{path}]"], fleet, capsys)
-    assert message.startswith(f"torchid: {path}: "), message
-    assert len(message) < 600
-    if case == "a later format":
-        assert f"{path}: format: {FORMAT + 1}, of another version of torchid; accepted: {FORMAT}" in message
-    if case == ONE_NOISE:
-        assert f"{path}: sensors.noise: joint_torque, base_force.x" in message
-        assert "accepted: joint_torque.front_left_hip" in message
 
 
 def test_damaged_files_give_a_fit_or_one_line(fleet: Path, tmp_path: Path) -> None:

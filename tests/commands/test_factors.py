@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,19 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 from demo import shortened_demo
-from fleets import WALKS, compressed, demo_fleet, fitted, fitted_twice, walks
-from refusals import refusal
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from fleets import compressed, demo_fleet, fitted_twice, walks
 
 import torchid
 from torchid.cli import main
-from torchid.commands.compress import CompressedFile
 from torchid.commands.results import Identification
 from torchid.config import load_config
 from torchid.fitting.factor_files import FactorFile, read_factors, write_factors
-from torchid.problem.metrics import ERROR_GROUPS, WHITENED
-from torchid.terminal.identification import compression_lines
-from torchid.terminal.lines import LINES
+from torchid.problem.metrics import WHITENED
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:identified.urdf:torchid.errors.TorchidWarning"),
@@ -32,7 +26,6 @@ pytestmark = [
 ]
 SAME = 1e-12
 KEPT = 350  # of 400 samples: the filter leaves out what it cannot see both sides of
-STATED = {"joint_torque": 1.0, "contact_force": 4.0, "contact_moment": 0.5, "base_force": 5.0, "base_moment": 1.0}
 OFFSETS = {"set": "full", "offsets": "log"}
 
 
@@ -120,54 +113,12 @@ def test_several_logs_from_their_factors_are_fitted_as_from_the_logs(
         assert factors.ridge.ridge == logs.ridge.ridge
 
 
-@pytest.mark.slow
-def test_files_of_two_calls_with_stated_noise_fit_as_those_of_one(tmp_path: Path) -> None:
-    file = walks(tmp_path, "biped", (2.0, 2.0, 3.0), sensors=OFFSETS | {"noise": STATED})
-    compressed(file, tmp_path / "one")
-    compressed(file, tmp_path / "here", f"logs.train=[{tmp_path / WALKS[0]}]")
-    compressed(file, tmp_path / "there", f"logs.train=[{tmp_path / WALKS[1]}, {tmp_path / WALKS[2]}]")
-    names = [Path(name).with_suffix(".factor").name for name in WALKS]
-    places = [tmp_path / place / name for place, name in zip(("here", "there", "there"), names, strict=True)]
-    for name, place in zip(names, places, strict=True):
-        assert (tmp_path / "one" / name).read_bytes() == place.read_bytes()
-    together = fitted(file, "a", f"logs.train={[str(tmp_path / 'one' / name) for name in names]}")
-    apart = fitted(file, "b", f"logs.train={[str(place) for place in places]}")
-    assert np.array_equal(together.estimate.phi, apart.estimate.phi)
-    assert_same(fitted(file, "c"), apart)
-
-
 # ------------------------------------------------------------------------------------------------ what a run says then
 
 
 @pytest.fixture(scope="module")
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return demo_fleet(tmp_path_factory.mktemp("fleet") / "demo")
-
-
-@pytest.mark.usefixtures("events")
-def test_a_run_of_factors_says_what_it_can(fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    output = tmp_path / "run"
-    assert main(["identify", "--verbose", str(fleet / "experiment.yaml"), f"output={output}"]) == 0
-    printed = capsys.readouterr().out
-    assert "What each log and contact state adds" in printed
-    assert {path.name.split(".")[0] for path in output.glob("*.png")} == {
-        "errors", "parameters", "identifiability", "inertia", "contributions"
-    }, "no figure of forces, which takes samples"  # fmt: skip
-    metrics = json.loads((output / "metrics.json").read_text())
-    assert metrics["train"][WHITENED] > 0.0
-    assert all(metrics["train"][f"{group}_rms"] is None for group in ERROR_GROUPS if group != WHITENED)
-    assert metrics["identifiability"]["sensors"] == []
-    assert metrics["samples"] == 2 * KEPT
-    by_log = {Path(one["file"]).name: one for one in metrics["factors"]}
-    assert set(by_log) == {"sway_train.factor", "sway_test.factor"}
-    assert by_log["sway_train.factor"]["log"] == "sway_train.npz"
-    config = load_config(output / "config.yaml")
-    assert [path.name for path in config.logs.train] == ["sway_test.factor", "sway_train.factor"]
-    assert {one["origin"] for one in metrics["noise"]["groups"]} == {"stated"}
-    events = EventAccumulator(str(output))
-    events.Reload()
-    assert "training/samples_per_second" not in events.Tags()["scalars"]
-    assert main(["evaluate", str(output), "--log", str(fleet / "sway_test.npz")]) == 0
 
 
 def test_what_was_left_to_the_logs_is_printed_and_taken_from_their_factors(
@@ -206,57 +157,6 @@ def test_the_table_of_files_says_what_is_in_them(
     verbose = capsys.readouterr().out.splitlines()
     assert verbose[0].startswith("Contact states")
     assert set(lines) < set(verbose)
-
-
-def test_a_fleet_that_is_compressed_has_its_answer_on_one_screen() -> None:
-    files = [CompressedFile(f"log_{k:03}.factor", 10**6, 1000, 6000, 5) for k in range(300)]
-    lines = compression_lines(files, 80, LINES)
-    assert lines[0] == "300 logs, 300000 samples, in 300 MB of factors"
-    assert len(lines) == LINES - 1  # and the folder
-    assert lines[-1] == f"and {300 - (LINES - 4)} files more: --verbose"
-    assert len(compression_lines(files, 80)) == 302
-
-
-def test_nothing_is_replaced_but_what_torchid_wrote(
-    fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    line = ["compress", str(fleet / "logs.yaml"), "--output", str(tmp_path / "f")]
-    assert main(line) == 0
-    capsys.readouterr()
-    assert "not empty; accepted: a new folder, or overwrite=true" in refusal(line, tmp_path, capsys)
-    assert main([*line, "overwrite=true"]) == 0
-    (tmp_path / "f" / "mine.factor").write_text("mine")
-    capsys.readouterr()
-    assert "mine.factor, which torchid did not write" in refusal([*line, "overwrite=true"], tmp_path, capsys)
-
-
-def test_rejected_samples_are_left_out_when_logs_are_compressed(fleet: Path, tmp_path: Path) -> None:
-    with np.load(fleet / "sway_train.npz") as log:
-        fields = dict(log)
-    fields["joint_torque"] = fields["joint_torque"].copy()
-    fields["joint_torque"][100, 3] += 500.0
-    np.savez(tmp_path / "spike.npz", **fields)
-    overrides = [f"logs.train=[{tmp_path / 'spike.npz'}]", "preprocessing.exclude_rejected=true"]
-    assert main(["compress", str(fleet / "logs.yaml"), "--output", str(tmp_path / "f"), *overrides]) == 0
-    found = read_factors(tmp_path / "f" / "spike.factor")
-    assert found.excluded > 0
-    assert found.excluded + len(found.log) == KEPT
-
-
-def test_an_implausible_fit_is_refused_without_a_look_for_samples(
-    fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with np.load(fleet / "sway_train.npz") as log:
-        np.savez(tmp_path / "reversed.npz", **{**log, "joint_torque": -log["joint_torque"]})
-    logs = f"logs.train=[{tmp_path / 'reversed.npz'}]"
-    assert main(["compress", str(fleet / "logs.yaml"), logs, "--output", str(tmp_path / "f")]) == 0
-    capsys.readouterr()
-    looked: list[Path] = []
-    monkeypatch.setattr("torchid.commands.plausibility.segments_to_check", lambda path, *_: looked.append(path))
-    factors = f"logs.train=[{tmp_path / 'f' / 'reversed.factor'}]"
-    message = refusal(["identify", str(fleet / "experiment.yaml"), factors], tmp_path, capsys)
-    assert "usual reasons: torques or wrenches of the opposite sign" in message
-    assert looked == []
 
 
 def test_a_file_reads_back_to_the_last_bit(fleet: Path, tmp_path: Path) -> None:

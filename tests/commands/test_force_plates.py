@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from large import SMALL, assert_same, is_on_disk, samples_of
+from large import SMALL
 from motions import value
-from plates import LABORATORIES, PLATES_MAP, centres_of_pressure, opensim_csv, plates_csv, walk, write_motion
+from plates import LABORATORIES, centres_of_pressure, plates_csv, walk, write_motion
 from raw_logs import write_arrays
 from refusals import refusal
 from repository import SHARED
@@ -97,35 +96,6 @@ def test_a_converted_log_is_fitted_block_by_block_compressed_checked_and_judged(
     assert "point" not in capsys.readouterr().out
 
 
-def test_plates_that_drift_are_zeroed_by_what_they_read_without_a_foot(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """An offset in a plate's own axes, which the map turns into the world's."""
-    write_motion(tmp_path / "motion.npz", walk(4.0))
-    fits = []
-    for name, offset in (("exact", 0.0), ("drifted", 1.0)):
-        plates_csv(tmp_path / f"{name}.csv", walk(4.0))
-        header, *rows = (tmp_path / f"{name}.csv").read_text().splitlines()
-        of = [0.0 if x == "time" else offset * (2.0 if "_F" in x else 300.0) * (-1) ** i
-              for i, x in enumerate(header.split(","))]  # fmt: skip
-        moved = [",".join(repr(float(x) + y) for x, y in zip(row.split(","), of, strict=True)) for row in rows]
-        (tmp_path / f"{name}.csv").write_text("\n".join([header, *moved]) + "\n")
-        text = PLATES_MAP.replace("above: 20", "above: 10")
-        file = experiment(tmp_path, f"motion.npz + {name}.csv", text, zero_in_air=bool(offset))
-        fits.append(identified(file)[0])
-        assert ("zero_in_air has subtracted" in capsys.readouterr().err) == bool(offset)
-    assert np.abs(fits[1] - fits[0]).max() < 1e-9 * np.abs(fits[0]).max()
-
-
-ARRAYS_MAP = """
-contact_order: [l_sole, r_sole]
-contact_wrench_world: {force: grf, moment: {column: free_moment, axes: [z]}}
-contact_wrench_point_world: {column: cop, unit: cm}
-contact_active: {above: 20}
-plates: {"*": {rpy_deg: [0, 0, 30], position: [1, 2, 3]}}
-"""
-
-
 def table(folder: Path) -> Path:
     """One table of motion and plates."""
     motion, plates = (write_motion(folder / "motion.csv", walk()), folder / "plates.csv")
@@ -147,18 +117,6 @@ def arrays(folder: Path) -> Path:
 
     known |= {"grf": turned(force), "cop": 100.0 * turned(points - [1.0, 2.0, 3.0]), "free_moment": free[..., None]}
     return write_arrays(folder / "both.h5", known)
-
-
-@pytest.mark.parametrize(("write", "columns"), [(table, PLATES_MAP), (arrays, ARRAYS_MAP)], ids=["table", "arrays"])
-@pytest.mark.parametrize("cutoff", ["null", "8"])
-def test_a_map_of_plates_is_read_block_by_block_as_a_whole(
-    write: Callable[[Path], Path], columns: str, cutoff: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("torchid.reading.log_steps.SPLINE_BLOCK", 256)
-    file = experiment(tmp_path, write(tmp_path).name, columns)
-    whole, large = (samples_of(file, f"preprocessing.cutoff_hz={cutoff}", *more) for more in ((), (SMALL,)))
-    assert is_on_disk(large)
-    assert_same(large, whole, 1e-10)
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="the recorded logs (../shared/data) are not here")
@@ -191,18 +149,3 @@ def test_plates_without_a_pose_in_their_world_are_refused(tmp_path: Path, capsys
     np.savez(tmp_path / "motion.npz", base_linear_velocity_world=velocity, **rest)
     complaint = refusal(["identify", str(experiment(tmp_path, MOTION, text))], tmp_path, capsys)
     assert "contact_wrench_point_world: given without base_position_world" in complaint
-
-
-def test_check_knows_readings_of_plates_by_their_names_and_init_lists_them(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    opensim_csv(tmp_path / "grf.csv", walk())
-    assert main(["check", str(tmp_path / "grf.csv")]) == 2
-    complaint = capsys.readouterr().err
-    assert "'ground_force_vx' and 1 like it (contact_wrench_world?)" in complaint
-    out = tmp_path / "x.yaml"
-    assert main(["init", str(BIPED), str(tmp_path / "grf.csv"), "--output", str(out)]) == 0
-    assert "#   ground_force_v{axis}: 3 columns, " in out.read_text()
-    assert not {"contact_wrench_local", "contact_wrench_world"} & set(
-        yaml.safe_load(out.read_text())["logs"]["columns"]
-    )

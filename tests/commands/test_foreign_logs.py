@@ -15,10 +15,7 @@ from refusals import refusal
 from repository import DEMO
 
 from torchid.cli import main
-from torchid.config import dump_config, load_config
-from torchid.fitting.experiment import set_up
 from torchid.logs import Log, read_log, write_log
-from torchid.reading.log_reader import LogReader
 
 SAMPLES = 300
 PARQUET, PD, MOTORS = "nested names", "PD law", "motor numbers in degrees"
@@ -80,25 +77,6 @@ def test_a_dialect_gives_the_parameters_of_the_log_and_is_evaluated_by_the_runs_
     assert again["joint_torque_rms"] == pytest.approx(metrics["test"]["joint_torque_rms"], rel=1e-9)
 
 
-def test_a_run_remembers_its_map_whatever_else_it_says(tmp_path: Path) -> None:
-    for dialect in DIALECTS:
-        if dialect == "LowState":  # has no pose of the base
-            continue
-        config = load_config(experiment(tmp_path, dialect))
-        (tmp_path / "dumped.yaml").write_text(dump_config(config))
-        assert load_config(tmp_path / "dumped.yaml").logs.columns == config.logs.columns
-
-
-def test_factors_of_a_dialect_are_those_of_the_log(tmp_path: Path, expected: dict[str, float]) -> None:
-    file = experiment(tmp_path, PARQUET)
-    assert main(["compress", str(file), "--output", str(tmp_path / "factors")]) == 0
-    factors = f"logs={{train: [{tmp_path / 'factors' / 'train.factor'}]}}"
-    assert main(["identify", str(file), factors]) == 0
-    bodies = json.loads((tmp_path / "run" / "parameters.json").read_text())["bodies"]
-    found = {f"{body['name']} {key}": x for body in bodies for key, x in body["identified"].items()}
-    assert_same(found, expected)
-
-
 @pytest.mark.parametrize("dialect", DIALECTS)
 def test_check_and_convert_take_the_map_of_an_experiment_file(
     tmp_path: Path, dialect: str, capsys: pytest.CaptureFixture[str]
@@ -115,25 +93,6 @@ def test_check_and_convert_take_the_map_of_an_experiment_file(
     capsys.readouterr()
     message = refusal(["check", str(path)], tmp_path, capsys)
     assert "logs.columns of an experiment file, which says what they hold" in message
-
-
-def test_check_of_an_experiment_reads_its_logs_by_the_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    main(["check", str(experiment(tmp_path, MOTORS))])
-    out = capsys.readouterr().out
-    assert " of 2 logs " in out
-    assert "motors" not in out
-
-
-@pytest.mark.parametrize("dialect", [MOTORS, PD, PARQUET, "groups"])
-def test_a_dialect_larger_than_memory_has_the_samples_of_one_that_is_not(tmp_path: Path, dialect: str) -> None:
-    config = load_config(experiment(tmp_path, dialect))
-    whole, large = (
-        LogReader(set_up(load_config(tmp_path / "experiment.yaml", more))).read(config.logs.train, None)[0]
-        for more in ([], [SMALL])
-    )
-    assert large.folder is not None
-    np.testing.assert_allclose(large.torque.numpy(), whole.torque.numpy(), rtol=0, atol=1e-11)
-    np.testing.assert_array_equal(large.active.numpy(), whole.active.numpy())
 
 
 BAD: list[tuple[dict[str, Any], str]] = [

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +23,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 import torchid
 from torchid.cli import main
 from torchid.config import load_config
-from torchid.errors import TorchidWarning
 from torchid.estimators.least_squares import VERDICTS
-from torchid.identifiability.base_parameters import StateReport
 from torchid.parameters import PARAMETERS
 from torchid.report import identified_urdf
-from torchid.report.tables import print_tables, state_table
 
 pytestmark = pytest.mark.usefixtures("events")
 
@@ -107,19 +103,6 @@ def test_parameters_json_names_every_body_and_parameter(run: Path) -> None:
     assert bodies[1]["identifiable"]["fv"]
 
 
-def test_parameters_json_judges_every_contact_state_alone(run: Path) -> None:
-    document, metrics = (json.loads((run / f"{name}.json").read_text()) for name in ("parameters", "metrics"))
-    states = document["contact_states"]
-    assert {state["name"] for state in states} == {state["name"] for state in metrics["contact_states"]}
-    for state in states:
-        assert [body["name"] for body in state["bodies"]] == [body["name"] for body in document["bodies"]]
-        assert 0 < state["rank"] <= metrics["rank"]
-        assert len([x for x in state["singular_values"] if x > 1e-10 * state["singular_values"][0]]) == state["rank"]
-        for alone, together in zip(state["bodies"], document["bodies"], strict=True):
-            for name in PARAMETERS:
-                assert together["identifiable"][name] or not alone["identifiable"][name], "more data determine more"
-
-
 def test_metrics_json_has_the_documented_fields(run: Path) -> None:
     metrics = json.loads((run / "metrics.json").read_text())
     groups = ("joint_torque_rms", "joint_torque_rms_by_joint", "base_force_rms", "base_moment_rms", "nullspace_rms")
@@ -186,21 +169,6 @@ def test_tensorboard_shows_train_and_test_before_and_after(run: Path) -> None:
     assert values == pytest.approx([mass["total_mass"] + k * error for k in (-1, 0, 1)])
 
 
-def test_tensorboard_shows_what_is_identified_and_by_what(run: Path) -> None:
-    events = EventAccumulator(str(run), size_guidance={"images": 0, "scalars": 0})
-    events.Reload()
-    metrics = json.loads((run / "metrics.json").read_text())
-    document = json.loads((run / "parameters.json").read_text())
-    for verdict, count in document["verdicts"].items():
-        assert events.Scalars(f"verdicts/{verdict}")[0].value == count
-    values = events.Scalars("identifiability/singular_value")
-    assert [value.step for value in values] == list(range(len(metrics["identifiability"]["singular_values"])))
-    assert values[0].value == pytest.approx(metrics["identifiability"]["singular_values"][0], rel=1e-6)
-    assert events.Scalars("identifiability/bits")[0].value == pytest.approx(metrics["identifiability"]["bits"])
-    (rate,) = events.Scalars("training/samples_per_second")
-    assert rate.value * metrics["seconds"]["compress"] == pytest.approx(metrics["samples"], rel=1e-6)
-
-
 def test_evaluating_the_test_log_again_gives_the_same_figures(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["evaluate", str(run), "--log", str(DEMO / "sway_test.npz")]) == 0
     assert "sway_test" in capsys.readouterr().out
@@ -208,27 +176,6 @@ def test_evaluating_the_test_log_again_gives_the_same_figures(run: Path, capsys:
     expected = json.loads((run / "metrics.json").read_text())
     assert found["identified"] == expected["test"]
     assert found["nominal"]["base_force_rms"] == pytest.approx(expected["test_nominal"]["base_force_rms"])
-
-
-def test_a_run_is_replaced_only_on_request(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    before = (run / "metrics.json").read_bytes()
-    assert main(["identify", str(DEMO / "quadruped.yaml"), f"output={run}"]) == 2
-    assert "overwrite=true" in capsys.readouterr().err
-    assert (run / "metrics.json").read_bytes() == before
-
-
-def test_overwriting_keeps_what_is_no_part_of_a_run(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (run / "notes.txt").write_text("mine")
-    assert main(["identify", str(DEMO / "quadruped.yaml"), f"output={run}", "overwrite=true"]) == 2
-    assert "notes.txt" in capsys.readouterr().err
-    assert (run / "notes.txt").read_text() == "mine"
-    (run / "notes.txt").unlink()
-
-
-def test_logs_of_one_name_are_not_evaluated_as_one(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    log = str(DEMO / "sway_test.npz")
-    assert main(["evaluate", str(run), "--log", log, "--log", log]) == 2
-    assert "several logs named 'sway_test'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("damage", [("NaN", "m"), ("true", "Ixx"), ('"1.0"', "fv")], ids=["NaN", "flag", "text"])
@@ -277,11 +224,6 @@ def demo_with(folder: Path, **changes: Callable[[Any], Any]) -> None:
     np.savez(folder / "sway_train.npz", **fields | {name: change(fields[name]) for name, change in changes.items()})
 
 
-def test_names_are_shown_as_they_are_and_never_as_markup(capsys: pytest.CaptureFixture[str]) -> None:
-    print_tables(state_table([asdict(StateReport("[red]x[/blue]", 3, 6, 6, 0.1))]))
-    assert "[red]x[/blue]" in capsys.readouterr().out
-
-
 def test_identified_urdf_moves_as_its_parameters_say(tmp_path: Path) -> None:
     robot = torchid.load_robot(DEMO / "quadruped.urdf")
     rng = np.random.default_rng(0)
@@ -296,26 +238,6 @@ def test_identified_urdf_moves_as_its_parameters_say(tmp_path: Path) -> None:
     predicted = torchid.Regressor(robot)(*map(torch.tensor, (q, v, a))) @ torch.tensor(inertial).flatten()
     expected = oracle.frictionless_forces(q, v, a)
     np.testing.assert_allclose(predicted.numpy(), expected, rtol=0, atol=1e-10 * np.abs(expected).max())
-
-
-def test_identified_urdf_reads_back_with_its_friction(tmp_path: Path) -> None:
-    robot = torchid.load_robot(DEMO / "quadruped.urdf")
-    phi = robot.nominal * 1.1
-    phi[1:, 10:] = [0.25, 0.5]
-    path = tmp_path / "identified.urdf"
-    path.write_bytes(identified_urdf(robot, phi))
-    np.testing.assert_allclose(torchid.load_robot(path).nominal, phi, rtol=1e-12, atol=1e-15)
-
-
-def test_a_urdf_that_nothing_can_load_is_warned_of(tmp_path: Path) -> None:
-    robot = torchid.load_robot(DEMO / "quadruped.urdf")
-    phi = robot.nominal.copy()
-    phi[2, 11], phi[3, 0] = -0.1, -1.0
-    with pytest.warns(TorchidWarning) as caught:
-        identified_urdf(robot, phi)
-    mass, friction = (str(warning.message) for warning in caught)
-    assert robot.body_names[3] in mass
-    assert f"negative friction at {robot.joint_names[1]};" in friction
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="the recorded human squats (../shared/data) are not here")

@@ -83,43 +83,7 @@ def test_several_files_are_checked_converted_and_compressed(demo: Path) -> None:
     assert Path("factors/motion + plates + torques.factor").is_file()
 
 
-def test_no_sample_of_the_first_file_is_used_twice(demo: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    other = "motion.npz + torques.npz + plates.npz@-3"
-    error = refusal(capsys, "identify", "quadruped.yaml", f"logs.train={json.dumps([NAME + '[:4]', other + '[3:]'])}")
-    assert "share samples; accepted: every sample once" in error
-    error = refusal(capsys, "identify", "quadruped.yaml", f"logs.train={json.dumps([NAME, other])}")
-    assert "share samples" in error
-    test = f"logs.test={json.dumps([other + '[3:]'])}"
-    assert main(["identify", "quadruped.yaml", f"logs.train={json.dumps([NAME + '[:4]'])}", test, "output=runs/x"]) == 0
-    assert f"{other}[3:] is fitted on as well" in capsys.readouterr().err
-
-
 def test_what_several_files_are_not_for_is_refused(demo: Path, capsys: pytest.CaptureFixture[str]) -> None:
     large = f"logs.train={json.dumps([JOINED])}", "preprocessing.memory_gb=1e-4"
     assert "file: several files with arrays of" in refusal(capsys, "identify", "quadruped.yaml", *large)
     assert "belongs to what is read" in refusal(capsys, "convert", NAME, "plates.npz", "--overwrite")
-
-
-def test_short_gaps_of_a_recording_hardly_change_the_fit(demo: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with np.load("sway_train.npz") as log:
-        broken = dict(log)
-    rng = np.random.default_rng(2)
-    for start in rng.integers(10, 580, 15):
-        broken["joint_position"][start : start + 4, rng.integers(12)] = np.nan
-        broken["base_quat_wxyz"][start + 5 : start + 8] = np.nan
-    np.savez("broken.npz", **broken)
-    error = refusal(capsys, "identify", "quadruped.yaml", "logs.train=[broken.npz]", "output=runs/refused")
-    assert "joint_position: nan at sample" in error
-    assert "preprocessing.bridge_gaps_s" in error
-    bridge = "preprocessing.bridge_gaps_s=0.2"  # some of the gaps touch
-    whole = identified("runs/whole", ["sway_train.npz"], ["sway_test.npz"])
-    found = identified("runs/bridged", ["broken.npz"], ["sway_test.npz"], bridge)
-    assert found["samples"] == whole["samples"]
-    for group, value in found["test"].items():
-        if isinstance(value, float):
-            assert value == pytest.approx(whole["test"][group], rel=0.05), group
-    in_blocks = identified("runs/large", ["broken.npz"], ["sway_test.npz"], bridge, "preprocessing.memory_gb=1e-4")
-    assert in_blocks["test"]["base_force_rms"] == pytest.approx(found["test"]["base_force_rms"], rel=1e-6)
-    capsys.readouterr()
-    assert main(["check", "quadruped.yaml", "logs.train=[broken.npz]", bridge]) == 0
-    assert "broken.npz: joint_position, base_quat_wxyz: gaps of at most 0.2 s bridged in" in capsys.readouterr().err

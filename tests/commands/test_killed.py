@@ -18,8 +18,7 @@ from run_folders import a_run, everything, names_in, write
 from shared_work import SMALL_CHUNK, TWO, children, finish_forked, is_running, started
 
 from torchid.cli import main
-from torchid.commands.folder import check_free
-from torchid.commands.manifest import MANIFEST
+from torchid.commands.folder import MANIFEST, check_free
 from torchid.staging import staging_folder
 
 _KILLED = """
@@ -76,7 +75,7 @@ def test_a_process_killed_at_any_step_loses_nothing_and_the_next_run_clears_what
 
 def test_what_a_living_process_makes_and_what_only_looks_like_it_stay(tmp_path: Path) -> None:
     output = tmp_path / "run"
-    names = {".run-notes.torchid/new/a", ".run-01234567.torchid/mine", ".run-01234567/new", ".run-0123456x.torchid/new"}
+    names = {".run-notes.torchid/new/a", ".run-01234567.torchid/mine", ".run-01234567/new", ".run-0123-567.torchid/new"}
     write(tmp_path, dict.fromkeys(names, "mine"))
     (tmp_path / ".run-76543210.torchid").symlink_to(tmp_path / ".run-01234567")
     before = everything(tmp_path)

@@ -3,26 +3,21 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
-from arms import ARMS
 from currents import HIP_SCALE, HIPS, KNEE_SCALE, KNEES, NOISE, quadruped_files
 from refusals import refusal
 from repository import SHARED
 from synthetic import ROBOTS
 
 from torchid.cli import main
-from torchid.commands.identify import identify
-from torchid.config import load_config
-from torchid.errors import ConfoundedWarning
 from torchid.estimators import LeastSquares
 from torchid.fitting.prior_knowledge import KnownMass, with_known_masses
-from torchid.identifiability.confounding import combination_standard_error, mass_weights
+from torchid.identifiability.confounding import mass_weights
 from torchid.parameters import PER_BODY
 from torchid.problem import LinearProblem
 
@@ -72,48 +67,6 @@ def test_a_known_total_mass_gives_the_scales_of_all_motors(
     assert metrics["total_mass"] == pytest.approx(mass, rel=1e-7 if not std else 1e-4)
 
 
-@pytest.mark.filterwarnings("ignore:identified.urdf")
-def test_without_it_they_are_confounded_and_of_the_size_that_the_urdf_s_mass_makes_them(
-    world: tuple[Path, float], tmp_path: Path
-) -> None:
-    file, mass = world
-    with pytest.warns(ConfoundedWarning) as caught:
-        identify(load_config(file, [f"output={tmp_path / 'run'}"]))
-    (message,) = (str(x.message) for x in caught if issubclass(x.category, ConfoundedWarning))
-    said = "scale of *_hip,*_thigh, *_knee: confounded with the total mass; do not trust either; state estimator."
-    assert said in message
-    (confounded,) = document(tmp_path / "run", "metrics")["confounded"]
-    assert (confounded["extras"], confounded["confounded_with"]) == (list(LABELS), ["total mass"])
-    assert said in confounded["message"]
-    assert not any(entry["told_apart"] for entry in scales_of(tmp_path / "run").values())
-    assert all(entry["standard_error"] is None for entry in scales_of(tmp_path / "run").values())
-    assert document(tmp_path / "run", "metrics")["total_mass"] is None
-    values = [1.0 + scales_of(tmp_path / "run")[label]["value"] for label in LABELS]
-    urdf = document(tmp_path / "run", "metrics")["total_mass_nominal"]
-    assert values == pytest.approx([HIP_SCALE * urdf / mass, KNEE_SCALE * urdf / mass], rel=1e-7)
-
-
-def test_the_mass_of_one_body_does_as_well(world: tuple[Path, float], tmp_path: Path) -> None:
-    """Of those that the rows determine alone: the trunk's is a sum with others', a shank's too; of all it is known."""
-    file, mass = world
-    metrics = {}
-    for name, more in (("total", ()), ("with trunk", ("estimator.masses={trunk: {value: 9.0, std: 3.0}}",))):
-        known = f"estimator.total_mass={mass!r}"
-        assert main(["identify", str(file), known, *more, f"output={tmp_path / name}"]) == 0
-        metrics[name] = document(tmp_path / name, "metrics")
-        found = scales_of(tmp_path / name)
-        assert [found[label]["value"] for label in LABELS] == pytest.approx([-0.1, 0.15], abs=1e-6)
-    assert metrics["with trunk"]["rank"] == metrics["total"]["rank"] + 1
-
-
-def test_a_heavier_robot_has_torques_of_larger_scale_in_proportion(world: tuple[Path, float], tmp_path: Path) -> None:
-    file, mass = world
-    assert main(["identify", str(file), f"estimator.total_mass={1.1 * mass!r}", f"output={tmp_path / 'run'}"]) == 0
-    found = scales_of(tmp_path / "run")
-    values = [1.0 + found[label]["value"] for label in LABELS]
-    assert values == pytest.approx([1.1 * HIP_SCALE, 1.1 * KNEE_SCALE], rel=1e-7)
-
-
 @pytest.mark.parametrize(
     ("more", "message"),
     [
@@ -136,18 +89,6 @@ def test_a_mass_that_cannot_be_is_refused_in_one_line(
     scales = () if "sgd" not in more else ("sensors={scales: {}}",)
     command = ["identify", str(file), more, f"output={tmp_path / 'run'}", *scales]
     assert message in refusal(command, file.parent, capsys)
-
-
-@pytest.mark.filterwarnings("ignore:identified.urdf")
-def test_a_total_mass_does_not_settle_scales_while_all_feet_stand(tmp_path: Path) -> None:
-    """A mass at a foot that stands acts on no joint: as much of the robot's as there may be."""
-    file, mass = quadruped_files(
-        tmp_path, SCALES, states=[[True] * 4], noise=0.5, sensors=SENSORS, estimator={"ridge": 0.01}
-    )
-    with pytest.warns(ConfoundedWarning, match="confounded with m of"):
-        identify(load_config(file, [f"estimator.total_mass={mass!r}"]))
-    found = scales_of(tmp_path / "run")
-    assert not any(found[label]["told_apart"] or found[label]["standard_error"] for label in LABELS)
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="the recorded logs (../shared/data) are not here")
@@ -174,29 +115,6 @@ def test_a_recorded_robot_that_stands_on_all_feet_is_refused_with_the_reason(
     assert "accepted: a sensor without a scale, or logs in which each contact lifts" in message
 
 
-@pytest.mark.filterwarnings("ignore:identified.urdf")
-def test_scales_of_all_motors_of_a_bolted_robot_are_refused_without_a_word_of_contacts(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "arms.urdf").write_text(ARMS)
-    time = np.arange(2000) / 100.0
-    position = np.stack([np.sin(2.0 * time) + 0.3 * np.sin(5.0 * time), np.cos(3.0 * time)], axis=1)
-    torque = np.stack([9.81 * np.cos(position[:, 0]), position[:, 1]], axis=1)
-    log = {"time": time, "joint_names": ["first", "second"], "joint_position": position, "joint_torque": torque}
-    np.savez(tmp_path / "log.npz", **log)
-    experiment = {
-        "robot": {"urdf": "arms.urdf", "fixed_base": True},
-        "logs": {"train": ["log.npz"]},
-        "preprocessing": {"cutoff_hz": 10},
-        "sensors": {"set": "joints", "scales": {"joint_torque": "all"}},
-        "output": str(tmp_path / "run"),
-    }
-    (tmp_path / "arms.yaml").write_text(yaml.safe_dump(experiment))
-    message = refusal(["identify", str(tmp_path / "arms.yaml")], tmp_path, capsys)
-    assert "sensors.scales: of all measured forces, which no mass determines here" in message
-    assert "accepted: a sensor without a scale, or estimator.masses of bodies whose weight acts on it" in message
-
-
 def test_exact_masses_hold_whatever_the_data_say_and_uncertain_ones_are_weighed() -> None:
     """Against the optimum with a Lagrange multiplier, and against rows of their own."""
     rng, count = np.random.default_rng(0), 3 * PER_BODY
@@ -219,14 +137,3 @@ def test_exact_masses_hold_whatever_the_data_say_and_uncertain_ones_are_weighed(
     rows = np.vstack([A, 1.5 / 0.2 * total])
     expected = np.linalg.lstsq(rows[:, free], np.append(left, 7.5 * (7.0 - total[~free] @ nominal[~free])))[0]
     np.testing.assert_allclose(LeastSquares().solve(uncertain).phi[free], expected, rtol=1e-9)
-
-
-def test_a_known_mass_is_as_well_known_where_other_rows_are_mostly_noise_of_the_motion() -> None:
-    rng, count = np.random.default_rng(0), 3 * PER_BODY
-    A, b = rng.normal(size=(2 * count, count)), rng.normal(size=2 * count)
-    problem = LinearProblem(A, b, 0.0, 2 * count, np.ones(count), np.ones(count), np.ones(count, dtype=bool))
-    lacking, total = replace(problem, shrinkage=0.5 * A), mass_weights(3)
-    known = [with_known_masses(x, [KnownMass("a", total, 7.0)]) for x in (problem, lacking)]
-    errors = [combination_standard_error(x, LeastSquares().solve(x), total) for x in (problem, lacking, *known)]
-    assert errors[1] > 2.0 * errors[0]
-    assert errors[3] == pytest.approx(errors[2], rel=1e-9), "the row of the mass lacks nothing"

@@ -8,24 +8,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
-import yaml
 from demo import shortened_demo
 from large import assert_same, tensors
 
 from torchid.cli import main
-from torchid.commands.compress import compress
 from torchid.config import load_config
 from torchid.errors import ConfigError, TorchidWarning
 from torchid.fitting.experiment import set_up
-from torchid.fitting.factor_files import read_factors
 from torchid.logs import read_log, write_log
 from torchid.problem import Samples
 from torchid.reading.log_reader import LogReader
-
-FEET = [f"{leg}_foot" for leg in ("front_left", "front_right", "rear_left", "rear_right")]
 
 
 @pytest.fixture(scope="module")
@@ -95,18 +89,6 @@ def test_a_run_on_parts_is_that_on_files_of_them(demo: Path, tmp_path: Path, mon
         assert value == pytest.approx(of_parts["test"][name], rel=1e-9), name
 
 
-def test_a_fold_is_tested_on_what_is_left_is_fitted_on(
-    demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(demo)
-    logs = {"train": [{"file": "sway_train.npz", "without_fold": 2}], "test": [{"file": "sway_train.npz", "fold": 2}]}
-    metrics = identified(demo, tmp_path / "run", logs, "preprocessing.cutoff_hz=null")
-    assert metrics["samples"] == 1_300 - 260 - 4 - 4  # two samples at each end of each part are not differentiated
-    written = yaml.safe_load((tmp_path / "run/config.yaml").read_text())["logs"]
-    assert [Path(x).name for x in written["train"]] == ["sway_train.npz[:20%]", "sway_train.npz[40%:]"]
-    assert [Path(x).name for x in written["test"]] == ["sway_train.npz[20%:40%]"]
-
-
 def test_parts_that_turn_out_to_overlap_are_warned_of_or_refused(demo: Path, tmp_path: Path) -> None:
     def analyzed(train: str, test: str) -> None:
         from torchid.commands.identify import identify
@@ -126,29 +108,6 @@ def test_parts_that_turn_out_to_overlap_are_warned_of_or_refused(demo: Path, tmp
         analyzed('["sway_train.npz[:6]", "sway_train.npz[-8:]"]', "[]")
 
 
-def test_parts_are_compressed_to_files_of_their_own(demo: Path, tmp_path: Path) -> None:
-    parts = [demo / f"sway_train.npz{text}" for text in ("[:7]", "[7:]")]
-    config = load_config(demo / "quadruped.yaml", [f"logs.train={[*map(str, parts)]}", "logs.test=[]"])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", TorchidWarning)
-        found = compress(config, tmp_path / "factors")
-    assert [one.name for one in found.files] == ["sway_train[:7].factor", "sway_train[7:].factor"]
-    assert len({read_factors(tmp_path / "factors" / one.name).sha256 for one in found.files}) == 2
-    fitted = identified(demo, tmp_path / "run", {"train": [str(tmp_path / "factors" / "*.factor")], "test": []})
-    assert fitted["samples"] == sum(one.samples for one in found.files)
-
-
-def test_a_part_is_checked_and_converted(
-    demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(demo)
-    main(["check", "sway_train.npz[-6:]"])
-    assert "600 samples" in " ".join(capsys.readouterr().out.split())
-    assert main(["convert", "sway_train.npz[:7]", str(tmp_path / "x.h5")]) == 0
-    assert len(read_log(tmp_path / "x.h5")) == 700
-    assert main(["convert", "sway_train.npz[:7]", "sway_train.npz", "--overwrite"]) == 2  # which is read
-
-
 @pytest.mark.parametrize("command", ["identify", "analyze", "check"])
 def test_a_range_outside_of_the_log_ends_in_one_line(
     demo: Path, tmp_path: Path, command: str, capsys: pytest.CaptureFixture[str]
@@ -161,14 +120,3 @@ def test_a_range_outside_of_the_log_ends_in_one_line(
         "accepted: a part of 0 to 7 s that has samples"
     )
     assert not (tmp_path / "run").exists()
-
-
-def test_plausibility_reads_the_parts_that_were_fitted(demo: Path, tmp_path: Path) -> None:
-    log = read_log(demo / "sway_train.npz")
-    bad = np.array(log.joint_torque)
-    bad[700:] *= -1.0
-    write_log(replace(log, joint_torque=bad), path := tmp_path / "half.npz")
-    identified(demo, tmp_path / "run", {"train": [f"{path}[:7]"], "test": []})
-    assert (
-        main(["identify", str(demo / "quadruped.yaml"), f"logs={{train: ['{path}[7:]']}}", f"output={tmp_path}/y"]) == 2
-    )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +19,12 @@ from mujoco_oracle import INERTIA_ROUNDING
 import torchid
 from torchid.cli import main
 from torchid.commands import EXPORT_FORMATS
-from torchid.commands.export import export
-from torchid.commands.report import report
 from torchid.config import load_config
-from torchid.errors import ConfigError
 from torchid.fitting.experiment import set_up
 from torchid.problem.chunks import chunks_by_state
 from torchid.problem.metrics import force_series
 from torchid.reading.log_reader import LogReader
-from torchid.report.mjcf_files import identified_mjcf, mjcf_of_urdf
+from torchid.report.mjcf_files import mjcf_of_urdf
 from torchid.robot import load_robot
 
 pytestmark = pytest.mark.filterwarnings("ignore:identified:torchid.errors.TorchidWarning")
@@ -55,34 +51,6 @@ def runs(short: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Pat
         own = settings | {"robot": {"urdf": None, key: file}, "output": out[key]}
         torchid.identify(short / "quadruped.yaml", **own)
     return out
-
-
-@pytest.mark.parametrize(("key", "other"), [("mjcf", "URDF"), ("urdf", "MJCF")])
-def test_the_page_of_a_run_names_the_robot_s_file(runs: dict[str, Path], key: str, other: str) -> None:
-    """In its texts and tables, above what the checks of the logs say."""
-    report(runs[key])
-    page = (runs[key] / "report.html").read_text()
-    named = re.sub(r"<img [^>]*>", "", page.partition("Data quality")[0])
-    assert f"{key.upper()}'s" in named
-    assert other not in named
-
-
-def test_what_an_mjcf_robot_is_compared_with_is_called_mjcf(
-    runs: dict[str, Path], short: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """In sentences, tables and the page, the same words as of a URDF otherwise."""
-    said = {}
-    for key, run in runs.items():
-        for words in (["evaluate"], ["evaluate", "--verbose"], ["replay", "--window", "0.1", "--samples", "2"]):
-            assert main([*words, str(run), "--log", str(short / "sway_test.npz[:1]")]) == 0
-        said[key] = re.sub(r"written to.*|[\d.]+(e[+-]\d+)?", "", capsys.readouterr().out).split()
-        answer = json.loads((run / "report.json").read_text())["answer"]
-        said[key] += [word for text in (answer["headline"], answer["total_mass"]) for word in text.split()[:5]]
-        said[key] += repr(torchid.evaluate(run, short / "sway_test.npz")).split()[:6]
-    assert "URDF" in " ".join(said["urdf"])
-    assert "URDF" not in " ".join(said["mjcf"])
-    words = [re.sub("[^A-Za-z]", "", word.replace("URDF", "MJCF")) for word in said["urdf"]]
-    assert [re.sub("[^A-Za-z]", "", word) for word in said["mjcf"]] == words
 
 
 def identified(run: Path) -> np.ndarray:
@@ -132,15 +100,6 @@ def test_every_format_is_what_its_reader_reads(
         assert set(json.loads(text)["joints"]) == set(robot.joint_names)
 
 
-def test_no_file_is_replaced_unless_told_so(runs: dict[str, Path], tmp_path: Path) -> None:
-    target = tmp_path / "out.json"
-    target.write_text("mine")
-    with pytest.raises(torchid.TorchidError, match="exists; accepted: a new file, or --overwrite"):
-        export(runs["urdf"], "json", target)
-    export(runs["urdf"], "json", target, overwrite=True)
-    assert json.loads(target.read_text())["joints"]
-
-
 def test_a_key_of_the_other_kind_is_refused(runs: dict[str, Path], tmp_path: Path) -> None:
     with pytest.raises(torchid.TorchidError, match=r"robot.urdf: .*no URDF; accepted: robot: \{mjcf: quadruped.xml\}"):
         torchid.identify(
@@ -180,34 +139,6 @@ def test_a_known_armature_is_taken_off_the_torques_and_a_fitted_one_is_all_of_it
     np.testing.assert_allclose(difference, torque.numpy(), atol=1e-10)
 
 
-def test_a_fitted_armature_does_not_depend_on_that_of_the_file_and_is_written(
-    runs: dict[str, Path], tmp_path: Path
-) -> None:
-    found = []
-    for file in models(runs, tmp_path, 'armature="0.05"'):
-        found.append(
-            torchid.identify(
-                DEMO / "quadruped.yaml",
-                robot={"urdf": None, "mjcf": file},
-                output=None,
-                actuators={"armature": True},
-                estimator={"name": "least_squares", "ridge": 1e-3},
-            )
-        )
-    armatures = [one.fitted_joints.armature for one in found]
-    assert armatures[1] == pytest.approx(armatures[0], abs=1e-10)
-    text = identified_mjcf(found[1].experiment.robot, found[1].experiment.robot.nominal, armatures[1]).decode()
-    written = dict(re.findall(r'<joint armature="([^"]*)" name="([^"]*)"', text))
-    assert {name: float(value) for value, name in written.items()} == armatures[1]
-
-
-def test_init_names_an_mjcf_robot_as_such(runs: dict[str, Path], tmp_path: Path) -> None:
-    file, log = runs["mjcf"].parent / "quadruped.xml", LOG
-    assert main(["init", str(file), str(log), "--output", str(tmp_path / "experiment.yaml")]) == 0
-    settings = yaml.safe_load((tmp_path / "experiment.yaml").read_text())
-    assert (tmp_path / settings["robot"]["mjcf"]).resolve() == file.resolve()
-
-
 def test_the_log_is_replayed_on_the_mjcf_robot_as_on_the_urdf(runs: dict[str, Path], tmp_path: Path) -> None:
     from torchid.commands.replay import replay
 
@@ -216,41 +147,6 @@ def test_the_log_is_replayed_on_the_mjcf_robot_as_on_the_urdf(runs: dict[str, Pa
     drifts = [replay(runs[key], log, 0.1).drift for key in ("urdf", "mjcf")]
     for one, other in zip(*drifts, strict=True):
         np.testing.assert_allclose(one.joints, other.joints, atol=1e-4)
-
-
-def test_a_log_is_checked_against_a_model_as_against_its_urdf(runs: dict[str, Path]) -> None:
-    file = runs["mjcf"].parent / "quadruped.xml"
-    log = torchid.read_log(LOG).select(slice(0, 300))
-    of_model, of_urdf = (torchid.check(log, load_robot(one)) for one in (file, DEMO / "quadruped.urdf"))
-    assert of_model.skipped == of_urdf.skipped
-    assert [one.name for one in of_model.findings] == [one.name for one in of_urdf.findings]
-
-
-@pytest.mark.parametrize("factor", [pytest.param(0.7, marks=pytest.mark.slow), 1.8, -1.0])
-def test_findings_against_a_model_are_those_against_its_urdf_and_name_the_model(
-    runs: dict[str, Path], factor: float
-) -> None:
-    """Of contact forces that are no weight of the robot, and of a torque that contradicts it."""
-    log = torchid.read_log(LOG).select(slice(0, 300))
-    assert log.joint_torque is not None
-    assert log.contact_wrench_local is not None
-    torque = log.joint_torque * np.where(np.arange(log.joint_torque.shape[1]) == 4, -1.0, 1.0)
-    log = replace(log, joint_torque=torque, contact_wrench_local=factor * log.contact_wrench_local)
-    entries = yaml.safe_load((DEMO / "quadruped.yaml").read_text())["contacts"]
-    contacts = [torchid.Contact(one["frame"], one["type"]) for one in entries]
-    files, said = {"urdf": DEMO / "quadruped.urdf", "mjcf": runs["mjcf"].parent / "quadruped.xml"}, {}
-    for key, file in files.items():
-        checked = torchid.check(log, load_robot(file), contacts)
-        said[key] = "; ".join(f"{one.found}; {one.advice}" for one in checked.findings)
-    assert "URDF" in said["urdf"]
-    assert "MJCF" in said["mjcf"]
-    assert re.sub(r"[\d.]+", "", said["mjcf"]) == re.sub(r"[\d.]+", "", said["urdf"]).replace("URDF", "MJCF")
-
-
-def test_a_log_is_checked_against_one_robot_alone(runs: dict[str, Path]) -> None:
-    file = runs["mjcf"].parent / "quadruped.xml"
-    with pytest.raises(ConfigError, match="urdf or mjcf"):
-        torchid.check(LOG, robot={"mjcf": file, "urdf": DEMO / "quadruped.urdf"})
 
 
 FOOT = '<geom type="capsule" fromto="0 0 0 0 0 -.3" size="0.05"/></body>'

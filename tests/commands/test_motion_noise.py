@@ -56,21 +56,6 @@ def test_a_run_says_how_much_was_noise_and_gives_more_to_what_is_small(
     assert stated["motion_noise"]["largest"] == pytest.approx(found["motion_noise"]["largest"], rel=0.2)
 
 
-def test_a_descent_takes_it_off_as_well(demo: Path, tmp_path: Path) -> None:
-    plain, _ = identified(demo, tmp_path / "plain", "estimator.name=consistent", "estimator.ridge=0.01")
-    metrics, _ = identified(
-        demo, tmp_path / "run", "estimator.name=sgd", "estimator.ridge=0.01", "estimator.training.epochs=2"
-    )
-    assert metrics["motion_noise"] == plain["motion_noise"]
-    assert metrics["solution"]["objective"] == pytest.approx(plain["solution"]["objective"], rel=1e-6)
-
-
-def test_robust_fits_take_it_off_as_well(demo: Path, tmp_path: Path) -> None:
-    plain, _ = identified(demo, tmp_path / "plain")
-    robust, _ = identified(demo, tmp_path / "robust", "estimator.robust.loss=huber")
-    assert robust["motion_noise"]["largest"] == pytest.approx(plain["motion_noise"]["largest"], rel=0.2)
-
-
 @pytest.mark.parametrize("settings", ["{cutoff_hz: 8}", "{cutoff_hz: 8, sample_rate_hz: 50}", "{cutoff_hz: null}"])
 def test_blocks_have_the_noise_of_the_whole_log(demo: Path, tmp_path: Path, settings: str) -> None:
     def noise(*more: str) -> MotionNoise:
@@ -87,10 +72,3 @@ def test_blocks_have_the_noise_of_the_whole_log(demo: Path, tmp_path: Path, sett
     assert whole.turns_force
     assert blocks.turns_force
     assert float(whole.joints[:, 2, 2].min()) > 0.01, "accelerations have noise"
-
-
-def test_noise_is_a_number_of_at_least_zero(demo: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["identify", str(demo / "quadruped.yaml"), "sensors.noise.joint_position=-1"]) == 2
-    assert "sensors.noise.joint_position: found -1; accepted: greater than or equal to 0" in capsys.readouterr().err
-    assert main(["identify", str(demo / "quadruped.yaml"), "sensors.noise.joint_positions=1"]) == 2
-    assert "joint_position" in capsys.readouterr().err.partition("joint_positions")[2]

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 from demo import shortened_demo
 
 from torchid.cli import main
-from torchid.parameters import Array
-from torchid.report.forces import ForceSeries, force_figure
 
 UNPHYSICAL = pytest.mark.filterwarnings("ignore:identified.urdf:torchid.errors.TorchidWarning")
 
@@ -48,61 +44,3 @@ def test_noise_that_residuals_show_is_no_measure_of_them(tmp_path: Path, capsys:
     assert floors(run) == {"train": {}, "test": {}}
     assert main(["evaluate", str(run), "--log", str(demo / "sway_test.npz")]) == 0
     assert "│   noise alone" not in capsys.readouterr().out
-
-
-def series(noise: Array | None) -> ForceSeries:
-    time, rng = np.arange(50) / 10.0, np.random.default_rng(0)
-    measured = rng.normal(size=(50, 2))
-    measured[:5, 1] = np.nan
-    return ForceSeries("walk.npz[0:5]", time, measured, measured + 1.0, measured + 0.1, noise)
-
-
-def test_forces_are_known_where_any_row_was_measured_in_full() -> None:
-    some = series(None)
-    assert some.known
-    assert not replace(some, measured=np.full((50, 2), np.nan)).known
-
-
-def test_the_figure_shows_errors_in_a_band_of_two_standard_deviations() -> None:
-    figure = force_figure(series(np.full((50, 2), 0.2)), ["knee", "hip"], 0)
-    assert len(figure.axes) == 4
-    for errors in figure.axes[1::2]:
-        (band,) = errors.collections
-        heights = band.get_paths()[0].vertices[:, 1]
-        assert (heights.min(), heights.max()) == pytest.approx((-0.4, 0.4))
-        nominal, identified = errors.get_lines()
-        np.testing.assert_allclose(np.nanmax(np.asarray(nominal.get_ydata(), dtype=float)), 1.0)
-        np.testing.assert_allclose(np.nanmax(np.asarray(identified.get_ydata(), dtype=float)), 0.1)
-        assert errors.get_title(loc="left") == "identified: rms 0.1, noise alone 0.2 [N m]"
-
-
-def test_the_figure_has_errors_without_a_band_where_the_noise_is_unknown() -> None:
-    for noise in (None, np.full((50, 2), np.nan)):
-        for errors in force_figure(series(noise), ["knee", "hip"], 0).axes[1::2]:
-            assert not errors.collections
-            assert errors.get_title(loc="left") == "identified: rms 0.1 [N m]"
-
-
-def test_a_sliding_joint_s_torque_is_shown_as_a_force() -> None:
-    shown = force_figure(series(None), ["knee", "rail"], 0, ["rail"])
-    assert [axis.get_ylabel() for axis in shown.axes[::2]] == ["[N m]", "[N]"]
-
-
-def test_stamps_of_a_clock_are_shown_as_seconds_since_the_first_sample() -> None:
-    as_recorded = force_figure(series(None), ["knee", "hip"], 0)
-    since_1970 = force_figure(replace(series(None), time=1.7e9 + series(None).time), ["knee", "hip"], 0)
-    for figure, label in ((as_recorded, "time [s]"), (since_1970, "time since the first sample [s]")):
-        np.testing.assert_allclose(figure.axes[0].get_lines()[0].get_xdata(), series(None).time, atol=1e-6)
-        assert {axis.get_xlabel() for axis in figure.axes} == {"", label}
-
-
-def test_the_figure_says_how_many_rows_it_leaves_out() -> None:
-    measured = np.tile(np.arange(8.0), (50, 1))
-    measured[:, 7] = np.nan
-    many = ForceSeries("walk.npz", np.linspace(0.0, 1.0, 50), measured, measured, measured)
-    names = [f"joint_{k}" for k in range(8)]
-    assert force_figure(many, names, 0).get_suptitle().startswith("Generalized forces (6 of 7 rows, the largest), walk")
-    assert force_figure(series(None), names, 0).get_suptitle().startswith("Generalized forces, walk")
-    assert "gaps" not in force_figure(many, names, 0).get_suptitle()
-    measured[:20, 3] = np.nan
-    assert force_figure(many, names, 0).get_suptitle().endswith("; gaps: forces without a sensor act")

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import warnings
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +17,6 @@ from torch import Tensor
 import torchid
 from torchid.cli import main
 from torchid.problem import RowBuilder, compress
-from torchid.problem.chunks import chunks_by_state, map_chunks, upload
-from torchid.problem.compression import _compress_chunks
 from torchid.problem.linear import parameter_scale
 from torchid.regressor import FrameJacobian, Regressor
 from torchid.sensing import Contact
@@ -87,45 +83,6 @@ def test_rows_and_factors(name: str, sensors: str) -> None:
         assert unlike(found.T @ found, expected.T @ expected) < 1e-12
 
 
-def test_the_host_waits_for_what_it_is_said_to_wait_for() -> None:
-    """As `test_device_traffic.py` counts it on tensors without values."""
-    urdf, bolted, contacts = ROBOTS["quadruped"]
-    robot = load(urdf, None, bolted)
-    samples, _ = random_samples(robot, contacts, 4000, 1, states=2)
-    bent = torch.tensor([0.0, 0.8, -1.6], dtype=torch.float64).repeat(4)  # no knee is straight: no rank is in doubt
-    samples = replace(samples, joint_position=bent + 0.1 * samples.joint_position)
-    builder = RowBuilder(robot, contacts, sensor_set("joints", robot, contacts)).to(GPU)
-    chunks = [(samples[index].to(GPU), state) for state, index in chunks_by_state(samples, 500)]
-    with torch.no_grad():
-        _compress_chunks(builder, iter(chunks), by_log=True)
-        with warnings.catch_warnings(record=True) as said:
-            warnings.simplefilter("always")
-            torch.cuda.set_sync_debug_mode("warn")
-            try:
-                _compress_chunks(builder, iter(chunks), by_log=True)
-            finally:
-                torch.cuda.set_sync_debug_mode("default")
-    waits = [Path(w.filename).name for w in said if "called a synchronizing" in str(w.message)]
-    assert waits == ["projection.py"] * len(chunks)
-
-
-def test_chunks_arrive_as_they_left() -> None:
-    urdf, _, contacts = ROBOTS["quadruped"]
-    samples, _ = random_samples(load(urdf), contacts, 50_000, 1)
-    builder = RowBuilder(load(urdf), contacts, sensor_set("joints", load(urdf), contacts)).to(GPU)
-    totals = []
-    for chunk, number in upload(((samples[k : k + 5000], k) for k in range(0, 50_000, 5000)), GPU):
-        assert chunk.torque.is_cuda
-        busy = chunk.torque @ chunk.torque.T  # so that the next copy is under way before this is done
-        assert torch.equal(chunk.torque.cpu(), samples.torque[number : number + 5000])
-        assert torch.equal(chunk.active.cpu(), samples.active[number : number + 5000])
-        totals.append(float(busy.sum()))
-    assert len(totals) == 10
-    done: list[int] = []
-    map_chunks([samples], builder, lambda chunks: sum(len(part) for part, _ in chunks), 5000, None, done.append)
-    assert sum(done) == 50_000
-
-
 @pytest.fixture(scope="module")
 def experiments(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return write_experiments(tmp_path_factory.mktemp("experiments"))
@@ -158,31 +115,6 @@ def test_whole_runs(name: str, experiments: dict[str, Path], tmp_path: Path) -> 
     assert_same(tmp_path / "cuda/run", tmp_path / "cpu/run", file, 1e-7 if DESCENT[0] in more else 1e-9)
 
 
-@pytest.mark.parametrize("command", ["evaluate", "analyze", "compress"])
-def test_other_commands(command: str, experiments: dict[str, Path], tmp_path: Path) -> None:
-    file = experiments["biped"]
-    if command == "evaluate":
-        assert main(["identify", str(file), f"output={tmp_path / 'run'}", "device=cuda"]) == 0
-        log = str(file.parent / "log1.npz")
-        for device in ("cuda", "cpu"):
-            output = ["--output", str(tmp_path / device), "--device", device]
-            assert main(["evaluate", str(tmp_path / "run"), "--log", log, *output]) == 0
-        one, other = (json.loads((tmp_path / device / "metrics.json").read_text()) for device in ("cuda", "cpu"))
-        for where, difference in differences(one, other):
-            assert difference < 1e-9, where
-        return
-    for device in ("cuda", "cpu"):
-        arguments = [f"output={tmp_path / device}"] if command == "analyze" else ["--output", str(tmp_path / device)]
-        assert main([command, str(file), *arguments, f"device={device}"]) == 0
-    if command == "compress":
-        runs = []
-        for device in ("cuda", "cpu"):
-            runs.append(tmp_path / f"from_{device}/run")
-            factors = json.dumps([f"{tmp_path / device}/*.factor"])
-            assert main(["identify", str(file), f"logs.train={factors}", f"output={runs[-1]}"]) == 0
-        assert_same(runs[0], runs[1], file, 1e-9)
-
-
 def test_two_processes_share_a_gpu(experiments: dict[str, Path], tmp_path: Path) -> None:
     file = experiments["biped"]
     status, _, complained = finish(
@@ -191,14 +123,3 @@ def test_two_processes_share_a_gpu(experiments: dict[str, Path], tmp_path: Path)
     assert status == 0, complained
     assert main(["identify", str(file), f"output={tmp_path / 'one/run'}", "device=cpu"]) == 0
     assert_same(tmp_path / "two/run", tmp_path / "one/run", file, 1e-9)
-
-
-def test_samples_of_a_posterior(experiments: dict[str, Path], tmp_path: Path) -> None:
-    assert main(["identify", str(experiments["arm"]), f"output={tmp_path / 'run'}", "estimator.name=consistent"]) == 0
-    sampler = torchid.PosteriorSampler(tmp_path / "run")
-    here = sampler.sample(4000, torch.Generator().manual_seed(0)).phi
-    there = sampler.to(GPU).sample(4000, torch.Generator("cuda").manual_seed(0)).phi
-    assert there.is_cuda
-    spread = here.std(0)
-    moved = (there.mean(0).cpu() - here.mean(0)).abs()[spread > 0] / spread[spread > 0]
-    assert float(moved.max()) < 5.0 * (2.0 / 4000) ** 0.5

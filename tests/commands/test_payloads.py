@@ -62,19 +62,6 @@ def test_a_known_load_in_one_log_gives_scales_and_masses(world: tuple[Path, floa
     assert metrics["test"]["joint_torque_rms"] < 1e-9 < 1e-2 < metrics["test_nominal"]["joint_torque_rms"]
 
 
-def test_whoever_does_not_say_so_has_scales_that_nothing_tells_and_names_them(
-    world: tuple[Path, float], tmp_path: Path
-) -> None:
-    """Without the bag's log a common factor of masses and scales is left; it is named."""
-    file, _ = world
-    alone = f"logs={{train: [{file.parent / 'a.npz'}], test: []}}"
-    metrics, scales = identified(file, tmp_path / "run", alone)
-    assert np.abs(np.array(scales) - [HIP_SCALE, KNEE_SCALE]).min() > 0.01
-    (confounded,) = metrics["confounded"]
-    assert confounded["extras"] == ["scale of *_hip,*_thigh", "scale of *_knee"]
-    assert confounded["confounded_with"] == ["total mass"]
-
-
 def test_all_ways_to_read_agree(world: tuple[Path, float], tmp_path: Path) -> None:
     """Block by block, from files of factors, and in an evaluation."""
     file, _ = world

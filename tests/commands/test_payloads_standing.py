@@ -13,7 +13,7 @@ from demo import DEMO
 from large import SMALL
 from motions import value
 from payloads import load_on
-from shared_work import differences, run_all
+from shared_work import run_all
 from synthetic import Oracle
 from walking import MACHINES, recorded, robot_of, truth
 
@@ -90,14 +90,6 @@ def test_what_is_identified_is_the_robot_without_its_load(folders: dict[int, Pat
     """To a filter's error of the load's forces, which are filtered by themselves."""
     truthful, stated, not_stated = (phi(folders[1] / name) for name in list(RUNS)[:3])
     assert np.abs(stated - truthful).max() < 0.02 * np.abs(not_stated - truthful).max()
-
-
-@pytest.mark.parametrize("name", SHARED)
-def test_two_processes_find_what_one_finds(folders: dict[int, Path], name: str) -> None:
-    for file in ("parameters", "metrics"):
-        one, two = (document(folder / name, file) for folder in folders.values())
-        worst = max(differences(one, two), key=lambda x: x[1])
-        assert worst[1] < 1e-6, worst
 
 
 def test_blocks_find_what_the_whole_log_gives(folders: dict[int, Path]) -> None:

@@ -13,17 +13,12 @@ import pytest
 from demo import FAST_ESTIMATOR
 from repository import DEMO
 from synthetic import UR5, Oracle, load, make_log
-from urdfs import inertial, joint, link, write
 
 import torchid
 from torchid.cli import main
-from torchid.commands.plausibility import force_gain, implausibility, is_implausible_factor
+from torchid.commands.plausibility import force_gain, implausibility
 from torchid.estimators import LeastSquares
 from torchid.identifiability.confounding import TotalMass
-from torchid.log_checks import REJECTED, SUSPICIOUS, Checked, Finding, Span
-from torchid.log_checks.check import check
-from torchid.logs import Log
-from torchid.parallel import forks_allowed
 from torchid.problem import (
     LinearProblem,
     RowBuilder,
@@ -63,10 +58,6 @@ def exchanged_legs(log: dict[str, Any]) -> None:
 
 def swapped_feet(log: dict[str, Any]) -> None:
     log["contact_active"] = log["contact_active"][:, [1, 0, 3, 2]]
-
-
-def late_torques_of_a_knee(log: dict[str, Any]) -> None:
-    log["joint_torque"][:, 2] = np.roll(log["joint_torque"][:, 2], 40)
 
 
 def in_degrees(log: dict[str, Any]) -> None:
@@ -128,33 +119,6 @@ def test_what_no_robot_can_be_ends_the_run_in_one_line_that_says_what_it_points_
     assert not (tmp_path / "run").exists()
 
 
-def in_degrees_at_the_end(log: dict[str, Any]) -> None:
-    """The recorder was set up anew in the meantime."""
-    log["joint_position"][900:] = np.degrees(log["joint_position"][900:])
-
-
-@pytest.mark.parametrize(
-    ("change", "segment", "together"),
-    [(in_degrees, "433 to 866", 1), (in_degrees_at_the_end, "867 to 1299", 3)],
-    ids=["middle", "end, three at a time"],
-)
-def test_a_long_log_is_looked_at_in_segments(
-    tmp_path: Path,
-    change: Callable[[dict[str, Any]], None],
-    segment: str,
-    together: int,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("torchid.commands.check.MOST_CHECKED", 500)
-    monkeypatch.setattr("torchid.commands.plausibility.thread_count", lambda: together)
-    with forks_allowed():
-        assert main(["identify", str(DEMO / "quadruped.yaml"), *changed(tmp_path, change, 1_300), RIDGE]) == 2
-    assert f"torchid check finds in train.npz (samples {segment} of 1300, counted from there): joint_position: " in (
-        capsys.readouterr().err
-    )
-
-
 def scalars_of_the_feet(log: dict[str, Any]) -> None:
     """Sizes of the feet's forces, entered as if they were all along one oblique axis of the frames."""
     wrench = np.zeros_like(log["contact_wrench_local"])
@@ -194,27 +158,6 @@ def arm_problem(factor: float = 1.0) -> tuple[LinearProblem, torchid.Robot]:
     return linear_problem(compress([bind_log(log, robot, [])], builder), builder, robot), robot
 
 
-def test_logs_are_checked_once_for_all_doubts_of_a_fit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    checked: list[int] = []
-
-    def counted(log: Log, *settings: Any) -> Checked:
-        checked.append(len(log))
-        zero = Finding("offset", SUSPICIOUS, "joint_torque", "reads 1 N m too much", "check its zero")
-        untouched = Finding("force without contact", REJECTED, "contact_active", "never set", "set it")
-        return replace(check(log, *settings), findings=(zero, replace(untouched, spans=(Span(0, 299, "foot"),))))
-
-    monkeypatch.setattr("torchid.commands.plausibility.check", counted)
-    overrides = [*changed(tmp_path, late_torques_of_a_knee), "estimator.ridge=0.001"]
-    main(["identify", str(DEMO / "quadruped.yaml"), *overrides])
-    told = capsys.readouterr().err
-    assert "forces differ from any rigid-body model" in told
-    assert "predict worse than the URDF's" in told
-    assert len(checked) == 1
-    assert told.count("torchid check finds in train.npz: contact_active: never set") == 2, "the most severe"
-
-
 @pytest.mark.parametrize(("factor", "stops"), [(1.0, False), (3.0, False), (-1.0, True), (1e3, True), (1e-3, True)])
 def test_an_arm_s_torques_of_the_wrong_sign_or_unit_are_noticed_without_a_total_mass(
     factor: float, stops: bool
@@ -225,13 +168,6 @@ def test_an_arm_s_torques_of_the_wrong_sign_or_unit_are_noticed_without_a_total_
     found = implausibility(problem, estimate.phi, unknown, robot)
     assert (found is not None) is stops
     assert ("opposite sign" in (found or "")) is (factor < 0.0)
-
-
-def test_forces_that_have_nothing_to_do_with_the_urdf_s_have_no_factor() -> None:
-    problem, _ = arm_problem()
-    noise = np.random.default_rng(1).normal(size=problem.b.shape)
-    assert force_gain(replace(problem, b=noise)) is None
-    assert force_gain(replace(problem, b=0.0 * noise)) is None
 
 
 def test_a_single_body_may_break_conditions_but_not_be_beyond_all_bounds() -> None:
@@ -260,39 +196,3 @@ def test_a_total_mass_counts_where_the_data_determine_it(mass: TotalMass, determ
     problem, robot = arm_problem()
     assert mass.determined is determined
     assert (implausibility(problem, problem.nominal, mass, robot) is not None) is stops
-
-
-def test_a_ratio_that_is_no_number_is_absurd() -> None:
-    assert is_implausible_factor(float("nan"))
-    assert is_implausible_factor(float("inf"))
-    assert not is_implausible_factor(1.0)
-
-
-@pytest.mark.parametrize("sign", [1.0, -1.0], ids=["right", "reversed"])
-def test_forces_of_bodies_that_cannot_exist_are_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], sign: float
-) -> None:
-    limit = '<limit lower="-2" upper="2" effort="99" velocity="9"/>'
-    slides = [
-        joint(name, parent, child, "prismatic", f'<axis xyz="{axis}"/>{limit}')
-        for name, parent, child, axis in (("x", "base", "bridge", "1 0 0"), ("y", "bridge", "head", "0 1 0"))
-    ]
-    urdf = write(tmp_path, link("base"), link("bridge"), link("head", inertial(mass="0.2")), *slides)
-    time = np.arange(2000) / 100.0
-    rate = 2.0 * np.pi * np.array([0.5, 0.7])
-    position = np.sin(rate * time[:, None])
-    force = np.array([1.3, sign * 0.25]) * -(rate**2) * position  # [N] of 1.05 and 0.25 kg
-    force = force + 0.05 * np.random.default_rng(0).normal(size=force.shape)
-    names = np.array(["x", "y"])
-    np.savez(tmp_path / "log.npz", time=time, joint_names=names, joint_position=position, joint_torque=force)
-    settings = {
-        "robot": {"urdf": urdf.name, "fixed_base": True},
-        "logs": {"train": ["log.npz[:80%]"], "test": ["log.npz[80%:]"]},
-        "preprocessing": {"cutoff_hz": 5},
-        "sensors": "joints",
-        "estimator": {"name": "consistent", "ridge": 1e-4},
-        "output": str(tmp_path / "run"),
-    }
-    (tmp_path / "stage.yaml").write_text(json.dumps(settings))
-    assert main(["identify", str(tmp_path / "stage.yaml")]) == 0
-    assert ("no bodies that can exist explain these forces" in capsys.readouterr().out) == (sign < 0.0)

@@ -28,9 +28,3 @@ def coverage(robot: str, repetitions: int) -> float:
 def test_credible_intervals_hold_the_truth_where_the_data_speak() -> None:
     """Of 8 times 6 combinations, a share that chance alone moves by 3 %."""
     assert coverage("Solo12", 8) > 0.85
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("robot", ["UR5", "Solo12", "G1"])
-def test_credible_intervals_hold_the_truth_in_200_repetitions(robot: str) -> None:
-    assert 0.92 < coverage(robot, 200) < 0.98

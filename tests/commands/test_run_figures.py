@@ -7,13 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from demo import shortened_demo
-from matplotlib.figure import Figure
 from matplotlib.image import imread
 from run_figures import OF_A_RUN
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from torchid.cli import main
-from torchid.report.figure_style import save_figure
 
 
 @pytest.mark.usefixtures("figures")
@@ -53,26 +51,3 @@ def test_figures_for_print_come_from_all_commands_and_tensorboard_keeps_its_pict
     assert set(pictures.Tags()["images"]) == {f"figure_{number}_{name}" for number, name in enumerate(OF_A_RUN, 1)}
     (forces,) = pictures.Images("figure_1_forces")
     assert min(forces.height, forces.width) > 200
-
-
-@pytest.mark.parametrize("form", _BEGINS)
-def test_a_figure_for_print_is_the_same_file_whenever_it_is_drawn(
-    form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    files = []
-    for second in ("0", "2000000000"):
-        monkeypatch.setenv("SOURCE_DATE_EPOCH", second)  # what matplotlib takes for now
-        figure = Figure()
-        figure.subplots().plot([0.0, 1.0], [0.0, 1.0])
-        save_figure(figure, tmp_path / f"{second}.{form}")
-        files.append((tmp_path / f"{second}.{form}").read_bytes())
-    assert files[0].startswith(_BEGINS[form])
-    assert files[1] == files[0]
-
-
-def test_a_format_that_is_none_is_refused_with_those_that_are(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    demo = shortened_demo(tmp_path / "demo", 50)
-    assert main(["identify", str(demo / "quadruped.yaml"), "figures.format=bmp"]) == 2
-    assert "figures.format: found 'bmp'" in capsys.readouterr().err

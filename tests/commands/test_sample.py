@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,6 @@ from torchid.commands.sample import sample
 from torchid.errors import ConfigError
 from torchid.fitting.posterior import POSTERIOR
 from torchid.parameters import consistency_margin
-from torchid.terminal.identification import sample_lines
 
 pytestmark = pytest.mark.filterwarnings("ignore:identified:torchid.errors.TorchidWarning")
 
@@ -76,46 +74,6 @@ def test_ranges_and_correlations_are_those_of_the_samples(run: Path, tmp_path: P
     assert "trunk.fc" not in names  # the base has no joint
 
 
-def test_auto_prior_of_a_robot_near_its_file_is_the_default(run: Path) -> None:
-    auto, default = (sample(run, 20, prior_error=x) for x in ("auto", 0.2))
-    assert auto.prior_error == 0.2
-    np.testing.assert_array_equal(auto.samples.phi, default.samples.phi)
-
-
-def test_the_answer_says_that_the_prior_is_too_narrow_and_what_fits(
-    run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    drawn = sample(run, 20)
-    posterior = drawn.fitted.posterior
-    light = posterior.nominal.copy()
-    light.reshape(-1, 12)[:, :10] *= 0.3  # bodies weigh three times what their file says
-    wrong = replace(drawn, fitted=replace(drawn.fitted, posterior=replace(posterior, nominal=light)))
-    assert drawn.fitted.nominal_error is not None
-    assert "too narrow" not in " ".join(sample_lines(drawn, 100))
-    text = " ".join(" ".join(sample_lines(wrong, 100)).split())
-    found = wrong.fitted.nominal_error
-    assert found is not None
-    assert found.value > 0.6
-    assert f"bodies are off the robot file by {100.0 * found.value:.0f} %" in text
-    assert "--prior-error auto" in text
-
-
-def test_the_answer_fits_on_a_screen(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["sample", str(run), "--count", "50"]) == 0
-    short = capsys.readouterr().out.splitlines()
-    assert len(short) <= 20
-    assert main(["sample", str(run), "--count", "50", "--verbose"]) == 0
-    assert len(capsys.readouterr().out.splitlines()) > 150
-    assert "95 % of them weigh" in short[0]
-    assert main(["sample", str(run), "--count", "2"]) == 0
-    two = capsys.readouterr().out
-    assert two.startswith("2 robots that can exist; all weigh ")
-    assert "least" in two
-    assert "2.5 %" not in two
-    assert main(["sample", str(run), "--count", "50", "--quiet"]) == 0
-    assert capsys.readouterr().out == ""
-
-
 @pytest.mark.parametrize(
     ("options", "complaint"),
     [
@@ -147,15 +105,3 @@ def test_runs_without_a_posterior_are_refused_with_advice(run: Path, tmp_path: P
         sample(tmp_path)
     with pytest.raises(torchid.TorchidError, match="none: RUN: no such file or folder; accepted: a run of this"):
         torchid.PosteriorSampler(tmp_path / "none")
-
-
-def test_files_that_stand_there_stay_without_overwrite(run: Path, tmp_path: Path) -> None:
-    out = tmp_path / "s.npz"
-    sample(run, 5, output=out)
-    before = out.read_bytes()
-    with pytest.raises(ConfigError, match="--overwrite"):
-        sample(run, 6, output=out)
-    assert out.read_bytes() == before
-    sample(run, 6, output=out, overwrite=True)
-    with np.load(out) as arrays:
-        assert len(arrays["samples"]) == 6

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from demo import DEMO, shortened_demo
+from demo import DEMO
 from motions import value
 from refusals import refusal
 from scipy.spatial.transform import Rotation
@@ -76,23 +76,6 @@ def test_a_run_counts_scalar_sensors_in_projected_errors_and_fits_their_offsets(
         assert abs(extra["value"]) < 1.0
     log = experiment.parent / "sway_test.npz"
     assert main(["evaluate", str(output), "--log", str(log)]) == 0
-
-
-def test_factors_of_scalar_sensors_are_not_those_of_others(
-    experiment: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = experiment.parent / "factors"
-    assert main(["compress", str(experiment), "--output", str(folder)]) == 0
-    train = f"logs.train=[{folder / 'sway_train.factor'}]"
-    output = experiment.parent / "runs/factors"
-    assert main(["identify", str(experiment), train, f"output={output}"]) == 0
-    capsys.readouterr()
-    arguments = ["identify", str(experiment), train, f"output={output}x"]
-    contacts = ", ".join(f"{{frame: {foot}, type: point, normal: [0, 0.6, 0.8]}}" for foot in FEET)
-    message = refusal([*arguments, f"contacts=[{contacts}]"], experiment.parent, capsys)
-    assert "contacts: without front_left_foot (point, read along 0.0, 0.6, 0.8), front_right_foot" in message
-    message = refusal([*arguments, "sensors.contact_wrenches={}"], experiment.parent, capsys)
-    assert "front_left_foot (point, read along 0.0, 0.0, 1.0)" in message
 
 
 @pytest.mark.parametrize(
@@ -165,14 +148,3 @@ def test_analyze_plans_with_scalar_sensors_and_measures_the_plan(
     (scenario,) = again["scenarios"].values()
     assert set(again["accuracy"]) == {"proposed"}, "it is the plan"
     assert scenario["proposed"] == scenario["checks"]
-
-
-def test_a_plan_with_scalar_sensors_is_not_measured_on_logs_that_are_read_as_wrenches(
-    experiment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    answers = analyzed(shortened_demo(tmp_path / "demo", 150) / "quadruped.yaml", "planned")
-    (plan,) = answers["scenarios"].values()
-    assert plan["cost"] == 10.0
-    assert set(answers["accuracy"]) == {"proposed"}
-    warned = f"do not read {', '.join(FEET)} along the normal (sensors.contact_wrenches: {{{FEET[0]}: [fn]}})"
-    assert f"{warned}; no accuracy of the sensor plan for logs" in capsys.readouterr().err

@@ -20,12 +20,10 @@ from walking import MACHINES, recorded, truth
 
 from torchid.cli import main
 from torchid.commands.check import check_experiment
-from torchid.config import load_config
-from torchid.errors import ConfigError, InputError, TorchidWarning
+from torchid.errors import ConfigError, InputError
 from torchid.fitting.experiment import set_up
 from torchid.logs import Log, write_log
 from torchid.problem.contact_detection import DetectionConfig
-from torchid.reading.log_reader import LogReader
 
 MACHINE = MACHINES["quadruped"]
 FEET = [{"frame": name, "type": "point"} for name in MACHINE.feet]
@@ -82,26 +80,6 @@ def test_a_fit_without_the_pose_of_the_base_predicts_as_well_as_with_it(written:
     assert again == pytest.approx(derived, rel=1e-12)
 
 
-def test_factors_of_such_logs_give_the_fit_of_the_logs(written: Written, tmp_path: Path) -> None:
-    file = written(base_motion="contacts")
-    noise = "sensors={set: joints, noise: {joint_torque: 0.1, base_force: 1, base_moment: 0.2}}"
-    assert main(["compress", str(file), noise, "--output", str(tmp_path / "factors")]) == 0
-    assert main(["identify", str(file), noise, f"output={tmp_path / 'logs'}"]) == 0
-    train = f"logs.train=[{tmp_path / 'factors' / 'train.factor'}]"
-    assert main(["identify", str(file), noise, train, f"output={tmp_path / 'fleet'}"]) == 0
-    one, other = (metrics_of(tmp_path / name)["test"]["nullspace_rms"] for name in ("logs", "fleet"))
-    assert one == pytest.approx(other, rel=1e-9)
-
-
-def test_the_checks_compare_forces_of_a_log_without_the_base(written: Written) -> None:
-    lacking = check_experiment(written())[0]
-    assert any(finding.name == "does not fit" and finding.field == "base_quat_xyzw" for finding in lacking.findings)
-    checked = check_experiment(written(base_motion="contacts"))[0]
-    assert checked.usable
-    assert not any("base_" in finding.field for finding in checked.findings)
-    assert not any(skip.name.startswith("forces against") for skip in checked.skipped)
-
-
 def test_the_checks_find_reversed_torques_without_the_base(written: Written) -> None:
     def reversed_torque(log: Log) -> Log:
         return replace(log, **NO_BASE, joint_torque=-value(log.joint_torque))
@@ -109,37 +87,6 @@ def test_the_checks_find_reversed_torques_without_the_base(written: Written) -> 
     checked = check_experiment(written(reversed_torque, base_motion="contacts"))[0]
     assert not checked.usable
     assert any(finding.field == "joint_torque" for finding in checked.findings)
-
-
-def test_the_checks_reject_a_log_in_which_nothing_stands(written: Written) -> None:
-    def in_the_air(log: Log) -> Log:
-        return replace(log, **NO_BASE, contact_active=np.zeros_like(value(log.contact_active)))
-
-    checked = check_experiment(written(in_the_air, base_motion="contacts"))[0]
-    (finding,) = [one for one in checked.findings if one.name == "does not fit"]
-    assert finding.found.startswith("no contact stands in any sample")
-
-
-def test_samples_that_the_checks_reject_are_left_out_too(written: Written) -> None:
-    def with_spike(log: Log) -> Log:
-        position = log.joint_position.copy()
-        position[500:503, 2] += 1.5
-        return replace(log, **NO_BASE, joint_position=position)
-
-    setup = set_up(load_config(written(with_spike, base_motion="contacts", exclude_rejected=True)))
-    reader = LogReader(setup)
-    with pytest.warns(TorchidWarning, match="samples excluded"):
-        (samples,) = reader.read(setup.config.logs.train, setup.sensors)
-    assert sum(reader.excluded.values()) > 3
-    assert float(value(samples.base.angular_acceleration).abs().max()) < 20.0
-
-
-def test_a_log_that_would_be_read_in_blocks_is_taken_whole(written: Written, monkeypatch: pytest.MonkeyPatch) -> None:
-    setup = set_up(load_config(written(base_motion="contacts")))
-    (one,) = LogReader(setup).read(setup.config.logs.train, setup.sensors)
-    monkeypatch.setattr("torchid.reading.log_reader._WHOLE_GB", 0.0)
-    (other,) = LogReader(setup).read(setup.config.logs.train, setup.sensors)
-    np.testing.assert_array_equal(value(one.base.specific_force), value(other.base.specific_force))
 
 
 # ---------------------------------------------------------------------------------------------------- detected contacts
@@ -154,33 +101,6 @@ def test_a_fit_with_detected_contacts_predicts_far_better_than_the_urdf(written:
     assert main(["identify", str(file)]) == 0
     metrics = metrics_of(tmp_path / "run")
     assert metrics["test"]["nullspace_rms"] < 0.4 * metrics["test_nominal"]["nullspace_rms"]
-
-
-def test_samples_near_changes_of_detected_contacts_are_dropped(written: Written) -> None:
-    counts = []
-    for margin in (0.0, 0.05):
-        file = written(lambda log: replace(log, **NO_FLAGS), detect_contacts={"margin_s": margin})
-        setup = set_up(load_config(file))
-        counts.append(len(LogReader(setup).read(setup.config.logs.train, setup.sensors)[0]))
-    assert counts[1] < counts[0] - 50
-
-
-def test_contacts_that_may_stand_count_unless_something_takes_them_to_keep_still(written: Written) -> None:
-    """Samples in which they may are dropped then: there are some where thresholds are high."""
-    counts = []
-    for more in ({}, {"max_slip": 100.0}):
-        file = written(lambda log: replace(log, **NO_FLAGS), detect_contacts={"touch": 0.2}, **more)
-        setup = set_up(load_config(file))
-        samples = LogReader(setup).read(setup.config.logs.train, setup.sensors)[0]
-        counts.append(len(samples))
-    assert counts[1] < counts[0] - 20, counts
-
-
-def test_the_checks_do_not_reject_flags_that_they_were_not_given(written: Written) -> None:
-    file = written(lambda log: replace(log, **NO_FLAGS), detect_contacts=True)
-    checked = check_experiment(file)[0]
-    assert checked.usable
-    assert not any("contact" in finding.field for finding in checked.findings)
 
 
 def test_thresholds_of_detection_are_checked(tmp_path: Path) -> None:
@@ -209,25 +129,6 @@ def test_thresholds_of_detection_are_checked(tmp_path: Path) -> None:
 # ------------------------------------------------------------------------------------------------------------- settings
 
 
-def refused_settings(folder: Path, contacts: list[dict[str, Any]], **robot: Any) -> str:
-    settings = changed(
-        robot={"urdf": str(DEMO / "quadruped.urdf")} | robot,
-        contacts=contacts,
-        preprocessing={"base_motion": "contacts"},
-    )
-    np.savez(folder / "a.npz")
-    return refused(lambda: set_up(load(folder / "x.yaml", settings)), "preprocessing.base_motion: ", ConfigError)
-
-
-def test_contacts_that_can_never_say_how_the_base_stands_are_refused(tmp_path: Path) -> None:
-    assert "the experiment has none; accepted: three point feet" in refused_settings(tmp_path, [])
-    assert "the experiment has point front_left_foot, point" in refused_settings(tmp_path, FEET[:2])
-    assert "robot.fixed_base is true" in refused_settings(tmp_path, FEET, fixed_base=True)
-    set_up(load(tmp_path / "y.yaml", changed(
-        robot={"urdf": str(DEMO / "quadruped.urdf")}, contacts=FEET[:3], preprocessing={"base_motion": "contacts"},
-    )))  # fmt: skip
-
-
 def test_one_floor_has_one_normal(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz")
     tilted = [*FEET[:3], FEET[3] | {"normal": [0.1, 0, 1]}]
@@ -237,12 +138,6 @@ def test_one_floor_has_one_normal(tmp_path: Path) -> None:
     line = refused(lambda: set_up(load(tmp_path / "x.yaml", settings)), "contacts[3].normal: [0.0995", ConfigError)
     assert "contacts[0] has [0, 0, 1]" in line
     set_up(load(tmp_path / "y.yaml", settings | {"preprocessing": {}}))
-
-
-def test_another_source_of_the_base_motion_is_refused_by_the_place_of_the_key(tmp_path: Path) -> None:
-    settings = changed(preprocessing={"base_motion": "imu"})
-    line = refused(lambda: load(tmp_path / "x.yaml", settings), f"{tmp_path / 'x.yaml'}: preprocessing.base_motion: ")
-    assert "'contacts'" in line
 
 
 # --------------------------------------------------------------------------------------------------------- a real robot
@@ -279,10 +174,3 @@ def test_a_standing_go2_without_an_imu_is_predicted_better_than_by_its_urdf(tmp_
     metrics = standing_go2(tmp_path)
     assert metrics["test"]["nullspace_rms_relative"] < 0.40
     assert metrics["test_nominal"]["nullspace_rms_relative"] > 0.41
-
-
-@REAL
-def test_a_go2_is_predicted_much_better_while_its_feet_carry_it_and_not_its_belly(tmp_path: Path) -> None:
-    metrics = standing_go2(tmp_path, detect_contacts=True)
-    assert metrics["test"]["nullspace_rms_relative"] < 0.25
-    assert metrics["test_nominal"]["nullspace_rms_relative"] > 0.30

@@ -82,23 +82,6 @@ def test_a_run_finds_it_beside_a_delay_and_an_evaluation_predicts_with_it(folder
     assert _rms(run, folder / "new.npz") < 0.3 * _rms(without, folder / "new.npz")
 
 
-def test_factors_with_its_number_give_the_run(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    stated = [f"actuators.{name}={x}" for name, x in _found(folder / "run").items()]
-    file = str(folder / "experiment.yaml")
-    assert main(["compress", file, "--output", str(folder / "factors"), *stated]) == 0
-    (factors,) = (folder / "factors").rglob("*.factor")
-    logs = f"logs={{train: [{factors}]}}"
-    assert main(["identify", file, logs, *stated, f"output={folder / 'again'}"]) == 0
-    first, again = (json.loads((folder / x / "parameters.json").read_text())["extras"] for x in ("run", "again"))
-    assert [x["value"] for x in again] == pytest.approx([x["value"] for x in first], rel=1e-6)
-    capsys.readouterr()
-    assert main(["identify", file, logs, *stated, "actuators.stribeck=0.3", f"output={folder / 'no'}"]) == 2
-    assert f"actuators.stribeck: {stated[1].partition('=')[2]}; accepted: 0.3" in capsys.readouterr().err
-    assert main(["identify", file, logs, f"output={folder / 'by_factors'}", stated[0]]) == 0, (
-        "auto is that of the factors"
-    )
-
-
 def _found(run: Path) -> dict[str, float]:
     actuators = load_config(run / "config.yaml").actuators
     return {"delay": float(actuators.delay or 0.0), "stribeck": float(actuators.stribeck or 0.0)}
@@ -122,30 +105,6 @@ def test_simulators_files_have_it_or_say_that_they_lack_it(folder: Path, capsys:
     assert isinstance(actuators, dict)
     assert list(actuators["friction"].values()) == pytest.approx(COULOMB + AT_REST, rel=0.1)
     assert list(actuators["dynamic_friction"].values()) == pytest.approx(COULOMB, rel=0.1)
-
-
-def test_samples_have_friction_at_rest_of_at_least_coulomb_friction(folder: Path) -> None:
-    assert main(["sample", str(folder / "run"), "--count", "200", "--output", str(folder / "samples.npz")]) == 0
-    with np.load(folder / "samples.npz") as samples:
-        named = dict(zip(samples["names"].tolist(), samples["samples"].T, strict=True))
-    at_rest = np.array([x for name, x in named.items() if name.startswith("Stribeck friction of ")])
-    assert at_rest.shape == (2, 200)
-    assert at_rest.min() >= 0.0
-    np.testing.assert_allclose(at_rest.mean(axis=1), AT_REST, rtol=0.15)
-
-
-def test_a_replay_moves_as_the_log_with_it_and_not_without(folder: Path) -> None:
-    """For 0.1 s: friction that drops with speed pushes apart whatever differs, such as 2 % of it."""
-    drifts = []
-    for run in ("run", "without_replay"):
-        if run != "run":
-            settings = ["actuators.stribeck=null", "actuators.stiction=false", f"output={folder / run}"]
-            assert main(["identify", str(folder / "experiment.yaml"), *settings]) == 0
-        out = folder / f"replay_{run}"
-        words = ["--log", str(folder / "new.npz"), "--samples", "2", "--window", "0.1", "--output", str(out)]
-        assert main(["replay", str(folder / run), *words]) == 0
-        drifts.append(json.loads((out / "replay.json").read_text())["quartiles"]["joints [rad]"]["identified"][1][-1])
-    assert drifts[0] < 0.3 * drifts[1], drifts
 
 
 @pytest.mark.parametrize(

@@ -15,10 +15,8 @@ from walking import MACHINES
 import torchid
 from torchid.commands.answer import answer
 from torchid.errors import ImplausibleFitError
-from torchid.fitting.noise import unexplained_joints
 from torchid.log_checks import SUSPICIOUS, Checked, Finding
 from torchid.logs import Log, write_log
-from torchid.problem import Metrics
 
 ARM = MACHINES["arm"]
 JOINT = 3
@@ -91,11 +89,6 @@ def test_a_fit_that_leaves_most_of_the_forces_is_refused_whether_or_not_a_mistak
             identified(log, tmp_path)
 
 
-def test_forces_that_are_stated_to_be_noise_are_not_refused(tmp_path: Path) -> None:
-    run = identified(of_random_torques(), tmp_path, noise={"joint_torque": 10.0})
-    assert run.metrics["train"].identified.relative["joint_torque"] > 0.9
-
-
 def test_a_refusal_names_the_band_that_a_fit_predicts(tmp_path: Path) -> None:
     log = case_of(ARM, "contacts").log
     noise = 1e-3 * np.random.default_rng(0).normal(size=log.joint_position.shape)
@@ -103,20 +96,6 @@ def test_a_refusal_names_the_band_that_a_fit_predicts(tmp_path: Path) -> None:
         ImplausibleFitError, match=r"preprocessing.cutoff_hz=\d.* up to 40 Hz, predicts this band worse"
     ):
         identified(replace(log, joint_position=log.joint_position + noise), tmp_path, cutoff_hz=40.0)
-
-
-def metrics_by_joint(left: float, floor: float | None) -> Metrics:
-    """Of a shoulder of 40 N m that is explained, an elbow of 10 N m and a wrist of 0.5 N m, both in part."""
-    measured, errors = {"shoulder": 40.0, "elbow": 10.0, "wrist": 0.5}, {"shoulder": 0.1, "elbow": left, "wrist": 0.4}
-    shares = {name: errors[name] / measured[name] for name in measured}
-    return Metrics({}, {}, {**errors}, {**shares}, None, noise={"joint_torque": floor})
-
-
-def test_what_is_left_of_a_joint_s_torque_counts_beyond_noise_and_small_forces() -> None:
-    assert unexplained_joints(metrics_by_joint(5.0, None)) == ["elbow"]
-    assert unexplained_joints(metrics_by_joint(5.0, 1.0)) == ["elbow"]
-    assert unexplained_joints(metrics_by_joint(5.0, 5.0)) == []
-    assert unexplained_joints(metrics_by_joint(3.0, None)) == []
 
 
 def test_an_honest_log_is_not_suspected(tmp_path: Path) -> None:

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import re
-from contextlib import redirect_stdout
-from io import StringIO
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from script_calls import ROOT, call, script
+from script_calls import ROOT, call
 from trainings import events_in
 
 from torchid.config.experiment import ActuatorsConfig
-from torchid.estimators import ResidualEffect
 
 DEMO = str(ROOT / "torchid" / "demo" / "quadruped.yaml")
 
@@ -55,33 +51,3 @@ def test_the_script_computes_where_it_is_told(tmp_path: Path) -> None:
     else:
         assert status == 2
         assert "device: 'cuda' is not available here; accepted: cpu, cuda, cuda:0, ..." in told
-
-
-def test_networks_start_at_no_force() -> None:
-    q, v, a = (torch.randn(5, size, dtype=torch.float64) for size in (11, 10, 10))
-    force = script("train_residual").JointNetworks(4)(q, v, a)
-    assert force.shape == (5, 10)
-    assert not force.any()
-
-
-def test_without_unseen_logs_there_is_nothing_to_compare() -> None:
-    status, _, told = call("train_residual", DEMO, "logs.test=[]")
-    assert status == 2
-    assert "logs.test: none" in told
-
-
-def test_a_cutoff_that_is_left_to_the_logs_is_chosen(tmp_path: Path) -> None:
-    auto = ("preprocessing.cutoff_hz=auto", "--epochs", "1", "--weight", "1")
-    assert call("train_residual", DEMO, *auto, "--curves", str(tmp_path / "curves"))[::2] == (0, "")
-
-
-def test_bodies_that_the_data_determine_nothing_of_have_no_standard_errors() -> None:
-    effect = ResidualEffect(
-        weight=1.0, choice=None, shares={}, rms={}, rigid_share=0.5, moved=np.zeros(2),
-        moved_scaled=np.array([0.2, 0.1]), moved_errors=np.array([np.nan, 3.0]),
-    )  # fmt: skip
-    with redirect_stdout(StringIO()) as printed:
-        script("train_residual").print_effect(effect, ("arm", "hand"))
-    assert (
-        "parameters moved most: arm (0.2 of its size), hand (0.1 of its size, 3 standard errors)" in printed.getvalue()
-    )

@@ -8,9 +8,6 @@ import pytest
 from refusals import refusal
 from repository import DEMO
 
-import torchid
-from torchid.errors import LogError
-
 KEYS = ["logs.train=[s3://bucket/a.factor]", "logs.test=[memory://bucket/a.npz]", "robot.urdf=s3://bucket/a.urdf"]
 
 
@@ -23,8 +20,3 @@ def test_no_key_takes_a_url(tmp_path: Path, capsys: pytest.CaptureFixture[str], 
 def test_compress_writes_to_no_url(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     message = refusal(["compress", str(DEMO / "quadruped.yaml"), "--output", "s3://bucket/factors"], tmp_path, capsys)
     assert message.startswith("torchid: s3://bucket/factors: output: a URL; accepted: a folder on this machine")
-
-
-def test_a_library_call_takes_no_url() -> None:
-    with pytest.raises(LogError, match="no such file"):
-        torchid.read_factors("s3://bucket/walk.factor")

@@ -121,9 +121,3 @@ def test_a_weld_is_a_fixed_joint_to_every_command(files: Path, capsys: pytest.Ca
     )
     assert "robot.weld" in capsys.readouterr().err
     assert main(["identify", experiment, f"logs.train=[{factor}]", f"output={files / 'of_factors'}"]) == 0
-
-
-def test_a_joint_that_moves_is_named(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    moving = f"logs.train=[{DEMO / _TRAIN}]"
-    main(["check", str(files / "experiment.yaml"), moving])
-    assert f"joint '{KNEE}' is up to" in " ".join(capsys.readouterr().err.split())

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 from experiments import LEAST, changed, load
 from refusals import assert_unknown_key, assert_wrong_value
 
@@ -73,32 +72,6 @@ def test_every_key_of_a_descent_arrives_and_reads_back_as_itself(file: Path, tmp
     assert load_config(elsewhere) == config
 
 
-def test_every_key_of_a_descent_is_that_of_its_estimator(file: Path) -> None:
-    settings = descent_settings(load(file, held_out(**DESCENT)))
-    training = DESCENT["training"]
-    for key in ("ridge", "rank_tolerance", "consistency"):
-        assert getattr(settings, key) == DESCENT[key]
-    assert settings.conditions.margin == DESCENT["margin"]
-    for key in ("finish", "epochs", "patience", "clip", "damping", "optimizer", "schedule"):
-        assert getattr(settings, key) == training[key]
-    assert vars(settings.penalties) == DESCENT["penalties"]
-
-
-def test_a_descent_without_a_schedule_keeps_its_rate(file: Path) -> None:
-    config = load(file, descent(schedule=None))
-    assert config.estimator.training.schedule is None
-    assert descent_settings(config).schedule is None
-    assert load(file, LEAST, "estimator.name=sgd", "estimator.training.schedule=null") == config
-
-
-@pytest.mark.parametrize("rate", ["1e-3", "1E-3", "0.001"])
-def test_options_of_an_optimizer_may_be_written_as_people_write_them(file: Path, rate: str) -> None:
-    text = yaml.safe_dump(LEAST) + f"estimator: {{name: sgd, training: {{optimizer: {{name: Adam, lr: {rate}}}}}}}\n"
-    assert descent_settings(load(file, text)).optimizer == {"name": "Adam", "lr": 1e-3}
-    config = load(file, descent(optimizer={"name": "Adam", "lr": 1}), f"estimator.training.optimizer.lr={rate}")
-    assert descent_settings(config).optimizer == {"name": "Adam", "lr": 1e-3}
-
-
 @pytest.mark.parametrize(
     ("estimator", "key", "having"),
     [
@@ -135,13 +108,6 @@ def test_conditions_are_refused_where_violations_are_only_penalized(file: Path, 
     )
     (key, value), taken = next(iter(setting.items())), load(file, changed(estimator={"name": "sgd"} | setting))
     assert getattr(taken.estimator, key) == (value if isinstance(value, str) else taken.estimator.symmetry)
-
-
-def test_penalties_of_bodies_that_are_possible_anyway_are_refused(file: Path) -> None:
-    estimator = {"name": "sgd", "penalties": {"mass": 1.0}}
-    found = "set, which consistency: log_cholesky has not; accepted: consistency: penalties"
-    assert_wrong_value(lambda: load(file, changed(estimator=estimator)), file, "estimator.penalties", found)
-    assert load(file, changed(estimator=estimator | {"consistency": "penalties"})).estimator.penalties.mass == 1.0
 
 
 @pytest.mark.parametrize(

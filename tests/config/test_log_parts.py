@@ -39,12 +39,6 @@ def test_one_recording_trains_and_tests(folder: Path) -> None:
     assert logs.files == [folder / "a.npz"]
 
 
-def test_a_range_behind_a_pattern_is_that_of_each_file(folder: Path) -> None:
-    logs = load(folder, train=["*.npz[:80%]"], test=["*.npz[80%:]"])
-    assert names(logs.train) == ["a.npz[:80%]", "b.npz[:80%]"]
-    assert names(logs.test) == ["a.npz[80%:]", "b.npz[80%:]"]
-
-
 def test_numbers_of_recordings_stand_for_each_of_them(folder: Path) -> None:
     logs = load(folder, train=["a.npz[#0:3]", "a.npz[#5]"], test=["*.npz[#3]"])
     assert names(logs.train) == ["a.npz[#0]", "a.npz[#1]", "a.npz[#2]", "a.npz[#5]"]
@@ -76,26 +70,12 @@ def test_a_fold_and_what_is_left_without_it_make_up_the_log(folder: Path) -> Non
     )
 
 
-def test_folds_of_patterns_are_those_of_each_file(folder: Path) -> None:
-    logs = load(folder, train=[{"file": "*.npz", "without_fold": 5}])
-    assert names(logs.train) == ["a.npz[:80%]", "b.npz[:80%]"]
-
-
 def test_the_written_settings_name_the_parts_and_are_read_again(folder: Path) -> None:
     load(folder, train=[{"file": "*.npz", "without_fold": 3}])
     config = load_config(folder / "experiment.yaml")
     (folder / "again.yaml").write_text(dump_config(config))
     assert load_config(folder / "again.yaml").logs == config.logs
     assert inputs_of(config) == [folder / "r.urdf", folder / "a.npz", folder / "b.npz"]
-
-
-def test_overrides_take_parts_too(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(folder)
-    assert names(load(folder, 'logs.train=["a.npz[:3]"]', train=["b.npz"]).train) == ["a.npz[:3]"]
-    overrides = "logs.train=[{file: a.npz, without_fold: 5}]", "logs.test=[{file: a.npz, fold: 5}]"
-    logs = load(folder, *overrides, train=["b.npz"])
-    assert logs.train == [folder / "a.npz[:80%]"]
-    assert logs.test == [folder / "a.npz[80%:]"]
 
 
 @pytest.mark.parametrize(
@@ -141,33 +121,10 @@ def test_samples_that_are_given_twice_are_refused(folder: Path) -> None:
         load(folder, sgd=True, train=["a.npz[0:30]"], validation=["a.npz[29:]"])
 
 
-def test_a_name_with_brackets_is_a_file_where_there_is_one(folder: Path) -> None:
-    (folder / "a.npz[0:3]").touch()
-    logs = load(folder, train=["a.npz[0:3]"], test=["a.npz"])  # no warning: another file
-    assert logs.files == [folder / "a.npz[0:3]", folder / "a.npz"]
-
-
-def test_a_pattern_whose_range_is_the_end_of_a_file_is_refused(folder: Path) -> None:
-    (folder / "a.npz[0:3]").touch()
-    with pytest.raises(ConfigError, match=r"a.npz\[0:3\] is a file that it matches without one"):
-        load(folder, train=["*.npz[0:3]"])
-
-
 def test_factors_have_no_parts(folder: Path) -> None:
     (folder / "a.factor").touch()
     with pytest.raises(ConfigError, match="a part of factors, which have no samples"):
         load(folder, train=["a.factor[0:3]"])
-
-
-def test_a_range_without_quotes_in_a_list_is_refused_with_how_to_write_it(folder: Path) -> None:
-    accepted = 'names with brackets take quotes in a list: ["walk.npz[0:30]"]'
-    with pytest.raises(ConfigError) as raised:
-        load(folder, "logs.train=[a.npz[0:3]]", train=["a.npz"])
-    assert accepted in str(raised.value)
-    (folder / "other.yaml").write_text("logs: {train: [a.npz[0:3]]}\n")
-    with pytest.raises(ConfigError) as raised:
-        load_config(folder / "other.yaml")
-    assert accepted in str(raised.value)
 
 
 def test_several_files_are_one_log_whose_name_says_which(folder: Path) -> None:
@@ -180,14 +137,6 @@ def test_several_files_are_one_log_whose_name_says_which(folder: Path) -> None:
     assert logs.files == [folder / "a.npz", folder / "c.h5", folder / "b/d.npz", elsewhere]
     (folder / "again.yaml").write_text(dump_config(load_config(folder / "experiment.yaml")))
     assert load_config(folder / "again.yaml").logs == logs
-
-
-def test_samples_of_several_files_are_those_of_the_first(folder: Path) -> None:
-    with pytest.warns(TorchidWarning, match=r"a.npz is fitted on as well"):
-        load(folder, train=[{"files": ["a.npz", "b.npz"], "to": 30}], test=["a.npz"])
-    load(folder, train=[{"files": ["a.npz", "b.npz"]}, {"files": ["a.npz", "c.h5"]}])  # one after the other, perhaps
-    load(folder, train=[{"files": ["a.npz", "c.h5"]}, {"files": ["b.npz", "c.h5"]}])  # one file may last for both
-    load(folder, train=["a.npz[0:30]"], test=[{"files": ["a.npz", "c.h5"], "from": 30}])  # decided by the stamps
 
 
 @pytest.mark.parametrize(

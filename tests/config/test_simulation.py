@@ -94,43 +94,6 @@ def test_what_a_simulation_writes_down_reads_back_as_itself_anywhere(file: Path,
     assert load_simulation(elsewhere) == config
 
 
-def test_waves_may_be_written_once_and_repeated_by_name(file: Path) -> None:
-    text = yaml.safe_dump(LEAST | {"motions": []}).replace("motions: []\n", "")
-    text += "motions:\n- {name: a, duration_s: 1, waves: [&w {what: com_z, hz: 1, amplitude: 1e-2}]}\n"
-    config = load(file, text + "- {name: b, duration_s: 1, waves: [*w, *w]}\n")
-    assert config.motions[1].waves == 2 * config.motions[0].waves
-    assert config.motions[0].waves[0].amplitude == 0.01
-
-
-def test_inputs_in_the_file_are_relative_to_it_and_results_and_overrides_to_the_caller(
-    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    config = load(file, ALL)
-    assert config.robot.urdf == file.parent / "models" / "robot.urdf"
-    assert config.output == tmp_path / "runs" / "all"
-    assert load(file, ALL, "output=here").output == tmp_path / "here"
-    assert load(file, ALL, "robot.urdf=../r.urdf").robot.urdf == tmp_path.parent / "r.urdf"
-
-
-def test_an_override_switches_one_imperfection_and_keeps_the_others(file: Path) -> None:
-    before = dataclasses.asdict(load(file, ALL))
-    after = dataclasses.asdict(
-        load(file, ALL, "sensors.bias.enabled=false", "seed=8", "motions=[{name: n, duration_s: 3}]")
-    )
-    before["sensors"]["bias"]["enabled"], before["seed"] = False, 8
-    before["motions"] = [{"name": "n", "duration_s": 3.0, "waves": [], "steps": None}]
-    assert after == before
-
-
-@pytest.mark.parametrize(
-    ("physics", "control"), [(1000, 1000), (1000, 500), (1000, 100), (300, 100), (1000, 1000 / 3), (0.3, 0.1)]
-)
-def test_the_controller_may_run_every_whole_number_of_physics_steps(file: Path, physics: float, control: float) -> None:
-    config = load(file, changed(physics_hz=physics, control_hz=control))
-    assert (config.physics_hz, config.control_hz) == (physics, control)
-
-
 @pytest.mark.parametrize(
     ("physics", "control"), [(1000, 300), (1000, 2000), (1000, 999), (1000, 1001), (1000, 400.1), (1000, 1e13)]
 )
@@ -144,17 +107,6 @@ def test_motions_of_one_name_are_refused(file: Path) -> None:
     one, other = ({"name": name, "duration_s": 1.0} for name in "ab")
     with pytest.raises(ConfigError, match="motions: several named 'b'; accepted: a name of its own for every motion"):
         load(file, changed(motions=[one, other, other]))
-
-
-@pytest.mark.parametrize("name", ["", ".hidden", "a/b", "../a", "a b", "a\n", "-a", "x" * 101])
-def test_a_motion_whose_name_is_no_file_name_is_refused(file: Path, name: str) -> None:
-    with pytest.raises(ConfigError, match="motions.0.name: "):
-        load(file, motion(name=name))
-
-
-@pytest.mark.parametrize("name", ["squat_0.5hz", "a", "1-2", "b.c"])
-def test_a_motion_may_be_named_like_a_file(file: Path, name: str) -> None:
-    assert load(file, motion(name=name)).motions[0].name == name
 
 
 @pytest.mark.parametrize(
@@ -213,21 +165,6 @@ def test_an_unknown_key_is_refused_by_its_place_and_the_nearest_that_exists(
 )
 def test_a_value_of_the_wrong_kind_is_refused_by_its_place(file: Path, settings: Any, place: str, found: str) -> None:
     assert_wrong_value(lambda: load(file, settings), file, place, found)
-
-
-@pytest.mark.parametrize("point", [[0.0, 0.1], [0.0, 0.1, 0.2, 0.3]])
-def test_a_point_has_three_numbers_and_one_of_others_is_not_called_an_empty_list(
-    file: Path, point: list[float]
-) -> None:
-    with pytest.raises(ConfigError, match="feet.0.points.0: ") as raised:
-        load(file, changed(feet=[{"frame": "a", "points": [point]}]))
-    assert "empty" not in str(raised.value)
-
-
-@pytest.mark.parametrize("key", LEAST)
-def test_each_of_the_four_keys_is_needed(file: Path, key: str) -> None:
-    with pytest.raises(ConfigError, match=f"{key}: missing"):
-        load(file, {name: value for name, value in LEAST.items() if name != key})
 
 
 def test_a_file_that_is_no_simulation_is_named(file: Path) -> None:

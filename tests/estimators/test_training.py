@@ -17,7 +17,7 @@ from thinned import slow_but
 from torch import Tensor, nn
 
 from torchid import parameters
-from torchid.commands.checkpoint import load_checkpoint, save_checkpoint
+from torchid.commands.training import load_checkpoint, save_checkpoint
 from torchid.errors import InputError
 from torchid.estimators import Epoch, LeastSquares, Sgd, SgdEstimate, Trainer
 from torchid.estimators.sgd import optimizer_names

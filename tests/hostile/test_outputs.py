@@ -18,8 +18,7 @@ from repository import ROOT
 from run_folders import names_in
 
 from torchid.cli import main
-from torchid.commands.folder import RUN, claim_folder, new_folder, require_replaceable, write_json
-from torchid.commands.manifest import MANIFEST
+from torchid.commands.folder import MANIFEST, RUN, claim_folder, new_folder, require_replaceable, write_json
 from torchid.errors import ConfigError, LogError
 from torchid.logs import read_log, write_log
 
@@ -103,16 +102,6 @@ def test_what_is_no_name_for_a_folder_is_refused(place: Path, tmp_path: Path, na
     assert verdict.outcome == "refused"
 
 
-def test_the_folder_of_the_logs_and_that_of_the_call_are_not_replaced(
-    place: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(place / "demo")
-    for output in (".", "..", str(place / "demo"), "", "sway_train.npz"):
-        verdict = judged(output, lambda output=output: main(identify(place, output, "overwrite=true")), place / "demo")
-        assert not verdict.faults
-        assert verdict.outcome == "refused"
-
-
 # ----------------------------------------------------------------------------------------------------------------- disk
 
 
@@ -191,17 +180,6 @@ def test_of_two_runs_into_one_folder_one_stands_and_it_is_whole(place: Path, ser
     assert names_in(folder) == ["0.001", "10.0", "run"]
 
 
-def test_of_two_trainings_into_one_folder_one_stands(place: Path, server: Commands) -> None:
-    folder, sgd = place / "trainings", "estimator={name: sgd, training: {epochs: 20}}"
-    running = [server.start(identify(place, folder / "run", sgd)) for _ in range(2)]
-    ended = [server.end(child) for child in running]
-    assert sorted(x.status for x in ended) == [0, 2], ended
-    assert all(len(x.said) == (x.status != 0) for x in ended)
-    assert is_whole(folder / "run")
-    assert len(list((folder / "run").glob("events*"))) <= 2  # of the training and of the run
-    assert names_in(folder) == ["run"]
-
-
 def test_another_run_that_was_faster_is_kept_or_replaced_whole(tmp_path: Path) -> None:
     for overwrite in (False, True):
         output = tmp_path / f"run-{overwrite}"
@@ -256,6 +234,3 @@ def test_a_folder_is_claimed_by_one_process_until_that_ends(tmp_path: Path) -> N
     with claim_folder(tmp_path / "x" / "run"):
         pass
     assert list((tmp_path / "x").iterdir()) == []
-    with claim_folder(tmp_path / "y" / "run"):
-        pass
-    assert not (tmp_path / "y").exists()

@@ -4,21 +4,13 @@ from __future__ import annotations
 
 import io
 from dataclasses import replace
-from pathlib import Path
 
-import matplotlib
-import numpy as np
 import pytest
-from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.colors import to_rgba
-from matplotlib.image import imread
 from rich.console import Console
 
-from torchid.errors import ConfoundedWarning, about_file
-from torchid.fitting.calibration import warn_of_confounded
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.problem.extras import Extra
-from torchid.report.figure_style import STYLE, save_figure
 from torchid.report.figures import extra_figure
 from torchid.report.tables import extra_table
 
@@ -77,18 +69,6 @@ def test_a_value_has_as_many_decimals_as_its_error_and_that_two_digits(
     assert expected in printed([replace(ARMATURE, value=value, noise_error=error)])
 
 
-def test_a_warning_of_what_cannot_be_told_apart_lists_sensors_and_parameters_by_their_commas() -> None:
-    mixed = ("trunk m", "trunk Izz", "thigh mcy", "scale of hip0")
-    joints = [replace(found("scale", f"hip{j}", ""), inflation=1e9, confounded_with=mixed) for j in range(8)]
-    foot = Extra("offset", "sole", "fz", "N", 1.0, False, contacts=((0, 2),))
-    off = ExtraEstimate(foot, "", 1.5, 1.4, 0.1, 1e9, mixed)
-    with pytest.warns(ConfoundedWarning) as caught, about_file("a.yaml"):
-        warn_of_confounded([*joints, off])
-    message = str(caught.list[0].message)
-    assert message.startswith("a.yaml: scale of hip0, hip1, hip2, hip3, hip4, hip5 and 2 more; offset of sole fz: ")
-    assert "confounded with m, Izz of trunk; mcy of thigh; do not trust" in message
-
-
 def test_the_figures_legend_names_every_log_whichever_panel_it_is_in() -> None:
     """Offsets have a panel of their own in front of the armature, which is that of all logs."""
     figure = extra_figure([*of_logs(2, 3), ARMATURE, found("armature", "j1", "", "kg m^2")])
@@ -103,31 +83,6 @@ def test_the_figures_legend_names_every_log_whichever_panel_it_is_in() -> None:
     assert len(set(keys)) == 3
 
 
-def test_every_point_is_in_the_row_of_its_unknown() -> None:
-    """Also of the last of many logs, and of what only holds for all of them."""
-    figure = extra_figure([*of_logs(7, 2), ARMATURE])
-    for axis, rows in zip(figure.axes, (2, 1), strict=True):
-        assert sorted(axis.get_ylim()) == [-0.5, rows - 0.5]
-        shown = [points for points in axis.collections if isinstance(points, PathCollection)]
-        assert shown
-        for points in shown:
-            places = np.asarray(points.get_offsets())[:, 1]
-            assert np.round(places).tolist() == list(range(rows))
-            assert np.abs(places - np.round(places)).max() < 0.4
-
-
-def test_logs_of_one_name_in_two_folders_are_both_in_the_legend() -> None:
-    figure = extra_figure([found("offset", "j0", f"{day}/walk.npz") for day in ("monday", "friday")])
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["walk.npz", "walk.npz"]
-
-
-def test_a_png_is_what_savefig_draws_in_two_passes(tmp_path: Path) -> None:
-    save_figure(extra_figure(of_logs(2, 3)), tmp_path / "saved.png")
-    with matplotlib.rc_context(STYLE):
-        extra_figure(of_logs(2, 3)).savefig(tmp_path / "drawn.png", dpi=130)
-    assert np.array_equal(*(imread(tmp_path / f"{name}.png") for name in ("saved", "drawn")))
-
-
 def test_confounded_values_leave_room_for_those_that_are_known() -> None:
     known = [replace(found("stiffness", f"j{k}", "", "N m/rad"), value=0.1 * k) for k in range(3)]
     far = replace(found("stiffness", "far", "", "N m/rad"), value=-70.0, inflation=1e9, confounded_with=("m of trunk",))
@@ -138,16 +93,3 @@ def test_confounded_values_leave_room_for_those_that_are_known() -> None:
     assert [text.get_text() for text in cut.texts] == ["◂ -70"]
     assert cut.get_xlabel() == "stiffness [N m/rad]"
     assert not cut.figure.legends, "all logs alone need no key"
-
-
-def test_an_interval_that_is_cut_leaves_the_panel() -> None:
-    """None ends within it short of its end."""
-    errors = (0.1, 30.0, np.inf)
-    extras = [replace(found("offset", f"j{k}", ""), noise_error=error) for k, error in enumerate(errors)]
-    (axis,) = extra_figure(extras).axes
-    (bars,) = (lines for lines in axis.collections if isinstance(lines, LineCollection))
-    ends = [sorted(bar[:, 0]) for bar in bars.get_segments()]
-    low, high = axis.get_xlim()
-    assert ends[0] == pytest.approx([1.5 - 0.196, 1.5 + 0.196])
-    assert low < ends[0][0] < ends[0][1] < high
-    assert all(first < low < high < last for first, last in ends[1:])

@@ -9,10 +9,7 @@ import pytest
 import torch
 from synthetic import random_states
 
-import torchid
 from torchid import Regressor, parameters
-from torchid.fitting.calibration import Calibration
-from torchid.problem import ExtraTerms, RowBuilder
 from torchid.report import FittedJoints
 from torchid.report.robot_files import isaaclab_text, joint_parameters, parameters_export
 from torchid.robot import Robot
@@ -56,14 +53,3 @@ def test_isaac_lab_keeps_what_was_not_identified(small: Robot) -> None:
     ]
     document = parameters_export(small, phi, joints)["joints"]
     assert [x["armature"] for x in document.values()] == [None, 0.0, 0.3]
-
-
-def test_what_no_row_depends_on_is_not_exported(small: Robot) -> None:
-    sensors = torchid.named_sensors("joints", small.n, 0)
-    builder = RowBuilder(small, (), sensors, ExtraTerms(armature=True))
-    known = builder.extras[0]
-    calibration = Calibration(
-        robot=small, builder=builder, phi=small.nominal.flatten(), values={("", known.label): 0.3}
-    )
-    assert len(builder.extras) > 1
-    assert FittedJoints.of(calibration.of_joints).armature == {known.name: 0.3}

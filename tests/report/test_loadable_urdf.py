@@ -12,7 +12,7 @@ from loadable import assert_loads
 from lxml import etree
 from mujoco_oracle import INERTIA_ROUNDING, IS_MUJOCO_3, mujoco_forces, mujoco_model
 from regressors import assert_close, without_shapes
-from repository import CONFIGS, DEMO
+from repository import CONFIGS
 from simulated import BIPED, SOLES
 from synthetic import G1, ROBOTS, SOLO12, TALOS_FULL, Array, Oracle, load, make_log, random_states
 
@@ -101,24 +101,6 @@ def test_real_inertias_however_small_are_not_raised(tmp_path: Path) -> None:
     np.testing.assert_allclose(model.body("leg").inertia, 1e-12)
 
 
-def test_joints_that_move_no_mass_at_all_are_still_refused(tmp_path: Path) -> None:
-    """They have no equation of motion: a file that loads would hide it."""
-    robot = pair(tmp_path, lower="")
-    path = written(robot, tmp_path)
-    assert "boundmass" not in path.read_text()
-    with pytest.raises(ValueError, match="mass and inertia of moving bodies"):
-        mujoco.MjModel.from_xml_path(str(path))
-
-
-def test_a_robot_that_needs_no_bound_gets_none_and_own_bounds_stay(tmp_path: Path) -> None:
-    demo = load(DEMO / "quadruped.urdf")
-    assert b"mujoco" not in identified_urdf(demo, demo.nominal)
-    robot = pair(tmp_path, extension='<mujoco><compiler boundmass="0.001" fusestatic="true"/></mujoco>')
-    compiler = etree.parse(str(written(robot, tmp_path))).getroot().find("mujoco/compiler")
-    assert compiler is not None
-    assert dict(compiler.attrib) == {"boundmass": "0.001", "fusestatic": "true", "boundinertia": repr(SMALLEST)}
-
-
 # ---------------------------------------------------------------------------------------------------------- meshes
 
 
@@ -139,15 +121,6 @@ def test_collision_meshes_and_relative_names_become_full_paths_and_packages_of_v
     assert mesh_names(path) == [names[0], *[str(file)] * 5]
     assert_loads(path, 3.0, 1)
     assert mesh_names(written(robot, tmp_path, full_mesh_paths=False)) == [*names, *names]
-
-
-@pytest.mark.parametrize("variable", ["ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH"])
-def test_meshes_are_looked_for_where_ros_does(variable: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    file = mesh_in(tmp_path, "ws/share/shapes/a.obj")
-    places = {"ROS_PACKAGE_PATH": f"/nowhere:{file.parent}", "AMENT_PREFIX_PATH": f"/nowhere:{tmp_path / 'ws'}"}
-    monkeypatch.setenv(variable, places[variable])
-    robot = pair(tmp_path, shape("collision", "package://shapes/a.obj"))
-    assert mesh_names(written(robot, tmp_path)) == [str(file)]
 
 
 def test_collisions_whose_mesh_is_nowhere_are_kept_as_comments_and_said(tmp_path: Path) -> None:

@@ -6,7 +6,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from physical import random_bodies
@@ -82,16 +81,3 @@ def test_bodies_that_cannot_exist_and_negative_friction_have_a_cross() -> None:
     assert crosses["mass"] == [-1.0]
     assert crosses["viscous"] == [-0.1]
     assert not crosses["Coulomb"]
-
-
-def test_names_of_thirty_bodies_do_not_touch() -> None:
-    figure = drawn()[0]
-    figure.set_canvas(FigureCanvasAgg(figure))
-    figure.canvas.draw()
-    boxes = [text.get_window_extent() for text in figure.axes[0].get_yticklabels()]
-    assert len(boxes) == len(NAMES)
-    for above, below in zip(boxes, boxes[1:], strict=False):
-        assert below.y1 <= above.y0
-    titles = [axis.xaxis.label.get_window_extent() for axis in figure.axes]
-    for left, right in zip(titles, titles[1:], strict=False):
-        assert left.x1 < right.x0

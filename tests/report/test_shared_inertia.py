@@ -71,13 +71,6 @@ def test_every_link_of_a_file_is_a_body_and_their_sum_is_what_was_identified(
     assert refused_by_simulators(robot, phi, FittedJoints()) == ""
 
 
-def test_links_beyond_welds_keep_their_own_inertia_where_they_can(tmp_path: Path) -> None:
-    robot = gripper(tmp_path, inertial("0.1", ixx="0.01", iyy="0.01", izz="0.01"))
-    (tmp_path / "x.urdf").write_bytes(identified_urdf(robot, robot.nominal * np.array([[1.0], [1.1]])))
-    read = load_robot(tmp_path / "x.urdf")
-    np.testing.assert_array_equal(read.nominal[2:, 0], 0.1)
-
-
 @pytest.mark.parametrize("installed", [True, False])
 def test_a_file_that_simulators_refuse_is_known_with_mujoco_and_without(
     tmp_path: Path, installed: bool, monkeypatch: pytest.MonkeyPatch

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pinocchio as pin
 import pytest
 import yourdfpy
 from lxml import etree
@@ -198,16 +197,6 @@ def test_all_that_is_not_inertia_or_friction_stays_as_it_was(tmp_path: Path) -> 
     assert kept[0] == kept[1]
 
 
-def test_friction_that_is_gone_is_written_and_friction_that_never_was_is_not(tmp_path: Path) -> None:
-    robot = robot_of("machine", tmp_path)
-    phi = robot.nominal.copy()
-    phi[:, parameters.FRICTION] = 0.0
-    root = etree.parse(str(exported(robot, phi, tmp_path))).getroot()
-    found = {joint.get("name"): joint.find("dynamics") for joint in root.findall("joint")}
-    assert dict(found["rail"].attrib) == dict(found["elbow"].attrib) == {"friction": "0.0", "damping": "0.0"}
-    assert found["wrist"] is found["knuckle"] is found["mount"] is None
-
-
 def test_bodies_without_mass_stay_as_they_were_and_bodies_that_lose_theirs_have_none(tmp_path: Path) -> None:
     """The human's clavicles and virtual links have no inertial at all."""
     robot = load(ROBOTS / "human_description/robots/human.urdf")
@@ -268,10 +257,3 @@ def test_a_consistent_fit_of_poor_data_is_taken_by_every_reader(name: str, foot:
         path = exported(robot, impossible, tmp_path)
     with pytest.raises(ValueError, match="A \\+ B >= C"):
         mujoco_model(path, robot)
-
-
-def test_pinocchio_is_new_enough_to_tell_friction() -> None:
-    """Else the comparisons above would say nothing of it."""
-    model = pin.Model()
-    assert hasattr(model, "damping")
-    assert hasattr(model, "upperDryFrictionLimit") or hasattr(model, "friction")

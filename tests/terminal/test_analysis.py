@@ -107,11 +107,6 @@ def test_what_is_lost_and_what_would_help_comes_first(lame: Analysis) -> None:
     assert posture.startswith("attention     the base is lost where all joints are at zero")
 
 
-def test_ranks_of_the_base_are_said_to_be_those_of_joints_that_move(lame: Analysis) -> None:
-    (_, attention) = (line for line in analysis_lines(replace(lame, resting=0.31), 1000) if "attention" in line)
-    assert "31 % of the logs' torques count as unmeasured at rest (actuators.stiction); the base is" in attention
-
-
 def test_sensors_that_suffice_are_named_with_the_proof(lame: Analysis) -> None:
     said = analysis_lines(sound(lame), 10_000)
     assert said[0] == "12 sensors suffice: the base is observable in all 2 contact states"
@@ -157,15 +152,6 @@ def test_the_scenario_with_the_fault_comes_first(lame: Analysis) -> None:
     )
 
 
-@pytest.mark.parametrize("width", WIDTHS)
-def test_names_are_never_broken(lame: Analysis, width: int) -> None:
-    names = {*FEET, *TORQUES, *lame.setup.robot.body_names}
-    words = " ".join(analysis_lines(lame, width)).split()
-    long = [word.strip(",:;()") for word in words if "-limb-" in word]
-    assert long
-    assert set(long) <= names
-
-
 def test_all_tables_are_printed_when_asked_for(
     file: Path, lame: Analysis, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -186,10 +172,3 @@ def test_all_tables_are_printed_when_asked_for(
         assert title in str(printed["--verbose"])
         assert title not in str(printed[None])
     assert str(printed[None]).splitlines() == analysis_lines(lame, terminal_width())
-
-
-def test_where_nothing_touches_no_sensor_is_needed(file: Path, tmp_path: Path) -> None:
-    only_air = ["analysis.scenarios={}", "analysis.scenarios={air: [[]]}"]
-    settings = [*only_air, "sensors={}", f"output={tmp_path / 'run'}"]
-    flight = analyze(load_analysis(file, settings))
-    assert text(flight).startswith("No sensor is needed: the base is observable in the contact state")

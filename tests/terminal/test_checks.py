@@ -18,7 +18,6 @@ from torchid.logs import Log, write_log
 from torchid.terminal.analysis import check_lines
 from torchid.terminal.lines import LINES
 
-LONG = "front_left_limb_of_a_robot_with_names_that_fill_a_whole_line_of_any_terminal"
 SPIKE = Finding(
     "spike", REJECTED, "joint_torque", "excursions of 200 N m in front_right_hip, which no motion explains",
     "leave out; check for a loose contact", ("front_right_hip",), (Span(3, 5, "front_right_hip"),),
@@ -79,19 +78,6 @@ def test_one_log_is_named_with_its_verdict() -> None:
     assert "not checked 1 check: forces against the model (no robot (--urdf))" in text([checked("walk")])
 
 
-def test_a_check_that_logs_lack_for_several_reasons_is_named_once() -> None:
-    still = replace(checked("rest"), skipped=(Skipped("forces against the model", "nothing moves"),))
-    reasons = "no robot (--urdf), 2 of 3 logs; nothing moves, 1 of 3 logs"
-    assert f"not checked 1 check: forces against the model ({reasons})" in text([checked("a"), still, checked("b")])
-
-
-def test_a_check_that_logs_lack_for_reasons_that_differ_in_a_number_is_named_with_one() -> None:
-    logs = [replace(checked("a"), skipped=(Skipped("noise", f"of l_foot1: {x} samples"),)) for x in ("12", "3.4e+05")]
-    assert "not checked 1 check: noise (of l_foot1: 12 samples or alike)" in text(logs)
-    others = [replace(log, skipped=(Skipped("noise", f"of l_foot{k}"),)) for k, log in enumerate(logs)]
-    assert "(of l_foot0, 1 of 2 logs; of l_foot1, 1 of 2 logs)" in text(others), "which are names"
-
-
 @pytest.mark.parametrize("width", [60, 100])
 def test_every_finding_is_shown_or_counted(width: int) -> None:
     names = [f"kind_{k}" for k in range(12)]
@@ -106,16 +92,6 @@ def test_every_finding_is_shown_or_counted(width: int) -> None:
     assert counted == {REJECTED: 12 - shown, SUSPICIOUS: 12, NOTE: 12}, "the most severe are shown"
 
 
-def test_notes_give_way_to_the_whole_text_of_what_has_to_be_done() -> None:
-    parts = [f"channel_{k} reads {k} N m more than all of the others do at rest" for k in range(5)]
-    severe = [replace(SPIKE, name=name, found="; ".join(parts)) for name in ("spike", "step")]
-    lines = check_lines([checked("walk", *severe, *(replace(WEIGHT, field=f"field_{k}") for k in range(6)))], (), 100)
-    said = " ".join(" ".join(lines).split())
-    assert said.count("; ".join(parts)) == 2
-    assert re.search(r"and \d notes more: --verbose", said)
-    assert len(lines) <= LINES
-
-
 def test_what_several_logs_share_is_said_once_and_where_all_of_it_is() -> None:
     logs = [checked(f"walk_{k}", SPIKE) for k in range(4)]
     said = text(logs)
@@ -124,15 +100,6 @@ def test_what_several_logs_share_is_said_once_and_where_all_of_it_is() -> None:
     assert "all in full: --verbose" in said
     again = [replace(SPIKE, field=field) for field in ("joint_position", "joint_torque")]
     assert "joint_position, joint_torque, spike: excursions" in text([checked("walk", *again)])
-
-
-@pytest.mark.parametrize("width", [60, 80, 120])
-def test_names_are_never_broken(width: int) -> None:
-    logs = [checked(f"{LONG}-{k}", replace(SPIKE, found=f"in {LONG}, {LONG}-knee")) for k in range(3)]
-    words = " ".join(check_lines(logs, (), width)).split()
-    assert {word.strip(",:") for word in words if "limb" in word} <= {
-        LONG, f"{LONG}-knee", *(f"{LONG}-{k}.npz" for k in range(3))
-    }  # fmt: skip
 
 
 def test_a_terminal_gets_plain_lines_of_its_width(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,8 +15,7 @@ import torchid
 from torchid.cli import main
 from torchid.commands.evaluate import EvaluatedRun
 from torchid.problem import Metrics
-from torchid.terminal.identification import MOST_LOGS, evaluation_lines
-from torchid.terminal.lines import LINES
+from torchid.terminal.identification import evaluation_lines
 
 LOG = str(DEMO / "sway_test.npz")
 
@@ -71,15 +70,6 @@ def test_a_log_that_is_predicted_far_worse_than_the_runs_own_needs_attention(run
     assert "torchid check" in line
 
 
-@pytest.mark.parametrize("width", [60, 80, 120])
-@pytest.mark.parametrize("count", [1, 2, 12])
-def test_any_number_of_logs_fits_on_a_screen(evaluated: EvaluatedRun, count: int, width: int) -> None:
-    lines = evaluation_lines(with_logs(evaluated, {f"trot_{k}": 0.05 + 0.01 * k for k in range(count)}), width)
-    assert len(lines) <= LINES
-    assert max(map(len, lines[:-1])) <= width
-    assert ("and 4 logs that are predicted better than these: --verbose" in lines) == (count > MOST_LOGS)
-
-
 def test_the_worst_log_comes_first_and_what_is_worse_than_the_urdf_is_said(evaluated: EvaluatedRun) -> None:
     logs = with_logs(evaluated, {"good": 0.1, "bad": 5.0, "fair": 0.2})
     said = " ".join(line.strip() for line in evaluation_lines(logs, 80))
@@ -100,12 +90,6 @@ def test_a_run_whose_model_does_not_explain_its_own_logs_says_so_of_others(run: 
     finally:
         file.write_text(json.dumps(document))
     assert evaluation_lines(lacking, 400)[0].endswith("'s; residuals of the run's own logs are not noise alone")
-
-
-def test_samples_left_out_are_counted(evaluated: EvaluatedRun) -> None:
-    lines = evaluation_lines(replace(evaluated, excluded={"sway_test": 12}), 80)
-    assert "left out      12 samples that torchid check rejects" in lines
-    assert not any("left out" in line for line in evaluation_lines(evaluated, 80))
 
 
 def test_all_errors_are_printed_when_asked_for(run: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -6,10 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from simulated import SHIPPED, shipped
+from simulated import shipped
 
-import torchid.commands.simulate
-from torchid.cli import main
 from torchid.config import SimulationConfig
 from torchid.simulation import Stability
 from torchid.terminal.lines import LINES
@@ -49,24 +47,3 @@ def test_the_worst_of_all_motions_comes_first_in_words() -> None:
         "The robot stands throughout 2 motions, 20 s: feet slip by at most 3.1 mm, "
         "the zero-moment point stays 50 mm inside the support, torques reach 62 % of their limits"
     )
-
-
-def test_names_are_never_broken() -> None:
-    name = "a-squat-of-a-name-that-is-longer-than-a-terminal-of-sixty-columns-is-wide"
-    for width in (60, 80, 120):
-        lines = simulation_lines(*motions([name, "short"]), width)
-        assert sum(line.split()[:1] == [name] for line in lines) == 1
-
-
-def test_quiet_prints_nothing_and_verbose_every_motion(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config, stood = motions([f"motion_{k}" for k in range(30)])
-    monkeypatch.setattr(torchid.commands.simulate, "simulate", lambda _: stood)
-    printed = {}
-    for option in ("--quiet", "--verbose", "-q"):
-        assert main(["simulate", str(SHIPPED), option]) == 0
-        printed[option] = capsys.readouterr().out
-    assert printed["--quiet"] == printed["-q"] == ""
-    assert all(name in printed["--verbose"] for name in stood)
-    assert printed["--verbose"].splitlines()[-1] == f"written to    {config.output}"

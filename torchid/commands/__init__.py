@@ -3,10 +3,10 @@
 A module for each command: `analyze`, `check` (and `convert`), `compress`, `demo`, `evaluate`, `export`, `identify`,
 `init`, `replay`, `report`, `sample`, `simulate`. What they are made of:
 
-- a fit: `prepared_data`, `chosen_settings`, `training`, `checkpoint`, `plausibility`
+- a fit: `prepared_data`, `chosen_settings`, `training, `plausibility`
 - what `identify` returns and says: `results`, `named_results`, `answer`, `run_figures`
-- parts of `init` and `analyze`: `init_logs`, `init_robot`, `analysis_request`, `sensor_set_accuracy`
-- folders: `folder`, `manifest`
+- parts of `init` and `analyze`: `init_logs`, `init_robot`, `sensor_set_accuracy`
+- folders: `folder`
 """
 
 # here, where the command line finds them without the imports of the commands, which take long

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -13,20 +14,19 @@ import numpy as np
 from rich.progress import Progress
 
 from torchid import distributed
-from torchid.commands.analysis_request import AnalysisRequest, errors_at
 from torchid.commands.chosen_settings import with_chosen_settings
 from torchid.commands.folder import ANALYSIS, check_free, new_folder, write_json
 from torchid.commands.sensor_set_accuracy import accuracies
 from torchid.config import AnalyzeConfig, dump_config, inputs_of
-from torchid.errors import ConfigError, UnknownNameError, during, join_names, warn
+from torchid.errors import ConfigError, SensorError, UnknownNameError, during, join_names, warn
 from torchid.fitting.experiment import RobotSetup, set_up_robot, with_noise
 from torchid.fitting.left_out import Evidence, leave_sensors_out
 from torchid.fitting.noise import unmeasured_at_rest
 from torchid.identifiability.base_parameters import BaseParameters, base_parameters
-from torchid.parallel import can_fork, in_forks, one_thread, thread_count, threads_at_most
+from torchid.parallel import one_thread
 from torchid.parameters import WRENCH_COMPONENTS
 from torchid.problem import Samples
-from torchid.problem.chunks import chunks_by_state, forks_share_passes
+from torchid.problem.chunks import chunks_by_state
 from torchid.problem.contact_state import ContactState
 from torchid.problem.elimination import free_parameters
 from torchid.problem.linear import parameter_scale
@@ -48,6 +48,7 @@ from torchid.sensing import Contact, SensorSet
 from torchid.sensing.sensors import NORMAL_FORCE, measured_components
 from torchid.sensor_planning.observability import (
     BaseObservability,
+    Candidate,
     candidates,
     contained_candidates,
     count_channels,
@@ -131,6 +132,92 @@ class Analysis:
         return document | {"sensors_left_out": without}
 
 
+@dataclass(frozen=True, kw_only=True)
+class AnalysisRequest:
+    """What an experiment file requests, its names looked up.
+
+    Attributes:
+        setup: robot, contacts and settings.
+        candidates: sensors to choose from.
+        keep: those that are there anyway.
+        exclude: those that cannot be.
+        proposed: the sensors of the file, None if it names none.
+        compared: sensor sets to compare, by name.
+    """
+
+    setup: RobotSetup
+    candidates: tuple[Candidate, ...]
+    keep: frozenset[Candidate]
+    exclude: frozenset[Candidate]
+    proposed: SensorSet | None
+    compared: Mapping[str, SensorSet]
+
+    @classmethod
+    def of(cls, setup: RobotSetup) -> AnalysisRequest:
+        """The request of an experiment file. Raises InputError: a name that nothing has, or that is taken."""
+        settings, config = setup.config.analysis, setup.config
+        choice = settings.candidates
+        with errors_at("analysis"):
+            offered = candidates(
+                robot=setup.robot,
+                contacts=setup.contacts,
+                joint_torques=choice.joint_torques,
+                per=choice.contacts,
+                costs=settings.costs,
+                ft_sensors=choice.ft_sensors,
+                normal_forces=choice.normal_forces,
+            )
+        proposed = None if config.sensors.empty else setup.sensors_of(config.sensors)
+        return cls(
+            setup=setup,
+            candidates=offered,
+            keep=_candidates_named(settings.keep, "keep", offered),
+            exclude=_candidates_named(settings.exclude, "exclude", offered),
+            proposed=proposed,
+            compared=_sets_named(setup, proposed),
+        )
+
+
+@contextmanager
+def errors_at(field: str, instead_of: str = "") -> Iterator[None]:
+    """Let errors name the experiment file, and a field of it before theirs or instead of its beginning."""
+    try:
+        yield
+    except UnknownNameError as error:
+        raise UnknownNameError.at_field(_field_in_file(field, instead_of, error), error.name, error.valid) from error
+    except SensorError as error:
+        raise SensorError.at_field(_field_in_file(field, instead_of, error), error.found, error.accepted) from error
+
+
+def _field_in_file(field: str, instead_of: str, error: UnknownNameError | SensorError) -> str:
+    return error.field.replace(instead_of, field, 1) if instead_of else f"{field}.{error.field}"
+
+
+def _candidates_named(names: Sequence[str], field: str, offered: Sequence[Candidate]) -> frozenset[Candidate]:
+    by_name: dict[str, list[Candidate]] = {}
+    for candidate in offered:
+        by_name.setdefault(candidate.name, []).append(candidate)
+    for name in names:
+        if name not in by_name:
+            raise UnknownNameError.at_field(f"analysis.{field}", name, by_name)
+        if len(by_name[name]) > 1:
+            found = f"'{name}', the name of several sensors: joint, contact or fixed joint"
+            raise ConfigError.at_field(f"analysis.{field}", found, "a name that only one sensor has")
+    return frozenset(by_name[name][0] for name in names)
+
+
+def _sets_named(setup: RobotSetup, proposed: SensorSet | None) -> dict[str, SensorSet]:
+    """The proposed set and those that the file compares."""
+    sets = {} if proposed is None else {"proposed": proposed}
+    for name, choice in setup.config.analysis.compare.items():
+        field = f"analysis.compare.{name}"
+        if name in sets:
+            raise ConfigError.at_field(field, "the name of what stands under sensors", "another name")
+        with errors_at(field, instead_of="sensors"):
+            sets[name] = setup.sensors_of(choice)
+    return sets
+
+
 @one_thread()
 def analyze(config: AnalyzeConfig) -> Analysis:
     """Plan and check sensors as an experiment file says under `analysis`, and write a folder if there is an output.
@@ -141,47 +228,29 @@ def analyze(config: AnalyzeConfig) -> Analysis:
     output = None if config.output is None else _analysis_folder(config.output)
     if output is not None:
         distributed.from_first(partial(check_free, output, config.overwrite, ANALYSIS, inputs_of(config)), "output")
-    request = AnalysisRequest.of(set_up_robot(config))
+    setup = set_up_robot(config)
+    request = AnalysisRequest.of(setup)
     with progress_bars() as bars:
-        setup, _ = with_chosen_settings(request.setup, bars)
+        setup, _ = with_chosen_settings(setup, bars)
         request = replace(request, setup=setup)
         train, test = _read(request, bars)
         if train:
-            setup = with_noise(
-                setup, distributed.from_first(partial(setup.estimate_noise, train, suggest=False), "noise")
-            )
+            noise = distributed.from_first(partial(setup.estimate_noise, train, suggest=False), "noise")
+            setup = with_noise(setup, noise)
             request = AnalysisRequest.of(setup)
         choices: dict[str, SensorChoice] = {}
-        progress: dict[str, StepCallback] = {}
         results: list[ScenarioAnalysis] = []
 
         def choose() -> dict[str, SensorSet]:
             for name, states in scenarios(setup, train).items():
-                progress[name] = _progress(name, bars)
-                choices[name] = _choose_sensors(request, states, train, progress[name])
+                progress = _progress(name, bars)
+                choices[name] = _choose_sensors(request, states, train, progress)
+                results.append(_explain_choice(request, name, choices[name], progress))
             return _sets_to_compare(request, choices, train)
 
-        def explain() -> None:
-            results.extend(_explain_choice(request, name, one, progress[name]) for name, one in choices.items())
-
-        def compare(sets: Mapping[str, SensorSet]) -> dict[str, SetAccuracy]:
-            return accuracies(setup, sets, train, test) if train and sets else {}
-
-        def compare_beside(sets: Mapping[str, SensorSet]) -> dict[str, SetAccuracy]:
-            with threads_at_most(thread_count() if is_long else 1):
-                return compare(sets)
-
-        is_long, processes = forks_share_passes([*train, *test]), thread_count() if train and can_fork() else 1
-        early = _shares(request.compared, processes - 1)
-        with in_forks(early, compare_beside, len(early)) as compared_early:
-            sets = distributed.from_first(choose, "sensor sets")
-            left = {name: one for name, one in sets.items() if not any(name in share for share in early)}
-            later = [] if is_long or processes == 1 else _shares(left, processes)
-            with in_forks(later, compare_beside, len(later)) as compared_later:
-                distributed.from_first(explain, "sensor plans")
-                bars.add_task("comparing sensor sets", total=None)
-                found = [*compared_early(), *compared_later(), {} if later else compare(left)]
-        compared = {name: share[name] for name in sets for share in found if name in share}
+        sets = distributed.from_first(choose, "sensor sets")
+        bars.add_task("comparing sensor sets", total=None)
+        compared = accuracies(setup, sets, train, test) if train and sets else {}
         without = distributed.from_first(partial(_leave_out, request, train), "sensors left out")
         analysis = Analysis(setup, tuple(results), compared, output, unmeasured_at_rest(train), without)
         if output is not None:
@@ -215,12 +284,6 @@ def _leave_out(request: AnalysisRequest, train: Sequence[Samples]) -> dict[str, 
 def _plan_label(name: str) -> str:
     """Name of the sensors planned for a scenario among the sets that are compared."""
     return f"sensor plan for {name}"
-
-
-def _shares(sets: Mapping[str, SensorSet], count: int) -> list[dict[str, SensorSet]]:
-    """Sensor sets in so many shares of about equal number, none of them empty."""
-    names = list(sets)
-    return [{name: sets[name] for name in names[first::count]} for first in range(min(count, len(names)))]
 
 
 def _analysis_folder(output: Path) -> Path:

@@ -15,8 +15,7 @@ from rich.progress import Progress
 
 from torchid import distributed
 from torchid.commands.chosen_settings import Choices, with_chosen_settings
-from torchid.commands.folder import COMPRESSED, check_free, new_folder
-from torchid.commands.manifest import file_checksum
+from torchid.commands.folder import COMPRESSED, check_free, file_checksum, new_folder
 from torchid.config import ExperimentConfig, inputs_of
 from torchid.errors import ConfigError, during, excerpt
 from torchid.fitting.experiment import Experiment, set_up, with_noise

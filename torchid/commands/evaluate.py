@@ -14,7 +14,7 @@ from pydantic import TypeAdapter
 from rich.progress import Progress
 
 from torchid import distributed
-from torchid.commands.folder import EVALUATION, RUN, check_free, new_folder, refuse_link, write_json
+from torchid.commands.folder import EVALUATION, EVALUATIONS, check_free, new_folder, refuse_link, write_json
 from torchid.commands.results import Identification
 from torchid.commands.run_figures import force_figures
 from torchid.config import load_config
@@ -317,7 +317,7 @@ def _output(run: Path, logs: Sequence[str | Path], given: Path | None, overwrite
     name = _log_names(logs)[0]
     if given is None and name in (".", ".."):
         raise ConfigError.at_field("logs", f"'{logs[0]}', whose name is of dots alone", "another name of the file")
-    output = run / RUN.inner_folder / name if given is None else given
+    output = run / EVALUATIONS / name if given is None else given
     inputs = [file.path for log in logs for file in split_range(log).files]
 
     def check() -> None:

@@ -1,27 +1,50 @@
-"""Folders of results: claimed by one run at a time, created whole or not at all, replacing only what torchid wrote."""
+"""Folders of results: created whole or not at all; a manifest lists what torchid wrote, and nothing else is removed."""
 
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import os
-from collections.abc import Iterable, Iterator, Sequence
+import stat
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import Any
 
-from torchid.commands.manifest import MANIFEST, FolderContents, FolderKind, inspect_folder, make_manifest, read_manifest
 from torchid.errors import ConfigError, current_file, excerpt, join_names
-from torchid.staging import CAN_LOCK, NEW, OLD, interrupts_deferred, leftovers, note_written, staging_folder, try_lock
+from torchid.staging import NEW, OLD, interrupts_deferred, leftovers, lock, note_written, staging_folder, take_over
 
-CHECKPOINT, EVENTS = "checkpoint.pt", "events.out.tfevents*"
-EVALUATION = FolderKind("an evaluation", replace="--overwrite")
-RUN = FolderKind("a run", "evaluation", EVALUATION)
-TRAINING = FolderKind("a training", result=False, growing=(CHECKPOINT, f".{CHECKPOINT}", EVENTS))
+MANIFEST, CHECKPOINT, EVENTS = "manifest.json", "checkpoint.pt", "events.out.tfevents*"
+EVALUATIONS = "evaluation"
+"""The folder in that of a run which holds its evaluations."""
+
+
+@dataclass(frozen=True)
+class FolderKind:
+    """What a folder that torchid writes holds.
+
+    Attributes:
+        name: with its article, as in "a run".
+        replace: what lets its command replace one that exists: a key of the experiment file, or an option.
+        growing: patterns of names of files in it that are written after its manifest.
+    """
+
+    name: str
+    replace: str = "overwrite=true"
+    growing: tuple[str, ...] = ()
+
+
+EVALUATION = FolderKind("an evaluation", "--overwrite")
+RUN = FolderKind("a run")
+TRAINING = FolderKind("a training", growing=(CHECKPOINT, f".{CHECKPOINT}", EVENTS))
 SIMULATION = FolderKind("a simulation")
 ANALYSIS = FolderKind("an analysis")
 STUDY = FolderKind("a study")
-REPLAY = FolderKind("a replay", replace="--overwrite")
-SAMPLES = FolderKind("samples", replace="--overwrite")
+REPLAY = FolderKind("a replay", "--overwrite")
+SAMPLES = FolderKind("samples", "--overwrite")
 COMPRESSED = FolderKind("compressed logs")
 EXAMPLES = FolderKind("examples")
 
@@ -29,6 +52,124 @@ _LONGEST_NAME = 200  # bytes; file systems take 255, and the temporary folder's 
 _TAKEN = (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR)  # by another run
 _TRIES = 100
 _MOST_NAMES = 50  # in one message
+_MAX_MANIFEST_BYTES = 2**24  # that of 100 000 files
+_PLACE = "a place that can be written"
+
+
+# ------------------------------------------------------------------------------------------------------- what is there
+
+
+def file_checksum(*paths: Path) -> str:
+    """SHA-256 of a file, or of several one after the other."""
+    digest = hashlib.sha256()
+    for path in paths:
+        with path.open("rb") as file:
+            while block := file.read(2**20):
+                digest.update(block)
+    return digest.hexdigest()
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """Kind and name of a folder, and the SHA-256 of each file in it, by its path in the folder."""
+
+    kind: str
+    folder: str
+    files: dict[str, str]
+
+    def write(self, folder: Path) -> None:
+        """Write it into its folder. Raises OSError: it cannot be written."""
+        files = {name: {"sha256": checksum} for name, checksum in self.files.items()}
+        text = json.dumps({"torchid": self.kind, "folder": self.folder, "files": files}, indent=1)
+        new = folder / f".{MANIFEST}"
+        new.write_text(text + "\n")
+        new.replace(folder / MANIFEST)
+
+
+def read_manifest(folder: Path) -> Manifest | None:
+    """The manifest of a folder, None if it has none of torchid's."""
+    path = folder / MANIFEST
+    try:
+        state = os.lstat(path)
+        if not stat.S_ISREG(state.st_mode) or state.st_size > _MAX_MANIFEST_BYTES:
+            return None
+        document: Any = json.loads(path.read_bytes())
+        files = {str(name): str(entry["sha256"]) for name, entry in document["files"].items()}
+        return Manifest(str(document["torchid"]), str(document["folder"]), files)
+    except (OSError, ValueError, TypeError, LookupError, AttributeError, RecursionError):  # anything may be in it
+        return None
+
+
+@dataclass
+class FolderContents:
+    """What is in a folder.
+
+    Attributes:
+        files: as torchid wrote them, the manifest last.
+        folders: that hold them, the innermost first.
+        foreign: names of all others.
+        changed: names of files that torchid wrote and somebody changed since.
+    """
+
+    files: list[Path] = field(default_factory=list)
+    folders: list[Path] = field(default_factory=list)
+    foreign: list[str] = field(default_factory=list)
+    changed: list[str] = field(default_factory=list)
+
+    def remove(self) -> None:
+        """Remove torchid's files, and the folders that are empty then; what the system refuses to remove stays."""
+        for path in self.files:
+            with suppress(OSError):
+                path.unlink()
+        for path in self.folders:
+            with suppress(OSError):
+                path.rmdir()
+
+
+def inspect_folder(folder: Path, kind: FolderKind) -> FolderContents | None:
+    """What in a folder torchid wrote and what it did not, links among it; None if torchid wrote none of this kind."""
+    manifest = read_manifest(folder)
+    if manifest is None or manifest.kind != kind.name:
+        return None
+    contents = FolderContents()
+    _inspect(folder, "", manifest, kind, contents)
+    return contents
+
+
+def _inspect(top: Path, above: str, manifest: Manifest, kind: FolderKind, contents: FolderContents) -> None:
+    """Add what is in a folder at a path relative to the top, and the folder."""
+    for path in sorted((top / above).iterdir()):
+        name = f"{above}/{path.name}" if above else path.name
+        for _ in take_over(path):  # what a killed process left
+            pass
+        if not os.path.lexists(path) or name == MANIFEST:
+            continue
+        mode = os.lstat(path).st_mode
+        inner = read_manifest(path) if kind == RUN and above == EVALUATIONS and stat.S_ISDIR(mode) else None
+        if inner is not None and (inner.kind, inner.folder) == (EVALUATION.name, path.name):
+            inside = inspect_folder(path, EVALUATION) or FolderContents()
+            contents.files += inside.files
+            contents.folders += inside.folders
+            contents.foreign += [f"{name}/{x}" for x in inside.foreign]
+            contents.changed += [f"{name}/{x}" for x in inside.changed]
+        elif stat.S_ISDIR(mode):
+            is_listed = any(file.startswith(f"{name}/") for file in manifest.files)
+            if is_listed or (kind == RUN and name == EVALUATIONS):
+                _inspect(top, name, manifest, kind, contents)
+            else:
+                contents.foreign.append(excerpt(f"{name}/"))
+        elif stat.S_ISREG(mode) and name in manifest.files:
+            is_unchanged = file_checksum(path) == manifest.files[name]
+            contents.files.append(path) if is_unchanged else contents.changed.append(excerpt(name))
+        elif stat.S_ISREG(mode) and not above and any(fnmatchcase(name, pattern) for pattern in kind.growing):
+            contents.files.append(path)
+        else:
+            contents.foreign.append(excerpt(name))
+    contents.files += [] if above else [top / MANIFEST]
+    contents.folders.append(top / above)
+
+
+# ------------------------------------------------------------------------------------------------ what may be written
 
 
 def check_free(output: Path, overwrite: bool, kind: FolderKind = RUN, inputs: Iterable[object] = ()) -> None:
@@ -56,7 +197,7 @@ def check_free(output: Path, overwrite: bool, kind: FolderKind = RUN, inputs: It
     if output.name in ("", ".."):
         raise ConfigError(output, "output", "no name for a folder", "a path to a new folder")
     if not (above.is_dir() and os.access(above, os.W_OK | os.X_OK)) or len(os.fsencode(output.name)) > _LONGEST_NAME:
-        raise ConfigError(output, "output", f"no folder can be made there, in {above}", "a place that can be written")
+        raise ConfigError(output, "output", f"no folder can be made there, in {above}", _PLACE)
     if names and not overwrite:
         raise ConfigError(output, "output", "not empty", f"a new folder, or {kind.replace}")
     if names:
@@ -84,18 +225,15 @@ def check_free_file(
         raise ConfigError(path, field, found, f"a new file, or {option} in place of a file")
     if not os.path.isdir(path.parent):
         raise ConfigError(path, field, f"no folder {path.parent}", "a file in an existing folder")
+    target = os.path.realpath(path)
     for other in inputs:
-        one, of = os.path.realpath(path), os.path.realpath(str(other))
-        if os.path.lexists(path) and (one == of or one.startswith(of + os.sep)):
+        read = os.path.realpath(str(other))
+        if os.path.lexists(path) and (target == read or target.startswith(read + os.sep)):
             raise ConfigError(path, field, "is or belongs to what is read", "another file")
 
 
 def refuse_link(folder: Path) -> None:
-    """Make sure that a folder in which files are written and removed is none that lies elsewhere.
-
-    Raises:
-        ConfigError: it does.
-    """
+    """Refuse a link as a folder in which files are written and removed. Raises ConfigError: it is one."""
     if folder.is_symlink():
         raise ConfigError(folder, "output", "a link", "a folder, or none")
 
@@ -126,25 +264,32 @@ def require_replaceable(folder: Path, kind: FolderKind, output: Path | None = No
         ConfigError: something in it is not torchid's, or has changed since.
     """
     output = output or folder
+    accepted = f"a new folder, or {kind.name} to overwrite"
     try:
         contents, names = inspect_folder(folder, kind), [excerpt(name) for name in sorted(os.listdir(folder))]
     except OSError as error:
         raise ConfigError(output, "output", f"cannot be read ({error})", "a new folder") from error
     if contents is None and (other := read_manifest(folder)):
-        accepted = f"a new folder, or {kind.name} to overwrite"
         raise ConfigError(output, "output", f"holds {excerpt(other.kind)}", accepted)
     if contents is None:
-        what = f"holds {join_names(names, _MOST_NAMES)}, and no {MANIFEST} that says that torchid wrote {kind.name}"
-        accepted = f"a new folder, or {kind.name} to overwrite; one that an older version wrote is for you to remove"
-        raise ConfigError(output, "output", what, accepted)
+        found = f"holds {join_names(names, _MOST_NAMES)}, and no {MANIFEST} that says that torchid wrote {kind.name}"
+        raise ConfigError(output, "output", found, accepted)
     unsafe = {"which torchid did not write": contents.foreign, "changed since torchid wrote it": contents.changed}
     complaints = [f"{join_names(paths, _MOST_NAMES)}, {what}" for what, paths in unsafe.items() if paths]
     closed = [str(path) for path in contents.folders if not os.access(path, os.W_OK | os.X_OK)]
     complaints += [f"{join_names(closed)}, where nothing can be removed"] if closed and not complaints else []
     if complaints:
-        accepted = f"a new folder, or {kind.name} to overwrite; move elsewhere what is yours"
-        raise ConfigError(output, "output", f"holds {' and '.join(complaints)}", accepted)
+        found = f"holds {' and '.join(complaints)}"
+        raise ConfigError(output, "output", found, f"{accepted}; move elsewhere what is yours")
     return contents
+
+
+# ------------------------------------------------------------------------------------------------------------- writing
+
+
+def write_json(path: Path, document: object) -> None:
+    """Write strict JSON: a number that is not finite is an error, not a NaN in the file."""
+    path.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 
 def recover_leftovers(output: Path, kind: FolderKind) -> None:
@@ -154,27 +299,20 @@ def recover_leftovers(output: Path, kind: FolderKind) -> None:
         OSError: it cannot be moved back.
     """
     for folder in leftovers(output):
-        if not os.path.lexists(folder / OLD):
-            continue
-        if not os.path.lexists(output):
-            (folder / OLD).rename(output)
-            continue
-        if contents := inspect_folder(folder / OLD, kind):
-            contents.remove()
-        for path, _, _ in os.walk(folder / OLD, topdown=False):  # the process was killed after their manifests went
-            with suppress(OSError):
-                os.rmdir(path)
-
-
-def write_json(path: Path, document: object) -> None:
-    """Write strict JSON: a number that is not finite is an error, not a NaN in the file."""
-    path.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n")
+        old = folder / OLD
+        if os.path.lexists(old) and not os.path.lexists(output):
+            old.rename(output)
+        elif os.path.lexists(old):
+            contents = inspect_folder(old, kind)
+            if contents is not None:
+                contents.remove()
+            for path, _, _ in os.walk(old, topdown=False):  # the process was killed after their manifests went
+                with suppress(OSError):
+                    os.rmdir(path)
 
 
 @contextmanager
-def new_folder(
-    output: Path, overwrite: bool = False, kind: FolderKind = RUN, growing: Sequence[str] = ()
-) -> Iterator[Path]:
+def new_folder(output: Path, overwrite: bool = False, kind: FolderKind = RUN) -> Iterator[Path]:
     """A temporary folder beside `output` that takes its place, with a manifest, when the block ends without an error.
 
     Of several at a time the first takes the place, or, with `overwrite`, the last.
@@ -183,36 +321,27 @@ def new_folder(
         output: the folder to be.
         overwrite: whether one of its kind may be replaced.
         kind: of the folder.
-        growing: patterns of files in it that are written on later.
 
     Raises:
         ConfigError: `output` exists and may not be replaced, from the start or when the block has ended.
     """
     check_free(output, overwrite, kind)
-    with _parent_folders(output), ExitStack() as stack:
+    with ExitStack() as stack:
         with _creation_errors_explained(output):
+            output.parent.mkdir(parents=True, exist_ok=True)
             folder = stack.enter_context(staging_folder(output))
             (folder / NEW).mkdir()
         yield folder / NEW
-        make_manifest(folder / NEW, kind, output.name, growing).write(folder / NEW)
+        files = {
+            path.relative_to(folder / NEW).as_posix(): file_checksum(path)
+            for path in sorted((folder / NEW).rglob("*"))
+            if path.is_file()
+        }
+        Manifest(kind.name, output.name, files).write(folder / NEW)
         with interrupts_deferred():
             _put(folder, output, overwrite, kind)
-            if kind.result:
+            if kind != TRAINING:
                 note_written(output)
-
-
-@contextmanager
-def _parent_folders(output: Path) -> Iterator[None]:
-    """The folders above `output`, which go with the block if they came with it and it leaves nothing in them."""
-    made = [folder for folder in (output.parent, *output.parent.parents) if not folder.exists()]
-    try:
-        with interrupts_deferred(), _creation_errors_explained(output):
-            output.parent.mkdir(parents=True, exist_ok=True)
-        yield
-    finally:
-        with interrupts_deferred(), suppress(OSError):  # a run is in it, this one or another
-            for folder in made:
-                folder.rmdir()
 
 
 @contextmanager
@@ -221,8 +350,7 @@ def _creation_errors_explained(output: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        found = f"no folder can be made there ({error.strerror})"
-        raise ConfigError(output, "output", found, "a place that can be written") from error
+        raise ConfigError(output, "output", f"no folder can be made there ({error.strerror})", _PLACE) from error
 
 
 def _put(folder: Path, output: Path, overwrite: bool, kind: FolderKind) -> None:
@@ -268,28 +396,17 @@ def claim_folder(folder: Path) -> Iterator[None]:
     Raises:
         ConfigError: another process is at work there.
     """
-    if not CAN_LOCK:
-        yield
-        return
-    lock, handle = folder.with_name(f".{folder.name}.lock"), -1
-    with _parent_folders(folder):
+    path = folder.with_name(f".{folder.name}.lock")
+    with interrupts_deferred(), _creation_errors_explained(folder):
+        path.parent.mkdir(parents=True, exist_ok=True)
         try:
-            with interrupts_deferred():
-                handle = _locked(lock, folder)
-            yield
-        finally:
-            with interrupts_deferred():
-                if handle >= 0:
-                    lock.unlink(missing_ok=True)
-                    os.close(handle)
-
-
-def _locked(lock: Path, folder: Path) -> int:
-    """Descriptor of a file that no other process has locked; the system unlocks it when this one ends or is killed."""
-    for _ in range(_TRIES):
-        with _creation_errors_explained(folder):
-            handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o644)
-        if try_lock(handle, lock) is not False:  # None, no locks there: one run at a time is then the user's affair
-            return handle
-        os.close(handle)  # another has it, or has just removed it
-    raise ConfigError(folder, "output", "another run is at work there", "another output, or patience")
+            handle = lock(path, os.O_RDWR | os.O_CREAT)
+        except (BlockingIOError, FileNotFoundError) as error:
+            accepted = "another output, or patience"
+            raise ConfigError(folder, "output", "another run is at work there", accepted) from error
+    try:
+        yield
+    finally:
+        with interrupts_deferred():
+            path.unlink(missing_ok=True)
+            os.close(handle)

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from torchid.commands.answer import answer
 from torchid.commands.check import check_experiment
-from torchid.commands.folder import RUN, refuse_link
-from torchid.commands.manifest import file_checksum, read_manifest
+from torchid.commands.folder import RUN, file_checksum, read_manifest, refuse_link
 from torchid.errors import ConfigError, InputError, during, excerpt
 from torchid.guards import MAX_JSON, MAX_YAML, read_bytes
 from torchid.report.log_checks import log_check_document
@@ -61,13 +60,12 @@ def report(run: str | Path) -> Path:
         raise ConfigError(folder, "RUN", "no run of torchid", _WRITTEN)
     page, written = folder / PAGE, manifest.files.get(PAGE)
     there = page.exists() or page.is_symlink()
-    if there and (page.is_symlink() or not page.is_file() or written is None or file_checksum(page) != written[1]):
+    if there and (page.is_symlink() or not page.is_file() or written is None or file_checksum(page) != written):
         raise ConfigError(folder, PAGE, "changed since torchid wrote it", f"a run without {PAGE}: move it elsewhere")
     files = _with_findings(_read(folder), folder)
     with during("writing", folder), atomic_file(page) as new:
         new.write_text(_made(files, folder))
-    entry = {PAGE: (page.stat().st_size, file_checksum(page))}
-    replace(manifest, files=dict(sorted((manifest.files | entry).items()))).write(folder)
+    replace(manifest, files=manifest.files | {PAGE: file_checksum(page)}).write(folder)
     return page
 
 

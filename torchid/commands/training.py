@@ -2,43 +2,43 @@
 
 from __future__ import annotations
 
-import glob
+import hashlib
+import io
 import os
 import shutil
-import socket
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import replace
-from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 import yaml
 from rich.progress import Progress
 
 from torchid import distributed, parameters
-from torchid.commands.checkpoint import load_checkpoint, refusing_damage, save_checkpoint
 from torchid.commands.folder import (
     CHECKPOINT,
     EVENTS,
     TRAINING,
     check_free,
+    inspect_folder,
     new_folder,
     recover_leftovers,
     refuse_inputs,
     refuse_link,
 )
-from torchid.commands.manifest import Manifest, inspect_folder, read_manifest
 from torchid.config import ExperimentConfig, dump_config, inputs_of
-from torchid.errors import ConfigError, InputError, SensorError, warn
+from torchid.errors import ConfigError, InputError, SensorError, excerpt, warn
 from torchid.estimators import Conditions, Epoch, Estimate, Sgd, SgdEstimate, Trainer
 from torchid.estimators.least_squares import IDENTIFIED
 from torchid.estimators.sgd import OPTIMIZERS
 from torchid.fitting.experiment import Experiment
 from torchid.fitting.fit import LogFitter
+from torchid.guards import check_regular
 from torchid.parameters import PARAMETERS, Array
 from torchid.problem import LinearProblem, Metrics, MiniBatches, Samples, TriangularFactor, assemble, compress_parts
 from torchid.problem.compression import Part
@@ -160,10 +160,8 @@ class Training:
 
     def copy_curves(self, folder: Path) -> None:
         """Copy the training's event files into the finished run's folder."""
-        contents = None if self.folder is None else inspect_folder(self.folder, TRAINING)
-        for path in contents.own if contents else ():
-            if fnmatchcase(path.name, EVENTS):
-                shutil.copy2(path, folder)
+        for path in () if self.folder is None else self.folder.glob(EVENTS):
+            shutil.copy2(path, folder)
 
     def remove_checkpoint(self) -> None:
         """Remove the checkpoint of a run that is done.
@@ -225,11 +223,9 @@ class Training:
             with refusing_damage(self.folder):
                 self._check(state, trainer, self.folder / CHECKPOINT)
                 trainer.load_state_dict(state["trainer"])
-            before = read_manifest(self.folder) or Manifest(TRAINING.name, self.folder.name, {})
-            replace(before, growing=(*before.growing, *_growing())).write(self.folder)
             found: dict[str, Any] = state["trainer"]
             return found
-        with new_folder(self.folder, True, TRAINING, _growing()) as folder:
+        with new_folder(self.folder, True, TRAINING) as folder:
             (folder / "config.yaml").write_text(self._text)
         return None
 
@@ -265,6 +261,68 @@ class Training:
             if distributed.is_first() and self.folder is not None:
                 (self.folder / CHECKPOINT).unlink(missing_ok=True)
             raise
+
+
+_CHECKPOINT_ACCEPTED = "a checkpoint that torchid wrote"
+_DIGEST_BYTES = hashlib.sha256().digest_size
+
+
+def save_checkpoint(folder: Path, state: dict[str, Any]) -> None:
+    """Write a state of plain types and tensors behind its SHA-256, under a temporary name first.
+
+    Raises:
+        OSError: names the file, if the disk is full or cannot be written.
+    """
+    path = folder / CHECKPOINT
+    temporary = folder / f".{CHECKPOINT}"
+    stream = io.BytesIO()
+    torch.save(state, stream)
+    content = stream.getvalue()
+    try:
+        with temporary.open("wb") as file:
+            file.write(hashlib.sha256(content).digest() + content)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+def load_checkpoint(folder: Path) -> dict[str, Any]:
+    """The state that `save_checkpoint` wrote; no code in the file is run.
+
+    Raises:
+        InputError: the file is damaged, was changed, or is none of ours.
+    """
+    path = folder / CHECKPOINT
+    with refusing_damage(folder):
+        check_regular(path)
+        whole = path.read_bytes()
+        content = whole[_DIGEST_BYTES:]
+        if hashlib.sha256(content).digest() != whole[:_DIGEST_BYTES]:
+            raise ValueError("not what was written, by its checksum")
+        state = torch.load(io.BytesIO(content), weights_only=True)
+    if not isinstance(state, dict):
+        raise InputError(path, "file", f"holds a {type(state).__name__}", _CHECKPOINT_ACCEPTED)
+    return state
+
+
+@contextmanager
+def refusing_damage(folder: Path) -> Iterator[None]:
+    """Turn whatever reading a checkpoint or taking up its state raises into one line that names the file.
+
+    Raises:
+        InputError: a checkpoint whose parts are not what they should be.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:  # noqa: B902 - an unpickler, torch and its optimizers raise what they like
+        found = f"not readable ({excerpt(str(error) or type(error).__name__, 200)})"
+        raise InputError(folder / CHECKPOINT, "file", found, _CHECKPOINT_ACCEPTED) from error
 
 
 def sampled_rows(fitter: LogFitter, parts: Sequence[Part]) -> Assembly:
@@ -305,11 +363,6 @@ def known_parameters(robot: Robot, estimate: Estimate, phi: Array) -> dict[str, 
     names = [f"{body}.{parameter}" for body in robot.body_names for parameter in PARAMETERS]
     known = (estimate.verdict == IDENTIFIED) & np.isfinite(estimate.standard_error)
     return {names[k]: (float(phi[k]), float(estimate.standard_error[k])) for k in np.flatnonzero(known)}
-
-
-def _growing() -> tuple[str, ...]:
-    """Patterns of what this process will write into the training's folder, event files by host and process."""
-    return CHECKPOINT, f".{CHECKPOINT}", f"{EVENTS}.{glob.escape(socket.gethostname())}.{os.getpid()}.*"
 
 
 def _described(epoch: Epoch) -> str:

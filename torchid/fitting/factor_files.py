@@ -474,7 +474,7 @@ def write_factors(path: str | Path, factors: FactorFile) -> None:
     arrays["description"] = np.frombuffer(json.dumps(description, allow_nan=False).encode(), np.uint8)
     arrays["values"] = values
     try:
-        with atomic_file(path, result=False) as new, during("writing", path), new.open("xb") as stream:
+        with atomic_file(path) as new, during("writing", path), new.open("xb") as stream:
             np.savez(stream, **arrays)
     except OSError as error:
         raise LogError(path, "file", f"cannot be written ({error})", "a path in a writable folder") from error

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import random
-import re
 import signal
 import time
 from pathlib import Path
@@ -13,12 +12,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from hostile_commands import Commands
 from repository import DEMO
 from run_figures import OF_A_RUN
 from run_folders import names_in
-from tensorboard.plugins.custom_scalar import layout_pb2
 from thinned import slow_but
 from trainings import (
     BY_EPOCH,
@@ -36,7 +33,8 @@ from trainings import (
 import torchid
 from torchid import parameters
 from torchid.cli import main
-from torchid.commands.checkpoint import CHECKPOINT, load_checkpoint, save_checkpoint
+from torchid.commands.folder import CHECKPOINT
+from torchid.commands.training import load_checkpoint
 from torchid.config import load_config
 from torchid.estimators import Trainer
 from torchid.estimators.least_squares import VERDICTS
@@ -94,9 +92,6 @@ def test_metrics_and_parameters_are_those_of_the_best_epoch(run: Path) -> None:
     assert phi[1:, 10:].min() > 0.0
 
 
-INTERVALS = "parameters by epoch, 95 % intervals"
-
-
 def identified(run: Path) -> list[tuple[str, str]]:
     """Bodies and parameters that are identified one by one."""
     bodies = json.loads((run / "parameters.json").read_text())["bodies"]
@@ -148,54 +143,6 @@ def test_curves_say_everything_by_epoch_and_show_train_and_unseen_logs(run: Path
     assert set(events.Tags()["images"]) == {f"figure_{k}_{name}" for k, name in enumerate(OF_A_RUN, 1)}
     (text,) = events.Tensors("config/text_summary")
     assert b"checkpoint_seconds: 0" in text.tensor_proto.string_val[0]
-
-
-NAMES = {
-    "sensors", "estimator", "ridge", "friction", "cutoff_hz",
-    *(f"settings.{name}" for name in ("margin", "prior", "consistency")),
-    *(f"training.{name}" for name in ("optimizer", "lr", "schedule", "batch_size", "epochs", "seed")),
-}  # fmt: skip
-
-
-def test_hyperparameters_stand_beside_the_final_errors(run: Path) -> None:
-    events = events_in(run)
-    tags = set(events.Tags()["scalars"])
-    assert {f"final/{name}_{group}" for name in ("train", "test") for group in ROW_GROUPS} <= tags
-    metrics = json.loads((run / "metrics.json").read_text())
-    (found,) = events.Scalars("final/test_nullspace")
-    assert found.value == pytest.approx(metrics["test"]["nullspace_rms_relative"], rel=1e-6)
-    (start,) = (summary for name, summary in events.summary_metadata.items() if name == "_hparams_/session_start_info")
-    content = start.plugin_data.content
-    for name in (b"training.optimizer", b"Adam", b"CosineAnnealingLR", b"training.batch_size", b"log_cholesky"):
-        assert name in content
-    names = sorted(name.decode() for name in set(re.findall(rb"[a-z_.]+", content)) if name.decode() in NAMES)
-    assert names[:5] == ["cutoff_hz", "estimator", "friction", "ridge", "sensors"], "which TensorBoard shows"
-
-
-def test_custom_charts_show_training_and_unseen_logs_together(run: Path) -> None:
-    events = events_in(run)
-    layout = layout_pb2.Layout()
-    layout.ParseFromString(events.Tensors("custom_scalars__config__")[0].tensor_proto.string_val[0])
-    found = {category.title: {x.title: x for x in category.chart} for category in layout.category}
-    for group in ERROR_GROUPS:
-        logs = [
-            f"error_relative_{name}{of}/{group}" for name in ("test", "left_out", "train") for of in ("_nominal", "")
-        ]
-        assert list(found["errors, share of measured"][group].multiline.tag) == logs
-    intervals = {name: chart.margin.series[0] for name, chart in found.pop(INTERVALS).items()}
-    for name, series in intervals.items():
-        value, low, high = (events.Scalars(tag) for tag in (series.value, series.lower, series.upper))
-        assert [x.step for x in value] == EVALUATED
-        assert all(a.value < x.value < b.value for a, x, b in zip(low, value, high, strict=True)), name
-    assert set(intervals) == {f"{body}.{parameter}" for body, parameter in identified(run)}
-    charts = {title: list(x.multiline.tag) for category in found.values() for title, x in category.items()}
-    assert charts["train, held out, unseen"] == ["loss/data$", "loss_held_out/data$", "loss_unseen/data$"]
-    tags = events.Tags()["scalars"]
-    for title, patterns in charts.items():
-        shown = [tag for tag in tags if any(re.match(pattern, tag) for pattern in patterns)]
-        assert len(shown) >= 2, f"{title} shows nothing"
-    bodies = torchid.load_robot(DEMO / "quadruped.urdf").body_names
-    assert len(charts["smallest eigenvalue"]) == len(bodies)
 
 
 # -------------------------------------------------------------------------------------------------------- being stopped
@@ -270,38 +217,3 @@ def test_what_came_after_the_last_checkpoint_is_done_again(
         assert capsys.readouterr().err == expected
     assert main(command(experiment, output, seldom, "--resume")) == 0
     assert_as_uninterrupted(output, run)
-
-
-def test_an_interrupt_before_the_first_checkpoint_leaves_nothing_in_the_way(
-    experiment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    output = tmp_path / "runs" / "run"
-    with pytest.MonkeyPatch.context() as context:
-        context.setattr("torchid.commands.training.save_checkpoint", lambda *_: signal.raise_signal(signal.SIGINT))
-        assert main(command(experiment, output)) == 1
-    assert capsys.readouterr().err == "torchid: interrupted in epoch 0; --resume goes on after epoch 0\n"
-    monkeypatch.setattr(Trainer, "finished", True)  # what matters is that it starts
-    assert main(command(experiment, output, "--resume")) == 0
-    assert "no checkpoint to go on from; training starts at the beginning" in capsys.readouterr().err
-    assert names_in(output.parent) == ["run"]
-
-
-def test_an_interrupt_while_results_are_written_loses_nothing_of_the_training(
-    experiment: Path, run: Path, output: Path
-) -> None:
-    def stopped(*_: object, **__: object) -> None:
-        signal.raise_signal(signal.SIGINT)
-
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr("torchid.commands.results.write_json", stopped)
-        assert main(command(experiment, output, "--resume")) == 1
-    assert names_in(output.parent) == ["run.training"]
-    assert load_checkpoint(training_of(output))["trainer"]["epoch"] == EPOCHS
-    assert main(command(experiment, output, "--resume")) == 0
-    assert_as_uninterrupted(output, run)
-
-
-def test_a_state_of_one_number_that_is_a_view_without_a_stride_comes_back(tmp_path: Path) -> None:
-    """The parameters of a run may be a single one."""
-    save_checkpoint(tmp_path, {"x": torch.tensor(2.0, dtype=torch.float64).expand(1)})
-    assert load_checkpoint(tmp_path)["x"].tolist() == [2.0]

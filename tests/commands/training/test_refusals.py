@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import random
 import resource
 import shutil
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,18 +17,14 @@ from trainings import (
     EPOCHS,
     assert_as_uninterrupted,
     command,
-    events_in,
     interrupt,
-    steps,
     stopped_in,
     training_of,
 )
 
-import torchid
 from torchid.cli import main
-from torchid.commands.checkpoint import CHECKPOINT, load_checkpoint, save_checkpoint
-from torchid.config import load_config
-from torchid.errors import InputError
+from torchid.commands.folder import CHECKPOINT
+from torchid.commands.training import load_checkpoint, save_checkpoint
 
 pytestmark = pytest.mark.usefixtures("events")
 
@@ -76,11 +69,6 @@ def test_other_logs_are_not_gone_on_with(
     assert "experiment.yaml: logs: not those of the checkpoint; accepted: the same files, unchanged" in line
 
 
-def test_a_finished_run_is_not_gone_on_with(experiment: Path, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    line = resume_refused(experiment, run, capsys)
-    assert f"{run}: --resume: a finished run; accepted: an unfinished one, or overwrite=true" in line
-
-
 @pytest.mark.parametrize("name", ["least_squares", "consistent"])
 def test_what_is_done_in_one_go_is_not_gone_on_with(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
@@ -113,29 +101,6 @@ def test_a_damaged_checkpoint_is_not_gone_on_with(
     assert line.endswith("accepted: a checkpoint that torchid wrote")
 
 
-@pytest.mark.parametrize("state", [{"trainer": {}}, [1, 2]], ids=str)
-def test_a_file_of_tensors_that_is_no_checkpoint_is_not_gone_on_with(
-    experiment: Path, output: Path, capsys: pytest.CaptureFixture[str], state: Any
-) -> None:
-    torch.save(state, training_of(output) / CHECKPOINT)
-    assert f"{training_of(output) / CHECKPOINT}: file: " in resume_refused(experiment, output, capsys)
-
-
-@pytest.mark.parametrize("epoch", [10**9, -5])
-def test_an_epoch_edited_by_hand_is_not_gone_on_from(
-    experiment: Path, output: Path, capsys: pytest.CaptureFixture[str], epoch: int
-) -> None:
-    folder = training_of(output)
-    state = load_checkpoint(folder)
-    state["trainer"]["epoch"] = epoch
-    save_checkpoint(folder, state)
-    line = resume_refused(experiment, output, capsys)
-    assert f"{folder / CHECKPOINT}: file: " in line
-    assert f"epoch: found {epoch}; accepted: a whole number from 0 to {EPOCHS}" in line
-    torch.save(state, folder / CHECKPOINT)
-    assert "not the values that were written" in resume_refused(experiment, output, capsys)
-
-
 def test_a_full_disk_is_told_as_such_and_leaves_the_last_checkpoint(tmp_path: Path) -> None:
     save_checkpoint(tmp_path, {"epoch": 1})
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -148,23 +113,6 @@ def test_a_full_disk_is_told_as_such_and_leaves_the_last_checkpoint(tmp_path: Pa
     assert raised.value.filename == str(tmp_path / CHECKPOINT)
     assert load_checkpoint(tmp_path) == {"epoch": 1}
     assert [path.name for path in tmp_path.iterdir()] == [CHECKPOINT]
-
-
-def test_whatever_bit_of_a_checkpoint_flips_it_is_refused_or_says_the_same(tmp_path: Path) -> None:
-    generator = torch.Generator().manual_seed(0)
-    numbers = torch.randn(300, generator=generator, dtype=torch.float64)
-    save_checkpoint(tmp_path, {"config": "a: 1", "trainer": {"x": numbers, "epoch": 3}})
-    path, draw = tmp_path / CHECKPOINT, random.Random(0)
-    content, read = path.read_bytes(), 0
-    for _ in range(300):
-        place = draw.randrange(len(content))
-        path.write_bytes(content[:place] + bytes([content[place] ^ (1 << draw.randrange(8))]) + content[place + 1 :])
-        with suppress(InputError):
-            state = load_checkpoint(tmp_path)
-            read += 1
-            assert torch.equal(state["trainer"]["x"], numbers)
-            assert (state["config"], state["trainer"]["epoch"]) == ("a: 1", 3)
-    assert read < 250, "some bits are only padding, but not most"
 
 
 # ----------------------------------------------------------------------------------------------------- what is replaced
@@ -202,27 +150,6 @@ def test_an_unfinished_training_is_not_overwritten_unless_asked_for(
     assert f"{training_of(output)}: output: an unfinished training; accepted: --resume, overwrite=true" in line
 
 
-def test_an_unfinished_training_is_begun_anew_if_asked_for(
-    experiment: Path, output: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    more = ("overwrite=true", "estimator.training.epochs=1", "estimator.training.seed=3")
-    assert main(command(experiment, output, *more)) == 0
-    assert steps(events_in(output), "loss/data") == [1], "nothing of the old curves"
-    assert names_in(output.parent) == ["run"]
-
-
-@pytest.mark.parametrize("more", [(), ("overwrite=true",), ("--resume",)], ids=["plain", "overwrite", "resume"])
-def test_a_folder_of_that_name_that_is_no_training_stays(
-    experiment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], more: tuple[str, ...]
-) -> None:
-    output = tmp_path / "runs" / "run"
-    training_of(output).mkdir(parents=True)
-    (training_of(output) / "notes.txt").write_text("mine")
-    assert "holds notes.txt, and no manifest.json that says that torchid wrote a training" in refusal(
-        command(experiment, output, *more), tmp_path, capsys
-    )
-
-
 def test_a_descent_that_diverges_ends_in_one_line_and_is_not_in_the_way_of_the_next(
     experiment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -240,14 +167,6 @@ def test_a_descent_that_diverges_ends_in_one_line_and_is_not_in_the_way_of_the_n
     assert names_in(output.parent) == ["run"]
 
 
-def test_nothing_to_learn_is_noticed_before_anything_is_written(
-    experiment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    bodies = ", ".join(torchid.load_robot(DEMO / "quadruped.urdf").body_names)
-    line = refusal(command(experiment, tmp_path / "run", f"estimator.frozen=[{bodies}]"), tmp_path, capsys)
-    assert "experiment.yaml: sensors: no parameter is in reach of them" in line
-
-
 @pytest.mark.parametrize(
     ("override", "expected"),
     [
@@ -262,34 +181,3 @@ def test_a_slip_in_the_settings_of_a_descent_is_named_before_anything_is_written
 ) -> None:
     line = refusal(command(experiment, tmp_path / "run", override), tmp_path, capsys)
     assert f"experiment.yaml: {expected}" in line
-
-
-def test_overrides_may_come_before_and_after_options_and_strangers_are_refused(
-    experiment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """As they stand in `torchid identify FILE --resume overwrite=true`, where argparse takes them for strangers."""
-    place, once = f"output={tmp_path / 'run'}", "estimator.training.epochs=1"
-    assert main(["identify", str(experiment / "experiment.yaml"), once, "--resume", place, "--debug"]) == 0
-    assert load_config(tmp_path / "run" / "config.yaml").estimator.training.epochs == 1
-    for stranger in (["identify", "a.yaml", "--resume", "--hurry"], ["evaluate", "run", "--log", "a.npz", "b=1"]):
-        with pytest.raises(SystemExit) as raised:
-            main(stranger)
-        assert raised.value.code == 2
-        assert f"unrecognized arguments: {stranger[-1]}" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("given", "setting"),
-    [
-        (["--output", "runs/a"], "output"),
-        (["--robot.base-link=trunk"], "robot.base_link"),
-        (["--overwrite"], "overwrite"),
-    ],
-)
-def test_an_option_that_is_a_setting_of_the_file_is_written_as_one(
-    given: list[str], setting: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for name in ("identify", "analyze", "simulate"):
-        with pytest.raises(SystemExit):
-            main([name, "a.yaml", *given])
-        assert capsys.readouterr().err.rstrip().endswith(f"; accepted: settings of the file as {setting}=VALUE")
