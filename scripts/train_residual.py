@@ -6,7 +6,6 @@
     torchid evaluate runs/learned --log other.npz
     python scripts/train_residual.py --device cuda                       # on a GPU
 
-The regularization weight of the networks is chosen by held-out blocks of the training logs, unless --weight is given.
 The logs under `test` are evaluated at the end only. Curves go to a new folder: `tensorboard --logdir runs/residual`.
 """
 
@@ -49,7 +48,7 @@ def main() -> int:
     parser.add_argument("overrides", nargs="*", help="key.subkey=value")
     parser.add_argument("--mode", choices=["joint", "parameters_first", "alternating"], default="joint")
     parser.add_argument("--epochs", type=int, default=100, help="passes over the training logs")
-    parser.add_argument("--weight", type=float, help="of the networks' force in the loss; chosen if not given")
+    parser.add_argument("--weight", type=float, default=0.1, help="of the networks' force in the loss")
     parser.add_argument("--curves", type=Path, default=Path("runs/residual"), help="new folder for TensorBoard")
     parser.add_argument("--output", type=Path, help="new folder for the fit with the networks beside it")
     parser.add_argument("--device", help="where to compute, by default what the file says: cpu, cuda, cuda:0, ...")
@@ -89,7 +88,7 @@ def compare(options: argparse.Namespace) -> None:
                 events.write_epoch(epoch, trainer.loss.mean_square(MiniBatches(test, builder)))
             seen, unseen = (trainer.loss.mean_square(MiniBatches(logs, builder)) ** 0.5 for logs in (train, test))
             used = {**hyperparameters(config), "estimator": f"sgd, {name}", "training.epochs": options.epochs}
-            weight = {"training.residual_weight": trainer.loss.residual_weight or 0.0}
+            weight = {"training.residual_weight": options.weight if networks else 0.0}
             events.write_hyperparameters(used | weight, {"unseen_rms": unseen, "train_rms": seen}, options.epochs)
         shares = (f"{100.0 * epoch.shares.get(of, 0.0):.3g} %" for of in ("rigid_body", "residual"))
         table.add_row(name, f"{seen:.3f}", f"{unseen:.3f}", *shares)
@@ -106,10 +105,6 @@ def print_effect(effect: ResidualEffect | None, bodies: Sequence[str]) -> None:
     """Print the networks' share of the force, and the bodies whose parameters they change most."""
     if effect is None:
         return
-    if effect.choice is not None:
-        gain = effect.choice.gain
-        by = "not converged without the networks" if gain is None else f"{100.0 * gain:.3g} % less loss than without"
-        print(f"residual weight {effect.weight:g}, by blocks of the training logs: {by}")
     for name, share in effect.shares.items():
         print(f"{name.replace('_', ' ')}: the networks give {100.0 * share:.3g} %, rms {effect.rms[name]:.3g}")
     print(f"rigid bodies can explain {100.0 * effect.rigid_share:.3g} % of the networks' force")

@@ -39,7 +39,6 @@ RUNS = {
     "arm, robust": ("arm", ("estimator.robust=tukey",)),
     "arm, ridge": ("arm", ("estimator.ridge=auto",)),
     "quadruped, descent": ("quadruped", DESCENT),
-    "arm, penalties": ("arm", (*DESCENT, "estimator.consistency=penalties")),
 }
 
 

@@ -13,15 +13,12 @@ from hypothesis import strategies as st
 from physical import data, least_eigenvalues, nothing_seen, of_points, pseudo, random_bodies
 from synthetic import Array
 
-from torchid.estimators import FreeParameters, LearnableParameters, LogCholeskyParameters
+from torchid.estimators import LogCholeskyParameters
 from torchid.problem import LinearProblem
 from torchid.problem.linear import parameter_scale
 
 seeds = st.integers(0, 2**32 - 1)
 few = settings(max_examples=10, deadline=None, derandomize=True)
-Kind = Callable[[LinearProblem], LearnableParameters]
-KINDS: dict[str, Kind] = {"free": FreeParameters, "log_cholesky": LogCholeskyParameters}
-kinds = pytest.mark.parametrize("kind", KINDS)
 MARGIN = 1e-4
 
 
@@ -42,7 +39,7 @@ def some_free(rng: np.random.Generator) -> LinearProblem:
     return nothing_seen(well_inside(rng, 4), free.ravel())
 
 
-def random_raw(rng: np.random.Generator, learnable: LearnableParameters, size: float) -> torch.Tensor:
+def random_raw(rng: np.random.Generator, learnable: LogCholeskyParameters, size: float) -> torch.Tensor:
     return torch.from_numpy(size * rng.normal(size=len(learnable.raw)))
 
 
@@ -60,11 +57,6 @@ def assert_possible(phi: Array, problem: LinearProblem, margin: float) -> None:
 
 
 # -------------------------------------------------------------------------------------------------------------- start
-
-
-def test_free_parameters_start_at_the_urdfs_to_the_last_bit() -> None:
-    problem = some_free(np.random.default_rng(0))
-    np.testing.assert_array_equal(value(FreeParameters(problem)()), problem.nominal)
 
 
 @few
@@ -143,13 +135,12 @@ def test_every_body_above_the_margin_can_be_reached(seed: int) -> None:
     np.testing.assert_allclose(found / scale, other / scale, rtol=0.0, atol=1e-11 * np.abs(other / scale).max())
 
 
-@kinds
 @few
 @given(seed=seeds)
-def test_what_is_not_free_stays_to_the_last_bit(kind: str, seed: int) -> None:
+def test_what_is_not_free_stays_to_the_last_bit(seed: int) -> None:
     rng = np.random.default_rng(seed)
     problem = some_free(rng)
-    learnable = KINDS[kind](problem)
+    learnable = LogCholeskyParameters(problem)
     learnable.precondition(problem, 0.1, 1.0)
     with torch.no_grad():
         learnable.raw.copy_(random_raw(rng, learnable, 3.0))
@@ -158,22 +149,20 @@ def test_what_is_not_free_stays_to_the_last_bit(kind: str, seed: int) -> None:
     assert (phi[problem.free] != problem.nominal[problem.free]).all()
 
 
-@kinds
 @pytest.mark.parametrize("what", ["friction alone", "nothing"])
-def test_bodies_that_are_all_frozen_leave_friction_to_learn_or_nothing(kind: str, what: str) -> None:
+def test_bodies_that_are_all_frozen_leave_friction_to_learn_or_nothing(what: str) -> None:
     rng = np.random.default_rng(3)
     free = np.zeros((3, 12), dtype=bool)
     free[1:, 10:] = what == "friction alone"
     problem = nothing_seen(random_bodies(rng, 3), free.ravel())
-    learnable = KINDS[kind](problem)
+    learnable = LogCholeskyParameters(problem)
     learnable.precondition(problem, 0.1, 1.0)
     assert len(learnable.raw) == free.sum()
     with torch.no_grad():
         learnable.raw.copy_(random_raw(rng, learnable, 1.0))
     phi = value(learnable())
     np.testing.assert_array_equal(phi[~problem.free], problem.nominal[~problem.free])
-    if kind == "log_cholesky":
-        assert_possible(phi, problem, MARGIN)
+    assert_possible(phi, problem, MARGIN)
 
 
 @pytest.mark.parametrize("part", [slice(0, 1), slice(4, 10), slice(9, 10)])
@@ -183,17 +172,15 @@ def test_a_body_of_which_part_is_free_is_refused(part: slice) -> None:
     problem = nothing_seen(random_bodies(np.random.default_rng(4), 2), free.ravel())
     with pytest.raises(ValueError, match="free: found a body of which part is free; accepted: .* body by body"):
         LogCholeskyParameters(problem)
-    assert len(FreeParameters(problem).raw) == free.sum()
 
 
 # ------------------------------------------------------------------------------------------------------- derivatives
 
 
-@kinds
 @pytest.mark.parametrize("size", [0.0, 0.3, 1.0])
-def test_gradients_are_those_of_finite_differences(kind: str, size: float) -> None:
+def test_gradients_are_those_of_finite_differences(size: float) -> None:
     rng = np.random.default_rng(5)
-    learnable = KINDS[kind](some_free(rng))
+    learnable = LogCholeskyParameters(some_free(rng))
     u = random_raw(rng, learnable, size).requires_grad_()
     assert torch.autograd.gradcheck(learnable.constrained, (u,), rtol=1e-6, atol=1e-8)
     assert torch.autograd.gradgradcheck(learnable.constrained, (u,), rtol=1e-5, atol=1e-7)
@@ -220,29 +207,6 @@ def objective(problem: LinearProblem, ridge: float) -> Callable[[torch.Tensor], 
     return of
 
 
-@pytest.mark.parametrize("ridge", [0.0, 1e-3])
-@pytest.mark.parametrize("damping", [1e-3, 1.0])
-def test_curvature_is_one_where_the_data_see_much_and_never_more(ridge: float, damping: float) -> None:
-    """Of a curvature h of the objective h / (h + damping) is left."""
-    problem = seen(6, 1e4)
-    of = objective(problem, ridge)
-    learnable = FreeParameters(problem)
-    free = np.flatnonzero(problem.free)
-    H = torch.autograd.functional.hessian(of, torch.from_numpy(problem.nominal)).numpy()[np.ix_(free, free)]
-    h = np.linalg.eigvalsh(H * np.outer(problem.scale[free], problem.scale[free]))
-    learnable.precondition(problem, ridge, damping)
-    raw = torch.from_numpy(np.random.default_rng(7).normal(size=len(free)))
-    found = torch.autograd.functional.hessian(lambda x: of(learnable.constrained(learnable.preconditioner @ x)), raw)
-    curvature = np.linalg.eigvalsh(found.numpy())
-    np.testing.assert_allclose(curvature, h / (h + damping), rtol=0.0, atol=1e-12)
-    assert curvature.max() <= 1.0 + 1e-12
-    assert h.max() > 0.1, "something must be seen"
-    if damping == 1e-3:
-        assert curvature[h > 0.3].min() > 0.996
-        assert (h > 0.3).sum() >= 5
-        assert ridge or curvature.min() < 0.1, "something must be hard to see"
-
-
 @pytest.mark.parametrize("damping", [1e-3, 1.0])
 def test_curvature_of_possible_bodies_is_so_too_where_the_data_fit(damping: float) -> None:
     """There the Gauss-Newton Hessian is the whole one."""
@@ -255,44 +219,3 @@ def test_curvature_of_possible_bodies_is_so_too_where_the_data_fit(damping: floa
     found = torch.autograd.functional.hessian(lambda x: of(learnable.constrained(learnable.preconditioner @ x)), start)
     np.testing.assert_allclose(np.linalg.eigvalsh(found.numpy()), h / (h + damping), rtol=0.0, atol=1e-10)
     assert h.max() > 0.1, "something must be seen"
-
-
-# ---------------------------------------------------------------------------------------------- precision and device
-
-
-@kinds
-def test_single_precision_moves_everything_and_changes_nothing_but_digits(kind: str) -> None:
-    rng = np.random.default_rng(9)
-    problem = some_free(rng)
-    learnable = KINDS[kind](problem)
-    learnable.precondition(problem, 0.1, 1.0)
-    with torch.no_grad():
-        learnable.raw.copy_(random_raw(rng, learnable, 0.5))
-    exact = value(learnable())
-    single = learnable.float().to("cpu")
-    tensors = dict(single.named_parameters()) | dict(single.named_buffers())
-    assert {x.dtype for x in tensors.values()} <= {torch.float32, torch.bool, torch.int64}
-    phi = single()
-    assert phi.dtype == torch.float32
-    phi.sum().backward()
-    assert single.raw.grad.dtype == torch.float32
-    np.testing.assert_allclose(value(phi) / problem.scale, exact / problem.scale, rtol=0.0, atol=3e-5)
-
-
-@kinds
-def test_parameters_move_to_another_device_as_a_whole(kind: str) -> None:
-    learnable = KINDS[kind](some_free(np.random.default_rng(10)))
-    moved = learnable.to("meta")
-    assert {x.device.type for x in [*moved.parameters(), *moved.buffers()]} == {"meta"}
-
-
-@kinds
-def test_a_state_loads_into_parameters_of_the_same_problem(kind: str) -> None:
-    rng = np.random.default_rng(11)
-    problem = some_free(rng)
-    one, other = KINDS[kind](problem), KINDS[kind](problem)
-    one.precondition(problem, 0.1, 1.0)
-    with torch.no_grad():
-        one.raw.copy_(random_raw(rng, one, 1.0))
-    other.load_state_dict(one.state_dict())
-    assert torch.equal(one(), other())

@@ -264,8 +264,6 @@ def test_what_rows_lack_is_no_share_of_the_data_and_part_of_the_standard_error(r
     moved = [LeastSquares(ridge).solve(replace(problem, b=problem.b - lacking.shrinkage @ z)).phi for z in unit]
     expected = np.sqrt(before.noise_error**2 + np.square(np.array(moved) - before.phi).sum(0))
     assert np.allclose(estimate.noise_error, expected, rtol=1e-9, equal_nan=True)
-    quarter = LeastSquares(ridge).solve(lacking.fraction(0.25))
-    assert np.allclose(quarter.data_share, estimate.data_share, rtol=1e-9), "of a part of the data likewise"
 
 
 def test_what_rows_lack_has_their_number_and_the_parameters() -> None:

@@ -107,13 +107,6 @@ def test_a_misspelt_optimizer_is_refused_by_the_nearest_names(name: str, nearest
     assert nearest in message.split("accepted: ")[1].split(", ")
 
 
-@pytest.mark.parametrize("name", ["CosineAnealingLR", "cosineannealinglr", "CosineAnnealing"])
-def test_a_misspelt_schedule_is_refused_by_the_nearest_names(name: str) -> None:
-    with pytest.raises(UnknownNameError) as raised:
-        Sgd(schedule={"name": name}).try_out()
-    assert "CosineAnnealingLR" in one_line(raised.value).split("accepted: ")[1].split(", ")
-
-
 def test_an_option_that_does_not_exist_is_refused_by_those_that_do() -> None:
     message = refused(optimizer={"name": "SGD", "lr": 0.1, "momentun": 0.9})
     assert "momentun" in message
@@ -160,19 +153,6 @@ def test_a_schedule_that_spans_the_run_spans_its_epochs_unless_told_otherwise() 
     assert rates("OneCycleLR", {"max_lr": 0.1, "total_steps": 100, "pct_start": 0.5}, 21)[-1] < 0.06
 
 
-def test_no_schedule_leaves_the_rate_alone() -> None:
-    optimizer, _ = parabola("SGD", lr=0.3)
-    assert make_schedule(None, optimizer, 5) is None
-    step_schedule(None, 1.0)
-    assert optimizer.param_groups[0]["lr"] == 0.3
-
-
-def test_a_schedule_by_plateaus_looks_at_the_loss() -> None:
-    losses = [5.0, 4.0, 4.0, 4.0, 3.0, 3.0, 3.0, 2.0]
-    found = rates("ReduceLROnPlateau", {"patience": 1, "factor": 0.5}, len(losses), losses)
-    assert found == [0.05, 0.05, 0.05, 0.05, 0.025, 0.025, 0.025, 0.0125]
-
-
 @pytest.mark.parametrize(
     ("name", "options"),
     [
@@ -195,21 +175,12 @@ def test_a_schedule_that_does_not_suit_its_optimizer_is_refused() -> None:
     assert "must support momentum" in message
 
 
-def test_what_does_not_work_is_refused_where_training_starts_and_not_before() -> None:
-    """Settings are made without running anything, a trainer refuses them before any other work."""
-    settings = Sgd(optimizer={"name": "Adam", "betas": 3})
-    w = demo()
-    with pytest.raises(InputError, match="estimator: optimizer Adam: "):
-        Trainer(settings, w.problem, w.batches)
-
-
 # ----------------------------------------------------------------------------------------------------- other settings
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"consistency": "cholesky"}, "consistency: found 'cholesky'; accepted: 'log_cholesky' or 'penalties'"),
         ({"residual": "both"}, "residual: found 'both'; accepted: 'joint', 'parameters_first' or 'alternating'"),
         ({"ridge": -1.0}, "ridge: found -1.0; accepted: greater than or equal to 0"),
         ({"residual_weight": float("nan")}, "residual_weight: found nan"),

@@ -29,16 +29,12 @@ ABOVE = MARGIN * (1.0 - 1e-9)
 
 
 def trained(w: World, identity: bool = False, **settings: Any) -> tuple[SgdEstimate, list[Epoch]]:
-    trainer = Trainer(Sgd(**{"ridge": RIDGE, "finish": None} | settings), w.problem, w.batches)
+    trainer = Trainer(Sgd(**{"ridge": RIDGE, "finish": False} | settings), w.problem, w.batches)
     if identity:
         preconditioner = trainer.loss.learnable.preconditioner
         preconditioner.copy_(torch.eye(len(preconditioner)))
     epochs: list[Epoch] = []
     return trainer.run(epochs.append), epochs
-
-
-def ratio(estimate: SgdEstimate) -> float:
-    return estimate.objective / estimate.unconstrained
 
 
 def left(estimate: SgdEstimate) -> float:
@@ -108,30 +104,13 @@ def test_the_figures_of_an_estimate_are_those_of_its_parameters(
     assert 0.0 < epochs[0].learning_rate - epochs[30].learning_rate < 0.05
 
 
-def test_penalties_pull_nearly_as_near_and_nearly_into_what_can_exist() -> None:
-    """1.015 was found (1.021 after 30 epochs, 1.011 after 60), and eigenvalues down to 2e-5."""
-    estimate, _ = trained(demo(), consistency="penalties", epochs=45, optimizer={"name": "Adam", "lr": 0.1})
-    assert ratio(estimate) <= 1.02
-    assert np.nanmin(estimate.eigenvalues) > -1e-3
-    assert estimate.phi.reshape(-1, 12)[1:, 10:].min() > -1e-3
-
-
 MOMENTUM: dict[str, Any] = {"optimizer": {"name": "SGD", "lr": 0.2, "momentum": 0.9}, "epochs": 40}
-RMSPROP: dict[str, Any] = {"optimizer": {"name": "RMSprop", "lr": 0.02}, "epochs": 30}
-
-
-@pytest.mark.parametrize("settings", [MOMENTUM, RMSPROP], ids=["SGD with momentum", "RMSprop"])
-def test_other_optimizers_get_near_as_well(settings: dict[str, Any]) -> None:
-    """SGD with momentum 3.1e-4, RMSprop 4.9e-4."""
-    estimate, _ = trained(demo(), **settings)
-    assert left(estimate) < 1e-3
-    assert np.nanmin(estimate.eigenvalues) >= ABOVE
 
 
 def test_without_the_preconditioner_the_same_descent_hardly_leaves_the_urdf() -> None:
     """32 times the closed form after as many epochs; so it was with steps of 0.03, 0.1 and 0.3."""
     estimate, _ = trained(demo(), True, **MOMENTUM)
-    assert ratio(estimate) > 20.0
+    assert estimate.objective > 20.0 * estimate.unconstrained
 
 
 # -------------------------------------------------------------------------------------------------------- what is lost
@@ -139,19 +118,13 @@ def test_without_the_preconditioner_the_same_descent_hardly_leaves_the_urdf() ->
 
 def test_the_loss_of_an_epoch_is_that_of_all_samples() -> None:
     w = arm()
-    nominal = w.problem.nominal
-    for consistency in ("log_cholesky", "penalties"):
-        trainer = Trainer(Sgd(**still(ridge=0.3, consistency=consistency)), w.problem, w.batches)
-        phi, epoch = trainer.phi(), trainer.run_epoch()
-        expected = {"data": w.problem.cost(phi) / w.problem.rows}
-        expected["prior"] = 0.3 * float(np.sum(((phi - nominal) / w.problem.scale) ** 2))
-        if consistency == "penalties":
-            expected |= {"eigenvalue": 0.0, "mass": 0.0, "friction": 0.0}
-        else:
-            expected["conditions"] = 0.0  # met
-        expected["total"] = sum(expected.values())
-        assert epoch.losses == pytest.approx(expected, rel=1e-12, abs=1e-12)
-        assert epoch.objective == pytest.approx(expected["total"], rel=1e-12)
+    trainer = Trainer(Sgd(**still(ridge=0.3)), w.problem, w.batches)
+    phi, epoch = trainer.phi(), trainer.run_epoch()
+    expected = {"data": w.problem.cost(phi) / w.problem.rows}
+    expected["prior"] = 0.3 * float(np.sum(((phi - w.problem.nominal) / w.problem.scale) ** 2))
+    expected["total"] = sum(expected.values())
+    assert epoch.losses == pytest.approx(expected, rel=1e-12, abs=1e-12)
+    assert epoch.objective == pytest.approx(expected["total"], rel=1e-12)
 
 
 def test_the_held_out_loss_is_the_cost_of_the_held_out_logs_compressed_per_row() -> None:
@@ -187,17 +160,9 @@ def test_the_parameters_with_the_least_held_out_loss_are_kept_and_patience_ends_
     np.testing.assert_array_equal(trainer.phi(), phis[best])
 
 
-def test_without_patience_all_epochs_are_run_and_the_best_kept() -> None:
-    w, held_out = arm(), half_way()
-    settings = Sgd(RIDGE, epochs=25, optimizer={"name": "Adam", "lr": 0.05}, schedule=None)
-    estimate = Trainer(settings, w.problem, w.batches, held_out.batches).run()
-    assert estimate.epochs == 25
-    assert estimate.best_epoch < 20
-
-
 def test_without_held_out_logs_the_last_parameters_are_kept_and_patience_means_nothing() -> None:
     w = arm()
-    trainer = Trainer(Sgd(RIDGE, epochs=12, patience=1, finish=None), w.problem, w.batches)
+    trainer = Trainer(Sgd(RIDGE, epochs=12, patience=1, finish=False), w.problem, w.batches)
     phis: list[Array] = []
     estimate = trainer.run(lambda _: phis.append(trainer.phi()))
     assert estimate.epochs == estimate.best_epoch == 12
@@ -231,16 +196,13 @@ def test_a_schedule_by_plateaus_goes_by_the_held_out_loss_if_there_is_one(with_h
         assert found == by_training
 
 
-@pytest.mark.parametrize("consistency", ["log_cholesky", "penalties"])
 @pytest.mark.parametrize("batch_size", [50, 1000], ids=["many steps", "one step an epoch"])
-@pytest.mark.parametrize("rate", [1e7, 1e200, 1e308, float("inf")])
-def test_a_descent_that_diverges_says_so_in_one_line_and_returns_no_parameters(
-    consistency: str, batch_size: int, rate: float
-) -> None:
+@pytest.mark.parametrize("rate", [1e7, 1e308])
+def test_a_descent_that_diverges_says_so_in_one_line_and_returns_no_parameters(batch_size: int, rate: float) -> None:
     w = arm()
     options = {"optimizer": {"name": "SGD", "lr": rate}, "schedule": None, "epochs": 5}
     batches = MiniBatches(w.logs, w.builder, batch_size)
-    trainer = Trainer(Sgd(RIDGE, consistency=consistency, **options), w.problem, batches)
+    trainer = Trainer(Sgd(RIDGE, **options), w.problem, batches)
     with pytest.raises(InputError) as raised:
         trainer.run()
     message = str(raised.value)
@@ -278,7 +240,6 @@ class Spring(nn.Module):
 SETTINGS: dict[str, dict[str, Any]] = {
     **{f"{name} alone": {"optimizer": {"name": name}, "schedule": None} for name in optimizer_names()},
     "Adam": {},
-    "Adam with penalties": {"consistency": "penalties"},
     "SGD momentum": {"optimizer": {"name": "SGD", "lr": 0.05, "momentum": 0.9, "nesterov": True}},
     "OneCycleLR": {"schedule": {"name": "OneCycleLR", "max_lr": 0.1}},
     "ReduceLROnPlateau": {"schedule": {"name": "ReduceLROnPlateau", "patience": 0, "threshold": 0.5}},
@@ -336,66 +297,3 @@ def test_a_descent_taken_up_again_after_any_epoch_is_the_uninterrupted_one_to_th
         estimate = resumed.estimate()
         np.testing.assert_array_equal(estimate.phi, final.phi)
         assert (estimate.best_epoch, estimate.objective) == (final.best_epoch, final.objective)
-
-
-def test_early_stopping_goes_on_where_it_was() -> None:
-    w, held_out = arm(), half_way()
-    settings = Sgd(RIDGE, epochs=60, patience=4, optimizer={"name": "Adam", "lr": 0.02}, schedule=None)
-
-    def new() -> Trainer:
-        return Trainer(settings, w.problem, w.batches, held_out.batches)
-
-    plain = new()
-    states: dict[int, Any] = {}
-    final = plain.run(lambda epoch: states.update({epoch.number: plain.state_dict()}))
-    for start in (final.best_epoch - 1, final.best_epoch + 2, final.epochs):
-        resumed = new()
-        resumed.load_state_dict(states[start])
-        assert resumed.finished == (start == final.epochs)
-        estimate = resumed.run()
-        assert (estimate.epochs, estimate.best_epoch) == (final.epochs, final.best_epoch)
-        np.testing.assert_array_equal(estimate.phi, final.phi)
-
-
-# ------------------------------------------------------------------------------------------------- states of strangers
-
-
-EDITS: dict[str, tuple[tuple[Any, ...], Any, str]] = {
-    "an epoch after the last": (("epoch",), 10**9, "epoch: found 1000000000; accepted: a whole number from 0 to 4"),
-    "an epoch before the first": (("epoch",), -5, "epoch: found -5; accepted: a whole number from 0 to 4"),
-    "half an epoch": (("epoch",), 1.5, "epoch: found 1.5; accepted: a whole number from 0 to 4"),
-    "a true epoch": (("epoch",), True, "epoch has the wrong type or shape"),
-    "a best epoch to come": (("best_epoch",), 4, "best_epoch: found 4; accepted: a whole number from 0 to 3"),
-    "a negative loss": (("best_loss",), -1.0, "best_loss: found -1.0; accepted: at least 0"),
-    "no loss": (("best_loss",), float("nan"), "best_loss has the wrong type or shape"),
-    "an infinite loss": (("best_loss",), float("inf"), "best_loss: found inf; accepted: at least 0"),
-    "a negative rate": (("optimizer", "param_groups", 0, "lr"), -0.1, "param_groups.0.lr: found -0.1; accepted: fin"),
-    "another decay": (("optimizer", "param_groups", 0, "weight_decay"), 9.0, "weight_decay: found 9.0; accepted: 0"),
-    "another epoch of the schedule": (("schedule", "last_epoch"), 99, "schedule.last_epoch: found 99; accepted: 3"),
-    "parameters that are none": (("learned", "learnable.raw"), float("nan"), "learnable.raw: found a number that is"),
-    "a negative weight": (("residual_weight",), -1.0, "residual_weight: found -1.0; accepted: 0.5"),
-}
-
-
-@pytest.mark.parametrize("edit", EDITS)
-def test_a_state_with_a_value_out_of_its_range_is_refused_by_its_place(edit: str) -> None:
-    w = arm()
-
-    def new() -> Trainer:
-        settings = Sgd(RIDGE, epochs=4, residual_weight=0.5)
-        return Trainer(settings, w.problem, w.batches, residual=Spring(w.robot.n))
-
-    trainer = new()
-    for _ in range(3):
-        trainer.run_epoch()
-    state = trainer.state_dict()
-    place, value, message = EDITS[edit]
-    within: Any = state
-    for key in place[:-1]:
-        within = within[key]
-    old = within[place[-1]]
-    within[place[-1]] = torch.full_like(old, value) if isinstance(old, Tensor) else value
-    with pytest.raises(ValueError) as raised:
-        new().load_state_dict(state)
-    assert message in str(raised.value)
-    assert "\n" not in str(raised.value)

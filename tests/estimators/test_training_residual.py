@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -14,7 +14,9 @@ from synthetic import Array
 from torch import Tensor, nn
 
 from torchid.errors import InputError
-from torchid.estimators import Epoch, Sgd, SgdEstimate, Trainer
+from torchid.estimators import Epoch, LeastSquares, Sgd, SgdEstimate, Trainer
+from torchid.problem import compress, linear_problem
+from torchid.regressor import Regressor
 
 MODES = ("joint", "parameters_first", "alternating")
 modes = pytest.mark.parametrize("mode", MODES)
@@ -85,19 +87,6 @@ def test_parameters_trained_together_with_a_module_are_those_of_the_robot_withou
     assert cost(without_cable(), run("parameters_first").estimate.phi) > 0.5 * spoilt
 
 
-def test_a_module_finds_the_strength_of_the_cable_that_there_is() -> None:
-    strength = run("joint").strength[run("joint").estimate.best_epoch]
-    assert strength[3].tolist() == pytest.approx([0.0, 0.0, 3.0], abs=0.3)
-    assert strength[1, 1].item() == pytest.approx(-8.0, abs=1.0)
-
-
-def test_a_force_that_is_known_needs_no_training() -> None:
-    w, held_out = with_cable(), unseen()
-    settings = Sgd(RIDGE, epochs=20, optimizer={"name": "Adam", "lr": 0.1})
-    estimate = Trainer(settings, w.problem, w.batches, held_out.batches, Fixed(cable)).run()
-    assert cost(without_cable(), estimate.phi) < 0.1 * cost(without_cable(), run(None).estimate.phi)
-
-
 # ------------------------------------------------------------------------------------------------------------ in turns
 
 
@@ -139,21 +128,14 @@ def test_a_module_is_left_as_it_was_found_and_can_be_trained_again(mode: str) ->
         assert residual.offset.tolist() == [1.0] * 3
 
 
-def test_a_module_may_learn_at_a_rate_of_its_own() -> None:
-    w, residual = arm(), Springs(arm().robot.n)
-    settings = Sgd(optimizer={"name": "Adam", "lr": 0.05}, residual_lr=0.5, residual_weight=0.0)
-    trainer = Trainer(settings, w.problem, w.batches, residual=residual)
-    assert [group["lr"] for group in trainer.optimizer.param_groups] == [0.05, 0.5]
-    assert trainer.run_epoch().learning_rate == 0.05
-
-
 # -------------------------------------------------------------------------------------------------------- what is said
 
 
 def test_the_shares_of_an_epoch_are_those_of_the_projected_forces() -> None:
     """On the quadruped, whose contact forces nobody measures: what is projected away does not count."""
     w = demo()
-    trainer = Trainer(Sgd(**still()), w.problem, w.batches, residual=Fixed(lambda q, v, a: 0.3 * v + 1.0))
+    settings = Sgd(**still(residual_weight=0.0))
+    trainer = Trainer(settings, w.problem, w.batches, residual=Fixed(lambda q, v, a: 0.3 * v + 1.0))
     phi = torch.from_numpy(trainer.phi())
     epoch = trainer.run_epoch()
     squares = {"rigid_body": 0.0, "residual": 0.0, "measured": 0.0}
@@ -235,3 +217,44 @@ def test_a_force_that_is_not_finite_ends_the_descent(value: float) -> None:
     trainer = Trainer(Sgd(epochs=1), w.problem, w.batches, residual=Fixed(lambda q, v, a: torch.full_like(v, value)))
     with pytest.raises(InputError, match="training: a loss of (nan|inf) in epoch 1"):
         trainer.run()
+
+
+def test_what_a_module_took_is_what_it_gives_and_moves() -> None:
+    """A known force: shares from the forces themselves, parameters from least squares without that force."""
+    w = with_cable()
+
+    def spring(q: Tensor, v: Tensor, _a: Tensor) -> Tensor:
+        return 2.0 * q + 0.3 * v
+
+    estimate = Trainer(Sgd(1e-5, epochs=1, residual_weight=0.0), w.problem, w.batches, residual=Fixed(spring)).run()
+    effect = estimate.residual
+    assert effect is not None
+    q, v, a = w.logs[0].coordinates()
+    force = spring(q, v, a)
+    rigid = Regressor(w.robot)(q, v, a) @ torch.from_numpy(estimate.phi)
+    assert effect.rms == pytest.approx({"joint_torque": float(force.square().mean().sqrt())}, rel=1e-9)
+    share = float(force.norm() / (force + rigid).norm())
+    assert effect.shares == pytest.approx({"joint_torque": share}, rel=1e-9)
+    assert w.logs[0].torque is not None
+    rest = [replace(w.logs[0], torque=w.logs[0].torque - force)]
+    without, plain = (
+        LeastSquares(1e-5).solve(linear_problem(compress(logs, w.builder), w.builder, w.robot))
+        for logs in (rest, w.logs)
+    )
+    np.testing.assert_allclose(effect.moved / w.problem.scale, (without.phi - plain.phi) / w.problem.scale, atol=1e-6)
+    in_scales = np.abs(effect.moved / w.problem.scale).reshape(-1, 12)[:, :10].max(axis=1)
+    np.testing.assert_allclose(effect.moved_scaled, in_scales)
+    assert np.nanmax(effect.moved_errors) > 1.0
+
+
+def test_a_force_of_rigid_bodies_is_told_as_theirs() -> None:
+    w = with_cable()
+    regressor, other = Regressor(w.robot), torch.from_numpy(w.problem.nominal * w.problem.free)
+    estimate = Trainer(
+        Sgd(epochs=1, residual_weight=0.0),
+        w.problem,
+        w.batches,
+        residual=Fixed(lambda q, v, a: regressor(q, v, a) @ other),
+    ).run()
+    assert estimate.residual is not None
+    assert estimate.residual.rigid_share == pytest.approx(1.0, abs=1e-6)

@@ -200,40 +200,6 @@ def test_processes_that_share_batches_have_each_sample_of_a_batch_once(size: int
             assert Counter(key for part, _ in parts for key in keys(part)) == Counter(keys(whole))
 
 
-@pytest.mark.parametrize("count", [1, 10, 2000])
-def test_blocks_are_successive_samples_of_one_log_and_as_long_as_one_another(count: int) -> None:
-    w = many()
-    blocks = [list(marks(block._logs[0])) for block in MiniBatches(w.logs, w.builder).split_blocks(count)]
-    assert [key for block in blocks for key in block] == [key for log in w.logs for key in marks(log)]
-    log_of = {key: number for number, log in enumerate(w.logs) for key in marks(log)}
-    of_logs = Counter(number for block in blocks for number in {log_of[key] for key in block})
-    assert sum(of_logs.values()) == len(blocks), "none has samples of two logs"
-    assert of_logs.keys() == {0, 1, 2}, "every log has one"
-    for number, log in enumerate(w.logs):
-        expected = min(max(count * len(log) / TOTAL, 1.0), len(log))
-        assert of_logs[number] == pytest.approx(expected, abs=0.5)
-        lengths = [len(block) for block in blocks if log_of[block[0]] == number]
-        assert max(lengths) - min(lengths) <= 1
-
-
-def test_one_block_in_every_few_is_held_out_and_the_others_are_kept() -> None:
-    w = many()
-    every, blocks = 4, [set(marks(block._logs[0])) for block in MiniBatches(w.logs, w.builder).split_blocks(22)]
-    assert len(blocks) % every == every - 1, "the last ones are kept"
-    numbers = set()
-    for seed in range(3):
-        kept, held_out = MiniBatches(w.logs, w.builder, 50, seed=seed).hold_out(22, every)
-        drawn = [blocks.index(set(marks(block._logs[0]))) for block in held_out]
-        assert [number // every for number in drawn] == list(range(len(blocks) // every))
-        left = Counter(key for log in kept._logs for key in marks(log))
-        assert left == Counter(key for number, block in enumerate(blocks) if number not in drawn for key in block)
-        assert (kept.batch_size, kept.seed) == (50, seed)
-        again = MiniBatches(w.logs, w.builder, 50, seed=seed).hold_out(22, every)[1]
-        assert [marks(x._logs[0]) for x in again] == [marks(x._logs[0]) for x in held_out]
-        numbers.add(tuple(drawn))
-    assert len(numbers) == 3, "another seed draws others"
-
-
 # --------------------------------------------------------------------------------------------------------------- rows
 
 

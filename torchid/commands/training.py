@@ -35,7 +35,7 @@ from torchid.config import ExperimentConfig, dump_config, inputs_of
 from torchid.errors import ConfigError, InputError, SensorError, excerpt, warn
 from torchid.estimators import Conditions, Epoch, Estimate, Sgd, SgdEstimate, Trainer
 from torchid.estimators.least_squares import IDENTIFIED
-from torchid.estimators.sgd import OPTIMIZERS
+from torchid.estimators.sgd import FULL_BATCH
 from torchid.fitting.experiment import Experiment
 from torchid.fitting.fit import LogFitter
 from torchid.guards import check_regular
@@ -188,7 +188,7 @@ class Training:
     def _share(self) -> tuple[int, int]:
         """The part of every batch that this process takes; all take all of it where a line search asks for more."""
         name = self.config.estimator.training.optimizer["name"]
-        return (0, 1) if OPTIMIZERS[name].full_batch else (distributed.rank(), distributed.world_size())
+        return (0, 1) if name in FULL_BATCH else (distributed.rank(), distributed.world_size())
 
     def _train(
         self, trainer: Trainer, evaluate: Evaluate, events: RunEvents | None, progress: Callable[[str], None]

@@ -4,10 +4,7 @@ from torchid.estimators.conditions import Conditions, Enclosure, Mirror, Violati
 from torchid.estimators.consistent import Consistent, ConsistentEstimate, nearest_consistent
 from torchid.estimators.least_squares import ConstrainedEstimate, Estimate, LeastSquares
 from torchid.estimators.sgd import (
-    FreeParameters,
-    LearnableParameters,
     LogCholeskyParameters,
-    PenaltyWeights,
     Sgd,
     TrainingSettings,
 )
@@ -21,12 +18,9 @@ __all__ = [
     "Enclosure",
     "Epoch",
     "Estimate",
-    "FreeParameters",
-    "LearnableParameters",
     "LeastSquares",
     "LogCholeskyParameters",
     "Mirror",
-    "PenaltyWeights",
     "ResidualEffect",
     "Sgd",
     "SgdEstimate",

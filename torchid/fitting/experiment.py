@@ -611,14 +611,10 @@ def _ft_field(config: ExperimentConfig | AnalyzeConfig, name: str) -> str:
 def batch_estimator(settings: EstimatorConfig, conditions: Conditions) -> LeastSquares | Consistent:
     """What solves a compressed problem in one go; for a descent, what it approaches with the same ridge.
 
-    Penalties of a descent are not part of it.
-
     Args:
         settings: of the estimator.
         conditions: from `conditions_from`.
     """
-    if settings.name == "least_squares":
-        return settings.least_squares
-    if settings.name == "sgd" and (settings.consistency == "penalties" or not settings.numeric_ridge):
+    if settings.name == "least_squares" or (settings.name == "sgd" and not settings.numeric_ridge):
         return settings.least_squares
     return settings.consistent(conditions)

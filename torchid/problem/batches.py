@@ -110,29 +110,6 @@ class MiniBatches:
     def __repr__(self) -> str:
         return f"MiniBatches: {self.samples} samples of {len(self._logs)} logs, {self.batch_size} a batch"
 
-    def split_blocks(self, count: int) -> list[MiniBatches]:
-        """Mini-batches of about `count` blocks of successive samples, each of one log, at least one of every log."""
-        pieces: list[Samples] = []
-        for log in self._logs:
-            parts = min(max(round(count * len(log) / max(self.samples, 1)), 1), max(len(log), 1))
-            cuts = [round(k * len(log) / parts) for k in range(parts + 1)]
-            pieces += [log[start:end] for start, end in zip(cuts, cuts[1:], strict=False)]
-        return [self.like(piece) for piece in pieces if len(piece)]
-
-    def hold_out(self, count: int, every: int) -> tuple[MiniBatches, list[MiniBatches]]:
-        """Mini-batches without some of about `count` blocks, and those blocks: one in `every`, drawn by the seed."""
-        blocks, generator = self.split_blocks(count), self._generator(-1)
-        held_out = [
-            start + int(torch.randint(every, (), generator=generator))
-            for start in range(0, len(blocks) - every + 1, every)
-        ]
-        kept = [block._logs[0] for number, block in enumerate(blocks) if number not in held_out]
-        return self.like(*kept), [blocks[number] for number in held_out]
-
-    def like(self, *logs: Samples) -> MiniBatches:
-        """Mini-batches of other samples, with the same settings."""
-        return MiniBatches(logs, self.builder, self.batch_size, self.seed, self._memory, self.share, self.assembly)
-
     def epoch(self, number: int) -> Iterator[Batch]:
         """All samples in the order of an epoch, numbered from 1."""
         return (batch for batch, _ in self.sized_epoch(number))

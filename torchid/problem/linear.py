@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any, TypeVar, cast
@@ -98,10 +98,6 @@ class EliminatedTerms:
             return frozenset()
         standing = [one for one in self.conditions if one.value(phi, psi) <= AT_BOUND * one.size]
         return frozenset(self.labels[number] for one in standing for number in np.flatnonzero(one.terms))
-
-    def scaled(self, root: float) -> EliminatedTerms:
-        """The same with rows times a number."""
-        return replace(self, C=root * self.C, D=root * self.D, z=root * self.z)
 
 
 T = TypeVar("T")
@@ -208,15 +204,6 @@ class LinearProblem:
         if key not in self._shared:
             self._shared[key] = compute()
         return cast(T, self._shared[key])
-
-    def fraction(self, share: float) -> LinearProblem:
-        """The problem scaled to a share of its rows: that share of its information."""
-        root = float(np.sqrt(share))
-        rows = max(round(share * self.rows), 1)
-        shrinkage = None if self.shrinkage is None else root * self.shrinkage
-        terms = None if self.terms is None else self.terms.scaled(root)
-        out = replace(self, A=root * self.A, b=root * self.b, residual=share * self.residual, rows=rows)
-        return replace(out, shrinkage=shrinkage, terms=terms)
 
     @property
     def parameter_shrinkage(self) -> Array | None:
