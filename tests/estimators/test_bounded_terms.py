@@ -14,7 +14,7 @@ from scipy.optimize import nnls
 from synthetic import Array
 
 from torchid import parameters
-from torchid.estimators import Consistent, LeastSquares
+from torchid.estimators import Consistent
 from torchid.estimators.conditions import term_violations
 from torchid.estimators.conic_problem import Prior
 from torchid.problem import LinearProblem
@@ -73,24 +73,6 @@ def test_terms_of_known_bodies_are_nonnegative_least_squares() -> None:
     np.testing.assert_allclose(estimate.psi, expected, rtol=0.0, atol=1e-5 * SIZE)
     standing = {f"term {k}" for k in np.flatnonzero(expected == 0.0)}
     assert {*estimate.active} == standing == {*terms.at_bounds(estimate.phi, estimate.psi)}
-
-
-@pytest.mark.parametrize("ridge", [0.0, 1e-3])
-def test_terms_that_are_positive_anyway_are_those_of_least_squares_and_change_nothing_else(
-    ridge: float,
-) -> None:
-    rng = np.random.default_rng(5)
-    nominal = random_bodies(rng, 2)
-    nominal[:, 10:] = 0.4
-    problem = data(rng, nominal, nominal, parameter_scale(nominal), 60, 3.0, 1e-4)
-    alone = Consistent(ridge).solve(problem)
-    with_terms = replace(problem, terms=terms_of(rng, problem, nominal, np.full(4, SIZE)))
-    estimate = Consistent(ridge).solve(with_terms)
-    np.testing.assert_allclose(estimate.phi / problem.scale, alone.phi / problem.scale, rtol=0.0, atol=2e-6)
-    np.testing.assert_allclose(estimate.psi, with_terms.terms.best(estimate.phi), rtol=0.0, atol=1e-6 * SIZE)
-    plain = LeastSquares(ridge)
-    np.testing.assert_array_equal(plain.solve(with_terms).phi, plain.solve(problem).phi)
-    assert estimate.active == ()
 
 
 def test_dry_friction_is_negative_in_neither_direction_and_a_joint_without_any_is_left_alone() -> None:

@@ -14,19 +14,14 @@ from physical import (
     PRIORS,
     active_case,
     nothing_seen,
-    of_points,
     random_bodies,
     random_case,
-    random_points,
-    random_reflection,
 )
-from scipy.optimize import nnls
 
 from torchid.errors import InputError, NumericalWarning
 from torchid.estimators import Conditions, Consistent, Enclosure, Mirror, violations
 from torchid.estimators.barrier import solve_barrier
 from torchid.estimators.conic_problem import Prior, build_conic_problem
-from torchid.problem.linear import parameter_scale
 
 all_priors = pytest.mark.parametrize("prior", PRIORS)
 
@@ -93,37 +88,6 @@ def test_a_start_far_from_what_the_conditions_allow_finds_it() -> None:
         assert estimate.objective == pytest.approx(least_objective(problem, conditions, "euclidean", 1e-3), rel=1e-6)
 
 
-def test_bounds_that_meet_hold_a_number() -> None:
-    """The known mass of one body."""
-    problem, scale = active_case(2)
-    lower, upper = np.full(scale.shape, -np.inf), np.full(scale.shape, np.inf)
-    lower[0, 0] = upper[0, 0] = 1.25 * problem.nominal[0]
-    estimate = Consistent(1e-3, conditions=Conditions(lower=lower, upper=upper)).solve(problem)
-    assert estimate.phi[0] == pytest.approx(lower[0, 0], rel=1e-7)
-
-
-def test_what_equalities_settle_needs_no_room() -> None:
-    """A barrier has no inside where a bound is met with equality: friction at its least, a body that is an image."""
-    rng = np.random.default_rng(13)
-    mass, place = random_points(rng)
-    S = random_reflection(rng)
-    nominal = np.array([of_points(mass, place), of_points(mass, place @ S.T)])
-    free = np.ones(24, dtype=bool)
-    free[12:] = False  # held, without friction
-    problem = replace(active_case(13)[0], nominal=nominal.ravel(), scale=parameter_scale(nominal).ravel(), free=free)
-    estimate = Consistent(1e-3, conditions=Conditions(1e-6, mirrors=(Mirror(0, 1, S),))).solve(problem)
-    np.testing.assert_allclose(estimate.phi / problem.scale, problem.nominal / problem.scale, rtol=0.0, atol=1e-9)
-
-
-def test_a_body_can_be_symmetric() -> None:
-    problem, scale = active_case(3, bodies=1)
-    S = np.diag([1.0, -1.0, 1.0])
-    conditions = Conditions(mirrors=(Mirror(0, 0, S),))
-    phi = Consistent(1e-3, conditions=conditions).solve(problem).phi.reshape(scale.shape)
-    np.testing.assert_allclose((phi / scale)[0, [2, 5, 8]], 0.0, atol=1e-9)  # what changes its sign
-    assert violations(phi, scale, conditions, 1e-7) == []
-
-
 # ------------------------------------------------------------------------------------------------------------- the gap
 
 
@@ -148,20 +112,6 @@ def test_no_multipliers_claim_a_gap_that_is_too_small(seed: int, prior: Prior) -
             assert gap >= conic.objective(x) - best.objective - 1e-12
 
 
-def test_multipliers_that_push_where_the_data_say_nothing_prove_nothing() -> None:
-    """Data on the mass alone, and the multiplier of a face of the box that its centre of mass lies on."""
-    nominal = random_bodies(np.random.default_rng(14), 1)
-    box = Enclosure(0, "box", nominal[0, 1:4] / nominal[0, 0], np.eye(3), np.full(3, 0.1))
-    problem = replace(nothing_seen(nominal), A=np.eye(12)[:1])  # a mass of 0
-    conic = build_conic_problem(problem, Conditions(enclosures=(box,)), 0.0, "euclidean")
-    face = conic.names.index("centre of mass of body 0") - len(conic.F0)
-    x = np.zeros(12)
-    x[1] = (conic.h[face] - conic.G[face] @ x) / conic.G[face, 1]
-    y = np.zeros(len(conic.h))
-    y[face] = conic.gradient(x)[0] / conic.G[face, 0]
-    assert conic.gap(x, np.zeros_like(conic.F0), y) >= conic.objective(x) - solve_barrier(conic).objective > 0.0
-
-
 @pytest.mark.parametrize("tolerance", [1e-1, 1e-3, 1e-6])
 @all_priors
 def test_a_gap_is_as_small_as_was_asked_for_and_true(prior: Prior, tolerance: float) -> None:
@@ -178,13 +128,6 @@ def test_a_solver_that_stops_short_says_so(monkeypatch: pytest.MonkeyPatch) -> N
     with pytest.warns(NumericalWarning, match="stopped at a gap of"):
         estimate = Consistent(1e-3).solve(problem)
     assert estimate.gap > 1e-6 * estimate.objective
-
-
-def test_outside_the_domain_of_an_entropic_prior_nothing_is_an_objective() -> None:
-    problem, _ = active_case(4)
-    conic = build_conic_problem(problem, Conditions(), 1e-3, "entropic")
-    assert np.isfinite(conic.objective(np.zeros(24)))
-    assert conic.objective(-2.0 * problem.nominal / problem.scale) == np.inf
 
 
 # ------------------------------------------------------------------------------------------------------ what is free
@@ -207,19 +150,3 @@ def test_what_is_not_free_is_taken_into_account(prior: Prior) -> None:
     np.testing.assert_allclose(
         alone.phi / only.scale, held.phi[:12] / only.scale, rtol=0.0, atol=1e-5
     )  # sqrt(gap / ridge)
-
-
-@all_priors
-def test_friction_alone_can_be_free(prior: Prior) -> None:
-    problem, _ = active_case(0)
-    free = np.arange(24) % 12 >= 10
-    estimate = Consistent(1e-6, prior).solve(replace(problem, free=free))
-    A, b = problem.A[:, free], problem.b - problem.A[:, ~free] @ problem.nominal[~free]
-    weight = np.sqrt(1e-6 * problem.rows)
-    stacked, right = np.vstack([A, weight * np.eye(4)]), np.append(b, weight * problem.nominal[free])
-    np.testing.assert_allclose(estimate.phi[free], nnls(stacked, right)[0], rtol=0.0, atol=1e-6)
-
-
-def test_an_unknown_prior_is_refused() -> None:
-    with pytest.raises(ValueError, match="accepted"):
-        Consistent(prior="riemannian")

@@ -62,16 +62,6 @@ def test_a_total_mass_or_mirror_image_couples_what_no_row_sees() -> None:
     assert abs(deviation(problem, image.phi)[BASE, MASS]) > 0.01
 
 
-def test_a_bound_that_excludes_the_nominal_value_is_met() -> None:
-    problem, _ = bolted()
-    lower = np.full((3, PER_BODY), -np.inf)
-    least = 1.2 * problem.nominal[MASS]
-    lower[BASE, MASS] = least
-    found = Consistent(1e-3, conditions=Conditions(lower=lower)).solve(problem)
-    assert found.phi[MASS] == pytest.approx(least, rel=1e-6)
-    assert found.phi[MASS] >= least
-
-
 def test_a_bounded_term_couples_the_friction_it_is_added_to() -> None:
     """As friction of both directions: their mean must not be below half of their difference."""
     problem, unseen = bolted()

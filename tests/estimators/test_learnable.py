@@ -68,15 +68,6 @@ def test_possible_bodies_start_at_the_urdfs_parameters(seed: int) -> None:
     np.testing.assert_allclose(difference[~moved], 0.0, rtol=0.0, atol=1e-14)
 
 
-@pytest.mark.parametrize(("urdf", "start"), [(0.0, 0.01), (-0.2, 0.01), (0.01, 0.01), (0.3, 0.3), (45.0, 45.0),
-                                             (2000.0, 2000.0)])  # fmt: skip
-def test_friction_starts_at_the_urdfs_or_at_a_hundredth_where_there_is_none(urdf: float, start: float) -> None:
-    nominal = random_bodies(np.random.default_rng(1), 2)
-    nominal[1, 10:] = urdf
-    phi = value(LogCholeskyParameters(nothing_seen(nominal))()).reshape(2, 12)
-    np.testing.assert_allclose(phi[1, 10:], start, rtol=1e-10)
-
-
 def test_bodies_that_cannot_exist_start_inside_and_the_others_where_they_were() -> None:
     rng = np.random.default_rng(2)
     nominal = random_bodies(rng, 3)
@@ -147,22 +138,6 @@ def test_what_is_not_free_stays_to_the_last_bit(seed: int) -> None:
     phi = value(learnable())
     np.testing.assert_array_equal(phi[~problem.free], problem.nominal[~problem.free])
     assert (phi[problem.free] != problem.nominal[problem.free]).all()
-
-
-@pytest.mark.parametrize("what", ["friction alone", "nothing"])
-def test_bodies_that_are_all_frozen_leave_friction_to_learn_or_nothing(what: str) -> None:
-    rng = np.random.default_rng(3)
-    free = np.zeros((3, 12), dtype=bool)
-    free[1:, 10:] = what == "friction alone"
-    problem = nothing_seen(random_bodies(rng, 3), free.ravel())
-    learnable = LogCholeskyParameters(problem)
-    learnable.precondition(problem, 0.1, 1.0)
-    assert len(learnable.raw) == free.sum()
-    with torch.no_grad():
-        learnable.raw.copy_(random_raw(rng, learnable, 1.0))
-    phi = value(learnable())
-    np.testing.assert_array_equal(phi[~problem.free], problem.nominal[~problem.free])
-    assert_possible(phi, problem, MARGIN)
 
 
 @pytest.mark.parametrize("part", [slice(0, 1), slice(4, 10), slice(9, 10)])

@@ -23,7 +23,6 @@ from physical import (
 )
 from synthetic import Array
 
-from torchid import parameters
 from torchid.errors import InputError
 from torchid.estimators import Conditions, Mirror, nearest_consistent, violations
 from torchid.estimators.conic_problem import Prior
@@ -80,37 +79,6 @@ def test_parameters_that_meet_the_conditions_are_their_own_projection(prior: Pri
     found = nearest_consistent(GOOD, SCALE, Conditions(1e-4), prior=prior)
     np.testing.assert_allclose(found / SCALE, GOOD / SCALE, rtol=0.0, atol=1e-6)  # sqrt(gap)
     np.testing.assert_array_equal(GOOD, before)
-
-
-def test_a_projection_projects_no_further() -> None:
-    found = nearest_consistent(body(2.0, np.zeros(3), [0.1, 0.2, 0.4]), SCALE, Conditions(1e-3))
-    assert violations(found, SCALE, Conditions(1e-3)) == []
-    again = nearest_consistent(found, SCALE, Conditions(1e-3))
-    np.testing.assert_allclose(again / SCALE, found / SCALE, rtol=0.0, atol=1e-6)
-
-
-def test_the_metric_of_a_projection_matters() -> None:
-    """A light body's parameters move least where its own pseudo-inertia measures them."""
-    broken = body(2.0, np.zeros(3), [0.1, 0.2, 0.4])
-    measure = parameters.perturb_parameters(GOOD, 0.3, np.random.default_rng(0))
-    near = {
-        "euclidean": nearest_consistent(broken, SCALE, Conditions()),
-        "pullback": nearest_consistent(broken, SCALE, Conditions(), prior="pullback", nominal=GOOD),
-        "other": nearest_consistent(broken, SCALE, Conditions(), prior="pullback", nominal=measure),
-    }
-    for name, reference in (("pullback", GOOD), ("other", measure)):
-        apart = {other: prior_value("pullback", phi, broken, SCALE, reference) for other, phi in near.items()}
-        assert min(apart, key=lambda other: apart[other]) == name
-
-
-def test_bodies_without_mass_get_none_by_projection() -> None:
-    phi = np.concatenate([body(1.0, np.zeros(3), [0.1, 0.2, 0.4]), np.zeros((2, 12))])
-    phi[2, 10] = 0.3  # a joint's friction, whatever hangs on it
-    found = nearest_consistent(phi, np.repeat(SCALE, 3, axis=0), Conditions(1e-4))
-    np.testing.assert_array_equal(found[1:, :10], 0.0)
-    np.testing.assert_array_equal(found[1, 10:], 0.0)
-    assert found[2, 10] == pytest.approx(0.3, abs=1e-6)
-    assert found[2, 11] == 0.0
 
 
 def test_friction_of_zero_moves_only_to_a_mirror_image_or_a_bound() -> None:

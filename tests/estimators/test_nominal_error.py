@@ -9,7 +9,7 @@ import pytest
 from physical import random_bodies
 
 from torchid.estimators import Conditions
-from torchid.estimators.posterior import NominalError, Posterior, nominal_error
+from torchid.estimators.posterior import Posterior, nominal_error
 from torchid.fitting.posterior import FittedPosterior
 
 BODIES, COMBINATIONS = 8, 30
@@ -44,20 +44,9 @@ def test_error_of_the_file_is_found_whatever_the_friction(width: float) -> None:
     assert {one.prior_is_narrow for one in found if one is not None} == {width > 0.3}
 
 
-def test_large_errors_are_said_in_whole_percents() -> None:
-    far, near = NominalError(10.12, 0.2, 3, 99.0), NominalError(0.42, 0.2, 3, 99.0)
-    assert "by 1012 % where the data determine them, 51 times the 20 % of the prior" in str(far)
-    assert "by 42 % where the data determine them, 2.1 times the 20 % of the prior" in str(near)
-
-
 def test_prior_of_the_right_width_is_seldom_called_narrow() -> None:
     found = [nominal_error(posterior_of_robot(seed, 0.2)) for seed in range(100, 160)]
     assert sum(one.clear for one in found if one is not None) <= 1  # one in a thousand
-
-
-def test_data_of_nothing_but_friction_say_nothing_of_bodies() -> None:
-    posterior = posterior_of_robot(0, 0.2)
-    assert nominal_error(replace(posterior, A=np.where(INERTIAL, 0.0, posterior.A))) is None
 
 
 def test_auto_takes_the_width_by_the_data_only_where_they_contradict_the_default() -> None:

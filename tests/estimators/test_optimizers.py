@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from descents import demo
@@ -144,15 +143,6 @@ def test_every_schedule_of_torch_lasts_all_epochs_by_its_name_or_is_refused(name
     assert len(set(found)) > 1, "it does something"
 
 
-def test_a_schedule_that_spans_the_run_spans_its_epochs_unless_told_otherwise() -> None:
-    assert rates("CosineAnnealingLR", {}, 9)[-1] == pytest.approx(0.025 * (1.0 + np.cos(np.pi * 8 / 9)))
-    assert rates("CosineAnnealingLR", {"T_max": 4}, 9)[4] == pytest.approx(0.0, abs=1e-12)
-    one_cycle = rates("OneCycleLR", {"max_lr": 0.1, "pct_start": 0.5}, 21)
-    assert max(one_cycle) == pytest.approx(0.1, rel=0.02)
-    assert one_cycle.index(max(one_cycle)) in (9, 10)
-    assert rates("OneCycleLR", {"max_lr": 0.1, "total_steps": 100, "pct_start": 0.5}, 21)[-1] < 0.06
-
-
 @pytest.mark.parametrize(
     ("name", "options"),
     [
@@ -168,11 +158,6 @@ def test_a_schedule_that_would_fail_in_some_epoch_is_refused_before_the_first(
     name: str, options: dict[str, Any]
 ) -> None:
     assert f"estimator: schedule {name}: " in refused(schedule={"name": name, **options}, epochs=EPOCHS)
-
-
-def test_a_schedule_that_does_not_suit_its_optimizer_is_refused() -> None:
-    message = refused(optimizer={"name": "Adagrad"}, schedule={"name": "OneCycleLR", "max_lr": 0.1})
-    assert "must support momentum" in message
 
 
 # ----------------------------------------------------------------------------------------------------- other settings

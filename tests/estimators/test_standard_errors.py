@@ -6,18 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from intervals import FEET, REPETITIONS, STATES, covered, noisy_torques
+from intervals import REPETITIONS, covered
 from numpy.typing import NDArray
 from scipy import signal, stats
-from synthetic import SOLO12, UR5, Array, Oracle, load, make_log
+from synthetic import UR5, Array, Oracle, load
 from true_robots import true_parameters
 
 from torchid.estimators import Estimate, LeastSquares
-from torchid.logs import Log, read_log, write_log
+from torchid.logs import Log
 from torchid.logs.low_pass import FILTER_ORDER
 from torchid.logs.preprocess import preprocess
 from torchid.parameters import FRICTION, PER_BODY
-from torchid.problem import LinearProblem, RowBuilder, Samples, bind_log, compress, linear_problem
+from torchid.problem import LinearProblem, RowBuilder, bind_log, compress, linear_problem
 from torchid.robot import Robot
 from torchid.sensing import SensorNoise, named_sensors
 
@@ -71,22 +71,6 @@ def test_intervals_of_a_ridge_hold_the_truth_whatever_it_keeps_of_the_nominal_pa
     assert np.mean(of_noise) < 0.75, "noise alone is not what such an estimate is off by"
 
 
-def test_intervals_from_noisy_joint_torques_of_a_robot_on_its_feet_hold_the_truth() -> None:
-    robot, rng = load(SOLO12), np.random.default_rng(1)
-    oracle = Oracle.of(robot)
-    oracle.perturb(rng, 0.2)
-    log = make_log(oracle, [(foot.frame, 3) for foot in FEET], STATES, 60, rng)
-    builder = RowBuilder(robot, FEET, named_sensors("joints", robot.n, 4, SensorNoise(0.3, 1.0, 0.1)))
-    estimates = []
-    for _, samples in zip(range(REPETITIONS), noisy_torques(bind_log(log, robot, FEET), builder, rng), strict=False):
-        estimates.append(LeastSquares().solve(linear_problem(compress([samples], builder, threads=1), builder, robot)))
-    holds = covered(estimates, true_parameters(oracle, robot).ravel())
-    assert holds.shape[1] > 60
-    assert_honest(holds)
-    spread = np.mean([estimate.residual_std for estimate in estimates])
-    assert spread == pytest.approx(1.0, abs=0.01), "the stated noise is the one there is"
-
-
 # ------------------------------------------------------------------------------------------------------ filtered noise
 
 
@@ -131,33 +115,6 @@ def test_intervals_from_a_filtered_log_hold_the_truth(filtered: tuple[list[Estim
     assert_honest(holds)
 
 
-def test_intervals_that_count_filtered_samples_as_independent_are_far_too_narrow(
-    filtered: tuple[list[Estimate], list[Estimate], Array],
-) -> None:
-    _, counted, true = filtered
-    assert covered(counted, true).mean() < 0.7
-
-
-def test_the_residual_of_a_filtered_log_is_the_share_of_the_noise_that_passes(
-    filtered: tuple[list[Estimate], list[Estimate], Array],
-) -> None:
-    corrected, _, _ = filtered
-    passed = np.mean([estimate.residual_std**2 for estimate in corrected])
-    assert passed == pytest.approx(1.0 / corrected[0].oversampling, rel=0.01)
-    assert corrected[0].oversampling == pytest.approx(RATE / 2.0 / (0.898 * CUTOFF), rel=0.03)
-
-
-def test_a_filtered_log_that_is_too_short_says_so_by_its_standard_errors_and_not_by_a_breakdown() -> None:
-    rng = np.random.default_rng(4)
-    A, b = rng.normal(size=(60, 10)), rng.normal(size=60)
-    problem = LinearProblem(A, b, 0.0, 60, np.zeros(10), np.ones(10), np.ones(10, bool))
-    kappas = (1.0, 2.0, 4.0, 5.9, 6.1, 50.0)
-    errors = [LeastSquares().solve(replace(problem, oversampling=kappa)).standard_error[0] for kappa in kappas]
-    assert errors == sorted(errors)
-    assert errors[1] == pytest.approx(errors[0] * np.sqrt(2.0 * 50.0 / 40.0))
-    assert errors[-1] == pytest.approx(errors[0] * 50.0)
-
-
 # ------------------------------------------------------------------------------------------------------ noise bandwidth
 
 
@@ -179,38 +136,3 @@ def test_the_noise_bandwidth_is_what_the_filter_leaves_of_white_noise(cutoff: fl
     impulse[2**14] = 1.0
     response = signal.sosfiltfilt(signal.butter(FILTER_ORDER, cutoff, fs=rate, output="sos"), impulse)
     assert out.noise_bandwidth_hz == pytest.approx(rate / 2.0 * float(np.sum(response**2)), rel=1e-9)
-
-
-def arm_samples(log: Log) -> Samples:
-    robot = load(UR5, fixed_base=True)
-    per_joint = log.arrays() | ({} if log.joint_direction is None else {"joint_direction": log.joint_direction})
-    spread = {name: np.repeat(array, robot.n, axis=1) for name, array in per_joint.items() if name != "time"}
-    return bind_log(replace(log, joint_names=robot.joint_names, **spread), robot, ())
-
-
-def test_samples_count_as_often_as_the_filtered_noise_can_change() -> None:
-    log = white(200.0, 20.0)
-    assert arm_samples(log).oversampling == 1.0
-    assert arm_samples(preprocess(log, None, 400.0)).oversampling == 1.0, "nothing is filtered"
-    alone, thinned = (arm_samples(preprocess(log, 10.0, rate)) for rate in (None, 50.0))
-    assert alone.oversampling == pytest.approx(100.0 / (0.898 * 10.0), rel=0.01)
-    assert thinned.oversampling == pytest.approx(alone.oversampling / 4.0, rel=1e-6)
-    assert arm_samples(preprocess(log, 95.0)).oversampling < 1.1
-    assert alone[5:9].oversampling == alone.to("cpu").oversampling == alone.oversampling
-
-
-def test_the_noise_bandwidth_survives_a_selection_and_is_no_part_of_a_file(tmp_path: pytest.TempPathFactory) -> None:
-    out = preprocess(white(100.0, 20.0), 10.0)
-    assert out.select(slice(5)).noise_bandwidth_hz == out.noise_bandwidth_hz
-    assert preprocess(out, None, 50.0).noise_bandwidth_hz == out.noise_bandwidth_hz
-    assert preprocess(out, 20.0).noise_bandwidth_hz == out.noise_bandwidth_hz, "what is gone does not come back"
-    write_log(out, f"{tmp_path}/out.npz")
-    with np.load(f"{tmp_path}/out.npz") as file:
-        assert "noise_bandwidth_hz" not in file
-    assert read_log(f"{tmp_path}/out.npz").noise_bandwidth_hz is None
-
-
-@pytest.mark.parametrize("bad", [0.5, np.nan, np.inf])
-def test_rows_that_are_more_than_independent_are_refused(bad: float) -> None:
-    with pytest.raises(ValueError, match="oversampling"):
-        LinearProblem(np.eye(2), np.ones(2), 0.0, 2, np.zeros(2), np.ones(2), np.ones(2, bool), bad)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ from synthetic import Array
 from thinned import slow_but
 from torch import Tensor, nn
 
-from torchid import parameters
 from torchid.commands.training import load_checkpoint, save_checkpoint
 from torchid.errors import InputError
 from torchid.estimators import Epoch, LeastSquares, Sgd, SgdEstimate, Trainer
@@ -69,15 +67,6 @@ def test_possible_bodies_get_near_the_closed_form_that_knows_no_conditions(
     assert len(epochs) == estimate.epochs == estimate.best_epoch == 60
 
 
-def test_bodies_can_exist_after_every_epoch_and_not_only_after_the_last() -> None:
-    w = demo()
-    trainer = Trainer(Sgd(RIDGE, epochs=3), w.problem, w.batches)
-    for _ in range(3):
-        trainer.run_epoch()
-        assert np.nanmin(parameters.least_eigenvalues(trainer.phi(), w.problem.scale)) >= ABOVE
-        assert trainer.phi().reshape(-1, 12)[1:, 10:].min() > 0.0
-
-
 def test_the_figures_of_an_estimate_are_those_of_its_parameters(
     demo_run: tuple[SgdEstimate, list[Epoch], float],
 ) -> None:
@@ -127,14 +116,6 @@ def test_the_loss_of_an_epoch_is_that_of_all_samples() -> None:
     assert epoch.objective == pytest.approx(expected["total"], rel=1e-12)
 
 
-def test_the_held_out_loss_is_the_cost_of_the_held_out_logs_compressed_per_row() -> None:
-    w, held_out = arm(), half_way()
-    trainer = Trainer(Sgd(RIDGE, epochs=3), w.problem, w.batches, held_out.batches)
-    for _ in range(3):
-        epoch = trainer.run_epoch()
-        assert epoch.held_out == pytest.approx(held_out.problem.cost(trainer.phi()) / held_out.problem.rows, rel=1e-12)
-
-
 # ------------------------------------------------------------------------------------------------------ when to stop
 
 
@@ -158,42 +139,6 @@ def test_the_parameters_with_the_least_held_out_loss_are_kept_and_patience_ends_
     np.testing.assert_array_equal(estimate.phi, phis[best])
     assert trainer.finished
     np.testing.assert_array_equal(trainer.phi(), phis[best])
-
-
-def test_without_held_out_logs_the_last_parameters_are_kept_and_patience_means_nothing() -> None:
-    w = arm()
-    trainer = Trainer(Sgd(RIDGE, epochs=12, patience=1, finish=False), w.problem, w.batches)
-    phis: list[Array] = []
-    estimate = trainer.run(lambda _: phis.append(trainer.phi()))
-    assert estimate.epochs == estimate.best_epoch == 12
-    np.testing.assert_array_equal(estimate.phi, phis[-1])
-    assert f"{estimate.deviation:.2g} standard errors from least squares" in repr(estimate).replace("\n ", "")
-
-
-@pytest.mark.parametrize("with_held_out", [True, False], ids=["held out", "training"])
-def test_a_schedule_by_plateaus_goes_by_the_held_out_loss_if_there_is_one(with_held_out: bool) -> None:
-    w, held_out = arm(), half_way()
-    options = {"patience": 0, "factor": 0.5, "threshold": 0.0}
-    settings = Sgd(RIDGE, epochs=20, schedule={"name": "ReduceLROnPlateau"} | options)
-    trainer = Trainer(settings, w.problem, w.batches, held_out.batches if with_held_out else None)
-    epochs: list[Epoch] = []
-    trainer.run(epochs.append)
-
-    def expected(losses: Sequence[float]) -> list[float]:
-        rates, best = [0.05], np.inf
-        for loss in losses:
-            rates.append(rates[-1] if loss < best else rates[-1] / 2.0)
-            best = min(best, loss)
-        return rates[:-1]
-
-    by_training = expected([epoch.losses["total"] for epoch in epochs])
-    found = [epoch.learning_rate for epoch in epochs]
-    if with_held_out:
-        assert found == expected([epoch.held_out for epoch in epochs])
-        assert found != by_training
-        assert found[-1] < 0.01
-    else:
-        assert found == by_training
 
 
 @pytest.mark.parametrize("batch_size", [50, 1000], ids=["many steps", "one step an epoch"])

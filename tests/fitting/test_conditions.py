@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -13,12 +12,10 @@ import pytest
 import yaml
 from experiments import LEAST
 from refusals import assert_wrong_value, refused
-from refusals import refusal as command_refusal
 from repository import CONFIGS, DEMO
 from synthetic import G1, SOLO12, Oracle, load, make_log
-from urdfs import INERTIAL, ball, inertial, joint, link, table, write
+from urdfs import INERTIAL, ball, joint, link, table, write
 
-from torchid.commands.identify import identify
 from torchid.config import dump_config, load_config
 from torchid.config.estimator import EstimatorConfig
 from torchid.errors import ConfigError, InputError, TorchidWarning, UnknownNameError, about_file
@@ -65,14 +62,6 @@ def biped() -> Robot:
 # ----------------------------------------------------------------------------------------------------------- values
 
 
-def test_without_keys_there_are_the_margin_and_friction_that_is_not_negative(tmp_path: Path, biped: Robot) -> None:
-    found = conditions(tmp_path, biped)
-    names = biped.body_names
-    assert found == Conditions(margin=1e-4, names=names)
-    found = conditions(tmp_path, biped, margin=0.01, total_mass=66)
-    assert found == Conditions(margin=0.01, total_mass=66.0, names=names)
-
-
 def test_bounds_stand_at_their_bodies_and_parameters(tmp_path: Path, biped: Robot) -> None:
     bounds = {"l_shank": {"m": [0.5, 1], "fc": [0, 2]}, "pelvis": {"mcx": [None, 0.25], "Iyz": [-0.5, None]}}
     found = conditions(tmp_path, biped, bounds=bounds | {"torso": {"m": [12, 12]}})
@@ -99,12 +88,6 @@ def test_centres_of_mass_are_kept_in_what_encloses_the_shapes(kind: str, shapes:
         np.testing.assert_array_equal(enclosure.axes, extent.axes)
 
 
-def test_visual_shapes_are_the_ones_asked_if_none_are_named(tmp_path: Path) -> None:
-    elements = link("base", f"{INERTIAL}{ball(0.1, 'collision')}{ball(0.2, 'visual')}")
-    (enclosure,) = conditions(tmp_path, load(write(tmp_path, elements)), com_inside="box").enclosures
-    np.testing.assert_allclose(enclosure.half, 0.2)
-
-
 def test_frozen_bodies_and_bodies_without_mass_are_not_enclosed_nor_complained_of(tmp_path: Path) -> None:
     elements = [link("base", INERTIAL + ball(0.1)), link("arm"), link("hand", INERTIAL + ball(0.2)), link("ghost", "")]
     joints = [joint("a", "base", "arm"), joint("b", "arm", "hand"), joint("c", "hand", "ghost")]
@@ -129,20 +112,6 @@ def test_a_urdf_that_contradicts_its_own_shapes_is_warned_of(tmp_path: Path) -> 
     assert conditions(tmp_path, robot, com_inside="ellipsoid").enclosures
 
 
-@pytest.mark.parametrize("kind", ["box", "ellipsoid"])
-def test_outside_is_judged_along_the_shapes_axes_and_for_the_kind_asked_for(kind: str, tmp_path: Path) -> None:
-    """A slender box turned by 45 degrees; the centre of mass is beyond its end by 1.2 or 2."""
-    for share, outside in ((0.9, ()), (1.2, ("box",)), (2.0, ("box", "ellipsoid"))):
-        place = share * 0.5 * np.sqrt(0.5)
-        solid = inertial(origin=f'<origin xyz="{place} {place} 0"/>')
-        shape = '<visual><origin rpy="0 0 0.7853981633974483"/><geometry><box size="1 0.1 0.1"/></geometry></visual>'
-        robot = load(write(tmp_path, link("base", solid + shape)))
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            conditions(tmp_path, robot, com_inside=kind)
-        assert len(caught) == (kind in outside)
-
-
 def test_left_and_right_become_mirror_images(tmp_path: Path, biped: Robot) -> None:
     found = conditions(tmp_path, biped, symmetry={"left": "l_", "right": "r_"}).mirrors
     assert len(found) == 7
@@ -150,13 +119,6 @@ def test_left_and_right_become_mirror_images(tmp_path: Path, biped: Robot) -> No
         assert biped.body_names[mirror.body].replace("l_", "r_") == biped.body_names[mirror.image]
         image = mirror_matrix(mirror.reflection) @ biped.nominal[mirror.body]
         np.testing.assert_allclose(image, biped.nominal[mirror.image], rtol=0.0, atol=1e-12)
-
-
-def test_two_frozen_bodies_are_no_mirror_images_and_one_still_is(tmp_path: Path, biped: Robot) -> None:
-    symmetry = {"left": "l_", "right": "r_"}
-    one = conditions(tmp_path, biped, symmetry=symmetry, frozen=["l_foot"]).mirrors
-    both = conditions(tmp_path, biped, symmetry=symmetry, frozen=["l_foot", "r_foot"]).mirrors
-    assert (len(one), len(both)) == (7, 6)
 
 
 # --------------------------------------------------------------------------------------------------------- refusals
@@ -253,36 +215,6 @@ def test_least_squares_has_no_conditions(case: dict, tmp_path: Path) -> None:
 # --------------------------------------------------------------------------------------------------------- whole runs
 
 
-def demo(folder: Path, **estimator: Any) -> Path:
-    """The demo's experiment with its paths absolute and another estimator."""
-    config = load_config(DEMO / "quadruped.yaml")
-    file = folder / "experiment.yaml"
-    file.write_text(dump_config(replace(config, estimator=EstimatorConfig(), output=folder / "run")))
-    settings = yaml.safe_load(file.read_text())
-    settings["estimator"] = {"name": "consistent", "ridge": 0.001, **estimator}
-    file.write_text(yaml.safe_dump(settings))
-    return file
-
-
-def test_a_run_meets_its_conditions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All of a run but its figures, which take ten times as long."""
-    monkeypatch.setattr(sys.modules["torchid.commands.identify"], "write_run", lambda *_: None)
-    bounds = {"trunk": {"m": [9.5, 9.5]}, "front_left_shank_link": {"fc": [0.35, None]}}
-    file = demo(tmp_path, symmetry={"left": "left", "right": "right"}, bounds=bounds, frozen=["rear_right_shank_link"])
-    robot = load(DEMO / "quadruped.urdf")
-    phi = identify(load_config(file)).estimate.phi.reshape(robot.nominal.shape)
-    np.testing.assert_allclose(phi[0, 0], 9.5, rtol=1e-7)
-    row = robot.body_names.index("front_left_shank_link")
-    assert phi[row, 10] >= 0.35 * (1.0 - 1e-7)
-    for name in robot.body_names:
-        if "left" in name:
-            left, right = (robot.body_names.index(n) for n in (name, name.replace("left", "right")))
-            expected = mirror_matrix(np.diag([1.0, -1.0, 1.0])) @ phi[left]
-            np.testing.assert_allclose(phi[right], expected, rtol=0.0, atol=1e-7)
-    frozen = robot.body_names.index("rear_right_shank_link")
-    np.testing.assert_array_equal(phi[frozen], robot.nominal[frozen])
-
-
 @pytest.mark.parametrize("kind", ["box", "ellipsoid"])
 def test_all_conditions_hold_together_where_least_squares_breaks_each(kind: str, tmp_path: Path) -> None:
     """On torques that are mostly noise."""
@@ -305,9 +237,3 @@ def test_all_conditions_hold_together_where_least_squares_breaks_each(kind: str,
     broken = " ".join(found.condition for found in violations(plain.reshape(phi.shape), scale, wanted))
     for word in (f"outside its {kind}", "no mirror image", "total mass", "m beyond its bounds", "fc beyond", "margin"):
         assert word in broken
-
-
-def test_a_slip_ends_a_run_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file = demo(tmp_path, bounds={"trunck": {"m": [1, 2]}})
-    message = command_refusal(["identify", str(file)], tmp_path, capsys)
-    assert message.endswith("estimator.bounds: unknown name 'trunck'; accepted: trunk")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +11,6 @@ import pytest
 import torch
 import yaml
 from repository import DEMO
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import torchid
 from torchid.cli import main
@@ -20,10 +18,7 @@ from torchid.config import load_config
 from torchid.fitting.cross_validation import (
     RIDGES,
     STRONGER,
-    RidgeChoice,
     Scorer,
-    TrainingScore,
-    calibrations_without_folds,
 )
 from torchid.fitting.experiment import Experiment, set_up, with_estimated_noise
 from torchid.fitting.left_out import RIDGE
@@ -35,28 +30,18 @@ from torchid.problem import (
     Samples,
     bind_log,
     compress,
-    compress_parts,
     linear_problem,
 )
-from torchid.problem.chunks import chunks_by_state, map_chunks
 from torchid.problem.compression import (
     FOLDS,
-    compress_in_blocks,
-    compress_in_folds,
-    cut_into_blocks,
-    merge_blocks_of_folds,
-    merge_folds,
-    merge_states,
     split_into_folds,
 )
-from torchid.problem.metrics import ROW_GROUPS, WHITENED, Evaluation, ForceSums, describe_worse, worse_than_nominal
-from torchid.report.figures import ridge_figure
+from torchid.problem.metrics import ROW_GROUPS, WHITENED, describe_worse, worse_than_nominal
 from torchid.sensing import Contact, SensorNoise, named_sensors
 
 pytestmark = pytest.mark.usefixtures("events")
 
 FEET = [f"{place}_foot" for place in ("front_left", "front_right", "rear_left", "rear_right")]
-UNPHYSICAL = "ignore:identified.urdf:torchid.errors.TorchidWarning"
 
 # ------------------------------------------------------------------------------------------------------------- folds
 
@@ -93,65 +78,6 @@ def test_too_few_independent_samples_are_not_cut(demo: tuple[RowBuilder, Samples
     assert [block.fold for block in split_into_folds([log[:200]], builder)] == [0], (
         "200 samples at 100 Hz, filtered at 8 Hz"
     )
-
-
-def test_parts_of_folds_together_are_those_of_the_logs(demo: tuple[RowBuilder, Samples]) -> None:
-    builder, log = demo
-    parts = compress_parts(split_into_folds([log], builder), builder)
-    whole = merge_folds(parts, builder)
-    by_state = {part.state: part for part in compress_parts([log], builder)}
-    assert {part.state for part in whole} == set(by_state)
-    for part in whole:
-        R, expected = (x.factor.triangle() for x in (part, by_state[part.state]))
-        assert (part.samples, part.factor.rows) == (by_state[part.state].samples, by_state[part.state].factor.rows)
-        assert torch.allclose(R.T @ R, expected.T @ expected, rtol=0.0, atol=1e-12 * float(expected.norm() ** 2))
-    assert [part.fold for part in merge_states(parts, builder)] == list(range(FOLDS))
-    folds = split_into_folds([log], builder)
-    cut = {part.key: part for part in compress_parts(cut_into_blocks(folds, builder), builder)}
-    blocks = compress_in_blocks(folds, builder)
-    assert {part.key for part in blocks} == set(cut)
-    assert len({(part.fold, part.block) for part in blocks}) > FOLDS, "rows of several blocks are made at once"
-    for part in blocks:
-        R, expected = (x.factor.triangle() for x in (part, cut[part.key]))
-        assert (part.samples, part.factor.rows) == (cut[part.key].samples, cut[part.key].factor.rows)
-        assert part.factor.independent_rows == pytest.approx(cut[part.key].factor.independent_rows)
-        assert torch.allclose(R.T @ R, expected.T @ expected, rtol=0.0, atol=1e-12 * float(expected.norm() ** 2))
-    of_blocks = {part.key: part for part in merge_blocks_of_folds(blocks, builder)}
-    without_blocks = compress_in_folds(folds, builder)
-    assert {part.key for part in without_blocks} == set(of_blocks)
-    for part in without_blocks:
-        expected = of_blocks[part.key]
-        for one, other in (
-            (
-                part.factor.triangle().T @ part.factor.triangle(),
-                expected.factor.triangle().T @ expected.factor.triangle(),
-            ),
-            (part.factor.whole_noise_gram(), expected.factor.whole_noise_gram()),
-        ):
-            assert other.any()
-            assert torch.allclose(one, other, rtol=0.0, atol=1e-12 * float(expected.factor.triangle().norm() ** 2))
-
-
-def test_small_chunks_of_folds_are_joined_and_each_keeps_its_parameters(demo: tuple[RowBuilder, Samples]) -> None:
-    builder, log = demo
-    robot, states = torchid.load_robot(DEMO / "quadruped.urdf"), [state for state, _ in chunks_by_state(log)]
-    folds = split_into_folds([log], builder)
-    loaded = [replace(fold, unloaded=None) for fold in folds]
-    (made,) = map_chunks(loaded, builder, list, threads=1)
-    assert sorted(state for _, state in made) == sorted(states), "one chunk for all folds"
-    assert sum(len(samples) for samples, _ in made) == len(log)
-    strangers = [replace(fold, source=f"{fold.fold}") for fold in loaded]
-    for others in (strangers, folds):  # other logs, and readings in the air, of which each fold has equations
-        assert len(map_chunks(others, builder, list, threads=1)[0]) == sum(len(list(chunks_by_state(x))) for x in folds)
-    evaluation, nominal = Evaluation(robot, builder.contacts), robot.nominal.flatten()
-    phi = {fold: np.stack([nominal, (1.0 + 0.1 * fold) * nominal]) for fold in range(FOLDS)}
-    together = evaluation.force_sums(folds, phi)
-    apart = [ForceSums.total(same) for same in zip(*(evaluation.force_sums([x], phi) for x in folds), strict=True)]
-    for one, other in zip(together, apart, strict=True):
-        assert np.allclose(one.rows.squares, other.rows.squares, rtol=1e-13)
-        assert np.array_equal(one.rows.count, other.rows.count)
-        assert np.allclose(one.projected.squares, other.projected.squares, rtol=1e-13)
-    assert not np.allclose(together[1].rows.squares, together[2].rows.squares, rtol=0.01)
 
 
 # ------------------------------------------------------------------------------------------------------- whole runs
@@ -193,49 +119,6 @@ def test_cross_validation_is_what_refitting_by_hand_gives(run: Path, demo: tuple
     assert (metrics["verdict"], metrics["worse_than_nominal"]) == (None, [])
 
 
-def test_of_long_training_logs_every_kth_sample_is_scored(
-    run: Path, demo: tuple[RowBuilder, Samples], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    _, log = demo
-    experiment = with_own_noise(run)
-    builder, evaluation = experiment.builder(experiment.sensors), experiment.evaluation()
-    fitter, blocks = experiment.fitter(builder, experiment.conditions()), split_into_folds([log], builder)
-    fit = fitter.fit(compress_in_blocks(blocks, builder))
-    compared, without = experiment.calibrations(fit, builder), calibrations_without_folds(fit, fitter)
-    parts = merge_states(fit.parts, builder)
-
-    def score(most: int) -> TrainingScore:
-        done: list[int] = []
-        scorer = Scorer(evaluation, builder, most)
-        found = scorer.score_training(blocks, parts, compared, without, done.append)
-        assert sum(done) == found.samples == scorer.scored(blocks)[1] <= most
-        return found
-
-    whole, thinned = score(len(log)), score(len(log) // 3)
-    assert (whole.samples, thinned.samples) == (len(log), sum(len(block[::4]) for block in blocks))
-    assert Scorer(evaluation, builder).scored(blocks) == (1, len(log)), "short logs are scored whole"
-    assert whole.metrics.identified.as_dict() == json.loads((run / "metrics.json").read_text())["train"]
-
-    monkeypatch.setattr("torchid.fitting.cross_validation.ENOUGH_SCORED", len(log) // 3)
-    alike, independent = score(len(log)), [replace(block, oversampling=1.0) for block in blocks]
-    assert alike.samples == sum(len(block[::3]) for block in blocks), "fewer than independent ones are left out"
-    assert Scorer(evaluation, builder).scored(independent) == (1, len(log)), "of a log without filter all"
-    monkeypatch.setattr("torchid.fitting.cross_validation.ENOUGH_SCORED", 1)
-    step = Scorer(evaluation, builder).scored(blocks)[0]
-    assert step == int(log.oversampling) == 6, "the filter's band is left"
-
-    def metrics(of: TrainingScore) -> list[Metrics]:
-        assert of.cross_validation is not None
-        return [*of.metrics, of.cross_validation.identified, of.cross_validation.nominal]
-
-    for few, off in (thinned, 0.02), (alike, 0.003):
-        for every, some in zip(metrics(whole), metrics(few), strict=True):
-            assert some.rms[WHITENED] == every.rms[WHITENED], "of all samples"
-            for group in ROW_GROUPS:
-                assert some.rms[group] != every.rms[group]
-                assert some.rms[group] == pytest.approx(every.rms[group], rel=off), group
-
-
 @pytest.mark.parametrize(
     ("lengths", "most", "step"), [((10, 10), 20, 1), ((10, 10), 19, 2), ((7, 7), 7, 3), ((5, 1, 1), 2, 5), ((), 3, 1)]
 )
@@ -246,20 +129,6 @@ def test_the_step_between_scored_samples_is_the_least_that_keeps_to_the_limit(
     scorer = Scorer(set_up(load_config(run / "config.yaml")).evaluation(), builder, most)
     logs = [log[:length] for length in lengths]
     assert scorer.scored(logs) == (step, sum(len(one[::step]) for one in logs))
-
-
-def test_the_number_of_scored_samples_is_stated(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(Scorer.__init__, "__defaults__", (500,))
-    settings = ["estimator.ridge=0.001", f"output={tmp_path / 'run'}"]
-    assert main(["identify", "--verbose", str(DEMO / "quadruped.yaml"), *settings]) == 0
-    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    evaluated = metrics["evaluated_samples"]
-    assert 400 < evaluated["train"] <= 500 < metrics["samples"]
-    assert evaluated["test"] > 500, "unseen logs are evaluated whole"
-    stated = f"errors of forces of {evaluated['train']} of {metrics['samples']} samples"
-    assert stated in capsys.readouterr().out
 
 
 def test_the_ridge_follows_from_the_residuals_unless_left_out_blocks_ask_for_more(run: Path) -> None:
@@ -289,52 +158,6 @@ def test_one_standard_error_takes_the_largest_ridge_that_held_out_blocks_cannot_
     assert yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())["estimator"]["ridge"] == found["ridge"]
 
 
-def test_tensorboard_and_a_figure_have_the_error_of_every_ridge(run: Path) -> None:
-    found = json.loads((run / "metrics.json").read_text())["ridge_selection"]
-    events = EventAccumulator(str(run))
-    events.Reload()
-    steps = [round(float(np.log10(ridge))) for ridge in found["tried"]]
-    for tag, values in (("mean_square", found["mean_square"]), ("standard_error", found["standard_error"])):
-        curve = {one.step: one.value for one in events.Scalars(f"ridge/held_out_{tag}")}
-        assert curve == pytest.approx(dict(zip(steps, values, strict=True)), rel=1e-6)
-    assert any(re.fullmatch(r"figure_\d+_ridge", tag) for tag in events.Tags()["images"])
-    assert (run / "ridge.png").is_file()
-
-
-def test_the_figure_marks_the_chosen_ridge_and_those_as_good_as_the_best() -> None:
-    tried = (0.0, 0.001, 0.01, 0.1, 1.0)
-    choice = RidgeChoice(0.1, tried, (2.2, 2.0, 2.1, 2.3, 3.0), (0.1, 0.0, 0.2, 0.3, 0.4), "one_standard_error")
-    axes = ridge_figure(choice).axes[0]
-    curve, least, chosen = axes.get_lines()
-    np.testing.assert_array_equal(curve.get_xdata(), tried[1:])
-    np.testing.assert_array_equal(curve.get_ydata(), choice.mean_square[1:])
-    assert np.ravel(least.get_ydata())[0] == 2.0
-    assert (float(np.ravel(chosen.get_xdata())[0]), float(np.ravel(chosen.get_ydata())[0])) == (0.1, 2.3)
-    (shaded,) = [patch for patch in axes.patches if patch.get_zorder() == 0]
-    x = shaded.get_window_extent().transformed(axes.transData.inverted())
-    assert 1e-4 < x.x0 < 1e-3
-    assert 0.1 < x.x1 < 1.0
-    assert axes.get_xscale() == "log"
-    (legend,) = axes.figure.legends
-    assert "chosen, the largest of these: 0.1, 2.3" in [text.get_text() for text in legend.get_texts()]
-    assert "[" in axes.get_xlabel()
-    assert "[" in axes.get_ylabel()
-
-
-def test_evaluate_and_tensorboard_have_the_whitened_projected_residual(run: Path) -> None:
-    assert main(["evaluate", str(run), "--log", str(DEMO / "sway_test.npz")]) == 0
-    metrics = json.loads((run / "metrics.json").read_text())
-    found = json.loads((run / "evaluation" / "sway_test" / "metrics.json").read_text())["sway_test"]
-    assert found["identified"][WHITENED] == pytest.approx(metrics["test"][WHITENED])
-    assert found["nominal"][WHITENED] == pytest.approx(metrics["test_nominal"][WHITENED])
-    events = EventAccumulator(str(run))
-    events.Reload()
-    scalars = [x for of in ("_nominal", "") for x in events.Scalars(f"error_rms_left_out{of}/{WHITENED}")]
-    cross = json.loads((run / "metrics.json").read_text())["cross_validation"]
-    assert [x.value for x in scalars] == pytest.approx([cross[x][WHITENED] for x in ("nominal", "identified")])
-    assert "answer/text_summary" in events.Tags()["tensors"]
-
-
 # ---------------------------------------------------------------------------------------------------------- the verdict
 
 
@@ -358,17 +181,3 @@ def test_worse_is_clearly_larger_and_no_rounding(nominal: float, identified: flo
     found = worse_than_nominal({"test": (metrics_of(nominal, 100.0), metrics_of(identified, 100.0))})
     assert bool(found) is worse
     assert (describe_worse(found, "URDF") is None) is not worse
-
-
-def test_a_sensor_in_a_limb_that_the_urdf_predicts_better_counts() -> None:
-    nominal, identified = (
-        replace(metrics_of(1.0, 100.0), limb_rms={"ft_force": x}, limb_relative={"ft_force": x / 118.0})
-        for x in (9.0, 87.7)
-    )
-    (found,) = worse_than_nominal({"test logs": (nominal, identified)})
-    assert (found.group, str(found)) == ("ft_force", "force in limbs 87.7 against 9 N")
-
-
-def test_what_was_not_measured_is_not_judged() -> None:
-    nothing = Metrics(dict.fromkeys(ROW_GROUPS), dict.fromkeys(ROW_GROUPS), {}, {}, None)
-    assert worse_than_nominal({"test": (nothing, nothing)}) == []

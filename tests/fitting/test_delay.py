@@ -10,15 +10,12 @@ import numpy as np
 import pytest
 from delays import DELAY, NOISE, STEP, arm, motion, recorded
 from motions import value
-from repository import DEMO
 
-from torchid.config import load_config
-from torchid.errors import LogError, TorchidWarning
+from torchid.errors import LogError
 from torchid.estimators import Conditions, Consistent, LeastSquares
-from torchid.fitting.experiment import set_up
 from torchid.fitting.fit import LogFitter
 from torchid.fitting.separable import EARLIEST_DELAY, LATEST_DELAY, DelayChoice, choose_delay
-from torchid.logs import Log, read_log
+from torchid.logs import Log
 from torchid.logs.preprocess import preprocess
 from torchid.logs.segments import with_delayed_torques
 from torchid.problem import ExtraTerms, RowBuilder, bind_log
@@ -57,15 +54,6 @@ def test_a_delay_of_a_part_of_a_step_is_found_to_a_microsecond(
     assert found.delay == pytest.approx(delay, abs=1e-6)
     assert found.residual < 1e-2 * found.undelayed_residual
     assert f"{1e3 * delay:.3g} ±" in str(found)
-
-
-@pytest.mark.parametrize("beyond", [EARLIEST_DELAY - 0.003, LATEST_DELAY + 0.003])
-def test_a_delay_beyond_those_that_are_tried_is_said_to_be_at_their_end(beyond: float) -> None:
-    end = min(max(beyond, EARLIEST_DELAY), LATEST_DELAY)
-    with pytest.warns(TorchidWarning, match=f"{end:g} s or beyond; are torques and positions stamped by the same"):
-        found = chosen(recorded(beyond))
-    assert found.found == end
-    assert "an end of what is tried: the best may lie beyond" in str(found)
 
 
 def test_it_is_found_beside_armatures_springs_offsets_and_scales() -> None:
@@ -123,36 +111,3 @@ def test_a_log_with_its_delay_has_the_torques_that_act_at_its_stamps(delay: floa
     np.testing.assert_allclose(acting.joint_torque[10:-10], expected[10:-10], rtol=0.0, atol=1e-6)
     np.testing.assert_allclose(acting.joint_torque, expected, rtol=0.0, atol=1e-3)  # not-a-knot ends
     assert with_delayed_torques(log, 0.0) is log
-
-
-def test_a_delay_reaches_across_no_break_of_a_log_and_knows_nothing_beside_what_was_not_recorded() -> None:
-    log = recorded()
-    broken = log.select(np.r_[0:600, 1000:1600])
-    acting = with_delayed_torques(broken, DELAY)
-    assert len(acting) == 1198, "the first sample of each part has no torque of before"
-    assert set(broken.time[[0, 600]]).isdisjoint(acting.time)
-    torque = value(log.joint_torque).copy()
-    torque[700, 0] = np.nan
-    lacking = with_delayed_torques(replace(log, joint_torque=torque), DELAY)
-    known = np.isfinite(lacking.joint_torque)
-    assert (~known).sum() == 2
-    assert known[:, 1].all()
-    with pytest.raises(LogError, match="no longer than actuators.delay of 9 s"):
-        with_delayed_torques(log, 9.0)
-
-
-@pytest.mark.parametrize("sensors", ["joints", pytest.param("full", marks=pytest.mark.slow)])
-def test_torques_of_a_quadruped_on_its_feet_are_found_to_be_as_late_as_they_are(sensors: str) -> None:
-    """The demo's noisy log has no delay; its torques are then taken from 4 ms later."""
-    setup = set_up(load_config(DEMO / "quadruped.yaml", [f"sensors.set={sensors}"]))
-    recorded_log, found = read_log(DEMO / "sway_train.npz"), []
-    for late in (0.0, 0.004):
-        log = preprocess(with_delayed_torques(recorded_log, -late), cutoff_hz=8.0)
-        samples = bind_log(log, setup.robot, setup.contacts)
-        fitter = setup.fitter(setup.builder(setup.sensors), setup.conditions())
-        found.append(choose_delay([samples], fitter, setup.terms))
-    none, delayed = found
-    assert none.delay == 0.0
-    assert delayed.interval[0] < 0.004 < delayed.interval[1]
-    assert delayed.delay - none.found == pytest.approx(0.004, abs=2e-5)
-    assert delayed.standard_error < 2e-4

@@ -33,13 +33,6 @@ def states(n: int) -> tuple[torch.Tensor, ...]:
     return q, v, a
 
 
-def test_its_forces_are_those_of_the_bodies_and_of_the_module(learned: RigidPlusResidual) -> None:
-    q, v, a = states(learned.residual.n)
-    rigid = learned.regressor(q, v, a) @ learned.phi
-    torch.testing.assert_close(learned(q, v, a) - rigid, learned.residual(q, v, a), rtol=0.0, atol=1e-10)
-    assert float(learned.residual(q, v, a)[:, 6:].abs().max().detach()) > 0.1
-
-
 def test_what_is_saved_loads_as_tensors_alone_and_gives_the_same_forces(
     learned: RigidPlusResidual, tmp_path: Path
 ) -> None:
@@ -56,12 +49,6 @@ def test_what_is_saved_loads_as_tensors_alone_and_gives_the_same_forces(
     learned.save(path)
     with pytest.raises(InputError, match="of this robot and module"):
         RigidPlusResidual.load(path, robot, torch.nn.Linear(3, 3))
-
-
-def test_torch_exports_it_as_one_graph(learned: RigidPlusResidual) -> None:
-    state = states(learned.residual.n)
-    program = torch.export.export(learned, state)
-    torch.testing.assert_close(program.module()(*state), learned(*state), rtol=0.0, atol=1e-12)
 
 
 def test_a_run_with_networks_is_evaluated_with_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,7 +15,6 @@ from torchid.fitting.left_out import (
     TERMS,
     Evidence,
     Reading,
-    TermsChoice,
     block_edges,
     choose_terms,
     compress_reading,
@@ -103,20 +102,6 @@ def test_a_term_that_errors_of_gains_explain_is_not_adopted() -> None:
     assert set(choose_terms(reading(there, gain=0.05), TERMS).adopted) == {"armature"}
     hidden = recorded(6, rotor=0.05, gains=0.05, reach=0.3)  # by these errors
     assert set(choose_terms(reading(hidden, gain=0.05), TERMS).adopted) == {"armature"}
-
-
-def test_adopted_terms_are_listed_with_what_each_is_worth() -> None:
-    one, other = Evidence(0.4, 9.0, 20), Evidence(0.05, 9.0, 20)
-    text = "torque offset -18 %, armature -18 % (error on left-out blocks)"
-    assert str(TermsChoice({"torque_offset": one, "armature": one}, {})) == text
-    near = str(TermsChoice({"armature": one}, {"stiffness": other}))
-    assert near == "armature -18 %; near misses: stiffness -2.5 % (error on left-out blocks)"
-
-
-def test_a_term_that_is_stated_is_fitted_beside_the_candidates() -> None:
-    chosen = choose_terms(reading(recorded(0, rotor=0.3)), ("torque_offset", "stiffness"), fixed=("armature",))
-    assert not chosen.adopted
-    assert {*chosen.rejected} == {"torque_offset", "stiffness"}
 
 
 def test_a_band_with_ringing_is_left_and_one_without_it_is_not() -> None:

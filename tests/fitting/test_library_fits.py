@@ -12,7 +12,7 @@ from shared_work import differences
 
 import torchid
 from torchid.cli import main
-from torchid.errors import LogError, UnknownNameError
+from torchid.errors import LogError
 from torchid.parameters import PARAMETERS
 
 FEET = ("front_left_foot", "front_right_foot", "rear_left_foot", "rear_right_foot")
@@ -93,23 +93,3 @@ def test_cross_validation_predicts_blocks_that_a_fit_has_not_seen(tmp_path: Path
     np.testing.assert_array_equal(compared.nominal.phi, robot.nominal.ravel())
     with pytest.raises(LogError, match="too few to leave blocks"):
         torchid.cross_validate([logs[0][:30]], fitter)
-
-
-def test_a_frozen_body_keeps_its_parameters_and_must_exist(tmp_path: Path) -> None:
-    folder = shortened_demo(tmp_path / "demo", 300)
-    robot = torchid.load_robot(folder / "quadruped.urdf")
-    contacts = [torchid.Contact(foot, "point") for foot in FEET]
-    logs = [torchid.bind_log(torchid.preprocess(torchid.read_log(folder / "sway_train.npz"), 8.0), robot, contacts)]
-    builder = torchid.RowBuilder(robot, contacts, torchid.named_sensors("full", robot.n, len(contacts)))
-    name = robot.body_names[1]
-    fitter = torchid.LogFitter(
-        robot=robot,
-        builder=builder,
-        estimator=torchid.LeastSquares(1e-3),
-        frozen=torchid.frozen_parameters(robot, [name]),
-    )
-    phi = fitter.fit(torchid.compress_in_blocks(logs, builder)).estimate.phi.reshape(robot.nominal.shape)
-    np.testing.assert_array_equal(phi[1], robot.nominal[1])
-    assert (phi[0] != robot.nominal[0]).any()
-    with pytest.raises(UnknownNameError, match="^frozen: unknown name 'trunkk'"):
-        torchid.frozen_parameters(robot, ["trunkk"])

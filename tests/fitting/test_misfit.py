@@ -19,13 +19,11 @@ from torchid.fitting.noise import (
     GroupNoise,
     Misfit,
     UnfittedFriction,
-    beyond_noise,
     resting_joints,
-    unexplained_forces,
     unfitted_friction,
 )
 from torchid.parameters import FRICTION
-from torchid.problem import ExtraTerms, LinearProblem, bind_log
+from torchid.problem import ExtraTerms, bind_log
 
 UNITS = (("N m", "N m s/rad"), ("N", "N s/m"))
 UNPHYSICAL = "ignore::torchid.errors.TorchidWarning"
@@ -96,21 +94,6 @@ def test_friction_that_is_not_fitted_shows_and_noise_does_not_look_like_it() -> 
         assert np.allclose(one.values, [0.3, 0.15], atol=0.15)
 
 
-def test_friction_that_explains_all_of_exact_forces_has_a_ratio() -> None:
-    """What is left is 0 by rounding, of either sign as a difference of squares."""
-    arm, rng = torchid.load_robot(UR5, fixed_base=True), np.random.default_rng(0)
-    free = np.zeros_like(arm.nominal, dtype=bool)
-    free[1:, :1] = True
-    for _ in range(20):
-        A, friction = rng.normal(size=(60, arm.nominal.size)), np.zeros_like(arm.nominal)
-        friction[1:, FRICTION] = rng.uniform(0.1, 1.0, (arm.n, 2))
-        nominal, scale = np.zeros(arm.nominal.size), np.ones(arm.nominal.size)
-        problem = torchid.LinearProblem(A, A @ friction.flatten(), 0.0, 60, nominal, scale, free.flatten())
-        found = unfitted_friction(problem, arm)
-        assert found is not None
-        assert np.isfinite(found.ratio)
-
-
 def test_joints_that_rest_are_told_with_their_share_where_friction_goes_with_the_sign() -> None:
     arm, count = torchid.load_robot(UR5, fixed_base=True), 3000
     t, rng = np.arange(count) / 100.0, np.random.default_rng(0)
@@ -175,38 +158,3 @@ def test_friction_that_the_model_lacks_is_said_before_all_else(
     said = " ".join(told["false"][1].split())
     assert "attention friction, compliance or contacts are missing" in said
     assert "unexplained residuals are 11 times" in said
-
-
-def test_stated_noise_explains_logs_that_are_resampled_after_the_filter(tmp_path: Path) -> None:
-    command = [
-        "identify",
-        "--quiet",
-        str(DEMO / "quadruped.yaml"),
-        f"output={tmp_path / 'run'}",
-        "estimator.ridge=0.001",
-    ]
-    assert main([*command, "preprocessing.sample_rate_hz=40"]) == 0
-    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    assert metrics["residual_std"] == pytest.approx(metrics["misfit"]["expected_residual_std"], rel=0.05)
-    for logs in ("train", "test"):
-        floor, error = metrics["noise_floor"][logs]["projected_residual"], metrics[logs]["projected_residual"]
-        assert error == pytest.approx(floor, rel=0.15), logs
-
-
-def test_a_residual_far_above_the_noise_need_not_be_most_of_the_forces() -> None:
-    rng = np.random.default_rng(0)
-    A, forces = rng.normal(size=(200, 4)), np.full(4, 100.0)
-    problem = LinearProblem(
-        A, A @ forces + 8.0 * rng.normal(size=200), 0.0, 200, np.zeros(4), np.ones(4), np.ones(4, bool)
-    )
-    estimate = torchid.LeastSquares(ridge=0.0).solve(problem)
-    assert "times the stated sensor noise" in beyond_noise(estimate)
-    assert unexplained_forces(estimate, problem) == ""
-
-
-def test_noise_that_is_stated_is_not_what_a_model_should_explain() -> None:
-    A, noise = np.random.default_rng(0).normal(size=(200, 4)), np.random.default_rng(1).normal(size=200)
-    problem = LinearProblem(A, noise, 0.0, 200, np.zeros(4), np.ones(4), np.ones(4, bool))
-    estimate = torchid.LeastSquares(ridge=0.0).solve(problem)
-    assert unexplained_forces(estimate, problem) == ""
-    assert "the fit leaves 9" in unexplained_forces(estimate, problem, noise_stated=False)

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from repository import DEMO
 from synthetic import SOLO12, Oracle, load, make_log
 
@@ -46,16 +45,6 @@ def test_residuals_of_samples_are_those_of_their_factors(sensors: str, offsets: 
         assert found.measured == pytest.approx(one.measured, rel=1e-10)
         assert found.error == pytest.approx(one.error, rel=1e-10)
     assert expected[0].error != pytest.approx(expected[1].error, rel=1e-3)
-
-
-def test_a_log_without_samples_has_no_residuals() -> None:
-    experiment = set_up(load_config(DEMO / "quadruped.yaml"))
-    log = preprocess(read_log(DEMO / "sway_train.npz"), 8.0)
-    samples = bind_log(log, experiment.robot, experiment.contacts)[torch.zeros(0, dtype=torch.int64)]
-    builder = experiment.builder(experiment.sensors)
-    one = Calibration(robot=experiment.robot, builder=builder, phi=experiment.robot.nominal.flatten(), values={})
-    (found,) = residuals_of_samples(builder, [samples], [one])
-    assert (found.error, found.measured, found.rows) == (0.0, 0.0, 0)
 
 
 def test_samples_without_a_reading_are_left_out_of_the_residual() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import torch
 from delays import arm, motion
 from scipy.integrate import cumulative_trapezoid
 from synthetic import Array
@@ -109,27 +108,3 @@ def test_what_holds_a_joint_at_rest_is_not_in_the_filtered_torques_that_count_as
     away = np.convolve(slow[:, 0], np.ones(2 * round(1.0 / (cutoff * STEP)) + 1), "same") == 0.0
     kept, within_reach = (~rests[:, 0]).mean(), away.mean()
     assert kept > 1.15 * within_reach > 0.0, "turns between two moves weigh less than pauses"
-
-
-def test_a_joint_that_never_moves_has_no_row_and_no_friction() -> None:
-    log, _ = recorded(0, moving=(1.0, 0.0))
-    fit = fitted(log, True)
-    verdicts = fit.estimate.verdict.reshape(-1, PER_BODY)
-    assert set(verdicts[2, [COULOMB, VISCOUS]]) == {"unobservable"}
-    np.testing.assert_allclose(friction(fit.estimate.phi)[0], TRUE[0], rtol=1e-9)
-    rests = preprocess(log, finds_rest=True).joint_rests
-    assert rests is not None
-    assert rests[:, 1].all()
-    assert fit.assembly.problem.rows == (~rests[:, 0]).sum()
-
-
-def test_noise_of_the_motion_does_not_change_which_joints_rest() -> None:
-    robot, _ = arm()
-    samples = bind_log(preprocess(recorded(0, NOISE)[0], 15.0, finds_rest=True), robot, ())
-    noise = samples.motion_noise
-    assert noise is not None
-    moved = noise.perturbed(samples, 1e3 * torch.ones(len(samples), 1, dtype=torch.float64))
-    assert moved.resting is samples.resting
-    assert not torch.equal(moved.joint_velocity, samples.joint_velocity)
-    without = replace(samples, resting=None)
-    assert without.motion_noise is noise

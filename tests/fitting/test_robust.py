@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import product
 from typing import ClassVar
 
@@ -12,9 +11,9 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from intervals import FEET, REPETITIONS, STATES, covered, noisy_torques
+from intervals import REPETITIONS, covered
 from scipy.optimize import least_squares
-from synthetic import SOLO12, UR5, Array, Oracle, load, make_log
+from synthetic import UR5, Array, Oracle, load, make_log
 from thinned import SLOW, slow_but
 from true_robots import true_parameters
 from urdfs import inertial, joint, link, write
@@ -57,26 +56,6 @@ def test_weights_and_slopes_are_derivatives_of_the_loss(kind: str, size: float, 
     loss = RobustLoss.named(kind, tuning)
     torch.testing.assert_close(loss.weight(u.detach()) * u.detach(), first.detach())
     torch.testing.assert_close(loss.slope(u.detach()), second.to(torch.float64), rtol=1e-9, atol=1e-12)
-
-
-@pytest.mark.parametrize("kind", LOSSES)
-@settings(deadline=None)
-@given(size=st.floats(0.0, 1e200), more=st.floats(1.0, 1e3), tuning=st.floats(0.1, 10.0))
-def test_larger_residuals_never_weigh_more(kind: str, size: float, more: float, tuning: float) -> None:
-    loss = RobustLoss.named(kind, tuning)
-    weight, larger, other = loss.weight(torch.tensor([size, size * more, -size], dtype=torch.float64)).tolist()
-    assert 0.0 <= larger <= weight <= 1.0
-    assert other == weight
-    assert loss.weight(torch.zeros(1, dtype=torch.float64)).item() == 1.0
-
-
-@pytest.mark.parametrize("kind", LOSSES)
-def test_the_usual_tuning_has_95_percent_efficiency_on_gaussian_noise(kind: str) -> None:
-    u = torch.linspace(-12.0, 12.0, 200_001, dtype=torch.float64)
-    density = torch.exp(-u.square() / 2.0) / np.sqrt(2.0 * np.pi) * (u[1] - u[0])
-    loss = RobustLoss.named(kind, None)
-    variance = (density * (loss.weight(u) * u).square()).sum() / (density * loss.slope(u)).sum() ** 2
-    assert 1.0 / float(variance) == pytest.approx(0.95, abs=5e-4)
 
 
 @settings(deadline=None)
@@ -181,18 +160,6 @@ def industrial_arm(samples: int = 400, terms: ExtraTerms | None = None) -> Bench
     return Bench(robot, builder, bind_log(log, robot, ()), true_parameters(oracle, robot).ravel())
 
 
-def quadruped(samples: int = 400) -> Bench:
-    """Joint torques alone, on unmeasured feet: every row mixes joints."""
-    robot, rng = load(SOLO12), np.random.default_rng(1)
-    oracle = Oracle.of(robot)
-    oracle.perturb(rng, 0.2)
-    log = make_log(oracle, [(foot.frame, 3) for foot in FEET], STATES, samples, rng)
-    builder = RowBuilder(robot, FEET, named_sensors("joints", robot.n, 4, SensorNoise(NOISE, 1.0, 0.1)))
-    clean = bind_log(log, robot, FEET)
-    pushed = next(noisy_torques(clean, builder, rng))  # on the base too; torques become noisier below
-    return Bench(robot, builder, pushed, true_parameters(oracle, robot).ravel())
-
-
 # --------------------------------------------------------------------------------------------------------- repetitions
 
 
@@ -260,39 +227,6 @@ def test_passes_over_some_samples_save_passes_over_all_and_change_nothing(
     np.testing.assert_array_equal(kept.estimate.phi, bench.fits(kind, *uneven)[1].estimate.phi, "each log keeps 200")
 
 
-@pytest.mark.parametrize("kind", slow_but(["huber"], LOSSES))
-def test_rows_that_mix_joints_are_robust_as_long_as_few_samples_are_hit(kind: str) -> None:
-    bench, rng = quadruped(), np.random.default_rng(3)
-    log = bench.clean
-    assert log.torque is not None
-    torque = log.torque.clone()
-    hit = rng.choice(len(log), len(log) // 20, replace=False)
-    torque[hit, rng.integers(0, bench.robot.n, len(hit))] += SPIKE
-    first, fit, found = bench.fits(kind, replace(log, torque=torque))
-    assert found.converged
-    assert np.sqrt(np.mean(bench.off(fit.estimate) ** 2)) < 1.5
-    assert np.sqrt(np.mean(bench.off(first.estimate, fit.estimate) ** 2)) > 4.0
-
-
-def test_outliers_are_all_that_is_lost_where_there_is_no_noise(arm: Bench) -> None:
-    assert arm.clean.torque is not None
-    log = replace(arm.clean, torque=arm.clean.torque.clone())
-    assert log.torque is not None
-    log.torque[::20] += SPIKE
-    first, fit, _ = arm.fits("tukey", log, passes=200)
-    known = fit.estimate.verdict == "identified"
-    assert np.abs(fit.estimate.phi - arm.true)[known].max() < 1e-9
-    assert np.abs(first.estimate.phi - arm.true)[known].max() > 0.1
-
-
-def test_a_log_without_noise_or_outliers_settles_at_once(arm: Bench) -> None:
-    _, fit, found = arm.fits("huber", arm.clean)
-    known = fit.estimate.verdict == "identified"
-    np.testing.assert_allclose(fit.estimate.phi[known], arm.true[known], rtol=0.0, atol=1e-10)
-    assert found.passes < 10
-    assert fit.assembly.problem.cost(fit.estimate.phi) >= 0.0
-
-
 # --------------------------------------------------------------------------------------------------- other algorithms
 
 
@@ -327,23 +261,6 @@ def test_the_fixed_point_is_that_of_other_algorithms_at_the_same_scale(
     if kind == "huber":
         solved = least_squares(lambda x: A @ x - b, phi, loss="huber", f_scale=TUNING[kind] * 1.1)
         np.testing.assert_allclose(A @ phi, A @ solved.x, rtol=0.0, atol=1e-4)
-
-
-@pytest.mark.parametrize("kind", slow_but(["tukey"], LOSSES))
-def test_the_order_of_chunks_and_the_number_of_threads_do_not_matter(
-    kind: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bench, rng = quadruped(), np.random.default_rng(5)
-    logs = [replace(bench.noisy(rng, 0.005), source=name) for name in ("a", "b")]
-    found = []
-    for order, options in ((logs, {"threads": 1}), (logs[::-1], {"threads": 3, "chunk": 37})):
-        monkeypatch.setattr("torchid.problem.compression.compress_parts", partial(compress_parts, **options))
-        found.append(bench.fits(kind, *order)[1:])
-    (one, one_found), (other, other_found) = found
-    size = np.abs(one.estimate.phi).max()
-    np.testing.assert_allclose(other.estimate.phi, one.estimate.phi, rtol=1e-10, atol=1e-10 * size)
-    np.testing.assert_allclose(other.estimate.standard_error, one.estimate.standard_error, rtol=1e-8)
-    assert other_found.passes == one_found.passes
 
 
 # ------------------------------------------------------------------------------------------------- with everything else
@@ -382,20 +299,3 @@ def test_offsets_of_sensors_are_found_among_outliers(kind: str) -> None:
     spoilt = [x.value - offsets[x.log, x.extra.name] for x in first.extras]
     errors = [x.standard_error for x in fit.extras]
     assert np.sqrt(np.mean((np.array(spoilt) / errors) ** 2)) > 10.0
-
-
-def test_errors_of_all_figures_are_those_of_the_loss(arm: Bench) -> None:
-    first, fit, _ = arm.fits("huber", arm.noisy(np.random.default_rng(8), 0.05))
-    problem, estimate = fit.assembly.problem, fit.estimate
-    assert problem.cost(estimate.phi) == pytest.approx(estimate.cost, rel=1e-9)
-    assert problem.cost(problem.nominal) == pytest.approx(estimate.nominal_cost, rel=1e-9)
-    again = LeastSquares().solve(problem)
-    np.testing.assert_allclose(again.noise_error, estimate.noise_error, rtol=1e-6)
-    assert estimate.residual_std < 0.1 * first.estimate.residual_std
-
-
-def test_a_loss_that_is_flat_where_all_rows_are_says_nothing_of_errors() -> None:
-    one_pass = Reweighting(RobustLoss("tukey", 1.0), {"x": torch.zeros(1, dtype=torch.float64)}, 1.0)
-    one_pass(log_named("x"), (0,), torch.tensor([[1.0, 5.0], [1.0, -7.0]], dtype=torch.float64))
-    assert np.isnan(one_pass.deviation(1.0))
-    assert np.isnan(Reweighting(RobustLoss("huber", 1.0), {}, 1.0).deviation(0.0))

@@ -10,7 +10,7 @@ import pytest
 from synthetic import Oracle, make_log
 
 import torchid
-from torchid.fitting.left_out import Evidence, block_edges, compress_reading, kind_of, leave_sensors_out, thinned
+from torchid.fitting.left_out import leave_sensors_out
 from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log
 from torchid.report.analysis import ALL_OF, contradicting_messages
 from torchid.sensing import SensorNoise, SensorSet, named_sensors
@@ -57,17 +57,3 @@ def test_the_foot_that_reads_too_much_is_found_and_no_other(terms: ExtraTerms) -
     clean = leave_sensors_out([walk(1.0)], fitter_of(terms), terms, sets)
     assert not any(one.adopted for one in clean.values())
     assert not contradicting_messages(clean)
-
-
-def test_both_fits_are_judged_by_the_same_rows() -> None:
-    """Of the smaller set, whose rows are as they are by themselves, in columns that have its unknowns elsewhere."""
-    terms, logs = ExtraTerms(offsets={"contact_force": "all"}, armature=True), thinned([walk(1.3)])
-    edges = block_edges(logs)
-    whole, alone = (compress_reading(logs, edges, fitter_of(terms, one)) for one in (FULL, without_foot(1)))
-    fewer, kinds = alone.in_columns_of(whole), {kind_of(extra) for extra in whole.extras}
-    assert len(whole.extras) > len(alone.extras)
-    np.testing.assert_array_equal(fewer.rows, alone.rows)
-    np.testing.assert_allclose(fewer.left_out(kinds), alone.left_out(kinds), rtol=1e-6)
-    by_hand = Evidence.of(whole.left_out(kinds, fewer), fewer.left_out(kinds))
-    sets = {"foot": without_foot(1)}
-    assert leave_sensors_out([walk(1.3)], fitter_of(terms), terms, sets)["foot"] == by_hand

@@ -14,7 +14,6 @@ from torchid.estimators import Conditions, Consistent, LeastSquares
 from torchid.fitting.fit import LogFitter
 from torchid.fitting.separable import StribeckChoice, choose_stribeck
 from torchid.logs import Log
-from torchid.logs.dry_friction import mean_stribeck
 from torchid.logs.preprocess import preprocess
 from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log
 from torchid.problem.compression import compress_in_blocks
@@ -58,16 +57,6 @@ def test_friction_at_rest_is_found_beside_friction_that_differs_by_direction(
         assert found["asymmetric_coulomb", dof] == pytest.approx(0.2, rel=1e-6)
 
 
-def test_friction_at_rest_is_never_less_than_coulomb_friction_of_a_consistent_fit() -> None:
-    log = bind_log(recorded(0.13, at_rest=-0.5 * AT_REST), arm()[0], ())
-    at_rest = []
-    for estimator in (LeastSquares(), Consistent(conditions=Conditions())):
-        fitter = fitter_of(ExtraTerms(stribeck=0.13), estimator)
-        at_rest.append([x.value for x in fitter.fit(compress_in_blocks([log], fitter.builder)).extras])
-    np.testing.assert_allclose(at_rest[0], -0.5 * AT_REST, rtol=1e-6)
-    np.testing.assert_allclose(at_rest[1], 0.0, atol=1e-6)
-
-
 @pytest.mark.parametrize("velocity", [0.03, 0.13, 0.5])
 def test_the_velocity_of_exact_torques_is_found(velocity: float) -> None:
     found = chosen(recorded(velocity))
@@ -85,18 +74,6 @@ def test_the_filter_passes_what_friction_at_rest_it_passes_of_torques(velocity: 
     assert found.residual < 0.35 * found.coulomb_residual
 
 
-@pytest.mark.parametrize(("width", "off"), [(None, 1.5e-4), (0.02, 2e-6)])
-def test_the_mean_over_a_step_is_that_of_many_velocities_between(width: float | None, off: float) -> None:
-    rng, velocity = np.random.default_rng(0), 0.1
-    before = rng.uniform(-0.2, 0.2, 200)
-    after = before + rng.uniform(-0.1, 0.1, 200)
-    between = before + (after - before) * ((np.arange(20000) + 0.5) / 20000)[:, None]
-    sign = np.sign(between) if width is None else np.tanh(between / width)
-    expected = (sign * np.exp(-np.square(between / velocity))).mean(axis=0)
-    found = mean_stribeck(np.stack([before, after]), width, velocity)[0]
-    np.testing.assert_allclose(found, expected, rtol=0.0, atol=off)
-
-
 def _held(count: int, cutoff_hz: float | None) -> tuple[int, float]:
     """How many of so many intervals hold the velocity, and the median standard error over the scatter."""
     found = [chosen(recorded(0.2, NOISE, seed), cutoff_hz) for seed in range(count)]
@@ -112,22 +89,8 @@ def test_intervals_hold_the_velocity_of_noisy_logs() -> None:
     assert held >= 10  # 11.4 expected, fewer than 10 in one of 50 cases
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("cutoff_hz", [None, 10.0])
-def test_95_of_100_intervals_hold_the_velocity(cutoff_hz: float | None) -> None:
-    held, ratio = _held(100, cutoff_hz)
-    assert held >= 90  # fewer in one of 35 cases
-    assert 0.8 < ratio < 1.25
-
-
 @pytest.mark.parametrize("estimator", [LeastSquares(), Consistent()], ids=["plain", "consistent"])
 def test_coulomb_friction_alone_has_no_velocity(estimator: LeastSquares | Consistent) -> None:
     found = chosen(recorded(0.1, NOISE, at_rest=np.zeros(2)), 10.0, estimator=estimator)
     assert found.velocity is None
     assert str(found).startswith("none: friction at rest is not significantly beyond Coulomb friction")
-
-
-def test_a_velocity_beyond_what_joints_reach_is_not_determined() -> None:
-    """Joints below 0.03 rad/s feel a drop over 2 rad/s as Coulomb friction and no more."""
-    found = chosen(recorded(2.0, 0.01, sines=1), 10.0)
-    assert found.velocity is None

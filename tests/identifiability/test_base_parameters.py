@@ -84,17 +84,6 @@ def flying(robot: Robot, friction: bool = True) -> LinearProblem:
     return structural_problem(robot, [], named_sensors("full", robot.n, 0), [()], friction)
 
 
-@machines
-def test_a_free_robot_has_ten_base_parameters_and_seven_per_hinge_and_four_per_slide(name: str) -> None:
-    robot = machine_named(name)
-    K = regressor(robot, 3 * len(robot.bodies) + 20)
-    K = K.reshape(*K.shape[:2], -1, parameters.PER_BODY)[..., parameters.INERTIAL]
-    for rows in (K, K[:, :6]):  # all that can be measured, and the wrench on the base alone
-        rank, gap = column_rank(rows.reshape(-1, 10 * len(robot.bodies)))
-        assert rank == textbook_count(robot)
-        assert gap > CLEAR
-
-
 @pytest.mark.parametrize("name", ["UR5", "TIAGo", "Solo12", "Talos"])
 def test_pinocchio_counts_the_same(name: str) -> None:
     robot = machine_named(name)
@@ -163,36 +152,6 @@ def test_base_parameters_cause_all_forces_and_hidden_directions_none(robot: Robo
     assert base.gap > CLEAR
 
 
-@settings(max_examples=15, deadline=None, derandomize=True)
-@given(machine(), st.booleans(), st.integers(0, 10_000))
-def test_lifted_parameters_cause_the_same_forces_and_are_the_nearest(robot: Robot, friction: bool, seed: int) -> None:
-    base = base_parameters(flying(robot, friction))
-    K, rng = regressor(robot, 30, seed), np.random.default_rng(seed)
-    nominal, true = base.scale * rng.normal(size=(2, len(base.scale)))
-    true = np.where(base.free, true, nominal)
-    lifted = base.lift(base.reduce(true), nominal)
-    np.testing.assert_allclose(
-        base.reduce(lifted) / base.scale[base.kept], base.reduce(true) / base.scale[base.kept], rtol=0.0, atol=1e-9
-    )
-    np.testing.assert_allclose(K @ lifted, K @ true, rtol=0, atol=1e-10 * np.abs(K * base.scale).max())
-    step = (lifted - nominal) / base.scale
-    np.testing.assert_array_equal(step[~base.free], 0.0)
-    np.testing.assert_allclose(base.null_space / base.scale @ step, 0.0, atol=1e-10 * np.linalg.norm(step))
-    np.testing.assert_allclose(base.lift(base.reduce(nominal), nominal), nominal, rtol=0, atol=1e-12 * base.scale.max())
-
-
-@pytest.mark.parametrize("name", ["UR5", "TIAGo", "Solo12", "Talos", "human"])
-def test_of_real_robots_too(name: str) -> None:
-    robot = machine_named(name)
-    base = base_parameters(flying(robot))
-    K, phi = regressor(robot, 50), base.scale * np.random.default_rng(3).normal(size=len(base.scale))
-    phi[~base.free] = 0.0
-    forces = K @ phi
-    np.testing.assert_allclose(
-        base(torch.from_numpy(K)).numpy() @ base.reduce(phi), forces, rtol=0, atol=1e-10 * abs(forces).max()
-    )
-
-
 @cache
 def arm() -> tuple[Robot, LinearProblem, BaseParameters]:
     """A flying Solo12."""
@@ -212,14 +171,6 @@ def test_forces_by_base_parameters_have_the_same_derivatives() -> None:
         forces = K @ torch.from_numpy(phi) if whole else base(K) @ torch.from_numpy(base.reduce(phi))
         gradients.append(torch.cat(torch.autograd.grad((forces**2).sum(), [q, v, a]), dim=1))
     torch.testing.assert_close(gradients[1], gradients[0], rtol=1e-9, atol=1e-9 * float(gradients[0].abs().max()))
-
-
-def test_forward_is_differentiable_and_takes_any_leading_shape() -> None:
-    _, _, base = arm()
-    K = torch.rand(2, 1, len(base.scale), dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(base, K)
-    assert base(K[0, 0]).shape == (base.rank,)
-    assert not base.state_dict()
 
 
 @pytest.mark.parametrize("frozen", ["nothing", "friction", "a body", "odd ones"])
@@ -248,12 +199,6 @@ def test_least_squares_finds_the_same_forces_in_base_parameters(frozen: str) -> 
     assert reduced.cost == pytest.approx(whole.cost, rel=1e-9)
     lifted = base.lift(reduced.phi, nominal)
     np.testing.assert_allclose((lifted - whole.phi) / problem.scale, 0.0, atol=1e-6)  # both are the nearest
-
-
-def test_other_free_parameters_than_it_was_made_from_are_refused() -> None:
-    _, problem, base = arm()
-    with pytest.raises(ValueError, match="free"):
-        base.reduce_problem(replace(problem, free=~problem.free))
 
 
 # ----------------------------------------------------------------------------------------------------------- words
@@ -292,43 +237,7 @@ def test_a_hinge_hides_mass_first_moment_along_it_and_one_inertia_as_textbooks_s
     assert unobservable_parameters(base, robot.body_names) == []  # the base's friction is no parameter of the fit
 
 
-def test_of_a_bolted_hinge_across_gravity_four_numbers_are_seen(tmp_path: Path) -> None:
-    elements = [BASE, link("arm"), joint("elbow", "base", "arm", extra='<axis xyz="0 1 0"/>')]
-    robot = load(write(tmp_path, *elements), fixed_base=True)
-    base = base_parameters(flying(robot))
-    assert format_base_parameters(base, robot.body_names) == ["mcx[arm]", "mcz[arm]", "Iyy[arm]", "fc[arm]", "fv[arm]"]
-    assert unobservable_parameters(base, robot.body_names) == [
-        "base: m, mcx, mcy, mcz, Ixx, Ixy, Ixz, Iyy, Iyz, Izz",
-        "arm: m, mcy, Ixx, Ixy, Ixz, Iyz, Izz",
-    ]
-
-
-def test_a_preference_chooses_what_is_kept(tmp_path: Path) -> None:
-    robot = hinge(tmp_path)
-    problem = flying(robot)
-    wish = np.ones(len(problem.scale))
-    wish[0] = 1e3  # the base's mass rather than the arm's
-    base = base_parameters(problem, preference=wish)
-    assert 0 not in base.kept
-    assert "m[arm] + m[base]" in format_base_parameters(base, robot.body_names)
-
-
 # ------------------------------------------------------------------------------------------------------- how clear
-
-
-def test_the_gap_is_that_of_the_values_about_the_rank() -> None:
-    assert rank_and_gap(np.array([2.0, 1.0, 1e-12])) == (2, pytest.approx(1e12))
-    assert rank_and_gap(np.array([2.0, 1.0, 1e-12]), tolerance=1e-14) == (3, pytest.approx(1e-12 / 2.0 / 2.0**-52))
-
-
-def test_values_below_rounding_make_no_gap_wider() -> None:
-    narrow, wide = rank_and_gap(np.array([4.0, 1e-3, 1e-18])), rank_and_gap(np.array([4.0, 1e-3]))
-    assert narrow == wide == (2, pytest.approx(1e-3 / (4.0 * 2.0**-52)))
-
-
-@pytest.mark.parametrize("values", [[], [0.0, 0.0]])
-def test_what_shows_nothing_has_rank_0_beyond_doubt(values: list[float]) -> None:
-    assert rank_and_gap(np.array(values)) == (0, np.inf)
 
 
 def test_values_that_fall_without_a_step_are_told() -> None:

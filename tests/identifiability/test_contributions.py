@@ -10,20 +10,16 @@ import pytest
 import torch
 from synthetic import SOLO12, UR5, Array, Oracle, load, make_log
 
-from torchid import parameters
 from torchid.estimators import LeastSquares
 from torchid.estimators.least_squares import VERDICTS
 from torchid.identifiability.information import (
     Contributions,
     InformationGain,
-    SensorContribution,
     contributions,
-    prior_directions,
     sensor_information,
 )
 from torchid.problem import ExtraTerms, LinearProblem, RowBuilder, Samples, assemble, bind_log, compress, compress_parts
-from torchid.problem.compression import Part, merge_factors
-from torchid.report.tables import contribution_table, table_text, verdict_table
+from torchid.problem.compression import Part
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet, chosen_sensors, named_sensors
 
@@ -50,24 +46,6 @@ def test_the_share_of_the_data_is_how_far_the_estimate_follows_the_truth() -> No
             assert (there.phi - here.phi)[p] == pytest.approx(shares[p], abs=1e-10)
 
 
-@pytest.mark.parametrize("rank", [0, 3, 7])
-def test_without_a_pull_the_shares_add_up_to_the_rank(rank: int) -> None:
-    rng = np.random.default_rng(rank)
-    estimate = LeastSquares().solve(problem_of(rng.normal(size=(30, rank)) @ rng.normal(size=(rank, 7)), np.ones(30)))
-    assert estimate.data_share.sum() == pytest.approx(rank, abs=1e-10)
-    assert len(estimate.singular_values) == 7
-    assert (np.diff(estimate.singular_values) <= 0.0).all()
-
-
-def test_a_pull_takes_shares_from_the_data_until_nothing_is_left() -> None:
-    problem = problem_of(np.diag([10.0, 1.0, 0.1]), np.zeros(3))
-    shares = [LeastSquares(ridge).solve(problem).data_share for ridge in (0.0, 1e-3, 1.0, 1e3, 1e12)]
-    np.testing.assert_allclose(shares[0], 1.0)
-    np.testing.assert_allclose(shares[2], [100 / 103, 1 / 4, 0.01 / 3.01])
-    np.testing.assert_allclose(shares[-1], 0.0, atol=1e-9)
-    assert (np.diff(shares, axis=0) < 0.0).all()
-
-
 def test_every_parameter_gets_the_verdict_that_its_share_and_the_rows_call_for() -> None:
     """Seen well, seen faintly, two seen only by their sum, never seen, and one that is not free."""
     A = np.array([[1.0, 0, 0, 0, 0, 1.0], [0, 0.1, 0, 0, 0, 1.0], [0, 0, 1.0, 1.0, 0, 1.0]])
@@ -79,16 +57,6 @@ def test_every_parameter_gets_the_verdict_that_its_share_and_the_rows_call_for()
     assert estimate.verdict_counts() == dict(zip(VERDICTS, (1, 1, 2, 1, 1), strict=True))
     assert LeastSquares().solve(problem).verdict.tolist()[:2] == ["identified"] * 2
     np.testing.assert_allclose(estimate.data_share[4], 0.0, atol=1e-15)
-
-
-def test_marks_stand_for_verdicts_and_bodies_with_nothing_free_are_left_out() -> None:
-    verdicts = np.full((3, parameters.PER_BODY), "fixed", dtype=object)
-    verdicts[1, :4] = ["identified", "dominated by the prior", "only in combination", "unobservable"]
-    text = table_text(verdict_table(["trunk", "arm", "dummy"], verdicts.flatten()))
-    (row,) = [line for line in text.splitlines() if "arm" in line]
-    assert row.split() == ["arm", "*", "p", "+", "."]
-    assert "dummy" not in text
-    assert max(map(len, text.splitlines())) <= 100
 
 
 # ----------------------------------------------------------------------------------------------------------- the worlds
@@ -177,33 +145,6 @@ def test_what_a_sensor_adds_is_what_a_problem_rebuilt_without_it_lacks(case: str
         assert np.abs(lost).max() > 1e-6 * size
 
 
-def test_a_foot_in_the_air_adds_nothing_and_a_torque_beside_too_few_others_neither() -> None:
-    up = quadruped(named_sensors("full", 12, 4, NOISE), states=[[False, True, True, True]])
-    wrenches = sensor_information(up.logs, up.builder).wrenches
-    assert not wrenches[0].any()
-    assert all(wrenches[foot].any() for foot in (1, 2, 3))
-    robot, rng = load(UR5, fixed_base=True), np.random.default_rng(5)
-    contacts = (Contact("tool0", "flat"),)
-    log = make_log(Oracle.of(robot), [("tool0", 6)], [[True]], 20, rng)
-    held = World(robot, contacts, named_sensors("joints", robot.n, 1, NOISE), [bind_log(log, robot, contacts)])
-    found = sensor_information(held.logs, held.builder)  # six unknown forces, six torques: nothing is left
-    assert not found.total.any()
-    assert not any(lost.any() for lost in found.torques.values())
-
-
-def test_some_samples_stand_for_all() -> None:
-    w = quadruped(named_sensors("full", 12, 4, NOISE), samples=(400, 200))
-    exact, found = (sensor_information(w.logs, w.builder, most) for most in (4000, 240))
-    problem = identified(w)[1]
-    N = prior_directions(w.builder, problem.scale * problem.free)
-    bits = [InformationGain.of(np.linalg.eigvalsh(N.T @ one.total @ N)).bits for one in (exact, found)]
-    assert bits[1] == pytest.approx(bits[0], rel=0.02)
-    seen: list[int] = []
-    sensor_information(w.logs, w.builder, 240, seen.append)
-    assert 200 <= sum(seen) <= 280
-    np.testing.assert_allclose(exact.total, gram(w), rtol=0.0, atol=1e-12 * np.abs(exact.total).max())
-
-
 # --------------------------------------------------------------------------------- a log or a contact state is left out
 
 
@@ -280,17 +221,6 @@ def test_what_a_contact_state_adds_is_what_a_fit_without_it_lacks(three_logs: Wo
         assert state.bits == pytest.approx((whole - rest).bits, rel=1e-8)
 
 
-def test_a_log_that_repeats_another_loses_no_rank_and_fewer_bits_than_it_holds(three_logs: World) -> None:
-    log = three_logs.logs[1]
-    twice = replace(three_logs, logs=[log, replace(log, source="again.npz")])
-    first, second = adds(twice).logs
-    assert first.rank == second.rank > 0
-    assert first.rank_lost == second.rank_lost == 0
-    alone = adds(replace(three_logs, logs=[log]))
-    assert 0.0 < first.bits == pytest.approx(second.bits)
-    assert first.bits <= 0.5 * alone.logs[0].rank  # twice the samples: half a bit for every combination, at most
-
-
 @pytest.mark.parametrize("unknown", UNKNOWN)
 def test_sensors_are_ranked_by_what_a_fit_without_them_lacks(unknown: str) -> None:
     w = replace(quadruped(named_sensors("full", 12, 4, NOISE), samples=(60, 40)), terms=UNKNOWN[unknown])
@@ -305,46 +235,3 @@ def test_sensors_are_ranked_by_what_a_fit_without_them_lacks(unknown: str) -> No
         rest, _ = knowledge(with_sensors(w, torques, wrenches), w.logs)
         assert sensor.bits == pytest.approx((whole - rest).bits, rel=1e-7)
         assert sensor.determined == pytest.approx((whole - rest).determined, rel=1e-7)
-
-
-def test_half_as_many_independent_samples_tell_as_much_as_half_the_rows(three_logs: World) -> None:
-    log = three_logs.logs[1]
-    twice = [replace(log, oversampling=5.0), replace(log, source="again.npz", oversampling=5.0)]
-    assert adds(replace(three_logs, logs=twice)).total.bits == pytest.approx(
-        adds(replace(three_logs, logs=[log])).total.bits
-    )
-
-
-# ---------------------------------------------------------------------------------------------------------- the factors
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_parts_hold_every_sample_once_and_merge_into_the_whole(three_logs: World, threads: int) -> None:
-    w, builder = three_logs, three_logs.builder
-    parts = compress_parts(w.logs, builder, chunk=3, threads=threads)
-    assert [part.source for part in parts] == sorted(part.source for part in parts)
-    assert len({(part.source, part.state) for part in parts}) == len(parts)
-    for log in w.logs:
-        assert sum(part.samples for part in parts if part.source == log.source) == len(log)
-    whole, R = gram(w), merge_factors((part.factor for part in parts), builder).triangle().numpy()[:-1, :-1]
-    np.testing.assert_allclose(R.T @ R, whole, rtol=0.0, atol=1e-13 * np.abs(whole).max())
-
-
-def test_rows_are_as_independent_as_those_of_the_logs_they_come_from(three_logs: World) -> None:
-    w = three_logs
-    logs = [replace(log, oversampling=kappa) for log, kappa in zip(w.logs, (1.0, 4.0, 2.0), strict=True)]
-    parts = compress_parts(logs, w.builder)
-    rows = [sum(p.factor.rows for p in parts if p.source == log.source) for log in logs]
-    factor = merge_factors((part.factor for part in parts), w.builder)
-    assert factor.oversampling == pytest.approx(sum(rows) / (rows[0] + rows[1] / 4.0 + rows[2] / 2.0))
-    assert merge_factors([], w.builder).oversampling == 1.0
-
-
-def test_tables_say_how_many_are_not_shown(three_logs: World) -> None:
-    found = adds(three_logs)
-    many = [SensorContribution(f"[red]joint {number}[/]", float(number), 1.0, "joint torque") for number in range(20)]
-    text = table_text(contribution_table(replace(found, sensors=many)))
-    assert "[red]joint 19[/]" in text
-    assert "[red]joint 7[/]" not in text
-    assert "and 8 more sensors" in text
-    assert max(map(len, text.splitlines())) <= 100

@@ -92,20 +92,3 @@ def test_the_noise_of_the_sensors_that_predictions_are_compared_with_is_as_expec
     for group, floor in (("base_force", NOISE.contact_force), ("base_moment", NOISE.contact_moment)):
         assert with_floors[group] == pytest.approx(np.hypot(expected.sensors[group] or 0.0, floor))
     assert with_floors["joint_torque"] == expected.sensors["joint_torque"]
-
-
-def test_without_rows_the_urdfs_error_is_all_there_is(robot: Robot, logs: list[Samples]) -> None:
-    problem = problem_of(robot, logs, "joints")
-    blind = replace(problem, A=0.0 * problem.A)
-    directions = error_directions(blind, 0.1, 1.0, 0.3)
-    covariance = directions.T @ directions
-    np.testing.assert_allclose(covariance, np.diag((0.3 * problem.scale * problem.free) ** 2), rtol=0.0, atol=1e-12)
-
-
-def test_exact_data_without_a_ridge_leave_errors_only_where_no_row_sees(robot: Robot, logs: list[Samples]) -> None:
-    problem = problem_of(robot, logs, "joints")
-    directions = error_directions(problem, 0.0, 0.0, 0.2)
-    seen = problem.A @ directions.T
-    assert np.abs(seen).max() < 1e-9 * np.abs(problem.A * problem.scale).max()
-    hidden = int(problem.free.sum()) - LeastSquares().solve(problem).rank
-    assert np.linalg.matrix_rank(directions / problem.scale) == hidden

@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from motions import value
-from recordings import Miscalibration, in_world
-from synthetic import G1, Array, Oracle, load, make_log
-from unknowns import Fit, fit
+from recordings import Miscalibration
+from synthetic import Array, Oracle, load, make_log
+from unknowns import fit
 from urdfs import BASE, inertial, joint, link, write
 from welded import SENSORS, machine
 
-from torchid.identifiability.confounding import INFLATION_LIMIT, total_mass
+from torchid.identifiability.confounding import INFLATION_LIMIT
 from torchid.logs import Log
-from torchid.logs.preprocess import preprocess
-from torchid.parameters import WRENCH_COMPONENTS
 from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log
 from torchid.problem.chunks import chunks_by_state
 from torchid.problem.elimination import free_parameters
@@ -149,20 +146,6 @@ def test_95_percent_intervals_of_offsets_hold_the_truth_that_often(tmp_path: Pat
     assert 0.93 < np.mean(hits) < 0.97
 
 
-def test_a_contact_that_never_touches_in_a_log_has_no_offset_there(recorded: Recorded) -> None:
-    robot, _, logs = recorded
-    without = replace(logs[1], active=logs[1].active & torch.tensor([True, False]))
-    touching = ~logs[1].active[:, 1]
-    found = fit(robot, CONTACTS, sensors_of(robot), OFFSETS, [logs[0], without[touching.nonzero()[:, 0]]])
-    labels = {(x.log, x.extra.label) for x in found.extras}
-    assert ("a.npz", "offset of fin fz") in labels
-    assert not {label for log, label in labels if log == "b.npz" and "fin" in label}
-    assert all(np.isfinite(x.value) and np.isfinite(x.standard_error) for x in found.extras)
-    complete = fit(robot, CONTACTS, sensors_of(robot), OFFSETS, logs)
-    for key in labels:
-        assert found.values[key] == pytest.approx(complete.values[key], abs=1e-6)
-
-
 # ------------------------------------------------------------------------------------------- what is confounded
 
 
@@ -184,94 +167,3 @@ def test_an_offset_and_a_weight_are_as_far_apart_as_the_acceleration_is_from_con
     if not found.separable:
         assert found.confounded_with == ("arm m",)
         assert (found.standard_error == np.inf) == (acceleration == 0.0)
-
-
-FEET = tuple(Contact(f"{side}_ankle_roll_link", "flat") for side in ("left", "right"))
-
-
-@cache
-def standing(lifted: bool) -> Fit:
-    """An upright humanoid at rest in many postures, plates along world axes; both feet down, or each lifted in turn."""
-    robot, rng = load(G1), np.random.default_rng(5)
-    oracle = Oracle.of(robot)
-    states = [[True, True], [True, False], [False, True]] if lifted else [[True, True]]
-    log = make_log(oracle, [(foot.frame, 6) for foot in FEET], states, 3, rng)
-    N, n = 300, robot.n
-    q = np.hstack([np.zeros((N, 6)), np.ones((N, 1)), rng.uniform(-0.4, 0.4, (N, n))])
-    still = np.zeros((N, 6 + n))
-    active = np.array([states[i % len(states)] for i in range(N)])
-    needed = oracle.forces(q, still, still)
-    J = np.stack([oracle.jacobian(q, foot.frame) for foot in FEET], axis=1) * active[:, :, None, None]
-    J = J.reshape(N, 12, -1)
-    wrench = np.linalg.pinv(J[:, :, :6].transpose(0, 2, 1)) @ needed[:, :6, None]
-    torque = needed[:, 6:] - (J[:, :, 6:].transpose(0, 2, 1) @ wrench)[..., 0]
-    zero = np.zeros((N, 3))
-    log = Log(
-        "standing.npz", np.arange(N) * 0.01, robot.joint_names, q[:, 7:], still[:, 6:], still[:, 6:], torque,
-        base_quat_xyzw=q[:, 3:7], base_linear_acceleration_world=zero, base_angular_velocity_base=zero,
-        base_angular_acceleration_base=zero, contact_names=tuple(foot.frame for foot in FEET), contact_active=active,
-        contact_wrench_local=wrench.reshape(N, 2, 6),
-    )  # fmt: skip
-    samples = bind_log(in_world(oracle, log), robot, FEET)
-    return fit(robot, FEET, named_sensors("full", n, 2), ExtraTerms(offsets={"contact_force": "log"}), [samples])
-
-
-@pytest.mark.parametrize("lifted", [False, True], ids=["both feet always down", "each lifted in turn"])
-def test_only_a_lifted_foot_tells_its_plates_vertical_offset_from_the_mass_of_a_robot_at_rest(lifted: bool) -> None:
-    found = standing(lifted)
-    apart = {x.extra.component: x.separable for x in found.extras}
-    vertical = [x for x in found.extras if x.extra.component == "fz"]
-    mass = total_mass(found.assembly, found.estimate)
-    assert len(vertical) == 2
-    assert apart["fz"] == lifted
-    assert mass.separable == lifted
-    for x in vertical:
-        assert x.separable == lifted
-        if lifted:
-            assert abs(x.value) < 1e-6
-        else:
-            assert any(name.endswith(" m") for name in x.confounded_with), x.confounded_with
-
-
-# ---------------------------------------------------------------------------------------------------- filtered logs
-
-
-@pytest.mark.parametrize("axes", ["local", "world"])
-def test_a_filter_that_smears_the_switching_of_contacts_leaves_offsets_exact(recorded: Recorded, axes: str) -> None:
-    """Readings that differ by an offset while active: the fits differ by just that, to rounding."""
-    robot, oracle, _ = recorded
-    rng, N = np.random.default_rng(6), 600
-    raw = make_log(oracle, [("sole", 6), ("fin", 3)], STATES, N, rng)
-    time = np.arange(N) * 0.01
-    active = np.stack([np.sin(2.1 * time) > -0.3, np.sin(3.7 * time + 1.0) > 0.2], axis=1)
-    waves = rng.uniform(0.3, 1.2, (3, robot.n))
-    swing = np.sin(2 * np.pi * waves[0] * time[:, None] + 3 * waves[1]) * waves[2]
-    still = np.zeros((N, 3))
-    log = replace(
-        raw,
-        joint_position=swing,
-        contact_active=active,
-        base_quat_xyzw=value(raw.base_quat_xyzw)[:1].repeat(N, 0),
-        base_linear_acceleration_world=np.sin(time)[:, None] * np.ones(3),
-        base_angular_velocity_base=still,
-        base_angular_acceleration_base=still,
-    )
-    log = in_world(oracle, log) if axes == "world" else log
-    log = replace(log, joint_velocity=None, joint_acceleration=None)
-    off = Miscalibration.random(log, rng)
-    read = [preprocess(x, cutoff_hz=6.0) for x in (log, off.read(log))]
-    assert read[1].contact_share is not None
-    smeared = (read[1].contact_share > 0.01) & (read[1].contact_share < 0.99)
-    assert smeared.mean() > 0.01
-    terms = ExtraTerms(offsets=dict.fromkeys(CHANNELS, "log"))
-    before, after = (fit(robot, CONTACTS, sensors_of(robot), terms, [bind_log(x, robot, CONTACTS)]) for x in read)
-    assert after.assembly.problem.oversampling > 3.0
-    true = dict(zip((f"offset of {name}" for name in robot.joint_names), off.torque, strict=True))
-    for c, contact in enumerate(CONTACTS):
-        for k in range(len(contact.components)):
-            true[f"offset of {contact.frame} {WRENCH_COMPONENTS[k]}"] = off.wrench[c, k]
-    told = [x for x in after.extras if x.separable and x.extra.label in true]
-    assert len(told) >= 9
-    for x in told:
-        shift = x.value - before.values[x.log, x.extra.label]
-        assert shift == pytest.approx(true[x.extra.label], rel=1e-7, abs=1e-7), x.extra.label

@@ -17,11 +17,9 @@ from torchid.fitting.fit import LogFitter
 from torchid.identifiability import confounding
 from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log, compress_parts, compression
 from torchid.problem.compression import compress_in_blocks, split_into_folds
-from torchid.problem.motion import MotionNoise
 from torchid.sensing import SensorNoise, named_sensors
 
 NOISE = 0.3
-NOISE_RAD_S2 = 3.0
 
 
 def scene(seconds: int, terms: ExtraTerms | None = None) -> tuple[Samples, LogFitter, Array, np.random.Generator]:
@@ -123,58 +121,6 @@ def test_intervals_hold_the_truth_where_errors_of_neighbours_are_alike(
     known_lack = [one for one in lack if one is not None]
     assert len(known_lack) == (12 if blocks == 20 else 0), "five blocks do not tell it from noise"
     assert min(known_lack, default=np.inf) > 3.0
-
-
-def test_noise_alone_is_no_lack_of_fit() -> None:
-    samples, fitter, _, rng = scene(400)
-    for _ in range(5):
-        log = noisy(samples, NOISE * rng.normal(size=(len(samples), 12)))
-        fit = fitter.fit(compress_in_blocks(split_into_folds([log], fitter.builder), fitter.builder))
-        assert fit.jackknife is not None
-        assert 0.8 < (fit.jackknife.lack_of_fit or 0.0) < 1.25
-
-
-def test_noise_of_the_motion_that_is_known_is_no_lack_of_fit() -> None:
-    samples, fitter, _, rng = scene(200)
-    base = samples.base
-    assert base.specific_force is not None
-    joints, bases = torch.zeros(12, 3, 3, dtype=torch.float64), torch.zeros(12, 12, dtype=torch.float64)
-    joints[:, 2, 2], bases[6:, 6:] = NOISE_RAD_S2, NOISE_RAD_S2 * torch.eye(6, dtype=torch.float64)
-
-    def drawn(width: int) -> torch.Tensor:
-        return NOISE_RAD_S2 * torch.from_numpy(rng.normal(size=(len(samples), width)))
-
-    moved = replace(base, specific_force=base.specific_force + drawn(3))
-    if base.angular_acceleration is not None:
-        moved = replace(moved, angular_acceleration=base.angular_acceleration + drawn(3))
-    log = replace(
-        noisy(samples, NOISE * rng.normal(size=(len(samples), 12))),
-        joint_acceleration=samples.joint_acceleration + drawn(12),
-        base=moved,
-        motion_noise=MotionNoise(joints, bases),
-    )
-    fit = fitter.fit(compress_in_blocks(split_into_folds([log], fitter.builder), fitter.builder))
-    assert fit.jackknife is not None
-    assert fit.jackknife.lack_of_fit is not None
-    assert fit.jackknife.lack_of_fit < 2.0
-
-
-def test_neighbours_of_very_many_blocks_count_as_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    samples, fitter, _, rng = scene(200)
-    log = noisy(samples, NOISE * rng.normal(size=(len(samples), 12)))
-    parts = compress_in_blocks(split_into_folds([log], fitter.builder), fitter.builder)
-    all_blocks = fitter.fit(parts).jackknife
-    monkeypatch.setattr(confounding, "MOST_BLOCKS", 10)
-    fewer = fitter.fit(parts[::-1]).jackknife  # whatever order threads leave them in
-    assert all_blocks is not None
-    assert fewer is not None
-    assert (all_blocks.blocks, fewer.blocks) == (20, 10)
-    ratio = fewer.error[fewer.error > 0.0] / all_blocks.error[fewer.error > 0.0]
-    assert 0.7 < np.median(ratio) < 1.5
-    groups = confounding._numbered(parts)
-    assert [groups["synthetic.npz", fold, block] for fold in range(5) for block in range(4)] == [
-        n // 2 for n in range(20)
-    ]
 
 
 def test_folds_are_blocks_and_without_three_blocks_there_is_no_scatter() -> None:

@@ -21,7 +21,6 @@ from synthetic import (
     random_states,
 )
 
-from torchid import parameters
 from torchid.regressor import FrameJacobian, Regressor
 from torchid.robot import Robot
 
@@ -108,24 +107,3 @@ def test_the_base_wrench_is_the_same_wrench_at_every_base_link(urdf: Path, base_
     carried = np.einsum("bki,bk->bi", J, there[:, :6])  # by virtual work: to the root and to the joints in between
     carried[:, 6:] += by_joints_of(from_other, from_root, 0, there[:, 6:])
     np.testing.assert_allclose(carried, here, rtol=0.0, atol=1e-12 * np.abs(here).max())
-
-
-@every_other_base
-def test_links_have_the_same_place_relative_to_one_another_from_every_base_link(urdf: Path, base_link: str) -> None:
-    from_root, from_other = load(urdf), load(urdf, base_link)
-    assert from_other.base_link == from_other.body_names[0] == base_link
-    q = np.random.default_rng(5).uniform(-1.0, 1.0, (3, from_root.n))
-    here = from_root.link_poses(torch.from_numpy(q))
-    there = from_other.link_poses(torch.from_numpy(by_joints_of(from_root, from_other, 0, q)))
-    assert set(here) == set(there)
-    for name, T_other_link in there.items():
-        T_root_link = here[base_link] @ T_other_link
-        np.testing.assert_allclose(T_root_link, here[name], rtol=0.0, atol=1e-14, err_msg=name)
-    np.testing.assert_allclose(there[base_link], np.tile(np.eye(4), (3, 1, 1)), rtol=0.0, atol=1e-15)
-
-
-def test_mass_is_the_same_from_every_base_link() -> None:
-    robot = load(G1)
-    total = robot.nominal[:, parameters.MASS].sum()
-    for base_link in list(robot.links)[::6]:
-        np.testing.assert_allclose(load(G1, base_link).nominal[:, parameters.MASS].sum(), total, rtol=1e-14)

@@ -70,9 +70,3 @@ def test_what_holds_the_robot_drops_out_as_a_contact_that_is_not_measured(attach
     assert size > 1.0, "the attachment's force"
     assert len(missed) == 1, "rows are left in all samples"
     assert missed[0] < 1e-12 * size
-
-
-def test_an_inactive_tie_is_none(tmp_path: Path) -> None:
-    path = tmp_path / "arm.xml"
-    path.write_text(ARM.format('<weld active="false" body1="target" body2="four"/>'))
-    assert "loop1 of four" not in load_robot(path, fixed_base=True).links

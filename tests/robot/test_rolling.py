@@ -7,14 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 from synthetic import ROBOTS, load
 from urdfs import joint, link, write
 
 from torchid.config.robot import ContactConfig
 from torchid.errors import ConfigError, UrdfError
 from torchid.fitting.experiment import resolve_contacts
-from torchid.problem.floor_pose import rolled_distance
 
 
 def shape(geometry: str, origin: str = "") -> str:
@@ -55,13 +53,6 @@ def test_balls_beside_the_frame_and_ends_of_meshes_are_taken(
     assert abs(contacts[0].radius - radius) < 1.2e-3
     np.testing.assert_allclose(contacts[0].centre, centre, atol=1e-3)
     assert text in found
-
-
-def test_no_ball_is_seen_in_a_sole_or_a_shank() -> None:
-    for urdf, frame in (("talos_full_v2.urdf", "left_sole_link"), ("icub.urdf", "l_foot"), ("go2.urdf", "FL_calf")):
-        contacts, text = resolve_contacts([ContactConfig(frame, "point")], load(next(ROBOTS.rglob(urdf))))
-        assert contacts[0].radius == 0.0
-        assert text == f"{frame}: radius 0: no sphere found in the URDF; state contacts[].radius if it rolls"
 
 
 @pytest.mark.parametrize(
@@ -116,12 +107,6 @@ def test_a_point_on_a_wheel_rolls_on_the_wheel(tmp_path: Path, kind: str, origin
         )
 
 
-def test_a_link_that_is_welded_to_the_frame_s_lends_its_shape(tmp_path: Path) -> None:
-    robot = foot_on(tmp_path, shape('<sphere radius="0.04"/>', '<origin xyz="0.1 0 0"/>'))
-    contacts, text = resolve_contacts([ContactConfig("toe", "point")], robot)
-    assert (contacts[0].radius, text) == (0.04, "toe: ball of radius 40 mm, from the collision sphere of foot")
-
-
 def test_what_the_file_states_counts_more_than_the_urdf(tmp_path: Path) -> None:
     robot = foot_on(tmp_path, shape('<sphere radius="0.04"/>'))
     contacts, text = resolve_contacts([ContactConfig("foot", "point", radius=0)], robot)
@@ -143,21 +128,3 @@ def test_what_no_contact_can_have_is_refused_in_one_line(tmp_path: Path) -> None
         robot = foot_on(tmp_path, shape(f'<sphere radius="{radius}"/>'))
         with pytest.raises(UrdfError, match=f"<sphere radius>: '{radius}'; accepted: 1 decimal number of at least 0"):
             resolve_contacts([ContactConfig("foot", "point")], robot)
-
-
-def test_a_sphere_goes_as_far_as_its_circumference() -> None:
-    angle = np.linspace(0.0, 2.0 * np.pi, 200)
-    turned = Rotation.from_rotvec(angle[:, None] * [0.0, 1.0, 0.0]).as_matrix()
-    went = rolled_distance(turned, 0.5, np.array([0.0, 0.0, 1.0]))
-    np.testing.assert_allclose(went, angle[:, None] * [0.5, 0.0, 0.0], atol=1e-12)
-    spun = Rotation.from_rotvec(angle[:, None] * [0.0, 0.0, 1.0]).as_matrix()
-    np.testing.assert_allclose(rolled_distance(spun, 0.5, np.array([0.0, 0.0, 1.0])), 0.0, atol=1e-12)
-
-
-def test_a_cylinder_rolls_across_its_axis() -> None:
-    angle = np.linspace(0.0, 1.0, 200)
-    axis = np.array([0.0, 0.8, 0.6])
-    level = Rotation.align_vectors([axis], [[0.0, 1.0, 0.0]])[0]
-    turned = (Rotation.from_rotvec(angle[:, None] * axis) * level).as_matrix()
-    went = rolled_distance(turned, 0.5, np.array([0.0, 0.0, 1.0]), "y")
-    np.testing.assert_allclose(went, angle[:, None] * np.cross(axis, [0.0, -0.6, 0.8]) * 0.5, atol=1e-12)

@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from synthetic import G1, PANDA, ROBOTS, SOLO12, TALOS, Array, load
-from urdfs import INERTIAL, ball, inertial, joint, link, table, words, write
+from urdfs import INERTIAL, ball, joint, link, table, words, write
 
 from torchid.errors import TorchidWarning, UrdfError
 from torchid.parameters import mass_com_inertia
@@ -132,30 +132,6 @@ def test_a_turned_shape_is_enclosed_along_its_own_axes(kind: str, seed: int, tmp
     assert np.prod(extent.half) == pytest.approx(np.prod(half), rel=5e-3)  # of the points, a little inside
 
 
-@table({
-    "box": ('<box size="0.2 0.4 0.6"/>', [0.1, 0.2, 0.3], np.sqrt(3.0)),
-    "cylinder": ('<cylinder radius="0.1" length="0.6"/>', [0.1, 0.1, 0.3], np.sqrt(2.0)),
-    "sphere": ('<sphere radius="0.25"/>', [0.25, 0.25, 0.25], 1.0),
-    "capsule": ('<capsule radius="0.1" length="0.4"/>', [0.1, 0.1, 0.3], None),
-})  # fmt: skip
-def test_half_edges_and_semi_axes_are_the_stated_ones(case: tuple, tmp_path: Path) -> None:
-    geometry, half, factor = case
-    extent = one(tmp_path, f'<visual><origin xyz="1 2 3" rpy="0.3 -0.2 0.5"/><geometry>{geometry}</geometry></visual>')
-    np.testing.assert_allclose(extent.centre, [1.0, 2.0, 3.0], rtol=0.0, atol=1e-12)
-    np.testing.assert_allclose(extent.half, half, rtol=1e-12)
-    if factor is not None:
-        np.testing.assert_allclose(extent.semi_axes, factor * np.array(half), rtol=1e-9)
-    else:
-        assert (extent.semi_axes < np.sqrt(2.0) * extent.half).all()
-
-
-def test_roll_pitch_and_yaw_turn_a_box_as_the_urdf_means(tmp_path: Path) -> None:
-    turned = '<origin rpy="1.5707963267948966 0 1.5707963267948966"/><geometry><box size="2 4 6"/></geometry>'
-    extent = one(tmp_path, f"<visual>{turned}</visual>")  # x to y; y to z; z to x
-    points = extent.centre + (CORNERS * extent.half) @ extent.axes.T
-    np.testing.assert_allclose(np.ptp(points, axis=0), [6.0, 2.0, 4.0], rtol=0.0, atol=1e-12)
-
-
 def test_a_plate_keeps_an_interior_and_a_point_is_no_shape(tmp_path: Path) -> None:
     extent = one(tmp_path, '<visual><geometry><box size="0.4 0.2 0"/></geometry></visual>')
     np.testing.assert_allclose(extent.half, [0.2, 0.1, 0.0002])
@@ -186,34 +162,6 @@ def test_all_shapes_of_all_welded_links_are_enclosed(kinds: list[str], seed: int
     for axes in own:
         local = np.concatenate(points) @ axes
         assert np.prod(2.0 * found.half) <= np.prod(local.max(axis=0) - local.min(axis=0)) * 1.02
-
-
-def test_matter_of_a_welded_link_without_shapes_is_the_uniform_box_of_its_inertia(tmp_path: Path) -> None:
-    """A box of 2 kg and edges 0.2, 0.4 and 0.6 m about the weld's centre, far from the base's ball."""
-    a, b, c = 0.2, 0.4, 0.6
-    numbers = {"ixx": (b * b + c * c) / 6, "iyy": (a * a + c * c) / 6, "izz": (a * a + b * b) / 6}
-    tip = link("tip", inertial("2", '<origin xyz="0 0 1" rpy="0 0 0"/>', **{k: repr(v) for k, v in numbers.items()}))
-    weld = joint("weld", "base", "tip", "fixed", '<origin xyz="3 0 0"/>')
-    found = extents(write(tmp_path, link("base", INERTIAL + ball(0.1)), tip, weld))["base"]
-    corners = [3.0, 0.0, 1.0] + CORNERS * [a, b, c] / 2.0
-    assert_encloses(found, np.concatenate([corners, 0.1 * sphere(4000)]))
-    assert np.abs(found.axes).max() == pytest.approx(1.0)
-
-
-def test_the_kind_that_is_preferred_counts_and_the_other_where_there_is_none(tmp_path: Path) -> None:
-    both = link("base", INERTIAL + ball(0.1, "collision") + ball(0.2, "visual"))
-    path = write(tmp_path, both, link("arm", INERTIAL + ball(0.3, "collision")), joint("elbow", "base", "arm"))
-    for prefer, radius in (("collision", 0.1), ("visual", 0.2)):
-        found = extents(path, prefer)
-        np.testing.assert_allclose(found["base"].half, radius)
-        np.testing.assert_allclose(found["arm"].half, 0.3)
-
-
-def test_bodies_without_mass_and_bodies_not_asked_for_are_left_out(tmp_path: Path) -> None:
-    shaped = (link("base", INERTIAL + ball(0.1)), link("arm", INERTIAL + ball(0.2)), link("ghost", ball(0.3)))
-    robot = load(write(tmp_path, *shaped, joint("elbow", "base", "arm"), joint("wrist", "arm", "ghost")))
-    assert list(body_extents(robot)) == [0, 1]
-    assert list(body_extents(robot, bodies=[1])) == [1]
 
 
 # ----------------------------------------------------------------------------------------------------------- meshes
@@ -264,15 +212,6 @@ def test_a_body_with_a_mesh_that_cannot_be_read_is_left_out_in_one_line(case: tu
     assert "\n" not in message
 
 
-def test_bodies_without_shapes_are_listed_once(tmp_path: Path) -> None:
-    elements = [link(name) for name in "abc"] + [link("d", INERTIAL + ball(0.1))]
-    joints = [joint("j", "a", "b"), joint("k", "b", "c"), joint("l", "c", "d")]
-    with pytest.warns(TorchidWarning) as caught:
-        assert list(extents(write(tmp_path, *elements, *joints))) == ["d"]
-    (message,) = (str(warning.message) for warning in caught)
-    assert message.endswith("machine.urdf: no shapes at a, b, c: their extent is unknown")
-
-
 def test_the_unit_of_a_collada_file_counts(tmp_path: Path) -> None:
     numbers = words(TETRAHEDRON.ravel())
     axes = "".join(f'<param name="{axis}" type="float"/>' for axis in "XYZ")
@@ -318,14 +257,6 @@ def test_a_shape_that_is_none_is_refused_by_its_link_in_one_line(case: tuple, tm
         body_extents(robot)
     assert str(caught.value).startswith(f"{path}: link 'base', <visual> {found}")
     assert "\n" not in str(caught.value)
-
-
-def test_comments_and_an_origin_with_less_than_all_are_read(tmp_path: Path) -> None:
-    origin = '<!-- where --><origin xyz="1 0 0"/>'
-    extent = one(tmp_path, f'<visual>{origin}<geometry><!-- what --><box size="2 2 2"/></geometry></visual>')
-    np.testing.assert_allclose(extent.centre, [1.0, 0.0, 0.0])
-    with pytest.raises(UrdfError, match=r"<visual> <origin rpy>: 'a b c'; accepted: 3 decimal numbers"):
-        one(tmp_path, '<visual><origin rpy="a b c"/><geometry><box size="2 2 2"/></geometry></visual>')
 
 
 # ------------------------------------------------------------------------------------------------------ real robots

@@ -12,7 +12,7 @@ from physical import of_points
 from refusals import refused
 from repository import CONFIGS, DEMO
 from scipy.spatial.transform import Rotation
-from synthetic import ANYMAL, G1, ROBOTS, ROMEO, SOLO8, SOLO12, TALOS, TALOS_FULL, Array, load
+from synthetic import ANYMAL, G1, ROBOTS, ROMEO, SOLO8, SOLO12, TALOS, Array, load
 from urdfs import joint, link, table, words, write
 
 from torchid.errors import ConfigError, about_file
@@ -21,7 +21,6 @@ from torchid.problem.linear import parameter_scale
 from torchid.robot import Robot, mirror_pairs
 
 GO1 = ROBOTS / "go1_description/urdf/go1.urdf"
-HUMAN = ROBOTS / "human_description/robots/human.urdf"
 PR2 = ROBOTS / "pr2_description/urdf/pr2.urdf"
 
 
@@ -60,14 +59,6 @@ def test_the_limbs_of_real_robots_are_mirror_images_and_so_is_their_matter(case:
         off.append(float(np.abs((image - robot.nominal[pair.image]) / scale[pair.image])[:10].max()))
     assert np.median(off) < 0.03
     assert tolerance is None or max(off) < tolerance
-
-
-def test_pairs_are_named_as_people_mean_them() -> None:
-    assert ("LF_HIP", "RF_HIP") in names(load(ANYMAL), "L", "R")
-    assert ("l_foot", "r_foot") in names(load(CONFIGS / "biped.urdf"), "l_", "r_")
-    assert names(load(CONFIGS / "biped.urdf"), "l_", "r_") == names(load(CONFIGS / "biped.urdf"), "r_", "l_")
-    fingers = [pair for pair in names(load(PR2), "l_", "r_") if "r_gripper_l_finger_link" in pair]
-    assert fingers == [("r_gripper_l_finger_link", "l_gripper_r_finger_link")], "not grippel_"
 
 
 # ------------------------------------------------------------------------------------------------- mirrored matter
@@ -136,28 +127,6 @@ def test_a_pair_that_is_not_mirrored_is_refused_with_the_distance(tmp_path: Path
     assert len(mirror_pairs(near, "left", "right")) == 2
 
 
-def test_joints_that_are_not_mirrored_are_refused_with_the_angle(tmp_path: Path) -> None:
-    robot = mirrored_robot(tmp_path, np.random.default_rng(3), upper_axis=np.array([0.5, 0.0, 0.0]))
-    assert "the joints of left_upper and right_upper are " in refusal(robot, "left", "right")
-
-
-def test_real_grippers_that_are_copies_of_each_other_are_refused_unless_they_stay_apart() -> None:
-    robot = load(TALOS_FULL)
-    message = refusal(robot, "left", "right")
-    assert "gripper_left_fingertip_1_link and gripper_right_fingertip_1_link are 0.064 m from being" in message
-    grippers = [name for name in robot.body_names if name.startswith("gripper")]
-    found = names(robot, "left", "right", apart=grippers)
-    assert ("arm_left_7_link", "arm_right_7_link") in found
-    assert not [pair for pair in found if "gripper" in pair[0]]
-    assert len(names(robot, "leg_left", "leg_right")) == 6
-
-
-def test_the_human_whose_left_is_along_z_is_refused_along_y_and_taken_along_z() -> None:
-    robot = load(HUMAN)
-    assert "m from being mirror images along y" in refusal(robot, "left", "right")
-    assert len(mirror_pairs(robot, "left", "right", "z")) > 5
-
-
 def arms(folder: Path, *bodies: str) -> Robot:
     """A trunk with a body on each side, two metres apart, and more on its middle."""
     elements = [link("shell_link")]
@@ -180,18 +149,3 @@ def arms(folder: Path, *bodies: str) -> Robot:
 def test_names_that_do_not_answer_to_each_other_are_refused(case: tuple, tmp_path: Path) -> None:
     bodies, tokens, found = case
     assert found in refusal(arms(tmp_path, *bodies), *tokens)
-
-
-def test_a_token_inside_a_word_needs_no_counterpart_and_neither_do_bodies_that_stay_apart(tmp_path: Path) -> None:
-    assert names(arms(tmp_path, "l_arm", "r_arm"), "l_", "r_") == {("l_arm", "r_arm")}  # the trunk is shell_link
-    robot = arms(tmp_path, "l_arm", "r_arm", "l_leg")
-    assert names(robot, "l_", "r_", apart=["l_leg"]) == {("l_arm", "r_arm")}
-    assert names(robot, "l_", "r_", apart=["l_leg", "l_arm"]) == {("l_arm", "r_arm")}, "one side may be known"
-    assert names(robot, "l_", "r_", apart=["l_leg", "l_arm", "r_arm"]) == set()
-
-
-def test_a_pair_of_which_one_has_no_mass_is_refused(tmp_path: Path) -> None:
-    origin = '<origin xyz="0 {} 0"/><axis xyz="0 0 1"/>'
-    elements = [link("trunk"), link("l_arm"), link("r_arm", "")]
-    joints = [joint(f"{s}_joint", "trunk", f"{s}_arm", extra=origin.format(y)) for s, y in (("l", 1), ("r", -1))]
-    assert "of l_arm and r_arm one has no mass" in refusal(load(write(tmp_path, *elements, *joints)), "l_", "r_")

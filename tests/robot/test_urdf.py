@@ -142,21 +142,10 @@ def test_a_joint_with_an_impossible_number_is_refused_by_its_name(case: tuple, t
     assert f"joint 'elbow', {expected}" in message
 
 
-@pytest.mark.parametrize("attribute", ["multiplier", "offset"])
-def test_a_mimic_joint_with_a_ratio_that_is_no_number_is_refused(attribute: str, tmp_path: Path) -> None:
-    follower = joint("wrist", "arm", "hand", extra=mimic("elbow", f'{attribute}="nan"'))
-    assert "joint 'wrist', <mimic>" in refusal(write(tmp_path, *TREE, link("hand"), follower))
-
-
 @table(UNREADABLE_NUMBERS)
 def test_a_number_that_cannot_be_read_is_refused_by_its_place(case: tuple, tmp_path: Path) -> None:
     elements, expected = case
     assert expected in refusal(write(tmp_path, *elements))
-
-
-def test_an_origin_that_is_not_finite_is_refused_at_a_fixed_joint_too(tmp_path: Path) -> None:
-    weld = joint("weld", "base", "arm", "fixed", '<origin xyz="0 0 nan"/>')
-    assert "joint 'weld', <origin>" in refusal(write(tmp_path, BASE, ARM, weld))
 
 
 @pytest.mark.parametrize(
@@ -184,12 +173,6 @@ def test_a_base_link_that_does_not_exist_names_the_nearest_links(tmp_path: Path)
     message = refusal(write(tmp_path, *TREE), UnknownNameError, base_link="bsae")
     assert "robot.base_link: unknown name 'bsae'" in message
     assert message.endswith("accepted: base")
-
-
-def test_a_link_that_does_not_exist_names_the_nearest_links(tmp_path: Path) -> None:
-    robot = load_robot(write(tmp_path, *TREE))
-    with pytest.raises(UnknownNameError, match=r"machine.urdf: contacts\[0\]: unknown name 'amr'; accepted: arm$"):
-        robot.link("amr", "contacts[0]")
 
 
 @pytest.mark.parametrize(
@@ -300,12 +283,6 @@ def test_xacro_that_is_not_expanded_is_refused(tmp_path: Path, element: str, dec
     assert "xacro that is not expanded, in line 1; accepted: the URDF that `xacro" in refusal(path)
 
 
-def test_a_namespace_that_xacro_leaves_behind_is_no_xacro(tmp_path: Path) -> None:
-    path = write(tmp_path, *TREE, "<!-- <xacro:include/> -->")
-    path.write_text(path.read_text().replace("<robot ", f"<robot {XACRO} "))
-    assert load_robot(path).joint_names == ("elbow",)
-
-
 def floating(world: str) -> tuple[str, ...]:
     return (world, *TREE, joint("root", "world", "base", "floating", ""))
 
@@ -329,10 +306,3 @@ def test_a_root_without_mass_below_a_floating_joint_is_the_world(tmp_path: Path,
 )
 def test_any_other_floating_joint_is_refused(tmp_path: Path, elements: tuple[str, ...]) -> None:
     assert "joint 'root': type 'floating'" in refusal(write(tmp_path, *elements))
-
-
-def test_what_carries_no_kinematics_is_not_read(tmp_path: Path) -> None:
-    broken = '<visual><geometry><mesh filename="package://nowhere/x.dae" scale="a b"/></geometry></visual>'
-    elements = (link("base", broken + INERTIAL), ARM, HINGE, '<transmission name="t"/>', "<gazebo>&lt;</gazebo>")
-    robot = load_robot(write(tmp_path, *elements, '<material name="m"><color rgba="red"/></material>', "<!-- a -->"))
-    assert robot.joint_names == ("elbow",)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from synthetic import ROBOTS, joint_map
-from urdfs import ARM, BASE, HINGE, TREE, inertial, joint, link, refusal, warned, write
+from urdfs import ARM, BASE, HINGE, inertial, joint, link, refusal, warned, write
 
 from torchid.errors import MasslessBodyWarning, UnknownNameError, UnphysicalInertiaWarning, UrdfError
 from torchid.robot import load_robot
@@ -40,30 +40,6 @@ def test_an_inertia_of_no_body_is_warned_of_by_link_and_kept_as_written(
     np.testing.assert_array_equal(robot.nominal[1, [4, 5]], [float(x) for x in numbers.groups()])
 
 
-def test_inertias_of_no_body_are_said_in_one_line(tmp_path: Path) -> None:
-    parts = [link("arm", inertial(ixx="0.3")), HINGE, link("tip", inertial(mass="0")), joint("wrist", "arm", "tip")]
-    _, caught = warned(write(tmp_path, BASE, *parts))
-    (message,) = [str(w.message) for w in caught]
-    assert "link 'arm': largest principal inertia 0.3 exceeds" in message
-    assert message.endswith("and the inertia of tip is no body's either; used as written")
-
-
-@pytest.mark.parametrize(
-    ("mass", "ixx", "warns"), [("1e-6", "3e-6", False), ("1e-6", "0.3", True), ("0.3", "3e-6", True)]
-)
-def test_the_inertia_of_a_dummy_link_is_no_reason_to_warn(mass: str, ixx: str, warns: bool, tmp_path: Path) -> None:
-    dummy = link("mount", inertial(mass=mass, ixx=ixx, iyy="1e-6", izz="1e-6"))
-    robot, caught = warned(write(tmp_path, *TREE, dummy, joint("weld", "arm", "mount", "fixed")))
-    assert bool(caught) == warns
-    assert robot.nominal[1, 0] == pytest.approx(1.0 + float(mass), rel=1e-12), "used as written"
-
-
-def test_a_thin_plate_or_a_point_mass_is_no_reason_to_warn(tmp_path: Path) -> None:
-    plate = link("base", inertial(ixx="0.05", iyy="0.05", izz="0.1"))
-    point = link("arm", inertial(ixx="0", iyy="0", izz="0"))
-    assert warned(write(tmp_path, plate, point, HINGE))[1] == []
-
-
 @pytest.mark.parametrize("element", ["", inertial(mass="0", ixx="0", iyy="0", izz="0")], ids=["no inertial", "zeros"])
 def test_a_limb_that_ends_in_a_massless_body_is_warned_of(element: str, tmp_path: Path) -> None:
     path = write(tmp_path, BASE, link("arm", element), HINGE)
@@ -71,22 +47,6 @@ def test_a_limb_that_ends_in_a_massless_body_is_warned_of(element: str, tmp_path
     assert [w.category for w in caught] == [MasslessBodyWarning]
     assert str(caught[0].message).startswith(f"{path}: link 'arm': no inertia at the end of a limb")
     assert robot.massless == ("arm",)
-
-
-def test_massless_bodies_between_others_are_listed_without_a_warning(tmp_path: Path) -> None:
-    path = write(tmp_path, BASE, link("cross", ""), ARM, joint("x", "base", "cross"), joint("y", "cross", "arm"))
-    robot, caught = warned(path)
-    assert caught == []
-    assert robot.massless == ("cross",)
-    assert [body.massless for body in robot.bodies] == [False, True, False]
-
-
-def test_a_massless_link_welded_to_a_body_with_mass_is_no_massless_body(tmp_path: Path) -> None:
-    frame = joint("weld", "arm", "tip", "fixed", '<origin xyz="0 0 1"/>')
-    robot, caught = warned(write(tmp_path, *TREE, link("tip", ""), frame))
-    assert caught == []
-    assert robot.massless == ()
-    assert robot.bodies[1].links == ("arm", "tip")
 
 
 def test_axis_and_numbers_left_out_have_the_values_the_urdf_specification_gives(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from regressors import assert_close, regressor
-from synthetic import PANDA, random_states
+from synthetic import random_states
 from urdfs import joint, link, write
 
 from torchid.errors import InputError, TorchidWarning
@@ -57,12 +57,6 @@ def test_forces_with_a_turned_wrist_and_a_slide_welded_off_zero_are_those_of_pin
     tmp_path: Path,
 ) -> None:
     _assert_forces_are_those_of_the_reduced_model(_load(_arm(tmp_path), {"roll": 0.9, "pu*": -0.35}))
-
-
-def test_forces_with_welded_fingers_and_wrist_are_those_of_pinocchios_reduced_model() -> None:
-    robot = _load(PANDA, {"panda_finger*": 0.03, "panda_joint7": -1.3, "panda_joint4": -0.8})
-    assert robot.welded["panda_finger_joint2"] == 0.03  # it follows the other finger
-    _assert_forces_are_those_of_the_reduced_model(robot)
 
 
 @pytest.mark.parametrize("base_link", [None, "hand"])

@@ -41,15 +41,3 @@ def test_every_start_leads_to_the_best_of_all_minimal_sets() -> None:
         assert [bits for bits, _ in climbed] == sorted((bits for bits, _ in climbed), reverse=True)
         assert {chosen for _, chosen in climbed} <= {chosen for _, chosen in ranked}
         assert climbed[0][0] == pytest.approx(ranked[0][0], rel=1e-9)
-
-
-def test_what_is_kept_stays_and_what_is_excluded_is_not_taken() -> None:
-    ranking, part, ranked = leg()
-    worst, best = ranked[-1][1], ranked[0][1]
-    kept = frozenset(c for c in worst if c not in best)
-    barred = frozenset(c for c in best if c not in worst)
-    keeping = improve_by_exchange(ranking, part, worst, kept, frozenset())
-    without = improve_by_exchange(ranking, part, worst, frozenset(), barred)
-    assert min(map(len, (kept, barred, keeping, without))) > 0
-    assert all(kept <= set(chosen) for _, chosen in keeping)
-    assert all(not barred & set(chosen) for _, chosen in without)

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from itertools import product
-from pathlib import Path
-
-import numpy as np
 import pytest
-from planning import NOISE, RANDOM, SIX, Machine, bits, minimal_of, sees_the_base, states_of, sufficient_sets
+from planning import sees_the_base, states_of
 from synthetic import G1, SOLO12, load
 
 from torchid.errors import SensorError, UnknownNameError
-from torchid.identifiability.base_parameters import structural_samples
 from torchid.problem.linear import parameter_scale
 from torchid.sensing import Contact, chosen_sensors, named_sensors
 from torchid.sensor_planning.observability import (
@@ -19,51 +14,14 @@ from torchid.sensor_planning.observability import (
     assess_sensors,
     candidates,
     count_channels,
-    demands,
     sensor_set,
     with_scalar_candidates,
 )
-from torchid.sensor_planning.planner import PlanningProblem, SetRanking, plan_sensors
-from torchid.sensor_planning.search import all_minimal_sets, cheapest_set, demand_groups
+from torchid.sensor_planning.planner import PlanningProblem, plan_sensors
 
 FEET = tuple(Contact(f"{leg}_FOOT", "point") for leg in ("FL", "FR", "HL", "HR"))
 NAMES = tuple(foot.frame for foot in FEET)
 GAIT = states_of("1111", "1001", "0110", "0000")
-MACHINES = {
-    "a leg on a point": Machine({"leg": ("base", (RANDOM,) * 3)}, (Contact("leg3", "point"),), states_of("1")),
-    "a leg on a flat foot": Machine({"leg": ("base", SIX)}, (Contact("leg6", "flat"),), states_of("1")),
-    "a leg on a rocker": Machine({"leg": ("base", SIX[:5])}, (Contact("leg5", "line", "x"),), states_of("1")),
-    "toe and heel": Machine(
-        {"leg": ("base", SIX)}, (Contact("leg6", "point"), Contact("leg5", "point")), states_of("11", "10")
-    ),
-    "a trunk with hands, and a leg": Machine(
-        {"trunk": ("base", (RANDOM,) * 2), "left": ("trunk2", (RANDOM,) * 2), "leg": ("base", (RANDOM,) * 3)},
-        (Contact("left2", "point"), Contact("leg3", "point")),
-        states_of("11", "01"),
-    ),
-}
-
-
-@pytest.mark.parametrize("per", ["device", "none"])
-@pytest.mark.parametrize("name", MACHINES)
-def test_all_sets_without_a_sensor_to_spare_are_those_that_trying_every_set_finds(
-    name: str, per: str, tmp_path: Path
-) -> None:
-    machine = MACHINES[name]
-    robot = machine.robot(tmp_path)
-    choice = candidates(robot, machine.contacts, per=per, normal_forces=[c.frame for c in machine.contacts])
-    contacts = with_scalar_candidates(machine.contacts, choice)
-    assert all(contact.along_normal for contact in contacts)
-    seen = Machine(machine.chains, contacts, machine.states)
-    wanted = demands(robot, contacts, machine.states, choice)
-    parts = [all_minimal_sets(part.demands, part.candidates) for part in demand_groups(wanted, choice)]
-    found = [frozenset().union(*sets) for sets in product(*parts)]  # type: ignore[arg-type]
-    expected = minimal_of(sufficient_sets(seen, robot, choice), choice)
-    assert set(found) == expected
-    assert any(c.kind == "normal_force" for chosen in expected for c in chosen)
-    least = cheapest_set(wanted, choice)
-    assert least.proven
-    assert least.cost == min(sum(c.cost for c in chosen) for chosen in expected)
 
 
 def test_a_scalar_sensor_is_one_channel_named_and_priced_by_itself() -> None:
@@ -89,27 +47,6 @@ def test_a_scalar_sensor_is_one_channel_named_and_priced_by_itself() -> None:
         SensorError, match=r"normal_forces: left_ankle_roll_link, beside single axes .*: device or none"
     ):
         candidates(robot, contacts, per="axis", normal_forces=frames[:1])
-
-
-@pytest.mark.parametrize("kinds", [("point",) * 4, ("flat", "line", "point", "point")])
-def test_leaving_sensors_out_of_the_rows_is_building_the_rows_without_them(kinds: tuple[str, ...]) -> None:
-    """A channel that a device and a scalar sensor read is lost with both only, and not with others' of the same."""
-    robot = load(SOLO12)
-    contacts = tuple(Contact(frame, kind) for frame, kind in zip(NAMES, kinds, strict=True))
-    offered = candidates(robot, contacts, normal_forces=NAMES[:3])
-    contacts, rng = with_scalar_candidates(contacts, offered), np.random.default_rng(2)
-    logs = structural_samples(robot, contacts, GAIT, 25)
-    prior = parameter_scale(robot.nominal).flatten()
-    for fixed in ((), ("FL_HAA", "FL_FOOT", "FR_FOOT.fn")):
-        others = tuple(c for c in offered if c.name in fixed)
-        open_ = tuple(c for c in offered if c not in others)
-        ranking = SetRanking(robot, contacts, logs, open_, others, NOISE, prior)
-        for share in (0.0, 0.3, 0.5, 0.8, 1.0):
-            chosen = tuple(c for c in open_ if rng.uniform() < share)
-            expected = bits(robot, contacts, logs, (*others, *chosen), prior)
-            assert ranking.bits(chosen) == pytest.approx(expected, rel=1e-8, abs=1e-6)
-        scalar = [c for c in open_ if c.kind == "normal_force"]
-        assert ranking.bits(scalar) > ranking.bits([]) or others
 
 
 def test_a_plan_ranks_them_with_the_others_and_takes_them_where_they_are_cheaper() -> None:

@@ -14,7 +14,7 @@ from torchid import parameters
 from torchid.errors import UnknownNameError
 from torchid.robot import Robot
 from torchid.sensing import Contact, named_sensors, with_ft_sensors
-from torchid.sensor_planning.observability import assess_sensors, candidates, contained_candidates, demands, sensor_set
+from torchid.sensor_planning.observability import assess_sensors, candidates, demands, sensor_set
 from torchid.sensor_planning.planner import MotionStack, PlanningProblem, irredundant_set, plan_sensors
 
 LEG = Machine(
@@ -40,15 +40,6 @@ def test_candidates_are_devices_or_axes_with_costs_by_kind_or_name(leg: Robot) -
     assert not [c for c in candidates(leg, LEG.contacts) if c.kind == "ft_sensor"], "none unless they are named"
     with pytest.raises(UnknownNameError, match="'j_leg5'.*accepted: "):
         candidates(leg, LEG.contacts, ft_sensors=["j_leg5"])
-
-
-def test_sets_and_candidates_go_back_and_forth(leg: Robot) -> None:
-    offered = candidates(leg, LEG.contacts, per="axis", ft_sensors=leg.ft_names)
-    chosen = tuple(c for c in offered if c.name in ("j_leg2", "leg6.fz", "j_leg4.my"))
-    sensors = sensor_set(leg, LEG.contacts, chosen)
-    assert sensors.torque.shape == (leg.n + 12,)
-    assert [name for name, taken in zip(leg.dof_names, sensors.torque, strict=True) if taken] == ["j_leg2", "j_leg4.my"]
-    assert contained_candidates(LEG.contacts, sensors, offered) == chosen
 
 
 def test_a_sensor_counts_where_a_contact_lies_beyond_it_and_nowhere_else(leg: Robot) -> None:

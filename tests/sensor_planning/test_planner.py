@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import time
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from planning import MACHINES, Machine, sees_the_base, states_of, tried
+from planning import MACHINES, sees_the_base, states_of, tried
 from synthetic import ANYMAL, G1, PANDA, SOLO12, Oracle, load, random_states
 
 from torchid.errors import SensorError, UnknownNameError
@@ -33,7 +32,6 @@ from torchid.sensor_planning.observability import (
     demands,
     describe_wrench,
     sensor_set,
-    simple_wrench_basis,
 )
 from torchid.sensor_planning.planner import branches, contact_requirements
 from torchid.sensor_planning.search import all_minimal_sets, bound_cost, cheapest_set, demand_groups
@@ -69,15 +67,6 @@ def test_a_standing_humanoid_needs_six_readings_per_leg_and_none_in_arms_or_wais
     for part, side in zip(parts, ("left_", "right_"), strict=True):
         assert all(c.name.startswith(side) and "shoulder" not in c.name for c in part.candidates)
         assert {len(chosen) for chosen in all_minimal_sets(part.demands, part.candidates) or ()} == {6}
-
-
-def test_a_foots_force_torque_sensor_may_be_traded_for_the_six_torques_of_its_leg_and_for_nothing_else() -> None:
-    choice = candidates(g1(), SOLES)
-    left, right = demand_groups(demands(g1(), SOLES, STANDING, choice), choice)
-    for part in (left, right):
-        device, torques = sorted(all_minimal_sets(part.demands, part.candidates) or (), key=len)
-        assert [c.kind for c in device] == ["contact"]
-        assert [c.kind for c in torques] == ["joint_torque"] * 6
 
 
 @pytest.mark.parametrize("radius", [0.0, 0.03])
@@ -137,17 +126,6 @@ def test_six_torques_of_a_planar_leg_do_not_replace_a_foots_force_torque_sensor(
     assert "\n" not in str(refused.value)
 
 
-def test_contacts_on_one_limb_make_one_group_and_others_their_own() -> None:
-    contacts = (*SOLES, Contact("left_rubber_hand", "point"), Contact("right_rubber_hand", "point"))
-    contacts += (Contact("left_knee_link", "point"), Contact("pelvis", "point"))
-    for state, groups in (
-        ("111111", [(0, 4), (1,), (2, 3), (5,)]),
-        ("011010", [(1,), (2,), (4,)]),
-        ("000000", []),
-    ):
-        assert [demand.contacts for demand in demands(g1(), contacts, states_of(state), ())] == groups
-
-
 def test_a_bolted_base_demands_nothing() -> None:
     robot = load(PANDA, fixed_base=True)
     contacts = (Contact("panda_link7", "flat"),)
@@ -170,18 +148,6 @@ def test_a_humanoid_has_five_branches_and_a_contact_constrains_all_on_its_way() 
     assert found[2].name == "waist_yaw_joint ... waist_pitch_joint"
     on_soles = branches(g1(), (*SOLES, HAND), states_of("110"))
     assert [b.constrained for b in on_soles] == [True, True, False, False, False]
-
-
-def test_limbs_part_where_a_body_carries_two_even_if_the_base_carries_one() -> None:
-    robot, _, _ = tried("hands on a trunk")
-    machine = MACHINES["hands on a trunk"]
-    found = branches(robot, machine.contacts, states_of("10"))
-    assert [(b.name, b.constrained) for b in found] == [
-        ("j_trunk1 ... j_trunk2", True), ("j_left1 ... j_left2", True), ("j_right1 ... j_right2", False),
-    ]  # fmt: skip
-    mimicking, _, _ = tried("a joint that mimics another")
-    (leg,) = branches(mimicking, MACHINES["a joint that mimics another"].contacts, states_of("1"))
-    assert leg.joints == ("j_leg1", "j_leg2", "j_leg3", "j_leg5")
 
 
 def test_candidates_are_named_priced_and_turned_into_masks_and_back() -> None:
@@ -300,24 +266,6 @@ def test_straight_legs_make_three_pitch_torques_act_alike() -> None:
     assert (measured.zero.rank, measured.dependent) == (6, ())
 
 
-def test_the_numbers_of_a_check_do_not_depend_on_the_size_of_its_chunks() -> None:
-    sensors = named_sensors("joints", g1().n, 2)
-    builder = RowBuilder(g1(), SOLES, sensors)
-    postures = random_postures(g1(), 1100, np.random.default_rng(2))
-    together = base_values(builder, STANDING[0], postures)
-    assert together.shape == (1100, 6)
-    np.testing.assert_allclose(
-        together[1050:], base_values(builder, STANDING[0], postures[1050:]), rtol=0.0, atol=1e-12
-    )
-
-
-def test_flight_sees_the_whole_base_without_a_sensor(tmp_path: Path) -> None:
-    machine = Machine({"leg": ("base", ("x", "z"))}, (Contact("leg2", "point"),), states_of("0"))
-    robot = machine.robot(tmp_path)
-    (check,) = assess_sensors(robot, machine.contacts, machine.states, sensor_set(robot, machine.contacts, ()), ())
-    assert (check.name, check.generic.rank, check.zero.rank, check.generic.least) == ("none", 6, 6, pytest.approx(1.0))
-
-
 @pytest.mark.parametrize(
     ("wrench", "text"),
     [
@@ -330,14 +278,6 @@ def test_flight_sees_the_whole_base_without_a_sensor(tmp_path: Path) -> None:
 )
 def test_a_wrench_is_put_in_words(wrench: tuple[float, ...], text: str) -> None:
     assert describe_wrench(np.array(wrench, dtype=float)) == text
-
-
-@pytest.mark.parametrize("kept", [(0, 4), (2, 3, 5), (0, 1, 2, 3, 4, 5)])
-def test_lost_axes_are_found_again_in_a_rotated_basis(kept: tuple[int, ...]) -> None:
-    axes = np.eye(6)[:, kept]
-    turned = axes @ np.linalg.qr(np.random.default_rng(1).normal(size=(len(kept), len(kept))))[0]
-    found = np.array(simple_wrench_basis(turned))
-    np.testing.assert_allclose(found[np.lexsort(found.T)], axes.T[np.lexsort(axes)], rtol=0.0, atol=1e-12)
 
 
 def test_a_base_that_is_often_all_but_lost_is_warned_of() -> None:

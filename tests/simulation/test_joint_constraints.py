@@ -78,22 +78,6 @@ def test_a_joint_that_mimics_another_follows_it_and_loads_its_motor(tmp_path: Pa
     assert drift(urdf, constraints, replace(log, torque=1.02 * log.torque)) > 1e-3
 
 
-@pytest.mark.parametrize(("kind", "position"), [("revolute", 0.7), ("prismatic", -0.15)])
-def test_a_held_joint_stays_where_it_is_held(tmp_path: Path, kind: str, position: float) -> None:
-    urdf = arm(tmp_path, kind)
-    log, joints = swinging(urdf, (0.0, position)), read_urdf(urdf)[1]
-    assert drift(urdf, JointConstraints.of(urdf, joints, held={"second": position}), log) < 2e-5
-    assert drift(urdf, JointConstraints.of(urdf, joints, held={"second": 0.0}), log) > 1e-3
-
-
-def test_damping_that_is_faster_than_the_steps_does_not_make_a_joint_jump(tmp_path: Path) -> None:
-    urdf = arm(tmp_path)
-    log, held = swinging(urdf, (0.0, 0.0)), JointConstraints.of(urdf, read_urdf(urdf)[1], held={"second": 0.0})
-    urdf.write_text(urdf.read_text().replace('damping="0.2"', 'damping="200"'))
-    assert drift(urdf, held, replace(log, torque=log.torque + 199.8 * log.velocity)) < 2e-4
-    assert drift(urdf, held, log) > 1e-2
-
-
 def test_a_biped_with_parallel_ankles_stands_on_its_motors_alone(tmp_path: Path) -> None:
     """Its exact log fulfils the equations of motion without the forces of its rods, which nobody measures."""
     path = tmp_path / "biped.xml"

@@ -57,33 +57,6 @@ def test_waves_are_sines_of_the_time_of_the_log_and_phases_are_in_turns(biped: S
     np.testing.assert_array_equal(moved[..., :2], 0.0)
 
 
-def test_waves_of_one_name_add_up(biped: Simulation) -> None:
-    first, second = wave("torso_pitch", 0.5, 0.1), wave("torso_pitch", 1.1, 0.05, 0.3)
-    index = biped.plant.joint_names.index("torso_pitch")
-
-    def moved(*waves: WaveConfig) -> Array:
-        joints = np.array([one.joints[0, index] for one in setpoints(biped, MotionConfig("m", 1.0, list(waves)))[1]])
-        return np.asarray(joints - biped.stance.position[7 + index])
-
-    np.testing.assert_allclose(moved(first, second), moved(first) + moved(second), rtol=0.0, atol=1e-14)
-
-
-def test_only_the_joints_that_a_wave_names_are_driven(biped: Simulation) -> None:
-    found = setpoints(biped, MotionConfig("m", 0.1, [wave("torso_roll", 1.0, 0.1), wave("base_yaw", 1.0, 0.1)]))[1]
-    driven = [name for name, flag in zip(biped.plant.joint_names, found[0].driven, strict=True) if flag]
-    assert driven == ["torso_roll"]
-
-
-def test_a_turning_base_has_the_angular_velocity_of_its_rotation(biped: Simulation) -> None:
-    time, found = setpoints(biped, MotionConfig("m", 1.0, [wave("base_yaw", 0.8, 0.1)]))
-    yaw = np.array([np.arctan2(setpoint.base[1, 0], setpoint.base[0, 0]) for setpoint in found])
-    np.testing.assert_allclose(
-        yaw[time >= 0.0], 0.1 * np.sin(2 * np.pi * 0.8 * time[time >= 0.0]), rtol=0.0, atol=1e-12
-    )
-    rate = np.array([setpoint.base_rate[0] for setpoint in found])
-    np.testing.assert_allclose(np.gradient(yaw, time)[2:-2], rate[2:-2, 2], rtol=0.0, atol=1e-9)
-
-
 # --------------------------------------------------------------------------------------------------------------- steps
 
 
@@ -104,34 +77,12 @@ def test_feet_are_lifted_in_turn_in_the_middle_of_their_part_of_the_period(biped
         assert (foot > 0.0).sum() / HZ == pytest.approx(1.4, abs=3.0 / HZ)
 
 
-@pytest.mark.parametrize("order", [SOLES, ("r_sole",)])
-def test_a_foot_bears_nothing_while_it_is_off_the_floor(biped: Simulation, order: tuple[str, ...]) -> None:
-    _, lift, load = heights_and_loads(biped, stepping(*order, seconds=12.0))
-    assert (lift > 1e-9).any()
-    assert load[lift > 1e-9].max() == 0.0
-    assert load.min() == 0.0
-    assert load.max() == 1.0
-
-
-def test_a_foot_that_is_lifted_twice_in_a_period_bears_nothing_either_time(biped: Simulation) -> None:
-    _, lift, load = heights_and_loads(biped, stepping("l_sole", "r_sole", "l_sole", swing_s=1.0))
-    assert load[lift > 1e-9].max() == 0.0
-
-
 def test_the_load_leaves_a_foot_in_the_stated_time_and_without_a_jump(biped: Simulation) -> None:
     time, lift, load = heights_and_loads(biped, stepping("r_sole", swing_s=1.4, transfer_s=0.25))
     foot = SOLES.index("r_sole")
     leaving = (load[:, foot] < 1.0) & (time < time[lift[:, foot].argmax()]) & (lift[:, foot] == 0.0)
     assert leaving.sum() / HZ == pytest.approx(0.25, abs=3.0 / HZ)
     assert np.abs(np.diff(load[:, foot])).max() < 2.0 / (0.25 * HZ)
-
-
-def test_a_step_that_would_have_to_begin_before_the_log_is_left_out(biped: Simulation) -> None:
-    """At 1 Hz, swings are highest at 0.25 s on the right and at 0.75 s on the left."""
-    time, lift, load = heights_and_loads(biped, stepping("r_sole", "l_sole", hz=1.0, swing_s=0.46, transfer_s=0.1))
-    begins = [time[lift[:, SOLES.index(name)] > 0.0].min() for name in ("r_sole", "l_sole")]
-    np.testing.assert_allclose(begins, [1.25 - 0.23, 0.75 - 0.23], rtol=0.0, atol=2.0 / HZ)
-    assert (load[time < 0.75 - 0.33] == 1.0).all()
 
 
 # --------------------------------------------------------------------------------------------------------------- names
@@ -164,21 +115,6 @@ def test_a_robot_stands_level_with_its_mass_above_the_middle_of_its_feet(config:
         corners.append(points[:, :2].mean(axis=0))
     assert np.abs(np.concatenate(lowest)).max() < 1e-6  # every point of every foot touches the floor
     np.testing.assert_allclose(plant.com[:2], np.mean(corners, axis=0), rtol=0.0, atol=1e-6)
-
-
-def test_a_stance_stays_close_to_the_posture_and_within_the_joints_ranges(biped: Simulation) -> None:
-    names, joints = biped.plant.joint_names, biped.stance.position[7:]
-    wanted = np.array([biped.config.posture.get(name, 0.0) for name in names])
-    assert np.abs(joints - wanted).max() < 0.05
-    low, high = biped.plant.limits.T
-    assert ((joints >= low) & (joints <= high)).all()
-
-
-def test_a_posture_with_one_leg_bent_is_met_halfway_with_both_feet_on_the_floor() -> None:
-    posture = {"l_hip_flexion": -0.55, "l_knee_flexion": 1.1, "l_ankle_flexion": -0.55}
-    simulation = set_up_simulation(robot_on(BIPED, [FootConfig(sole) for sole in SOLES], posture))
-    knees = [simulation.plant.joint_names.index(f"{side}_knee_flexion") for side in "lr"]
-    np.testing.assert_allclose(simulation.stance.position[7:][knees], 0.55, rtol=0.0, atol=0.01)
 
 
 def test_a_posture_beyond_a_joints_range_is_refused() -> None:

@@ -12,10 +12,9 @@ from typing import Any
 import pytest
 import yaml
 from refusals import files_in, refusal
-from simulated import BIPED, QUADRUPED, SHIPPED, SOLES, STOOD
+from simulated import BIPED, SHIPPED, SOLES, STOOD
 
 from torchid.cli import main
-from torchid.commands.folder import SIMULATION, new_folder
 from torchid.config import load_simulation
 from torchid.errors import InputError, about_file
 from torchid.simulation import Recording, set_up_simulation
@@ -127,11 +126,6 @@ def test_a_robot_that_cannot_be_simulated_is_refused_in_one_line(
         assert part in line
 
 
-def test_a_foot_named_twice_is_refused_in_one_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    edit(folder, feet(frames=("l_sole", "l_sole")))
-    assert "sim.yaml: feet" in refused(folder, capsys)
-
-
 NOTHING_TO_STAND_ON: dict[str, dict[str, Any]] = {
     "biped on two points": feet(ONE_POINT, ONE_POINT),
     "only foot lifted": feet(frames=("l_sole",)) | steps("l_sole", hz=0.5, swing_s=1.0),
@@ -234,13 +228,3 @@ def test_a_folder_is_replaced_on_request_only_and_only_by_its_like(
     output = occupied(folder, *names)
     assert expected in refused(folder, capsys, *overrides)
     assert sorted(path.name for path in output.iterdir()) == sorted(names)
-
-
-def test_an_identification_does_not_replace_a_simulation(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    output = folder / "out"
-    with new_folder(output, kind=SIMULATION) as new:
-        (new / "nominal.urdf").write_text("x")
-    demo = QUADRUPED.parent / "quadruped.yaml"
-    assert main(["identify", str(demo), f"output={output}", "overwrite=true"]) == 2
-    assert "holds a simulation; accepted: a new folder, or a run to overwrite" in capsys.readouterr().err
-    assert len(list(output.iterdir())) == 2

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from torchid.errors import InputError, LogError
 from torchid.simulation.plant import point_foot
-from torchid.simulation.replay import Drift, Model, ReplayedLog, replay_log
+from torchid.simulation.replay import Model, ReplayedLog, replay_log
 
 RATE, SECONDS = 1000.0, 1.2
 TIMES = np.array([0.1, 0.2])
@@ -90,39 +90,6 @@ def test_pd_targets_hold_a_wrong_arm_near_its_log_as_that_law_would(tmp_path: Pa
     np.testing.assert_array_equal(end(model_of(heavy)), end(model_of(heavy), gains=np.zeros((2, 2))))
 
 
-def test_targets_are_those_that_made_the_torques(tmp_path: Path) -> None:
-    """One joint alone, at rest: a constant torque error e under kp ends at e / kp."""
-    path = tmp_path / "wheel.urdf"
-    wheel = (
-        '<link name="a"><inertial><mass value="1"/><inertia ixx="0.02" iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/>'
-    )
-    path.write_text(
-        f'<robot name="wheel"><link name="base"/>{wheel}</inertial></link><joint name="first" type="continuous">'
-        '<parent link="base"/><child link="a"/><axis xyz="0 0 1"/></joint></robot>'
-    )
-    time, zero = 0.001 * np.arange(2001.0), np.zeros((2001, 1))
-    log = ReplayedLog("rest", time, zero, zero, zero, None, None, np.zeros((2001, 0), dtype=bool))
-    model = Model(path, ("first",), np.zeros(1), np.array([0.6]), np.zeros(1))
-    found = replay_log(model, log, (), np.array([[0, 2000]]), np.array([1.9]), gains=np.array([[3.0], [1.0]]))
-    np.testing.assert_allclose(found.joints, -0.2, atol=1e-3)
-
-
-def test_springs_of_joints_pull_towards_position_zero(tmp_path: Path) -> None:
-    true = arm(tmp_path)
-    log = swinging(true)
-    held = replace(log, torque=log.torque + log.position * [3.0, 1.5])
-    assert drift(model_of(true, stiffness=3.0), held) < 2e-5
-    assert drift(model_of(true), held) > 1e-2
-    assert drift(model_of(true, stiffness=-3.0), replace(log, torque=log.torque - log.position * [3.0, 1.5])) < 2e-5
-
-
-def test_an_arm_on_a_turned_base_feels_gravity_as_the_log_says(tmp_path: Path) -> None:
-    true, tilt = arm(tmp_path), Rotation.from_euler("xyz", [0.4, -0.8, 0.3])
-    log = swinging(true, tilt=tilt)
-    assert drift(model_of(true), log) < 2e-5
-    assert drift(model_of(true), replace(log, quat_xyzw=None)) > 1e-2
-
-
 def test_a_base_of_equal_feet_falls_straight_where_nothing_drives_the_legs() -> None:
     """The demo's quadruped begins on the floor: at once its feet are still, so that its base does not turn."""
     joints = tuple(
@@ -178,20 +145,3 @@ def test_what_cannot_be_replayed_is_named(tmp_path: Path) -> None:
     assert "armature of first" in refused(
         lambda: replay_log(negative, log, (), log.windows(0.2), TIMES), str(tmp_path), InputError
     )
-
-
-def test_the_joints_of_a_drift_have_their_root_mean_square() -> None:
-    found = Drift(TIMES, np.array([[[3.0, 4.0, 100.0]]]), None)
-    assert found.of_joints(np.array([0, 1]))[0, 0] == pytest.approx(np.sqrt(12.5))
-
-
-def test_friction_that_drops_with_speed_is_that_of_the_log(tmp_path: Path) -> None:
-    """For a joint that swings, but for what MuJoCo's soft constraint creeps where it turns."""
-    true = arm(tmp_path)
-    log = swinging(true)
-    at_rest, velocity = np.array([0.5, 0.2]), 2.0
-    dry = np.sign(log.velocity) * at_rest * np.exp(-np.square(log.velocity / velocity))
-    log = replace(log, torque=log.torque + dry)
-    with_it, without = replace(model_of(true), stribeck=at_rest, stribeck_velocity=velocity), model_of(true)
-    assert drift(with_it, log) < 2.5e-3
-    assert drift(without, log) > 3e-2

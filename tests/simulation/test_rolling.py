@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from lxml import etree
 from motions import value
-from scipy.spatial.transform import Rotation
 from simulated import QUADRUPED, feet_of, quadruped
 from synthetic import Array, load
 
 from torchid import parameters
-from torchid.cli import main
-from torchid.config import FootConfig, MotionConfig, load_config
+from torchid.config import FootConfig, MotionConfig
 from torchid.config.robot import ContactConfig
 from torchid.config.simulation import SimulatedRobotConfig, WaveConfig
 from torchid.estimators import LeastSquares
-from torchid.fitting.experiment import resolve_contacts, set_up
+from torchid.fitting.experiment import resolve_contacts
 from torchid.log_checks.findings import Finding
 from torchid.log_checks.standing_feet import check_standing_feet
-from torchid.logs import Log, write_log
+from torchid.logs import Log
 from torchid.problem import RowBuilder, bind_log, compress, linear_problem
 from torchid.problem.floor_pose import rolled_distance
 from torchid.robot import Robot
@@ -130,21 +127,6 @@ def test_the_radius_is_found_in_the_urdf(on_balls: OnBalls) -> None:
     assert text == f"{', '.join(on_balls.log.contact_names)}: ball of radius 30 mm, from the collision sphere"
 
 
-def test_commands_say_what_rolls_and_settings_have_the_number(
-    on_balls: OnBalls, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write_log(on_balls.log, tmp_path / "sway.npz")
-    feet = "".join(f"\n- {{frame: {frame}, type: point}}" for frame in on_balls.log.contact_names)
-    text = f"robot: {{urdf: {on_balls.robot.path}}}\nlogs: {{train: [sway.npz]}}\nsensors: joints\noutput: run\n"
-    (tmp_path / "run.yaml").write_text(f"{text}contacts:{feet}")
-    config = set_up(load_config(tmp_path / "run.yaml")).config
-    assert [contact.radius for contact in config.contacts] == [RADIUS] * 4
-    for arguments in ([tmp_path / "run.yaml"], [tmp_path / "sway.npz", "--urdf", on_balls.robot.path]):
-        assert main(["check", *map(str, arguments)]) == 0
-        printed = " ".join(capsys.readouterr().out.split())
-        assert f"{', '.join(on_balls.log.contact_names)}: ball of radius 30 mm, from the collision sphere" in printed
-
-
 @pytest.mark.parametrize("noise", [0.0, 1e-3])
 @pytest.mark.parametrize("stated", [0.0, 0.01, 0.06])
 def test_the_check_names_the_radius_that_the_log_shows(on_balls: OnBalls, stated: float, noise: float) -> None:
@@ -158,16 +140,3 @@ def test_the_check_names_the_radius_that_the_log_shows(on_balls: OnBalls, stated
     assert f"stated are {1e3 * stated:g} mm" in finding.found
     found = float(finding.found.partition("balls of ")[2].split()[0])
     assert found == pytest.approx(1e3 * RADIUS, rel=0.1 if noise else 0.02)
-
-
-def test_the_true_radius_is_no_finding(on_balls: OnBalls) -> None:
-    assert not list(check_standing_feet(on_balls.log, on_balls.robot, contacts_of(on_balls.log, RADIUS)))
-
-
-def test_a_ball_on_a_slope_rolls_along_it() -> None:
-    """The velocity of a point that turns with the ball, against that of its centre."""
-    rng, normal = np.random.default_rng(0), np.array([0.6, 0.0, 0.8])
-    turned = Rotation.from_rotvec(1e-4 * rng.normal(size=3)).as_matrix()
-    (_, went) = rolled_distance(np.stack([np.eye(3), turned]), 0.2, normal)
-    np.testing.assert_allclose(went, (turned - np.eye(3)) @ (0.2 * normal), atol=1e-8)
-    assert abs(went @ normal) < 1e-12

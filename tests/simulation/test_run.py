@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from pathlib import Path
 
@@ -16,8 +15,6 @@ from synthetic import load
 from torchid import parameters
 from torchid.cli import main
 from torchid.config import FootConfig, dump_config, load_simulation
-from torchid.report.tables import stability_table, table_text
-from torchid.simulation import Stability
 from torchid.simulation.plant import find_feet
 
 MOTIONS = (*SQUATS, *SWAYS, UNSEEN)
@@ -42,15 +39,6 @@ def test_a_simulation_folder_holds_what_it_promises(biped_folder: Path) -> None:
 
 def test_the_resolved_simulation_reads_back_as_itself(biped_folder: Path) -> None:
     assert load_simulation(biped_folder / "simulation.yaml") == short(biped_folder)
-
-
-def test_stability_json_has_the_documented_fields_of_every_motion_in_the_files_order(biped_folder: Path) -> None:
-    found = json.loads((biped_folder / "stability.json").read_text())
-    assert list(found) == list(MOTIONS)
-    for run in found.values():
-        assert set(run) == {field.name for field in dataclasses.fields(Stability)}
-        assert run["base_height"][0] <= run["base_height"][1]
-        assert len(run["unloaded"]) == 2
 
 
 def test_the_nominal_robot_is_the_true_one_with_other_inertias_and_could_exist(biped_folder: Path) -> None:
@@ -125,22 +113,3 @@ def test_shipped_experiments_read_the_logs_that_the_shipped_simulation_writes(mo
         assert matched == [*SQUATS, *SWAYS]
         assert [Path(path).stem for path in settings["logs"]["test"]] == [UNSEEN]
         assert [contact["frame"] for contact in settings["contacts"]] == [foot.frame for foot in config.feet]
-
-
-def test_the_shipped_simulation_leaves_half_a_minute_of_every_training_motion() -> None:
-    """The experiments' filter takes two periods of its cutoff at each end."""
-    config = load_simulation(SHIPPED)
-    lost = 2 * 2 / yaml.safe_load((SHIPPED.parent / "biped_joints.yaml").read_text())["preprocessing"]["cutoff_hz"]
-    seconds = {motion.name: motion.duration_s - lost for motion in config.motions}
-    assert [round(seconds[name], 6) for name in (*SQUATS, *SWAYS)] == [30.0] * 12
-    assert seconds[UNSEEN] == pytest.approx(6.0)
-    assert config.sensors.noise.enabled
-
-
-def test_the_table_of_how_a_robot_stood_says_its_units() -> None:
-    found = {"base_height": (0.6, 0.8), "slip": 0.002, "zmp_margin": 0.03, "effort": 0.2, "unloaded": (0.0, 0.25)}
-    text = table_text(stability_table({"squat": found}))
-    for unit in ("[m]", "[mm]", "[%]"):
-        assert unit in text
-    for value in ("0.600 to 0.800", "2.0", "30", "20", "0, 25"):
-        assert value in text

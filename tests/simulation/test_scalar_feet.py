@@ -17,7 +17,7 @@ from synthetic import Array, load
 
 from torchid import parameters
 from torchid.cli import main
-from torchid.config import MotionConfig, SensorImperfectionsConfig, SimulationConfig, dump_config, load_simulation
+from torchid.config import MotionConfig, SensorImperfectionsConfig, SimulationConfig, dump_config
 from torchid.config.simulation import WaveConfig, WhiteNoiseConfig
 from torchid.estimators import LeastSquares
 from torchid.logs import Log, read_log
@@ -61,23 +61,6 @@ def walked(tmp_path_factory: pytest.TempPathFactory) -> Walked:
     with forked_simulations():
         assert main(["simulate", str(folder / "simulation.yaml")]) == 0
     return Walked(config)
-
-
-def test_the_log_has_the_vertical_force_of_these_feet_and_wrenches_of_the_others(walked: Walked) -> None:
-    exact, log = walked.log("exact", "test"), walked.log("logs", "test")
-    along = np.array([frame in SCALAR for frame in walked.feet])
-    _, rotations = feet_of(exact, QUADRUPED)
-    up = np.einsum("nfi,nfi->nf", rotations[:, :, 2], value(exact.contact_wrench_local)[..., :3])
-    np.testing.assert_allclose(value(exact.contact_force_normal)[:, along], up[:, along], rtol=0.0, atol=1e-9)
-    assert np.ptp(up[:, along] - value(exact.contact_wrench_local)[:, along, 2]) > 1.0, "not along the foot's own axis"
-    assert np.isnan(value(exact.contact_force_normal)[:, ~along]).all()
-    assert np.isfinite(value(exact.contact_wrench_local)).all()
-    noise = value(log.contact_force_normal)[:, along] - up[:, along]
-    assert noise.std() == pytest.approx(NOISE.contact_force, rel=0.05)
-    assert np.isnan(value(log.contact_force_normal)[:, ~along]).all()
-    assert np.isnan(value(log.contact_wrench_local)[:, along]).all()
-    assert np.isfinite(value(log.contact_wrench_local)[:, ~along]).all()
-    assert load_simulation(walked.config.output / "simulation.yaml") == walked.config
 
 
 @pytest.mark.parametrize("torques", [False, True])

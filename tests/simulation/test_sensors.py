@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from motions import value
 from scipy.spatial.transform import Rotation
-from simulated import LIFTING, SOLES, SQUATS, short
+from simulated import LIFTING, SOLES
 from synthetic import Array
 
 from torchid.config import SensorImperfectionsConfig
@@ -68,13 +68,6 @@ def test_no_sensor_reads_velocities_or_accelerations(sensors: SensorImperfection
     assert given == {"time", "contact_active", *EXACT}
 
 
-def test_written_sensor_logs_hold_no_velocities_and_exact_ones_all(biped_folder: Path) -> None:
-    with np.load(biped_folder / "logs" / f"{SQUATS[0]}.npz") as measured:
-        assert not [name for name in measured if "velocity" in name or "acceleration" in name]
-    with np.load(biped_folder / "exact" / f"{SQUATS[0]}.npz") as exact:
-        assert len([name for name in exact if "velocity" in name or "acceleration" in name]) == 6
-
-
 # --------------------------------------------------------------------------------------------------------------- noise
 
 
@@ -98,26 +91,12 @@ def test_noise_is_white_and_as_strong_as_stated() -> None:
         assert np.abs(together).max() < 5.0 / np.sqrt(len(found)), "channels or samples go together"
 
 
-def test_a_noisy_orientation_is_a_rotation_still() -> None:
-    log = sensor_log(truth(1000), SensorImperfectionsConfig(noise=NOISE), seed=0)
-    np.testing.assert_allclose(np.linalg.norm(value(log.base_quat_xyzw), axis=1), 1.0, rtol=1e-12)
-
-
 def test_the_same_seed_and_name_give_the_same_noise_and_others_another() -> None:
     sensors = SensorImperfectionsConfig(noise=NOISE)
     first = value(sensor_log(truth(50), sensors, seed=0).joint_torque)
     np.testing.assert_array_equal(first, value(sensor_log(truth(50), sensors, seed=0).joint_torque))
     assert not np.isclose(first, value(sensor_log(truth(50), sensors, seed=1).joint_torque)).any()
     assert not np.isclose(first, value(sensor_log(truth(50, source="n"), sensors, seed=0).joint_torque)).any()
-
-
-def test_the_noise_of_a_log_does_not_depend_on_the_folder_it_lies_in(biped_folder: Path) -> None:
-    """An exact log that was filed and read again gives the sensor log that was written beside it."""
-    config = short(biped_folder)
-    exact, written = (read_log(biped_folder / kind / f"{SQUATS[0]}.npz") for kind in ("exact", "logs"))
-    again = sensor_log(exact, config.sensors, config.seed, SQUATS[0])
-    for name in ("joint_position", "base_position_world", "joint_torque", "contact_wrench_local"):
-        np.testing.assert_allclose(value(getattr(again, name)), value(getattr(written, name)), rtol=0.0, atol=1e-12)
 
 
 # ---------------------------------------------------------------------------------------------------------- bias, gain
@@ -147,23 +126,6 @@ def test_bias_and_gain_are_as_large_as_stated_and_differ_by_channel() -> None:
     for numbers in (offset, gain, force, force_gain):
         assert len(np.unique(numbers)) == numbers.size
         assert abs(numbers.mean()) < 5.0 * numbers.std() / np.sqrt(numbers.size)
-
-
-@pytest.mark.parametrize("field", ["joint_torque", "contact_wrench_local"])
-def test_bias_and_gain_stay_the_same_over_time_and_from_log_to_log(field: str) -> None:
-    first, again, other = (bias_and_gain(field, *run) for run in (("m", 0, 20), ("n", 0, 4), ("m", 1, 4)))
-    np.testing.assert_allclose(again, first, rtol=0.0, atol=1e-12)
-    assert np.abs(np.array(other) - np.array(first)).min() > 0.0
-
-
-@pytest.mark.parametrize(
-    "sensors", [SensorImperfectionsConfig(bias=BIAS), SensorImperfectionsConfig(delay=DelayConfig(True, 0.02))]
-)
-def test_imperfect_force_sensors_leave_the_motion_as_it_is(sensors: SensorImperfectionsConfig) -> None:
-    exact = truth(100)
-    log = sensor_log(exact, sensors, seed=0)
-    for name in ("joint_position", "base_position_world", "base_quat_xyzw"):
-        np.testing.assert_array_equal(value(getattr(log, name)), value(getattr(exact, name)), err_msg=name)
 
 
 # --------------------------------------------------------------------------------------------------------------- delay
@@ -215,18 +177,6 @@ def test_a_contact_is_active_while_the_measured_load_exceeds_the_threshold() -> 
     ]
 
 
-def test_flags_of_late_feet_are_late(biped_folder: Path) -> None:
-    exact = read_log(biped_folder / "exact" / f"{LIFTING}.npz")
-    late = SensorImperfectionsConfig(delay=DelayConfig(True, 0.05))
-    flags, delayed = (value(sensor_log(exact, sensors, seed=0).contact_active) for sensors in (NONE, late))
-    np.testing.assert_array_equal(delayed[50:], flags[:-50])
-
-
-def test_a_foot_that_is_never_loaded_is_never_active() -> None:
-    exact = truth(50, contact_wrench_local=np.zeros((50, 2, 6)))
-    assert not value(sensor_log(exact, NONE, seed=0).contact_active).any()
-
-
 # ------------------------------------------------------------------------------------- feet that read along the normal
 
 
@@ -267,21 +217,3 @@ def test_it_has_the_errors_of_a_force_and_leaves_those_of_all_others_as_they_are
     read = value(sensor_log(dataclasses.replace(wrenches, contact_wrench_local=as_fz), sensors, seed=2).contact_wrench)
     np.testing.assert_array_equal(value(log.contact_force_normal)[:, 0], read[:, 0, 2])
     assert np.isnan(value(log.contact_force_normal)[:, 1]).all()
-
-
-def test_noise_bias_and_gain_of_a_force_along_the_normal_are_as_large_as_stated() -> None:
-    force = np.full((10000, 200), 100.0)
-    exact = truth(len(force), feet=200, contact_force_normal=force)
-    noisy = value(sensor_log(exact, SensorImperfectionsConfig(noise=NOISE), seed=0).contact_force_normal) - force
-    np.testing.assert_allclose(noisy.std(axis=0), NOISE.contact_force, rtol=4.0 / np.sqrt(2 * len(force)))
-    exact = truth(2, feet=200, contact_force_normal=np.repeat([[0.0], [100.0]], 200, axis=1))
-    biased = value(sensor_log(exact, SensorImperfectionsConfig(bias=BIAS), seed=0).contact_force_normal)
-    assert biased[0].std() == pytest.approx(BIAS.contact_force, rel=0.15)
-    assert ((biased[1] - biased[0]) / 100.0).std() == pytest.approx(BIAS.gain, rel=0.15)
-
-
-def test_it_touches_while_it_reads_more_than_the_threshold() -> None:
-    force = np.array([0.0, 29.0, 31.0, 500.0, -900.0, -31.0])[:, None] * [1.0, np.nan]
-    active = value(sensor_log(truth(6, contact_force_normal=force), NONE, seed=0).contact_active)
-    assert active[:, 0].astype(int).tolist() == [0, 0, 1, 1, 0, 0]
-    assert active[:, 1].all()

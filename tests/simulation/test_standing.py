@@ -21,19 +21,15 @@ from simulated import (
     SWAYS,
     UNSEEN,
     feet_of,
-    forces,
     points_at,
     quadruped,
     robot_on,
-    shipped,
     squat,
     zero_moment_margins,
 )
 from synthetic import ANYMAL, G1, SOLO12
 
-from torchid.commands.simulate import simulate
-from torchid.config import BoundsConfig, FootConfig, MotionConfig, SensorImperfectionsConfig, SimulationConfig
-from torchid.config.simulation import WaveConfig
+from torchid.config import BoundsConfig, FootConfig, SensorImperfectionsConfig, SimulationConfig
 from torchid.errors import InputError, UrdfError
 from torchid.logs import read_log
 from torchid.simulation import set_up_simulation
@@ -70,15 +66,6 @@ def test_nobody_falls_in_the_first_seconds_of_any_motion(biped_folder: Path) -> 
         assert left > 0.05 or name != LIFTING, name
 
 
-@pytest.mark.slow
-def test_nobody_falls_in_the_half_minute_of_every_motion(tmp_path: Path) -> None:
-    output = tmp_path / "biped"
-    simulate(shipped(output))
-    assert_nobody_falls(output)
-    for name in SWAYS:
-        assert all(0.15 < share < 0.30 for share in stability(output)[name]["unloaded"]), name
-
-
 @pytest.mark.parametrize("name", [SQUATS[1], LIFTING])
 def test_what_is_said_of_how_the_robot_stood_is_what_its_log_shows(biped_folder: Path, name: str) -> None:
     log, said = read_log(biped_folder / "exact" / f"{name}.npz"), stability(biped_folder)[name]
@@ -107,14 +94,6 @@ def test_a_foot_bears_its_load_or_none_but_for_instants(biped_folder: Path, name
     weak = (load > 0.1) & (load < THRESHOLD)
     assert weak.mean(axis=0).max() < 0.02
     assert (load < 0.1).any()
-
-
-@pytest.mark.parametrize(("name", "amplitude"), [(SQUATS[1], 0.07), (SQUATS[2], 0.034)])
-def test_squats_move_the_pelvis_about_as_far_as_the_centre_of_mass_is_told_to(
-    biped_folder: Path, name: str, amplitude: float
-) -> None:
-    height = value(read_log(biped_folder / "exact" / f"{name}.npz").base_position_world)[:, 2]
-    assert 0.9 < np.ptp(height) / (2 * amplitude) < 1.5
 
 
 # -------------------------------------------------------------------------------------------------------------- bounds
@@ -176,14 +155,6 @@ def test_other_robots_stand_where_they_are_put_and_squat_as_far_as_they_are_told
     assert 0.7 < np.ptp(value(recording.log.base_position_world)[:, 2]) / 0.06 < 1.4
 
 
-def test_a_point_foot_feels_no_moment_but_that_of_its_spheres_radius() -> None:
-    recording, _ = set_up_simulation(quadruped()).run(squat(0.03, seconds=0.5))
-    wrench = value(recording.log.contact_wrench_local)
-    force, moment = np.linalg.norm(wrench[..., :3], axis=2), np.linalg.norm(wrench[..., 3:], axis=2)
-    assert force.min() > 10.0
-    assert (moment <= 0.0101 * force).all()  # 10 mm, and the floor gives way
-
-
 def test_a_robot_that_no_matter_could_be_made_of_is_refused(tmp_path: Path) -> None:
     """ANYmal's cameras and hatch break the triangle inequality of inertias, the bodies they are part of do not."""
     feet = points_at(*(f"{leg}_FOOT" for leg in ("LF", "RF", "LH", "RH")))
@@ -195,33 +166,7 @@ def test_a_robot_that_no_matter_could_be_made_of_is_refused(tmp_path: Path) -> N
     assert "\n" not in str(raised.value)
 
 
-def test_joints_without_limits_are_measured_against_none(tmp_path: Path) -> None:
-    text = re.sub(r"<limit[^>]*/>", "", BIPED.read_text()).replace('type="revolute"', 'type="continuous"')
-    (tmp_path / "free.urdf").write_text(text)
-    config = shipped(Path("nowhere"), f"robot.urdf={tmp_path / 'free.urdf'}")
-    _, stood = set_up_simulation(config).run(squat(0.02, seconds=0.2))
-    assert (stood.effort, stood.beyond_limits) == (0.0, 0.0)
-
-
 def test_a_threshold_that_no_foot_ever_reaches_is_refused() -> None:
     config = dataclasses.replace(solo12(), sensors=SensorImperfectionsConfig(contact_threshold=30.0))
     with pytest.raises(InputError, match=r"sensors.contact_threshold: 30 N, but .* never bears more than"):
         set_up_simulation(config).run(config.motions[0])
-
-
-def test_a_root_link_named_world_is_a_link_like_any_other(tmp_path: Path) -> None:
-    ends = '<parent link="world"/><child link="pelvis"/><origin xyz="0.1 0.2 0.3" rpy="0 0 0.5"/>'
-    extra = f'<link name="world"/><joint name="bolt" type="fixed">{ends}</joint></robot>'
-    urdf = tmp_path / "biped.urdf"
-    urdf.write_text(BIPED.read_text().replace("</robot>", extra))
-    config = shipped(Path("nowhere"))
-    config = dataclasses.replace(config, robot=dataclasses.replace(config.robot, urdf=urdf))
-    recording, _ = set_up_simulation(config).run(squat(0.03, seconds=0.5))
-    measured, predicted = forces(recording.log, urdf)
-    assert np.abs(measured - predicted).max() < 1e-9 * np.abs(measured).max()
-
-
-def test_the_zero_moment_point_of_point_feet_that_turn_is_the_logs_own() -> None:
-    motion = MotionConfig("lean", 2.0, [WaveConfig("com_x", 0.5, 0.12)])
-    _, stood = set_up_simulation(quadruped()).run(motion)
-    assert stood.zmp_margin == pytest.approx(0.0515, abs=5e-4)  # by the log alone; 0.0436 with the feet's first pose
