@@ -12,9 +12,7 @@ The logs under `test` are evaluated at the end only. Curves go to a new folder: 
 from __future__ import annotations
 
 import argparse
-import math
 import os
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,7 +29,7 @@ from torchid.commands.identify import identify
 from torchid.commands.run_figures import hyperparameters
 from torchid.config import load_config
 from torchid.errors import ConfigError, about_file
-from torchid.estimators import ResidualEffect, Sgd, Trainer
+from torchid.estimators import Sgd, Trainer
 from torchid.fitting.experiment import set_up
 from torchid.problem import MiniBatches
 from torchid.reading.log_reader import LogReader
@@ -46,7 +44,6 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("file", nargs="?", default=DEMO, help="experiment file")
     parser.add_argument("overrides", nargs="*", help="key.subkey=value")
-    parser.add_argument("--mode", choices=["joint", "parameters_first", "alternating"], default="joint")
     parser.add_argument("--epochs", type=int, default=100, help="passes over the training logs")
     parser.add_argument("--weight", type=float, default=0.1, help="of the networks' force in the loss")
     parser.add_argument("--curves", type=Path, default=Path("runs/residual"), help="new folder for TensorBoard")
@@ -72,8 +69,9 @@ def compare(options: argparse.Namespace) -> None:
     train, test = (reader.read(paths, experiment.sensors) for paths in (config.logs.train, config.logs.test))
     train = [replace(log, motion_noise=None) for log in train]  # a descent sees samples as they are
     problem = torchid.linear_problem(torchid.compress(train, builder), builder, robot, config.estimator.friction)
-    ridge, chosen = config.estimator.numeric_ridge, {"residual": options.mode, "residual_weight": options.weight}
-    settings = Sgd(ridge=ridge, epochs=options.epochs, residual_lr=0.01, **chosen)
+    settings = Sgd(
+        ridge=config.estimator.numeric_ridge, epochs=options.epochs, residual_lr=0.01, residual_weight=options.weight
+    )
     torch.manual_seed(0)
     table = Table(title="rms of the projected residual, in standard deviations of the stated sensor noise")
     for name in ("", "training logs", "unseen logs", "share of rigid bodies", "share of networks"):
@@ -94,28 +92,14 @@ def compare(options: argparse.Namespace) -> None:
         table.add_row(name, f"{seen:.3f}", f"{unseen:.3f}", *shares)
     Console(width=100).print(table)
     estimate = trainer.estimate()
-    print_effect(estimate.residual, robot.body_names)
+    if estimate.residual is not None:
+        for name, share in estimate.residual.shares.items():
+            rms = estimate.residual.rms[name]
+            print(f"{name.replace('_', ' ')}: the networks give {100.0 * share:.3g} %, rms {rms:.3g}")
     if options.output is not None:
         learned = RigidPlusResidual(robot, estimate.phi, beside.cpu())
         identify(replace(config, output=None)).write(options.output, learned=learned)
         print(f"written to {options.output}: torchid evaluate takes the networks up")
-
-
-def print_effect(effect: ResidualEffect | None, bodies: Sequence[str]) -> None:
-    """Print the networks' share of the force, and the bodies whose parameters they change most."""
-    if effect is None:
-        return
-    for name, share in effect.shares.items():
-        print(f"{name.replace('_', ' ')}: the networks give {100.0 * share:.3g} %, rms {effect.rms[name]:.3g}")
-    print(f"rigid bodies can explain {100.0 * effect.rigid_share:.3g} % of the networks' force")
-    most = sorted(zip(effect.moved_scaled, effect.moved_errors, bodies, strict=True), reverse=True)[:3]
-    print(f"parameters moved most: {', '.join(_moved(*one) for one in most)}")
-
-
-def _moved(scaled: float, errors: float, body: str) -> str:
-    """How far the networks move the parameters of a body; in standard errors where the data determine any."""
-    by_data = f", {errors:.2g} standard errors" if math.isfinite(errors) else ""
-    return f"{body} ({scaled:.2g} of its size{by_data})"
 
 
 if __name__ == "__main__":

@@ -160,7 +160,7 @@ def test_what_a_file_leaves_out_is_what_the_estimators_leave_out(file: Path) -> 
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_every_setting_of_an_estimator_is_a_key_or_needs_more_than_a_file(file: Path, name: str) -> None:
     """Conditions need a robot, residual modules are code."""
-    needs_more = {"conditions", "residual", "residual_lr", "residual_weight"}
+    needs_more = {"conditions", "residual_lr", "residual_weight"}
     estimator = load(file, LEAST).estimator
     keys = vars(estimator).keys() | vars(estimator.training).keys()
     assert {field.name for field in dataclasses.fields(ESTIMATORS[name])} - keys <= needs_more

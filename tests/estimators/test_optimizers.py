@@ -166,7 +166,6 @@ def test_a_schedule_that_would_fail_in_some_epoch_is_refused_before_the_first(
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"residual": "both"}, "residual: found 'both'; accepted: 'joint', 'parameters_first' or 'alternating'"),
         ({"ridge": -1.0}, "ridge: found -1.0; accepted: greater than or equal to 0"),
         ({"residual_weight": float("nan")}, "residual_weight: found nan"),
         ({"optimizer": {"lr": 0.1}}, "optimizer: found {'lr': 0.1}; accepted: a mapping with the name of a class"),

@@ -191,8 +191,6 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "MultiStepLR": {"schedule": {"name": "MultiStepLR", "milestones": [1, 3]}},
     "CyclicLR": {"schedule": {"name": "CyclicLR", "base_lr": 0.01, "max_lr": 0.1, "step_size_up": 2}},
     "a residual": {"residual_lr": 0.01},
-    "a residual in turns": {"residual": "alternating"},
-    "a residual at last": {"residual": "parameters_first"},
 }
 SETTINGS["LBFGS alone"]["optimizer"] = {"name": "LBFGS", "max_iter": 3}
 

@@ -7,7 +7,7 @@ import re
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -334,9 +334,6 @@ class TrainingSettings:
             raise InputError("estimator", at, f"fails: {_short(error)}", "other options, or another one") from error
 
 
-ResidualMode = Literal["joint", "parameters_first", "alternating"]
-
-
 @dataclass(frozen=True)
 class Sgd(TrainingSettings, Regularized):
     """min of the mean squared whitened residual + ridge * prior, one mini-batch at a time.
@@ -346,16 +343,13 @@ class Sgd(TrainingSettings, Regularized):
 
     Attributes:
         prior, conditions: as in `Consistent`.
-        residual: how a residual module is trained: "joint", with the parameters; "parameters_first", after them, in the
-            second half of the epochs; "alternating", in every other epoch.
-        residual_lr: learning rate of the module; None: the optimizer's.
+        residual_lr: learning rate of a residual module; None: the optimizer's.
         residual_weight: of the mean square of the module's whitened force in the loss: a module that can fit any force
             fits the share 1 / (1 + residual_weight) of the residual.
     """
 
     prior: Prior = "euclidean"
     conditions: Conditions = field(default_factory=Conditions)
-    residual: ResidualMode = "joint"
     residual_lr: Positive | None = None
     residual_weight: NotNegative = 0.1
 

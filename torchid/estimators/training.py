@@ -6,7 +6,7 @@ import copy
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import chain
 from typing import Any
@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torchid import distributed, parameters
 from torchid.errors import InputError
 from torchid.estimators.conic_problem import ConicProblem
-from torchid.estimators.least_squares import ConstrainedEstimate, LeastSquares, Minimizer, report_rounding
+from torchid.estimators.least_squares import ConstrainedEstimate, Minimizer, report_rounding
 from torchid.estimators.sgd import (
     FULL_BATCH,
     LogCholeskyParameters,
@@ -31,7 +31,7 @@ from torchid.estimators.sgd import (
     step_schedule,
 )
 from torchid.parallel import one_thread
-from torchid.parameters import INERTIAL, PER_BODY, Array
+from torchid.parameters import Array
 from torchid.problem import Batch, LinearProblem, MiniBatches
 
 
@@ -216,87 +216,35 @@ def _difference(problem: LinearProblem, data: LinearProblem, device: torch.devic
 
 @dataclass(frozen=True)
 class ResidualEffect:
-    """Effect of a residual module on force and parameters, on the training samples.
+    """The force of a residual module on the training samples.
 
     Attributes:
-        rms: of the module's force by group, "base_force" [N], "base_moment" [N m], "joint_torque" [N m, N] and
-            "limb_wrench" [N, N m].
+        rms: by group, "base_force" [N], "base_moment" [N m], "joint_torque" [N m, N] and "limb_wrench" [N, N m].
         shares: by group, that rms over the rms of the whole force, rigid bodies and module together.
-        rigid_share: rms of the part of the module's projected whitened force that rigid bodies can explain, over the
-            rms of all of it.
-        moved: (12 L,), change of the parameters by the module: the least squares estimate on the force less the
-            module's part, minus that on the whole force.
-        moved_scaled: (L,), the largest of each body's ten inertial parameters, in units of their scale.
-        moved_errors: (L,), likewise in standard errors of the parameters that the data determine, NaN without any.
     """
 
     rms: dict[str, float]
     shares: dict[str, float]
-    rigid_share: float
-    moved: Array
-    moved_scaled: Array
-    moved_errors: Array
 
 
-def residual_effect(
-    loss: Loss, problem: LinearProblem, batches: MiniBatches, estimator: LeastSquares
-) -> ResidualEffect | None:
-    """Effect of a loss's residual module; None without a module.
-
-    Args:
-        loss: with the current parameters and module.
-        problem: the compressed samples.
-        batches: the samples.
-        estimator: for the estimates with and without the module's part.
-    """
+@torch.no_grad()
+def residual_effect(loss: Loss, batches: MiniBatches) -> ResidualEffect | None:
+    """The force of a loss's residual module on some samples; None without a module."""
     if loss.residual is None:
         return None
-    with loss.evaluating(), torch.no_grad():
-        gradient, square = _correlation(loss, batches)
-        rms, shares = _by_group(loss.residual, loss.learnable().cpu().numpy(), batches)
-    free = problem.free
-    explained = np.linalg.lstsq(problem.A[:, free].T, gradient[free], rcond=None)[
-        0
-    ]  # A^T explained = sum of K^T W W^T r
-    plain, without_module = (estimator.solve(x) for x in (problem, replace(problem, b=problem.b - explained)))
-    moved = without_module.phi - plain.phi
-    with np.errstate(divide="ignore", invalid="ignore"):
-        errors = np.abs(moved) / np.where(plain.standard_error > 0.0, plain.standard_error, np.nan)
-    return ResidualEffect(
-        rms=rms,
-        shares=shares,
-        rigid_share=float(np.linalg.norm(explained) / np.sqrt(square)) if square else 0.0,
-        moved=moved,
-        moved_scaled=_largest(np.abs(moved) / problem.scale),
-        moved_errors=_largest(errors),
-    )
-
-
-def _correlation(loss: Loss, batches: MiniBatches) -> tuple[Array, float]:
-    """K^T r over all whitened projected rows, (12 L,), and the sum of squares of r, the module's force."""
-    phi = loss.learnable()
-    total, square = torch.zeros_like(phi), 0.0
-    for batch in batches.chunks():
-        force = loss.forces(batch, phi)[1]
-        if force is not None:
-            total += batches.columns.T @ torch.einsum("bij,bi->j", batch.K, force)
-            square += float(force.square().sum())
-    return total.cpu().numpy(), square
-
-
-def _by_group(module: nn.Module, phi: Array, batches: MiniBatches) -> tuple[dict[str, float], dict[str, float]]:
-    """Rms of a module's force by group, and its share of the rms of the whole."""
     base_rows = batches.builder.tree.base_rows
-    own: dict[str, float] = {}
-    whole: dict[str, float] = {}
-    for (q, v, a), rigid in batches.generalized_forces(phi):
-        force = module(q, v, a)
-        for name, rows in _groups(base_rows, v.shape[1], rigid.shape[1]).items():
-            per_row = 1.0 / (batches.samples * (rows.stop - rows.start))
-            for sums, part in ((own, force), (whole, rigid + force)):
-                sums[name] = sums.get(name, 0.0) + per_row * float(part[:, rows].square().sum())
-    shares = {name: float(np.sqrt(own[name] / x)) if x else 0.0 for name, x in whole.items()}
-    return {name: float(np.sqrt(x)) for name, x in own.items()}, shares
+    with_module: dict[str, float] = {}
+    alone: dict[str, float] = {}
+    with loss.evaluating():
+        phi = loss.learnable().cpu().numpy()
+        for (q, v, a), rigid in batches.generalized_forces(phi):
+            force = loss.residual(q, v, a)
+            for name, rows in _groups(base_rows, v.shape[1], rigid.shape[1]).items():
+                per_row = 1.0 / (batches.samples * (rows.stop - rows.start))
+                for sums, part in ((alone, force), (with_module, rigid + force)):
+                    sums[name] = sums.get(name, 0.0) + per_row * float(part[:, rows].square().sum())
+    shares = {name: float(np.sqrt(alone[name] / x)) if x else 0.0 for name, x in with_module.items()}
+    return ResidualEffect({name: float(np.sqrt(x)) for name, x in alone.items()}, shares)
 
 
 def _groups(base_rows: int, nv: int, rows: int) -> dict[str, slice]:
@@ -304,12 +252,6 @@ def _groups(base_rows: int, nv: int, rows: int) -> dict[str, slice]:
     base = {"base_force": slice(0, 3), "base_moment": slice(3, 6)} if base_rows else {}
     groups = base | {"joint_torque": slice(base_rows, nv), "limb_wrench": slice(nv, rows)}
     return {name: rows for name, rows in groups.items() if rows.stop > rows.start}
-
-
-def _largest(x: Array) -> Array:
-    """Largest of each body's ten inertial entries, (L,), of (12 L,); NaN if all are."""
-    by_body = x.reshape(-1, PER_BODY)[:, INERTIAL]
-    return np.where(np.isnan(by_body).all(axis=1), np.nan, np.nan_to_num(by_body).max(axis=1))
 
 
 CONVERGED = 0.01
@@ -412,8 +354,7 @@ class Trainer:
             raise ValueError(f"batches: {found}; accepted: whole batches")
         settings.try_out()
         self.settings, self.problem, self.batches, self.held_out = settings, problem, batches, held_out
-        self._least_squares = settings.least_squares
-        self.closed_form = self._least_squares.solve(problem)
+        self.closed_form = settings.least_squares.solve(problem)
         self._conic = settings.conic_problem(problem)
         self._least = self._conic.unconstrained
         learnable = LogCholeskyParameters(problem, settings.conditions.margin)
@@ -438,12 +379,8 @@ class Trainer:
         """Whether all epochs are done or the held-out loss has stopped falling."""
         if self.epoch >= self.settings.epochs:
             return True
-        module_later = self.loss.residual is not None and self.settings.residual == "parameters_first"
-        last_improvement = max(
-            self.best_epoch, self.settings.epochs // 2 if module_later else 0
-        )  # before, the module has not been trained
         patience = self.settings.patience
-        return patience is not None and self.held_out is not None and self.epoch - last_improvement >= patience
+        return patience is not None and self.held_out is not None and self.epoch - self.best_epoch >= patience
 
     def run(self, on_epoch: Callable[[Epoch], None] | None = None) -> SgdEstimate:
         """Train until finished.
@@ -467,7 +404,6 @@ class Trainer:
             InputError: the loss diverges.
         """
         self.epoch += 1
-        self._freeze()
         self.loss.train()
         rate, start = float(self.optimizer.param_groups[0]["lr"]), time.perf_counter()
         losses: dict[str, float] = {}
@@ -488,7 +424,6 @@ class Trainer:
         self._require_converging(0.0 if held_out is None else held_out)
         if not all(bool(x.isfinite().all()) for x in chain(*self._trained)):
             self._require_converging(float("nan"))  # of a module, in the last step
-        self._unfreeze()
         step_schedule(self.schedule, losses["total"] if held_out is None else held_out)
         if held_out is None or held_out < self.best_loss * (1.0 - _BETTER):
             self.best_epoch, self.best_loss = self.epoch, losses["total"] if held_out is None else held_out
@@ -538,7 +473,7 @@ class Trainer:
             eigenvalues=parameters.least_eigenvalues(phi, self.problem.scale),
             epochs=self.epoch,
             best_epoch=self.best_epoch,
-            residual=residual_effect(self.loss, self.problem, self.batches, self._least_squares),
+            residual=residual_effect(self.loss, self.batches),
             excess=None if self.loss.residual is not None else excess(self.settings, self.problem, found),
         )
 
@@ -591,25 +526,6 @@ class Trainer:
         """Mean squared whitened residual plus prior."""
         y = deviations(self.problem, found)
         return self._conic.objective(np.asarray(np.linalg.solve(self._conic.deviations, y), dtype=np.float64))
-
-    def _freeze(self) -> None:
-        """Freeze the parameters or the residual module if they are not trained in this epoch."""
-        if self.loss.residual is None:
-            return
-        first = self.epoch <= self.settings.epochs // 2
-        trained_now = {
-            "joint": (True, True),
-            "parameters_first": (first, not first),
-            "alternating": (self.epoch % 2 == 1, self.epoch % 2 == 0),
-        }[self.settings.residual]
-        for group, trained in zip(self._trained, trained_now, strict=True):
-            for x in group:
-                x.requires_grad_(trained)
-
-    def _unfreeze(self) -> None:
-        """Unfreeze all: another trainer may use the residual module next."""
-        for x in chain(*self._trained):
-            x.requires_grad_(True)
 
     def _require_converging(self, loss: float) -> None:
         if not loss <= _DIVERGED * max(1.0, self.problem.cost(self.problem.nominal) / max(self.problem.rows, 1)):
