@@ -50,7 +50,7 @@ def test_noise_ridge_outliers_and_cross_validation_are_those_of_the_command(tmp_
     blocks = torchid.split_into_folds(logs, unregularized.builder)
     parts = torchid.compress_in_blocks(blocks, unregularized.builder)
     estimators = [torchid.LeastSquares(ridge) for ridge in written["ridge_selection"]["tried"]]
-    choice = torchid.choose_ridge(parts, blocks, unregularized, estimators, loss)
+    choice = torchid.choose_ridge(parts, blocks, unregularized, estimators)
     assert choice.ridge == written["ridge_selection"]["ridge"]
     assert list(choice.mean_square) == written["ridge_selection"]["mean_square"]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from functools import cache
 
@@ -11,14 +12,12 @@ import torch
 from misread import world
 from motions import value
 from recordings import Miscalibration
-from synthetic import Array
 from unknowns import fit
 from welded import CONTACTS
 
-from torchid.identifiability.confounding import disagreements
+from torchid.fitting.calibration import warn_of_masked
 from torchid.logs import Log
 from torchid.logs.preprocess import UNLOADED_MARGIN_S, find_unloaded, preprocess
-from torchid.parameters import WRENCH_COMPONENTS
 from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log, compress_parts
 from torchid.problem.compression import Part
 from torchid.problem.unloaded_sensors import unloaded_offset_equations
@@ -53,15 +52,6 @@ def bound(log: Log) -> Samples:
 def builder_of(terms: ExtraTerms = OFFSETS, name: str = "full") -> RowBuilder:
     robot = world().robot
     return RowBuilder(robot, CONTACTS, named_sensors(name, robot.n, len(CONTACTS), NOISE, len(robot.ft_names)), terms)
-
-
-def in_the_air(change: Array | float, only: tuple[int, ...] = (0, 1, 2)) -> Log:
-    """The log with other readings of some contacts in the air: `change` is added."""
-    log, _ = swinging()
-    wrench, free = value(log.contact_wrench_local).copy(), ~value(log.contact_active)
-    for contact in only:
-        wrench[free[:, contact], contact] += change
-    return replace(log, contact_wrench_local=wrench)
 
 
 def written(reading: float) -> Log:
@@ -208,20 +198,7 @@ def test_a_clamp_at_0_is_recognized_and_a_coarse_sensor_about_0_is_not_taken_for
         free = ~value(log.contact_active)[..., None]
         (part,) = of_air(replace(log, contact_wrench_local=np.where(free, readings, wrench)))
         assert bool(part.masked) == masked
-
-
-def test_a_sensor_that_is_off_in_another_way_in_the_air_is_named_with_both_numbers() -> None:
-    robot = world().robot
-    sensors = named_sensors("full", robot.n, len(CONTACTS), NOISE, len(robot.ft_names))
-    for change, named in (
-        (0.0, set()),
-        (35.0, {f"offset of {CONTACTS[0].frame} {name}" for name in WRENCH_COMPONENTS}),
-    ):
-        samples = bound(in_the_air(change, only=(0,)))
-        blind = fit(robot, CONTACTS, sensors, ALL, [replace(samples, unloaded=None)])
-        parts = compress_parts([samples], blind.builder, threads=1)
-        found = disagreements(parts, blind.builder, blind.extras)
-        assert {x.extra.label for x in found} == named
-        for x in found:
-            assert x.in_the_air - x.in_contact == pytest.approx(change, abs=1e-5)
-            assert x.standard_errors > 5.0
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            warn_of_masked([part], builder_of())
+        assert [" read exactly 0 in the air" in str(x.message) for x in caught] == [True] * masked

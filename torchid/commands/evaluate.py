@@ -278,7 +278,6 @@ def _calibrations(experiment: Experiment, phi: Array, shared: Comparison[dict[st
             builder=builder,
             phi=of_bodies.flatten(),
             values={("", label): value for label, value in values.items()},
-            loss=experiment.loss,
         )
         for of_bodies, values in zip((robot.nominal, phi), shared, strict=True)
     )

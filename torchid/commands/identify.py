@@ -24,7 +24,7 @@ from torchid.config import ExperimentConfig, inputs_of
 from torchid.errors import ConfigError, NumericalWarning, warn_about_file
 from torchid.estimators import Conditions, Estimate, Violation, violations
 from torchid.estimators.conditions import term_violations
-from torchid.fitting.calibration import Calibration, Comparison, warn_of_confounded, warn_of_disagreement
+from torchid.fitting.calibration import Calibration, Comparison, warn_of_confounded, warn_of_masked
 from torchid.fitting.cross_validation import CrossValidation, Scorer, calibrations_without_folds
 from torchid.fitting.factor_files import FactorFile
 from torchid.fitting.fit import Fit, LogFitter
@@ -113,7 +113,7 @@ def _solved(
     of_mass = float(np.linalg.norm(gains @ mass_weights(len(experiment.robot.bodies))))
     mass = require_plausible(fit, checked, logs["train"], of_mass)
     warn_of_confounded([one for one in fit.extras if one.extra.what not in ready.choices.adopted_terms])
-    warn_of_disagreement(fit, fitter)
+    warn_of_masked(fit.parts, fitter.builder)
     if experiment.sensors.task_weights is not None and fit.jackknife is None:  # the only errors that know of weights
         found = f"set, of logs of fewer than {LEAST_BLOCKS} blocks, whose scatter intervals come from"
         raise ConfigError.at_field("estimator.task_weights", found, "longer logs, or no such key")
@@ -141,7 +141,7 @@ def _identify(
         alone = _by_state(fitter, whole)
         added = distributed.from_first(partial(_contributions, ready, whole, problem, bars), "contributions")
     with clock("evaluate"):
-        without_folds = calibrations_without_folds(fit, fitter, experiment.loss)
+        without_folds = calibrations_without_folds(fit, fitter)
         scorer, of_blocks = Scorer(evaluation, builder), merge_states(fit.parts, builder)
         scores = _scores(scorer, logs["test"], blocks, of_blocks, compared, without_folds, bars)
         traces = distributed.from_first(lambda: [trace_forces(evaluation, log, compared) for log in shown], "traces")

@@ -70,8 +70,8 @@ class _Reference:
             for elimination, own in zip(assembly.eliminations, assembly.extras_at(phi), strict=True)
             for extra, value in zip(elimination.extras, own, strict=True)
         }
-        robot, loss = self.setup.robot, self.setup.loss
-        return Calibration(robot=robot, builder=self.builder, phi=phi, values=values, loss=loss)
+        robot = self.setup.robot
+        return Calibration(robot=robot, builder=self.builder, phi=phi, values=values)
 
 
 def _reference(setup: RobotSetup, train: Sequence[Samples]) -> _Reference | None:

@@ -14,9 +14,8 @@ from torch import Tensor
 
 from torchid.errors import ConfoundedWarning, LogError, about_file, current_file, join_names, warn, warn_about_file
 from torchid.estimators.least_squares import Minimizer
-from torchid.fitting.fit import Fit, LogFitter
-from torchid.fitting.robust import RobustLoss, fit_extras_robustly
-from torchid.identifiability.confounding import ExtraEstimate, disagreements, estimate_extras
+from torchid.fitting.fit import Fit
+from torchid.identifiability.confounding import ExtraEstimate
 from torchid.parameters import Array
 from torchid.problem import Evaluation, RowBuilder, Samples, assemble, compress_parts
 from torchid.problem.compression import Block, CompressedBlock, Part
@@ -55,14 +54,12 @@ class Calibration:
         builder: of the rows of the sensors and actuators whose extra parameters are meant.
         phi: (12 L,), parameters of the bodies.
         values: the extra parameters that are known.
-        loss: what residuals cost when those of a new log are fitted; None: their squares.
     """
 
     robot: Robot
     builder: RowBuilder
     phi: Array
     values: ExtraValues
-    loss: RobustLoss | None = None
     _of_new_logs: dict[str, Array | float] = field(default_factory=dict, init=False)
 
     __repr__ = short_repr
@@ -136,43 +133,29 @@ class Calibration:
             message = f"{error.source}: {error.field}: {error.found}; offsets and scales of this log stay unknown"
             warn(message)
             return 0.0
-        own = np.array([x.per_log for x in builder.extras])
-
-        def columns(values: Array) -> Tensor:
-            extras = np.empty(len(own))
-            extras[own], extras[~own] = values, shared
-            return builder.to_columns(np.append(self.phi, extras)[None])[0]
-
-        if self.loss is None:
-            return solve(compress_parts([log], builder))
-        return fit_extras_robustly(log, builder, solve, columns, self.loss)
+        return solve(compress_parts([log], builder))
 
 
-def calibrations(
-    fit: Fit, robot: Robot, builder: RowBuilder, loss: RobustLoss | None = None
-) -> Comparison[Calibration]:
+def calibrations(fit: Fit, robot: Robot, builder: RowBuilder) -> Comparison[Calibration]:
     """Nominal and identified parameters, each with the extra parameters that the logs of a fit show for them.
 
     Args:
         fit: of compressed logs.
         robot: the robot.
         builder: of their rows.
-        loss: as in `Calibration`.
     """
-    return calibrations_at(fit.assembly, Minimizer(fit.estimate.phi, fit.estimate.psi), robot, builder, loss)
+    return calibrations_at(fit.assembly, Minimizer(fit.estimate.phi, fit.estimate.psi), robot, builder)
 
 
 def calibrations_at(
-    assembly: Assembly, minimizer: Minimizer, robot: Robot, builder: RowBuilder, loss: RobustLoss | None = None
+    assembly: Assembly, minimizer: Minimizer, robot: Robot, builder: RowBuilder
 ) -> Comparison[Calibration]:
     """As `calibrations`, of what an estimator has found; arguments as of `calibration_at`."""
     pair = Minimizer(assembly.problem.nominal), minimizer
-    return Comparison(*(calibration_at(assembly, one, robot, builder, loss) for one in pair))
+    return Comparison(*(calibration_at(assembly, one, robot, builder) for one in pair))
 
 
-def calibration_at(
-    assembly: Assembly, minimizer: Minimizer, robot: Robot, builder: RowBuilder, loss: RobustLoss | None = None
-) -> Calibration:
+def calibration_at(assembly: Assembly, minimizer: Minimizer, robot: Robot, builder: RowBuilder) -> Calibration:
     """Parameters that an estimator has found, with the extra parameters that fit them best.
 
     Args:
@@ -180,7 +163,6 @@ def calibration_at(
         minimizer: for its problem.
         robot: the robot.
         builder: of the rows.
-        loss: as in `Calibration`.
     """
     extras = zip(assembly.eliminations, assembly.extras_at(*minimizer), strict=True)
     values = {
@@ -189,7 +171,7 @@ def calibration_at(
         for extra, value, std in zip(one.extras, found, one.std_if_known, strict=True)
         if np.isfinite(std)
     }
-    return Calibration(robot=robot, builder=builder, phi=minimizer.phi, values=values, loss=loss)
+    return Calibration(robot=robot, builder=builder, phi=minimizer.phi, values=values)
 
 
 _NAMED, _NAMED_IN_SHORT = 6, 2  # sensors or bodies that a warning names, and the answer of a run
@@ -264,42 +246,19 @@ def _advice(extras: Sequence[ExtraEstimate], by_mass: bool) -> str:
     return "add motion that unloads the sensor, state what is known, or zero the sensor before the log"
 
 
-def warn_of_disagreement(fit: Fit, fitter: LogFitter) -> None:
-    """Name contact sensors whose readings in the air say nothing of their offsets, or contradict the rest of the data.
-
-    Args:
-        fit: of compressed logs.
-        fitter: that it comes from.
+def warn_of_masked(parts: Sequence[Part], builder: RowBuilder) -> None:
+    """Name contact sensors whose readings in the air say nothing of their offsets.
 
     Warns:
-        TorchidWarning: one for each log that has some of the one or the other.
+        TorchidWarning: one for each log that has some.
     """
-    builder, estimator = fitter.builder, fitter.estimator
-    on_ground = [part for part in fit.parts if not part.unloaded]
-    if len(on_ground) == len(fit.parts):
-        return
-    for log in dict.fromkeys(part.source for part in fit.parts):
-        masked = {number for part in fit.parts if part.source == log for number in part.masked}
+    for log in dict.fromkeys(part.source for part in parts):
+        masked = {number for part in parts if part.source == log for number in part.masked}
         if masked:
             channels = (builder.extras[number] for number in sorted(masked))
             named = _grouped(f"{x.name} {x.component}" for x in channels)
             message = f"{log}: {named} read exactly 0 in the air, as if masked or clamped"
             warn(f"{message}, which says nothing of their offsets")
-    assembly = fitter.assemble(on_ground)
-    estimate = fitter.least_squares.solve(assembly.problem)
-    extras = estimate_extras(assembly, estimate, fitter.robot.body_names, estimator.rank_tolerance)
-    noise = float(np.sqrt(fit.assembly.problem.oversampling) * fit.estimate.residual_std)
-    contradictions = disagreements(fit.parts, builder, extras, noise)
-    for log in dict.fromkeys(x.log for x in contradictions):
-        own = [x for x in contradictions if x.log == log]
-        named = "; ".join(
-            f"{x.extra.name} {x.extra.component} reads {x.in_the_air:.4g} {x.extra.unit} in the air, where "
-            f"{x.in_contact:.4g} +- {x.standard_error:.2g} fits the rest of the data"
-            for x in own[:_NAMED]
-        )
-        more = f"; and {len(own) - _NAMED} more" if len(own) > _NAMED else ""
-        advice = "look for drift, a gain, cross talk, wrong contact_active, or noise in the base's motion"
-        warn(f"{log}: {named}{more}; {advice}")
 
 
 def _grouped(labels: Iterable[str], most: int = _NAMED) -> str:

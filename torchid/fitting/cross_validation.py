@@ -16,7 +16,6 @@ from torchid.errors import LogError, TorchidWarning
 from torchid.estimators.least_squares import Minimizer
 from torchid.fitting.calibration import Calibration, Comparison, calibration_at, calibrations_at
 from torchid.fitting.fit import BatchEstimator, Fit, LogFitter, LogProblem
-from torchid.fitting.robust import RobustLoss
 from torchid.parallel import one_thread, share_between_processes, thread_count
 from torchid.parameters import Array
 from torchid.problem import Evaluation, ExtraTerms, Metrics, RowBuilder, Samples
@@ -162,9 +161,7 @@ class RidgeChoice:
 
 
 @one_thread()
-def cross_validate(
-    logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms | None = None, loss: RobustLoss | None = None
-) -> CrossValidation:
+def cross_validate(logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms | None = None) -> CrossValidation:
     """Errors of predicted forces on blocks of some logs, each block predicted by the fit of all others.
 
     Blocks are contiguous in time, see `split_into_folds`: errors of successive samples are alike::
@@ -176,7 +173,6 @@ def cross_validate(
         logs: bound logs.
         fitter: of their rows.
         terms: the extra terms of the fitter's builder.
-        loss: as in `Calibration`.
 
     Raises:
         LogError: too few samples to leave some out.
@@ -184,7 +180,7 @@ def cross_validate(
     builder = fitter.builder
     blocks = split_into_folds(logs, builder)
     problem = fitter.build_problem(compress_in_folds(blocks, builder))  # scatter between blocks is not needed
-    compared = calibrations_without_folds(problem, fitter, loss)
+    compared = calibrations_without_folds(problem, fitter)
     if not compared:
         raise _too_few(logs)
     scorer = Scorer(Evaluation(fitter.robot, builder.contacts, str(builder.device), terms), builder)
@@ -193,15 +189,12 @@ def cross_validate(
 
 
 @one_thread()
-def calibrations_without_folds(
-    fit: Fit | LogProblem, fitter: LogFitter, loss: RobustLoss | None = None
-) -> list[Comparison[Calibration]]:
+def calibrations_without_folds(fit: Fit | LogProblem, fitter: LogFitter) -> list[Comparison[Calibration]]:
     """For every fold of a fit, in order, nominal parameters and those of all others; none where there is only one.
 
     Args:
         fit: whose blocks keep the weights and the noise of readings that they have.
         fitter: that it comes from.
-        loss: as in `Calibration`.
     """
     folds = sorted({part.fold for part in fit.parts})
     if len(folds) < 2:
@@ -216,7 +209,7 @@ def calibrations_without_folds(
             return assembly, fitter.estimator.minimize(assembly.problem)
 
     solved = share_between_processes(folds, without, thread_count())
-    return [calibrations_at(assembly, found, fitter.robot, fitter.builder, loss) for assembly, found in solved]
+    return [calibrations_at(assembly, found, fitter.robot, fitter.builder) for assembly, found in solved]
 
 
 @one_thread()
@@ -225,7 +218,6 @@ def choose_ridge(
     blocks: Sequence[Block],
     fitter: LogFitter,
     estimators: Sequence[BatchEstimator],
-    loss: RobustLoss | None = None,
     done: Callable[[int], None] | None = None,
     rule: RidgeRule = "auto",
 ) -> RidgeChoice:
@@ -244,7 +236,6 @@ def choose_ridge(
         blocks: training logs, as `split_into_folds` or `fold_compressed` cuts them.
         fitter: of their rows.
         estimators: one for each ridge to try, ascending.
-        loss: as in `Calibration`.
         done: called with the number of fits done.
         rule: which of them is taken.
 
@@ -260,7 +251,7 @@ def choose_ridge(
     shares = [(fold, first) for first in range(count) for fold in folds]  # five folds are no two equal halves
 
     def held_out(share: tuple[int, int]) -> Array:
-        return _held_out_squares(share[0], together, blocks, fitter, estimators[share[1] :: count], loss, done)
+        return _held_out_squares(share[0], together, blocks, fitter, estimators[share[1] :: count], done)
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", TorchidWarning)  # the fit says the same
@@ -280,7 +271,6 @@ def _held_out_squares(
     blocks: Sequence[Block],
     fitter: LogFitter,
     estimators: Sequence[BatchEstimator],
-    loss: RobustLoss | None,
     done: Callable[[int], None] | None,
 ) -> Array:
     """Mean squares on a fold of what each estimator fits without it."""
@@ -289,7 +279,7 @@ def _held_out_squares(
     fitted = []
     for estimator in estimators:
         found = estimator.minimize(assembly.problem)
-        fitted.append(calibration_at(assembly, found, fitter.robot, fitter.builder, loss))
+        fitted.append(calibration_at(assembly, found, fitter.robot, fitter.builder))
         if done is not None:
             done(1)
     return np.array([left.error / max(left.rows, 1) for left in sum_residuals(fitter.builder, logs, own, fitted)])

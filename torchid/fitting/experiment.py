@@ -432,7 +432,7 @@ class RobotSetup:
 
     def calibrations(self, fit: Fit, builder: RowBuilder) -> Comparison[Calibration]:
         """Nominal and identified parameters of a fit, with the extra parameters that fit them best."""
-        return calibrations(fit, self.robot, builder, self.loss)
+        return calibrations(fit, self.robot, builder)
 
     def estimate_noise(
         self,
@@ -481,7 +481,7 @@ class RobotSetup:
                 return RidgeChoice(ridges[0], ridges[:1], (left**2,), (0.0,))
         estimators = [batch_estimator(replace(settings, ridge=ridge), conditions) for ridge in ridges]
         try:
-            return choose_ridge(parts, blocks, fitter, estimators, self.loss, rule=settings.ridge_rule)
+            return choose_ridge(parts, blocks, fitter, estimators, rule=settings.ridge_rule)
         except LogError as error:
             accepted = "a number, 0.001 say, or longer logs"
             raise ConfigError.at_field("estimator.ridge", f"{settings.ridge}, but {error.found}", accepted) from error

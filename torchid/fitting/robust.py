@@ -19,7 +19,7 @@ from torchid.fitting.fit import Fit, LogFitter, Solve, with_block_errors
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.parallel import one_thread
 from torchid.parameters import Array
-from torchid.problem import RowBuilder, Samples, compress_parts
+from torchid.problem import Samples, compress_parts
 from torchid.problem.chunks import ProgressCallback
 from torchid.problem.compression import (
     Part,
@@ -27,7 +27,6 @@ from torchid.problem.compression import (
     add_noise_gram,
     compress_in_blocks,
     cut_into_blocks,
-    merge_factors,
     noise_gram_by_part,
 )
 from torchid.problem.noise_gram import NoiseGram, noise_gram_of_share
@@ -50,7 +49,6 @@ _LEAST_ROUGH = 200  # of them in each log, which may have unknowns of its own
 _WORTHWHILE = 4  # times as many samples, from which on that saves more than it costs
 _START = 3  # passes with Huber's loss before Tukey's
 _FARTHEST = 1.9  # steps of weighted least squares, a majorizer of the loss: any below 2 makes that smaller
-_SAME = 1e-3  # change of the extra parameters of one log
 
 
 @dataclass(frozen=True)
@@ -238,39 +236,6 @@ def _passes(rows: _Rows, loss: RobustLoss, start: _Point, first_pass: int = 0, s
         converged = distributed.broadcast(same, "convergence")
         at = at.beyond(fit, scale, reweighting.newton_ratio)
     return _Passes(fit, at, reweighting, done, converged)
-
-
-def fit_extras_robustly(
-    log: Samples,
-    builder: RowBuilder,
-    solve: Callable[[list[Part]], Array],
-    columns: Callable[[Array], Tensor],
-    loss: RobustLoss,
-) -> Array:
-    """Extra parameters of a log, (M,), with outliers down-weighted and everything else known, as in `fit_robustly`.
-
-    Args:
-        log: a bound log.
-        builder: of its rows.
-        solve: the extra parameters that fit compressed parts of the log best.
-        columns: all parameters in the builder's columns for given extra parameters, (width,).
-        loss: what residuals cost.
-    """
-    parts = compress_parts([log], builder)
-    values = solve(parts)
-    factor = merge_factors((part.factor for part in parts), builder)
-    misfit = factor.triangle() @ torch.cat([columns(values), torch.tensor([-1.0], dtype=torch.float64)])
-    scale = float(misfit.norm()) / np.sqrt(max(factor.rows, 1))
-    for done in range(loss.passes):
-        current = _loss_of_pass(loss, done)
-        reweighting = Reweighting(current, {log.source: columns(values)}, max(scale, _TINY))
-        before, values = values, solve(compress_parts([log], builder, weight_rows=reweighting))
-        steady = abs(reweighting.median_scale - scale) <= _STEADY * scale
-        scale = reweighting.median_scale
-        same = current == loss and steady and np.allclose(values, before, rtol=_SAME, atol=_SAME)
-        if distributed.broadcast(same, "convergence"):
-            break
-    return values
 
 
 class Reweighting:

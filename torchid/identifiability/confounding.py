@@ -14,7 +14,7 @@ from torchid.estimators.least_squares import residual_std
 from torchid.parallel import one_thread
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import LinearProblem, RowBuilder
-from torchid.problem.compression import Part, merge_factors
+from torchid.problem.compression import Part
 from torchid.problem.elimination import Assembly, Elimination
 from torchid.problem.extras import Extra
 from torchid.reprs import decimal
@@ -29,8 +29,6 @@ Welsch, "Regression Diagnostics", 1980.
 
 _BY_MASS = 0.9  # share of a variance that a known total mass would take off, from which on it is named
 _NAMED = 4  # parameters, at most, in a message
-_CONTRADICTS = 5.0  # standard errors between readings in the air and in contact; noise is seldom white
-_NOTICEABLE = 3.0  # standard deviations of the sensor's noise: less is invisible in a single reading
 
 
 @dataclass(frozen=True)
@@ -104,70 +102,6 @@ def estimate_extras(
     if assembly.scaled_by is None:
         return out
     return [replace(x, noise_error=np.inf, inflation=np.inf, mass_separates=True) for x in out]
-
-
-@dataclass(frozen=True)
-class Disagreement:
-    """An offset for which readings in the air and the other data disagree.
-
-    Attributes:
-        extra: the offset.
-        log: source of the log.
-        in_the_air: reading of the unloaded sensor, in its unit.
-        in_contact: the same, predicted with the offset and scale that fit the other data best.
-        standard_error: of the difference.
-    """
-
-    extra: Extra
-    log: str
-    in_the_air: float
-    in_contact: float
-    standard_error: float
-
-    @property
-    def standard_errors(self) -> float:
-        """Difference of the two in standard errors."""
-        return abs(self.in_the_air - self.in_contact) / self.standard_error
-
-    def exceeds_noise(self, noise: Array) -> bool:
-        """Whether the difference is significant and exceeds the noise (6,) of contact sensors [N, N m]."""
-        axis = 0 if self.extra.contact is None else self.extra.contact[1]
-        difference = abs(self.in_the_air - self.in_contact)
-        return self.standard_errors > _CONTRADICTS and difference > _NOTICEABLE * float(noise[axis])
-
-
-@one_thread()
-def disagreements(
-    parts: Sequence[Part], builder: RowBuilder, in_contact: Sequence[ExtraEstimate], noise: float = 1.0
-) -> list[Disagreement]:
-    """Offsets for which readings in the air and all other rows disagree, most significant first.
-
-    Args:
-        parts: of the logs.
-        builder: of their rows.
-        in_contact: extra parameters of a fit without the unloaded parts.
-        noise: standard deviation of whitened rows, correlation counted.
-    """
-    out = []
-    for source in dict.fromkeys(part.source for part in parts if part.unloaded):
-        estimates = {(x.extra.what, at): x for x in in_contact if x.log in ("", source) for at in x.extra.contacts}
-        R = merge_factors(
-            (part.factor for part in parts if part.unloaded and part.source == source), builder
-        ).triangle()
-        for number, extra in enumerate(builder.extras, start=builder.columns.count):
-            column, at = R[:, number].numpy(), extra.contact
-            if extra.what != "offset" or at is None or not column.any():
-                continue
-            if (offset := estimates.get(("offset", at))) is not None:
-                weight = float(column @ column)
-                read, scale = float(column @ R[:, -1].numpy()) / weight, estimates.get(("scale", at))
-                expected, variance = offset.value, offset.standard_error**2 + noise**2 / weight
-                if scale is not None:
-                    expected, variance = expected / (1.0 + scale.value), variance + (read * scale.standard_error) ** 2
-                deviation = float(np.sqrt(variance))
-                out.append(Disagreement(extra, source, read, expected, deviation))
-    sensors = builder.sensors.noise.wrench_std
-    return sorted((x for x in out if x.exceeds_noise(sensors)), key=lambda x: -x.standard_errors)
 
 
 @dataclass(frozen=True)
