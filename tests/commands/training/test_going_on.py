@@ -106,7 +106,6 @@ def test_curves_say_everything_by_epoch_and_show_train_and_unseen_logs(run: Path
             "loss/data",
             "loss/prior",
             "loss/beside",
-            "loss/conditions",
             "loss_held_out/data",
             "share_of_force/rigid_body",
         ),
@@ -137,7 +136,7 @@ def test_curves_say_everything_by_epoch_and_show_train_and_unseen_logs(run: Path
         unseen = tag in ("loss_held_out/data", "training_error_relative_test/nullspace")  # little, after 240 samples
         assert values[-1] < (0.97 if unseen else 0.9) * values[0], tag
     total = [event.value for event in events.Scalars("loss/total")]
-    terms = ("data", "prior", "beside", "conditions")
+    terms = ("data", "prior", "beside")
     parts = zip(*([event.value for event in events.Scalars(f"loss/{term}")] for term in terms), strict=True)
     assert total == pytest.approx([sum(pair) for pair in parts], rel=1e-6)
     assert set(events.Tags()["images"]) == {f"figure_{k}_{name}" for k, name in enumerate(OF_A_RUN, 1)}
