@@ -18,9 +18,9 @@ from rich.table import Table
 from torchid import parameters
 from torchid.parallel import one_thread
 from torchid.problem import RowBuilder, Samples, compress
-from torchid.problem.chunk_dynamics import Workspace
 from torchid.problem.chunks import chunk_size, chunks_by_state
 from torchid.problem.contact_state import ContactState
+from torchid.problem.rows import Workspace
 
 STAGES = ("kinematics, wrench columns", "null space W", "projection to rows", "factorization")
 _NUMBER = 8  # bytes

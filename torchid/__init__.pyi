@@ -111,7 +111,7 @@ from .problem.compression import (
     compress_in_blocks,
     compress_log,
     fold_compressed,
-    merge_blocks,
+    merge,
     split_into_folds,
 )
 from .regressor import (
@@ -207,7 +207,7 @@ __all__ = [
     "split_into_folds",
     "linear_problem",
     "load_robot",
-    "merge_blocks",
+    "merge",
     "motion_from_state",
     "named_sensors",
     "preprocess",

@@ -13,7 +13,7 @@ from torchid.fitting.prior_knowledge import conditions_from
 from torchid.parameters import Array
 from torchid.problem import Evaluation, RowBuilder, Samples, TriangularFactor, linear_problem
 from torchid.problem.chunks import chunks_by_state
-from torchid.problem.compression import compress_by_state, merge_factors
+from torchid.problem.compression import compress_parts, merge, merge_factors
 from torchid.problem.contact_state import ContactState, state_name
 from torchid.problem.metrics import BASE_ROWS, force_series, null_space_part
 
@@ -65,7 +65,8 @@ class CompressedLogs:
 def compress_groups(experiment: Experiment, groups: Mapping[str, Sequence[Samples]]) -> CompressedLogs:
     """Compress groups of logs with an experiment's sensors."""
     builder = RowBuilder(experiment.robot, experiment.contacts, experiment.sensors).to(experiment.config.device)
-    factors = {name: compress_by_state(logs, builder) for name, logs in groups.items()}
+    parts = {name: merge(compress_parts(logs, builder), builder, "state") for name, logs in groups.items()}
+    factors = {name: {part.state: part.factor for part in by_state} for name, by_state in parts.items()}
     counts: dict[str, dict[ContactState, int]] = {name: {} for name in groups}
     for name, logs in groups.items():
         for samples in logs:

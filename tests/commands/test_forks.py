@@ -15,16 +15,10 @@ from pathlib import Path
 import pytest
 import torch
 from demo import shortened_demo
-from random_samples import random_samples
-from synthetic import SOLO12, load
 
 from torchid import parallel
 from torchid.cli import main
-from torchid.fitting.robust import Reweighting, RobustLoss
 from torchid.parallel import Fork, forks_allowed, share_between_forks
-from torchid.problem import RowBuilder, chunks, compress_parts
-from torchid.problem.chunks import map_chunks
-from torchid.sensing import Contact, named_sensors
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks are made on Linux alone")
 
@@ -48,33 +42,6 @@ def test_tensors_outlive_the_copy_that_made_them() -> None:
         process, values = fork.result()
     assert process != os.getpid()
     assert torch.equal(values, torch.arange(1000.0))
-
-
-def test_passes_over_samples_find_the_same_in_forks_as_in_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(chunks, "_WORTH_FORKING", 300)
-    contacts = [Contact("FL_FOOT", "point")]
-    robot = load(SOLO12)
-    samples, _ = random_samples(robot, contacts, 300, 0, states=2)
-    builder = RowBuilder(robot, contacts, named_sensors("joints", robot.n, len(contacts)))
-    parameters = {samples.source: torch.zeros(builder.width, dtype=torch.float64)}
-
-    def weighted() -> tuple[torch.Tensor, Reweighting, int]:
-        weights, done = Reweighting(RobustLoss.named("huber"), parameters, 1.0), list[int]()
-        parts = compress_parts([samples], builder, 40, 2, done.append, weights)
-        return torch.stack([part.factor.triangle() for part in parts]), weights, sum(done)
-
-    def processes() -> set[int]:
-        return set(map_chunks([samples], builder, lambda own: (list(own), os.getpid())[1], 40, 2))
-
-    factors, weights, _ = weighted()
-    assert processes() == {os.getpid()}
-    with forks_allowed():
-        of_forks, weights_of_forks, done = weighted()
-        assert len(processes()) == 2
-    assert torch.equal(of_forks, factors)
-    for name in ("median_scale", "mean_weight", "newton_ratio"):
-        assert getattr(weights_of_forks, name) == getattr(weights, name), name
-    assert done == len(samples)
 
 
 def test_an_error_is_that_of_this_process() -> None:

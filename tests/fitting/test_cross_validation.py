@@ -33,6 +33,7 @@ from torchid.problem import (
     linear_problem,
 )
 from torchid.problem.compression import (
+    BY_FOLD,
     FOLDS,
     split_into_folds,
 )

@@ -23,8 +23,8 @@ from torchid.estimators import Conditions, Consistent, Estimate, LeastSquares, v
 from torchid.fitting.fit import Fit, LogFitter
 from torchid.fitting.robust import TUNING, Reweighting, RobustLoss, RobustSummary, fit_robustly
 from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log, compress_parts
-from torchid.problem.chunk_dynamics import ChunkDynamics, Workspace
 from torchid.problem.compression import Part
+from torchid.problem.rows import ChunkDynamics, Workspace
 from torchid.robot import Robot
 from torchid.sensing import SensorNoise, named_sensors
 

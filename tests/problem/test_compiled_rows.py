@@ -18,9 +18,9 @@ from synthetic import PANDA, TALOS, TALOS_FULL, load
 import torchid
 from torchid.kernels import compiling_announced
 from torchid.problem import RowBuilder, Samples, TriangularFactor, chunks, compress, compress_parts, row_compressor
-from torchid.problem.chunk_dynamics import Workspace
 from torchid.problem.chunks import choose_kernels, chunks_by_state
 from torchid.problem.extras import ExtraTerms
+from torchid.problem.rows import Workspace
 
 numba = pytest.importorskip("numba", reason="compiled kernels need Numba, of the extra [fast]")
 kernels = pytest.importorskip("torchid.kernels.gram")

@@ -14,16 +14,15 @@ from walking import MACHINES, recorded, robot_of, truth
 
 from torchid.logs.preprocess import preprocess
 from torchid.problem import ExtraTerms, RowBuilder, Samples, TriangularFactor, bind_log, compress_parts
-from torchid.problem.chunk_dynamics import block_spans
 from torchid.problem.compression import (
+    BY_FOLD,
     FOLDS,
     LEAST_PER_FOLD,
     Part,
+    block_spans,
     compress_log,
     fold_compressed,
-    merge_blocks,
-    merge_folds,
-    merge_states,
+    merge,
     piece_spans,
     split_into_folds,
 )
@@ -90,19 +89,19 @@ def test_blocks_of_compressed_logs_are_those_of_their_samples(
     assert [(x.source, x.fold, len(x)) for x in found] == [(x.source, x.fold, len(x)) for x in expected]
     assert oversampling == 1.0 or len({x.fold for x in found}) == 1500 // (LEAST_PER_FOLD * oversampling) < FOLDS
     parts = compress_parts(expected, builder)
-    merged = merge_states([part for part in parts if not part.unloaded], builder)
+    merged = merge([part for part in parts if not part.unloaded], builder, *BY_FOLD)
     unloaded = [part for part in parts if part.unloaded]
     assert unloaded
-    cut = merge_blocks(found, builder)
+    cut = [part for block in found for part in block.parts]
     loaded = [part for part in cut if not part.unloaded]
     assert len({(part.source, part.fold, part.block) for part in loaded}) == len(loaded) >= len(merged)
-    assert_same([*merge_states(loaded, builder), *(part for part in cut if part.unloaded)], [*merged, *unloaded])
+    assert_same([*merge(loaded, builder, *BY_FOLD), *(part for part in cut if part.unloaded)], [*merged, *unloaded])
 
 
 def test_contact_states_of_a_compressed_log_are_those_of_its_samples(walk: tuple[RowBuilder, Samples]) -> None:
     builder, log = walk
     parts = [part for part in compress_parts([log], builder) if not part.unloaded]
-    expected = {part.state: part for part in merge_folds(parts, builder)}
+    expected = {part.state: part for part in parts}
     found = {part.state: part for part in compress_log(log, builder).by_state}
     assert found.keys() == expected.keys()
     assert len(found) > 1

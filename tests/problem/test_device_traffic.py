@@ -70,7 +70,7 @@ def traffic(builder: RowBuilder, chunks: Chunks) -> dict[str, int]:
     there = [(samples.to(DEVICE), state) for samples, state in chunks]
 
     def compress() -> list[Part]:
-        return _compress_chunks(builder, iter(there), by_log=True)
+        return _compress_chunks(builder, iter(there), None)
 
     with torch.no_grad(), DeviceTraffic() as mode:
         compress()
@@ -122,7 +122,7 @@ def test_a_state_that_is_met_for_the_first_time_costs_a_few_copies_once(tmp_path
     builder = builder.to(DEVICE)
     there = [(samples.to(DEVICE), state) for samples, state in chunks]
     with torch.no_grad(), DeviceTraffic() as mode:
-        _compress_chunks(builder, iter(there), by_log=True)
+        _compress_chunks(builder, iter(there), None)
     del mode.found[DECISION]
     assert 0 < sum(mode.found.values()) < 100
 

@@ -37,7 +37,7 @@ from torchid.identifiability.information import Contributions, contributions
 from torchid.parallel import one_thread
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Evaluation, LinearProblem, Metrics, Samples
-from torchid.problem.compression import Block, Part, merge_folds, merge_states
+from torchid.problem.compression import BY_FOLD, Block, Part, merge
 from torchid.problem.contact_state import ContactState, state_name
 from torchid.problem.metrics import LOG_SETS
 from torchid.problem.motion import is_at_rest
@@ -137,12 +137,12 @@ def _identify(
         forces = distributed.from_first(lambda: [compare_forces(evaluation, log, compared) for log in shown], "forces")
         begun = _begin_figures(ready, fit, forces, stack)
     with clock("identifiability"):
-        whole = merge_folds(_with_states(fit.parts, ready.factors), builder)
+        whole = merge(_with_states(fit.parts, ready.factors), builder, "source", "state", "unloaded")
         alone = _by_state(fitter, whole)
         added = distributed.from_first(partial(_contributions, ready, whole, problem, bars), "contributions")
     with clock("evaluate"):
         without_folds = calibrations_without_folds(fit, fitter)
-        scorer, of_blocks = Scorer(evaluation, builder), merge_states(fit.parts, builder)
+        scorer, of_blocks = Scorer(evaluation, builder), merge(fit.parts, builder, *BY_FOLD)
         scores = _scores(scorer, logs["test"], blocks, of_blocks, compared, without_folds, bars)
         traces = distributed.from_first(lambda: [trace_forces(evaluation, log, compared) for log in shown], "traces")
         friction = unfitted_friction(problem, experiment.robot)

@@ -22,7 +22,7 @@ from torchid.fitting.fit import LogFitter
 from torchid.fitting.noise import NoiseSummary
 from torchid.identifiability.base_parameters import StateReport, require_base, state_reports
 from torchid.problem import RowBuilder, Samples
-from torchid.problem.compression import Block, Part, compress_in_blocks, fold_compressed, merge_blocks, split_into_folds
+from torchid.problem.compression import Block, Part, compress_in_blocks, fold_compressed, split_into_folds
 from torchid.reading.log_reader import LogReader, check_read
 
 
@@ -117,7 +117,7 @@ def _data_of_factors(experiment: Experiment, clock: Stopwatch, bars: Progress) -
     with clock("compress"):
         builder = fleet.experiment.builder(fleet.experiment.sensors)
         blocks = fold_compressed([one.log for one in fleet.files], builder)
-        parts = merge_blocks(blocks, builder)
+        parts = [part for block in blocks for part in block.parts]
     excluded = {one.log.source: one.excluded for one in fleet.files if one.excluded}
     return CompressedData(
         experiment=fleet.experiment,

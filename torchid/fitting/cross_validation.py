@@ -19,19 +19,12 @@ from torchid.fitting.fit import BatchEstimator, Fit, LogFitter, LogProblem
 from torchid.parallel import one_thread, share_between_processes, thread_count
 from torchid.parameters import Array
 from torchid.problem import Evaluation, ExtraTerms, Metrics, RowBuilder, Samples
-from torchid.problem.chunk_dynamics import Workspace
 from torchid.problem.chunks import ProgressCallback, map_chunks
-from torchid.problem.compression import (
-    Block,
-    Part,
-    compress_in_folds,
-    compress_unloaded,
-    merge_states,
-    split_into_folds,
-)
+from torchid.problem.compression import BY_FOLD, Block, Part, compress_parts, compress_unloaded, merge, split_into_folds
 from torchid.problem.contact_state import ContactState
 from torchid.problem.elimination import Assembly
 from torchid.problem.metrics import ForceSums
+from torchid.problem.rows import Workspace
 from torchid.sensing.sensors import recorded_components
 from torchid.settings import RidgeRule
 
@@ -179,12 +172,12 @@ def cross_validate(logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms
     """
     builder = fitter.builder
     blocks = split_into_folds(logs, builder)
-    problem = fitter.build_problem(compress_in_folds(blocks, builder))  # scatter between blocks is not needed
+    problem = fitter.build_problem(compress_parts(blocks, builder))
     compared = calibrations_without_folds(problem, fitter)
     if not compared:
         raise _too_few(logs)
     scorer = Scorer(Evaluation(fitter.robot, builder.contacts, str(builder.device), terms), builder)
-    scores = scorer.score_by_fold(blocks, merge_states(problem.parts, builder), dict(enumerate(compared)))
+    scores = scorer.score_by_fold(blocks, merge(problem.parts, builder, *BY_FOLD), dict(enumerate(compared)))
     return CrossValidation(len(compared), *scores)
 
 
@@ -199,7 +192,7 @@ def calibrations_without_folds(fit: Fit | LogProblem, fitter: LogFitter) -> list
     folds = sorted({part.fold for part in fit.parts})
     if len(folds) < 2:
         return []
-    blocks = merge_states(fit.parts, fitter.builder)
+    blocks = merge(fit.parts, fitter.builder, *BY_FOLD)
 
     def without(fold: int) -> tuple[Assembly, Minimizer]:
         rest = [block for block in blocks if block.fold != fold]
@@ -245,7 +238,7 @@ def choose_ridge(
     folds = sorted({part.fold for part in parts})
     if len(folds) < 2:
         raise _too_few(blocks)
-    together = merge_states(parts, fitter.builder)
+    together = merge(parts, fitter.builder, *BY_FOLD)
     count = min(max(thread_count(), distributed.world_size()), len(estimators))
     squares = np.empty((len(folds), len(estimators)))
     shares = [(fold, first) for first in range(count) for fold in folds]  # five folds are no two equal halves

@@ -40,7 +40,7 @@ from torchid.logs.ros_topics import Topics, require_joints
 from torchid.parameters import Array
 from torchid.problem import Evaluation, ExtraTerms, RowBuilder, Samples
 from torchid.problem.base_pose import FEET
-from torchid.problem.compression import Block, Part, merge_states
+from torchid.problem.compression import BY_FOLD, Block, Part, merge
 from torchid.problem.extras import CHANNELS, ScaleGroups, measured_channels
 from torchid.problem.floor_pose import FEWEST_POINTS, points_of
 from torchid.problem.noise import LogOfOtherProcess
@@ -474,7 +474,7 @@ class RobotSetup:
             plain = LeastSquares(rank_tolerance=settings.rank_tolerance)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", TorchidWarning)  # the fit says the same
-                problem = fitter.build_problem(merge_states(parts, fitter.builder)).assembly.problem
+                problem = fitter.build_problem(merge(parts, fitter.builder, *BY_FOLD)).assembly.problem
                 left = plain.solve(problem).residual_std
             ridges = tuple(float(f"{max(RIDGE * left**2, RIDGES[0]) * factor:.2g}") for factor in STRONGER)
             if len({part.fold for part in parts}) < 2:

@@ -27,8 +27,7 @@ from torchid.identifiability.base_parameters import StateReport, merge_state_rep
 from torchid.logs.containers import FACTORS, Container, open_npz, reader_errors_explained
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, TriangularFactor
-from torchid.problem.chunk_dynamics import block_spans
-from torchid.problem.compression import FOLDS, CompressedLog, Part, piece_spans
+from torchid.problem.compression import FOLDS, CompressedLog, Part, block_spans, piece_spans
 from torchid.problem.extras import ACTUATORS, NoiseGroups, in_words, noise_key
 from torchid.problem.noise import noise_of_sensors
 from torchid.reprs import short_repr

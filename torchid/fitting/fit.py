@@ -23,7 +23,7 @@ from torchid.identifiability.confounding import (
 from torchid.parallel import one_thread
 from torchid.parameters import PER_BODY
 from torchid.problem import LinearProblem, RowBuilder, assemble
-from torchid.problem.compression import Part, merge_blocks_of_folds
+from torchid.problem.compression import Part, merge
 from torchid.problem.elimination import Assembly
 from torchid.problem.noise_gram import scale_columns
 from torchid.reprs import short_repr
@@ -131,7 +131,9 @@ class LogFitter:
                 folds: with fewer than three, standard errors rest on the assumption that residuals are noise.
             solve: instead of the estimator's.
         """
-        fit = self.solve_problem(self.build_problem(merge_blocks_of_folds(parts, self.builder)), solve)
+        fit = self.solve_problem(
+            self.build_problem(merge(parts, self.builder, "source", "state", "fold", "unloaded")), solve
+        )
         estimator = self.estimator
         jackknife = jackknife_blocks(parts, self.builder, fit.assembly, estimator.ridge, estimator.rank_tolerance)
         return fit if jackknife is None else with_block_errors(fit, jackknife)

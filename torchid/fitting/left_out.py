@@ -19,7 +19,7 @@ from torchid.fitting.fit import LogFitter
 from torchid.parallel import one_thread
 from torchid.parameters import Array
 from torchid.problem import ExtraTerms, RowBuilder, Samples
-from torchid.problem.compression import compress_spans
+from torchid.problem.compression import compress_parts, in_blocks
 from torchid.problem.elimination import column_prior
 from torchid.problem.extras import SLOPE, Extra, in_words
 from torchid.problem.linear import PRIOR_DEVIATION, parameter_scale
@@ -193,7 +193,7 @@ def compress_reading(
     first = dict(zip(edges, np.cumsum([0, *(len(x) - 1 for x in edges.values())]).tolist(), strict=False))
     count = sum(len(x) - 1 for x in edges.values())
     grams, rows = np.zeros((count, builder.width + 1, builder.width + 1)), np.zeros(count)
-    for part in compress_spans(logs, spans, builder):
+    for part in compress_parts(in_blocks(logs, spans), builder):
         block = first[part.source] + part.block
         rows[block] += part.factor.rows
         for support, x in part.factor.blocks.items():
@@ -225,7 +225,7 @@ def thinned(logs: Sequence[Samples]) -> list[Samples]:
     """About `SAMPLES` of all logs, evenly spaced, with the rate of the torques as the column of a delay."""
     step, out = max(1, sum(map(len, logs)) // SAMPLES), []
     for log in logs:
-        some: dict[str, object] = {"folder": None, "motion_noise": None}
+        some: dict[str, object] = {"folder": None, "motion_noise": None, "unloaded": None}
         if log.torque is not None and len(log) > 1:
             rate = np.gradient(log.torque.numpy(), log.time.numpy(), axis=0)[:, : log.joint_velocity.shape[1]]
             some["slope"] = torch.from_numpy(rate)

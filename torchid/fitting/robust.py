@@ -23,13 +23,10 @@ from torchid.problem import Samples, compress_parts
 from torchid.problem.chunks import ProgressCallback
 from torchid.problem.compression import (
     Part,
-    PartKey,
     add_noise_gram,
     compress_in_blocks,
-    cut_into_blocks,
-    noise_gram_by_part,
 )
-from torchid.problem.noise_gram import NoiseGram, noise_gram_of_share
+from torchid.problem.noise_gram import NoiseGram, PartKey
 from torchid.problem.row_compressor import RowWeighting
 from torchid.problem.samples import concatenate
 from torchid.rounding import MAD_PER_STD
@@ -143,13 +140,9 @@ def fit_robustly(
         Huber, "Robust Statistics", 1981, sections 7.6 (standard errors) and 7.8 (re-weighting).
     """
     builder = fitter.builder
-    if first is None:
-        parts = compress_in_blocks(logs, builder, progress=progress) if parts is None else parts
-        first = fitter.fit(parts, solve)
-    if parts is None:
-        noise_gram = noise_gram_by_part(cut_into_blocks(logs, builder), builder)
-    else:
-        noise_gram = {part.key: part.factor.noise_gram for part in parts if part.factor.noise_gram}
+    parts = compress_in_blocks(logs, builder, progress=progress) if parts is None else parts
+    first = fitter.fit(parts, solve) if first is None else first
+    noise_gram = {part.key: part.factor.noise_gram for part in parts if part.factor.noise_gram}
     start, first_pass = _Point(first, first.estimate.residual_std), 0
     step = min(sum(map(len, logs)) // _ROUGH_SAMPLES, min(map(len, logs)) // _LEAST_ROUGH)
     step = min(step, max(_ROUGH_STEP, sum(map(len, logs)) // _MOST_ROUGH))
@@ -186,7 +179,11 @@ def _some_rows(logs: Sequence[Samples], noise_gram: Mapping[PartKey, NoiseGram],
     for log in logs:
         by_log.setdefault(log.source, []).append(log.every(step))
     some = [replace(concatenate(pieces), fold=0, block=0) for pieces in by_log.values()]
-    of_some = noise_gram_of_share(noise_gram, lambda key: (*key[:2], 0, 0, key[4]), 1.0 / step)
+    of_some: dict[PartKey, NoiseGram] = {}
+    for key, of_part in noise_gram.items():
+        total = of_some.setdefault(key._replace(fold=0, block=0), {})
+        for support, x in of_part.items():
+            total[support] = total.get(support, 0.0) + x / step
     return _Rows(fitter, lambda weigh: compress_parts(some, fitter.builder, weight_rows=weigh), of_some, set(by_log))
 
 

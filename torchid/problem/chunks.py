@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from itertools import chain, pairwise
 from typing import TypeVar
@@ -15,14 +15,12 @@ import torch
 
 from torchid import distributed
 from torchid.errors import excerpt, warn
-from torchid.parallel import can_fork, one_thread, run_in_workers, share_between_forks, thread_count
-from torchid.problem.chunk_dynamics import are_of_one_log, join_pieces
+from torchid.parallel import run_in_workers, thread_count
 from torchid.problem.contact_state import ContactState
 from torchid.problem.rows import RowBuilder
-from torchid.problem.samples import Samples
+from torchid.problem.samples import Samples, concatenate
 
 Label = TypeVar("Label")
-Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 ProgressCallback = Callable[[int], None]
@@ -33,7 +31,6 @@ CHUNK = 4096
 
 _LEAST, _EACH = 2048, 4  # samples per chunk where there are fewer chunks than so many for each worker
 _LET_GO = 4  # chunks of a worker, after which pages that samples are mapped to leave the memory of the process
-_WORTH_FORKING = 50_000  # samples of a pass: forks save 0.8 us of each on two cores, and take 15 to 30 ms to make
 _WORTH_LOADING = 200_000  # samples of a pass: kernels take 0.4 s to load and save 2.6 to 6 us of each on two cores
 _MOST_ON_GPU = 64 * CHUNK  # samples per chunk: launching the work on one takes the host 12 ms, whatever its size
 _SHARE_OF_GPU, _ON_GPU = 8, 48 * 2**10  # a chunk takes one of so many parts of a GPU's memory; bytes of a sample
@@ -71,28 +68,16 @@ def map_chunks(
     choose_kernels(builder, sum(sizes))
     distributed.require_same(hash(tuple(zip(sizes, (task.state for task in tasks), strict=True))), "logs")
     share = distributed.own_share(sizes)
-    own, done = tasks[share], sizes[share]
-    workers = min(workers, max(len(own), 1))  # to start a thread takes as long as a small chunk
-    forked = workers > 1 and _is_worth_forking(sum(done)) and can_fork()
-    reported = sum(done[::workers] if forked else done)
-    report = None if progress is None else _ProgressOfAll(progress, sum(sizes), reported)
+    own = tasks[share]
+    report = None if progress is None else _ProgressOfAll(progress, sum(sizes), sum(sizes[share]))
 
-    def run(part: Iterator[_Chunk], reporting: bool = True) -> Result:
-        return reduce(_pieces(part, builder.device, report if reporting else None))
+    def run(part: Iterator[_Chunk]) -> Result:
+        return reduce(_pieces(part, builder.device, report))
 
-    results = _run_in_forks(own, run, workers) if forked else run_in_workers(own, run, workers)
+    results = run_in_workers(own, run, workers)
     if report is not None:
         report(0)
     return list(chain.from_iterable(distributed.all_gather(results, "chunks")))
-
-
-def forks_share_passes(logs: Sequence[Samples]) -> bool:
-    """Whether forks of this process share a pass over some logs, so that little is won by work beside it."""
-    return _is_worth_forking(sum(map(len, logs)))
-
-
-def _is_worth_forking(samples: int) -> bool:
-    return samples >= _WORTH_FORKING
 
 
 def choose_kernels(builder: RowBuilder, samples: int) -> None:
@@ -183,6 +168,51 @@ def _chunks(logs: Sequence[Samples], size: int, workers: int) -> list[_Chunk]:
     return out
 
 
+def are_of_one_log(piece: Samples, other: Samples) -> bool:
+    """Whether two pieces differ in samples, folds and blocks alone, and have no readings in the air.
+
+    Each fold, and each chunk, has equations of its own of these readings.
+    """
+    if piece.unloaded is not None or other.unloaded is not None:
+        return False
+    own, others = (
+        {name: x for name, x in (vars(log) | vars(log.base)).items() if name not in ("base", "fold", "block", "blocks")}
+        for log in (piece, other)
+    )
+    return all(
+        x is others[name] or isinstance(x, torch.Tensor) is isinstance(others[name], torch.Tensor) is True
+        for name, x in own.items()
+    )
+
+
+def join_pieces(pieces: Sequence[Samples]) -> Samples:
+    """Pieces of one log as one, which has the fold and block of each sample."""
+    if len(pieces) == 1:
+        return pieces[0]
+    numbers = [
+        torch.tensor([[piece.fold, piece.block]]).expand(len(piece), 2) if piece.blocks is None else piece.blocks
+        for piece in pieces
+    ]
+    return replace(concatenate([replace(piece, blocks=None) for piece in pieces]), blocks=torch.cat(numbers))
+
+
+def blocks_in(samples: Samples) -> list[tuple[int, int, int, int]]:
+    """Fold, number, first sample and end of the blocks that a chunk has samples of."""
+    if samples.blocks is None:
+        return [(samples.fold, samples.block, 0, len(samples))]
+    numbers, counts = torch.unique_consecutive(samples.blocks, return_counts=True, dim=0)
+    ends = counts.cumsum(0).tolist()
+    spans = zip(numbers.tolist(), [0, *ends[:-1]], ends, strict=True)
+    return [(fold, number, start, end) for (fold, number), start, end in spans]
+
+
+def span_of_samples(index: torch.Tensor | slice, start: int, end: int) -> tuple[int, int]:
+    """Which of the samples of some rows, all or some of those of a chunk, lie between two of the chunk."""
+    if isinstance(index, torch.Tensor):  # of samples whose contacts have one rank
+        start, end = torch.searchsorted(index, torch.tensor([start, end]).to(index)).tolist()
+    return start, end
+
+
 def chunks_by_state(
     samples: Samples, chunk: int = CHUNK, workers: int = 1
 ) -> Iterator[tuple[ContactState, slice | torch.Tensor]]:
@@ -235,20 +265,6 @@ def subsample_states(logs: Sequence[Samples], count: int) -> Iterator[tuple[Samp
         for samples, index in pieces:
             share = min(len(index), max(1, round(count * len(index) / total)))
             yield samples[index[torch.linspace(0, len(index) - 1, share).long()]], state, len(index) / share
-
-
-def _run_in_forks(tasks: Sequence[Task], run: Callable[[Iterator[Task], bool], Result], workers: int) -> list[Result]:
-    """As `run_in_workers`, to the last bit, by this process, whose chunks are reported, and forks of it.
-
-    They wait for no lock of Python's: two take 7 to 10 % less time for a sample of a quadruped than two threads.
-    """
-
-    @torch.no_grad()
-    def work(first: int) -> Result:
-        return run(iter(tasks[first::workers]), first == 0)
-
-    with one_thread():
-        return share_between_forks(range(workers), work, workers)
 
 
 def chunk_size(device: torch.device) -> int:

@@ -14,12 +14,11 @@ from torchid.kernels import limbs, rows, states
 from torchid.kernels.gram import SPAN, write_gram, write_grams
 from torchid.kernels.tiles import TILE
 from torchid.parameters import Array
-from torchid.problem.chunk_dynamics import BlockRows, ChunkKinematics, Workspace
 from torchid.problem.contact_state import ContactStateLayout
 from torchid.problem.extras import dof_extra_column
 from torchid.problem.row_blocks import RowBlock, subtract_payload
 from torchid.problem.row_compressor import ColumnLevels
-from torchid.problem.rows import general_bases
+from torchid.problem.rows import BlockRows, ChunkKinematics, Workspace, general_bases
 from torchid.problem.samples import Samples
 from torchid.regressor.kinematics import BodyStates, JointMotion, Motion, joint_motion
 from torchid.regressor.tree import KinematicTree

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -14,7 +14,6 @@ from torch import Tensor
 
 from torchid import parameters
 from torchid.parameters import Array
-from torchid.problem.chunk_dynamics import ChunkKinematics
 from torchid.problem.extras import Extra
 from torchid.problem.row_blocks import RowBlock, RowBlocks, row_block
 from torchid.problem.samples import Samples
@@ -36,6 +35,9 @@ from torchid.robot import Robot
 from torchid.rounding import KINEMATIC_TOLERANCE, is_significant
 from torchid.sensing import Contact, SensorSet
 from torchid.sensing.sensors import measured_components
+
+if TYPE_CHECKING:
+    from torchid.problem.rows import ChunkKinematics
 
 
 class LineOfAction(NamedTuple):

@@ -16,11 +16,10 @@ from torchid.errors import format_percent, join_names
 from torchid.logs.lazy_arrays import Spill
 from torchid.parallel import one_thread
 from torchid.parameters import GRAVITY, MASS, Array
-from torchid.problem.chunk_dynamics import ChunkDynamics, ChunkKinematics, folds_in
-from torchid.problem.chunks import ProgressCallback, chunks_by_state, map_chunks
+from torchid.problem.chunks import ProgressCallback, blocks_in, chunks_by_state, map_chunks
 from torchid.problem.contact_state import ContactState
 from torchid.problem.extras import ACTUATORS, Extra, ExtraTerms, contact_extra_column, dof_extra_column
-from torchid.problem.rows import RowBuilder, leave_out_torques
+from torchid.problem.rows import ChunkDynamics, ChunkKinematics, RowBuilder, leave_out_torques
 from torchid.problem.samples import Samples
 from torchid.regressor.columns import body_wrenches
 from torchid.regressor.regressor import friction_columns, generalized_forces, joint_row
@@ -189,8 +188,8 @@ def measured_and_predicted_forces(
     torque = torch.nn.functional.pad(builder.recorded_torque(samples), (base_rows, 0))
     measured = torque + contact_forces(builder, samples, state, kinematics).T
     by_fold = [
-        _predicted(builder, samples[start:end], kinematics.some(slice(start, end)), phi[fold])
-        for fold, start, end in folds_in(samples)
+        _predicted(builder, samples[start:end], kinematics.select(slice(start, end)), phi[fold])
+        for fold, _, start, end in blocks_in(samples)
     ]
     predicted = by_fold[0] if len(by_fold) == 1 else torch.cat(by_fold, dim=1)
     return GeneralizedForces(measured, torque, predicted)
@@ -617,7 +616,7 @@ class Evaluation:
         """Sums of the variances of the measured forces, from some samples of a chunk: they hardly change."""
         sums, step = SumsOfSquares(self.robot.n_rows), -(-len(samples) // _NOISE_SAMPLES)
         part = samples.every(step)
-        variance = reading_variance(self.builder, part, state, kinematics.some(slice(None, None, step)), noise)
+        variance = reading_variance(self.builder, part, state, kinematics.select(slice(None, None, step)), noise)
         sums.add(variance.sqrt(), len(samples) / len(part))
         return sums
 

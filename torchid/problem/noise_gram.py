@@ -11,12 +11,10 @@ Source: Fuller, "Measurement Error Models", 1987, section 2.2; the noise that is
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import groupby
-from operator import itemgetter
-from typing import TypeVar
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -26,13 +24,12 @@ from torchid import distributed
 from torchid.errors import format_percent
 from torchid.parallel import one_thread
 from torchid.parameters import Array
-from torchid.problem.chunk_dynamics import span_of_samples
-from torchid.problem.chunks import ProgressCallback, chunk_size, map_chunks
+from torchid.problem.chunks import blocks_in, chunk_size, join_pieces, map_chunks, span_of_samples
 from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import TriangularFactor, gram_matrix
 from torchid.problem.motion import with_noise_alone
 from torchid.problem.rows import RowBuilder
-from torchid.problem.samples import Samples, concatenate
+from torchid.problem.samples import Samples
 from torchid.rounding import RANK_TOLERANCE, column_scale, is_significant
 
 LEAST_SIGNAL = 1.0 / 3.0
@@ -48,10 +45,22 @@ _NEGLIGIBLE = 1e-5  # share of noise in any combination: far below all standard 
 _COPIES = 3  # of each sample, see `_copies`
 _RESOLVED = 1e-5  # least singular value, of columns of unit size, along which a difference of squares is no rounding
 
-Support = tuple[int, ...]
-NoiseGram = dict[Support, Tensor]
-Key = TypeVar("Key", bound=Hashable)
-Other = TypeVar("Other", bound=Hashable)
+NoiseGram = dict[tuple[int, ...], Tensor]
+
+
+class PartKey(NamedTuple):
+    """Which rows of some logs belong together: those of one log, contact state, fold and block; see `Part`."""
+
+    source: str
+    state: ContactState
+    fold: int = 0
+    block: int = 0
+    unloaded: bool = False
+
+    @classmethod
+    def spans(cls, samples: Samples, state: ContactState) -> list[tuple[PartKey, int, int]]:
+        """Keys of the parts that a chunk has rows of, each with the first of its samples and the end."""
+        return [(cls(samples.source, state, fold, block), a, b) for fold, block, a, b in blocks_in(samples)]
 
 
 @dataclass(frozen=True)
@@ -94,52 +103,35 @@ def noise_of_reading(column: int, size: Tensor) -> NoiseGram:
     return {(column,): size * size.new_tensor([[1.0, -1.0], [-1.0, 1.0]])}
 
 
-def estimate_noise_gram(
-    pieces: Sequence[Samples],
-    builder: RowBuilder,
-    key: Callable[[Samples, ContactState], Key],
-    progress: ProgressCallback | None = None,
-) -> dict[Key, NoiseGram]:
-    """What noise of their motion adds to X^T X of the rows of some logs; nothing without noise.
+def estimate_noise_gram(logs: Sequence[Samples], builder: RowBuilder) -> dict[PartKey, NoiseGram]:
+    """What noise of their motion adds to X^T X of the rows of each part of some logs; nothing without noise.
 
     Args:
-        pieces: of bound logs, in the order of their samples.
+        logs: bound logs, or pieces of them in the order of their samples, with their folds and blocks.
         builder: of the rows.
-        key: which rows belong together.
-        progress: called with 0 where some of the samples of a piece have been taken.
     """
     scaled = bool(scale_columns(builder))
-    step = distributed.broadcast(max(1, sum(map(len, pieces)) // _perturbed(pieces)), "samples with noise")
+    step = distributed.broadcast(max(1, sum(map(len, logs)) // _perturbed(logs)), "samples with noise")
     by_log: dict[str, list[Samples]] = {}
-    for piece in pieces:
+    for piece in logs:
         if (scaled or piece.motion_noise is not None) and len(piece):
-            by_log.setdefault(piece.source, []).append(piece)
-    logs = [concatenate([_spread(piece, step, progress) for piece in of_log]) for of_log in by_log.values()]
-    total: dict[Key, NoiseGram] = {}
-    if not logs:
+            blocks = [piece[start:end] for *_, start, end in blocks_in(piece)]
+            by_log.setdefault(piece.source, []).extend(_spread(block, step) for block in blocks)
+    total: dict[PartKey, NoiseGram] = {}
+    if not by_log:
         return total
-    reduce, chunk = partial(_noise_gram_of_chunks, builder, by_log, key), chunk_size(builder.device) // _COPIES
-    for of_worker in map_chunks(logs, builder, reduce, chunk):
-        for of_key, noise_gram in of_worker.items():
+    reduce, chunk = partial(_noise_gram_of_chunks, builder), chunk_size(builder.device) // _COPIES
+    for of_worker in map_chunks(list(map(join_pieces, by_log.values())), builder, reduce, chunk):
+        for key, noise_gram in of_worker.items():
             halves = {support: x.cpu().triu() for support, x in noise_gram.items()}
             both = {support: x + x.triu(1).T for support, x in halves.items()}  # to the last bit, as files have one
-            _add(total.setdefault(of_key, {}), both, float(step))
+            _add(total.setdefault(key, {}), both, float(step))
     return total
 
 
 def _add(total: NoiseGram, noise_gram: NoiseGram, weight: float) -> None:
     for support, x in noise_gram.items():
         total[support] = total[support] + weight * x if support in total else weight * x
-
-
-def noise_gram_of_share(
-    noise_gram: Mapping[Key, NoiseGram], key: Callable[[Key], Other], share: float
-) -> dict[Other, NoiseGram]:
-    """About the noise Gram matrix of an evenly spread share of the rows, by another key of theirs."""
-    total: dict[Other, NoiseGram] = {}
-    for one, of_one in noise_gram.items():
-        _add(total.setdefault(key(one), {}), of_one, share)
-    return total
 
 
 def _perturbed(pieces: Sequence[Samples]) -> int:
@@ -153,17 +145,14 @@ def _perturbed(pieces: Sequence[Samples]) -> int:
     return int(min(max(independent, _LEAST_PERTURBED), _MOST_PERTURBED))
 
 
-def _spread(piece: Samples, step: int, progress: ProgressCallback | None) -> Samples:
+def _spread(piece: Samples, step: int) -> Samples:
     """One in so many samples, drawn so that they are in phase with nothing."""
     if step == 1:
         return piece
     starts = np.arange(0, len(piece), step)
     width = np.minimum(step, len(piece) - starts)
     at = starts + (np.random.default_rng(0).uniform(size=len(starts)) * width).astype(int)
-    taken = piece[torch.from_numpy(at)]
-    if progress is not None:
-        progress(0)
-    return taken
+    return piece[torch.from_numpy(at)]
 
 
 def _copies(spans: Sequence[tuple[int, int]]) -> tuple[Tensor, Tensor]:
@@ -178,48 +167,31 @@ def _copies(spans: Sequence[tuple[int, int]]) -> tuple[Tensor, Tensor]:
     return at, side
 
 
-def _alike(ends: Iterable[tuple[Key, int]]) -> Iterator[tuple[Key, int, int]]:
-    """Successive samples with one key: that, the first and the end, from the key and the end of each piece."""
-    start = 0
-    for key, run in groupby(ends, key=itemgetter(0)):
-        *_, (_, end) = run
-        if end > start:
-            yield key, start, end
-        start = end
-
-
 @torch.no_grad()
 def _noise_gram_of_chunks(
-    builder: RowBuilder,
-    pieces: Mapping[str, Sequence[Samples]],
-    key: Callable[[Samples, ContactState], Key],
-    chunks: Iterator[tuple[Samples, ContactState]],
-) -> dict[Key, NoiseGram]:
-    """By key of the piece: half of what pairs of samples with noise have more."""
-    out: dict[Key, NoiseGram] = {}
-    workspace, scales = builder.workspaces.take(), scale_columns(builder)
+    builder: RowBuilder, chunks: Iterator[tuple[Samples, ContactState]]
+) -> dict[PartKey, NoiseGram]:
+    """By part: half of what pairs of samples with noise have more."""
+    out: dict[PartKey, NoiseGram] = {}
+    workspace, scales = builder.workspaces.take(), set(scale_columns(builder))
     for samples, state in chunks:
-        noise, own = samples.motion_noise, pieces[samples.source]
-        starts = torch.stack([piece.time[0] for piece in own]).to(samples.time)
-        of_piece = torch.searchsorted(starts, samples.time.contiguous(), right=True)
-        ends = torch.bincount(of_piece - 1, minlength=len(own)).cumsum(0).tolist()
-        spans = list(_alike((key(piece, state), end) for piece, end in zip(own, ends, strict=True)))
-        for rows, index in (
-            builder.blocks(with_noise_alone(samples, builder.sensors.noise), state, workspace) if scales else ()
-        ):
-            for of_key, start, end in spans:
-                sums = out.setdefault(of_key, {})
-                first, last = span_of_samples(index, start, end)
-                for column in set(scales) & set(rows.block.support):
-                    of_column = rows.values[rows.block.support.index(column), :, first:last]
-                    _add(sums, noise_of_reading(column, of_column.square().sum()), 1.0)
+        spans = PartKey.spans(samples, state)
+        if scales:
+            alone = with_noise_alone(samples, builder.sensors.noise)
+            for rows, index in builder.blocks(alone, state, workspace):
+                for key, start, end in spans:
+                    first, last = span_of_samples(index, start, end)
+                    for column in scales & set(rows.block.support):
+                        of_column = rows.values[rows.block.support.index(column), :, first:last]
+                        _add(out.setdefault(key, {}), noise_of_reading(column, of_column.square().sum()), 1.0)
+        noise = samples.motion_noise
         if noise is None:
             continue
         at, side = _copies([(start, end) for _, start, end in spans])
         perturbed = noise.perturbed(samples[at.to(samples.time.device)], side.to(samples.time)[:, None])
         for rows, index in builder.blocks(perturbed, state, workspace):
-            for of_key, start, end in spans:
-                sums, second = out.setdefault(of_key, {}), 2 * start + end
+            for key, start, end in spans:
+                sums, second = out.setdefault(key, {}), 2 * start + end
                 for weight, (first, last) in (
                     (-1.0, span_of_samples(index, 3 * start, second)),
                     (0.5, span_of_samples(index, second, 3 * end)),

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import groupby
 
 import numpy as np
@@ -51,22 +50,6 @@ class Nodes:
 
 
 @dataclass(frozen=True)
-class PathStep:
-    """Moved nodes whose path sums follow from those above them in one product, evenly spaced in all that they are of.
-
-    Attributes:
-        moved: numbers among the block's `moved`.
-        nodes: numbers of them.
-        sums: numbers of their path sums; above: of those that these add to, None if they start from nothing.
-    """
-
-    moved: slice
-    nodes: slice
-    sums: slice
-    above: slice | None
-
-
-@dataclass(frozen=True)
 class RowBlock:
     """Rows that combine the same degrees of freedom.
 
@@ -93,15 +76,6 @@ class RowBlock:
     def support(self) -> tuple[int, ...]:
         """Columns in which the rows can differ from zero."""
         return (*self.inertial, *self.friction, *self.extras)
-
-    @cached_property
-    def path_steps(self) -> tuple[PathStep, ...]:
-        """All moved nodes, those above before those below: few products of many nodes where limbs are alike."""
-        first, depth, by_depth = int(self.base != "none"), list[int](), dict[int, list[tuple[int, int, int | None]]]()
-        for number, (node, _, _, above) in enumerate(self.moved):
-            depth.append(0 if above is None or above < first else depth[above - first] + 1)
-            by_depth.setdefault(depth[-1], []).append((number, node, above))
-        return tuple(_path_step(run, first) for level in by_depth.values() for run in _evenly_spaced(level))
 
     @property
     def operations(self) -> int:
@@ -277,38 +251,6 @@ def _runs(layout: ColumnLayout, kept: Sequence[tuple[int, ...]], sources: Sequen
                 sources=range(sources[start] or 0, (sources[end - 1] or 0) + 1),
             )
         start = end
-
-
-def _evenly_spaced(
-    level: Sequence[tuple[int, int, int | None]],
-) -> Iterator[Sequence[tuple[int, int, int | None]]]:
-    """Runs of numbers, nodes and path sums above whose differences from one to the next are the same.
-
-    All nodes of a level start from nothing, or none does.
-    """
-    start = 0
-    while start < len(level):
-        end, steps = start + 1, set[tuple[int, int, int]]()
-        while end < len(level):
-            (number, node, above), (before, node_before, above_before) = level[end], level[end - 1]
-            step = (number - before, node - node_before, (above or 0) - (above_before or 0))
-            if min(step) < 0 or len(steps | {step}) > 1:
-                break
-            steps.add(step)
-            end += 1
-        yield level[start:end]
-        start = end
-
-
-def _path_step(run: Sequence[tuple[int, int, int | None]], first: int) -> PathStep:
-    def spaced(numbers: Sequence[int]) -> slice:
-        return slice(numbers[0], numbers[-1] + 1, (numbers[1] - numbers[0] or 1) if len(numbers) > 1 else 1)
-
-    numbers, nodes = [number for number, *_ in run], [node for _, node, _ in run]
-    above = [x for *_, x in run if x is not None]
-    return PathStep(
-        spaced(numbers), spaced(nodes), spaced([first + x for x in numbers]), spaced(above) if above else None
-    )
 
 
 def triangularize_base_rows(W: Tensor) -> None:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from torchid.parameters import Array
-from torchid.problem.chunk_dynamics import BlockRows, ChunkDynamics, ChunkKinematics, ChunkPart, Workspace, Workspaces
 from torchid.problem.contact_state import (
     ContactState,
     ContactStateLayout,
@@ -32,7 +32,7 @@ from torchid.problem.row_blocks import (
 )
 from torchid.problem.samples import Samples
 from torchid.regressor.columns import all_wrench_columns
-from torchid.regressor.kinematics import body_states, joint_motion, joint_screw_axes
+from torchid.regressor.kinematics import BodyStates, JointMotion, body_states, joint_motion, joint_screw_axes
 from torchid.regressor.regressor import (
     forces_at_base,
     generalized_forces,
@@ -48,6 +48,143 @@ from torchid.sensing.projection import any_suspect, null_space, whitened_null_sp
 
 if TYPE_CHECKING:
     from torchid.problem.compiled_rows import CompiledRows
+
+
+class Workspace:
+    """Named buffers of one worker, reused: fresh memory for large arrays takes as long as the arithmetic on them."""
+
+    def __init__(self) -> None:
+        self._buffers: dict[str, Tensor] = {}
+
+    def empty(self, name: str, like: Tensor, *shape: int) -> Tensor:
+        """A contiguous array with arbitrary values, valid until the next request with this name."""
+        buffer, size = self._buffers.get(name), math.prod(shape)
+        if buffer is None or buffer.numel() < size or (buffer.dtype, buffer.device) != (like.dtype, like.device):
+            buffer = self._buffers[name] = like.new_empty(size)
+        return buffer[:size].view(shape)
+
+
+class Workspaces:
+    """Workspaces of workers that come and go: what one has given back, the next one takes.
+
+    The first touch of so much memory takes as long as a chunk or two.
+    """
+
+    def __init__(self) -> None:
+        self._idle: list[Workspace] = []
+
+    def take(self) -> Workspace:
+        """One that nobody else has until it is given back."""
+        try:
+            return self._idle.pop()  # no lock: one bytecode
+        except IndexError:
+            return Workspace()
+
+    def give_back(self, workspace: Workspace) -> None:
+        """Leave one to others; what was read from it is then no longer valid."""
+        self._idle.append(workspace)
+
+
+@dataclass(frozen=True)
+class ChunkKinematics:
+    """Kinematics of B samples, from which predictions and contact Jacobians are computed.
+
+    Attributes:
+        joints: motion of all joints.
+        states: of the joint frames of all nodes.
+        screw_axes: (6, L, B), see `joint_screw_axes`.
+        rotation_world_base: (B, 3, 3), None where it was not recorded.
+        arms: (3, 3, B) [m] by rolling contact, see `torchid.regressor.regressor.rolling_arms`.
+        recorded_normals: whether each of these has normals of its own.
+        ground_axes: (3, 3, B) in base axes by contact that is read along the ground's normal, see
+            `torchid.regressor.regressor.ground_axes`.
+        resting: (n, B) bool, joints whose torque counts as unmeasured, see `Samples`; None for none.
+    """
+
+    joints: JointMotion
+    states: BodyStates
+    screw_axes: Tensor
+    rotation_world_base: Tensor | None
+    arms: Mapping[int, Tensor]
+    recorded_normals: bool
+    ground_axes: Mapping[int, Tensor]
+    resting: Tensor | None
+
+    def without_rest(self, forces: Tensor, base_rows: int, value: float = math.nan) -> Tensor:
+        """Generalized forces (M, B, n_rows) with a value in the rows of joints at rest."""
+        if self.resting is None:
+            return forces
+        at = nn.functional.pad(self.resting.T, (base_rows, forces.shape[2] - base_rows - len(self.resting)))
+        return forces.masked_fill(at, value)
+
+    def select(self, index: Tensor | slice) -> Self:
+        """Those of some samples; views by a slice."""
+        if index == slice(None):
+            return self
+
+        def pick(x: Tensor) -> Tensor:
+            return x[..., index]
+
+        return replace(
+            self,
+            joints=JointMotion(*map(pick, vars(self.joints).values())),
+            states=BodyStates(*map(pick, vars(self.states).values())),
+            screw_axes=pick(self.screw_axes),
+            rotation_world_base=None if self.rotation_world_base is None else self.rotation_world_base[index],
+            arms={contact: pick(arms) for contact, arms in self.arms.items()},
+            ground_axes={contact: pick(axes) for contact, axes in self.ground_axes.items()},
+            resting=None if self.resting is None else pick(self.resting),
+        )
+
+
+@dataclass(frozen=True)
+class ChunkDynamics(ChunkKinematics):
+    """Kinematics of B samples with the columns of the inertial parameters, from which rows are computed.
+
+    Attributes:
+        wrenches: (6, columns, B), wrench at the base origin of a unit of each inertial parameter; the forces of
+            inertias, which are zero, need not have been written.
+    """
+
+    wrenches: Tensor
+
+    def select(self, index: Tensor | slice) -> Self:
+        """Those of some samples; views by a slice."""
+        return replace(super().select(index), wrenches=self.wrenches[..., index])
+
+
+@dataclass(frozen=True)
+class ChunkPart:
+    """Samples of one rank: their generalized forces f, (base rows + coupled joints, B), and measured contact rows."""
+
+    samples: Samples
+    f: Tensor
+    measured: Tensor
+    dynamics: ChunkDynamics
+
+
+@dataclass(frozen=True)
+class BlockRows:
+    """Rows of a block at B samples.
+
+    `stacked`: (columns + 1, columns + 1 + r B), the rows by column, the right-hand side last, after room for a factor;
+    `values`: (columns + 1, r, B), the rows in it. `absent`: (r, B) bool, rows of zeros, which a sample has not, as one
+    torque more is unmeasured there; None if all are there.
+    """
+
+    block: RowBlock
+    stacked: Tensor
+    values: Tensor
+    absent: Tensor | None
+
+    @classmethod
+    def empty(
+        cls, block: RowBlock, rows: int, like: Tensor, workspace: Workspace, absent: Tensor | None = None
+    ) -> BlockRows:
+        """Memory for so many rows at each of the samples of a tensor (..., B)."""
+        width, samples = len(block.support) + 1, like.shape[-1]
+        stacked = workspace.empty("rows", like, width, width + rows * samples)
+        return cls(block, stacked, stacked[:, width:].unflatten(1, (rows, samples)), absent)
 
 
 @dataclass(frozen=True)
@@ -347,23 +484,14 @@ class RowBuilder(nn.Module):
             (columns, rows): rows are (M, len(columns) + 1), the right-hand side last, valid until the next
                 is requested.
         """
-        for columns, stacked in self.stacked_rows(samples, state, workspace):
-            yield columns, stacked[len(columns) + 1 :]
-
-    def stacked_rows(
-        self, samples: Samples, state: ContactState, workspace: Workspace | None = None
-    ) -> Iterator[tuple[tuple[int, ...], Tensor]]:
-        """The same with room above each block for a triangular factor of as many rows as it has columns.
-
-        Yields:
-            (columns, stacked): (len(columns) + 1 + M, len(columns) + 1), columns contiguous.
-        """
-        return ((rows.block.support, rows.stacked.T) for rows, _ in self.blocks(samples, state, workspace))
+        for rows, _ in self.blocks(samples, state, workspace):
+            support = rows.block.support
+            yield support, rows.stacked.T[len(support) + 1 :]
 
     def blocks(
         self, samples: Samples, state: ContactState, workspace: Workspace | None = None
     ) -> Iterator[tuple[BlockRows, Tensor | slice]]:
-        """The same with the samples that each block is of, in order."""
+        """The same as `BlockRows`, with the samples that each block is of, in order."""
         workspace, layout = workspace or Workspace(), self.layout(state, samples.contact_normal is not None)
         if self.compiled is not None and (chunk := self.compiled.chunk(samples, layout, workspace)) is not None:
             yield from chunk.rows()
@@ -606,12 +734,12 @@ class RowBuilder(nn.Module):
         path_sums = workspace.empty("path_sums", W_joints, 6, of_base + len(nodes), *W_joints.shape[1:])
         if W_base is not None and of_base:
             path_sums[:, 0] = W_base
-        for step in block.path_steps:
-            screw_axes, own = dynamics.screw_axes[:, step.nodes, None], path_sums[:, step.sums]
-            if step.above is None:
-                torch.mul(screw_axes, torques[step.moved], out=own)
+        for number, (node, _, _, above) in enumerate(block.moved):
+            screw_axis, path_sum = dynamics.screw_axes[:, node, None], path_sums[:, of_base + number]
+            if above is None:
+                torch.mul(screw_axis, torques[number], out=path_sum)
             else:
-                torch.addcmul(path_sums[:, step.above], screw_axes, torques[step.moved], out=own)
+                torch.addcmul(path_sums[:, above], screw_axis, torques[number], out=path_sum)
         start = 0
         for run in block.nodes:
             end = start + len(run.nodes) * len(run.kept)
