@@ -44,8 +44,8 @@ MAX_LIST = 1000
 
 # -------------------------------------------------------------------------------------------------------- factors
 
-#: Bytes of the description of a compressed log, and triangles in it: one of a humanoid in 64 contact states has 3000.
-MAX_DESCRIPTION, MAX_TRIANGLES = 8 * MEBIBYTE, 50_000
+#: Bytes of the description of a compressed log.
+MAX_DESCRIPTION = 8 * MEBIBYTE
 
 # --------------------------------------------------------------------------------------------------------- settings
 

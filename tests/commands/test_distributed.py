@@ -49,7 +49,6 @@ RUNS = {
     "quadruped, descent to its end": ("quadruped", FINISHED),
     "short": ("short", ()),
 }
-BY_FOUR = ("arm, robust", "quadruped, descent", "short")
 MORE = {
     "quadruped": ("quadruped", ()),
     "quadruped, consistent": ("quadruped", ("estimator.name=consistent",)),
@@ -127,16 +126,6 @@ def test_two_processes_find_what_one_finds(runs: dict[int, Path], experiments: d
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
-def test_four_processes_find_what_one_finds(
-    runs: dict[int, Path], experiments: dict[str, Path], tmp_path: Path
-) -> None:
-    run_all(4, tmp_path / "4", [(name, experiments[RUNS[name][0]], RUNS[name][1]) for name in BY_FOUR])
-    for name in BY_FOUR:
-        assert_same(tmp_path / "4" / name, runs[1] / name, experiments[RUNS[name][0]], "descent" in name)
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
 def test_processes_together_find_what_one_finds_with_other_settings(
     experiments: dict[str, Path], tmp_path: Path
 ) -> None:
@@ -190,15 +179,6 @@ def test_a_mistake_that_all_see_is_told_once(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.slow
-def test_torchrun_names_the_status_of_such_a_mistake(tmp_path: Path) -> None:
-    status, printed, complained = finish((*TWO, "-m", "torchid", *MISTAKEN, f"output={tmp_path / 'run'}"))
-    assert status != 0
-    assert_told_once(printed, complained)
-    assert "exitcode  : 2" in complained
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.fixture
 def two_machines(tmp_path: Path) -> tuple[Path, Path]:
     """Folders in which two processes work, as machines without a common disk do."""
@@ -239,17 +219,6 @@ def test_machines_with_other_logs_are_told_apart(two_machines: tuple[Path, Path]
     assert (
         line == "torchid: logs: not the same in all processes; accepted: the same files and settings on every machine"
     )
-
-
-@pytest.mark.slow
-def test_other_commands_run_once(tmp_path: Path) -> None:
-    for arguments, text in (
-        (["convert", str(DEMO / "sway_test.npz"), str(tmp_path / "log.h5")], "written to"),
-        (["--version"], f"torchid {torchid.__version__}"),
-    ):
-        status, printed, complained = finish((*TWO, "-m", "--", "torchid", *arguments))
-        assert status == 0, complained
-        assert printed.count(text) == 1
 
 
 @pytest.mark.slow

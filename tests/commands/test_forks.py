@@ -13,7 +13,6 @@ import warnings
 from pathlib import Path
 
 import pytest
-import torch
 from demo import shortened_demo
 
 from torchid import parallel
@@ -35,13 +34,6 @@ def test_a_library_makes_no_forks_of_the_process_that_uses_it() -> None:
     assert {process for process in share_between_forks(range(4), lambda _: os.getpid(), 2)} == {os.getpid()}
     with Fork(os.getpid) as fork:
         assert fork.result() == os.getpid()
-
-
-def test_tensors_outlive_the_copy_that_made_them() -> None:
-    with forks_allowed(), Fork(lambda: (os.getpid(), torch.arange(1000.0))) as fork:
-        process, values = fork.result()
-    assert process != os.getpid()
-    assert torch.equal(values, torch.arange(1000.0))
 
 
 def test_an_error_is_that_of_this_process() -> None:

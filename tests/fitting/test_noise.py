@@ -24,7 +24,6 @@ from torchid.parameters import MASS, PER_BODY
 from torchid.problem import RowBuilder, Samples, bind_log, compress_parts
 from torchid.problem.extras import NoiseGroups
 from torchid.problem.motion import levelled_base_axes
-from torchid.rounding import MAD_PER_STD, STD_PER_MAD
 from torchid.sensing import SensorNoise
 from torchid.sensing.projection import whitened_null_space
 
@@ -34,11 +33,6 @@ SAMPLES = 300
 HORIZONTAL, VERTICAL = 2.3, 0.1  # N: of differentiated odometry, 0.9 and 0.04 m/s^2 of a robot of 2.5 kg
 TRUE = SensorNoise(0.1, 0.2, 0.02, (HORIZONTAL, HORIZONTAL, VERTICAL), (0.1, 0.2, 0.05))
 QUICK, MANY = 8, 200
-
-
-def test_a_median_deviation_over_its_constant_is_the_standard_deviation_of_normal_numbers() -> None:
-    assert pytest.approx(stats.norm.ppf(0.75), abs=2e-5) == MAD_PER_STD
-    assert pytest.approx(1.0 / stats.norm.ppf(0.75), abs=3e-5) == STD_PER_MAD
 
 
 # ------------------------------------------------------------------------------------------------------- axes and rows
@@ -142,15 +136,6 @@ def pushed(setup: RobotSetup, rng: np.random.Generator) -> Samples:
     return read(setup, rng, np.einsum("nij,nkj->nki", axes_of(setup), push).reshape(-1, 6))
 
 
-def shaken(setup: RobotSetup, rng: np.random.Generator) -> Samples:
-    """With noise of sensors, and of accelerations as differentiated odometry has them."""
-    samples = read(setup, rng, np.zeros((SAMPLES, 6)))
-    mass = setup.true.reshape(-1, PER_BODY)[:, MASS].sum()
-    noise = np.array([HORIZONTAL, HORIZONTAL, VERTICAL]) / mass * rng.normal(size=(SAMPLES, 3))
-    force = samples.base.specific_force + torch.from_numpy(np.einsum("nij,nj->ni", axes_of(setup), noise))
-    return replace(samples, base=replace(samples.base, specific_force=force))
-
-
 def fit(experiment: Experiment, samples: Samples, noise: SensorNoise | None = None) -> Estimate:
     sensors = experiment.sensors if noise is None else replace(experiment.sensors, noise=noise)
     builder = RowBuilder(experiment.robot, experiment.contacts, sensors)
@@ -205,21 +190,6 @@ def check_intervals(setup: RobotSetup, sensors: str, repeats: int) -> None:
 @pytest.mark.parametrize("sensors", slow_but(["full"], ["full", "contacts", "joints"]))
 def test_intervals_hold_the_truth_with_the_noise_that_residuals_show(setup: RobotSetup, sensors: str) -> None:
     check_intervals(setup, sensors, QUICK)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("sensors", ["full", "contacts", "joints"])
-def test_intervals_hold_the_truth_in_many_experiments(setup: RobotSetup, sensors: str) -> None:
-    check_intervals(setup, sensors, MANY)
-
-
-@pytest.mark.parametrize("sensors", slow_but(["full"], ["full", "contacts"]))
-def test_differentiated_odometry_spoils_the_mass_no_more(setup: RobotSetup, sensors: str) -> None:
-    """Noise of accelerations stands in K, and pulls the mass down: by as much as rows that show it are trusted."""
-    found = fits(setup, sensors, shaken, 6)
-    before, after = (mass_errors(x, setup.true) for x in (found.guessed, found.estimated))
-    assert before.mean() < -0.005
-    assert abs(after.mean()) < 0.1 * abs(before.mean())
 
 
 # ---------------------------------------------------------------------------------------------- what is stated is kept
@@ -297,30 +267,6 @@ def test_exact_logs_and_logs_of_a_few_samples_leave_noise_that_is_positive(setup
     assert min(one.used for groups in (exact.groups, few.groups) for one in groups) > 0.0
     assert exact.noise.joint_torque == pytest.approx((1e-3 * SensorNoise().joint_torque,) * 12), "the floor"
     assert "assumed" in origins(few).values()
-
-
-@pytest.mark.parametrize("size", [1e-9, 1e3])
-def test_noise_that_nobody_stated_is_as_much_smaller_as_the_robot(setup: RobotSetup, size: float) -> None:
-    """Of robots of millimetres, whose torques are nanonewtonmetres, and of those of tons."""
-    samples = pushed(setup, np.random.default_rng(0))
-    assert samples.torque is not None
-    assert samples.wrench is not None
-    scaled = replace(samples, torque=size * samples.torque, wrench=size * samples.wrench)
-    experiment = setup.experiment()
-    found, expected = (experiment.estimate_noise([one], experiment.sensors).noise for one in (scaled, samples))
-    np.testing.assert_allclose(found.joint_torque, size * np.array(expected.joint_torque), rtol=0.05)
-    assert found.contact_force == pytest.approx(size * expected.contact_force, rel=0.05)
-
-
-def test_the_same_logs_give_the_same_noise_beside_settings_that_do_not_state_it(setup: RobotSetup) -> None:
-    experiment, samples = setup.experiment(), pushed(setup, np.random.default_rng(0))
-    found, again = (experiment.estimate_noise([samples], experiment.sensors) for _ in range(2))
-    assert found == again
-    used = with_noise(experiment, found)
-    assert used.sensors.noise == used.noise
-    assert used.noise == replace(found.noise, contact_moment=0.2, ft_force=None, ft_moment=None), "none of these"
-    assert used.config == experiment.config, "which states what the user has stated"
-    assert used.estimate_noise([samples], experiment.sensors).noise == found.noise
 
 
 def test_the_sensors_of_a_log_are_those_whose_every_value_it_has(setup: RobotSetup) -> None:

@@ -19,7 +19,7 @@ from torchid.fitting.experiment import Experiment, set_up
 from torchid.fitting.fit import LogFitter
 from torchid.fitting.noise import NoiseSummary
 from torchid.problem import RowBuilder, Samples, bind_log, compress_parts
-from torchid.problem.noise import information_about, prior_precision
+from torchid.problem.noise import prior_precision
 from torchid.regressor import Regressor
 from torchid.sensing import SensorNoise
 
@@ -124,19 +124,6 @@ def test_noise_of_joints_a_thousand_times_apart_is_told_apart(arm: Arm) -> None:
     np.testing.assert_allclose(np.median([one.noise.joint_torque for one in found], axis=0), std, rtol=0.1)
 
 
-def test_few_readings_do_not_tell_joints_apart(arm: Arm) -> None:
-    """15 samples leave 54 of 90 readings to the noise: an estimate of each joint alone would be 30 % off."""
-    logs = [arm.noisy(np.full(6, 0.3), seed, FEW) for seed in range(REPEATS)]
-    found = [estimated(arm, log) for log in logs]
-    spread = [np.ptp(np.log(one.noise.joint_torque)) for one in found]
-    assert np.median(spread) < 0.1
-    assert [one.origin for one in found[0].groups].count("pooled") >= 3
-    fits, known = ([arm.fit(log, x) for log, x in zip(logs, noise, strict=True)] for noise in (
-        [one.noise for one in found], [SensorNoise()] * REPEATS
-    ))  # fmt: skip
-    assert (arm.errors(fits) < 1.05 * arm.errors(known)).all()
-
-
 def test_the_spread_of_alike_variances_is_the_most_likely_one() -> None:
     """Against the likelihood of estimates that are normal about them, by its determinant, over a grid."""
     rng, count = np.random.default_rng(0), 8
@@ -160,21 +147,6 @@ def test_the_spread_of_alike_variances_is_the_most_likely_one() -> None:
         np.testing.assert_allclose(precision.sum(0), 0.0, atol=1e-9 * precision[0, 0])
 
 
-def test_information_on_some_variances_is_less_where_others_are_unknown() -> None:
-    """That on a part of the unknowns of a normal likelihood, by its Schur complement."""
-    rng = np.random.default_rng(1)
-    root = rng.normal(size=(5, 7))
-    information, score, index = root @ root.T, rng.normal(size=5), np.array([0, 3])
-    own, pull = information_about(index, information, score)
-    whole = np.linalg.inv(information)
-    np.testing.assert_allclose(np.linalg.inv(own), whole[np.ix_(index, index)], rtol=1e-4)
-    np.testing.assert_allclose(np.linalg.solve(own, pull), (whole @ score)[index], rtol=1e-4)
-    lost = np.zeros((6, 6))  # with a base row that no sample has
-    lost[:5, :5] = information
-    for found, expected in zip(information_about(index, lost, np.append(score, 0.0)), (own, pull), strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-12)
-
-
 # ------------------------------------------------------------------------------------------------------------- stated
 
 
@@ -186,16 +158,6 @@ def test_stated_noise_is_that_of_the_pattern_with_most_letters(arm: Arm) -> None
         (x, "stated") for x in (0.5, 0.5, 0.5, 0.02, 0.02, 0.01)
     ]
     assert found.noise.joint_torque == experiment.noise.joint_torque
-
-
-def test_one_number_is_the_map_of_one_entry(arm: Arm) -> None:
-    samples = arm.noisy(np.full(6, 0.3), seed=0)
-    one, mapped = (arm.experiment(f"sensors.noise.joint_torque={x}") for x in ("0.3", "{'*': 0.3}"))
-    assert one.noise == mapped.noise
-    assert estimated(arm, samples, "sensors.noise.joint_torque=0.3") == estimated(
-        arm, samples, "sensors.noise.joint_torque={'*': 0.3}"
-    )
-    assert (arm.fit(samples, one.noise).phi == arm.fit(samples, SensorNoise(joint_torque=0.3)).phi).all()
 
 
 @pytest.mark.parametrize(

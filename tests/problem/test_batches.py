@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -15,7 +15,6 @@ from synthetic import DRONE, G1, PANDA, TALOS_FULL, Array, load
 from torch import Tensor
 
 from torchid.problem import Batch, MiniBatches, RowBuilder, Samples, compress, linear_problem
-from torchid.problem.motion import BaseMotion
 from torchid.regressor import FrameJacobian, Regressor
 from torchid.robot import Robot
 from torchid.sensing import Contact
@@ -106,28 +105,6 @@ def test_an_epoch_has_every_sample_of_every_log_once(batch_size: int) -> None:
     for epoch in (1, 2):
         assert Counter(order(batches, epoch)) == expected
     assert Counter(key for batch in batches.chunks() for key in keys(batch)) == expected
-
-
-@pytest.mark.parametrize("batch_size", [7, 200, 1000])
-def test_all_batches_but_one_are_full(batch_size: int) -> None:
-    w = many()
-    sizes = Counter(len(batch) for batch in MiniBatches(w.logs, w.builder, batch_size).epoch(1))
-    assert sizes == Counter({batch_size: TOTAL // batch_size, TOTAL % batch_size: 1})
-
-
-def test_logs_and_contact_states_are_mixed_in_every_batch() -> None:
-    """Of 100 samples, 40 are expected from the shorter log and 25 in each contact state; four standard deviations."""
-    w = many()
-    log_of, state_of = {}, {}
-    for number, log in enumerate(w.logs):
-        for key, state in zip(marks(log), log.active.tolist(), strict=True):
-            log_of[key], state_of[key] = number, tuple(state)
-    batches = [batch for batch in MiniBatches(w.logs, w.builder, 100).epoch(3) if len(batch) == 100]
-    assert len(batches) == 10
-    for batch in batches:
-        assert Counter(log_of[key] for key in keys(batch))[2] == pytest.approx(40, abs=4.0 * np.sqrt(40 * 0.6))
-        states = Counter(state_of[key] for key in keys(batch))
-        assert list(states.values()) == pytest.approx([25] * 4, abs=4.0 * np.sqrt(25 * 0.75))
 
 
 def test_the_order_depends_on_the_seed_and_the_number_of_the_epoch_and_nothing_else() -> None:
@@ -267,52 +244,3 @@ def test_forces_of_parameters_are_those_of_the_dense_regressor_log_by_log() -> N
         assert torch.equal(torch.cat([coordinates[number] for coordinates, _ in found]), expected)
     force, expected = torch.cat([force for _, force in found]), torch.cat([dense(w, log, phi) for log in w.logs])
     assert float((force - expected).abs().max()) <= 1e-13 * float(expected.abs().max())
-
-
-@pytest.mark.parametrize("kind", ["biped", "bolted arm"])
-def test_batches_say_in_which_state_of_the_robot_their_rows_were_recorded(kind: str) -> None:
-    w = world(kind, "joints")
-    known = {}
-    for log in w.logs:
-        for q, v, a in zip(*log.coordinates(), strict=True):
-            known[a[-1].item()] = (q, v, a)
-    for batch in MiniBatches(w.logs, w.builder, 16).epoch(1):
-        assert batch.q.shape[1] == w.robot.n + (0 if w.robot.fixed_base else 7)
-        for q, v, a in zip(batch.q, batch.v, batch.a, strict=True):
-            for found, expected in zip((q, v, a), known[a[-1].item()], strict=True):
-                assert torch.equal(found, expected)
-
-
-def test_a_tilted_bolted_arm_feels_gravity_along_its_own_axes() -> None:
-    w, phi = world("bolted arm in free motion", "joints"), world("bolted arm in free motion", "joints").random_phi(3)
-    tilt = torch.tensor([0.3, -0.5, 0.2, 0.0], dtype=torch.float64)
-    tilt[3] = (1.0 - tilt.square().sum()).sqrt()
-    log = replace(w.logs[0], base=BaseMotion(tilt.expand(len(w.logs[0]), 4)))
-    assert log.base.rotation is not None
-    gravity = log.base.rotation[0].mT @ torch.tensor([0.0, 0.0, -9.81], dtype=torch.float64)
-    regressor = Regressor(w.robot, tuple(gravity.tolist()))
-    batches = MiniBatches([log], w.builder, 16)
-    for batch in batches.epoch(1):
-        force = regressor(batch.q, batch.v, batch.a) @ torch.from_numpy(phi)
-        expected = (batch.W.mT @ force[..., None])[..., 0]
-        found = batch.K @ (batches.columns @ torch.from_numpy(phi))
-        np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-13 * float(expected.abs().max()))
-
-
-@cases
-def test_forces_that_no_sensor_of_the_set_measures_do_not_matter(kind: str, sensors: str) -> None:
-    w = world(kind, sensors)
-    spoilt = []
-    for log, junk in zip(w.logs, (torch.nan, 1e300), strict=True):
-        torque, wrench = log.torque.clone(), log.wrench.clone()
-        torque[:, ~torch.from_numpy(w.builder.sensors.torque)] = junk
-        hidden = torch.from_numpy(~w.builder.sensors.wrench)
-        if log.wrench_in_world:  # components along world axes make up all those along the frame's
-            hidden = hidden.unflatten(1, (2, 3)).all(dim=2).repeat_interleave(3, dim=1)
-        wrench[:, hidden] = junk
-        wrench[~log.active] = junk
-        spoilt.append(replace(log, torque=torque, wrench=wrench))
-    plain, other = (MiniBatches(logs, w.builder, 16).epoch(1) for logs in (w.logs, spoilt))
-    for batch, found in zip(plain, other, strict=True):
-        assert equal(batch, found)
-        assert torch.isfinite(batch.f).all()

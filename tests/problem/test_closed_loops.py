@@ -11,19 +11,14 @@ import torch
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed")
 
-from closed_loops import FEET, MODELS, RANKS, LoopWorld, loop_world
+from closed_loops import MODELS, RANKS, LoopWorld, loop_world
 from synthetic import Array
 
-from torchid import parameters
 from torchid.errors import LogError
 from torchid.estimators import Estimate, LeastSquares
-from torchid.identifiability.base_parameters import standing_states
 from torchid.problem import Evaluation, RowBuilder, Samples, bind_log, compress, linear_problem
-from torchid.problem.chunks import chunks_by_state
-from torchid.problem.linear import parameter_scale
 from torchid.problem.metrics import at_motors, force_series, null_space_part
 from torchid.regressor import FrameJacobian, LoopJacobian, Regressor
-from torchid.regressor.loops import LoopClosures
 from torchid.sensing import Projection, SensorSet, named_sensors
 
 EXACT = 1e-8  # of the largest force or of a parameter's size; 1e-12 measured for most
@@ -90,19 +85,6 @@ def test_true_parameters_explain_what_is_left_without_constraint_forces(name: st
 
 
 @robots
-@pytest.mark.parametrize("sensors", ["full", "joints", "contacts"])
-def test_identifiable_parameters_are_the_true_ones(name: str, sensors: str) -> None:
-    w = loop_world(name)
-    estimate = found(name, sensors)
-    scale = parameter_scale(w.robot.nominal).flatten()
-    known = estimate.identifiable
-    assert known.sum() > 10
-    error = (estimate.phi - w.true.flatten())[known] / scale[known]
-    assert np.abs(error).max() < EXACT
-    assert np.sqrt(estimate.cost / estimate.nominal_cost) < 1e-10
-
-
-@robots
 def test_what_was_found_predicts_the_motors_of_motions_that_no_fit_has_seen(name: str) -> None:
     w = loop_world(name, 60, 7)
     samples, evaluation = samples_of(w), Evaluation(w.robot, w.contacts)
@@ -133,26 +115,6 @@ def test_torques_at_the_motors_are_those_of_virtual_work(name: str) -> None:
     assert np.isnan(errors[:, in_loops]).all()
 
 
-def test_a_pin_of_a_planar_four_bar_has_two_rows_that_do_work_and_a_welded_coupler_three() -> None:
-    for name, count in (("four-bar leg", 2), ("welded coupler", 3)):
-        w = loop_world(name)
-        layout = RowBuilder(w.robot, w.contacts, sensors_of(w)).layout((False,))
-        assert [len(loop.wrenches) for loop in layout.loops] == [count]
-
-
-@robots
-def test_rows_are_as_many_as_motions_and_those_by_sample_are_those_of_the_fit(name: str) -> None:
-    w = loop_world(name)
-    builder, samples = RowBuilder(w.robot, w.contacts, sensors_of(w)), samples_of(w)
-    for state, index in chunks_by_state(samples):
-        unmeasured = sum(len(contact.components) for contact, on in zip(FEET[name], state, strict=True) if on)
-        rows, W = builder.rows_by_sample(samples[index], state)
-        used = (W != 0.0).any(1).sum(1)
-        assert set(used.tolist()) == {6 + w.robot.n - RANKS[name] - unmeasured}
-        bound = (rows[..., :-1] @ builder.to_columns(w.true.flatten()[None])[0] - rows[..., -1]).abs().max()
-        assert bound < 1e-11 * rows[..., -1].abs().max()
-
-
 @robots
 def test_the_public_modules_make_the_same_equations(name: str) -> None:
     w = loop_world(name)
@@ -181,20 +143,6 @@ def test_the_public_modules_make_the_same_equations(name: str) -> None:
         assert group.K.shape[1] == 6 + w.robot.n - RANKS[name]
 
 
-@robots
-def test_random_motion_keeps_the_loops_closed_to_second_order(name: str) -> None:
-    w = loop_world(name)
-    state = (True,) * len(w.contacts)
-    q, v, a = standing_states(w.robot, w.contacts, state, 40, np.random.default_rng(0))
-    closures, step = LoopClosures(w.robot), 1e-4
-    q, v, a = q[:, 7:], v[:, 6:], a[:, 6:]
-    before, at, after = (closures.deviations(q + s * v + 0.5 * s**2 * a) for s in (-step, 0.0, step))
-    assert at.abs().max() < 1e-12
-    assert ((after - before).abs().max() / (2.0 * step)) < 1e-6 * v.abs().max() ** 3
-    assert ((after - 2.0 * at + before).abs().max() / step**2) < 1e-5 * a.abs().max()
-    assert len(torch.unique(q.round(decimals=6), dim=0)) == 40
-
-
 def test_a_wrong_frame_is_refused_with_how_far_the_loop_is_open() -> None:
     w = loop_world("four-bar leg")
     loop = replace(w.robot.loops[0], frames=(w.robot.loops[0].frames[0], "toe"))
@@ -218,10 +166,3 @@ def test_a_torque_of_a_joint_without_a_motor_is_refused() -> None:
     samples = bind_log(replace(w.log, joint_torque=torque), w.robot, w.contacts)
     assert samples.torque is not None
     assert torch.equal(samples.torque, samples_of(w).torque)
-
-
-def test_friction_of_joints_without_a_motor_is_found_too() -> None:
-    w = loop_world("biped")
-    phi = found("biped", "joints").phi.reshape(w.true.shape)
-    passive = [body for body, of in enumerate(w.robot.bodies) if of.joint and of.joint.name in w.robot.passive]
-    np.testing.assert_allclose(phi[passive][:, parameters.FRICTION], w.true[passive][:, parameters.FRICTION], rtol=1e-8)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,11 +18,9 @@ from torchid.problem.compression import (
     FOLDS,
     LEAST_PER_FOLD,
     Part,
-    block_spans,
     compress_log,
     fold_compressed,
     merge,
-    piece_spans,
     split_into_folds,
 )
 from torchid.sensing import named_sensors
@@ -109,30 +106,3 @@ def test_contact_states_of_a_compressed_log_are_those_of_its_samples(walk: tuple
         G = gram(expected[state].factor)
         assert part.samples == expected[state].samples
         assert (gram(part.factor) - G).abs().max() <= 1e-12 * G.abs().max()
-
-
-@pytest.mark.parametrize("samples", [1, 3, 7, 59, 60, 1001])
-def test_pieces_make_up_the_blocks_of_any_number_of_blocks(samples: int) -> None:
-    for most in range(1, FOLDS + 1):
-        pieces = piece_spans(samples, most)
-        assert [start for start, _ in pieces[1:]] == [stop for _, stop in pieces[:-1]]
-        assert (pieces[0][0], pieces[-1][1]) == (0, samples)
-        ends = {end for piece in pieces for end in piece}
-        assert all(end in ends for count in range(1, most + 1) for span in block_spans(samples, count) for end in span)
-
-
-def test_what_a_log_compresses_to_does_not_grow_with_it(walk: tuple[RowBuilder, Samples]) -> None:
-    builder, log = walk
-
-    def numbers(samples: Samples) -> int:
-        compressed = compress_log(samples, builder)
-        parts = [*compressed.pieces, *compressed.by_state]
-        return sum(block.numel() for part in parts for block in part.factor.blocks.values())
-
-    def repeated(times: int) -> Samples:
-        tensors: dict[str, Any] = {
-            name: torch.cat([x] * times) for name, x in vars(log).items() if isinstance(x, torch.Tensor)
-        }
-        return replace(log, base=log.base.map(lambda x: torch.cat([x] * times)), **tensors)
-
-    assert numbers(repeated(4)) <= 1.005 * numbers(repeated(2))

@@ -13,7 +13,6 @@ from thinned import each_once
 from true_robots import (
     EXACT,
     KINDS,
-    SAMPLES,
     World,
     driving,
     fit,
@@ -27,7 +26,6 @@ from true_robots import (
 
 from torchid import parameters
 from torchid.estimators import Estimate, LeastSquares
-from torchid.identifiability.base_parameters import require_base, state_reports
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
 from torchid.problem.linear import parameter_scale
 from torchid.problem.metrics import force_series
@@ -86,34 +84,6 @@ def test_contact_sensors_alone_find_all_inertial_forces_and_leave_friction_at_th
     assert worst(forces[:, seen], true[:, seen]) < EXACT
     if not seen.all():  # mimic fingers that turn against each other: their common inertia never reaches the base
         assert worst(forces, true) > 1e-7
-
-
-@robots
-def test_one_foots_wrench_and_the_other_legs_torques_find_all_but_friction_of_the_unmeasured_leg(name: str) -> None:
-    w = world(name)
-    leg = np.isin(w.robot.joint_names, w.kind.leg)
-    assert leg.sum() == len(w.kind.leg)
-    phi = found(name, "mixed").phi
-    measured = np.concatenate([np.ones(6, bool), ~leg])
-    true = w.oracle.forces(*unseen(name))
-    assert worst(predicted(w.robot, phi, *unseen(name))[:, measured], true[:, measured]) < EXACT
-    frictionless = phi.reshape(-1, parameters.PER_BODY).copy()
-    frictionless[:, parameters.FRICTION] = 0.0
-    true = w.oracle.frictionless_forces(*unseen(name))
-    assert worst(predicted(w.robot, frictionless.flatten(), *unseen(name)), true) < EXACT
-
-
-@robots
-@pytest.mark.parametrize("sensors", ["full", "joints", "contacts", "mixed"])
-def test_the_result_says_that_it_is_exact_and_that_the_urdf_was_not(name: str, sensors: str) -> None:
-    w = world(name)
-    estimate = found(name, sensors)
-    assert estimate.residual_std < 1e-11
-    assert np.sqrt(estimate.cost / estimate.nominal_cost) < 1e-12
-    reports = state_reports(w.logs, RowBuilder(w.robot, w.kind.contacts, sensors_of(w, sensors)))
-    require_base(reports)
-    assert {report.base_rank for report in reports} == {6}
-    assert sum(report.samples for report in reports) == SAMPLES
 
 
 @robots
@@ -200,11 +170,3 @@ def test_how_samples_are_cut_ordered_and_shared_out_does_not_change_the_result(w
     np.testing.assert_array_equal(estimate.identifiable, expected.identifiable)
     known = expected.identifiable
     np.testing.assert_allclose(estimate.standard_error[known], expected.standard_error[known], rtol=1e-8)
-
-
-@pytest.mark.parametrize("threads", [1, 2, 3])
-def test_threads_are_given_back(threads: int) -> None:
-    before = torch.get_num_threads()
-    w = world("ANYmal")
-    fit(w, sensors_of(w, "full"), [w.logs[0][:50]], threads=threads)
-    assert torch.get_num_threads() == before

@@ -4,21 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from misread import WIDTH, World, with_actuators, world
 from motions import value
-from recordings import Miscalibration, in_world, with_imu
-from synthetic import G1, Oracle, load, make_log, random_states
-from true_robots import predicted, true_parameters, worst
+from recordings import Miscalibration, in_world
+from synthetic import Oracle, make_log, random_states
+from true_robots import predicted, worst
 from unknowns import Fit, fit
 from welded import CONTACTS, SENSORS, STATES
 
-from torchid.estimators import Consistent
-from torchid.identifiability.base_parameters import base_parameters, structural_problem
 from torchid.logs import Log
 from torchid.problem import ExtraTerms, bind_log
 from torchid.problem.extras import ACTUATORS, CHANNELS, list_extras
@@ -93,12 +89,6 @@ def test_scales_are_found_beside_offsets_where_some_sensor_is_true_to_scale(case
     assert_recovered(w, fitted(w, sensors_of(w.robot, name), terms), terms)
 
 
-def test_scales_of_plates_are_those_of_what_they_read_about_a_point_of_the_world() -> None:
-    scaled = ("contact_force", "contact_moment")
-    terms, w = ExtraTerms(dict.fromkeys(CHANNELS, "log"), dict.fromkeys(scaled, "log")), world(True, scaled, "plates")
-    assert_recovered(w, fitted(w, sensors_of(w.robot, "full"), terms), terms)
-
-
 def test_where_no_sensor_is_true_to_scale_none_can_be_told_from_the_masses() -> None:
     """All forces twice as large and a robot twice as heavy would read the same."""
     every = dict.fromkeys(CHANNELS, "all")
@@ -109,16 +99,6 @@ def test_where_no_sensor_is_true_to_scale_none_can_be_told_from_the_masses() -> 
         assert not x.separable
         assert x.standard_error == np.inf
         assert x.confounded_with
-
-
-@pytest.mark.parametrize("axes", ["world", "plates"])
-@pytest.mark.parametrize("name", ["contacts", "mixed"])
-def test_offsets_of_plates_that_read_along_world_axes_are_constant_along_these(name: str, axes: str) -> None:
-    terms, w = ExtraTerms(offsets=dict.fromkeys(CHANNELS, "log")), world(axes=axes)
-    found = fitted(w, sensors_of(w.robot, name), terms)
-    assert_recovered(w, found, terms)
-    if name == "mixed":
-        assert ("a.npz", "offset of sole fy") in found.values, "measured fx and fz are made of all three readings"
 
 
 # ------------------------------------------------------------------------------------------------- actuators
@@ -157,77 +137,6 @@ def test_terms_of_actuators_are_found_with_friction_that_turns_over_smoothly(kin
 
 
 # --------------------------------------------------------------------------------- a humanoid on Monday morning
-
-LEGS = ("left", "right")
-ANKLES = tuple(f"{side}_ankle_ft" for side in LEGS)
-FEET = tuple(Contact(f"{side}_foot", "flat") for side in LEGS)
-
-
-def with_ankle_sensors(folder: Path) -> Path:
-    """G1 with a skew force/torque sensor in each ankle, a foot of 0.6 kg beyond it, and a skew IMU on the pelvis."""
-    root = ElementTree.parse(G1).getroot()
-
-    def weld(name: str, parent: str, child: str, pose: str, mass: str = "") -> None:
-        link = ElementTree.SubElement(root, "link", name=child)
-        if mass:
-            link.append(ElementTree.fromstring(mass))
-        joint = ElementTree.SubElement(root, "joint", name=name, type="fixed")
-        joint.append(ElementTree.fromstring(f"<origin {pose}/>"))
-        ElementTree.SubElement(joint, "parent", link=parent)
-        ElementTree.SubElement(joint, "child", link=child)
-
-    foot = """<inertial><origin xyz="0.03 0.002 -0.02" rpy="0.2 0.1 -0.3"/><mass value="0.6"/>
-        <inertia ixx="0.0009" ixy="0.0001" ixz="-0.0002" iyy="0.0021" iyz="0.0001" izz="0.0024"/></inertial>"""
-    poses = 'xyz="0.01 0 -0.02" rpy="0.3 -0.2 0.7"', 'xyz="0 0.01 -0.03" rpy="-0.4 0.1 2"'
-    for side, pose in zip(LEGS, poses, strict=True):
-        weld(f"{side}_ankle_ft", f"{side}_ankle_roll_link", f"{side}_foot", pose, foot)
-    weld("imu_weld", "pelvis", "imu", 'xyz="-0.1 0.05 0.2" rpy="0.5 -0.9 2.1"')
-    path = folder / "g1.urdf"
-    ElementTree.ElementTree(root).write(path)
-    return path
-
-
-def test_a_humanoid_with_ankle_sensors_and_an_imu_is_found_with_all_offsets_that_change_from_log_to_log(
-    tmp_path: Path,
-) -> None:
-    robot, rng = load(with_ankle_sensors(tmp_path), None, False, ANKLES), np.random.default_rng(11)
-    oracle = Oracle.of(robot)
-    oracle.perturb(rng, 0.2)
-    states = [[True, True], [True, False], [False, True]]
-    contacts, logs, misread = [(foot.frame, 6) for foot in FEET], [], []
-    for name in ("a.npz", "b.npz", "c.npz"):
-        log = make_log(oracle, contacts, states, 300, rng, name)
-        misread.append(Miscalibration.random(log, rng))
-        log = with_imu(oracle, misread[-1].read(log), "imu")
-        logs.append(bind_log(log, robot, FEET))
-        assert logs[-1].base.quat_xyzw is None
-    sensors = with_ft_sensors(named_sensors("joints", robot.n, 2, ft=2), robot, ANKLES)
-    terms = ExtraTerms(offsets={"joint_torque": "log", "ft_force": "log", "ft_moment": "log"})
-    found = fit(robot, FEET, sensors, terms, logs)
-
-    assert len(found.extras) == 3 * (robot.n + 12)
-    for log, own in zip(logs, misread, strict=True):
-        offsets = dict(zip(robot.dof_names, np.append(own.torque, own.ft), strict=True))
-        for name, expected in offsets.items():
-            label = f"offset of {'limb sensor ' if '.' in name else ''}{' '.join(name.rsplit('.', 1))}"
-            assert found.values[log.source, label] == pytest.approx(expected, rel=EXACT), (log.source, label)
-    assert all(x.separable for x in found.extras)
-
-    state = random_states(np.random.default_rng(99), robot.n, 100)
-    assert worst(predicted(robot, found.estimate.phi, *state), oracle.forces(*state)) < 1e-9
-    true = true_parameters(oracle, robot).ravel()
-    base = base_parameters(structural_problem(robot, FEET, sensors, [tuple(state) for state in states]))
-    assert found.estimate.rank == base.rank
-    expected, units = base.reduce(true), np.abs(base.combination) @ base.scale
-    np.testing.assert_allclose((base.reduce(found.estimate.phi) - expected) / units, 0.0, rtol=0.0, atol=EXACT)
-
-
-def test_parameters_bound_to_be_physical_are_found_with_the_offsets_too() -> None:
-    terms, w = ExtraTerms(offsets=dict.fromkeys(CHANNELS, "log")), world()
-    logs = [bind_log(log, w.robot, CONTACTS) for log in w.logs]
-    found = fit(w.robot, CONTACTS, sensors_of(w.robot, "full+limbs"), terms, logs, Consistent())
-    for key, expected in w.true(found.builder, terms).items():
-        assert found.values[key] == pytest.approx(expected, abs=1.5e-3), key  # 4.2e-4: where the interior point stops
 
 
 @pytest.mark.parametrize("turned", [lambda _, log: log, in_world], ids=["along the frames", "along the world"])

@@ -12,13 +12,11 @@ from synthetic import Oracle, load, make_log
 from welded import CONTACTS, SENSORS, STATES, machine
 
 from torchid.config import load_config
-from torchid.fitting.calibration import Calibration
-from torchid.fitting.cross_validation import sum_residuals
 from torchid.fitting.experiment import set_up
 from torchid.logs import read_log
 from torchid.logs.preprocess import preprocess
 from torchid.parameters import Array
-from torchid.problem import Samples, bind_log, compress_parts
+from torchid.problem import Samples, bind_log
 from torchid.problem.metrics import Evaluation, force_series, noise_series
 from torchid.robot import Robot
 from torchid.sensing import SensorNoise
@@ -69,25 +67,6 @@ def test_metrics_have_the_rms_of_the_noise_by_group(recorded: tuple[Robot, Oracl
     assert without.as_dict() == found.as_dict()
 
 
-def test_rows_that_a_sensor_of_unknown_noise_enters_have_no_floor(recorded: tuple[Robot, Oracle, Samples]) -> None:
-    robot, oracle, samples = recorded
-    builder, base = Evaluation(robot, CONTACTS).builder, robot.base_rows
-    found = noise_series(builder, samples, SensorNoise.of_known({"joint_torque": 0.3}))[:, : base + robot.n]
-    q, reached = samples.coordinates()[0].numpy(), np.zeros((24, robot.n_rows), dtype=bool)
-    for number, contact in enumerate(CONTACTS):
-        touching = samples.active[:, number].numpy()
-        moved = np.abs(oracle.jacobian(q, contact.frame)).max((0, 1)) > 1e-9
-        reached[touching] |= moved
-    reached = reached[:, : base + robot.n]
-    assert np.isnan(found[reached]).all()
-    free = ~reached
-    free[:, :base] = False
-    assert free.any()
-    np.testing.assert_allclose(found[free], 0.3)
-    unread = replace(samples, torque=None)
-    assert np.isnan(noise_series(builder, unread, NOISE)[:, base:]).all()
-
-
 def test_noise_that_is_added_to_a_log_leaves_as_much_after_the_filter() -> None:
     experiment = set_up(load_config(DEMO / "quadruped.yaml"))
     log, rng = read_log(DEMO / "sway_train.npz"), np.random.default_rng(1)
@@ -106,16 +85,3 @@ def test_noise_that_is_added_to_a_log_leaves_as_much_after_the_filter() -> None:
     expected = noise_series(evaluation.builder, before, noise)
     for rows in (slice(0, 3), slice(3, 6), slice(6, None)):
         assert rms(difference[:, rows]) == pytest.approx(rms(expected[:, rows]), rel=0.06)
-
-
-def test_the_floor_of_whitened_rows_is_the_share_that_the_filter_leaves() -> None:
-    experiment = set_up(load_config(DEMO / "quadruped.yaml"))
-    log = preprocess(read_log(DEMO / "sway_train.npz"), 8.0)
-    samples, builder = (
-        bind_log(log, experiment.robot, experiment.contacts)[:200],
-        experiment.builder(experiment.sensors),
-    )
-    one = Calibration(robot=experiment.robot, builder=builder, phi=experiment.robot.nominal.flatten(), values={})
-    (found,) = sum_residuals(builder, [samples], compress_parts([samples], builder), [one])
-    assert 6.8 < samples.oversampling < 7.1
-    assert found.noise / found.rows == pytest.approx(1.0 / samples.oversampling, rel=1e-12)

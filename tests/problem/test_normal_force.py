@@ -27,8 +27,7 @@ from unknowns import fit
 from torchid.errors import LogError, SensorError, UnknownNameError
 from torchid.logs import Log, read_log, write_log
 from torchid.logs.preprocess import preprocess
-from torchid.problem import Evaluation, ExtraTerms, RowBuilder, bind_log, compress_parts
-from torchid.problem.unloaded_sensors import unloaded_offset_equations
+from torchid.problem import ExtraTerms, RowBuilder, bind_log, compress_parts
 from torchid.sensing import Contact, SensorSet, chosen_sensors, named_sensors
 
 ASKEW = (0.3, -0.2, 0.8)
@@ -83,40 +82,6 @@ def test_the_field_comes_back_from_every_format_and_in_the_order_of_the_contacts
     bound = value(bind_log(preprocess(again), load(ANYMAL), FEET).wrench).numpy()
     np.testing.assert_array_equal(bound[:, :, 2], force[2:-2, ::-1])
     assert np.isnan(bound[:, :, [0, 1, 3, 4, 5]]).all()
-
-
-def test_it_is_filtered_and_zero_without_contact_as_a_wrench_is() -> None:
-    log = a_log()
-    wrench = np.zeros((COUNT, 4, 6))
-    wrench[:, :, 2] = log.contact_force_normal
-    settings = {"cutoff_hz": 9.0, "sample_rate_hz": 73.0}
-    filtered = preprocess(replace(log, contact_wrench_local=wrench), **settings)
-    force = value(filtered.contact_force_normal)
-    np.testing.assert_array_equal(force, value(filtered.contact_wrench_local)[:, :, 2])
-    assert np.abs(force[:, 1]).max() == 0.0
-    assert 90.0 < force.max() < 120.0
-    readings = value(filtered.contact_unloaded)
-    assert readings.shape[2] == 7
-    np.testing.assert_array_equal(readings[:, :, 6], readings[:, :, 2])
-    broken = value(log.contact_force_normal).copy()
-    broken[120, 3] = np.nan
-    with pytest.warns(UserWarning, match="contact_force_normal: NaN in part of LF_FOOT"):
-        force = value(preprocess(replace(log, contact_force_normal=broken), **settings).contact_force_normal)
-    np.testing.assert_array_equal(np.isnan(force).all(axis=0), [False, False, False, True])
-
-
-def test_readings_in_the_air_give_the_offset_an_equation_of_its_own() -> None:
-    log, terms = a_log(), ExtraTerms(offsets={"contact_force": "log"})
-    builder = RowBuilder(load(ANYMAL), FEET, sensors_of(FEET, EVERY_FOOT), terms)
-    wrench = np.full((COUNT, 4, 6), 3.0)  # not what the contacts are read by
-    for one in (preprocess(log, 9.0), preprocess(replace(log, contact_wrench_world=wrench), 9.0)):
-        samples = bind_log(one, load(ANYMAL), FEET, builder.sensors)
-        air = value(samples.unloaded).numpy()
-        assert set(np.unique(air[np.isfinite(air)])) == {7.0}
-        assert np.isnan(air[:, :, [0, 1, 3, 4, 5]]).all()
-        equations = list(unloaded_offset_equations(builder, samples))
-        assert [builder.extras[x.offset].label for x in equations] == [f"offset of {name} fn" for name in NAMES]
-        assert {(x.mean, x.masked) for x in equations} == {(7.0, False)}
 
 
 @pytest.mark.parametrize(
@@ -244,20 +209,6 @@ def test_offsets_and_scales_of_scalar_sensors_are_recovered_with_the_parameters(
             assert np.abs(misfit).max() < 1e-9 * np.abs(R[:, -1]).max()
 
 
-def test_scalar_sensors_of_all_feet_weigh_the_robot() -> None:
-    """Forces along one normal have a sum that nothing unmeasured is part of; those of some feet have none."""
-    robot, (log, _) = load(ANYMAL), walked(1)
-    ranks = []
-    for fn in ((), NAMES[:2], NAMES):
-        contacts, sensors = read_by(fn, ())
-        sensors = replace(sensors, torque=np.zeros(12, dtype=bool))
-        down = log.select(np.flatnonzero(value(log.contact_active).all(axis=1)))
-        builder = RowBuilder(robot, contacts, sensors)
-        parts = compress_parts([bind_log(down, robot, contacts)], builder, threads=1)
-        ranks.append(sum(part.factor.rows for part in parts) / len(down))
-    assert ranks == [0.0, 0.0, 1.0]
-
-
 def test_cells_in_a_level_sole_leave_what_is_not_in_its_plane() -> None:
     """Forces in the plane of three cells, and the moment about its normal, are all that is not measured."""
     frames = ("base_link", "base_imu_link", "caster_front_left_1_link")
@@ -276,13 +227,3 @@ def test_cells_in_a_level_sole_leave_what_is_not_in_its_plane() -> None:
         level = replace(samples, contact_normal=torch.from_numpy(normal)[:, None].expand(-1, 3, -1))
         _, W = builder.rows_by_sample(level, (True,) * 3)
         np.testing.assert_array_equal(W.numpy().any(axis=1).sum(axis=1), rank)
-
-
-def test_base_rows_have_no_errors_and_joint_rows_of_the_null_space_do() -> None:
-    robot, (log, phi) = load(ANYMAL), walked(1)
-    contacts, sensors = read_by(NAMES, ())
-    samples = bind_log(log.select(value(log.contact_active).any(axis=1)), robot, contacts, sensors)
-    metrics = Evaluation(robot, contacts).metrics([samples], phi[None])[0]
-    assert metrics.rms["base_force"] is None
-    assert metrics.rms["base_moment"] is None
-    assert value(metrics.rms["nullspace"]) < 1e-8

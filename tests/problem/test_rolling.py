@@ -23,7 +23,6 @@ from torchid.logs import Log, read_log, write_log
 from torchid.logs.preprocess import preprocess
 from torchid.problem import ExtraTerms, RowBuilder, bind_log, compress
 from torchid.problem.base_pose import feet_poses
-from torchid.problem.noise import SampledRows
 from torchid.sensing import Contact
 
 ASKEW = (0.3, -0.2, 0.8)
@@ -74,19 +73,6 @@ def test_the_jacobian_of_a_ball_gives_the_velocity_of_the_material_point() -> No
         arm = -radius * (bases[i] @ poses[i]).T @ normal[i]
         np.testing.assert_allclose(speed[i, :3], twist[i, :3] + np.cross(twist[i, 3:], arm), atol=1e-12)
         np.testing.assert_allclose(speed[i, 3:], twist[i, 3:], atol=1e-13)
-
-
-@pytest.mark.parametrize("sensors", ["full", "contacts", "joints", "mixed"])
-def test_without_a_radius_nothing_changes_to_the_last_bit(sensors: str) -> None:
-    robot = load(ANYMAL)
-    plain = [Contact(contact.frame, "point") for contact in BALLS]
-    samples, _ = random_samples(robot, plain, 40, 0, states=4)
-    factors = []
-    for contacts in (plain, [replace(contact, radius=0.0) for contact in BALLS], BALLS):
-        builder = RowBuilder(robot, contacts, sensor_set(sensors, robot, contacts))
-        factors.append(compress([samples], builder).triangle())
-    assert torch.equal(factors[0], factors[1])
-    assert not torch.allclose(factors[0], factors[2])
 
 
 @pytest.mark.parametrize("world", [False, True])
@@ -149,11 +135,6 @@ def test_normals_come_back_from_every_format_and_in_the_order_of_the_contacts(tm
     np.testing.assert_array_equal(bound.numpy(), log.contact_normal_world[2:-2, ::-1])
 
 
-def test_normals_are_not_bound_where_no_contact_rolls() -> None:
-    points = [Contact(contact.frame, "point") for contact in BALLS]
-    assert bind_log(preprocess(a_log()), load(ANYMAL), points).contact_normal is None
-
-
 @pytest.mark.parametrize(
     ("change", "found"),
     [
@@ -194,41 +175,6 @@ def test_normals_need_flags_of_contacts(tmp_path: Path) -> None:
     normals = np.zeros((2, 1, 3))
     path = write_arrays(tmp_path / "log.npz", fields | {"contact_normal_world": normals})
     assert "contact_normal_world: given without contact_names" in log_refusal(path)
-
-
-def test_filters_hold_normals_and_give_widened_contacts_those_of_the_nearest_sample() -> None:
-    log = a_log()
-    active = np.zeros((60, 4), dtype=bool)
-    active[28:32] = True
-    normals = np.full((60, 4, 3), np.nan)
-    normals[28:30], normals[30:32] = [0.0, 0.0, 1.0], [0.0, 0.6, 0.8]
-    filtered = preprocess(replace(log, contact_active=active, contact_normal_world=normals), cutoff_hz=20.0)
-    found = filtered.contact_normal_world
-    assert found is not None
-    later, down = filtered.time >= 0.3 - 1e-9, filtered.contact_active
-    assert down is not None
-    assert 16 < down.sum() < down.size
-    for when, normal in ((~later, [0.0, 0.0, 1.0]), (later, [0.0, 0.6, 0.8])):
-        chosen = found[when][down[when]]
-        np.testing.assert_array_equal(chosen, np.broadcast_to(normal, chosen.shape))
-    assert np.isnan(found[~down]).all()
-    assert bind_log(filtered, load(ANYMAL), BALLS).contact_normal is not None
-
-
-@pytest.mark.parametrize("along_normal", [False, True])
-def test_sources_of_noise_know_nothing_of_normals_in_the_air(along_normal: bool) -> None:
-    contacts = [replace(ball, along_normal=along_normal) for ball in BALLS]
-    robot = load(ANYMAL)
-    samples, _ = random_samples(robot, contacts, 40, 0, states=4)
-    normals = unit(np.random.default_rng(0).normal(size=(40, 4, 3)))
-    known = torch.from_numpy(normals)
-    unknown = torch.where(samples.active[..., None], known, torch.nan)
-    builder = RowBuilder(robot, contacts, sensor_set("full", robot, contacts))
-    found, expected = (SampledRows([replace(samples, contact_normal=x)], builder).chunks for x in (unknown, known))
-    assert not samples.active.all()
-    for one, other in zip(found, expected, strict=True):
-        assert torch.equal(one.sources, other.sources)
-        assert one.sources.isfinite().all()
 
 
 # --------------------------------------------------------------------------------------------------------- refusals

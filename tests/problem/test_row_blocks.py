@@ -9,55 +9,12 @@ import torch
 from random_samples import random_samples, sensor_set
 
 import torchid
-from torchid import parameters
 from torchid.problem import RowBuilder, TriangularFactor
-from torchid.problem.row_blocks import RowBlock, triangularize_base_rows
+from torchid.problem.row_blocks import triangularize_base_rows
 
 ROBOT = torchid.load_robot(Path(torchid.__file__).parent / "demo" / "quadruped.urdf")
 FEET = [torchid.Contact(f"{end}_{side}_foot", "point") for end in ("front", "rear") for side in ("left", "right")]
 DIAGONAL = (True, False, False, True)  # front left, rear right
-
-
-def blocks_of(sensors: str, state: tuple[bool, ...], rank: int) -> tuple[RowBuilder, tuple[RowBlock, ...]]:
-    builder = RowBuilder(ROBOT, FEET, sensor_set(sensors, ROBOT, FEET))
-    return builder, builder.layout(state).blocks.of_rank(rank)
-
-
-def inertias(builder: RowBuilder, block: RowBlock) -> set[str]:
-    """Bodies with an inertia among the columns of a block."""
-    layout, names = builder.columns.layout, ROBOT.body_names
-    return {
-        names[builder.tree.body_of[node]]
-        for node, kept in enumerate(layout.kept)
-        for number, column in enumerate(kept, start=layout.starts[node])
-        if column >= parameters.INERTIA.start and number in block.inertial
-    }
-
-
-def test_rows_with_the_bases_force_leave_out_inertias_of_swinging_legs() -> None:
-    builder, (force, moment) = blocks_of("joints", DIAGONAL, 6)
-    assert (force.rows, moment.rows) == (slice(0, 3), slice(3, 6))
-    standing = {name for name in ROBOT.body_names if name.startswith(("front_left", "rear_right"))}
-    assert inertias(builder, force) == standing
-    assert inertias(builder, moment) == set(ROBOT.body_names)
-    assert len(moment.inertial) == builder.columns.layout.count > len(force.inertial)
-
-
-def test_measured_forces_leave_each_leg_its_own_rows() -> None:
-    builder, (*legs, force, moment) = blocks_of("full", (True,) * 4, 18)
-    assert [inertias(builder, leg) for leg in legs] == [
-        {name for name in ROBOT.body_names if name.startswith(side)}
-        for side in ("rear_right", "rear_left", "front_right", "front_left")
-    ]
-    assert inertias(builder, force) == set(ROBOT.body_names) - {ROBOT.body_names[0]}
-    assert inertias(builder, moment) == set(ROBOT.body_names)
-    assert [block.rows.stop - block.rows.start for block in (*legs, force, moment)] == [3] * 6
-
-
-def test_the_forces_of_a_base_alone_need_no_inertia_at_all() -> None:
-    builder, (force, moment) = blocks_of("contacts", (True,) * 4, 6)
-    assert not inertias(builder, force)
-    assert len(force.inertial) < 0.4 * len(moment.inertial)
 
 
 def test_a_foot_that_the_ground_holds_is_in_no_combination_of_rows() -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchid.problem import TriangularFactor
 from torchid.problem import row_compressor as module
-from torchid.problem.row_compressor import ColumnLevels, RowCompressor
+from torchid.problem.row_compressor import RowCompressor
 
 COLUMNS = 12
 PARAMETERS = np.linspace(-2.0, 3.0, COLUMNS)
@@ -101,35 +101,6 @@ def test_the_factor_has_the_lengths_of_the_rows(
     assert relative_difference(R, np.vstack(chunks)) < limit
 
 
-@kinds
-def test_exact_rows_give_the_parameters_back_as_qr_does(kind: Callable[[np.random.Generator, int], Array]) -> None:
-    chunks = exact_rows(kind, 4)
-    size = np.linalg.norm(np.vstack(chunks), axis=0)
-
-    def found(R: Array) -> tuple[Array, float]:
-        scaled = R / np.where(size > 0.0, size, 1.0)
-        x, *_ = np.linalg.lstsq(scaled[:, :-1], scaled[:, -1], rcond=1e-11)
-        return x, float(np.linalg.norm(scaled[:, :-1] @ x - scaled[:, -1]))
-
-    (x, left), (expected, left_by_qr) = (
-        found(compressed(chunks).triangle().numpy()),
-        found(np.linalg.qr(np.vstack(chunks), mode="r")),
-    )
-    assert left < 1e-14 + 10.0 * left_by_qr
-    exact = size[:-1] * PARAMETERS / size[-1]
-    if kind is dependent:
-        np.testing.assert_allclose(x, expected, atol=1e-13)
-    else:
-        assert np.abs(x - exact).max() < 1e-14 + 10.0 * np.abs(expected - exact).max()
-
-
-def test_a_plain_gram_matrix_would_lose_what_the_compressor_keeps() -> None:
-    """Else the test above says nothing."""
-    rows = np.vstack(exact_rows(nearly_dependent, 4))
-    scaled = rows / np.linalg.norm(rows, axis=0)
-    assert np.linalg.eigvalsh(scaled.T @ scaled).min() < 1e-15
-
-
 def test_rows_that_columns_were_not_combined_for_are_factorized_and_columns_combined_anew() -> None:
     rng, factorized = np.random.default_rng(3), 0
     still = rng.normal(size=(200, 3)) @ rng.normal(size=(3, COLUMNS + 1))  # as of a robot that holds a pose
@@ -151,24 +122,6 @@ def test_rows_that_columns_were_not_combined_for_are_factorized_and_columns_comb
     assert relative_difference(factor.triangle().numpy(), rows) < limit
 
 
-def test_rows_that_most_columns_would_be_combined_for_are_factorized_until_others_come(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(module, "_MOST_COMBINED", 0.5)
-    chunks = [*exact_rows(nearly_dependent, 2), *exact_rows(well_conditioned, 2)]
-    added, combined = list[bool](), module._Sum.add
-
-    def add(self: module._Sum, X: Array) -> bool:
-        added.append(combined(self, X))
-        return added[-1]
-
-    monkeypatch.setattr(module._Sum, "add", add)
-    factor = compressed(chunks)
-    assert added == [True, True], "the last two alone are summed"
-    assert factor.rows == 1200
-    assert relative_difference(factor.triangle().numpy(), np.vstack(chunks)) < 1e-12
-
-
 @pytest.mark.parametrize("small", [1e-3, 1e-12, 1e-70])
 def test_a_column_that_the_sampled_rows_hardly_have_takes_no_digits_of_others(small: float) -> None:
     """As friction that only slow samples show: its combination for these alone would be as large as it is small."""
@@ -179,42 +132,12 @@ def test_a_column_that_the_sampled_rows_hardly_have_takes_no_digits_of_others(sm
     assert relative_difference(compressed(chunks).triangle().numpy(), np.vstack(chunks)) < 1e-12
 
 
-def test_levels_make_rows_well_conditioned_and_can_be_undone() -> None:
-    rows = np.vstack(exact_rows(nearly_dependent, 1, 1e-3))
-    levels = ColumnLevels.of(np.linalg.qr(rows, mode="r"))
-    X = rows.T.copy()
-    gram = levels.apply(X, 0, module.write_gram)
-    assert gram is not None
-    np.testing.assert_allclose(gram, X @ X.T, rtol=0.0, atol=1e-13 * gram.max())
-    unit = X / np.linalg.norm(X, axis=1, keepdims=True)
-    assert np.linalg.eigvalsh(unit @ unit.T).min() > module._LEAST_EIGENVALUE
-    assert 0 < len(levels.lower) < COLUMNS
-    np.testing.assert_allclose(levels.squares_before(gram), np.square(rows[:, levels.lower]).sum(0), rtol=1e-12)
-    kept = np.setdiff1d(np.arange(COLUMNS + 1), levels.lower)
-    np.testing.assert_array_equal(X[kept], rows.T[kept])
-    R = levels.undo(np.linalg.qr(X.T, mode="r"))
-    assert relative_difference(R, rows) < 1e-7, "the least singular value is 1e-8"
-
-
 @pytest.mark.parametrize("number", [np.nan, np.inf])
 @pytest.mark.parametrize("chunk", [0, 2])
 def test_numbers_that_are_not_finite_reach_the_factor(number: float, chunk: int) -> None:
     chunks = exact_rows(well_conditioned, 4)
     chunks[chunk][17, 4] = number
     assert not compressed(chunks).triangle().isfinite().all()
-
-
-def test_factors_take_turns() -> None:
-    """Rows reach the factor that they are added to, whichever came before."""
-    chunks, compressor = exact_rows(well_conditioned, 4), RowCompressor()
-    factors = [TriangularFactor(COLUMNS), TriangularFactor(COLUMNS)]
-    for number, rows in enumerate(chunks):
-        compressor.add(factors[number % 2], tuple(range(COLUMNS)), with_room(rows), 2.0)
-    compressor.finish()
-    for number, factor in enumerate(factors):
-        rows = np.vstack(chunks[number::2])
-        assert (factor.rows, factor.independent_rows) == (600, 300.0)
-        assert relative_difference(factor.triangle().numpy(), rows) < 1e-12
 
 
 def test_a_factor_is_the_same_to_the_last_bit_whatever_was_compressed_before() -> None:
@@ -226,20 +149,3 @@ def test_a_factor_is_the_same_to_the_last_bit_whatever_was_compressed_before() -
             own.add(target, tuple(range(COLUMNS)), with_room(rows))
     own.finish()
     assert torch.equal(factor.triangle(), alone.triangle())
-
-
-def test_columns_are_combined_once_a_chunk_has_many_rows(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of few rows, Householder QR is faster."""
-    chunks, support = exact_rows(well_conditioned, 3), tuple(range(COLUMNS))
-    monkeypatch.setattr(module, "_LEAST_ROWS", 301)
-    factor, compressor = TriangularFactor(COLUMNS), RowCompressor()
-    compressor.add(factor, support, with_room(chunks[0]))
-    assert support in factor.blocks
-    factorized = factor.blocks[support].clone()
-    for rows in (np.vstack(chunks[1:]), chunks[0]):
-        compressor.add(factor, support, with_room(rows))
-        assert torch.equal(factor.blocks[support], factorized)
-    compressor.finish()
-    rows = np.vstack([*chunks, chunks[0]])
-    assert factor.rows == len(rows)
-    assert relative_difference(factor.triangle().numpy(), rows) < 1e-12

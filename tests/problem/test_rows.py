@@ -15,7 +15,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_samples import NOISE, random_samples, sensor_set
-from synthetic import G1, PANDA, SOLO12, Array, load
+from synthetic import G1, Array, load
 
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
 from torchid.problem.metrics import force_series
@@ -115,23 +115,6 @@ def assert_same_rows(
 
 
 SETS = ("full", "contacts", "joints", "mixed", "nothing")
-HELD = {
-    "arm held by the hand": (PANDA, "panda_hand", [Contact("panda_link0", "flat")]),
-    "humanoid held by the torso": (
-        G1, "torso_link", [Contact("pelvis", "point"), Contact("left_ankle_roll_link", "flat")]
-    ),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("sensors", SETS)
-@pytest.mark.parametrize("case", HELD)
-def test_fast_rows_are_the_plain_ones_when_another_link_is_the_base(case: str, sensors: str) -> None:
-    urdf, base_link, contacts = HELD[case]
-    robot = load(urdf, base_link)
-    samples, state = random_samples(robot, contacts, 40, 1)
-    assert_same_rows(robot, contacts, sensor_set(sensors, robot, contacts), samples, state)
-
-
 CONTACTS = [
     *(Contact(f"corner_{corner}", "point") for corner in range(4)),
     Contact("left_sole", "flat"),
@@ -168,27 +151,6 @@ def test_four_points_on_one_rigid_foot_count_once(walker: Path, sensors: str) ->
         assert_same_rows(robot, feet, chosen, samples, state)
         rows[len(feet)] = compress([samples], RowBuilder(robot, feet, chosen)).rows
     assert rows[4] == rows[1]
-
-
-def test_straight_legs_among_bent_ones_give_the_rows_of_their_own_rank() -> None:
-    robot = load(SOLO12)
-    contacts = [Contact(f"{leg}_FOOT", "point") for leg in ("FL", "FR", "HL", "HR")]
-    samples, (q, v, a) = random_samples(robot, contacts, 40, 7)
-    q[::3, 7:] = 0.0
-    samples.joint_position[:] = torch.from_numpy(q[:, 7:])
-    samples.active[:20] = True
-    torque = np.array(["HAA" not in name for name in robot.joint_names])
-    assert_same_rows(robot, contacts, SensorSet(torque, np.zeros((4, 6), bool), NOISE), samples, (q, v, a))
-
-
-def test_a_foot_below_unmeasured_joints_of_a_bolted_robot_says_nothing() -> None:
-    robot = load(SOLO12, fixed_base=True)
-    contacts = [Contact("FL_FOOT", "point"), Contact("FR_FOOT", "point")]
-    torque = np.array([name.startswith("FR_") for name in robot.joint_names])
-    samples, state = random_samples(robot, contacts, 40, 5)
-    for wrench in (True, False):
-        sensors = SensorSet(torque, np.full((2, 6), wrench), NOISE)
-        assert_same_rows(robot, contacts, sensors, samples, state)
 
 
 @pytest.mark.parametrize("world", [False, True], ids=["local", "world"])

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from misread import World, world
-from motions import value
 from recordings import Miscalibration, in_world
 from synthetic import make_log, random_states
 from true_robots import predicted, worst
@@ -18,8 +17,6 @@ from torchid.estimators import Consistent, LeastSquares
 from torchid.logs import Log
 from torchid.problem import ExtraTerms, bind_log
 from torchid.problem.extras import CHANNELS, list_extras
-from torchid.problem.metrics import calibrate_readings
-from torchid.regressor.tree import KinematicTree
 from torchid.sensing import SensorSet, named_sensors, with_ft_sensors
 
 EXACT = 1e-7
@@ -86,38 +83,6 @@ def test_one_scale_is_found_for_each_group_and_the_robot_with_them(axes: str, of
     assert all(x.separable and np.isfinite(x.standard_error) for x in found.extras)
     state = random_states(np.random.default_rng(99), w.robot.n, 100)
     assert worst(predicted(w.robot, found.estimate.phi, *state), w.oracle.forces(*state)) < 1e-9
-
-
-def test_a_consistent_fit_finds_them_too() -> None:
-    w = world()
-    found = fitted(w, logs_of(w)[0], ExtraTerms(scales=GROUPS), Consistent())
-    assert {label: x for (_, label), x in found.values.items()} == pytest.approx(VALUES, abs=1e-4)
-
-
-def test_a_group_of_one_is_the_sensor_alone_and_one_for_each_is_what_all_says() -> None:
-    """To the last bit: columns and their order are the same."""
-    w = world()
-    logs, _ = logs_of(w)
-    names = w.robot.joint_names
-    apart, every = (fitted(w, logs, ExtraTerms(scales={"joint_torque": x})) for x in ([[n] for n in names], "all"))
-    assert apart.values == every.values
-    assert np.array_equal(apart.estimate.phi, every.estimate.phi)
-
-
-@pytest.mark.parametrize("axes", ["local", "world"])
-def test_readings_calibrated_with_the_scales_of_groups_are_the_forces(axes: str) -> None:
-    w, rng = world(), np.random.default_rng(15)
-    contacts = [(contact.frame, contact.components) for contact in CONTACTS]
-    log = make_log(w.oracle, contacts, STATES, 20, rng)
-    log = in_world(w.oracle, log) if axes == "world" else log
-    terms = ExtraTerms(scales=GROUPS)
-    extras = list_extras(w.robot, CONTACTS, sensors_of(w), terms)
-    ideal, read = (bind_log(one, w.robot, CONTACTS) for one in (log, misread(log).read(log)))
-    found = calibrate_readings(read, extras, np.array([VALUES[x.label] for x in extras]), KinematicTree(w.robot))
-    np.testing.assert_allclose(value(found.torque), value(ideal.torque), rtol=0.0, atol=1e-11)
-    touching = ideal.active[:, :, None].numpy() & np.isfinite(value(ideal.wrench).numpy())
-    assert touching.sum() > 100
-    np.testing.assert_allclose(value(found.wrench)[touching], value(ideal.wrench)[touching], rtol=0.0, atol=1e-11)
 
 
 def test_only_measured_members_of_a_group_count() -> None:

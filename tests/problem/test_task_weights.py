@@ -11,7 +11,7 @@ import torch
 from demo import shortened_demo
 from random_samples import NOISE, random_samples, sensor_set
 from repository import ROOT
-from synthetic import PANDA, Array, load
+from synthetic import Array
 
 import torchid
 from torchid.cli import main
@@ -59,42 +59,11 @@ def test_rows_are_the_weighted_errors_that_no_unmeasured_force_can_make(name: st
 
 
 @pytest.mark.parametrize("name", SETS)
-def test_equal_weights_are_a_factor_of_all_rows(name: str) -> None:
-    sensors = sensor_set(name, ROBOT, FEET)
-    plain = compress([SAMPLES], RowBuilder(ROBOT, FEET, sensors)).triangle()
-    twice = RowBuilder(ROBOT, FEET, replace(sensors, task_weights=np.full(ROBOT.n_rows, 2.0)))
-    R = compress([SAMPLES], twice).triangle()
-    torch.testing.assert_close(R.T @ R, 4.0 * plain.T @ plain, rtol=1e-10, atol=1e-10 * float(plain.square().sum()))
-
-
-def test_weights_of_a_bolted_arm_weigh_its_joints() -> None:
-    arm = load(PANDA, fixed_base=True)
-    samples = random_samples(arm, [], 20, 1)[0]
-    sensors, weights = torchid.named_sensors("joints", arm.n, 0, NOISE), np.arange(1.0, arm.n + 1.0)
-    plain, _ = RowBuilder(arm, [], sensors).rows_by_sample(samples, ())
-    weighted, _ = RowBuilder(arm, [], replace(sensors, task_weights=weights)).rows_by_sample(samples, ())
-    torch.testing.assert_close(weighted, torch.from_numpy(weights)[:, None] * plain, rtol=1e-10, atol=1e-12)
-
-
-@pytest.mark.parametrize("name", SETS)
 def test_noise_leaves_rows_of_one_but_for_weights(name: str) -> None:
     sensors = sensor_set(name, ROBOT, FEET)
     assert mean_noise_square([SAMPLES], RowBuilder(ROBOT, FEET, sensors)) == pytest.approx(1.0, rel=1e-10)
     weighted = RowBuilder(ROBOT, FEET, replace(sensors, task_weights=3.0 * np.ones(ROBOT.n_rows)))
     assert mean_noise_square([SAMPLES], weighted) == pytest.approx(9.0, rel=1e-10)
-
-
-def test_the_more_a_joint_counts_the_smaller_its_errors() -> None:
-    K = torchid.Regressor(ROBOT)(*map(torch.from_numpy, STATE))
-    air, errors = replace(SAMPLES, active=torch.zeros_like(SAMPLES.active)), []
-    for weight in (0.1, 1.0, 10.0):
-        weights = np.ones(ROBOT.n_rows)
-        weights[6 + 4] = weight
-        builder = RowBuilder(ROBOT, FEET, replace(sensor_set("joints", ROBOT, FEET), task_weights=weights))
-        fitter = torchid.LogFitter(robot=ROBOT, builder=builder, estimator=torchid.LeastSquares(ridge=1e-9))
-        phi = fitter.fit(torchid.compress_parts([air], builder)).estimate.phi
-        errors.append(float(((K @ torch.from_numpy(phi))[:, 6 + 4] - air.torque[:, 4]).square().mean()))
-    assert errors[0] > errors[1] > errors[2] > 0.0
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 
 import pytest
@@ -11,10 +10,8 @@ from random_samples import random_samples
 from synthetic import SOLO12, load
 from threadpoolctl import threadpool_info
 
-from torchid.estimators import Consistent, consistent
-from torchid.estimators.conic_problem import ConicProblem, build_conic_problem
 from torchid.parallel import one_thread, run_in_workers, thread_count
-from torchid.problem import RowBuilder, compress, linear_problem
+from torchid.problem import RowBuilder
 from torchid.problem.chunks import chunks_by_state, worker_count
 from torchid.sensing import Contact, named_sensors
 
@@ -46,14 +43,6 @@ def test_every_task_is_done_once_with_one_thread_each_and_without_gradients(work
     assert torch.get_num_threads() == before
 
 
-@pytest.mark.parametrize("tasks", [0, 1])
-def test_a_single_task_is_done_without_another_thread(tasks: int) -> None:
-    def run(own: object) -> tuple[int, list[int]]:
-        return threading.get_ident(), list(own)
-
-    assert run_in_workers(range(tasks), run, 4) == [(threading.get_ident(), list(range(tasks)))]
-
-
 def test_each_worker_gets_as_many_chunks_of_a_state_and_no_chunk_is_split_for_it() -> None:
     samples, _ = random_samples(load(SOLO12), [Contact("FL_FOOT", "point")], 100, 0, states=1)
     for chunk, expected in ((100, [100]), (60, [50, 50]), (40, [25] * 4)):
@@ -76,26 +65,6 @@ def test_a_block_with_one_thread_has_one_in_linear_algebra_and_as_many_workers_a
         assert torch.get_num_threads() == thread_count() == 2
     finally:
         torch.set_num_threads(before)
-
-
-def test_a_consistent_fit_is_built_with_one_thread_of_linear_algebra(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With two, the fit of a quadruped took 0.3 s of processor time on a busy machine instead of 0.03."""
-    robot, threads = load(SOLO12), []
-    builder = RowBuilder(robot, [], named_sensors("joints", robot.n, 0))
-    problem = linear_problem(compress([random_samples(robot, [], 64, 0)[0]], builder), builder, robot)
-
-    def watched(*arguments: object) -> ConicProblem:
-        threads.append((torch.get_num_threads(), {x["num_threads"] for x in threadpool_info() if is_blas(x)}))
-        return build_conic_problem(*arguments)
-
-    monkeypatch.setattr(consistent, "build_conic_problem", watched)
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
-        Consistent(1e-3).solve(problem)
-    finally:
-        torch.set_num_threads(before)
-    assert threads == [(1, {1})]
 
 
 def is_blas(pool: dict[str, object]) -> bool:

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from regressors import base_kinds, by_joints_of, regressor, seen_from
+from regressors import base_kinds, regressor
 from synthetic import Oracle, load, make_log, random_states
-from true_robots import hide, true_parameters, worst
+from true_robots import hide, worst
 from urdfs import BASE, inertial, joint, link, write
 from welded import CONTACTS, REAL, SENSORS, STATES, machine
 
@@ -21,7 +21,6 @@ from torchid.estimators import LeastSquares
 from torchid.identifiability.base_parameters import state_reports
 from torchid.parameters import WRENCH_COMPONENTS
 from torchid.problem import RowBuilder, Samples, bind_log, compress, linear_problem
-from torchid.problem.metrics import force_series
 from torchid.regressor import FrameJacobian
 from torchid.robot import Robot, load_robot
 from torchid.sensing import SensorSet, chosen_sensors, named_sensors, with_ft_sensors
@@ -80,35 +79,6 @@ def test_a_sensor_under_a_hanging_mass_reads_its_weight_and_beside_the_lever_its
     np.testing.assert_allclose(reading, [0, 0, -weight, 0, 0.3 * weight, 0], rtol=0.0, atol=1e-12)
 
 
-def test_without_sensors_the_robot_is_the_lumped_one(urdf: Path) -> None:
-    lumped, split = load(urdf), load(urdf, None, False, SENSORS)
-    assert lumped.ft_names == ()
-    assert lumped.dof_names == lumped.joint_names == split.joint_names
-    state = random_states(np.random.default_rng(2), lumped.n, 5)
-    np.testing.assert_array_equal(regressor(load(urdf, ft_joints=()), *state), regressor(lumped, *state))
-    forces = np.einsum("bilk,lk->bi", regressor(lumped, *state)[..., :10], lumped.nominal[:, :10])
-    found = np.einsum("bilk,lk->bi", regressor(split, *state)[..., :10], split.nominal[:, :10])[:, : split.nv]
-    np.testing.assert_allclose(found, forces, rtol=0.0, atol=EXACT * np.abs(forces).max())
-
-
-@pytest.mark.parametrize("base_link", ["hips", "hand", "sole", "fin"])
-def test_a_sensor_reads_the_same_wrench_whichever_link_is_the_base(urdf: Path, base_link: str) -> None:
-    """Held by one foot alone, so that no other force depends on what is called the base."""
-    from_root, from_other = load(urdf, None, False, SENSORS), load(urdf, base_link, False, SENSORS)
-    state = random_states(np.random.default_rng(3), from_root.n, 6)
-    moved = seen_from(Oracle.of(load(urdf)), base_link, *state)
-    moved = tuple(by_joints_of(from_root, from_other, k, x) for k, x in zip((7, 6, 6), moved, strict=True))
-    readings = []
-    for robot, motion in ((from_root, state), (from_other, moved)):
-        needed = np.einsum("bilk,lk->bi", regressor(robot, *motion)[..., :10], robot.nominal[:, :10])
-        J = FrameJacobian(robot, "foot")(torch.from_numpy(motion[0])).numpy()
-        wrench = np.linalg.solve(J[:, :, :6].transpose(0, 2, 1), needed[:, :6, None])[..., 0]
-        left = needed - np.einsum("bki,bk->bi", J, wrench)
-        order = [robot.base_rows + robot.dof_names.index(name) for name in from_root.dof_names]
-        readings.append(left[:, order])
-    np.testing.assert_allclose(readings[1], readings[0], rtol=0.0, atol=1e-12 * np.abs(readings[0]).max())
-
-
 # ------------------------------------------------------------------------------------------------ rows and fits
 
 SETS: dict[str, tuple[str, tuple[str, ...]]] = {
@@ -156,29 +126,6 @@ def test_limb_sensors_mixed_with_others_find_all_that_they_can_see(urdf: Path, n
     assert worst(found[:, seen], true[:, seen]) < 1e-11
     nominal = np.einsum("bilk,lk->bi", regressor(robot, *state), robot.nominal)
     assert worst(nominal[:, seen], true[:, seen]) > 0.01
-
-
-@base_kinds
-def test_measured_and_predicted_series_hold_the_limbs_wrenches(urdf: Path, fixed_base: bool) -> None:
-    robot = load(urdf, None, fixed_base, SENSORS)
-    oracle, samples = recorded(robot, 6, 60)
-    builder = RowBuilder(robot, CONTACTS, sensors_of(robot, "everything"))
-    measured, (predicted,) = force_series(builder, samples, true_parameters(oracle, robot).reshape(1, -1))
-    assert measured.shape == (60, robot.nv + 6 * len(SENSORS))
-    np.testing.assert_allclose(predicted, measured, rtol=0.0, atol=1e-12 * np.abs(measured).max())
-
-
-def test_the_bodies_on_both_sides_of_a_sensor_are_found_apart(urdf: Path) -> None:
-    """What no joint separates, a sensor does: all ten parameters of the sole, beyond the last weld."""
-    robot = load(urdf, None, False, SENSORS)
-    oracle, samples = recorded(robot, 7)
-    sensors = sensors_of(robot, "everything")
-    builder = RowBuilder(robot, CONTACTS, sensors)
-    estimate = LeastSquares().solve(linear_problem(compress([samples], builder), builder, robot))
-    true, sole = oracle.inertial_parameters(robot), robot.body_names.index("sole")
-    found = estimate.phi.reshape(-1, parameters.PER_BODY)[sole, :10]
-    assert estimate.identifiable.reshape(-1, parameters.PER_BODY)[sole, :10].all()
-    np.testing.assert_allclose(found, true[sole], rtol=0.0, atol=1e-10 * np.abs(true[sole]).max())
 
 
 # ----------------------------------------------------------------------------------------------------- refusals

@@ -37,20 +37,6 @@ def test_the_forces_power_is_the_rate_of_change_of_energy(urdf: Path, seed: int)
 
 @few
 @given(seed=seeds)
-@of_robots(SOLO12, PANDA)
-def test_two_robots_in_one_need_the_sum_of_their_forces(urdf: Path, seed: int) -> None:
-    robot, rng = load(urdf), np.random.default_rng(seed)
-    one, other = Oracle.of(robot), Oracle.of(robot)
-    one.perturb(rng, 0.5)
-    other.perturb(rng, 0.5)
-    state = random_states(rng, robot.n, 2)
-    both = one.inertial_parameters(robot) + other.inertial_parameters(robot)
-    found = np.einsum("bilk,lk->bi", regressor(robot, *state)[..., parameters.INERTIAL], both)
-    assert_close(found, one.frictionless_forces(*state) + other.frictionless_forces(*state))
-
-
-@few
-@given(seed=seeds)
 def test_wrenches_of_bodies_are_their_columns_times_their_parameters(small: Robot, seed: int) -> None:
     rng, tree = np.random.default_rng(seed), KinematicTree(small)
     motion = motion_from_state(*tensors(*random_states(rng, small.n, 3)), small.n)
@@ -72,66 +58,6 @@ def test_neither_place_nor_heading_matters(small: Robot, seed: int) -> None:
     heading = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi))
     elsewhere[:, 3:7] = (heading * Rotation.from_quat(q[:, 3:7])).as_quat()
     assert_close(regressor(small, elsewhere, v, a), K)
-
-
-def test_a_quaternion_is_normalized_and_one_of_norm_0_is_no_turn(small: Robot) -> None:
-    q, v, a = random_states(np.random.default_rng(0), small.n, 3)
-    K, longer = regressor(small, q, v, a), q.copy()
-    longer[:, 3:7] *= [[2.0], [-0.3], [0.0]]
-    found = regressor(small, longer, v, a)
-    assert_close(found[:2], K[:2])
-    longer[2, 3:7] = [0.0, 0.0, 0.0, 1.0]
-    assert_close(found[2], regressor(small, longer, v, a)[2])
-
-
-@few
-@given(seed=seeds)
-def test_a_robot_on_a_train_needs_the_same_forces(small: Robot, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    q, v, a = random_states(rng, small.n, 3)
-    train_base = Rotation.from_quat(q[:, 3:7]).inv().apply(10.0 * rng.normal(size=3))
-    boosted, changed = v.copy(), a.copy()
-    boosted[:, :3] += train_base
-    changed[:, :3] -= np.cross(v[:, 3:6], train_base)  # seen from the turning base, the train's velocity turns back
-    assert_close(regressor(small, q, boosted, changed), regressor(small, q, v, a), 1e-13)  # the train is fast
-
-
-@few
-@given(seed=seeds)
-def test_played_backwards_a_motion_needs_the_same_forces_but_for_friction(small: Robot, seed: int) -> None:
-    q, v, a = random_states(np.random.default_rng(seed), small.n, 3)
-    forth, back = regressor(small, q, v, a), regressor(small, q, -v, a)
-    np.testing.assert_array_equal(back[..., parameters.INERTIAL], forth[..., parameters.INERTIAL])
-    np.testing.assert_array_equal(back[..., parameters.FRICTION], -forth[..., parameters.FRICTION])
-
-
-@few
-@given(seed=seeds)
-def test_falling_freely_and_floating_without_gravity_are_the_same(small: Robot, seed: int) -> None:
-    q, v, a = random_states(np.random.default_rng(seed), small.n, 3)
-    falling = a.copy()
-    falling[:, :3] += Rotation.from_quat(q[:, 3:7]).inv().apply([0.0, 0.0, -9.81])
-    weightless = Regressor(small, gravity=(0.0, 0.0, 0.0))(*tensors(q, v, a)).numpy()
-    assert_close(regressor(small, q, v, falling).reshape(weightless.shape), weightless)
-
-
-def test_a_resting_robot_feels_its_weight_only(small: Robot) -> None:
-    q, v, _ = random_states(np.random.default_rng(10), small.n, 3)
-    f = np.einsum("bilk,lk->bi", regressor(small, q, 0.0 * v, 0.0 * v), small.nominal)
-    up = Rotation.from_quat(q[:, 3:7]).inv().apply([0.0, 0.0, 1.0])
-    np.testing.assert_allclose(f[:, :3], 9.81 * 10.0 * up, rtol=1e-14)  # five bodies of 2 kg
-    weightless = Regressor(small, gravity=(0.0, 0.0, 0.0))(*tensors(q, 0.0 * v, 0.0 * v))
-    assert not weightless.any()
-
-
-@of_robots(PANDA, UR5)
-def test_a_bolted_base_is_a_floating_one_that_does_not_move(urdf: Path) -> None:
-    floating, bolted = load(urdf), load(urdf, fixed_base=True)
-    q, v, a = random_states(np.random.default_rng(11), bolted.n, 4, fixed_base=True)
-    resting = np.zeros((4, 6))
-    standing = np.hstack([resting, np.ones((4, 1)), q])
-    K = regressor(floating, standing, np.hstack([resting, v]), np.hstack([resting, a]))
-    np.testing.assert_array_equal(regressor(bolted, q, v, a), K[:, 6:])
 
 
 def test_a_tilted_bolted_base_feels_gravity_along_its_own_axes() -> None:

@@ -10,7 +10,7 @@ import pinocchio as pin
 import pytest
 import torch
 from mujoco_oracle import joint_addresses, mujoco_forces, mujoco_model
-from regressors import assert_close, base_kinds, of_robots, regressor, tensors, without_shapes
+from regressors import assert_close, base_kinds, of_robots, regressor, without_shapes
 from synthetic import (
     ANYMAL,
     BAXTER,
@@ -29,10 +29,9 @@ from synthetic import (
     load,
     random_states,
 )
-from torch import Tensor
 
 from torchid import parameters
-from torchid.regressor import FrameJacobian, Motion, Regressor
+from torchid.regressor import FrameJacobian, Motion
 from torchid.regressor.kinematics import joint_motion
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
@@ -97,18 +96,6 @@ def test_frame_jacobians_are_pinocchios(urdf: Path, fixed_base: bool) -> None:
         np.testing.assert_allclose(J, oracle.jacobian(q, frame), rtol=0.0, atol=1e-14, err_msg=frame)
 
 
-def test_the_derivative_of_force_by_acceleration_is_pinocchios_mass_matrix() -> None:
-    robot = load(SOLO12)
-    q, v, a = random_states(np.random.default_rng(4), robot.n, 1)
-    phi = torch.from_numpy(robot.nominal).flatten()
-
-    def force(acceleration: Tensor) -> Tensor:
-        return (Regressor(robot)(*tensors(q, v), acceleration) @ phi)[0]
-
-    (found,) = torch.autograd.functional.jacobian(force, (torch.from_numpy(a),))
-    assert_close(found[:, 0].numpy(), Oracle.of(robot).mass_matrix(q[0]))
-
-
 # ---------------------------------------------------------------------------------------------------------- MuJoCo
 
 
@@ -170,22 +157,3 @@ def test_friction_of_a_mimic_joint_reaches_its_master_through_the_ratio(small: R
     power = v[:, 6 + slide, None] * K[:, 6 + slide, body, parameters.FRICTION]
     np.testing.assert_allclose(power[:, 0], 1.5 * speed, rtol=1e-15)  # the follower runs at -1.5 times the speed
     np.testing.assert_allclose(power[:, 1], 1.5**2 * speed**2, rtol=1e-15)
-
-
-@base_kinds
-@of_robots(ROMEO, BAXTER, SOLO12)
-def test_friction_acts_on_its_own_joint_alone_and_never_on_the_base(urdf: Path, fixed_base: bool) -> None:
-    robot = load(urdf, fixed_base=fixed_base)
-    state = random_states(np.random.default_rng(8), robot.n, 4, fixed_base)
-    K = regressor(robot, *state)[..., parameters.FRICTION]
-    joints = [body.joint for body in robot.bodies]
-    masters = [joint and (joint.mimic.master if joint.mimic else joint.name) for joint in joints]
-    expected = np.zeros(K.shape, dtype=bool)
-    for body, master in enumerate(masters[1:], start=1):
-        expected[:, robot.base_rows + robot.joint_names.index(str(master)), body] = True
-    np.testing.assert_array_equal(K != 0.0, expected)
-
-
-def test_a_joint_at_rest_has_no_friction(small: Robot) -> None:
-    q, v, a = random_states(np.random.default_rng(9), small.n, 2)
-    assert not regressor(small, q, 0.0 * v, a)[..., parameters.FRICTION].any()

@@ -10,7 +10,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from synthetic import ANYMAL, G1, SOLO12, Array, load, random_states
+from synthetic import ANYMAL, SOLO12, Array, load, random_states
 from torch import Tensor
 
 from torchid.regressor import FrameJacobian
@@ -95,20 +95,6 @@ def test_any_sensors_project_as_sample_by_sample_with_numpy(seed: int) -> None:
     check(scene, rng.random(robot.n) < share[0], rng.random(len(scene.components)) < share[1])
 
 
-def test_with_everything_measured_nothing_is_projected() -> None:
-    scene = Scene(robot_of(ANYMAL), FEET, 1)
-    for group in check(scene, np.ones(12, bool), np.ones(12, bool)):
-        torch.testing.assert_close(group.V, torch.eye(18, dtype=torch.float64).expand_as(group.V), rtol=0, atol=0)
-        torch.testing.assert_close(group.K, scene.K[group.index], rtol=0, atol=0)
-        assert (group.base_rank == 6).all()
-
-
-def test_contact_sensors_leave_the_base_rows_and_nothing_else() -> None:
-    for group in check(Scene(robot_of(ANYMAL), FEET, 2), np.zeros(12, bool), np.ones(12, bool)):
-        assert group.V.shape[1:] == (18, 6)
-        assert not group.V[:, 6:].any()
-
-
 def test_without_sensors_each_foot_on_the_ground_hides_more_of_the_base() -> None:
     """Points on the ground leave a body 6, 3, 1 and 0 ways to move."""
     scene = Scene(robot_of(ANYMAL), FEET, 3, samples=40)
@@ -121,13 +107,6 @@ def test_without_sensors_each_foot_on_the_ground_hides_more_of_the_base() -> Non
         assert group.K.shape[1:] == (left[feet], 9)
         assert (group.base_rank == left[feet]).all()
     assert seen == set(left)
-
-
-def test_without_contacts_a_robot_flies_in_one_state() -> None:
-    (group,) = check(Scene(robot_of(ANYMAL), [], 4), np.ones(12, bool), np.zeros(0, bool))
-    assert group.V.shape == (12, 18, 18)
-    (group,) = check(Scene(robot_of(ANYMAL), [], 4), np.zeros(12, bool), np.zeros(0, bool))
-    assert group.V.shape == (12, 18, 6)
 
 
 def test_no_samples_make_no_groups() -> None:
@@ -148,38 +127,6 @@ def test_a_bolted_base_has_no_rows_and_no_base_to_lose() -> None:
 
 
 # --------------------------------------------------------------------------------------------------- lost directions
-
-
-def test_four_points_on_a_rigid_foot_hide_what_a_flat_foot_hides() -> None:
-    scene = Scene(load(G1), [Contact("left_ankle_roll_link", "flat")], 6)
-    scene.touching[:] = True
-    torque, nothing = np.ones(29, bool), np.zeros(6, bool)
-    (flat,) = check(scene, torque, nothing)
-    points = torch.tensor([[0.1, 0.05, -0.03], [0.1, -0.05, -0.03], [-0.1, 0.05, -0.03], [-0.1, -0.05, -0.03]])
-    twist = scene.J
-    J = torch.cat(
-        [twist[:, :3] - torch.linalg.cross(p.to(twist).view(1, 3, 1), twist[:, 3:], dim=1) for p in points], 1
-    )
-    project = Projection(torque, np.zeros(12, bool))
-    active, unread = torch.ones(12, 12, dtype=torch.bool), torch.full((12, 12), torch.nan, dtype=torch.float64)
-    (group,) = project(J, active, scene.K, scene.torque, unread)
-    assert group.V.shape == flat.V.shape == (12, 35, 29)
-    torch.testing.assert_close(group.V @ group.V.mT, flat.V @ flat.V.mT, rtol=0.0, atol=1e-13)
-    torch.testing.assert_close(group.V @ group.K, flat.V @ flat.K, rtol=0.0, atol=1e-12)
-
-
-def test_each_straight_knee_hides_one_direction_of_the_base_from_the_torques() -> None:
-    """A force in the plane of hip and straight knee, along the leg, does no work on the leg's joints."""
-    scene = Scene(robot_of(SOLO12), SOLOS_FEET, 7, samples=16)
-    scene.touching[:] = True
-    rng = np.random.default_rng(7)
-    straight = torch.from_numpy(rng.random((16, 4)) < 0.5)
-    scene.q[:, [9, 12, 15, 18]] *= ~straight  # the knees
-    found = {}
-    for group in check(scene, np.ones(12, bool), np.zeros(12, bool)):
-        found |= dict(zip(group.index.tolist(), group.base_rank.tolist(), strict=True))
-    assert [found[sample] for sample in range(16)] == (6 - straight.sum(1)).tolist()
-    assert len(set(found.values())) > 3
 
 
 def test_samples_that_lose_rank_share_a_batch_with_others() -> None:
@@ -252,21 +199,6 @@ def test_what_is_not_measured_or_does_not_touch_never_reaches_the_result(noise: 
 
 
 @pytest.mark.parametrize("noise", [None, 0.5], ids=["orthonormal", "whitened"])
-def test_gradients_flow_through_regressor_and_measured_forces(noise: float | None) -> None:
-    scene = Scene(robot_of(ANYMAL), FEET, 10, samples=3)
-    project = Projection([True] * 6 + [False] * 6, [True] * 3 + [False] * 9, 6, noise, noise, noise)
-    weights = torch.randn(9, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-
-    def projected(K: Tensor, torque: Tensor, wrench: Tensor) -> Tensor:
-        groups = project(scene.J, scene.active, K @ weights, torque, wrench)
-        return torch.cat([torch.cat([group.K, group.f[..., None]], dim=2).flatten() for group in groups])
-
-    assert torch.autograd.gradcheck(
-        projected, [x.clone().requires_grad_() for x in (scene.K, scene.torque, scene.wrench)], fast_mode=True
-    )
-
-
-@pytest.mark.parametrize("noise", [None, 0.5], ids=["orthonormal", "whitened"])
 def test_projected_forces_have_their_gradient_in_the_posture(noise: float | None) -> None:
     """With feet of which nothing, part or all is measured: the null space turns with the legs."""
     scene = Scene(robot_of(ANYMAL), FEET, 11, samples=4)
@@ -306,12 +238,6 @@ def test_a_part_of_a_batch_of_another_precision_or_none_is_refused_by_name(wrong
         project(active=touching, **batch | {wrong: batch[wrong].double()})
     with pytest.raises(TypeError, match=f"^{wrong}: found NoneType; accepted: a tensor"):
         project(active=touching, **batch | {wrong: None})
-
-
-def test_masks_have_an_entry_for_each_row() -> None:
-    for masks, name in (((True, [False]), "torque_measured"), (([True], False), "wrench_measured")):
-        with pytest.raises(ValueError, match=rf"{name}: found shape \(\); accepted: a bool for each row"):
-            Projection(*masks)  # type: ignore[arg-type]
 
 
 def test_flags_that_are_numbers_are_refused_and_never_taken_for_indices() -> None:

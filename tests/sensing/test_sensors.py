@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from synthetic import ANYMAL, UR5, Oracle, load, make_log
 
 from torchid.errors import BaseLostError, BaseLostWarning, SensorError, UnknownNameError, about_file
 from torchid.identifiability.base_parameters import (
     StateReport,
-    _base_statistics,
-    merge_state_reports,
     require_base,
     state_reports,
 )
@@ -57,10 +53,6 @@ def test_what_is_unmeasured_of_some_sensors_is_named() -> None:
     assert minimized_errors(robot, FEET, sensors) == says
     arm = load(UR5, fixed_base=True)
     assert minimized_errors(arm, [], named_sensors("joints", arm.n, 0)) == "errors of joint torques"
-
-
-def test_contacts_of_the_robot_pass_unchanged() -> None:
-    assert validate_contacts(load(ANYMAL), FEET) == tuple(FEET)
 
 
 @pytest.mark.parametrize(
@@ -128,14 +120,6 @@ def test_a_sensor_that_does_not_exist_is_refused_by_the_nearest_names(
         chosen_sensors(JOINTS, SOLES, torques, wrenches)
 
 
-def test_base_rows_are_trusted_to_one_contact_sensors_noise_unless_told() -> None:
-    noise = SensorNoise(contact_force=3.0, contact_moment=0.4)
-    np.testing.assert_array_equal(noise.wrench_std, [3.0, 3.0, 3.0, 0.4, 0.4, 0.4])
-    np.testing.assert_array_equal(noise.base_std, noise.wrench_std)
-    told = SensorNoise(contact_force=3.0, base_force=7.0, base_moment=0.6)
-    np.testing.assert_array_equal(told.base_std, [7.0, 7.0, 7.0, 0.6, 0.6, 0.6])
-
-
 # --------------------------------------------------------------------------------------------------------- the base
 
 
@@ -195,38 +179,3 @@ def test_the_axes_of_line_contacts_are_named_where_the_base_is_lost() -> None:
     with pytest.raises(BaseLostError) as raised:
         require_base(lost, contacts=contacts[2:])
     assert "line_axis" not in str(raised.value)
-
-
-def test_a_bolted_base_cannot_be_lost() -> None:
-    robot = load(ANYMAL, fixed_base=True)
-    log = make_log(Oracle.of(robot), [(foot.frame, 3) for foot in FEET], [[True] * 4], 5, np.random.default_rng(1))
-    (report,) = state_reports([bind_log(log, robot, FEET)], RowBuilder(robot, FEET, named_sensors("contacts", 12, 4)))
-    assert report.base_rank is None
-    assert report.base_singular_value is None
-    require_base([report])
-
-
-def test_the_rank_is_that_of_most_samples_and_not_of_the_best() -> None:
-    values = torch.ones(64, 6)
-    values[:63, 2:] = 0.0
-    rank, smallest, full, shares = _base_statistics(values, torch.ones(64))
-    assert (rank, smallest, full) == (2, 0.0, 1 / 64)
-    assert shares == {6: 1 / 64, 2: 63 / 64}
-    with pytest.raises(BaseLostError, match=r"rank 2 of 6, 6 in 1.6 % of them"):
-        require_base([StateReport("stand", 64, 6, rank, smallest, full, shares)])
-    rank, smallest, full, shares = _base_statistics(values.flip(0), torch.tensor([1000.0] + [1.0] * 63))
-    assert rank == 6, "a sample counts as often as it stands for others"
-
-
-def test_a_sample_of_a_long_log_counts_as_one_of_a_short_log() -> None:
-    short = [StateReport("stand", 1, 6, 2, value, 0.0, {2: 1.0}) for value in (0.0, 0.1, 0.4)]
-    long = StateReport("stand", 9, 8, 6, 0.3, 1.0, {6: 1.0})
-    for logs in ([*short, long], [long, *short[::-1]]):
-        (report,) = merge_state_reports([[log] for log in logs])
-        assert (report.samples, report.rows, report.base_rank, report.base_singular_value) == (12, 8, 6, 0.3)
-        assert report.base_rank_shares == {6: pytest.approx(0.75), 2: pytest.approx(0.25)}
-        assert report.base_full_share == pytest.approx(0.75)
-    (report,) = merge_state_reports([[log] for log in short])
-    assert (report.base_rank, report.base_singular_value, report.base_full_share) == (2, 0.1, 0.0)
-    (report,) = merge_state_reports([[replace(long, samples=3)], *([log] for log in short)])
-    assert report.base_rank == 6, "which half of the samples reach"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -22,7 +21,7 @@ from torchid import __version__
 from torchid.errors import ConfigError, LogError, about_file, during, excerpt, join_names
 from torchid.fitting.experiment import Experiment, require_comparable, with_noise, with_radius
 from torchid.fitting.noise import GroupNoise, NoiseSummary
-from torchid.guards import MAX_ARRAYS, MAX_DESCRIPTION, MAX_LETTERS, MAX_TRIANGLES, check_unpacked_size
+from torchid.guards import MAX_ARRAYS, MAX_DESCRIPTION, MAX_LETTERS, check_unpacked_size
 from torchid.identifiability.base_parameters import StateReport, merge_state_reports
 from torchid.logs.containers import FACTORS, Container, open_npz, reader_errors_explained
 from torchid.parameters import Array
@@ -214,163 +213,95 @@ Whole = Annotated[int, Field(ge=0, le=2**53)]
 
 
 @dataclass(config=STRICT, frozen=True)
-class PackedPart:
-    """A part but for the numbers of its triangles, as documents of JSON have it.
+class _Part:
+    """A part but for its numbers: `blocks` are numbers of supports with those of rows, `noise_gram` of supports."""
 
-    `state`: a digit for each contact; `triangles`: number of the support, rows, whether packed as a triangle;
-    `noise_gram`: numbers of the supports.
-    """
-
-    state: str
+    state: Annotated[str, Field(pattern="^[01]*$")]
     samples: Whole
     rows: Whole
     independent_rows: NotNegative
-    masked: Annotated[list[Whole], Field(alias="gated")]  # as files of this format call it
-    triangles: list[tuple[Whole, Whole, bool]]
-    noise_gram: Annotated[list[Whole], Field(alias="surplus")]  # as files of this format call it
+    masked: list[Whole]
+    blocks: list[tuple[Whole, Whole]]
+    noise_gram: list[Whole]
 
 
-class PartPacker:
-    """Takes parts apart, one after the other."""
-
-    def __init__(self) -> None:
-        self._supports, self._values = dict[tuple[int, ...], int](), list[Array]()
-
-    @property
-    def supports(self) -> list[tuple[int, ...]]:
-        """Columns of the blocks so far, which triangles name by number."""
-        return list(self._supports)
-
-    @property
-    def values(self) -> Array:
-        """The numbers of all triangles so far."""
-        return np.concatenate([np.empty(0), *self._values])
-
-    def pack(self, parts: Sequence[Part]) -> list[dict[str, object]]:
-        """The documents of further parts, each as `PackedPart` reads it; their names and folds are not in them."""
-        out: list[dict[str, object]] = []
-        for part in parts:
-            triangles = []
-            for support, block in part.factor.blocks.items():
-                rows = block.cpu().numpy()
-                packed = len(rows) == rows.shape[1] and not np.tril(rows, -1).any()
-                self._values.append(rows[np.triu_indices(len(rows))] if packed else rows.ravel())
-                triangles.append((self._number(support), len(rows), packed))
-            for x in part.factor.noise_gram.values():
-                self._values.append(x.cpu().numpy()[np.triu_indices(len(x))])
-            out.append(
-                {
-                    "state": "".join("01"[active] for active in part.state),
-                    "samples": part.samples,
-                    "rows": part.factor.rows,
-                    "independent_rows": part.factor.independent_rows,
-                    "gated": sorted(part.masked),
-                    "triangles": triangles,
-                    "surplus": [self._number(support) for support in part.factor.noise_gram],
-                }
-            )
-        return out
-
-    def _number(self, support: tuple[int, ...]) -> int:
-        return self._supports.setdefault(support, len(self._supports))
+def _pack(parts: Sequence[Part], supports: dict[tuple[int, ...], int], values: list[Array]) -> list[dict[str, object]]:
+    """The documents of some parts, as `_Part` has them; adds to the columns that they name, and to all numbers."""
+    out: list[dict[str, object]] = []
+    for part in parts:
+        blocks, noise_gram = part.factor.blocks, part.factor.noise_gram
+        numbers = [supports.setdefault(support, len(supports)) for support in (*blocks, *noise_gram)]
+        for block in (*blocks.values(), *noise_gram.values()):
+            rows = block.cpu().numpy()
+            values.append(rows[np.triu_indices(len(rows))] if len(rows) == rows.shape[1] else rows.ravel())
+        out.append(
+            {
+                "state": "".join("01"[active] for active in part.state),
+                "samples": part.samples,
+                "rows": part.factor.rows,
+                "independent_rows": part.factor.independent_rows,
+                "masked": sorted(part.masked),
+                "blocks": [(number, len(block)) for number, block in zip(numbers, blocks.values(), strict=False)],
+                "noise_gram": numbers[len(blocks) :],
+            }
+        )
+    return out
 
 
-class PartReader:
-    """Parts of a log, read one after the other; ValueError where one cannot be that of a log."""
+class _PartReader:
+    """Reads the parts of a log, one after the other; ValueError where one cannot be that of a log."""
 
-    def __init__(
-        self,
-        values: Array,
-        supports: Sequence[Sequence[int]],
-        columns: int,
-        contacts: int,
-        extras: int,
-        most: float = math.inf,
-    ) -> None:
-        """Nothing is read yet.
+    def __init__(self, source: str, description: _Description, values: Array) -> None:
+        settings = description.settings
+        columns, contacts = settings.get("columns"), settings.get("contacts")
+        if not isinstance(columns, int) or columns < 1 or not isinstance(contacts, list):
+            raise ValueError("neither columns nor contacts")
+        self._source, self._values, self._taken = source, values, 0
+        self._columns, self._contacts = columns, len(contacts)
+        self._supports = [tuple(support) for support in description.supports]
+        if any(len(set(x)) != len(x) or max(x, default=0) >= columns for x in self._supports):
+            raise ValueError(f"columns that are not among {columns}")
 
-        Args:
-            values: numbers of all triangles.
-            supports: columns of blocks, that triangles name by number.
-            columns: how many the problem has.
-            contacts: how many there are.
-            extras: how many extra parameters there are.
-            most: triangles.
-        """
-        self._columns, self._contacts, self._extras, self._most = columns, contacts, extras, most
-        self._supports = [_support(one, columns) for one in supports]
-        self._stream, self._triangles = _Stream(values), 0
-
-    @property
-    def numbers_left(self) -> int:
-        """Numbers that belong to no part so far."""
-        return self._stream.left
-
-    def read(self, source: str, one: PackedPart, unloaded: bool = False) -> Part:
-        """The next part, of a log of this name."""
-        self._triangles += 1 + len(one.triangles) + len(one.noise_gram)
-        if self._triangles > self._most:
-            raise ValueError(f"more than {self._most} triangles")
-        if len(one.state) != self._contacts or set(one.state) - {"0", "1"}:
-            raise ValueError(f"contact state {one.state[:MAX_LETTERS]!r}")
-        if max(one.masked, default=-1) >= self._extras or (unloaded and one.samples):
-            raise ValueError("readings in the air of a sensor that is none")
+    def read(self, one: _Part, unloaded: bool = False) -> Part:
+        """The next part."""
+        if len(one.state) != self._contacts or (unloaded and one.samples):
+            raise ValueError("a part of other contacts or samples")
         if not one.independent_rows <= one.rows or (one.rows and not one.independent_rows):
             raise ValueError(f"{one.independent_rows:g} independent of {one.rows} rows")
-        triangles = {}
-        for number, rows, packed in one.triangles:
-            support = self._supports[number]
-            triangles[support] = self._stream.triangle(len(support) + 1, rows, packed)
-        noise_gram = {}
-        for number in one.noise_gram:
-            width = len(self._supports[number]) + 1
-            half = self._stream.triangle(width, width, packed=True)
-            noise_gram[self._supports[number]] = half + half.triu(1).T
-        if len(triangles) != len(one.triangles) or len(noise_gram) != len(one.noise_gram):
+        blocks = {self._supports[number]: self._block(number, rows) for number, rows in one.blocks}
+        halves = {self._supports[n]: self._block(n, len(self._supports[n]) + 1) for n in one.noise_gram}
+        if len(blocks) != len(one.blocks) or len(halves) != len(one.noise_gram):
             raise ValueError("the same columns twice")
-        factor = TriangularFactor.from_blocks(self._columns, one.rows, one.independent_rows, triangles, noise_gram)
+        noise_gram = {support: half + half.triu(1).T for support, half in halves.items()}
+        factor = TriangularFactor.from_blocks(self._columns, one.rows, one.independent_rows, blocks, noise_gram)
         state = tuple(digit == "1" for digit in one.state)
-        return Part(source, state, factor, one.samples, unloaded=unloaded, masked=set(one.masked))
+        return Part(self._source, state, factor, one.samples, unloaded=unloaded, masked=set(one.masked))
 
-
-def _support(columns: Sequence[int], count: int) -> tuple[int, ...]:
-    if len(set(columns)) != len(columns) or max(columns, default=0) >= count:
-        raise ValueError(f"columns that are not among {count}")
-    return tuple(columns)
-
-
-class _Stream:
-    """The numbers of all triangles, one after the other."""
-
-    def __init__(self, values: Array) -> None:
-        self._values, self._taken = values, 0
-
-    @property
-    def left(self) -> int:
-        return len(self._values) - self._taken
-
-    def triangle(self, width: int, rows: int, packed: bool) -> torch.Tensor:
-        """The next triangle, or rows too few to make one, (rows, width); ValueError if there are not enough."""
-        if rows > width or (packed and rows != width):
-            raise ValueError(f"{rows} rows of {width} numbers")
-        size = width * (width + 1) // 2 if packed else rows * width
-        if size > self.left:
-            raise ValueError("fewer numbers than are described")
+    def _block(self, number: int, rows: int) -> torch.Tensor:
+        """The next triangle, or rows too few to make one, in some columns and the right-hand side."""
+        width = len(self._supports[number]) + 1
+        size = width * (width + 1) // 2 if rows == width else rows * width
+        if rows > width or size > len(self._values) - self._taken:
+            raise ValueError("other numbers than are described")
         values = self._values[self._taken : self._taken + size]
         self._taken += size
-        if not packed:
+        if rows < width:
             return torch.from_numpy(values.reshape(rows, width).copy())
         triangle = np.zeros((width, width))
         triangle[np.triu_indices(width)] = values
         return torch.from_numpy(triangle)
 
+    def require_all_read(self) -> None:
+        """Refuse numbers that belong to no part."""
+        if self._taken < len(self._values):
+            raise ValueError("more numbers than are described")
 
-FORMAT = 3
+
+FORMAT = 4
 """Version of the format, a whole number that grows whenever a reader of an older version would be wrong."""
 
 _ACCEPTED = f"a whole {FACTORS} file, as torchid compress writes it"
 _GEOMETRY = ("T_parent_joint", "T_joint_link", "joint_map", "joint_constant", "contact_node", "T_node_contact")
-_EXTRAS = ("sensors.offsets", "sensors.scales", "actuators")
 _LARGEST = 1e30  # of a number: squares stay within the range of float64
 _Text = Annotated[str, Field(max_length=10 * MAX_LETTERS)]
 _Origin = Literal["estimated", "pooled", "at most", "confounded", "assumed"]
@@ -419,13 +350,6 @@ class _State:
 
 
 @dataclass(config=STRICT, frozen=True)
-class _Unloaded:
-    start: Whole
-    stop: Whole
-    parts: list[PackedPart]
-
-
-@dataclass(config=STRICT, frozen=True)
 class _Description:
     format: int
     torchid: _Text
@@ -439,13 +363,13 @@ class _Description:
     blocks: Annotated[int, Field(ge=1, le=FOLDS)]
     settings: dict[str, Value]
     noise: dict[str, Annotated[Number, Field(gt=0.0)]]
-    pieces: list[PackedPart]
-    by_state: list[PackedPart]
-    unloaded: list[_Unloaded]
+    pieces: list[_Part]
+    by_state: list[_Part]
+    unloaded: list[tuple[Whole, Whole, list[_Part]]]
     supports: list[list[Whole]]
     states: list[_State]
-    payloads: list[Payload] = field(default_factory=list)
-    noise_origins: dict[str, _Origin] = field(default_factory=dict)
+    payloads: list[Payload]
+    noise_origins: dict[str, _Origin]
 
 
 _DESCRIPTION: TypeAdapter[_Description] = TypeAdapter(_Description)
@@ -518,7 +442,8 @@ def _require_suffix(path: Path) -> None:
 
 def _packed(factors: FactorFile) -> tuple[dict[str, object], Array]:
     """The description, and the numbers of all triangles."""
-    log, packer = factors.log, PartPacker()
+    log = factors.log
+    supports, values = dict[tuple[int, ...], int](), list[Array]()
     description = {
         "format": FORMAT,
         "torchid": factors.version,
@@ -532,17 +457,15 @@ def _packed(factors: FactorFile) -> tuple[dict[str, object], Array]:
         "blocks": log.blocks,
         "settings": factors.model.settings,
         "noise": factors.model.noise,
-        "pieces": packer.pack(log.pieces),
-        "by_state": packer.pack(log.by_state),
-        "unloaded": [{"start": a, "stop": b, "parts": packer.pack(parts)} for (a, b), parts in log.unloaded.items()],
-        "supports": packer.supports,
+        "pieces": _pack(log.pieces, supports, values),
+        "by_state": _pack(log.by_state, supports, values),
+        "unloaded": [(*span, _pack(parts, supports, values)) for span, parts in log.unloaded.items()],
+        "supports": list(supports),
         "states": [asdict(state) for state in factors.states],
+        "payloads": factors.payloads,
+        "noise_origins": factors.noise_origins,
     }
-    if factors.payloads:  # a file of a robot without stays what it was
-        description["payloads"] = factors.payloads
-    if factors.noise_origins:
-        description["noise_origins"] = factors.noise_origins
-    return description, packer.values
+    return description, np.concatenate([np.empty(0), *values])
 
 
 # ------------------------------------------------------------------------------------------------------------- reading
@@ -586,33 +509,19 @@ def _array(container: Container, name: str, dtype: type, dimensions: int | None 
 def _log(source: str, description: _Description, values: Array) -> CompressedLog:
     """The compressed log; ValueError if it cannot be one."""
     samples, blocks = description.samples, description.blocks
-    parts = PartReader(values, description.supports, *_sizes(description.settings), MAX_TRIANGLES)
-    pieces, by_state = (
-        [parts.read(source, one) for one in same] for same in (description.pieces, description.by_state)
-    )
-    unloaded = {
-        (x.start, x.stop): [parts.read(source, one, unloaded=True) for one in x.parts] for x in description.unloaded
-    }
-    spans = {span for count in range(1, blocks + 1) for span in block_spans(samples, count)}
-    if not set(unloaded) <= spans or len(unloaded) != len(description.unloaded):
+    parts = _PartReader(source, description, values)
+    pieces = [parts.read(one) for one in description.pieces]
+    by_state = [parts.read(one) for one in description.by_state]
+    unloaded = {(start, stop): [parts.read(x, unloaded=True) for x in own] for start, stop, own in description.unloaded}
+    parts.require_all_read()
+    if not set(unloaded) <= {span for count in range(1, blocks + 1) for span in block_spans(samples, count)}:
         raise ValueError("readings in the air of what is no block of the log")
     if [part.samples for part in pieces] != [stop - start for start, stop in piece_spans(samples, blocks)]:
         raise ValueError("pieces of other samples than those of the log")
     if sum(part.samples for part in by_state) != samples or len({part.state for part in by_state}) != len(by_state):
         raise ValueError("contact states of other samples than those of the log")
-    if parts.numbers_left:
-        raise ValueError("more numbers than are described")
     noise = description.oversampling, description.noise_left
     return CompressedLog(source, samples, *noise, blocks, pieces, by_state, unloaded)
-
-
-def _sizes(settings: Mapping[str, Value]) -> tuple[int, int, int]:
-    """Numbers of columns, contacts and extra parameters; ValueError without them."""
-    columns, contacts = settings.get("columns"), settings.get("contacts")
-    if not isinstance(columns, int) or columns < 1 or not isinstance(contacts, list):
-        raise ValueError("neither columns nor contacts")
-    labels = (settings.get(key) for key in _EXTRAS)
-    return columns, len(contacts), sum(len(x) for x in labels if isinstance(x, list))
 
 
 _THE_EXPERIMENT = "the experiment file"

@@ -255,7 +255,8 @@ def compress_in_blocks(
         progress: called with the number of samples done.
         weight_rows: as in `compress_parts`.
     """
-    return compress_parts(_in_about_twenty_blocks(logs, builder), builder, None, None, progress, weight_rows)
+    in_blocks_of_folds = _in_about_twenty_blocks(logs, builder)
+    return compress_parts(in_blocks_of_folds, builder, progress=progress, weight_rows=weight_rows)
 
 
 def _compress_chunks(

@@ -16,7 +16,7 @@ from torchid.errors import format_percent, join_names
 from torchid.logs.lazy_arrays import Spill
 from torchid.parallel import one_thread
 from torchid.parameters import GRAVITY, MASS, Array
-from torchid.problem.chunks import ProgressCallback, blocks_in, chunks_by_state, map_chunks
+from torchid.problem.chunks import CHUNK, ProgressCallback, blocks_in, chunks_by_state, map_chunks
 from torchid.problem.contact_state import ContactState
 from torchid.problem.extras import ACTUATORS, Extra, ExtraTerms, contact_extra_column, dof_extra_column
 from torchid.problem.rows import ChunkDynamics, ChunkKinematics, RowBuilder, leave_out_torques
@@ -208,30 +208,37 @@ def _predicted(builder: RowBuilder, samples: Samples, kinematics: ChunkKinematic
     return predicted
 
 
+def _on_device(
+    builder: RowBuilder, samples: Samples, chunk: int = CHUNK
+) -> Iterator[tuple[Samples, ContactState, slice | np.ndarray]]:
+    """A log in chunks of one contact state on the builder's device, and where in its order these belong."""
+    for state, index in chunks_by_state(samples, chunk):
+        yield samples[index].to(builder.device), state, index if isinstance(index, slice) else index.numpy()
+
+
+@one_thread()
+@torch.no_grad()
 def noise_series(builder: RowBuilder, samples: Samples, noise: SensorNoise) -> Array:
     """Standard deviation of the measured forces of a log in its order by `reading_variance`, (N, n_rows) [N, N m]."""
     out = np.empty((len(samples), builder.tree.n_rows))
-    with torch.no_grad(), one_thread():
-        for state, index in chunks_by_state(samples):
-            chunk = samples[index].to(builder.device)
-            variance = reading_variance(builder, chunk, state, builder.kinematics(chunk), noise)
-            out[index if isinstance(index, slice) else index.numpy()] = variance.sqrt().cpu().numpy()
+    for chunk, state, where in _on_device(builder, samples):
+        variance = reading_variance(builder, chunk, state, builder.kinematics(chunk), noise)
+        out[where] = variance.sqrt().cpu().numpy()
     return out
 
 
+@one_thread()
+@torch.no_grad()
 def force_series(builder: RowBuilder, samples: Samples, phi: Array) -> tuple[Array, Array]:
     """Measured (N, n_rows) and predicted (M, N, n_rows) forces of a log in its order, `phi` as for `to_columns`."""
     columns = builder.to_columns(phi)
     n_rows = builder.tree.n_rows
     measured, predicted = np.empty((len(samples), n_rows)), np.empty((len(phi), len(samples), n_rows))
-    with torch.no_grad(), one_thread():
-        for state, index in chunks_by_state(samples):
-            chunk = samples[index].to(builder.device)
-            by_fold, kinematics = {chunk.fold: columns}, builder.kinematics(chunk)
-            forces = measured_and_predicted_forces(builder, chunk, state, by_fold, kinematics)
-            where = index if isinstance(index, slice) else index.numpy()
-            measured[where] = forces.measured.cpu().numpy()
-            predicted[:, where] = forces.predicted.cpu().numpy()
+    for chunk, state, where in _on_device(builder, samples):
+        by_fold, kinematics = {chunk.fold: columns}, builder.kinematics(chunk)
+        forces = measured_and_predicted_forces(builder, chunk, state, by_fold, kinematics)
+        measured[where] = forces.measured.cpu().numpy()
+        predicted[:, where] = forces.predicted.cpu().numpy()
     return measured, predicted
 
 
@@ -267,30 +274,29 @@ def pressure_centres(
     return centre_of_pressure(wrench, normal, -(soles @ normal[..., None]).mean((1, 2)), least)
 
 
+@one_thread()
+@torch.no_grad()
 def pressure_series(builder: RowBuilder, samples: Samples, wrenches: Array, least: float) -> Array:
     """`pressure_centres` of wrenches (M, N, 6) of a log in its order, (M, N, 3) [m]."""
     out = np.empty((*wrenches.shape[:2], 3))
-    with torch.no_grad(), one_thread():
-        for state, index in chunks_by_state(samples):
-            chunk, where = samples[index].to(builder.device), index if isinstance(index, slice) else index.numpy()
-            wrench, kinematics = torch.from_numpy(wrenches[:, where]).to(chunk.time), builder.kinematics(chunk)
-            out[:, where] = pressure_centres(builder, chunk, state, kinematics, wrench, least).cpu().numpy()
+    for chunk, state, where in _on_device(builder, samples):
+        wrench, kinematics = torch.from_numpy(wrenches[:, where]).to(chunk.time), builder.kinematics(chunk)
+        out[:, where] = pressure_centres(builder, chunk, state, kinematics, wrench, least).cpu().numpy()
     return out
 
 
+@one_thread()
+@torch.no_grad()
 def null_space_part(builder: RowBuilder, samples: Samples, forces: Array) -> Array:
     """V_x V_x^T f of generalized forces (M, N, n_rows): the part of each row inside the builder's null space."""
-    out, base = forces.copy(), builder.tree.base_rows
-    with torch.no_grad(), one_thread():
-        for state, index in chunks_by_state(samples):
-            where = np.arange(len(samples))[index if isinstance(index, slice) else index.numpy()]
-            coupled = [*range(base), *(base + joint for joint in builder.layout(state).coupled_joints)]
-            kinematics = builder.kinematics(samples[index].to(builder.device))
-            for part, V in builder.null_space_bases(state, kinematics):
-                chosen = where[part if isinstance(part, slice) else part.cpu().numpy()]
-                at = np.ix_(np.arange(len(forces)), chosen, coupled)
-                inside = V @ (V.mT @ torch.from_numpy(forces[at]).to(V)[..., None])
-                out[at] = inside[..., 0].cpu().numpy()
+    out, base, every = forces.copy(), builder.tree.base_rows, np.arange(len(samples))
+    for chunk, state, where in _on_device(builder, samples):
+        coupled = [*range(base), *(base + joint for joint in builder.layout(state).coupled_joints)]
+        for part, V in builder.null_space_bases(state, builder.kinematics(chunk)):
+            chosen = every[where][part if isinstance(part, slice) else part.cpu().numpy()]
+            at = np.ix_(np.arange(len(forces)), chosen, coupled)
+            inside = V @ (V.mT @ torch.from_numpy(forces[at]).to(V)[..., None])
+            out[at] = inside[..., 0].cpu().numpy()
     return out
 
 
@@ -319,17 +325,16 @@ def null_space_components(
         yield torch.cat([inside, alone[:, index]], dim=2)
 
 
+@one_thread()
+@torch.no_grad()
 def at_motors(builder: RowBuilder, samples: Samples, forces: Array) -> Array:
     """Generalized forces of a log in its order, (M, N, n_rows), as the motors of closed loops feel them."""
     if builder.motors.none:
         return forces
     out = forces.copy()
-    with torch.no_grad(), one_thread():
-        for _, index in chunks_by_state(samples):
-            kinematics = builder.kinematics(samples[index].to(builder.device))
-            where = index if isinstance(index, slice) else index.numpy()
-            part = torch.from_numpy(forces[:, where]).to(kinematics.screw_axes)
-            out[:, where] = builder.motors.of(builder.tree, kinematics, part).cpu().numpy()
+    for chunk, _, where in _on_device(builder, samples):
+        part = torch.from_numpy(forces[:, where]).to(chunk.time)
+        out[:, where] = builder.motors.of(builder.tree, builder.kinematics(chunk), part).cpu().numpy()
     return out
 
 
@@ -350,6 +355,8 @@ class ProjectedForces:
     noise: Array
 
 
+@one_thread()
+@torch.no_grad()
 def projected_forces(builder: RowBuilder, samples: Samples, phi: torch.Tensor) -> ProjectedForces:
     """The rows of a fit, W^T [K phi, f], mapped back by W (W^T W)^-1, whose span is that of V_x.
 
@@ -360,21 +367,18 @@ def projected_forces(builder: RowBuilder, samples: Samples, phi: torch.Tensor) -
     """
     shape = len(samples), builder.tree.n_rows
     measured, noise, predicted = np.empty(shape), np.empty(shape), np.empty((len(phi), *shape))
-    with torch.no_grad(), one_thread():
-        for state, index in chunks_by_state(samples, _CHUNK):
-            chunk = samples[index].to(builder.device)
-            rows, W = builder.rows_by_sample(chunk, state)
-            gram = W.mT @ W
-            gram.diagonal(dim1=1, dim2=2)[(W == 0.0).all(1)] = 1.0  # of samples with fewer rows
-            back = torch.linalg.solve(gram, W.mT).mT
-            forces = back @ torch.cat([rows[..., -1:], rows[..., :-1] @ phi.T], dim=2)
-            forces[(W == 0.0).all(2)] = torch.nan
-            where = index if isinstance(index, slice) else index.numpy()
-            measured[where] = forces[..., 0].cpu().numpy()
-            predicted[:, where] = forces[..., 1:].permute(2, 0, 1).cpu().numpy()
-            noise[where] = (back.square().sum(2) * chunk.noise_left).sqrt().cpu().numpy()
-            if builder.task_weights is not None:
-                noise[where] = np.nan  # rows are white in other units
+    for chunk, state, where in _on_device(builder, samples, _CHUNK):
+        rows, W = builder.rows_by_sample(chunk, state)
+        gram = W.mT @ W
+        gram.diagonal(dim1=1, dim2=2)[(W == 0.0).all(1)] = 1.0  # of samples with fewer rows
+        back = torch.linalg.solve(gram, W.mT).mT
+        forces = back @ torch.cat([rows[..., -1:], rows[..., :-1] @ phi.T], dim=2)
+        forces[(W == 0.0).all(2)] = torch.nan
+        measured[where] = forces[..., 0].cpu().numpy()
+        predicted[:, where] = forces[..., 1:].permute(2, 0, 1).cpu().numpy()
+        noise[where] = (back.square().sum(2) * chunk.noise_left).sqrt().cpu().numpy()
+        if builder.task_weights is not None:
+            noise[where] = np.nan  # rows are white in other units
     return ProjectedForces(measured, predicted, noise)
 
 
