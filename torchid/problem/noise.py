@@ -22,8 +22,6 @@ import numpy as np
 import scipy.linalg
 import scipy.optimize
 import torch
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.special import chdtri, ndtr
 from torch import Tensor
 
@@ -57,8 +55,7 @@ class SampledChunk:
     """Samples of one log in one contact state.
 
     `rows`, (B, n_rows, width + 1), whitened with the noise of the builder; `sources`, (B, E, n_rows), one standard
-    deviation of each source of noise in these rows. `blocks`: numbers of sources, (k, e), and of rows, (k, r), that
-    have nothing to do with others, for all k that have as many.
+    deviation of each source of noise in these rows.
     """
 
     log: str
@@ -66,7 +63,6 @@ class SampledChunk:
     oversampling: float
     rows: Tensor
     sources: Tensor
-    blocks: tuple[tuple[Tensor, Tensor], ...]
 
 
 @dataclass(frozen=True)
@@ -134,8 +130,7 @@ class SampledRows:
     def _chunk(self, samples: Samples, state: ContactState) -> SampledChunk:
         rows, W = self.builder.rows_by_sample(samples.to(self.builder.device), state)
         sources = (self._unit_forces(samples.to(self.builder.device)) @ W).cpu() * self._std[:, None]
-        blocks = _blocks((sources != 0.0).any(0).numpy())
-        return SampledChunk(samples.source, state, samples.oversampling, rows.cpu().double(), sources.double(), blocks)
+        return SampledChunk(samples.source, state, samples.oversampling, rows.cpu().double(), sources.double())
 
     def _unit_forces(self, samples: Samples) -> Tensor:
         """Generalized force of a unit of each noise source, (B, E, n_rows)."""
@@ -162,22 +157,10 @@ class SampledRows:
         """
         if (variance == 1.0).all():
             return replace(chunk, rows=chunk.rows[::step])
-        scale = torch.from_numpy(np.sqrt(variance)[self.group_of])
-        before, sources, coupled = chunk.rows[::step], torch.zeros_like(chunk.sources), []
-        std = torch.ones_like(before[..., :1])  # of rows on their own
-        for own, slots in chunk.blocks:
-            of = slice(None), own[..., None], slots[:, None]
-            U = scale[of[1]] * chunk.sources[of]
-            L = noise_root(U)
-            sources[of] = whitened(L, U.mT).mT
-            if slots.shape[1] == 1:
-                std[:, slots[:, 0]] = L[::step, ..., 0]
-            else:
-                coupled.append((slots, L[::step]))
-        rows = before / std
-        for slots, L in coupled:
-            rows[:, slots] = whitened(L, before[:, slots])
-        return replace(chunk, rows=rows, sources=sources)
+        sources = torch.from_numpy(np.sqrt(variance)[self.group_of])[:, None] * chunk.sources
+        L = noise_root(sources)
+        rows = torch.linalg.solve_triangular(L[::step], chunk.rows[::step], upper=False)
+        return replace(chunk, rows=rows, sources=torch.linalg.solve_triangular(L, sources.mT, upper=False).mT)
 
     @one_thread()
     def compress(self, variance: Array, columns: Mapping[str, Tensor] | None = None) -> list[Part]:
@@ -216,34 +199,9 @@ class SampledRows:
 
 
 def noise_root(sources: Tensor) -> Tensor:
-    """L (..., r, r) with `L L^T` the covariance of rows that have these sources (..., e, r); 1 of rows of zeros."""
-    if sources.shape[-1] == 1:
-        size = torch.linalg.vector_norm(sources, dim=-2, keepdim=True)
-        return torch.where(size == 0.0, 1.0, size)
+    """L (B, r, r) with `L L^T` the covariance of rows that have these sources (B, e, r); 1 of rows of zeros."""
     S = sources.mT @ sources
     return torch.linalg.cholesky(S + torch.diag_embed((S.diagonal(dim1=-2, dim2=-1) == 0.0).to(S)))
-
-
-def whitened(root: Tensor, rows: Tensor) -> Tensor:
-    """L^-1 X of rows X (..., r, columns) with such a root (..., r, r): a quotient where r is 1."""
-    return rows / root if root.shape[-1] == 1 else torch.linalg.solve_triangular(root, rows, upper=False)
-
-
-def _blocks(present: np.ndarray) -> tuple[tuple[Tensor, Tensor], ...]:
-    """`SampledChunk.blocks` by which source is in which row, (E, n_rows)."""
-    sources, rows = np.nonzero(present)
-    count, size = len(present), sum(present.shape)
-    linked = coo_array((np.ones(len(rows)), (sources, count + rows)), (size, size))
-    label = connected_components(linked, directed=False)[1]
-    alike: dict[tuple[int, int], list[tuple[np.ndarray, np.ndarray]]] = {}
-    for number in np.unique(label[sources]):
-        of = np.flatnonzero(label == number)
-        block = of[of < count], of[of >= count] - count
-        alike.setdefault((len(block[0]), len(block[1])), []).append(block)
-    return tuple(
-        (torch.from_numpy(np.stack([own for own, _ in blocks])), torch.from_numpy(np.stack([own for _, own in blocks])))
-        for blocks in alike.values()
-    )
 
 
 def _sources_of_scales(builder: RowBuilder) -> dict[int, list[int]]:
@@ -523,17 +481,13 @@ class VarianceComponentEstimator:
 
         def of_chunk(number: int) -> tuple[Tensor, Tensor, Tensor]:
             chunk, r = self.rows.chunks[number], residuals.r[number]
-            M, size = torch.zeros(count, count, dtype=torch.float64), r.new_zeros(len(r), len(group_of))
-            score = torch.zeros_like(size)
-            for own, slots in chunk.blocks:
-                sources = scale[own[..., None]] * chunk.sources[:, own[..., None], slots[:, None]]
-                both = torch.cat([sources.mT, r[:, slots, None]], dim=3)
-                solved = whitened(noise_root(sources), both)
-                white, y = solved[..., :-1], solved[..., -1:]  # (B, k, r, e), (B, k, r, 1)
-                pairs = index[own[..., None]], index[own[:, None]]
-                M.index_put_(pairs, (white.mT @ white).square().sum(0), accumulate=True)
-                size[:, own], score[:, own] = white.square().sum(2), (white.mT @ y)[..., 0]
-            return M, size, score
+            sources = scale[:, None] * chunk.sources
+            both = torch.cat([sources.mT, r[..., None]], dim=2)
+            solved = torch.linalg.solve_triangular(noise_root(sources), both, upper=False)
+            white, y = solved[..., :-1], solved[..., -1:]  # (B, n_rows, E), (B, n_rows, 1)
+            M = torch.zeros(count, count, dtype=torch.float64)
+            M.index_put_((index[:, None], index), (white.mT @ white).square().sum(0), accumulate=True)
+            return M, white.square().sum(1), (white.mT @ y)[..., 0]
 
         parts = map_in_workers(range(len(residuals.r)), of_chunk)
         M = torch.stack([x for x, *_ in parts]).sum(0)
