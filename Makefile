@@ -3,11 +3,10 @@ PYTHON ?= python3
 PIP := .venv/bin/pip --disable-pip-version-check
 
 # Tests of single parts: no commands, descents, bags, property tests of whole rows, nor comparisons over many robots.
-FAST := tests/config tests/logs tests/robot tests/regressor tests/sensing tests/problem/test_rows.py \
+FAST := tests/config tests/logs tests/robot tests/regressor tests/sensing tests/problem/test_rows_two_ways.py \
 	tests/estimators/test_conditions.py tests/estimators/test_least_squares.py tests/estimators/test_penalties.py
 SLOW := tests/logs/test_bags.py tests/logs/test_bag_messages.py tests/logs/test_bag_stamps.py tests/logs/test_mutations.py \
-	tests/regressor/test_oracle.py tests/robot/test_shapes.py \
-	tests/problem/test_rows.py::test_fast_rows_are_the_plain_ones_whatever_is_measured_touches_and_however_frames_are_turned
+	tests/regressor/test_oracle.py tests/robot/test_shapes.py
 SIM := tests/simulation tests/robot tests/report tests/commands/test_mjcf_runs.py tests/commands/test_replay.py \
 	tests/commands/test_closed_loops.py
 TESTS ?= tests

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from motions import value
+from random_samples import random_samples
 from scipy.linalg import null_space
-from synthetic import Array, Oracle, load, make_log
+from synthetic import G1, TALOS_FULL, Array, Oracle, load, make_log
 from welded import CONTACTS, SENSORS, STATES, machine
 
-from torchid.problem import bind_log
+from torchid.problem import RowBuilder, Samples, bind_log
 from torchid.problem.metrics import Evaluation, force_series
+from torchid.regressor import FrameJacobian, Regressor
+from torchid.robot import Robot
+from torchid.sensing import Contact, named_sensors
 
 
 def rms(x: Array) -> float:
@@ -97,3 +103,53 @@ def test_joint_torques_are_said_to_be_of_limbs_in_the_air_only_where_no_others_c
         "none": "joint torque, limbs in the air [N m]",
         "flight": "joint torque [N m]",
     }
+
+
+SOLES = [Contact("left_sole_link", "flat"), Contact("right_sole_link", "line")]
+
+
+def local_wrenches(robot: Robot, contacts: Sequence[Contact], samples: Samples) -> torch.Tensor:
+    """Wrenches (B, C, 6) along the contact frames' axes, turned by pytorch-kinematics' poses."""
+    assert samples.wrench is not None
+    if not samples.wrench_in_world:
+        return samples.wrench
+    poses = robot.link_poses(samples.joint_position)
+    R = torch.stack([samples.base.rotation @ poses[c.frame][:, :3, :3] for c in contacts], dim=1)
+    return (samples.wrench.unflatten(2, (2, 3)) @ R).flatten(2)
+
+
+@pytest.mark.parametrize("world", [False, True], ids=["local", "world"])
+def test_evaluation_measures_and_predicts_what_the_plain_path_does(world: bool) -> None:
+    robot, rng = load(TALOS_FULL), np.random.default_rng(4)
+    samples, state = random_samples(robot, SOLES, 40, rng, world)
+    builder = RowBuilder(robot, SOLES, named_sensors("full", robot.n, len(SOLES)))
+    phi = rng.normal(size=(3, robot.nominal.size))
+    phi.reshape(3, -1, 12)[:, 0, 10:] = 0.0  # the base has no joint
+    measured, predicted = force_series(builder, samples, phi)
+    q, v, a = map(torch.from_numpy, state)
+    expected = torch.nn.functional.pad(samples.torque, (6, 0))
+    wrench = local_wrenches(robot, SOLES, samples)
+    for place, contact in enumerate(SOLES):
+        used = list(contact.components)
+        pushing = (wrench[:, place] * samples.active[:, place, None])[:, used]
+        expected += (FrameJacobian(robot, contact.frame)(q)[:, used].mT @ pushing[..., None])[..., 0]
+    np.testing.assert_allclose(measured, expected, rtol=0.0, atol=1e-13 * float(expected.abs().max()))
+    K = Regressor(robot)(q, v, a).numpy()
+    expected_forces = np.einsum("bip,mp->mbi", K, phi)
+    np.testing.assert_allclose(predicted, expected_forces, rtol=0.0, atol=1e-13 * np.abs(expected_forces).max())
+
+
+def test_an_unmeasured_wrench_leaves_the_joints_that_it_does_not_load_measured() -> None:
+    robot = load(G1)
+    contacts = [Contact("left_ankle_roll_link", "flat"), Contact("right_ankle_roll_link", "flat")]
+    samples, _ = random_samples(robot, contacts, 40, 6)
+    builder = RowBuilder(robot, contacts, named_sensors("joints", robot.n, 2))
+    known, _ = force_series(builder, samples, robot.nominal.reshape(1, -1))
+    samples.wrench[:, 0] = torch.nan
+    measured, _ = force_series(builder, samples, robot.nominal.reshape(1, -1))
+    leg = [f"left_{part}_joint" for part in ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")]
+    loaded = np.concatenate([np.ones(6, bool), np.isin(robot.joint_names, leg)])
+    on_ground = samples.active[:, 0].numpy()
+    assert np.isnan(measured[np.ix_(on_ground, loaded)]).all()
+    np.testing.assert_array_equal(measured[on_ground][:, ~loaded], known[on_ground][:, ~loaded])
+    np.testing.assert_array_equal(measured[~on_ground], known[~on_ground])
