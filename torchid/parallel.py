@@ -66,17 +66,6 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-@contextmanager
-def threads_at_most(count: int) -> Iterator[None]:
-    """Let `thread_count` be no more within the block, beside which other processes work."""
-    global _outside
-    before, _outside = _outside, min(thread_count(), count)
-    try:
-        yield
-    finally:
-        _outside = before
-
-
 @cache
 def _pools() -> ThreadpoolController:
     from threadpoolctl import ThreadpoolController
