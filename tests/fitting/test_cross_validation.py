@@ -33,7 +33,6 @@ from torchid.problem import (
     linear_problem,
 )
 from torchid.problem.compression import (
-    BY_FOLD,
     FOLDS,
     split_into_folds,
 )

@@ -18,6 +18,8 @@ from torchid.problem.compression import (
     FOLDS,
     LEAST_PER_FOLD,
     Part,
+    block_spans,
+    compress_in_blocks,
     compress_log,
     fold_compressed,
     merge,
@@ -105,4 +107,20 @@ def test_contact_states_of_a_compressed_log_are_those_of_its_samples(walk: tuple
     for state, part in found.items():
         G = gram(expected[state].factor)
         assert part.samples == expected[state].samples
+        assert (gram(part.factor) - G).abs().max() <= 1e-12 * G.abs().max()
+
+
+def test_blocks_whose_rows_are_made_at_once_are_those_of_pieces(walk: tuple[RowBuilder, Samples]) -> None:
+    builder, log = walk
+    folds = split_into_folds([log], builder)
+    blocks = [part for part in compress_in_blocks(folds, builder) if not part.unloaded]
+    assert len({(part.fold, part.block) for part in blocks}) > FOLDS
+    for part in blocks:
+        fold = replace(folds[part.fold], unloaded=None)
+        count = 1 + max(other.block for other in blocks if other.fold == part.fold)
+        start, stop = block_spans(len(fold), count)[part.block]
+        (piece,) = (x for x in compress_parts([fold[start:stop]], builder) if x.state == part.state)
+        assert (part.samples, part.factor.rows) == (piece.samples, piece.factor.rows)
+        assert part.factor.independent_rows == pytest.approx(piece.factor.independent_rows)
+        G = gram(piece.factor)
         assert (gram(part.factor) - G).abs().max() <= 1e-12 * G.abs().max()
