@@ -58,6 +58,7 @@ MORE = {
     "arm, consistent": ("arm", ("estimator.name=consistent",)),
     "biped, robust": ("biped", ("estimator.robust=huber",)),
     "biped, consistent, robust": ("biped", ("estimator.name=consistent", "estimator.robust=tukey")),
+    "arm, penalties": ("arm", (*DESCENT, "estimator.consistency=penalties")),
     "quadruped, line search": ("quadruped", (*DESCENT, "estimator.training.optimizer={name: LBFGS}")),
 }
 

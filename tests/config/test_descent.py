@@ -22,6 +22,8 @@ DESCENT: dict[str, Any] = {
     "rank_tolerance": 1e-7,
     "frozen": ["pelvis"],
     "margin": 0.001,
+    "consistency": "penalties",
+    "penalties": {"eigenvalue": 3.0, "log_det": 0.01, "mass": 4.0, "friction": 5.0},
     "training": {
         "epochs": 7,
         "batch_size": 32,
@@ -49,7 +51,10 @@ def held_out(**estimator: Any) -> dict[str, Any]:
 
 def test_a_descent_has_the_documented_defaults(file: Path) -> None:
     estimator = load(file, changed(estimator={"name": "sgd"})).estimator
-    assert estimator.margin == 1e-4
+    assert (estimator.consistency, estimator.margin) == ("log_cholesky", 1e-4)
+    assert dataclasses.asdict(estimator.penalties) == {
+        **{"eigenvalue": 10.0, "log_det": 0.0, "mass": 10.0, "friction": 10.0}
+    }
     assert dataclasses.asdict(estimator.training) == {
         **{"epochs": 200, "batch_size": 256, "patience": None, "clip": 1.0, "damping": 1.0, "seed": 0, "finish": True},
         **{"optimizer": {"name": "Adam"}, "schedule": {"name": "CosineAnnealingLR"}},
@@ -72,8 +77,11 @@ def test_every_key_of_a_descent_arrives_and_reads_back_as_itself(file: Path, tmp
     [
         ({"name": "least_squares", "margin": 0.1}, "margin", "consistent or sgd"),
         ({"name": "least_squares", "training": {"epochs": 3}}, "training", "sgd"),
+        ({"name": "least_squares", "consistency": "penalties"}, "consistency", "sgd"),
+        ({"name": "least_squares", "penalties": {"mass": 1.0}}, "penalties", "sgd"),
         ({"name": "least_squares", "com_inside": "box"}, "com_inside", "consistent or sgd"),
         ({"name": "least_squares", "prior": "entropic"}, "prior", "consistent or sgd"),
+        ({"name": "consistent", "consistency": "penalties"}, "consistency", "sgd"),
         ({"name": "consistent", "training": {"seed": 3}}, "training", "sgd"),
     ],
     ids=lambda value: value["name"] if isinstance(value, dict) else value,
@@ -87,6 +95,19 @@ def test_a_key_of_another_estimator_is_refused_by_those_that_have_it(
         f"estimator.{key}",
         f"set, which {estimator['name']} has not; accepted: name: {having}, or no such key",
     )
+
+
+@pytest.mark.parametrize(
+    "setting", [{"prior": "pullback"}, {"com_inside": "box"}, {"symmetry": {"left": "l_", "right": "r_"}}]
+)
+def test_conditions_are_refused_where_violations_are_only_penalized(file: Path, setting: dict[str, Any]) -> None:
+    estimator = {"name": "sgd", "consistency": "penalties"} | setting
+    found = "set, which consistency: penalties has not; accepted: consistency: log_cholesky, or no such key"
+    assert_wrong_value(
+        lambda: load(file, changed(estimator=estimator)), file, f"estimator.{next(iter(setting))}", found
+    )
+    (key, value), taken = next(iter(setting.items())), load(file, changed(estimator={"name": "sgd"} | setting))
+    assert getattr(taken.estimator, key) == (value if isinstance(value, str) else taken.estimator.symmetry)
 
 
 @pytest.mark.parametrize(
@@ -107,7 +128,10 @@ def test_a_key_of_another_estimator_is_refused_by_those_that_have_it(
         (descent(optimizer={"lr": 0.1}), "estimator.training.optimizer", "a mapping with the name of a class"),
         (descent(optimizer={"name": 3}), "estimator.training.optimizer", "a mapping with the name of a class"),
         (descent(schedule={"T_max": 3}), "estimator.training.schedule", "a mapping with the name of a class"),
+        (changed(estimator={"name": "sgd", "consistency": "hope"}), "estimator.consistency", "'hope'"),
         (changed(estimator={"name": "sgd", "margin": 1.0}), "estimator.margin", "1.0"),
+        (changed(estimator={"name": "sgd", "penalties": {"mass": -1.0}}), "estimator.penalties.mass", "-1.0"),
+        (changed(estimator={"name": "sgd", "penalties": 3.0}), "estimator.penalties", "3.0"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
@@ -122,6 +146,7 @@ def test_a_setting_of_a_descent_of_the_wrong_kind_is_refused_by_its_place(
     [
         (descent(batchsize=3), "estimator.training", "batchsize", "batch_size"),
         (descent(optimiser={"name": "Adam"}), "estimator.training", "optimiser", "optimizer"),
+        (changed(estimator={"penalties": {"eigenvalues": 1.0}}), "estimator.penalties", "eigenvalues", "eigenvalue"),
         (changed(logs={"train": ["a"], "validate": ["b"]}), "logs", "validate", "validation"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",

@@ -273,3 +273,10 @@ class TestDescentInLogCholesky(EstimatorContract):
         problem = usual_problem()
         in_chunks = Trainer(replace(self.settings, ridge=RIDGE), problem, RowBatches(problem, 25)).run()
         self.assert_same(problem, in_chunks.phi, self.solve(problem).phi)
+
+
+class TestDescentWithPenalties(TestDescentInLogCholesky):
+    """Bodies that only nearly exist; 6e-8 was found."""
+
+    accuracy = 1e-6
+    settings = Sgd(optimizer={"name": "LBFGS"}, epochs=15, schedule=None, consistency="penalties")

@@ -12,9 +12,9 @@ from physical import PRIORS, random_case
 from synthetic import UR5, load
 from thinned import slow_but
 
-from torchid.estimators import Consistent, LeastSquares, Sgd, Trainer, violations
+from torchid.estimators import Conditions, Consistent, LeastSquares, PenaltyWeights, Sgd, Trainer, violations
 from torchid.estimators.least_squares import Minimizer
-from torchid.estimators.sgd import excess, nearest_allowed
+from torchid.estimators.sgd import excess, least_penalized, nearest_allowed
 from torchid.problem import ExtraTerms, MiniBatches, RowBuilder, assemble, compress_parts
 from torchid.sensing import SensorNoise, named_sensors
 
@@ -44,6 +44,16 @@ def test_of_a_descent_that_ends_early_it_is_known_by_how_much() -> None:
     assert excess(settings, case.problem, Minimizer(nominal)) == pytest.approx(
         (cost + away) / best.objective - 1.0, rel=1e-6
     )
+
+
+@pytest.mark.parametrize("weight", [1.0, 100.0])
+def test_with_penalties_the_bound_holds_and_vanishes_at_the_optimum(weight: float) -> None:
+    case = random_case(np.random.default_rng(1), plain=True)
+    weights = PenaltyWeights(eigenvalue=weight, mass=weight, friction=weight)
+    settings = Sgd(RIDGE, consistency="penalties", penalties=weights, conditions=Conditions())
+    before = Minimizer(case.problem.nominal)
+    found = least_penalized(settings, case.problem, before)
+    assert excess(settings, case.problem, found) < 1e-6 < excess(settings, case.problem, before)
 
 
 def bolted_arm(terms: ExtraTerms) -> tuple[Trainer, MiniBatches, object]:

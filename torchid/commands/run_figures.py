@@ -233,6 +233,7 @@ def hyperparameters(config: ExperimentConfig) -> dict[str, str | float | bool]:
         "friction": estimator.friction,
         "ridge": estimator.numeric_ridge,
         "sensors": config.sensors.set or "by name",
+        "settings.consistency": estimator.consistency if descent else estimator.name,
         "settings.margin": 0.0 if estimator.name == "least_squares" else estimator.margin,
         "settings.prior": estimator.prior,
         "training.optimizer": training.optimizer["name"] if descent else "none",

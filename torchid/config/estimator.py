@@ -10,9 +10,10 @@ from pydantic.dataclasses import dataclass
 
 from torchid.config.robot import PerAxis, PerJoint
 from torchid.errors import ConfigError
-from torchid.estimators import Conditions, Consistent, LeastSquares, Sgd, TrainingSettings
+from torchid.estimators import Conditions, Consistent, LeastSquares, PenaltyWeights, Sgd, TrainingSettings
 from torchid.estimators.conditions import EnclosureKind
 from torchid.estimators.conic_problem import Prior
+from torchid.estimators.sgd import Consistency
 from torchid.settings import (
     AUTO,
     STRICT,
@@ -164,6 +165,8 @@ class EstimatorConfig(_ConditionsConfig, _FitConfig):
     """
 
     prior: Prior = Consistent.prior
+    consistency: Consistency = Sgd.consistency
+    penalties: PenaltyWeights = dataclasses.field(default_factory=PenaltyWeights)
     training: TrainingConfig = dataclasses.field(default_factory=TrainingConfig)
 
     @property
@@ -212,6 +215,14 @@ def validate_keys(estimator: EstimatorConfig) -> None:
         if estimator.name not in having and value != getattr(defaults, key):
             found = f"set, which {estimator.name} has not"
             raise ConfigError.at_field(f"estimator.{key}", found, f"name: {' or '.join(having)}, or no such key")
+    if estimator.name == "sgd" and estimator.consistency == "penalties":
+        for key in (*_fields(_ConditionsConfig), "prior"):
+            if key not in ("margin", "com_shapes") and getattr(estimator, key) != getattr(defaults, key):
+                found = "set, which consistency: penalties has not"
+                raise ConfigError.at_field(f"estimator.{key}", found, "consistency: log_cholesky, or no such key")
+    if estimator.consistency != "penalties" and estimator.penalties != defaults.penalties:
+        found = f"set, which consistency: {estimator.consistency} has not"
+        raise ConfigError.at_field("estimator.penalties", found, "consistency: penalties, or no such key")
 
 
 _OF_BATCH_FITS = {"robust"}

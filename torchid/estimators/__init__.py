@@ -3,7 +3,10 @@
 from torchid.estimators.conditions import Conditions, Enclosure, Mirror, Violation, violations
 from torchid.estimators.consistent import Consistent, ConsistentEstimate, nearest_consistent
 from torchid.estimators.least_squares import ConstrainedEstimate, Estimate, LeastSquares
+from torchid.estimators.penalties import PenaltyWeights
 from torchid.estimators.sgd import (
+    FreeParameters,
+    LearnableParameters,
     LogCholeskyParameters,
     Sgd,
     TrainingSettings,
@@ -18,9 +21,12 @@ __all__ = [
     "Enclosure",
     "Epoch",
     "Estimate",
+    "FreeParameters",
+    "LearnableParameters",
     "LeastSquares",
     "LogCholeskyParameters",
     "Mirror",
+    "PenaltyWeights",
     "ResidualEffect",
     "Sgd",
     "SgdEstimate",

@@ -5,11 +5,13 @@ from __future__ import annotations
 import inspect
 import re
 import warnings
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+import scipy.optimize
 import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer, lr_scheduler
@@ -21,10 +23,8 @@ from torchid.estimators.barrier import solve_barrier
 from torchid.estimators.conditions import Conditions
 from torchid.estimators.conic_problem import ConicProblem, Prior, build_conic_problem
 from torchid.estimators.consistent import Consistent
-from torchid.estimators.least_squares import (
-    Minimizer,
-    Regularized,
-)
+from torchid.estimators.least_squares import Minimizer, Regularized
+from torchid.estimators.penalties import PenaltyWeights, penalties
 from torchid.parallel import one_thread
 from torchid.parameters import INERTIAL, PER_BODY, Array
 from torchid.problem import LinearProblem
@@ -175,16 +175,11 @@ _LEAST_FRICTION = 0.01  # of its scale: initial friction if the URDF has none, s
 _LEAST_EIGENVALUE = 1e-3  # above the margin: initial one of a body whose nominal eigenvalue is smaller
 
 
-class LogCholeskyParameters(nn.Module):
+class LearnableParameters(nn.Module, ABC):
     """phi, (12 L,), and M terms, if the problem has any, as a function of `raw`, which is 0 at the nominal parameters.
 
-    Only physically consistent phi: scaled pseudo-inertias above a margin, positive friction. J = margin I + R R^T with
-    R = R_0 M, where R_0 is the Cholesky factor at the nominal parameters and M is lower triangular with the logarithms
-    of its diagonal and its other entries as coordinates, so that M is the identity where they are 0. Friction is a
-    softplus. phi is a function of `preconditioner @ raw`: in the units of `raw` the compressed problem's Hessian is
-    near the identity.
-
-    Source: Rucker, Wensing, "Smooth parameterization of rigid-body inertia", RA-L 2022.
+    phi is a function of `preconditioner @ raw`: in the units of `raw` the compressed problem's Hessian is near the
+    identity.
     """
 
     nominal: Tensor
@@ -192,65 +187,25 @@ class LogCholeskyParameters(nn.Module):
     free: Tensor
     terms: Tensor
     preconditioner: Tensor
-    root: Tensor
-    friction_start: Tensor
 
-    def __init__(self, problem: LinearProblem, margin: float = Conditions.margin) -> None:
-        """Start at the nominal parameters, with eigenvalues raised above the margin, without a preconditioner.
+    def __init__(self, problem: LinearProblem, size: int) -> None:
+        """Start at the nominal parameters, without a preconditioner.
 
         Args:
             problem: its nominal parameters, scale and free parameters are used.
-            margin: least eigenvalue of every free body's scaled pseudo-inertia.
-
-        Raises:
-            ValueError: inertial parameters that are not free body by body.
+            size: number of variables of `constrained`.
         """
         super().__init__()
-        self.margin = margin
-        free, bodies = problem.free.reshape(-1, PER_BODY), problem.free_bodies()
-        moving = np.zeros(free.shape, dtype=bool)
-        moving[bodies, INERTIAL] = True
-        frictional = (free & ~moving).ravel()
-        scaled = (problem.nominal / problem.scale).reshape(-1, PER_BODY)
-        values, vectors = np.linalg.eigh(parameters.pseudo_inertia(scaled[bodies]))
-        above = np.maximum(values - margin, _LEAST_EIGENVALUE)
-        start = np.maximum(scaled.ravel()[frictional], _LEAST_FRICTION)
+        for name in ("nominal", "scale", "free"):
+            self.register_buffer(name, torch.from_numpy(np.array(getattr(problem, name))))
         terms = np.zeros(0) if problem.terms is None else problem.terms.size
-        rows, columns = np.tril_indices(4)
-        arrays = {
-            "nominal": problem.nominal,
-            "scale": problem.scale,
-            "free": problem.free,
-            "root": np.linalg.cholesky((vectors * above[:, None]) @ vectors.transpose(0, 2, 1)),
-            "friction_start": start + np.log(-np.expm1(-start)),
-            "_from_pseudo": np.linalg.pinv(parameters.PSEUDO_BASIS.reshape(-1, 16).T),
-            "_rows": rows,
-            "_columns": columns,
-            "_inertial": moving.ravel(),
-            "_frictional": frictional,
-        }
-        for name, array in arrays.items():
-            self.register_buffer(name, torch.from_numpy(np.array(array)))
         self.register_buffer("terms", torch.from_numpy(terms.copy()), persistent=bool(len(terms)))
-        size = INERTIAL.stop * len(bodies) + len(start) + len(terms)
-        self.register_buffer("preconditioner", torch.eye(size, dtype=torch.float64))
-        self.raw = nn.Parameter(torch.zeros(size, dtype=torch.float64))
+        self.register_buffer("preconditioner", torch.eye(size + len(terms), dtype=torch.float64))
+        self.raw = nn.Parameter(torch.zeros(size + len(terms), dtype=torch.float64))
 
+    @abstractmethod
     def constrained(self, u: Tensor) -> Tensor:
-        """Parameters (12 L,) at log-Cholesky coordinates `u`, ten by body, then friction."""
-        bodies = len(self.root)
-        coordinates = u[: INERTIAL.stop * bodies].reshape(bodies, INERTIAL.stop)
-        rows, columns = self.get_buffer("_rows"), self.get_buffer("_columns")
-        entries = torch.where(rows == columns, coordinates.exp(), coordinates)
-        M = entries.new_zeros(bodies, 4, 4)
-        M[:, rows, columns] = entries
-        R = self.root @ M
-        J = R @ R.mT + self.margin * torch.eye(4, dtype=u.dtype, device=u.device)
-        ten = J.flatten(1) @ self.get_buffer("_from_pseudo").T
-        friction = nn.functional.softplus(u[INERTIAL.stop * bodies :] + self.friction_start)
-        inertial, frictional = self.get_buffer("_inertial"), self.get_buffer("_frictional")
-        phi = self.nominal.masked_scatter(inertial, ten.flatten() * self.scale[inertial])
-        return phi.masked_scatter(frictional, friction * self.scale[frictional])
+        """Parameters (12 L,) at variables `u`."""
 
     def _with_terms(self, u: Tensor) -> Tensor:
         count = len(u) - len(self.terms)
@@ -278,6 +233,84 @@ class LogCholeskyParameters(nn.Module):
         values, vectors = torch.linalg.eigh(hessian)  # negative eigenvalues are rounding
         root = (values.clamp_min(0.0) + damping).rsqrt()
         self.preconditioner.copy_(vectors @ (root[:, None] * vectors.T))
+
+
+class FreeParameters(LearnableParameters):
+    """Any phi: nominal parameters plus deviations of the free ones in units of their scale."""
+
+    def __init__(self, problem: LinearProblem) -> None:
+        """Start at the nominal parameters of a problem."""
+        super().__init__(problem, int(problem.free.sum()))
+
+    def constrained(self, u: Tensor) -> Tensor:
+        """Parameters (12 L,) at deviations `u` of the free ones (F,)."""
+        return self.nominal.masked_scatter(self.free, self.nominal[self.free] + self.scale[self.free] * u)
+
+
+class LogCholeskyParameters(LearnableParameters):
+    """Only physically consistent phi: scaled pseudo-inertias above a margin, positive friction.
+
+    J = margin I + R R^T with R = R_0 M, where R_0 is the Cholesky factor at the nominal parameters and M is lower
+    triangular with the logarithms of its diagonal and its other entries as coordinates, so that M is the identity where
+    they are 0. Friction is a softplus.
+
+    Source: Rucker, Wensing, "Smooth parameterization of rigid-body inertia", RA-L 2022.
+    """
+
+    root: Tensor
+    friction_start: Tensor
+
+    def __init__(self, problem: LinearProblem, margin: float = Conditions.margin) -> None:
+        """Start at the nominal parameters, with eigenvalues raised above the margin.
+
+        Args:
+            problem: its nominal parameters, scale and free parameters are used.
+            margin: least eigenvalue of every free body's scaled pseudo-inertia.
+
+        Raises:
+            ValueError: inertial parameters that are not free body by body.
+        """
+        free, bodies = problem.free.reshape(-1, PER_BODY), problem.free_bodies()
+        moving = np.zeros(free.shape, dtype=bool)
+        moving[bodies, INERTIAL] = True
+        frictional = (free & ~moving).ravel()
+        super().__init__(problem, INERTIAL.stop * len(bodies) + int(frictional.sum()))
+        self.margin = margin
+        scaled = (problem.nominal / problem.scale).reshape(-1, PER_BODY)
+        values, vectors = np.linalg.eigh(parameters.pseudo_inertia(scaled[bodies]))
+        above = np.maximum(values - margin, _LEAST_EIGENVALUE)
+        start = np.maximum(scaled.ravel()[frictional], _LEAST_FRICTION)
+        rows, columns = np.tril_indices(4)
+        arrays = {
+            "root": np.linalg.cholesky((vectors * above[:, None]) @ vectors.transpose(0, 2, 1)),
+            "friction_start": start + np.log(-np.expm1(-start)),
+            "_from_pseudo": np.linalg.pinv(parameters.PSEUDO_BASIS.reshape(-1, 16).T),
+            "_rows": rows,
+            "_columns": columns,
+            "_inertial": moving.ravel(),
+            "_frictional": frictional,
+        }
+        for name, array in arrays.items():
+            self.register_buffer(name, torch.from_numpy(np.array(array)))
+
+    def constrained(self, u: Tensor) -> Tensor:
+        """Parameters (12 L,) at log-Cholesky coordinates `u`, ten by body, then friction."""
+        bodies = len(self.root)
+        coordinates = u[: INERTIAL.stop * bodies].reshape(bodies, INERTIAL.stop)
+        rows, columns = self.get_buffer("_rows"), self.get_buffer("_columns")
+        entries = torch.where(rows == columns, coordinates.exp(), coordinates)
+        M = entries.new_zeros(bodies, 4, 4)
+        M[:, rows, columns] = entries
+        R = self.root @ M
+        J = R @ R.mT + self.margin * torch.eye(4, dtype=u.dtype, device=u.device)
+        ten = J.flatten(1) @ self.get_buffer("_from_pseudo").T
+        friction = nn.functional.softplus(u[INERTIAL.stop * bodies :] + self.friction_start)
+        inertial, frictional = self.get_buffer("_inertial"), self.get_buffer("_frictional")
+        phi = self.nominal.masked_scatter(inertial, ten.flatten() * self.scale[inertial])
+        return phi.masked_scatter(frictional, friction * self.scale[frictional])
+
+
+Consistency = Literal["log_cholesky", "penalties"]
 
 
 @dataclass(frozen=True)
@@ -336,20 +369,23 @@ class TrainingSettings:
 
 @dataclass(frozen=True)
 class Sgd(TrainingSettings, Regularized):
-    """min of the mean squared whitened residual + ridge * prior, one mini-batch at a time.
-
-    Bodies have pseudo-inertias above the margin and positive friction in every step, and meet all conditions at the
-    end.
+    """min of the mean squared whitened residual + ridge * prior + penalties, one mini-batch at a time.
 
     Attributes:
+        consistency: "log_cholesky", bodies have pseudo-inertias above the margin and positive friction in every step,
+            and meet all conditions at the end; "penalties", what breaks the margin or these signs costs, and there are
+            no other conditions.
         prior, conditions: as in `Consistent`.
+        penalties: their weights, for "penalties".
         residual_lr: learning rate of a residual module; None: the optimizer's.
         residual_weight: of the mean square of the module's whitened force in the loss: a module that can fit any force
             fits the share 1 / (1 + residual_weight) of the residual.
     """
 
+    consistency: Consistency = "log_cholesky"
     prior: Prior = "euclidean"
     conditions: Conditions = field(default_factory=Conditions)
+    penalties: PenaltyWeights = field(default_factory=PenaltyWeights)
     residual_lr: Positive | None = None
     residual_weight: NotNegative = 0.1
 
@@ -359,10 +395,106 @@ class Sgd(TrainingSettings, Regularized):
         """Objective and conditions for the compressed samples."""
         return build_conic_problem(problem, self.conditions, self.ridge, self.prior)
 
+    def learnable(self, problem: LinearProblem) -> LearnableParameters:
+        """The parameters that a descent moves, with their preconditioner."""
+        learnable: LearnableParameters = FreeParameters(problem)
+        damping = self.damping + self.penalties.curvature
+        if self.consistency == "log_cholesky":
+            learnable, damping = LogCholeskyParameters(problem, self.conditions.margin), self.damping
+        learnable.precondition(problem, self.ridge, damping)
+        return learnable
+
     @property
     def consistent(self) -> Consistent:
         """The estimator in closed form with the same objective."""
         return Consistent(self.ridge, self.prior, self.conditions, rank_tolerance=self.rank_tolerance)
+
+
+class Penalties(nn.Module):
+    """Penalties of a problem's bodies, and of terms beyond their bounds."""
+
+    start: Tensor
+    free: Tensor
+    bodies: Tensor
+    G: Tensor
+    h: Tensor
+
+    def __init__(self, settings: Sgd, problem: LinearProblem) -> None:
+        """Of a descent's settings."""
+        super().__init__()
+        self._margin = settings.conditions.margin
+        self._weights = settings.penalties
+        conic = settings.conic_problem(problem)
+        bounded = {condition.name for condition in problem.terms.conditions} if problem.terms else set()
+        rows = np.array([name in bounded for name in conic.names[len(conic.F0) :]], dtype=bool)
+        arrays = {
+            "start": problem.nominal / problem.scale,
+            "free": problem.free,
+            "bodies": problem.free_bodies(),
+            "G": np.linalg.solve(conic.deviations.T, conic.G[rows].T).T,
+            "h": conic.h[rows],
+        }
+        for name, array in arrays.items():
+            self.register_buffer(name, torch.from_numpy(np.array(array)), persistent=False)
+
+    def forward(self, y: Tensor) -> dict[str, Tensor]:
+        """By name, at deviations of the free parameters, and the terms, in units of their scale, (n,)."""
+        moved = self.start[self.free] + y[: int(self.free.sum())]
+        scaled = self.start.masked_scatter(self.free, moved).unflatten(0, (-1, PER_BODY))
+        out = penalties(scaled, self.bodies, self._margin, self._weights)
+        if len(self.h):
+            out["terms"] = self._weights.friction * (self.G @ y - self.h).clamp_max(0.0).square().sum()
+        return out
+
+
+class _Penalized:
+    """The objective of a descent with penalties on all samples, at deviations (n,)."""
+
+    def __init__(self, settings: Sgd, problem: LinearProblem) -> None:
+        self._penalties = Penalties(settings, problem)
+        conic = settings.conic_problem(problem)
+        self.floor = conic.floor
+        root = np.linalg.solve(conic.deviations.T, conic.root.T).T
+        linear = np.linalg.solve(conic.deviations.T, conic.linear)
+        self._root, self._target, self._linear = map(torch.from_numpy, (root, conic.target, linear))
+        self._constant = conic.constant
+        self.hessian = 2.0 * self._root.T @ self._root
+
+    def slope(self, y: Array) -> tuple[float, Array]:
+        """Value and gradient."""
+        at = torch.from_numpy(np.array(y)).requires_grad_()
+        value = (self._root @ at - self._target).square().sum() + self._linear @ at + self._constant
+        value = value + sum(self._penalties(at).values())
+        (gradient,) = torch.autograd.grad(value, at)
+        return value.item(), gradient.numpy()
+
+
+_LBFGS_OPTIONS = {"maxiter": 3000, "maxcor": 30, "ftol": 0.0, "gtol": 1e-12}
+
+
+@one_thread()
+def least_penalized(settings: Sgd, problem: LinearProblem, start: Minimizer) -> Minimizer:
+    """The parameters of the least objective with penalties on all samples, by preconditioned L-BFGS.
+
+    Args:
+        settings: of the descent.
+        problem: the compressed samples.
+        start: where the descent ended.
+    """
+    penalized, y = _Penalized(settings, problem), deviations(problem, start)
+    damping = 1e-6 * float(penalized.hessian.diagonal().max()) + settings.penalties.curvature
+    values, vectors = torch.linalg.eigh(penalized.hessian)
+    P = (vectors @ ((values.clamp_min(0.0) + damping).rsqrt()[:, None] * vectors.T)).numpy()
+
+    def loss(u: Array) -> tuple[float, Array]:
+        value, gradient = penalized.slope(y + P @ u)
+        return value, P @ gradient
+
+    y = y + P @ scipy.optimize.minimize(loss, np.zeros(len(y)), jac=True, method="L-BFGS-B", options=_LBFGS_OPTIONS).x
+    count = int(problem.free.sum())
+    phi = problem.nominal.copy()
+    phi[problem.free] += problem.scale[problem.free] * y[:count]
+    return Minimizer(phi, None if problem.terms is None else y[count:] * problem.terms.size)
 
 
 _MET = 1e-9  # violation of a condition, in units of the scale, that is rounding
@@ -395,8 +527,14 @@ def deviations(problem: LinearProblem, found: Minimizer) -> Array:
 def excess(settings: Sgd, problem: LinearProblem, found: Minimizer) -> float:
     """How far the objective of a minimizer is above the least one at most, as a share of that or of what counts as 0.
 
-    The least one is that of the interior-point method.
+    The least one is that of the interior-point method; with penalties, which only add to the quadratic, it is at least
+    what this promises along the gradient.
     """
+    if settings.consistency == "penalties":
+        penalized = _Penalized(settings, problem)
+        value, slope = penalized.slope(deviations(problem, found))
+        least = value - 0.5 * float(slope @ np.linalg.pinv(penalized.hessian.numpy(), hermitian=True) @ slope)
+        return (value - least) / max(least, penalized.floor)
     conic = settings.conic_problem(problem)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NumericalWarning)  # of its gap, which counts below

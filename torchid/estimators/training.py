@@ -21,10 +21,12 @@ from torchid.estimators.conic_problem import ConicProblem
 from torchid.estimators.least_squares import ConstrainedEstimate, Minimizer, report_rounding
 from torchid.estimators.sgd import (
     FULL_BATCH,
-    LogCholeskyParameters,
+    LearnableParameters,
+    Penalties,
     Sgd,
     deviations,
     excess,
+    least_penalized,
     make_optimizer,
     make_schedule,
     nearest_allowed,
@@ -116,7 +118,7 @@ class Loss(nn.Module):
         settings: Sgd,
         problem: LinearProblem,
         batches: MiniBatches,
-        learnable: LogCholeskyParameters,
+        learnable: LearnableParameters,
         residual: nn.Module | None,
         data: LinearProblem | None = None,
     ) -> None:
@@ -130,6 +132,7 @@ class Loss(nn.Module):
         conic, terms = settings.conic_problem(problem), problem.terms
         rows = min(len(problem.A) + (len(terms.C) if terms else 0), len(conic.linear))
         self._prior = _Prior(conic, rows).to(batches.columns.device)
+        self._penalties = Penalties(settings, problem).to(batches.columns.device)
         self._beside = None if data is None else _difference(problem, data, batches.columns.device)
 
     def forward(self, batch: Batch, size: int | None = None) -> LossTerms:
@@ -148,6 +151,8 @@ class Loss(nn.Module):
             losses["beside"] = of_one * self._beside(phi)
         if settings.ridge:
             losses["prior"] = of_one * self._prior(self._scaled(phi))
+        if settings.consistency == "penalties":
+            losses |= {name: of_one * x for name, x in self._penalties(self._scaled(phi)).items()}
         forces = {"rigid_body": rigid, "measured": batch.f}
         if other is not None:
             forces["residual"] = other
@@ -357,9 +362,8 @@ class Trainer:
         self.closed_form = settings.least_squares.solve(problem)
         self._conic = settings.conic_problem(problem)
         self._least = self._conic.unconstrained
-        learnable = LogCholeskyParameters(problem, settings.conditions.margin)
-        learnable.precondition(problem, settings.ridge, settings.damping)
-        self.loss = Loss(settings, problem, batches, learnable.to(batches.columns.device), residual, data)
+        learnable = settings.learnable(problem).to(batches.columns.device)
+        self.loss = Loss(settings, problem, batches, learnable, residual, data)
         self._trained: list[list[nn.Parameter]] = [[self.loss.learnable.raw]]
         if residual is not None:
             self._trained.append([x for x in residual.parameters() if x.requires_grad])
@@ -453,14 +457,17 @@ class Trainer:
     def estimate(self) -> SgdEstimate:
         """The parameters, and residual module, of least held-out loss; without held-out logs the last ones.
 
-        After the last epoch, without held-out logs or a module, those of the least objective on all samples, which the
-        interior-point method computes: at the border of what is possible, coordinates such as J = R R^T bend faster
-        than descents converge, so that 800 steps of L-BFGS left a quadruped 0.1 of a parameter's scale away. Statistics
-        are those of least squares with the same ridge.
+        After the last epoch, without held-out logs or a module, those of the least objective on all samples: with
+        penalties by L-BFGS, of possible bodies by the interior-point method, because at the border of what is possible
+        coordinates such as J = R R^T bend faster than descents converge: 800 steps of L-BFGS left a quadruped 0.1 of a
+        parameter's scale away. Statistics are those of least squares with the same ridge.
         """
         self.loss.load_state_dict(self._best)
         plain, found = self.closed_form, self._minimizer()
-        if self.finished and self.held_out is None and self.loss.residual is None and self.settings.finish:
+        finish = self.finished and self.held_out is None and self.loss.residual is None and self.settings.finish
+        if self.settings.consistency == "penalties":
+            found = least_penalized(self.settings, self.problem, found) if finish else found
+        elif finish:
             found = self.settings.consistent.minimize(self.problem)
         else:
             found = nearest_allowed(self.settings, self.problem, found)

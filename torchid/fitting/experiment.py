@@ -615,6 +615,7 @@ def batch_estimator(settings: EstimatorConfig, conditions: Conditions) -> LeastS
         settings: of the estimator.
         conditions: from `conditions_from`.
     """
-    if settings.name == "least_squares" or (settings.name == "sgd" and not settings.numeric_ridge):
+    penalized = settings.name == "sgd" and settings.consistency == "penalties"
+    if settings.name == "least_squares" or penalized or (settings.name == "sgd" and not settings.numeric_ridge):
         return settings.least_squares
     return settings.consistent(conditions)

@@ -24,7 +24,7 @@ _POSITIVE = ("m", "Ixx", "Iyy", "Izz")
 def conditions_from(settings: EstimatorConfig, robot: Robot) -> Conditions:
     """Conditions on the parameters (L, 12) of a robot's bodies, as an experiment file says.
 
-    Least squares may break them. `com_inside` leaves out bodies
+    Least squares may break them; those of a descent with penalties are a margin alone. `com_inside` leaves out bodies
     that are frozen, have no mass, or whose shapes are not known. Two frozen bodies need not be mirror images.
 
     Args:
@@ -40,8 +40,8 @@ def conditions_from(settings: EstimatorConfig, robot: Robot) -> Conditions:
     Warns:
         TorchidWarning: bodies without known shapes, or whose centre of mass in the URDF is outside theirs.
     """
-    if settings.name == "least_squares":
-        return Conditions(margin=0.0, names=robot.body_names)
+    if settings.name == "least_squares" or (settings.name == "sgd" and settings.consistency == "penalties"):
+        return Conditions(margin=settings.margin if settings.name == "sgd" else 0.0, names=robot.body_names)
     lower, upper = _bounds(settings, robot)
     return Conditions(
         margin=settings.margin,
