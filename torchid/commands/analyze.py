@@ -56,11 +56,9 @@ from torchid.sensor_planning.observability import (
 )
 from torchid.sensor_planning.planner import (
     PlanningProblem,
-    SensorChoice,
     SensorPlan,
     StepCallback,
-    choose_sensors,
-    explain_choice,
+    plan_sensors,
 )
 
 if TYPE_CHECKING:
@@ -238,14 +236,14 @@ def analyze(config: AnalyzeConfig) -> Analysis:
             noise = distributed.from_first(partial(setup.estimate_noise, train, suggest=False), "noise")
             setup = with_noise(setup, noise)
             request = AnalysisRequest.of(setup)
-        choices: dict[str, SensorChoice] = {}
+        choices: dict[str, SensorPlan] = {}
         results: list[ScenarioAnalysis] = []
 
         def choose() -> dict[str, SensorSet]:
             for name, states in scenarios(setup, train).items():
                 progress = _progress(name, bars)
-                choices[name] = _choose_sensors(request, states, train, progress)
-                results.append(_explain_choice(request, name, choices[name], progress))
+                choices[name] = _plan_sensors(request, states, train, progress)
+                results.append(_analysis_of(request, name, choices[name], progress))
             return _sets_to_compare(request, choices, train)
 
         sets = distributed.from_first(choose, "sensor sets")
@@ -334,10 +332,10 @@ def scenarios(setup: RobotSetup, train: Sequence[Samples]) -> dict[str, tuple[Co
     return out
 
 
-def _choose_sensors(
+def _plan_sensors(
     request: AnalysisRequest, states: tuple[ContactState, ...], train: Sequence[Samples], progress: StepCallback
-) -> SensorChoice:
-    """Choose sensors for one scenario."""
+) -> SensorPlan:
+    """Plan the sensors of one scenario."""
     setup, settings = request.setup, request.setup.config.analysis
     robot = setup.robot
     problem = PlanningProblem(
@@ -354,16 +352,12 @@ def _choose_sensors(
         seed=settings.seed,
     )
     with errors_at("analysis"):
-        return choose_sensors(problem, progress)
+        return plan_sensors(problem, progress)
 
 
-def _explain_choice(
-    request: AnalysisRequest, name: str, choice: SensorChoice, progress: StepCallback
-) -> ScenarioAnalysis:
-    """What each chosen sensor is needed for, and a check of those that are proposed."""
-    setup, problem, contacts = request.setup, choice.problem, request.setup.contacts
-    with errors_at("analysis"):
-        plan = explain_choice(choice, progress)
+def _analysis_of(request: AnalysisRequest, name: str, plan: SensorPlan, progress: StepCallback) -> ScenarioAnalysis:
+    """A plan, with a check of the sensors that are proposed."""
+    setup, problem, contacts = request.setup, plan.problem, request.setup.contacts
     progress("base parameters", 0, 1)
     if request.proposed is None:
         proposed, at_best = None, problem.stack.problem(sensor_set(setup.robot, contacts, plan.chosen))
@@ -391,7 +385,7 @@ def _progress(name: str, bars: Progress) -> StepCallback:
 
 
 def _sets_to_compare(
-    request: AnalysisRequest, choices: Mapping[str, SensorChoice], train: Sequence[Samples]
+    request: AnalysisRequest, choices: Mapping[str, SensorPlan], train: Sequence[Samples]
 ) -> dict[str, SensorSet]:
     """Sensor sets to compare by accuracy: those with a name, and those planned for contact states of the logs."""
     setup, sets = request.setup, dict(request.compared)
@@ -409,7 +403,7 @@ def _sets_to_compare(
     return sets
 
 
-def _chosen_along_normals(choice: SensorChoice, contacts: Sequence[Contact]) -> tuple[str, ...]:
+def _chosen_along_normals(choice: SensorPlan, contacts: Sequence[Contact]) -> tuple[str, ...]:
     """Frames of contacts at which a scalar sensor alone is chosen, while others of the same frames read wrenches."""
     wrench = sensor_set(choice.problem.robot, contacts, choice.chosen).wrench
     return tuple(
@@ -419,7 +413,7 @@ def _chosen_along_normals(choice: SensorChoice, contacts: Sequence[Contact]) -> 
     )
 
 
-def _is_chosen(choice: SensorChoice, sensors: SensorSet, contacts: Sequence[Contact]) -> bool:
+def _is_chosen(choice: SensorPlan, sensors: SensorSet, contacts: Sequence[Contact]) -> bool:
     """Whether a set, read along the axes of these contacts, is the chosen one; what none can exert does not count."""
     chosen = sensor_set(choice.problem.robot, contacts, choice.chosen)
     wrench, other = (measured_components(contacts, one) for one in (chosen, sensors))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import chain, count
@@ -47,8 +46,6 @@ from torchid.sensor_planning.search import CheapestSet, DemandGroup, all_minimal
 _ROUNDING_SHARE = 1e-9  # of the largest column in units of the scales, or of unit columns: smaller ones are rounding
 _SAMPLES = 96  # per contact state: bits change by less than 1 % with four times as many
 _ROUNDING = 1e-13
-_ROUNDS = 12
-_SAME_COST = 1e-9
 
 
 class MotionStack:
@@ -229,48 +226,6 @@ def rank_sets(
     return [RankedSet(-bits, sets[index]) for bits, index in ranked]
 
 
-def improve_by_exchange(
-    ranking: SetRanking,
-    part: DemandGroup,
-    first: Sequence[Candidate],
-    keep: AbstractSet[Candidate],
-    exclude: AbstractSet[Candidate],
-) -> list[RankedSet]:
-    """Sets reached from a sufficient one by exchanging one sensor at a time for more information, best first.
-
-    Args:
-        ranking: of the part's candidates.
-        part: whose demands every set meets.
-        first: the initial set.
-        keep: sensors in every set.
-        exclude: sensors in no set.
-    """
-    best = RankedSet(ranking.bits(first), tuple(first))
-    visited = [best]
-    for _ in range(_ROUNDS):
-        others = _neighbours(part, best.sensors, keep, exclude)
-        neighbours = [RankedSet(ranking.bits(chosen), chosen) for chosen in others]
-        higher = max(neighbours, key=lambda ranked: ranked.bits, default=best)
-        if higher.bits <= best.bits:
-            break
-        best = higher
-        visited.append(best)
-    return visited[::-1]
-
-
-def _neighbours(
-    part: DemandGroup, chosen: Sequence[Candidate], keep: AbstractSet[Candidate], exclude: AbstractSet[Candidate]
-) -> Iterator[tuple[Candidate, ...]]:
-    """Sufficient sets that differ by one sensor of the same cost."""
-    for old in chosen:
-        for new in part.candidates:
-            same_cost = abs(new.cost - old.cost) <= _SAME_COST * old.cost
-            if old not in keep and new not in exclude and new not in chosen and same_cost:
-                exchanged = tuple(c for c in part.candidates if (c in chosen and c is not old) or c is new)
-                if not any(demand.missing(exchanged) for demand in part.demands):
-                    yield exchanged
-
-
 @dataclass(frozen=True)
 class _StateRows:
     """Of B samples with all sensors: Q (B, c, n_rows) and Q R (B, c, P) of the channels, and their candidates."""
@@ -376,7 +331,7 @@ class PartPlan:
 
     `frames`: its contacts. `sets`: all its minimal sets, in which no sensor is redundant; None if there are too many
     candidates to enumerate. `ranked`: the cheapest of them with their information [bits], most informative first; if
-    they were not enumerated, those visited by the exchange search.
+    they were not enumerated, the one that was found.
     """
 
     frames: tuple[str, ...]
@@ -431,13 +386,17 @@ class ContactRequirement:
 
 
 @dataclass(frozen=True)
-class SensorChoice:
-    """The recommended sensors of a scenario.
+class SensorPlan:
+    """The recommended sensors of a scenario, with the reasons.
 
     Attributes:
         problem: that they solve.
         chosen: the recommended set. Its `cost` is the least possible if `proven`; `lower_bound`: no set costs less.
         parts: independent parts. The minimal sets of the robot are the unions of one set of each part.
+        branches: chains of joints, and which of them contacts constrain; `requirements`: of every group of contacts.
+        observability: of the base with the recommended set, state by state.
+        stack_rank, stack_full: rank of the stack of samples with it, and with all candidates.
+        removals: ranks without each of its sensors.
     """
 
     problem: PlanningProblem
@@ -446,24 +405,6 @@ class SensorChoice:
     lower_bound: float
     proven: bool
     parts: tuple[PartPlan, ...]
-
-    @property
-    def proof(self) -> str:
-        """Whether a cheaper set may exist, in words."""
-        return "no cheaper set exists" if self.proven else "not proven to be the cheapest"
-
-
-@dataclass(frozen=True)
-class SensorPlan(SensorChoice):
-    """The same with the reasons.
-
-    Attributes:
-        branches: chains of joints, and which of them contacts constrain; `requirements`: of every group of contacts.
-        observability: of the base with the recommended set, state by state.
-        stack_rank, stack_full: rank of the stack of samples with it, and with all candidates.
-        removals: ranks without each of its sensors.
-    """
-
     branches: tuple[Branch, ...]
     requirements: tuple[ContactRequirement, ...]
     observability: tuple[BaseObservability, ...]
@@ -471,18 +412,14 @@ class SensorPlan(SensorChoice):
     stack_full: int
     removals: tuple[Removal, ...]
 
+    @property
+    def proof(self) -> str:
+        """Whether a cheaper set may exist, in words."""
+        return "no cheaper set exists" if self.proven else "not proven to be the cheapest"
+
 
 def plan_sensors(problem: PlanningProblem, progress: StepCallback | None = None) -> SensorPlan:
     """The cheapest sensor set for a scenario, and of these the most informative one, with the reasons.
-
-    Raises:
-        SensorError: as `choose_sensors`.
-    """
-    return explain_choice(choose_sensors(problem, progress), progress)
-
-
-def choose_sensors(problem: PlanningProblem, progress: StepCallback | None = None) -> SensorChoice:
-    """The cheapest sensor set for a scenario, and of these the most informative one.
 
     Raises:
         SensorError: the candidates do not suffice, or a criterion that does not fit the robot.
@@ -502,22 +439,20 @@ def choose_sensors(problem: PlanningProblem, progress: StepCallback | None = Non
         all_demands = demands(problem.robot, problem.contacts, problem.states, problem.candidates, problem.seed)
         least = cheapest_set(all_demands, problem.candidates, problem.keep, problem.exclude)
         parts, chosen = _best_parts(problem, demand_groups(all_demands, problem.candidates), least, report)
-    return SensorChoice(problem, chosen, least.cost, least.lower_bound, least.proven, parts)
-
-
-def explain_choice(choice: SensorChoice, progress: StepCallback | None = None) -> SensorPlan:
-    """The reasons for a choice of sensors."""
-    problem, chosen, stack = choice.problem, choice.chosen, choice.problem.stack
-    (progress or (lambda *_: None))("leaving sensors out", 0, 1)
-
-    fewer = [tuple(c for c in chosen if c is not candidate) for candidate in chosen]
+    report("leaving sensors out", 0, 1)
+    stack, fewer = problem.stack, [tuple(c for c in chosen if c is not candidate) for candidate in chosen]
     (_, full), (_, rank), *without = share_between_forks(
         [problem.candidates, chosen, *fewer],
         lambda sensors: (_base_rank(problem, sensors), stack.rank(sensors)),
         thread_count(),
     )
     return SensorPlan(
-        **vars(choice),
+        problem=problem,
+        chosen=chosen,
+        cost=least.cost,
+        lower_bound=least.lower_bound,
+        proven=least.proven,
+        parts=parts,
         branches=branches(problem.robot, problem.contacts, problem.states),
         requirements=contact_requirements(problem.robot, problem.contacts, problem.states, problem.seed),
         observability=tuple(problem.assess(sensor_set(problem.robot, problem.contacts, chosen))),
@@ -596,13 +531,9 @@ def _best_parts(
             prior=problem.prior,
         )
         description = f"ranking sets, {', '.join(frames)}"
-        if sets is None:
-            report(description, 0, 1)
-            ranked = improve_by_exchange(ranking, part, initial, keep, exclude)
-        else:
-            bound = total_cost(initial) * (1.0 + _EXACT)
-            cheapest = [s for s in sets if total_cost(s) <= bound]
-            ranked = rank_sets(ranking, cheapest, _counted(report, description, len(cheapest)))
+        bound = total_cost(initial) * (1.0 + _EXACT)
+        cheapest = [initial] if sets is None else [s for s in sets if total_cost(s) <= bound]
+        ranked = rank_sets(ranking, cheapest, _counted(report, description, len(cheapest)))
         chosen = (chosen - own) | frozenset(ranked[0].sensors)
         out.append(PartPlan(frames, part.candidates, None if sets is None else tuple(sets), tuple(ranked)))
     return tuple(out), tuple(c for c in problem.candidates if c in chosen)
