@@ -61,7 +61,6 @@ ALL: dict[str, Any] = {
         "costs": {"joint_torque": 2.0, "l_sole.fz": 0.5},
         "criterion": "stack",
         "compare": {"legs": {"joint_torques": ["hip"], "contact_wrenches": {"l_sole": ["fz"]}}},
-        "prior_error": 0.1,
         "seed": 3,
     },
     "figures": {"format": "svg"},

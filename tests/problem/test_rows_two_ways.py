@@ -16,13 +16,12 @@ import numpy as np
 import pytest
 import torch
 from random_samples import NOISE, random_samples, sensor_set
-from synthetic import PANDA, TALOS_FULL, Array, load
+from synthetic import Array
 
 import torchid
 from torchid.identifiability.base_parameters import merge_state_reports, state_reports
 from torchid.problem import RowBuilder, compress
 from torchid.problem.chunks import chunks_by_state
-from torchid.problem.metrics import predict_by_columns, predict_forces
 
 ROBOT = torchid.load_robot(Path(torchid.__file__).parent / "demo" / "quadruped.urdf")
 FEET = [torchid.Contact(f"{end}_{side}_foot", "point") for end in ("front", "rear") for side in ("left", "right")]
@@ -75,22 +74,6 @@ def test_both_ways_give_the_same_equations_up_to_a_rotation(name: str) -> None:
     )
     np.testing.assert_allclose(A_fast.T @ b_fast / size, A.T @ b / size, rtol=0.0, atol=1e-14 * np.linalg.norm(b))
     assert np.linalg.norm(b_fast) == pytest.approx(np.linalg.norm(b), rel=1e-13)
-
-
-@pytest.mark.parametrize(
-    "robot",
-    [ROBOT, load(TALOS_FULL, ft_joints=("wrist_left_ft_joint",)), load(PANDA, fixed_base=True)],
-    ids=["quadruped", "mimic fingers, a sensor in a limb", "bolted arm"],
-)
-def test_forces_are_the_same_by_columns_of_k_and_without_them(robot: torchid.Robot) -> None:
-    sensors = torchid.named_sensors("full", robot.n, 0, NOISE, len(robot.ft_names))
-    builder = RowBuilder(robot, [], sensors)
-    samples = random_samples(robot, [], 20, 1)[0]
-    phi = torch.from_numpy(np.random.default_rng(2).normal(size=(7, builder.columns.count)))
-    dynamics = builder.dynamics(samples)
-    by_columns, without = predict_by_columns(builder, dynamics, phi), predict_forces(builder, dynamics, phi)
-    assert without.shape == (7, robot.n_rows, 20)
-    np.testing.assert_allclose(by_columns, without, rtol=0.0, atol=1e-13 * without.abs().max().item())
 
 
 @pytest.mark.parametrize("name", SENSOR_SETS)

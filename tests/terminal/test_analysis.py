@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import yaml
@@ -14,7 +16,6 @@ from torchid.cli import main
 from torchid.commands.analyze import Analysis, analyze
 from torchid.config import load_analysis
 from torchid.identifiability.base_parameters import unobservable_parameters
-from torchid.identifiability.information import ExpectedErrors
 from torchid.problem.metrics import ROW_GROUPS
 from torchid.report.analysis import SetAccuracy
 from torchid.report.tables import terminal_width
@@ -59,10 +60,10 @@ def sound(analysis: Analysis) -> Analysis:
 
 def with_logs(analysis: Analysis, rank: int, *confounded: str, sets: int = 1) -> Analysis:
     """The same with the accuracy of sensor sets on logs that determine so many combinations."""
-    rms = {group: 0.1234 for group in ROW_GROUPS}
+    measured: Any = SimpleNamespace(rms=dict.fromkeys(ROW_GROUPS, 0.1234))
     names = ["proposed", *(f"set {k}" for k in range(1, sets))]
     advice = tuple(f"mend that {message}" for message in confounded)
-    accuracy = SetAccuracy(11, rank, ExpectedErrors(rms, rms), None, confounded, advice)
+    accuracy = SetAccuracy(11, rank, measured, confounded, advice)
     setup = analysis.setup
     settings = replace(setup.config.analysis, scenarios=None)
     setup = replace(setup, config=replace(setup.config, analysis=settings))
@@ -134,7 +135,7 @@ def test_logs_that_determine_less_than_the_sensors_could_are_named(lame: Analysi
     rank = lame.scenarios[0].base.rank
     assert f"the logs determine {rank - 7} of {rank} combinations: record motion" in text(with_logs(lame, rank - 7))
     assert "the logs determine" not in text(with_logs(lame, rank))
-    assert "rms error, expected joint torque [N m] base force [N]" in text(with_logs(lame, rank))
+    assert "rms error, measured joint torque [N m] base force [N]" in text(with_logs(lame, rank))
     said = text(with_logs(lame, rank, "offset of a: confounded with b; do not trust either", "another", sets=2))
     assert "attention proposed, set 1: mend that offset of a: confounded with b; do not trust either" in said
     assert "and 2 more: --verbose" in said

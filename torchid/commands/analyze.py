@@ -429,7 +429,7 @@ def _write_analysis(analysis: Analysis, output: Path, overwrite: bool = False) -
         which = "planned" if scenario.proposed is None else "proposed"
         texts.append(base_parameters_text(f"{scenario.name}, {which} sensors", scenario.base, names))
         figures[f"sensors-{scenario.name}"] = _picture(setup, scenario)
-    if analysis.accuracies:
+    if any(found.measured is not None for found in analysis.accuracies.values()):
         figures["accuracy"] = accuracy_figure(analysis.accuracies)
     with during("writing", output), new_folder(output, overwrite, ANALYSIS) as folder:
         (folder / "config.yaml").write_text(dump_config(setup.config))

@@ -1,4 +1,4 @@
-"""Accuracy of sensor sets: expected from the training logs, and measured on the test logs."""
+"""Accuracy of sensor sets: what a fit of the training logs with each leaves on the test logs."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ from torchid.commands.plausibility import TrainingLogs, require_plausible
 from torchid.errors import ImplausibleFitError, LogError, warn
 from torchid.fitting.calibration import Calibration, list_confounded
 from torchid.fitting.experiment import RobotSetup, batch_estimator
-from torchid.identifiability.information import error_directions, expected_errors
 from torchid.parallel import share_between_forks, thread_count
 from torchid.parameters import Array
-from torchid.problem import Evaluation, ExtraTerms, RowBuilder, Samples, assemble, compress_parts
+from torchid.problem import Evaluation, RowBuilder, Samples, assemble, compress_parts
 from torchid.problem.compression import split_into_folds
 from torchid.problem.elimination import Assembly
 from torchid.problem.samples import require_forces
@@ -31,8 +30,8 @@ def accuracies(
 ) -> dict[str, SetAccuracy]:
     """Fit with every sensor set that the training logs recorded, by least squares instead of a descent.
 
-    What is measured is compared with readings calibrated for the parameters of each fit, by all sensors if the training
-    logs have them, or else by the set's; what is expected counts offsets and the like as known in predictions.
+    Predictions are compared with readings calibrated for the parameters of each fit, by all sensors if the training
+    logs have them, or else by the set's.
 
     Warns:
         TorchidWarning: the training logs lack a sensor of a set, or no robot can have left its fit; it is left out.
@@ -98,7 +97,7 @@ def _accuracy(
     evaluation: Evaluation,
     reference: _Reference | None,
 ) -> SetAccuracy:
-    settings, robot = setup.config.estimator, setup.robot
+    settings = setup.config.estimator
     builder, conditions = setup.builder(sensors), setup.conditions()
     fitter = setup.fitter(builder, conditions)
     if settings.name == "sgd":
@@ -110,18 +109,11 @@ def _accuracy(
         settings = replace(settings, ridge=choice.ridge)
     fit = fitter.fit(parts, batch_estimator(settings, conditions).solve)
     require_plausible(fit, TrainingLogs(setup))
-    estimate, problem = fit.estimate, fit.assembly.problem
-    noise = estimate.residual_std
-    variance = noise**2 * problem.oversampling
-    prior_error = setup.config.analysis.prior_error
-    directions = error_directions(problem, settings.numeric_ridge, variance, prior_error, settings.rank_tolerance)
-    scaled_noise = setup.noise.scaled(noise)
-    bodies = Evaluation(robot, setup.contacts, setup.config.device, ExtraTerms(sign_width=setup.terms.sign_width))
-    expected = expected_errors(bodies.builder, test or train, directions, scaled_noise)
+    estimate = fit.estimate
     calibration = (reference or _Reference(setup, builder, fit.assembly)).calibration(estimate.phi)
     phi = calibration.parameters(evaluation)
     measured = evaluation.metrics(calibration.calibrate(test), phi[None])[0] if test else None
     possible = measured_components(setup.contacts, sensors)
     channels, confounded = int(sensors.torque.sum() + possible.sum()), list_confounded(fit.extras)
     words, advice = tuple(map(str, confounded)), tuple(one.in_short for one in confounded)
-    return SetAccuracy(channels, estimate.rank, expected, measured, words, advice)
+    return SetAccuracy(channels, estimate.rank, measured, words, advice)

@@ -75,9 +75,8 @@ class AnalysisConfig:
     logs, or, without logs, all contacts at once. `keep`: candidates that every plan has, `exclude`: that none has;
     `costs` per channel, by candidate or by kind (joint_torque, contact, normal_force, ft_sensor). `criterion`:
     per_sample, the base survives the projection of every sample (None, for a floating base); stack, many samples
-    together determine all that full sensing would (None, for a fixed one). `compare`: sensor sets whose accuracy is
-    predicted from the training logs and measured on the test logs; `prior_error`: standard deviation of the URDF's
-    parameters, as a share of the size of each body.
+    together determine all that full sensing would (None, for a fixed one). `compare`: sensor sets whose fits of the
+    training logs are measured on the test logs.
     """
 
     scenarios: Annotated[Scenarios, Field(min_length=1)] | None = None
@@ -87,7 +86,6 @@ class AnalysisConfig:
     costs: dict[str, Positive] = dataclasses.field(default_factory=dict)
     criterion: Literal["per_sample", "stack"] | None = None
     compare: dict[Name, Choice] = dataclasses.field(default_factory=dict)
-    prior_error: Annotated[Positive, Field(le=100.0)] = 0.2
     seed: Seed = 0
 
 

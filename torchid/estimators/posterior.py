@@ -19,7 +19,7 @@ from torchid.reprs import short_repr
 from torchid.rounding import RANK_TOLERANCE, is_significant
 
 PRIOR_ERROR = 0.2
-"""Default standard deviation of the nominal parameters, as a share of each body; that of `analysis.prior_error`."""
+"""Default standard deviation of the nominal parameters, as a share of each body."""
 
 _LEAST_NOISE = 1e-8  # of rows without any, as a share of the rms of the right-hand side
 _THINNEST = 1e-4  # least eigenvalue of the scaled pseudo-inertias that the prior is relative to

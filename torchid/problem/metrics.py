@@ -19,10 +19,10 @@ from torchid.parameters import GRAVITY, MASS, Array
 from torchid.problem.chunks import CHUNK, ProgressCallback, blocks_in, chunks_by_state, map_chunks
 from torchid.problem.contact_state import ContactState
 from torchid.problem.extras import ACTUATORS, Extra, ExtraTerms, contact_extra_column, dof_extra_column
-from torchid.problem.rows import ChunkDynamics, ChunkKinematics, RowBuilder, leave_out_torques
+from torchid.problem.rows import ChunkKinematics, RowBuilder, leave_out_torques
 from torchid.problem.samples import Samples
 from torchid.regressor.columns import body_wrenches
-from torchid.regressor.regressor import friction_columns, generalized_forces, joint_row
+from torchid.regressor.regressor import generalized_forces
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, named_sensors
@@ -101,21 +101,6 @@ def predict_forces(builder: RowBuilder, kinematics: ChunkKinematics, phi: Tensor
     torque[:, 1:].addcmul_(coulomb, joints.direction[1:]).addcmul_(viscous, joints.velocity[1:])
     by_joint = tree.joint_map.T @ torque
     return torch.cat([wrench.sum(2).transpose(0, 1), by_joint], 1) if tree.base_rows else by_joint
-
-
-def predict_by_columns(builder: RowBuilder, dynamics: ChunkDynamics, phi: Tensor) -> Tensor:
-    """As `predict_forces`, of some hundred parameter vectors: by columns of K, which all of these have in common."""
-    tree, columns = builder.tree, builder.columns
-    inertial, base = columns.layout.count, tree.base_rows
-    out = phi.new_empty(tree.n_rows, len(phi), dynamics.wrenches.shape[-1])
-    torch.matmul(phi[:, :inertial], dynamics.wrenches[:base], out=out[:base])
-    for row, forces in zip(columns.joint_rows, out[base:], strict=True):
-        block = joint_row(row, tree, columns.layout, dynamics.screw_axes, dynamics.wrenches)
-        torch.mm(phi[:, row.start : row.end], block, out=forces)
-        for body, *friction in friction_columns(row, dynamics.joints):
-            at = columns.friction(body)
-            forces.addmm_(phi[:, at : at + 2], torch.stack(friction))
-    return out.transpose(0, 1)
 
 
 def with_payload_columns(builder: RowBuilder, samples: Samples, phi: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Results of `torchid analyze`: tables, text, `analysis.json`, and the figure of expected and measured accuracy."""
+"""Results of `torchid analyze`: tables, text, `analysis.json`, and the figure of accuracy."""
 
 from __future__ import annotations
 
@@ -16,10 +16,9 @@ from rich.text import Text
 from torchid.errors import format_count, format_percent
 from torchid.fitting.left_out import Evidence
 from torchid.identifiability.base_parameters import BaseParameters, format_base_parameters, unobservable_parameters
-from torchid.identifiability.information import ExpectedErrors
 from torchid.problem import Metrics
 from torchid.problem.metrics import ROW_GROUPS, group_name
-from torchid.report.figure_style import IDENTIFIED_COLOR, MEASURED_COLOR, NOISE_COLOR, STYLE, label_decades
+from torchid.report.figure_style import MEASURED_COLOR, STYLE, label_decades
 from torchid.rounding import BASE_RANK_TOLERANCE
 from torchid.sensor_planning.observability import BaseObservability, Candidate, LostBase, PostureSummary
 from torchid.sensor_planning.planner import PartPlan, SensorPlan
@@ -31,8 +30,6 @@ _LONGEST_NAME = 20  # of a sensor set that a table does not break
 _MAX_SETS, _MAX_REMEDIES, _BASE_DIRECTIONS = 5, 8, 6
 #: Smallest singular value of S_b V_x: below, the noise of the base's rows is a thousand times that of the sensors.
 _MIN_SINGULAR_VALUE = 1e-3
-#: Markers and colors of expected and measured errors.
-_MODEL, _EXPECTED, _MEASURED = ("o", IDENTIFIED_COLOR), ("s", NOISE_COLOR), ("D", MEASURED_COLOR)
 
 
 def sensor_plan_document(plan: SensorPlan) -> dict[str, Any]:
@@ -250,14 +247,13 @@ def _table(title: str, *headings: str) -> Table:
 
 @dataclass(frozen=True)
 class SetAccuracy:
-    """Errors of a fit with one sensor set: expected, and measured on the test logs, if any.
+    """Errors of a fit with one sensor set, measured on the test logs, if any.
 
     `confounded`: what it is that the set does not separate, in words; `advice`: for each, what not to trust and to do.
     """
 
     channels: int
     rank: int
-    expected: ExpectedErrors
     measured: Metrics | None
     confounded: tuple[str, ...] = ()
     advice: tuple[str, ...] = ()
@@ -268,34 +264,24 @@ class SetAccuracy:
             "channels": self.channels,
             "rank": self.rank,
             "confounded": list(self.confounded),
-            "expected_model_error": self.expected.model,
-            "expected_sensor_noise": self.expected.sensors,
-            "expected": self.expected.total,
             "measured": None if self.measured is None else self.measured.rms,
         }
 
 
 def accuracy_table(sets: Mapping[str, SetAccuracy]) -> Table:
-    """Expected and measured rms error by group of rows."""
-    title = "Accuracy of sensor sets, rms error: expected of the model, with noise added, measured"
+    """Rms error by group of rows, where it was measured."""
+    title = "Accuracy of sensor sets, rms error on the test logs"
     table = Table(title=title, title_justify="left")
     longest = max(map(len, sets), default=0)
     table.add_column("sensors", overflow="fold", min_width=min(longest, _LONGEST_NAME))
     table.add_column("channels", justify="right")
     table.add_column("rank", justify="right")
-    table.add_column("", no_wrap=True)
     for label in ROW_GROUPS.values():
         table.add_column(Text(label.replace(" [", "\n[")), justify="right")
     for name, found in sets.items():
-        first: list[Text | str] = [Text(name), str(found.channels), str(found.rank)]
-        for label, errors in (
-            ("expected", found.expected.model),
-            ("with noise", found.expected.total),
-            ("measured", {} if found.measured is None else found.measured.rms),
-        ):
-            table.add_row(*first, label, *(_number(errors.get(group)) for group in ROW_GROUPS))
-            first = ["", "", ""]
-        table.add_section()
+        errors = {} if found.measured is None else found.measured.rms
+        numbers = (_number(errors.get(group)) for group in ROW_GROUPS)
+        table.add_row(Text(name), str(found.channels), str(found.rank), *numbers)
     return table
 
 
@@ -335,24 +321,18 @@ def _number(x: float | None) -> str:
 @matplotlib.rc_context(STYLE)
 def accuracy_figure(sets: Mapping[str, SetAccuracy]) -> Figure:
     """One panel per group of rows that the logs give, with the sensor sets side by side on a logarithmic scale."""
-    groups = [group for group in ROW_GROUPS if any(found.expected.model[group] is not None for found in sets.values())]
+    measured = {name: found.measured.rms for name, found in sets.items() if found.measured is not None}
+    groups = [group for group in ROW_GROUPS if any(rms[group] is not None for rms in measured.values())]
     figure = Figure(figsize=(2.6 * max(len(groups), 2) + 0.6, 3.8), layout="constrained")
     axes = figure.subplots(1, len(groups), squeeze=False)[0]
-    index = np.arange(len(sets))
+    index = np.arange(len(measured))
     for axis, group in zip(axes, groups, strict=True):
-        measured = [None if found.measured is None else found.measured.rms[group] for found in sets.values()]
-        for shift, name, (marker, color), heights in (
-            (-0.15, "expected model error", _MODEL, [found.expected.model[group] for found in sets.values()]),
-            (0.0, "expected, with noise added", _EXPECTED, [found.expected.total[group] for found in sets.values()]),
-            (0.15, "measured on the test logs", _MEASURED, measured),
-        ):
-            known = [np.nan if height is None else height for height in heights]
-            axis.plot(index + shift, known, marker, color=color, markersize=7, label=name)
+        heights = [np.nan if (x := rms[group]) is None else x for rms in measured.values()]
+        axis.plot(index, heights, "D", color=MEASURED_COLOR, markersize=7)
         axis.set_yscale("log")
-        axis.margins(x=0.3 / max(len(sets) - 1, 1), y=0.15)
+        axis.margins(x=0.3 / max(len(measured) - 1, 1), y=0.15)
         label_decades(axis.yaxis)
-        axis.set_xticks(index, list(sets), rotation=40, ha="right")
+        axis.set_xticks(index, list(measured), rotation=40, ha="right")
         axis.set_title(group_name(group), loc="left", fontsize=9)
         axis.set_ylabel(f"rms error {ROW_GROUPS[group][ROW_GROUPS[group].index('[') :]}")
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=3)
     return figure

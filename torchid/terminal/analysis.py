@@ -194,21 +194,20 @@ def _attention(analysis: Analysis, scenarios: Sequence[ScenarioAnalysis]) -> Ite
 
 
 def _accuracy_lines(sets: Mapping[str, SetAccuracy], room: int, width: int) -> list[str]:
-    """A table of the errors of sensor sets, measured if that was done (of all or none), in so many lines."""
-    if not sets:
+    """A table of the errors of sensor sets, measured if there were test logs, in so many lines."""
+    if all(found.measured is None for found in sets.values()):
         return []
     most = room - 2 if len(sets) <= room - 2 else room - 3  # an empty line, a heading, how many others there are
     if most < 1:
         return labelled("compared", f"{format_count(len(sets), 'sensor set')}: analysis.json, --verbose", width)
     shown = dict(list(sets.items())[:most])
-    measured = [found.measured.rms for found in shown.values() if found.measured is not None]
-    errors = measured or [found.expected.total for found in shown.values()]
+    errors = [found.measured.rms for found in shown.values() if found.measured is not None]
     columns = [
         (label, ["" if (rms := of.get(group)) is None else f"{rms:.3g}" for of in errors])
         for group, label in ROW_GROUPS.items()
     ]
     columns += [("rank", [str(found.rank) for found in shown.values()])]
-    lines = column_lines((f"rms error, {'measured' if measured else 'expected'}", list(shown)), columns, width)
+    lines = column_lines(("rms error, measured", list(shown)), columns, width)
     if len(sets) > len(shown):
         lines.append(f"and {len(sets) - len(shown)} sensor sets more: analysis.json, --verbose")
     return ["", *lines]
