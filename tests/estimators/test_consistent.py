@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conic_reference import least_objective
-from hypothesis import assume, example, given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from physical import (
     PRIORS,
@@ -26,7 +26,7 @@ from synthetic import Array, transform
 
 from torchid import parameters
 from torchid.errors import InputError
-from torchid.estimators import Conditions, Consistent, LeastSquares, violations
+from torchid.estimators import Conditions, Consistent, violations
 from torchid.estimators.conic_problem import Prior
 from torchid.problem.linear import parameter_scale
 
@@ -105,26 +105,6 @@ def test_a_general_optimizer_finds_nothing_better(seed: int, prior: Prior) -> No
         )
         assert found.fun >= 1.0 - 1e-9 - estimate.gap / estimate.objective
         assert found.fun < 1.02  # it does arrive: the comparison means something
-
-
-@few
-@given(seed=seeds)
-def test_without_active_conditions_it_is_least_squares(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    nominal = random_bodies(rng, 2)
-    nominal[:, 10:] = 1.0
-    scale = parameter_scale(nominal)
-    problem = data(rng, nominal, nominal + 1e-3 * scale * rng.normal(size=nominal.shape), scale, 20, 10.0, 1e-4)
-    plain = LeastSquares(ridge := 1e-3).solve(problem)
-    least = float(least_eigenvalues(plain.phi.reshape(nominal.shape), scale).min())
-    assume(least > 1e-4)
-    estimate = Consistent(ridge, "euclidean", Conditions(0.5 * least)).solve(problem)
-    np.testing.assert_allclose(estimate.phi / problem.scale, plain.phi / problem.scale, rtol=0.0, atol=1e-7)
-    assert estimate.unconstrained == pytest.approx(estimate.objective, rel=1e-7)
-    assert estimate.increase == pytest.approx(0.0, abs=1e-7 * estimate.objective)
-    for name in ("standard_error", "identifiable", "rank", "condition_number", "nominal_cost", "rows"):
-        np.testing.assert_array_equal(getattr(estimate, name), getattr(plain, name))
-    assert estimate.cost == problem.cost(estimate.phi)
 
 
 @pytest.mark.parametrize("ridge", [0.0, 1e-10])

@@ -14,7 +14,7 @@ from synthetic import Array
 from thinned import slow_but
 
 from torchid.estimators import LeastSquares
-from torchid.problem import LinearProblem, TriangularFactor
+from torchid.problem import LinearProblem
 from torchid.problem.linear import PRIOR_DEVIATION
 
 seeds = st.integers(0, 2**32 - 1)
@@ -135,15 +135,6 @@ def test_without_a_ridge_standard_errors_are_the_textbooks() -> None:
     assert estimate.residual_std == pytest.approx(np.sqrt(variance))
 
 
-def test_only_what_the_data_determine_counts_as_identifiable() -> None:
-    """The first is seen alone; the second and third only by their sum, however hard a ridge pulls; the fourth never."""
-    A = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 1.0, 0.0], [1.0, 1.0, 1.0, 0.0]])
-    for ridge in (0.0, 1.0):
-        estimate = LeastSquares(ridge).solve(problem_of(A, np.array([1.0, 4.0, 5.1])))
-        np.testing.assert_array_equal(estimate.identifiable, [True, False, False, False])
-        np.testing.assert_array_equal(np.isnan(estimate.standard_error), [False, True, True, True])
-
-
 # ------------------------------------------------------------------------------------------------------------ refusals
 
 
@@ -162,29 +153,6 @@ def test_numbers_that_are_not_finite_are_refused_and_never_become_parameters(nam
     spoilt.flat[1] = bad
     with pytest.raises(ValueError, match="finite"):
         LeastSquares().solve(replace(good, **{name: spoilt}))
-
-
-# --------------------------------------------------------------------------------------------------- what is kept of X
-
-
-@few
-@given(seed=seeds)
-def test_a_triangular_factor_keeps_all_that_least_squares_needs(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    factors, rows = [TriangularFactor(7), TriangularFactor(7)], []
-    for _ in range(rng.integers(0, 12)):
-        support = [tuple(range(7)), (0, 3, 4), (5,), ()][rng.integers(4)]
-        block = rng.normal(size=(rng.integers(0, 12), len(support) + 1)) * 10.0 ** rng.uniform(-3, 3)
-        factors[rng.integers(2)].add(support, torch.from_numpy(block))
-        wide = np.zeros((len(block), 8))
-        wide[:, [*support, 7]] = block
-        rows.append(wide)
-    X = np.concatenate([np.zeros((0, 8)), *rows])
-    factors[0].merge(factors[1])
-    R = factors[0].triangle().numpy()
-    assert factors[0].rows == len(X)
-    np.testing.assert_array_equal(R, np.triu(R))
-    np.testing.assert_allclose(R.T @ R, X.T @ X, rtol=0.0, atol=1e-14 * np.sum(X * X))
 
 
 # --------------------------------------------------------------------------------------------- rows that hold back data

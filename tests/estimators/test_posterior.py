@@ -7,14 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from long_chain import LongChain
 from physical import GOOD, SCALE, active_case, nothing_seen, random_case
 from synthetic import Array
 from thinned import slow_but
 
 from torchid.estimators import Conditions, LeastSquares, violations
 from torchid.estimators.barrier import barrier_gaussian
-from torchid.estimators.conic_problem import ConicProblem
 from torchid.estimators.posterior import Posterior, whitened_rows
 from torchid.estimators.truncated_gaussian import TruncatedGaussian
 from torchid.problem import LinearProblem
@@ -104,38 +102,6 @@ def test_the_barrier_has_the_mean_of_an_exponential_tail() -> None:
     rate = 1e4 * 1e4  # of exp(-|A fc - b|^2 / 2) at fc = 0
     np.testing.assert_allclose(found.mean[friction] + GOOD[0, 10], 1.0 / rate, rtol=1e-3)
     np.testing.assert_allclose(np.sqrt(found.covariance[friction, friction]), 2.0 / rate, rtol=1e-3)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("prior_error", [0.2, 0.6])
-def test_mean_and_covariance_are_those_of_long_chains_where_bodies_are_cut_off(prior_error: float) -> None:
-    conic, owners, sampler = cut_off(prior_error)
-    x = sampler.draw(40_000, torch.Generator().manual_seed(1)).numpy()
-    assert_alike(x, states_of(LongChain(conic, owners, 1000, seed=2), 5000, 25))
-
-
-def cut_off(prior_error: float) -> tuple[ConicProblem, np.ndarray, TruncatedGaussian]:
-    problem, _ = active_case(3)
-    posterior = posterior_of(problem, Conditions(1e-3), noise=0.1)
-    conic, owners = posterior.conic_problem(prior_error), posterior.owners()
-    sampler = TruncatedGaussian(conic, owners)
-    assert sampler.near
-    return conic, owners, sampler
-
-
-def states_of(chain: LongChain, steps: int, every: int) -> Array:
-    """What chains are at in a number of steps, after two fifths as many."""
-    states: list[Array] = []
-    chain.run(2 * steps // 5)
-    chain.run(steps, lambda x: states.append(x.copy()), every=every)
-    return np.concatenate(states)
-
-
-def assert_alike(x: Array, reference: Array) -> None:
-    mean, deviation = reference.mean(axis=0), reference.std(axis=0)
-    np.testing.assert_allclose((x.mean(axis=0) - mean) / deviation, 0.0, atol=0.05)
-    np.testing.assert_allclose(x.std(axis=0) / deviation, 1.0, atol=0.05)
-    np.testing.assert_allclose(np.corrcoef(x.T), np.corrcoef(reference.T), atol=0.05)
 
 
 def test_the_seed_decides_every_bit_whatever_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -93,15 +93,6 @@ def test_the_figures_of_an_estimate_are_those_of_its_parameters(
     assert 0.0 < epochs[0].learning_rate - epochs[30].learning_rate < 0.05
 
 
-MOMENTUM: dict[str, Any] = {"optimizer": {"name": "SGD", "lr": 0.2, "momentum": 0.9}, "epochs": 40}
-
-
-def test_without_the_preconditioner_the_same_descent_hardly_leaves_the_urdf() -> None:
-    """32 times the closed form after as many epochs; so it was with steps of 0.03, 0.1 and 0.3."""
-    estimate, _ = trained(demo(), True, **MOMENTUM)
-    assert estimate.objective > 20.0 * estimate.unconstrained
-
-
 # -------------------------------------------------------------------------------------------------------- what is lost
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from experiments import LEAST
-from refusals import assert_wrong_value, refused
+from refusals import refused
 from repository import CONFIGS, DEMO
 from synthetic import G1, SOLO12, Oracle, load, make_log
 from urdfs import INERTIAL, ball, joint, link, table, write
@@ -172,44 +172,6 @@ def test_centres_of_mass_inside_nothing_are_refused(tmp_path: Path) -> None:
     assert message.startswith("com_inside: box, but quadruped.urdf says of no body that is fitted what shape it has")
     message = refusal(tmp_path, robot, com_shapes="collision")
     assert message.startswith("com_shapes: collision, without com_inside; accepted: com_inside: box or ellipsoid")
-
-
-@table({
-    "word": ({"com_inside": "sphere"}, "com_inside", "'sphere'"),
-    "flag": ({"com_inside": True}, "com_inside", "True"),
-    "shapes": ({"com_inside": "box", "com_shapes": "both"}, "com_shapes", "'both'"),
-    "tokens": ({"symmetry": ["l_", "r_"]}, "symmetry", "found ['l_', 'r_']"),
-    "one token": ({"symmetry": {"left": "l_"}}, "symmetry.right", "missing"),
-    "empty token": ({"symmetry": {"left": "", "right": "r_"}}, "symmetry.left", "''"),
-    "normal": ({"symmetry": {"left": "l_", "right": "r_", "normal": "up"}}, "symmetry.normal", "'up'"),
-    "bounds": ({"bounds": [1, 2]}, "bounds", "found [1, 2]"),
-    "number": ({"bounds": {"torso": {"m": 3}}}, "bounds.torso.m", "3"),
-    "one number": ({"bounds": {"torso": {"m": [3]}}}, "bounds.torso.m", "found [3]"),
-    "three numbers": ({"bounds": {"torso": {"m": [1, 2, 3]}}}, "bounds.torso.m", "found [1, 2, 3]"),
-    "not a number": ({"bounds": {"torso": {"m": ["a", 2]}}}, "bounds.torso.m.0", "'a'"),
-    "not finite": ({"bounds": {"torso": {"m": [float("nan"), 2]}}}, "bounds.torso.m.0", "nan"),
-})  # fmt: skip
-def test_a_value_of_the_wrong_kind_is_refused_by_its_place(case: tuple, tmp_path: Path) -> None:
-    keys, place, found = case
-    file = tmp_path / "experiment.yaml"
-    assert_wrong_value(lambda: settings_of(tmp_path, **keys), file, f"estimator.{place}", found)
-
-
-@table({
-    "com_inside": {"com_inside": "box"},
-    "com_shapes": {"com_shapes": "collision"},
-    "symmetry": {"symmetry": {"left": "l_", "right": "r_"}},
-    "bounds": {"bounds": {"torso": {"m": [1, 2]}}},
-})  # fmt: skip
-def test_least_squares_has_no_conditions(case: dict, tmp_path: Path) -> None:
-    (key,) = case
-    file = tmp_path / "experiment.yaml"
-    assert_wrong_value(
-        lambda: settings_of(tmp_path, name="least_squares", **case),
-        file,
-        f"estimator.{key}",
-        "which least_squares has not",
-    )
 
 
 # --------------------------------------------------------------------------------------------------------- whole runs

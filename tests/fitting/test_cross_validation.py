@@ -18,14 +18,12 @@ from torchid.config import load_config
 from torchid.fitting.cross_validation import (
     RIDGES,
     STRONGER,
-    Scorer,
 )
 from torchid.fitting.experiment import Experiment, set_up, with_estimated_noise
 from torchid.fitting.left_out import RIDGE
 from torchid.logs import read_log
 from torchid.logs.preprocess import preprocess
 from torchid.problem import (
-    Metrics,
     RowBuilder,
     Samples,
     bind_log,
@@ -36,7 +34,7 @@ from torchid.problem.compression import (
     FOLDS,
     split_into_folds,
 )
-from torchid.problem.metrics import ROW_GROUPS, WHITENED, describe_worse, worse_than_nominal
+from torchid.problem.metrics import WHITENED
 from torchid.sensing import Contact, SensorNoise, named_sensors
 
 pytestmark = pytest.mark.usefixtures("events")
@@ -119,18 +117,6 @@ def test_cross_validation_is_what_refitting_by_hand_gives(run: Path, demo: tuple
     assert (metrics["verdict"], metrics["worse_than_nominal"]) == (None, [])
 
 
-@pytest.mark.parametrize(
-    ("lengths", "most", "step"), [((10, 10), 20, 1), ((10, 10), 19, 2), ((7, 7), 7, 3), ((5, 1, 1), 2, 5), ((), 3, 1)]
-)
-def test_the_step_between_scored_samples_is_the_least_that_keeps_to_the_limit(
-    run: Path, demo: tuple[RowBuilder, Samples], lengths: tuple[int, ...], most: int, step: int
-) -> None:
-    builder, log = demo
-    scorer = Scorer(set_up(load_config(run / "config.yaml")).evaluation(), builder, most)
-    logs = [log[:length] for length in lengths]
-    assert scorer.scored(logs) == (step, sum(len(one[::step]) for one in logs))
-
-
 def test_the_ridge_follows_from_the_residuals_unless_left_out_blocks_ask_for_more(run: Path) -> None:
     metrics = json.loads((run / "metrics.json").read_text())
     found = metrics["ridge_selection"]
@@ -156,28 +142,3 @@ def test_one_standard_error_takes_the_largest_ridge_that_held_out_blocks_cannot_
     assert best < chosen < len(error) - 1, "another one than the best, and than the largest tried"
     assert found["rule"] == "one_standard_error"
     assert yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())["estimator"]["ridge"] == found["ridge"]
-
-
-# ---------------------------------------------------------------------------------------------------------- the verdict
-
-
-def metrics_of(rms: float, measured: float, group: str = "base_force") -> Metrics:
-    values: dict[str, float | None] = dict.fromkeys([*ROW_GROUPS, WHITENED])
-    return Metrics({**values, group: rms}, {**values, group: rms / measured if rms else 0.0}, {}, {}, None)
-
-
-@pytest.mark.parametrize(
-    ("nominal", "identified", "worse"),
-    [
-        (1.0, 1.2, True),
-        (1.0, 1.04, False),
-        (1.0, 0.5, False),
-        (0.0, 1e-9, False),
-        (1e-12, 1e-10, False),
-        (0.0, 1, True),
-    ],
-)
-def test_worse_is_clearly_larger_and_no_rounding(nominal: float, identified: float, worse: bool) -> None:
-    found = worse_than_nominal({"test": (metrics_of(nominal, 100.0), metrics_of(identified, 100.0))})
-    assert bool(found) is worse
-    assert (describe_worse(found, "URDF") is None) is not worse

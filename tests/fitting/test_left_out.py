@@ -93,17 +93,6 @@ def test_terms_of_actuators_are_adopted_where_they_are_and_not_where_they_are_no
     assert str(nothing).startswith("none")
 
 
-def test_a_term_that_errors_of_gains_explain_is_not_adopted() -> None:
-    """Torques of the weight change with the position as those of a spring do, and are 5 % off here."""
-    log = recorded(3, gains=0.05, reach=0.3)
-    assert choose_terms(reading(log), TERMS).adopted
-    assert not choose_terms(reading(log, gain=0.05), TERMS).adopted
-    there = recorded(3, rotor=0.3, gains=0.05)
-    assert set(choose_terms(reading(there, gain=0.05), TERMS).adopted) == {"armature"}
-    hidden = recorded(6, rotor=0.05, gains=0.05, reach=0.3)  # by these errors
-    assert set(choose_terms(reading(hidden, gain=0.05), TERMS).adopted) == {"armature"}
-
-
 def test_a_band_with_ringing_is_left_and_one_without_it_is_not() -> None:
     for ringing, expected in ((30.0, 1), (0.0, 0)):
         log = recorded(1, ringing=ringing, encoder=1e-7)  # whose noise is none of its accelerations at 40 Hz

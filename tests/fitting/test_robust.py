@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from intervals import REPETITIONS, covered
 from scipy.optimize import least_squares
 from synthetic import UR5, Array, Oracle, load, make_log
-from thinned import SLOW, slow_but
+from thinned import SLOW
 from true_robots import true_parameters
 from urdfs import inertial, joint, link, write
 
@@ -187,44 +187,6 @@ def test_intervals_of_robust_fits_hold_the_truth_with_and_without_outliers(
         assert ratio < 1.0 / 200.0, "14 times more accurate than least squares; measured: 20 and 22 times"
     else:
         assert ratio < (1.08 if repetitions == REPETITIONS else 1.15), "on clean noise; measured: 1.03 to 1.06"
-
-
-# ------------------------------------------------------------------------------------------------------- gross outliers
-
-
-@pytest.mark.parametrize("kind", LOSSES)
-def test_gross_outliers_in_a_twentieth_of_the_torques_leave_the_parameters_where_they_are(kind: str) -> None:
-    bench = industrial_arm()
-    first, fit, found = bench.fits(kind, bench.noisy(np.random.default_rng(2), 0.05))
-    assert found.converged
-    assert np.abs(bench.off(fit.estimate)).max() < 4.0
-    assert 0.6 < np.sqrt(np.mean(bench.off(fit.estimate) ** 2)) < 1.4
-    assert np.sqrt(np.mean(bench.off(first.estimate, fit.estimate) ** 2)) > 15.0  # standard errors of the robust fit
-    assert found.scale == pytest.approx(1.0, abs=0.1)
-    assert 0.8 < found.mean_weight < 0.96
-
-
-@pytest.mark.parametrize("kind", slow_but(["tukey"], LOSSES))
-def test_passes_over_some_samples_save_passes_over_all_and_change_nothing(
-    kind: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bench = industrial_arm(4000)
-    log = bench.noisy(np.random.default_rng(2), 0.1)
-    _, expected, slow = bench.fits(kind, log[:2000], replace(log[2000:], source="other"))
-    monkeypatch.setattr("torchid.fitting.robust._ROUGH_SAMPLES", 1000)
-    _, fit, fast = bench.fits(kind, log[:2000], replace(log[2000:], source="other"))
-    assert fast.passes == 2 < slow.passes  # steps of least squares alone take 3 or 4
-    assert fast.converged
-    known = expected.estimate.verdict == "identified"
-    moved = (fit.estimate.phi - expected.estimate.phi)[known] / expected.estimate.standard_error[known]
-    assert 0.0 < np.abs(moved).max() < 0.1
-    assert fast.scale == pytest.approx(slow.scale, rel=0.02)
-
-    assert fit.estimate.rows == expected.estimate.rows, "the last passes see all samples"
-    uneven = log[:3300], replace(log[3300:], source="other")
-    _, kept, _ = bench.fits(kind, *uneven)
-    monkeypatch.undo()
-    np.testing.assert_array_equal(kept.estimate.phi, bench.fits(kind, *uneven)[1].estimate.phi, "each log keeps 200")
 
 
 # --------------------------------------------------------------------------------------------------- other algorithms

@@ -66,14 +66,6 @@ def test_the_velocity_of_exact_torques_is_found(velocity: float) -> None:
     assert f"{found.velocity:.3g} rad/s (m/s) (95 %: " in str(found)
 
 
-@pytest.mark.parametrize("velocity", [0.1, 0.5])
-def test_the_filter_passes_what_friction_at_rest_it_passes_of_torques(velocity: float) -> None:
-    """Samples of torques, where friction jumps within a step, leave a percent."""
-    found = chosen(recorded(velocity), cutoff_hz=10.0)
-    assert found.velocity == pytest.approx(velocity, rel=1e-2)
-    assert found.residual < 0.35 * found.coulomb_residual
-
-
 def _held(count: int, cutoff_hz: float | None) -> tuple[int, float]:
     """How many of so many intervals hold the velocity, and the median standard error over the scatter."""
     found = [chosen(recorded(0.2, NOISE, seed), cutoff_hz) for seed in range(count)]

@@ -160,19 +160,6 @@ def arm() -> tuple[Robot, LinearProblem, BaseParameters]:
     return robot, problem, base_parameters(problem)
 
 
-def test_forces_by_base_parameters_have_the_same_derivatives() -> None:
-    robot, _, base = arm()
-    phi = base.scale * np.random.default_rng(4).normal(size=len(base.scale))
-    phi[~base.free] = 0.0
-    gradients = []
-    for whole in (True, False):
-        q, v, a = (torch.from_numpy(x).requires_grad_() for x in random_states(np.random.default_rng(5), robot.n, 4))
-        K = Regressor(robot)(q, v, a)
-        forces = K @ torch.from_numpy(phi) if whole else base(K) @ torch.from_numpy(base.reduce(phi))
-        gradients.append(torch.cat(torch.autograd.grad((forces**2).sum(), [q, v, a]), dim=1))
-    torch.testing.assert_close(gradients[1], gradients[0], rtol=1e-9, atol=1e-9 * float(gradients[0].abs().max()))
-
-
 @pytest.mark.parametrize("frozen", ["nothing", "friction", "a body", "odd ones"])
 def test_least_squares_finds_the_same_forces_in_base_parameters(frozen: str) -> None:
     _, problem, _ = arm()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -13,15 +11,12 @@ from synthetic import ANYMAL, G1, PANDA, SOLO12, TIAGO, Array, Oracle, load
 
 from torchid import parameters
 from torchid.identifiability.base_parameters import (
-    base_parameters,
     standing_samples,
     standing_states,
-    structural_problem,
     structural_samples,
-    unobservable_parameters,
 )
 from torchid.regressor import motion_from_state
-from torchid.sensing import Contact, named_sensors
+from torchid.sensing import Contact
 
 # --------------------------------------------------------------------------------------------------------- standing
 
@@ -125,14 +120,6 @@ def test_samples_are_the_states_and_reproducible() -> None:
 # ------------------------------------------------------------------------------------------ what standing feet hide
 
 
-def feet_of(name: str) -> list[str]:
-    robot, contacts = biped(name)
-    return [robot.body_names[robot.link(contact.frame)[0]] for contact in contacts]
-
-
-INERTIA = set(parameters.PARAMETERS[parameters.INERTIA])
-
-
 @bipeds
 def test_no_force_whatsoever_depends_on_the_inertia_of_a_foot_that_stands(name: str) -> None:
     robot, contacts = biped(name)
@@ -141,22 +128,3 @@ def test_no_force_whatsoever_depends_on_the_inertia_of_a_foot_that_stands(name: 
     left, right = (robot.link(contact.frame)[0] for contact in contacts)
     assert np.abs(K[:, :, left, parameters.INERTIA]).max() < 1e-12
     assert np.abs(K[:, :, right, parameters.INERTIA]).max() > 1.0
-
-
-@bipeds
-def test_a_level_sole_hides_seven_numbers_and_one_on_a_slope_six(name: str) -> None:
-    """Gravity never turns in the frame of the level one: its first moment along gravity has no effect."""
-    robot, level = biped(name)
-    slope = [replace(contact, normal=(0.1, 0.0, 1.0)) for contact in level]
-    sensors = named_sensors("full", robot.n, len(level))
-    level_base, slope_base = (
-        base_parameters(structural_problem(robot, contacts, sensors, [LEFT], False)) for contacts in (level, slope)
-    )
-    assert (level_base.rank, slope_base.rank) == (10 + 7 * robot.n - 9, 10 + 7 * robot.n - 8)
-    foot = feet_of(name)[0]
-    hidden = [
-        set(dict(line.split(": ") for line in unobservable_parameters(base, robot.body_names))[foot].split(", "))
-        for base in (level_base, slope_base)
-    ]
-    assert hidden[1] == INERTIA
-    assert hidden[0] - INERTIA == {parameters.PARAMETERS[3]}

@@ -125,15 +125,6 @@ def test_a_file_that_is_missing_is_named_with_the_one_that_includes_it(tmp_path:
         load_robot(tmp_path / "scene.xml")
 
 
-def test_a_missing_mesh_matters_only_where_it_gives_a_body_its_inertia(tmp_path: Path) -> None:
-    text = """<mujoco><asset><mesh name="m" file="none.stl"/></asset><worldbody><body name="b"><joint name="j"/>{}
-    <geom type="mesh" mesh="m"/></body></worldbody></mujoco>"""
-    inertial = '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
-    assert robot_of(text.format(inertial), tmp_path, True).nominal[1, 0] == 1.0
-    with pytest.raises(UrdfError, match=r"none\.stl"):
-        robot_of(text.format(""), tmp_path, True)
-
-
 BODY = '<mujoco>\n<worldbody>\n<body name="b"{}>{}<geom size=".1"/><site name="s"/></body></worldbody>{}</mujoco>'
 HINGE = '<joint name="j"{}/>'
 POLYNOMIAL = '<equality>\n<joint joint1="j" polycoef="0 1 2 0 0"/></equality>'
@@ -248,24 +239,6 @@ def test_loops_close_where_mujoco_closes_them(
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     np.testing.assert_allclose(data.efc_pos, 0.0, atol=1e-15)
-
-
-@pytest.mark.parametrize(
-    ("actuators", "passive"),
-    [
-        ('<motor joint="j"/>', ("k",)),
-        ('<position jointinparent="k"/>', ("j",)),
-        ('<motor site="s"/>', ()),
-        ("", ()),
-    ],
-)
-def test_joints_of_robots_with_loops_that_no_actuator_drives_have_no_motor(
-    actuators: str, passive: tuple[str, ...], tmp_path: Path
-) -> None:
-    closed = '<connect site1="s" site2="t"/>'
-    assert robot_of(LOOPED.format(closed, actuators), tmp_path, True).passive == passive
-    assert robot_of(LOOPED.format("", actuators), tmp_path, True).passive == (), "as before without loops"
-    assert load_robot(tmp_path / "robot.xml", fixed_base=True, passive=["j"]).passive == ("j",)
 
 
 def test_a_robot_without_a_free_joint_must_be_said_to_be_bolted(tmp_path: Path) -> None:

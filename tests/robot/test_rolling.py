@@ -56,34 +56,6 @@ def test_balls_beside_the_frame_and_ends_of_meshes_are_taken(
 
 
 @pytest.mark.parametrize(
-    ("shapes", "kind", "radius"),
-    [
-        ([shape('<sphere radius="0.03"/>')], "point", 0.03),
-        ([shape('<sphere radius="0.03"/>', '<origin xyz="0.0025 0 0"/>')], "point", 0.03),
-        ([shape('<sphere radius="0.03"/>', '<origin xyz="0.07 0 0"/>')], "point", 0.03),
-        ([shape('<sphere radius="0.03"/>', '<origin xyz="0.07 0 0"/>')] * 2, "point", 0.0),
-        ([shape('<sphere radius="0.05"/>', '<origin xyz="1 0 0"/>'), shape('<sphere radius="0.03"/>')], "point", 0.03),
-        ([shape('<sphere radius="0.005"/>', '<origin xyz="0 0 0.0009"/>')], "point", 0.005),
-        ([shape('<sphere radius="0.02"/>'), shape('<sphere radius="0.03"/>')], "point", 0.03),
-        ([shape('<box size="1 1 1"/>')], "point", 0.0),
-        ([shape('<cylinder radius="0.03" length="0.1"/>')], "point", 0.0),
-        ([shape('<sphere radius="0.03"/>')], "line", 0.0),
-        ([shape('<cylinder radius="0.2" length="0.1"/>', '<origin rpy="1.5707963 0 0" xyz="0 1 0.01"/>')], "line", 0.2),
-        ([shape('<cylinder radius="0.2" length="0.1"/>', '<origin rpy="1.5707963 0 0" xyz="0 0 0.03"/>')], "line", 0.0),
-        ([shape('<cylinder radius="0.2" length="0.1"/>', '<origin rpy="1.5 0 0"/>')], "line", 0.0),
-        ([shape('<cylinder radius="0.2" length="0.1"/>')], "line", 0.0),
-        ([shape('<sphere radius="0.03"/>')], "flat", 0.0),
-    ],
-)  # fmt: skip
-def test_a_shape_about_the_origin_is_taken_and_no_other(
-    tmp_path: Path, shapes: list[str], kind: Any, radius: float
-) -> None:
-    contacts, text = resolve_contacts([ContactConfig("foot", kind)], foot_on(tmp_path, *shapes))
-    assert contacts[0].radius == radius
-    assert ("radius 0:" in text, text == "") == (kind != "flat" and not radius, kind == "flat")
-
-
-@pytest.mark.parametrize(
     ("kind", "origin", "found"),
     [
         ("continuous", '<origin rpy="1.5707963267948966 0 0"/>', 0.08),  # about the axle, y

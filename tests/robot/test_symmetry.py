@@ -10,55 +10,19 @@ import pytest
 import torch
 from physical import of_points
 from refusals import refused
-from repository import CONFIGS, DEMO
 from scipy.spatial.transform import Rotation
-from synthetic import ANYMAL, G1, ROBOTS, ROMEO, SOLO8, SOLO12, TALOS, Array, load
+from synthetic import Array, load
 from urdfs import joint, link, table, words, write
 
 from torchid.errors import ConfigError, about_file
 from torchid.estimators.conditions import mirror_matrix
-from torchid.problem.linear import parameter_scale
 from torchid.robot import Robot, mirror_pairs
-
-GO1 = ROBOTS / "go1_description/urdf/go1.urdf"
-PR2 = ROBOTS / "pr2_description/urdf/pr2.urdf"
 
 
 def names(robot: Robot, *tokens: str, **options: object) -> set[tuple[str, str]]:
     """The pairs, by name."""
     pairs = mirror_pairs(robot, *tokens, **options)  # type: ignore[arg-type]
     return {(robot.body_names[pair.body], robot.body_names[pair.image]) for pair in pairs}
-
-
-# ------------------------------------------------------------------------------------------------------ real robots
-
-
-@table({
-    "G1": (G1, "left", "right", 13, 0.003),
-    "Talos": (TALOS, "left", "right", 14, None),  # its URDF has different arms
-    "ANYmal": (ANYMAL, "L", "R", 6, 0.015),
-    "Solo12": (SOLO12, "L_", "R_", 6, 3e-4),
-    "Solo12, front": (SOLO12, "FL_", "FR_", 3, 3e-4),
-    "Solo8": (SOLO8, "L_", "R_", 4, 3e-4),
-    "Go1": (GO1, "L_", "R_", 6, 0.015),
-    "Romeo": (ROMEO, "L", "R", 23, None),  # one elbow's inertia is another
-    "PR2": (PR2, "l_", "r_", 13, None),
-    "biped": (CONFIGS / "biped.urdf", "l_", "r_", 7, 1e-12),
-    "quadruped": (DEMO / "quadruped.urdf", "left", "right", 6, 1e-12),
-})  # fmt: skip
-def test_the_limbs_of_real_robots_are_mirror_images_and_so_is_their_matter(case: tuple) -> None:
-    urdf, left, right, count, tolerance = case
-    robot = load(urdf)
-    pairs = mirror_pairs(robot, left, right)
-    assert len(pairs) == count
-    scale, off = parameter_scale(robot.nominal), []
-    for pair in pairs:
-        np.testing.assert_allclose(pair.reflection @ pair.reflection.T, np.eye(3), rtol=0.0, atol=1e-12)
-        assert np.linalg.det(pair.reflection) == pytest.approx(-1.0)
-        image = mirror_matrix(pair.reflection) @ robot.nominal[pair.body]
-        off.append(float(np.abs((image - robot.nominal[pair.image]) / scale[pair.image])[:10].max()))
-    assert np.median(off) < 0.03
-    assert tolerance is None or max(off) < tolerance
 
 
 # ------------------------------------------------------------------------------------------------- mirrored matter

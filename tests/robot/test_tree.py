@@ -30,7 +30,6 @@ from synthetic import (
 from urdfs import write
 
 from torchid import parameters
-from torchid.errors import TorchidWarning
 from torchid.robot import load_robot
 
 REAL = (
@@ -110,20 +109,6 @@ def test_the_chain_moves_every_joint_by_its_name_and_carries_every_link(urdf: Pa
 # ------------------------------------------------------------------------------------------------ written by hand
 
 
-def test_joints_are_in_the_depth_first_order_of_the_file(tmp_path: Path) -> None:
-    names = ["base", "a", "a1", "a2", "b", "b1"]
-    joints = [
-        joint("to_b", "base", "b"),
-        joint("to_a", "base", "a"),
-        joint("to_a2", "a", "a2"),
-        joint("to_b1", "b", "b1"),
-        joint("to_a1", "a", "a1"),
-    ]
-    robot = load_robot(write(tmp_path, *map(link, names), *joints))
-    assert robot.joint_names == ("to_b", "to_b1", "to_a", "to_a2", "to_a1")
-    assert robot.body_names == ("base", "b", "b1", "a", "a2", "a1")
-
-
 def test_a_welded_body_weighs_in_by_the_parallel_axes_of_its_turned_frame(tmp_path: Path) -> None:
     robot = load_robot(write(tmp_path, link("base"), link("tool"), joint("weld", "base", "tool", "fixed")))
     assert len(robot.bodies) == 1
@@ -149,32 +134,3 @@ def test_mimic_joints_that_follow_mimic_joints_end_at_the_one_that_is_free(tmp_p
     matrix, offset = robot.joint_map
     np.testing.assert_array_equal(matrix, [[1.0], [-2.0], [-6.0]])  # first, middle, last
     np.testing.assert_array_equal(offset, [0.0, 0.25, 3.0 * 0.25 + 0.5])
-
-
-@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
-@pytest.mark.parametrize("base_link", ["base", "tip"])
-def test_a_joint_that_mimics_a_fixed_one_is_held_at_its_offset(kind: str, base_link: str, tmp_path: Path) -> None:
-    weld = joint("weld", "base", "stand", "fixed")
-    path = write(
-        tmp_path,
-        *map(link, ["base", "stand", "arm", "tip"]),
-        weld,
-        joint("held", "stand", "arm", kind, mimic("weld", 2.0, 0.7)),
-        joint("held_too", "arm", "tip", kind, mimic("held", 3.0, -0.1)),
-    )
-    with pytest.warns(TorchidWarning, match="'weld' is fixed, so that it is fixed too") as caught:
-        robot = load_robot(path, base_link)
-    assert [f"joint '{name}'" in str(w.message) for w, name in zip(caught, ("held", "held_too"), strict=True)] == [
-        True
-    ] * 2
-    assert robot.n == 0
-    assert robot.body_names == (base_link,)
-    moved = []
-    for position in (0.7, 3.0 * 0.7 - 0.1):
-        turn = Rotation.from_rotvec([0.0, 0.0, position]).as_matrix()
-        still = transform(np.eye(3), np.array([0.0, 0.0, position]))
-        moved.append(ORIGIN @ (still if kind == "prismatic" else transform(turn, np.zeros(3))))
-    T_base_tip = ORIGIN @ moved[0] @ moved[1]
-    expected = T_base_tip if base_link == "base" else np.linalg.inv(T_base_tip)
-    _, found = robot.link("tip" if base_link == "base" else "base")
-    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-14)

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
-from refusals import refused
 from urdfs import ARM, BASE, HINGE, INERTIA, INERTIAL, TREE, inertial, joint, link, mimic, refusal, table, write
 
-from torchid.errors import TorchidWarning, UnknownNameError, UrdfError
+from torchid.errors import UnknownNameError
 from torchid.report.urdf_files import identified_urdf
 from torchid.robot import load_robot
 
@@ -192,24 +190,6 @@ def test_malformed_xml_is_refused(text: str, tmp_path: Path) -> None:
     assert "XML: not well-formed" in refusal(path)
 
 
-def test_prefixes_that_nothing_declares_change_no_robot(tmp_path: Path) -> None:
-    plain, prefixed = tmp_path / "plain.urdf", tmp_path / "prefixed.urdf"
-    plain.write_text(f'<robot name="m">{BASE}{ARM}{HINGE}</robot>')
-    tags = {"<joint ": '<joint drake:n="1" ', "<mass ": "<drake:note/><mass drake:unit='kg' "}
-    text = plain.read_text()
-    for tag, with_prefix in tags.items():
-        text = text.replace(tag, with_prefix)
-    prefixed.write_text(text)
-    one, other = load_robot(plain), load_robot(prefixed)
-    np.testing.assert_array_equal(other.nominal, one.nominal)
-    assert other.joint_names == one.joint_names
-    prefixed.write_bytes(identified_urdf(other, 1.5 * other.nominal))
-    assert b'drake:n="1"' in prefixed.read_bytes()  # the file's other readers keep what they had
-    np.testing.assert_allclose(load_robot(prefixed).nominal, 1.5 * one.nominal, rtol=1e-12)
-    prefixed.write_text(text.replace("</robot>", ""))
-    assert "XML: not well-formed" in refusal(prefixed)
-
-
 def test_a_file_of_another_format_is_refused_by_its_root(tmp_path: Path) -> None:
     path = tmp_path / "machine.sdf"
     path.write_text('<sdf version="1.9"/>')
@@ -244,29 +224,6 @@ def test_a_robot_without_any_mass_is_refused_with_a_guess_that_is_taken(tmp_path
     assert "no link has mass" in text
     guess = text[text.index("<inertial><mass") :]
     assert load_robot(write(tmp_path, link("base", guess), link("arm", guess), HINGE)).nominal[:, 0].tolist() == [1, 1]
-
-
-def test_a_stated_mass_is_spread_over_a_robot_without_any(tmp_path: Path) -> None:
-    places = {"HIP": '<origin xyz="0 0 0.4"/>', "KNEE": '<origin xyz="0.2 0 0.4"/>', "SOLE": '<origin xyz="0 0 9"/>'}
-    axis = '<axis xyz="0 0 1"/>'
-    path = write(
-        tmp_path,
-        *(link(name, "") for name in ("base", "arm", "hand", "tool")),
-        joint("hip", "base", "arm", extra=places["HIP"] + axis),
-        joint("knee", "arm", "hand", extra=places["KNEE"] + axis),
-        joint("weld", "hand", "tool", "fixed", places["SOLE"]),
-    )
-    with pytest.warns(TorchidWarning, match="no link has mass; 6 kg are spread evenly over 3 links") as told:
-        robot = load_robot(path, total_mass=6.0)
-    assert len(told) == 1
-    np.testing.assert_allclose(robot.nominal[:, 0], 2.0, rtol=1e-15)
-    np.testing.assert_allclose(robot.nominal[:, 1:4] / 2.0, [[0, 0, 0.2], [0.1, 0, 0.2], [0, 0, 4.5]], atol=1e-15)
-    radius = (2.0 / 1000.0 / (4.0 / 3.0 * np.pi)) ** (1.0 / 3.0)
-    assert robot.nominal[0, 9] == pytest.approx(0.4 * 2.0 * radius**2)
-    for none in (0.0, -1.0, float("nan"), float("inf")):
-        assert refused(lambda total=none: load_robot(path, total_mass=total), f"{path}: total_mass: ", UrdfError)
-    heavy = write(tmp_path, *TREE)
-    assert load_robot(heavy, total_mass=50.0).nominal[:, 0].sum() < 3.0, "a file with masses keeps them"
 
 
 XACRO = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'

@@ -77,14 +77,6 @@ def test_feet_are_lifted_in_turn_in_the_middle_of_their_part_of_the_period(biped
         assert (foot > 0.0).sum() / HZ == pytest.approx(1.4, abs=3.0 / HZ)
 
 
-def test_the_load_leaves_a_foot_in_the_stated_time_and_without_a_jump(biped: Simulation) -> None:
-    time, lift, load = heights_and_loads(biped, stepping("r_sole", swing_s=1.4, transfer_s=0.25))
-    foot = SOLES.index("r_sole")
-    leaving = (load[:, foot] < 1.0) & (time < time[lift[:, foot].argmax()]) & (lift[:, foot] == 0.0)
-    assert leaving.sum() / HZ == pytest.approx(0.25, abs=3.0 / HZ)
-    assert np.abs(np.diff(load[:, foot])).max() < 2.0 / (0.25 * HZ)
-
-
 # --------------------------------------------------------------------------------------------------------------- names
 
 

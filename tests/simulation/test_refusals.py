@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import yaml
 from refusals import files_in, refusal
-from simulated import BIPED, SHIPPED, SOLES, STOOD
+from simulated import BIPED, SHIPPED, SOLES
 
 from torchid.cli import main
 from torchid.config import load_simulation
@@ -171,20 +171,6 @@ def test_an_interrupted_simulation_leaves_neither_files_nor_processes(
     assert multiprocessing.active_children() == []
 
 
-def test_a_simulation_that_fails_at_its_end_leaves_nothing(
-    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full_disk(*_: object, **__: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("torchid.commands.simulate._in_processes", lambda *_: {"m": STOOD})
-    monkeypatch.setattr("json.dumps", full_disk)
-    before = files_in(folder)
-    assert main(["simulate", str(folder / "sim.yaml")]) == 1
-    assert "No space left" in capsys.readouterr().err
-    assert files_in(folder) == before
-
-
 def test_without_mujoco_a_simulation_says_how_to_install_it(
     folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -194,37 +180,3 @@ def test_without_mujoco_a_simulation_says_how_to_install_it(
     monkeypatch.setitem(sys.modules, "mujoco", None)
     line = refusal(["simulate", str(folder / "sim.yaml")], folder, capsys)
     assert line.endswith("MuJoCo, which is not installed; accepted: pip install '.[sim]' in the clone of torchid")
-
-
-# -------------------------------------------------------------------------------------------------- folders in the way
-
-
-def occupied(folder: Path, *names: str) -> Path:
-    """An output folder that already holds files."""
-    output = folder / "out"
-    output.mkdir()
-    for name in names:
-        (output / name).write_text(name)
-    return output
-
-
-@pytest.mark.parametrize(
-    ("names", "overrides", "expected"),
-    [
-        (("simulation.yaml", "stability.json"), (), "not empty; accepted: a new folder, or overwrite=true"),
-        (("simulation.yaml", "notes.txt"), ("overwrite=true",), "holds notes.txt, simulation.yaml, and no manifest"),
-        (
-            ("config.yaml", "metrics.json"),
-            ("overwrite=true",),
-            "holds config.yaml, metrics.json, and no manifest.json that says that torchid wrote a simulation",
-        ),
-        (("stability.json",), ("overwrite=true",), "holds stability.json, and no manifest"),
-    ],
-    ids=["not asked to", "with a file of the user's", "an identification", "without its mark"],
-)
-def test_a_folder_is_replaced_on_request_only_and_only_by_its_like(
-    folder: Path, capsys: pytest.CaptureFixture[str], names: tuple[str, ...], overrides: tuple[str, ...], expected: str
-) -> None:
-    output = occupied(folder, *names)
-    assert expected in refused(folder, capsys, *overrides)
-    assert sorted(path.name for path in output.iterdir()) == sorted(names)

@@ -17,8 +17,6 @@ from torchid.config.robot import ContactConfig
 from torchid.config.simulation import SimulatedRobotConfig, WaveConfig
 from torchid.estimators import LeastSquares
 from torchid.fitting.experiment import resolve_contacts
-from torchid.log_checks.findings import Finding
-from torchid.log_checks.standing_feet import check_standing_feet
 from torchid.logs import Log
 from torchid.problem import RowBuilder, bind_log, compress, linear_problem
 from torchid.problem.floor_pose import rolled_distance
@@ -125,18 +123,3 @@ def test_the_radius_is_found_in_the_urdf(on_balls: OnBalls) -> None:
     )
     assert {contact.radius for contact in contacts} == {RADIUS}
     assert text == f"{', '.join(on_balls.log.contact_names)}: ball of radius 30 mm, from the collision sphere"
-
-
-@pytest.mark.parametrize("noise", [0.0, 1e-3])
-@pytest.mark.parametrize("stated", [0.0, 0.01, 0.06])
-def test_the_check_names_the_radius_that_the_log_shows(on_balls: OnBalls, stated: float, noise: float) -> None:
-    """With noise of encoders, too, which moves the feet as far as rolling does."""
-    position = on_balls.log.joint_position
-    noisy = position + noise * np.random.default_rng(0).normal(size=position.shape)
-    log = replace(on_balls.log, joint_position=noisy)
-    (finding,) = check_standing_feet(log, on_balls.robot, contacts_of(log, stated))
-    assert isinstance(finding, Finding)
-    assert (finding.name, finding.severity) == ("radius", "suspicious")
-    assert f"stated are {1e3 * stated:g} mm" in finding.found
-    found = float(finding.found.partition("balls of ")[2].split()[0])
-    assert found == pytest.approx(1e3 * RADIUS, rel=0.1 if noise else 0.02)

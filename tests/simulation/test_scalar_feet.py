@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from forked import forked_simulations
 from motions import value
 from refusals import refusal
@@ -86,39 +84,6 @@ def test_exact_readings_give_the_parameters_back(walked: Walked, torques: bool) 
     assert found.rank == (94 if torques else 28)
     assert off(found.phi) < (2e-3 if torques else 1e-10) * off(began.nominal)
     assert found.phi.reshape(true.shape)[:, 0].sum() == pytest.approx(true[:, 0].sum(), rel=1e-6 if torques else 1e-12)
-
-
-@pytest.mark.filterwarnings("ignore:identified.urdf:torchid.errors.TorchidWarning")
-@pytest.mark.filterwarnings("ignore::torchid.errors.NumericalWarning")
-def test_what_is_simulated_is_identified(walked: Walked, capsys: pytest.CaptureFixture[str]) -> None:
-    """From noisy positions, torques and feet of both kinds, with an experiment file that names `fn`."""
-    folder, simulated = walked.config.output.parent, walked.config.output
-    experiment = {
-        "robot": {"urdf": str(simulated / "nominal.urdf")},
-        "contacts": [{"frame": foot, "type": "point"} for foot in walked.feet],
-        "logs": {kind: [str(simulated / "logs" / f"{kind}.npz")] for kind in ("train", "test")},
-        "preprocessing": {"cutoff_hz": 15.0},
-        "sensors": {
-            "joint_torques": list(load(QUADRUPED).joint_names),
-            "contact_wrenches": {foot: ["fn"] if foot in SCALAR else ["fx", "fy", "fz"] for foot in walked.feet},
-        },
-        "estimator": {"name": "least_squares", "ridge": "auto", "friction": False},
-        "output": str(folder / "run"),
-    }
-    (folder / "run.yaml").write_text(yaml.safe_dump(experiment))
-    assert main(["identify", str(folder / "run.yaml")]) == 0, capsys.readouterr().err
-    metrics = json.loads((folder / "run/metrics.json").read_text())
-    assert metrics["test"]["projected_residual"] < 1.3 < 8.0 < metrics["test_nominal"]["projected_residual"]
-    for group in ("joint_torque_rms", "nullspace_rms"):
-        assert metrics["test"][group] < 0.7 * metrics["test_nominal"][group]
-    true, nominal, found = (
-        load(path).nominal[:, 0].sum()
-        for path in (QUADRUPED, simulated / "nominal.urdf", folder / "run/identified.urdf")
-    )
-    assert abs(found - true) < 0.005 < 0.5 < abs(nominal - true)
-    capsys.readouterr()
-    arguments = ["identify", str(folder / "run.yaml"), "sensors=full", f"output={folder / 'full'}"]
-    assert f"contact_wrench '{SCALAR[0]}'" in refusal(arguments, folder, capsys)
 
 
 def test_a_foot_has_one_of_two_sensors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from motions import value
 from scipy.spatial.transform import Rotation
-from simulated import LIFTING, SOLES
+from simulated import LIFTING
 from synthetic import Array
 
 from torchid.config import SensorImperfectionsConfig
@@ -146,18 +146,6 @@ def test_late_feet_read_what_was_a_delay_ago_and_nothing_else_is_late(
 # ------------------------------------------------------------------------------------------------------------ contacts
 
 
-def test_contact_flags_are_read_off_the_measured_force_whatever_the_exact_log_says(biped_folder: Path) -> None:
-    exact = read_log(biped_folder / "exact" / f"{LIFTING}.npz")
-    sensors = SensorImperfectionsConfig(noise=dataclasses.replace(NOISE, enabled=True))
-    flags = value(sensor_log(exact, sensors, seed=0).contact_active)
-    lying = dataclasses.replace(exact, contact_active=~value(exact.contact_active))
-    np.testing.assert_array_equal(value(sensor_log(lying, sensors, seed=0).contact_active), flags)
-    assert (flags != value(exact.contact_active)).mean() < 0.02
-    assert flags.any(axis=0).all()
-    assert (~flags).any(axis=0).all()
-    assert exact.contact_names == SOLES
-
-
 def test_a_contact_is_active_while_the_measured_load_exceeds_the_threshold() -> None:
     wrench = np.zeros((9, 2, 6))
     wrench[:, 0, 2] = [0, 20, 29, 31, 100, 500, 31, 29, 0]
@@ -199,21 +187,3 @@ def test_a_foot_that_reads_along_the_normal_reads_nothing_else() -> None:
     log = sensor_log(alone, NONE, seed=3)
     assert log.contact_wrench_local is None
     np.testing.assert_array_equal(value(log.contact_force_normal), value(alone.contact_force_normal))
-
-
-@pytest.mark.parametrize(
-    "sensors", [SensorImperfectionsConfig(noise=NOISE), SensorImperfectionsConfig(NOISE, BIAS, DelayConfig(True))]
-)
-def test_it_has_the_errors_of_a_force_and_leaves_those_of_all_others_as_they_are(
-    sensors: SensorImperfectionsConfig,
-) -> None:
-    exact, wrenches = scalar_foot()
-    log, other = (sensor_log(one, sensors, seed=2) for one in (exact, wrenches))
-    for name in ("joint_position", "joint_torque", "base_position_world", "base_quat_xyzw"):
-        np.testing.assert_array_equal(value(getattr(log, name)), value(getattr(other, name)), err_msg=name)
-    np.testing.assert_array_equal(value(log.contact_wrench_local)[:, 1], value(other.contact_wrench_local)[:, 1])
-    as_fz = value(wrenches.contact_wrench_local).copy()
-    as_fz[:, 0, 2] = value(exact.contact_force_normal)[:, 0]
-    read = value(sensor_log(dataclasses.replace(wrenches, contact_wrench_local=as_fz), sensors, seed=2).contact_wrench)
-    np.testing.assert_array_equal(value(log.contact_force_normal)[:, 0], read[:, 0, 2])
-    assert np.isnan(value(log.contact_force_normal)[:, 1]).all()

@@ -113,6 +113,8 @@ def damped_inverse(A: Tensor) -> Callable[[Tensor], Tensor]:
 _LOOSE = 1e-6  # relative gap above which there is a warning
 _PATIENCE = 2  # steps in a row without a smaller gap: rounding makes small gaps uneven
 _SHARE = 0.98  # of the longest step that stays inside
+_CENTRE_SHRINK = 0.1  # of the barrier's weight from step to step towards a point of the central path
+_CENTRED_CHANGE = 1e-9  # relative, of blocks and slacks, in the last of these steps
 _SHORT = 0.2  # length of a corrected step below which a plain one is taken
 _ACCURATE, _CENTRED = 1e-9, 0.5  # complementarity, relative to the objective, from which on the gap itself is computed
 
@@ -266,6 +268,27 @@ class _PrimalDual:
             promised = -float(self.problem.gradient(point.x.numpy()) @ affine.x.numpy())
             move = solve(max(kappa, promised / max(self.problem.degree, 1)), none, none)
             length = min(1.0, _SHARE * self._longest(point, Z_root, move))
+        return self._moved(point, move, length)
+
+    def centre(self, x: np.ndarray, kappa: float) -> np.ndarray:
+        """The point of the central path at a barrier weight, (n,), from a strictly feasible one."""
+        point, none = self.start(x), torch.zeros(())
+        for _ in range(_STEPS):
+            target = max(kappa, _CENTRE_SHRINK * point.complementarity / max(self.problem.degree, 1))
+            move = self._newton(point)(target, none, none)
+            Z_root, failed = torch.linalg.cholesky_ex(point.Z)
+            length = 0.0 if failed.any() else min(1.0, _SHARE * self._longest(point, Z_root, move))
+            after = self._moved(point, move, length) if length else None
+            if after is None:
+                break
+            relative = torch.cat([move.blocks.flatten(), move.slack / point.slack])
+            point = after
+            if target == kappa and length == 1.0 and float(relative.abs().sum()) < _CENTRED_CHANGE:
+                break
+        return point.x.numpy()
+
+    def _moved(self, point: _Point, move: _Direction, length: float) -> _Point | None:
+        """A share of a step from a point; None where rounding leaves none."""
         while (factors := self.factors(point.x + length * move.x)) is None and length > _SHORTEST:
             length *= 0.5  # infeasible by rounding alone
         if factors is None:
@@ -308,7 +331,7 @@ class _PrimalDual:
         relative_Z = _symmetric(torch.linalg.solve_triangular(Z_root, half.mT, upper=False))
         eigenvalues = torch.linalg.eigvalsh(torch.cat([move.blocks, relative_Z])).ravel()
         rates = torch.cat([eigenvalues, move.slack / point.slack, move.y / point.y])
-        return 1.0 / max(-float(rates.min()), 1e-9) if len(rates) else 1.0
+        return 1.0 / max(-float(rates.min()), 1e-9) if len(rates) else np.inf
 
 
 def _symmetric(A: Tensor) -> Tensor:
@@ -330,12 +353,6 @@ small. With a quarter it is within 1 %, for as many passes.
 
 _RARE = 0.01  # share of draws that a condition excludes, above which it counts as near
 _DRAWS, _PASSES = 400, 6
-_CENTER_STEPS = 100  # of Newton's method
-_CENTERED_DECREMENT = 1e-10  # squared, at which these end
-_SUFFICIENT_DECREASE = 1e-4  # of the objective, as a share of what its slope promises
-_SHORTEST_CENTER_STEP = 1e-9  # share of a step
-_CLOSE = 0.05  # squared decrement from which on full steps converge quadratically
-_GROWTH = 50.0  # of the quadratic from one point of the central path to the next
 
 
 @dataclass(frozen=True)
@@ -384,6 +401,7 @@ class BarrierGaussian:
 
 
 @one_thread()
+@torch.inference_mode()
 def barrier_gaussian(conic: ConicProblem) -> BarrierGaussian:
     """The Gaussian for the density exp(-objective / 2) of a problem without log-determinants.
 
@@ -394,7 +412,7 @@ def barrier_gaussian(conic: ConicProblem) -> BarrierGaussian:
     conditions = _Conditions(conic)
     near = np.zeros(conditions.count, dtype=bool)
     for _ in range(_PASSES):
-        mean = _minimizer(conditions, x, near)
+        mean = _mean(conic, x, near)
         outside = conditions.outside(mean[:, None])[:, 0]
         if not outside.any():
             found = conditions.gaussian(mean, near)
@@ -405,8 +423,23 @@ def barrier_gaussian(conic: ConicProblem) -> BarrierGaussian:
         near |= outside
     else:
         near[:] = True
-    mean = _minimizer(conditions, x, near)
+    mean = _mean(conic, x, near)
     return conditions.gaussian(mean, near)
+
+
+def _mean(conic: ConicProblem, x: Array, near: np.ndarray) -> Array:
+    """Where the density times the barriers of some conditions is largest, from a point inside all."""
+    blocks, rows = np.split(near, [len(conic.F0)])
+    part = replace(
+        conic,
+        F0=conic.F0[blocks],
+        F=conic.F[blocks],
+        variables=conic.variables[blocks],
+        weights=conic.weights[blocks],
+        G=conic.G[rows],
+        h=conic.h[rows],
+    )
+    return _PrimalDual(part).centre(x, 2.0)
 
 
 class _Conditions:
@@ -458,67 +491,3 @@ def _near_rows(blocks: Array, rows: Array, near: np.ndarray) -> tuple[Array, Arr
     """Rows X of the barrier's Hessian X^T X at the point that slopes are relative to."""
     weighted = blocks[near[: len(blocks)]] * np.sqrt(CURVATURE * ENTRY_WEIGHTS)[:, None]
     return weighted.reshape(-1, blocks.shape[-1]), np.sqrt(CURVATURE) * rows[near[len(blocks) :]]
-
-
-def _minimizer(conditions: _Conditions, x: Array, near: np.ndarray) -> Array:
-    """Where the density times the barriers of some conditions is largest, from a point inside.
-
-    Newton's method from afar may run into conditions nearby where data are sharp, and take ever shorter steps along
-    them. Then the quadratic begins small beside the barriers, and grows.
-    """
-    found, decrement = _newton(conditions, x, near, 1.0, _CENTER_STEPS)
-    if decrement < _CLOSE:
-        return found
-    share = 1.0 / _newton(conditions, x, near, 1.0, 0)[1]
-    while share < 1.0:
-        x, _ = _newton(conditions, x, near, share, _CENTER_STEPS)
-        share *= _GROWTH
-    return _newton(conditions, x, near, 1.0, _CENTER_STEPS)[0]
-
-
-def _newton(conditions: _Conditions, x: Array, near: np.ndarray, share: float, steps: int) -> tuple[Array, float]:
-    """Minimizer of a share of the quadratic and the barriers, from a point inside, and the last squared decrement."""
-    conic, N, sharp = conditions.conic, conditions.N, np.sqrt(share)
-    of_blocks, of_rows = near[: len(conic.F0)], near[len(conic.F0) :]
-
-    def value(x: Array) -> float:
-        misfit, slack = sharp * (conic.root @ x - conic.target), (conic.G @ x - conic.h)[of_rows]
-        try:
-            roots = np.linalg.cholesky(conditions.blocks(x[:, None])[of_blocks, 0])
-        except np.linalg.LinAlgError:
-            return np.inf
-        if slack.min(initial=1.0) <= 0.0:
-            return np.inf
-        determinants = 2.0 * np.log(np.diagonal(roots, axis1=1, axis2=2)).sum()
-        return float(0.5 * misfit @ misfit - determinants - np.log(slack).sum())
-
-    before = value(x)
-    for count in range(steps + 1):
-        inverse = np.linalg.inv(np.linalg.cholesky(conditions.blocks(x[:, None])[of_blocks, 0]))
-        slopes = np.einsum("kij,kjln,kml->kimn", inverse, conditions.slopes[of_blocks], inverse, optimize=True)
-        rows = conic.G[of_rows] / (conic.G @ x - conic.h)[of_rows, None]
-        J = np.concatenate([sharp * conic.root, slopes.reshape(-1, len(x)), rows]) @ N
-        misfit = share * (conic.root @ x - conic.target)
-        gradient = N.T @ (conic.root.T @ misfit - np.einsum("kiin->n", slopes) - rows.sum(axis=0))
-        R = np.linalg.qr(J, mode="r")
-        half = scipy.linalg.solve_triangular(R, gradient, trans=1)
-        step, decrement, length = -N @ scipy.linalg.solve_triangular(R, half), float(half @ half), 1.0
-        if count == steps or decrement < _CENTERED_DECREMENT:
-            break
-        while (
-            not _is_enough(before, after := value(x + length * step), length, decrement)
-            and length > _SHORTEST_CENTER_STEP
-        ):
-            length *= 0.5
-        if length <= _SHORTEST_CENTER_STEP:
-            break
-        x, before = x + length * step, after
-    return x, decrement
-
-
-def _is_enough(before: float, after: float, length: float, decrement: float) -> bool:
-    """Whether a step lowers a self-concordant function by enough; near its minimum full ones do, beyond rounding.
-
-    Boyd, Vandenberghe, "Convex Optimization", section 9.6.
-    """
-    return after < np.inf and (decrement < _CLOSE or after <= before - _SUFFICIENT_DECREASE * length * decrement)
