@@ -22,10 +22,9 @@ _CHAINS = 512  # that find out how many passes make a state new
 _TRIES = (3, 6, 15)  # on an ellipse, at once, after which a chain stays where it is; each halves the arc
 _INSIDE = 1e-12  # least pivot of a block and slack of a row, relative to the mean's: above what rounding can hide
 _ALIKE = 0.25  # correlation of a coordinate with what it was, in all chains, below which states count as new
-_MOST_WHOLE, _MOST_APART, _MOST = 5, 8, 200  # passes after which each kind of moves counts as too slow
+_MOST_WHOLE, _MOST = 5, 200  # passes after which each kind of moves counts as too slow
 _BURN_IN = 4  # times as many passes as make states new, before the first is used
 _SHRINK, _SHRINKS = 0.8, 200  # of draws from the Gaussian that are outside, towards its mean
-_TAIL = 30.0  # standard deviations, from which on a normal tail is exponential, to a thousandth of its length
 _DIAGONAL = tuple(np.flatnonzero(UPPER[0] == UPPER[1]).tolist())
 
 
@@ -45,42 +44,6 @@ class _Group:
     rows: Tensor
 
 
-@dataclass(frozen=True)
-class _Bounded:
-    """A variable that bounds alone concern.
-
-    `end`: a bound, relative to the mean; `other`: on the other side, None where there is none; `spread`: standard
-    deviation where all others are fixed, negative if `end` is an upper bound; `kept`, `pull`: then the centre is
-    `kept * x + pull`, less what the others make of it.
-    """
-
-    variable: int
-    end: float
-    other: float | None
-    spread: float
-    kept: float
-    pull: float
-
-    @classmethod
-    def of(cls, variable: int, gaussian: BarrierGaussian, precision: float) -> _Bounded:
-        """Of a Gaussian whose own precision, without barriers, is that where all others are fixed."""
-        slopes, near = gaussian.rows[:, variable], gaussian.near[len(gaussian.blocks) :]
-        low = float(max((_INSIDE - 1.0) / slopes[slopes > 0.0], default=-math.inf))
-        high = float(min((_INSIDE - 1.0) / slopes[slopes < 0.0], default=math.inf))
-        deviation, kept = precision**-0.5, 1.0 + CURVATURE * float(np.square(slopes[near]).sum()) / precision
-        pull = -float(slopes[near].sum()) / precision
-        if low == -math.inf:
-            return cls(variable, high, None, -deviation, kept, pull)
-        return cls(variable, low, high if high < math.inf else None, deviation, kept, pull)
-
-    def draw(self, centre: Tensor, uniform: Tensor) -> Tensor:
-        """From the normal distribution around a centre, cut off by the bounds, (B,)."""
-        low = (self.end - centre) / self.spread
-        high = None if self.other is None else (self.other - centre) / self.spread
-        drawn = torch.add(centre, _truncated_normal(low, high, uniform), alpha=self.spread)
-        return drawn.clamp(self.end, self.other) if self.spread > 0.0 else drawn.clamp(max=self.end)
-
-
 @dataclass
 class _State:
     """Points of B chains, all relative to the mean: x (n, B), root @ x, entries of blocks (K, 10, B), rows (M, B)."""
@@ -97,9 +60,8 @@ class EllipticalSlice(torch.nn.Module):
     An ellipse through the state and a draw from the Gaussian has that Gaussian's density all along, so that a point of
     it needs only to meet the conditions, and to be likely enough by what the density has beside the Gaussian
     (`BarrierGaussian`): the arc is cut down until one does. Where conditions are far, all variables together move so.
-    Else friction, which bounds of its own concern, is drawn exactly, one by one, and the rest moves while it is fixed;
-    and where bodies are near their conditions, two bodies at a time, which few of these concern. Which moves it takes,
-    and how many passes of them make a state new, is measured once, on a first set of chains.
+    Else two bodies move at a time, which few of these concern. Which moves it takes, and how many passes of them make a
+    state new, is measured once, on a first set of chains.
 
     Source: Murray, Adams, MacKay, "Elliptical slice sampling", AISTATS 2010; with a Gaussian of one's own choice:
     Nishihara, Murray, Adams, "Parallel MCMC with generalized elliptical slice sampling", JMLR 2014.
@@ -112,8 +74,6 @@ class EllipticalSlice(torch.nn.Module):
     block_changes: Tensor
     row_changes: Tensor
     near: Tensor
-    alone_columns: Tensor
-    alone_weights: Tensor
     weights: Tensor
     unit: Tensor
 
@@ -129,8 +89,6 @@ class EllipticalSlice(torch.nn.Module):
             NumericalWarning: states stay alike for too long, so that draws will be correlated.
         """
         super().__init__()
-        alone = _bounded_alone(conic, gaussian)
-        gaussian = replace(gaussian, root=_triangular_from(gaussian.root, alone))
         arrays = {
             "mean": gaussian.mean,
             "root": gaussian.root,
@@ -144,13 +102,7 @@ class EllipticalSlice(torch.nn.Module):
         }
         for name, array in arrays.items():
             self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(array)))
-        precision = np.square(conic.root[:, alone]).sum(axis=0)
-        self.alone = [_Bounded.of(int(v), gaussian, float(p)) for v, p in zip(alone, precision, strict=True)]
-        by_alone = np.ascontiguousarray(gaussian.root[: len(alone), alone].T)
-        self.register_buffer("alone_columns", torch.from_numpy(by_alone))
-        self.register_buffer("alone_weights", torch.from_numpy(by_alone / precision[:, None]))
         self._groups = 0
-        self._add_group(gaussian, conic.E, np.setdiff1d(np.arange(len(gaussian.mean)), alone))
         for variables in _pairs(gaussian, owners):
             self._add_group(gaussian, conic.E, variables)
         self.moves, self.passes = "whole", 1
@@ -186,8 +138,7 @@ class EllipticalSlice(torch.nn.Module):
     def _measure(self) -> None:
         """Find out which moves it takes, and how many, until states are new."""
         generator = torch.Generator().manual_seed(0)
-        kinds = [("whole", _MOST_WHOLE), *([("apart", _MOST_APART)] if len(self.alone) else []), ("pairs", _MOST)]
-        for self.moves, most in kinds:
+        for self.moves, most in (("whole", _MOST_WHOLE), ("pairs", _MOST)):
             state = self._start(_CHAINS, generator)
             for _ in range(2):
                 self._pass(state, generator)
@@ -224,11 +175,9 @@ class EllipticalSlice(torch.nn.Module):
     def _pass(self, state: _State, generator: torch.Generator | None) -> None:
         """One move of all variables, together, or one part after the other while the others rest."""
         if self.moves != "whole":
-            for number in range(1) if self.moves == "apart" else range(1, self._groups):
+            for number in range(self._groups):
                 self._move_group(state, self._group(number), generator)
-            self._move_alone(state, generator)
-        if self.moves != "apart":
-            self._move_all(state, generator)
+        self._move_all(state, generator)
 
     def _group(self, number: int) -> _Group:
         return _Group(*(getattr(self, f"{name}_{number}") for name in _Group.__annotations__))
@@ -248,20 +197,6 @@ class EllipticalSlice(torch.nn.Module):
         state.whitened += group.basis @ y
         state.blocks[group.blocks] += changed[:cut].view(-1, 10, changed.shape[1])
         state.rows[group.rows] += changed[cut:]
-
-    def _move_alone(self, state: _State, generator: torch.Generator | None) -> None:
-        """Draw each variable that only bounds of its own concern from its exact distribution with all others fixed."""
-        size = (len(self.alone), state.x.shape[1])
-        uniform = 1.0 - torch.rand(size, dtype=state.x.dtype, device=state.x.device, generator=generator)  # never 0
-        for number, one in enumerate(self.alone):
-            x, above = state.x[one.variable], state.whitened[: number + 1]  # the columns are zero below
-            weights, column = self.alone_weights[number, : number + 1], self.alone_columns[number, : number + 1]
-            centre = torch.addmv(x, above.T, weights, beta=one.kept, alpha=-1.0).add_(one.pull)
-            drawn = one.draw(centre, uniform[number])
-            above.addr_(column, drawn - x)
-            x.copy_(drawn)
-        if self.alone:
-            state.rows = self.row_changes @ state.x
 
     def _move_all(self, state: _State, generator: torch.Generator | None) -> None:
         size = (self.directions.shape[1], state.x.shape[1])
@@ -344,40 +279,6 @@ def inside(blocks: Tensor, rows: Tensor) -> Tensor:
     last = j - i * i / h
     pivots = torch.minimum(torch.minimum(a, e), torch.minimum(h, last))  # NaN where one before is 0
     return (pivots > _INSIDE).all(0) & (rows > _INSIDE - 1.0).all(0)
-
-
-def _truncated_normal(low: Tensor, high: Tensor | None, uniform: Tensor) -> Tensor:
-    """Standard normal numbers above `low`, below `high`, far into the tails, from uniform ones above 0, all (B,)."""
-    if high is None:
-        tail = low - torch.log(uniform) / low
-        return torch.where(low > _TAIL, tail, -torch.special.ndtri(uniform * _above(low)))
-    flipped = low + high < 0.0
-    near, far = torch.where(flipped, -high, low), torch.where(flipped, -low, high)  # the one nearer to 0 first
-    body = -torch.special.ndtri(_above(far) + uniform * (_above(near) - _above(far)))
-    tail = near - torch.log1p(-uniform * -torch.expm1(-near * (far - near))) / near
-    drawn = torch.where(near > _TAIL, tail, body)
-    return torch.where(flipped, -drawn, drawn)
-
-
-def _above(x: Tensor) -> Tensor:
-    """How often a standard normal number is larger; torch's own is 0 from 8.3 on."""
-    return 0.5 * torch.erfc(x / math.sqrt(2.0))
-
-
-def _bounded_alone(conic: ConicProblem, gaussian: BarrierGaussian) -> np.ndarray:
-    """Variables that only rows of their own concern, one of which is near: friction, most often."""
-    of_rows, alone = conic.G != 0.0, np.ones(len(conic.linear), dtype=bool)
-    alone[conic.variables.ravel()] = False
-    alone &= ~conic.E.any(axis=0) & ~of_rows[of_rows.sum(axis=1) > 1].any(axis=0)
-    return np.flatnonzero(alone & of_rows[gaussian.near[len(conic.F0) :]].any(axis=0))
-
-
-def _triangular_from(root: Array, first: np.ndarray) -> Array:
-    """Another root of the same matrix, whose columns of some variables are zero below as many rows."""
-    order = np.concatenate([first, np.setdiff1d(np.arange(root.shape[1]), first)])
-    out = np.empty_like(root)
-    out[:, order] = np.linalg.qr(root[:, order], mode="r")
-    return out
 
 
 def _standardized(x: Tensor) -> Tensor:
