@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import torch
 from hypothesis import given
 from regressors import assert_close, few, of_robots, regressor, seeds, tensors
 from scipy.spatial.transform import Rotation
@@ -13,10 +12,6 @@ from synthetic import PANDA, SOLO12, UR5, Oracle, load, random_states
 
 from torchid import parameters
 from torchid.regressor import Regressor
-from torchid.regressor.columns import body_wrenches, full_layout
-from torchid.regressor.kinematics import body_states, joint_motion, motion_from_state
-from torchid.regressor.regressor import all_wrench_columns
-from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 
 
@@ -33,17 +28,6 @@ def test_the_forces_power_is_the_rate_of_change_of_energy(urdf: Path, seed: int)
     size = np.einsum("bi,bilk,lk->b", np.abs(state[1]), np.abs(K), np.abs(oracle.inertial_parameters(robot)))
     expected = oracle.power(*state)
     np.testing.assert_array_less(np.abs(power - expected), 1e-9 * size)  # energies are differenced over 1e-4 s
-
-
-@few
-@given(seed=seeds)
-def test_wrenches_of_bodies_are_their_columns_times_their_parameters(small: Robot, seed: int) -> None:
-    rng, tree = np.random.default_rng(seed), KinematicTree(small)
-    motion = motion_from_state(*tensors(*random_states(rng, small.n, 3)), small.n)
-    states = body_states(tree, motion, joint_motion(tree, motion))
-    phi = torch.from_numpy(rng.normal(size=(2, tree.n_nodes, 10)))
-    columns = all_wrench_columns(states, full_layout(tree)).unflatten(1, (-1, 10))
-    assert_close(body_wrenches(states, phi).numpy(), torch.einsum("wlkb,mlk->wmlb", columns, phi).numpy())
 
 
 @few

@@ -142,7 +142,7 @@ class MiniBatches:
                 own = with_payload_columns(self.builder, samples, columns)
                 yield (
                     samples.coordinates(),
-                    predict_forces(self.builder, self.builder.kinematics(samples), own)[0].T,
+                    predict_forces(self.builder, self.builder.dynamics(samples), own)[0].T,
                 )
 
     def _generator(self, number: int) -> torch.Generator:

@@ -268,7 +268,6 @@ def _passive_motion(tree: KinematicTree, kinematics: ChunkKinematics, group: _Gr
     return motion, determined & (values[:, p - 1 : p] > _DETERMINED * size if p else determined)
 
 
-_INERTIAL = parameters.INERTIAL.stop
 ContactState = tuple[bool, ...]
 """Which contacts touch the ground."""
 IN_THE_AIR = "none"
@@ -291,13 +290,6 @@ class RowColumns:
         self.layout = reduced_layout(tree)
         self.joint_rows: list[JointRow] = joint_rows(tree, self.layout)
         self.count = self.layout.count + 2 * (tree.n_nodes - 1)
-        self._inertial_slots = [_INERTIAL * node + k for node, kept in enumerate(self.layout.kept) for k in kept]
-
-    def inertial_by_node(self, phi: Tensor) -> Tensor:
-        """Inertial parameters (M, L, 10) of all nodes, 0 where dropped, from parameters (M, columns)."""
-        out = phi.new_zeros(len(phi), self.tree.n_nodes * _INERTIAL)
-        out[:, self._inertial_slots] = phi[:, : self.layout.count]
-        return out.unflatten(1, (-1, _INERTIAL))
 
     def friction(self, body: int) -> int:
         """The first of the two friction columns of a body's joint."""

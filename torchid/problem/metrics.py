@@ -21,8 +21,7 @@ from torchid.problem.contact_state import ContactState
 from torchid.problem.extras import ACTUATORS, Extra, ExtraTerms, contact_extra_column, dof_extra_column
 from torchid.problem.rows import ChunkKinematics, RowBuilder, leave_out_torques
 from torchid.problem.samples import Samples
-from torchid.regressor.columns import body_wrenches
-from torchid.regressor.regressor import generalized_forces
+from torchid.regressor.regressor import friction_columns, generalized_forces, joint_row
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, named_sensors
@@ -87,20 +86,22 @@ class GeneralizedForces:
     predicted: Tensor
 
 
-def predict_forces(builder: RowBuilder, kinematics: ChunkKinematics, phi: Tensor) -> Tensor:
+def predict_forces(builder: RowBuilder, dynamics: ChunkDynamics, phi: Tensor) -> Tensor:
     """K phi, (M, n_rows, B), for M parameter vectors (M, columns) in the builder's columns, without extras.
 
-    Joint forces are products of screw axes with wrenches summed over subtrees; the rows of K are never formed.
+    Row by row: no more of K than one of its rows is ever formed. `dynamics`: whole ones.
     """
     tree, columns = builder.tree, builder.columns
-    wrench = body_wrenches(kinematics.states, columns.inertial_by_node(phi))
-    below = tree.ancestors.T @ wrench
-    torque = below.mul_(kinematics.screw_axes[:, None]).sum(0)
-    coulomb, viscous = phi[:, columns.layout.count : columns.count, None].unflatten(1, (-1, 2)).unbind(2)
-    joints = kinematics.joints
-    torque[:, 1:].addcmul_(coulomb, joints.direction[1:]).addcmul_(viscous, joints.velocity[1:])
-    by_joint = tree.joint_map.T @ torque
-    return torch.cat([wrench.sum(2).transpose(0, 1), by_joint], 1) if tree.base_rows else by_joint
+    inertial, base = columns.layout.count, tree.base_rows
+    out = phi.new_empty(tree.n_rows, len(phi), dynamics.wrenches.shape[-1])
+    torch.matmul(phi[:, :inertial], dynamics.wrenches[:base], out=out[:base])
+    for row, forces in zip(columns.joint_rows, out[base:], strict=True):
+        block = joint_row(row, tree, columns.layout, dynamics.screw_axes, dynamics.wrenches)
+        torch.mm(phi[:, row.start : row.end], block, out=forces)
+        for body, *friction in friction_columns(row, dynamics.joints):
+            at = columns.friction(body)
+            forces.addmm_(phi[:, at : at + 2], torch.stack(friction))
+    return out.transpose(0, 1)
 
 
 def with_payload_columns(builder: RowBuilder, samples: Samples, phi: Tensor) -> Tensor:
@@ -162,7 +163,7 @@ def reading_variance(
 
 
 def measured_and_predicted_forces(
-    builder: RowBuilder, samples: Samples, state: ContactState, phi: Mapping[int, Tensor], kinematics: ChunkKinematics
+    builder: RowBuilder, samples: Samples, state: ContactState, phi: Mapping[int, Tensor], dynamics: ChunkDynamics
 ) -> GeneralizedForces:
     """Measured and predicted forces of samples that share a contact state; `phi` is (M, width) by fold.
 
@@ -171,18 +172,18 @@ def measured_and_predicted_forces(
     """
     base_rows = builder.tree.base_rows
     torque = torch.nn.functional.pad(builder.recorded_torque(samples), (base_rows, 0))
-    measured = torque + contact_forces(builder, samples, state, kinematics).T
+    measured = torque + contact_forces(builder, samples, state, dynamics).T
     by_fold = [
-        _predicted(builder, samples[start:end], kinematics.select(slice(start, end)), phi[fold])
+        _predicted(builder, samples[start:end], dynamics.select(slice(start, end)), phi[fold])
         for fold, _, start, end in blocks_in(samples)
     ]
     predicted = by_fold[0] if len(by_fold) == 1 else torch.cat(by_fold, dim=1)
     return GeneralizedForces(measured, torque, predicted)
 
 
-def _predicted(builder: RowBuilder, samples: Samples, kinematics: ChunkKinematics, phi: Tensor) -> Tensor:
+def _predicted(builder: RowBuilder, samples: Samples, dynamics: ChunkDynamics, phi: Tensor) -> Tensor:
     """What `measured_and_predicted_forces` predicts at parameters (M, width), (M, B, n_rows)."""
-    predicted = predict_forces(builder, kinematics, with_payload_columns(builder, samples, phi)).mT
+    predicted = predict_forces(builder, dynamics, with_payload_columns(builder, samples, phi)).mT
     base_rows = builder.tree.base_rows
     if not builder.known_torques.none:
         predicted[..., base_rows:] += builder.known_torques.of(samples)
@@ -216,14 +217,15 @@ def noise_series(builder: RowBuilder, samples: Samples, noise: SensorNoise) -> A
 @torch.no_grad()
 def force_series(builder: RowBuilder, samples: Samples, phi: Array) -> tuple[Array, Array]:
     """Measured (N, n_rows) and predicted (M, N, n_rows) forces of a log in its order, `phi` as for `to_columns`."""
-    columns = builder.to_columns(phi)
+    columns, workspace = builder.to_columns(phi), builder.workspaces.take()
     n_rows = builder.tree.n_rows
     measured, predicted = np.empty((len(samples), n_rows)), np.empty((len(phi), len(samples), n_rows))
     for chunk, state, where in _on_device(builder, samples):
-        by_fold, kinematics = {chunk.fold: columns}, builder.kinematics(chunk)
-        forces = measured_and_predicted_forces(builder, chunk, state, by_fold, kinematics)
+        dynamics = builder.dynamics(chunk, workspace, whole=True)
+        forces = measured_and_predicted_forces(builder, chunk, state, {chunk.fold: columns}, dynamics)
         measured[where] = forces.measured.cpu().numpy()
         predicted[:, where] = forces.predicted.cpu().numpy()
+    builder.workspaces.give_back(workspace)
     return measured, predicted
 
 
@@ -574,8 +576,9 @@ class Evaluation:
 
         def sum_chunks(chunks: Iterator[tuple[Samples, ContactState]]) -> list[ForceSums]:
             sums = [ForceSums(self.robot.n_rows) for _ in range(count)]
+            workspace = builder.workspaces.take()
             for samples, state in chunks:
-                kinematics = builder.kinematics(samples)
+                kinematics = builder.dynamics(samples, workspace, whole=True)
                 forces = measured_and_predicted_forces(builder, samples, state, columns, kinematics)
                 sums[0].add_contact_forces(forces.measured[:, joints], forces.torque[:, joints])
                 errors = torch.cat([-forces.measured[None], forces.predicted - forces.measured])
@@ -593,6 +596,7 @@ class Evaluation:
                 for group in null_space_components(builder, state, kinematics, vectors):
                     for total, inside in zip(sums, group, strict=True):
                         total.projected.add(inside.flatten()[:, None])
+            builder.workspaces.give_back(workspace)
             return sums
 
         loaded = [replace(log, unloaded=None) for log in logs]

@@ -143,7 +143,7 @@ class ChunkDynamics(ChunkKinematics):
 
     Attributes:
         wrenches: (6, columns, B), wrench at the base origin of a unit of each inertial parameter; the forces of
-            inertias, which are zero, need not have been written.
+            inertias, which are zero, need not have been written, see `RowBuilder.dynamics`.
     """
 
     wrenches: Tensor
@@ -468,11 +468,16 @@ class RowBuilder(nn.Module):
         resting = None if samples.resting is None else samples.resting.T
         return ChunkKinematics(joints, states, screw_axes, rotation, arms, recorded_normals, along, resting)
 
-    def dynamics(self, samples: Samples, workspace: Workspace | None = None) -> ChunkDynamics:
-        """Dynamics of some samples; with a workspace, valid until the next call with the same."""
+    def dynamics(self, samples: Samples, workspace: Workspace | None = None, whole: bool = False) -> ChunkDynamics:
+        """Dynamics of some samples; with a workspace, valid until the next call with the same.
+
+        `whole`: whether forces of inertias, which are zero, are written to it too.
+        """
         kinematics, layout, out = self.kinematics(samples), self.columns.layout, None
         if workspace is not None:
             out = workspace.empty("wrenches", kinematics.screw_axes, 6, layout.count, len(samples))
+            if whole:
+                out[:3].zero_()
         return ChunkDynamics(**vars(kinematics), wrenches=all_wrench_columns(kinematics.states, layout, out))
 
     def rows(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cache
 from itertools import groupby
 
 import numpy as np
@@ -143,68 +142,6 @@ def wrench_columns(states: BodyStates, columns: tuple[int, ...], out: Tensor, is
     (x, y, z), (fx, fy, fz) = states.position.unsqueeze(2).unbind(), out[:3, :, :n_with_force].unbind()
     for row, (a, f), (b, g) in ((3, (y, fz), (z, fy)), (4, (z, fx), (x, fz)), (5, (x, fy), (y, fx))):
         out[row, :, :n_with_force].addcmul_(a, f).addcmul_(b, g, value=-1)
-
-
-def body_wrenches(states: BodyStates, phi: Tensor) -> Tensor:
-    """Wrenches that bodies with given parameters demand, without their columns.
-
-    Args:
-        states: of the L frames that the parameters are expressed in.
-        phi: (M, L, 10), M sets of inertial parameters.
-
-    Returns:
-        (6, M, L, B), force [N], then moment about the base origin [N m].
-
-    Source: as `wrench_columns`. In the body frame, forces and moments are linear in 12 functions of the motion.
-    """
-    inverse = states.rotation.transpose(0, 1)
-    omega, alpha, force = (
-        rotate_vectors(inverse, x)
-        for x in (states.angular_velocity, states.angular_acceleration, states.specific_force)
-    )
-    products = [omega[i] * omega[j] for i, j in parameters.INERTIA_AXES]
-    functions = torch.stack([*force, *alpha, *products], dim=1)  # (L, 12, B)
-    coefficients = torch.tensordot(phi, _newton_euler_coefficients().to(phi), dims=([2], [1])).permute(1, 2, 0, 3)
-    local = coefficients.flatten(1, 2) @ functions  # (L, 6 M, B)
-    local = local.unflatten(1, (6, -1)).permute(1, 2, 0, 3)
-    out = torch.empty(local.shape, dtype=local.dtype, device=local.device)
-    rotation = states.rotation.unsqueeze(2)
-    for vector in (slice(0, 3), slice(3, 6)):
-        torch.mul(rotation[:, 0], local[vector][0], out=out[vector])
-        for k in (1, 2):
-            out[vector].addcmul_(rotation[:, k], local[vector][k])
-    x, y, z = states.position
-    fx, fy, fz = out[:3]
-    for moment, (a, f), (b, g) in zip(out[3:], ((y, fz), (z, fx), (x, fy)), ((z, fy), (x, fz), (y, fx)), strict=True):
-        moment.addcmul_(a, f).addcmul_(b, g, value=-1)
-    return out
-
-
-@cache
-def _newton_euler_coefficients() -> Tensor:
-    """Coefficients (6, 10, 12) of the force and moment, in the body frame, of each unit inertial parameter.
-
-    The functions are the specific force, the angular acceleration, and the products of angular velocities in the
-    order of `parameters.INERTIA_AXES`.
-    """
-    epsilon = np.zeros((3, 3, 3))
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        epsilon[i, j, k], epsilon[i, k, j] = 1.0, -1.0
-    a, alpha = np.eye(12)[:3], np.eye(12)[3:6]
-    square = np.zeros((3, 3, 12))
-    for number, (i, j) in enumerate(parameters.INERTIA_AXES, start=6):
-        square[i, j, number] = square[j, i, number] = 1.0
-    out = np.zeros((6, parameters.INERTIAL.stop, 12))
-    out[:3, parameters.MASS] = a
-    # alpha x h + omega x (omega x h), and h x a
-    centripetal = square - np.eye(3)[..., None] * np.einsum("iif->f", square)
-    out[:3, parameters.FIRST_MOMENT] = np.einsum("ijk,jf->ikf", epsilon, alpha) + centripetal
-    out[3:, parameters.FIRST_MOMENT] = np.einsum("ijk,kf->ijf", epsilon, a)
-    for number, (i, j) in enumerate(parameters.INERTIA_AXES, start=parameters.INERTIA.start):
-        unit = np.zeros((3, 3))
-        unit[i, j] = unit[j, i] = 1.0  # I alpha + omega x (I omega)
-        out[3:, number] = unit @ alpha + np.einsum("ijk,kl,jlf->if", epsilon, unit, square)
-    return torch.from_numpy(out)
 
 
 def _unit_wrenches(states: BodyStates, columns: Sequence[int]) -> tuple[list[_Vector], list[_Vector]]:
