@@ -49,20 +49,6 @@ RUNS = {
     "quadruped, descent to its end": ("quadruped", FINISHED),
     "short": ("short", ()),
 }
-MORE = {
-    "quadruped": ("quadruped", ()),
-    "quadruped, consistent": ("quadruped", ("estimator.name=consistent",)),
-    "short, descent": ("short", DESCENT),
-    "biped": ("biped", ()),
-    "arm, ridge": ("arm", ("estimator.ridge=auto",)),
-    "arm, consistent": ("arm", ("estimator.name=consistent",)),
-    "biped, robust": ("biped", ("estimator.robust=huber",)),
-    "biped, consistent, robust": ("biped", ("estimator.name=consistent", "estimator.robust=tukey")),
-    "arm, penalties": ("arm", (*DESCENT, "estimator.consistency=penalties")),
-    "quadruped, line search": ("quadruped", (*DESCENT, "estimator.training.optimizer={name: LBFGS}")),
-}
-
-
 @pytest.fixture(scope="module")
 def experiments(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Three robots; and the quadruped with a log of three samples, fewer than processes."""
@@ -123,19 +109,6 @@ def assert_same(shared: Path, one: Path, experiment: Path, descends: bool) -> No
 @pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
 def test_two_processes_find_what_one_finds(runs: dict[int, Path], experiments: dict[str, Path], name: str) -> None:
     assert_same(runs[2] / name, runs[1] / name, experiments[RUNS[name][0]], "descent" in name)
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
-def test_processes_together_find_what_one_finds_with_other_settings(
-    experiments: dict[str, Path], tmp_path: Path
-) -> None:
-    chosen = [(name, experiments[robot], more) for name, (robot, more) in MORE.items()]
-    for processes in (1, 2, 3, 4):
-        run_all(processes, tmp_path / str(processes), chosen)
-    for name, file, more in chosen:
-        for processes in ("2", "3", "4"):
-            assert_same(tmp_path / processes / name, tmp_path / "1" / name, file, "estimator.name=sgd" in more)
 
 
 @pytest.mark.slow
@@ -233,21 +206,6 @@ def test_an_evaluation_is_that_of_one_process(
         assert status == 0, complained
         documents.append(json.loads((tmp_path / name / "evaluation/log1/metrics.json").read_text()))
     for where, difference in differences(*documents):
-        assert difference < 1e-10, where
-
-
-@pytest.mark.slow
-def test_an_analysis_is_that_of_one_process(experiments: dict[str, Path], tmp_path: Path) -> None:
-    documents = []
-    for name, before in (("one", (sys.executable, "-m")), ("two", (*TWO, "-m"))):
-        output = tmp_path / name
-        status, printed, complained = finish(
-            (*before, "torchid", "analyze", str(experiments["arm"]), f"output={output}")
-        )
-        assert status == 0, complained
-        assert printed.count("The sensors of the file determine") == 1, "one process answers"
-        documents.append(json.loads((tmp_path / f"{name}.analysis/analysis.json").read_text()))
-    for where, difference in differences(documents[0]["accuracy"], documents[1]["accuracy"]):
         assert difference < 1e-10, where
 
 

@@ -99,18 +99,6 @@ def test_parameters_of_sensors_and_actuators_do_not_hide_the_noise(arm: Arm, ter
 # ---------------------------------------------------------------------------------------------------------- estimated
 
 
-def test_noise_that_is_alike_is_estimated_as_that_of_all_joints_together(arm: Arm) -> None:
-    """The fit is as good as with weights that are known to be equal, and intervals hold the truth."""
-    std = np.full(6, 0.3)
-    logs = [arm.noisy(std, seed) for seed in range(REPEATS)]
-    found = [estimated(arm, log) for log in logs]
-    fits = [arm.fit(log, one.noise) for log, one in zip(logs, found, strict=True)]
-    known = [arm.fit(log, SensorNoise(joint_torque=0.3)) for log in logs]
-    assert (arm.errors(fits) < 1.03 * arm.errors(known)).all()
-    assert 0.92 < covered(fits, arm.true).mean() < 0.98
-    np.testing.assert_allclose([one.noise.joint_torque for one in found], 0.3, rtol=0.15)
-
-
 def test_noise_of_joints_a_thousand_times_apart_is_told_apart(arm: Arm) -> None:
     """Joints of little noise are predicted far better than with one figure for all, and intervals hold the truth."""
     std = 3.0 * UNLIKE

@@ -235,16 +235,6 @@ def test_without_noise_nothing_changes(robot: Robot, builder: RowBuilder) -> Non
     )
 
 
-def test_scaled_merged_and_compact_factors_take_their_noise_gram_along(robot: Robot, builder: RowBuilder) -> None:
-    one, two = (compress([motion(robot, count)], builder) for count in (300, 700))
-    expected = 4.0 * one.whole_noise_gram() + two.whole_noise_gram()
-    both = one.scaled(2.0)
-    both.merge(two)
-    assert torch.allclose(both.whole_noise_gram(), expected, rtol=1e-12)
-    assert torch.allclose(both.compact().whole_noise_gram(), expected, rtol=1e-12)
-    assert not one.noise_gram.keys() - both.noise_gram.keys()
-
-
 def test_parameters_of_noisy_motion_are_no_more_too_small(robot: Robot) -> None:
     bolted = torchid.load_robot(robot.path, fixed_base=True)
     builder = RowBuilder(bolted, [], named_sensors("joints", bolted.n, 0, SensorNoise(0.1, 1.0, 0.1)))

@@ -147,17 +147,6 @@ def test_what_is_missing_of_a_scalar_sensor_is_named() -> None:
     assert hint[:65] not in message(a_log(contact_force_normal=None), points, full).replace(hint[:64], "", 1)
 
 
-@pytest.mark.parametrize("radius", [0.0, 0.04])
-def test_the_normal_needs_the_orientation_of_the_base(radius: float) -> None:
-    imu = {name: np.zeros((COUNT, 3)) for name in ("imu_specific_force", "imu_angular_velocity")}
-    log = preprocess(a_log(base_quat_xyzw=None, base_position_world=None, imu_frame="base", **imu))
-    contacts = [replace(foot, radius=radius) for foot in FEET]
-    message = refused(lambda: bind_log(log, load(ANYMAL), contacts), "walk.npz: base_quat_xyzw: ", LogError)
-    does = "(radius 0.04 m) rolls" if radius else "(sensor fn) stands"
-    assert f"missing, though LF_FOOT {does} on ground that is known in the world" in message
-    bind_log(log, load(ANYMAL), [Contact(name, "point") for name in NAMES])
-
-
 # --------------------------------------------------------------------------------------------------- what is identified
 
 

@@ -21,7 +21,7 @@ from torchid.errors import LogError, SensorError
 from torchid.identifiability.base_parameters import standing_states
 from torchid.logs import Log, read_log, write_log
 from torchid.logs.preprocess import preprocess
-from torchid.problem import ExtraTerms, RowBuilder, bind_log, compress
+from torchid.problem import RowBuilder, bind_log, compress
 from torchid.problem.base_pose import feet_poses
 from torchid.sensing import Contact
 
@@ -73,30 +73,6 @@ def test_the_jacobian_of_a_ball_gives_the_velocity_of_the_material_point() -> No
         arm = -radius * (bases[i] @ poses[i]).T @ normal[i]
         np.testing.assert_allclose(speed[i, :3], twist[i, :3] + np.cross(twist[i, 3:], arm), atol=1e-12)
         np.testing.assert_allclose(speed[i, 3:], twist[i, 3:], atol=1e-13)
-
-
-@pytest.mark.parametrize("world", [False, True])
-def test_offsets_of_the_readings_of_a_ball_act_where_its_force_does(world: bool) -> None:
-    robot, rng = load(ANYMAL), np.random.default_rng(3)
-    samples, _ = random_samples(robot, BALLS, 20, 0, world, states=1)
-    terms = ExtraTerms(offsets={"contact_force": "all"})
-    builder = RowBuilder(robot, BALLS, sensor_set("mixed", robot, BALLS), terms)
-    state = (True,) * 4
-    samples = replace(samples, active=torch.ones_like(samples.active))
-    assert samples.wrench is not None
-    offsets = rng.normal(size=len(builder.extras))
-    shifted = samples.wrench.clone()
-    for extra, offset in zip(builder.extras, offsets.tolist(), strict=True):
-        assert extra.contact is not None
-        shifted[:, extra.contact[0], extra.contact[1]] += offset
-    (rows, _), (moved, _) = (
-        builder.rows_by_sample(replace(samples, wrench=wrench), state) for wrench in (samples.wrench, shifted)
-    )
-    columns = rows[..., builder.columns.count : builder.width]
-    assert len(offsets) >= 5
-    torch.testing.assert_close(
-        moved[..., -1] - rows[..., -1], columns @ torch.from_numpy(offsets), rtol=0.0, atol=1e-12
-    )
 
 
 # --------------------------------------------------------------------------------------------------- logs with normals

@@ -10,7 +10,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from synthetic import ANYMAL, SOLO12, Array, load, random_states
+from synthetic import ANYMAL, Array, load, random_states
 from torch import Tensor
 
 from torchid.regressor import FrameJacobian
@@ -18,7 +18,6 @@ from torchid.robot import Robot
 from torchid.sensing import Contact, ProjectedGroup, Projection
 
 FEET = [Contact(f"{leg}_FOOT", "point") for leg in ("LF", "RF", "LH", "RH")]
-SOLOS_FEET = [Contact(f"{leg}_FOOT", "point") for leg in ("FL", "FR", "HL", "HR")]
 robot_of = cache(load)
 seeds = st.integers(0, 2**32 - 1)
 few = settings(max_examples=20, deadline=None, derandomize=True)
@@ -95,20 +94,6 @@ def test_any_sensors_project_as_sample_by_sample_with_numpy(seed: int) -> None:
     check(scene, rng.random(robot.n) < share[0], rng.random(len(scene.components)) < share[1])
 
 
-def test_without_sensors_each_foot_on_the_ground_hides_more_of_the_base() -> None:
-    """Points on the ground leave a body 6, 3, 1 and 0 ways to move."""
-    scene = Scene(robot_of(ANYMAL), FEET, 3, samples=40)
-    left = {0: 6, 1: 3, 2: 1, 3: 0, 4: 0}
-    seen = set()
-    for group in check(scene, np.zeros(12, bool), np.zeros(12, bool)):
-        feet = int(group.active.sum()) // 3
-        seen.add(feet)
-        assert group.V.shape[2] == left[feet]
-        assert group.K.shape[1:] == (left[feet], 9)
-        assert (group.base_rank == left[feet]).all()
-    assert seen == set(left)
-
-
 def test_no_samples_make_no_groups() -> None:
     assert Scene(robot_of(ANYMAL), FEET, 4, samples=0).project(Projection([True] * 12, [False] * 12)) == []
 
@@ -127,20 +112,6 @@ def test_a_bolted_base_has_no_rows_and_no_base_to_lose() -> None:
 
 
 # --------------------------------------------------------------------------------------------------- lost directions
-
-
-def test_samples_that_lose_rank_share_a_batch_with_others() -> None:
-    """Without hip-roll sensors, four straight parallel legs can push up and sideways, 8 ways, in a plane: 3 unseen."""
-    scene = Scene(robot_of(SOLO12), SOLOS_FEET, 8, samples=16)
-    scene.touching[:] = True
-    straight = [0, 5, 6, 15]
-    scene.q[straight, 7:] = 0.0
-    torque = np.array(["HAA" not in name for name in scene.robot.joint_names])
-    rank = {}
-    for group in check(scene, torque, np.zeros(12, bool)):
-        rank |= dict.fromkeys(group.index.tolist(), 18 - group.V.shape[2])
-    assert {rank[sample] for sample in straight} == {13}
-    assert {rank[sample] for sample in set(rank) - set(straight)} == {16}
 
 
 # ------------------------------------------------------------------------------------------------- noise, leaks, grads
