@@ -41,7 +41,7 @@ from torchid.parameters import Array
 from torchid.problem.linear import parameter_scale
 
 FINISHED = ("estimator.name=sgd", "estimator.training.epochs=4", "estimator.ridge=0.1")
-DESCENT = (*FINISHED, "estimator.training.finish=null")
+DESCENT = (*FINISHED, "estimator.training.finish=false")
 RUNS = {
     "biped, consistent": ("biped", ("estimator.name=consistent",)),
     "arm, robust": ("arm", ("estimator.robust=tukey",)),
@@ -49,6 +49,8 @@ RUNS = {
     "quadruped, descent to its end": ("quadruped", FINISHED),
     "short": ("short", ()),
 }
+
+
 @pytest.fixture(scope="module")
 def experiments(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Three robots; and the quadruped with a log of three samples, fewer than processes."""
