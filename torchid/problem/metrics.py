@@ -19,7 +19,7 @@ from torchid.parameters import GRAVITY, MASS, Array
 from torchid.problem.chunks import CHUNK, ProgressCallback, blocks_in, chunks_by_state, map_chunks
 from torchid.problem.contact_state import ContactState
 from torchid.problem.extras import ACTUATORS, Extra, ExtraTerms, contact_extra_column, dof_extra_column
-from torchid.problem.rows import ChunkKinematics, RowBuilder, leave_out_torques
+from torchid.problem.rows import ChunkDynamics, ChunkKinematics, RowBuilder, leave_out_torques
 from torchid.problem.samples import Samples
 from torchid.regressor.regressor import friction_columns, generalized_forces, joint_row
 from torchid.regressor.tree import KinematicTree
