@@ -8,13 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from demo import shortened_demo
-from large import SMALL, Fields, assert_same, experiment, is_on_disk, overrides, recorded, samples_of
 from refusals import refusal
-from thinned import each_once
 
 from torchid.cli import main
-from torchid.errors import TorchidWarning
-from torchid.problem import Samples
 
 
 @pytest.fixture(scope="module")
@@ -60,47 +56,6 @@ def test_feet_that_stand_lose_no_sample(dragged: Path, tmp_path: Path) -> None:
             main(["identify", str(dragged), logs, f"preprocessing.max_slip={limit}", f"output={tmp_path / name}"]) == 0
         )
     assert samples(tmp_path / "all") == samples(tmp_path / "auto")
-
-
-def stepping(with_imu: bool) -> Fields:
-    """A long log of joints that keep still but for one leg's jerks, with the pose of its base or an IMU alone."""
-    fields = recorded()
-    time = fields["time"]
-    jerks = np.maximum(np.sin(0.9 * time), 0.0) ** 40 * (time > time[len(time) // 3])
-    fields["joint_position"] = np.full_like(fields["joint_position"], 0.3)
-    fields["joint_position"][:, 1] += 0.1 * jerks * np.sin(20.0 * time)
-    fields["base_quat_xyzw"] = np.tile([0.0, 0.0, 0.0, 1.0], (len(time), 1))
-    fields["base_position_world"] = np.zeros((len(time), 3))
-    if with_imu:
-        del fields["base_position_world"], fields["base_quat_xyzw"]
-        fields["imu_frame"], fields["imu_angular_velocity"] = np.array("trunk"), np.zeros((len(time), 3))
-        fields["imu_specific_force"] = np.tile([0.0, 0.0, 9.81], (len(time), 1))
-    return fields
-
-
-@pytest.mark.parametrize(("with_imu", "limit"), each_once([False, True], ["0.3", "auto"]))
-def test_blocks_of_a_long_log_lose_the_samples_that_the_whole_log_loses(
-    tmp_path: Path, with_imu: bool, limit: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    file = experiment(tmp_path, stepping(with_imu), ".h5")
-    settings = (*overrides({"cutoff_hz": 20, "contact_margin_s": 0.01}), f"preprocessing.max_slip={limit}")
-
-    def read(*more: str) -> tuple[Samples, str]:
-        with pytest.warns(TorchidWarning, match="samples dropped") as said:
-            samples = samples_of(file, *settings, *more)
-        (line,) = [str(x.message) for x in said if "samples dropped" in str(x.message)]
-        return samples, line
-
-    monkeypatch.setattr("torchid.reading.log_reader._WHOLE_GB", np.inf)
-    whole, line = read()
-    assert len(whole) < len(samples_of(file, *settings, "preprocessing.max_slip=null")) - 50
-    monkeypatch.setattr("torchid.reading.log_reader._WHOLE_GB", 0.0)
-    monkeypatch.setattr("torchid.reading.log_steps.BLOCK_GB", 1e-4)
-    for more in ((), (SMALL,)):
-        blocks, of_blocks = read(*more)
-        assert is_on_disk(blocks) == bool(more)
-        assert_same(blocks, whole, 1e-10)
-        assert of_blocks == line
 
 
 @pytest.mark.parametrize(

@@ -79,19 +79,6 @@ def test_steps_of_an_encoder_are_no_vibration() -> None:
     assert wider_low_pass(coarse, timeline_of(coarse)) is None
 
 
-def test_parts_of_a_log_have_the_directions_of_the_whole() -> None:
-    log, _ = recorded(0.8, velocity_noise=0.02)
-    with pytest.warns(TorchidWarning, match="joints move faster"):
-        timeline = with_sign_filter(timeline_of(log), log, signal_noise(log, timeline_of(log)))
-    assert timeline.sign_low_pass is not None
-    assert timeline.sign_noise is not None
-    whole = move_to_timeline(log, timeline, {}).joint_direction
-    samples, part = timeline.part(2000, 2600)
-    of_part = move_to_timeline(log.select(samples), part, {}).joint_direction
-    assert whole is not None
-    np.testing.assert_allclose(of_part, whole[2000:2600], atol=1e-12)
-
-
 def noisy(seed: int, velocity_noise: float, position_noise: float) -> tuple[Log, FloatArray]:
     """Four joints that swing with 0.18 rad/s, and their true velocities; with noise of one or the other."""
     rng, time = np.random.default_rng(seed), np.arange(6000) / RATE

@@ -217,7 +217,7 @@ def test_no_parameters_are_fitted_where_something_else_carries_the_robot(monkeyp
 def normal_forces(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: float) -> tuple[Array, Array]:
     """Stamps (K,) [s] of a filtered log, and forces (K, C) [N] along the ground's normal."""
     whole = prepare(log, robot, contacts, cutoff_hz)
-    return whole.log.time, ForcesAlongNormals.of([whole], len(whole.log), robot, contacts).of_part(whole)
+    return whole.log.time, ForcesAlongNormals.of(whole, robot, contacts).of_samples(whole)
 
 
 def test_samples_whose_flags_may_be_wrong_are_not_certain() -> None:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,18 +16,18 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from stances import Stance, stance
 from synthetic import Array
-from thinned import each_once
 from walking import robot_of
 
+from torchid.config.experiment import AnalyzeConfig
 from torchid.config.log_reading import PreprocessingConfig
+from torchid.config.robot import RobotConfig
 from torchid.errors import LogError, TorchidWarning, UnknownNameError
+from torchid.fitting.experiment import RobotSetup
 from torchid.logs import Log
-from torchid.logs.blocks import LogBlocks
 from torchid.logs.preprocess import DERIVATIVE_CHAINS, preprocess
 from torchid.problem import Samples, bind_log
 from torchid.problem.base_pose import LogWithPose, base_pose_from_feet
-from torchid.problem.derived_blocks import base_pose_in_blocks
-from torchid.reading.log_steps import LogSteps
+from torchid.reading.log_reader import LogReader
 from torchid.robot import Robot
 from torchid.sensing import Contact
 
@@ -59,38 +58,6 @@ def without(log: Log, foot: int, samples: slice = slice(None)) -> Log:
     active = value(log.contact_active).copy()
     active[samples, foot] = False
     return replace(log, contact_active=active)
-
-
-CASES: dict[str, Callable[[], Stance]] = {
-    "points": partial(stance, "quadruped", LEVEL, 0.0, ((1, 50, 90),)),
-    "balls on a slope": partial(stance, "quadruped", ASKEW, 0.022, ((1, 50, 90), (2, 120, 140))),
-    "soles": partial(stance, "biped", AHEAD, 0.0, ((0, 40, 70),)),
-}
-
-
-@pytest.mark.parametrize(("name", "most"), each_once([*CASES], [1, 7, 64]))
-def test_a_walk_that_is_read_in_parts_is_that_of_the_whole_log(tmp_path: Path, name: str, most: int) -> None:
-    """Wherever the parts end: in a stance, at a change of feet, or between samples without enough feet."""
-    case = CASES[name]()
-    log = without(without(without(case.log, 0, slice(100, 110)), 1, slice(100, 110)), 2 % len(case.contacts()))
-    whole = found(case, log) if name != "points" else found(case, log := without(case.log, 0, slice(60, 70)))
-    names = {"joint_names": np.array(log.joint_names), "contact_names": np.array(log.contact_names)}
-    fields = {"joint_position": log.joint_position, "contact_active": value(log.contact_active)}
-    fields |= {"imu_angular_velocity": np.zeros((len(log), 3)), "base_quat_wxyz": np.ones((len(log), 4))}
-    blocks = LogBlocks(log.source, names | {"imu_frame": np.array("imu")}, log.time, fields)
-
-    def pieces(count: int) -> Iterator[slice]:
-        return (slice(start, min(start + most, count)) for start in range(0, count, most))
-
-    for folder in (None, tmp_path):
-        stood, segments = base_pose_in_blocks(blocks, robot_of(case.machine), case.contacts(), pieces, folder)
-        assert (segments.segments, segments.dropped) == (whole.segments, whole.dropped)
-        assert segments.uneven == pytest.approx(whole.uneven, abs=1e-9)
-        assert stood.fields.keys() == {"joint_position", "contact_active", "base_quat_xyzw", "base_position_world"}
-        assert "imu_frame" not in stood.names
-        for field in ("base_quat_xyzw", "base_position_world"):
-            expected = value(getattr(whole.log, field))
-            np.testing.assert_allclose(np.asarray(stood.fields[field][:]), expected, rtol=0.0, atol=1e-11)
 
 
 # ----------------------------------------------------------------------------------------------------------------- pose
@@ -214,7 +181,9 @@ def with_pose(
 ) -> Samples:
     """Samples of a log with the motion of the base from the feet that stand."""
     settings = PreprocessingConfig(cutoff_hz=cutoff_hz, sample_rate_hz=rate_hz, base_motion="contacts")
-    return LogSteps(Path(log.source), settings, robot, contacts, None, None).samples_of(log, np.ones(len(log), bool))
+    config = AnalyzeConfig(robot=RobotConfig(urdf=robot.path), preprocessing=settings, output=None)
+    setup = RobotSetup(config=config, robot=robot, contacts=tuple(contacts))
+    return LogReader(setup).samples_of(log, Path(log.source), None)
 
 
 @pytest.mark.parametrize("name", ["quadruped", "humanoid"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -73,18 +72,6 @@ def test_samples_far_apart_are_taken_from_files_without_their_pages_staying_in_m
         assert chosen.pages is None
         for name, x in tensors(chosen).items():
             assert torch.equal(x.nan_to_num(), expected[name]), name
-
-
-@pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
-def test_mapped_samples_that_are_sent_to_another_process_are_in_its_memory(tmp_path: Path) -> None:
-    demo = shortened_demo(tmp_path / "demo", 300) / "quadruped.yaml"
-    config = load_config(demo, [f"output={tmp_path / 'run'}", SMALL])
-    setup = set_up(config)
-    [log] = LogReader(setup).read(config.logs.train, setup.sensors)
-    there = pickle.loads(pickle.dumps(log))  # noqa: S301 - what was just written
-    there.pages.release()
-    for name, x in tensors(there).items():
-        assert torch.equal(x.nan_to_num(), tensors(log)[name].nan_to_num()), name
 
 
 def test_tensors_share_the_arrays_of_a_log_but_for_read_only_ones() -> None:

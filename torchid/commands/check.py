@@ -191,7 +191,8 @@ def recorded_segments(
         return
     with open_log_blocks(path, None, logs.columns, settings.needs_flags) as blocks:
         for segment in _segments(len(blocks)):
-            log = blocks.read(segment, allow_gaps=allow_gaps)
+            with about_file(path):
+                log = blocks.read(segment, allow_gaps)
             yield LogSegment(log, _segment_name(path, segment, len(blocks)), len(blocks))
 
 

@@ -337,11 +337,8 @@ class _TrialReader(LogReader):
         super().__init__(setup)
         self._kept = recorded
 
-    def _together(self, path: Path) -> float:
+    def _size_gb(self, path: Path) -> float:
         return 0.0
-
-    def _takes_blocks(self, path: Path, gigabytes: float) -> bool:
-        return False
 
     def _recorded(self, path: Path) -> Log:
         files = self.setup.config.logs

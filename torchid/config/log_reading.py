@@ -51,7 +51,7 @@ class PreprocessingConfig:
     `max_slip`: speed [m/s] above which a contact that should stand slips, so that the sample is dropped; auto, from the
     noise of each contact's velocity; None keeps all.
     `exclude_rejected`: leave out the samples that `torchid check` rejects.
-    `memory_gb`: a log whose arrays take more [GB] is read block by block, and its samples are kept on the disk.
+    `memory_gb`: a log whose arrays take more than an eighth [GB] is read in parts, its samples kept on the disk.
     """
 
     cutoff_hz: PositiveOrAuto = None

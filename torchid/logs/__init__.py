@@ -6,7 +6,7 @@
 - maps of foreign columns: `column_map`, `column_entries`, `column_matching`, `entry_values`, `mapped_fields`, `units`,
   `name_matching`, `force_plates`
 - preprocessing: `preprocess`, `timeline`, `low_pass`, `cutoff`, `segments`, `gaps`, `quaternion`, `flags`,
-  `dry_friction`, `signal_noise`; of logs larger than memory `blocks`
+  `dry_friction`, `signal_noise`; of large logs `blocks`
 """
 
 from typing import TYPE_CHECKING

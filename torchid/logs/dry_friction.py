@@ -7,7 +7,7 @@ noise of the velocities allows.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -121,10 +121,8 @@ OFTEN = 0.2
 _EVIDENT = 0.01  # share of the velocities' power by which the error must fall: less is a few per cent of the reversals
 
 
-def with_sign_filter(
-    timeline: Timeline, log: Log, noise: SignalNoise, parts: Iterable[tuple[FloatArray, FloatArray]] | None = None
-) -> Timeline:
-    """A timeline of a log, or of one whose start this is, with the filter of `wider_low_pass` and the noise behind it.
+def with_sign_filter(timeline: Timeline, log: Log, noise: SignalNoise) -> Timeline:
+    """A timeline of a log with the filter of `wider_low_pass` and the noise behind it.
 
     Where joints at rest are to be found, with the velocity that they have at most: a tenth of the root mean square, as
     in `resting_share`, or three standard deviations of noise.
@@ -134,9 +132,8 @@ def with_sign_filter(
 
     Args:
         timeline: of the log.
-        log: as recorded, or its start.
+        log: as recorded.
         noise: of its motion, by this timeline.
-        parts: stamps (N,) [s] and joint positions (N, n) of all parts of the log, in order; None where `log` is all.
 
     Warns:
         TorchidWarning: the timeline's own filter takes off much of the joints' motion.
@@ -158,7 +155,8 @@ def with_sign_filter(
     of_position, step, noisy = noise.std.get("joint_position", none), float(np.median(np.diff(log.time))), of_sign > 0.0
     ratio = float(np.median(of_position[noisy] / of_sign[noisy])) if noisy.any() else 0.0
     lag = max(1, round(np.sqrt(2.0) * ratio / step))
-    square = mean_square_velocity([(log.time, log.joint_position)] if parts is None else parts, lag)
+    velocity = np.diff(log.joint_position[::lag], axis=0) / np.diff(log.time[::lag])[:, None]  # mean, over the lag
+    square = np.square(velocity).mean(axis=0) if len(velocity) else np.full(len(none), np.inf)
     expected = (1.0 - _UNKNOWN) * 2.0 * np.square(of_position / (lag * step))  # of the positions' noise, at least
     still = noisy & (square < np.square(of_sign) + expected)
     if timeline.finds_rest:
@@ -171,25 +169,6 @@ def with_signs_of(timeline: Timeline, whole: Timeline) -> Timeline:
     """The timeline of a segment with what `with_sign_filter` has found of the whole log."""
     found = {name: getattr(whole, name) for name in ("sign_low_pass", "sign_noise", "rest_speed")}
     return replace(timeline, **found)
-
-
-def mean_square_velocity(parts: Iterable[tuple[FloatArray, FloatArray]], lag: int) -> FloatArray:
-    """Mean square of the joints' mean velocities over so many samples, (n,); infinite of a log that is no longer.
-
-    Args:
-        parts: stamps (N,) [s] and joint positions (N, n) of all parts of a log, in order.
-        lag: the samples.
-    """
-    squares: FloatArray | float = np.inf
-    done, count, last = 0, 0, list[tuple[FloatArray, FloatArray]]()
-    for time, position in parts:
-        some = slice(-done % lag, None, lag)
-        at, q = (np.concatenate(x) for x in zip(*last, (time[some], position[some]), strict=True))
-        mean = np.diff(q, axis=0) / np.diff(at)[:, None]
-        if len(mean):
-            squares = (squares if count else 0.0) + np.square(mean).sum(axis=0)
-        done, count, last = done + len(time), count + len(mean), [(at[-1:], q[-1:])]
-    return np.asarray(squares / max(count, 1))
 
 
 def resting_share(velocity: FloatArray, noise: FloatArray | float = 0.0) -> FloatArray:
@@ -234,7 +213,7 @@ def wider_low_pass(log: Log, timeline: Timeline) -> WiderLowPass | None:
     whatever is not smooth from sample to sample, quantization included, so that it is rather too large.
 
     Args:
-        log: as recorded, or its start.
+        log: as recorded.
         timeline: that it is preprocessed to.
     """
     cutoff, low_pass = timeline.cutoff_hz, timeline.low_pass

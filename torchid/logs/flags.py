@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
 
 import numpy as np
 from pydantic.dataclasses import dataclass
@@ -37,26 +36,11 @@ def with_flags_by_force(log: Log, settings: ContactThreshold) -> tuple[Log, Bool
         LogError: no force, or no flag either, of a contact; a force that is NaN in some samples; no normal of the
             ground where a contact stands.
     """
-    measured = MeasuredForces.of(log.source, [log])
-    active, certain = flags_by_force(log, measured, measured.sizes(log), settings)
-    normals = log.contact_normal_world
-    if normals is not None:
-        with about_file(log.source):
-            normals = normalize_normals(normals, active, log.contact_names)
-    return dataclasses.replace(log, contact_active=active, contact_normal_world=normals), certain
-
-
-def flags_by_force(
-    log: Log, measured: MeasuredForces, force: FloatArray, settings: ContactThreshold
-) -> tuple[BoolArray, BoolArray]:
-    """Flags (N, C) of contacts that carry forces (N, C) [N], and where they (N,) are certain, as `with_flags_by_force`.
-
-    Args:
-        log: with stamps, names of contacts and recorded flags, if there are any; nothing else is looked at.
-        measured: what the forces are of.
-        force: the `sizes` of all its samples.
-        settings: thresholds.
-    """
+    scalar, wrench = log.contact_force_normal, log.contact_wrench
+    if not log.contact_names or (scalar is None and wrench is None):
+        accepted = f"contact_wrench_local or {FORCE_NORMAL}, to compare with {_KEY}"
+        raise LogError(log.source, "contact_wrench", "missing", accepted)
+    force = _force_sizes(log)
     active = np.zeros(force.shape, dtype=bool) if log.contact_active is None else log.contact_active.copy()
     certain = np.ones(len(log), dtype=bool)
     below = settings.above if settings.below is None else settings.below
@@ -70,65 +54,34 @@ def flags_by_force(
             accepted = f"forces to compare with {_KEY}, or gaps that preprocessing.bridge_gaps_s bridges"
             if missing.all():
                 found, accepted = f"no force of {name}", f"forces to compare with {_KEY}, or contact_active"
-            raise LogError(log.source, measured.field(column), found, accepted)
+            is_scalar = scalar is not None and (wrench is None or not np.isnan(scalar[:, column]).all())
+            raise LogError(log.source, FORCE_NORMAL if is_scalar else log.contact_wrench_field, found, accepted)
         loaded = hysteresis(force[:, column], settings.above, below)
         active[:, column] = without_short(loaded, shortest)
         certain &= active[:, column] | ~loaded
-    return active, certain
+    normals = log.contact_normal_world
+    if normals is not None:
+        with about_file(log.source):
+            normals = normalize_normals(normals, active, log.contact_names)
+    return dataclasses.replace(log, contact_active=active, contact_normal_world=normals), certain
 
 
-@dataclasses.dataclass(frozen=True)
-class MeasuredForces:
-    """Which readings say what contacts carry: `contact_force_normal`, or else the size of a wrench's force.
+def _force_sizes(log: Log) -> FloatArray:
+    """What contacts carry, (N, C) [N]: `contact_force_normal`, or else the size of a wrench's force.
 
-    The size needs no orientation of foot, base or ground.
-
-    Attributes:
-        normal: contacts (C,) whose force along the normal has a value in some sample.
-        components: likewise those (C, 3) of wrenches' forces.
-        wrench_field: name of the field of wrenches, None if there are none.
+    The size needs no orientation of foot, base or ground. A component that is NaN throughout the log counts as 0, a
+    contact of which all are has NaN.
     """
-
-    normal: BoolArray
-    components: BoolArray
-    wrench_field: str | None
-
-    @classmethod
-    def of(cls, source: str, parts: Iterable[Log]) -> MeasuredForces:
-        """Those of a log, from all of its samples. Raises LogError: the log has neither."""
-        found: MeasuredForces | None = None
-        for log in parts:
-            scalar, wrench = log.contact_force_normal, log.contact_wrench
-            if not log.contact_names or (scalar is None and wrench is None):
-                accepted = f"contact_wrench_local or {FORCE_NORMAL}, to compare with {_KEY}"
-                raise LogError(source, "contact_wrench", "missing", accepted)
-            if found is None:
-                count, field = len(log.contact_names), None if wrench is None else log.contact_wrench_field
-                found = cls(np.zeros(count, dtype=bool), np.zeros((count, 3), dtype=bool), field)
-            if scalar is not None:
-                found.normal[:] |= ~np.isnan(scalar).all(axis=0)
-            if wrench is not None:
-                found.components[:] |= ~np.isnan(wrench[:, :, :3]).all(axis=0)
-        if found is None:
-            raise ValueError("no samples")
-        return found
-
-    def sizes(self, log: Log) -> FloatArray:
-        """What contacts carry in some samples of the log, (N, C) [N].
-
-        A component that is NaN throughout the log counts as 0, a contact of which all are has NaN.
-        """
-        force = np.full((len(log), len(log.contact_names)), np.nan)
-        if log.contact_wrench is not None:
-            sizes = np.linalg.norm(np.where(self.components, log.contact_wrench[:, :, :3], 0.0), axis=2)
-            force = np.where(self.components.any(axis=1), sizes, np.nan)
-        if log.contact_force_normal is not None:
-            force = np.where(self.normal, log.contact_force_normal, force)
-        return np.asarray(force)
-
-    def field(self, column: int) -> str:
-        """The field that a contact's force is of."""
-        return FORCE_NORMAL if self.wrench_field is None or self.normal[column] else self.wrench_field
+    force = np.full((len(log), len(log.contact_names)), np.nan)
+    if log.contact_wrench is not None:
+        components = log.contact_wrench[:, :, :3]
+        known = np.asarray(~np.isnan(components).all(axis=0))
+        sizes = np.linalg.norm(np.where(known, components, 0.0), axis=2)
+        force = np.where(known.any(axis=1), sizes, np.nan)
+    scalar = log.contact_force_normal
+    if scalar is not None:
+        force = np.where(~np.isnan(scalar).all(axis=0), scalar, force)
+    return np.asarray(force)
 
 
 def samples_of(seconds: float, time: FloatArray) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -52,26 +52,9 @@ def bridge_gaps(raw: Mapping[str, NDArray[Any]], longest_s: float | None) -> dic
     Warns:
         TorchidWarning: how many samples were filled.
     """
-    out, filled = fill_short_gaps(raw, longest_s)
-    if filled and longest_s is not None:
-        count = int(np.any(list(filled.values()), axis=0).sum())
-        warn_of_filled(filled, count, len(raw["time"]), longest_s)
-    return out
-
-
-def warn_of_filled(names: Iterable[str], count: int, samples: int, longest_s: float) -> None:
-    """Warn that gaps of some fields were filled in so many of all samples."""
-    what = f"gaps of at most {longest_s:g} s bridged in {count} of {samples} samples"
-    warn_about_file(f"{', '.join(names)}: {what}")
-
-
-def fill_short_gaps(
-    raw: Mapping[str, NDArray[Any]], longest_s: float | None
-) -> tuple[dict[str, NDArray[Any]], dict[str, BoolArray]]:
-    """The fields as `bridge_gaps` has them, and in which samples (N,) of which something was filled."""
-    out, filled = dict(raw), dict[str, BoolArray]()
+    out, filled = dict(raw), dict[str, BoolArray]()  # samples (N,) in which something was filled
     if longest_s is None:
-        return out, filled
+        return out
     time = parse_time(raw["time"])
     for name in sorted(_with_gaps(raw), key=lambda name: name != FLAGS):  # readings depend on flags
         missing = _missing(name, raw[name])
@@ -80,7 +63,11 @@ def fill_short_gaps(
         if short.any():
             out[name] = _held(raw[name], short) if name == FLAGS else _filled(time, name, raw[name], short)
             filled[name] = np.asarray(short.reshape(len(time), -1).any(axis=1))
-    return out, filled
+    if filled:
+        count = int(np.any(list(filled.values()), axis=0).sum())
+        what = f"gaps of at most {longest_s:g} s bridged in {count} of {len(time)} samples"
+        warn_about_file(f"{', '.join(filled)}: {what}")
+    return out
 
 
 def refuse_gaps(name: str, values: FloatArray, time: FloatArray, labels: tuple[str, ...] = ()) -> None:
@@ -201,56 +188,19 @@ def require_no_turns(log: Log) -> None:
     raise LogError(log.source, "joint_position", found, accepted)
 
 
-@dataclass
+@dataclass(frozen=True)
 class Coverage:
-    """Which channels of a field were measured throughout, gathered block by block.
+    """Which channels of a field were measured throughout.
 
-    Of every channel: `measurable`, samples in which there is something to measure (all, or those in contact);
-    `missing`, those of them that are NaN, from the `first` to the `last`; `values`, samples with a value.
+    Attributes:
+        missing: samples (N, ...) in which there is something to measure (all, or those in contact) and no value.
+        complete: channels with a value in all measurable samples, and in at least one sample.
+        broken: channels with a value in some samples and NaN in others.
     """
 
-    samples: int
-    measurable: NDArray[np.intp]
-    missing: NDArray[np.intp]
-    values: NDArray[np.intp]
-    first: NDArray[np.intp]
-    last: NDArray[np.intp]
-
-    @classmethod
-    def empty(cls, channels: tuple[int, ...]) -> Coverage:
-        """Coverage of no samples."""
-        return cls(0, *(np.zeros(channels, dtype=np.intp) for _ in range(5)))
-
-    def add(self, values: FloatArray, active: BoolArray | None) -> None:
-        """Add samples (N, ...) of the field; `active`: (N, C) of the contacts of a reading."""
-        nan = np.isnan(values)
-        if active is not None:
-            active = active.reshape(active.shape + (1,) * (values.ndim - 2))
-        self.measurable += len(values) if active is None else active.sum(axis=0)
-        self.values += len(values)
-        if nan.any():
-            self.values -= nan.sum(axis=0)
-            self._add_missing(nan if active is None else nan & active)
-        self.samples += len(values)
-
-    def _add_missing(self, missing: BoolArray) -> None:
-        """Add what is missing of the samples that are added, (N, ...)."""
-        count = missing.sum(axis=0)
-        if count.any():
-            new = (count > 0) & (self.missing == 0)
-            self.first[new] = self.samples + np.argmax(missing, axis=0)[new]
-            self.last[count > 0] = self.samples + (len(missing) - 1 - np.argmax(missing[::-1], axis=0))[count > 0]
-            self.missing += count
-
-    @property
-    def complete(self) -> BoolArray:
-        """Channels with a value in all measurable samples, and in at least one sample."""
-        return np.asarray((self.missing == 0) & (self.values > 0))
-
-    @property
-    def broken(self) -> BoolArray:
-        """Channels with a value in some samples and NaN in others."""
-        return np.asarray((self.missing > 0) & (self.missing < self.measurable) & (self.values > 0))
+    missing: BoolArray
+    complete: BoolArray
+    broken: BoolArray
 
 
 def warn_of_gaps(log: Log, name: str, coverage: Coverage) -> None:
@@ -259,12 +209,12 @@ def warn_of_gaps(log: Log, name: str, coverage: Coverage) -> None:
     Warns:
         TorchidWarning: names them.
     """
-    labels = column_labels(name, log.names)
-    broken = [
-        f"{describe_element((0, *channel), labels).partition(', ')[2]}"
-        f" (samples {coverage.first[channel]} to {coverage.last[channel]})"
-        for channel in map(tuple, np.argwhere(coverage.broken).tolist())
-    ]
+    labels, broken = column_labels(name, log.names), list[str]()
+    channel: tuple[int, ...]
+    for channel in map(tuple, np.argwhere(coverage.broken).tolist()):
+        samples = np.flatnonzero(np.moveaxis(coverage.missing, 0, -1)[channel])
+        label = describe_element((0, *channel), labels).partition(", ")[2]
+        broken.append(f"{label} (samples {samples[0]} to {samples[-1]})")
     if broken:
         message = f"{log.source}: {name}: NaN in part of {', '.join(broken)}: NaN throughout after preprocessing"
         message += f", unless {_KEY} bridges these gaps or preprocessing.exclude_rejected leaves them out"
@@ -274,6 +224,12 @@ def warn_of_gaps(log: Log, name: str, coverage: Coverage) -> None:
 def measure_coverage(log: Log, name: str) -> Coverage:
     """Coverage of the field `name` of a log."""
     values: FloatArray = getattr(log, name)
-    found = Coverage.empty(values.shape[1:])
-    found.add(values, log.contact_active if name in CONTACT_READINGS else None)
-    return found
+    missing = np.isnan(values)
+    measurable: BoolArray = np.ones(len(values), dtype=np.bool_)
+    has_values: BoolArray = np.asarray(~missing.all(axis=0))
+    if name in CONTACT_READINGS and log.contact_active is not None:
+        measurable = log.contact_active.reshape(log.contact_active.shape + (1,) * (values.ndim - 2))
+        missing &= measurable
+    lost = missing.sum(axis=0)
+    complete = has_values & (lost == 0)
+    return Coverage(missing, complete, has_values & ~complete & (lost < measurable.sum(axis=0)))

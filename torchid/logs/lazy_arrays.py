@@ -1,7 +1,7 @@
 """Arrays of a log that may not be in memory: on the disk, or worked out where they are sliced; or read whole.
 
-On the disk they are in temporary files that vanish with the process, or mapped to files. Worked out are fields of other
-fields or foreign arrays, and what fills gaps.
+On the disk they are in temporary files that vanish with the process, or mapped to files. Worked out are fields of
+foreign arrays.
 """
 
 from __future__ import annotations
@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 
 from torchid.errors import InputError, LogError
 from torchid.guards import check_fields
-from torchid.logs.flags import runs
-from torchid.logs.log import FloatArray
 
 if TYPE_CHECKING:
     from torchid.logs.mapped_fields import MappedFields
@@ -43,25 +41,6 @@ class LazyArray(Protocol):
 
 class SpillError(InputError):
     """The disk has no room for arrays that exceed the memory."""
-
-
-class Filled:
-    """An array in memory that is filled row by row, without a second copy at the end."""
-
-    def __init__(self, rows: int) -> None:
-        """Start empty, with room for so many rows as soon as there is a first."""
-        self._length, self._filled, self._array = rows, 0, np.zeros(0)
-
-    def append(self, rows: NDArray[Any]) -> None:
-        """Add rows, all of one shape and type."""
-        if not self._filled:
-            self._array = np.empty((self._length, *rows.shape[1:]), rows.dtype)
-        self._array[self._filled : self._filled + len(rows)] = rows
-        self._filled += len(rows)
-
-    def array(self) -> NDArray[Any]:
-        """All rows, (N, ...)."""
-        return self._array
 
 
 class Spill:
@@ -108,11 +87,6 @@ class Spill:
     def _failure(self, error: OSError) -> SpillError:
         accepted = "a folder with room for the log, or a preprocessing.memory_gb that takes it"
         return SpillError(self.source, f"temporary file in {self.folder}", f"cannot be written ({error})", accepted)
-
-
-def growing_array(source: object, folder: Path | None, rows: int) -> Filled | Spill:
-    """An array that so many rows will be added to: on the disk of a folder, or in memory without one."""
-    return Filled(rows) if folder is None else Spill(source, folder)
 
 
 _DONTNEED = getattr(mmap, "MADV_DONTNEED", None)  # not on Windows
@@ -178,81 +152,6 @@ class MappedArray:
 
     def _is_constant(self, source: str) -> bool:
         return source in self._constant and len(self._arrays[source].shape) == 1
-
-
-class GapsFilled:
-    """An array (N, k) without gaps (NaN): each is filled linearly, those at the ends with the nearest value.
-
-    A channel of which more than a share is missing is NaN throughout.
-    """
-
-    def __init__(self, array: LazyArray, most_missing: float, parts: Iterable[FloatArray]) -> None:
-        self.shape, self.dtype = array.shape, np.dtype(np.float64)
-        self._array = array
-        channels = [_Gaps() for _ in range(array.shape[1])]
-        most, start = most_missing * array.shape[0], 0
-        for values in parts:
-            for gaps, channel in zip(channels, values.T, strict=True):
-                gaps.add(start, channel, most)
-            start += len(values)
-        self.broken = np.array([gaps.missing > most for gaps in channels])
-        """Channels (k,) that are NaN throughout."""
-
-        self._tables = [
-            np.zeros((0, 4)) if bad else gaps.table() for gaps, bad in zip(channels, self.broken, strict=True)
-        ]
-
-    def __getitem__(self, rows: slice) -> NDArray[Any]:
-        start, _, _ = rows.indices(self.shape[0])
-        out = np.array(self._array[rows], dtype=np.float64)
-        out[:, self.broken] = np.nan
-        for channel, table in zip(out.T, self._tables, strict=True):
-            missing = np.flatnonzero(np.isnan(channel)) if len(table) else np.zeros(0, dtype=np.intp)
-            first, stop, before, after = table[np.searchsorted(table[:, 0], start + missing, side="right") - 1].T
-            slope = (after - before) / (stop - (first - 1.0))
-            channel[missing] = slope * (start + missing - (first - 1.0)) + before
-        return out
-
-
-class _Gaps:
-    """Gaps of one channel: first samples, those after the last, values before and after."""
-
-    def __init__(self) -> None:
-        self.missing = 0
-        self._found: list[FloatArray] = []
-        self._last = np.nan  # value of the last sample that has one
-        self._open: tuple[int, float] | None = None  # start of a gap that has not ended, and the value before it
-
-    def add(self, offset: int, values: FloatArray, most: float) -> None:
-        """Add successive samples; nothing is kept of a channel of which more than so many are missing."""
-        nan = np.isnan(values)
-        self.missing += int(nan.sum())
-        if self.missing > most:
-            self._found, self._open = [], None
-            return
-        table = []
-        if self._open is not None and not nan.all():
-            start, before = self._open
-            stop = int(np.argmin(nan))
-            table.append((start, offset + stop, before, values[stop]))
-            self._open = None
-        for start, stop in runs(nan):
-            before = values[start - 1] if start else self._last
-            if stop == len(values):
-                self._open = self._open or (offset + start, before)
-            elif start or not table:
-                table.append((offset + start, offset + stop, before, values[stop]))
-        if not nan.all():
-            self._last = values[np.flatnonzero(~nan)[-1]]
-        if table:
-            self._found.append(np.array(table, dtype=np.float64))
-
-    def table(self) -> FloatArray:
-        """All gaps (G, 4)."""
-        last = [] if self._open is None else [np.array([[self._open[0], np.inf, self._open[1], self._open[1]]])]
-        out = np.concatenate([np.zeros((0, 4)), *self._found, *last])
-        out[:, 2] = np.where(np.isnan(out[:, 2]), out[:, 3], out[:, 2])
-        return out
 
 
 class ArraysInMemory:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from torchid.errors import InputError, LogError, about_file
+from torchid.errors import InputError, about_file
 from torchid.logs.dry_friction import channels_together, dry_friction, with_sign_filter
 from torchid.logs.gaps import Coverage, measure_coverage, require_no_turns, warn_of_gaps
 from torchid.logs.log import (
@@ -102,10 +102,7 @@ def preprocess(
         return replace(log, motion_noise=noise) if noise.found else log
     require_no_turns(log)  # which would pass for fast motion
     timeline = with_sign_filter(timeline, log, noise)
-    coverage = {name: measure_coverage(log, name) for name in gapless_fields(log, timeline)}
-    for name, found in coverage.items():
-        warn_of_gaps(log, name, found)
-    out = move_to_timeline(log, timeline, coverage)
+    out = move_to_timeline(log, timeline, measured_coverage(log, timeline))
     with about_file(log.source):
         warn_of_noisy_accelerations(log, out, timeline, noise)
     return replace(out, motion_noise=noise)
@@ -127,21 +124,23 @@ def make_timeline(
     return replace(timeline, sign_width=sign_width, stribeck=stribeck, finds_rest=finds_rest)
 
 
-def gapless_fields(log: Log, timeline: Timeline) -> list[str]:
-    """Fields that are filtered or resampled, and whose channels must therefore have no gap."""
+def measured_coverage(log: Log, timeline: Timeline) -> dict[str, Coverage]:
+    """Coverage of fields that are filtered or resampled, whose channels must then have no gap; warns of gaps."""
     if timeline.low_pass is None and timeline.output is None:
-        return []
-    return [name for name in NAN_ALLOWED if getattr(log, name) is not None]
+        return {}
+    coverage = {name: measure_coverage(log, name) for name in NAN_ALLOWED if getattr(log, name) is not None}
+    for name, found in coverage.items():
+        warn_of_gaps(log, name, found)
+    return coverage
 
 
-def move_to_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Coverage], is_part: bool = False) -> Log:
-    """A log, or a part of one, preprocessed to a timeline.
+def move_to_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Coverage]) -> Log:
+    """A log, or a segment of one, preprocessed to a timeline.
 
     Args:
         log: the log.
         timeline: stamps of it and of the result.
         coverage: of fields that must have no gap.
-        is_part: which contacts are in the air is told by `contact_unloaded` alone.
 
     Raises:
         LogError: a joint's position jumps by a whole turn, or is not finite.
@@ -149,7 +148,7 @@ def move_to_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Covera
     require_no_turns(log)
     with about_file(log.source):
         fields = _fields_on_timeline(log, timeline, coverage)
-        readings = log.contact_unloaded if is_part else unloaded_readings(log)
+        readings = unloaded_readings(log)
         return replace(log, **fields, contact_unloaded=None if readings is None else timeline.hold(readings))
 
 
@@ -294,13 +293,9 @@ def near_contact_changes(log: Log, time: FloatArray, margin: float) -> BoolArray
     return near
 
 
-def away_from_changes(log: Log, time: FloatArray, margin: float) -> BoolArray | None:
-    """Which of some stamps are not `near_contact_changes`, None for all. Raises LogError: none is."""
-    near = near_contact_changes(log, time, margin)
-    if near.all():
-        found = f"no sample further than {margin:g} s from a change of contact"
-        raise LogError(log.source, "contact_active", found, "a smaller preprocessing.contact_margin_s")
-    return ~near if near.any() else None
+def away_from_changes(log: Log, time: FloatArray, margin: float) -> BoolArray:
+    """Which of some stamps are not `near_contact_changes`."""
+    return ~near_contact_changes(log, time, margin)
 
 
 def find_unloaded(time: FloatArray, active: BoolArray, margin: float = UNLOADED_MARGIN_S) -> BoolArray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import numbers
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -137,27 +137,6 @@ class Timeline:
         """Whether the preprocessed log's stamps are the log's own, but for those dropped at the ends."""
         return self.output is None and self.grid is self.native
 
-    def part(self, first: int, last: int) -> tuple[slice, Timeline]:
-        """What a part of the output's stamps depends on: samples of the log, and the timeline from these to the part.
-
-        The same numbers come out as from the whole, but for rounding: filter (`LowPass.settling`) and spline reach into
-        the neighbourhood, and the spline is drawn through the same blocks of samples.
-        """
-        at = self.output_stamps[first:last]
-        spoiled = 0 if self.low_pass is None else self.low_pass.settling + self.low_pass.padding
-        beyond = SPLINE_OVERLAP + 2 * spoiled  # directions are filtered twice
-        grid = _around(self.grid, at, beyond)
-        samples = grid if self.grid is self.native else _around(self.native, self.grid[grid][[0, -1]], SPLINE_OVERLAP)
-        native = self.native[samples]
-        start, each = self.kept.start - grid.start, self.kept.step or 1
-        return samples, replace(
-            self,
-            native=native,
-            grid=native if self.grid is self.native else self.grid[grid],
-            kept=slice(start + each * first, start + each * last, each) if self.output is None else slice(0),
-            output=None if self.output is None else at,
-        )
-
     def smooth(self, values: FloatArray) -> FloatArray:
         """The channels (N, ...) on the grid, (M, ...), low-pass filtered; `values` itself where nothing changes."""
         if self.grid is not self.native:
@@ -214,16 +193,6 @@ def nearest_known(normals: FloatArray) -> FloatArray:
         nearer_before = np.abs(every - samples[before]) < np.abs(samples[after] - every)
         out[:, contact] = normals[samples[np.where(nearer_before, before, after)], contact]
     return out
-
-
-def _around(stamps: FloatArray, at: FloatArray, beyond: int) -> slice:
-    """Samples up to some beyond the first and last of `at`, in whole blocks of the spline."""
-    first = int(np.searchsorted(stamps, at[0], side="right")) - 1 - beyond
-    last = int(np.searchsorted(stamps, at[-1])) + 1 + beyond
-    return slice(
-        max(0, first // SPLINE_BLOCK * SPLINE_BLOCK),
-        min(len(stamps), -(-last // SPLINE_BLOCK) * SPLINE_BLOCK + SPLINE_OVERLAP),
-    )
 
 
 # --------------------------------------------------------------------------------------------------------------- layout

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +14,6 @@ from pydantic.dataclasses import dataclass
 
 from torchid.logs import Log
 from torchid.logs.flags import beside_changes, hysteresis, samples_of, without_short
-from torchid.logs.lazy_arrays import growing_array
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import find_unloaded
 from torchid.problem.contact_slip import base_velocity, contact_velocities, keep_still
@@ -156,55 +155,15 @@ def detect_contacts(
         none, every = np.zeros((len(log), 0), dtype=bool), np.ones(len(log), dtype=bool)
         return Detection(none, every, none, every)
 
-    def filtered(cutoff_hz: float) -> Filtered:
-        whole = prepare(log, robot, contacts, cutoff_hz)
-        return Filtered(whole.log.time, cutoff_hz, lambda: [whole])
-
-    return detect_in_parts(filtered, log.time, robot, contacts, settings, sign_width)
-
-
-class Filtered(NamedTuple):
-    """A log that is filtered for detection.
-
-    Attributes:
-        time: (K,) [s] of its samples.
-        cutoff_hz: of the filter, half the sample rate without one.
-        parts: makes its successive parts, once more each time.
-    """
-
-    time: FloatArray
-    cutoff_hz: float
-    parts: Callable[[], Iterable[DetectionSamples]]
-
-
-def detect_in_parts(
-    filtered: Callable[[float], Filtered],
-    stamps: FloatArray,
-    robot: Robot,
-    contacts: Sequence[Contact],
-    settings: DetectionConfig,
-    sign_width: float | None = None,
-    folder: Path | None = None,
-) -> Detection:
-    """As `detect_contacts`, of a log that is prepared in successive parts.
-
-    Args:
-        filtered: the log at a cutoff [Hz]; two passes, and with `refit` one for each cutoff that is tried.
-        stamps: (N,) [s] of the log as recorded.
-        robot: the robot.
-        contacts: one or more.
-        settings: thresholds.
-        sign_width: as of `detect_contacts`.
-        folder: with room for forces and velocities; None: in memory.
-    """
-    known = filtered(detection_cutoff_hz(settings.cutoff_hz, stamps))
-    forces = ForcesAlongNormals.of(known.parts(), len(known.time), robot, contacts, sign_width)
-    seen = _Seen.of(known, forces, settings, folder)
+    filtered = partial(prepare, log, robot, contacts)
+    known = filtered(detection_cutoff_hz(settings.cutoff_hz, log.time))
+    forces = ForcesAlongNormals.of(known, robot, contacts, sign_width)
+    seen = _Seen.of(known, forces, settings)
     found, time = seen.judged(), seen.time
     if settings.refit and seen.accelerates:
-        found, time = _detect_again(filtered, forces, seen, found, folder)
-    inside = (stamps >= time[0]) & (stamps <= time[-1])
-    nearest = _nearest(time, stamps)
+        found, time = _detect_again(filtered, forces, seen, found)
+    inside = (log.time >= time[0]) & (log.time <= time[-1])
+    nearest = _nearest(time, log.time)
     active, certain, possible, clear = (part[nearest] for part in found)
     return Detection(active, inside & certain, possible, inside & clear)
 
@@ -223,36 +182,33 @@ class _Seen:
         share: of the weight that contacts carry, (K, C).
         velocity: (K, C, 3) [m/s], in the world or not; None where it is unknown.
         in_world: whether it is.
-        accelerates: whether the acceleration of the base is known.
         settings: thresholds.
     """
 
-    known: Filtered
+    known: DetectionSamples
     share: FloatArray
     velocity: FloatArray | None
     in_world: bool
-    accelerates: bool
     settings: DetectionConfig
 
     @classmethod
-    def of(cls, known: Filtered, forces: ForcesAlongNormals, settings: DetectionConfig, folder: Path | None) -> _Seen:
-        """One pass over a log, with forces that are worked out of other parts of it."""
-        shares, velocities = (growing_array("contacts", folder, len(known.time)) for _ in range(2))
-        robot, contacts = forces.balance.robot, forces.balance.contacts
-        in_world = moves = accelerates = False
-        for part in known.parts():
-            shares.append(forces.of_part(part) / forces.balance.weight)
-            in_world, moves = (base := base_velocity(part.log, part.samples)) is not None, part.base_is_known
-            accelerates = moves and part.acceleration_is_known
-            if moves:
-                velocities.append(contact_velocities(part.samples, robot, contacts, base))
-        velocity = velocities.array() if moves else None
-        return cls(known, shares.array(), velocity, in_world, accelerates, settings)
+    def of(cls, known: DetectionSamples, forces: ForcesAlongNormals, settings: DetectionConfig) -> _Seen:
+        """What the signals say with these forces."""
+        balance, base = forces.balance, base_velocity(known.log, known.samples)
+        velocity = None
+        if known.base_is_known:
+            velocity = contact_velocities(known.samples, balance.robot, balance.contacts, base)
+        return cls(known, forces.of_samples(known) / balance.weight, velocity, base is not None, settings)
+
+    @property
+    def accelerates(self) -> bool:
+        """Whether the acceleration of the base is known."""
+        return self.known.base_is_known and self.known.acceleration_is_known
 
     @property
     def time(self) -> FloatArray:
         """Stamps (K,) [s]."""
-        return self.known.time
+        return self.known.log.time
 
     @property
     def smear_s(self) -> float:
@@ -298,11 +254,7 @@ class _Seen:
 
 
 def _detect_again(
-    filtered: Callable[[float], Filtered],
-    forces: ForcesAlongNormals,
-    seen: _Seen,
-    found: Detection,
-    folder: Path | None,
+    filtered: Callable[[float], DetectionSamples], forces: ForcesAlongNormals, seen: _Seen, found: Detection
 ) -> tuple[Detection, FloatArray]:
     """Contacts by parameters that fit the log, and the stamps (K,) [s] of the samples in which they are known.
 
@@ -314,7 +266,6 @@ def _detect_again(
         forces: by the URDF.
         seen: with these, at the cutoff of the settings.
         found: which contacts stand by these.
-        folder: with room, or None.
     """
     time, sharp = seen.time, seen.known
     lowest: float | None = None
@@ -323,7 +274,7 @@ def _detect_again(
     for more in reversed(range(_FITS)):
         if again is None:
             break
-        best = _sharpest(filtered, sharp, again, seen, air, folder)
+        best = _sharpest(filtered, sharp, again, seen, air)
         in_the_air = air[_nearest(seen.time, best.time)]
         noise = best.noise(in_the_air)
         if lowest is not None and noise > _LESS * lowest:
@@ -334,19 +285,18 @@ def _detect_again(
         if not is_sharp or not more:
             break
         of_robot = forces.balance.robot, forces.balance.contacts, forces.balance.builder.tree.sign_width
-        by_urdf = ForcesAlongNormals.of(sharp.parts(), len(time), *of_robot)
+        by_urdf = ForcesAlongNormals.of(sharp, *of_robot)
         away = find_unloaded(time, ~found.clear[:, None], 2.0 * best.smear_s)[:, 0]
         again = _fitted(by_urdf, found.possible, away)
     return found, time
 
 
 def _sharpest(
-    filtered: Callable[[float], Filtered],
-    known: Filtered,
+    filtered: Callable[[float], DetectionSamples],
+    known: DetectionSamples,
     forces: ForcesAlongNormals,
     seen: _Seen,
     in_the_air: BoolArray,
-    folder: Path | None,
 ) -> _Seen:
     """What the widest filter shows whose noise leaves the thresholds as they are, or signals without one.
 
@@ -358,12 +308,11 @@ def _sharpest(
         forces: with parameters that fit the log.
         seen: settings, and stamps of those in the air.
         in_the_air: contacts (K, C) that surely are.
-        folder: with room, or None.
     """
-    best = _Seen.of(known, forces, seen.settings, folder)
-    highest = nyquist_hz(known.time)
+    best = _Seen.of(known, forces, seen.settings)
+    highest = nyquist_hz(known.log.time)
     while best.known.cutoff_hz < highest:
-        wider = _Seen.of(filtered(min(2.0 * best.known.cutoff_hz, highest)), forces, seen.settings, folder)
+        wider = _Seen.of(filtered(min(2.0 * best.known.cutoff_hz, highest)), forces, seen.settings)
         if _DEVIATIONS * wider.noise(in_the_air[_nearest(seen.time, wider.time)]) > seen.settings.touch:
             break
         best = wider

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from torchid.problem.extras import ExtraTerms
 from torchid.problem.linear import PRIOR_DEVIATION, LinearProblem
 from torchid.problem.metrics import force_series
 from torchid.problem.rows import RowBuilder
-from torchid.problem.samples import Samples, concatenate
+from torchid.problem.samples import Samples
 from torchid.regressor import FrameJacobian
 from torchid.robot import Robot
 from torchid.sensing import Contact, named_sensors
@@ -60,46 +60,29 @@ class ForcesAlongNormals:
 
     @classmethod
     def of(
-        cls,
-        parts: Iterable[DetectionSamples],
-        count: int,
-        robot: Robot,
-        contacts: Sequence[Contact],
-        sign_width: float | None = None,
+        cls, known: DetectionSamples, robot: Robot, contacts: Sequence[Contact], sign_width: float | None = None
     ) -> ForcesAlongNormals:
-        """Of the parts of a log of so many samples, with friction whose sign is so wide [rad/s or m/s]."""
-        every, start, power, chosen = -(-count // _FITTED), 0, np.zeros(robot.n), list[tuple[Samples, FloatArray]]()
-        for part in parts:
-            measured = np.full((len(part.log), robot.n), np.nan)
-            if part.samples.torque is not None:
-                measured = part.samples.torque[:, : robot.n].numpy()
-            power = power + np.square(measured).sum(axis=0)
-            some = slice(-start % every, None, every)
-            chosen.append((part.samples[some], part.rotation[some]))
-            start += len(part.log)
-        balance = _Balance.of(robot, contacts, np.sqrt(power / count), sign_width)
-        samples = concatenate([samples for samples, _ in chosen])
-        rotation = np.concatenate([rotation for _, rotation in chosen])
+        """Of a log, with friction whose sign is so wide [rad/s or m/s]."""
+        torque_rms = np.full(robot.n, np.nan)
+        if known.samples.torque is not None:
+            torque_rms = np.sqrt(np.square(known.samples.torque[:, : robot.n].numpy()).mean(axis=0))
+        balance = _Balance.of(robot, contacts, torque_rms, sign_width)
+        chosen = np.arange(0, len(known.log), -(-len(known.log) // _FITTED))
+        samples, rotation = known.samples[torch.from_numpy(chosen)], known.rotation[chosen]
         found = balance.equations(samples, rotation)
         actuators = _fit_actuators(found)
-        return cls(
-            balance,
-            actuators,
-            np.arange(0, count, every),
-            samples,
-            rotation,
-            balance.unexplained_force(found, actuators),
-        )
+        unexplained = balance.unexplained_force(found, actuators)
+        return cls(balance, actuators, chosen, samples, rotation, unexplained)
 
     def with_parameters(self, nominal: FloatArray, armature: FloatArray) -> ForcesAlongNormals:
         """Those of the robot with other parameters (L, 12), and armatures (m,) of joints whose torque was measured."""
         balance = dataclasses.replace(self.balance, robot=dataclasses.replace(self.balance.robot, nominal=nominal))
         return dataclasses.replace(self, balance=balance, actuators=np.outer(armature, [1.0, 0.0, 0.0]))
 
-    def of_part(self, part: DetectionSamples) -> FloatArray:
-        """Forces (K, C) [N] of some samples."""
-        chosen = [slice(start, start + _TOGETHER) for start in range(0, len(part.log), _TOGETHER)]
-        equations = (self.balance.equations(part.samples[x], part.rotation[x]) for x in chosen)
+    def of_samples(self, known: DetectionSamples) -> FloatArray:
+        """Forces (K, C) [N] of all samples of a log."""
+        chosen = [slice(start, start + _TOGETHER) for start in range(0, len(known.log), _TOGETHER)]
+        equations = (self.balance.equations(known.samples[x], known.rotation[x]) for x in chosen)
         return np.concatenate([self.balance.normal_forces(found, self.actuators) for found in equations])
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -27,25 +26,25 @@ from torchid.robot import Robot
 from torchid.sensing import Contact
 
 _RATE_SHARE = 0.2  # of the sample rate: highest cutoff
-MAX_GAPS = 0.05
-"""Share of a torque's samples that may be missing, and are interpolated."""
-
+_MAX_GAPS = 0.05  # share of a torque's samples that may be missing, and are interpolated
 _FEWEST_TORQUES = 3  # above a contact, one for each component of a force
 
 
 @dataclasses.dataclass(frozen=True)
 class DetectionSamples:
-    """Successive samples of a log for detection, or all of them.
+    """A log that is filtered for detection.
 
     Attributes:
         log: preprocessed, without contacts.
         samples: bound from it, one for one, in which all contacts stand.
         rotation: (K, 3, 3) of the base to a world with any heading.
+        cutoff_hz: of the filter, or half the sample rate or more where there is none.
     """
 
     log: Log
     samples: Samples
     rotation: FloatArray
+    cutoff_hz: float
 
     @property
     def base_is_known(self) -> bool:
@@ -72,20 +71,12 @@ def prepare(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: floa
     Raises:
         InputError: no torques, fewer than three of joints above a contact, joints that are missing, or as `preprocess`.
     """
-    require_torque(log.source, log.joint_torque is not None)
-    with quiet():
-        known = preprocess(for_detection(log), filter_hz(cutoff_hz, log.time))
-    return bind_for_detection(known, robot, contacts)
-
-
-def require_torque(source: str, given: bool) -> None:
-    """Refuse a log without joint torques."""
-    if not given:
-        raise LogError(source, "joint_torque", "missing", "the field, from which preprocessing.detect_contacts is")
-
-
-def bind_for_detection(known: Log, robot: Robot, contacts: Sequence[Contact]) -> DetectionSamples:
-    """A preprocessed log, or a part of one, in the robot's order; LogError as `prepare`."""
+    if log.joint_torque is None:
+        raise LogError(log.source, "joint_torque", "missing", "the field, from which preprocessing.detect_contacts is")
+    is_filtered = cutoff_hz < (1.0 - JITTER) * nyquist_hz(log.time)
+    with warnings.catch_warnings():  # noise and gaps are warned of where the log is read for its own sake
+        warnings.simplefilter("ignore", TorchidWarning)
+        known = preprocess(_for_detection(log), cutoff_hz if is_filtered else None)
     order = joint_order(known, robot)
     position, velocity, acceleration, torque = (
         torch.from_numpy(np.ascontiguousarray(getattr(known, f"joint_{name}")[:, order]))
@@ -98,7 +89,7 @@ def bind_for_detection(known: Log, robot: Robot, contacts: Sequence[Contact]) ->
         known.source, torch.tensor(known.time), position, velocity, acceleration, base,
         torch.cat([torque, in_limbs], dim=1), None, False, torch.ones(len(known), len(contacts), dtype=torch.bool),
     )  # fmt: skip
-    return DetectionSamples(known, samples, rotation)
+    return DetectionSamples(known, samples, rotation, cutoff_hz)
 
 
 def detection_cutoff_hz(cutoff_hz: float, time: FloatArray) -> float:
@@ -109,19 +100,6 @@ def detection_cutoff_hz(cutoff_hz: float, time: FloatArray) -> float:
 def nyquist_hz(time: FloatArray) -> float:
     """Half the sample rate [Hz] of a log with stamps (N,) [s]."""
     return 0.5 / float(np.median(np.diff(time))) if len(time) > 1 else 0.5
-
-
-def filter_hz(cutoff_hz: float, time: FloatArray) -> float | None:
-    """The cutoff [Hz] of the filter of a log with stamps (N,) [s]; None, no filter, from half its sample rate on."""
-    return cutoff_hz if cutoff_hz < (1.0 - JITTER) * nyquist_hz(time) else None
-
-
-@contextmanager
-def quiet() -> Iterator[None]:
-    """Keep warnings of noise and gaps to where the log is read for its own sake."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", TorchidWarning)
-        yield
 
 
 def _require_torques(log: Log, robot: Robot, contacts: Sequence[Contact], measured: BoolArray) -> None:
@@ -138,7 +116,7 @@ def _require_torques(log: Log, robot: Robot, contacts: Sequence[Contact], measur
             raise LogError(log.source, "joint_torque", found, accepted)
 
 
-def for_detection(log: Log) -> Log:
+def _for_detection(log: Log) -> Log:
     """The log without contacts and with its gaps interpolated; torques with many are NaN throughout."""
     fields: dict[str, Any] = {name: None for name in vars(log) if name.startswith(("contact_", "ft_"))}
     fields |= {"contact_names": (), "ft_names": ()}
@@ -147,7 +125,7 @@ def for_detection(log: Log) -> Log:
         for name, array in log.arrays().items()
         if name.startswith(("joint_", "base_", "imu_"))
     }
-    broken = np.isnan(np.asarray(log.joint_torque)).mean(axis=0) > MAX_GAPS
+    broken = np.isnan(np.asarray(log.joint_torque)).mean(axis=0) > _MAX_GAPS
     filled["joint_torque"] = np.where(broken, np.nan, filled["joint_torque"])
     return dataclasses.replace(log, **fields | filled)
 

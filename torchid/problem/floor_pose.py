@@ -171,8 +171,6 @@ class LegOdometry:
     def along(self, runs: Sequence[slice], footholds: Footholds) -> tuple[FloatArray, FloatArray]:
         """Rotations (M, 3, 3) to the world and positions (M, 3) [m] in it, along the runs of a segment.
 
-        A segment may be walked in parts, of which each begins with the last sample of the part before.
-
         Args:
             runs: of samples on the same feet, without a gap.
             footholds: of their M samples.

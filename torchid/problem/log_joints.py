@@ -35,7 +35,8 @@ def joint_order(log: Log, robot: Robot) -> list[int]:
         found = f"{join_names(lacking, _LISTED)} of {robot.path.name} missing"
         listed = ", ".join(lacking) if len(lacking) <= _LISTED else f"{lacking[0]}, ..."
         accepted = f"every joint that moves, or robot.weld: [{listed}] for those that are held"
-        raise LogError(log.source, "joint_names", found, accepted + FOLLOW * bool(robot.loops))
+        accepted += "; joints of loops follow from others that determine them" if robot.loops else ""
+        raise LogError(log.source, "joint_names", found, accepted)
     return [log.joint_names.index(name) for name in robot.joint_names]
 
 
@@ -92,21 +93,17 @@ def without_welded_joints(log: Log, robot: Robot | None) -> Log:
     if robot is None or robot.welded.keys().isdisjoint(log.joint_names):
         return log
     kept = [column for column, name in enumerate(log.joint_names) if name not in robot.welded]
-    warn_of_moving_welds(log, robot, distances_from_welds(log, robot))
+    _warn_of_moving_welds(log, robot)
     arrays: dict[str, Any] = {
         name: array[:, kept] for name, array in log.arrays().items() if SHAPES[name] == ("N", "n")
     }
     return replace(log, joint_names=tuple(log.joint_names[column] for column in kept), **arrays)
 
 
-def distances_from_welds(log: Log, robot: Robot) -> FloatArray:
-    """Largest distance of the log's joints, (n,) [rad or m], from where they are welded; 0 for others."""
+def _warn_of_moving_welds(log: Log, robot: Robot) -> None:
+    """Warn, once, if joints of a log are not where they are welded."""
     held = np.array([robot.welded.get(name, np.nan) for name in log.joint_names])
-    return np.nan_to_num(np.abs(log.joint_position - held)).max(axis=0, initial=0.0)
-
-
-def warn_of_moving_welds(log: Log, robot: Robot, distances: FloatArray) -> None:
-    """Warn, once, if joints of a log are not where they are welded, by distances (n,) [rad or m] from there."""
+    distances = np.nan_to_num(np.abs(log.joint_position - held)).max(axis=0, initial=0.0)
     far = []
     for name, distance in zip(log.joint_names, distances, strict=True):
         limit, unit = _TOLERANCE.get(robot.kind_of_welded.get(name, ""), _TOLERANCE_OF_OTHERS)
@@ -116,9 +113,6 @@ def warn_of_moving_welds(log: Log, robot: Robot, distances: FloatArray) -> None:
         text = "; ".join(far)
         warn(f"{log_title(log.source)}: joint {text}, where robot.weld holds it: welding is an approximation here")
 
-
-FOLLOW = "; joints of loops follow from others in logs that fit into preprocessing.memory_gb"
-"""What helps where a log lacks joints of a robot with loops."""
 
 _CHUNK = 4096  # samples
 

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from torchid.errors import LogError, warn
 from torchid.logs import Log
-from torchid.logs.log import FORCE_NORMAL, POINTS, WRENCHES, BoolArray, FloatArray
-from torchid.logs.preprocess import UNLOADED_MARGIN_S, unloaded_readings
+from torchid.logs.log import FORCE_NORMAL, POINTS, WRENCHES, FloatArray
+from torchid.logs.preprocess import UNLOADED_MARGIN_S, find_unloaded
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.rounding import MAD_PER_STD
@@ -121,86 +120,39 @@ def zero_in_air(log: Log, contacts: Sequence[Contact]) -> Log:
     Warns:
         TorchidWarning: what was subtracted, by contact; channels that are masked in the air.
     """
-    field, wrench, scalar = log.contact_wrench_field, log.contact_wrench, log.contact_force_normal
-    offsets = offsets_in_the_air(log, contacts, [(log, unloaded_readings(log))])
-    zeroed: dict[str, Any] = {} if wrench is None else {field: wrench - offsets[:, :6]}
-    if scalar is not None:
-        zeroed[FORCE_NORMAL] = scalar - offsets[:, 6]
-    return dataclasses.replace(log, **zeroed)
-
-
-def offsets_in_the_air(
-    log: Log, contacts: Sequence[Contact], parts: Iterable[tuple[Log, FloatArray | None]]
-) -> FloatArray:
-    """What `zero_in_air` subtracts, (C, 7) [N, N m]: components of wrenches, and the force along the normal.
-
-    Args:
-        log: any samples of it, which name contacts and fields.
-        contacts: as of `zero_in_air`.
-        parts: all samples of the log, in order, each part with its `unloaded_readings`.
-
-    Raises:
-        LogError: as `zero_in_air`.
-
-    Warns:
-        TorchidWarning: likewise.
-    """
+    wrench, scalar = log.contact_wrench, log.contact_force_normal
     if log.contact_wrench_world is not None and not log.moments_about_world_origin:
         found = f"given with {_KEY}, though no offset is constant along the world's axes of a sensor that moves"
         accepted = f"{WRENCHES[0]} or {FORCE_NORMAL}; of force plates {POINTS}, or logs.columns.plates"
         raise LogError(log.source, WRENCHES[1], found, accepted)
-    if log.contact_wrench is None and log.contact_force_normal is None:
+    if wrench is None and scalar is None:
         raise LogError(log.source, WRENCHES[0], "missing", f"readings of contacts, which {_KEY} is for")
-    air = _Readings.of(len(log.contact_names), parts)
-    offsets, masked = np.zeros((len(log.contact_names), 7)), list[str]()
+    count = len(log.contact_names)
+    six = np.zeros((len(log), count, 6)) if wrench is None else wrench
+    along = np.zeros((len(log), count)) if scalar is None else scalar
+    readings = np.concatenate([six, along[..., None]], axis=2)
+    reads = np.nan_to_num(readings).any(axis=0)  # others are such as moments of points
+    in_the_air = np.zeros(readings.shape[:2], dtype=bool)
+    if log.contact_active is not None:
+        in_the_air = find_unloaded(log.time, log.contact_active)
+    offsets, masked = np.zeros((count, 7)), list[str]()
     for contact in contacts:
         if contact.frame not in log.contact_names:
             continue
         column = log.contact_names.index(contact.frame)
-        for component in np.flatnonzero(air.reads[column]):  # others are such as moments of points
-            count, above, below = (int(x[column, component]) for x in (air.count, air.above, air.below))
-            _require_readings(log, contact.frame, int(component), count)
-            offsets[column, component] = air.total[column, component] / count
-            if _are_masked(count, above, below) and contact.frame not in masked:
+        for component in np.flatnonzero(reads[column]):
+            values = readings[in_the_air[:, column], column, component]
+            values = values[np.isfinite(values)]
+            _require_readings(log, contact.frame, int(component), len(values))
+            offsets[column, component] = values.sum() / len(values)
+            is_masked = _are_masked(len(values), int((values > 0.0).sum()), int((values < 0.0).sum()))
+            if is_masked and contact.frame not in masked:
                 masked.append(contact.frame)
     _warn_of_offsets(log, offsets, masked)
-    return offsets
-
-
-@dataclasses.dataclass(frozen=True)
-class _Readings:
-    """What channels of contact sensors, (C, 7) each, read in the air, and whether they ever read anything but 0.
-
-    Attributes:
-        reads: those that do, in the air or not.
-        count: readings in the air; `above`, `below`: 0 of these.
-        total: their sum [N, N m].
-    """
-
-    reads: BoolArray
-    count: NDArray[np.intp]
-    above: NDArray[np.intp]
-    below: NDArray[np.intp]
-    total: FloatArray
-
-    @classmethod
-    def of(cls, contacts: int, parts: Iterable[tuple[Log, FloatArray | None]]) -> _Readings:
-        count, above, below = np.zeros((3, contacts, 7), dtype=np.intp)
-        out = cls(np.zeros((contacts, 7), dtype=bool), count, above, below, np.zeros((contacts, 7)))
-        for log, unloaded in parts:
-            if log.contact_wrench is not None:
-                out.reads[:, :6] |= np.nan_to_num(log.contact_wrench).any(axis=0)
-            if log.contact_force_normal is not None:
-                out.reads[:, 6] |= np.nan_to_num(log.contact_force_normal).any(axis=0)
-            if unloaded is None:
-                continue
-            own = slice(unloaded.shape[2])
-            finite = np.isfinite(unloaded)
-            out.count[:, own] += finite.sum(axis=0)
-            out.above[:, own] += (finite & (unloaded > 0.0)).sum(axis=0)
-            out.below[:, own] += (finite & (unloaded < 0.0)).sum(axis=0)
-            out.total[:, own] += np.where(finite, unloaded, 0.0).sum(axis=0)
-        return out
+    zeroed: dict[str, Any] = {} if wrench is None else {log.contact_wrench_field: wrench - offsets[:, :6]}
+    if scalar is not None:
+        zeroed[FORCE_NORMAL] = scalar - offsets[:, 6]
+    return dataclasses.replace(log, **zeroed)
 
 
 def _require_readings(log: Log, frame: str, component: int, count: int) -> None:

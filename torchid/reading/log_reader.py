@@ -1,49 +1,83 @@
-"""Logs on their way from files to a robot's samples, block by block where they are larger than memory."""
+"""From log files to samples of a robot: flags, pose of the base, filter, binding, slip.
+
+A log that is too large to be worked on at once is cut into parts that overlap as far as the filter remembers. Each part
+is prepared like any log in memory; its samples are kept on the disk, without those of the overlap.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import gettempdir
+from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from torchid import distributed
 from torchid.config.logs import require_apart
-from torchid.errors import ConfigError, LogError
+from torchid.errors import ConfigError, LogError, about_file
 from torchid.fitting.experiment import RobotSetup, S
 from torchid.log_checks import drop_rejected
 from torchid.log_checks.check import check
 from torchid.log_checks.spikes import warn_of_steps
 from torchid.logs import Log, read_log
-from torchid.logs.blocks import GIGABYTE, has_blocks, log_bytes
-from torchid.logs.containers import LogKind, existing_log_kind
+from torchid.logs.blocks import GIGABYTE, LogBlocks, has_blocks, log_bytes, open_log_blocks
+from torchid.logs.dry_friction import with_sign_filter, with_signs_of
 from torchid.logs.flags import with_flags_by_force
-from torchid.logs.log import BoolArray
+from torchid.logs.gaps import Coverage
+from torchid.logs.lazy_arrays import MappedPages, Spill
+from torchid.logs.log import BoolArray, FloatArray
+from torchid.logs.low_pass import LowPass
+from torchid.logs.preprocess import (
+    away_from_changes,
+    away_from_stamps,
+    find_unloaded,
+    lacks_derivatives,
+    make_timeline,
+    measured_coverage,
+    move_to_timeline,
+    unloaded_readings,
+)
 from torchid.logs.read import files_of_recordings_kept
-from torchid.logs.segments import with_delayed_torques
+from torchid.logs.segments import count_samples, long_segments, with_delayed_torques
+from torchid.logs.signal_noise import signal_noise, warn_of_noisy_accelerations
 from torchid.logs.time_range import LogPart, split_range
+from torchid.logs.timeline import JITTER, SPLINE_OVERLAP, Timeline
 from torchid.parameters import Array
-from torchid.problem import Samples
+from torchid.problem import Samples, bind_log
+from torchid.problem.base_pose import LogWithPose, base_pose_from_feet, warn_of_pose
 from torchid.problem.contact_detection import with_detected_contacts
+from torchid.problem.contact_slip import measure_slip, warn_of_slip
 from torchid.problem.log_joints import with_loop_joints, without_welded_joints
+from torchid.problem.motion import BaseMotion
+from torchid.problem.samples import concatenate, oversampling
 from torchid.problem.unloaded_sensors import zero_in_air
-from torchid.reading.log_steps import BLOCK_GB, LogSteps
 from torchid.robot import payload_parameters, with_payload
 from torchid.sensing import SensorSet
+from torchid.sensing.sensors import UP
 
-_WHOLE_GB = 2.0 * BLOCK_GB  # recorded arrays that are taken whole: no block is worth its neighbourhood
+_COPIES = 8  # a part takes some times the memory of its recorded arrays: derivatives, splines, bound tensors
+_SHARED_MULTIPLE = 840  # samples of parts and overlaps: where every k-th is kept, k to 8, these are the same
+_FEWEST = 5 * _SHARED_MULTIPLE  # samples of a part
+
+_SETTLED_S = 1.0  # beyond the filter's reach, for flags and poses that follow from samples before [s]
 
 
 class LogReader:
     """Reads, preprocesses and binds logs; each on its own, so that nothing is differentiated across a seam.
 
-    Logs whose arrays together take more than the memory they may take are kept on the disk from then on, all but bags.
+    Samples of a log that is worked on in parts are kept on the disk, as are those of logs from the one on that together
+    with those before it takes more than the memory they may take.
 
     Attributes:
         setup: robot, contacts and settings.
-        folder: on whose disk logs are kept, as long as they are used.
+        folder: on whose disk samples are kept, as long as they are used.
         excluded: how many samples of each log were left out because they are rejected, by path.
     """
 
@@ -58,7 +92,7 @@ class LogReader:
         self.setup = setup
         self.folder = _folder_beside(setup.config.output) if folder is None else folder
         self.excluded: dict[str, int] = {}
-        self._held = 0.0  # arrays of logs in memory [GB]
+        self._held_gb = 0.0  # arrays of logs in memory
 
     def read(
         self, paths: Sequence[Path], required: SensorSet | None, on_read: Callable[[Path], None] | None = None
@@ -76,46 +110,43 @@ class LogReader:
         logs = list[Samples]()
         with files_of_recordings_kept():
             for path in paths:
-                together = self._together(path)
-                is_bag = existing_log_kind(path) is LogKind.BAG
-                if together > self.setup.config.preprocessing.memory_gb and not is_bag:
-                    logs.append(self._large(path, required, together))
-                else:
-                    logs.append(self._small(path, required))
-                    self._held = together + (logs[-1].nbytes / GIGABYTE if is_bag else 0.0)
+                logs.append(self._read_one(path, required))
                 if on_read is not None:
                     on_read(path)
         names = distributed.broadcast([log.source for log in logs], "names of the logs")  # they may lie elsewhere there
         added = [payload_of(self.setup, path) for path in paths]
         return [replace(log, source=name, payload=x) for log, name, x in zip(logs, names, added, strict=True)]
 
-    def _together(self, path: Path) -> float:
-        """What a log takes in memory with those before it [GB]."""
-        return memory_needed(path, self.setup.config.preprocessing.memory_gb, self._held)
+    def _read_one(self, path: Path, required: SensorSet | None) -> Samples:
+        """The samples of a log, in memory or on the disk."""
+        files, limit_gb = self.setup.config.logs, self.setup.config.preprocessing.memory_gb
+        size_gb = self._size_gb(path)
+        self.excluded.pop(str(path), None)
+        if size_gb > limit_gb and split_range(path).joins:
+            found = f"several files with arrays of {size_gb:.2g} GB, which are not in memory at once"
+            needed = f"a preprocessing.memory_gb above {size_gb:.2g}"
+            raise LogError(path, "file", found, f"{needed}, or the one file that torchid convert makes of them")
+        has_parts = size_gb > limit_gb or has_blocks(path, None if files is None else files.columns)
+        if size_gb > limit_gb / _COPIES and has_parts:
+            samples = self._in_parts(path, required)
+        else:
+            samples = self.samples_of(self._recorded(path), path, required)
+            together_gb = self._held_gb + size_gb
+            if together_gb > limit_gb:
+                samples = _on_disk(path, self.folder, [samples])
+            else:
+                self._held_gb = together_gb or samples.nbytes / GIGABYTE  # that of a bag is not known before
+        if not len(samples):
+            found, accepted = "no sample away from changes of contact", "a smaller preprocessing.contact_margin_s"
+            if self._checks_slip:
+                found = f"{found} in which no contact slips"
+                accepted = "a larger preprocessing.max_slip, or a smaller contact_margin_s"
+            raise LogError(path, "contact_active", found, accepted)
+        return samples
 
-    def _small(self, path: Path, required: SensorSet | None) -> Samples:
-        """A log that fits into memory."""
-        settings = self.setup.config.preprocessing
-        if self._takes_blocks(path, log_bytes(path, GIGABYTE * _WHOLE_GB) / GIGABYTE):
-            return self._steps(path, required, None).samples(fits_contact_offsets(self.setup))
-        read = self._recorded(path)
-        own = setup_of_log(self.setup, path)
-        acting = with_delayed_torques(without_welded_joints(read, own.robot), self.setup.config.actuators.known_delay)
-        recorded, certain = apply_contact_settings(with_loop_joints(acting, own.robot), own)
-        steps = self._steps(path, required, None)
-        with_unloaded = fits_contact_offsets(self.setup)
-        if not settings.exclude_rejected:
-            warn_of_steps(recorded)
-            return steps.samples_of(recorded, certain, with_unloaded)
-        declared = replace(self.setup.declared, delay=0.0)  # the log has been read with it
-        checked = check(recorded, own.robot, self.setup.contacts, settings.filter_hz, settings.derived, declared)
-
-        def drop(samples: Samples, derived: bool) -> Samples:
-            usable = drop_rejected(samples, checked, settings.filter_hz, derived)
-            self.excluded[str(path)] = len(samples) - len(usable)
-            return usable
-
-        return steps.samples_of(recorded, certain, with_unloaded, checked.repaired, drop)
+    def _size_gb(self, path: Path) -> float:
+        """What the arrays of a log take."""
+        return memory_needed(path, self.setup.config.preprocessing.memory_gb / _COPIES)
 
     def _recorded(self, path: Path) -> Log:
         """A log as it is in its file."""
@@ -130,51 +161,174 @@ class LogReader:
             needs_flags=settings.needs_flags,
         )
 
-    def _large(self, path: Path, required: SensorSet | None, together: float) -> Samples:
-        """A log that does not, with those before it [GB]."""
+    # ------------------------------------------------------------------------------------------------- logs in parts
+
+    def _in_parts(self, path: Path, required: SensorSet | None) -> Samples:
+        """The samples of a log of which a part is in memory at a time."""
+        settings, files = self.setup.config.preprocessing, self.setup.config.logs
+        columns = None if files is None else files.columns
+        with about_file(path), open_log_blocks(path, self.folder, columns, settings.needs_flags) as blocks:
+            self._require_known_heading(blocks)
+            most = int(settings.memory_gb * GIGABYTE / (_COPIES * blocks.row_bytes))
+            starts = range(0, len(blocks), max(most // _SHARED_MULTIPLE * _SHARED_MULTIPLE, _FEWEST))
+            pieces = (slice(start, min(start + starts.step, len(blocks))) for start in starts)
+            return _on_disk(path, self.folder, (self._part(blocks, path, piece, required) for piece in pieces))
+
+    def _part(self, blocks: LogBlocks, path: Path, piece: slice, required: SensorSet | None) -> Samples:
+        """Some successive samples of a log, by those around that they depend on."""
+        settings, time = self.setup.config.preprocessing, blocks.time
+        beyond = _overlap(time, settings.filter_hz)
+        around = slice(max(piece.start - beyond, 0), min(piece.stop + beyond, len(time)))
+        name = f"{path} (samples {around.start} to {around.stop - 1} of {len(time)}, counted from there)"
+        with about_file(path if around == slice(0, len(time)) else name):
+            log = blocks.read(around, settings.exclude_rejected, settings.bridge_gaps_s)
+        samples = self.samples_of(log, path, required)
+        stamps, slack = samples.time.numpy(), JITTER * float(np.median(np.diff(log.time)))  # however they round
+        inside = stamps >= time[piece.start] - slack
+        if piece.stop < len(time):
+            inside &= stamps < time[piece.stop] - slack
+        return samples[torch.from_numpy(np.flatnonzero(inside))]
+
+    def _require_known_heading(self, blocks: LogBlocks) -> None:
+        """Refuse a tilted floor on which the feet alone tell a heading, from the beginning of the whole log on."""
         settings = self.setup.config.preprocessing
-        needed = f"a preprocessing.memory_gb above {together:.2g}"
-        arrays = f"arrays of {together:.2g} GB, which are not in memory at once"
-        if split_range(path).joins:
-            found = f"several files with {arrays}"
-            raise LogError(path, "file", found, f"{needed}, or the one file that torchid convert makes of them")
-        if self.setup.config.actuators.known_delay:
-            raise LogError(path, "actuators.delay", f"set for {arrays}", f"{needed}, or parts of the log")
+        measured = "imu_frame" in blocks.names or any(name.startswith("base_quat") for name in blocks.fields)
+        by_feet = settings.base_motion is not None or (settings.detect_contacts is not None and not measured)
+        if by_feet and any(contact.normal != UP for contact in self.setup.contacts):
+            setting = "detect_contacts" if settings.base_motion is None else "base_motion: contacts"
+            found = f"unknown, with {setting} on a tilted floor in a log that is not in memory at once"
+            accepted = "the base's orientation or an IMU, a larger preprocessing.memory_gb, or parts of the log"
+            raise LogError(blocks.source, "base_quat_xyzw", found, accepted)
+
+    # --------------------------------------------------------------------------------- the steps of a log in memory
+
+    @property
+    def _checks_slip(self) -> bool:
+        return self.setup.config.preprocessing.max_slip is not None and bool(self.setup.contacts)
+
+    def samples_of(self, recorded: Log, path: Path, required: SensorSet | None) -> Samples:
+        """The samples of a log, or of a part of one, that are kept; there may be none."""
+        setup, settings = self.setup, self.setup.config.preprocessing
+        own = setup_of_log(setup, path)
+        acting = with_delayed_torques(without_welded_joints(recorded, own.robot), setup.config.actuators.known_delay)
+        flagged, certain = apply_contact_settings(with_loop_joints(acting, own.robot), own)
+        checked, clean = None, flagged
         if settings.exclude_rejected:
-            accepted = f"{needed}, or parts of the logs that torchid check passes"
-            raise LogError(path, "preprocessing.exclude_rejected", f"set for {arrays}", accepted)
-        return self._steps(path, required, self.folder).samples(fits_contact_offsets(self.setup))
+            declared = replace(setup.declared, delay=0.0)  # the log has been read with it
+            checked = check(flagged, own.robot, setup.contacts, settings.filter_hz, settings.derived, declared)
+            clean = checked.repaired
+        else:
+            warn_of_steps(flagged)
+        with about_file(recorded.source):
+            samples, moved, is_derived = self._bound(clean, required)
+        time = samples.time.numpy()
+        kept = np.ones(len(time), dtype=bool)
+        if flagged.contact_active is not None and self._checks_slip:
+            from_feet = settings.base_motion is not None
+            limits = settings.slip_limit, settings.filter_hz, from_feet
+            slip = measure_slip(moved, samples, flagged, setup.robot, setup.contacts, *limits)
+            warn_of_slip(slip, recorded.source)
+            kept &= ~slip.slips.any(axis=1)
+        if settings.margin_s is not None and settings.detect_contacts is None:
+            kept &= away_from_changes(flagged, time, settings.margin_s)
+        if not certain.all():
+            kept &= away_from_stamps(time, flagged.time[~certain], settings.margin_s or 0.0)
+        if checked is not None:
+            usable = drop_rejected(samples, checked, settings.filter_hz, is_derived)
+            before = self.excluded.get(str(path), 0)
+            self.excluded[str(path)] = before + len(samples) - len(usable)
+            kept &= np.isin(time, usable.time.numpy())
+        return samples if kept.all() else samples[torch.from_numpy(np.flatnonzero(kept))]
 
-    def _takes_blocks(self, path: Path, gigabytes: float) -> bool:
-        """Whether a log with so much in arrays is read block by block even if there is memory for it.
+    def _bound(self, log: Log, required: SensorSet | None) -> tuple[Samples, Log, bool]:
+        """A log filtered, differentiated and in the robot's order.
 
-        Where fields are worked out of others, blocks take more passes over it.
+        Segments between which the base's pose is not known are worked on by themselves, with the coverage and the
+        friction's sign of all.
+
+        Returns:
+            All samples, the last segment of the log that they are bound from, and whether samples depend on others.
         """
-        settings = self.setup.config.preprocessing
-        filled = settings.bridge_gaps_s is not None or settings.zero_in_air
-        logs, delayed = self.setup.config.logs, bool(self.setup.config.actuators.known_delay)
-        joined = not has_blocks(path, None if logs is None else logs.columns)
-        whole = settings.exclude_rejected or settings.derived or filled or delayed or joined
-        return gigabytes > _WHOLE_GB and not whole and not self.setup.robot.loops
+        setup, settings = self.setup, self.setup.config.preprocessing
+        if setup.contacts and log.contact_active is not None and fits_contact_offsets(setup):
+            log = replace(log, contact_unloaded=unloaded_readings(log, find_unloaded(log.time, log.contact_active)))
+        standing, longest, stated = None, log, setup.config.sensors.noise.motion
+        if settings.base_motion is not None:
+            standing = base_pose_from_feet(log, setup.robot, setup.contacts)
+            log = standing.log
+            longest = log.select(max(standing.segments, key=lambda segment: segment.stop - segment.start))
+            stated = {}
+        whole = self._timeline(log.time, lacks_derivatives(longest))
+        noise = signal_noise(longest, whole, stated)
+        coverage = dict[str, Coverage]()
+        if whole is not None:
+            whole = with_sign_filter(whole, longest, noise)
+            coverage = measured_coverage(log, whole)
+        segments = [(log, whole)]
+        if standing is not None and whole is not None:
+            segments = self._segments(standing, whole)
+        samples, bandwidths = list[Samples](), list[float]()
+        for segment, timeline in segments:
+            moved = segment
+            if timeline is not None:
+                moved = move_to_timeline(segment, timeline, coverage)
+                bandwidths += [] if timeline.bandwidth_hz is None else [timeline.bandwidth_hz]
+                if len(segment) == len(longest):  # which stands for all
+                    warn_of_noisy_accelerations(segment, moved, timeline, noise)
+            if standing is None:
+                moved = replace(moved, motion_noise=noise)
+            samples.append(bind_log(moved, setup.robot, setup.contacts, required))
+        bound = concatenate(samples)
+        if not fits_contact_offsets(setup):
+            bound = replace(bound, unloaded=None)
+        rate = oversampling(bound.time.numpy(), min(bandwidths, default=None))
+        return replace(bound, oversampling=rate), moved, whole is not None or noise.found
 
-    def _steps(self, path: Path, required: SensorSet | None, folder: Path | None) -> LogSteps:
-        """The steps from the log to samples."""
-        setup = self.setup
-        settings = setup.config.preprocessing
-        return LogSteps(
-            path,
-            settings,
-            setup.robot,
-            setup.contacts,
-            required,
-            folder,
-            motion_noise=setup.config.sensors.noise.motion,
-            sign_width=setup.terms.sign_width,
-            stribeck=setup.terms.stribeck,
-            finds_rest=setup.config.actuators.known["stiction"],
-            columns=None if setup.config.logs is None else setup.config.logs.columns,
-            loaded=setup_of_log(setup, path).robot,
-        )
+    def _timeline(self, time: FloatArray, differentiates: bool) -> Timeline | None:
+        """Stamps of a log and of what becomes of it; None where nothing has to be done."""
+        setup, settings = self.setup, self.setup.config.preprocessing
+        friction = setup.terms.sign_width, setup.terms.stribeck, setup.config.actuators.known["stiction"]
+        return make_timeline(time, differentiates, settings.filter_hz, settings.sample_rate_hz, *friction)
+
+    def _segments(self, standing: LogWithPose, whole: Timeline) -> list[tuple[Log, Timeline | None]]:
+        """The segments of a log with a pose that are long enough, each with its timeline; warns of the others."""
+        usable = long_segments(standing.log.time, standing.segments, whole)
+        warn_of_pose(standing, count_samples(standing.segments) - count_samples(usable))
+        segments = list[tuple[Log, Timeline | None]]()
+        for chosen in usable:
+            segment = standing.log.select(chosen)
+            timeline = self._timeline(segment.time, True)
+            segments.append((segment, None if timeline is None else with_signs_of(timeline, whole)))
+        return segments
+
+
+def _overlap(time: FloatArray, cutoff_hz: float | None) -> int:
+    """Samples on either side of a part that it depends on, of a log with stamps (N,) [s] that is filtered so."""
+    step = float(np.median(np.diff(time)))
+    samples = SPLINE_OVERLAP + math.ceil(_SETTLED_S / step)
+    if cutoff_hz is not None and cutoff_hz < 0.5 / step:
+        low_pass = LowPass.butterworth(cutoff_hz, step)
+        samples += 2 * (low_pass.settling + low_pass.padding)  # directions are filtered twice
+    return math.ceil(samples / _SHARED_MULTIPLE) * _SHARED_MULTIPLE
+
+
+def _on_disk(path: Path, folder: Path, parts: Iterable[Samples]) -> Samples:
+    """Successive samples of a log as one, in temporary files in a folder; what is no tensor is that of the first."""
+    spills: defaultdict[tuple[str, bool], Spill] = defaultdict(partial(Spill, path, folder))
+    first: Samples | None = None
+    for samples in parts:
+        first = samples[:0] if first is None else first
+        for part, is_base in ((samples, False), (samples.base, True)):
+            for name, x in vars(part).items():
+                if isinstance(x, Tensor):
+                    spills[name, is_base].append(x.numpy())
+    if first is None:
+        raise ValueError("no samples")
+    arrays = {key: spill.array() for key, spill in spills.items()}
+    of_log: dict[str, Any] = {name: torch.from_numpy(x) for (name, is_base), x in arrays.items() if not is_base}
+    of_base = {name: torch.from_numpy(x) for (name, is_base), x in arrays.items() if is_base}
+    pages = MappedPages(arrays.values())
+    return replace(first, source=str(path), folder=folder, pages=pages, base=BaseMotion(**of_base), **of_log)
 
 
 def apply_contact_settings(log: Log, setup: RobotSetup) -> tuple[Log, BoolArray]:
