@@ -137,7 +137,9 @@ class LogReader:
             else:
                 self._held_gb = together_gb or samples.nbytes / GIGABYTE  # that of a bag is not known before
         if not len(samples):
-            found, accepted = "no sample away from changes of contact", "a smaller preprocessing.contact_margin_s"
+            margin_s = self.setup.config.preprocessing.margin_s or 0.0
+            found = f"no sample further than {margin_s:g} s from a change of contact"
+            accepted = "a smaller preprocessing.contact_margin_s"
             if self._checks_slip:
                 found = f"{found} in which no contact slips"
                 accepted = "a larger preprocessing.max_slip, or a smaller contact_margin_s"
