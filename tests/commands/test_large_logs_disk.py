@@ -46,7 +46,7 @@ IDENTIFY = ("estimator.ridge=0.001", "sensors=joints")
 
 
 def fitted(file: Path, *more: str) -> np.ndarray:
-    setup = set_up(load_config(file, (*overrides({"cutoff_hz": 20}), *more)))
+    setup = set_up(load_config(file, (*overrides({"cutoff_hz": 18}), *more)))
     builder = RowBuilder(setup.robot, setup.contacts, setup.sensors)
     logs = LogReader(setup).read(setup.config.logs.train, setup.sensors)
     problem = linear_problem(compress(logs, builder), builder, setup.robot)
