@@ -219,7 +219,7 @@ def test_an_interrupt_leaves_nothing_behind(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "torchid", "identify", str(file), SMALL, f"output={tmp_path / 'run'}"]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     descriptors = Path(f"/proc/{process.pid}/fd")
-    deadline = clock.monotonic() + 60.0
+    deadline = clock.monotonic() + 240.0  # of a busy machine
     while not any(str(tmp_path) in target and "deleted" in target for target in links(descriptors)):
         assert clock.monotonic() < deadline
         assert process.poll() is None
